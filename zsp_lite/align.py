@@ -121,7 +121,7 @@ def align_category(
     return synchronise(found)
 
 
-def label_errors(found: CategoryAlignment, labels: Mapping[str, PoseLabel]) -> tuple[list[float], list[float]]:
+def alignment_errors(found: CategoryAlignment, labels: Mapping[str, PoseLabel]) -> tuple[list[float], list[float]]:
     """Compute the rotation errors in degrees of all ordered pairs of labelled objects, and of every pair alone."""
     turns = {name: labels[name].trans[:3, :3] for name in found.objects if name in labels}
     true = {(a, b): turns[b] @ turns[a].T for a, b in permutations(turns, 2)}
