@@ -11,7 +11,7 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.data.photograph import load_photograph
 from zsp_lite.errors import InputError
 from zsp_lite.importers.convert import scale_frame
-from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth
+from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth, separate_colours
 
 RADIUS = 0.3
 DIRECTIONS = [(1, 0.2, 0.6), (0.4, 1, 0.5), (0.7, -0.8, 0.4), (1, 0.5, 1.5)]
@@ -132,3 +132,10 @@ def test_the_photographed_motorcycle_is_found():
     photograph = load_photograph()
     (found,) = masks_from_depth([replace(photograph, mask=None)])
     assert overlap(found.mask, photograph.mask > 0.5) > 0.7
+
+
+def test_a_box_that_fits_is_the_mask_although_colours_are_separated_on_a_smaller_copy():
+    inside = np.zeros((960, 960), bool)
+    inside[301:661, 301:661] = True
+    rgb = np.where(inside[..., None], np.uint8([180, 60, 60]), np.uint8(120))
+    assert np.abs(np.argwhere(separate_colours(rgb, inside)).mean(axis=0) - 480.5).max() < 0.1

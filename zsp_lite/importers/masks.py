@@ -111,7 +111,7 @@ def separate_colours(
     shrink = max(1, max(height, width) / _LONGEST_SIDE)
     size = max(1, round(width / shrink)), max(1, round(height / shrink))
     bgr = cv2.resize(rgb[..., ::-1], size, interpolation=cv2.INTER_AREA)
-    small = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
+    small = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT)
     foreground = (cv2.GC_FGD, cv2.GC_PR_FGD)
     if 0 < np.isin(small, foreground).mean() < 1:  # GrabCut needs pixels of both kinds
         cv2.setRNGSeed(0)  # GrabCut initialises its clusters at random
