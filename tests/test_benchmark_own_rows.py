@@ -397,7 +397,7 @@ def test_a_backbone_of_ones_own_is_known_by_its_name_and_its_weights():
 
 
 def test_the_library_is_known_by_version_and_commit(tmp_path, monkeypatch):
-    monkeypatch.setattr(identity, "_PACKAGE", tmp_path)
+    monkeypatch.setattr(identity, "REPOSITORY", tmp_path)
     version, found = identity.library_version.__wrapped__, []
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=b"]
     (tmp_path / "__init__.py").touch()

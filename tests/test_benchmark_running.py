@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_info
 
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark.execution import make_chunks, one_thread, open_workers
+from zsp_lite.benchmark.execution import make_chunks, open_workers
 from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
 from zsp_lite.benchmark.problem import FrameStore, Problem
@@ -38,6 +38,7 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels, write_label
 from zsp_lite.data.pairs import sample_pairs
 from zsp_lite.errors import InputError
+from zsp_lite.threads import one_thread
 
 pytestmark = pytest.mark.slow
 needs_signals = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGSTOP, SIGKILL and pgrep")
