@@ -92,8 +92,7 @@ def align_category(
         allow_other_version: Continue a run of another version of the library.
 
     Raises:
-        InputError: There are fewer than two sequences, one is too short, the pairs that have poses do not connect all
-            of them, or OUT holds another run.
+        InputError: Sequences are fewer than two, too short, or not connected by pairs with poses; OUT has another run.
         FatalError: The backbone is broken, or a frame cannot be read.
     """
     chosen = {pair.key: pair for pair in object_pairs(dataset, category, sequences, pairs, targets)}
