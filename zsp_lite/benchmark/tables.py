@@ -48,10 +48,11 @@ class Cell:
     metric: str = ""  # of `METRICS`
 
     def __str__(self) -> str:
-        value, low, high = ("" if x is None else f"{x:.{self.decimals}f}" for x in (self.value, self.low, self.high))
         if self.decimals == 3 and self.value < 0.001:  # a p value
             return "< 0.001"
-        return f"{value} [{low}, {high}]" if low else value
+        number = f"{{:.{self.decimals}f}}"
+        text = number if self.low is None else f"{number} [{number}, {number}]"
+        return text.format(self.value, self.low, self.high)
 
 
 @dataclass(frozen=True, eq=False)
