@@ -157,7 +157,7 @@ def test_latex_has_the_best_method_of_a_category_in_bold_and_the_published_figur
         assert [text.startswith(r"\textbf") for text in texts] == [value == min(values) for value in values]
     assert "other data (CO3D) and another backbone (DINO ViT-S/8).}" in as_latex(found["table_1"])
     assert "other data" not in as_latex(found["categories_median"]) and "other data" in found["table_1"].note
-    assert body_of(found["table_1"])[-1] == ["Ours (K=50) (paper, CO3D)", "53.8", "46.3", "31.1"]
+    assert body_of(found["table_1"])[-1] == ["paper, CO3D: Ours (K=50)", "53.8", "46.3", "31.1"]
 
 
 def test_table_1_has_the_single_categories_that_the_run_has(tmp_path):

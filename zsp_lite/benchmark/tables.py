@@ -48,10 +48,11 @@ class Cell:
     metric: str = ""  # of `METRICS`
 
     def __str__(self) -> str:
-        value, low, high = ("" if x is None else f"{x:.{self.decimals}f}" for x in (self.value, self.low, self.high))
         if self.decimals == 3 and self.value < 0.001:  # a p value
             return "< 0.001"
-        return f"{value} [{low}, {high}]" if low else value
+        number = f"{{:.{self.decimals}f}}"
+        text = number if self.low is None else f"{number} [{number}, {number}]"
+        return text.format(self.value, self.low, self.high)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +238,7 @@ def as_latex(table: Table) -> str:
     shown = table.cells[titles].dropna(how="all")
     texts, best = shown.map(_number), shown.apply(_are_best, axis=int(table.across))
     published = table.cells.reindex(columns=[f"{PUBLISHED}: {title}" for title in titles]).dropna(how="all")
-    published = published.set_axis(titles, axis="columns").rename(lambda label: f"{label} ({PUBLISHED})")
+    published = published.set_axis(titles, axis="columns").rename(lambda label: f"{PUBLISHED}: {label}")
     lines = pd.concat([texts.mask(best, r"\textbf{" + texts + "}"), published.map(_number)])
     lines = lines.rename(index=_escape, columns=_escape)
     title = re.sub(r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title)  # LaTeX counts tables itself
