@@ -265,7 +265,7 @@ class Vandal:
 
     def problem(self, problem):
         overwrite(*problem.frames())
-        for view in (*problem.views(), *problem.estimate().target_views, problem.reference, *problem.targets):
+        for view in (*problem.views(), *problem.estimate().target_views):
             view.features.keys[:], view.features.saliency[:], view.foreground[:] = 0, 0, False
         found = problem.estimate(settings={"solver": "verified"})
         found.matches.reference[:], found.sim3.R[:] = 0, np.eye(3)

@@ -270,6 +270,6 @@ def _least_absolute(
     scaled = weight
     for _ in range(_REWEIGHTINGS):
         weighted = incidence.T * scaled
-        x = np.linalg.lstsq(weighted @ incidence, weighted @ difference, rcond=None)[0]  # of least norm, so of mean zero
+        x = np.linalg.lstsq(weighted @ incidence, weighted @ difference, rcond=None)[0]  # of least norm: mean zero
         scaled = weight / (np.linalg.norm(incidence @ x - difference, axis=1) + 1e-9)
     return x
