@@ -8,7 +8,7 @@ STAMP := $(VENV)/.installed
 LAB := my_notebooks
 NOTEBOOKS := $(sort $(wildcard notebooks/*.ipynb))
 
-.PHONY: help demo test check lint format lab notebooks site browser hostile exercises doctor clean
+.PHONY: help demo test check lint format lab notebooks site browser hostile gpu exercises doctor clean
 
 help:
 	@echo "make demo       the method end to end on data_samples/; writes $(OUT)/report.html"
@@ -21,6 +21,7 @@ help:
 	@echo "make site       the course as a web site, in outputs/site/; no notebook is executed"
 	@echo "make browser    every notebook in JupyterLab in Chromium; keeps a picture of each in outputs/browser/"
 	@echo "make hostile    damaged, oversized and malicious inputs, each in a process with limits (Linux; minutes)"
+	@echo "make gpu        poses, notebooks and speed on a CUDA GPU; writes outputs/gpu/"
 	@echo "make exercises  student versions of the exercises, in notebooks/exercises/release/"
 	@echo "make doctor     what is installed, what is missing, and what to do about it"
 	@echo "make clean      remove .venv, caches and outputs/"
@@ -89,6 +90,10 @@ browser: $(STAMP)
 
 hostile: $(STAMP)
 	$(RUN) -m tests.hostile
+
+# Skipped where there is no CUDA GPU.
+gpu: $(STAMP)
+	$(RUN) -m tests.gpu
 
 # nbgrader starts the program `alembic`, which is in the environment's bin folder.
 exercises: $(STAMP)

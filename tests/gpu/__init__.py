@@ -1,0 +1,1 @@
+"""Checks on a CUDA GPU: `python -m tests.gpu`, or `make gpu`."""
