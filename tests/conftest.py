@@ -50,6 +50,15 @@ def raises(expected, *args, **kwargs):
 pytest.raises = raises
 
 
+@pytest.fixture
+def links(tmp_path_factory):
+    """Skips the test where this user may not make symbolic links, as on Windows without its developer mode."""
+    try:
+        (tmp_path_factory.mktemp("links") / "link").symlink_to("nowhere")
+    except OSError as error:
+        pytest.skip(f"no symbolic links here: {error}")
+
+
 @pytest.fixture(scope="session")
 def ellipsoids(tmp_path_factory):
     """A labelled data set with the category "ellipsoid": two sequences of seven views of one object.

@@ -28,13 +28,11 @@ def with_large_weights(model: nn.Module) -> nn.Module:
 
 @dataclass(frozen=True)
 class Architecture:
-    """What the tests know of an architecture by themselves: where its parts are and what stands before the patches."""
+    """What the tests know of an architecture by themselves: what stands before the patches, and a part's name."""
 
     patch: int
     special: int  # tokens before the patches
-    stack: str = "layers"
     norm: str = "layernorm_before"
-    attention: str = "attention"
     settings: dict = field(default_factory=dict)
     interpolates: bool = True  # only when asked to
 
@@ -43,11 +41,11 @@ _REGISTERS = {"num_register_tokens": 4}
 ARCHITECTURES = {
     "vit": Architecture(16, 1),
     "deit": Architecture(16, 2),
-    "dinov2": Architecture(14, 1, "encoder.layer", "norm1", interpolates=False),
-    "dinov2_with_registers": Architecture(14, 5, "encoder.layer", "norm1", settings=_REGISTERS, interpolates=False),
-    "dinov3_vit": Architecture(16, 5, "model.layer", "norm1", settings=_REGISTERS, interpolates=False),
+    "dinov2": Architecture(14, 1, "norm1", interpolates=False),
+    "dinov2_with_registers": Architecture(14, 5, "norm1", settings=_REGISTERS, interpolates=False),
+    "dinov3_vit": Architecture(16, 5, "norm1", settings=_REGISTERS, interpolates=False),
     "vit_mae": Architecture(16, 1),
-    "clip": Architecture(14, 1, "encoder.layers", "layer_norm1", "self_attn"),
+    "clip": Architecture(14, 1, "layer_norm1"),
 }
 
 

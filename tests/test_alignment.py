@@ -10,8 +10,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3, _draw_samples, ransac, umeyama
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import PoseLabel
 from zsp_lite.errors import InputError, rotation_matrix
+from zsp_lite.features import FeatureMap
 
 seeds = st.integers(0, 2**32 - 1)
 scales = st.floats(0.3, 4.0)
@@ -73,13 +76,18 @@ def test_a_rounded_rotation_becomes_the_nearest_one_and_another_is_refused_with_
         Sim3(1.0, 1.03 * exact, np.zeros(3))
 
 
-def test_a_similarity_keeps_its_values_when_the_arrays_it_was_made_of_change():
+def test_records_keep_their_values_when_the_arrays_that_they_were_made_of_change():
     R, t, trans = np.eye(3), np.zeros(3), np.eye(4)
-    found, label = Sim3(1.0, R, t), PoseLabel(trans, "a", "a")
-    for array in (R, t, trans):
+    rgb, depth = np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.float32)
+    keys = torch.zeros(2, 2, 1)
+    sim3, label = Sim3(1.0, R, t), PoseLabel(trans, "a", "a")
+    camera = Camera(R, t, np.ones(2), np.ones(2), (2, 2))
+    frame, features = Frame(rgb, depth, depth, camera), FeatureMap(keys, keys[..., 0], keys[0, 0])
+    for array in (R, t, trans, rgb, depth, keys):
         array[0] = 5
-    assert_same(found, Sim3.identity())
-    assert np.array_equal(label.trans, np.eye(4))
+    assert_same(sim3, Sim3.identity())
+    assert np.array_equal(label.trans, np.eye(4)) and np.array_equal(camera.matrix, np.eye(4))
+    assert not frame.rgb.any() and not frame.depth.any() and not frame.mask.any() and not features.keys.any()
 
 
 # Umeyama

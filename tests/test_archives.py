@@ -222,7 +222,7 @@ def test_nothing_is_written_outside_the_folder_and_no_link_is_made(server, tmp_p
     assert not any(path.is_symlink() for path in tmp_path.rglob("*"))
 
 
-def test_a_link_in_the_folder_is_not_followed_out_of_it(server, tmp_path, capsys):
+def test_a_link_in_the_folder_is_not_followed_out_of_it(server, tmp_path, capsys, links):
     (tmp_path / "co3d").mkdir()
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "co3d/toaster").symlink_to(tmp_path / "elsewhere", target_is_directory=True)

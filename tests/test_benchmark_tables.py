@@ -155,10 +155,9 @@ def test_latex_has_the_best_method_of_a_category_in_bold_and_the_published_figur
     for category, *texts in lines[:-1]:
         values = [run.summary["methods"][name]["per_category"][category]["median"] for name in heading[1:]]
         assert [text.startswith(r"\textbf") for text in texts] == [value == min(values) for value in values]
-    assert r"\multicolumn{4}{l}{paper, CO3D} \\" in as_latex(found["table_1"])
     assert "other data (CO3D) and another backbone (DINO ViT-S/8).}" in as_latex(found["table_1"])
     assert "other data" not in as_latex(found["categories_median"]) and "other data" in found["table_1"].note
-    assert body_of(found["table_1"])[-1] == ["Ours (K=50)", "53.8", "46.3", "31.1"]
+    assert body_of(found["table_1"])[-1] == ["paper, CO3D: Ours (K=50)", "53.8", "46.3", "31.1"]
 
 
 def test_table_1_has_the_single_categories_that_the_run_has(tmp_path):
@@ -213,16 +212,19 @@ def test_what_is_no_run_is_refused(tmp_path):
     changed = [(b'"error":1.0', new) for new in errors] + [(b"chair/a:0/b:0", new) for new in keys]
     for old, new in changed:
         path.write_bytes(whole.replace(old, new))
-        with pytest.raises(InputError, match=f"{tmp_path}, line 1: "):
+        with pytest.raises(InputError, match=f"{re.escape(str(tmp_path))}, line 1: "):
             read_run(tmp_path)
-    for content, told in ((b"no gzip", f"{packed}.*gzip"), (gzip.compress(whole)[:15], f"{packed}.*gzip")):
+    for content, told in (
+        (b"no gzip", f"{re.escape(str(packed))}.*gzip"),
+        (gzip.compress(whole)[:15], f"{re.escape(str(packed))}.*gzip"),
+    ):
         packed.write_bytes(content)
         with pytest.raises(InputError, match=told):
             read_run(tmp_path)
     settings = (tmp_path / SETTINGS).read_bytes()
     for new in (b"{}", settings.replace(b'"calls"', b'"call"'), settings.replace(b'"targets": 5', b'"targets": "5"')):
         (tmp_path / SETTINGS).write_bytes(new)
-        with pytest.raises(InputError, match=f"{tmp_path / SETTINGS}: "):
+        with pytest.raises(InputError, match=re.escape(f"{tmp_path / SETTINGS}: ")):
             read_run(tmp_path)
 
 

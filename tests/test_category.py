@@ -51,7 +51,7 @@ def test_poses_are_recovered_among_outliers_and_half_turns_whatever_the_order_of
     scale = np.exp(np.mean(np.log([one.scale for one in truth])))  # the mean log scale of the found poses is zero
     for (name, one), true in zip(alignment.objects.items(), truth, strict=True):
         expected = Sim3(truth[0].scale / scale, np.eye(3), np.zeros(3)) @ truth[0].inverse() @ true
-        np.testing.assert_allclose(one.sim3.matrix, expected.matrix, atol=1e-2)
+        np.testing.assert_allclose(one.sim3.matrix, expected.matrix, atol=2e-2)
         assert np.array_equal(one.sim3.matrix, again.objects[name].sim3.matrix)
     assert len(alignment.disagreements) == 3 and min(alignment.disagreements.values()) > 150
 

@@ -44,7 +44,9 @@ def test_a_missing_and_an_empty_file_are_named(root, part):
     gone.unlink()
     empty.write_bytes(b"")
     (check,) = check_folder(root)
-    assert check.problems == [f"{gone.relative_to(root)} is missing", f"{empty.relative_to(root)} is empty"]
+    assert check.problems == [
+        f"{gone.relative_to(root).as_posix()} is missing", f"{empty.relative_to(root).as_posix()} is empty",
+    ]  # fmt: skip
     assert check.complete == 0 and check.usable == 2, "three whole frames are enough to be evaluated"
 
 

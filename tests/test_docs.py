@@ -35,8 +35,8 @@ _INLINE_CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 def markdown(page: Path) -> str:
     """The text of a Markdown file, or of a notebook's Markdown cells."""
     if page.suffix != ".ipynb":
-        return page.read_text()
-    cells = json.loads(page.read_text())["cells"]
+        return page.read_text(encoding="utf-8")
+    cells = json.loads(page.read_bytes())["cells"]
     return "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
 
 
@@ -51,7 +51,7 @@ def command_blocks(page: Path) -> list[str]:
 
 
 def test_the_page_of_the_command_line_is_that_of_the_program():
-    assert command_line.PAGE.read_text() == command_line.page(), "run python -m tools.command_line"
+    assert command_line.PAGE.read_text(encoding="utf-8") == command_line.page(), "run python -m tools.command_line"
 
 
 @pytest.mark.parametrize("page", PAGES, **ids)
@@ -72,7 +72,8 @@ def test_every_module_and_file_of_the_package_that_is_named_exists(page):
 @functools.cache
 def all_code() -> str:
     folders = REPOSITORY / "zsp_lite", REPOSITORY / "notebooks"
-    return "\n".join(path.read_text() for folder in folders for path in folder.rglob("*") if path.suffix in CODE)
+    paths = (path for folder in folders for path in folder.rglob("*") if path.suffix in CODE)
+    return "\n".join(path.read_text(encoding="utf-8") for path in paths)
 
 
 @pytest.mark.parametrize("page", PAGES, **ids)
@@ -153,14 +154,14 @@ def test_python_code_compiles_and_imports_what_exists(page):
         exec("\n".join(re.findall(r"^(?:from|import) .+$", block, re.MULTILINE)), {})
 
 
-def test_the_examples_of_methods_of_ones_own_run_as_they_stand(tmp_path, monkeypatch, capsys):
+def test_the_examples_of_methods_of_ones_own_run_as_they_stand(tmp_path, monkeypatch, capsys, links):
     page = REPOSITORY / "docs" / "benchmark_your_own.md"
     (tmp_path / "data_samples").symlink_to(REPOSITORY / "data_samples")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     names = re.findall(r"`(\w+\.py)`:?\n", markdown(page))
     for name, block in zip(names, python_blocks(page), strict=True):
-        Path(name).write_text(block)
+        Path(name).write_text(block, encoding="utf-8")
     few = ["--categories", "bicycle", "--pairs", "1", "--targets", "2"]
     rows = {}
     for line in command_blocks(page):

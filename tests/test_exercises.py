@@ -444,7 +444,7 @@ def test_nbgrader_recognises_the_files_of_learning_platforms(config):
 
 
 def test_the_five_exercises_have_100_points_and_no_test_decides_more_than_two():
-    readme = (EXERCISES / "README.md").read_text()
+    readme = (EXERCISES / "README.md").read_text(encoding="utf-8")
     for assignment in ASSIGNMENTS:
         notebook = source(assignment)
         points = {name: cell.metadata.nbgrader.points for name, cell in graded(notebook, grade=True).items()}

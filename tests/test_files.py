@@ -99,6 +99,7 @@ def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path, monkeypatch, 
     assert not (tmp_path / "executed").exists()
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes in folders")
 @pytest.mark.parametrize("read", [read_image, read_depth, read_ply, read_checkpoint, read_frame_index])
 def test_what_is_no_file_is_refused_without_being_opened(tmp_path, read):
     os.mkfifo(tmp_path / "pipe")
@@ -109,12 +110,12 @@ def test_what_is_no_file_is_refused_without_being_opened(tmp_path, read):
 
 
 def test_a_path_with_a_null_byte_is_refused_in_one_printable_line():
-    with pytest.raises(InputError, match=r"image 'a\\x00b'\.\.\. cannot be read: embedded null byte"):
+    with pytest.raises(InputError, match=r"image 'a\\x00b'\.\.\. cannot be read: .*embedded null [^\n]+$"):
         read_bytes("a\0b", "image")
 
 
 @pytest.mark.parametrize("path", ["../x", "/etc/passwd", "a\0b", "x" * 5000, "link/x"])
-def test_paths_out_of_a_folder_are_refused(tmp_path, path):
+def test_paths_out_of_a_folder_are_refused(tmp_path, path, links):
     (tmp_path / "link").symlink_to("/etc")
     with pytest.raises(InputError, match="path .* (leads out of the data folder|is invalid)"):
         path_inside(tmp_path, path)

@@ -152,7 +152,7 @@ def test_broken_picks_are_named(root):
     with pytest.raises(InputError, match="2 names, but 1 picks on the reference"):
         Labelling(root, "chair")
     labelling.path.write_text("{")
-    with pytest.raises(InputError, match="label_picks/chair.json"):
+    with pytest.raises(InputError, match="label_picks.chair.json"):
         Labelling(root, "chair")
 
 

@@ -13,7 +13,7 @@ PACKAGE = Path(zsp_lite.__file__).parent
 # From the bottom to the top. A module imports from lower layers and from its own subpackage only. Imports inside
 # functions, which delay the loading of large libraries, follow the same rule.
 LAYERS = [
-    "choices errors",
+    "choices errors threads",
     "io",
     "alignment features matchers metrics minimal",
     "data",

@@ -11,7 +11,7 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.data.photograph import load_photograph
 from zsp_lite.errors import InputError
 from zsp_lite.importers.convert import scale_frame
-from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth
+from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth, separate_colours
 
 RADIUS = 0.3
 DIRECTIONS = [(1, 0.2, 0.6), (0.4, 1, 0.5), (0.7, -0.8, 0.4), (1, 0.5, 1.5)]
@@ -132,3 +132,13 @@ def test_the_photographed_motorcycle_is_found():
     photograph = load_photograph()
     (found,) = masks_from_depth([replace(photograph, mask=None)])
     assert overlap(found.mask, photograph.mask > 0.5) > 0.7
+
+
+def test_separating_colours_on_a_smaller_copy_does_not_shift_the_mask():
+    off = []
+    for first in (300, 301, 302):  # the copy has a third of the rows
+        inside = np.zeros((960, 960), bool)
+        inside[first : first + 360, first : first + 360] = True
+        rgb = np.where(inside[..., None], np.uint8([180, 60, 60]), np.uint8(120))
+        off.append(np.argwhere(separate_colours(rgb, inside)).mean() - np.argwhere(inside).mean())
+    assert np.mean(off) == pytest.approx(0, abs=0.2)

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -52,7 +53,7 @@ def test_a_sequence_of_a_data_folder_is_read_with_its_numbers_and_masks(ellipsoi
     expected = ellipsoids.load(ellipsoids.frame("ellipsoid", "b", 5))
     np.testing.assert_array_equal(frame.rgb, expected.rgb)
     np.testing.assert_array_equal(frame.mask, expected.mask)
-    assert source.describe([0, 2]).endswith("ellipsoid/b, frames 0, 2")
+    assert source.describe([0, 2]).endswith(f"{Path('ellipsoid/b')}, frames 0, 2")
     assert position == 5 and source.reference(None)[0] == 0
     with pytest.raises(InputError, match="no frame 7, expected one of 7 from 0 to 6"):
         source.reference(7)
@@ -304,7 +305,7 @@ def test_the_command_prints_the_poses_and_names_its_files(backbone, ellipsoids, 
     words = [str(folder / "a"), str(folder / "b"), "--targets", "3", "--out", str(tmp_path)]
     assert cli.main(["estimate", *words, "--solver", "both", "--reference-frame", "2"]) == 0
     text = capsys.readouterr().out
-    assert "ellipsoid/a, frame 2 (mask: given)" in text and "The rotations of both solvers differ by" in text
+    assert f"{Path('ellipsoid/a')}, frame 2 (mask: given)" in text and "The rotations of both solvers differ by" in text
     for name in ("report.html", "target.ply", "aligned_paper.ply", "aligned_verified.ply"):
         assert f"Written: {tmp_path / name}" in text.replace("\n", "") and (tmp_path / name).is_file()
 

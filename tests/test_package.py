@@ -69,7 +69,8 @@ def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
     empty.mkdir()
     install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--no-compile"]
     subprocess.run([*install, "--target", str(site), str(wheel)], check=True)
-    (example, *_) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
+    readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    (example, *_) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
     code = (
         f"import zsp_lite; assert zsp_lite.__file__.startswith({str(site)!r})\n"
         "from dataclasses import replace; from zsp_lite.synthetic.export import PRESETS\n"

@@ -124,7 +124,7 @@ def test_the_demo_begins_with_the_photograph_and_credits_it(motorcycles, photogr
     monkeypatch.setattr(CoordinateBackbone, "name", "coordinates", raising=False)
     monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)
     assert main(["demo", "--data", str(motorcycles.root), "--out", str(tmp_path)]) == 0
-    text, page = capsys.readouterr().out, (tmp_path / "report.html").read_text()
+    text, page = capsys.readouterr().out, (tmp_path / "report.html").read_text(encoding="utf-8")
     assert text.index("Photographed motorcycle") < text.index("One pair per category")
     assert text.count("│ verified ") == 2 and MODELS_NOTE in " ".join(text.split())
     assert "Which way does a real motorcycle stand?" in page and "Middlebury" in page

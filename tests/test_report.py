@@ -45,7 +45,7 @@ def page(results, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def text(page):
-    return page.read_text()
+    return page.read_text(encoding="utf-8")
 
 
 def test_with_perfect_features_the_demo_estimates_the_true_pose(results):
@@ -105,7 +105,7 @@ def test_two_poses_are_shown_in_the_same_view_where_the_answer_is_one_of_two(res
     estimate = results[0].estimates["verified"]
     other = estimate.alternatives[0]
     two = replace(results[0], estimates={"verified": replace(estimate, one_of_two=True)})
-    page = write_report(tmp_path / "report.html", [two], "name").read_text()
+    page = write_report(tmp_path / "report.html", [two], "name").read_text(encoding="utf-8")
     assert f"turned by {estimate.angle_to(other):.0f} degrees" in page and "One of two" in page
     _, best, second = _two_poses_figure(estimate).axes
     np.testing.assert_array_equal(best.images[0].get_array(), second.images[0].get_array())
@@ -142,7 +142,7 @@ def test_all_text_is_escaped(results, text, tmp_path):
     estimate = replace(results[0].estimates["verified"], flags=(hostile,), timings={hostile: 1.0})
     own = {"title": hostile, "sources": (hostile, hostile), "estimates": {hostile: estimate}, "errors": {hostile: 1.0}}
     result = replace(results[0], **own)
-    page = write_report(tmp_path / "report.html", [result], hostile, hostile, hostile).read_text()
+    page = write_report(tmp_path / "report.html", [result], hostile, hostile, hostile).read_text(encoding="utf-8")
     assert hostile not in page
     assert page.count("&lt;img src=x onerror=alert(1)&gt;") >= 15
 

@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -118,6 +119,20 @@ def test_an_object_cut_off_by_the_border_is_not_known_to_end_there():
     assert float(project_points(maps, *one, left).silhouette_distance) == 0
     # 32 pixels to the border and 19.2 beyond are 51.2, at 32 pixels per unit of length.
     assert float(project_points(maps, *one, right).silhouette_distance) == pytest.approx(51.2 / 32, rel=0.05)
+
+
+@pytest.mark.parametrize("size, grid", [((224, 224), (28, 28)), ((96, 160), (12, 20)), ((210, 140), (15, 7))])
+def test_a_map_pixel_reads_the_patch_that_its_centre_lies_in(size, grid):
+    camera = Camera(np.eye(3), np.zeros(3), np.full(2, 200.0), np.full(2, 100.0), size)
+    image, ones = np.zeros((*size, 3), np.uint8), np.ones(size, np.float32)
+    features = FeatureMap(torch.zeros(*grid, 4), torch.ones(grid), torch.ones(4))
+    view = View(Frame(image, ones, ones, camera), features, torch.ones(grid, dtype=torch.bool), ones)
+    maps = build_maps([view], [(np.eye(3), np.zeros(3))], Sim3.identity(), [np.arange(grid[0] * grid[1])])
+    width, height = maps.size[0].int().tolist()
+    # floor((i + 1/2) / n * cells), in exact fractions
+    row, column = ([int(Fraction(2 * i + 1, 2 * n) * k) for i in range(n)] for n, k in zip((height, width), grid))
+    expected = np.array(row)[:, None] * grid[1] + np.array(column)
+    np.testing.assert_array_equal(maps.table[:, 3].reshape(height, width), expected)
 
 
 def test_working_units_have_mean_zero_and_unit_spread(scene):

@@ -61,7 +61,7 @@ def test_every_control_changes_the_picture_and_going_back_restores_it(name):
 
 def test_no_module_imports_ipywidgets_before_a_widget_is_made():
     for path in Path(common.__file__).parent.glob("*.py"):
-        assert not re.search("^(from|import) ipywidgets", path.read_text(), re.MULTILINE), path.name
+        assert not re.search("^(from|import) ipywidgets", path.read_text(encoding="utf-8"), re.MULTILINE), path.name
 
 
 def test_without_ipywidgets_the_error_has_the_command_that_installs_it(monkeypatch):
@@ -89,14 +89,14 @@ def test_attention_names_the_patch_with_the_largest_weight():
 
 
 def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim):
-    truth = examples.sample_pair()
+    pair = examples.sample_pair()
     kinds, cells = {"one": sim, "other": -sim}, np.stack(np.divmod(sim.argmax(1).numpy(), 28), -1)
-    widget = features.similarities(truth.reference.rgb, truth.target.rgb, kinds, truth.cells, truth.valid, "other")
+    widget = features.patch_similarities(pair.reference.rgb, pair.target.rgb, kinds, pair.cells, pair.valid, "other")
     widget.controls["kind"].value, widget.controls["row"].value, widget.controls["col"].value = "one", 15, 9
     row, col = cells[15 * 28 + 9]
     assert f"nearest neighbour ({row}, {col}), cosine {sim[15 * 28 + 9].max():.2f}" in widget.caption.value
     assert (
-        f"{correct_matches(cells.reshape(28, 28, 2), truth.cells)[truth.valid].mean():.0%} have" in widget.caption.value
+        f"{correct_matches(cells.reshape(28, 28, 2), pair.cells)[pair.valid].mean():.0%} have" in widget.caption.value
     )
 
 

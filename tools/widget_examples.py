@@ -55,13 +55,13 @@ def attention() -> "VBox":
     return features.attention(image, queries, keys, GRID, backbone.model.num_heads)
 
 
-def similarities() -> "VBox":
-    """`features.similarities` on a sample pair: the keys of two layers, and those of the last with context."""
+def patch_similarities() -> "VBox":
+    """`features.patch_similarities` on a sample pair: the keys of two layers, and those of the last with context."""
     pair, (first, second) = sample_pair(), sample_views()
     tokens = features.all_facets(_backbone(), [pair.reference.rgb, pair.target.rgb])
     sims = {f"layer {n}, key": similarity(*tokens[n, "key"][:, 1:].unflatten(1, GRID)) for n in (3, 11)}
     sims["bare key"] = key_similarities(first.features.keys, [second.features.keys])[0]
-    return features.similarities(pair.reference.rgb, pair.target.rgb, sims, pair.cells, pair.valid)
+    return features.patch_similarities(pair.reference.rgb, pair.target.rgb, sims, pair.cells, pair.valid)
 
 
 def saliency() -> "VBox":
@@ -115,7 +115,7 @@ def label_poses() -> "VBox":
 WIDGETS: dict[str, Callable[[], "VBox"]] = {
     build.__name__: build
     for build in (
-        attention, similarities, saliency, cycle, ransac_settings, one_outlier, box_to_mask, label_poses,
+        attention, patch_similarities, saliency, cycle, ransac_settings, one_outlier, box_to_mask, label_poses,
     )
 }  # fmt: skip
 

@@ -92,8 +92,8 @@ def align_category(
         allow_other_version: Continue a run of another version of the library.
 
     Raises:
-        InputError: There are fewer than two sequences, one is too short, the pairs that have poses do not connect all
-            of them, or OUT holds another run.
+        InputError: Sequences are fewer than two, too short, or not connected by pairs with poses; OUT has another run.
+        FatalError: The backbone is broken, or a frame cannot be read.
     """
     chosen = {pair.key: pair for pair in object_pairs(dataset, category, sequences, pairs, targets)}
     loaded = as_backbone(backbone)
@@ -120,7 +120,7 @@ def align_category(
     return synchronise(found)
 
 
-def label_errors(found: CategoryAlignment, labels: Mapping[str, PoseLabel]) -> tuple[list[float], list[float]]:
+def alignment_errors(found: CategoryAlignment, labels: Mapping[str, PoseLabel]) -> tuple[list[float], list[float]]:
     """Compute the rotation errors in degrees of all ordered pairs of labelled objects, and of every pair alone."""
     turns = {name: labels[name].trans[:3, :3] for name in found.objects if name in labels}
     true = {(a, b): turns[b] @ turns[a].T for a, b in permutations(turns, 2)}

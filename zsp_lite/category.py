@@ -269,7 +269,7 @@ def _least_absolute(
     """Minimise sum_k w_k |incidence_k x - difference_k| over x of mean zero, by iteratively reweighted squares."""
     scaled = weight
     for _ in range(_REWEIGHTINGS):
-        normal = incidence.T @ (scaled[:, None] * incidence)
-        x = np.linalg.lstsq(normal, incidence.T @ (scaled[:, None] * difference))[0]  # of least norm, so of mean zero
+        weighted = incidence.T * scaled
+        x = np.linalg.lstsq(weighted @ incidence, weighted @ difference, rcond=None)[0]  # of least norm: mean zero
         scaled = weight / (np.linalg.norm(incidence @ x - difference, axis=1) + 1e-9)
     return x

@@ -12,7 +12,6 @@ P S: a dozen additions of S to itself.
 
 import warnings
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -21,12 +20,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
-from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap, Grid, average_pool, bin_indices
 from zsp_lite.matchers import MATCHERS, Matcher
+from zsp_lite.threads import one_thread
 
 Keys = FeatureMap | Float[Tensor, "_ _ _"] | Float[np.ndarray, "_ _ _"]
 
@@ -253,13 +252,9 @@ def _gram(features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = Tr
     return (descriptors @ descriptors.T).round(decimals=6).numpy()
 
 
-_thread_pools = lru_cache(ThreadpoolController)
-
-
 def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -> Int[np.ndarray, " m"]:
     """Cluster m points, given by their inner products, by k-means; returns their labels."""
-    # One thread is fastest for so few points, and several would slow down PyTorch's threads afterwards.
-    with _thread_pools().limit(limits=1, user_api="blas"), warnings.catch_warnings():
+    with one_thread(), warnings.catch_warnings():
         # Eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions of the same inner products,
         # hence the same distances: k-means on them is k-means on the descriptors of 17 D dimensions, but faster.
         values, vectors = np.linalg.eigh(gram)

@@ -1,7 +1,7 @@
 """The whole method on one page (Goodwin et al., ECCV 2022): features of object crops in, pose out.
 
-Each step is written as its definition; the library's other modules compute the same with fewer operations. I1 is the
-reference image, I2 a target image, Phi(I) the normalised descriptors of image I, u a patch of I1 and v a patch of I2.
+Each step is its definition; the library's other modules compute the same with fewer operations, its `estimate_pose`
+from files. I1 is the reference image, I2 a target image, Phi(I) the descriptors of I, u a patch of I1 and v one of I2.
 """
 
 from typing import NamedTuple

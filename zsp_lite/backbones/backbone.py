@@ -89,7 +89,8 @@ class Backbone:
         return features
 
     def _extract(self, batch: Float[Tensor, "b 3 s s"]) -> list[FeatureMap]:
-        with torch.inference_mode():
+        # The patches' convolution in float32, too: by default, a GPU computes it in TensorFloat-32.
+        with torch.inference_mode(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
             tokens = self.model.extract(normalize(batch, self.mean, self.std), self.layer, self.facet)
             saliency = tokens.attention[:, list(self.saliency_heads)].float().mean(1)
             low, high = saliency.amin(1, keepdim=True), saliency.amax(1, keepdim=True)

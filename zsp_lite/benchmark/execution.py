@@ -8,18 +8,17 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import Any
 
 import cloudpickle
-import cv2
-from threadpoolctl import threadpool_limits
 
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.io.files import digest, read_bytes, write_atomic
+from zsp_lite.threads import one_thread
 
 Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
 CHUNK_SIZE = 16  # pairs
@@ -84,30 +83,6 @@ def _evaluate_chunk(shared: str, digest_of_it: str, chunk: Chunk) -> list[dict[s
         _worker.evaluator, _worker.shared = cloudpickle.loads(pickled)(), shared
     with one_thread():
         return list(_worker.evaluator.lines(chunk))
-
-
-_lock, _blocks, _of_process = threading.Lock(), 0, ExitStack()
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Restrict all libraries to one thread within a block: more are slower on small matrices, and disturb workers."""
-    global _blocks
-    with _lock:
-        _blocks += 1
-        # OpenCV and BLAS have one number for all threads of the process: the last of several blocks restores it.
-        if _blocks == 1:
-            _of_process.callback(cv2.setNumThreads, cv2.getNumThreads())
-            cv2.setNumThreads(1)
-            _of_process.enter_context(threadpool_limits(1, user_api="blas"))
-    try:
-        with threadpool_limits(1, user_api="openmp"):  # of this thread; torch counts by it
-            yield
-    finally:
-        with _lock:
-            _blocks -= 1
-            if not _blocks:
-                _of_process.close()
 
 
 @contextmanager

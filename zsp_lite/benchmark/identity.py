@@ -18,8 +18,7 @@ import torch
 from zsp_lite import __version__
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.io.files import digest
-
-_PACKAGE = Path(__file__).parents[1]
+from zsp_lite.samples import REPOSITORY
 
 
 def described(value: Any) -> str:
@@ -50,12 +49,12 @@ def fingerprint(extractor: Any) -> str:
 @functools.cache
 def library_version() -> dict[str, str | None]:
     """Return the version of zsp_lite, and the commit of its checkout, "-dirty" if files differ; None if installed."""
-    git, commit = ["git", "-C", str(_PACKAGE)], None
-    with suppress(OSError, subprocess.SubprocessError):
-        # An installed copy may lie inside the repository of another project, whose commit says nothing.
-        subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], check=True, capture_output=True)
-        describe = [*git, "describe", "--always", "--abbrev=40", "--dirty", "--exclude", "*"]
-        commit = subprocess.run(describe, check=True, capture_output=True, text=True).stdout.strip()
+    commit = None
+    # An installed copy may lie inside the repository of another project, whose commit says nothing.
+    if (REPOSITORY / ".git").exists():
+        describe = ["git", "-C", str(REPOSITORY), "describe", "--always", "--abbrev=40", "--dirty", "--exclude", "*"]
+        with suppress(OSError):  # git is not installed
+            commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip() or None
     return {"version": __version__, "commit": commit}
 
 

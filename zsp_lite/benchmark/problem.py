@@ -139,16 +139,6 @@ class Problem:
         problem._hand_over = deepcopy
         return problem
 
-    @property
-    def reference(self) -> View:
-        """The reference's crop with the features of the run's backbone."""
-        return self.views()[0]
-
-    @property
-    def targets(self) -> list[View]:
-        """The targets' crops with the features of the run's backbone."""
-        return self.views()[1:]
-
     def frames(self, depth: bool = False) -> list[Frame]:
         """Return the object crops, the reference's first, resized to the backbone's input.
 

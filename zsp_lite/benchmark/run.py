@@ -69,6 +69,7 @@ def evaluate(
 
     Raises:
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds another run.
+        FatalError: A backbone or a row is broken, or a frame cannot be read.
     """
     check_integer("targets", targets, 1)
     rows, dataset = resolve(methods), Co3D(data)

@@ -38,9 +38,7 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
                 for category in dict.fromkeys(categories) for members in [categories == category]
             },
         }  # fmt: skip
-        for part in ("translation", "scale"):
-            if row[part].notna().any():
-                methods[name][part] = float(row[part].median())
+        methods[name] |= row[["translation", "scale"]].astype(float).median().dropna().to_dict()
         if row["symmetric_error"].notna().any():
             known = row["symmetric_error"].fillna(row["error"]).to_numpy(np.float64)
             methods[name]["symmetric_acc30"] = float(accuracy(known, 30))

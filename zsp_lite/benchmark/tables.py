@@ -8,6 +8,7 @@ the rows of each table, and what the paper published for CO3D (20 categories wit
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,8 @@ WITH_OTHERS = ("category",)  # rows that see other objects than the two of the p
 _LOWEST_IS_BEST = ("mean_category_median", "median", "above150", "translation")
 _SYMBOLS = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _SYMBOLS |= {"°": r"$^\circ$", "−": "$-$"}
-_TEX = str.maketrans(_SYMBOLS | {one: f"\\{one}" for one in "%_&#${}"} | {one: f"${one}$" for one in "<>|"})
+_SYMBOLS |= {one: f"\\{one}" for one in "%_&#${}"} | {one: f"${one}$" for one in "<>|"}
+_escape = methodcaller("translate", str.maketrans(_SYMBOLS))
 
 
 @dataclass(frozen=True)
@@ -46,10 +48,11 @@ class Cell:
     metric: str = ""  # of `METRICS`
 
     def __str__(self) -> str:
-        value, low, high = ("" if x is None else f"{x:.{self.decimals}f}" for x in (self.value, self.low, self.high))
         if self.decimals == 3 and self.value < 0.001:  # a p value
             return "< 0.001"
-        return f"{value} [{low}, {high}]" if low else value
+        number = f"{{:.{self.decimals}f}}"
+        text = number if self.low is None else f"{number} [{number}, {number}]"
+        return text.format(self.value, self.low, self.high)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,25 +232,19 @@ def as_markdown(table: Table) -> str:
 def as_latex(table: Table) -> str:
     """Format three columns as a booktabs table: no intervals, the best value of a metric in bold.
 
-    The paper's figures of these columns follow below a line.
+    The paper's figures of these columns follow in lines of their own.
     """
-    shown = table.cells[[title for title in table.cells if title != "pairs"][:3]].dropna(how="all")
+    titles = [title for title in table.cells if title != "pairs"][:3]
+    shown = table.cells[titles].dropna(how="all")
     texts, best = shown.map(_number), shown.apply(_are_best, axis=int(table.across))
-    texts = texts.mask(best, texts.map(lambda text: rf"\textbf{{{text}}}"))
-    texts.index, texts.columns = texts.index.str.translate(_TEX), texts.columns.str.translate(_TEX)
-    lines = [["", *texts], [], *map(list, texts.itertuples())]
-    published = table.cells.reindex(columns=[f"{PUBLISHED}: {title}" for title in shown]).dropna(how="all")
-    if len(published):
-        lines += [[], [rf"\multicolumn{{{len(lines[0])}}}{{l}}{{{PUBLISHED}}}"]]
-        lines += [[label.translate(_TEX), *cells] for label, *cells in published.map(_number).itertuples()]
+    published = table.cells.reindex(columns=[f"{PUBLISHED}: {title}" for title in titles]).dropna(how="all")
+    published = published.set_axis(titles, axis="columns").rename(lambda label: f"{PUBLISHED}: {label}")
+    lines = pd.concat([texts.mask(best, r"\textbf{" + texts + "}"), published.map(_number)])
+    lines = lines.rename(index=_escape, columns=_escape)
     title = re.sub(r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title)  # LaTeX counts tables itself
-    caption = ". ".join(filter(None, (title, table.data, _PUBLISHED_NOTE if len(published) else "")))
-    return "\n".join([
-        r"\begin{table}[tb]", rf"\caption{{{caption.translate(_TEX)}}}",
-        rf"\label{{tab:{table.name}}}", rf"\begin{{tabular}}{{l{'r' * shown.shape[1]}}}", r"\toprule",
-        *(rf"{' & '.join(line)} \\" if line else r"\midrule" for line in lines),
-        r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
-    ])  # fmt: skip
+    caption = _escape(". ".join(filter(None, (title, table.data, _PUBLISHED_NOTE if len(published) else ""))))
+    alignment = "l" + "r" * len(titles)
+    return lines.to_latex(position="tb", label=f"tab:{table.name}", caption=caption, column_format=alignment)
 
 
 def _are_best(cells: pd.Series) -> pd.Series:

@@ -36,7 +36,7 @@ def align(
     fewer than five objects, or where objects look alike from two sides, some may be turned round against the rest: look
     at the report.
     """
-    from zsp_lite.align import align_category, label_errors, write_alignment, write_labels
+    from zsp_lite.align import align_category, alignment_errors, write_alignment, write_labels
     from zsp_lite.category import SAME_ANGLE
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.data.co3d import Co3D
@@ -53,7 +53,7 @@ def align(
     print_rows(f"{category}: {len(found.objects)} objects in one frame", COLUMNS, object_rows(found))
     for (first, second), angle in found.disagreements.items():
         print(f"{first} to {second}: the best pose of the pair alone is {angle:.0f}° away")
-    errors, alone = label_errors(found, read_labels(dataset.root, category))
+    errors, alone = alignment_errors(found, read_labels(dataset.root, category))
     if errors:
         right, before = (sum(error < SAME_ANGLE for error in some) / len(some) for some in (errors, alone))
         print(f"By the pose labels, {right:.1%} of {len(errors)} ordered pairs are within {SAME_ANGLE:.0f}°;", end=" ")

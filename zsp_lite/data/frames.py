@@ -31,7 +31,10 @@ _BLACK = 10  # an image without a colour of this value is black, as CO3D's hidde
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Image with its camera and, if known, its depth map and object mask; InputError if they do not fit together."""
+    """Image with its camera and, if known, its depth map and object mask: copies of what is given.
+
+    InputError if they do not fit together.
+    """
 
     rgb: UInt8[np.ndarray, "h w 3"]  # (H, W, 3) colours, uint8
     depth: Float32[np.ndarray, "h w"] | None  # (H, W) along +z in units of the camera's world, 0 where unknown
@@ -40,14 +43,16 @@ class Frame:
     name: str = ""  # for error messages
 
     def __post_init__(self):
-        label, size, rgb = f"frame {self.name}".rstrip(), self.camera.size, np.asarray(self.rgb)
+        label, size, rgb = f"frame {self.name}".rstrip(), self.camera.size, np.array(self.rgb)
         if rgb.dtype != np.uint8 or rgb.shape != (*size, 3):
             raise InputError(f"{label} rgb is {rgb.dtype} {rgb.shape}, expected uint8 {(*size, 3)} as the camera")
         object.__setattr__(self, "rgb", rgb)
         for name, top in (("depth", MAX_LENGTH), ("mask", 1.0)):
             if (values := getattr(self, name)) is None:
                 continue
-            if getattr(values, "dtype", None) != np.float32:
+            if getattr(values, "dtype", None) == np.float32:
+                values = np.array(values)
+            else:
                 values = real_array(f"{label} {name}", values).astype(np.float32)
             if values.shape != size or not (values.min() >= 0 and values.max() <= top):  # not, because of NaN
                 found = f"shape {values.shape}" if values.shape != size else f"{values.min()} to {values.max()}"

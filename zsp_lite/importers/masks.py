@@ -111,7 +111,7 @@ def separate_colours(
     shrink = max(1, max(height, width) / _LONGEST_SIDE)
     size = max(1, round(width / shrink)), max(1, round(height / shrink))
     bgr = cv2.resize(rgb[..., ::-1], size, interpolation=cv2.INTER_AREA)
-    small = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
+    small = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT)
     foreground = (cv2.GC_FGD, cv2.GC_PR_FGD)
     if 0 < np.isin(small, foreground).mean() < 1:  # GrabCut needs pixels of both kinds
         cv2.setRNGSeed(0)  # GrabCut initialises its clusters at random
@@ -168,26 +168,35 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
 
 def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
     """Say in one line what speaks against the masks of frames of one world; frames with a defect do not count."""
-    on_object, around, centres = [], [], []
+    plane, distance = _plane_around(frames)
+    usable, found = 0, Counter()
     for frame in frames:
         if not frame_defect(frame):
-            known, mask = frame.depth > 0, frame.mask > ON_OBJECT
-            widened = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-            step = sampling_step(frame, len(frames))
-            on_object.append(world_points(frame, known & mask, step))
-            around.append(world_points(frame, known & ~widened, step))
-            centres.append(frame.camera.centre)
-    if not centres:
-        return ()
-    centre, cloud = np.median(np.concatenate(on_object), axis=0), np.concatenate(around)
-    distance = float(np.linalg.norm(centres - centre, axis=1).mean())
-    plane = _supporting_plane(centres, cloud[_within(cloud, centre, distance)], distance)
-    usable = (frame for frame in frames if not frame_defect(frame))
-    found = Counter(sign for frame in usable for sign in _signs(frame, plane, distance))
-    signs = [f"{sign} ({count} of {len(centres)} frames)" for sign, count in found.items()]
-    if plane is None:
+            usable += 1
+            found.update(_signs(frame, plane, distance))
+    signs = [f"{sign} ({count} of {usable} frames)" for sign, count in found.items()]
+    if usable and plane is None:
         signs.append("no plane is found that the object stands on")
     return (f"the masks may be wrong: {', '.join(signs)}",) if signs else ()
+
+
+def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:
+    """Fit the plane that an object stands on to points outside of its masks; return also the cameras' distance."""
+    on_object, around, centres = [], [], []
+    for frame in frames:
+        if frame_defect(frame):
+            continue
+        known, mask = frame.depth > 0, frame.mask > ON_OBJECT
+        widened = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        step = sampling_step(frame, len(frames))
+        on_object.append(world_points(frame, known & mask, step))
+        around.append(world_points(frame, known & ~widened, step))
+        centres.append(frame.camera.centre)
+    if not centres:
+        return None, 0.0
+    centre, cloud = np.median(np.concatenate(on_object), axis=0), np.concatenate(around)
+    distance = float(np.linalg.norm(centres - centre, axis=1).mean())
+    return _supporting_plane(centres, cloud[_within(cloud, centre, distance)], distance), distance
 
 
 def _within(points: Float[np.ndarray, "n 3"], focus: Float[np.ndarray, "3"], distance: float) -> Bool[np.ndarray, " n"]:

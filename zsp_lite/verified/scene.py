@@ -52,9 +52,8 @@ class ViewMaps:
     principal_point: Float[Tensor, "v 2"]  # (x, y) in map pixels
     size: Float[Tensor, "v 2"]  # (width, height) in map pixels, whole numbers
     first_row: Int[Tensor, " v"]  # table row of each view's first pixel
-    # row-major, view after view: depth in working units; weight of that depth (the soft mask, 0 where
-    # the depth is unknown); distance to the silhouette in map pixels (0 inside); similarity column of the patch (-1
-    # for none). Columns are contiguous in memory
+    # row-major, view after view, each column contiguous: depth in working units; its weight (the soft mask, 0 where the
+    # depth is unknown); distance to the silhouette in map pixels (0 inside); similarity column of the patch (-1: none)
     table: Float[Tensor, "pixels 4"]
     pixel_scale: Float[Tensor, "v 2"]  # (x, y) pixels of the view's frame per map pixel
 
@@ -102,8 +101,8 @@ def build_scene(
     reference: View, targets: Sequence[View], similarities: Sequence[Tensor], matches: Sequence[Matches] = ()
 ) -> Scene:
     """Prepare the scene of a reference view and its target views."""
-    first = targets[0].frame.camera
-    to_camera = [_relative_pose(first, target.frame.camera) for target in targets]
+    cameras = tuple(target.frame.camera for target in targets)
+    to_camera = [_relative_pose(cameras[0], camera) for camera in cameras]
     source = reference.measured_points[0].reshape(-1, 3)
     clouds = [(view.measured_points[0].reshape(-1, 3) - t) @ R for view, (R, t) in zip(targets, to_camera)]
     cloud, known = np.concatenate(clouds), np.concatenate([target.known_foreground.ravel() for target in targets])
@@ -131,7 +130,6 @@ def build_scene(
         v = np.ravel_multi_index(tuple(match.target.T), target.features.grid)
         both = reference.measured_points[1].ravel()[u] & target.measured_points[1].ravel()[v]
         matched.append((float_tensor(source[u[both]]), float_tensor(points[v[both]])))
-    cameras = tuple(target.frame.camera for target in targets)
     still = [(np.eye(3), np.zeros(3))]  # the reference's points are in its camera's frame
     return Scene(
         reference_points=float_tensor(source[source_valid]),
@@ -147,7 +145,7 @@ def build_scene(
         matches=tuple(matched),
         view_similarity=view_similarity,
         view_similarity_std=float(view_similarity.std(correction=0)),
-        view_span=view_span(cameras, first.to_world(target_to_working.inverse().t)),
+        view_span=view_span(cameras, cameras[0].to_world(target_to_working.inverse().t)),
     )
 
 
@@ -198,18 +196,22 @@ def _table(
     view: View, columns: Int[np.ndarray, " patches"], scale: float
 ) -> tuple[Camera, Float[np.ndarray, "4 pixels"]]:
     """Resize the camera to about _MAP_PIXELS pixels, with equal focal lengths along both axes, and fill its table."""
-    frame, camera, grid = view.frame, view.frame.camera, view.features.grid
+    camera, grid = view.frame.camera, view.features.grid
     aspect = (camera.size[0] / camera.focal_length[1]) / (camera.size[1] / camera.focal_length[0])
     height = max(round(float(np.sqrt(_MAP_PIXELS * aspect))), 1)
     width = max(round(_MAP_PIXELS / height), 1)
-    rows, cols = ((2 * np.arange(n) + 1) * old // (2 * n) for n, old in zip((height, width), camera.size))
     mask = cv2.resize(view.soft_mask, (width, height), interpolation=cv2.INTER_LINEAR)
-    depth = np.zeros((height, width), np.float32) if frame.depth is None else frame.depth[np.ix_(rows, cols)]
+    depth = view.frame.depth[_at_centres((height, width), camera.size)]
     outside = [(mask < threshold).astype(np.uint8) for threshold in _MASK_THRESHOLDS]
     distance = [cv2.distanceTransform(one, cv2.DIST_L2, 5).clip(max=_NO_SILHOUETTE) for one in outside]
-    patch = (np.arange(height) * grid[0] // height)[:, None] * grid[1] + np.arange(width) * grid[1] // width
-    table = depth * scale, np.where(depth > 0, mask, 0), np.mean(distance, axis=0), columns[patch]
+    column = columns.reshape(grid)[_at_centres((height, width), grid)]
+    table = depth * scale, np.where(depth > 0, mask, 0), np.mean(distance, axis=0), column
     return camera.resize((height, width)), np.stack([values.astype(np.float32) for values in table]).reshape(4, -1)
+
+
+def _at_centres(size: tuple[int, int], grid: tuple[int, int]) -> tuple[Int[np.ndarray, "_ _"], ...]:
+    """Index a grid over an image of (height, width) pixels, such as its patches, by the cell at each pixel's centre."""
+    return np.ix_(*((2 * np.arange(n) + 1) * cells // (2 * n) for n, cells in zip(size, grid)))
 
 
 def double_centre(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:

@@ -75,7 +75,7 @@ def attention(
     return interactive_figure(figure, controls, update, alt)
 
 
-def similarities(
+def patch_similarities(
     reference: Image,
     target: Image,
     sims: Mapping[str, Float[Tensor, "n n"]],
