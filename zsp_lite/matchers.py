@@ -78,12 +78,13 @@ def optimal_transport(similarity: Float[Tensor, "m n"]) -> tuple[Int[Tensor, " m
 
 
 def sinkhorn(cost: Float[Tensor, "n1 n2"], regularisation: float, steps: int) -> Float[Tensor, "n1 n2"]:
-    """Compute the entropy-regularised transport plan between uniform masses (Cuturi 2013), in float64.
+    """Compute the entropy-regularised transport plan between uniform masses (Cuturi 2013), in float64 on the CPU.
 
     Its columns sum to 1 / n2, its rows to 1 / n1 in the limit of many steps.
     """
+    cost = cost.cpu().double()  # some GPUs do not have float64
     # Subtracting the minimum leaves the plan as it is and keeps the kernel from underflowing.
-    kernel = torch.exp((cost.min() - cost.to(torch.float64)) / regularisation)
+    kernel = torch.exp((cost.min() - cost) / regularisation)
     n1, n2 = kernel.shape
     rows, columns = kernel.new_ones(n1), kernel.new_ones(n2)
     for _ in range(steps):
@@ -93,11 +94,12 @@ def sinkhorn(cost: Float[Tensor, "n1 n2"], regularisation: float, steps: int) ->
 
 
 def on_foreground(choose: Callable[[Float[Tensor, "m n"]], tuple[Int[Tensor, " m"], Float[Tensor, " m"]]]) -> Matcher:
-    """Make a matcher of a function that matches the foreground patches alone, given their similarities."""
+    """Make a matcher of a function that matches the foreground patches alone, given their similarities; on the CPU."""
 
     def matcher(similarity, foreground1, foreground2):
-        partner = torch.zeros(len(foreground1), dtype=torch.long, device=similarity.device)
-        score = torch.full((len(foreground1),), -torch.inf, dtype=torch.float64, device=similarity.device)
+        similarity, foreground1, foreground2 = (one.cpu() for one in (similarity, foreground1, foreground2))
+        partner = torch.zeros(len(foreground1), dtype=torch.long)
+        score = torch.full((len(foreground1),), -torch.inf, dtype=torch.float64)
         if foreground1.any() and foreground2.any():
             chosen, found = choose(similarity[foreground1][:, foreground2])
             partner[foreground1] = foreground2.nonzero()[:, 0][chosen]

@@ -112,11 +112,11 @@ def build_scene(
     source, cloud = reference_to_working.apply(source), target_to_working.apply(cloud)
 
     starts = np.cumsum([len(one) for one in clouds])[:-1]  # of the patches of each target but the first
-    foregrounds = [target.foreground.cpu().ravel() for target in targets]
+    foregrounds = [target.foreground.ravel() for target in targets]
     column = _number(np.concatenate(foregrounds))
-    reference_foreground = reference.foreground.cpu().ravel()
+    reference_foreground = reference.foreground.ravel()
     between_foregrounds = [
-        similarity.cpu().float()[reference_foreground][:, foreground]
+        similarity.float()[reference_foreground][:, foreground]
         for similarity, foreground in zip(similarities, foregrounds, strict=True)
     ]
     # Of each view: each foreground patch's highest similarity in the other view, averaged in both directions.

@@ -64,7 +64,7 @@ class VerifiedSolver:
         with torch.no_grad():
             with timed(timings, "scene"):
                 # By a hash of their content, which neither the order of the targets nor the world's axes change.
-                content = [target.frame.rgb.tobytes() + target.foreground.cpu().numpy().tobytes() for target in targets]
+                content = [target.frame.rgb.tobytes() + target.foreground.numpy().tobytes() for target in targets]
                 digests = [hashlib.blake2b(one, digest_size=16).digest() for one in content]
                 order = tuple(sorted(range(len(targets)), key=digests.__getitem__))
                 targets, matched = ([some[k] for k in order] for some in (targets, matched))

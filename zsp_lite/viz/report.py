@@ -165,11 +165,11 @@ def _stages(result: PairResult, scene_id: str) -> dict[str, str]:
     """Draw the method's stages for the chosen view of the first solver; `scene_id` is unique on the page."""
     views, names = plots.chosen_views([result.estimate]), ("reference", "chosen target")
     images = [view.frame.rgb for view in views]
-    saliency = dict(zip(names, (view.features.saliency.cpu().numpy() for view in views)))
+    saliency = dict(zip(names, (view.features.saliency.numpy() for view in views)))
     cycles, sim = {}, similarity(views[0].features, views[1].features)
     for name, start, end, table in ((names[0], *views, sim), (names[1], *views[::-1], sim.T)):
         distances = cyclical_distances(table, start.features.grid, end.features.grid, start.foreground, end.foreground)
-        cycles[name] = distances.cpu().numpy()
+        cycles[name] = distances.numpy()
     style = {"limits": (-10, 0), "cmap": "cividis", "label": "− distance (patches)"}
     figure, axes = plots.show_images(images, names, size=2.7)
     plots.draw_matches(axes, plots.match_pixels(views, result.estimate.matches), result.estimate.inliers)

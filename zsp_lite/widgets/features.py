@@ -130,7 +130,7 @@ def patch_similarities(
 
 def saliency(view: View) -> Widget:
     """Show the foreground patches above a saliency threshold, and their overlap with the object mask."""
-    grid, values = view.features.grid, view.features.saliency.cpu().numpy()
+    grid, values = view.features.grid, view.features.saliency.numpy()
     truth = patch_mask(view.frame, grid)
     thresholds = np.linspace(0, 1, 101)
     overlaps = [mask_iou(torch.from_numpy(values > threshold), truth) for threshold in thresholds]

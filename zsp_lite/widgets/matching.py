@@ -14,7 +14,7 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
     """Show the cycle of a reference patch u, from its nearest neighbour v in the target back to u' (eq. 2)."""
     grid = reference.features.grid
     forth, back = (x.numpy() for x in nearest_neighbours(sim))
-    values = sim.cpu().numpy()
+    values = sim.numpy()
     titles = ["reference: similarity to v", "target: similarity to u"]
     figure, axes = plots.show_images([reference.frame.rgb, target.frame.rgb], titles, size=3.7)
     maps = [plots.overlay_map(axis, np.zeros(grid), 0.55, limits=(0, 1)) for axis in axes]
@@ -38,6 +38,6 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
             + (f"; {off} not on the foreground, so the distance is infinite." if off else ".")
         )
 
-    start = divmod(int(np.where(reference.foreground.cpu(), values.max(1).reshape(grid), -2).argmax()), grid[1])
+    start = divmod(int(np.where(reference.foreground, values.max(1).reshape(grid), -2).argmax()), grid[1])
     alt = "A solid arrow from the patch u to its nearest neighbour v, a dashed arrow from v to the patch u'."
     return interactive_figure(figure, patch_sliders(grid, start, " of u"), update, alt)
