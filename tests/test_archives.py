@@ -122,17 +122,6 @@ def test_the_first_chunk_can_be_used_alone_and_completed_later(server, source, t
     assert contents(root / "toaster") == contents(source / "toaster")
 
 
-def test_the_single_sequence_subset_has_its_own_archives_and_folder(server, source, tmp_path, capsys):
-    assert download(tmp_path / "single", "--single-sequence") == 0
-    assert len(Co3D(tmp_path / "single").sequences("toaster")) == 3
-    assert download(tmp_path / "single") == 2
-    assert "is from co3d (single-sequence), expected another folder" in capsys.readouterr().err
-    shutil.copytree(source, tmp_path / "mine")
-    assert download(tmp_path / "mine") == 2
-    assert "is from elsewhere, expected another folder" in capsys.readouterr().err
-    assert contents(tmp_path / "mine") == contents(source)
-
-
 def test_labelled_sequences_are_read_out_of_the_archive_on_the_server(server, source, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(archives, "_PART", 4_096)
     root, options = tmp_path / "v1", ("--labels", str(source), "--labelled-only")

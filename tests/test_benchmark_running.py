@@ -36,7 +36,6 @@ from zsp_lite.benchmark.tables import compare, every_table
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels, write_label
-from zsp_lite.data.pairs import sample_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.threads import one_thread
 
@@ -234,15 +233,6 @@ def test_a_vision_transformers_features_do_not_depend_on_threads():
     assert one == two
 
 
-def test_chunks_hold_every_pair_once_and_pairs_beside_each_other_that_share_frames():
-    work = {pair: ["ours"] for n in (3, 5) for pair in sample_pairs(Co3D(small_folder()), "lump", 12, n)}
-    chunks = make_chunks(work, 5)
-    assert sorted(map(str, work.items())) == sorted(str(one) for chunk in chunks for one in chunk)
-    assert [len(chunk) for chunk in chunks] == [5] * 4 + [len(work) - 20]
-    targets = [pair.target_sequence for chunk in chunks for pair, _ in chunk]
-    assert targets == sorted(targets)
-
-
 def test_a_run_is_not_continued_by_another_version_of_the_library_unless_it_is_allowed(tmp_path, monkeypatch):
     run = functools.partial(evaluate, small_folder(), BACKBONE, pairs={"lump": 1}, targets=2, out=tmp_path)
     run(["ours-bv"])
@@ -300,18 +290,6 @@ def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
     with pytest.raises(InputError, match="a run with labels of lump"):
         run(tmp_path / "run")
     run(tmp_path / "other")
-
-
-def test_by_default_a_run_is_of_the_categories_that_have_labels(tmp_path):
-    root = shutil.copytree(small_folder(), tmp_path / "data")
-    shutil.rmtree(root / "class_labels" / "lump")
-    run = functools.partial(evaluate, root, BACKBONE, ["ours-bv"], targets=2, out=tmp_path / "out")
-    assert run(pairs=1)["data"]["categories"] == ["pebble"]
-    with pytest.raises(InputError, match="lump has 0 labelled sequences"):
-        run(pairs={"lump": 1})
-    shutil.rmtree(root / "class_labels")
-    with pytest.raises(InputError, match="none of 2 categories has pose labels"):
-        run(pairs=1)
 
 
 def test_rows_stand_on_the_problems_of_the_last_call_and_earlier_rows_stay_if_they_have_these(tmp_path):

@@ -2,25 +2,18 @@
 concept and no model file in common (`tools/concepts.csv`)."""
 
 import csv
-import hashlib
 import json
-import zipfile
 
 import numpy as np
 import pytest
-from model_files import write_quad
 from PIL import Image
 
-from tools import same_shape
-from tools.models import LICENCES, Catalogue, Entry, attribution, build, read_catalogue
-from tools.same_shape import CATALOGUE, copy_same_shape
+from tools.models import LICENCES, attribution, read_catalogue
 from tools.training_categories import TRAINING
 from tools.validation_categories import VALIDATION
 from zsp_lite.backbones.load import WEIGHTS
-from zsp_lite.errors import InputError
 from zsp_lite.samples import REPOSITORY
 from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.meshes import list_models, read_mesh
 
 TOOLS = REPOSITORY / "tools"
 ARTISTS, SAMPLES = TOOLS / "artists.json", TOOLS / "samples.json"
@@ -107,59 +100,6 @@ def test_no_file_is_in_two_catalogues_and_the_sample_data_show_those_of_theirs()
     records = json.loads((REPOSITORY / "data_samples" / "rendered_models.json").read_text())
     shown = {record["sha256"] for models in records["sequences"].values() for record in models.values()}
     assert shown == {entry.sha256 for models in CATALOGUES["samples"].values() for entry in models.values()}
-
-
-def test_models_of_one_shape_are_of_the_catalogue_of_their_side_and_copied_under_their_class(tmp_path, monkeypatch):
-    listed = json.loads(CATALOGUE.read_text())
-    assert listed.keys() == {"training", "validation"}
-    for side in listed:
-        known = {f"{category}/{name}" for category, entries in CATALOGUES[side].items() for name in entries}
-        names = [name for some in listed[side].values() for name in some]
-        assert len(set(names)) == len(names) and set(names) <= known
-    (tmp_path / "list.json").write_text('{"training": {"stool": ["chair_kind/oak"]}}')
-    monkeypatch.setattr(same_shape, "CATALOGUE", tmp_path / "list.json")
-    models = tmp_path / "models"
-    for name in ("oak", "elm"):
-        (models / "chair_kind" / name).mkdir(parents=True)
-        (models / "chair_kind" / name / f"{name}.obj").write_text("v 0 0 0")
-    (models / "models.json").write_text('{"chair_kind/oak": {"front": "+x"}, "chair_kind/elm": {}}')
-    copy_same_shape("training", models, tmp_path / "out")
-    (model,) = list_models(tmp_path / "out")
-    assert (model.category, model.name, model.info.front) == ("stool", "oak", "+x")
-
-
-def test_the_builder_copies_converts_and_checks(aircraft, tmp_path):
-    packages, texture = tmp_path / "packages", np.full((4, 4, 3), 90, np.uint8)
-    quad = write_quad(tmp_path / "quad.obj", texture)
-    (packages / "home").mkdir()
-    with zipfile.ZipFile(packages / "home" / "set.sh3f", "w") as archive:
-        for path in (quad, quad.with_suffix(".mtl"), quad.with_suffix(".png")):
-            archive.write(path, f"set/sign/{path.name}")
-    checksum = lambda path: hashlib.sha256(path.read_bytes()).hexdigest()  # noqa: E731
-    sign = Entry("home", "set.sh3f", checksum(quad), "CC0 1.0", "Ann", "LICENSE.TXT", member="set/sign/quad.obj")
-    plane = Entry("sky", "plane.ac", checksum(aircraft), "GPL-2+", "Bob", "copyright", textures="liveries", front="-x")
-    catalogue = Catalogue({"home": "1.0", "sky": "2.0"}, {"sign": {"stop": sign}, "aircraft": {"plane": plane}})
-    out = tmp_path / "models"
-    build(packages, out, catalogue)
-    page = (out / "ATTRIBUTION.md").read_text()
-    assert "| sign/stop | | Ann | [CC0 1.0](" in page
-    assert "| aircraft/plane | | Bob | GPL-2+ | plane.ac | converted" in page
-    build(packages, out, catalogue)  # again into the same folder
-    aircraft_model, sign_model = list_models(out)
-    assert aircraft_model.info.front == "-x" and aircraft_model.info.changes == "converted from AC3D, -x taken as front"
-    assert sign_model.info.source == "home 1.0: set/sign/quad.obj" and sign_model.info.author == "Ann"
-    mesh = read_mesh(aircraft_model.path)
-    assert len(sign_model.read().faces) == len(mesh.faces) == 2  # a line is no surface
-    assert mesh.vertices.min(0) == pytest.approx([10, -1, -1]) and mesh.vertices.max(0) == pytest.approx([10, 1, 1])
-    assert mesh.uv.max((0, 1)).tolist() == [2, 1]  # the texture repeats twice
-    (material,) = mesh.materials
-    assert material.colour == pytest.approx([1, 0, 0, 0.75], abs=0.01) and material.texture.shape == (8, 8, 4)
-    aircraft.write_text(AC3D + " ")
-    with pytest.raises(InputError, match="plane.ac .*checksum"):
-        build(packages, out, catalogue)
-    aircraft.unlink()
-    with pytest.raises(InputError, match="expected the unpacked package sky"):
-        build(packages, out, catalogue)
 
 
 def test_the_weights_name_every_model_that_they_were_trained_on():

@@ -152,17 +152,6 @@ def test_an_output_folder_that_is_a_file_is_refused_before_any_computation(
     assert (tmp_path / "file").read_text() == "mine" and not loaded
 
 
-def test_options_of_the_demo_reach_the_library(ellipsoids, tmp_path, monkeypatch, loaded):
-    monkeypatch.setattr("zsp_lite.demo.run_demo", lambda dataset, backbone, solvers: iter(loaded.append(solvers) or ()))
-    monkeypatch.setattr("zsp_lite.viz.report.write_report", lambda path, *others: path)
-    monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)
-    words = ["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]
-    assert main([*words, "--layer", "block3", "--facet", "value", "--image-size", "96"]) == 0
-    assert main([*words, "--backbone", "dino_vits8", "--solver", "paper"]) == 0
-    config = BackboneConfig("zsp-tiny", "block3", "value", 96)
-    assert loaded == [config, ("paper", "verified"), "dino_vits8", ("paper",)]
-
-
 def test_synth_writes_a_co3d_folder(tmp_path):
     words = "synth --category mouse --sequences 1 --frames 2 --seed 3 --out".split()
     assert main([*words, str(tmp_path)]) == 0

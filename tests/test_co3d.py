@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from co3d_folders import contents, convert_to_v2, edit_json, sequence_data
+from co3d_folders import convert_to_v2, edit_json, sequence_data
 
 from zsp_lite.data.co3d import Co3D, Pair, write_co3d
 from zsp_lite.data.frames import write_depth, write_image, write_mask
@@ -67,32 +67,12 @@ def test_written_files_have_the_layout_of_co3d(root):
     assert set(entry["viewpoint"]) == {"R", "T", "focal_length", "principal_point"}  # v1 has no format
 
 
-def test_writing_together_again_and_one_after_the_other_gives_the_same_bytes(tmp_path):
-    for name in ("together", "again"):
-        write_co3d(tmp_path / name, "chair", [sequence_data("b_2"), sequence_data("a_1")])
-    for name in ("b_2", "a_1"):
-        write_co3d(tmp_path / "apart", "chair", [sequence_data(name)])
-    assert contents(tmp_path / "together") == contents(tmp_path / "again") == contents(tmp_path / "apart")
-
-
 def test_a_sequence_written_again_replaces_itself_and_nothing_else(root):
     write_co3d(root, "chair", [sequence_data("b_2", frames=2, quality=0.9)])
     dataset = Co3D(root)
     assert [key.sequence_name for key in dataset.frame_list("chair")] == ["a_1"] * 4 + ["b_2"] * 2
     scores = {s.sequence_name: s.point_cloud.quality_score for s in dataset.sequences("chair")}
     assert scores == {"a_1": 0.5, "b_2": 0.9}
-
-
-def test_an_interrupted_run_leaves_the_finished_sequences(tmp_path):
-    def sequences():
-        yield sequence_data("a_1")
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_co3d(tmp_path, "chair", sequences())
-    dataset = Co3D(tmp_path)
-    assert [sequence.sequence_name for sequence in dataset.sequences("chair")] == ["a_1"]
-    assert len(dataset.frames("chair", "a_1")) == 4
 
 
 def test_the_frame_list_keeps_file_order_and_frames_are_sorted_by_number(root):

@@ -4,11 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from co3d_folders import edit_json, sequence_data
+from co3d_folders import sequence_data
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.labels import PoseLabel, label_bytes, read_labels, write_label
 from zsp_lite.errors import InputError
@@ -114,16 +113,6 @@ def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
     assert labelling.progress()[-1].state == "open"
 
 
-def test_a_change_that_is_refused_leaves_a_skipped_sequence_skipped(root):
-    labelling = Labelling(root, "chair")
-    labelling.skip("b")
-    labelling.undo("b")
-    with pytest.raises(InputError, match="all 0 keypoints are picked"):
-        labelling.pick("b", (0, 0, 0))
-    assert labelling.progress() == Labelling(root, "chair").progress()
-    assert labelling.progress()[-1].state == "skipped"
-
-
 def test_invalid_categories_sequences_and_picks_are_refused(root):
     labelling = Labelling(root, "chair")
     pick_all(labelling, "best", corners())
@@ -183,11 +172,6 @@ def test_a_large_residual_is_accepted_only_if_confirmed(root):
     assert "a" not in read_labels(root, "chair")
     labelling.accept("a", confirmed=True)
     assert "a" in read_labels(root, "chair")
-
-
-def test_without_a_camera_a_cloud_is_seen_along_its_worlds_axes(root):
-    edit_json(root / "chair" / FRAMES_FILE, lambda frames: [frame.pop("viewpoint") for frame in frames] and None)
-    np.testing.assert_array_equal(Labelling(root, "chair").first_view("a"), np.eye(3))
 
 
 def test_the_reference_is_that_of_the_labels_or_the_best_of_the_given_sequences(root):

@@ -113,17 +113,6 @@ def test_orientations_are_rotations_to_front_x_and_up_z():
             info.axes(".obj")
 
 
-def test_given_axes_hold_for_the_models_that_the_models_file_does_not_orient(tmp_path):
-    write_wedge(tmp_path / "chair" / "a.obj")
-    write_wedge(tmp_path / "chair" / "b.obj")
-    (tmp_path / "models.json").write_text('{"chair/b": {"front": "+z", "up": "+y", "author": "Ann"}}')
-    turned, own = list_models(tmp_path, front="+x")
-    assert (turned.info.front, turned.info.up, own.info.front, own.info.author) == ("+x", None, "+z", "Ann")
-    # The side at +x of the file is on the left by default, and in front when +x is given.
-    quarter = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
-    assert turned.read().vertices == pytest.approx(own.read().vertices @ quarter.T, abs=1e-9)
-
-
 def test_a_folder_lists_models_in_files_and_in_folders_of_their_own(tmp_path):
     write_wedge(tmp_path / "chair" / "plain.obj")
     write_quad(tmp_path / "chair" / "own" / "model.obj", CHECKS)

@@ -31,35 +31,12 @@ def test_patches_are_marked_at_their_centres_in_pixels_x_y():
     assert marks == [("o", 10, 10), ("o", 30, 50), ("*", 70, 30)]
 
 
-def test_the_outline_of_patches_is_cut_at_the_border_of_the_image():
-    _, (axis,) = plots.show_images([IMAGE])
-    for cell, reach in (((1, 2), 0), ((1, 2), 1), ((0, 3), 1)):
-        plots.outline_patch(axis, cell, (3, 4), reach)
-    boxes = [[40, 20, 60, 40], [20, 0, 80, 60], [40, 0, 80, 40]]
-    assert [patch.get_bbox().extents.tolist() for patch in axis.patches] == boxes
-
-
-def test_the_panels_of_points_share_their_extent():
-    square = np.array([[0, 0], [0, 2], [4, 0], [4, 2.0]])
-    panels = {"a": {"square": square}, "b": {"moved": square / 2 + 7, "far": square + 100}}
-    first, second = plots.show_points(panels).axes
-    assert np.diff(first.get_xlim()) == pytest.approx(np.diff(second.get_xlim()))
-    assert np.mean(first.get_xlim()) == pytest.approx(2) and np.mean(second.get_ylim()) == pytest.approx(7.5)
-
-
 def test_lines_join_the_centres_of_matched_patches_and_those_of_outliers_are_dashed():
     cells = np.array([[0, 0], [1, 1], [2, 3]])
     figure = plots.show_matches([IMAGE, IMAGE], [cells, cells[::-1]], (3, 4), np.array([True, False, True]))
     lines = {(tuple(line.xy1), tuple(line.xy2)): line.get_linestyle() for line in figure.artists}
     assert set(lines) == {((10, 10), (70, 50)), ((30, 30), (30, 30)), ((70, 50), (10, 10))}
     assert [line in ("-", "solid") for line in lines.values()] == [False, True, True]  # outliers first, below
-
-
-def test_of_many_matches_fifteen_are_joined_with_the_same_share_of_inliers():
-    cells = np.stack([np.arange(60) // 10, np.arange(60) % 10], axis=1)
-    figure = plots.show_matches([IMAGE, IMAGE], [cells, cells], (6, 10), np.arange(60) % 5 == 0)
-    assert [line.get_linestyle() in ("-", "solid") for line in figure.artists] == 12 * [False] + 3 * [True]
-    assert sum(len(marks.get_offsets()) for marks in figure.axes[0].collections) == 60
 
 
 def test_points_and_axes_are_drawn_at_their_projections_and_nothing_behind_the_camera():
@@ -88,9 +65,3 @@ def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects(
     drawn = np.concatenate([collection.get_offsets() for collection in figure.axes[0].collections])
     # The point beyond the border (110) stands at it (80).
     np.testing.assert_allclose(sorted(map(tuple, drawn)), [(20, 10), (40, 10), (40, 40), (60, 10), (80, 10)])
-
-
-def test_bars_reach_from_their_lower_to_their_upper_end():
-    (axis,) = plots.show_intervals([1, 2], {"row": ([3, 5], [2, 4], [6, 7])}).axes
-    assert axis.lines[0].get_xydata().tolist() == [[1, 3], [2, 5]]
-    assert [bar.tolist() for bar in axis.collections[0].get_segments()] == [[[1, 2], [1, 6]], [[2, 4], [2, 7]]]

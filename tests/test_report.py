@@ -8,14 +8,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from plotly.offline import get_plotlyjs
-from synthetic_views import CoordinateBackbone, level_camera
+from synthetic_views import CoordinateBackbone
 
 from zsp_lite.choices import SOLVERS
 from zsp_lite.demo import demo_pairs, run_demo
 from zsp_lite.metrics import rotation_error
 from zsp_lite.samples import REPOSITORY
 from zsp_lite.viz.plots import object_cloud
-from zsp_lite.viz.pose_picture import coverage
 from zsp_lite.viz.report import _two_poses_figure, overview, table_rows, write_overview, write_report
 
 pytestmark = pytest.mark.slow
@@ -145,20 +144,6 @@ def test_all_text_is_escaped(results, text, tmp_path):
     page = write_report(tmp_path / "report.html", [result], hostile, hostile, hostile).read_text(encoding="utf-8")
     assert hostile not in page
     assert page.count("&lt;img src=x onerror=alert(1)&gt;") >= 15
-
-
-@pytest.mark.parametrize("roll", [0, 1])
-def test_cameras_stand_around_the_object_as_seen_from_above_with_the_reference_below(roll):
-    turns = {1: 0, 2: 40, 4: 100}
-    cameras = {number: level_camera(turn, 0, 2 + number).turn(roll) for number, turn in turns.items()}
-    seen = coverage(cameras, level_camera(70, 30, 5).centre, np.array([1.0, 2, 3]))
-    assert list(seen.targets) == [1, 2, 4]
-    np.testing.assert_allclose(seen.reference, [0, -np.cos(np.radians(30))], atol=1e-9)
-    for place, turn in zip(seen.targets.values(), turns.values()):
-        angle = np.radians(-90 + turn - 70)  # counter-clockwise in the world is so in the drawing
-        np.testing.assert_allclose(place, [np.cos(angle), np.sin(angle)], atol=1e-9)
-    np.testing.assert_allclose((np.array(seen.gap) - [-60, 200] + 180) % 360, 180)  # from 100 to 0 degrees
-    assert seen.nearest in (2, 4) and np.cos(np.radians(seen.angle)) == pytest.approx(np.cos(np.pi / 6) ** 2)
 
 
 def test_the_overview_marks_the_pose_of_each_solver_in_its_view(results, tmp_path, exact_poses):

@@ -1,16 +1,13 @@
 """tools/tuning.py: the fits recover known parameters, are evaluated on held-out categories, and refuse other splits."""
 
-import logging
 from dataclasses import astuple, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_views import CoordinateBackbone
 
 from tools import tuning
 from tools.concepts import check_sides
-from tools.tuning import Outcome, collect_outcomes, fit_calibration, fit_weights, leave_out
+from tools.tuning import Outcome, fit_calibration, fit_weights, leave_out
 from zsp_lite.errors import InputError
 from zsp_lite.verified.confidence import Calibration
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
@@ -77,25 +74,6 @@ def test_no_fit_sees_the_category_it_is_evaluated_on():
     outcomes = sample_outcomes(12, np.random.default_rng(4))
     seen = leave_out(outcomes, lambda some: {one.category for one in some})
     assert all(one.category not in others and len(others) == 3 for one, others in zip(outcomes, seen))
-
-
-@pytest.mark.slow
-def test_outcomes_hold_the_solvers_hypotheses(ellipsoids, caplog, monkeypatch):
-    monkeypatch.setattr(tuning, "load_backbone", lambda device: CoordinateBackbone())
-    with caplog.at_level(logging.INFO):
-        outcomes = collect_outcomes(Path(ellipsoids.root), "ellipsoid", 2, ((3, 360.0), (2, 360.0), (5, 60.0)))
-    correct = sum(one.errors[0] < 30 for one in outcomes[:2])
-    assert [one.n_views for one in outcomes[:4]] == [3, 3, 2, 2]
-    assert all(40 < one.span <= 60 and one.n_views == 2 for one in outcomes[4:])  # of seven views evenly around
-    name = f"{Path(ellipsoids.root).name}/ellipsoid"
-    assert f"{name}: 2 pairs of 3 views all around, Acc30 {50 * correct} %" in caplog.messages
-    assert min(one.errors[0] for one in outcomes[:2]) < 5
-    for one in outcomes:
-        m = len(one.errors)
-        assert one.terms.shape == (m, len(TERM_NAMES)) and one.angles.shape == (m, m)
-        assert one.ranked(ScoreCoefficients())[1][0] == one.errors[0]  # the solver ranks by the default weights
-        np.testing.assert_allclose(np.diag(one.angles), 0, atol=1e-3)
-        assert one.angles[~np.eye(m, dtype=bool)].min() > 14.9
 
 
 def test_categories_of_another_side_are_refused(tmp_path, capsys):
