@@ -20,10 +20,6 @@ from zsp_lite.synthetic.export import export_categories, make_object, sequence_n
 from zsp_lite.synthetic.primitives import surface_spread
 from zsp_lite.synthetic.sequences import record_sequence, soft_mask, stereo_depth
 
-PAPER = tuple(
-    "backpack bicycle book car chair hairdryer handbag hydrant keyboard laptop motorcycle mouse "
-    "remote teddybear toaster toilet toybus toyplane toytrain toytruck".split()
-)
 
 ALL = {name: build for builders in (*SPLITS.values(), CATEGORIES) for name, build in builders.items()}
 SEED, FRAMES, SIZE = 5, 6, 72
