@@ -4,7 +4,9 @@ These sets are torch files that refer to frames by their positions in the catego
 """
 
 import io
-from collections.abc import Sequence
+import itertools
+import logging
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +19,8 @@ from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import load_torch, plain_name, stable_hash, write_atomic
 
+logger = logging.getLogger(__name__)
+
 
 class _PublishedPair(msgspec.Struct):
     category: str = msgspec.field(name="class")
@@ -27,10 +31,11 @@ class _PublishedPair(msgspec.Struct):
 
 
 def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int = 0) -> list[Pair]:
-    """Sample `n` evaluation pairs of a category, each with `n_targets` target frames.
+    """Sample `n` different evaluation pairs of a category, or all if there are fewer, each with `n_targets` frames.
 
     Reference sequences take turns; the target sequence is a random other one. The reference frame is random; the target
-    frames are evenly spaced from a random start. The pairs of a smaller `n` are the first ones of a larger.
+    frames are evenly spaced from a random start. The pairs of a smaller `n` are the first ones of a larger. A reference
+    without a new pair is passed over.
     """
     rng = np.random.default_rng([seed, stable_hash(category) >> 1])
     sequences = sorted(read_labels(dataset.root, category))
@@ -42,16 +47,35 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
     if (found := len(numbers[shortest])) < n_targets:
         raise InputError(f"labelled sequence {category}/{shortest} has {found} frames, expected at least {n_targets}")
 
-    pairs = []
-    for index in range(n):
-        reference = sequences[index % len(sequences)]
-        others = [name for name in sequences if name != reference]
-        target = others[rng.integers(len(others))]
-        frame = numbers[reference][rng.integers(len(numbers[reference]))]
+    def make(reference: str, frame: int, target: str, start: int) -> Pair:
         length = len(numbers[target])
-        positions = (rng.integers(length) + np.arange(n_targets) * length // n_targets) % length
-        pairs.append(Pair(category, reference, frame, target, tuple(numbers[target][p] for p in positions)))
-    return pairs
+        positions = (start + np.arange(n_targets) * length // n_targets) % length
+        return Pair(
+            category, reference, numbers[reference][frame], target, tuple(numbers[target][p] for p in positions)
+        )
+
+    def shuffled(reference: str) -> Iterator[Pair]:
+        views = [(name, start) for name in sequences if name != reference for start in range(len(numbers[name]))]
+        order = np.random.default_rng([seed, stable_hash(f"{category}/{reference}") >> 1])
+        for index in order.permutation(len(numbers[reference]) * len(views)).tolist():
+            yield make(reference, index // len(views), *views[index % len(views)])
+
+    total = sum(len(numbers[first]) * len(numbers[second]) for first, second in itertools.permutations(sequences, 2))
+    if n > total:
+        logger.warning("category %s has only %d different pairs with %d target frames", category, total, n_targets)
+    others = {name: shuffled(name) for name in sequences}  # nothing is shuffled before the first repetition
+    pairs: dict[Pair, None] = {}
+    references = itertools.cycle(sequences)
+    while len(pairs) < min(n, total):
+        reference = next(references)
+        targets = [name for name in sequences if name != reference]
+        target = targets[rng.integers(len(targets))]
+        frame, start = (int(rng.integers(len(numbers[name]))) for name in (reference, target))
+        pair = make(reference, frame, target, start)
+        if pair in pairs:  # another one replaces it: to draw again would take long for the last pairs
+            pair = next((other for other in others[reference] if other not in pairs), pair)
+        pairs[pair] = None
+    return list(pairs)
 
 
 def labelled_categories(dataset: Co3D) -> list[str]:
