@@ -33,7 +33,7 @@ from zsp_lite.errors import FatalError, InputError, check_integer, describe_fail
 from zsp_lite.io.files import digest, write_atomic
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, view_alignment
-from zsp_lite.synthetic.ground_truth import common_turns
+from zsp_lite.synthetic.ground_truth import common_turns, warn_without_poses
 
 Poses = Float[np.ndarray, "n 4 4"]
 logger = logging.getLogger(__name__)
@@ -74,6 +74,7 @@ def evaluate(
     rows, dataset = resolve(methods), Co3D(data)
     numbers = pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
     work = pairs_of_rows(dataset, rows, numbers, targets)
+    warn_without_poses(dataset.root, numbers)
     loaded = as_backbone(backbone)
     extractors = make_extractors(loaded, rows)
     for row in rows.values():

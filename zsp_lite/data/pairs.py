@@ -50,9 +50,8 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
     def make(reference: str, frame: int, target: str, start: int) -> Pair:
         length = len(numbers[target])
         positions = (start + np.arange(n_targets) * length // n_targets) % length
-        return Pair(
-            category, reference, numbers[reference][frame], target, tuple(numbers[target][p] for p in positions)
-        )
+        frames = tuple(numbers[target][position] for position in positions)
+        return Pair(category, reference, numbers[reference][frame], target, frames)
 
     def shuffled(reference: str) -> Iterator[Pair]:
         views = [(name, start) for name in sequences if name != reference for start in range(len(numbers[name]))]

@@ -4,6 +4,9 @@ Instances of a category have different proportions. Their points are therefore c
 (rear, right, bottom) to 1 (front, left, top) along each axis of the object's bounding box.
 """
 
+import logging
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +26,7 @@ from zsp_lite.views import object_crop, patch_mask
 POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
 _MARGIN = 0.05  # a point farther outside the box than this belongs to the background
 _MASK_THRESHOLD = 0.8  # masks are soft and accurate to one or two pixels
+logger = logging.getLogger(__name__)
 _Vector = tuple[float, float, float]
 _Row = tuple[float, float, float, float]
 
@@ -70,12 +74,23 @@ def read_poses(out: Path, category: str) -> dict[str, ObjectPose]:
     return read_json(path, dict[str, ObjectPose], "object poses") if path.is_file() else {}
 
 
+def warn_without_poses(out: Path, categories: Iterable[str]) -> None:
+    """Warn of files of object poses that cannot be read: `common_turns` then knows nothing."""
+    for category in categories:
+        try:
+            read_poses(out, category)
+        except InputError as error:
+            logger.warning("%s; there is no symmetric_acc30", error)
+
+
 def common_turns(out: Path, category: str, first: str, second: str) -> Float[np.ndarray, "s 3 3"] | None:
     """Return the turns in the world of the second object after which both look the same; None where nothing is known.
 
     The first is the identity.
     """
-    poses = read_poses(out, category)
+    poses = {}
+    with suppress(InputError):  # the benchmark warns of these files once
+        poses = read_poses(out, category)
     if not {first, second} <= poses.keys():
         return None
     angles = [[0.0], *([turn] for turn in poses[first].turns if turn in poses[second].turns)]
