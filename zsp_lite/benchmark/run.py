@@ -71,7 +71,7 @@ def evaluate(
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds another run.
     """
     check_integer("targets", targets, 1)
-    rows, dataset = resolve(methods), Co3D(data)
+    rows, dataset, remarks = resolve(methods), Co3D(data), {}
     numbers = pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
     work = pairs_of_rows(dataset, rows, numbers, targets)
     warn_without_poses(dataset.root, numbers)
@@ -80,8 +80,9 @@ def evaluate(
     for row in rows.values():
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
-        elif isinstance(row.solve, StoredPoses) and not any(map(row.solve.of, work)):
-            raise InputError(f"{row.solve.path} has no pose for any of the {len(work)} pairs of --list-pairs")
+        elif isinstance(row.solve, StoredPoses):
+            solve, remarks[name] = row.solve.fit(dataset, [pair for pair, names in work.items() if name in names])
+            rows[name] = replace(row, solve=solve)
     others = {name: f"; {fingerprint(one)}" for name, one in extractors.items() if name != "backbone"}
     with execution.open_workers(executor) as (pool, workers):
         settings = Settings(
@@ -92,7 +93,7 @@ def evaluate(
                 f"{category}, N = {n}": "evaluation set" if shipped_pairs(dataset, category, n, number) else "sampled"
                 for category, number in numbers.items() for n in {row.targets or targets for row in rows.values()}
             },
-            calls=[Call(**environment(), workers=workers, rows=list(rows), pairs=dict(numbers))],
+            remarks=remarks, calls=[Call(**environment(), workers=workers, rows=list(rows), pairs=dict(numbers))],
         )  # fmt: skip
         with open_run(out, settings, allow_other_version):
             make = partial(Evaluator, str(Path(data).resolve()), rows, backbone if pool else loaded)

@@ -37,7 +37,7 @@ class Call(msgspec.Struct):
 
 
 class Settings(msgspec.Struct):
-    """What decides the results of a run; a later call may add to methods, labels, origins, and versions."""
+    """What decides the results of a run; a later call may add to methods, labels, origins, remarks, and versions."""
 
     data: str
     backbone: str  # fingerprint
@@ -47,6 +47,7 @@ class Settings(msgspec.Struct):
     labels: dict[str, str]  # hash of the pose labels by category
     origins: dict[str, str]  # of the pairs: an evaluation set of the folder, or sampled
     calls: Annotated[list[Call], msgspec.Meta(min_length=1)]
+    remarks: dict[str, str] = {}  # on the poses of a row from a file, or "" (see `exchange.fit_poses`)
 
 
 class _Result(msgspec.Struct):
@@ -94,13 +95,13 @@ class Run:
 
     @cached_property
     def failures(self) -> list[str]:
-        """Of each row that failed on pairs: on how many, and the reason of the first."""
+        """Of each row that failed on pairs: on how many, and the reason of the first; and remarks on stored poses."""
         failed = self.table[self.table["failed"] != ""].groupby("row", sort=False)["failed"]
         pairs = self.table["row"].value_counts()
         return [
             f"{name} failed on {len(reasons)} of {pairs[name]} pairs, counted as 180°; the first: {reasons.iloc[0]}."
             for name, reasons in failed
-        ]
+        ] + [f"{name}: {remark}." for name, remark in self.settings.remarks.items() if remark and name in pairs]
 
     def row(self, name: str) -> pd.DataFrame:
         """Return the table's lines of a row by pair key; InputError for an unknown row."""
@@ -141,7 +142,7 @@ def _continued(out: Path, now: Settings, allow_other_version: bool) -> Settings:
             more = ", or continue with --allow-other-version" if name == "version" else ""
             told = f"{name} {held[name]}, this is {asked[name]}; choose another folder{more}"
             raise InputError(f"{out} holds a run with {told}")
-    merged = {name: getattr(before, name) | getattr(now, name) for name in ("methods", "labels", "origins")}
+    merged = {name: getattr(before, name) | getattr(now, name) for name in ("methods", "labels", "origins", "remarks")}
     library = [*(one for one in before.library if one != now.library[0]), *now.library]
     return msgspec.structs.replace(now, library=library, calls=before.calls + now.calls, **merged)
 
