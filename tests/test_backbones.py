@@ -12,7 +12,7 @@ from small_backbones import ARCHITECTURES, save_all, small_vit
 from torch import nn
 
 from zsp_lite.backbones import load
-from zsp_lite.backbones.backbone import Backbone, block_index
+from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import PretrainedWeights, available_backbones, load_backbone, verify
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.identity import fingerprint
@@ -142,14 +142,6 @@ BAD_IMAGES = [
 def test_bad_images_are_refused_by_number(vit, image):
     with pytest.raises(InputError, match="^image 1 is .*, expected [^\n]+$"):
         Backbone(vit, "small", device="cpu", batch_size=1)([np.zeros((8, 8, 3), np.uint8), image])
-
-
-def test_a_block_is_chosen_by_its_number_from_either_end():
-    layers = {"last": 11, "block0": 0, "block9": 9, 9: 9, -1: 11, -12: 0, " -2 ": 10}
-    assert {layer: block_index(layer, 12) for layer in layers} == layers
-    for layer in ("block12", 12, -13, "first", "", "block", "block-1", "9x"):
-        with pytest.raises(InputError, match="^vit: layer is .*'last', 'block0' to 'block11', or a number from -12 to"):
-            block_index(layer, 12, "vit")
 
 
 # checkpoints

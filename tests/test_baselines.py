@@ -16,7 +16,7 @@ from zsp_lite.backbones.backbone import normalize
 from zsp_lite.baselines import geometry
 from zsp_lite.baselines.geometry import align, essential_rotation, icp
 from zsp_lite.baselines.networks import PoseContrast, Swav, euler_to_rotation, square_crop
-from zsp_lite.baselines.sift import Keypoints, RootSift, Sift, dense_sift, mutual_matches
+from zsp_lite.baselines.sift import Keypoints, Sift, dense_sift, mutual_matches
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
@@ -138,12 +138,6 @@ def test_the_posecontrast_checkpoint_loads_and_its_difference_is_the_relative_po
             PoseContrast()
 
 
-def test_a_square_crop_has_the_aspect_ratio_of_the_photograph():
-    frame = render(look_at((1, 0.2, 0.4), size=(60, 80)), Sim3.identity())
-    square = square_crop(object_crop(replace(frame, mask=None)))
-    assert (square[:27] == 0).all() and (square[197:] == 0).all() and square[57:167].any()
-
-
 def test_icp_finds_a_small_motion_of_a_cloud_and_its_scale():
     rng = np.random.default_rng(0)
     source = rng.normal(size=(400, 3)) * (1.5, 1.0, 0.6)
@@ -218,14 +212,6 @@ def test_the_essential_matrix_gives_the_rotation_between_cameras_with_other_intr
     few = Matches(pixels[0][:4], pixels[1][:4], np.ones(4), np.zeros(4))
     rotation, inliers, note = essential_rotation(*frames, few, grid)
     assert (rotation == np.eye(3)).all() and inliers == 0 and "4 matches" in note
-
-
-def test_every_patch_is_salient_and_has_a_descriptor_of_unit_length(picture):
-    features = RootSift()([picture, np.full((100, 150, 3), 0.5)])
-    assert [f.keys.shape for f in features] == [(28, 28, 128)] * 2
-    assert bool((features[0].saliency == 1).all()) and features[0].global_feature.shape == (128,)
-    torch.testing.assert_close(features[0].keys.square().sum(-1), torch.ones(28, 28))
-    assert bool(features[1].keys.isfinite().all())
 
 
 def test_the_descriptors_are_those_of_opencv(picture):

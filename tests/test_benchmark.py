@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmark_folder import BACKBONE, run_rows, small_folder
+from benchmark_folder import BACKBONE, own_method, run_rows, small_folder
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite.benchmark.run import evaluate
@@ -17,7 +17,7 @@ from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.data.pairs import category_pairs, sample_pairs, write_published_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
-from zsp_lite.synthetic.ground_truth import ObjectPose
+from zsp_lite.synthetic.ground_truth import POSES_FILE, ObjectPose, object_poses
 
 ROWS = ("ours", "ours-bv", "oracle-view")
 
@@ -143,3 +143,17 @@ def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(tmp_pa
         found = read_run(tmp_path / str(expected)).row("mine")[["symmetric_error", "error"]]
         np.testing.assert_allclose(found, [[expected, 180]] * 2, atol=1e-5)
         assert summary["methods"]["mine"]["symmetric_acc30"] == 100 * (expected < 30)
+
+
+def test_object_poses_of_another_layout_cost_a_warning_and_the_figure_that_needs_them(tmp_path, caplog):
+    dataset = Co3D(shutil.copytree(small_folder(), tmp_path / "copy"))
+    path = dataset.root / "lump" / POSES_FILE
+    path.write_text('{"100_a": {"trans": [[1, 0, 0, 0]], "scale": 1}}')
+    found = evaluate(dataset.root, BACKBONE, {"mine": own_method}, {"lump": 3}, 2, tmp_path / "out")["methods"]["mine"]
+    assert found["n"] == 3 and found["failed"] == 0 and "symmetric_acc30" not in found
+    (told,) = caplog.messages
+    assert (
+        str(path) in told and "expected" in told.lower() and told.endswith(": without it there is no symmetric_acc30")
+    )
+    with pytest.raises(InputError, match=POSES_FILE):
+        object_poses(dataset, "lump")

@@ -27,8 +27,9 @@ from zsp_lite.benchmark.problem import Answer, FrameStore, Problem
 from zsp_lite.benchmark.run import evaluate_pair
 from zsp_lite.benchmark.runs import LINES, read_lines, read_run
 from zsp_lite.benchmark.tables import every_table
+from zsp_lite.data import exchange
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.exchange import write_questions
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import category_pairs
@@ -149,13 +150,53 @@ def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
     (tmp_path / "exact.csv").write_text("\n".join(lines[:2]))  # other poses under the same name
     with pytest.raises(InputError, match="a run with methods of exact"):
         run_rows(rows, tmp_path / "run", 4, 3)
-    with pytest.raises(InputError, match="exact.csv has no pose for any of the 6 pairs"):
+    with pytest.raises(InputError, match="exact.csv has no pose for any of the pairs"):
         run_rows(rows, tmp_path / "other", 6, 2, "pebble")
     end = f"{pairs[0].target_sequence},{pairs[0].target_frames[1]}"
     second = lines[1].replace(end, f"{pairs[0].target_sequence},{pairs[0].target_frames[0]}")
     (tmp_path / "two.csv").write_text("\n".join([*lines, second]))
     with pytest.raises(FatalError, match="two.csv has 2 poses of the pair lump/.*, expected one"):
         run_rows([f"two={tmp_path / 'two.csv'}"], tmp_path / "other", 4, 3)
+
+
+FLIP = np.diag([1.0, -1.0, -1.0])
+CONVENTIONS = {
+    "": lambda R: R, "inverted": lambda R: R.T, "conjugated by diag(1, -1, -1)": lambda R: FLIP @ R @ FLIP,
+    "inverted and conjugated by diag(1, -1, -1)": lambda R: FLIP @ R.T @ FLIP,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("convention", [*CONVENTIONS, "none"])
+def test_a_spreadsheets_poses_are_read_and_the_note_names_their_convention_and_how_many_fit_no_pair(
+    tmp_path, caplog, convention
+):
+    dataset, lines = Co3D(small_folder()), [COLUMNS.replace(",", ";"), "lump;x;1;y;2;1 0 0 0 1 0 0 0 1;;"]
+    for pair in category_pairs(dataset, "lump", 12, 3):
+        ends = (pair.reference_sequence, pair.reference_frame), (pair.target_sequence, pair.target_frames[1])
+        known = ((dataset.camera(dataset.frame("lump", *end)), placement("lump", end[0])) for end in ends)
+        true = true_pose(*(part for one in known for part in one)).R
+        change = CONVENTIONS.get(convention, lambda R: Rotation.random(random_state=len(lines)).as_matrix())
+        R = change(true)
+        numbers = " ".join(f"{value:.4f}".replace(".", ",") for value in R.ravel())
+        lines.append(f"lump;{ends[0][0]};{ends[0][1]:06d};{ends[1][0]};{ends[1][1]:06d};{numbers};;")
+    (tmp_path / "mine.csv").write_text("\ufeff" + "\r\n".join(lines), encoding="utf-8")
+    run_rows({"mine": str(tmp_path / "mine.csv")}, tmp_path / "run", 12, 3)
+    found = read_run(tmp_path / "run")
+    told = "mine: 1 of 13 poses fit no pair"
+    if convention not in ("", "none"):
+        told += f"; rotations agree with the labels if {convention}: median 0° in place of "
+    for note in (found.summary["note"], caplog.text):
+        assert told in note and ("agree with" in note) == ("agree with" in told)
+    assert (found.row("mine")["error"].max() < 0.01) == (convention == "")
+
+
+def test_sequences_without_their_leading_zeros_are_found_where_one_fits(monkeypatch):
+    monkeypatch.setattr(exchange, "other_convention", lambda *_: "")
+    pairs = [Pair("cup", "0012", 1, "b", (2,)), Pair("cup", "0013", 1, "b", (2,))]
+    poses, dataset = {("cup", "12", 1, "b", 2): exchange.StoredPose(np.eye(3), None, None)}, Co3D(small_folder())
+    assert list(exchange.fit_poses("p", poses, dataset, pairs)[0]) == [("cup", "0012", 1, "b", 2)]
+    with pytest.raises(InputError, match="poses p: .*'12'.* fits .*'0012'.* expected names as in pairs.csv"):
+        exchange.fit_poses("p", poses, dataset, [*pairs, Pair("cup", "012", 1, "b", (2,))])
 
 
 RIGHT = "lump,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1"

@@ -32,7 +32,7 @@ from zsp_lite.benchmark.methods import resolve
 from zsp_lite.benchmark.problem import FrameStore, Problem
 from zsp_lite.benchmark.run import Evaluator, evaluate, pairs_of_rows, write_reports
 from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, read_lines, read_run
-from zsp_lite.benchmark.tables import compare, every_table
+from zsp_lite.benchmark.tables import compare
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels, write_label
@@ -290,19 +290,6 @@ def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
     with pytest.raises(InputError, match="a run with labels of lump"):
         run(tmp_path / "run")
     run(tmp_path / "other")
-
-
-def test_rows_stand_on_the_problems_of_the_last_call_and_earlier_rows_stay_if_they_have_these(tmp_path):
-    run_rows(["ours", "oracle-view"], tmp_path, 3)
-    assert list(run_rows(["ours-bv", "ours-n1"], tmp_path, 2)) == ["ours", "oracle-view", "ours-bv", "ours-n1"]
-    found = read_run(tmp_path)
-    assert set(found.table.groupby("row").size()) == {2} and found.note == "" and "note" not in found.summary
-    assert found.row("ours").index.equals(found.row("ours-bv").index)
-    assert list(run_rows(["ours", "rootsift"], tmp_path, 4)) == ["ours", "rootsift"]
-    note = "Without oracle-view, ours-bv, ours-n1, which lack pairs of the last call."
-    assert read_run(tmp_path).summary["note"] == note
-    assert all(note in table.note for table in every_table(read_run(tmp_path).summary))
-    assert list(run_rows(["ours-bv"], tmp_path, 1, category="pebble")) == ["ours-bv"]
 
 
 def test_the_tables_of_an_unfinished_run_say_so(tmp_path, monkeypatch):

@@ -219,14 +219,6 @@ def test_what_is_in_the_cache_needs_no_hub(offline, pictures):
     verify("hf:someone/small")
 
 
-def test_what_the_hub_refuses_is_told_in_one_line(monkeypatch):
-    def refuse(name, local_files_only=False, **_):
-        raise huggingface_hub.errors.LocalEntryNotFoundError("not here") if local_files_only else OSError("503\n\nBusy")
-
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", refuse)
-    refused("hf:someone/closed", "hf:someone/closed: neither a folder nor a model .* gives .503 Busy")
-
-
 @pytest.mark.parametrize("name", ["hf:", "hf:../nowhere", "hf:facebook/dinov2-small"])
 def test_what_is_neither_a_folder_nor_a_name_is_refused(name, offline):
     refused(name, "neither a folder nor a model OWNER/MODEL that the Hugging Face hub gives")

@@ -113,16 +113,6 @@ def test_orientations_are_rotations_to_front_x_and_up_z():
             info.axes(".obj")
 
 
-def test_a_folder_lists_models_in_files_and_in_folders_of_their_own(tmp_path):
-    write_wedge(tmp_path / "chair" / "plain.obj")
-    write_quad(tmp_path / "chair" / "own" / "model.obj", CHECKS)
-    write_wedge(tmp_path / "bed" / "x.OBJ")
-    assert [f"{m.category}/{m.name}" for m in list_models(tmp_path)] == ["bed/x", "chair/own", "chair/plain"]
-    write_wedge(tmp_path / "chair" / "own.obj")
-    with pytest.raises(InputError, match="chair/own has two files"):
-        list_models(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("folder", "entries", "message"),
     [

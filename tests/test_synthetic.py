@@ -20,7 +20,6 @@ from zsp_lite.synthetic.export import export_categories, make_object, sequence_n
 from zsp_lite.synthetic.primitives import surface_spread
 from zsp_lite.synthetic.sequences import record_sequence, soft_mask, stereo_depth
 
-
 ALL = {name: build for builders in (*SPLITS.values(), CATEGORIES) for name, build in builders.items()}
 SEED, FRAMES, SIZE = 5, 6, 72
 

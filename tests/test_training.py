@@ -20,7 +20,7 @@ from zsp_lite.training.batches import crop_grids, sample_batch
 from zsp_lite.training.distillation import Distillation, DistillationConfig, distillation_loss, multi_crop
 from zsp_lite.training.objectives import attention_loss, correspondence_loss, losses
 from zsp_lite.training.renders import GRID, SIZE, VIEWS, render_object, render_set
-from zsp_lite.training.trainee import Trainee, as_trainee, initial_backbone
+from zsp_lite.training.trainee import Trainee, initial_backbone
 
 pytestmark = pytest.mark.slow
 
@@ -167,15 +167,6 @@ def test_attention_on_the_mask_is_worth_more_than_attention_off_it():
     off, missed = attention_loss(-logits, coverage)
     assert iou == 1 and missed == 0
     assert on < 0.6 < 5 < off
-
-
-def test_the_mean_key_of_the_crops_is_subtracted(renders):
-    model = as_trainee(initial_backbone(renders, 24, 2, 2), 1, renders, 48)
-    batch = sample_batch(renders, np.random.default_rng(7), 3, VIEWS, 48, (0.85, 1.0))
-    with torch.no_grad():
-        keys = model(batch.images).keys
-    assert keys.mean((0, 1)).norm() > 0.1
-    torch.testing.assert_close(model.centred(keys).mean((0, 1)), torch.zeros(24), atol=1e-5, rtol=0)
 
 
 def test_a_few_steps_teach_a_network_where_the_object_is(renders):

@@ -119,9 +119,8 @@ def umeyama_batch(
 ) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, " b"]]:
     """Fit similarities to a batch of point sets, without checks (see `umeyama`).
 
-    The fit is the least-squares optimum with a scale in `scale_range`: the best rotation does not depend on the scale,
-    and the error is quadratic in it. Returns scales, rotations, translations, and conditionings: the ratio of the
-    second to the first singular value of the covariance, 0 for collinear points.
+    The best rotation does not depend on the scale, in which the error is quadratic. Returns scales, rotations,
+    translations, and the ratio of the second to the first singular value of the covariance, 0 for collinear points.
     """
     source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
     centred_source, centred_target = source - source_mean[:, None], target - target_mean[:, None]

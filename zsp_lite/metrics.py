@@ -40,31 +40,18 @@ def rotation_angle(first: Float[np.ndarray, "*a 3 3"], second: Float[np.ndarray,
 
 
 def accuracy(errors: ArrayLike, threshold: float, weights: ArrayLike | None = None) -> np.ndarray | float:
-    """Compute the percentage of errors strictly below the threshold; Acc30 is threshold=30.
+    """Compute the percentages (...) of errors (..., n) in degrees strictly below a threshold; Acc30 is threshold=30.
 
-    Args:
-        errors: (..., n) in degrees.
-        threshold: In degrees.
-        weights: None, or (..., n) non-negative weights, broadcast against `errors`.
-
-    Returns:
-        Percentages (...), over the last axis.
+    Non-negative weights (..., n) are broadcast against the errors.
     """
     return 100 * weighted_mean(np.asarray(errors) < threshold, weights)
 
 
 def median(errors: ArrayLike, weights: ArrayLike | None = None) -> np.ndarray | float:
-    """Compute the median of errors, optionally weighted.
+    """Compute the medians (...) of errors (..., n), or of errors (n,) with non-negative weights (..., n).
 
     The weighted median halves the total weight. Where the half falls between two errors it is their mean, so that
     equal weights give the ordinary median.
-
-    Args:
-        errors: (..., n); (n,) where weights are given.
-        weights: None, or (..., n) non-negative weights of a positive sum.
-
-    Returns:
-        Medians (...), over the last axis.
     """
     errors = np.asarray(errors, np.float64)
     if weights is None:

@@ -113,8 +113,8 @@ def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Metho
     """Resolve names to rows, in order and without duplicates.
 
     Names are those of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, "module:thing",
-    "poses.csv", or NAME=one of these. A mapping leads from names to these, to `Method`s, or to objects of one's own
-    (see `own.kind_of`). InputError if a name is unknown, or a thing cannot be imported or read, or is none of these.
+    "poses.csv", or NAME=one of these. A mapping leads from names to these, to `Method`s, or to objects of one's own.
+    InputError if a name is unknown, or a thing cannot be imported or read, or is of no kind (see `own.kind_of`).
     """
     if not isinstance(methods, Mapping):
         names = [methods] if isinstance(methods, str) else methods

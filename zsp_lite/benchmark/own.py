@@ -4,9 +4,9 @@ import inspect
 import os
 import pkgutil
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,8 @@ import numpy as np
 from zsp_lite.alignment import SCALE_RANGE, ransac
 from zsp_lite.baselines.sift import unproject_pixels
 from zsp_lite.benchmark.problem import Answer, Problem
-from zsp_lite.data.co3d import Pair
-from zsp_lite.data.exchange import PairKey, StoredPose
+from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.exchange import PairKey, StoredPose, fit_poses
 from zsp_lite.errors import FatalError, InputError, describe_failure, real_array
 
 KINDS = ("problem", "keypoints", "matcher")  # functions of one, two and three arguments
@@ -94,22 +94,24 @@ def fit_keypoints(problem: Problem, view: int, first: Any, second: Any) -> Answe
 
 @dataclass(frozen=True)
 class StoredPoses:
-    """Row of poses that another program computed (see `exchange.read_poses`)."""
+    """Row of poses that another program computed (see `exchange`)."""
 
     path: str
     _poses: Mapping[PairKey, StoredPose]
     digest: str  # of the file
 
     def __call__(self, problem: Problem) -> Answer:
-        pair, found = problem.pair, self.of(problem.pair)
+        pair = problem.pair
+        key = pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence
+        found = [view for view, frame in enumerate(pair.target_frames) if (*key, frame) in self._poses]
         if not found:
             raise InputError(f"{self.path} has no pose")
         if len(found) > 1:
             raise FatalError(f"{self.path} has {len(found)} poses of the pair {pair.key}, expected one")
-        return found[0]
+        pose = self._poses[*key, pair.target_frames[found[0]]]
+        return Answer(pose.rotation, found[0], pose.translation, pose.scale)
 
-    def of(self, pair: Pair) -> list[Answer]:
-        """Look up the poses of a pair."""
-        key = pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence
-        found = [(view, self._poses.get((*key, frame))) for view, frame in enumerate(pair.target_frames)]
-        return [Answer(pose.rotation, view, pose.translation, pose.scale) for view, pose in found if pose]
+    def fitted(self, dataset: Co3D, pairs: Iterable[Pair]) -> tuple["StoredPoses", str]:
+        """Return the row of the poses of some pairs, and a remark (see `exchange.fit_poses`)."""
+        poses, remark = fit_poses(self.path, self._poses, dataset, pairs)
+        return replace(self, _poses=poses), remark

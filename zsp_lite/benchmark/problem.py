@@ -120,10 +120,7 @@ class FrameStore:
 
 
 class Problem:
-    """One pair as a method sees it: everything but the true pose. Results are computed once and shared by all methods.
-
-    `pair` names the frames, `seed` is for the method's random draws.
-    """
+    """One pair as a method sees it: everything but the true pose. Results are computed once for all methods."""
 
     def __init__(self, pair: Pair, store: FrameStore):
         self.pair, self.seed, self.store = pair, pair.seed, store

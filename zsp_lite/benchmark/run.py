@@ -72,16 +72,18 @@ def evaluate(
         FatalError: A backbone or a row is broken, or a frame cannot be read.
     """
     check_integer("targets", targets, 1)
-    rows, dataset = resolve(methods), Co3D(data)
+    rows, dataset, remarks = resolve(methods), Co3D(data), []
     numbers = pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
     work = pairs_of_rows(dataset, rows, numbers, targets)
     loaded = as_backbone(backbone)
     extractors = make_extractors(loaded, rows)
-    for row in rows.values():
+    for name, row in rows.items():
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
-        elif isinstance(row.solve, StoredPoses) and not any(map(row.solve.of, work)):
-            raise InputError(f"{row.solve.path} has no pose for any of the {len(work)} pairs of --list-pairs")
+        elif isinstance(row.solve, StoredPoses):
+            solve, remark = row.solve.fitted(dataset, work)
+            rows[name] = replace(row, solve=solve)
+            remarks += [f"{name}: {remark}."] if remark else []
     others = {name: f"; {fingerprint(one)}" for name, one in extractors.items() if name != "backbone"}
     with execution.open_workers(executor) as (pool, workers):
         settings = Settings(
@@ -92,14 +94,14 @@ def evaluate(
                 f"{category}, N = {n}": "evaluation set" if shipped_pairs(dataset, category, n, number) else "sampled"
                 for category, number in numbers.items() for n in {row.targets or targets for row in rows.values()}
             },
-            calls=[Call(**environment(), workers=workers, rows=list(rows), pairs=dict(numbers))],
+            calls=[Call(**environment(), workers=workers, rows=list(rows), pairs=dict(numbers), remarks=remarks)],
         )  # fmt: skip
         with open_run(out, settings, allow_other_version):
             make = partial(Evaluator, str(Path(data).resolve()), rows, backbone if pool else loaded)
             evaluate_pairs(out, make, work, pool, workers)
     found = read_run(out)
-    for failure in found.failures:
-        logger.warning("%s", failure)
+    for remark in (*remarks, *found.failures):
+        logger.warning("%s", remark)
     return _write_summary(found, out)
 
 

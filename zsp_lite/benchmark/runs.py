@@ -34,6 +34,7 @@ class Call(msgspec.Struct):
     rows: list[str]
     pairs: dict[str, int]  # by category
     finished: bool = True
+    remarks: list[str] = []  # on poses from files
 
 
 class Settings(msgspec.Struct):
@@ -198,7 +199,7 @@ def read_run(out: str | Path) -> Run:
         notes.append(f"Not finished: {table['row'].value_counts().max()} of {sum(last.pairs.values())} pairs.")
     if hidden := [name for name in settings.methods if name not in rows]:
         notes.append(f"Without {', '.join(hidden)}, which lack pairs of the last call.")
-    return Run(settings, table, timings, " ".join(notes))
+    return Run(settings, table, timings, " ".join([*notes, *last.remarks]))
 
 
 def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:

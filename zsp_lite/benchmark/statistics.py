@@ -56,10 +56,9 @@ def object_draws(objects: ArrayLike, categories: ArrayLike | None = None, resamp
     """Draw bootstrap weights (resamples, n) of pairs by resampling the objects (n, 2) that the pairs are made of.
 
     In each replicate the objects of a category are drawn with replacement, and the weight of a pair is the product of
-    its two objects' multiplicities: the pigeonhole bootstrap (Owen 2007) with one set of objects on both sides, as in
-    the vertex bootstrap of a network (Snijders & Borgatti 1999). If the errors depend little on the objects, the
-    intervals are too wide: the estimated variance is then up to three times the true one. Every category keeps its
-    total weight. With fewer than three objects, which do not tell the spread, pairs are resampled as independent.
+    its two objects' multiplicities: the pigeonhole bootstrap (Owen 2007) with one set of objects on both sides. If the
+    errors depend little on the objects, the intervals are too wide: the estimated variance is then up to three times
+    the true one. Every category keeps its total weight. Pairs of fewer than three objects are resampled themselves.
     """
     objects = np.asarray(objects, dtype=str)
     categories = np.full(len(objects), "") if categories is None else np.asarray(categories, dtype=str)
@@ -139,9 +138,8 @@ def paired_difference(first: ArrayLike, second: ArrayLike, threshold: float = 30
 def paired_test(first: ArrayLike, second: ArrayLike, threshold: float = 30, weights: Draws | None = None) -> dict:
     """Test whether the second method is better than the first on the same pairs. All p values are two-sided.
 
-    Errors (n,) are in degrees, of the same pairs in the same order; a pair is solved below the threshold. To what
-    `paired_difference` returns are added "sign_test_p", of McNemar's exact test over the pairs that only one of the two
-    solves, and "permutation_test_p", of the mean difference of the errors, by 10,000 flips of the differences' signs.
+    Errors (n,) are in degrees; a pair is solved below the threshold. To what `paired_difference` returns are added
+    "sign_test_p", of McNemar's exact test, and "permutation_test_p", of the mean difference, by 10,000 flips of signs.
     Both treat pairs as independent: where pairs share objects, these p values are too small.
     """
     from scipy.stats import binomtest, permutation_test

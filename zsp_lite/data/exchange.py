@@ -5,20 +5,23 @@ docs/benchmark_your_own.md has the columns of both.
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import binom
 
-from zsp_lite.alignment import Sim3
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.errors import InputError, check_magnitude, real_array
+from zsp_lite.data.labels import read_labels, relative_pose
+from zsp_lite.errors import InputError, check_magnitude, real_array, rotation_matrix
 from zsp_lite.io.files import digest, read_bytes, write_atomic
+from zsp_lite.metrics import rotation_error
 
 PairKey = tuple[str, str, int, str, int]  # category, reference sequence and frame, target sequence and frame
 _KEY = ("category", "reference_sequence", "reference_frame", "target_sequence", "target_frame")
+_CHANCE = 5e-4  # probability by which another convention may be named by chance
 
 
 class StoredPose(NamedTuple):
@@ -57,7 +60,10 @@ def read_poses(path: str | Path) -> tuple[dict[PairKey, StoredPose], str]:
     """Read poses, with a line for each pair, and the hash of the file."""
     data, poses = read_bytes(path, "poses"), {}
     try:
-        reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), restval="")
+        text = data.decode("utf-8-sig")
+        mark = next((mark for mark in ";\t" if mark in text.partition("\n")[0]), ",")
+        reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=mark, restval="")
+        reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
         lines = [(reader.reader.line_num, line) for line in reader]  # its own is wrong after a blank line
     except (ValueError, csv.Error) as error:
         raise InputError(f"poses {path}: {error}, expected a CSV file") from error
@@ -67,11 +73,11 @@ def read_poses(path: str | Path) -> tuple[dict[PairKey, StoredPose], str]:
         try:
             if None in line:
                 raise ValueError(f"more than the {len(reader.fieldnames)} fields of the header")
-            rotation = Sim3(1.0, _numbers("rotation", line["rotation"], 9).reshape(3, 3), np.zeros(3)).R
-            translation, scale = (line.get(name, "") for name in ("translation", "scale"))
+            rotation = rotation_matrix("rotation", _numbers("rotation", line["rotation"], 9).reshape(3, 3))
+            translation, scale = (line.get(name, "").strip() for name in ("translation", "scale"))
             translation = _numbers("translation", translation, 3) if translation else None
             scale = float(_numbers("scale", scale, 1)[0]) if scale else None
-            key = tuple(int(line[name]) if name.endswith("frame") else line[name] for name in _KEY)
+            key = tuple(int(line[name]) if name.endswith("frame") else line[name].strip() for name in _KEY)
             if key in poses:
                 raise ValueError("second pose of the same frames")
             poses[key] = StoredPose(rotation, translation, scale)
@@ -81,7 +87,56 @@ def read_poses(path: str | Path) -> tuple[dict[PairKey, StoredPose], str]:
 
 
 def _numbers(name: str, text: str, size: int) -> np.ndarray:
-    """Read the numbers of a field."""
-    values = real_array(name, np.array(text.split(), float), (size,))
+    """Read the numbers of a field; a comma in one is its decimal point."""
+    values = real_array(name, np.array(text.replace(",", ".").split(), float), (size,))
     check_magnitude(name, values)
     return values
+
+
+def fit_poses(
+    path: str | Path, poses: Mapping[PairKey, StoredPose], dataset: Co3D, pairs: Iterable[Pair]
+) -> tuple[dict[PairKey, StoredPose], str]:
+    """Return the poses of pairs, and what is to be said of the others and of the convention.
+
+    A spreadsheet removes the leading zeros of sequences. InputError if a name without them fits two sequences, or if
+    no pose has a pair.
+    """
+    asked: dict[PairKey, PairKey] = {}  # full names by themselves and by names without leading zeros
+    for pair in pairs:
+        for frame in pair.target_frames:
+            key = pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence, frame
+            short = key[0], key[1].lstrip("0"), key[2], key[3].lstrip("0"), key[4]
+            asked[key] = key
+            if asked.setdefault(short, key) != key and short in poses:
+                raise InputError(f"poses {path}: {short} fits {key} and {asked[short]}, expected names as in pairs.csv")
+    found = {asked[key]: pose for key, pose in poses.items() if key in asked}
+    if not found:
+        raise InputError(f"{path} has no pose for any of the pairs of --list-pairs")
+    surplus = len(poses) - len(found)
+    remarks = f"{surplus} of {len(poses)} poses fit no pair" if surplus else "", other_convention(dataset, found)
+    return found, "; ".join(filter(None, remarks))
+
+
+def other_convention(dataset: Co3D, poses: Mapping[PairKey, StoredPose]) -> str:
+    """Name another convention by which rotations clearly agree with the labels, or return "".
+
+    Those of other programs may be inverted, or conjugated by diag(1, -1, -1) for cameras in OpenGL's axes.
+    """
+    truths = []
+    for category, first, number, second, target in poses:
+        labels = read_labels(dataset.root, category)
+        reference, other = dataset.frame(category, first, number), dataset.frame(category, second, target)
+        cameras = dataset.camera(reference), dataset.camera(other)
+        truths.append(relative_pose(labels[first], cameras[0], labels[second], cameras[1])[:3, :3])
+    given = np.stack([pose.rotation for pose in poses.values()])
+    flipped = given * np.outer((1, -1, -1), (1, -1, -1))
+    readings = {"": given, "inverted": given.swapaxes(1, 2), "conjugated by diag(1, -1, -1)": flipped}
+    readings["inverted and conjugated by diag(1, -1, -1)"] = flipped.swapaxes(1, 2)
+    errors = {name: rotation_error(rotations, np.stack(truths)) for name, rotations in readings.items()}
+    medians = {name: float(np.median(error)) for name, error in errors.items()}
+    best = min(medians, key=medians.get)
+    # By chance, a sixth of turns about the vertical is below 30 degrees.
+    by_chance = binom.sf((errors[best] < 30).sum() - 1, len(truths), 1 / 6)
+    if medians[best] > min(30, medians[""] / 2) or by_chance > _CHANCE:
+        return ""
+    return f"rotations agree with the labels if {best}: median {medians[best]:.0f}° in place of {medians['']:.0f}°"

@@ -4,6 +4,8 @@ These sets are torch files that refer to frames by their positions in the catego
 """
 
 import io
+import itertools
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -17,6 +19,8 @@ from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import load_torch, plain_name, stable_hash, write_atomic
 
+logger = logging.getLogger(__name__)
+
 
 class _PublishedPair(msgspec.Struct):
     category: str = msgspec.field(name="class")
@@ -27,7 +31,7 @@ class _PublishedPair(msgspec.Struct):
 
 
 def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int = 0) -> list[Pair]:
-    """Sample `n` evaluation pairs of a category, each with `n_targets` target frames.
+    """Sample `n` different evaluation pairs of a category, or all if there are fewer, each with `n_targets` frames.
 
     Reference sequences take turns; the target sequence is a random other one. The reference frame is random; the target
     frames are evenly spaced from a random start. The pairs of a smaller `n` are the first ones of a larger.
@@ -42,16 +46,25 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
     if (found := len(numbers[shortest])) < n_targets:
         raise InputError(f"labelled sequence {category}/{shortest} has {found} frames, expected at least {n_targets}")
 
-    pairs = []
-    for index in range(n):
-        reference = sequences[index % len(sequences)]
-        others = [name for name in sequences if name != reference]
-        target = others[rng.integers(len(others))]
-        frame = numbers[reference][rng.integers(len(numbers[reference]))]
-        length = len(numbers[target])
-        positions = (rng.integers(length) + np.arange(n_targets) * length // n_targets) % length
-        pairs.append(Pair(category, reference, frame, target, tuple(numbers[target][p] for p in positions)))
-    return pairs
+    every = sum(map(len, numbers.values()))  # frames; each is the start of one choice of target frames
+    left = {name: len(own) * (every - len(own)) for name, own in numbers.items()}  # pairs that are not sampled yet
+    if (total := sum(left.values())) < n:
+        logger.warning(
+            "category %s has %d different pairs with %d target frames, not %d", category, total, n_targets, n
+        )
+    pairs: dict[Pair, None] = {}
+    for reference in itertools.cycle(sequences):
+        if len(pairs) == min(n, total):
+            return list(pairs)
+        found = len(pairs)
+        while left[reference] and len(pairs) == found:  # drawn again if it is there already
+            others = [name for name in sequences if name != reference]
+            target = others[rng.integers(len(others))]
+            frame = numbers[reference][rng.integers(len(numbers[reference]))]
+            length = len(numbers[target])
+            positions = (rng.integers(length) + np.arange(n_targets) * length // n_targets) % length
+            pairs[Pair(category, reference, frame, target, tuple(numbers[target][p] for p in positions))] = None
+        left[reference] -= len(pairs) - found
 
 
 def labelled_categories(dataset: Co3D) -> list[str]:

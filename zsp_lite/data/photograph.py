@@ -29,12 +29,9 @@ _FARTHEST = 2.75  # metres; the motorcycle is nearer, the bench and the shelf be
 def load_photograph() -> Frame:
     """Load a photograph of a motorcycle with dense depth and an object mask.
 
-    The photograph and its disparities, measured with structured light, come with scikit-image
-    (`skimage.data.stereo_motorcycle`). They are a scene of the Middlebury 2014 stereo data: D. Scharstein et al.,
-    High-resolution stereo datasets with subpixel-accurate ground truth. GCPR 2014.
-
-    The world is the camera's frame. Lengths are scaled as in CO3D (supplement), so that the points of the object have
-    unit standard deviation, averaged over the axes; one unit is about 0.22 m.
+    Photograph and disparities, measured with structured light, are scikit-image's `stereo_motorcycle`, of Middlebury's
+    2014 stereo data (Scharstein et al., GCPR 2014). The world is the camera's frame. Lengths are scaled as in CO3D, so
+    that the points of the object have unit standard deviation; one unit is about 0.22 m.
     """
     import skimage.data
 

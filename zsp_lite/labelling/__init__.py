@@ -2,7 +2,6 @@
 
 keypoints: alignment of two point clouds by keypoints
 session: picks and labels of a category, stored on disk
-candidates: contact sheet of the sequences to label
 
 The widget for notebooks is in `zsp_lite.widgets.labelling`.
 """

@@ -32,14 +32,9 @@ class Alignment:
 
 
 def align_picks(reference: ArrayLike, picks: ArrayLike) -> Alignment:
-    """Align keypoints by Umeyama's method with scale.
+    """Align keypoints (n, 3) of the reference sequence, n >= 4, and of another one by Umeyama's method with scale.
 
-    Args:
-        reference: (n, 3) keypoints on the reference sequence, n >= 4.
-        picks: (n, 3) the same keypoints on another sequence.
-
-    Raises:
-        InputError: The numbers differ or are below 4, a keypoint is not finite, or all are equal or collinear.
+    InputError if the numbers differ or are below 4, a keypoint is not finite, or all are equal or collinear.
     """
     reference, picks = (np.asarray(points, dtype=np.float64) for points in (reference, picks))
     if len(reference) != len(picks) or len(picks) < MIN_KEYPOINTS:

@@ -58,17 +58,9 @@ class Labelling:
     ):
         """Open a category with its stored picks.
 
-        Args:
-            root: The data folder.
-            category: Name of the category.
-            sequences: Sequences to label. The default is the ten with the best point clouds (`Co3D.select`), or all
-                with a point cloud if there are no quality scores.
-            reference: Reference sequence. The default is that of the stored picks and labels, or else the sequence
-                with the best point cloud.
-
-        Raises:
-            InputError: The category or a sequence is unknown, fewer than two sequences have point clouds, or the stored
-                picks or labels have another reference.
+        By default, the sequences are the ten with the best point clouds (`Co3D.select`), or all with a point cloud if
+        there are no quality scores; the reference is that of the stored picks and labels, or else the best point cloud.
+        InputError if a name is unknown, fewer than two sequences have point clouds, or the references differ.
         """
         self.root, self.category, self.dataset = Path(root), plain_name(category, "category"), Co3D(root)
         known = {one.sequence_name: one for one in self.dataset.sequences(category)}
@@ -184,14 +176,8 @@ class Labelling:
     def accept(self, sequence: str, confirmed: bool = False) -> Path:
         """Write the label of a sequence, also in `doubt` if `confirmed`, and that of the reference, the identity.
 
-        Without picks on the sequence, the label is the proposal.
-
-        Returns:
-            The label file of the sequence.
-
-        Raises:
-            InputError: Keypoints are missing, the sequence is the reference, or the label is in doubt and not
-                confirmed.
+        Without picks on the sequence, the label is the proposal. Returns the label file of the sequence. InputError if
+        keypoints are missing, the sequence is the reference, or the label is in doubt and not confirmed.
         """
         alignment, picked = self.alignment(sequence), len(self.picks(sequence))
         sim3 = alignment.sim3 if alignment else None if picked else self.proposal(sequence)

@@ -4,6 +4,8 @@ Instances of a category have different proportions. Their points are therefore c
 (rear, right, bottom) to 1 (front, left, top) along each axis of the object's bounding box.
 """
 
+import functools
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_json
 from zsp_lite.views import object_crop, patch_mask
 
+logger = logging.getLogger(__name__)
 POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
 _MARGIN = 0.05  # a point farther outside the box than this belongs to the background
 _MASK_THRESHOLD = 0.8  # masks are soft and accurate to one or two pixels
@@ -70,12 +73,22 @@ def read_poses(out: Path, category: str) -> dict[str, ObjectPose]:
     return read_json(path, dict[str, ObjectPose], "object poses") if path.is_file() else {}
 
 
+@functools.cache
+def _warn(message: str) -> None:
+    """Log a warning once."""
+    logger.warning("%s", message)
+
+
 def common_turns(out: Path, category: str, first: str, second: str) -> Float[np.ndarray, "s 3 3"] | None:
     """Return the turns in the world of the second object after which both look the same; None where nothing is known.
 
     The first is the identity.
     """
-    poses = read_poses(out, category)
+    try:
+        poses = read_poses(out, category)
+    except InputError as error:  # a file of an older layout, for instance, costs one figure only
+        _warn(f"{error}: without it there is no symmetric_acc30")
+        return None
     if not {first, second} <= poses.keys():
         return None
     angles = [[0.0], *([turn] for turn in poses[first].turns if turn in poses[second].turns)]

@@ -305,18 +305,6 @@ def show_dots(groups: Mapping[str, Mapping[str, ArrayLike]], median: bool = True
     return figure
 
 
-def show_histograms(groups: Mapping[str, ArrayLike], bins: ArrayLike | int = 20, **labels: Any) -> Figure:
-    """Show histograms of one to four groups over each other: the first filled, the others as hatched outlines."""
-    figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
-    edges = np.histogram_bin_edges(np.concatenate([np.ravel(values) for values in groups.values()]), bins)
-    for (name, values), colour, hatch in zip(groups.items(), (BLUE, VERMILLION, ORANGE, GREEN), ("", "//", "..", "xx")):
-        style = {"histtype": "step", "hatch": hatch, "linewidth": 2} if hatch else {"alpha": 0.8}
-        axis.hist(values, edges, color=colour, label=name, **style)
-    axis.set(**labels)
-    _legend(figure, axis)
-    return figure
-
-
 def show_intervals(
     x: ArrayLike, intervals: Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike]], joined: bool = True, **labels: Any
 ) -> Figure:
@@ -369,9 +357,8 @@ def pca_colours(
 ) -> list[Float[np.ndarray, "rows cols 3"]]:
     """Map features to colours by their first three principal components, which all maps share.
 
-    Each component is scaled to its range from the 2nd to the 98th percentile, which is robust to outliers. Similar
-    colours mean similar features, also between images. The components are fitted to the `foreground` patches; others
-    are white. The result has an RGB image in [0, 1] for each map, with one pixel per patch.
+    Each component is scaled to its range from the 2nd to the 98th percentile. The components are fitted to the
+    `foreground` patches; others are white. Each map gives an RGB image in [0, 1], with one pixel per patch.
     """
     features = [np.asarray(one, dtype=np.float64) for one in maps]
     on = [np.asarray(one, bool) for one in foreground or (np.ones(one.shape[:2]) for one in features)]
