@@ -183,6 +183,7 @@ def test_the_embedded_backbone_is_found_by_its_name(vit, tmp_path, monkeypatch):
         load_backbone("zsp-tiny")
     save_file(vit.state_dict(), path, metadata={"num_heads": "1"})
     assert load_backbone("zsp-tiny").name == "zsp-tiny" and available_backbones()["zsp-tiny"] == path
+    assert load.as_backbone(path).embed_dim == load.as_backbone(str(path)).embed_dim == vit.embed_dim
 
 
 @pytest.mark.parametrize(

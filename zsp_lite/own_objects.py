@@ -74,7 +74,8 @@ class Source:
         frames = {position: self.read(position) for position in sorted({*positions, *map(int, others)})}
         some = list(frames.values())
         if self.mask != "given":
-            frames = dict(zip(frames, masks_from_box(some, self.box) if self.box else masks_from_depth(some)))
+            masked = masks_from_box(some, self.box) if self.box else masks_from_depth(some)
+            frames = dict(zip(frames, masked, strict=True))
         elif without := [self.numbers[k] for k, frame in frames.items() if frame.mask is None]:
             where = f"{self.path}, frame {without[0]}"
             raise InputError(f"{where}: no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH")

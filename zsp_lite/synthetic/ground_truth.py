@@ -22,7 +22,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_json
 from zsp_lite.views import object_crop, patch_mask
 
-logger = logging.getLogger(__name__)
+_warn_once = functools.cache(logging.getLogger(__name__).warning)
 POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
 _MARGIN = 0.05  # a point farther outside the box than this belongs to the background
 _MASK_THRESHOLD = 0.8  # masks are soft and accurate to one or two pixels
@@ -73,12 +73,6 @@ def read_poses(out: Path, category: str) -> dict[str, ObjectPose]:
     return read_json(path, dict[str, ObjectPose], "object poses") if path.is_file() else {}
 
 
-@functools.cache
-def _warn(message: str) -> None:
-    """Log a warning once."""
-    logger.warning("%s", message)
-
-
 def common_turns(out: Path, category: str, first: str, second: str) -> Float[np.ndarray, "s 3 3"] | None:
     """Return the turns in the world of the second object after which both look the same; None where nothing is known.
 
@@ -87,7 +81,7 @@ def common_turns(out: Path, category: str, first: str, second: str) -> Float[np.
     try:
         poses = read_poses(out, category)
     except InputError as error:  # a file of an older layout, for instance, costs one figure only
-        _warn(f"{error}: without it there is no symmetric_acc30")
+        _warn_once("%s", f"{error}: without it there is no symmetric_acc30")
         return None
     if not {first, second} <= poses.keys():
         return None
