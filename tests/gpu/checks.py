@@ -85,8 +85,9 @@ def notebooks(device: str) -> Result:
                 text = text.replace(r"device=\"cpu\"", rf"device=\"{device}\"")
             Path(folder, path.name).write_text(text.replace("nbval-check-output", "not-compared"), encoding="utf-8")
         command = [sys.executable, "-m", "pytest", "-c", "pyproject.toml", "--rootdir", folder, "-q", "--nbval-lax"]
-        command += ["--nbval-current-env", "--nbval-cell-timeout=300", "-n", "2", "--dist", "loadfile", folder]
-        status = subprocess.run(command, cwd=REPOSITORY).returncode
+        command += ["--nbval-current-env", "--nbval-cell-timeout=300", "-n", "4", "--dist", "loadfile", folder]
+        environment = os.environ | {"OMP_NUM_THREADS": str(max(1, CORES // 4))}
+        status = subprocess.run(command, cwd=REPOSITORY, env=environment).returncode
     return [], [f"pytest of the notebooks ended with {status}"] if status else []
 
 
