@@ -140,6 +140,6 @@ def other_convention(dataset: Co3D, poses: Mapping[PairKey, StoredPose]) -> str:
     best = min(medians, key=medians.get)
     # By chance, a sixth of turns about the vertical is below 30 degrees.
     by_chance = binom.sf((errors[best] < 30).sum() - 1, len(truths), 1 / 6)
-    if medians[best] > min(30, medians[""] / 2) or by_chance > _CHANCE:
+    if not best or medians[best] > min(30, medians[""] / 2) or by_chance > _CHANCE:
         return ""
     return f"rotations agree with the labels if {best}: median {medians[best]:.0f}° in place of {medians['']:.0f}°"
