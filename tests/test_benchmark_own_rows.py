@@ -206,7 +206,7 @@ RIGHT = "lump,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1"
     ("text", "told"),
     [
         ("", "a CSV file"), ("\xff", "codec.* a CSV file"), (f"{COLUMNS}\nlump,a,0", "line 2: "),
-        ("category,target_frame", "no column reference_sequence, .*rotation"), (f"{COLUMNS}\n{RIGHT}x", "line 2: .*1x"),
+        ("category,target_frame", "columns reference_sequence, .*rotation"), (f"{COLUMNS}\n{RIGHT}x", "line 2: .*1x"),
         (f"{COLUMNS}\n{RIGHT}\n{RIGHT.replace('0 0 0 1,', '0 0 0,')}", "line 3: rotation has shape .8,., exp"),
         (f"{COLUMNS}\n\n{RIGHT.replace(',1 0', ',nan 0')}", "line 3: rotation holds nan"),
         (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',-1 0')}", "line 2: "),
@@ -214,6 +214,8 @@ RIGHT = "lump,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1"
         (f"{COLUMNS}\n{RIGHT.replace(',0 0 1,', ',0 0,')}", "line 2: translation has shape .2,., expected"),
         (f"{COLUMNS}\n{RIGHT}\n{RIGHT}", "line 3: second pose of the same frames"),
         (f"{COLUMNS}\n{RIGHT},surplus", "line 2: more than the 8 fields of the header"),
+        (f"{COLUMNS},ROTATION\n{RIGHT},", "several columns rotation"), (f"{COLUMNS}\n{RIGHT[:-1]}0", "scale is 0.0"),
+        (f"{COLUMNS}\n{RIGHT.replace(',b,1,', ',b,1.000,')}", "line 2: .*'1.000'"),  # or a thousand
     ],
 )  # fmt: skip
 def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_path):
@@ -221,8 +223,19 @@ def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_pat
     path.write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=f"poses {re.escape(str(path))}.*{told}"):
         resolve([f"theirs={path}"])
-    path.write_text(f"{COLUMNS}\n{RIGHT}\n")
-    assert resolve([f"theirs={path}"])["theirs"].features == "none"
+    saved = f"{COLUMNS.title()},,\n,,,,,,,,,\n{RIGHT.replace('a,0,b,1', 'a,0.0,b,0001')},,\n".replace("_", " ")
+    path.write_text(saved, encoding="utf-16")
+    assert resolve([f"theirs={path}"])["theirs"].solve._poses.keys() == {("lump", "a", 0, "b", 1)}
+
+
+def test_rotations_of_which_half_are_inverted_are_in_no_other_convention():
+    dataset, poses = Co3D(small_folder()), {}
+    for index, pair in enumerate(category_pairs(dataset, "lump", 24, 1)):
+        ends = (pair.reference_sequence, pair.reference_frame), (pair.target_sequence, pair.target_frames[0])
+        known = ((dataset.camera(dataset.frame("lump", *end)), placement("lump", end[0])) for end in ends)
+        rotation = true_pose(*(part for one in known for part in one)).R
+        poses["lump", *ends[0], *ends[1]] = exchange.StoredPose(rotation.T if index < 13 else rotation, None, None)
+    assert exchange.other_convention(dataset, poses) == ""
 
 
 def test_the_questions_have_a_line_for_each_frame_with_its_files_and_camera(tmp_path):
