@@ -163,6 +163,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 CONVENTIONS = {
     "": lambda R: R, "inverted": lambda R: R.T, "conjugated by diag(1, -1, -1)": lambda R: FLIP @ R @ FLIP,
     "inverted and conjugated by diag(1, -1, -1)": lambda R: FLIP @ R.T @ FLIP,
+    "conjugated by diag(-1, -1, 1)": lambda R: R * np.outer((-1, -1, 1), (-1, -1, 1)),
 }  # fmt: skip
 
 
@@ -176,8 +177,7 @@ def test_a_spreadsheets_poses_are_read_and_the_note_names_their_convention_and_h
         known = ((dataset.camera(dataset.frame("lump", *end)), placement("lump", end[0])) for end in ends)
         true = true_pose(*(part for one in known for part in one)).R
         change = CONVENTIONS.get(convention, lambda R: Rotation.random(random_state=len(lines)).as_matrix())
-        R = change(true)
-        numbers = " ".join(f"{value:.4f}".replace(".", ",") for value in R.ravel())
+        numbers = " ".join(f"{value:.4f}".replace(".", ",") for value in change(true).ravel())
         lines.append(f"lump;{ends[0][0]};{ends[0][1]:06d};{ends[1][0]};{ends[1][1]:06d};{numbers};;")
     (tmp_path / "mine.csv").write_text("\ufeff" + "\r\n".join(lines), encoding="utf-8")
     run_rows({"mine": str(tmp_path / "mine.csv")}, tmp_path / "run", 12, 3)
@@ -185,18 +185,23 @@ def test_a_spreadsheets_poses_are_read_and_the_note_names_their_convention_and_h
     told = "mine: 1 of 13 poses fit no pair"
     if convention not in ("", "none"):
         told += f"; rotations agree with the labels if {convention}: median 0° in place of "
-    for note in (found.summary["note"], caplog.text):
+    run_rows(["oracle-view"], tmp_path / "run", 12, 3)  # the note stays with the row
+    for note in (found.summary["note"], caplog.text, read_run(tmp_path / "run").summary["note"]):
         assert told in note and ("agree with" in note) == ("agree with" in told)
     assert (found.row("mine")["error"].max() < 0.01) == (convention == "")
 
 
 def test_sequences_without_their_leading_zeros_are_found_where_one_fits(monkeypatch):
     monkeypatch.setattr(exchange, "other_convention", lambda *_: "")
-    pairs = [Pair("cup", "0012", 1, "b", (2,)), Pair("cup", "0013", 1, "b", (2,))]
-    poses, dataset = {("cup", "12", 1, "b", 2): exchange.StoredPose(np.eye(3), None, None)}, Co3D(small_folder())
-    assert list(exchange.fit_poses("p", poses, dataset, pairs)[0]) == [("cup", "0012", 1, "b", 2)]
+    pairs = [Pair("cup", "0012", 1, "000", (2,)), Pair("cup", "0_b", 1, "0012", (2,))]
+    saved = ("cup", "0_b", 1, "12", 2), ("cup", "12", 1, "0", 2)  # a spreadsheet changes what is a number only
+    poses, dataset = dict.fromkeys(saved, exchange.StoredPose(np.eye(3), None, None)), Co3D(small_folder())
+    full = [("cup", "0_b", 1, "0012", 2), ("cup", "0012", 1, "000", 2)]
+    assert list(exchange.fit_poses("p", poses, dataset, pairs)[0]) == full
+    pairs.append(Pair("cup", "012", 1, "000", (2,)))
+    assert exchange.fit_poses("p", dict.fromkeys(full, poses[saved[0]]), dataset, pairs)[0].keys() == set(full)
     with pytest.raises(InputError, match="poses p: .*'12'.* fits .*'0012'.* expected names as in pairs.csv"):
-        exchange.fit_poses("p", poses, dataset, [*pairs, Pair("cup", "012", 1, "b", (2,))])
+        exchange.fit_poses("p", poses, dataset, pairs)
 
 
 RIGHT = "lump,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1"

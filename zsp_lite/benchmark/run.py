@@ -72,7 +72,7 @@ def evaluate(
         FatalError: A backbone or a row is broken, or a frame cannot be read.
     """
     check_integer("targets", targets, 1)
-    rows, dataset, remarks = resolve(methods), Co3D(data), []
+    rows, dataset, remarks = resolve(methods), Co3D(data), {}
     numbers = pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
     work = pairs_of_rows(dataset, rows, numbers, targets)
     loaded = as_backbone(backbone)
@@ -81,9 +81,9 @@ def evaluate(
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
         elif isinstance(row.solve, StoredPoses):
-            solve, remark = row.solve.fitted(dataset, work)
+            solve, remark = row.solve.fitted(dataset, [pair for pair, names in work.items() if name in names])
             rows[name] = replace(row, solve=solve)
-            remarks += [f"{name}: {remark}."] if remark else []
+            remarks[name] = f"{name}: {remark}." if remark else ""
     others = {name: f"; {fingerprint(one)}" for name, one in extractors.items() if name != "backbone"}
     with execution.open_workers(executor) as (pool, workers):
         settings = Settings(
@@ -100,7 +100,7 @@ def evaluate(
             make = partial(Evaluator, str(Path(data).resolve()), rows, backbone if pool else loaded)
             evaluate_pairs(out, make, work, pool, workers)
     found = read_run(out)
-    for remark in (*remarks, *found.failures):
+    for remark in filter(None, [*remarks.values(), *found.failures]):
         logger.warning("%s", remark)
     return _write_summary(found, out)
 
@@ -155,12 +155,11 @@ def pairs_of_rows(
     dataset: Co3D, rows: Mapping[str, Method], numbers: Mapping[str, int], targets: int
 ) -> dict[Pair, list[str]]:
     """Return the pairs, each with the rows that are evaluated on it: the same for all rows of as many target views."""
-    for category, number in numbers.items():
-        check_integer(f"pairs of {category}", number, 1)
     work: dict[Pair, list[str]] = {}
     for n_targets in {row.targets or targets for row in rows.values()}:
         names = [name for name, row in rows.items() if (row.targets or targets) == n_targets]
         for category, n in numbers.items():
+            check_integer(f"pairs of {category}", n, 1)
             work |= dict.fromkeys(category_pairs(dataset, category, n, n_targets), names)
     return work
 

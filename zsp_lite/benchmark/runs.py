@@ -34,7 +34,7 @@ class Call(msgspec.Struct):
     rows: list[str]
     pairs: dict[str, int]  # by category
     finished: bool = True
-    remarks: list[str] = []  # on poses from files
+    remarks: dict[str, str] = {}  # on poses from a file, by row
 
 
 class Settings(msgspec.Struct):
@@ -199,7 +199,8 @@ def read_run(out: str | Path) -> Run:
         notes.append(f"Not finished: {table['row'].value_counts().max()} of {sum(last.pairs.values())} pairs.")
     if hidden := [name for name in settings.methods if name not in rows]:
         notes.append(f"Without {', '.join(hidden)}, which lack pairs of the last call.")
-    return Run(settings, table, timings, " ".join([*notes, *last.remarks]))
+    remarks = {name: remark for call in settings.calls for name, remark in call.remarks.items() if name in rows}
+    return Run(settings, table, timings, " ".join(filter(None, [*notes, *remarks.values()])))
 
 
 def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:

@@ -1,7 +1,4 @@
-"""CSV files that are exchanged with another program: the frames of pairs, and the poses that it finds for them.
-
-docs/benchmark_your_own.md has the columns of both.
-"""
+"""CSV files exchanged with another program, pairs and poses; docs/benchmark_your_own.md has the columns of both."""
 
 import csv
 import io
@@ -106,18 +103,19 @@ def fit_poses(
 ) -> tuple[dict[PairKey, StoredPose], str]:
     """Return the poses of pairs, and what is to be said of the others and of the convention.
 
-    A spreadsheet removes the leading zeros of sequences. InputError if a name without them fits two sequences, or if
-    no pose has a pair.
+    Names may lack leading zeros, as after a spreadsheet. InputError if such a name is ambiguous, or no pose has a pair.
     """
-    asked: dict[PairKey, PairKey] = {}  # full names by themselves and by names without leading zeros
+    asked: dict[PairKey, set[PairKey]] = {}  # by names without leading zeros
     for pair in pairs:
         for frame in pair.target_frames:
             key = pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence, frame
-            short = key[0], key[1].lstrip("0"), key[2], key[3].lstrip("0"), key[4]
-            asked[key] = key
-            if asked.setdefault(short, key) != key and short in poses:
-                raise InputError(f"poses {path}: {short} fits {key} and {asked[short]}, expected names as in pairs.csv")
-    found = {asked[key]: pose for key, pose in poses.items() if key in asked}
+            asked.setdefault(_shortened(key), set()).add(key)
+    found: dict[PairKey, StoredPose] = {}
+    for key in sorted(poses):  # by category: a data set keeps the frames of one
+        fits = asked.get(_shortened(key), set())
+        if len(fits) > 1 and key not in fits:
+            raise InputError(f"poses {path}: {key} fits {sorted(fits)}, expected names as in pairs.csv")
+        found |= dict.fromkeys(fits & {key} or fits, poses[key])
     if not found:
         raise InputError(f"{path} has no pose for any of the pairs of --list-pairs")
     surplus = len(poses) - len(found)
@@ -125,21 +123,26 @@ def fit_poses(
     return found, "; ".join(filter(None, remarks))
 
 
+def _shortened(key: PairKey) -> PairKey:
+    """Remove leading zeros from the names of a key."""
+    return tuple(part.lstrip("0") if isinstance(part, str) else part for part in key)
+
+
 def other_convention(dataset: Co3D, poses: Mapping[PairKey, StoredPose]) -> str:
     """Name another convention by which rotations clearly agree with the labels, or return "".
 
-    Those of other programs may be inverted, or conjugated by diag(1, -1, -1) for cameras in OpenGL's axes.
+    Those of other programs may be inverted, or conjugated, for cameras in OpenGL's or PyTorch3D's axes.
     """
-    truths = []
+    truths, labels = [], {category: read_labels(dataset.root, category) for category in {key[0] for key in poses}}
     for category, first, number, second, target in poses:
-        labels = read_labels(dataset.root, category)
-        reference, other = dataset.frame(category, first, number), dataset.frame(category, second, target)
-        cameras = dataset.camera(reference), dataset.camera(other)
-        truths.append(relative_pose(labels[first], cameras[0], labels[second], cameras[1])[:3, :3])
+        frames = dataset.frame(category, first, number), dataset.frame(category, second, target)
+        reference, other = map(dataset.camera, frames)
+        truths.append(relative_pose(labels[category][first], reference, labels[category][second], other)[:3, :3])
     given = np.stack([pose.rotation for pose in poses.values()])
-    flipped = given * np.outer((1, -1, -1), (1, -1, -1))
-    readings = {"": given, "inverted": given.swapaxes(1, 2), "conjugated by diag(1, -1, -1)": flipped}
-    readings["inverted and conjugated by diag(1, -1, -1)"] = flipped.swapaxes(1, 2)
+    readings = {"": given}
+    for signs in ((1, -1, -1), (-1, -1, 1)):
+        readings[f"conjugated by diag{signs}"] = given * np.outer(signs, signs)
+    readings |= {f"inverted and {name}".removesuffix(" and "): one.swapaxes(1, 2) for name, one in readings.items()}
     errors = {name: rotation_error(rotations, np.stack(truths)) for name, rotations in readings.items()}
     medians = {name: float(np.median(error)) for name, error in errors.items()}
     best = min(medians, key=medians.get)
