@@ -68,9 +68,7 @@ def read_poses(path: str | Path) -> tuple[dict[PairKey, StoredPose], str]:
     except (ValueError, csv.Error) as error:
         raise InputError(f"poses {path}: {error}, expected a CSV file") from error
     if wrong := [name for name in (*_KEY, "rotation") if reader.fieldnames.count(name) != 1]:
-        raise InputError(
-            f"poses {path}: no or several columns {', '.join(wrong)}, expected a CSV file with one of each"
-        )
+        raise InputError(f"poses {path}: no or two columns {', '.join(wrong)}, expected a CSV file with one of each")
     for number, line in lines:
         try:
             if any(line.pop(None, ())):
@@ -113,9 +111,10 @@ def fit_poses(
     found: dict[PairKey, StoredPose] = {}
     for key in sorted(poses):  # by category: a data set keeps the frames of one
         fits = asked.get(_shortened(key), set())
-        if len(fits) > 1 and key not in fits:
-            raise InputError(f"poses {path}: {key} fits {sorted(fits)}, expected names as in pairs.csv")
-        found |= dict.fromkeys(fits & {key} or fits, poses[key])
+        fits = fits & {key} or fits
+        if len(fits) > 1 or fits & found.keys():
+            raise InputError(f"poses {path}: {key} fits {sorted(fits)}, expected one pair that has no other line")
+        found |= dict.fromkeys(fits, poses[key])
     if not found:
         raise InputError(f"{path} has no pose for any of the pairs of --list-pairs")
     surplus = len(poses) - len(found)
