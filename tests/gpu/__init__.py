@@ -1,1 +1,0 @@
-"""Checks on a CUDA GPU: `python -m tests.gpu`, or `make gpu`."""
