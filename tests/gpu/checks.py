@@ -32,8 +32,7 @@ from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.samples import REPOSITORY, sample_data
 from zsp_lite.views import extract_views, object_crop
 
-CORES = os.cpu_count()
-LARGEST_ANGLE = 1.0  # degrees between the poses of two devices
+CORES, LARGEST_ANGLE = os.cpu_count(), 1.0  # degrees between the poses of two devices
 # Share of pairs of a solver that may differ: of features that differ in the last digits, a tie may fall the other way.
 TIES = 0.05
 Result = tuple[list[str], list[str]]  # lines of a table, and what failed
@@ -85,8 +84,9 @@ def notebooks(device: str) -> Result:
                 text = text.replace(r"device=\"cpu\"", rf"device=\"{device}\"")
             Path(folder, path.name).write_text(text.replace("nbval-check-output", "not-compared"), encoding="utf-8")
         command = [sys.executable, "-m", "pytest", "-c", "pyproject.toml", "--rootdir", folder, "-q", "--nbval-lax"]
-        command += ["--nbval-current-env", "--nbval-cell-timeout=300", "-n", "2", "--dist", "loadfile", folder]
-        status = subprocess.run(command, cwd=REPOSITORY).returncode
+        command += ["--nbval-current-env", "--nbval-cell-timeout=300", "-n", "4", "--dist", "loadfile", folder]
+        threads = {"OMP_NUM_THREADS": str(max(1, CORES // 4))}
+        status = subprocess.run(command, cwd=REPOSITORY, env=os.environ | threads).returncode
     return [], [f"pytest of the notebooks ended with {status}"] if status else []
 
 
