@@ -70,7 +70,6 @@ def test_target_frames_are_evenly_spaced_round_the_sequence(dataset, n_targets):
 def test_sampling_depends_on_seed_and_category_alone(dataset):
     pairs = sample_pairs(dataset, "chair", 20, 5, seed=1)
     assert pairs == sample_pairs(Co3D(dataset.root), "chair", 20, 5, seed=1)
-    assert pairs[:7] == sample_pairs(dataset, "chair", 7, 5, seed=1)
     assert pairs != sample_pairs(dataset, "chair", 20, 5, seed=2)
     other = sample_pairs(dataset, "lamp", 20, 5, seed=1)
     assert [pair.target_sequence for pair in pairs] != [pair.target_sequence for pair in other]
@@ -85,7 +84,7 @@ def test_all_pairs_are_different_and_too_large_a_number_gives_all_there_are(tmp_
     assert len({pair.key for pair in every}) == total and {pair.reference_sequence for pair in every[-4:]} == {"c"}
     assert all(sample_pairs(Co3D(tmp_path), "chair", n, 2) == every[:n] for n in range(total)) and not caplog.text
     assert sample_pairs(Co3D(tmp_path), "chair", 10**9, 2) == every
-    assert "category chair has 62 different pairs with 2 target frames, not 1000000000" in caplog.text
+    assert "category chair has 62 different pairs of 2 targets, not 1000000000" in caplog.text
 
 
 def test_missing_labels_and_frames_are_refused(dataset, tmp_path):
@@ -96,11 +95,9 @@ def test_missing_labels_and_frames_are_refused(dataset, tmp_path):
         sample_pairs(Co3D(tmp_path), "chair", 1, 1)
 
 
-def test_a_pairs_seed_is_a_function_of_its_key(dataset):
+def test_a_pairs_seed_is_a_function_of_its_key():
     pair = Pair("chair", "a", 1, "b", (2, 3))
-    assert pair.key == "chair/a:1/b:2,3"
-    assert pair.seed == 1587145652271358322  # the same on every machine and in every run
-    assert len({pair.seed for pair in sample_pairs(dataset, "chair", 50, 5)}) == 50
+    assert (pair.key, pair.seed) == ("chair/a:1/b:2,3", 1587145652271358322)  # on every machine
 
 
 def test_pairs_are_read_back_from_the_published_format(dataset, tmp_path):

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -12,13 +13,13 @@ from scipy.stats import binom
 
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels, relative_pose
-from zsp_lite.errors import InputError, check_magnitude, real_array, rotation_matrix
+from zsp_lite.errors import InputError, check_magnitude, check_number, real_array, rotation_matrix
 from zsp_lite.io.files import digest, read_bytes, write_atomic
 from zsp_lite.metrics import rotation_error
 
 PairKey = tuple[str, str, int, str, int]  # category, reference sequence and frame, target sequence and frame
 _KEY = ("category", "reference_sequence", "reference_frame", "target_sequence", "target_frame")
-_CHANCE = 5e-4  # probability by which another convention may be named by chance
+_CHANCE = 0.01  # largest p value of the sign test by which another convention is named
 
 
 class StoredPose(NamedTuple):
@@ -57,23 +58,28 @@ def read_poses(path: str | Path) -> tuple[dict[PairKey, StoredPose], str]:
     """Read poses, with a line for each pair, and the hash of the file."""
     data, poses = read_bytes(path, "poses"), {}
     try:
-        text = data.decode("utf-8-sig")
+        # A redirection in PowerShell writes UTF-16 with its byte-order mark.
+        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
         mark = next((mark for mark in ";\t" if mark in text.partition("\n")[0]), ",")
         reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=mark, restval="")
-        reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
-        lines = [(reader.reader.line_num, line) for line in reader]  # its own is wrong after a blank line
+        reader.fieldnames = ["_".join(name.lower().split()) for name in reader.fieldnames or ()]
+        # The reader's own number of a line is wrong after a blank one; a spreadsheet's blank lines have separators.
+        lines = [(reader.reader.line_num, line) for line in reader if any(line.values())]
     except (ValueError, csv.Error) as error:
         raise InputError(f"poses {path}: {error}, expected a CSV file") from error
-    if missing := [name for name in (*_KEY, "rotation") if name not in (reader.fieldnames or ())]:
-        raise InputError(f"poses {path}: no column {', '.join(missing)}, expected a CSV file with these")
+    if wrong := [name for name in (*_KEY, "rotation") if reader.fieldnames.count(name) != 1]:
+        raise InputError(f"poses {path}: no or two columns {', '.join(wrong)}, expected a CSV file with one of each")
     for number, line in lines:
         try:
-            if None in line:
+            if any(line.pop(None, ())):
                 raise ValueError(f"more than the {len(reader.fieldnames)} fields of the header")
             rotation = rotation_matrix("rotation", _numbers("rotation", line["rotation"], 9).reshape(3, 3))
             translation, scale = (line.get(name, "").strip() for name in ("translation", "scale"))
             translation = _numbers("translation", translation, 3) if translation else None
             scale = float(_numbers("scale", scale, 1)[0]) if scale else None
+            if scale is not None:
+                check_number("scale", scale, above=0)
+            line |= {name: re.sub(r"[.,]0$", "", line[name].strip()) for name in _KEY if name.endswith("frame")}
             key = tuple(int(line[name]) if name.endswith("frame") else line[name].strip() for name in _KEY)
             if key in poses:
                 raise ValueError("second pose of the same frames")
@@ -105,9 +111,10 @@ def fit_poses(
     found: dict[PairKey, StoredPose] = {}
     for key in sorted(poses):  # by category: a data set keeps the frames of one
         fits = asked.get(_shortened(key), set())
-        if len(fits) > 1 and key not in fits:
-            raise InputError(f"poses {path}: {key} fits {sorted(fits)}, expected names as in pairs.csv")
-        found |= dict.fromkeys(fits & {key} or fits, poses[key])
+        fits = fits & {key} or fits
+        if len(fits) > 1 or fits & found.keys():
+            raise InputError(f"poses {path}: {key} fits {sorted(fits)}, expected one pair that has no other line")
+        found |= dict.fromkeys(fits, poses[key])
     if not found:
         raise InputError(f"{path} has no pose for any of the pairs of --list-pairs")
     surplus = len(poses) - len(found)
@@ -138,8 +145,8 @@ def other_convention(dataset: Co3D, poses: Mapping[PairKey, StoredPose]) -> str:
     errors = {name: rotation_error(rotations, np.stack(truths)) for name, rotations in readings.items()}
     medians = {name: float(np.median(error)) for name, error in errors.items()}
     best = min(medians, key=medians.get)
-    # By chance, a sixth of turns about the vertical is below 30 degrees.
-    by_chance = binom.sf((errors[best] < 30).sum() - 1, len(truths), 1 / 6)
-    if not best or medians[best] > min(30, medians[""] / 2) or by_chance > _CHANCE:
+    # Rows that confuse left and right, or turn little, have small errors in either reading: that of most pairs counts.
+    by_chance = binom.sf((errors[best] < errors[""]).sum() - 1, len(truths), 1 / 2)
+    if medians[best] > min(30, medians[""] / 2) or by_chance > _CHANCE:
         return ""
     return f"rotations agree with the labels if {best}: median {medians[best]:.0f}° in place of {medians['']:.0f}°"

@@ -49,9 +49,7 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
     every = sum(map(len, numbers.values()))  # frames; each is the start of one choice of target frames
     left = {name: len(own) * (every - len(own)) for name, own in numbers.items()}  # pairs that are not sampled yet
     if (total := sum(left.values())) < n:
-        logger.warning(
-            "category %s has %d different pairs with %d target frames, not %d", category, total, n_targets, n
-        )
+        logger.warning("category %s has %d different pairs of %d targets, not %d", category, total, n_targets, n)
     pairs: dict[Pair, None] = {}
     for reference in itertools.cycle(sequences):
         if len(pairs) == min(n, total):
