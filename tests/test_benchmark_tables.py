@@ -69,15 +69,17 @@ def test_a_run_of_three_rows_has_the_tables_of_these_with_chosen_metrics_and_dif
     assert every_table(made.summary, ["acc30"])[0].cells.shape[1] == 5
 
 
-def test_rows_that_see_other_objects_stand_apart_from_those_that_see_the_pair_only(tmp_path):
-    made = made_up_run(tmp_path, ["ours", "category", "verified", "category-n3"])
+def test_rows_that_see_more_stand_apart_from_those_that_see_the_pair_only(tmp_path):
+    made = made_up_run(tmp_path, ["ours", "category", "scans-8", "verified", "category-n3", "scans-2"])
     found = {table.name: table for table in every_table(made.summary)}
     assert found["with_others"].title == "With other unlabelled objects of the category"
-    assert list(found["with_others"].cells.index) == ["category", "category-n3"]
+    assert list(found["with_others"].cells.index) == ["verified", "category", "category-n3"]
+    assert found["with_scans"].title == "With several frames of the reference object"
+    assert list(found["with_scans"].cells.index) == ["verified", "scans-8", "scans-2"]
     rows = [list(found["all_rows"].cells.index), list(found["categories_acc30"].cells)]
     assert rows == [["ours", "verified"]] * 2 == [tables.important_rows(made.summary)] * 2
     names = [table.name for table in every_table(made_up_run(tmp_path / "alone", ["category"]).summary)]
-    assert names[0] == "with_others" and "all_rows" not in names and len(names) == 4
+    assert names[0] == "with_others" and not {"all_rows", "with_scans"} & {*names} and len(names) == 4
 
 
 def test_figures_by_category_are_those_of_the_summary(run):

@@ -99,6 +99,71 @@ def test_inconsistent_parts_are_refused_by_name(changes, message):
         Frame(**values, camera=random_camera(0, SIZE))
 
 
+def arrays(**changes):
+    """Arguments of `Frame.from_arrays`: an image of 24 x 32 pixels, with depth of half its size."""
+    depth = np.full((12, 16), 2000.0)
+    depth[0, :4] = np.nan, np.inf, 0, -1
+    given = {"rgb": np.full((*SIZE, 3), 128, np.uint8), "depth": depth, "K": [[40, 0, 15.5], [0, 41, 11.5], [0, 0, 1]]}
+    return given | {"depth_unit": 0.001} | changes
+
+
+def test_arrays_of_a_camera_become_a_frame_with_half_integer_pixel_centres():
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = random_camera(np.random.default_rng(0)).R, (1, 2, 3)
+    frame = Frame.from_arrays(**arrays(pose=pose, name="cup"))
+    camera = frame.camera
+    assert frame.name == "cup" and frame.mask is None and camera.size == SIZE
+    np.testing.assert_allclose([camera.focal_length, camera.principal_point], [[40, 41], [16, 12]])
+    np.testing.assert_allclose(camera.to_world(np.eye(3)), np.eye(3) @ pose[:3, :3].T + (1, 2, 3))
+    np.testing.assert_array_equal(frame.depth[:2, :8], 0)
+    np.testing.assert_array_equal(frame.depth[2:], np.float32(2))
+    four = Frame.from_arrays(**arrays(K=(40, 41, 16, 12), half_pixels=True))
+    np.testing.assert_array_equal(four.camera.K, camera.K)
+
+
+@pytest.mark.parametrize(
+    "rgb",
+    [
+        np.full(SIZE, 128, np.uint8),
+        np.full((*SIZE, 4), 128, np.uint8),
+        np.full((*SIZE, 3), 128 / 255, np.float32),
+    ],
+)
+def test_grey_images_alpha_and_floats_are_colours(rgb):
+    np.testing.assert_array_equal(Frame.from_arrays(**arrays(rgb=rgb)).rgb, np.full((*SIZE, 3), 128))
+
+
+def test_a_mask_holds_booleans_zeros_and_ones_or_up_to_255():
+    inside = np.zeros(SIZE, bool)
+    inside[5:9, 3:20] = True
+    for mask in (inside, inside.astype(np.int64), inside.astype(np.float32), 255 * inside.astype(np.uint8)):
+        np.testing.assert_array_equal(Frame.from_arrays(**arrays(mask=mask)).mask > 0.5, inside)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rgb": np.zeros((3, *SIZE), np.uint8)}, r"rgb has shape \(3, 24, 32\), expected \(H, W\), \(H, W, 3\)"),
+        ({"rgb": np.zeros(SIZE, np.uint16)}, "rgb is uint16"),
+        ({"rgb": np.full((*SIZE, 3), 128.0)}, "rgb is float64"),
+        ({"depth": np.ones((12, 12))}, r"depth has shape \(12, 12\), expected shape \(24, 32\)"),
+        ({"depth": np.full(SIZE, "far")}, "expected real numbers"),
+        ({"depth_unit": 0.0}, "depth_unit is 0.0, expected a finite number greater than 0"),
+        ({"K": np.eye(4)}, r"K has shape \(4, 4\), expected real numbers of shape \(4,\)"),
+        ({"K": np.array([[40, 0, 16], [1, 41, 12], [0, 0, 1]])}, "expected fx 0 cx, 0 fy cy, 0 0 1 in pixels"),
+        ({"K": (40, 41, 640, 360)}, r"CX,CY is \(640.5, 360.5\), expected a point inside its \(32, 24\) pixels"),
+        ({"K": (-40, 41, 16, 12)}, "focal_length is -40.0"),
+        ({"mask": np.full(SIZE, 7)}, "mask has 7 at most, expected booleans, 0 and 1, or 0 to 255"),
+        ({"mask": np.ones((12, 16))}, "mask has shape"),
+        ({"pose": np.diag([2.0, 2, 2, 1])}, "camera-to-world pose"),
+    ],
+)
+def test_arrays_that_cannot_be_a_frame_are_refused_by_one_line(changes, message):
+    with pytest.raises(InputError, match=message) as error:
+        Frame.from_arrays(**arrays(name="cup", **changes))
+    assert "\n" not in str(error.value) and str(error.value).startswith(("frame cup", "depth_unit"))
+
+
 def test_depth_and_masks_survive_their_files(tmp_path):
     rng = np.random.default_rng(0)
     depth = np.where(rng.random(SIZE) < 0.5, rng.uniform(1, 9, SIZE), 0).astype(np.float32)

@@ -18,7 +18,7 @@ LAYERS = [
     "alignment features matchers metrics minimal",
     "data",
     "matching views",
-    "best_view points",
+    "best_view motorcycle points",
     "estimates",
     "pipeline backbones",
     "verified labelling importers synthetic baselines",

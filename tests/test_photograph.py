@@ -10,8 +10,8 @@ from zsp_lite.cli.demo import MODELS_NOTE
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
 from zsp_lite.data.depth import fit_plane, unproject_depth
-from zsp_lite.data.photograph import FRONT, UP, load_photograph, motorcycle_frame
 from zsp_lite.metrics import rotation_error
+from zsp_lite.motorcycle import FRONT, UP, load_photograph, motorcycle_frame
 from zsp_lite.points import axis_deviation, object_points
 from zsp_lite.viz.photograph import run_photograph
 
@@ -91,7 +91,7 @@ def photograph():
     """Stands in for the photograph in all that follows."""
     rendered = render(look_at((-0.7, 1, 0.35)), AT_HOME, "photograph")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("zsp_lite.data.photograph.load_photograph", lambda: rendered)
+        patch.setattr("zsp_lite.motorcycle.load_photograph", lambda: rendered)
         yield rendered
 
 

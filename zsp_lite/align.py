@@ -1,4 +1,4 @@
-"""A whole category in one frame, as a run of the benchmark's kind, and one's own pair with the help of others."""
+"""A whole category in one frame, as a run of the benchmark's kind."""
 
 import json
 import logging
@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext, suppress
-from dataclasses import replace
 from functools import partial
 from itertools import permutations
 from pathlib import Path
@@ -23,17 +22,13 @@ from zsp_lite.benchmark.identity import environment, fingerprint, library_versio
 from zsp_lite.benchmark.problem import FrameStore, Problem
 from zsp_lite.benchmark.run import evaluate_pairs
 from zsp_lite.benchmark.runs import Call, Settings, open_run, read_lines
-from zsp_lite.category import SAME_ANGLE, CategoryAlignment, PairHypotheses, object_pairs, synchronise, world_hypotheses
-from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
+from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
 from zsp_lite.data.published import write_all
 from zsp_lite.errors import InputError, NoPoseError
-from zsp_lite.estimates import PairResult, PoseEstimate
-from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.files import write_atomic
-from zsp_lite.metrics import rotation_angle, rotation_error
-from zsp_lite.own_objects import Source, estimate_pose, known_errors
-from zsp_lite.verified.confidence import modes, reliability_flags
+from zsp_lite.metrics import rotation_error
 
 logger = logging.getLogger(__name__)
 
@@ -46,6 +41,7 @@ class _Line(msgspec.Struct):
     centre: list[float] = []
     matrices: list[list[list[float]]] = []
     probabilities: list[float] = []
+    span: float = 360.0
 
 
 class PairSolver:
@@ -61,7 +57,7 @@ class PairSolver:
             with suppress(NoPoseError):
                 found = hypotheses(Problem(pair, self._store))
                 line |= {"centre": found.centre.tolist(), "matrices": [one.matrix.tolist() for one in found.sim3s]}
-                line |= {"probabilities": found.probabilities.tolist()}
+                line |= {"probabilities": found.probabilities.tolist(), "span": found.span}
             yield line
 
 
@@ -86,7 +82,8 @@ def align_category(
         backbone: Backbone, or what `load_backbone` takes.
         sequences: Names of the sequences, one per object; None for all of the category.
         pairs: Objects that each object is the reference of; None for all others, or from twelve objects on, for six.
-        targets: Target frames per pair of frames; each pair of objects becomes three of these.
+        targets: Target frames per pair of frames; each pair of objects becomes several of these
+            (see `category.references_per_pair`).
         out: Folder of the run, which keeps the hypotheses of the pairs; None keeps nothing.
         executor: Number of processes; "dask://HOST:PORT"; or any `Executor`.
         allow_other_version: Continue a run of another version of the library.
@@ -135,78 +132,8 @@ def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
     for line in (line for line in read_lines(out, _Line) if line.matrices):
         names = [part.rpartition(":")[0] for part in line.pair.split("/")[1:]]
         sim3s = tuple(map(Sim3.from_matrix, np.array(line.matrices)))
-        found[line.pair] = PairHypotheses(*names, sim3s, np.array(line.probabilities), np.array(line.centre))
+        found[line.pair] = PairHypotheses(*names, sim3s, np.array(line.probabilities), np.array(line.centre), line.span)
     return found
-
-
-def estimate_with_helpers(
-    sources: Sequence[Source], backbone: FeatureExtractor, reference_frame: int | None = None, targets: int = 5,
-    upright: bool = True,
-) -> PairResult:  # fmt: skip
-    """Estimate the pose between the first two of one's own objects; the others settle what these two cannot.
-
-    Of the hypotheses for these two, the one that agrees with the alignment of all objects comes first.
-    """
-    if len({one.path.resolve() for one in sources}) < len(sources):
-        raise InputError(f"{', '.join(str(one.path) for one in sources)}: expected different objects")
-    solve = partial(estimate_pose, solver="verified", targets=targets, backbone=_Remembering(backbone), upright=upright)
-    found = {(0, 1): solve(*sources[:2], reference_frame=reference_frame)}
-    for a, b in permutations(range(len(sources)), 2):
-        if (a, b) != (0, 1) and sources[b].format != "image":  # an image alone is the reference of pairs only
-            with suppress(NoPoseError):
-                found[a, b] = solve(sources[a], sources[b], reference_frame=None if a else reference_frame)
-    names = [f"{k} {one.name}" for k, one in enumerate(sources)]
-    pairs = {
-        (a, b): world_hypotheses(Pair("", names[a], 0, names[b], ()), one.estimates["verified"])
-        for (a, b), one in found.items()
-    }
-    alignment = synchronise(list(pairs.values()))
-    estimate, (first, second) = found[0, 1].estimates["verified"], found[0, 1].sources
-    helpers = ", ".join(str(one.path) for one in sources[2:])
-    result = replace(found[0, 1], sources=(first, f"{second}; helpers: {helpers}"))
-    rotations = np.stack([one.R for one in pairs[0, 1].sim3s])
-    angles = rotation_angle(rotations, alignment.between(*names[:2]).R)
-    if angles.min() > SAME_ANGLE:
-        flags = (*estimate.flags, "no hypothesis agrees with the other objects: they were not used")
-        return replace(result, estimates={"verified": replace(estimate, flags=flags)})
-    sure = min(alignment.objects[name].probability for name in names[:2])
-    estimates = {"verified": _settled(estimate, int(angles.argmin()), sure)}
-    return replace(result, estimates=estimates, errors=known_errors(*sources[:2], result, estimates))
-
-
-def _settled(estimate: PoseEstimate, chosen: int, probability: float) -> PoseEstimate:
-    """Put the hypothesis with an index first, with a probability; the others share what is left."""
-    rotations = np.stack([estimate.world_rotation(one) for one in estimate.hypotheses])
-    before = rotation_angle(rotations[:, None], rotations)
-    order = sorted(range(len(rotations)), key=lambda k: k != chosen)
-    after, ordered = before[np.ix_(order, order)], [estimate.hypotheses[k] for k in order]
-    mode = modes(after)
-    rest = sum(one.confidence for k, one in enumerate(ordered) if 0 != mode[k] == k) or 1.0
-    hypotheses = tuple(
-        replace(one, mode=int(m), confidence=(1 - probability) * one.confidence / rest if m else probability)
-        for one, m in zip(ordered, mode)
-    )
-    old, (new, one_of_two) = reliability_flags(estimate.hypotheses, before)[0], reliability_flags(hypotheses, after)
-    return replace(
-        estimate, sim3=ordered[0].sim3, view=ordered[0].view, hypotheses=hypotheses, one_of_two=one_of_two,
-        flags=(*new, *(flag for flag in estimate.flags if flag not in old)),
-    )  # fmt: skip
-
-
-class _Remembering:
-    """A backbone that computes the features of an image once."""
-
-    def __init__(self, backbone: FeatureExtractor):
-        self._backbone, self._known = backbone, {}
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._backbone, name)
-
-    def __call__(self, images: Sequence[np.ndarray]) -> list[Any]:
-        for image in images:
-            if (name := image.tobytes()) not in self._known:
-                (self._known[name],) = self._backbone([image])
-        return [self._known[image.tobytes()] for image in images]
 
 
 def write_alignment(found: CategoryAlignment, out: str | Path) -> Path:

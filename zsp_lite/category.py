@@ -17,7 +17,7 @@ the logarithm of a mixture of von Mises-Fisher densities and a uniform one, whic
 3. Scales, linear in their logarithms, then translations: least absolute deviations over the hypotheses that agree.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,20 +26,26 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order
 
 from zsp_lite.alignment import Sim3, nearest_rotation
+from zsp_lite.data.cameras import view_span
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.io.files import stable_hash
 from zsp_lite.metrics import rotation_angle
+from zsp_lite.verified.confidence import hidden_share
 
 KAPPA, FLOOR = 16.0, 0.1  # \kappa, with which a hypothesis 20 degrees off counts 1/e, and \epsilon
 SAME_ANGLE = 30.0  # degrees; rotations further apart disagree
-ALL_PAIRS_BELOW, PAIRS_PER_OBJECT, REFERENCES = 12, 6, 3  # see `object_pairs`
+ALL_PAIRS_BELOW, PAIRS_PER_OBJECT = 12, 6  # see `object_pairs`
+_REFERENCES, _REFERENCES_OF_ONE = 3, 16  # see `references_per_pair`
 _CHAINS, _TEMPERATURES = 48, (*np.geomspace(1, 0.3, 12), *[0.0] * 4)  # of each sweep: at 0, coordinate ascent
 _PROPOSERS, _AVERAGING_SWEEPS, _REWEIGHTINGS = 8, 6, 10
 _WEAK = 1e-3  # weight of hypotheses that disagree, so that every object gets a scale and a translation
 # Coefficients of `_judge`, fitted by tools/category_fit.py on validation categories to sets of three to five objects.
 MARGIN, NONE, NONE_AGREEING = 1.57, -3.07, -2.37
+# The same of `_judge_two`: factors of \alpha and \beta, and \lambda.
+SCALE_OF_TWO, NONE_OF_TWO, UNSEEN_OF_TWO = (0.36, -0.58, -0.43), (1.01, -2.95, -2.27, 0.95), 0.17
+_LEAST_WEIGHT = 0.05  # in `_judge_two`, of a frame that was solved against a single view
 
 _Rotations = Float[np.ndarray, "t n 3 3"]  # of n objects in each of t chains
 _Candidates = Float[np.ndarray, "t c 3 3"]  # for the rotation of one object
@@ -55,6 +61,7 @@ class PairHypotheses:
     sim3s: tuple[Sim3, ...]  # most probable first
     probabilities: Float[np.ndarray, " m"]
     centre: Float[np.ndarray, "3"]  # a point amid the reference object, in its world
+    span: float = 360.0  # angle in degrees that the target views span around the target
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +89,15 @@ class CategoryAlignment:
         return self.objects[target].sim3.inverse() @ self.objects[reference].sim3
 
 
+def references_per_pair(objects: int) -> int:
+    """Return from how many frames of the first object a pair of objects is solved: the more, the fewer objects."""
+    return max(_REFERENCES, _REFERENCES_OF_ONE // objects)
+
+
 def object_pairs(
     dataset: Co3D, category: str, sequences: Sequence[str] | None, per_object: int | None, targets: int
 ) -> list[Pair]:
-    """Choose the pairs that a category is aligned by (see `align_category`): three pairs of frames for two objects."""
+    """Choose the pairs of frames that a category is aligned by (see `align_category`)."""
     numbers: dict[str, list[int]] = {}
     for key in dataset.frame_list(category):
         numbers.setdefault(key.sequence_name, []).append(key.frame_number)
@@ -93,7 +105,7 @@ def object_pairs(
     if (n := len(names)) < 2:
         raise InputError(f"category {category}: {n} sequences to align, expected at least 2")
     for name in names:
-        if (length := len(numbers.get(name, ()))) < (least := max(targets, REFERENCES)):
+        if (length := len(numbers.get(name, ()))) < (least := max(targets, _REFERENCES)):
             raise InputError(f"sequence {category}/{name} has {length} frames, expected at least {least}")
     if per_object is None:
         per_object = n - 1 if n < ALL_PAIRS_BELOW else PAIRS_PER_OBJECT
@@ -107,23 +119,46 @@ def object_pairs(
         # Frames that are evenly spaced over a sequence show several sides; the random starts depend on the names only.
         first, around = sorted(numbers[reference]), sorted(numbers[target])
         start, target_start = rng.integers(len(first)), rng.integers(len(around))
-        for r in range(REFERENCES):
-            frame = first[(start + r * len(first) // REFERENCES) % len(first)]
-            turn = (np.arange(targets) + r / REFERENCES) / targets  # of the sequence, from its start
+        count = min(references_per_pair(n), len(first))
+        for r in range(count):
+            frame = first[(start + r * len(first) // count) % len(first)]
+            turn = (np.arange(targets) + r / count) / targets  # of the sequence, from its start
             positions = (target_start + (turn * len(around)).astype(int)) % len(around)
             pairs.append(Pair(category, reference, frame, target, tuple(around[k] for k in positions)))
     return pairs
 
 
-def world_hypotheses(pair: Pair, estimate: PoseEstimate) -> PairHypotheses:
-    """Convert the hypotheses of the verified solver, between cameras, to similarities between the two worlds."""
-    view = estimate.reference_view
-    cameras = [one.frame.camera for one in (view, *estimate.target_views)]
-    reference, *targets = (Sim3(1.0, camera.R, camera.t) for camera in cameras)
-    sim3s = tuple(targets[one.view].inverse() @ one.sim3 @ reference for one in estimate.hypotheses)
+def scan_pairs(pair: Pair, numbers: Mapping[str, Sequence[int]], references: int) -> list[Pair]:
+    """Return the pairs of frames that the pose of a pair is found from by several frames of both objects.
+
+    These are `references` frames of each object, evenly spaced over the `numbers` of its sequence from the pair's own
+    frame on, each with as many views of the other as the pair has. The pair itself is the first.
+    """
+    ends, count = (pair.reference_sequence, pair.target_sequence), len(pair.target_frames)
+
+    def around(name: str, start: int, count: int) -> tuple[int, ...]:
+        frames = sorted(numbers[name])
+        first = frames.index(start)
+        return tuple(frames[(first + k * len(frames) // count) % len(frames)] for k in range(count))
+
+    starts = dict(zip(ends, (pair.reference_frame, pair.target_frames[0])))
+    views = dict(zip(ends, (around(ends[0], pair.reference_frame, count), pair.target_frames)))
+    return [
+        Pair(pair.category, a, frame, b, views[b])
+        for a, b in (ends, ends[::-1])
+        for frame in around(a, starts[a], references)
+    ]
+
+
+def world_hypotheses(reference: str, target: str, estimate: PoseEstimate) -> PairHypotheses:
+    """Convert the hypotheses of the verified solver to similarities between the worlds of two objects, by name."""
+    sim3s = tuple(estimate.between_worlds(one.sim3, one.view) for one in estimate.hypotheses)
     probabilities = np.array([one.confidence for one in estimate.hypotheses])
-    centre = cameras[0].to_world(np.median(view.measured_points[0][view.known_foreground], axis=0))
-    return PairHypotheses(pair.reference_sequence, pair.target_sequence, sim3s, probabilities, centre)
+    view, used = estimate.reference_view, np.flatnonzero(np.isfinite(estimate.view_scores))
+    centre = view.frame.camera.to_world(np.median(view.measured_points[0][view.known_foreground], axis=0))
+    cameras = [estimate.target_views[k].frame.camera for k in used]
+    span = view_span(cameras, sim3s[0].apply(centre))
+    return PairHypotheses(reference, target, sim3s, probabilities, centre, span)
 
 
 def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
@@ -145,7 +180,10 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
     objects = {}
     for i, name in enumerate(names):
         sim3, agreeing = Sim3(scales[i], rotations[i], translations[i]), off[(ends == i).any(axis=1)] < SAME_ANGLE
-        probability, turned, other = _judge(nodes[i], rotations, i, float(agreeing.mean()))
+        if len(names) > 2:
+            probability, turned, other = _judge(nodes[i], rotations, i, float(agreeing.mean()))
+        else:
+            probability, turned, other = _judge_two(nodes[i], rotations, i, np.array([pair.span for pair in pairs]))
         alternative = None
         if turned is not None:  # about the object's centre
             alternative = Sim3(scales[i], turned, sim3.apply(centres[i]) - scales[i] * turned @ centres[i])
@@ -229,16 +267,42 @@ def _judge(
     node: _Node, rotations: Float[np.ndarray, "n 3 3"], i: int, agreeing: float
 ) -> tuple[float, Float[np.ndarray, "3 3"] | None, float]:
     """Return the probability of an object's rotation, the best other one, all others fixed, and its probability."""
+    margin, best = _margin(node, rotations, i)
+    # The pairs of an object err together, so the margin counts by the root of their number. A conditional logit; that
+    # none is right is less probable if more of the object's pairs agree.
+    other, none = np.exp(-MARGIN * margin / np.sqrt(len(node.neighbour))), np.exp(NONE + NONE_AGREEING * agreeing)
+    return float(1 / (1 + other + none)), best, float(other / (1 + other + none))
+
+
+def _judge_two(
+    node: _Node, rotations: Float[np.ndarray, "2 3 3"], i: int, spans: Float[np.ndarray, " d"]
+) -> tuple[float, Float[np.ndarray, "3 3"] | None, float]:
+    r"""Return the same for one of two objects, whose pairs have target views that span these angles in degrees.
+
+    The probabilities are those of `verified.confidence`, with the h of the largest span. \alpha depends on h and the
+    number of pairs; \beta on the probability that the surest pair, and the mean of all, give to the rotation, and on h.
+    Pairs count by 1 - h of their own span.
+    """
+    margin, best = _margin(node, rotations, i)
+    near = rotation_angle(node.proposals(rotations[None])[0], rotations[i]) < SAME_ANGLE
+    votes, hidden = (node.weight * near).max(axis=1), hidden_share(spans / 360)
+    weight = 1 + _LEAST_WEIGHT - hidden
+    hidden, number = hidden.min(), weight.sum() / weight.max()
+    other = np.exp(-np.exp(np.dot(SCALE_OF_TWO, (1, np.log(number), hidden))) * margin)
+    none = np.exp(np.dot(NONE_OF_TWO, (1, votes.max(), np.average(votes, weights=weight), hidden)))
+    share = (1 - UNSEEN_OF_TWO * hidden) / (1 + other + none)
+    return float(share), best, float(share * other)
+
+
+def _margin(
+    node: _Node, rotations: Float[np.ndarray, "n 3 3"], i: int
+) -> tuple[float, Float[np.ndarray, "3 3"] | None]:
+    """Return by how much an object's rotation is better than the best other one, all others fixed, and that one."""
     proposals = node.proposals(rotations[None])
     others = proposals.reshape(-1, 3, 3)
     others = others[rotation_angle(others, rotations[i]) > SAME_ANGLE]
     present, *scores = node.score(np.concatenate([rotations[None, i], others])[None], proposals)[0].tolist()
-    # The pairs of an object err together, so the margin counts by the root of their number.
-    margin = (present - max(scores, default=-np.inf)) / np.sqrt(len(node.neighbour))
-    # A conditional logit; that none is right is less probable if more of the object's pairs agree.
-    other, none = np.exp(-MARGIN * margin), np.exp(NONE + NONE_AGREEING * agreeing)
-    best = others[np.argmax(scores)] if scores else None
-    return float(1 / (1 + other + none)), best, float(other / (1 + other + none))
+    return (present - max(scores), others[np.argmax(scores)]) if scores else (np.inf, None)
 
 
 def _scales_and_translations(

@@ -83,6 +83,16 @@ class PoseEstimate:
         """Other poses, most probable first, without those within 30 degrees of a better one; () without hypotheses."""
         return tuple(one for index, one in enumerate(self.hypotheses) if one.mode == index)[1:]
 
+    @property
+    def world_sim3(self) -> Sim3:
+        """The pose as a similarity from the world of the reference to that of the target views."""
+        return self.between_worlds(self.sim3, self.view)
+
+    def between_worlds(self, sim3: Sim3, view: int) -> Sim3:
+        """Return the similarity between the worlds that a pose in a target view stands for."""
+        reference, target = (one.frame.camera for one in (self.reference_view, self.target_views[view]))
+        return Sim3(1.0, target.R, target.t).inverse() @ sim3 @ Sim3(1.0, reference.R, reference.t)
+
     def world_rotation(self, pose: Hypothesis | None = None) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from the reference camera's frame to the world of the target views."""
         sim3, view = (self.sim3, self.view) if pose is None else (pose.sim3, pose.view)
@@ -115,6 +125,15 @@ class PoseEstimate:
 
 
 @dataclass(frozen=True, eq=False)
+class Vote:
+    """What one frame of one object says of a pose that several frames of both determine."""
+
+    name: str  # the frame, such as "frame 12 of my_cup"
+    estimate: PoseEstimate  # its own: of this frame's object in views of the other
+    degrees: float  # angle from its best rotation to that of the answer
+
+
+@dataclass(frozen=True, eq=False)
 class PairResult:
     """Pose estimates of one pair by one solver, or by both. `print` shows them."""
 
@@ -128,6 +147,14 @@ class PairResult:
     # where the masks of the reference and of the targets come from: "given", "box" or "auto"
     masks: tuple[str, str] = ("given", "given")
     backbone: str = ""  # name of the backbone
+    votes: tuple[
+        Vote, ...
+    ] = ()  # of the frames of the two objects, the reference frame's first; () for one frame alone
+
+    @property
+    def world_sim3(self) -> Sim3:
+        """Similarity from the world of the reference to that of the target, by the first solver."""
+        return self.estimate.world_sim3
 
     @property
     def estimate(self) -> PoseEstimate:
@@ -163,6 +190,7 @@ class PairResult:
                 "scale": float(estimate.sim3.scale),
                 "inliers": int(estimate.inliers.sum()),
                 "matches": len(estimate.matches),
+                "world_matrix": estimate.world_sim3.matrix.tolist(),
                 "reference_turn_degrees": estimate.reference_turn,
                 "confidence": estimate.confidence,
                 "error_degrees": self.errors.get(solver),
@@ -185,6 +213,10 @@ class PairResult:
             "backbone": self.backbone,
             "estimates": solved,
             "degrees_between_solvers": self.disagreement,
+            "votes": [
+                {"frame": one.name, "confidence": one.estimate.confidence, "degrees_from_answer": one.degrees}
+                for one in self.votes
+            ],
         }
 
 

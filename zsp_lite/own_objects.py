@@ -1,41 +1,56 @@
-"""One's own pair, from files to files: open, load and mask, estimate, write.
+"""One's own pair, from files or frames to files: open, load and mask, estimate, write.
 
-A source is a sequence of a data folder, a folder with a capture, or an image with depth.
+A source is a sequence of a data folder, a folder with a capture, an image with depth, or frames in memory.
 """
 
 import os
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
+from itertools import permutations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from tqdm import tqdm
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import DEFAULT, BackboneLike, as_backbone
+from zsp_lite.category import SAME_ANGLE, references_per_pair, synchronise, world_hypotheses
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.annotations import FRAMES_FILE
-from zsp_lite.data.cameras import Box, view_span
+from zsp_lite.data.cameras import Box, camera_from_pose, view_span
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, frame_defect, read_image
-from zsp_lite.errors import InputError, check_choice, check_integer
-from zsp_lite.estimates import PairResult, PoseEstimate, label_errors
-from zsp_lite.importers.capture import READERS, SIGNS, CaptureFrame, camera_from_pose
+from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
+from zsp_lite.estimates import Hypothesis, PairResult, PoseEstimate, Vote, label_errors, timed
+from zsp_lite.importers.capture import READERS, SIGNS, CaptureFrame
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
-from zsp_lite.pipeline import ZeroShotPose, solve_pair
+from zsp_lite.metrics import rotation_angle, rotation_error
+from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import axis_deviation, object_pixels, world_cloud
+from zsp_lite.verified.confidence import reliability_flags
+from zsp_lite.verified.solver import measured_inliers
+from zsp_lite.views import View
 
 _IMAGES = (".jpg", ".jpeg", ".png")
 # Options that each format takes; "open" is a source that is open already.
 _TAKEN = {"open": (), "image": ("mask", "box", "intrinsics", "depth", "depth_unit")}
-_TAKEN |= {"sequence": ("mask", "box"), "nerfstudio": ("mask", "box"), "lists": ("mask", "box", "depth_unit")}
+_TAKEN |= dict.fromkeys(("sequence", "frames", "nerfstudio"), ("mask", "box")) | {
+    "lists": ("mask", "box", "depth_unit")
+}
 _UNIT_GIVEN_BY = {"nerfstudio": "depth_unit_scale_factor in transforms.json"}  # for others by --depth-unit
 _NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
 _ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
+_REFERENCES = 4  # frames of each object that are solved against views of the other
+_LEAST_PROBABLE = 0.005  # an alternative is named above this
+_Ends = tuple[int, int, int]  # numbers of two objects, and the position of a frame of the first
 _CONTEXT = 8  # frames of a source that are segmented together with the reference frame, or tried as the reference
 
 
@@ -43,8 +58,8 @@ _CONTEXT = 8  # frames of a source that are segmented together with the referenc
 class Source:
     """Frames of one object in one world, read when needed."""
 
-    path: Path  # the sequence, the capture or the image
-    format: str  # "sequence", "image", or the format of a capture
+    path: Path  # the sequence, the capture or the image; a name for frames in memory
+    format: str  # "sequence", "image", "frames", or the format of a capture
     numbers: tuple[int, ...]  # number of each frame: that of the annotations, or its position in the capture
     read: Callable[[int], Frame]  # reads the frame at a position of `numbers`, with the mask that comes with it, if any
     mask: str  # where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours)
@@ -59,13 +74,9 @@ class Source:
         """Name the source and its frames at some positions."""
         if self.format == "image":
             return f"image {self.path}"
-        kind = "sequence" if self.format == "sequence" else "capture"
+        kind = self.format if self.format in ("sequence", "frames") else "capture"
         frames = ", ".join(str(self.numbers[position]) for position in positions)
         return f"{kind} {self.path}, frame{'s' if len(positions) > 1 else ''} {frames}"
-
-    def spread(self, count: int) -> list[int]:
-        """Return the positions of at most `count` evenly spaced frames."""
-        return sorted(set((np.arange(count) * len(self.numbers) // count).tolist()))
 
     def load(self, positions: Sequence[int]) -> list[Frame]:
         """Load frames with masks of the object; InputError if a file cannot be read, or no frame shows the object."""
@@ -86,28 +97,79 @@ class Source:
         found = [] if self.mask == "given" else list(mask_flags(frames))
         depth = np.concatenate([frame.depth[object_pixels(frame)] for frame in frames])
         distance = float(np.quantile(depth, 0.25)) if len(depth) else _NEAREST
-        if self.format != "sequence" and not _NEAREST <= distance <= _FARTHEST:
+        if self.format not in ("sequence", "frames") and not _NEAREST <= distance <= _FARTHEST:
             cure = _UNIT_GIVEN_BY.get(self.format, "--depth-unit (0.001: millimetres, 1: metres)")
             expected = f"expected {_NEAREST:g} to {_FARTHEST:g} m; the unit of its depth is given by {cure}"
             found.insert(0, f"the object is {distance:.3g} m from the camera, {expected}")
         return tuple(f"{self.path}: {flag}" for flag in found)
 
-    def reference(self, number: int | None) -> tuple[int, Frame]:
-        """Return the position and the frame of a number; by default, of the first usable one among some."""
-        if number not in (None, *self.numbers):
+    def select(
+        self, references: int, targets: int, first: int | None = None
+    ) -> tuple[list[int], list[int], dict[int, Frame]]:
+        """Load evenly spaced frames; return the positions of reference frames and of target views, and the frames.
+
+        Frames with a defect are no references. The first reference frame is that with the number `first`.
+        """
+        if first not in (None, *self.numbers):
             known = f"{len(self.numbers)} from {min(self.numbers)} to {max(self.numbers)}"
-            raise InputError(f"{self.path} has no frame {number}, expected one of {known}")
-        for position in self.spread(_CONTEXT) if number is None else [self.numbers.index(number)]:
-            (frame,) = self.load([position])
-            if not (defect := frame_defect(frame)):
-                return position, frame
-        expected = "another --reference-frame, --mask or --box"
-        raise InputError(f"{self.path}: no usable reference frame: {defect}, expected {expected}")
+            raise InputError(f"{self.path} has no frame {first}, expected one of {known}")
+        start = 0 if first is None else self.numbers.index(first)
+        tried = max(references, _CONTEXT) if references and first is None else references
+        candidates = [(start + position) % len(self.numbers) for position in spread(tried, len(self.numbers))]
+        views = spread(targets, len(self.numbers))
+        needed = list(dict.fromkeys([*candidates, *views]))
+        frames = dict(zip(needed, self.load(needed), strict=True))
+        defects = {position: frame_defect(frames[position]) for position in candidates}
+        usable = [position for position in candidates if not defects[position]]
+        if references and (not usable or first is not None and defects[start]):
+            expected = "another --reference-frame, --mask or --box"
+            raise InputError(f"{self.path}: no usable reference frame: {defects[start]}, expected {expected}")
+        return [usable[k] for k in spread(references, len(usable))], views, frames
+
+
+_Object = str | Path | Frame | Sequence[Frame] | Source  # a path, frames, or what `open_source` returns
+
+
+@dataclass(frozen=True, eq=False)
+class _Scan:
+    """The frames of a source that an estimate uses, whole and as views of an object of unit standard deviation."""
+
+    source: Source
+    references: list[int]  # positions of the frames that are solved against target views of other objects
+    targets: list[int]  # positions of the target views
+    frames: dict[int, Frame]
+    views: dict[int, View]
+    scale: float  # from the lengths of the frames to those of the views
+    cloud: Float[np.ndarray, "n 3"]
+
+    @classmethod
+    def of(
+        cls, source: Source, method: ZeroShotPose, references: int, targets: int, first: int | None = None
+    ) -> "_Scan":
+        """Load frames of a source (see `Source.select`), and extract their features."""
+        chosen, shown, frames = source.select(references, targets, first)
+        cloud = world_cloud([frames[position] for position in shown or chosen])[0]
+        # The method expects objects of about unit standard deviation. Sequences of data folders have it.
+        scale = 1.0 if source.format == "sequence" or not len(cloud) else 1 / (axis_deviation(cloud) or 1)
+        used = dict.fromkeys([*chosen, *shown])
+        views = method.views([scale_frame(frames[position], scale) for position in used])
+        return cls(source, chosen, shown, frames, dict(zip(used, views, strict=True)), scale, cloud)
+
+    @property
+    def target_views(self) -> list[View]:
+        """The views that reference frames of other objects are solved against."""
+        return [self.views[position] for position in self.targets]
+
+    @property
+    def seen(self) -> tuple[int, float]:
+        """Number of usable target views, and the angle in degrees that they span around the object."""
+        cameras = [self.frames[k].camera for k in self.targets if not frame_defect(self.frames[k])]
+        return len(cameras), view_span(cameras, np.median(self.cloud, axis=0)) if len(self.cloud) else 0.0
 
 
 def estimate_pose(
-    reference: str | Path | Source,
-    target: str | Path | Source,
+    reference: _Object,
+    target: _Object,
     solver: str = "verified",
     reference_frame: int | None = None,
     targets: int = 5,
@@ -116,58 +178,138 @@ def estimate_pose(
     backbone: BackboneLike = DEFAULT,
     out: str | Path | None = None,
     upright: bool = True,
+    references: int | None = None,
+    helpers: Sequence[_Object] = (),
+    workers: int = 1,
 ) -> PairResult:
-    """Estimate the pose between two objects of one category, each named by a path; no label is needed.
+    """Estimate the pose between two objects of one category, given as paths or frames; no label is needed.
 
+    The paper takes one frame of the reference. The verified solver takes several, and where the target has several
+    frames, these against views of the reference, too: the pose is what most frames agree on (see `category`).
     `open_source` explains the paths, and takes the settings that only one of the two has, such as a box around the
-    object. Flags name implausible lengths, doubtful masks, target views of one side only, and two categories.
+    object. Flags name implausible lengths, doubtful masks, objects seen from one side only, frames that disagree, and
+    two categories.
 
     Args:
         reference: The reference object.
-        target: The target object.
+        target: The target object. The frames of one object are in one world.
         solver: "verified", "paper" or "both".
-        reference_frame: Frame number of the reference; by default its first frame with known depth and an object.
+        reference_frame: Frame number of the reference, in whose camera the pose is; by default its first frame with
+            known depth and an object.
         targets: Number of target views, evenly spaced over the target's frames.
         mask: Where the masks of both come from: "given", "auto", or as `open_source` decides.
         intrinsics: Camera intrinsics of both, where they are images (see `open_source`).
         backbone: Backbone, or what `load_backbone` takes.
         out: Folder for the report and the point clouds (see `write_pair`); None writes nothing.
         upright: Whether the reference image is upright; False tries its four turns by 90 degrees (see `ZeroShotPose`).
+        references: Number of reference frames of each object, evenly spaced; 1 is the paper's setting. By default 4,
+            or 1 with a `reference_frame`, or more with helpers (see `category.references_per_pair`).
+        helpers: Other objects of the category: what two objects cannot tell, all together mostly can.
+        workers: Number of frames that are solved at once, by threads.
 
     Raises:
         InputError: An input or an option is missing or wrong, or the pose cannot be estimated.
     """
     check_choice("solver", solver, SOLVERS)
     check_integer("targets", targets, 1)
+    check_integer("workers", workers, 1)
+    if references is None:
+        alone = _REFERENCES if reference_frame is None else 1
+        references = references_per_pair(2 + len(helpers)) if helpers else alone
+    check_integer("references", references, 1)
+    several = "verified" in SOLVERS[solver] and (references > 1 or bool(helpers))
     given = {name: (one,) for name, one in (("mask", mask), ("intrinsics", intrinsics)) if one is not None}
     with nullcontext() if out is None else writing(out):  # a folder that cannot be written is an error at once
-        first, second = sources = open_pair(reference, target, given)
-        position, frame = first.reference(reference_frame)
-        positions = second.spread(targets)
-        frames = second.load(positions)
+        sources = [*open_pair(reference, target, given), *map(_opened, helpers)]
+        if helpers and len({one.path.resolve() for one in sources}) < len(sources):
+            raise InputError(f"{', '.join(str(one.path) for one in sources)}: expected different objects")
         model = as_backbone(backbone)
         foreground = "saliency" if getattr(model, "has_saliency", True) else "mask"
-        method = ZeroShotPose(model, foreground=foreground, upright=upright)
-        clouds = world_cloud([frame])[0], world_cloud(frames)[0]
-        # The method expects objects of about unit standard deviation. Sequences of data folders have it.
-        unscaled = [one.format == "sequence" or not len(cloud) for one, cloud in zip(sources, clouds)]
-        scales = [1.0 if done else 1 / (axis_deviation(cloud) or 1) for done, cloud in zip(unscaled, clouds)]
-        scaled = [scale_frame(one, scales[1]) for one in frames]
-        flags = *first.flags([frame]), *second.flags(frames), *_side_flags(frames, clouds[1])
-        kinds = sorted({one.path.resolve().parent.name for one in sources if one.format == "sequence"})
-        if len(kinds) > 1:
-            flags = f"the objects are of different categories: {', '.join(kinds)}", *flags
-        solved = solve_pair(method, scale_frame(frame, scales[0]), scaled, SOLVERS[solver])
-        estimates = {name: _in_units(one, *scales, flags) for name, one in solved.items()}
+        method = ZeroShotPose(model, foreground=foreground, upright=upright, solver="verified")
+        scans = [_Scan.of(sources[0], method, references if several else 1, targets if several else 0, reference_frame)]
+        scans += [_Scan.of(one, method, references if several else 0, targets) for one in sources[1:]]
+        first, second, position = *scans[:2], scans[0].references[0]
+        views, flags = (first.views[position], second.target_views), _pair_flags(scans)
+        solved = {name: replace(method, solver=name).estimate_from_views(*views) for name in SOLVERS[solver]}
+        votes = ()
+        if several:
+            timings = dict(solved["verified"].timings)
+            with timed(timings, "other frames"):
+                found = {(0, 1, position): solved["verified"], **_solve_others(scans, method, workers)}
+                agreed, votes = _agreed_pose(scans, method, found)
+            solved["verified"] = replace(agreed, timings=timings)
+        estimates = {name: _in_units(one, first.scale, second.scale, flags) for name, one in solved.items()}
+        where = first.source.describe(first.references), second.source.describe(second.targets)
+        if helpers:
+            where = where[0], f"{where[1]}; helpers: {', '.join(str(one.path) for one in sources[2:])}"
         result = PairResult(
-            f"{first.name} to {second.name}", (first.describe([position]), second.describe(positions)), frame,
-            tuple(frames), estimates, {}, masks=(first.mask, second.mask),
-            backbone=getattr(model, "name", str(backbone)),
+            f"{sources[0].name} to {sources[1].name}", where, first.frames[position],
+            tuple(second.frames[k] for k in second.targets), estimates, {},
+            masks=(sources[0].mask, sources[1].mask), backbone=getattr(model, "name", str(backbone)), votes=votes,
         )  # fmt: skip
-        result = replace(result, errors=known_errors(first, second, result, estimates))
+        result = replace(result, errors=known_errors(*sources[:2], result))
         if out is not None:
             write_pair(result, out)
     return result
+
+
+def _solve_others(scans: Sequence[_Scan], method: ZeroShotPose, workers: int) -> dict[_Ends, PoseEstimate]:
+    """Solve every reference frame of each object against the views of each other one, but for the first of all."""
+    ends = [(a, b, position) for a, b in permutations(range(len(scans)), 2) for position in scans[a].references]
+
+    def solve(a: int, b: int, position: int) -> PoseEstimate | None:
+        with suppress(NoPoseError):
+            return method.estimate_from_views(scans[a].views[position], scans[b].target_views)
+
+    with ThreadPoolExecutor(workers) as pool:
+        solved = list(tqdm(pool.map(solve, *zip(*ends[1:])), total=len(ends) - 1, unit="frame", delay=1, disable=None))
+    return {end: one for end, one in zip(ends[1:], solved, strict=True) if one}
+
+
+def _agreed_pose(
+    scans: Sequence[_Scan], method: ZeroShotPose, found: Mapping[_Ends, PoseEstimate]
+) -> tuple[PoseEstimate, tuple[Vote, ...]]:
+    """Find the pose that the hypotheses of all frames agree on, in the first frame's camera, and their votes."""
+    names = [f"{k} {scan.source.name}" for k, scan in enumerate(scans)]
+    agreement = synchronise([world_hypotheses(names[a], names[b], one) for (a, b, _), one in found.items()])
+    one, other = (agreement.objects[name] for name in names[:2])
+    answers = [(agreement.between(*names[:2]), min(one.probability, other.probability))]
+    if other.alternative and other.alternative_probability > _LEAST_PROBABLE:
+        answers.append((other.alternative.inverse() @ one.sim3, other.alternative_probability))
+    votes = []
+    for (a, b, position), estimate in found.items():
+        if max(a, b) < 2:
+            name = f"frame {scans[a].source.numbers[position]} of {scans[a].source.name}"
+            degrees = float(rotation_error(estimate.world_sim3.R, agreement.between(names[a], names[b]).R))
+            votes.append(Vote(name, _in_units(estimate, scans[a].scale, scans[b].scale, ()), degrees))
+    against = [vote.name for vote in votes if vote.degrees > SAME_ANGLE]
+    flags = [f"{len(against)} of {len(votes)} frames vote for another pose: {', '.join(against)}"] if against else []
+    return _answer(next(iter(found.values())), method, answers, flags), tuple(votes)
+
+
+def _answer(
+    estimate: PoseEstimate, method: ZeroShotPose, answers: Sequence[tuple[Sim3, float]], flags: Sequence[str]
+) -> PoseEstimate:
+    """Replace the hypotheses of an estimate by similarities between the worlds, each with its probability."""
+    reference, targets = estimate.reference_view, estimate.target_views
+    to_reference, *to_targets = (Sim3(1.0, one.frame.camera.R, one.frame.camera.t) for one in (reference, *targets))
+    hypotheses, left_out = [], np.where(np.isfinite(estimate.view_scores), 0.0, np.inf)
+    for mode, (sim3, probability) in reversed([*enumerate(answers)]):
+        poses = [camera @ sim3 @ to_reference.inverse() for camera in to_targets]
+        angles = rotation_angle(np.stack([pose.R for pose in poses]), np.eye(3)) + left_out
+        view = int(angles.argmin())
+        score = float(np.log(max(probability, 1e-9)))
+        hypotheses.insert(0, Hypothesis(poses[view], view, score, {}, probability, mode))
+    (matched,) = method.match_views(reference, [targets[view]])
+    turns = np.stack([sim3.R for sim3, _ in answers])
+    between = rotation_angle(turns[:, None], turns)
+    doubts, one_of_two = reliability_flags(hypotheses, between)
+    kept = [flag for flag in estimate.flags if "left out" in flag]
+    return replace(
+        estimate, sim3=poses[view], view=view, matches=matched.matches, view_scores=-angles,
+        inliers=measured_inliers(reference, targets[view], matched.matches, poses[view], method.threshold),
+        hypotheses=tuple(hypotheses), one_of_two=one_of_two, flags=(*doubts, *flags, *kept),
+    )  # fmt: skip
 
 
 def write_pair(result: PairResult, out: str | Path) -> list[Path]:
@@ -194,19 +336,19 @@ def write_pair(result: PairResult, out: str | Path) -> list[Path]:
 
 
 def open_source(
-    path: str | Path,
+    path: str | Path | Frame | Sequence[Frame],
     intrinsics: tuple[float, float, float, float] | None = None,
     depth: str | Path | None = None,
     depth_unit: float | None = None,
     mask: str | None = None,
     box: Box | None = None,
 ) -> Source:
-    """Open a sequence of a data folder, a folder with a capture, or an image.
+    """Open a sequence of a data folder, a folder with a capture, an image, or frames of one object in one world.
 
     Args:
         path: ROOT/CATEGORY/SEQUENCE of a data folder; the folder of a capture in a format of `importers.READERS`; or a
             JPEG or PNG file NAME.EXT. Depth of an image is NAME_depth.png (16 bit) or NAME_depth.npy, registered to
-            its colours, and its mask, if there is one, NAME_mask.png.
+            its colours, and its mask, if there is one, NAME_mask.png. Or frames, such as of `Frame.from_arrays`.
         intrinsics: fx, fy, cx, cy of an image in pixels, with pixel centres at half-integers (0.5 more than OpenCV's
             cx and cy).
         depth: Depth file of an image, if it is named otherwise.
@@ -218,15 +360,21 @@ def open_source(
     Raises:
         InputError: The path is none of these, a file cannot be read, or an option is missing or does not fit.
     """
-    path, options = Path(path), {"intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit}
-    layout, options = _format(path), {name: value for name, value in options.items() if value is not None}
+    layout, options = _format(path), {"intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit}
+    options = {name: value for name, value in options.items() if value is not None}
+    if layout == "frames":
+        frames = _check_frames([path] if isinstance(path, Frame) else path)
+        path = frames[0].name or f"{len(frames)} frames"
+    path = Path(path)
     for name in options:
         if name not in _TAKEN[layout]:
             raise InputError(f"--{name.replace('_', '-')} does not go with {path}, of the format {layout}")
     if mask not in (None, *(("box",) if box is not None else ("given", "auto"))):
         expected = "--mask given, --mask auto, or --mask box with --box TOP,LEFT,HEIGHT,WIDTH"
         raise InputError(f"{path}: mask is {mask!r} and box is {box}, expected {expected}")
-    if layout == "sequence":
+    if layout == "frames":
+        numbers, read = tuple(range(len(frames))), frames.__getitem__
+    elif layout == "sequence":
         folder = Path(os.path.abspath(path))
         dataset = Co3D(folder.parents[1])
         every = dataset.frames(folder.parent.name, folder.name)
@@ -241,16 +389,14 @@ def open_source(
     return Source(path, layout, numbers, read, mask, box)
 
 
-def open_pair(
-    reference: str | Path | Source, target: str | Path | Source, options: Mapping[str, Sequence]
-) -> list[Source]:
+def open_pair(reference: _Object, target: _Object, options: Mapping[str, Sequence]) -> list[Source]:
     """Open two sources with the options of a command line, by the names of arguments of `open_source`.
 
     An option has one value for each path that takes it (`depth`: each image), or one for all of them. A single `box` is
     for the first path whose `mask` is "box", if any, or the first of both. An open source takes none.
     """
     sides = reference, target
-    formats = ["open" if isinstance(side, Source) else _format(Path(side)) for side in sides]
+    formats = [_format(side) for side in sides]
     given: list[dict] = [{}, {}]
     for name, values in options.items():
         takers = [k for k in (0, 1) if name in _TAKEN[formats[k]]]
@@ -263,11 +409,30 @@ def open_pair(
             takers = (boxed or takers)[:1]
         for k, value in zip(takers, values if len(values) == 2 else [*values] * 2):
             given[k][name] = value
-    return [side if isinstance(side, Source) else open_source(side, **some) for side, some in zip(sides, given)]
+    return [_opened(side, **some) for side, some in zip(sides, given)]
 
 
-def _format(path: Path) -> str:
-    """Tell a "sequence" from an "image" and from a capture, of which the format is returned."""
+def _opened(side: _Object, **options: Any) -> Source:
+    return side if isinstance(side, Source) else open_source(side, **options)
+
+
+def _check_frames(frames: Sequence[Frame]) -> list[Frame]:
+    """Refuse what cannot be frames of one object in one world."""
+    if not frames or not all(isinstance(frame, Frame) for frame in frames):
+        raise InputError(f"frames are {reprlib.repr(frames)}, expected a sequence of zsp_lite.Frame")
+    for number, frame in enumerate(frames):
+        if frame.depth is None:
+            raise InputError(f"frame {number} {frame.name} has no depth map, expected one")
+    if len({frame.camera.matrix.tobytes() for frame in frames}) == 1 < len(frames):
+        raise InputError(f"all {len(frames)} frames have the same camera pose, expected their poses in one world")
+    return list(frames)
+
+
+def _format(side: _Object) -> str:
+    """Tell a "sequence" from an "image", from "frames", and from a capture, of which the format is returned."""
+    if not isinstance(side, str | Path):
+        return "open" if isinstance(side, Source) else "frames"
+    path = Path(side)
     if path.is_file() and path.suffix.lower() in _IMAGES:
         return "image"
     whole = Path(os.path.abspath(path))  # for the names of "." and of "mine/cup/.."
@@ -295,32 +460,38 @@ def _open_image(
     if not found:
         names = " or ".join(file.name for file in beside)
         raise InputError(f"image {path}: no {names} beside it, expected its depth there or as --depth FILE")
-    camera = camera_from_pose(np.eye(4), intrinsics, read_image(path).shape[:2], f"image {path}")
-    if not all(0 < place < side for place, side in zip(camera.principal_point, camera.size[::-1])):
-        expected = f"a point inside its {camera.size[::-1]} pixels"
-        raise InputError(f"image {path}: CX,CY is {intrinsics[2:]}, expected {expected}")
+    camera = camera_from_pose(np.eye(4), intrinsics, read_image(path).shape[:2], f"image {path}", uncropped=True)
     mask = path.with_name(f"{path.stem}_mask.png")
     return CaptureFrame(path, found[0], camera, depth_unit, mask=mask if mask.is_file() else None)
 
 
-def known_errors(
-    first: Source, second: Source, result: PairResult, estimates: dict[str, PoseEstimate]
-) -> dict[str, float]:
+def spread(count: int, length: int) -> list[int]:
+    """Return at most `count` evenly spaced positions among `length`, which go once around an object."""
+    return sorted({k * length // count for k in range(count)})
+
+
+def known_errors(first: Source, second: Source, result: PairResult) -> dict[str, float]:
     """Compute rotation errors if both are labelled sequences of one category; {} otherwise."""
     one, other = (source.path.resolve() for source in (first, second))
     if {first.format, second.format} != {"sequence"} or one.parent != other.parent:
         return {}
-    return label_errors(replace(result, estimates=estimates), one.parent, (one.name, other.name))
+    return label_errors(result, one.parent, (one.name, other.name))
 
 
-def _side_flags(targets: Sequence[Frame], points: Float[np.ndarray, "n 3"]) -> tuple[str, ...]:
-    """Say where the usable target views do not show all sides of the object, of which some points are known."""
-    cameras = [frame.camera for frame in targets if not frame_defect(frame)]
-    span = view_span(cameras, np.median(points, axis=0)) if len(points) else 0.0
-    if len(cameras) > 2 and span >= _ALL_SIDES:
-        return ()
-    seen = f"{'two sides' if span >= _ALL_SIDES else 'one side'} only ({span:.0f} degrees)"
-    return (f"the target was seen from {seen}: if the reference was taken from another side, this pose is wrong",)
+def _pair_flags(scans: Sequence[_Scan]) -> tuple[str, ...]:
+    """Name two categories, and what is doubtful about the frames in use and the sides that they show."""
+    kinds = sorted({one.source.path.resolve().parent.name for one in scans if one.source.format == "sequence"})
+    flags = [f"the objects are of different categories: {', '.join(kinds)}"] if len(kinds) > 1 else []
+    for scan in scans:
+        flags += scan.source.flags([scan.frames[position] for position in scan.views])
+    seen = [scan.seen for scan in scans[:2] if scan.targets]
+    count, span = max(seen, key=lambda one: (one[1], one[0]))
+    if count < 3 or span < _ALL_SIDES:
+        sides = "two sides" if span >= _ALL_SIDES else "one side"
+        what, other = ("the target was", "the reference") if len(seen) < 2 else ("each object was", "one")
+        seen_from = f"seen from {sides} only ({span:.0f} degrees)"
+        flags.append(f"{what} {seen_from}: if {other} was taken from another side, this pose is wrong")
+    return tuple(flags)
 
 
 def _in_units(

@@ -1,6 +1,8 @@
-"""The paper's baselines (sec. 5.2 and supplement), and the alignment of a category, as rows of the benchmark."""
+"""The paper's baselines (sec. 5.2 and supplement), and poses that many frames or objects agree on, as rows."""
 
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,9 +12,10 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.baselines.geometry import align
 from zsp_lite.baselines.sift import Keypoints, mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints
-from zsp_lite.benchmark.problem import Answer, FrameStore, Problem
+from zsp_lite.benchmark.problem import Answer, Problem
 from zsp_lite.best_view import score_from_cosines
-from zsp_lite.category import PairHypotheses, object_pairs, synchronise, world_hypotheses
+from zsp_lite.category import PairHypotheses, object_pairs, scan_pairs, synchronise, world_hypotheses
+from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError, NoPoseError
 
 _K = 50  # number of matches, as in "Ours"
@@ -55,24 +58,39 @@ def posecontrast(problem: Problem) -> Answer:
 
 def category(problem: Problem) -> Answer:
     """Run "category": the pose by the alignment of all objects of the category, which needs no label of any."""
-    own = hypotheses(problem)
-    alignment = synchronise([*_of_all_objects(problem.store, len(problem.pair.target_frames)), own])
+    pairs = object_pairs(problem.store.dataset, problem.store.category, None, None, len(problem.pair.target_frames))
+    return _agreed(problem, [problem.pair, *pairs])
+
+
+@dataclass(frozen=True)
+class Scans:
+    """Run "scans-R": the pose that `references` frames of each object agree on, solved against views of the other."""
+
+    references: int
+
+    def __call__(self, problem: Problem) -> Answer:
+        numbers: dict[str, list[int]] = {}
+        for frame in problem.store.dataset.frame_list(problem.store.category):
+            numbers.setdefault(frame.sequence_name, []).append(frame.frame_number)
+        return _agreed(problem, scan_pairs(problem.pair, numbers, self.references))
+
+
+def _agreed(problem: Problem, pairs: Sequence[Pair]) -> Answer:
+    """Return the pose that the hypotheses of pairs of frames agree on, those of the problem's own pair among them."""
+    own, kept = hypotheses(problem), problem.store.kept
+    for pair in pairs:
+        if pair not in kept:  # for other rows, and for other pairs of the same objects
+            kept[pair] = None
+            with suppress(NoPoseError):
+                kept[pair] = hypotheses(Problem(pair, problem.store))
+    found = [kept[pair] for pair in pairs if pair != problem.pair and kept[pair]]
+    alignment = synchronise([own, *found])
     reference, target = (Sim3(1.0, one.camera.R, one.camera.t) for one in problem.frames()[:2])
     sim3 = target @ alignment.between(own.reference, own.target) @ reference.inverse()
     return Answer(sim3.R, 0, sim3.t, sim3.scale, confidence=alignment.objects[own.target].probability)
 
 
-def _of_all_objects(store: FrameStore, views: int) -> list[PairHypotheses]:
-    """Find the hypotheses between all objects of a category, once for all pairs of so many views."""
-    if ("category", views) not in store.kept:
-        found = []
-        for pair in object_pairs(store.dataset, store.category, None, None, views):
-            with suppress(NoPoseError):
-                found.append(hypotheses(Problem(pair, store)))
-        store.kept["category", views] = found
-    return store.kept["category", views]
-
-
 def hypotheses(problem: Problem) -> PairHypotheses:
     """Find the hypotheses of the verified solver between the worlds of both objects."""
-    return world_hypotheses(problem.pair, problem.estimate(settings={"solver": "verified"}))
+    ends = problem.pair.reference_sequence, problem.pair.target_sequence
+    return world_hypotheses(*ends, problem.estimate(settings={"solver": "verified"}))

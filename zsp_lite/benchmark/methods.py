@@ -78,7 +78,10 @@ METHODS: dict[str, Method] = {
     # Beyond the paper.
     "verified": Method(settings={"solver": "verified"}),
     "verified-mask": Method(settings={"solver": "verified"} | _MASK),
-    # Sees the other objects of the category, too, without labels: a table of its own.
+    # See other frames of both objects, and other objects of the category, too, without labels: tables of their own.
+    "scans-2": Method(solve=baseline_rows.Scans(2)),
+    "scans-4": Method(solve=baseline_rows.Scans(4)),
+    "scans-8": Method(solve=baseline_rows.Scans(8)),
     "category": Method(solve=baseline_rows.category),
 }
 
@@ -97,6 +100,7 @@ GROUPS: dict[str, list[str]] = {
         table["group"]: [line["row"] for line in table["rows"] if line["row"] not in ("swav", "posecontrast")]
         for table in read_paper_tables() if "group" in table
     },
+    "scans": ["scans-2", "scans-4", "scans-8"],
     "verified-views": ["verified", "verified-n1", "verified-n3", "verified-n10", "verified-mask"],
     "ablations": ["ours", "table3", "matchers", "correspondences", "trials", "depth", "published"],  # at one N
     "paper": ["ours", "ours-bv", "table1", "ablations", "views", "rootsift", "ours-mask"],

@@ -110,10 +110,15 @@ def write_reports(run: str | Path, out: str | Path | None = None, metrics: Seque
 
     `metrics` are the figures of the table of all rows. Tables of an earlier call which have no rows now are removed.
     """
-    from zsp_lite.benchmark.tables import every_table, write_figures, write_tables  # workers need no matplotlib
+    from zsp_lite.benchmark.tables import (
+        SEE_MORE,
+        every_table,
+        write_figures,
+        write_tables,
+    )  # workers need no matplotlib
 
     found, out = read_run(run), Path(out or run)
-    for name in ("all_rows", "with_others", *(spec["name"] for spec in read_paper_tables())):
+    for name in ("all_rows", *SEE_MORE, *(spec["name"] for spec in read_paper_tables())):
         for path in (out / "tables").glob(f"{name}.*"):
             path.unlink()
     write_tables(every_table(found.summary, metrics), out / "tables")

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from zsp_lite.benchmark.methods import METHODS, read_paper_tables
+from zsp_lite.benchmark.methods import GROUPS, METHODS, read_paper_tables
 from zsp_lite.benchmark.runs import Run
 from zsp_lite.benchmark.statistics import draws_of, paired_difference
 from zsp_lite.choices import METRICS, METRICS_SHOWN
@@ -29,7 +29,11 @@ from zsp_lite.viz.plots import COLOURS, show_dots, show_panels
 PAPER = METRICS_SHOWN[:3]
 PUBLISHED = "paper, CO3D"
 _PUBLISHED_NOTE = "Figures of the paper: other data (CO3D) and another backbone (DINO ViT-S/8)."
-WITH_OTHERS = ("category",)  # rows that see other objects than the two of the pair
+# Rows that see more than the pair, in tables of their own: by the name of the table its title and rows.
+SEE_MORE = {
+    "with_scans": ("With several frames of the reference object", GROUPS["scans"]),
+    "with_others": ("With other unlabelled objects of the category", ["category"]),
+}
 _LOWEST_IS_BEST = ("mean_category_median", "median", "above150", "translation")
 _SYMBOLS = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _SYMBOLS |= {"°": r"$^\circ$", "−": "$-$"}
@@ -74,24 +78,26 @@ class Table:
 
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
     """Return all tables of a run; `metrics` are the figures of the table of all rows (see `METRICS`)."""
-    first = all_rows(summary, metrics), all_rows(summary, metrics, with_others=True)
+    first = (all_rows(summary, metrics, name) for name in ("all_rows", *SEE_MORE))
     tables = *first, *paper_tables(summary), *(by_category(summary, one) for one in PAPER)
     return [table for table in tables if table.cells.size]
 
 
-def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN, with_others: bool = False) -> Table:
-    """Return every row that sees the pair only, or `with_others`: figures, failed pairs, difference to "ours"."""
-    what = ("with_others", "With other unlabelled objects of the category") if with_others else ("all_rows", "All rows")
+def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN, table: str = "all_rows") -> Table:
+    """Return every row that sees the pair only, or those of a table of `SEE_MORE` below "verified", which does, too."""
+    title, members = SEE_MORE.get(table, ("All rows", []))
+    names = [name for name in summary["methods"] if _plain(name) in members or not members and not _sees_more(name)]
+    if members and names:  # what they add to
+        names = [*(name for name in summary["methods"] if _plain(name) == "verified"), *names]
     rows = {}
-    for name, row in summary["methods"].items():
-        if (_plain(name) in WITH_OTHERS) != with_others:
-            continue
+    for name in names:
+        row = summary["methods"][name]
         pairs, failed = (Cell(row[count], decimals=0) for count in ("n", "failed"))
         difference = _difference(summary.get("against", {}).get(name))
         rows[name] = [pairs, *(_cell(row, metric) for metric in metrics), failed, *difference]
     titles = ["pairs", *(METRICS[name] for name in metrics), "failed", "Acc30 − ours", "p"]
     gain = 'Acc30 − ours: difference to "ours" on the same pairs, in points, and its p value by the same bootstrap.'
-    return _table(summary, *what, rows, titles, metrics, gain)
+    return _table(summary, table, title, rows, titles, metrics, gain)
 
 
 def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
@@ -176,13 +182,17 @@ def own_rows(summary: Mapping[str, Any]) -> list[str]:
 def important_rows(summary: Mapping[str, Any]) -> list[str]:
     """List the rows of a run that see the pair only, or all if none does, "ours" and one's own first."""
     first = ["ours", *own_rows(summary), "ours-bv", "verified"]
-    names = [name for name in summary["methods"] if _plain(name) not in WITH_OTHERS]
+    names = [name for name in summary["methods"] if not _sees_more(name)]
     return sorted(names or summary["methods"], key=lambda name: first.index(name) if name in first else len(first))
 
 
 def _plain(name: str) -> str:
     """ROW of "ROW-nN"."""
     return re.sub(r"-n\d+$", "", name)
+
+
+def _sees_more(name: str) -> bool:
+    return any(_plain(name) in rows for _, rows in SEE_MORE.values())
 
 
 def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:

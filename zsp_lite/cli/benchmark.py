@@ -90,7 +90,7 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
 
     found = [one for one in tables.every_table(summary, metrics) if not one.name.startswith("categories")]
     for table in (*found, tables.by_category(summary, most=_ROWS_SHOWN)):
-        if with_paper or table.name in ("all_rows", "with_others", "categories_acc30"):
+        if with_paper or table.name in ("all_rows", *tables.SEE_MORE, "categories_acc30"):
             print_table(table)
 
 

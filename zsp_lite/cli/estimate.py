@@ -24,18 +24,35 @@ from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, bac
 )
 @click.option("--solver", type=click.Choice(SOLVERS), default="verified", help="Solver of the pose.")
 @click.option("--reference-frame", type=INDEX, show_default="first usable", help="Its number in REFERENCE.")
+@click.option(
+    "--references", type=COUNT, show_default="4; 1 with --reference-frame", help="Reference frames of each object."
+)
 @click.option("--targets", type=COUNT, default=5, help="Number of target views, evenly spaced.")
 @click.option("--mask", type=click.Choice(MASKS), multiple=True, help="Origin of the objects' masks, see above.")
 @click.option("--box", type=BOX, multiple=True, help="Bounding box of the object in the first image in pixels.")
 @click.option("--intrinsics", type=INTRINSICS, multiple=True, help="Camera intrinsics in pixels, see above.")
 @click.option("--depth", type=PATH, multiple=True, help="Depth of an image, if it is not beside it. Once per image.")
 @click.option("--depth-unit", type=LENGTH, multiple=True, show_default="0.001", help="Metres per stored depth value.")
+@click.option("--workers", type=COUNT, default=1, help="Frames that are solved at once.")
 @click.option("--not-upright", is_flag=True, help="Try four turns by 90 degrees of the reference image.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 @backbone_options
 @click.option("--out", type=PATH, default="outputs/estimate", help="Folder for the report and the point clouds.")
 def estimate(
-    reference, target, others, helpers, solver, reference_frame, targets, not_upright, as_json, backbone, out, **given
+    reference,
+    target,
+    others,
+    helpers,
+    solver,
+    reference_frame,
+    references,
+    targets,
+    workers,
+    not_upright,
+    as_json,
+    backbone,
+    out,
+    **given,
 ) -> None:
     """Estimate the pose between two objects of one category; no label is needed.
 
@@ -65,22 +82,17 @@ def estimate(
 
     from zsp_lite.backbones.load import load_backbone
     from zsp_lite.io.locks import writing
-    from zsp_lite.own_objects import estimate_pose, open_pair, open_source, write_pair
+    from zsp_lite.own_objects import estimate_pose, open_pair, write_pair
 
     if helpers and solver != "verified":
         raise click.UsageError("--helpers goes with --solver verified only")
     if others and not helpers:
         raise click.UsageError(f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers")
     with writing(out):
-        sources = open_pair(reference, target, given)
-        model, upright = load_backbone(backbone), not not_upright
-        if helpers:
-            from zsp_lite.align import estimate_with_helpers
-
-            sources += [open_source(path) for path in (*helpers, *others)]
-            found = estimate_with_helpers(sources, model, reference_frame, targets, upright)
-        else:
-            found = estimate_pose(*sources, solver, reference_frame, targets, backbone=model, upright=upright)
+        found = estimate_pose(
+            *open_pair(reference, target, given), solver, reference_frame, targets, backbone=load_backbone(backbone),
+            upright=not not_upright, references=references, helpers=(*helpers, *others), workers=workers,
+        )  # fmt: skip
         files = write_pair(found, out)
     if as_json:
         print(json.dumps(found.as_json() | {"files": [str(path) for path in files]}, indent=1, allow_nan=False))
@@ -102,9 +114,14 @@ def _print_tables(found: Any) -> None:
     print(legend([name for name in COLUMNS[1:] if name != "error" or found.errors]))
     for solver, one in found.estimates.items():
         view = f"view {one.view + 1} ({found.targets[one.view].name})"
-        print(f"{solver}: reference-camera points to camera points of {view}")
-        for line in one.sim3.matrix:
-            print("  " + " ".join(f"{value:10.5f}" for value in line))
+        cameras = f"camera points of {found.reference.name} to those of {view}"
+        for points, sim3 in (
+            (cameras, one.sim3),
+            ("world points of the reference to those of the target", one.world_sim3),
+        ):
+            print(f"{solver}: {points}")
+            for line in sim3.matrix:
+                print("  " + " ".join(f"{value:10.5f}" for value in line))
         if one.reference_turn:
             print(f"  features of the reference turned by {one.reference_turn}° counterclockwise")
         for rank, other in enumerate(one.alternatives, 2):

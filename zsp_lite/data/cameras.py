@@ -10,7 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Real
 
-from zsp_lite.errors import check_integer, check_magnitude, check_number, real_array, rotation_matrix
+from zsp_lite.errors import (
+    InputError,
+    check_integer,
+    check_magnitude,
+    check_number,
+    real_array,
+    rigid_matrix,
+    rotation_matrix,
+)
 
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
 Values = Real[np.ndarray, "..."] | Sequence
@@ -146,6 +154,26 @@ class Camera:
             R, t = _QUARTER_TURN @ camera.R, _QUARTER_TURN @ camera.t
             camera = Camera(R, t, camera.focal_length[::-1], centre, camera.size[::-1])
         return camera
+
+
+def camera_from_pose(
+    pose: Values, intrinsics: Values, size: tuple[int, int], where: str, uncropped: bool = False
+) -> Camera:
+    """Create a camera from fx, fy, cx, cy and its camera-to-world pose in OpenCV's axes; errors begin with `where`.
+
+    The principal point of an `uncropped` image lies inside it.
+    """
+    pose = rigid_matrix(f"{where}: camera-to-world pose", pose)
+    rotation = pose[:3, :3]
+    values = real_array(f"{where}: intrinsics", intrinsics, (4,))
+    if uncropped and not all(0 < place < side for place, side in zip(values[2:], size[::-1])):
+        raise InputError(
+            f"{where}: CX,CY is {(*values[2:].tolist(),)}, expected a point inside its {size[::-1]} pixels"
+        )
+    try:
+        return Camera(rotation.T, -rotation.T @ pose[:3, 3], values[:2], values[2:], size)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def _ndc(size: Sequence[int], intrinsics_format: str) -> tuple[np.ndarray, np.ndarray]:

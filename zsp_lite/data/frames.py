@@ -16,9 +16,9 @@ from jaxtyping import Bool, Float32, Real, UInt8, UInt16
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from zsp_lite.data.cameras import Box, Camera
+from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose
 from zsp_lite.data.depth import decode_depth, encode_depth
-from zsp_lite.errors import MAX_LENGTH, InputError, real_array
+from zsp_lite.errors import MAX_LENGTH, InputError, check_number, real_array
 from zsp_lite.io.files import read_bytes, write_atomic
 
 MAX_PIXELS = 1 << 26  # of an image file
@@ -26,6 +26,7 @@ ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above thi
 # The start of a JPEG's segment, or the end of the image: FF and a byte other than that of image data (00), of a marker
 # alone (01, D0 to D8) and of padding (FF).
 _JPEG_MARKER = re.compile(rb"\xff[\x02-\xcf\xd9-\xfe]")
+_SAME_ASPECT = 0.01  # largest relative difference of the aspect ratios of an image and its smaller depth map
 _BLACK = 10  # an image without a colour of this value is black, as CO3D's hidden frames are
 
 
@@ -59,6 +60,52 @@ class Frame:
                 raise InputError(f"{label} {name} has {found}, expected shape {size} and values from 0 to {top:g}")
             object.__setattr__(self, name, values)
 
+    @classmethod
+    def from_arrays(
+        cls, rgb: np.ndarray, depth: np.ndarray, K: Values, mask: np.ndarray | None = None, pose: Values | None = None,
+        depth_unit: float = 1.0, name: str = "", half_pixels: bool = False,
+    ) -> "Frame":  # fmt: skip
+        """Make a frame of arrays as a camera gives them, in any unit of length.
+
+        Args:
+            rgb: Colours (H, W, 3), with or without alpha, or grey (H, W): uint8, or floats from 0 to 1.
+            depth: Numbers (h, w) along +z, registered to the colours, of their size, or smaller and of the same aspect
+                ratio; unknown where NaN, infinite, zero or negative.
+            K: Intrinsics of the colours, (3, 3) or (fx, fy, cx, cy), pixels; the first pixel's centre is (0, 0).
+            mask: The object's pixels (H, W): booleans, 0 and 1, or 0 to 255. None leaves it to `estimate_pose`.
+            pose: Rigid transform (4, 4) from camera to world in OpenCV's axes (x right, y down, z forward), in units of
+                the world. By default, the world is the camera's frame.
+            depth_unit: World units per unit of `depth`.
+            name: Name for messages and reports.
+            half_pixels: Whether K has the first pixel's centre at (0.5, 0.5) in place of (0, 0), as `Camera` has.
+
+        Raises:
+            InputError: Arrays that are none of these, or do not fit together.
+        """
+        label, image, matrix = f"frame {name}".rstrip(), np.asarray(rgb), np.asarray(K)
+        if image.ndim == 2:
+            image = np.repeat(image[..., None], 3, axis=2)
+        if image.ndim != 3 or image.shape[2] not in (3, 4):
+            raise InputError(f"{label} rgb has shape {image.shape}, expected (H, W), (H, W, 3) or (H, W, 4)")
+        image, size = image[..., :3], image.shape[:2]
+        if matrix.shape == (3, 3):
+            if np.abs(matrix[[0, 1, 2, 2], [1, 0, 0, 1]]).max() > 0 or matrix[2, 2] != 1:
+                raise InputError(f"{label} K is {matrix.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
+            matrix = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+        intrinsics = real_array(f"{label} K", matrix, (4,)) + (0, 0, *[0.0 if half_pixels else 0.5] * 2)
+        camera = camera_from_pose(np.eye(4) if pose is None else pose, intrinsics, size, label, uncropped=True)
+        if image.dtype.kind == "f" and 0 <= image.min() and image.max() <= 1:
+            image = np.rint(255 * image).astype(np.uint8)
+        check_number("depth_unit", depth_unit, above=0)
+        values = real_array(f"{label} depth", depth, (None, None)) * depth_unit
+        values = np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+        if mask is not None:
+            mask = real_array(f"{label} mask", mask).astype(np.float32)
+            if 1 < (most := mask.max()) <= ON_OBJECT * 255:
+                raise InputError(f"{label} mask has {most:g} at most, expected booleans, 0 and 1, or 0 to 255")
+            mask = mask / np.float32(255) if most > 1 else mask
+        return cls(image, enlarge_depth(values, size), mask, camera, name)
+
     @property
     def shows_object(self) -> bool:
         """Whether some pixel is on the object; without a mask all are."""
@@ -69,6 +116,15 @@ class Frame:
         depth = "no depth" if self.depth is None else f"depth known at {(self.depth > 0).mean():.0%} of the pixels"
         mask = "no mask" if self.mask is None else f"mask above {ON_OBJECT} at {(self.mask > ON_OBJECT).mean():.0%}"
         return f"Frame({self.name!r}, {height} x {width} pixels, {depth}, {mask})"
+
+
+def enlarge_depth(depth: Float32[np.ndarray, "h w"], size: tuple[int, int]) -> Float32[np.ndarray, "..."]:
+    """Enlarge a smaller depth map of the same aspect ratio to an image's size (H, W); others stay as they are."""
+    (rows, columns), (height, width) = depth.shape, size
+    if rows >= height or abs(rows * width / (columns * height) - 1) > _SAME_ASPECT:
+        return depth
+    # The nearest values, because means of two surfaces lie on neither.
+    return cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
 
 def frame_defect(frame: Frame) -> str:

@@ -11,14 +11,13 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import Frame, check_pixels, read_grey16, read_image, read_mask
-from zsp_lite.errors import MAX_LENGTH, InputError, real_array, rigid_matrix
+from zsp_lite.data.cameras import Camera, camera_from_pose
+from zsp_lite.data.frames import Frame, check_pixels, enlarge_depth, read_grey16, read_image, read_mask
+from zsp_lite.errors import MAX_LENGTH, InputError
 from zsp_lite.io.files import decode_json, path_inside, read_bytes, read_json
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-_SAME_ASPECT = 0.01  # largest relative difference of the aspect ratios of an image and its smaller depth map
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # +y up, looking along -z
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 _Row = tuple[float, float, float, float]
@@ -41,10 +40,7 @@ class CaptureFrame:
         """Load the frame; InputError if a file is missing, damaged or of another size than the camera's image."""
         height, width = self.camera.size
         rgb, depth = read_image(self.image), _read_depth(self.depth) * np.float32(self.depth_unit)
-        rows, columns = depth.shape
-        if rows < height and abs(rows * width / (columns * height) - 1) < _SAME_ASPECT:
-            # The nearest values, because means of two surfaces lie on neither.
-            depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+        depth = enlarge_depth(depth, (height, width))
         mask = None if self.mask is None else read_mask(self.mask)
         for path, pixels in ((self.image, rgb), (self.depth, depth), (self.mask, mask)):
             if pixels is not None:
@@ -67,19 +63,6 @@ def evenly_spaced(frames: Sequence[CaptureFrame], count: int) -> list[CaptureFra
 def files_by_stem(folder: str | Path) -> dict[str, Path]:
     """Return the files of a folder by their names without extension; links may not lead out of it."""
     return {path.stem: path_inside(folder, path.name) for path in sorted(Path(folder).glob("*"))}
-
-
-def camera_from_pose(
-    pose: Float[np.ndarray, "4 4"], intrinsics: Sequence[float], size: tuple[int, int], where: str
-) -> Camera:
-    """Create a camera from fx, fy, cx, cy and its camera-to-world pose in OpenCV's axes; errors begin with `where`."""
-    pose = rigid_matrix(f"{where}: camera-to-world pose", pose)
-    rotation = pose[:3, :3]
-    values = real_array(f"{where}: intrinsics", intrinsics, (4,))
-    try:
-        return Camera(rotation.T, -rotation.T @ pose[:3, 3], values[:2], values[2:], size)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
 
 
 def _read_depth(path: Path) -> Float[np.ndarray, "h w"]:

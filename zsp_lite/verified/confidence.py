@@ -87,8 +87,8 @@ def reliability_flags(
             f"{start} degrees apart explain the views about equally well (probabilities {shown}): the object may be "
             "symmetric"
         )
-    if max(terms["forward_overlap"], terms["reverse_overlap"]) < _MIN_OVERLAP:
+    if terms and max(terms["forward_overlap"], terms["reverse_overlap"]) < _MIN_OVERLAP:
         flags.append("no view confirms the pose: nearly no point lies on an observed surface")
-    if max(terms["forward_similarity"], terms["reverse_similarity"]) < _MIN_SIMILARITY:
+    if terms and max(terms["forward_similarity"], terms["reverse_similarity"]) < _MIN_SIMILARITY:
         flags.append("no view confirms the pose: features of points that coincide are not similar")
     return tuple(flags), one_of_two

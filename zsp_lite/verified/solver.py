@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from zsp_lite.alignment import Sim3
 from zsp_lite.best_view import ViewMatch
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
+from zsp_lite.matching import Matches
 from zsp_lite.verified.confidence import Calibration, evidence, modes, reliability_flags
 from zsp_lite.verified.poses import Poses, concatenate, non_maximum_suppression, rotation_angles
 from zsp_lite.verified.proposals import poses_from_matches, poses_from_views
@@ -48,11 +50,8 @@ class VerifiedSolver:
         rotation, best = solution.poses.rotation, solution.hypotheses[0]
         flags, one_of_two = reliability_flags(solution.hypotheses, rotation_angles(rotation, rotation).numpy())
         matches = matched[best.view].matches
-        (source, known), (target, seen) = (view.measured_points for view in (reference, targets[best.view]))
-        u, v = tuple(matches.reference.T), tuple(matches.target.T)
-        residual = np.linalg.norm(best.sim3.apply(source[u]) - target[v], axis=1)
         spread = 1 / solution.scene.target_to_working.scale  # of the target's points from all views
-        inliers = known[u] & seen[v] & (residual < threshold * spread)
+        inliers = measured_inliers(reference, targets[best.view], matches, best.sim3, threshold * spread)
         return PoseEstimate(
             best.sim3, best.view, matches, inliers, -solution.view_angles,
             reference, tuple(targets), solution.timings, flags, solution.hypotheses, one_of_two,
@@ -99,3 +98,13 @@ class VerifiedSolver:
                 hypotheses = tuple(Hypothesis(*one) for one in zip(*parts))
         view_angles = angles[0][np.argsort(order)].astype(np.float64)
         return Solution(hypotheses, view_angles, timings, scene, order, poses)
+
+
+def measured_inliers(
+    reference: View, target: View, matches: Matches, sim3: Sim3, threshold: float
+) -> Bool[np.ndarray, " k"]:
+    """Return which matches have measured depth on both sides and a residual below the threshold under a pose."""
+    (source, known), (destination, seen) = reference.measured_points, target.measured_points
+    u, v = tuple(matches.reference.T), tuple(matches.target.T)
+    residual = np.linalg.norm(sim3.apply(source[u]) - destination[v], axis=1)
+    return known[u] & seen[v] & (residual < threshold)

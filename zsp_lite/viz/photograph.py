@@ -9,7 +9,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from zsp_lite.data import photograph as motorcycle
+from zsp_lite import motorcycle
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
 from zsp_lite.demo import N_TARGETS
@@ -47,7 +47,7 @@ def run_photograph(dataset: Co3D, backbone: FeatureExtractor) -> Iterator[Photog
     """Estimate how the motorcycle in a real photograph stands, from a synthetic motorcycle whose front is known.
 
     There is one result for each foreground and solver, and none without a category of synthetic motorcycles. The
-    sequence is `TARGET` of `data.photograph`, or the first of other data; both are independent of the results.
+    sequence is `TARGET` of `motorcycle`, or the first of other data; both are independent of the results.
     """
     if not (dataset.root / motorcycle.CATEGORY / POSES_FILE).is_file():
         return
