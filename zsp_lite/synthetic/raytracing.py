@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from zsp_lite.data.cameras import Camera
 from zsp_lite.io.ply import load_open3d
 from zsp_lite.synthetic.meshes import TexturedMesh
-from zsp_lite.synthetic.room import FLOOR_REACH, RoomLight
+from zsp_lite.synthetic.room import FLOOR_REACH, Room
 from zsp_lite.synthetic.textures import pyramid, sample_image, sample_pyramid, srgb_to_linear
 
 _LAYERS = 4  # surfaces with holes that a ray passes through
@@ -51,13 +51,13 @@ class MeshScene:
     def __init__(
         self,
         mesh: TexturedMesh,
-        lighting: RoomLight,
+        room: Room,
         seed: int | np.random.Generator,
         coordinates: Float[np.ndarray, "v 3"] | None = None,  # of the object that the mesh is a deformed copy of
         samples: int = 2,  # per pixel, along each axis
     ):
         o3d = load_open3d()
-        self.mesh, self.lighting, self.room = mesh, lighting, lighting.room
+        self.mesh, self.room = mesh, room
         self._rng, self._samples = np.random.default_rng(seed), samples
         self._tensor = o3d.core.Tensor
         self._rays = o3d.t.geometry.RaycastingScene(nthreads=1)
@@ -163,7 +163,7 @@ class MeshScene:
         shares.reshape(-1, 3)[hits.ray] = np.column_stack([of_light, of_room, np.ones(len(key))])
         of_light, of_room, neighbours = cv2.blur(shares, (3, 3)).reshape(-1, 3)[hits.ray].T
         key, visible = key * of_light / neighbours, of_room / neighbours
-        around = self.lighting.irradiance(normal) * (_BLOCKED + (1 - _BLOCKED) * visible)[:, None]
+        around = self.room.irradiance(normal) * (_BLOCKED + (1 - _BLOCKED) * visible)[:, None]
         diffuse = (key[:, None] * light_colour + around) * albedo
 
         specular, roughness, opacity = self._properties[material].T
@@ -172,7 +172,7 @@ class MeshScene:
         exponent = 2 / np.maximum(roughness, 0.25) ** 4 - 2
         cosine = np.maximum(_dot(normal, _unit(light - view)), 0)
         highlight = key * (exponent + 8) / 8 * cosine**exponent
-        mirrored = self.lighting.reflection(view + 2 * facing[:, None] * normal, roughness) * visible[:, None]
+        mirrored = self.room.reflection(view + 2 * facing[:, None] * normal, roughness) * visible[:, None]
         colour = diffuse * (1 - reflectance) + reflectance * (mirrored + highlight[:, None] * light_colour)
 
         shaded = np.zeros((*size, 4), np.float32)
@@ -222,11 +222,11 @@ class MeshScene:
     ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
         """Return the radiance of the room with the shadow of the object, and the depth of the floor."""
         eye, flat_rays = camera.centre - self.origin, rays.reshape(-1, 3)
-        radiance, reach = self.lighting.radiance(eye, flat_rays, 1 / camera.focal_length.mean())
+        radiance, reach = self.room.radiance(eye, flat_rays, 1 / camera.focal_length.mean())
         floor = np.flatnonzero(reach)
         u, v = ((eye + reach[floor, None] * flat_rays[floor])[:, :2] / self._shadow_width + 0.5).T
         shares = sample_image(self._shadow, u, v, cv2.BORDER_CONSTANT)
-        radiance[floor] *= self.lighting.on_the_floor(*shares.T)
+        radiance[floor] *= self.room.on_the_floor(*shares.T)
         depth = np.where(reach < FLOOR_REACH, reach, 0).astype(np.float32)
         return radiance.reshape(rays.shape), depth.reshape(rays.shape[:2])
 

@@ -18,7 +18,7 @@ from zsp_lite.points import axis_deviation
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.primitives import TAU
 from zsp_lite.synthetic.raytracing import MeshScene, Rendering
-from zsp_lite.synthetic.room import RoomLight, random_room
+from zsp_lite.synthetic.room import random_room
 from zsp_lite.synthetic.textures import blur, smooth_noise
 
 _ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
@@ -88,7 +88,7 @@ def render_sequence(
     tall, wide = _ASPECTS[rng.integers(len(_ASPECTS))]
     size = round(tall / min(tall, wide) * image_size), round(wide / min(tall, wide) * image_size)
     cameras = handheld_sweep(mesh.vertices, rng, frames, size, heights)
-    scene = MeshScene(mesh, RoomLight(random_room(rng)), rng)
+    scene = MeshScene(mesh, random_room(rng), rng)
     first = cameras[0].matrix  # its frame is the world, so that the object's pose does not depend on the category
     to_object = np.linalg.inv(first)
     # The last digits of sines and products depend on the processor; rounding makes the files equal everywhere.
