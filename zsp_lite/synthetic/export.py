@@ -19,7 +19,7 @@ from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
 from zsp_lite.synthetic.assembly import Builder, make_shape, random_materials
 from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.ground_truth import POSES_FILE, ObjectPose, read_poses
-from zsp_lite.synthetic.meshes import TexturedMesh, list_models
+from zsp_lite.synthetic.meshes import TexturedMesh, canonical_mesh, list_models, read_mesh
 from zsp_lite.synthetic.sequences import HEIGHTS, record_sequence
 
 SETTINGS_FILE = "synthetic.json"  # in the data folder of procedural objects: the settings of the export
@@ -131,17 +131,18 @@ def export_models(
     elif out.is_dir() and Co3D(out).categories():
         raise InputError(f"folder {out} holds other data, expected an empty one or an export of models")
     for model in tqdm(models, "rendering", disable=None):
+        rotation = model.info.axes(model.path.suffix)  # to the canonical frame
         record = {
             "file": model.path.relative_to(folder).as_posix(),
             "sha256": sha256(model.path, "model"),
-            "rotation": np.round(model.info.axes(model.path.suffix), 9).ravel().tolist(),  # to the canonical frame
+            "rotation": np.round(rotation, 9).ravel().tolist(),
             **{name: getattr(model.info, name) for name in ("author", "licence", "source", "changes")},
         }
         known = rendered.sequences.get(model.category, {}).get(model.name) == record
         if known and model.name in read_poses(out, model.category):
             continue
         try:
-            mesh = model.read()
+            mesh = canonical_mesh(read_mesh(model.path), rotation)
         except InputError as error:
             left_out[f"{model.category}/{model.name}"] = str(error)
             continue

@@ -62,6 +62,11 @@ def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
     return float(np.sqrt(((middle - mean) ** 2 * area).sum(0) / area.sum()).mean())
 
 
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors (..., 3) scaled to unit length; zeros stay."""
+    return vectors / np.maximum(np.sqrt(np.einsum("...d,...d->...", vectors, vectors))[..., None], 1e-30)
+
+
 def box(size, centre=(0, 0, 0)) -> Mesh:
     """Return an axis-aligned box of the given size (3,)."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])

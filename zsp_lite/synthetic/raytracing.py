@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from zsp_lite.data.cameras import Camera
 from zsp_lite.io.ply import load_open3d
 from zsp_lite.synthetic.meshes import TexturedMesh
+from zsp_lite.synthetic.primitives import unit
 from zsp_lite.synthetic.room import FLOOR_REACH, Room
 from zsp_lite.synthetic.textures import pyramid, sample_image, sample_pyramid, srgb_to_linear
 
@@ -67,7 +68,7 @@ class MeshScene:
         self.origin = np.array([*(low + high)[:2] / 2, low[2]], np.float32)  # of the room
         first, second, third = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float32), 1, 0)
         cross = np.cross(second - first, third - first)  # normal, with twice the area of the face as its length
-        self._flat = _unit(cross)
+        self._flat = unit(cross)
         self._coordinates = (mesh.vertices if coordinates is None else coordinates)[mesh.faces].astype(np.float32)
         self._textures = [None if m.texture is None else pyramid(m.texture) for m in mesh.materials]
         self._has_holes = [m.texture is not None and bool(m.texture[..., 3].min() < 128) for m in mesh.materials]
@@ -142,12 +143,12 @@ class MeshScene:
         rays, material = rays.reshape(-1, 3)[hits.ray], self.mesh.material[hits.face]
         footprint = hits.distance / (camera.focal_length.mean() * self._samples)  # width of a sample, in units
         albedo = self._albedo(hits, footprint)
-        view, flat = _unit(rays), _towards(self._flat[hits.face], rays)
+        view, flat = unit(rays), _towards(self._flat[hits.face], rays)
         normal = _interpolated(hits.weights, self.mesh.normals[hits.face])
         normal *= np.where(_dot(normal, flat) < 0, np.float32(-1), np.float32(1))[:, None]
         # Visible points do not face away, though their interpolated normals may.
-        normal = _unit(normal)
-        normal = _unit(normal - np.maximum(_dot(normal, view) + 0.02, 0)[:, None] * view)
+        normal = unit(normal)
+        normal = unit(normal - np.maximum(_dot(normal, view) + 0.02, 0)[:, None] * view)
         facing = np.maximum(-_dot(normal, view), 0.02)
         point = camera.centre.astype(np.float32) + hits.distance[:, None] * rays + _OFFSET * flat
 
@@ -156,7 +157,7 @@ class MeshScene:
         lit, of_light = np.flatnonzero(key), np.ones(len(key), np.float32)
         of_light[lit] = self._visible_share(point[lit], self._towards_light(len(lit), 1))
         # Directions with a density of the cosine about the normal.
-        towards_room = _unit(normal[:, None] + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
+        towards_room = unit(normal[:, None] + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
         of_room = self._visible_share(point, towards_room)
         # Few rays per sample are noisy: each sample takes the mean of its neighbours on the object.
         shares = np.zeros((*size, 3), np.float32)
@@ -170,7 +171,7 @@ class MeshScene:
         # Reflectance by Schlick's approximation, the highlight by Blinn and Phong with its normalisation.
         reflectance = (specular + np.maximum(1 - roughness - specular, 0) * (1 - facing) ** 5)[:, None]
         exponent = 2 / np.maximum(roughness, 0.25) ** 4 - 2
-        cosine = np.maximum(_dot(normal, _unit(light - view)), 0)
+        cosine = np.maximum(_dot(normal, unit(light - view)), 0)
         highlight = key * (exponent + 8) / 8 * cosine**exponent
         mirrored = self.room.reflection(view + 2 * facing[:, None] * normal, roughness) * visible[:, None]
         colour = diffuse * (1 - reflectance) + reflectance * (mirrored + highlight[:, None] * light_colour)
@@ -201,7 +202,7 @@ class MeshScene:
     def _towards_light(self, n: int, count: int) -> Float[np.ndarray, "n {count} 3"]:
         """Return directions to random points of the key light, `count` for each of n points."""
         offset = np.float32(np.tan(self.room.light_radius)) * _spread_directions(self._rng, n, count)
-        return _unit(self.room.light.astype(np.float32) + offset)
+        return unit(self.room.light.astype(np.float32) + offset)
 
     def _shadow_on_the_floor(self) -> tuple[Float[np.ndarray, "n n 2"], float]:
         """Return the visible shares of the key light and of the room on a grid below the object, and its width."""
@@ -212,7 +213,7 @@ class MeshScene:
         x, y = np.meshgrid(line, line)
         point = np.stack([x, y, np.full_like(x, _OFFSET)], -1).reshape(-1, 3) + self.origin
         towards_light = self._towards_light(len(point), _RAYS)
-        towards_room = _unit(np.float32([0, 0, 1]) + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
+        towards_room = unit(np.float32([0, 0, 1]) + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
         key = self._visible_share(point, towards_light).reshape(n, n)
         around = self._visible_share(point, towards_room).reshape(n, n)
         return np.dstack([cv2.GaussianBlur(key, (0, 0), 0.8), cv2.GaussianBlur(around, (0, 0), 2.0)]), width
@@ -252,11 +253,6 @@ def _towards(normal: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]) -
 def _dot(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Return the scalar products of the rows."""
     return np.einsum("nd,nd->n", one, other)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors (..., 3) scaled to unit length."""
-    return vectors / np.maximum(np.sqrt(np.einsum("...d,...d->...", vectors, vectors))[..., None], 1e-12)
 
 
 def _spread_directions(rng: np.random.Generator, n: int, count: int) -> Float[np.ndarray, "n {count} 3"]:
