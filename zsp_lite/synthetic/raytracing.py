@@ -155,7 +155,7 @@ class MeshScene:
         light, light_colour = self.room.light.astype(np.float32), self.room.light_colour.astype(np.float32)
         key = np.maximum(normal @ light, 0) * (flat @ light > 0)
         lit, of_light = np.flatnonzero(key), np.ones(len(key), np.float32)
-        of_light[lit] = self._visible_share(point[lit], self._towards_light(len(lit), 1))
+        of_light[lit] = self._lit_share(point[lit], 1)
         # Directions with a density of the cosine about the normal.
         towards_room = unit(normal[:, None] + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
         of_room = self._visible_share(point, towards_room)
@@ -199,10 +199,10 @@ class MeshScene:
         # Artists use pure black and fully saturated colours; real surfaces reflect a few percent of all colours.
         return 0.015 + 0.8 * albedo
 
-    def _towards_light(self, n: int, count: int) -> Float[np.ndarray, "n {count} 3"]:
-        """Return directions to random points of the key light, `count` for each of n points."""
-        offset = np.float32(np.tan(self.room.light_radius)) * _spread_directions(self._rng, n, count)
-        return unit(self.room.light.astype(np.float32) + offset)
+    def _lit_share(self, point: Float[np.ndarray, "n 3"], count: int) -> np.ndarray:
+        """Return the share (n,) of the key light that the object does not block, by `count` rays from each point."""
+        offset = np.float32(np.tan(self.room.light_radius)) * _spread_directions(self._rng, len(point), count)
+        return self._visible_share(point, unit(self.room.light.astype(np.float32) + offset))
 
     def _shadow_on_the_floor(self) -> tuple[Float[np.ndarray, "n n 2"], float]:
         """Return the visible shares of the key light and of the room on a grid below the object, and its width."""
@@ -212,9 +212,8 @@ class MeshScene:
         line = ((np.arange(n, dtype=np.float32) + 0.5) / n - 0.5) * width
         x, y = np.meshgrid(line, line)
         point = np.stack([x, y, np.full_like(x, _OFFSET)], -1).reshape(-1, 3) + self.origin
-        towards_light = self._towards_light(len(point), _RAYS)
+        key = self._lit_share(point, _RAYS).reshape(n, n)
         towards_room = unit(np.float32([0, 0, 1]) + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
-        key = self._visible_share(point, towards_light).reshape(n, n)
         around = self._visible_share(point, towards_room).reshape(n, n)
         return np.dstack([cv2.GaussianBlur(key, (0, 0), 0.8), cv2.GaussianBlur(around, (0, 0), 2.0)]), width
 
