@@ -60,9 +60,6 @@ def test_objects_of_a_category_are_unit_sized_vary_and_do_not_coincide_with_them
     assert np.linalg.norm(shapes[3].vertices[:, None] - turned[None, ::3], axis=-1).min(0).max() > 0.2
 
 
-# Sequences
-
-
 # Sensor
 
 
