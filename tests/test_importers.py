@@ -25,9 +25,9 @@ METRES = 0.13  # per unit of the rendered world: the object is about 30 cm wide
 def hairdryer_views():
     """Eight views around a hairdryer, in metres."""
     shape = make_object("hairdryer", 0, 4)
-    rendered = render_sequence(shape, np.random.default_rng(2), 8, 96)
+    exact, _ = render_sequence(shape, np.random.default_rng(2), 8, 96)
     frames = []
-    for view in rendered.views:
+    for view in exact:
         camera = replace(view.camera, t=view.camera.t * METRES)
         depth = (view.depth * METRES).astype(np.float32)
         frames.append(Frame(view.rgb, depth, view.mask.astype(np.float32), camera, f"{len(frames):04d}"))

@@ -18,7 +18,7 @@ from zsp_lite.synthetic.assembly import make_shape
 from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.export import export_categories, make_object, sequence_name, shape_turns
 from zsp_lite.synthetic.primitives import surface_spread
-from zsp_lite.synthetic.sequences import record_sequence, soft_mask, stereo_depth
+from zsp_lite.synthetic.sequences import record_sequence, render_sequence, soft_mask, stereo_depth
 
 ALL = {name: build for builders in (*SPLITS.values(), CATEGORIES) for name, build in builders.items()}
 SEED, FRAMES, SIZE = 5, 6, 72
@@ -33,11 +33,13 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def chairs():
-    """Two chairs with simulated sensor errors, each with its exact rendering."""
+    """Two chairs with simulated sensor errors, each with its exact pose and scale, and its exact views before that."""
 
     def recorded(index):
         name, key = sequence_name(SEED, "chair", index), stable_hash(f"{SEED}/chair/{index}")
-        return record_sequence(make_object("chair", index, SEED), name, key, FRAMES, SIZE)
+        mesh = make_object("chair", index, SEED)
+        views, _ = render_sequence(mesh, np.random.default_rng([key, 1]), FRAMES, SIZE)
+        return *record_sequence(mesh, name, key, FRAMES, SIZE), views
 
     return [recorded(0), recorded(1)]
 
@@ -58,9 +60,6 @@ def test_objects_of_a_category_are_unit_sized_vary_and_do_not_coincide_with_them
     assert np.linalg.norm(shapes[3].vertices[:, None] - turned[None, ::3], axis=-1).min(0).max() > 0.2
 
 
-# Sequences
-
-
 # Sensor
 
 
@@ -70,32 +69,32 @@ def test_depth_has_holes_and_noise_and_masks_are_soft_and_accurate_to_two_pixels
     mask = soft_mask(truth, np.random.default_rng(0))
     assert mask[30:50, 30:50].min() > 0.99 and mask[:16].max() < 0.1
     assert ((mask > 0.1) & (mask < 0.9)).sum() > 100
-    for data, exact in chairs:
-        for frame, view in zip(data.frames, exact.views, strict=True):
+    for data, _, scale, views in chairs:
+        for frame, view in zip(data.frames, views, strict=True):
             known = frame.depth[view.mask] > 0
             assert 0.45 < known.mean() < 0.8  # and the others are holes
-            assert np.abs(frame.depth / np.where(view.depth > 0, view.depth, 1) - 1)[view.mask][known].mean() < 0.02
+            assert np.abs(frame.depth[view.mask] / (scale * view.depth[view.mask]) - 1)[known].mean() < 0.02
             inside = view.mask.astype(np.uint8)
             to_edge = cv2.distanceTransform(inside, cv2.DIST_L2, 5) + cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
             wrong = (frame.mask > 0.5) != view.mask
             assert 0 < wrong.sum() and to_edge[wrong].max() <= 2.5
-    edge_on = replace(chairs[0][1].views[0], mask=np.zeros_like(chairs[0][1].views[0].mask))  # of a flat object
+    edge_on = replace(view, mask=np.zeros_like(view.mask))  # of a flat object
     assert np.isfinite(stereo_depth(edge_on, 0.3, 0.2, np.random.default_rng(0))).all()
 
 
 def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):
-    for data, exact in chairs:
+    for data, pose, scale, views in chairs:
         assert data.points.std(0).mean() == pytest.approx(1)
         np.testing.assert_allclose(np.linalg.norm(data.normals, axis=1), 1, atol=1e-4)
-        R, t = exact.object_pose[:3, :3], exact.object_pose[:3, 3]
-        canonical = (data.points - t) @ R / exact.scale
-        seen = np.concatenate([view.canonical[view.mask] for view in exact.views])
+        R, t = pose[:3, :3], pose[:3, 3]
+        canonical = (data.points - t) @ R / scale
+        seen = np.concatenate([view.canonical[view.mask] for view in views])
         assert (canonical > seen.min(0) - 0.3).all() and (canonical < seen.max(0) + 0.3).all()
-        for view in exact.views:  # canonical coordinates project onto their own pixels and depth
+        for frame, view in zip(data.frames, views, strict=True):  # coordinates project onto their own pixels and depth
             row, col = np.nonzero(view.mask)
-            pixels, depth = view.camera.project(exact.scale * view.canonical[row, col].astype(float) @ R.T + t)
+            pixels, depth = frame.camera.project(scale * view.canonical[row, col].astype(float) @ R.T + t)
             assert np.abs(pixels - np.stack([col + 0.5, row + 0.5], 1)).max() < 0.02
-            np.testing.assert_allclose(depth, view.depth[row, col], rtol=1e-4)
+            np.testing.assert_allclose(depth, scale * view.depth[row, col], rtol=1e-4)
 
 
 # Export
@@ -105,8 +104,8 @@ def test_an_export_reads_back(folder, chairs):
     dataset = Co3D(folder)
     assert dataset.categories() == ["chair", "toytruck"]
     assert len(dataset.select("toytruck")) == 2
-    assert list(read_labels(folder, "chair")) == [data.name for data, _ in chairs]
-    for data, _ in chairs:
+    assert list(read_labels(folder, "chair")) == [data.name for data, *_ in chairs]
+    for data, *_ in chairs:
         np.testing.assert_allclose(dataset.point_cloud("chair", data.name)[0], data.points, atol=1e-4)
         for annotation, wanted in zip(dataset.frames("chair", data.name), data.frames, strict=True):
             np.testing.assert_allclose(dataset.load(annotation).depth, wanted.depth, rtol=1e-3)

@@ -19,8 +19,8 @@ from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
 from zsp_lite.synthetic.assembly import Builder, make_shape, random_materials
 from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.ground_truth import POSES_FILE, ObjectPose, read_poses
-from zsp_lite.synthetic.meshes import TexturedMesh, list_models
-from zsp_lite.synthetic.sequences import HEIGHTS, RenderedSequence, record_sequence
+from zsp_lite.synthetic.meshes import TexturedMesh, canonical_mesh, list_models, read_mesh
+from zsp_lite.synthetic.sequences import HEIGHTS, record_sequence
 
 SETTINGS_FILE = "synthetic.json"  # in the data folder of procedural objects: the settings of the export
 RENDERED_FILE = "rendered_models.json"  # in that of models: the settings, and the model of each sequence
@@ -131,17 +131,18 @@ def export_models(
     elif out.is_dir() and Co3D(out).categories():
         raise InputError(f"folder {out} holds other data, expected an empty one or an export of models")
     for model in tqdm(models, "rendering", disable=None):
+        rotation = model.info.axes(model.path.suffix)  # to the canonical frame
         record = {
             "file": model.path.relative_to(folder).as_posix(),
             "sha256": sha256(model.path, "model"),
-            "rotation": np.round(model.info.axes(model.path.suffix), 9).ravel().tolist(),  # to the canonical frame
+            "rotation": np.round(rotation, 9).ravel().tolist(),
             **{name: getattr(model.info, name) for name in ("author", "licence", "source", "changes")},
         }
         known = rendered.sequences.get(model.category, {}).get(model.name) == record
         if known and model.name in read_poses(out, model.category):
             continue
         try:
-            mesh = model.read()
+            mesh = canonical_mesh(read_mesh(model.path), rotation)
         except InputError as error:
             left_out[f"{model.category}/{model.name}"] = str(error)
             continue
@@ -172,14 +173,14 @@ def _check_same_settings(out: Path, found: Mapping, settings: Mapping) -> None:
 
 
 def write_sequence(
-    out: Path, category: str, mesh: TexturedMesh, recorded: tuple[SequenceData, RenderedSequence]
+    out: Path, category: str, mesh: TexturedMesh, recorded: tuple[SequenceData, Float[np.ndarray, "4 4"], float]
 ) -> None:
     """Add a recorded sequence to a data folder; its pose is written last, so that a sequence with one is complete."""
-    data, exact = recorded
+    data, pose, scale = recorded
     write_co3d(out, category, [data], quality=88)
     low, high = mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()
     poses = read_poses(out, category)
-    poses[data.name] = ObjectPose(exact.object_pose.tolist(), exact.scale, low, high, shape_turns(mesh.vertices))
+    poses[data.name] = ObjectPose(pose.tolist(), scale, low, high, shape_turns(mesh.vertices))
     write_atomic(out / category / POSES_FILE, json.dumps(msgspec.to_builtins(poses), indent=1).encode())
 
 
@@ -192,15 +193,13 @@ def shape_turns(vertices: Float[np.ndarray, "v 3"]) -> tuple[int, ...]:
     return tuple(turn for turn, farthest in distance.items() if farthest < 0.03 * np.ptp(points))
 
 
-def write_labels(out: Path, category: str, names: Iterable[str]) -> None:
+def write_labels(out: Path, category: str, names: Sequence[str]) -> None:
     """Write the pose labels of sequences from their object poses; the first name is the reference."""
     poses = {name: np.array(pose.trans) for name, pose in read_poses(out, category).items()}
-    reference, *others = names
-    write_label(out, category, PoseLabel(np.eye(4), reference, reference))
-    for name in others:
-        # Rounded, to be equal on all processors, and without negative zeros.
-        trans = np.round(poses[name] @ np.linalg.inv(poses[reference]), 12) + 0.0
-        write_label(out, category, PoseLabel(trans, name, reference))
+    for name in names:
+        # Rounded, to be equal on all processors, and without negative zeros; of the reference, exactly the identity.
+        trans = np.round(poses[name] @ np.linalg.inv(poses[names[0]]), 12) + 0.0
+        write_label(out, category, PoseLabel(trans, name, names[0]))
 
 
 def write_pairs(out: Path, category: str, pairs: int, targets: Iterable[int], seed: int) -> None:

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, UInt8
 
 from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import file_size, plain_name, read_bytes, read_json
-from zsp_lite.synthetic.primitives import Mesh, joined, surface_spread
+from zsp_lite.synthetic.primitives import Mesh, joined, surface_spread, unit
 from zsp_lite.synthetic.textures import linear_to_srgb
 
 EXTENSIONS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".dae")
@@ -84,10 +84,6 @@ class Model:
     name: str
     path: Path
     info: ModelInfo
-
-    def read(self) -> TexturedMesh:
-        """Read the mesh in canonical coordinates; InputError if `read_mesh` refuses it."""
-        return canonical_mesh(read_mesh(self.path), self.info.axes(self.path.suffix))
 
 
 def list_models(folder: str | Path, front: str | None = None, up: str | None = None) -> list[Model]:
@@ -257,7 +253,7 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray,
     size = _size(vertices)
     a, b, c = np.moveaxis(vertices[faces] / size, 1, 0)
     weighted = np.cross(b - a, c - a)  # by area
-    unit = _unit(weighted)
+    normal = unit(weighted)
     # Corners in the order of their points, and in `first` the position of the first corner of the same point.
     _, point = np.unique(np.round(vertices / size, 6), axis=0, return_inverse=True)
     point = point.ravel()[faces.ravel()]
@@ -269,11 +265,7 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray,
     for step in range(min(int(counts.max()), _FACES_PER_POINT)):  # every corner with the step-th corner of its point
         several = several[counts[of[several]] > step]
         other = face[first[of[several]] + step]
-        close = np.einsum("nd,nd->n", unit[face[several]], unit[other]) > _CREASE
+        close = np.einsum("nd,nd->n", normal[face[several]], normal[other]) > _CREASE
         total[corner[several[close]]] += weighted[other[close]]
-    normals = _unit(np.where(total.any(1, keepdims=True), total, np.repeat(unit, 3, axis=0)))
+    normals = unit(np.where(total.any(1, keepdims=True), total, np.repeat(normal, 3, axis=0)))
     return normals.reshape(-1, 3, 3).astype(np.float32)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)

@@ -62,6 +62,11 @@ def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
     return float(np.sqrt(((middle - mean) ** 2 * area).sum(0) / area.sum()).mean())
 
 
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors (..., 3) scaled to unit length; zeros stay."""
+    return vectors / np.maximum(np.sqrt(np.einsum("...d,...d->...", vectors, vectors))[..., None], 1e-30)
+
+
 def box(size, centre=(0, 0, 0)) -> Mesh:
     """Return an axis-aligned box of the given size (3,)."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -126,11 +131,10 @@ def extrusion(outline, thickness: float, plane: str = "xz", offset: float = 0.0)
     outline = np.asarray(outline, float)
     n = len(outline)
     flat = np.concatenate([outline, [outline.mean(0)]])
+    across = np.repeat([-thickness / 2, thickness / 2], n + 1) + offset
     i, k = np.arange(n), (np.arange(n) + 1) % n
     back, front, hub = np.full(n, n), n + 1, np.full(n, 2 * n + 1)
     faces = [[back, i, k], [hub, front + k, front + i], [i, k, front + k], [i, front + k, front + i]]
     vertices = np.zeros((2 * n + 2, 3))
-    u, v, w = _PLANES[plane]
-    vertices[:, u], vertices[:, v] = np.tile(flat[:, 0], 2), np.tile(flat[:, 1], 2)
-    vertices[:, w] = np.repeat([-thickness / 2, thickness / 2], n + 1) + offset
+    vertices[:, _PLANES[plane]] = np.column_stack([np.tile(flat, (2, 1)), across])
     return Mesh(vertices, np.stack([np.stack(f, 1) for f in faces], 1).reshape(-1, 3))

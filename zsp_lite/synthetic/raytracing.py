@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, UInt8
 from zsp_lite.data.cameras import Camera
 from zsp_lite.io.ply import load_open3d
 from zsp_lite.synthetic.meshes import TexturedMesh
-from zsp_lite.synthetic.room import FLOOR_REACH, RoomLight
+from zsp_lite.synthetic.primitives import unit
+from zsp_lite.synthetic.room import FLOOR_REACH, Room
 from zsp_lite.synthetic.textures import pyramid, sample_image, sample_pyramid, srgb_to_linear
 
 _LAYERS = 4  # surfaces with holes that a ray passes through
@@ -51,13 +52,13 @@ class MeshScene:
     def __init__(
         self,
         mesh: TexturedMesh,
-        lighting: RoomLight,
+        room: Room,
         seed: int | np.random.Generator,
         coordinates: Float[np.ndarray, "v 3"] | None = None,  # of the object that the mesh is a deformed copy of
         samples: int = 2,  # per pixel, along each axis
     ):
         o3d = load_open3d()
-        self.mesh, self.lighting, self.room = mesh, lighting, lighting.room
+        self.mesh, self.room = mesh, room
         self._rng, self._samples = np.random.default_rng(seed), samples
         self._tensor = o3d.core.Tensor
         self._rays = o3d.t.geometry.RaycastingScene(nthreads=1)
@@ -67,7 +68,7 @@ class MeshScene:
         self.origin = np.array([*(low + high)[:2] / 2, low[2]], np.float32)  # of the room
         first, second, third = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float32), 1, 0)
         cross = np.cross(second - first, third - first)  # normal, with twice the area of the face as its length
-        self._flat = _unit(cross)
+        self._flat = unit(cross)
         self._coordinates = (mesh.vertices if coordinates is None else coordinates)[mesh.faces].astype(np.float32)
         self._textures = [None if m.texture is None else pyramid(m.texture) for m in mesh.materials]
         self._has_holes = [m.texture is not None and bool(m.texture[..., 3].min() < 128) for m in mesh.materials]
@@ -142,37 +143,37 @@ class MeshScene:
         rays, material = rays.reshape(-1, 3)[hits.ray], self.mesh.material[hits.face]
         footprint = hits.distance / (camera.focal_length.mean() * self._samples)  # width of a sample, in units
         albedo = self._albedo(hits, footprint)
-        view, flat = _unit(rays), _towards(self._flat[hits.face], rays)
+        view, flat = unit(rays), _towards(self._flat[hits.face], rays)
         normal = _interpolated(hits.weights, self.mesh.normals[hits.face])
         normal *= np.where(_dot(normal, flat) < 0, np.float32(-1), np.float32(1))[:, None]
         # Visible points do not face away, though their interpolated normals may.
-        normal = _unit(normal)
-        normal = _unit(normal - np.maximum(_dot(normal, view) + 0.02, 0)[:, None] * view)
+        normal = unit(normal)
+        normal = unit(normal - np.maximum(_dot(normal, view) + 0.02, 0)[:, None] * view)
         facing = np.maximum(-_dot(normal, view), 0.02)
         point = camera.centre.astype(np.float32) + hits.distance[:, None] * rays + _OFFSET * flat
 
         light, light_colour = self.room.light.astype(np.float32), self.room.light_colour.astype(np.float32)
         key = np.maximum(normal @ light, 0) * (flat @ light > 0)
         lit, of_light = np.flatnonzero(key), np.ones(len(key), np.float32)
-        of_light[lit] = self._visible_share(point[lit], self._towards_light(len(lit), 1))
+        of_light[lit] = self._lit_share(point[lit], 1)
         # Directions with a density of the cosine about the normal.
-        towards_room = _unit(normal[:, None] + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
+        towards_room = unit(normal[:, None] + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
         of_room = self._visible_share(point, towards_room)
         # Few rays per sample are noisy: each sample takes the mean of its neighbours on the object.
         shares = np.zeros((*size, 3), np.float32)
         shares.reshape(-1, 3)[hits.ray] = np.column_stack([of_light, of_room, np.ones(len(key))])
         of_light, of_room, neighbours = cv2.blur(shares, (3, 3)).reshape(-1, 3)[hits.ray].T
         key, visible = key * of_light / neighbours, of_room / neighbours
-        around = self.lighting.irradiance(normal) * (_BLOCKED + (1 - _BLOCKED) * visible)[:, None]
+        around = self.room.irradiance(normal) * (_BLOCKED + (1 - _BLOCKED) * visible)[:, None]
         diffuse = (key[:, None] * light_colour + around) * albedo
 
         specular, roughness, opacity = self._properties[material].T
         # Reflectance by Schlick's approximation, the highlight by Blinn and Phong with its normalisation.
         reflectance = (specular + np.maximum(1 - roughness - specular, 0) * (1 - facing) ** 5)[:, None]
         exponent = 2 / np.maximum(roughness, 0.25) ** 4 - 2
-        cosine = np.maximum(_dot(normal, _unit(light - view)), 0)
+        cosine = np.maximum(_dot(normal, unit(light - view)), 0)
         highlight = key * (exponent + 8) / 8 * cosine**exponent
-        mirrored = self.lighting.reflection(view + 2 * facing[:, None] * normal, roughness) * visible[:, None]
+        mirrored = self.room.reflection(view + 2 * facing[:, None] * normal, roughness) * visible[:, None]
         colour = diffuse * (1 - reflectance) + reflectance * (mirrored + highlight[:, None] * light_colour)
 
         shaded = np.zeros((*size, 4), np.float32)
@@ -198,10 +199,10 @@ class MeshScene:
         # Artists use pure black and fully saturated colours; real surfaces reflect a few percent of all colours.
         return 0.015 + 0.8 * albedo
 
-    def _towards_light(self, n: int, count: int) -> Float[np.ndarray, "n {count} 3"]:
-        """Return directions to random points of the key light, `count` for each of n points."""
-        offset = np.float32(np.tan(self.room.light_radius)) * _spread_directions(self._rng, n, count)
-        return _unit(self.room.light.astype(np.float32) + offset)
+    def _lit_share(self, point: Float[np.ndarray, "n 3"], count: int) -> np.ndarray:
+        """Return the share (n,) of the key light that the object does not block, by `count` rays from each point."""
+        offset = np.float32(np.tan(self.room.light_radius)) * _spread_directions(self._rng, len(point), count)
+        return self._visible_share(point, unit(self.room.light.astype(np.float32) + offset))
 
     def _shadow_on_the_floor(self) -> tuple[Float[np.ndarray, "n n 2"], float]:
         """Return the visible shares of the key light and of the room on a grid below the object, and its width."""
@@ -211,9 +212,8 @@ class MeshScene:
         line = ((np.arange(n, dtype=np.float32) + 0.5) / n - 0.5) * width
         x, y = np.meshgrid(line, line)
         point = np.stack([x, y, np.full_like(x, _OFFSET)], -1).reshape(-1, 3) + self.origin
-        towards_light = self._towards_light(len(point), _RAYS)
-        towards_room = _unit(np.float32([0, 0, 1]) + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
-        key = self._visible_share(point, towards_light).reshape(n, n)
+        key = self._lit_share(point, _RAYS).reshape(n, n)
+        towards_room = unit(np.float32([0, 0, 1]) + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
         around = self._visible_share(point, towards_room).reshape(n, n)
         return np.dstack([cv2.GaussianBlur(key, (0, 0), 0.8), cv2.GaussianBlur(around, (0, 0), 2.0)]), width
 
@@ -222,11 +222,11 @@ class MeshScene:
     ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
         """Return the radiance of the room with the shadow of the object, and the depth of the floor."""
         eye, flat_rays = camera.centre - self.origin, rays.reshape(-1, 3)
-        radiance, reach = self.lighting.radiance(eye, flat_rays, 1 / camera.focal_length.mean())
+        radiance, reach = self.room.radiance(eye, flat_rays, 1 / camera.focal_length.mean())
         floor = np.flatnonzero(reach)
         u, v = ((eye + reach[floor, None] * flat_rays[floor])[:, :2] / self._shadow_width + 0.5).T
         shares = sample_image(self._shadow, u, v, cv2.BORDER_CONSTANT)
-        radiance[floor] *= self.lighting.on_the_floor(*shares.T)
+        radiance[floor] *= self.room.on_the_floor(*shares.T)
         depth = np.where(reach < FLOOR_REACH, reach, 0).astype(np.float32)
         return radiance.reshape(rays.shape), depth.reshape(rays.shape[:2])
 
@@ -252,11 +252,6 @@ def _towards(normal: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]) -
 def _dot(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Return the scalar products of the rows."""
     return np.einsum("nd,nd->n", one, other)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors (..., 3) scaled to unit length."""
-    return vectors / np.maximum(np.sqrt(np.einsum("...d,...d->...", vectors, vectors))[..., None], 1e-12)
 
 
 def _spread_directions(rng: np.random.Generator, n: int, count: int) -> Float[np.ndarray, "n {count} 3"]:

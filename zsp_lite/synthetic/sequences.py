@@ -5,7 +5,7 @@ grazing angles. Its masks come from a segmentation network (PointRend), accurate
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from zsp_lite.points import axis_deviation
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.primitives import TAU
 from zsp_lite.synthetic.raytracing import MeshScene, Rendering
-from zsp_lite.synthetic.room import RoomLight, random_room
+from zsp_lite.synthetic.room import random_room
 from zsp_lite.synthetic.textures import blur, smooth_noise
 
 _ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
@@ -30,16 +30,6 @@ _OBJECT_HOLES, _FLOOR_HOLES = (0.28, 0.46), (0.1, 0.3)
 # Ranges of CO3D's viewpoint quality and point cloud quality in the sequences that the paper labels, and of CO3D's
 # factor from stored depth to depth.
 _SCORES = (1.3, 3.0), (0.35, 1.0), (0.4, 2.5)
-
-
-@dataclass(frozen=True, eq=False)
-class RenderedSequence:
-    """Exact views of one object, and the pose of the object in the world of the sequence."""
-
-    views: tuple[Rendering, ...]  # their cameras map from the world
-    timestamps: tuple[float, ...]  # seconds
-    object_pose: Float[np.ndarray, "4 4"]  # rigid transform [R t]: `world = R @ (scale * canonical) + t`
-    scale: float
 
 
 def orbit_pose(azimuth: float, elevation: float, roll: float, distance: float, target) -> tuple[np.ndarray, np.ndarray]:
@@ -90,12 +80,15 @@ def handheld_sweep(
 
 def render_sequence(
     mesh: TexturedMesh, rng: np.random.Generator, frames: int, image_size: int, heights: tuple[float, float] = HEIGHTS
-) -> RenderedSequence:
-    """Render views around an object in a random room; `image_size` is the shorter image side."""
+) -> tuple[list[Rendering], Float[np.ndarray, "4 4"]]:
+    """Render exact views around an object in a random room; `image_size` is the shorter image side.
+
+    Their cameras map from the world of the sequence, the second result from the object to it.
+    """
     tall, wide = _ASPECTS[rng.integers(len(_ASPECTS))]
     size = round(tall / min(tall, wide) * image_size), round(wide / min(tall, wide) * image_size)
     cameras = handheld_sweep(mesh.vertices, rng, frames, size, heights)
-    scene = MeshScene(mesh, RoomLight(random_room(rng)), rng)
+    scene = MeshScene(mesh, random_room(rng), rng)
     first = cameras[0].matrix  # its frame is the world, so that the object's pose does not depend on the category
     to_object = np.linalg.inv(first)
     # The last digits of sines and products depend on the processor; rounding makes the files equal everywhere.
@@ -104,8 +97,7 @@ def render_sequence(
         view = scene.render(camera)
         pose = np.round(view.camera.matrix @ to_object, 9) + 0.0  # no negative zeros
         views.append(replace(view, camera=replace(view.camera, R=pose[:3, :3], t=pose[:3, 3])))
-    seconds = np.round(np.arange(frames) * rng.uniform(0.4, 0.9), 3)
-    return RenderedSequence(tuple(views), tuple(seconds.tolist()), np.round(first, 9), 1.0)
+    return views, np.round(first, 9)
 
 
 def stereo_depth(
@@ -168,28 +160,27 @@ def fused_cloud(
 
 def record_sequence(
     mesh: TexturedMesh, name: str, key: int, frames: int, image_size: int, heights: tuple[float, float] = HEIGHTS
-) -> tuple[SequenceData, RenderedSequence]:
-    """Return a sequence with the errors of CO3D's data, and the exact one; the point cloud has CO3D's unit spread."""
-    sequence = render_sequence(mesh, np.random.default_rng([key, 1]), frames, image_size, heights)
+) -> tuple[SequenceData, Float[np.ndarray, "4 4"], float]:
+    """Return a sequence with the errors of CO3D's data, whose point cloud has CO3D's unit spread.
+
+    The other results are the object's exact pose [R t] and scale in it: `world = R @ (scale * canonical) + t`.
+    """
+    rng = np.random.default_rng([key, 1])
+    views, pose = render_sequence(mesh, rng, frames, image_size, heights)
+    seconds = np.round(np.arange(frames) * rng.uniform(0.4, 0.9), 3).tolist()
     rng = np.random.default_rng([key, 2])
     object_holes, floor_holes = rng.uniform(*_OBJECT_HOLES), rng.uniform(*_FLOOR_HOLES)
     depths, masks = [], []
-    for view in sequence.views:
+    for view in views:
         shares = np.clip(np.array([object_holes, floor_holes]) + rng.normal(0, 0.03, 2), 0.05, 0.9)
         depths.append(stereo_depth(view, *shares, rng))
         masks.append(soft_mask(view.mask, rng))
-    points, normals, colours = fused_cloud(sequence.views, depths, int(rng.integers(5000, 8001)), rng)
+    points, normals, colours = fused_cloud(views, depths, int(rng.integers(5000, 8001)), rng)
     factor = round(1 / axis_deviation(points), 9)
-    views = [
-        replace(view, depth=view.depth * np.float32(factor), camera=replace(view.camera, t=view.camera.t * factor))
-        for view in sequence.views
-    ]
-    pose = sequence.object_pose.copy()
     pose[:3, 3] *= factor
-    exact = replace(sequence, views=tuple(views), object_pose=pose, scale=factor)
     recorded = [
-        Frame(view.rgb, depth * np.float32(factor), mask, view.camera, f"{name}/{number}")
-        for number, (view, depth, mask) in enumerate(zip(views, depths, masks, strict=True))
+        Frame(view.rgb, depth * np.float32(factor), mask, replace(view.camera, t=view.camera.t * factor))
+        for view, depth, mask in zip(views, depths, masks, strict=True)
     ]
     scores = [round(rng.uniform(*limits), 4) for limits in _SCORES]
-    return SequenceData(name, recorded, sequence.timestamps, points * factor, colours, normals, *scores), exact
+    return SequenceData(name, recorded, seconds, points * factor, colours, normals, *scores), pose, factor

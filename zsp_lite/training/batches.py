@@ -37,13 +37,10 @@ def crop_grids(
     # Each group is mirrored as a whole or not.
     flip = np.repeat(rng.choice([-1.0, 1.0], n // per_object), per_object)
     c, s = np.cos(angle), np.sin(angle)
-    affine = np.stack([
-        np.stack([width * c * flip, -width * s, x], 1),
-        np.stack([height * s * flip, height * c, y], 1),
-    ], 1).astype(np.float32)  # fmt: skip
-    grid = F.affine_grid(torch.from_numpy(affine), (n, 1, side, side), align_corners=False)
-    turn = np.stack([np.stack([flip * c, flip * s], 1), np.stack([-s, c], 1)], 1).astype(np.float32)
-    return grid, torch.from_numpy(turn)
+    affine = np.array([[width * c * flip, -width * s, x], [height * s * flip, height * c, y]], np.float32)
+    turn = np.array([[flip * c, flip * s], [-s, c]], np.float32)
+    affine, turn = (torch.from_numpy(matrix).permute(2, 0, 1).contiguous() for matrix in (affine, turn))
+    return F.affine_grid(affine, (n, 1, side, side), align_corners=False), turn
 
 
 def recolour(rng: np.random.Generator, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:

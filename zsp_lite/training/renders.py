@@ -17,7 +17,7 @@ from zsp_lite.synthetic.assembly import Assembly, make_shape, random_materials
 from zsp_lite.synthetic.meshes import TexturedMesh
 from zsp_lite.synthetic.primitives import TAU, Mesh, box, capsule, cylinder, ellipsoid, extrusion, torus
 from zsp_lite.synthetic.raytracing import MeshScene, Rendering
-from zsp_lite.synthetic.room import RoomLight, random_room
+from zsp_lite.synthetic.room import Room, random_room
 from zsp_lite.synthetic.sequences import orbit_pose
 
 VIEWS = 8  # per object
@@ -100,11 +100,11 @@ def render_instance(
 
 
 @lru_cache(maxsize=ROOMS)
-def _room(index: int) -> RoomLight:
+def _room(index: int) -> Room:
     """Return a room in half the resolution, to save memory."""
     room = random_room(index)
     halves = (cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in room.images)
-    return RoomLight(replace(room, images=tuple(halves)))
+    return replace(room, images=tuple(halves))
 
 
 def build_random_object(a: Assembly) -> None:

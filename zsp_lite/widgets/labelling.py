@@ -145,9 +145,8 @@ class _LabellingWidget:
         return f"Written: {'/'.join(path.parts[-3:])}. {self.next()}"
 
     def skip(self) -> str:
-        sequence = self.current
-        self.labelling.skip(sequence)
-        return f"{sequence} is skipped. {self.next()}"
+        self.labelling.skip(self.current)
+        return f"{self.current} is skipped. {self.next()}"
 
     def next(self) -> str:
         """Go to the next open sequence."""
