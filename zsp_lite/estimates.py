@@ -131,6 +131,7 @@ class Vote:
     name: str  # the frame, such as "frame 12 of my_cup"
     estimate: PoseEstimate  # its own: of this frame's object in views of the other
     degrees: float  # angle from its best rotation to that of the answer
+    backward: bool  # whether it is a frame of the target, in views of the reference
 
 
 @dataclass(frozen=True, eq=False)

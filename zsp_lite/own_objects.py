@@ -281,7 +281,7 @@ def _agreed_pose(
         if max(a, b) < 2:
             name = f"frame {scans[a].source.numbers[position]} of {scans[a].source.name}"
             degrees = float(rotation_error(estimate.world_sim3.R, agreement.between(names[a], names[b]).R))
-            votes.append(Vote(name, _in_units(estimate, scans[a].scale, scans[b].scale, ()), degrees))
+            votes.append(Vote(name, _in_units(estimate, scans[a].scale, scans[b].scale, ()), degrees, a > b))
     against = [vote.name for vote in votes if vote.degrees > SAME_ANGLE]
     flags = [f"{len(against)} of {len(votes)} frames vote for another pose: {', '.join(against)}"] if against else []
     return _answer(next(iter(found.values())), method, answers, flags), tuple(votes)
