@@ -3,12 +3,11 @@
 from dataclasses import replace
 
 import pytest
-import torch
 from benchmark_folder import BACKBONE, run_rows, small_folder
 
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.benchmark import problem
-from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, resolve
+from zsp_lite.benchmark.methods import GROUPS, METHODS, resolve
 from zsp_lite.benchmark.problem import FrameStore, Problem
 from zsp_lite.benchmark.runs import read_run
 from zsp_lite.data.co3d import Co3D
@@ -79,30 +78,3 @@ def test_similarities_are_computed_once_for_all_rows_of_a_pair(tmp_path, monkeyp
     monkeypatch.setattr(problem, "similarities", lambda *args: (calls.append(args), similarities(*args))[1])
     run_rows(("ours", "ours-bv", "ours-globalsim", "ours-trials500", "ours-k30", "ours-n3"), tmp_path, 2, 3)
     assert len(calls) == 2 * 3
-
-
-class TrueViewpoints:
-    name = "true viewpoints"
-
-    def describe(self, frames):
-        """The pose of each frame's label, and its viewing direction as its feature."""
-        labels = read_labels(small_folder(), "pebble")
-        found = ((frame.camera.R, labels[frame.name.split("/")[0]].trans[:3, :3]) for frame in frames)
-        return [(camera @ turn, torch.from_numpy(camera[2].copy())) for camera, turn in found]
-
-
-def test_two_right_absolute_poses_make_a_right_relative_one(tmp_path, monkeypatch):
-    monkeypatch.setitem(EXTRACTORS, "posecontrast", lambda backbone: TrueViewpoints())
-    assert run_rows(["posecontrast"], tmp_path, 4, 3, "pebble")["posecontrast"]["median"] < 1e-5
-
-
-def test_swav_is_matched_as_mutual_neighbours(tmp_path, monkeypatch):
-    monkeypatch.setitem(EXTRACTORS, "swav", lambda backbone: BACKBONE)
-    assert run_rows(["swav"], tmp_path, 4, 5, "pebble")["swav"]["acc30"] >= 75
-
-
-def test_a_row_whose_weights_are_missing_says_so_before_anything_runs(tmp_path, monkeypatch):
-    monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
-    with pytest.raises(InputError, match="posecontrast"):
-        run_rows(["posecontrast"], tmp_path / "run")
-    assert not (tmp_path / "run").exists()

@@ -1,1 +1,1 @@
-"""Other methods: the baselines of the paper (ICP, SIFT, SwAV, PoseContrast), and RootSIFT features."""
+"""Other methods: the baselines of the paper (ICP, SIFT), and RootSIFT features."""

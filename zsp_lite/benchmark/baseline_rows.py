@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.baselines.geometry import align
@@ -47,13 +46,6 @@ def sift(problem: Problem) -> Answer:
     view = int(np.argmax([score_from_cosines(torch.from_numpy(similarity), _K) for *_, similarity in found]))
     one, two, _ = found[view]
     return fit_keypoints(problem, view, first.pixels[one], others[view].pixels[two])
-
-
-def posecontrast(problem: Problem) -> Answer:
-    """Run "PoseContrast": the relative rotation of the viewpoints of the reference and the most similar view."""
-    (rotation, feature), *others = (problem.store.describe("posecontrast", key) for key in problem.keys)
-    view = int(np.argmax([float(F.cosine_similarity(feature, other, dim=0)) for _, other in others]))
-    return Answer(others[view][0] @ rotation.T, view)
 
 
 def category(problem: Problem) -> Answer:

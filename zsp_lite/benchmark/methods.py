@@ -8,7 +8,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from zsp_lite.baselines.networks import PoseContrast, Swav
 from zsp_lite.baselines.sift import RootSift, Sift
 from zsp_lite.benchmark import baseline_rows
 from zsp_lite.benchmark.identity import described
@@ -23,8 +22,6 @@ EXTRACTORS: dict[str, Callable[[Any], Any]] = {
     "backbone": lambda backbone: backbone,
     "rootsift": lambda backbone: RootSift(),
     "sift": lambda backbone: Sift(),
-    "swav": lambda backbone: Swav(),
-    "posecontrast": lambda backbone: PoseContrast(),
 }
 
 
@@ -69,12 +66,10 @@ METHODS: dict[str, Method] = {
     "ours-nodepth": Method(answer="essential matrix"),
     # Cycles, clusters and saliency of the target view, as in the published code.
     "ours-published": Method(settings={"cycle_from": "target"}),
-    # Table 1, the baselines. SwAV has no saliency: it uses the true mask, and is matched as mutual neighbours.
+    # Table 1, the baselines; SWaV and PoseContrast have published figures only.
     "icp": Method("none", solve=baseline_rows.icp),
     "icp-bv": Method(solve=baseline_rows.icp_best_view),
     "sift": Method("sift", solve=baseline_rows.sift),
-    "swav": Method("swav", settings=_MASK | {"matcher": "mutual", "kmeans": False, "binning": False}),
-    "posecontrast": Method("posecontrast", solve=baseline_rows.posecontrast),
     # Beyond the paper.
     "verified": Method(settings={"solver": "verified"}),
     "verified-mask": Method(settings={"solver": "verified"} | _MASK),
@@ -92,12 +87,12 @@ def read_paper_tables() -> list[dict[str, Any]]:
     return json.loads(Path(__file__).with_name("paper_tables.json").read_text(encoding="utf-8"))
 
 
-# Rows or other groups: the tables of the paper, one by one and together, and what goes beyond them. In no group are
-# "category", and the rows whose checkpoints have to be downloaded.
+# Rows or other groups: the tables of the paper, one by one and together, and what goes beyond them. In no group is
+# "category".
 GROUPS: dict[str, list[str]] = {
     "default": ["ours", "ours-bv", "rootsift"],
     **{
-        table["group"]: [line["row"] for line in table["rows"] if line["row"] not in ("swav", "posecontrast")]
+        table["group"]: [line["row"] for line in table["rows"] if line["row"]]
         for table in read_paper_tables() if "group" in table
     },
     "scans": ["scans-2", "scans-4", "scans-8"],
