@@ -17,7 +17,7 @@ the logarithm of a mixture of von Mises-Fisher densities and a uniform one, whic
 3. Scales, linear in their logarithms, then translations: least absolute deviations over the hypotheses that agree.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,9 +98,7 @@ def object_pairs(
     dataset: Co3D, category: str, sequences: Sequence[str] | None, per_object: int | None, targets: int
 ) -> list[Pair]:
     """Choose the pairs of frames that a category is aligned by (see `align_category`)."""
-    numbers: dict[str, list[int]] = {}
-    for key in dataset.frame_list(category):
-        numbers.setdefault(key.sequence_name, []).append(key.frame_number)
+    numbers = _frame_numbers(dataset, category)
     names = sorted(numbers if sequences is None else set(sequences))
     if (n := len(names)) < 2:
         raise InputError(f"category {category}: {n} sequences to align, expected at least 2")
@@ -117,7 +115,7 @@ def object_pairs(
         reference, target = names[a], names[b]
         rng = np.random.default_rng([0, stable_hash(f"{category}/{reference}/{target}") >> 1])
         # Frames that are evenly spaced over a sequence show several sides; the random starts depend on the names only.
-        first, around = sorted(numbers[reference]), sorted(numbers[target])
+        first, around = numbers[reference], numbers[target]
         start, target_start = rng.integers(len(first)), rng.integers(len(around))
         count = min(references_per_pair(n), len(first))
         for r in range(count):
@@ -128,16 +126,17 @@ def object_pairs(
     return pairs
 
 
-def scan_pairs(pair: Pair, numbers: Mapping[str, Sequence[int]], references: int) -> list[Pair]:
+def scan_pairs(dataset: Co3D, pair: Pair, references: int) -> list[Pair]:
     """Return the pairs of frames that the pose of a pair is found from by several frames of both objects.
 
-    These are `references` frames of each object, evenly spaced over the `numbers` of its sequence from the pair's own
-    frame on, each with as many views of the other as the pair has. The pair itself is the first.
+    These are `references` frames of each object, evenly spaced over its sequence from the pair's own frame on, each
+    with as many views of the other as the pair has. The pair itself is the first.
     """
+    numbers = _frame_numbers(dataset, pair.category)
     ends, count = (pair.reference_sequence, pair.target_sequence), len(pair.target_frames)
 
     def around(name: str, start: int, count: int) -> tuple[int, ...]:
-        frames = sorted(numbers[name])
+        frames = numbers[name]
         first = frames.index(start)
         return tuple(frames[(first + k * len(frames) // count) % len(frames)] for k in range(count))
 
@@ -148,6 +147,14 @@ def scan_pairs(pair: Pair, numbers: Mapping[str, Sequence[int]], references: int
         for a, b in (ends, ends[::-1])
         for frame in around(a, starts[a], references)
     ]
+
+
+def _frame_numbers(dataset: Co3D, category: str) -> dict[str, list[int]]:
+    """List the numbers of the frames of every sequence of a category, in ascending order."""
+    numbers: dict[str, list[int]] = {}
+    for key in dataset.frame_list(category):
+        numbers.setdefault(key.sequence_name, []).append(key.frame_number)
+    return {name: sorted(found) for name, found in numbers.items()}
 
 
 def world_hypotheses(reference: str, target: str, estimate: PoseEstimate) -> PairHypotheses:

@@ -3,13 +3,12 @@
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 
 from zsp_lite.alignment import Sim3
@@ -18,7 +17,6 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels, relative_pose
-from zsp_lite.features import FeatureMap
 from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error
 from zsp_lite.views import View
@@ -59,9 +57,6 @@ class PoseEstimate:
     # whether the solver cannot decide between the estimate and its first alternative: both are nearly equally probable
     # and far apart, such as by a half turn (see `verified.confidence.reliability_flags`)
     one_of_two: bool = False
-    # by how many degrees the reference crop was turned counterclockwise for its features (see `ZeroShotPose.upright`).
-    # The pose is that of the image as given
-    reference_turn: int = 0
 
     @property
     def target_camera(self) -> Camera:
@@ -192,7 +187,6 @@ class PairResult:
                 "inliers": int(estimate.inliers.sum()),
                 "matches": len(estimate.matches),
                 "world_matrix": estimate.world_sim3.matrix.tolist(),
-                "reference_turn_degrees": estimate.reference_turn,
                 "confidence": estimate.confidence,
                 "error_degrees": self.errors.get(solver),
                 "flags": list(estimate.flags),
@@ -269,31 +263,6 @@ def match_points(
     """Unproject matches to 3D points, each in the frame of its own camera (sec. 4.3)."""
     (source, _), (destination, _) = reference.patch_points, target.patch_points
     return source[tuple(matches.reference.T)], destination[tuple(matches.target.T)]
-
-
-def turn_reference_back(estimate: PoseEstimate, reference: View, quarters: int) -> PoseEstimate:
-    """Express an estimate for a reference turned by `quarters` (see `numpy.rot90`) in the camera of the reference.
-
-    With Q the rotation from the camera points of `reference` to those of the turned camera, the pose T becomes T Q.
-    """
-    camera = reference.frame.camera
-    turn = Sim3(1.0, camera.turn(quarters).R @ camera.R.T, np.zeros(3))
-    rows, columns = reference.features.grid
-    patches = np.rot90(np.arange(rows * columns).reshape(rows, columns), quarters)
-    matched = np.stack(np.unravel_index(patches[tuple(estimate.matches.reference.T)], (rows, columns)), axis=-1)
-    view = estimate.reference_view
-    maps = view.features.keys, view.features.saliency, view.foreground
-    keys, saliency, foreground = (torch.rot90(one, -quarters, (0, 1)) for one in maps)
-    features = FeatureMap(keys, saliency, view.features.global_feature)
-    mask = np.ascontiguousarray(np.rot90(view.soft_mask, -quarters))
-    return replace(
-        estimate,
-        sim3=estimate.sim3 @ turn,
-        matches=replace(estimate.matches, reference=matched),
-        reference_view=View(reference.frame, features, foreground, mask),
-        hypotheses=tuple(replace(one, sim3=one.sim3 @ turn) for one in estimate.hypotheses),
-        reference_turn=90 * (quarters % 4),
-    )
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from zsp_lite.choices import SOLVERS
 from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.cameras import Box, camera_from_pose, view_span
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.frames import Frame, frame_defect, read_image
+from zsp_lite.data.frames import Frame, frame_defect, read_image, turn_frame
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
 from zsp_lite.estimates import Hypothesis, PairResult, PoseEstimate, Vote, label_errors, timed
 from zsp_lite.importers.capture import READERS, SIGNS, CaptureFrame
@@ -201,7 +201,8 @@ def estimate_pose(
         intrinsics: Camera intrinsics of both, where they are images (see `open_source`).
         backbone: Backbone, or what `load_backbone` takes.
         out: Folder for the report and the point clouds (see `write_pair`); None writes nothing.
-        upright: Whether the reference image is upright; False tries its four turns by 90 degrees (see `ZeroShotPose`).
+        upright: Whether the reference images are upright; False tries four turns by 90 degrees, since phones may store
+            images turned, and keeps the best. The pose is then that of the turned image, and a flag says so.
         references: Number of reference frames of each object, evenly spaced; 1 is the paper's setting. By default 4,
             or 1 with a `reference_frame`, or more with helpers (see `category.references_per_pair`).
         helpers: Other objects of the category: what two objects cannot tell, all together mostly can.
@@ -225,11 +226,15 @@ def estimate_pose(
             raise InputError(f"{', '.join(str(one.path) for one in sources)}: expected different objects")
         model = as_backbone(backbone)
         foreground = "saliency" if getattr(model, "has_saliency", True) else "mask"
-        method = ZeroShotPose(model, foreground=foreground, upright=upright, solver="verified")
+        method = ZeroShotPose(model, foreground=foreground, solver="verified")
         scans = [_Scan.of(sources[0], method, references if several else 1, targets if several else 0, reference_frame)]
         scans += [_Scan.of(one, method, references if several else 0, targets) for one in sources[1:]]
+        flags = _pair_flags(scans)
+        if not upright:
+            scans[0], turn = _stood_up(*scans[:2], replace(method, solver=SOLVERS[solver][-1]))
+            flags = *flags, f"the reference is turned by {turn}° counterclockwise: the pose is that of the turned image"
         first, second, position = *scans[:2], scans[0].references[0]
-        views, flags = (first.views[position], second.target_views), _pair_flags(scans)
+        views = first.views[position], second.target_views
         solved = {name: replace(method, solver=name).estimate_from_views(*views) for name in SOLVERS[solver]}
         votes = ()
         if several:
@@ -251,6 +256,20 @@ def estimate_pose(
         if out is not None:
             write_pair(result, out)
     return result
+
+
+def _stood_up(scan: _Scan, target: _Scan, method: ZeroShotPose) -> tuple[_Scan, int]:
+    """Turn the frames of a scan by the quarter turns that suit its first reference frame best; return the degrees."""
+    scores, position = {}, scan.references[0]
+    for quarters in range(4):
+        (view,) = method.views([turn_frame(scale_frame(scan.frames[position], scan.scale), quarters)])
+        with suppress(NoPoseError):
+            one = method.estimate_from_views(view, target.target_views)
+            scores[quarters] = one.hypotheses[0].score if one.hypotheses else one.view_scores[one.view]
+    quarters = max(scores, key=scores.get, default=0)
+    frames = {key: turn_frame(frame, quarters) for key, frame in scan.frames.items()}
+    views = method.views([scale_frame(frames[key], scan.scale) for key in scan.views])
+    return replace(scan, frames=frames, views=dict(zip(scan.views, views, strict=True))), 90 * quarters
 
 
 def _solve_others(scans: Sequence[_Scan], method: ZeroShotPose, workers: int) -> dict[_Ends, PoseEstimate]:

@@ -1,7 +1,6 @@
 """Zero-shot pose estimation from frames to a pose, composed of the stages' functions (paper, fig. 2 and sec. 4)."""
 
 import pkgutil
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -14,9 +13,9 @@ from jaxtyping import Float
 
 from zsp_lite.alignment import MOST_TRIALS, SCALE_RANGE, Sim3, ransac
 from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch, ViewSelector
-from zsp_lite.data.frames import Frame, frame_defect, turn_frame
+from zsp_lite.data.frames import Frame, frame_defect
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer, check_number
-from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed, turn_reference_back
+from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import key_similarities, match
@@ -52,10 +51,6 @@ class ZeroShotPose:
         solver: "paper" selects the best view and aligns with it by RANSAC; or a name in `SOLVER_CLASSES`, such as
             "verified", or a `Solver`. The settings view_selector, trials and sample_size are for "paper" only.
         seed: Seed of k-means and of the solver.
-        upright: The reference image is upright, as the target views are. False tries four turns of its crop by 90
-            degrees, since phones may store images turned, and keeps the estimate with the highest score: that of the
-            first hypothesis, or of the chosen view where a solver has none. The pose is that of the image as given.
-            Keep True where images are upright: fewer wrong poses compete.
 
     Raises:
         InputError: A setting is out of range.
@@ -74,7 +69,6 @@ class ZeroShotPose:
     binning: bool = True
     solver: str | Solver = "paper"
     seed: int = 0
-    upright: bool = True
 
     def __post_init__(self):
         stages = {"matcher": ("cyclical", *MATCHERS), "view_selector": VIEW_SELECTORS}
@@ -108,12 +102,11 @@ class ZeroShotPose:
             InputError: There are no targets, no target is usable, or the reference has an empty mask or no known
                 depth.
         """
-        timings = Counter()
+        timings: dict[str, float] = {}
         with timed(timings, "features"):
             first, *others = self.views([reference, *targets])
         found = self.estimate_from_views(first, others)
-        timings.update(found.timings)  # adds the features of the reference's turns
-        return replace(found, timings=dict(timings))
+        return replace(found, timings=timings | found.timings)
 
     def views(self, frames: Iterable[Frame]) -> list[View]:
         """Crop frames to their objects and extract features and foregrounds, all in one batch."""
@@ -146,39 +139,12 @@ class ZeroShotPose:
     ) -> PoseEstimate:
         """Run the stages after feature extraction: matching and the solver (see `estimate`).
 
-        `matched` is the result of `match_views`, if it is known already; the reference is then taken as it is. Else, if
-        it is not `upright`, the features of its other three turns are extracted here.
+        `matched` is the result of `match_views`, if it is known already.
         """
         if not targets:
             raise InputError("no target views, expected at least one")
         if defect := frame_defect(reference.frame):
             raise NoPoseError(f"reference {reference.frame.name or 'view'}: {defect}")
-        if self.upright or matched is not None:
-            return self._solve(reference, targets, matched)
-        features: dict[str, float] = {}
-        with timed(features, "features"):
-            turned = [turn_frame(reference.frame, quarters) for quarters in (1, 2, 3)]
-            turns = [reference, *extract_views(self.backbone, turned, self.foreground)]
-        found, failures, timings = [], [], Counter(features)
-        for quarters, view in enumerate(turns):
-            try:
-                one = self._solve(view, targets)
-            except InputError as error:  # this turn does not determine a pose, another one may
-                failures.append(error)
-                continue
-            timings.update(one.timings)
-            score = one.hypotheses[0].score if one.hypotheses else one.view_scores[one.view]
-            found.append((score, quarters, one))
-        if not found:
-            raise failures[0]
-        _, quarters, best = max(found, key=lambda one: one[0])
-        best = turn_reference_back(best, reference, quarters) if quarters else best
-        return replace(best, timings=dict(timings))
-
-    def _solve(
-        self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch] | None = None
-    ) -> PoseEstimate:
-        """Match the reference view as it is and run the solver on the usable target views."""
         timings: dict[str, float] = {}
         if matched is None:
             with timed(timings, "matching"):

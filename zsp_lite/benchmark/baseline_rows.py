@@ -61,10 +61,7 @@ class Scans:
     references: int
 
     def __call__(self, problem: Problem) -> Answer:
-        numbers: dict[str, list[int]] = {}
-        for frame in problem.store.dataset.frame_list(problem.store.category):
-            numbers.setdefault(frame.sequence_name, []).append(frame.frame_number)
-        return _agreed(problem, scan_pairs(problem.pair, numbers, self.references))
+        return _agreed(problem, scan_pairs(problem.store.dataset, problem.pair, self.references))
 
 
 def _agreed(problem: Problem, pairs: Sequence[Pair]) -> Answer:

@@ -160,8 +160,7 @@ class Problem:
             method = ZeroShotPose(self.store.extractors[features], **settings, seed=self.seed)
             keys = self.keys if target is None else [self.keys[0], self.keys[1 + target]]
             reference, *targets = (self.store.view(features, key, method.foreground) for key in keys)
-            # A reference that may stand on its side is matched in four turns, by the method itself.
-            matched = [self._match(method, reference, view) for view in targets] if method.upright else None
+            matched = [self._match(method, reference, view) for view in targets]
             self._estimates[name] = method.estimate_from_views(reference, targets, matched)
             for stage, seconds in self._estimates[name].timings.items():
                 self.store.timings.setdefault(stage, []).append(seconds)

@@ -34,7 +34,7 @@ from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, bac
 @click.option("--depth", type=PATH, multiple=True, help="Depth of an image, if it is not beside it. Once per image.")
 @click.option("--depth-unit", type=LENGTH, multiple=True, show_default="0.001", help="Metres per stored depth value.")
 @click.option("--workers", type=COUNT, default=1, help="Frames that are solved at once.")
-@click.option("--not-upright", is_flag=True, help="Try four turns by 90 degrees of the reference image.")
+@click.option("--not-upright", is_flag=True, help="Try four turns by 90 degrees of the reference images.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 @backbone_options
 @click.option("--out", type=PATH, default="outputs/estimate", help="Folder for the report and the point clouds.")
@@ -43,16 +43,16 @@ def estimate(
     target,
     others,
     helpers,
-    solver,
-    reference_frame,
-    references,
-    targets,
-    workers,
     not_upright,
     as_json,
     backbone,
     out,
-    **given,
+    mask,
+    box,
+    intrinsics,
+    depth,
+    depth_unit,
+    **settings,
 ) -> None:
     """Estimate the pose between two objects of one category; no label is needed.
 
@@ -84,15 +84,14 @@ def estimate(
     from zsp_lite.io.locks import writing
     from zsp_lite.own_objects import estimate_pose, open_pair, write_pair
 
-    if helpers and solver != "verified":
+    if helpers and settings["solver"] != "verified":
         raise click.UsageError("--helpers goes with --solver verified only")
     if others and not helpers:
         raise click.UsageError(f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers")
     with writing(out):
-        found = estimate_pose(
-            *open_pair(reference, target, given), solver, reference_frame, targets, backbone=load_backbone(backbone),
-            upright=not not_upright, references=references, helpers=(*helpers, *others), workers=workers,
-        )  # fmt: skip
+        given = {"mask": mask, "box": box, "intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit}
+        settings |= {"backbone": load_backbone(backbone), "upright": not not_upright, "helpers": (*helpers, *others)}
+        found = estimate_pose(*open_pair(reference, target, given), **settings)
         files = write_pair(found, out)
     if as_json:
         print(json.dumps(found.as_json() | {"files": [str(path) for path in files]}, indent=1, allow_nan=False))
@@ -114,16 +113,12 @@ def _print_tables(found: Any) -> None:
     print(legend([name for name in COLUMNS[1:] if name != "error" or found.errors]))
     for solver, one in found.estimates.items():
         view = f"view {one.view + 1} ({found.targets[one.view].name})"
-        cameras = f"camera points of {found.reference.name} to those of {view}"
-        for points, sim3 in (
-            (cameras, one.sim3),
-            ("world points of the reference to those of the target", one.world_sim3),
-        ):
+        matrices = {f"camera points of {found.reference.name} to those of {view}": one.sim3}
+        matrices["world points of the reference to those of the target"] = one.world_sim3
+        for points, sim3 in matrices.items():
             print(f"{solver}: {points}")
             for line in sim3.matrix:
                 print("  " + " ".join(f"{value:10.5f}" for value in line))
-        if one.reference_turn:
-            print(f"  features of the reference turned by {one.reference_turn}° counterclockwise")
         for rank, other in enumerate(one.alternatives, 2):
             print(
                 f"  hypothesis {rank}: turned by {one.angle_to(other):.0f}° from the best, "

@@ -28,7 +28,7 @@ from zsp_lite.viz import category_sheet, plots
 from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, PhotographResult, photograph_figure, photograph_rows
 from zsp_lite.viz.pose_picture import pose_picture
 from zsp_lite.viz.scene3d import aligned_clouds
-from zsp_lite.viz.votes import votes_figure
+from zsp_lite.viz.votes import ring_figure, votes_figure
 
 COLUMNS = ("category", "solver", "view", "inliers", "error", "confidence", "time")
 _MEANINGS = {
@@ -86,7 +86,9 @@ def write_report(
                     for solver, estimate in result.estimates.items()
                     if estimate.one_of_two
                 },
-                "votes": _data_uri(votes_figure(result)) if result.votes else "",
+                "votes": [_data_uri(one) for one in (votes_figure(result.votes), ring_figure(result))]
+                if result.votes
+                else [],
                 "stages": _stages(result, f"scene-{index}"),
             }
             for index, result in enumerate(results, 1)
