@@ -32,7 +32,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.io.files import stable_hash
 from zsp_lite.metrics import rotation_angle
-from zsp_lite.verified.confidence import hidden_share
+from zsp_lite.verified.confidence import Calibration, hidden_share
 
 KAPPA, FLOOR = 16.0, 0.1  # \kappa, with which a hypothesis 20 degrees off counts 1/e, and \epsilon
 SAME_ANGLE = 30.0  # degrees; rotations further apart disagree
@@ -43,9 +43,9 @@ _PROPOSERS, _AVERAGING_SWEEPS, _REWEIGHTINGS = 8, 6, 10
 _WEAK = 1e-3  # weight of hypotheses that disagree, so that every object gets a scale and a translation
 # Coefficients of `_judge`, fitted by tools/category_fit.py on validation categories to sets of three to five objects.
 MARGIN, NONE, NONE_AGREEING = 1.57, -3.07, -2.37
-# The same of `_judge_two`: factors of \alpha and \beta, and \lambda.
-SCALE_OF_TWO, NONE_OF_TWO, UNSEEN_OF_TWO = (0.36, -0.58, -0.43), (1.01, -2.95, -2.27, 0.95), 0.17
-_LEAST_WEIGHT = 0.05  # in `_judge_two`, of a frame that was solved against a single view
+# Probabilities of two objects, whose evidence `compare_two` returns (fit: `tools/tuning.py`).
+OF_TWO = Calibration((-1.08, -0.02, -0.65, 1.57, 0.35), (2.62, 0.27, 0.54, -6.18, -2.27), 0.112)
+_LEAST_WEIGHT = 0.05  # of a pair whose target was seen from one place
 
 _Rotations = Float[np.ndarray, "t n 3 3"]  # of n objects in each of t chains
 _Candidates = Float[np.ndarray, "t c 3 3"]  # for the rotation of one object
@@ -190,7 +190,8 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
         if len(names) > 2:
             probability, turned, other = _judge(nodes[i], rotations, i, float(agreeing.mean()))
         else:
-            probability, turned, other = _judge_two(nodes[i], rotations, i, np.array([pair.span for pair in pairs]))
+            margin, turned, known = compare_two(nodes[i], rotations, i, np.array([pair.span for pair in pairs]))
+            probability, other = OF_TWO.probabilities(np.array([0.0, margin]), known).tolist()
         alternative = None
         if turned is not None:  # about the object's centre
             alternative = Sim3(scales[i], turned, sim3.apply(centres[i]) - scales[i] * turned @ centres[i])
@@ -281,24 +282,19 @@ def _judge(
     return float(1 / (1 + other + none)), best, float(other / (1 + other + none))
 
 
-def _judge_two(
+def compare_two(
     node: _Node, rotations: Float[np.ndarray, "2 3 3"], i: int, spans: Float[np.ndarray, " d"]
-) -> tuple[float, Float[np.ndarray, "3 3"] | None, float]:
-    r"""Return the same for one of two objects, whose pairs have target views that span these angles in degrees.
+) -> tuple[float, Float[np.ndarray, "3 3"] | None, Float[np.ndarray, "5"]]:
+    """Return the `_margin` of one of two objects, the best other rotation, and the evidence for `OF_TWO`.
 
-    The probabilities are those of `verified.confidence`, with the h of the largest span. \alpha depends on h and the
-    number of pairs; \beta on the probability that the surest pair, and the mean of all, give to the rotation, and on h.
-    Pairs count by 1 - h of their own span.
+    This is how far around the better seen object the target views go, the number of pairs, and the probability that the
+    surest pair, and all in the mean, give to the rotation. Pairs count by the share of the circle that they show.
     """
     margin, best = _margin(node, rotations, i)
     near = rotation_angle(node.proposals(rotations[None])[0], rotations[i]) < SAME_ANGLE
-    votes, hidden = (node.weight * near).max(axis=1), hidden_share(spans / 360)
-    weight = 1 + _LEAST_WEIGHT - hidden
-    hidden, number = hidden.min(), weight.sum() / weight.max()
-    other = np.exp(-np.exp(np.dot(SCALE_OF_TWO, (1, np.log(number), hidden))) * margin)
-    none = np.exp(np.dot(NONE_OF_TWO, (1, votes.max(), np.average(votes, weights=weight), hidden)))
-    share = (1 - UNSEEN_OF_TWO * hidden) / (1 + other + none)
-    return float(share), best, float(share * other)
+    votes, weight = (node.weight * near).max(axis=1), 1 + _LEAST_WEIGHT - hidden_share(spans / 360)
+    mean, number = np.average(votes, weights=weight), weight.sum() / weight.max()
+    return margin, best, np.array([1.0, spans.max() / 360, np.log(number), votes.max(), mean])
 
 
 def _margin(

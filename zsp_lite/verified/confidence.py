@@ -51,7 +51,7 @@ class Calibration:
     none: tuple[float, ...] = (0.55, -2.87, 0.72, 0.61, -28.5, -0.501)  # \beta
     unseen: float = 0.313  # \lambda
 
-    def probabilities(self, deficit: Float[np.ndarray, " m"], x: Float[np.ndarray, "6"]) -> Float[np.ndarray, " m"]:
+    def probabilities(self, deficit: Float[np.ndarray, " m"], x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " m"]:
         """Return the probabilities of poses by their `deficit` S_1 - S_k, which is infinite for a pose that is none."""
         odds = np.exp(-np.exp(x @ self.scale) * deficit)
         return (1 - self.unseen * hidden_share(x[1])) * odds / (np.exp(x @ self.none) + odds.sum())
