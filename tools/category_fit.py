@@ -32,7 +32,8 @@ def collect(data: Co3D, category: str, names: list[str], method: ZeroShotPose) -
     for pair in object_pairs(data, category, names, None, 5):
         reference = view(pair.reference_sequence, pair.reference_frame)
         targets = [view(pair.target_sequence, number) for number in pair.target_frames]
-        yield world_hypotheses(pair, replace(method, seed=pair.seed).estimate_from_views(reference, targets))
+        estimate = replace(method, seed=pair.seed).estimate_from_views(reference, targets)
+        yield world_hypotheses(pair.reference_sequence, pair.target_sequence, estimate)
 
 
 def examples(pairs: list[PairHypotheses], labels: dict[str, Float[np.ndarray, "3 3"]]) -> list[tuple]:

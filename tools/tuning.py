@@ -5,8 +5,9 @@ categories, that neither the backbone nor the weights were fitted on. docs/rebui
 
     python -m tools.tuning weights outputs/training_poses:30 outputs/training:30
     python -m tools.tuning calibration outputs/{validation:60,validation_poses:60}
+    python -m tools.tuning scans outputs/{validation:6,validation_poses:6}
 
-FOLDER:PAIRS is a data folder and the number of pairs of each of its categories, in each setting of the target views:
+The last fits `category.OF_TWO`. FOLDER:PAIRS is a data folder and the number of pairs of each of its categories, in each setting of the target views:
 all around the object, and for the calibration also within arcs. Folders with categories of another
 side (`concepts.csv`) are refused. The tool prints the fitted values and how well they do on categories left out of the
 fit; the constants in `zsp_lite/verified` are these, rounded.
@@ -22,8 +23,10 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass, replace
 from functools import cache
+from itertools import combinations, product
 from pathlib import Path
 from typing import TypeVar
 
@@ -33,12 +36,15 @@ from jaxtyping import Float
 
 from tools.concepts import DATA_HELP, check_sides, folder_and_pairs
 from zsp_lite.backbones.load import load_backbone
+from zsp_lite.category import _build_nodes, compare_two, synchronise, world_hypotheses
 from zsp_lite.data.cameras import view_span
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.data.pairs import sample_pairs
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, NoPoseError
+from zsp_lite.io.files import stable_hash
 from zsp_lite.metrics import rotation_error
+from zsp_lite.own_objects import spread
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.verified.confidence import Calibration, evidence, hidden_share, modes
@@ -57,36 +63,30 @@ ALL_AROUND = 360.0
 _SETTINGS = {
     "weights": ((5, ALL_AROUND),),
     "calibration": (*((n, ALL_AROUND) for n in (1, 2, 3, 5, 10)), *((5, arc) for arc in (30.0, 60.0, 90.0, 120.0))),
-}
+    # Degrees that each of two objects was seen around, and number of its target views.
+    "scans": (
+        ((360.0, 5), (360.0, 5)), ((360.0, 3), (360.0, 3)), ((150.0, 5), (150.0, 5)), ((70.0, 5), (70.0, 5)),
+        ((360.0, 5), (1.0, 1)), ((100.0, 5), (360.0, 5)),
+    ),
+}  # fmt: skip
+_FRAMES = 1, 2, 4, 8  # reference frames of each object
 _log = logging.getLogger("zsp_lite.tuning")
 _Fit = TypeVar("_Fit")
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The hypotheses of the verified solver for one pair, with their errors.
-
-    Attributes:
-        category: Category of the pair.
-        terms: (m, terms) score terms of the m hypotheses, in the order of `TERM_NAMES`.
-        errors: (m,) rotation errors in degrees.
-        angles: (m, m) angles between the hypotheses' rotations in degrees.
-        setting: Setting of the target views, in words.
-        span: Angle in degrees that the usable target views span around the target.
-        n_views: Number of usable target views.
-        nearest: (m,) angle in degrees between the reference's camera and the nearest target view's, by hypothesis.
-        view_std: Standard deviation of the target views' similarity to the reference.
-    """
+    """The m hypotheses of the verified solver for one pair, with their errors."""
 
     category: str
-    terms: Float[np.ndarray, "m terms"]
-    errors: Float[np.ndarray, " m"]
-    angles: Float[np.ndarray, "m m"]
-    setting: str
-    span: float
-    n_views: int
-    nearest: Float[np.ndarray, " m"]
-    view_std: float
+    terms: Float[np.ndarray, "m terms"]  # of the score, in the order of `TERM_NAMES`
+    errors: Float[np.ndarray, " m"]  # of the rotations, degrees
+    angles: Float[np.ndarray, "m m"]  # between the rotations, degrees
+    setting: str  # of the target views, in words
+    span: float  # angle in degrees that the usable target views span around the target
+    n_views: int  # usable target views
+    nearest: Float[np.ndarray, " m"]  # degrees between the reference's camera and the nearest target view's
+    view_std: float  # standard deviation of the target views' similarity to the reference
 
     @property
     def correctness(self) -> Float[np.ndarray, " m"]:
@@ -115,13 +115,7 @@ class Outcome:
 def collect_outcomes(
     root: Path, category: str, pairs: int, settings: Sequence[tuple[int, float]], seed: int = 0
 ) -> list[Outcome]:
-    """Run the verified solver on `pairs` pairs of a category in each setting of the target views.
-
-    Features are extracted once per image.
-
-    Raises:
-        InputError: A sequence has no pose label.
-    """
+    """Run the verified solver on `pairs` pairs of a category in each setting; features are extracted once per image."""
     torch.set_num_threads(1)
     dataset, backbone, outcomes = Co3D(root), load_backbone(device="cpu"), []
     labels, name = read_labels(root, category), f"{root.name}/{category}"  # folders may share names of categories
@@ -148,6 +142,61 @@ def collect_outcomes(
         outcomes += found
         accuracy = np.mean([one.errors[0] < CORRECT_ANGLE for one in found])
         _log.info("%s: %d pairs of %s, Acc30 %.0f %%", name, len(found), setting, 100 * accuracy)
+    return outcomes
+
+
+@dataclass(frozen=True, eq=False)
+class ScanOutcome:
+    """What an `Outcome` tells the calibration, of two objects that are solved from several frames of both."""
+
+    category: str
+    setting: str
+    frames: int
+    poses: tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]  # see `Outcome.ranked`
+    known: Float[np.ndarray, "5"]
+
+    def ranked(self, weights: ScoreCoefficients | None) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        return self.poses
+
+    def evidence(self, weights: ScoreCoefficients | None) -> Float[np.ndarray, "5"]:
+        return self.known
+
+
+def collect_scans(root: Path, category: str, pairs: int, settings: Sequence[tuple]) -> list[ScanOutcome]:
+    """Find the poses between `pairs` pairs of objects of a category from several frames of both, in each setting."""
+    torch.set_num_threads(1)
+    dataset, labels, outcomes = Co3D(root), read_labels(root, category), []
+    method = ZeroShotPose(load_backbone(device="cpu"), solver="verified")
+    view = cache(lambda name, k: method.views([dataset.load(dataset.frames(category, name)[k])])[0])
+    every = list(combinations(list(labels)[:8], 2))
+    chosen = np.random.default_rng(stable_hash(category) >> 1).permutation(len(every))[:pairs]
+    for ends, setting in product([every[k] for k in chosen], settings):
+        rng, frames, targets = np.random.default_rng(stable_hash(f"{ends}{setting}") >> 1), {}, {}
+        for name, (arc, views) in zip(ends, setting):
+            count = len(dataset.frames(category, name))
+            some = (rng.integers(count) + np.arange(max(1, round(count * arc / ALL_AROUND)))) % count
+            frames[name] = [int(some[k]) for k in spread(_FRAMES[-1], len(some))]
+            targets[name] = [view(name, int(some[k])) for k in spread(views, len(some))]
+        found = []
+        for first, second in (ends, ends[::-1]):
+            for rank, k in enumerate(frames[first]):
+                with suppress(NoPoseError):
+                    estimate = method.estimate_from_views(view(first, k), targets[second])
+                    found.append((rank, world_hypotheses(first, second, estimate)))
+        names = sorted(ends)
+        true = labels[names[1]].trans[:3, :3] @ labels[names[0]].trans[:3, :3].T
+        for count in _FRAMES:
+            some = [one for rank, one in found if rank % (_FRAMES[-1] // count) == 0]
+            objects = synchronise(some).objects
+            rotations = np.stack([objects[name].sim3.R for name in names])
+            sides = np.array([[names.index(one.reference), names.index(one.target)] for one in some])
+            spans = np.array([one.span for one in some])
+            margin, other, known = compare_two(_build_nodes(some, sides)[1], rotations, 1, spans)
+            poses = [rotations[1]] if other is None else [rotations[1], other]
+            errors = rotation_error(np.stack([one.T @ rotations[0] for one in poses]), true)
+            seen = " and ".join(f"{views} views within {arc:.0f}°" for arc, views in setting)
+            deficit = np.array([0.0, margin])[: len(poses)]
+            outcomes.append(ScanOutcome(f"{root.name}/{category}", seen, count, (deficit, errors), known))
     return outcomes
 
 
@@ -216,12 +265,7 @@ def conditional_logit(
 ) -> Float[np.ndarray, " k"]:  # fmt: skip
     r"""Fit weights w of hypotheses' columns x so that softmax(x w) is the probability of being correct.
 
-    Minimises -mean_pairs \log \sum_i softmax(x w)_i c_i + ridge |w|^2.
-
-    Args:
-        columns: For each pair, a row per hypothesis.
-        correctness: For each pair, c of every hypothesis, in [0, 1].
-        ridge: Penalty of the squared weights.
+    Minimises -mean_pairs \log \sum_i softmax(x w)_i c_i + ridge |w|^2; c in [0, 1] is the `correctness`.
     """
     # One row per pair, padded to the longest list with hypotheses of probability 0.
     shape = len(columns), max(map(len, correctness))
@@ -253,15 +297,8 @@ def fit_calibration(
 ) -> Calibration:
     """Fit the calibration by maximum likelihood: which of the different poses, if any, is right?
 
-    Every category counts the same, so that the numbers of pairs chosen per category do not decide.
-
-    Args:
-        outcomes: Outcomes in several settings of the target views.
-        weights: Weights of the score.
-        ridge: Penalty on the squared coefficients of the evidence, per standard deviation of it.
-
-    Raises:
-        InputError: All estimates are right, or none is.
+    Every category counts the same, so that the numbers of pairs chosen per category do not decide. The `ridge` is on
+    coefficients per standard deviation of the evidence. InputError if all estimates are right, or none is.
     """
     ranked = [one.ranked(weights) for one in outcomes]
     right = [np.flatnonzero(error < CORRECT_ANGLE) for _, error in ranked]
@@ -386,13 +423,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     fit = given.constants
     try:
-        check_sides([folder for folder, _ in given.data], "validation" if fit == "calibration" else "training")
+        check_sides([folder for folder, _ in given.data], "training" if fit == "weights" else "validation")
         jobs = [(root, category, pairs) for root, pairs in given.data for category in Co3D(root).categories()]
         with ProcessPoolExecutor(os.cpu_count(), initializer=_log_progress) as pool:
-            parts = pool.map(collect_outcomes, *zip(*jobs), [_SETTINGS[fit]] * len(jobs))
+            collect = collect_scans if fit == "scans" else collect_outcomes
+            parts = pool.map(collect, *zip(*jobs), [_SETTINGS[fit]] * len(jobs))
             outcomes = [one for part in parts for one in part]
         report = report_weights if fit == "weights" else report_calibration
         print("\n".join(report(outcomes, ScoreCoefficients())))
+        if fit == "scans":
+            by_frames = [replace(one, setting=f"{one.frames} frames of each object") for one in outcomes]
+            print("\n".join(report(by_frames, ScoreCoefficients())))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
