@@ -88,7 +88,7 @@ def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN,
     title, members = SEE_MORE.get(table, ("All rows", []))
     names = [name for name in summary["methods"] if _plain(name) in members or not members and not _sees_more(name)]
     if members and names:  # what they add to
-        names = [*(name for name in summary["methods"] if _plain(name) == "verified"), *names]
+        names = [*(name for name in summary["methods"] if name == "verified"), *names]
     rows = {}
     for name in names:
         row = summary["methods"][name]
