@@ -6,6 +6,7 @@ import json
 import re
 import runpy
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -13,8 +14,10 @@ import nbformat
 import numpy as np
 import pytest
 
-from tools import command_line, drawings
+from tools import drawings
 from zsp_lite.cli.main import cli, main
+from zsp_lite.data.labels import read_labels
+from zsp_lite.metrics import rotation_error
 
 REPOSITORY = Path(__file__).parents[1]
 NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
@@ -48,10 +51,6 @@ def command_blocks(page: Path) -> list[str]:
     """The lines of indented code blocks, with continued lines joined."""
     lines = [line[4:] for line in markdown(page).splitlines() if line.startswith("    ")]
     return "\n".join(lines).replace("\\\n", " ").splitlines()
-
-
-def test_the_page_of_the_command_line_is_that_of_the_program():
-    assert command_line.PAGE.read_text(encoding="utf-8") == command_line.page(), "run python -m tools.command_line"
 
 
 @pytest.mark.parametrize("page", PAGES, **ids)
@@ -178,25 +177,31 @@ def test_the_examples_of_methods_of_ones_own_run_as_they_stand(tmp_path, monkeyp
 
 @pytest.mark.slow
 def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
-    from zsp_lite.data.frames import write_image, write_mask
-
     first, second = python_blocks(REPOSITORY / "README.md")
     monkeypatch.chdir(REPOSITORY)
     names: dict = {}
     exec(first, names)
     assert not names["estimate"].flags and capsys.readouterr().out
 
-    # The second block reads pictures of its user: here the frames of the first.
-    import cv2
+    # The second block gets frames of a camera, and reads the scan of another object: here sample sequences.
+    from test_importers import write_lists
 
-    for name, frame in (("my_cup", names["reference"]), ("other_cup", names["targets"][names["estimate"].view])):
-        rgb, mask, depth = (part.repeat(2, 0).repeat(2, 1) for part in (frame.rgb, frame.mask, frame.depth))
-        write_image(tmp_path / f"{name}.jpg", rgb)
-        write_mask(tmp_path / f"{name}_mask.png", mask)
-        cv2.imwrite(str(tmp_path / f"{name}_depth.png"), np.rint(1000 * depth).astype(np.uint16))
+    dataset, scans = names["dataset"], []
+    for name in ("scooter", "scooter2"):
+        frames = dataset.frames("motorcycle", name)[::4]
+        scans.append([replace(dataset.load(frame), name=str(k)) for k, frame in enumerate(frames)])
+    (tmp_path / "scans/other_cup/pictures").mkdir(parents=True)
+    write_lists(tmp_path / "scans/other_cup", scans[1])
+    names["K"] = scans[0][0].camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    names["camera"] = [
+        (one.rgb, np.rint(1000 * one.depth).astype(np.uint16), np.linalg.inv(one.camera.matrix)) for one in scans[0]
+    ]
     monkeypatch.chdir(tmp_path)
     exec(second, names)
-    assert names["pose"].confidence is not None and len(names["pose"].matches) > 10
+    assert names["pose"].confidence > 0.5 and len(names["cups"].votes) == 8
+    labels = read_labels(REPOSITORY / "data_samples", "motorcycle")
+    between = labels["scooter2"].trans @ np.linalg.inv(labels["scooter"].trans)
+    assert rotation_error(names["cups"].world_sim3.R, between[:3, :3]) < 15
     assert (tmp_path / "outputs/cups-python/report.html").is_file()
 
 

@@ -7,10 +7,10 @@ categories, that neither the backbone nor the weights were fitted on. docs/rebui
     python -m tools.tuning calibration outputs/{validation:60,validation_poses:60}
     python -m tools.tuning scans outputs/{validation:6,validation_poses:6}
 
-The last fits `category.OF_TWO`. FOLDER:PAIRS is a data folder and the number of pairs of each of its categories, in each setting of the target views:
-all around the object, and for the calibration also within arcs. Folders with categories of another
-side (`concepts.csv`) are refused. The tool prints the fitted values and how well they do on categories left out of the
-fit; the constants in `zsp_lite/verified` are these, rounded.
+The last fits `category.OF_TWO`. FOLDER:PAIRS is a data folder and the number of pairs of each of its categories, in
+each setting of the target views: all around the object, and but for the weights also within arcs. Folders with
+categories of another side (`concepts.csv`) are refused. The tool prints the fitted values and how well they do on
+categories left out of the fit; the constants of the library are these, rounded.
 
 The weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the probability that one
 is correct is the softmax of their scores. They are fitted to hypotheses that the solver finds with its present weights.
