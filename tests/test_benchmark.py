@@ -128,6 +128,11 @@ def test_unknown_methods_categories_and_folders_and_the_folder_of_another_run_ar
     assert not (tmp_path / "a").exists()
 
 
+def _object_pose(matrix: np.ndarray) -> dict:
+    matrix[3] = 0, 0, 0, 1
+    return {"trans": matrix.tolist(), "scale": 1.0, "low": [0, 0, 0], "high": [1, 1, 1]}
+
+
 def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(tmp_path, monkeypatch):
     labels = read_labels(small_folder(), "lump")
 
@@ -145,13 +150,20 @@ def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(tmp_pa
         assert summary["methods"]["mine"]["symmetric_acc30"] == 100 * (expected < 30)
 
 
-def test_object_poses_of_another_layout_cost_a_warning_and_the_figure_that_needs_them(tmp_path, caplog):
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('{"100_a": {"trans": [[1, 0, 0, 0]], "scale": 1}}', "Expected"),
+        (json.dumps({"100_a": _object_pose(1.05 * np.eye(4))}), "100_a is"),
+    ],
+)
+def test_object_poses_of_another_layout_cost_a_warning_and_the_figure_that_needs_them(tmp_path, caplog, text, expected):
     dataset = Co3D(shutil.copytree(small_folder(), tmp_path / "copy"))
     path = dataset.root / "lump" / POSES_FILE
-    path.write_text('{"100_a": {"trans": [[1, 0, 0, 0]], "scale": 1}}')
+    path.write_text(text)
     found = evaluate(dataset.root, BACKBONE, {"mine": own_method}, {"lump": 3}, 2, tmp_path / "out")["methods"]["mine"]
     assert found["n"] == 3 and found["failed"] == 0 and "symmetric_acc30" not in found
     (told,) = caplog.messages
-    assert str(path) in told and "Expected" in told and told.endswith(": without it there is no symmetric_acc30")
+    assert str(path) in told and expected in told and told.endswith(": without it there is no symmetric_acc30")
     with pytest.raises(InputError, match=POSES_FILE):
         object_poses(dataset, "lump")

@@ -1,10 +1,13 @@
 """Methods of one's own: what they may be and may return, poses from a file, and how a row is told from another."""
 
 import csv
+import os
 import re
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 from types import SimpleNamespace
 
 import benchmark_folder
@@ -24,7 +27,7 @@ from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, Method, description, resolve
 from zsp_lite.benchmark.own import kind_of
 from zsp_lite.benchmark.problem import Answer, FrameStore, Problem
-from zsp_lite.benchmark.run import evaluate_pair
+from zsp_lite.benchmark.run import evaluate, evaluate_pair
 from zsp_lite.benchmark.runs import LINES, read_lines, read_run
 from zsp_lite.benchmark.tables import every_table
 from zsp_lite.data import exchange
@@ -116,9 +119,10 @@ def test_keypoints_that_fit_no_pose_are_noted_and_those_that_are_none_fail(tmp_p
         "uneven": lambda first, second: (ones, ones[1:], ones[:, 0]),
     }  # fmt: skip
     found = run_rows(rows, tmp_path)
-    assert [row["failed"] for row in found.values()] == [0, 1, 0]
-    for name in ("none", "uneven"):
-        assert read_run(tmp_path).row(name)["note"].iloc[0].startswith("pose is the best view's, not a fit: ")
+    assert [row["failed"] for row in found.values()] == [0, 1, 1]
+    assert read_run(tmp_path).row("none")["note"].iloc[0].startswith("pose is the best view's, not a fit: ")
+    told = "matched points are 9 and 8, expected as many in both images"
+    assert read_run(tmp_path).row("uneven")["failed"].iloc[0] == told
     with pytest.raises(FatalError, match="scores of matches are negative, expected 0 or more"):  # less than no match
         run_rows({"distances": lambda first, second: (ones, ones, -ones[:, 0])}, tmp_path)
 
@@ -280,9 +284,10 @@ def test_an_answer_is_a_rotation_in_a_view_or_the_pair_fails_and_its_numbers_can
     rows = {
         "large": lambda problem: Answer(2 * np.eye(3)), "words": lambda problem: "north",
         "mirror": lambda problem: np.diag([1.0, 1.0, -1.0]), "far view": lambda problem: (np.eye(3), 2),
+        "nowhere": lambda problem: Answer(np.eye(3), translation=np.full(3, np.nan)),
     }  # fmt: skip
     assert all(row["failed"] == 1 and row["median"] == 180 for row in run_rows(rows, tmp_path).values())
-    told = "large failed on 1 of 1 pairs, counted as 180°; the first: pose of the row is [[2.0, 0.0, 0.0], "
+    told = "large failed on 1 of 1 pairs, counted as 180°; the first: Sim3: R is [[2.0, 0.0, 0.0], "
     assert told in caplog.text and told in next(iter(every_table(read_run(tmp_path).summary))).note
     run_rows({"sure": lambda problem: Answer(np.eye(3), inliers=4, confidence=1 / 3)}, tmp_path)
     assert read_run(tmp_path).row("sure")[["inliers", "confidence"]].to_numpy().tolist() == [[4, 0.3333]]
@@ -316,6 +321,8 @@ class Vandal:
         overwrite(*problem.frames())
         for view in (*problem.views(), *problem.estimate().target_views):
             view.features.keys[:], view.features.saliency[:], view.foreground[:] = 0, 0, False
+        overwrite(*map(problem.store.frame, problem.keys))
+        problem.store.view("backbone", problem.keys[0], "saliency").features.keys[:] = 0
         found = problem.estimate(settings={"solver": "verified"})
         found.matches.reference[:], found.sim3.R[:] = 0, np.eye(3)
         return np.eye(3)
@@ -344,6 +351,26 @@ def test_rows_do_not_reach_each_other_in_any_order(tmp_path):
         for run in others:
             found, expected = run.row(name), alone.row(name)
             assert found.drop(columns="seconds").equals(expected.drop(columns="seconds")), name
+
+
+def test_a_matcher_of_keypoints_gets_the_same_reference_for_every_view(tmp_path):
+    def overwriting(first, second):
+        seen.append(int(first.sum()))
+        first[:] = 0
+        return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
+
+    seen = []
+    run_rows({"mine": overwriting}, tmp_path, 1, 3)
+    assert len(seen) == 3 and len(set(seen)) == 1 and seen[0] > 0
+
+
+@pytest.mark.slow
+def test_workers_may_have_another_current_folder_than_the_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with ProcessPoolExecutor(1, get_context("spawn"), os.chdir, ("/",)) as executor:
+        assert (
+            evaluate(small_folder(), "zsp-tiny", ["icp"], {"lump": 2}, 2, "run", executor)["methods"]["icp"]["n"] == 2
+        )
 
 
 def fails(problem):
@@ -376,10 +403,12 @@ class Broken(CoordinateBackbone):
     [
         (lambda maps: [replace(one, keys=one.keys * float("nan")) for one in maps], "values that are not finite"),
         (lambda maps: [replace(one, keys=one.keys[:, :0]) for one in maps], "have shapes"),
-        (lambda maps: maps[1:], "returned 0 of nothing"), (lambda maps: maps[9], "IndexError"),
+        (lambda maps: maps[1:], r"returned \d of"), (lambda maps: maps[9], "IndexError"),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("run", ["ours", "category", lambda problem: problem.views() and np.eye(3), "align"])
+@pytest.mark.parametrize(
+    "run", ["ours", "category", lambda problem: problem.views() and np.eye(3), "estimator", "align"]
+)
 def test_a_broken_backbone_ends_the_run_and_nothing_is_stored(tmp_path, monkeypatch, wrong, told, run):
     monkeypatch.setattr(Broken, "wrong", staticmethod(wrong))
     backbone = Broken(grid=8)
@@ -387,7 +416,7 @@ def test_a_broken_backbone_ends_the_run_and_nothing_is_stored(tmp_path, monkeypa
         if run == "align":
             align_category(Co3D(small_folder()), "lump", backbone, targets=2, out=tmp_path)
         else:
-            run_rows({"row": run}, tmp_path, backbone=backbone)
+            run_rows({"row": ZeroShotPose(backbone) if run == "estimator" else run}, tmp_path, backbone=backbone)
     assert not (tmp_path / LINES).read_bytes()
 
 

@@ -125,11 +125,12 @@ def test_a_folders_own_pairs_are_found(tmp_path):
     write_co3d(tmp_path, "chair", [sequence_data(name) for name in "ab"])
     dataset = Co3D(tmp_path)
     assert shipped_pairs(dataset, "chair", 2) == []
-    pairs = [Pair("chair", "a", number % 4, "b", (0, 2)) for number in range(5)]
+    pairs = [Pair("chair", "a", number % 4, "b", (0, 2)) for number in range(5)]  # the last is the first
     for n in (3, 5):
         write_published_pairs(pairs_path(tmp_path, "chair", n, 2), pairs[:n], dataset)
     assert shipped_pairs(dataset, "chair", 2) == pairs[:3]
-    assert shipped_pairs(dataset, "chair", 2, at_least=4) == pairs
+    assert shipped_pairs(dataset, "chair", 2, at_least=4) == pairs[:4]
+    assert shipped_pairs(dataset, "chair", 2, at_least=5) == []
     assert shipped_pairs(dataset, "chair", 2, at_least=6) == shipped_pairs(dataset, "chair", 1) == []
 
 

@@ -15,7 +15,7 @@ from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, look_at, ref
 from zsp_lite import pipeline
 from zsp_lite.alignment import ransac
 from zsp_lite.best_view import ViewMatch, correspondence_score
-from zsp_lite.errors import InputError
+from zsp_lite.errors import FatalError, InputError
 from zsp_lite.estimates import PoseEstimate, match_points
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
@@ -237,7 +237,7 @@ def test_nothing_that_a_plug_in_overwrites_reaches_the_rest(reference, targets):
 )
 def test_a_backbone_that_does_not_return_a_map_for_each_image_is_refused(reference, targets, answer):
     method = ZeroShotPose(lambda images: answer(CoordinateBackbone()(images)))
-    with pytest.raises(InputError, match=r"backbone function returned \d of .* for 6 images, expected 6 of FeatureMap"):
+    with pytest.raises(FatalError, match=r"backbone function returned \d of .* for 6 images, expected 6 of FeatureMap"):
         method.estimate(reference, targets)
 
 

@@ -174,14 +174,16 @@ def ransac(
         raise InputError(f"ransac: scale_range is {scale_range}, expected (smallest, largest), both not negative")
     source, target = _point_pairs(source, target, minimum=sample_size)
     rng, block = np.random.default_rng(seed), max(_BLOCK // len(source), 1)
-    winners = []
+    winner = None
     for first in range(0, trials, block):
         samples = _draw_samples(len(source), sample_size, min(block, trials - first), rng)
-        winners += _best_trial(source, target, samples, threshold, scale_range)
-    if not winners:
+        found = _best_trial(source, target, samples, threshold, scale_range)
+        if found and (winner is None or (-found[1].sum(), found[2]) < (-winner[1].sum(), winner[2])):
+            winner = found
+    if winner is None:
         found = f"no usable sample in {trials} trials over {len(source)} points"
         raise InputError(f"ransac: {found}: all collinear, or scale outside {scale_range}")
-    sim3, chosen, _ = min(winners, key=lambda one: (-one[1].sum(), one[2]))
+    sim3, chosen, _ = winner
 
     if chosen.sum() >= 3:
         *fit, conditioning = umeyama_batch(source[None, chosen], target[None, chosen], scale_range)
@@ -193,12 +195,12 @@ def ransac(
 def _best_trial(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], samples: Int[np.ndarray, "trials size"],
     threshold: float, scale_range: tuple[float, float],
-) -> list[tuple[Sim3, Bool[np.ndarray, " n"], float]]:  # fmt: skip
-    """Return the fit to the best sample, its inliers and the sum of their residuals; [] if no sample is usable."""
+) -> tuple[Sim3, Bool[np.ndarray, " n"], float] | None:  # fmt: skip
+    """Return the fit to the best sample, its inliers and the sum of their residuals; None if no sample is usable."""
     scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
     usable = (conditioning > _COLLINEAR_SAMPLE) & (scale >= scale_range[0]) & (scale <= scale_range[1])
     if not usable.any():
-        return []
+        return None
     scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
     linear = scale[:, None, None] * rotation
     offset = linear @ source.T + translation[:, :, None] - target.T  # (trials, 3, N)
@@ -208,7 +210,7 @@ def _best_trial(
     leaders = np.flatnonzero(counts == counts.max())
     sums = np.where(inlier[leaders], residual[leaders], 0).sum(axis=1)
     best = leaders[sums.argmin()]
-    return [(Sim3(scale[best], rotation[best], translation[best]), inlier[best], float(sums.min()))]
+    return Sim3(scale[best], rotation[best], translation[best]), inlier[best], float(sums.min())
 
 
 def _draw_samples(n: int, size: int, trials: int, rng: np.random.Generator) -> Int[np.ndarray, "trials size"]:

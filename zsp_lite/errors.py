@@ -52,6 +52,8 @@ def ends_the_run(what: str) -> Iterator[None]:
     """Turn an error of the block, which reads data or calls a backbone, into a FatalError: it is not the pair's."""
     try:
         yield
+    except FatalError:
+        raise
     except InputError as error:
         raise FatalError(str(error)) from error
     except Exception as error:  # a plug-in may raise anything

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from zsp_lite.data.depth import patch_points
 from zsp_lite.data.frames import Frame, crop_to_object, frame_defect, resize_frame
-from zsp_lite.errors import InputError, NoPoseError
+from zsp_lite.errors import FatalError, InputError, NoPoseError, ends_the_run
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor, FeatureMap
 
 IMAGE_SIZE = 224  # pixels of an object crop for a backbone without the attribute image_size
@@ -61,13 +61,14 @@ def extract_views(backbone: FeatureExtractor, crops: Sequence[Frame], foreground
 
 
 def feature_maps(backbone: FeatureExtractor, crops: Sequence[Frame]) -> list[FeatureMap]:
-    """Call a backbone on copies of the crops' images; InputError unless it returns a feature map for each."""
-    maps = list(backbone([crop.rgb.copy() for crop in crops]))
+    """Call a backbone on copies of the crops' images; FatalError unless it returns a feature map for each."""
+    name = getattr(backbone, "name", type(backbone).__name__)
+    with ends_the_run(f"backbone {name}"):
+        maps = list(backbone([crop.rgb.copy() for crop in crops]))
     if len(maps) != len(crops) or not all(isinstance(one, FeatureMap) for one in maps):
-        name = getattr(backbone, "name", type(backbone).__name__)
         kinds = ", ".join(sorted({type(one).__name__ for one in maps})) or "nothing"
         expected = f"expected {len(crops)} of FeatureMap"
-        raise InputError(f"backbone {name} returned {len(maps)} of {kinds} for {len(crops)} images, {expected}")
+        raise FatalError(f"backbone {name} returned {len(maps)} of {kinds} for {len(crops)} images, {expected}")
     return maps
 
 

@@ -16,7 +16,7 @@ from zsp_lite.baselines.sift import unproject_pixels
 from zsp_lite.benchmark.problem import Answer, Problem
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.exchange import PairKey, StoredPose, fit_poses
-from zsp_lite.errors import FatalError, InputError, describe_failure, real_array
+from zsp_lite.errors import FatalError, InputError, describe_failure, ends_the_run, real_array
 
 KINDS = ("problem", "keypoints", "matcher")  # functions of one, two and three arguments
 
@@ -61,7 +61,9 @@ class Estimator:
     own: Any
 
     def __call__(self, problem: Problem) -> Any:
-        return self.own.estimate(*problem.store.dataset.load_pair(problem.pair))
+        with ends_the_run("reading frames"):
+            frames = problem.store.dataset.load_pair(problem.pair)
+        return self.own.estimate(*frames)
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ class KeypointMatcher:
 
     def __call__(self, problem: Problem) -> Answer:
         reference, *targets = problem.frames()
-        found = [self.own(reference.rgb, target.rgb) for target in targets]
+        found = [self.own(reference.rgb.copy(), target.rgb) for target in targets]
         scores = [real_array("scores of matches", score) for _, _, score in found]
         if any((one < 0).any() for one in scores):  # the view of the highest sum is chosen
             raise FatalError("scores of matches are negative, expected 0 or more")
@@ -84,6 +86,8 @@ def fit_keypoints(problem: Problem, view: int, first: Any, second: Any) -> Answe
     """Fit the pose to matched pixels of the reference's crop and of a target's: depth, then RANSAC (sec. 4.3)."""
     reference, *targets = problem.frames(depth=True)
     first, second = (real_array("matched points", points).reshape(-1, 2) for points in (first, second))
+    if len(first) != len(second):
+        raise InputError(f"matched points are {len(first)} and {len(second)}, expected as many in both images")
     try:
         points = unproject_pixels(reference, first), unproject_pixels(targets[view], second)
         sim3, inliers = ransac(*points, seed=problem.seed, scale_range=SCALE_RANGE)

@@ -65,7 +65,9 @@ def as_answer(found: Any) -> Answer:
         sim3, inliers = found.sim3, int(found.inliers.sum())
         return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, inliers, found.confidence)
     if isinstance(found, Answer):
-        return replace(found, rotation=_rotation(found.rotation))
+        move, scale = found.translation, 1.0 if found.scale is None else found.scale
+        exact = Sim3(scale, found.rotation, np.zeros(3) if move is None else move)  # refuses what is no pose
+        return replace(found, rotation=exact.R, translation=None if move is None else exact.t)
     pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
     if isinstance(pose, Sim3):
         return Answer(pose.R, int(view), pose.t, pose.scale)
@@ -111,6 +113,13 @@ class FrameStore:
         """Return a frame's crop with its features and foreground (see `views.frame_view`)."""
         return frame_view(self.frame(key), self.describe(features, key), foreground)
 
+    def with_copies(self) -> "FrameStore":
+        """Return the store for a row of one's own: what it returns are copies, which the row may overwrite."""
+        store = copy(self)
+        for name in ("frame", "describe", "view"):
+            setattr(store, name, lambda *key, shared=getattr(self, name): deepcopy(shared(*key)))
+        return store
+
     def timed(self, stage: str, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function, and add the time that it takes to the `timings` of a stage."""
         start = time.perf_counter()
@@ -123,7 +132,7 @@ class Problem:
     """One pair as a method sees it: everything but the true pose. Results are computed once for all methods."""
 
     def __init__(self, pair: Pair, store: FrameStore):
-        self.pair, self.seed, self.store = pair, pair.seed, store
+        self.pair, self.seed, self.store, self._store = pair, pair.seed, store, store
         targets = [(pair.target_sequence, number) for number in pair.target_frames]
         self.keys: tuple[FrameKey, ...] = (pair.reference_sequence, pair.reference_frame), *targets
         self._estimates: dict[tuple, PoseEstimate] = {}
@@ -133,7 +142,7 @@ class Problem:
     def with_copies(self) -> "Problem":
         """Return the problem for a row of one's own: what it returns are copies, which the row may overwrite."""
         problem = copy(self)
-        problem._hand_over = deepcopy
+        problem.store, problem._hand_over = self.store.with_copies(), deepcopy
         return problem
 
     def frames(self, depth: bool = False) -> list[Frame]:
@@ -141,14 +150,14 @@ class Problem:
 
         With `depth`, InputError, which fails the pair, if one has no depth map.
         """
-        frames = [self.store.frame(key) for key in self.keys]
+        frames = [self._store.frame(key) for key in self.keys]
         if depth and (missing := [frame.name for frame in frames if frame.depth is None]):
             raise InputError(f"no depth map: {', '.join(missing)}")
         return self._hand_over(frames)
 
     def views(self) -> list[View]:
         """Return the crops with the features of the run's backbone, and the foreground that its saliency finds."""
-        return self._hand_over([self.store.view("backbone", key, "saliency") for key in self.keys])
+        return self._hand_over([self._store.view("backbone", key, "saliency") for key in self.keys])
 
     def estimate(
         self, features: str = "backbone", settings: Mapping[str, Any] | None = None, target: int | None = None
@@ -157,19 +166,19 @@ class Problem:
         settings = settings or {}
         name = (features, target, *sorted(settings.items()))
         if name not in self._estimates:
-            method = ZeroShotPose(self.store.extractors[features], **settings, seed=self.seed)
+            method = ZeroShotPose(self._store.extractors[features], **settings, seed=self.seed)
             keys = self.keys if target is None else [self.keys[0], self.keys[1 + target]]
-            reference, *targets = (self.store.view(features, key, method.foreground) for key in keys)
+            reference, *targets = (self._store.view(features, key, method.foreground) for key in keys)
             matched = [self._match(method, reference, view) for view in targets]
             self._estimates[name] = method.estimate_from_views(reference, targets, matched)
             for stage, seconds in self._estimates[name].timings.items():
-                self.store.timings.setdefault(stage, []).append(seconds)
+                self._store.timings.setdefault(stage, []).append(seconds)
         return self._hand_over(self._estimates[name])
 
     def _match(self, method: ZeroShotPose, reference: View, target: View) -> ViewMatch:
         similarity = self._similarity(reference.features, target.features, method.binning)
-        return self.store.timed("matching", method.match_views, reference, [target], similarity)[0]
+        return self._store.timed("matching", method.match_views, reference, [target], similarity)[0]
 
     def _compare(self, reference: FeatureMap, target: FeatureMap, binning: bool) -> list[torch.Tensor]:
         compare = similarities if binning else key_similarities
-        return self.store.timed("similarity", compare, reference, [target])
+        return self._store.timed("similarity", compare, reference, [target])

@@ -144,7 +144,7 @@ def evaluate_pairs(
     todo = {pair: names for pair, names in new.items() if names}
     chunks = execution.make_chunks(todo, max(1, min(execution.CHUNK_SIZE, len(todo) // (4 * workers))))
     make = partial(make, max(1, get_num_threads() // workers))
-    shared = Path(out) / f".rows-{uuid4()}"  # for the workers
+    shared = Path(out).resolve() / f".rows-{uuid4()}"  # for workers, which may have another current folder
     quiet = not logger.isEnabledFor(logging.INFO)
     look = {"unit": "pair", "delay": 1, "disable": quiet or None}  # None: hidden outside a terminal
     with (

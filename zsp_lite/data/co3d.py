@@ -143,10 +143,9 @@ class Co3D:
 
         They are those of the box of the cloud's points, without the outermost 2 % on each side.
         """
-        try:
-            points, _ = self.point_cloud(category, sequence)
-        except InputError:
+        if not any(one.point_cloud for one in self.sequences(category) if one.sequence_name == sequence):
             return None
+        points, _ = self.point_cloud(category, sequence)
         low, high = np.quantile(points, (0.02, 0.98), axis=0)
         return (low + high) / 2, float(np.linalg.norm(high - low))
 

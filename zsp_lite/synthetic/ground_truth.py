@@ -18,7 +18,7 @@ from sklearn.neighbors import NearestNeighbors
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.depth import patch_points
 from zsp_lite.data.frames import Frame
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, rigid_matrix
 from zsp_lite.io.files import read_json
 from zsp_lite.views import object_crop, patch_mask
 
@@ -69,8 +69,11 @@ class GroundTruthPair:
 
 def read_poses(out: Path, category: str) -> dict[str, ObjectPose]:
     """Return the object pose of every sequence of a category; none without the file."""
-    path = out / category / POSES_FILE
-    return read_json(path, dict[str, ObjectPose], "object poses") if path.is_file() else {}
+    if not (path := out / category / POSES_FILE).is_file():
+        return {}
+    poses = read_json(path, dict[str, ObjectPose], "object poses")
+    exact = {name: rigid_matrix(f"object poses {path}: {name}", one.trans).tolist() for name, one in poses.items()}
+    return {name: msgspec.structs.replace(one, trans=exact[name]) for name, one in poses.items()}
 
 
 def common_turns(out: Path, category: str, first: str, second: str) -> Float[np.ndarray, "s 3 3"] | None:
