@@ -188,7 +188,8 @@ def test_the_papers_figures_were_copied_right():
     ours = read_paper_tables()[0]["rows"][-1]
     assert ours["row"] == "ours" and ours["published"] == [53.8, 46.3, 31.1, 71.0, 26.0, 82.0, 39.0, 42.0]
     for table in read_paper_tables():
-        assert all(resolve(line["row"]) and len(line["published"]) == len(table["published"]) for line in table["rows"])
+        assert all(len(line["published"]) == len(table["published"]) for line in table["rows"])
+        assert all(resolve(line["row"]) for line in table["rows"] if line["row"])  # others have published figures only
 
 
 def test_a_runs_table_has_the_parts_of_each_result_and_of_each_pairs_key(tmp_path):

@@ -11,7 +11,7 @@ from zsp_lite.samples import REPOSITORY
 from zsp_lite.verified.verification import ScoreCoefficients
 from zsp_lite.viz.reliability import reliability
 
-README_ROWS = ("ours", "ours-bv-n1", "ours-bv", "rootsift", "oracle-view", "verified")
+README_ROWS = ("ours", "ours-bv-n1", "ours-bv", "rootsift", "oracle-view", "verified", "scans-4")
 
 
 @pytest.fixture(scope="module")

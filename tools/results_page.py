@@ -1,18 +1,20 @@
 """Put the tables of the stored runs into the pages: python -m tools.results_page.
 
-A table of a page stands between the lines <!-- table RUN NAME --> and <!-- end of table -->, without its notes and
-without the columns of single categories.
+A table of a page stands between the lines <!-- table RUN NAME --> and <!-- end of table -->, without its notes: the
+figures of the paper, over all categories.
 """
 
 import re
 
 from zsp_lite.benchmark.runs import read_run
-from zsp_lite.benchmark.tables import Table, as_markdown, every_table
+from zsp_lite.benchmark.tables import PAPER, Table, as_markdown, every_table
+from zsp_lite.choices import METRICS
 from zsp_lite.io.files import write_atomic
 from zsp_lite.samples import REPOSITORY
 
 RUNS = REPOSITORY / "notebooks" / "results" / "paper_run"
 PAGE = REPOSITORY / "docs" / "results.md"
+_FIGURES = [METRICS[name] for name in PAPER]
 _MARKED = re.compile(r"(<!-- table (\w+) (\w+) -->\n)(.*?)(<!-- end of table -->)", re.DOTALL)
 
 
@@ -23,7 +25,7 @@ def updated(text: str) -> str:
         start, run, name, _, end = found.groups()
         summary = read_run(RUNS / run).summary
         (table,) = (one for one in every_table(summary) if one.name == name)
-        cells = table.cells[[title for title in table.cells if not re.fullmatch(r"(.*: )?\w+ Acc30", title)]]
+        cells = table.cells[[title for title in table.cells if title.rpartition(": ")[2] in _FIGURES]]
         title = f"{table.title} ({max(row['n'] for row in summary['methods'].values()):,} pairs)"
         shown = Table(name, title, cells)
         return f"{start}{as_markdown(shown)}\n{end}"
