@@ -22,7 +22,7 @@ import pytest
 import torch
 from benchmark_folder import BACKBONE, SlowBackbone, after_each_save, run_rows, small_folder
 from synthetic_views import CoordinateBackbone
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
@@ -202,11 +202,13 @@ def test_numbers_of_threads_are_restored_after_blocks_that_overlap():
 
     started, go, ended = threading.Barrier(2), threading.Event(), threading.Event()
     go.set()
-    before = counts()
-    with ThreadPoolExecutor(2) as executor:  # the first block to start may be the first or the last to end
-        inside = [one.result() for one in (executor.submit(block, go, ended), executor.submit(block, ended, go))]
-    assert [one[0] for one in inside] == [1, 1]
-    assert counts() == before
+    with threadpool_limits(2, "blas"):
+        before = counts()
+        with ThreadPoolExecutor(2) as executor:  # the first block to start may be the first or the last to end
+            inside = [one.result() for one in (executor.submit(block, go, ended), executor.submit(block, ended, go))]
+        assert [one[0] for one in inside] == [1, 1]
+        assert all(set(numbers.values()) == {1} for _, numbers in inside)
+        assert counts() == before and 2 in before[1].values()
 
 
 def test_unusable_executors_are_refused(monkeypatch):

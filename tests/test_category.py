@@ -13,9 +13,16 @@ from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.category import PairHypotheses, object_pairs, references_per_pair, synchronise, world_hypotheses
+from zsp_lite.category import (
+    PairHypotheses,
+    object_pairs,
+    references_per_pair,
+    scan_pairs,
+    synchronise,
+    world_hypotheses,
+)
 from zsp_lite.data.annotations import FrameKey
-from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
@@ -79,6 +86,15 @@ def test_pairs_connect_all_objects_and_see_each_reference_from_evenly_spaced_sid
     seen = [number for one in pairs[:count] for number in one.target_frames]
     around = np.sort([one.reference_frame for one in pairs[:count]])
     assert np.diff(around, append=around[0] + 12).max() == -(-12 // count) and len(set(seen)) == 12
+
+
+def test_scans_shorter_than_the_number_of_frames_give_every_frame_once():
+    names = Mock(Co3D, frame_list=lambda category: [FrameKey(name, f) for name in "ab" for f in range(5)])
+    pair = Pair("cup", "a", 2, "b", (1, 3))
+    pairs = scan_pairs(names, pair, 8)
+    assert pairs[0] == pair and len(pairs) == len(set(pairs)) == 10
+    assert {one.reference_frame for one in scan_pairs(names, pair, 2)} == {1, 2, 3, 4}
+    assert scan_pairs(names, pair, 2)[2].target_frames == (2, 4)
 
 
 def test_hypotheses_between_cameras_become_similarities_between_worlds(ellipsoids):

@@ -241,6 +241,15 @@ def test_a_backbone_that_does_not_return_a_map_for_each_image_is_refused(referen
         method.estimate(reference, targets)
 
 
+def test_a_solver_has_a_score_for_each_usable_view(views):
+    def one_score(reference, targets, matched, *, seed, threshold):
+        found = align_best_view(reference, targets, matched)
+        return replace(found, view_scores=found.view_scores[:1])
+
+    with pytest.raises(ValueError, match="size 1 into shape"):
+        ZeroShotPose(CoordinateBackbone(), solver=one_score).estimate_from_views(views[0], views[1:])
+
+
 def test_a_solver_says_whether_kmeans_selects_its_matches(views):
     def matches(**settings):
         method = replace(BASE, **settings)

@@ -137,7 +137,7 @@ def scan_pairs(dataset: Co3D, pair: Pair, references: int) -> list[Pair]:
 
     def around(name: str, start: int, count: int) -> tuple[int, ...]:
         frames = numbers[name]
-        first = frames.index(start)
+        first, count = frames.index(start), min(count, len(frames))
         return tuple(frames[(first + k * len(frames) // count) % len(frames)] for k in range(count))
 
     starts = dict(zip(ends, (pair.reference_frame, pair.target_frames[0])))

@@ -10,6 +10,7 @@ c2), J_s' the same for columns, and P the 3x3 average pooling in both images, th
 P S: a dozen additions of S to itself.
 """
 
+import threading
 import warnings
 from dataclasses import dataclass
 from typing import Literal
@@ -28,6 +29,8 @@ from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.threads import one_thread
 
 Keys = FeatureMap | Float[Tensor, "_ _ _"] | Float[np.ndarray, "_ _ _"]
+
+_filters = threading.Lock()  # of warnings: threads would restore each other's
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +257,7 @@ def _gram(features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = Tr
 
 def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -> Int[np.ndarray, " m"]:
     """Cluster m points, given by their inner products, by k-means; returns their labels."""
-    with one_thread(), warnings.catch_warnings():
+    with one_thread(), _filters, warnings.catch_warnings():
         # Eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions of the same inner products,
         # hence the same distances: k-means on them is k-means on the descriptors of 17 D dimensions, but faster.
         values, vectors = np.linalg.eigh(gram)

@@ -227,11 +227,14 @@ def estimate_pose(
         model = as_backbone(backbone)
         foreground = "saliency" if getattr(model, "has_saliency", True) else "mask"
         method = ZeroShotPose(model, foreground=foreground, solver="verified")
-        scans = [_Scan.of(sources[0], method, references if several else 1, targets if several else 0, reference_frame)]
-        scans += [_Scan.of(one, method, references if several else 0, targets) for one in sources[1:]]
+        counts = (references, targets) if several else (1, 0)
+        with timed(before := {}, "features"):
+            scans = [_Scan.of(sources[0], method, *counts, reference_frame)]
+            scans += [_Scan.of(one, method, references if several else 0, targets) for one in sources[1:]]
         flags = _pair_flags(scans)
         if not upright:
-            scans[0], turn = _stood_up(*scans[:2], replace(method, solver=SOLVERS[solver][-1]))
+            with timed(before, "turns"):
+                scans[0], turn = _stood_up(*scans[:2], replace(method, solver=SOLVERS[solver][-1]))
             flags = *flags, f"the reference is turned by {turn}° counterclockwise: the pose is that of the turned image"
         first, second, position = *scans[:2], scans[0].references[0]
         views = first.views[position], second.target_views
@@ -243,7 +246,10 @@ def estimate_pose(
                 found = {(0, 1, position): solved["verified"], **_solve_others(scans, method, workers)}
                 agreed, votes = _agreed_pose(scans, method, found)
             solved["verified"] = replace(agreed, timings=timings)
-        estimates = {name: _in_units(one, first.scale, second.scale, flags) for name, one in solved.items()}
+        estimates = {
+            name: _in_units(replace(one, timings=before | one.timings), first.scale, second.scale, flags)
+            for name, one in solved.items()
+        }
         where = first.source.describe(first.references), second.source.describe(second.targets)
         if helpers:
             where = where[0], f"{where[1]}; helpers: {', '.join(str(one.path) for one in sources[2:])}"

@@ -155,7 +155,7 @@ class ZeroShotPose:
             seen = deepcopy(seen)
         found = self._solver()(*seen, seed=self.seed, threshold=self.threshold)
         scores = np.full(len(targets), -np.inf)
-        scores[usable] = found.view_scores
+        scores[usable] = np.reshape(found.view_scores, len(usable))
         return replace(
             found, view=usable[found.view], view_scores=scores, reference_view=reference, target_views=tuple(targets),
             timings=timings | found.timings, flags=(*flags, *found.flags),

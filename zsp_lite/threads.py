@@ -7,9 +7,11 @@ from contextlib import ExitStack, contextmanager
 from functools import lru_cache
 
 import cv2
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import OpenBLASController, ThreadpoolController
 
 _lock, _blocks, _of_process = threading.Lock(), 0, ExitStack()
+# From threadpoolctl 3.8 on, only the thread that set the number for OpenBLAS first may set it, unless this is called.
+_let_this_thread_set = getattr(OpenBLASController, "clear_controlling_thread", lambda force: None)
 
 
 @lru_cache(1)
@@ -29,7 +31,8 @@ def one_thread() -> Iterator[None]:
         if _blocks == 1:
             _of_process.callback(cv2.setNumThreads, cv2.getNumThreads())
             cv2.setNumThreads(1)
-            _of_process.enter_context(libraries.limit(limits=1, user_api="blas"))
+            _let_this_thread_set(force=True)
+            _of_process.callback(libraries.limit(limits=1, user_api="blas").restore_original_limits)
     try:
         with libraries.limit(limits=1, user_api="openmp"):  # of this thread; torch counts by it
             yield
@@ -37,4 +40,5 @@ def one_thread() -> Iterator[None]:
         with _lock:
             _blocks -= 1
             if not _blocks:
+                _let_this_thread_set(force=True)
                 _of_process.close()

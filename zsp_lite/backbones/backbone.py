@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 import numpy as np
 import torch
@@ -90,7 +91,9 @@ class Backbone:
 
     def _extract(self, batch: Float[Tensor, "b 3 s s"]) -> list[FeatureMap]:
         # The patches' convolution in float32, too: by default, a GPU computes it in TensorFloat-32.
-        with torch.inference_mode(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+        cudnn = torch.backends.cudnn
+        flags = cudnn.flags(cudnn.enabled, cudnn.benchmark, deterministic=cudnn.deterministic, allow_tf32=False)
+        with torch.inference_mode(), flags if self.device.type == "cuda" else nullcontext():
             tokens = self.model.extract(normalize(batch, self.mean, self.std), self.layer, self.facet)
             saliency = tokens.attention[:, list(self.saliency_heads)].float().mean(1)
             low, high = saliency.amin(1, keepdim=True), saliency.amax(1, keepdim=True)

@@ -67,13 +67,13 @@ class Scans:
 def _agreed(problem: Problem, pairs: Sequence[Pair]) -> Answer:
     """Return the pose that the hypotheses of pairs of frames agree on, those of the problem's own pair among them."""
     own, kept = hypotheses(problem), problem.store.kept
-    for pair in pairs:
-        if pair not in kept:  # for other rows, and for other pairs of the same objects
-            kept[pair] = None
+    others = [pair for pair in pairs if pair != problem.pair]
+    for key in ((hypotheses, pair) for pair in others):
+        if key not in kept:  # for other rows, and for other pairs of the same objects
+            kept[key] = None
             with suppress(NoPoseError):
-                kept[pair] = hypotheses(Problem(pair, problem.store))
-    found = [kept[pair] for pair in pairs if pair != problem.pair and kept[pair]]
-    alignment = synchronise([own, *found])
+                kept[key] = hypotheses(Problem(key[1], problem.store))
+    alignment = synchronise([own, *filter(None, (kept[hypotheses, pair] for pair in others))])
     reference, target = (Sim3(1.0, one.camera.R, one.camera.t) for one in problem.frames()[:2])
     sim3 = target @ alignment.between(own.reference, own.target) @ reference.inverse()
     return Answer(sim3.R, 0, sim3.t, sim3.scale, confidence=alignment.objects[own.target].probability)

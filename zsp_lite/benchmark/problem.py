@@ -116,7 +116,7 @@ class FrameStore:
     def with_copies(self) -> "FrameStore":
         """Return the store for a row of one's own: what it returns are copies, which the row may overwrite."""
         store = copy(self)
-        for name in ("frame", "describe", "view"):
+        for name in ("frame", "describe", "view", "extent"):
             setattr(store, name, lambda *key, shared=getattr(self, name): deepcopy(shared(*key)))
         return store
 

@@ -35,7 +35,6 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, view_alignment
 from zsp_lite.synthetic.ground_truth import common_turns
 
-Poses = Float[np.ndarray, "n 4 4"]
 logger = logging.getLogger(__name__)
 
 
@@ -207,7 +206,7 @@ def evaluate_pair(
     return {"pair": pair.key, "results": results, "timings": timings}
 
 
-def _evaluate(name: str, method: Method, problem: Problem, truths: Poses) -> dict[str, Any]:
+def _evaluate(name: str, method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -> dict[str, Any]:
     start, own = time.perf_counter(), replace(method, targets=None) not in METHODS.values()
     given = problem.with_copies() if own else problem
     try:
@@ -250,7 +249,7 @@ def _measure(answer: Answer, problem: Problem, truth: Float[np.ndarray, "4 4"]) 
     return {name: value for name, value in plain.items() if value is not None}
 
 
-def _answer(method: Method, problem: Problem, truths: Poses) -> Answer:
+def _answer(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:
     """Answer of a row that is the paper's method with other settings."""
     if method.answer == "true view":
         nearest = int(rotation_error(np.eye(3), truths[:, :3, :3]).argmin())

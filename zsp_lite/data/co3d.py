@@ -143,7 +143,8 @@ class Co3D:
 
         They are those of the box of the cloud's points, without the outermost 2 % on each side.
         """
-        if not any(one.point_cloud for one in self.sequences(category) if one.sequence_name == sequence):
+        clouds = {one.sequence_name: one.point_cloud for one in self.sequences(category)}
+        if (cloud := clouds.get(sequence)) is None or not path_inside(self.root, cloud.path).is_file():
             return None
         points, _ = self.point_cloud(category, sequence)
         low, high = np.quantile(points, (0.02, 0.98), axis=0)

@@ -82,12 +82,12 @@ def pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:
 
 
 def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 1) -> list[Pair]:
-    """Read the first evaluation set of the data folder with at least so many different pairs; [] if there is none."""
-    sets = (
-        [*dict.fromkeys(read_published_pairs(path, dataset))]
-        for path in pair_files(dataset, category, f"*samples_{n_targets}tgt")
-    )
-    return next((pairs for pairs in sets if len(pairs) >= at_least), [])
+    """Read the first evaluation set of the folder with at least so many pairs, without repetitions; [] without one."""
+    sets = (read_published_pairs(path, dataset) for path in pair_files(dataset, category, f"*samples_{n_targets}tgt"))
+    pairs = next((pairs for pairs in sets if len(pairs) >= at_least), [])
+    if len(different := [*dict.fromkeys(pairs)]) < len(pairs):
+        logger.warning("category %s: %d of %d stored pairs are different", category, len(different), len(pairs))
+    return different
 
 
 def category_pairs(dataset: Co3D, category: str, n: int, n_targets: int) -> list[Pair]:

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from zsp_lite.errors import InputError, check_magnitude
+from zsp_lite.errors import InputError, check_magnitude, rotation_matrix
 from zsp_lite.io.files import file_size, plain_name, read_bytes, read_json
 from zsp_lite.synthetic.primitives import Mesh, joined, surface_spread, unit
 from zsp_lite.synthetic.textures import linear_to_srgb
@@ -70,10 +70,7 @@ class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
         front, up = self.front or front, self.up or up
         given = [_AXES[one] if isinstance(one, str) else np.array(one) for one in (front, up)]
         x, z = (vector / max(np.linalg.norm(vector), 1e-6) for vector in given)
-        y = np.cross(z, x)
-        if not np.linalg.norm(y) > 1 - 5e-7:  # of unit vectors at 90 degrees, to 0.06 degrees
-            raise InputError(f"front is {front} and up is {up}, expected perpendicular axes")
-        return np.stack([np.cross(y, z), y, z])
+        return rotation_matrix(f"front {front} and up {up}: the axes", np.stack([x, np.cross(z, x), z]))
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
-from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
 
 from zsp_lite.category import CategoryAlignment
@@ -44,7 +43,9 @@ def objects_figure(
         for axis, name in zip(line, names, strict=True):
             axis.set(xticks=[], yticks=[], frame_on=False)
             if name in cameras:
-                axis.imshow(_nearest(dataset, category, name, cameras[name]))
+                frames = _frames(dataset, category, name)
+                angles = rotation_angle(np.stack([dataset.camera(one).R for one in frames]), cameras[name])
+                axis.imshow(object_crop(dataset.load(frames[int(np.argmin(angles))])).rgb)
     for axis, name in zip(axes[1], names, strict=True):
         text, colour = f"{name[:16]}\n{100 * objects[name].probability:.0f} %", VERMILLION if name in look else "black"
         axis.set_xlabel(text, fontsize=8, color=colour, parse_math=False)
@@ -73,12 +74,3 @@ def _frames(dataset: Co3D, category: str, name: str) -> list[FrameAnnotation]:
     """Read the frames of an object with a camera, and those with a mask only if there are some."""
     frames = [one for one in dataset.frames(category, name) if one.viewpoint is not None]
     return [one for one in frames if one.mask is not None] or frames
-
-
-def _nearest(
-    dataset: Co3D, category: str, name: str, rotation: Float[np.ndarray, "3 3"]
-) -> UInt8[np.ndarray, "side side 3"]:
-    """Load the object's crop in the frame whose camera is nearest to a rotation."""
-    frames = _frames(dataset, category, name)
-    angles = rotation_angle(np.stack([dataset.camera(one).R for one in frames]), rotation)
-    return object_crop(dataset.load(frames[int(np.argmin(angles))])).rgb

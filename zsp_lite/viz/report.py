@@ -13,7 +13,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
@@ -39,6 +39,7 @@ _MEANINGS = {
 }
 _RIGHT = 30.0  # degrees; a pose with a smaller error is marked as right
 _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark ground
+_TEMPLATES = Environment(loader=PackageLoader("zsp_lite.viz"), autoescape=True, undefined=StrictUndefined)
 _COLOURED = "text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"
 
 
@@ -55,7 +56,7 @@ def write_category_report(path: Path, alignment: CategoryAlignment, dataset: Co3
     parts = [names[start : start + category_sheet.MOST] for start in range(0, len(names), category_sheet.MOST)]
     figures = [category_sheet.objects_figure(dataset, category, alignment, part) for part in parts]
     sheets = [_encode(figure, dpi=150, format="jpg", pil_kwargs={"quality": 90}) for figure in figures]
-    text = _template("category.html").render(
+    text = _TEMPLATES.get_template("category.html").render(
         category=category, columns=category_sheet.COLUMNS, rows=category_sheet.object_rows(alignment),
         images=[f"data:image/jpeg;base64,{base64.b64encode(sheet).decode()}" for sheet in sheets],
         doubtful=category_sheet.doubtful(alignment),
@@ -94,7 +95,7 @@ def write_report(
             for index, result in enumerate(results, 1)
         ]
         picture = _data_uri(photograph_figure(photograph)) if photograph else ""
-    page = _template("report.html").render(
+    page = _TEMPLATES.get_template("report.html").render(
         plotly=Markup(get_plotlyjs()), backbone=backbone, columns=COLUMNS, pairs=pairs, data=data, data_note=data_note,
         own=own, photograph=photograph, photograph_columns=PHOTOGRAPH_COLUMNS,
         photograph_rows=photograph_rows(photograph), photograph_picture=picture,
@@ -102,11 +103,6 @@ def write_report(
     )  # fmt: skip
     write_atomic(path, page.encode(errors="replace"))
     return path
-
-
-def _template(name: str) -> Template:
-    environment = Environment(loader=PackageLoader("zsp_lite.viz"), autoescape=True, undefined=StrictUndefined)
-    return environment.get_template(name)
 
 
 def _notebook_link(name: str, folder: Path) -> Markup:
@@ -204,7 +200,7 @@ def _scene_html(result: PairResult, scene_id: str) -> Markup:
     config = {"displaylogo": False, "responsive": True, "scrollZoom": False, "displayModeBar": False}
     content = {"points": cloud.round(4).tolist(), "poses": [move.matrix[:3].round(6).tolist() for move in moves]}
     plot = scene.to_html(full_html=False, include_plotlyjs=False, div_id=scene_id, config=config)
-    return Markup(_template("scene.html").render(names=list(poses), plot=Markup(plot), content=content))
+    return Markup(_TEMPLATES.get_template("scene.html").render(names=list(poses), plot=Markup(plot), content=content))
 
 
 def _two_poses_figure(estimate: PoseEstimate) -> Figure:
