@@ -228,7 +228,8 @@ def estimate_pose(
         foreground = "saliency" if getattr(model, "has_saliency", True) else "mask"
         method = ZeroShotPose(model, foreground=foreground, solver="verified")
         counts = (references, targets) if several else (1, 0)
-        with timed(before := {}, "features"):
+        before: dict[str, float] = {}
+        with timed(before, "features"):
             scans = [_Scan.of(sources[0], method, *counts, reference_frame)]
             scans += [_Scan.of(one, method, references if several else 0, targets) for one in sources[1:]]
         flags = _pair_flags(scans)
@@ -258,7 +259,9 @@ def estimate_pose(
             tuple(second.frames[k] for k in second.targets), estimates, {},
             masks=(sources[0].mask, sources[1].mask), backbone=getattr(model, "name", str(backbone)), votes=votes,
         )  # fmt: skip
-        result = replace(result, errors=known_errors(*sources[:2], result))
+        one, other = (source.path.resolve() for source in sources[:2])
+        if first.source.format == second.source.format == "sequence" and one.parent == other.parent:
+            result = replace(result, errors=label_errors(result, one.parent, (one.name, other.name)))
         if out is not None:
             write_pair(result, out)
     return result
@@ -493,14 +496,6 @@ def _open_image(
 def spread(count: int, length: int) -> list[int]:
     """Return at most `count` evenly spaced positions among `length`, which go once around an object."""
     return sorted({k * length // count for k in range(count)})
-
-
-def known_errors(first: Source, second: Source, result: PairResult) -> dict[str, float]:
-    """Compute rotation errors if both are labelled sequences of one category; {} otherwise."""
-    one, other = (source.path.resolve() for source in (first, second))
-    if {first.format, second.format} != {"sequence"} or one.parent != other.parent:
-        return {}
-    return label_errors(result, one.parent, (one.name, other.name))
 
 
 def _pair_flags(scans: Sequence[_Scan]) -> tuple[str, ...]:
