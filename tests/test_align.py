@@ -106,7 +106,7 @@ def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     alignment = json.loads((out / "alignment.json").read_text())
     assert alignment["disagreements"] == [{"pair": [A, C], "degrees": 179.96}]
     np.testing.assert_allclose(alignment["objects"][B]["world_to_frame"], run[1].objects[B].sim3.matrix)
-    labelling = Labelling(root, "lump", SEQUENCES, reference=A)
+    labelling = Labelling(root, "lump")
     assert rotation_error(labelling.proposal(C).R, run[1].between(A, C).R) < 0.01
 
 

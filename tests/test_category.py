@@ -21,7 +21,6 @@ from zsp_lite.category import (
     synchronise,
     world_hypotheses,
 )
-from zsp_lite.data.annotations import FrameKey
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
@@ -76,7 +75,7 @@ def test_contradictory_evidence_lowers_the_probability_and_names_the_other_turn(
 
 @pytest.mark.parametrize(("n", "per_object"), [(2, 1), (4, 3), (11, 10), (12, 6), (40, 6)])
 def test_pairs_connect_all_objects_and_see_each_reference_from_evenly_spaced_sides(n, per_object):
-    names = Mock(Co3D, frame_list=lambda category: [FrameKey(f"{k:02d}", f) for k in range(n) for f in range(12)])
+    names = Mock(Co3D, frame_numbers=lambda category: {f"{k:02d}": list(range(12)) for k in range(n)})
     pairs = object_pairs(names, "cup", None, None, 4)
     assert pairs == object_pairs(names, "cup", None, None, 4)
     ends = np.array([[int(one.reference_sequence), int(one.target_sequence)] for one in pairs])
@@ -89,7 +88,7 @@ def test_pairs_connect_all_objects_and_see_each_reference_from_evenly_spaced_sid
 
 
 def test_scans_shorter_than_the_number_of_frames_give_every_frame_once():
-    names = Mock(Co3D, frame_list=lambda category: [FrameKey(name, f) for name in "ab" for f in range(5)])
+    names = Mock(Co3D, frame_numbers=lambda category: {name: list(range(5)) for name in "ab"})
     pair = Pair("cup", "a", 2, "b", (1, 3))
     pairs = scan_pairs(names, pair, 8)
     assert pairs[0] == pair and len(pairs) == len(set(pairs)) == 10

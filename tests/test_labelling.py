@@ -1,6 +1,7 @@
 """Labelling by keypoints: labels agree with known ones, sessions survive a restart, bad picks are refused."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -124,14 +125,19 @@ def test_invalid_categories_sequences_and_picks_are_refused(root):
         (lambda: labelling.skip("best"), "best cannot be skipped: it is the reference"),
         (lambda: labelling.pick("a", (0, np.nan, 0)), "picks on a holds nan, expected finite"),
         (lambda: labelling.pick("a", (0, 1)), "picks on a is .*, expected real numbers of shape .n, 3."),
-        (lambda: Labelling(root, "chair", reference="a"), "expected one reference sequence"),
-        (lambda: Labelling(root, "chair", ["c"]), "has no point cloud"),
         (lambda: Labelling(root, "stool"), "category is 'stool', expected one of"),
     ):
         with pytest.raises(InputError, match=message):
             call()
     assert read_labels(root, "chair") == {}
     np.testing.assert_array_equal(Labelling(root, "chair").picks("a"), corners()[:3])
+    for name, message in (("a", "expected one reference sequence"), ("c", "c has no point cloud")):
+        if name == "c":
+            (root / "label_picks/chair.json").unlink()
+        write_label(root, "chair", PoseLabel(np.eye(4), name, name))
+        with pytest.raises(InputError, match=message):
+            Labelling(root, "chair")
+        shutil.rmtree(root / "class_labels")
 
 
 def test_broken_picks_are_named(root):
@@ -174,10 +180,9 @@ def test_a_large_residual_is_accepted_only_if_confirmed(root):
     assert "a" in read_labels(root, "chair")
 
 
-def test_the_reference_is_that_of_the_labels_or_the_best_of_the_given_sequences(root):
-    write_co3d(root, "chair", [sequence_data("c", quality=2.5)])
-    labelling = Labelling(root, "chair", ["b", "c", "a", "b"])
-    assert labelling.reference == "c" and labelling.sequences == ["c", "b", "a"]
+def test_the_reference_is_that_of_the_labels_or_the_best(root):
+    write_co3d(root, "chair", [sequence_data("c", quality=3.5)])
+    assert Labelling(root, "chair").reference == "c"
     write_label(root, "chair", PoseLabel(np.eye(4), "b", "b"))
     assert Labelling(root, "chair").reference == "b"
 

@@ -11,7 +11,7 @@ from plotly.offline import get_plotlyjs
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite.choices import SOLVERS
-from zsp_lite.demo import demo_pairs, run_demo
+from zsp_lite.demo import N_TARGETS, demo_pairs, run_demo
 from zsp_lite.metrics import rotation_error
 from zsp_lite.samples import REPOSITORY
 from zsp_lite.viz.plots import object_cloud
@@ -57,11 +57,11 @@ def test_with_perfect_features_the_demo_estimates_the_true_pose(results):
 def test_shipped_evaluation_pairs_are_preferred(ellipsoids):
     from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 
-    pairs = sample_pairs(ellipsoids, "ellipsoid", 3, 2, seed=11)
-    path = pairs_path(ellipsoids.root, "ellipsoid", 3, 2)
+    pairs = sample_pairs(ellipsoids, "ellipsoid", 3, N_TARGETS, seed=11)
+    path = pairs_path(ellipsoids.root, "ellipsoid", 3, N_TARGETS)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_published_pairs(path, pairs, ellipsoids)
-    assert demo_pairs(ellipsoids, n_targets=2) == pairs[:1]
+    assert demo_pairs(ellipsoids) == pairs[:1]
 
 
 def test_alternatives_are_the_different_poses_below_the_best_with_angles_in_the_world(results):

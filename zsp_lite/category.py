@@ -98,7 +98,7 @@ def object_pairs(
     dataset: Co3D, category: str, sequences: Sequence[str] | None, per_object: int | None, targets: int
 ) -> list[Pair]:
     """Choose the pairs of frames that a category is aligned by (see `align_category`)."""
-    numbers = _frame_numbers(dataset, category)
+    numbers = dataset.frame_numbers(category)
     names = sorted(numbers if sequences is None else set(sequences))
     if (n := len(names)) < 2:
         raise InputError(f"category {category}: {n} sequences to align, expected at least 2")
@@ -132,7 +132,7 @@ def scan_pairs(dataset: Co3D, pair: Pair, references: int) -> list[Pair]:
     These are `references` frames of each object, evenly spaced over its sequence from the pair's own frame on, each
     with as many views of the other as the pair has. The pair itself is the first.
     """
-    numbers = _frame_numbers(dataset, pair.category)
+    numbers = dataset.frame_numbers(pair.category)
     ends, count = (pair.reference_sequence, pair.target_sequence), len(pair.target_frames)
 
     def around(name: str, start: int, count: int) -> tuple[int, ...]:
@@ -147,14 +147,6 @@ def scan_pairs(dataset: Co3D, pair: Pair, references: int) -> list[Pair]:
         for a, b in (ends, ends[::-1])
         for frame in around(a, starts[a], references)
     ]
-
-
-def _frame_numbers(dataset: Co3D, category: str) -> dict[str, list[int]]:
-    """List the numbers of the frames of every sequence of a category, in ascending order."""
-    numbers: dict[str, list[int]] = {}
-    for key in dataset.frame_list(category):
-        numbers.setdefault(key.sequence_name, []).append(key.frame_number)
-    return {name: sorted(found) for name, found in numbers.items()}
 
 
 def world_hypotheses(reference: str, target: str, estimate: PoseEstimate) -> PairHypotheses:

@@ -12,15 +12,12 @@ from zsp_lite.pipeline import ZeroShotPose, solve_pair
 N_TARGETS = 5
 
 
-def demo_pairs(dataset: Co3D, n_targets: int = N_TARGETS) -> list[Pair]:
-    """Select, independently of results, the first evaluation pair of every category with pose labels.
-
-    For a category without pairs of `n_targets` target views, it is the first of a sample with seed 0.
-    """
+def demo_pairs(dataset: Co3D) -> list[Pair]:
+    """Select, independently of results, the first stored or sampled evaluation pair of every labelled category."""
     pairs = []
     for category in labelled_categories(dataset):
-        shipped = shipped_pairs(dataset, category, n_targets)
-        pairs.append((shipped or sample_pairs(dataset, category, 1, n_targets, seed=0))[0])
+        shipped = shipped_pairs(dataset, category, N_TARGETS)
+        pairs.append((shipped or sample_pairs(dataset, category, 1, N_TARGETS))[0])
     return pairs
 
 

@@ -143,9 +143,7 @@ class PairResult:
     # where the masks of the reference and of the targets come from: "given", "box" or "auto"
     masks: tuple[str, str] = ("given", "given")
     backbone: str = ""  # name of the backbone
-    votes: tuple[
-        Vote, ...
-    ] = ()  # of the frames of the two objects, the reference frame's first; () for one frame alone
+    votes: tuple[Vote, ...] = ()  # of the frames of both objects, the reference frame's first; () for one frame
 
     @property
     def world_sim3(self) -> Sim3:

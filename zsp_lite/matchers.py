@@ -29,11 +29,7 @@ class Matcher(Protocol):
     """
 
     def __call__(
-        self,
-        similarity: Float[Tensor, "n1 n2"],
-        foreground1: Bool[Tensor, " n1"],
-        foreground2: Bool[Tensor, " n2"],
-        /,
+        self, similarity: Float[Tensor, "n1 n2"], foreground1: Bool[Tensor, " n1"], foreground2: Bool[Tensor, " n2"], /
     ) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
         """Match the patches of image 1 with those of image 2, given the cosines between their descriptors.
 

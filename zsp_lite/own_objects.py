@@ -41,10 +41,9 @@ from zsp_lite.views import View
 
 _IMAGES = (".jpg", ".jpeg", ".png")
 # Options that each format takes; "open" is a source that is open already.
-_TAKEN = {"open": (), "image": ("mask", "box", "intrinsics", "depth", "depth_unit")}
-_TAKEN |= dict.fromkeys(("sequence", "frames", "nerfstudio"), ("mask", "box")) | {
-    "lists": ("mask", "box", "depth_unit")
-}
+_MASKED = ("mask", "box")
+_TAKEN = {"open": (), "image": (*_MASKED, "intrinsics", "depth", "depth_unit"), "lists": (*_MASKED, "depth_unit")}
+_TAKEN |= dict.fromkeys(("sequence", "frames", "nerfstudio"), _MASKED)
 _UNIT_GIVEN_BY = {"nerfstudio": "depth_unit_scale_factor in transforms.json"}  # for others by --depth-unit
 _NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
 _ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object

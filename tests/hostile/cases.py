@@ -27,7 +27,7 @@ COMMANDS_OF = {
     "run to continue": ("out/run.jsonl", (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/out")),
     "settings of a run": ("out/run.json", (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/out")),
     "checked annotations": (FRAMES, ("data", "check", "ROOT/data")),
-    "weights": ("x.safetensors", ("weights", "verify", "ROOT/x.safetensors")),
+    "weights": ("x.safetensors", ("demo", "--backbone", "ROOT/x.safetensors", "--out", "ROOT/d")),
 }
 for kind in STRANGE:
     for what, (name, read) in READERS_OF.items():

@@ -1,12 +1,11 @@
 """Checkpoint files of vision transformers in the DINO layout."""
 
 import math
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
 from safetensors import safe_open
-from torch import Tensor, nn
+from torch import Tensor
 
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
@@ -61,18 +60,11 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> 
             f"{path.name}: not a vision transformer in the DINO layout ({error}); num_heads is read from the metadata, "
             "by default one per 64 channels"
         ) from error
-    load_weights(model, weights, path.name)
-    return model
-
-
-def load_weights(model: nn.Module, weights: Mapping[str, Tensor], name: str, ignored: Sequence[str] = ()) -> None:
-    """Load a state dict of finite weights into a module, as float32, without the keys of the prefixes `ignored`."""
-    state = {key: x for key, x in weights.items() if not key.startswith(tuple(ignored))}
-    for key, x in state.items():
-        if torch.is_tensor(x) and not x.isfinite().all():
-            raise InputError(f"{name}: {key} holds values that are not finite")
-    state = {key: x.float() if torch.is_tensor(x) and x.is_floating_point() else x for key, x in state.items()}
+    for key, values in weights.items():
+        if not values.isfinite().all():
+            raise InputError(f"{path.name}: {key} holds values that are not finite")
     try:
-        model.load_state_dict(state, assign=True)
+        model.load_state_dict({key: values.float() for key, values in weights.items()}, assign=True)
     except RuntimeError as error:  # several lines that name every key
-        raise InputError(f"{name}: the weights do not fit: {' '.join(str(error).split())[:300]}") from error
+        raise InputError(f"{path.name}: the weights do not fit: {' '.join(str(error).split())[:300]}") from error
+    return model

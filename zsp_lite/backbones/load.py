@@ -7,7 +7,6 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from zsp_lite.backbones.backbone import IMAGENET_MEAN, IMAGENET_STD, Backbone
@@ -155,16 +154,6 @@ def download(name: str) -> Path:
             f"{weights.md5_prefix}...; remove it, then run zsp-lite weights fetch {name}"
         )
     return path
-
-
-def verify(name_or_path: str | Path) -> None:
-    """Raise InputError unless a backbone is there, loads, and has finite features of an image."""
-    name = str(name_or_path)
-    if available_backbones().get(name, name) is None:
-        raise InputError(f"backbone {name}: {obtained_by(name)}")
-    backbone = load_backbone(name_or_path, "cpu")
-    side = backbone.image_size
-    backbone([np.broadcast_to(np.linspace(0, 255, side, dtype=np.uint8)[:, None, None], (side, side, 3))])
 
 
 def _load_huggingface(config: BackboneConfig, device: str | torch.device | None) -> Backbone:

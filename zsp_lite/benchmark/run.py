@@ -109,12 +109,12 @@ def write_reports(run: str | Path, out: str | Path | None = None, metrics: Seque
 
     `metrics` are the figures of the table of all rows. Tables of an earlier call which have no rows now are removed.
     """
-    from zsp_lite.benchmark.tables import (
+    from zsp_lite.benchmark.tables import (  # workers need no matplotlib
         SEE_MORE,
         every_table,
         write_figures,
         write_tables,
-    )  # workers need no matplotlib
+    )
 
     found, out = read_run(run), Path(out or run)
     for name in ("all_rows", *SEE_MORE, *(spec["name"] for spec in read_paper_tables())):
@@ -226,11 +226,7 @@ def _evaluate(name: str, method: Method, problem: Problem, truths: Float[np.ndar
 
 
 def _measure(answer: Answer, problem: Problem, truth: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
-    """Measure an answer: "error" in degrees, and what is known of the others.
-
-    "symmetric_error" is up to turns after which both objects look the same, "translation" the error of the object's
-    centre in diameters of the target, "scale" estimated over labelled, which is 1.
-    """
+    """Measure an answer: "error", and what is known of the other members of a stored result."""
     known = {name: getattr(answer, name) for name in ("view", "note", "scale", "inliers", "confidence")}
     known["error"] = rotation_error(answer.rotation, truth[:3, :3])
     reference, *targets = (frame.camera for frame in problem.frames())

@@ -55,9 +55,9 @@ class _Result(msgspec.Struct):
 
     error: _Degrees
     confidence: Annotated[float, msgspec.Meta(ge=0, le=1)] | None = None
-    symmetric_error: _Degrees | None = None
-    translation: float | None = None
-    scale: float | None = None
+    symmetric_error: _Degrees | None = None  # up to turns after which both objects look the same
+    translation: float | None = None  # error of the object's centre in diameters of the target
+    scale: float | None = None  # estimated over labelled, which is 1
     view: int | None = None
     inliers: int | None = None
     seconds: float | None = None

@@ -109,8 +109,7 @@ def tables(run, out, metrics) -> None:
 @click.argument("run_a", type=PATH)
 @click.argument("run_b", type=PATH)
 @click.option("--rows", type=NAMES, show_default="all common rows", help="A:B for row A of RUN_A and B of RUN_B, or A.")
-@click.option("--out", type=PATH, help="Folder to write the table to.")
-def compare(run_a, run_b, rows, out) -> None:
+def compare(run_a, run_b, rows) -> None:
     """Compare two benchmark runs on their common pairs, with intervals over objects and tests of significance.
 
     RUN_A and RUN_B are folders of runs.
@@ -119,7 +118,4 @@ def compare(run_a, run_b, rows, out) -> None:
     from zsp_lite.benchmark.runs import read_run
     from zsp_lite.cli.terminal import print_table
 
-    table = tables.compare(read_run(run_a), read_run(run_b), rows, (str(run_a), str(run_b)))
-    print_table(table)
-    if out:
-        tables.write_tables([table], out)
+    print_table(tables.compare(read_run(run_a), read_run(run_b), rows, (str(run_a), str(run_b))))

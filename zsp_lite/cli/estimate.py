@@ -38,22 +38,7 @@ from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, bac
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 @backbone_options
 @click.option("--out", type=PATH, default="outputs/estimate", help="Folder for the report and the point clouds.")
-def estimate(
-    reference,
-    target,
-    others,
-    helpers,
-    not_upright,
-    as_json,
-    backbone,
-    out,
-    mask,
-    box,
-    intrinsics,
-    depth,
-    depth_unit,
-    **settings,
-) -> None:
+def estimate(reference, target, others, helpers, not_upright, as_json, backbone, out, **settings) -> None:
     """Estimate the pose between two objects of one category; no label is needed.
 
     REFERENCE and TARGET are each a sequence of a data folder (ROOT/CATEGORY/SEQUENCE), the folder of a capture (see
@@ -89,7 +74,7 @@ def estimate(
     if others and not helpers:
         raise click.UsageError(f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers")
     with writing(out):
-        given = {"mask": mask, "box": box, "intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit}
+        given = {name: settings.pop(name) for name in ("mask", "box", "intrinsics", "depth", "depth_unit")}
         settings |= {"backbone": load_backbone(backbone), "upright": not not_upright, "helpers": (*helpers, *others)}
         found = estimate_pose(*open_pair(reference, target, given), **settings)
         files = write_pair(found, out)

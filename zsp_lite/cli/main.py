@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @cli.group(no_args_is_help=False, epilog=examples("weights list", "weights fetch dino_vits8"))
 def weights() -> None:
-    """List, download or verify the weights of backbones."""
+    """List or download the weights of backbones."""
 
 
 @weights.command("list", epilog=examples("weights list"))
@@ -91,13 +91,3 @@ def fetch(name) -> None:
     from zsp_lite.backbones.load import download
 
     print(f"Available: {download(name)}")
-
-
-@weights.command(epilog=examples("weights verify dino_vits8", "weights verify path/to/checkpoint.pth"))
-@click.argument("name")
-def verify(name) -> None:
-    """Check that weights are complete and load: NAME as `weights list` prints it, hf:NAME, or a checkpoint file."""
-    from zsp_lite.backbones import load
-
-    load.verify(name)
-    print(f"{name}: complete, loads")

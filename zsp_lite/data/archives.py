@@ -93,10 +93,8 @@ def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | Non
     """Return the number of bytes that missing archives of these sizes need on the disk; InputError if it has less."""
     # Unpacked archives are about as large as the archives. Of whole archives, one at a time is there, too.
     whole = [size or 0 for archive, size in zip(missing, sizes) if not archive.sequences]
-    needed = sum(size or 0 for size in sizes) + max(whole, default=0)
-    for archive in missing:
-        for path in (root / _WORK / archive.name, root / _WORK / f"{archive.name}.part"):
-            needed -= path.stat().st_size if path.is_file() else 0
+    present = [path.stat().st_size for archive in missing for path in (root / _WORK).glob(f"{archive.name}*")]
+    needed = sum(size or 0 for size in sizes) + max(whole, default=0) - sum(present)
     existing = next(path for path in (root.absolute(), *root.absolute().parents) if path.exists())
     if needed > (free := shutil.disk_usage(existing).free):
         raise InputError(

@@ -84,6 +84,10 @@ class Co3D:
         """List the frames in the order of the annotation file, to which the ids of published pairs refer."""
         return self._frame_index(category).keys
 
+    def frame_numbers(self, category: str) -> dict[str, list[int]]:
+        """List the numbers of the frames of every sequence of a category, in ascending order."""
+        return {name: list(found) for name, found in self._frame_index(category).by_sequence.items()}
+
     def frames(self, category: str, sequence: str) -> list[records.FrameAnnotation]:
         """Read the frame annotations of a sequence, sorted by frame number."""
         index = self._frame_index(category)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 from scipy.stats import binom
 
@@ -46,11 +47,7 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
                 "depth_scale": depth and depth.scale_adjustment, "mask": mask and mask.path,
                 "fx": fx, "fy": fy, "cx": cx, "cy": cy, "R": R, "t": t,
             })  # fmt: skip
-    text = io.StringIO()
-    writer = csv.DictWriter(text, lines[0], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(lines)
-    write_atomic(path, text.getvalue().encode())
+    write_atomic(path, pd.DataFrame(lines).to_csv(index=False, lineterminator="\n").encode())
     return Path(path)
 
 

@@ -4,7 +4,6 @@ All image files are opened here.
 """
 
 import io
-import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -23,9 +22,6 @@ from zsp_lite.io.files import read_bytes, write_atomic
 
 MAX_PIXELS = 1 << 26  # of an image file
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
-# The start of a JPEG's segment, or the end of the image: FF and a byte other than that of image data (00), of a marker
-# alone (01, D0 to D8) and of padding (FF).
-_JPEG_MARKER = re.compile(rb"\xff[\x02-\xcf\xd9-\xfe]")
 _SAME_ASPECT = 0.01  # largest relative difference of the aspect ratios of an image and its smaller depth map
 _BLACK = 10  # an image without a colour of this value is black, as CO3D's hidden frames are
 
@@ -259,25 +255,15 @@ def _decode(path: str | Path, what: str, flags: int) -> np.ndarray:
     is_jpeg = data[:2] == b"\xff\xd8"
     image, expected = None, "a complete JPEG or PNG"
     with suppress(OSError, SyntaxError, cv2.error):  # SyntaxError: of Pillow, for another format
-        width, height = (JpegImageFile if is_jpeg else PngImageFile)(io.BytesIO(data)).size  # reads the header only
+        opened = (JpegImageFile if is_jpeg else PngImageFile)(io.BytesIO(data))  # reads the header only
+        width, height = opened.size
         if width * height > MAX_PIXELS:
             expected = f"at most {MAX_PIXELS} pixels, not {height} x {width}"
-        elif _has_jpeg_end(data) if is_jpeg else _has_png_end(data):  # OpenCV fills missing parts of an image with grey
+        elif opened.load() if is_jpeg else _has_png_end(data):  # OpenCV fills missing parts of an image with grey
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         raise InputError(f"{what} {path} cannot be decoded ({len(data)} bytes), expected {expected}")
     return image
-
-
-def _has_jpeg_end(data: bytes) -> bool:
-    """Say whether a JPEG file has the end marker of its image; any data may follow, as in a phone's motion photos."""
-    position = 2
-    while marker := _JPEG_MARKER.search(data, position):
-        if marker[0] == b"\xff\xd9":
-            return True
-        # A segment begins with its length. Image data follow the segment FFDA; they contain no other marker.
-        position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2])
-    return False
 
 
 def _has_png_end(data: bytes) -> bool:

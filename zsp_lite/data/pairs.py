@@ -38,8 +38,8 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
     """
     rng = np.random.default_rng([seed, stable_hash(category) >> 1])
     sequences = sorted(read_labels(dataset.root, category))
-    frames = dataset.frame_list(category)
-    numbers = {name: sorted(key.frame_number for key in frames if key.sequence_name == name) for name in sequences}
+    frames = dataset.frame_numbers(category)
+    numbers = {name: frames.get(name, []) for name in sequences}
     if len(sequences) < 2:
         raise InputError(f"category {category} has {len(sequences)} labelled sequences, expected at least 2")
     shortest = min(sequences, key=lambda name: len(numbers[name]))

@@ -1,6 +1,6 @@
 """Conversion of a capture to a sequence of a data folder in CO3D's layout, with a fused point cloud (Open3D)."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -117,9 +117,6 @@ class LazyFrames(Sequence[Frame]):
 
     def __getitem__(self, position: int) -> Frame:
         return self._load(self._indices[position])
-
-    def __iter__(self) -> Iterator[Frame]:
-        return map(self._load, self._indices)
 
 
 def fuse(

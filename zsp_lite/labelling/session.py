@@ -53,14 +53,12 @@ class Labelling:
     coordinates of the sequence. Only one process may use a session at a time.
     """
 
-    def __init__(
-        self, root: str | Path, category: str, sequences: Sequence[str] | None = None, reference: str | None = None
-    ):
+    def __init__(self, root: str | Path, category: str):
         """Open a category with its stored picks.
 
-        By default, the sequences are the ten with the best point clouds (`Co3D.select`), or all with a point cloud if
-        there are no quality scores; the reference is that of the stored picks and labels, or else the best point cloud.
-        InputError if a name is unknown, fewer than two sequences have point clouds, or the references differ.
+        The sequences are the ten with the best point clouds (`Co3D.select`), or all with a point cloud if there are no
+        quality scores; the reference is that of the stored picks and labels, or else the best point cloud. InputError
+        if the category is unknown, fewer than two sequences have point clouds, or the references differ.
         """
         self.root, self.category, self.dataset = Path(root), plain_name(category, "category"), Co3D(root)
         known = {one.sequence_name: one for one in self.dataset.sequences(category)}
@@ -70,11 +68,11 @@ class Labelling:
         if stored and len(stored.names) != (found := len(stored.picks.get(stored.reference_seq, []))):
             raise InputError(f"picks {self.path}: {len(stored.names)} names, but {found} picks on the reference")
         references = {label.reference_seq for label in read_labels(root, category).values()}
-        references |= ({stored.reference_seq} if stored else set()) | ({reference} if reference else set())
+        references |= {stored.reference_seq} if stored else set()
         if len(references) > 1:
             found = f"reference, stored picks and labels name {', '.join(sorted(references))}"
             raise InputError(f"category {category}: {found}, expected one reference sequence")
-        chosen = sequences or [one.sequence_name for one in self.dataset.select(category)] or with_cloud
+        chosen = [one.sequence_name for one in self.dataset.select(category)] or with_cloud
         chosen = list(dict.fromkeys([*references, *chosen]))
         if missing := [name for name in chosen if name not in with_cloud]:
             allowed = ", ".join(with_cloud) or "none"

@@ -136,13 +136,7 @@ def circle_patch(axis: Axes, cell: Cell, grid: tuple[int, int], marker: str = "o
 
 
 def outline_patch(
-    axis: Axes,
-    cell: Cell,
-    grid: tuple[int, int],
-    reach: int = 0,
-    colour: str = "white",
-    label: str = "",
-    **style: Any,
+    axis: Axes, cell: Cell, grid: tuple[int, int], reach: int = 0, colour: str = "white", label: str = "", **style: Any
 ) -> list[Artist]:
     """Outline a patch of the image of an axis, or the block of patches up to `reach` around it, with a label beside it.
 

@@ -10,6 +10,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -77,23 +78,7 @@ def write_report(
 ) -> Path:
     """Write the page of the demo, or of a pair of the user's `own`."""
     with plt.rc_context(dict.fromkeys(_COLOURED, _GREY)):
-        pairs = [
-            {
-                "result": result,
-                "rows": table_rows(result),
-                "pictures": {solver: _data_uri(pose_picture(result, solver)) for solver in result.estimates},
-                "both": {
-                    solver: _data_uri(_two_poses_figure(estimate))
-                    for solver, estimate in result.estimates.items()
-                    if estimate.one_of_two
-                },
-                "votes": [_data_uri(one) for one in (votes_figure(result.votes), ring_figure(result))]
-                if result.votes
-                else [],
-                "stages": _stages(result, f"scene-{index}"),
-            }
-            for index, result in enumerate(results, 1)
-        ]
+        pairs = [_pair_parts(result, f"scene-{index}") for index, result in enumerate(results, 1)]
         picture = _data_uri(photograph_figure(photograph)) if photograph else ""
     page = _TEMPLATES.get_template("report.html").render(
         plotly=Markup(get_plotlyjs()), backbone=backbone, columns=COLUMNS, pairs=pairs, data=data, data_note=data_note,
@@ -103,6 +88,19 @@ def write_report(
     )  # fmt: skip
     write_atomic(path, page.encode(errors="replace"))
     return path
+
+
+def _pair_parts(result: PairResult, scene_id: str) -> dict[str, Any]:
+    """Make the rows and the pictures of a pair for the template."""
+    estimates, votes = result.estimates, [votes_figure(result.votes), ring_figure(result)] if result.votes else []
+    return {
+        "result": result,
+        "rows": table_rows(result),
+        "pictures": {solver: _data_uri(pose_picture(result, solver)) for solver in estimates},
+        "both": {solver: _data_uri(_two_poses_figure(one)) for solver, one in estimates.items() if one.one_of_two},
+        "votes": [_data_uri(figure) for figure in votes],
+        "stages": _stages(result, scene_id),
+    }
 
 
 def _notebook_link(name: str, folder: Path) -> Markup:

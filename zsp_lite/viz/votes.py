@@ -24,10 +24,8 @@ def votes_figure(votes: Sequence[Vote]) -> Figure:
     views = [view for vote in shown for view in plots.chosen_views([vote.estimate])]
     titles = []
     for vote in shown:
-        titles += [
-            vote.name.replace(" of ", "\nof "),
-            f"{vote.degrees:.0f}° off,\nprob. {vote.estimate.confidence:.2f}",
-        ]
+        confidence = f"prob. {vote.estimate.confidence:.2f}"
+        titles += [vote.name.replace(" of ", "\nof "), f"{vote.degrees:.0f}° off,\n{confidence}"]
     figure, axes = plots.show_images([plots.pale(view.frame.rgb) for view in views], titles, columns=8, size=1.45)
     for k, vote in enumerate(shown):
         plots.draw_estimates(axes[2 * k : 2 * k + 2], [vote.estimate], most=1500, size=2)
