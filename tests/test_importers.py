@@ -13,7 +13,7 @@ from zsp_lite.data.check import check_folder
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, write_image, write_mask
 from zsp_lite.errors import InputError
-from zsp_lite.importers import READERS, CaptureFrame, import_capture
+from zsp_lite.importers import CaptureFrame, import_capture, open_capture
 from zsp_lite.importers.convert import fuse
 from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.synthetic.export import make_object
@@ -85,7 +85,7 @@ def capture(request, tmp_path, views):
     folder = tmp_path / request.param
     folder.mkdir()
     WRITERS[request.param](folder, views)
-    return READERS[request.param](folder)
+    return open_capture(folder, request.param).frames
 
 
 @pytest.fixture
@@ -157,7 +157,7 @@ def test_distortion_is_corrected(tmp_path, views):
         grid_y, grid_x = np.mgrid[:height, :width]
         picture += 255 * np.exp(-((grid_x - x) ** 2 + (grid_y - y) ** 2) / 4)[..., None]
     write_image(folder / f"images/{view.name}.jpg", picture.clip(0, 255).astype(np.uint8), 98)
-    loaded = READERS["nerfstudio"](folder)[0].load().rgb[..., 0].astype(float)
+    loaded = open_capture(folder, "nerfstudio").frames[0].load().rgb[..., 0].astype(float)
     for x, y in wanted:
         top, left = int(y) - 4, int(x) - 4
         patch = loaded[top : top + 9, left : left + 9]
@@ -168,7 +168,7 @@ def test_distortion_is_corrected(tmp_path, views):
 def test_masks_come_from_files_by_name(tmp_path, views):
     folder = tmp_path / "scan"
     write_lists(folder, views)
-    capture = READERS["lists"](folder)
+    capture = open_capture(folder, "lists").frames
     with pytest.raises(InputError, match=r"0000.jpg has no mask, expected .*\(--masks DIR\)"):
         import_capture(capture, tmp_path / "data", "teapot", "mine")
     for view in views[1:]:
@@ -229,7 +229,7 @@ def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(tmp_path,
     WRITERS[kind](tmp_path, views)
     damage(tmp_path)
     with pytest.raises(InputError, match=message) as caught:
-        READERS[kind](tmp_path)
+        open_capture(tmp_path, kind).frames
     assert "\n" not in str(caught.value)
 
 
@@ -238,7 +238,7 @@ def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
     height, width = views[0].camera.size
     plane = np.repeat(np.arange(500, 500 + height // 2), width // 2).reshape(height // 2, width // 2)
     write_depth16(tmp_path / f"depths/{views[0].name}.png", plane / 1000)
-    frame = READERS["nerfstudio"](tmp_path)[0]
+    frame = open_capture(tmp_path, "nerfstudio").frames[0]
     np.testing.assert_allclose(frame.load().depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
     write_depth16(tmp_path / f"depths/{views[0].name}.png", plane[:, ::2] / 1000)
     with pytest.raises(InputError, match=r"expected .* = \(96, 128\)"):
@@ -250,7 +250,7 @@ def test_an_npy_file_that_is_no_depth_map_is_refused(tmp_path, views, values):
     write_lists(tmp_path, views[:1])
     np.save(tmp_path / f"z/{views[0].name}.npy", values)
     with pytest.raises(InputError, match=r"expected an .npy file of numbers \(H, W\)"):
-        READERS["lists"](tmp_path)[0].load()
+        open_capture(tmp_path, "lists").frames[0].load()
 
 
 def test_a_single_frame_is_fused_and_a_surface_that_one_of_many_frames_saw_is_left_out(views):
@@ -272,7 +272,7 @@ def test_bad_boxes_empty_depth_and_frames_without_overlap_are_refused(views):
 def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(tmp_path, views):
     folder = tmp_path / "scan"
     write_nerfstudio(folder, [*views[:5], replace(views[5], mask=np.zeros_like(views[5].mask))])
-    capture = READERS["nerfstudio"](folder)
+    capture = open_capture(folder, "nerfstudio").frames
     done = import_capture(capture, tmp_path / "data", "teapot", "mine")
     assert (done.frames, done.empty) == (5, 1)
     assert len(Co3D(tmp_path / "data").frames("teapot", "mine")) == 5

@@ -33,6 +33,7 @@ from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, bac
 @click.option("--intrinsics", type=INTRINSICS, multiple=True, help="Camera intrinsics in pixels, see above.")
 @click.option("--depth", type=PATH, multiple=True, help="Depth of an image, if it is not beside it. Once per image.")
 @click.option("--depth-unit", type=LENGTH, multiple=True, show_default="0.001", help="Metres per stored depth value.")
+@click.option("--object", type=INDEX, multiple=True, help="Number of the object in a scene of BOP.")
 @click.option("--workers", type=COUNT, default=1, help="Frames that are solved at once.")
 @click.option("--not-upright", is_flag=True, help="Try four turns by 90 degrees of the reference images.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
@@ -52,12 +53,13 @@ def estimate(
     intrinsics,
     depth,
     depth_unit,
+    object,
     **settings,
 ) -> None:
     """Estimate the pose between two objects of one category; no label is needed.
 
-    REFERENCE and TARGET are each a sequence of a data folder (ROOT/CATEGORY/SEQUENCE), the folder of a capture (see
-    `zsp-lite data import --help`), or an image NAME.jpg with its depth NAME_depth.png and, if there is one, its mask
+    REFERENCE and TARGET are each a sequence of a data folder (ROOT/CATEGORY/SEQUENCE), the folder or zip of a capture
+    (see `zsp-lite data import --help`), or an image NAME.jpg with its depth NAME_depth.png and, if there is one, its mask
     NAME_mask.png.
 
     --mask, --box, --intrinsics and --depth-unit may be given twice: for REFERENCE, then for TARGET. A single value is
@@ -66,8 +68,8 @@ def estimate(
     \b
     --mask        given: with the images; box: by GrabCut from --box, the default with a box;
                   auto: what stands on a plane, by depth and colours, the default without masks
-    --intrinsics  of an image; pixel centres at half-integers, 0.5 more than OpenCV's cx and cy
-    --depth-unit  of an image, or of a capture given as lists: 0.001 for millimetres, 1 for metres
+    --intrinsics  of an image, or of TUM RGB-D; pixel centres at half-integers, 0.5 more than OpenCV's cx and cy
+    --depth-unit  of an image, or of a capture, whose own it replaces: 0.001 for millimetres, 1 for metres
     --depth       16-bit PNG or .npy, registered to the colours
 
     --helpers are scans of other objects of the category, without labels: what the pair alone cannot tell, such as
@@ -90,6 +92,7 @@ def estimate(
         raise click.UsageError(f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers")
     with writing(out):
         given = {"mask": mask, "box": box, "intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit}
+        given["object"] = object
         settings |= {"backbone": load_backbone(backbone), "upright": not not_upright, "helpers": (*helpers, *others)}
         found = estimate_pose(*open_pair(reference, target, given), **settings)
         files = write_pair(found, out)

@@ -1,0 +1,73 @@
+"""Scenes of benchmarks and of depth cameras: BOP, ScanNet, Open3D's recorder."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from zsp_lite.errors import InputError, real_array
+from zsp_lite.importers.capture import (
+    HALF_PIXEL,
+    CaptureFrame,
+    Makers,
+    make_frame,
+    parse_numbers,
+    read_capture_json,
+    read_lines,
+)
+
+_MILLIMETRES = 0.001
+
+
+def read_bop(folder: Path, object: int | None = None) -> Makers:
+    """Read a scene in BOP's format, in the frame of one of its objects, in each image the first with its number."""
+    scene = read_capture_json(folder / "scene_gt.json", dict[str, list[dict[str, Any]]])
+    cameras = read_capture_json(folder / "scene_camera.json", dict[str, dict[str, Any]])
+    numbers = {image: [one.get("obj_id") for one in placed] for image, placed in scene.items()}
+    known = sorted({str(number) for some in numbers.values() for number in some})
+    if object is None and len(known) == 1:
+        object = int(known[0])
+    if str(object) not in known:
+        raise InputError(f"{folder} has the objects {', '.join(known)}, expected one of them as --object N")
+    for image, some in numbers.items():
+        if object in some and image in cameras:
+            index = some.index(object)
+            yield partial(_make_bop, folder, image, index, scene[image][index] | cameras[image])
+
+
+def _make_bop(folder: Path, image: str, index: int, values: dict[str, Any]) -> CaptureFrame:
+    """Make a frame of an annotation and a camera; pixel centres are at integers, lengths in millimetres."""
+    where, name = f"{folder}, image {image}", f"{image:0>6}"
+    shapes = {"cam_R_m2c": (9,), "cam_t_m2c": (3,), "cam_K": (9,)}
+    R, t, K = (real_array(f"{where}: {key}", values.get(key), shape) for key, shape in shapes.items())
+    pose = np.column_stack([R.reshape(3, 3).T, -_MILLIMETRES * R.reshape(3, 3).T @ t])
+    unit = _MILLIMETRES * float(real_array(f"{where}: depth_scale", values.get("depth_scale", 1), ()))
+    mask = f"mask_visib/{name}_{index:06d}"
+    files = f"rgb/{name}", f"depth/{name}"
+    return make_frame(folder, *files, pose, K.reshape(3, 3) + HALF_PIXEL, where, mask=mask, depth_unit=unit)
+
+
+def read_scannet(folder: Path) -> Makers:
+    """Read a scene in ScanNet's format, with a text file for the pose of each image."""
+    where = folder / "intrinsic/intrinsic_color.txt"
+    K = parse_numbers(read_lines(where), where, (3, 4))
+    for path in sorted((folder / "pose").glob("*.txt")):
+        pose = parse_numbers(read_lines(path), path, (4,))
+        yield partial(make_frame, folder, f"color/{path.stem}", f"depth/{path.stem}", pose, K, str(path))
+
+
+def read_open3d(folder: Path) -> Makers:
+    """Read frames of Open3D's recorder, with the trajectory that its reconstruction writes."""
+    log = next((one for one in (folder / "trajectory.log", folder / "scene/trajectory.log") if one.is_file()), None)
+    if log is None:
+        raise InputError(f"{folder} has no trajectory.log, expected poses: run Open3D's reconstruction system on it")
+    camera = read_capture_json(folder / "intrinsic.json", dict[str, Any])
+    K = real_array(f"{folder}/intrinsic.json: intrinsic_matrix", camera.get("intrinsic_matrix"), (9,))
+    lines = [line for k, line in enumerate(read_lines(log)) if k % 5]  # the first of five lines has frame numbers
+    images = sorted(path.stem for path in (folder / "color").iterdir() if path.suffix.lower() in (".jpg", ".png"))
+    if len(lines) != 4 * len(images):
+        raise InputError(f"{log} has {len(lines)} lines of matrices, expected 4 for each of {len(images)} images")
+    for image, pose in zip(images, parse_numbers(lines, log, (4,)).reshape(-1, 4, 4)):
+        files = f"color/{image}", f"depth/{image}"
+        yield partial(make_frame, folder, *files, pose, K.reshape(3, 3).T + HALF_PIXEL, f"{log}, frame {image}")
