@@ -109,7 +109,7 @@ class Source:
             raise _UnreadableError(str(error), position) from error
 
     def without(self, error: "_UnreadableError") -> "Source":
-        """Leave out a frame that cannot be read; the error is raised if the frame is the only one or that of the box."""
+        """Leave out an unreadable frame; the error is raised if it is the only one or that of the box."""
         if len(self.numbers) == 1 or self.box and error.position == 0:
             raise error
         numbers, cameras = (
@@ -412,11 +412,11 @@ def open_source(
     """Open a sequence of a data folder, a folder with a capture, an image, or frames of one object in one world.
 
     Args:
-        path: ROOT/CATEGORY/SEQUENCE of a data folder; a capture in a format of `importers.FORMATS`, a folder or zip; or a
+        path: ROOT/CATEGORY/SEQUENCE of a data folder; the folder or zip of a capture (see `importers.recognise`); or a
             JPEG or PNG file NAME.EXT. Depth of an image is NAME_depth.png (16 bit) or NAME_depth.npy, registered to
             its colours, and its mask, if there is one, NAME_mask.png. Or frames, such as of `Frame.from_arrays`.
-        intrinsics: fx, fy, cx, cy of an image or of TUM RGB-D in pixels, with pixel centres at half-integers (0.5 more than OpenCV's
-            cx and cy).
+        intrinsics: fx, fy, cx, cy of an image or of TUM RGB-D in pixels, with pixel centres at half-integers (0.5 more
+            than OpenCV's cx and cy).
         depth: Depth file of an image, if it is named otherwise.
         depth_unit: World units per stored depth value; by default the format's own, and 0.001 of an image.
         mask: "given", "box" or "auto". By default "box" if there is a box, "given" if the first frame has a mask, and
@@ -442,7 +442,7 @@ def open_source(
         raise InputError(f"{path}: mask is {mask!r} and box is {box}, expected {expected}")
     cameras, left_out = (), ()
     if layout == "frames":
-        numbers, read, cameras = range(len(frames)), frames.__getitem__, [frame.camera for frame in frames]
+        numbers, read = range(len(frames)), frames.__getitem__
     elif layout == "sequence":
         folder = Path(os.path.abspath(path))
         dataset = Co3D(folder.parents[1])

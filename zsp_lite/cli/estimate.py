@@ -59,8 +59,8 @@ def estimate(
     """Estimate the pose between two objects of one category; no label is needed.
 
     REFERENCE and TARGET are each a sequence of a data folder (ROOT/CATEGORY/SEQUENCE), the folder or zip of a capture
-    (see `zsp-lite data import --help`), or an image NAME.jpg with its depth NAME_depth.png and, if there is one, its mask
-    NAME_mask.png.
+    (see `zsp-lite data import --help`), or an image NAME.jpg with its depth NAME_depth.png and, if there is one, its
+    mask NAME_mask.png.
 
     --mask, --box, --intrinsics and --depth-unit may be given twice: for REFERENCE, then for TARGET. A single value is
     for both, a single --box for REFERENCE, or for the one whose --mask is box.
@@ -92,7 +92,7 @@ def estimate(
         raise click.UsageError(f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers")
     with writing(out):
         given = {"mask": mask, "box": box, "intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit}
-        given["object"] = object
+        given |= {"object": object}
         settings |= {"backbone": load_backbone(backbone), "upright": not not_upright, "helpers": (*helpers, *others)}
         found = estimate_pose(*open_pair(reference, target, given), **settings)
         files = write_pair(found, out)

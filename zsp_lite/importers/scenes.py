@@ -4,6 +4,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from zsp_lite.errors import InputError, real_array
@@ -20,29 +21,38 @@ from zsp_lite.importers.capture import (
 _MILLIMETRES = 0.001
 
 
+class _Annotation(msgspec.Struct):
+    """Pose of an object in an image of BOP."""
+
+    obj_id: int
+    cam_R_m2c: Any
+    cam_t_m2c: Any
+
+
 def read_bop(folder: Path, object: int | None = None) -> Makers:
     """Read a scene in BOP's format, in the frame of one of its objects, in each image the first with its number."""
-    scene = read_capture_json(folder / "scene_gt.json", dict[str, list[dict[str, Any]]])
+    scene = read_capture_json(folder / "scene_gt.json", dict[str, list[_Annotation]])
     cameras = read_capture_json(folder / "scene_camera.json", dict[str, dict[str, Any]])
-    numbers = {image: [one.get("obj_id") for one in placed] for image, placed in scene.items()}
-    known = sorted({str(number) for some in numbers.values() for number in some})
+    numbers = {image: [one.obj_id for one in placed] for image, placed in scene.items()}
+    known = sorted({number for some in numbers.values() for number in some})
     if object is None and len(known) == 1:
-        object = int(known[0])
-    if str(object) not in known:
-        raise InputError(f"{folder} has the objects {', '.join(known)}, expected one of them as --object N")
+        object = known[0]
+    if object not in known:
+        raise InputError(f"{folder} has the objects {', '.join(map(str, known))}, expected one of them as --object N")
     for image, some in numbers.items():
         if object in some and image in cameras:
             index = some.index(object)
-            yield partial(_make_bop, folder, image, index, scene[image][index] | cameras[image])
+            yield partial(_make_bop, folder, image, index, scene[image][index], cameras[image])
 
 
-def _make_bop(folder: Path, image: str, index: int, values: dict[str, Any]) -> CaptureFrame:
+def _make_bop(folder: Path, image: str, index: int, placed: _Annotation, camera: dict[str, Any]) -> CaptureFrame:
     """Make a frame of an annotation and a camera; pixel centres are at integers, lengths in millimetres."""
     where, name = f"{folder}, image {image}", f"{image:0>6}"
-    shapes = {"cam_R_m2c": (9,), "cam_t_m2c": (3,), "cam_K": (9,)}
-    R, t, K = (real_array(f"{where}: {key}", values.get(key), shape) for key, shape in shapes.items())
+    R = real_array(f"{where}: cam_R_m2c", placed.cam_R_m2c, (9,))
+    t = real_array(f"{where}: cam_t_m2c", placed.cam_t_m2c, (3,))
+    K = real_array(f"{where}: cam_K", camera.get("cam_K"), (9,))
     pose = np.column_stack([R.reshape(3, 3).T, -_MILLIMETRES * R.reshape(3, 3).T @ t])
-    unit = _MILLIMETRES * float(real_array(f"{where}: depth_scale", values.get("depth_scale", 1), ()))
+    unit = _MILLIMETRES * float(real_array(f"{where}: depth_scale", camera.get("depth_scale", 1), ()))
     mask = f"mask_visib/{name}_{index:06d}"
     files = f"rgb/{name}", f"depth/{name}"
     return make_frame(folder, *files, pose, K.reshape(3, 3) + HALF_PIXEL, where, mask=mask, depth_unit=unit)
