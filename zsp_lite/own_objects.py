@@ -54,14 +54,6 @@ _SWEEPS = 50  # over the chosen views, which mostly stay after ten
 _CONTEXT = 8  # frames of a source that are segmented together with the reference frame, or tried as the reference
 
 
-class _UnreadableError(InputError):
-    """A frame of a source that cannot be read."""
-
-    def __init__(self, message: str, position: int):
-        super().__init__(message)
-        self.position = position
-
-
 @dataclass(frozen=True, eq=False)
 class Source:
     """Frames of one object in one world, read when needed."""
@@ -69,7 +61,7 @@ class Source:
     path: Path  # the sequence, the capture or the image; a name for frames in memory
     format: str  # "sequence", "image", "frames", or the format of a capture
     numbers: tuple[int, ...]  # number of each frame: that of the annotations, or its position in the capture
-    read: Callable[[int], Frame]  # reads the frame with a number, with the mask that comes with it, if any
+    read: Callable[[int], Frame]  # reads the frame at a position of `numbers`, with the mask that comes with it, if any
     mask: str  # where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours)
     box: Box | None = None  # bounding box of the object in the first frame, for "box"
     cameras: tuple[Camera, ...] = ()  # of the frames, where these are chosen by their directions, not by their order
@@ -92,7 +84,7 @@ class Source:
         """Load frames with masks of the object; InputError if a file cannot be read, or no frame shows the object."""
         # The box is that of the first frame, and automatic masks are better with more frames.
         others = {"given": [], "box": [0], "auto": np.linspace(0, len(self.numbers) - 1, _CONTEXT).round()}[self.mask]
-        frames = {position: self._read(position) for position in sorted({*positions, *map(int, others)})}
+        frames = {position: self.read(position) for position in sorted({*positions, *map(int, others)})}
         some = list(frames.values())
         if self.mask != "given":
             masked = masks_from_box(some, self.box) if self.box else masks_from_depth(some)
@@ -101,21 +93,6 @@ class Source:
             where = f"{self.path}, frame {without[0]}"
             raise InputError(f"{where}: no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH")
         return [frames[position] for position in positions]
-
-    def _read(self, position: int) -> Frame:
-        try:
-            return self.read(self.numbers[position])
-        except InputError as error:
-            raise _UnreadableError(str(error), position) from error
-
-    def without(self, error: "_UnreadableError") -> "Source":
-        """Leave out an unreadable frame; the error is raised if it is the only one or that of the box."""
-        if len(self.numbers) == 1 or self.box and error.position == 0:
-            raise error
-        numbers, cameras = (
-            (*one[: error.position], *one[error.position + 1 :]) for one in (self.numbers, self.cameras)
-        )
-        return replace(self, numbers=numbers, cameras=cameras, left_out=(*self.left_out, str(error)))
 
     def flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
         """Question the unit of length where the object is implausibly far, and the masks of frames if not given."""
@@ -179,12 +156,7 @@ class _Scan:
         cls, source: Source, method: ZeroShotPose, references: int, targets: int, first: int | None = None
     ) -> "_Scan":
         """Load frames of a source (see `Source.select`), and extract their features."""
-        while True:
-            try:
-                chosen, shown, frames = source.select(references, targets, first)
-                break
-            except _UnreadableError as error:
-                source = source.without(error)
+        chosen, shown, frames = source.select(references, targets, first)
         cloud = world_cloud([frames[position] for position in shown or chosen])[0]
         # The method expects objects of about unit standard deviation. Sequences of data folders have it.
         scale = 1.0 if source.format == "sequence" or not len(cloud) else 1 / (axis_deviation(cloud) or 1)
@@ -442,26 +414,24 @@ def open_source(
         raise InputError(f"{path}: mask is {mask!r} and box is {box}, expected {expected}")
     cameras, left_out = (), ()
     if layout == "frames":
-        numbers, read = range(len(frames)), frames.__getitem__
+        numbers, read = tuple(range(len(frames))), frames.__getitem__
     elif layout == "sequence":
         folder = Path(os.path.abspath(path))
         dataset = Co3D(folder.parents[1])
         every = dataset.frames(folder.parent.name, folder.name)
-        if not (frames := {one.frame_number: one for one in every if None not in (one.viewpoint, one.depth)}):
+        if not (frames := [one for one in every if one.viewpoint is not None and one.depth is not None]):
             raise InputError(f"{path}: no frame has a camera and depth, expected some")
-        numbers, read = frames, lambda number: dataset.load(frames[number])
-    elif layout == "image":
-        frame = _open_image(path, **options)
-        numbers, read = [0], lambda _: frame.load()
+        numbers, read = tuple(one.frame_number for one in frames), lambda k: dataset.load(frames[k])
     else:
-        _, capture, left_out = open_capture(path, **options)
-        numbers, read = range(len(capture)), lambda number: capture[number].load()
-        cameras = [one.camera for one in capture]
-    numbers = tuple(numbers)
+        if layout == "image":
+            capture = [_open_image(path, **options)]
+        else:
+            _, capture, left_out = open_capture(path, **options)
+        numbers, read = tuple(range(len(capture))), lambda k: capture[k].load()
+        cameras = tuple(frame.camera for frame in capture)
     if mask is None:
-        masked = capture[0].mask if layout in FORMATS else read(numbers[0]).mask
-        mask = "box" if box is not None else "auto" if masked is None else "given"
-    return Source(path, layout, numbers, read, mask, box, tuple(cameras), tuple(left_out))
+        mask = "box" if box is not None else "auto" if read(0).mask is None else "given"
+    return Source(path, layout, numbers, read, mask, box, cameras, tuple(left_out))
 
 
 def open_pair(reference: _Object, target: _Object, options: Mapping[str, Sequence]) -> list[Source]:

@@ -141,7 +141,8 @@ for name, layout, change in (
         written("odometry.csv", "timestamp, frame\n" + "".join(f"0, {k}, 0, 0, 0, 0, 0, 0, 1\n" for k in (1e9, 1e18, -5, "nan")))(path),
         written("depth/1000000000.png", "")(path))),
     ("video of 10 hours", "stray", lambda path: (
-        rewritten("rgb.mp4", ten_hours)(path), rewritten("odometry.csv", lambda data: data.replace(b", 0.0", b", 9.0"))(path))),
+        rewritten("rgb.mp4", ten_hours)(path), rewritten("odometry.csv", lambda data: data.replace(b", 0.0", b", 9e5"))(path),
+        written("depth/900000.png", "")(path))),
     ("video that is a list of addresses", "stray", written("rgb.mp4", "#EXTM3U\n#EXTINF:9,\n/etc/passwd\n")),
     ("camera of objects", "polycam", written("keyframes/corrected_cameras/000000.json", '{"fx": {}, "t_00": "x"}')),
     ("depth of an archive that is no LZFSE", "record3d", lambda path: None),

@@ -210,6 +210,8 @@ def import_(source, root, category, sequence, box, masks, frames, **options) -> 
     refuse_options({"masks": box and masks}, (), "--box")
     refuse_options(given, FORMATS[layout].options, f"the format {layout}")
     capture = open_capture(source[-1], layout, frames, **given)
+    if capture.left_out and len(capture.frames) < 3:
+        raise InputError(f"{source[-1]}: {len(capture.frames)} frames remain, expected 3: {capture.left_out[0]}")
     done = import_capture(capture.frames, root, category, sequence, box, masks, frames)
     print(
         f"Written: {root / category / sequence}: {done.frames} frames, {done.points:,} points, "

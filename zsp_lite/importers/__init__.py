@@ -2,11 +2,21 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import MOST_FRAMES, Capture, CaptureFrame, Makers, collect, find_masks, sharp_frames
+from zsp_lite.importers.capture import (
+    MOST_FRAMES,
+    Capture,
+    CaptureFrame,
+    Makers,
+    check_files,
+    collect,
+    find_masks,
+    sharp_frames,
+)
 from zsp_lite.importers.convert import import_capture
 from zsp_lite.importers.lists import read_lists, read_tum
 from zsp_lite.importers.nerfstudio import read_nerfstudio
@@ -29,13 +39,13 @@ class Format:
 
 # A folder has the first format whose signs it has.
 FORMATS = {
-    "nerfstudio": Format(("transforms*.json",), "nerfstudio, Blender, NeRFCapture, instant-ngp", read_nerfstudio),
+    "nerfstudio": Format(("transforms*.json",), "nerfstudio, Blender, NeRFCapture or instant-ngp", read_nerfstudio),
     "stray": Format(("rgb.mp4", "odometry.csv"), "Stray Scanner", read_stray),
     "polycam": Format(("keyframes/*cameras",), "Polycam's raw data", read_polycam),
-    "record3d": Format(("metadata", "rgbd"), "Record3D's .r3d", read_record3d),
-    "lists": Format(("poses.txt",), "plain text lists", read_lists),
+    "record3d": Format(("metadata", "rgbd"), "Record3D", read_record3d),
+    "lists": Format(("poses.txt",), "lists", read_lists),
     "tum": Format(("groundtruth.txt", "rgb.txt"), "TUM RGB-D", read_tum, ("depth_unit", "intrinsics")),
-    "bop": Format(("scene_gt.json", "scene_camera.json"), "a scene of BOP", read_bop, ("depth_unit", "object")),
+    "bop": Format(("scene_gt.json", "scene_camera.json"), "BOP", read_bop, ("depth_unit", "object")),
     "scannet": Format(("pose", "intrinsic/intrinsic_color.txt"), "ScanNet", read_scannet),
     "open3d": Format(("intrinsic.json", "color"), "Open3D's recorder", read_open3d),
 }
@@ -71,7 +81,7 @@ def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
         if any(file.name in signs or file.suffix.lower() in signs for file in (path, *files)):
             raise InputError(f"{path} {problem}, {_HOW}")
     found = "has another format" if path.exists() else "does not exist"
-    known = ", ".join(f"{name} ({', '.join(one.signs)})" for name, one in FORMATS.items())
+    known = "; ".join(f"{one.what} ({', '.join(one.signs)})" for one in FORMATS.values())
     raise InputError(f"{path} {found}, expected {also}a folder or zip with the files of {known}")
 
 
@@ -91,16 +101,18 @@ def open_capture(
     Raises:
         InputError: The capture cannot be read, or none of its frames can be used.
     """
-    path = Path(path)
+    source = path = Path(path)
     if layout is None or path.is_file():
-        layout, path = recognise(path)
+        found, path = recognise(path)
+        layout = layout or found
     options |= {"count": count} if layout == "stray" else {}
     frames, left_out = collect(FORMATS[layout].read(path, **options))
+    frames, damaged = collect(partial(check_files, frame) for frame in sharp_frames(frames, count))
+    left_out += damaged
     if not frames:
         found = f"none of {len(left_out)} frames can be used: {left_out[0]}" if left_out else "no frame, expected some"
-        raise InputError(f"capture {path}: {found}")
-    frames = sharp_frames(frames, count)
-    masks = find_masks(path / "masks", [frame.image for frame in frames])
+        raise InputError(f"capture {source}: {found}")
+    masks = find_masks((path if path.is_dir() else path.parent) / "masks", [frame.image for frame in frames])
     frames = [replace(frame, mask=frame.mask or mask) for frame, mask in zip(frames, masks)]
     if depth_unit is not None:
         frames = [replace(frame, depth_unit=depth_unit) for frame in frames]

@@ -4,7 +4,7 @@ import codecs
 import io
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -116,8 +116,8 @@ def make_frame(
     return CaptureFrame(paths[0], paths[1], camera, mask=paths[2], confidence=paths[3], **others)
 
 
-def collect(makers: Makers) -> tuple[list[CaptureFrame], list[str]]:
-    """Return the frames that can be made, in natural order, and what is wrong with the others."""
+def collect(makers: Iterable[Callable[[], CaptureFrame]]) -> tuple[list[CaptureFrame], list[str]]:
+    """Return the frames that can be made, in natural order, and what is wrong with each of the others."""
     frames, left_out = [], []
     for make in makers:
         try:
@@ -127,6 +127,13 @@ def collect(makers: Makers) -> tuple[list[CaptureFrame], list[str]]:
         except InputError as error:
             left_out.append(str(error))
     return sorted(frames, key=lambda frame: _natural_order(frame.image)), left_out
+
+
+def check_files(frame: CaptureFrame) -> CaptureFrame:
+    """Return the frame; InputError if its image or depth cannot be decoded."""
+    read_grey(frame.image, half=True)
+    _read_depth(frame.depth)
+    return frame
 
 
 def left_out_flags(left_out: Sequence[str]) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from zsp_lite.data.cameras import Box
 from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, find_masks, left_out_flags
+from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, find_masks
 from zsp_lite.importers.masks import mask_flags, masks_from_box
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
@@ -32,7 +32,7 @@ class ImportResult:
     empty: int  # frames that were left out because their masks are empty
     points: int
     scale: float  # factor from the capture's lengths to those of the sequence
-    flags: tuple[str, ...]  # frames that are left out because they cannot be read, and what speaks against the masks
+    flags: tuple[str, ...]  # what speaks against the masks
 
 
 def import_capture(
@@ -76,42 +76,24 @@ def import_capture(
             f"{missing[0]} has no mask, expected a box in the first picture (--box TOP,LEFT,HEIGHT,WIDTH), or a folder "
             "of masks that are named like the pictures (--masks DIR)"
         )
-    read: list[int] = []
-    left_out: list[str] = []
-
-    def readable() -> Iterator[Frame]:
-        for index, one in enumerate(capture):
-            try:
-                frame = one.load()
-            except InputError as error:
-                if box is not None and index == 0:  # the box is for this frame
-                    raise
-                left_out.append(str(error))
-            else:
-                read.append(index)
-                yield frame
-
     if box is None:
-        bits, shown = [], [frame.shows_object for frame in readable()]
+        bits, seen = [], [index for index, frame in enumerate(capture) if frame.load().shows_object]
     else:
-        bits = [np.packbits(frame.mask > ON_OBJECT) for frame in masks_from_box(readable(), box)]
-        shown = [mask.any() for mask in bits]
-    if left_out and len(read) < _MIN_VIEWS:
-        raise InputError(f"{len(read)} of {len(capture)} frames can be read, expected {_MIN_VIEWS}: {left_out[0]}")
-    seen = [index for index, on_object in zip(read, shown) if on_object]
+        found = masks_from_box((frame.load() for frame in capture), box)
+        bits = [np.packbits(frame.mask > ON_OBJECT) for frame in found]
+        seen = [index for index, mask in enumerate(bits) if mask.any()]
     if not seen:
         raise InputError(f"the masks of all {len(capture)} frames are empty, expected an object")
-    packed = dict(zip(read, bits))
 
     def load(index: int) -> Frame:
         frame = capture[index].load()
         if box is None:
             return frame
-        mask = np.unpackbits(packed[index], count=frame.depth.size).reshape(frame.depth.shape)
+        mask = np.unpackbits(bits[index], count=frame.depth.size).reshape(frame.depth.shape)
         return replace(frame, mask=mask.astype(np.float32))
 
     frames = LazyFrames(load, seen)
-    flags = (*left_out_flags(left_out), *(mask_flags(frames) if box is not None else ()))
+    flags = mask_flags(frames) if box is not None else ()
     points, colours, normals = fuse(frames)
     scale = 1 / axis_deviation(points)
     scaled = LazyFrames(lambda index: scale_frame(load(index), scale), seen)
@@ -121,7 +103,7 @@ def import_capture(
         unfinished.touch()
         write_co3d(root, category, [data])
         unfinished.unlink()
-    return ImportResult(len(seen), len(read) - len(seen), len(points), scale, flags)
+    return ImportResult(len(seen), len(capture) - len(seen), len(points), scale, flags)
 
 
 class LazyFrames(Sequence[Frame]):

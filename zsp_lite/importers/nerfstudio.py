@@ -75,10 +75,10 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
         expected = f"one of {', '.join(_MODELS)} with k4 = 0, or {_FISHEYE}"
         raise InputError(f"{where}: camera_model is {found}, expected {expected}")
     image = find_inside(folder, frame.file_path)
-    width, height = frame.w, frame.h
-    if image and not (width and height):
-        height, width = image_size(image)
-    if frame.fl_x is None and frame.camera_angle_x is None:
+    if image is None:
+        raise InputError(f"{where}: {frame.file_path} is missing in {folder}")
+    height, width = (int(frame.h), int(frame.w)) if frame.h and frame.w else image_size(image)
+    if not (frame.fl_x or frame.camera_angle_x):
         raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
     fx = frame.fl_x or width / 2 / math.tan(frame.camera_angle_x / 2)
     fy = frame.fl_y or (height / 2 / math.tan(frame.camera_angle_y / 2) if frame.camera_angle_y else fx)
@@ -86,7 +86,7 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     # OpenCV's order of the coefficients; its model has no r^8 term, k4.
     last = (frame.k3, frame.k4) if fisheye else (frame.p1, frame.p2, frame.k3)
     return make_frame(
-        folder, image or frame.file_path, frame.depth_file_path or frame.depth_path, frame.transform_matrix,
-        (fx, fy, cx, cy), where, FROM_OPENGL, (int(height), int(width)), frame.mask_path, fisheye=fisheye,
+        folder, image, frame.depth_file_path or frame.depth_path, frame.transform_matrix,
+        (fx, fy, cx, cy), where, FROM_OPENGL, (height, width), frame.mask_path, fisheye=fisheye,
         depth_unit=frame.integer_depth_scale or frame.depth_unit_scale_factor, distortion=(frame.k1, frame.k2, *last),
     )  # fmt: skip

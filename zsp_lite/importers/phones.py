@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import msgspec
@@ -50,13 +50,16 @@ def read_polycam(folder: Path) -> Makers:
         yield partial(make_frame, folder, *files, pose, intrinsics, f"{path}", FROM_OPENGL, confidence=confidence)
 
 
+_Side = Annotated[int, msgspec.Meta(ge=1, le=10_000)]  # pixels
+
+
 class _Record3D(msgspec.Struct):
     """The file `metadata` of a Record3D scan; numbers of a pose that are not finite are None."""
 
-    K: list[float]  # in column-major order
+    K: Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)]  # in column-major order
     poses: list[list[float | None]]  # qx, qy, qz, qw, tx, ty, tz
-    dw: int
-    dh: int
+    dw: _Side = 256  # of the depth maps; by default those of the LiDAR
+    dh: _Side = 192
     perFrameIntrinsicCoeffs: list[list[float | None]] | None = None
 
 

@@ -77,6 +77,8 @@ def sharp_pictures(path: Path, numbers: Sequence[int], count: int) -> dict[int, 
         for number, image in sorted(islice(images, len(part)), key=_sharpness)[-1:]:
             pictures[number] = folder / f"{number:06d}.jpg"
             write_image(pictures[number], image[..., ::-1], 95)
+    if not pictures:
+        raise InputError(f"video {path} ends before frame {numbers[0]}, the first with depth")
     return pictures
 
 
