@@ -50,7 +50,7 @@ _ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of 
 _REFERENCES = 4  # frames of each object that are solved against views of the other
 _LEAST_PROBABLE = 0.005  # an alternative is named above this
 _Ends = tuple[int, int, int]  # numbers of two objects, and the position of a frame of the first
-_SWEEPS = 50  # over the chosen views, which mostly stay after ten
+_SWEEPS = 20  # over the chosen views, which mostly stay after ten
 _CONTEXT = 8  # frames of a source that are segmented together with the reference frame, or tried as the reference
 
 
@@ -510,7 +510,7 @@ def spread(count: int, length: int) -> list[int]:
 def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
     """Return the positions of at most `count` cameras, spread evenly over the directions from which they see an object.
 
-    They are the first camera and those farthest from it and from each other, moved as charges that repel each other.
+    They are the first camera and others that lie as charges which repel each other.
     """
     if len(cameras) <= count:
         return list(range(len(cameras)))
@@ -520,18 +520,13 @@ def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
     directions = centres - point
     directions /= np.linalg.norm(directions, axis=1, keepdims=True).clip(1e-9)
     order = [0, *(1 + np.lexsort(directions[1:].T.round(6)))]  # the same for every order of the other cameras
-    directions = directions[order]
-    energy = 1 / (np.sum((directions[:, None] - directions) ** 2, axis=-1) + 1e-9)
+    gaps = directions[order][:, None] - directions[order]
+    energy = 1 / (np.sum(gaps**2, axis=-1) + 1e-9)
     chosen = [0]
-    while len(chosen) < count:
-        chosen.append(int(energy[chosen].max(axis=0).argmin()))
     for _ in range(_SWEEPS):
-        before = list(chosen)
-        for k in range(1, count):
+        for k in range(1, count):  # in the first sweep, they are added
             others = chosen[:k] + chosen[k + 1 :]
-            chosen[k] = int(energy[others].sum(axis=0).argmin())
-        if chosen == before:
-            break
+            chosen[k : k + 1] = [int(energy[others].sum(axis=0).argmin())]
     return sorted(int(order[k]) for k in chosen)
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,10 @@ from zsp_lite.importers.capture import (
     Capture,
     CaptureFrame,
     Makers,
-    check_files,
     collect,
     find_masks,
-    sharp_frames,
+    read_sample,
+    sharpest,
 )
 from zsp_lite.importers.convert import import_capture
 from zsp_lite.importers.lists import read_lists, read_tum
@@ -107,8 +106,7 @@ def open_capture(
         layout = layout or found
     options |= {"count": count} if layout == "stray" else {}
     frames, left_out = collect(FORMATS[layout].read(path, **options))
-    frames, damaged = collect(partial(check_files, frame) for frame in sharp_frames(frames, count))
-    left_out += damaged
+    frames = [frame for frame, _ in sharpest(frames, count, read_sample, left_out)]
     if not frames:
         found = f"none of {len(left_out)} frames can be used: {left_out[0]}" if left_out else "no frame, expected some"
         raise InputError(f"capture {source}: {found}")

@@ -129,13 +129,6 @@ def collect(makers: Iterable[Callable[[], CaptureFrame]]) -> tuple[list[CaptureF
     return sorted(frames, key=lambda frame: _natural_order(frame.image)), left_out
 
 
-def check_files(frame: CaptureFrame) -> CaptureFrame:
-    """Return the frame; InputError if its image or depth cannot be decoded."""
-    read_grey(frame.image, half=True)
-    _read_depth(frame.depth)
-    return frame
-
-
 def left_out_flags(left_out: Sequence[str]) -> tuple[str, ...]:
     """Name the frames that are left out in one flag, if there are any."""
     more = f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
@@ -154,32 +147,39 @@ def evenly_spaced(frames: Sequence[CaptureFrame], count: int) -> list[CaptureFra
     return [frames[index] for index in chosen]
 
 
-def stretches(length: int, count: int) -> list[list[int]]:
-    """Divide positions into at most `count` stretches, and return a few candidates of each: the first frame alone."""
-    if length <= count:
-        return [[position] for position in range(length)]
-    parts = np.array_split(np.arange(1, length), max(count - 1, 1))
-    return [[0], *(part[:: -(-len(part) // _CANDIDATES)].tolist() for part in parts)][:count]
+def sharpest(
+    items: Sequence[Any], count: int, read: Callable[[Any], np.ndarray], left_out: list[str]
+) -> Iterator[tuple[Any, np.ndarray]]:
+    """Yield at most `count` items, the sharpest of the candidates of each stretch, with the images that are read.
+
+    What is wrong with unreadable ones is added to `left_out`. The first frame is chosen, because a box may be for it.
+    """
+    parts = [[position] for position in range(len(items))]
+    if len(items) > count:
+        later = np.array_split(np.arange(1, len(items)), max(count - 1, 1))
+        parts = [[0], *(part[:: -(-len(part) // _CANDIDATES)].tolist() for part in later)][:count]
+    for part in parts:
+        images = []
+        for position in part:
+            try:
+                images.append((items[position], read(items[position])))
+            except InputError as error:
+                left_out.append(str(error))
+        if images:
+            yield max(images, key=lambda one: _sharpness(one[1]))
 
 
-def sharp_frames(frames: Sequence[CaptureFrame], count: int) -> list[CaptureFrame]:
-    """Keep at most `count` frames: of the candidates of each stretch the one with the sharpest image."""
-
-    def measured(frame: CaptureFrame) -> float:
-        try:
-            return sharpness(read_grey(frame.image, half=True))
-        except InputError:
-            return -1.0
-
-    groups = [[frames[k] for k in part] for part in stretches(len(frames), count)]
-    return [part[0] if len(part) == 1 else max(part, key=measured) for part in groups]
-
-
-def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
+def _sharpness(image: UInt8[np.ndarray, "..."]) -> float:
     """Return the variance of the Laplacian of a small copy of an image."""
-    scale = min(1.0, _SHARPNESS_SIDE / max(grey.shape))
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    scale = min(1.0, _SHARPNESS_SIDE / max(image.shape))
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(small, cv2.CV_32F).var())
+
+
+def read_sample(frame: CaptureFrame) -> UInt8[np.ndarray, "h w"]:
+    """Read the image of a frame at half its size; InputError if it or the depth cannot be decoded."""
+    _read_depth(frame.depth)
+    return read_grey(frame.image, half=True)
 
 
 def trusted(levels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -225,16 +225,15 @@ def read_lines(path: Path) -> list[str]:
     return lines
 
 
-def parse_numbers(
-    lines: list[str], where: Any, columns: tuple[int, ...] = (), delimiter: str | None = None
-) -> Float[np.ndarray, "rows columns"]:
-    """Convert lines to numbers, as many in each as one of `columns`, if given."""
+def read_numbers(path: Path, columns: tuple[int, ...], **options: Any) -> Float[np.ndarray, "rows columns"]:
+    """Read a text file of numbers by `numpy.loadtxt` with its options, as many in each line as one of `columns`."""
+    lines = read_lines(path)
     try:
-        values = np.loadtxt(lines, ndmin=2, delimiter=delimiter)
+        values = np.loadtxt(lines, ndmin=2, **options)
     except ValueError as error:
-        raise InputError(f"{where}: {error}") from error
-    if columns and values.shape[1] not in columns:
-        raise InputError(f"{where}: {values.shape[1]} numbers per line, expected {' or '.join(map(str, columns))}")
+        raise InputError(f"{path}: {error}") from error
+    if values.shape[1] not in columns:
+        raise InputError(f"{path}: {values.shape[1]} numbers per line, expected {' or '.join(map(str, columns))}")
     return values
 
 

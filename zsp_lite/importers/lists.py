@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import Makers, make_frame, parse_numbers, read_lines
+from zsp_lite.importers.capture import Makers, make_frame, read_lines, read_numbers
 
 _TUM_INTRINSICS = 525.0, 525.0, 320.0, 240.0  # the benchmark's default, with pixel centres at half-integers
 _TUM_UNIT, _TUM_TOLERANCE = 1 / 5000, 0.02  # metres per stored depth value; seconds between an image and its depth
@@ -21,38 +21,30 @@ def read_lists(folder: Path) -> Makers:
     intrinsics.txt: the 3 x 3 matrix K in pixels, or fx fy cx cy, once or in a line per frame; pixel centres are at
     half-integers
     """
-    lists = {name: read_lines(folder / name) for name in ("rgb.txt", "depth.txt", "poses.txt", "intrinsics.txt")}
-    intrinsics = parse_numbers(lists["intrinsics.txt"], f"{folder}/intrinsics.txt", (3, 4))
-    poses = parse_numbers(lists["poses.txt"], f"{folder}/poses.txt", (12, 16))
+    images, depths = (read_lines(folder / name) for name in ("rgb.txt", "depth.txt"))
+    poses = read_numbers(folder / "poses.txt", (12, 16))
+    intrinsics = read_numbers(folder / "intrinsics.txt", (3, 4))
     if intrinsics.shape[1] == 3 or len(intrinsics) == 1:
-        del lists["intrinsics.txt"]
         intrinsics = [intrinsics.squeeze()] * len(poses)
-    counts = {name: len(lines) for name, lines in lists.items()}
+    counts = {"rgb.txt": len(images), "depth.txt": len(depths), "poses.txt": len(poses), "intrinsics": len(intrinsics)}
     if len(set(counts.values())) > 1:
         found = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise InputError(f"capture {folder}: the lists have lines: {found}; expected equal numbers")
-    for line, names in enumerate(zip(lists["rgb.txt"], lists["depth.txt"])):
+    for line, names in enumerate(zip(images, depths)):
         where = f"capture {folder}, line {line + 1} of the lists"
         yield partial(make_frame, folder, *names, poses[line], intrinsics[line], where)
 
 
 def read_tum(folder: Path, intrinsics: tuple[float, float, float, float] = _TUM_INTRINSICS) -> Makers:
     """Read a sequence of TUM's RGB-D benchmark: image, depth and pose of the nearest times are a frame."""
-    where = f"{folder}/groundtruth.txt"
-    poses = parse_numbers(read_lines(folder / "groundtruth.txt"), where, (8,))
-    (times, images), (depth_times, depths) = (_timed_files(folder / name) for name in ("rgb.txt", "depth.txt"))
+    poses = read_numbers(folder / "groundtruth.txt", (8,))
+    names = [folder / name for name in ("rgb.txt", "depth.txt")]
+    times, depth_times = (read_numbers(name, (1,), usecols=0)[:, 0] for name in names)
+    images, depths = ([line.split(maxsplit=1)[-1] for line in read_lines(name)] for name in names)
     for time, image, depth, pose in zip(times, images, _nearest(depth_times, times), _nearest(poses[:, 0], times)):
         if min(depth, pose) >= 0:
-            yield partial(
-                make_frame, folder, image, depths[depth], poses[pose, 1:], intrinsics, f"{where}, time {time:.6f}",
-                depth_unit=_TUM_UNIT,
-            )  # fmt: skip
-
-
-def _timed_files(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Read a list of times and file names."""
-    rows = [line.split(maxsplit=1) for line in read_lines(path)]
-    return parse_numbers([row[0] for row in rows], path, (1,))[:, 0], [row[-1] for row in rows]
+            files, where = (image, depths[depth]), f"{folder}, time {time:.6f}"
+            yield partial(make_frame, folder, *files, poses[pose, 1:], intrinsics, where, depth_unit=_TUM_UNIT)
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> list[int]:

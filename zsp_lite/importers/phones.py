@@ -8,33 +8,38 @@ import cv2
 import msgspec
 import numpy as np
 
+from zsp_lite.data.frames import write_image
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import (
     FROM_OPENGL,
     CaptureFrame,
     Makers,
     make_frame,
-    parse_numbers,
     read_capture_json,
-    read_lines,
+    read_numbers,
+    sharpest,
 )
-from zsp_lite.importers.unpacked import new_folder, sharp_pictures
+from zsp_lite.importers.unpacked import new_folder, open_video
 from zsp_lite.io.files import read_bytes
 
 
 def read_stray(folder: Path, count: int) -> Makers:
     """Read a scan of Stray Scanner, at most `count` sharp frames of its video."""
-    where, matrix = folder / "odometry.csv", folder / "camera_matrix.csv"
-    rows = parse_numbers(read_lines(where)[1:], where, delimiter=",", columns=(9,))
-    K = parse_numbers(read_lines(matrix), matrix, delimiter=",", columns=(3,))
+    rows = read_numbers(folder / "odometry.csv", (9,), delimiter=",", skiprows=1)
+    K = read_numbers(folder / "camera_matrix.csv", (3,), delimiter=",")
     names = [f"{number:06.0f}.png" for number in rows[:, 1]]
-    with_depth = [int(name[:-4]) for name in names if (folder / "depth" / name).is_file()]
-    pictures = sharp_pictures(folder / "rgb.mp4", sorted(set(with_depth)), count) if with_depth else {}
+    with_depth = sorted({int(name[:-4]) for name in names if (folder / "depth" / name).is_file()})
+    pictures, images, left_out = new_folder(), {}, []
+    for number, image in sharpest(with_depth, count, open_video(folder / "rgb.mp4"), left_out):
+        images[number] = pictures / f"{number:06d}.jpg"
+        write_image(images[number], image, 95)
+    if left_out and not images:
+        raise InputError(left_out[0])
     for row, name in zip(rows, names):
-        if not with_depth or row[1] in pictures or row[1] not in with_depth:
-            image = pictures.get(row[1], "rgb.mp4")
-            text, confidence = f"{where}, frame {row[1]:g}", f"confidence/{name}"
-            yield partial(make_frame, folder, image, f"depth/{name}", row[2:], K, text, confidence=confidence)
+        if row[1] in images or row[1] not in with_depth:
+            files = images.get(row[1], "rgb.mp4"), f"depth/{name}"
+            where, confidence = f"{folder}/odometry.csv, frame {row[1]:g}", f"confidence/{name}"
+            yield partial(make_frame, folder, *files, row[2:], K, where, confidence=confidence)
 
 
 def read_polycam(folder: Path) -> Makers:

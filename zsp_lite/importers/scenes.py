@@ -8,15 +8,7 @@ import msgspec
 import numpy as np
 
 from zsp_lite.errors import InputError, real_array
-from zsp_lite.importers.capture import (
-    HALF_PIXEL,
-    CaptureFrame,
-    Makers,
-    make_frame,
-    parse_numbers,
-    read_capture_json,
-    read_lines,
-)
+from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, Makers, make_frame, read_capture_json, read_numbers
 
 _MILLIMETRES = 0.001
 
@@ -60,11 +52,10 @@ def _make_bop(folder: Path, image: str, index: int, placed: _Annotation, camera:
 
 def read_scannet(folder: Path) -> Makers:
     """Read a scene in ScanNet's format, with a text file for the pose of each image."""
-    where = folder / "intrinsic/intrinsic_color.txt"
-    K = parse_numbers(read_lines(where), where, (3, 4))
+    K = read_numbers(folder / "intrinsic/intrinsic_color.txt", (3, 4))
     for path in sorted((folder / "pose").glob("*.txt")):
-        pose = parse_numbers(read_lines(path), path, (4,))
-        yield partial(make_frame, folder, f"color/{path.stem}", f"depth/{path.stem}", pose, K, str(path))
+        files = f"color/{path.stem}", f"depth/{path.stem}"
+        yield partial(make_frame, folder, *files, read_numbers(path, (4,)), K, str(path))
 
 
 def read_open3d(folder: Path) -> Makers:
@@ -74,10 +65,10 @@ def read_open3d(folder: Path) -> Makers:
         raise InputError(f"{folder} has no trajectory.log, expected poses: run Open3D's reconstruction system on it")
     camera = read_capture_json(folder / "intrinsic.json", dict[str, Any])
     K = real_array(f"{folder}/intrinsic.json: intrinsic_matrix", camera.get("intrinsic_matrix"), (9,))
-    lines = [line for k, line in enumerate(read_lines(log)) if k % 5]  # the first of five lines has frame numbers
     images = sorted(path.stem for path in (folder / "color").iterdir() if path.suffix.lower() in (".jpg", ".png"))
-    if len(lines) != 4 * len(images):
-        raise InputError(f"{log} has {len(lines)} lines of matrices, expected 4 for each of {len(images)} images")
-    for image, pose in zip(images, parse_numbers(lines, log, (4,)).reshape(-1, 4, 4)):
+    lines = read_numbers(log, (4,), usecols=(0, 1, 2, -1))  # three frame numbers, and four lines of a matrix
+    if len(lines) != 5 * len(images):
+        raise InputError(f"{log} has {len(lines)} lines, expected 5 for each of {len(images)} images")
+    for image, pose in zip(images, lines.reshape(-1, 5, 4)[:, 1:]):
         files = f"color/{image}", f"depth/{image}"
         yield partial(make_frame, folder, *files, pose, K.reshape(3, 3).T + HALF_PIXEL, f"{log}, frame {image}")

@@ -6,9 +6,8 @@ import struct
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
-from itertools import islice
 from lzma import LZMAError
 from pathlib import Path
 
@@ -16,9 +15,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from zsp_lite.data.frames import MAX_PIXELS, write_image
+from zsp_lite.data.frames import MAX_PIXELS
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import sharpness, stretches
 from zsp_lite.io.files import file_size
 
 _MOST, _LARGE, _RATIO = 20e9, 1e9, 200  # bytes of an unpacked zip; above the second at most 200 times those of the zip
@@ -66,28 +64,11 @@ def _problem(members: Sequence[zipfile.ZipInfo], size: int) -> str:
     return ""
 
 
-def sharp_pictures(path: Path, numbers: Sequence[int], count: int) -> dict[int, Path]:
-    """Write at most `count` frames of a video to image files: of the candidates of each stretch the sharpest.
+def open_video(path: Path) -> Callable[[int], UInt8[np.ndarray, "h w 3"]]:
+    """Return a function that decodes the frame with a number, as it is stored; the numbers may not decrease.
 
-    The frames are chosen from `numbers`, which increase, and returned by them.
+    InputError if the file is no video, and by the function if it has no such frame.
     """
-    groups = [[numbers[k] for k in part] for part in stretches(len(numbers), count)]
-    images, folder, pictures = _decode(path, [number for part in groups for number in part]), new_folder(), {}
-    for part in groups:
-        for number, image in sorted(islice(images, len(part)), key=_sharpness)[-1:]:
-            pictures[number] = folder / f"{number:06d}.jpg"
-            write_image(pictures[number], image[..., ::-1], 95)
-    if not pictures:
-        raise InputError(f"video {path} ends before frame {numbers[0]}, the first with depth")
-    return pictures
-
-
-def _sharpness(frame: tuple[int, np.ndarray]) -> float:
-    return sharpness(cv2.cvtColor(frame[1], cv2.COLOR_BGR2GRAY))
-
-
-def _decode(path: Path, numbers: Sequence[int]) -> Iterator[tuple[int, UInt8[np.ndarray, "h w 3"]]]:
-    """Decode the frames of a video with these numbers, which increase, as it stores them; InputError if it is none."""
     file_size(path, "video")
     with open(path, "rb") as file:
         is_video = file.read(8)[4:] == b"ftyp"  # other files may name addresses, which are not to be opened
@@ -96,9 +77,14 @@ def _decode(path: Path, numbers: Sequence[int]) -> Iterator[tuple[int, UInt8[np.
     if not video.isOpened() or pixels > MAX_PIXELS:
         raise InputError(f"video {path} cannot be decoded, expected an MP4 file of at most {MAX_PIXELS} pixels")
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-    for number in numbers:
+
+    def read(number: int) -> UInt8[np.ndarray, "h w 3"]:
+        nonlocal position
         while position < number and video.grab():
             position += 1
         decoded, image = video.retrieve() if position == number else (False, None)
-        if decoded:
-            yield number, image
+        if not decoded:
+            raise InputError(f"video {path} ends before frame {number}")
+        return image[..., ::-1]
+
+    return read
