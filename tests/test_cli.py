@@ -22,7 +22,7 @@ from zsp_lite.cli.main import cli, main
 from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.frames import write_mask
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
-from zsp_lite.importers import READERS
+from zsp_lite.importers import FORMATS, Capture
 from zsp_lite.importers.convert import ImportResult
 
 IMPORT = ("data", "import", "--root=x", "--category=c", "--sequence=s")
@@ -272,13 +272,21 @@ def test_options_of_the_import_reach_the_library(monkeypatch, capsys):
         given.append(arguments)
         return ImportResult(1, 0, 1, 1.0, ("the masks may be wrong: why",))
 
-    for layout in READERS:
-        monkeypatch.setitem(READERS, layout, lambda folder, **options: (folder, options))
+    monkeypatch.setattr("zsp_lite.importers.recognise", lambda path: ("bop", path))
+    monkeypatch.setattr("zsp_lite.importers.open_capture", lambda *a, **b: Capture("", (a, b), ["lost: a.jpg"]))
     monkeypatch.setattr("zsp_lite.importers.import_capture", import_capture)
     words = "--root mine --category cup --sequence one --frames 7".split()
     assert main(["data", "import", "nerfstudio", "scan", *words, "--box", "1,2,3,4"]) == 0
-    assert given.pop() == ((Path("scan"), {}), Path("mine"), "cup", "one", (1, 2, 3, 4), None, 7)
-    assert "flag: the masks may be wrong: why\n" in capsys.readouterr().out
-    assert main(["data", "import", "lists", "scan", *words, "--depth-unit", "0.5", "--masks", "there"]) == 0
-    capture = (Path("scan"), {"depth_unit": 0.5})
+    capture = (Path("scan"), "nerfstudio", 7), {}
+    assert given.pop() == (capture, Path("mine"), "cup", "one", (1, 2, 3, 4), None, 7)
+    text = capsys.readouterr().out
+    assert "flag: 1 frames are left out: lost: a.jpg\nflag: the masks may be wrong: why\n" in text
+    assert main(["data", "import", "scan", *words, "--depth-unit", "0.5", "--object", "0", "--masks", "there"]) == 0
+    capture = (Path("scan"), "bop", 7), {"depth_unit": 0.5, "object": 0}
     assert given.pop() == (capture, Path("mine"), "cup", "one", None, Path("there"), 7)
+    for wrong in (["lists", "scan", "--object", "0"], ["folder", "scan"]):
+        assert main(["data", "import", *wrong, *words]) == 2
+    assert "folder scan: expected SCAN, or one of nerfstudio, stray, " in capsys.readouterr().err
+    assert main(["data", "import", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(f"  {name} " in text for name in FORMATS)

@@ -13,7 +13,7 @@ from zsp_lite.data.check import check_folder
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, write_image, write_mask
 from zsp_lite.errors import InputError
-from zsp_lite.importers import READERS, CaptureFrame, import_capture
+from zsp_lite.importers import CaptureFrame, import_capture, open_capture
 from zsp_lite.importers.convert import fuse
 from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.synthetic.export import make_object
@@ -85,13 +85,13 @@ def capture(request, tmp_path, views):
     folder = tmp_path / request.param
     folder.mkdir()
     WRITERS[request.param](folder, views)
-    return READERS[request.param](folder)
+    return open_capture(folder, request.param).frames
 
 
 @pytest.fixture
 def scan(tmp_path, views):
     write_nerfstudio(tmp_path / "scan", views)
-    return READERS["nerfstudio"](tmp_path / "scan")
+    return open_capture(tmp_path / "scan").frames
 
 
 def test_every_format_gives_the_true_depth_in_metres(capture, views):
@@ -140,24 +140,28 @@ def test_an_import_holds_a_few_frames_at_once(tmp_path, scan, monkeypatch, box):
     assert max(held) <= 3
 
 
-def test_distortion_is_corrected(tmp_path, views):
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_distortion_is_corrected(tmp_path, views, model):
     folder = tmp_path / "scan"
     write_nerfstudio(folder, views[:1])
     names, coefficients = ("k1", "k2", "p1", "p2", "k3"), np.array([0.12, -0.03, 0.002, -0.001, 2.0])
-    edited(lambda content: content.update(zip(names, coefficients)))(folder)
+    if model == "OPENCV_FISHEYE":
+        names, coefficients = ("k1", "k2", "k3", "k4"), np.array([0.12, -0.03, 0.02, -0.01])
+    edited(lambda content: content.update(zip(names, coefficients), camera_model=model))(folder)
     # A distorted image of a grid of dots, projected by OpenCV.
     view, camera = views[0], views[0].camera
     height, width = camera.size
     wanted = np.mgrid[20 : width - 20 : 12, 20 : height - 20 : 12].reshape(2, -1).T + 0.5
     rays = camera.unproject_camera(wanted, np.ones(len(wanted)))
     matrix = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-    stored, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, coefficients)
+    project = cv2.projectPoints if model == "OPENCV" else cv2.fisheye.projectPoints
+    stored, _ = project(rays[:, None], np.zeros(3), np.zeros(3), matrix, coefficients)
     picture = np.zeros((height, width, 3), np.float32)
-    for x, y in stored[:, 0]:
+    for x, y in stored.reshape(-1, 2):
         grid_y, grid_x = np.mgrid[:height, :width]
         picture += 255 * np.exp(-((grid_x - x) ** 2 + (grid_y - y) ** 2) / 4)[..., None]
     write_image(folder / f"images/{view.name}.jpg", picture.clip(0, 255).astype(np.uint8), 98)
-    loaded = READERS["nerfstudio"](folder)[0].load().rgb[..., 0].astype(float)
+    loaded = open_capture(folder, "nerfstudio").frames[0].load().rgb[..., 0].astype(float)
     for x, y in wanted:
         top, left = int(y) - 4, int(x) - 4
         patch = loaded[top : top + 9, left : left + 9]
@@ -168,7 +172,7 @@ def test_distortion_is_corrected(tmp_path, views):
 def test_masks_come_from_files_by_name(tmp_path, views):
     folder = tmp_path / "scan"
     write_lists(folder, views)
-    capture = READERS["lists"](folder)
+    capture = open_capture(folder, "lists").frames
     with pytest.raises(InputError, match=r"0000.jpg has no mask, expected .*\(--masks DIR\)"):
         import_capture(capture, tmp_path / "data", "teapot", "mine")
     for view in views[1:]:
@@ -209,16 +213,10 @@ def edited(change):
 @pytest.mark.parametrize(
     ("kind", "damage", "message"),
     [
-        ("nerfstudio", edited(lambda c: c.update(camera_model="OPENCV_FISHEYE")), "camera_model is 'OPENCV_FISHEYE'"),
-        ("nerfstudio", edited(lambda c: c.pop("fl_x")), "frame 0: Object missing required field `fl_x`"),
+        ("nerfstudio", edited(lambda c: c.update(camera_model="PANORAMA")), "none of 8 frames .* 'PANORAMA'"),
+        ("nerfstudio", edited(lambda c: c.pop("fl_x")), "frame 0: no focal length, expected fl_x or"),
         ("nerfstudio", edited(lambda c: [f.pop("depth_file_path") for f in c["frames"]]), "none of 8 frames has depth"),
-        ("nerfstudio", edited(lambda c: c["frames"][2].update(file_path="../a.jpg")), "leads out of the data folder"),
         ("nerfstudio", edited(lambda c: c.update(w=31.5)), "multiple of 1"),
-        (
-            "nerfstudio",
-            edited(lambda c: c["frames"][1]["transform_matrix"][0].__setitem__(0, 5.0)),
-            "frame 1: .*pose is",
-        ),
         ("nerfstudio", edited(lambda c: c.update(k4=0.01)), "frame 0: .* with k4 = 0.01, expected .* with k4 = 0"),
         ("lists", replaced("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "rgb.txt 8, depth.txt 8, poses.txt 1"),
         ("lists", replaced("poses.txt", 8 * ("1 0 0 0 " * 3 + "1 0 0 1\n")), "off the expected 0 0 0 1"),
@@ -229,7 +227,7 @@ def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(tmp_path,
     WRITERS[kind](tmp_path, views)
     damage(tmp_path)
     with pytest.raises(InputError, match=message) as caught:
-        READERS[kind](tmp_path)
+        open_capture(tmp_path, kind).frames
     assert "\n" not in str(caught.value)
 
 
@@ -238,7 +236,7 @@ def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
     height, width = views[0].camera.size
     plane = np.repeat(np.arange(500, 500 + height // 2), width // 2).reshape(height // 2, width // 2)
     write_depth16(tmp_path / f"depths/{views[0].name}.png", plane / 1000)
-    frame = READERS["nerfstudio"](tmp_path)[0]
+    frame = open_capture(tmp_path, "nerfstudio").frames[0]
     np.testing.assert_allclose(frame.load().depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
     write_depth16(tmp_path / f"depths/{views[0].name}.png", plane[:, ::2] / 1000)
     with pytest.raises(InputError, match=r"expected .* = \(96, 128\)"):
@@ -250,7 +248,7 @@ def test_an_npy_file_that_is_no_depth_map_is_refused(tmp_path, views, values):
     write_lists(tmp_path, views[:1])
     np.save(tmp_path / f"z/{views[0].name}.npy", values)
     with pytest.raises(InputError, match=r"expected an .npy file of numbers \(H, W\)"):
-        READERS["lists"](tmp_path)[0].load()
+        open_capture(tmp_path, "lists").frames[0].load()
 
 
 def test_a_single_frame_is_fused_and_a_surface_that_one_of_many_frames_saw_is_left_out(views):
@@ -272,7 +270,7 @@ def test_bad_boxes_empty_depth_and_frames_without_overlap_are_refused(views):
 def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(tmp_path, views):
     folder = tmp_path / "scan"
     write_nerfstudio(folder, [*views[:5], replace(views[5], mask=np.zeros_like(views[5].mask))])
-    capture = READERS["nerfstudio"](folder)
+    capture = open_capture(folder, "nerfstudio").frames
     done = import_capture(capture, tmp_path / "data", "teapot", "mine")
     assert (done.frames, done.empty) == (5, 1)
     assert len(Co3D(tmp_path / "data").frames("teapot", "mine")) == 5

@@ -22,12 +22,13 @@ from zsp_lite.backbones.load import DEFAULT, BackboneLike, as_backbone
 from zsp_lite.category import SAME_ANGLE, references_per_pair, synchronise, world_hypotheses
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.annotations import FRAMES_FILE
-from zsp_lite.data.cameras import Box, camera_from_pose, view_span
+from zsp_lite.data.cameras import Box, Camera, camera_from_pose, view_span
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, frame_defect, read_image, turn_frame
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
 from zsp_lite.estimates import Hypothesis, PairResult, PoseEstimate, Vote, label_errors, timed
-from zsp_lite.importers.capture import READERS, SIGNS, CaptureFrame
+from zsp_lite.importers import FORMATS, open_capture, recognise
+from zsp_lite.importers.capture import CaptureFrame, left_out_flags
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth
 from zsp_lite.io.locks import writing
@@ -42,14 +43,14 @@ from zsp_lite.views import View
 _IMAGES = (".jpg", ".jpeg", ".png")
 # Options that each format takes; "open" is a source that is open already.
 _MASKED = ("mask", "box")
-_TAKEN = {"open": (), "image": (*_MASKED, "intrinsics", "depth", "depth_unit"), "lists": (*_MASKED, "depth_unit")}
-_TAKEN |= dict.fromkeys(("sequence", "frames", "nerfstudio"), _MASKED)
-_UNIT_GIVEN_BY = {"nerfstudio": "depth_unit_scale_factor in transforms.json"}  # for others by --depth-unit
+_TAKEN = {"open": (), "image": (*_MASKED, "intrinsics", "depth", "depth_unit"), "sequence": _MASKED, "frames": _MASKED}
+_TAKEN |= {name: (*_MASKED, *one.options) for name, one in FORMATS.items()}
 _NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
 _ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
 _REFERENCES = 4  # frames of each object that are solved against views of the other
 _LEAST_PROBABLE = 0.005  # an alternative is named above this
 _Ends = tuple[int, int, int]  # numbers of two objects, and the position of a frame of the first
+_SWEEPS = 20  # over the chosen views, which mostly stay after ten
 _CONTEXT = 8  # frames of a source that are segmented together with the reference frame, or tried as the reference
 
 
@@ -63,6 +64,8 @@ class Source:
     read: Callable[[int], Frame]  # reads the frame at a position of `numbers`, with the mask that comes with it, if any
     mask: str  # where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours)
     box: Box | None = None  # bounding box of the object in the first frame, for "box"
+    cameras: tuple[Camera, ...] = ()  # of the frames, where these are chosen by their directions, not by their order
+    left_out: tuple[str, ...] = ()  # what is wrong with each frame that cannot be used
 
     @property
     def name(self) -> str:
@@ -97,15 +100,15 @@ class Source:
         depth = np.concatenate([frame.depth[object_pixels(frame)] for frame in frames])
         distance = float(np.quantile(depth, 0.25)) if len(depth) else _NEAREST
         if self.format not in ("sequence", "frames") and not _NEAREST <= distance <= _FARTHEST:
-            cure = _UNIT_GIVEN_BY.get(self.format, "--depth-unit (0.001: millimetres, 1: metres)")
-            expected = f"expected {_NEAREST:g} to {_FARTHEST:g} m; the unit of its depth is given by {cure}"
+            cure = "the unit of its depth is given by --depth-unit (0.001: millimetres, 1: metres)"
+            expected = f"expected {_NEAREST:g} to {_FARTHEST:g} m; {cure}"
             found.insert(0, f"the object is {distance:.3g} m from the camera, {expected}")
-        return tuple(f"{self.path}: {flag}" for flag in found)
+        return tuple(f"{self.path}: {flag}" for flag in (*left_out_flags(self.left_out), *found))
 
     def select(
         self, references: int, targets: int, first: int | None = None
     ) -> tuple[list[int], list[int], dict[int, Frame]]:
-        """Load evenly spaced frames; return the positions of reference frames and of target views, and the frames.
+        """Load frames from all sides; return the positions of reference frames and of target views, and the frames.
 
         Frames with a defect are no references. The first reference frame is that with the number `first`.
         """
@@ -114,8 +117,9 @@ class Source:
             raise InputError(f"{self.path} has no frame {first}, expected one of {known}")
         start = 0 if first is None else self.numbers.index(first)
         tried = max(references, _CONTEXT) if references and first is None else references
-        candidates = [(start + position) % len(self.numbers) for position in spread(tried, len(self.numbers))]
-        views = spread(targets, len(self.numbers))
+        every = range(len(self.numbers))
+        candidates = self._spread(tried, [*every[start:], *every[:start]])
+        views = self._spread(targets, every)
         needed = list(dict.fromkeys([*candidates, *views]))
         frames = dict(zip(needed, self.load(needed), strict=True))
         defects = {position: frame_defect(frames[position]) for position in candidates}
@@ -123,7 +127,13 @@ class Source:
         if references and (not usable or first is not None and defects[start]):
             expected = "another --reference-frame, --mask or --box"
             raise InputError(f"{self.path}: no usable reference frame: {defects[start]}, expected {expected}")
-        return [usable[k] for k in spread(references, len(usable))], views, frames
+        return self._spread(references, usable), views, frames
+
+    def _spread(self, count: int, positions: Sequence[int]) -> list[int]:
+        """Choose at most `count` positions with the first, evenly by the directions of the cameras, or by the order."""
+        if not self.cameras or count == 0:
+            return [positions[k] for k in spread(count, len(positions))]
+        return [positions[k] for k in spread_views([self.cameras[position] for position in positions], count)]
 
 
 _Object = str | Path | Frame | Sequence[Frame] | Source  # a path, frames, or what `open_source` returns
@@ -369,25 +379,28 @@ def open_source(
     depth_unit: float | None = None,
     mask: str | None = None,
     box: Box | None = None,
+    object: int | None = None,
 ) -> Source:
     """Open a sequence of a data folder, a folder with a capture, an image, or frames of one object in one world.
 
     Args:
-        path: ROOT/CATEGORY/SEQUENCE of a data folder; the folder of a capture in a format of `importers.READERS`; or a
+        path: ROOT/CATEGORY/SEQUENCE of a data folder; the folder or zip of a capture (see `importers.recognise`); or a
             JPEG or PNG file NAME.EXT. Depth of an image is NAME_depth.png (16 bit) or NAME_depth.npy, registered to
             its colours, and its mask, if there is one, NAME_mask.png. Or frames, such as of `Frame.from_arrays`.
-        intrinsics: fx, fy, cx, cy of an image in pixels, with pixel centres at half-integers (0.5 more than OpenCV's
-            cx and cy).
+        intrinsics: fx, fy, cx, cy of an image or of TUM RGB-D in pixels, with pixel centres at half-integers (0.5 more
+            than OpenCV's cx and cy).
         depth: Depth file of an image, if it is named otherwise.
-        depth_unit: World units per stored depth value, for an image and for a capture of plain lists; 0.001 by default.
+        depth_unit: World units per stored depth value; by default the format's own, and 0.001 of an image.
         mask: "given", "box" or "auto". By default "box" if there is a box, "given" if the first frame has a mask, and
             "auto" otherwise.
         box: Bounding box (top, left, height, width) of the object in the first frame, pixels.
+        object: Number of the object in a scene of BOP.
 
     Raises:
         InputError: The path is none of these, a file cannot be read, or an option is missing or does not fit.
     """
-    layout, options = _format(path), {"intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit}
+    layout = _format(path)
+    options = {"intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit, "object": object}
     options = {name: value for name, value in options.items() if value is not None}
     if layout == "frames":
         frames = _check_frames([path] if isinstance(path, Frame) else path)
@@ -399,6 +412,7 @@ def open_source(
     if mask not in (None, *(("box",) if box is not None else ("given", "auto"))):
         expected = "--mask given, --mask auto, or --mask box with --box TOP,LEFT,HEIGHT,WIDTH"
         raise InputError(f"{path}: mask is {mask!r} and box is {box}, expected {expected}")
+    cameras, left_out = (), ()
     if layout == "frames":
         numbers, read = tuple(range(len(frames))), frames.__getitem__
     elif layout == "sequence":
@@ -409,11 +423,15 @@ def open_source(
             raise InputError(f"{path}: no frame has a camera and depth, expected some")
         numbers, read = tuple(one.frame_number for one in frames), lambda k: dataset.load(frames[k])
     else:
-        capture = [_open_image(path, **options)] if layout == "image" else READERS[layout](path, **options)
+        if layout == "image":
+            capture = [_open_image(path, **options)]
+        else:
+            _, capture, left_out = open_capture(path, **options)
         numbers, read = tuple(range(len(capture))), lambda k: capture[k].load()
+        cameras = tuple(frame.camera for frame in capture)
     if mask is None:
         mask = "box" if box is not None else "auto" if read(0).mask is None else "given"
-    return Source(path, layout, numbers, read, mask, box)
+    return Source(path, layout, numbers, read, mask, box, cameras, tuple(left_out))
 
 
 def open_pair(reference: _Object, target: _Object, options: Mapping[str, Sequence]) -> list[Source]:
@@ -465,15 +483,7 @@ def _format(side: _Object) -> str:
     whole = Path(os.path.abspath(path))  # for the names of "." and of "mine/cup/.."
     if path.is_dir() and (whole.parent / FRAMES_FILE).is_file():
         return "sequence"
-    for name, sign in SIGNS.items():
-        if (path / sign).is_file():
-            return name
-    found = "has another format" if path.exists() else "does not exist"
-    signs = " or ".join(f"{sign} ({name})" for name, sign in SIGNS.items())
-    raise InputError(
-        f"{path} {found}, expected a JPEG or PNG file, CATEGORY/SEQUENCE of a data folder, or a folder with {signs}; "
-        "`zsp-lite data import --help` lists what each format holds"
-    )
+    return recognise(path, "a JPEG or PNG file, CATEGORY/SEQUENCE of a data folder, or ")[0]
 
 
 def _open_image(
@@ -495,6 +505,29 @@ def _open_image(
 def spread(count: int, length: int) -> list[int]:
     """Return at most `count` evenly spaced positions among `length`, which go once around an object."""
     return sorted({k * length // count for k in range(count)})
+
+
+def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
+    """Return the positions of at most `count` cameras, spread evenly over the directions from which they see an object.
+
+    They are the first camera and others that lie as charges which repel each other.
+    """
+    if len(cameras) <= count:
+        return list(range(len(cameras)))
+    centres, axes = np.stack([one.centre for one in cameras]), np.stack([one.R[2] for one in cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None]  # the point that is nearest to all optical axes is the object
+    point = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None)[0]
+    directions = centres - point
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True).clip(1e-9)
+    order = [0, *(1 + np.lexsort(directions[1:].T.round(6)))]  # the same for every order of the other cameras
+    gaps = directions[order][:, None] - directions[order]
+    energy = 1 / (np.sum(gaps**2, axis=-1) + 1e-9)
+    chosen = [0]
+    for _ in range(_SWEEPS):
+        for k in range(1, count):  # in the first sweep, they are added
+            others = chosen[:k] + chosen[k + 1 :]
+            chosen[k : k + 1] = [int(energy[others].sum(axis=0).argmin())]
+    return sorted(int(order[k]) for k in chosen)
 
 
 def _pair_flags(scans: Sequence[_Scan]) -> tuple[str, ...]:

@@ -4,7 +4,12 @@ import gzip
 import json
 import struct
 import sys
+import zipfile
 import zlib
+from dataclasses import replace
+
+from co3d_folders import sequence_data
+from test_readers import write as write_scan
 
 from tests.hostile.harness import (
     BENCHMARK,
@@ -19,6 +24,7 @@ from tests.hostile.harness import (
     strange,
     written,
 )
+from zsp_lite.importers import open_capture
 
 COMMANDS_OF = {
     "picture": ("a.png", ("estimate", "ROOT/a.png", "ROOT/b.png", "--intrinsics", "60,60,32,32", "--out", "ROOT/e")),
@@ -83,6 +89,70 @@ case("malicious", "depth map of objects", read_capture("lists"), lambda folder: 
     written("capture/depth.txt", "z/0.npy\n")(folder)))  # fmt: skip
 for target in ("capture/pictures/0.jpg", "capture/rgb.txt"):
     case("malicious", f"{target} is a link out of the folder", read_capture("lists"), _link(target, "/etc/passwd"))
+
+
+def scan(layout: str, change):
+    """Write one frame in a layout of `test_readers`, and change the folder."""
+
+    def write(folder):
+        path, _ = write_scan(layout, folder / "scan", [replace(sequence_data("c", 1).frames[0], name="0")])
+        change(path)
+        (folder / "path").write_text(str(path))
+
+    return write
+
+
+def read_scan(folder):
+    return [frame.load() for frame in open_capture((folder / "path").read_text()).frames]
+
+
+def rewritten(name: str, change):
+    return lambda path: (path / name).write_bytes(change((path / name).read_bytes()))
+
+
+def zip_of(name: str, size: int):
+    def write(path):
+        with (
+            zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as zipped,
+            zipped.open(name, "w", force_zip64=True) as file,
+        ):
+            for _ in range(size >> 20):
+                file.write(bytes(1 << 20))
+
+    return write
+
+
+def ten_hours(data: bytes) -> bytes:
+    """The duration of the header of an MP4 file and of its media, in their time scale."""
+    for kind, at in ((b"mvhd", 16), (b"mdhd", 16)):
+        start = data.index(kind) + 4
+        scale = int.from_bytes(data[start + at - 4 : start + at])
+        data = data[: start + at] + (36_000 * scale).to_bytes(4) + data[start + at + 4 :]
+    return data
+
+
+for name, layout, change in (
+    ("zip that unpacks to 3 GB", "nerfstudio", zip_of("transforms.json", 3 << 30)),
+    ("zip with a path that climbs", "nerfstudio", zip_of("../../executed", 1 << 20)),
+    ("transforms.json with a path that climbs", "polycam", lambda path: written("transforms.json", json.dumps(
+        {"fl_x": 1, "frames": [{"file_path": "../../../../../etc/passwd", "depth_path": "/dev/zero", "transform_matrix": [[1, 0, 0, 0]] * 3}]}))(path)),
+    ("quaternion of zeros", "stray", written("odometry.csv", "timestamp, frame\n0, 0, 0, 0, 0, 0, 0, 0, 0\n")),
+    ("frames without end", "stray", lambda path: (
+        written("odometry.csv", "timestamp, frame\n" + "".join(f"0, {k}, 0, 0, 0, 0, 0, 0, 1\n" for k in (1e9, 1e18, -5, "nan")))(path),
+        written("depth/1000000000.png", "")(path))),
+    ("video of 10 hours", "stray", lambda path: (
+        rewritten("rgb.mp4", ten_hours)(path), rewritten("odometry.csv", lambda data: data.replace(b", 0.0", b", 9e5"))(path),
+        written("depth/900000.png", "")(path))),
+    ("video that is a list of addresses", "stray", written("rgb.mp4", "#EXTM3U\n#EXTINF:9,\n/etc/passwd\n")),
+    ("camera of objects", "polycam", written("keyframes/corrected_cameras/000000.json", '{"fx": {}, "t_00": "x"}')),
+    ("depth of an archive that is no LZFSE", "record3d", lambda path: None),
+    ("quaternion of zeros", "tum", written("groundtruth.txt", "10 0 0 0 0 0 0 0\n")),
+    ("times that are no numbers", "tum", written("rgb.txt", "nan a.jpg\ninf b.jpg\n-1e308 c.jpg\n")),
+    ("objects that are lists", "bop", written("scene_gt.json", '{"0": [{"obj_id": [], "cam_R_m2c": {}, "cam_t_m2c": "x"}]}')),
+    ("pose of many numbers", "scannet", written("pose/000000.txt", "1 2 3 4\n" * 100_000)),
+    ("matrix of nothing", "open3d", written("intrinsic.json", '{"intrinsic_matrix": [[], [[]]]}')),
+):  # fmt: skip
+    case("scan", f"{layout}: {name}", read_scan, scan(layout, change))
 ON_DATA = (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/new")
 for option, value in (("--executor", "dask://\0"), ("--methods", "os:_exit"), ("--methods", "raises:now"),
                       ("--methods", "a=/dev/zero/x.csv"), ("--categories", "../.."), ("--list-pairs", "/dev/null/x")):  # fmt: skip

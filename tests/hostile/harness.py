@@ -23,7 +23,7 @@ from zsp_lite.data.frames import read_depth, read_image, read_mask
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.data.published import import_labels
-from zsp_lite.importers import READERS
+from zsp_lite.importers import open_capture
 
 CASES: list["Case"] = []
 
@@ -91,7 +91,7 @@ def read_frames(folder: Path):
 
 
 def read_capture(layout: str) -> Callable[[Path], object]:
-    return lambda folder: [frame.load() for frame in READERS[layout](folder / "capture")]
+    return lambda folder: [frame.load() for frame in open_capture(folder / "capture", layout).frames]
 
 
 FRAMES, SEQUENCES = "data/cup/frame_annotations.jgz", "data/cup/sequence_annotations.jgz"

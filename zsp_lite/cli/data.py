@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from zsp_lite.cli.common import BOX, COUNT, LENGTH, PATH, examples, refuse_options, replace_option
+from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, examples, refuse_options, replace_option
 from zsp_lite.errors import InputError
 
 _LICENCE = "CO3D is under CC BY-NC 4.0: no commercial use."
@@ -165,43 +165,57 @@ def transfer(v1, v2, category, replace) -> None:
     print(f"Written: {len(residuals)} labels of {category} in {v2}")
 
 
-@data.command("import", epilog=examples("data import lists scan --root mine --category cup --sequence one"))
-@click.argument("layout", type=click.Choice(("nerfstudio", "lists")))
-@click.argument("folder", type=PATH)
+@data.command("import", epilog=examples("data import scan.zip --root mine --category cup --sequence one"))
+@click.argument("source", metavar="[FORMAT] SCAN", type=PATH, nargs=-1, required=True)
 @root_option
 @click.option("--category", metavar="NAME", required=True, help="Category of the object.")
 @click.option("--sequence", metavar="NAME", required=True, help="Name of the new sequence.")
 @click.option("--box", type=BOX, help="Bounding box of the object in the first image in pixels.")
 @click.option("--masks", type=PATH, help="Folder of mask files named like the images, instead of --box.")
-@click.option("--frames", type=COUNT, default=100, help="Maximum number of frames, evenly spaced.")
-@click.option("--depth-unit", type=LENGTH, show_default="0.001", help="World units per stored depth value, for lists.")
-def import_(layout, folder, root, category, sequence, box, masks, frames, depth_unit) -> None:
+@click.option("--frames", type=COUNT, default=100, help="Maximum number of frames, evenly spaced and sharp.")
+@click.option("--depth-unit", type=LENGTH, show_default="the format's own", help="Metres per stored depth value.")
+@click.option("--intrinsics", type=INTRINSICS, show_default="525,525,320,240", help="Camera of tum in pixels.")
+@click.option("--object", type=INDEX, help="Number of the object, for bop.")
+def import_(source, root, category, sequence, box, masks, frames, **options) -> None:
     """Import an RGB-D capture, images with depth and camera poses in one world, as a sequence of a data folder.
 
-    The first argument is the format of FOLDER, which holds:
+    SCAN is a folder, or the zip file that an app has exported. Its FORMAT is recognised by its files, if it is not
+    given:
 
     \b
-      nerfstudio  transforms.json         intrinsics, and per frame file_path, depth_file_path and
-                                          transform_matrix; phone scanners export it; depth in mm,
-                                          or depth_unit_scale_factor; mask_path is used if present
+      nerfstudio  transforms.json: nerfstudio, Blender, NeRFCapture, instant-ngp
+      stray       rgb.mp4, odometry.csv: Stray Scanner
+      polycam     keyframes/cameras: Polycam's raw data
+      record3d    metadata, rgbd: Record3D's .r3d; needs `pip install lzfse`
       lists       rgb.txt, depth.txt      one file per line; depth as 16-bit PNG or .npy
-                  masks/                  if present, mask files named like the images
                   poses.txt               lines of 12 or 16 numbers: camera to world, OpenCV's axes
-                  intrinsics.txt          3 x 3 matrix in pixels, pixel centres at half-integers
-                  --depth-unit            metres per stored depth value, 0.001 by default
+                  intrinsics.txt          3 x 3 matrix in pixels, or fx fy cx cy, once or in each line;
+                                          pixel centres at half-integers
+      tum         groundtruth.txt, rgb.txt: TUM RGB-D
+      bop         scene_gt.json, scene_camera.json: a scene of BOP
+      scannet     pose/, intrinsic/: ScanNet
+      open3d      intrinsic.json, color/, trajectory.log: Open3D's recorder and reconstruction
 
     Depth maps must be registered to the images: a pixel of both shows the same point. The object is given by --box, by
-    which GrabCut segments it in all images, by --masks, or by masks of the capture; frames without it are left out.
+    which GrabCut segments it in all images, by --masks, or by masks of the capture, in masks/ with the names of the
+    images; frames without it are left out.
     """
-    from zsp_lite.importers import READERS, import_capture
+    from zsp_lite.importers import FORMATS, import_capture, open_capture, recognise
+    from zsp_lite.importers.capture import left_out_flags
 
-    given = {} if depth_unit is None else {"depth_unit": depth_unit}
+    layout = recognise(source[-1])[0] if len(source) == 1 else str(source[0])
+    if layout not in FORMATS or len(source) > 2:
+        raise click.UsageError(f"{' '.join(map(str, source))}: expected SCAN, or one of {', '.join(FORMATS)} before it")
+    given = {name: value for name, value in options.items() if value is not None}
     refuse_options({"masks": box and masks}, (), "--box")
-    refuse_options(given, ("depth_unit",) if layout == "lists" else (), f"the format {layout}")
-    done = import_capture(READERS[layout](folder, **given), root, category, sequence, box, masks, frames)
+    refuse_options(given, FORMATS[layout].options, f"the format {layout}")
+    capture = open_capture(source[-1], layout, frames, **given)
+    if capture.left_out and len(capture.frames) < 3:
+        raise InputError(f"{source[-1]}: {len(capture.frames)} frames remain, expected 3: {capture.left_out[0]}")
+    done = import_capture(capture.frames, root, category, sequence, box, masks, frames)
     print(
         f"Written: {root / category / sequence}: {done.frames} frames, {done.points:,} points, "
         f"scaled by {done.scale:.4g}" + (f"; {done.empty} frames without the object left out" if done.empty else "")
     )
-    for flag in done.flags:
+    for flag in (*left_out_flags(capture.left_out), *done.flags):
         print(f"flag: {flag}")

@@ -33,6 +33,7 @@ from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, bac
 @click.option("--intrinsics", type=INTRINSICS, multiple=True, help="Camera intrinsics in pixels, see above.")
 @click.option("--depth", type=PATH, multiple=True, help="Depth of an image, if it is not beside it. Once per image.")
 @click.option("--depth-unit", type=LENGTH, multiple=True, show_default="0.001", help="Metres per stored depth value.")
+@click.option("--object", type=INDEX, multiple=True, help="Number of the object in a scene of BOP.")
 @click.option("--workers", type=COUNT, default=1, help="Frames that are solved at once.")
 @click.option("--not-upright", is_flag=True, help="Try four turns by 90 degrees of the reference images.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
@@ -41,9 +42,9 @@ from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, bac
 def estimate(reference, target, others, helpers, not_upright, as_json, backbone, out, **settings) -> None:
     """Estimate the pose between two objects of one category; no label is needed.
 
-    REFERENCE and TARGET are each a sequence of a data folder (ROOT/CATEGORY/SEQUENCE), the folder of a capture (see
-    `zsp-lite data import --help`), or an image NAME.jpg with its depth NAME_depth.png and, if there is one, its mask
-    NAME_mask.png.
+    REFERENCE and TARGET are each a sequence of a data folder (ROOT/CATEGORY/SEQUENCE), the folder or zip of a capture
+    (see `zsp-lite data import --help`), or an image NAME.jpg with its depth NAME_depth.png and, if there is one, its
+    mask NAME_mask.png.
 
     --mask, --box, --intrinsics and --depth-unit may be given twice: for REFERENCE, then for TARGET. A single value is
     for both, a single --box for REFERENCE, or for the one whose --mask is box.
@@ -51,8 +52,8 @@ def estimate(reference, target, others, helpers, not_upright, as_json, backbone,
     \b
     --mask        given: with the images; box: by GrabCut from --box, the default with a box;
                   auto: what stands on a plane, by depth and colours, the default without masks
-    --intrinsics  of an image; pixel centres at half-integers, 0.5 more than OpenCV's cx and cy
-    --depth-unit  of an image, or of a capture given as lists: 0.001 for millimetres, 1 for metres
+    --intrinsics  of an image, or of TUM RGB-D; pixel centres at half-integers, 0.5 more than OpenCV's cx and cy
+    --depth-unit  of an image, or of a capture, whose own it replaces: 0.001 for millimetres, 1 for metres
     --depth       16-bit PNG or .npy, registered to the colours
 
     --helpers are scans of other objects of the category, without labels: what the pair alone cannot tell, such as
@@ -74,7 +75,7 @@ def estimate(reference, target, others, helpers, not_upright, as_json, backbone,
     if others and not helpers:
         raise click.UsageError(f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers")
     with writing(out):
-        given = {name: settings.pop(name) for name in ("mask", "box", "intrinsics", "depth", "depth_unit")}
+        given = {name: settings.pop(name) for name in ("mask", "box", "intrinsics", "depth", "depth_unit", "object")}
         settings |= {"backbone": load_backbone(backbone), "upright": not not_upright, "helpers": (*helpers, *others)}
         found = estimate_pose(*open_pair(reference, target, given), **settings)
         files = write_pair(found, out)

@@ -18,7 +18,7 @@ from PIL.PngImagePlugin import PngImageFile
 from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose
 from zsp_lite.data.depth import decode_depth, encode_depth
 from zsp_lite.errors import MAX_LENGTH, InputError, check_number, real_array
-from zsp_lite.io.files import read_bytes, write_atomic
+from zsp_lite.io.files import file_size, read_bytes, write_atomic
 
 MAX_PIXELS = 1 << 26  # of an image file
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
@@ -212,6 +212,19 @@ def read_grey16(path: str | Path) -> UInt16[np.ndarray, "h w"]:
     if bits.dtype != np.uint16 or bits.ndim != 2:
         raise InputError(f"depth {path} holds {bits.dtype} of shape {bits.shape}, expected a 16-bit greyscale PNG")
     return bits
+
+
+def read_grey(path: str | Path, half: bool = False) -> UInt8[np.ndarray, "h w"]:
+    """Read an 8-bit image file in grey, or at half its size; InputError if it is damaged."""
+    return _decode(path, "image", cv2.IMREAD_REDUCED_GRAYSCALE_2 if half else cv2.IMREAD_GRAYSCALE)
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """Read the size (H, W) of a JPEG or PNG file from its header."""
+    file_size(path, "image")
+    with open(path, "rb") as file, suppress(OSError, SyntaxError):
+        return (JpegImageFile if file.peek(2)[:2] == b"\xff\xd8" else PngImageFile)(file).size[::-1]
+    raise InputError(f"image {path} cannot be decoded, expected a complete JPEG or PNG")
 
 
 def check_pixels(path: str | Path, image: np.ndarray, size: tuple[int, int]) -> None:

@@ -1,6 +1,117 @@
-"""Import of RGB-D captures into CO3D's layout: a reader per format, object masks, the fused point cloud."""
+"""Import of RGB-D captures: the formats that are read, object masks, and sequences in CO3D's layout."""
 
-from zsp_lite.importers.capture import READERS, CaptureFrame
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from zsp_lite.errors import InputError
+from zsp_lite.importers.capture import (
+    MOST_FRAMES,
+    Capture,
+    CaptureFrame,
+    Makers,
+    collect,
+    find_masks,
+    read_sample,
+    sharpest,
+)
 from zsp_lite.importers.convert import import_capture
+from zsp_lite.importers.lists import read_lists, read_tum
+from zsp_lite.importers.nerfstudio import read_nerfstudio
+from zsp_lite.importers.phones import read_polycam, read_record3d, read_stray
+from zsp_lite.importers.scenes import read_bop, read_open3d, read_scannet
+from zsp_lite.importers.unpacked import unpack
 
-__all__ = ["READERS", "CaptureFrame", "import_capture"]
+__all__ = ["FORMATS", "Capture", "CaptureFrame", "import_capture", "open_capture", "recognise"]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of captures."""
+
+    signs: tuple[str, ...]  # patterns of files; a folder of the format has all
+    what: str
+    read: Callable[..., Makers]
+    options: tuple[str, ...] = ("depth_unit",)  # of `open_capture`
+
+
+# A folder has the first format whose signs it has.
+FORMATS = {
+    "nerfstudio": Format(("transforms*.json",), "nerfstudio, Blender, NeRFCapture or instant-ngp", read_nerfstudio),
+    "stray": Format(("rgb.mp4", "odometry.csv"), "Stray Scanner", read_stray),
+    "polycam": Format(("keyframes/*cameras",), "Polycam's raw data", read_polycam),
+    "record3d": Format(("metadata", "rgbd"), "Record3D", read_record3d),
+    "lists": Format(("poses.txt",), "lists", read_lists),
+    "tum": Format(("groundtruth.txt", "rgb.txt"), "TUM RGB-D", read_tum, ("depth_unit", "intrinsics")),
+    "bop": Format(("scene_gt.json", "scene_camera.json"), "BOP", read_bop, ("depth_unit", "object")),
+    "scannet": Format(("pose", "intrinsic/intrinsic_color.txt"), "ScanNet", read_scannet),
+    "open3d": Format(("intrinsic.json", "color"), "Open3D's recorder", read_open3d),
+}
+_HOW = "expected raw data with depth and poses, as Stray Scanner, Record3D or Polycam export them from LiDAR"
+# What is near to a capture, by names and extensions of its files.
+_INCOMPLETE = {
+    ("sparse", "images.bin", "images.txt", "database.db"): "has COLMAP's poses, but no measured depth",
+    (".mp4", ".mov", ".m4v"): "is a video without depth and poses",
+    (".ply", ".splat", ".obj", ".glb", ".usdz"): "is a model as Luma or KIRI export it, without depth and poses",
+}
+
+
+def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
+    """Recognise a capture: a folder, the zip or .r3d file of an app, or a transforms.json.
+
+    Returns:
+        The name of its format in `FORMATS`, and the folder or file that the reader takes.
+
+    Raises:
+        InputError: The path is no capture; the message says what it lacks, or what is expected, and `also`.
+    """
+    path, folder = Path(path), Path(path)
+    if path.is_file() and path.suffix.lower() in (".zip", ".r3d"):
+        folder = unpack(path.resolve())
+    if path.is_file() and path.match("transforms*.json"):
+        return "nerfstudio", path
+    files = [one for one in folder.glob("*") if not one.name.startswith((".", "__MACOSX"))]
+    for place in (folder, *files[: len(files) == 1]):  # an app may put a folder into its zip
+        for name, one in FORMATS.items():
+            if all(any(place.glob(sign)) for sign in one.signs):
+                return name, place
+    for signs, problem in _INCOMPLETE.items():
+        if any(file.name in signs or file.suffix.lower() in signs for file in (path, *files)):
+            raise InputError(f"{path} {problem}, {_HOW}")
+    found = "has another format" if path.exists() else "does not exist"
+    known = "; ".join(f"{one.what} ({', '.join(one.signs)})" for one in FORMATS.values())
+    raise InputError(f"{path} {found}, expected {also}a folder or zip with the files of {known}")
+
+
+def open_capture(
+    path: str | Path, layout: str | None = None, count: int = MOST_FRAMES, depth_unit: float | None = None,
+    **options: Any,
+) -> Capture:  # fmt: skip
+    """Read the frames of a capture, with the masks of its folder masks/, if it has one.
+
+    Args:
+        path: A folder, zip or file (see `recognise`).
+        layout: Name of its format in `FORMATS`; by default, it is recognised.
+        count: Number of frames to choose, the sharp ones of each stretch, where the capture has more.
+        depth_unit: World units per stored depth value, by default the format's own.
+        options: `intrinsics` or `object`, where the format takes them.
+
+    Raises:
+        InputError: The capture cannot be read, or none of its frames can be used.
+    """
+    source = path = Path(path)
+    if layout is None or path.is_file():
+        found, path = recognise(path)
+        layout = layout or found
+    options |= {"count": count} if layout == "stray" else {}
+    frames, left_out = collect(FORMATS[layout].read(path, **options))
+    frames = [frame for frame, _ in sharpest(frames, count, read_sample, left_out)]
+    if not frames:
+        found = f"none of {len(left_out)} frames can be used: {left_out[0]}" if left_out else "no frame, expected some"
+        raise InputError(f"capture {source}: {found}")
+    masks = find_masks((path if path.is_dir() else path.parent) / "masks", [frame.image for frame in frames])
+    frames = [replace(frame, mask=frame.mask or mask) for frame, mask in zip(frames, masks)]
+    if depth_unit is not None:
+        frames = [replace(frame, depth_unit=depth_unit) for frame in frames]
+    return Capture(layout, frames, left_out)

@@ -1,28 +1,40 @@
-"""RGB-D captures: the files and camera of a frame, how they become a `Frame`, and a reader for each format."""
+"""RGB-D captures: the files and camera of a frame, how they become a `Frame`, and what the readers of formats share."""
 
+import codecs
 import io
-from collections.abc import Callable, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, NamedTuple
 
 import cv2
-import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
+from scipy.spatial.transform import Rotation
 
-from zsp_lite.data.cameras import Camera, camera_from_pose
-from zsp_lite.data.frames import Frame, check_pixels, enlarge_depth, read_grey16, read_image, read_mask
-from zsp_lite.errors import MAX_LENGTH, InputError
-from zsp_lite.io.files import decode_json, path_inside, read_bytes, read_json
+from zsp_lite.data.cameras import Camera, Values, camera_from_pose
+from zsp_lite.data.frames import (
+    Frame,
+    check_pixels,
+    enlarge_depth,
+    image_size,
+    read_grey,
+    read_grey16,
+    read_image,
+    read_mask,
+)
+from zsp_lite.errors import InputError, real_array
+from zsp_lite.io.files import OutsideError, decode_json, find_inside, read_bytes
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # +y up, looking along -z
-_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
-_Row = tuple[float, float, float, float]
-_Side = Annotated[float, msgspec.Meta(multiple_of=1)]  # pixels; exporters write 640 or 640.0
-_Coefficient = Annotated[float, msgspec.Meta(ge=-100, le=100)]  # of the distortion
+FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # +y up, looking along -z
+MOST_FRAMES = 100  # of a capture; the sharp ones are chosen where there are more
+_CANDIDATES = 4  # frames of which the sharpest is chosen
+_SHARPNESS_SIDE = 640  # pixels of an image whose sharpness is measured
+_NO_NUMBER = re.compile(rb"(?<=[\s,:\[])(?:-?Infinity|NaN)(?=[\s,\]}])")  # Python writes these into JSON
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +47,17 @@ class CaptureFrame:
     depth_unit: float = 0.001  # world units per stored depth value
     distortion: tuple[float, ...] = ()  # OpenCV's k1, k2, p1, p2, k3; image, depth and mask are undistorted
     mask: Path | None = None
+    fisheye: bool = False  # whether the distortion is that of OpenCV's fisheye cameras, k1, k2, k3, k4
+    confidence: Path | None = None  # of each pixel of the depth map, see `trusted`
 
     def load(self) -> Frame:
         """Load the frame; InputError if a file is missing, damaged or of another size than the camera's image."""
         height, width = self.camera.size
         rgb, depth = read_image(self.image), _read_depth(self.depth) * np.float32(self.depth_unit)
+        if self.confidence is not None:
+            levels = read_grey(self.confidence)
+            check_pixels(self.confidence, levels, depth.shape)
+            depth = np.where(trusted(levels), depth, np.float32(0))
         depth = enlarge_depth(depth, (height, width))
         mask = None if self.mask is None else read_mask(self.mask)
         for path, pixels in ((self.image, rgb), (self.depth, depth), (self.mask, mask)):
@@ -47,11 +65,80 @@ class CaptureFrame:
                 check_pixels(path, pixels, (height, width))
         if any(self.distortion):
             matrix, coefficients = self.camera.K - HALF_PIXEL, np.array(self.distortion)
-            maps = cv2.initUndistortRectifyMap(matrix, coefficients, None, matrix, (width, height), cv2.CV_32FC1)
+            undistorted = cv2.fisheye.initUndistortRectifyMap if self.fisheye else cv2.initUndistortRectifyMap
+            maps = undistorted(matrix, coefficients, np.eye(3), matrix, (width, height), cv2.CV_32FC1)
             rgb = cv2.remap(rgb, *maps, cv2.INTER_LINEAR)
             depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
             mask = None if mask is None else cv2.remap(mask, *maps, cv2.INTER_LINEAR)
         return Frame(rgb, depth, mask, self.camera, self.image.name)
+
+
+class Capture(NamedTuple):
+    """Frames of a capture in the natural order of their image names, whatever the order in its files."""
+
+    format: str
+    frames: list[CaptureFrame]
+    left_out: list[str]  # what is wrong with each frame that is left out
+
+
+Makers = Iterator[Callable[[], CaptureFrame]]  # what a reader returns; a frame that cannot be used raises InputError
+
+
+def make_frame(
+    folder: Path, image: str | Path, depth: str | Path, pose: Values, intrinsics: Values, where: str,
+    axes: Values = np.eye(4), size: tuple[int, int] | None = None, mask: str | None = None,
+    confidence: str | Path | None = None, **others: Any,
+) -> CaptureFrame:  # fmt: skip
+    """Make a frame of what the files in the folder of a capture say; InputError if its files or numbers are no frame.
+
+    The pose, camera to world, is a matrix of 12 or 16 numbers, or a position and a quaternion x, y, z, w, in OpenCV's
+    axes after multiplication by `axes`. Intrinsics are fx, fy, cx, cy or a matrix. Mask and confidence may be missing.
+    """
+    names = image, depth, mask, confidence
+    paths = [find_inside(folder, name) if isinstance(name, str) else name for name in names]
+    if None in paths[:2]:
+        raise InputError(f"{where}: {names[paths.index(None)]} is missing in {folder}")
+    pose, K = (real_array(f"{where}: {name}", one) for name, one in (("pose", pose), ("intrinsics", intrinsics)))
+    if pose.size not in (7, 12, 16):
+        raise InputError(f"{where}: the pose has {pose.size} numbers, expected 7, 12 or 16")
+    if pose.size == 7:
+        length = np.linalg.norm(pose[3:])
+        if not 0.9 < length < 1.1:
+            raise InputError(f"{where}: quaternion {pose[3:].tolist()} has the length {length:.3g}, expected 1")
+        pose = np.column_stack([Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]])
+    if pose.size == 12:
+        pose = np.vstack([pose.reshape(3, 4), (0, 0, 0, 1)])
+    if K.ndim == 2:
+        if K.shape not in ((3, 3), (4, 4)) or K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]].tolist() != [0, 0, 0, 0, 1]:
+            raise InputError(f"{where}: intrinsics are {K.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
+        K = K[[0, 1, 0, 1], [0, 1, 2, 2]]
+    camera = camera_from_pose(pose.reshape(-1, 4) @ axes, K, size or image_size(paths[0]), where)
+    return CaptureFrame(paths[0], paths[1], camera, mask=paths[2], confidence=paths[3], **others)
+
+
+def collect(makers: Iterable[Callable[[], CaptureFrame]]) -> tuple[list[CaptureFrame], list[str]]:
+    """Return the frames that can be made, in natural order, and what is wrong with each of the others."""
+    frames, left_out = [], []
+    for make in makers:
+        try:
+            frames.append(make())
+        except OutsideError:
+            raise
+        except InputError as error:
+            left_out.append(str(error))
+    return sorted(frames, key=lambda frame: _natural_order(frame.image)), left_out
+
+
+def left_out_flags(left_out: Sequence[str]) -> tuple[str, ...]:
+    """Name the frames that are left out in one flag, if there are any."""
+    more = f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
+    return (f"{len(left_out)} frames are left out: {'; '.join(left_out[:3])}{more}",) if left_out else ()
+
+
+def _natural_order(path: Path) -> tuple[list[str | int], str]:
+    """Order paths such that frame 10 follows frame 9."""
+    text = path.as_posix()
+    return [int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", text))], text
 
 
 def evenly_spaced(frames: Sequence[CaptureFrame], count: int) -> list[CaptureFrame]:
@@ -60,9 +147,94 @@ def evenly_spaced(frames: Sequence[CaptureFrame], count: int) -> list[CaptureFra
     return [frames[index] for index in chosen]
 
 
-def files_by_stem(folder: str | Path) -> dict[str, Path]:
-    """Return the files of a folder by their names without extension; links may not lead out of it."""
-    return {path.stem: path_inside(folder, path.name) for path in sorted(Path(folder).glob("*"))}
+def sharpest(
+    items: Sequence[Any], count: int, read: Callable[[Any], np.ndarray], left_out: list[str]
+) -> Iterator[tuple[Any, np.ndarray]]:
+    """Yield at most `count` items, the sharpest of the candidates of each stretch, with the images that are read.
+
+    What is wrong with unreadable ones is added to `left_out`. The first frame is chosen, because a box may be for it.
+    """
+    parts = [[position] for position in range(len(items))]
+    if len(items) > count:
+        later = np.array_split(np.arange(1, len(items)), max(count - 1, 1))
+        parts = [[0], *(part[:: -(-len(part) // _CANDIDATES)].tolist() for part in later)][:count]
+    for part in parts:
+        images = []
+        for position in part:
+            try:
+                images.append((items[position], read(items[position])))
+            except InputError as error:
+                left_out.append(str(error))
+        if images:
+            yield max(images, key=lambda one: _sharpness(one[1]))
+
+
+def _sharpness(image: UInt8[np.ndarray, "..."]) -> float:
+    """Return the variance of the Laplacian of a small copy of an image."""
+    scale = min(1.0, _SHARPNESS_SIDE / max(image.shape))
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(small, cv2.CV_32F).var())
+
+
+def read_sample(frame: CaptureFrame) -> UInt8[np.ndarray, "h w"]:
+    """Read the image of a frame at half its size; InputError if it or the depth cannot be decoded."""
+    _read_depth(frame.depth)
+    return read_grey(frame.image, half=True)
+
+
+def trusted(levels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Tell measured depth from smeared depth by levels of confidence: 0, 1, 2, or 0 to 255.
+
+    The lowest level is unknown, and the middle one is kept where it is wide, as on dark surfaces, but not in thin
+    bands, as along silhouettes, where the depth is a mean of object and background.
+    """
+    best = levels >= (2 if levels.max() <= 2 else 255)
+    middle = ((levels > 0) & ~best).astype(np.uint8)
+    return best | (cv2.morphologyEx(middle, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0)
+
+
+def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
+    """Find the mask of each image in a folder: by its relative path or its name, with its extension or without.
+
+    The longest path that both share decides. Images of one name in several folders do not share a mask.
+    """
+    files = {path.relative_to(folder).with_suffix("").as_posix(): path for path in sorted(Path(folder).rglob("*.*"))}
+
+    def tails(image: Path) -> list[str]:
+        return ["/".join(image.with_suffix("").parts[-count:]) for count in range(len(image.parts), 0, -1)]
+
+    shared = Counter(tail for image in images for tail in tails(image))
+    found = []
+    for image in images:
+        own = [name for tail in tails(image) if shared[tail] == 1 for name in (tail + image.suffix, tail)]
+        found.append(next((files[name] for name in own if name in files), None))
+    return found
+
+
+def read_capture_json(path: Path, kind: Any) -> Any:
+    """Read a JSON file of a capture; numbers that are not finite, which are not JSON, are null."""
+    data = _NO_NUMBER.sub(b"null", read_bytes(path, "capture").removeprefix(codecs.BOM_UTF8))
+    return decode_json(data, kind, f"capture {path}")
+
+
+def read_lines(path: Path) -> list[str]:
+    """Read the lines of a text file but for empty ones and those that begin with #."""
+    text = read_bytes(path, "list").decode("utf-8-sig", "replace")
+    if not (lines := [line for part in text.splitlines() if (line := part.strip()) and line[0] != "#"]):
+        raise InputError(f"{path} is empty, expected at least 1 line")
+    return lines
+
+
+def read_numbers(path: Path, columns: tuple[int, ...], **options: Any) -> Float[np.ndarray, "rows columns"]:
+    """Read a text file of numbers by `numpy.loadtxt` with its options, as many in each line as one of `columns`."""
+    lines = read_lines(path)
+    try:
+        values = np.loadtxt(lines, ndmin=2, **options)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
+    if values.shape[1] not in columns:
+        raise InputError(f"{path}: {values.shape[1]} numbers per line, expected {' or '.join(map(str, columns))}")
+    return values
 
 
 def _read_depth(path: Path) -> Float[np.ndarray, "h w"]:
@@ -79,105 +251,3 @@ def _read_depth(path: Path) -> Float[np.ndarray, "h w"]:
         raise InputError(f"depth {path} holds {found}, expected an .npy file of numbers (H, W)")
     values = values.astype(np.float32)
     return np.where(np.isfinite(values) & (values > 0), values, np.float32(0))
-
-
-class _NerfstudioFrame(msgspec.Struct):
-    """A frame, together with what the file gives for all frames."""
-
-    file_path: str
-    transform_matrix: tuple[_Row, _Row, _Row, _Row]
-    fl_x: float
-    cx: float
-    cy: float
-    w: _Side
-    h: _Side
-    depth_file_path: str | None = None
-    mask_path: str | None = None
-    fl_y: float | None = None
-    k1: _Coefficient = 0.0
-    k2: _Coefficient = 0.0
-    p1: _Coefficient = 0.0
-    p2: _Coefficient = 0.0
-    k3: _Coefficient = 0.0
-    k4: float = 0.0
-    camera_model: str = "OPENCV"
-    depth_unit_scale_factor: Annotated[float, msgspec.Meta(gt=0, le=MAX_LENGTH)] = 0.001
-
-
-def read_nerfstudio(folder: str | Path) -> list[CaptureFrame]:
-    """Read the frames with depth of nerfstudio's transforms.json, which phone scanners export.
-
-    The depth is in millimetres unless the file has `depth_unit_scale_factor`.
-    """
-    path = path_inside(folder, "transforms.json")
-    common, frames = read_json(path, dict[str, Any], "capture"), []
-    listed = decode_json(msgspec.json.encode(common.pop("frames", None)), list[dict[str, Any]], f"{path}, frames")
-    for number, own in enumerate(listed):
-        if own.get("depth_file_path") is None:
-            continue
-        where = f"{path}, frame {number}"
-        frame = decode_json(msgspec.json.encode(common | own), _NerfstudioFrame, where)
-        if frame.camera_model not in _MODELS or frame.k4:
-            found = f"{frame.camera_model!r} with k4 = {frame.k4:g}"
-            raise InputError(f"{where}: camera_model is {found}, expected one of {', '.join(_MODELS)} with k4 = 0")
-        pose = np.array(frame.transform_matrix) @ _FROM_OPENGL
-        intrinsics, size = (frame.fl_x, frame.fl_y or frame.fl_x, frame.cx, frame.cy), (int(frame.h), int(frame.w))
-        camera = camera_from_pose(pose, intrinsics, size, where)
-        image, depth = path_inside(folder, frame.file_path), path_inside(folder, frame.depth_file_path)
-        mask = None if frame.mask_path is None else path_inside(folder, frame.mask_path)
-        distortion = frame.k1, frame.k2, frame.p1, frame.p2, frame.k3  # OpenCV's order; its model has no r^8 term, k4
-        frames.append(CaptureFrame(image, depth, camera, frame.depth_unit_scale_factor, distortion, mask))
-    if not frames:
-        raise InputError(f"{path}: none of {len(listed)} frames has depth_file_path, expected RGB-D frames")
-    return frames
-
-
-def read_lists(folder: str | Path, depth_unit: float = 0.001) -> list[CaptureFrame]:
-    """Read a capture given as plain text lists: line n of each describes frame n.
-
-    rgb.txt, depth.txt: one file name per line; `depth_unit` is in world units per stored depth value
-    poses.txt: one camera-to-world matrix per line, 12 or 16 numbers in row-major order, in OpenCV's axes
-    intrinsics.txt: the 3 x 3 matrix K in pixels, with pixel centres at half-integers
-    masks/: if it is there, a mask file for each image, of the image's name with any extension
-    """
-    lists = {name: _read_lines(folder, name) for name in ("rgb.txt", "depth.txt", "poses.txt")}
-    counts = {name: len(lines) for name, lines in lists.items()}
-    if len(set(counts.values())) > 1:
-        found = ", ".join(f"{name} {count}" for name, count in counts.items())
-        raise InputError(f"capture {folder}: the lists have lines: {found}; expected equal numbers")
-    K = _numbers(_read_lines(folder, "intrinsics.txt"), f"{folder}/intrinsics.txt", (3,))
-    if K.shape != (3, 3) or K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]].tolist() != [0, 0, 0, 0, 1]:
-        raise InputError(f"{folder}/intrinsics.txt is {K.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
-    intrinsics = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    poses = _numbers(lists["poses.txt"], f"{folder}/poses.txt", (12, 16))
-    masks, size = files_by_stem(Path(folder) / "masks"), read_image(path_inside(folder, lists["rgb.txt"][0])).shape[:2]
-    frames = []
-    for number, (image, depth, pose) in enumerate(zip(lists["rgb.txt"], lists["depth.txt"], poses, strict=True), 1):
-        image, depth = path_inside(folder, image), path_inside(folder, depth)
-        matrix = np.array([*pose, 0, 0, 0, 1][:16]).reshape(4, 4)
-        camera = camera_from_pose(matrix, intrinsics, size, f"capture {folder}, line {number} of the lists")
-        frames.append(CaptureFrame(image, depth, camera, depth_unit, mask=masks.get(image.stem)))
-    return frames
-
-
-def _read_lines(folder: str | Path, name: str) -> list[str]:
-    """Read the lines of a text file, without comments (#) and empty lines."""
-    text = read_bytes(path_inside(folder, name), "list").decode("utf-8", "replace")
-    if not (lines := [line for part in text.splitlines() if (line := part.split("#")[0].strip())]):
-        raise InputError(f"{folder}/{name} is empty, expected at least 1 line")
-    return lines
-
-
-def _numbers(lines: list[str], where: str, columns: tuple[int, ...]) -> Float[np.ndarray, "rows columns"]:
-    """Convert lines to numbers, as many in each as one of `columns`."""
-    try:
-        values = np.loadtxt(lines, ndmin=2)
-    except ValueError as error:
-        raise InputError(f"{where}: {error}") from error
-    if values.shape[1] not in columns:
-        raise InputError(f"{where}: {values.shape[1]} numbers per line, expected {' or '.join(map(str, columns))}")
-    return values
-
-
-READERS: dict[str, Callable[..., list[CaptureFrame]]] = {"nerfstudio": read_nerfstudio, "lists": read_lists}
-SIGNS = {"nerfstudio": "transforms.json", "lists": "poses.txt"}  # files by which a format is recognised

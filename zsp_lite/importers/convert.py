@@ -11,7 +11,7 @@ from zsp_lite.data.cameras import Box
 from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, files_by_stem
+from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, find_masks
 from zsp_lite.importers.masks import mask_flags, masks_from_box
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
@@ -50,7 +50,7 @@ def import_capture(
     whose mask is empty are left out. An interrupted import can be repeated.
 
     Args:
-        capture: Frames of one reader in `READERS`.
+        capture: Frames of a capture (see `open_capture`).
         root: The data folder, new or existing.
         category: Name of the category.
         sequence: Name of the new sequence.
@@ -69,8 +69,8 @@ def import_capture(
     if box is not None:
         capture = [replace(frame, mask=None) for frame in capture]
     elif masks is not None:
-        files = files_by_stem(masks)
-        capture = [replace(frame, mask=files.get(frame.image.stem)) for frame in capture]
+        files = find_masks(masks, [frame.image for frame in capture])
+        capture = [replace(frame, mask=mask) for frame, mask in zip(capture, files)]
     if box is None and (missing := [frame.image.name for frame in capture if frame.mask is None]):
         raise InputError(
             f"{missing[0]} has no mask, expected a box in the first picture (--box TOP,LEFT,HEIGHT,WIDTH), or a folder "

@@ -8,7 +8,7 @@ import os
 import secrets
 import stat
 import zlib
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import msgspec
@@ -20,6 +20,10 @@ MAX_WEIGHTS = 4 << 30  # bytes of a file of weights
 # Compressed data may grow to this many bytes, or by this factor if that is more. Annotations grow by 10.
 GROWTH_ALLOWED, _GROWTH_FACTOR = 1 << 26, 32
 _LONGEST_NAME = 255  # bytes, on most file systems
+
+
+class OutsideError(InputError):
+    """A path that leads out of its folder by its own text."""
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:
@@ -126,6 +130,19 @@ def path_inside(root: str | Path, relative: str) -> Path:
     except (ValueError, OSError, RuntimeError):  # null byte, name too long, cyclic links
         problem = "is invalid in"
     raise InputError(f"path {_shown(relative)} {problem} the data folder {root}, expected a path inside")
+
+
+def find_inside(root: str | Path, text: str) -> Path | None:
+    """Find a file, or an image without its extension, by a path that a file of the folder gives, relative or absolute.
+
+    Links inside the folder, which its owner made, may lead anywhere. OutsideError if the text itself leads out of it.
+    """
+    root, text = os.path.abspath(root), text.replace("\\", "/")
+    path = os.path.normpath(text if PureWindowsPath(text).drive else os.path.join(root, text))
+    if not path.startswith((os.path.join(root, ""), os.path.join(os.path.realpath(root), ""))):
+        expected = "a path inside, relative or absolute; a link inside may lead elsewhere"
+        raise OutsideError(f"path {_shown(text)} leads out of the folder {root}, expected {expected}")
+    return next((Path(path + end) for end in ("", ".png", ".jpg", ".jpeg") if os.path.isfile(path + end)), None)
 
 
 def plain_name(name: str, what: str) -> str:

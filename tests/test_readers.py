@@ -1,0 +1,490 @@
+"""Scans in the layouts of apps and depth cameras, made of rendered frames: what is read, refused and left out."""
+
+import json
+import stat
+import sys
+import types
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic_views import CoordinateBackbone
+from test_importers import hairdryer_views, to_world, write_depth16, write_lists, write_nerfstudio
+
+from zsp_lite.cli.main import main
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.frames import write_image, write_mask
+from zsp_lite.errors import InputError
+from zsp_lite.importers import open_capture, recognise
+from zsp_lite.importers.capture import find_masks, sharpest, trusted
+from zsp_lite.metrics import rotation_error
+from zsp_lite.own_objects import estimate_pose, open_source, spread_views
+from zsp_lite.samples import sample_data
+
+OPENGL = np.diag([1.0, -1, -1, 1])
+
+
+@pytest.fixture(scope="module")
+def views():
+    return hairdryer_views()[:4]
+
+
+@pytest.fixture(autouse=True)
+def lzfse(monkeypatch):
+    """Stands for the package lzfse: nothing is compressed."""
+    module = types.SimpleNamespace(decompress=bytes, error=type("error", (Exception,), {}))
+    monkeypatch.setitem(sys.modules, "lzfse", module)
+
+
+def write_files(folder, frames, images="images/{}.jpg", depths="depth/{}.png", unit=0.001, masks="masks/{}.png"):
+    """Write the images, the depth in 16 bits (0 where it is too far) and the masks of frames by their numbers."""
+    for k, frame in enumerate(frames):
+        write_image(folder / images.format(f"{k:06d}"), frame.rgb, 95)
+        values = np.rint(frame.depth / unit)
+        write_depth16(folder / depths.format(f"{k:06d}"), np.where(values < 65536, values, 0) / 1000)
+        write_mask(folder / masks.format(f"{k:06d}"), frame.mask)
+
+
+def write_confidence(folder, frames):
+    for k, frame in enumerate(frames):
+        folder.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / f"{k:06d}.png"), np.full(frame.camera.size, 2, np.uint8))
+
+
+def quaternion(pose):
+    return Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+
+
+def write_video(path, images):
+    height, width = images[0].shape[:2]
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30, (width, height))
+    for image in images:
+        video.write(image[..., ::-1])
+    video.release()
+
+
+def write_stray(folder, frames):
+    write_files(folder, frames)
+    write_confidence(folder / "confidence", frames)
+    write_video(folder / "rgb.mp4", [frame.rgb for frame in frames])
+    np.savetxt(folder / "camera_matrix.csv", frames[0].camera.K, delimiter=", ")
+    rows = [[k / 60, k, *to_world(frame)[:3, 3], *quaternion(to_world(frame))] for k, frame in enumerate(frames)]
+    header = "timestamp, frame, x, y, z, qx, qy, qz, qw"
+    np.savetxt(folder / "odometry.csv", rows, delimiter=", ", header=header, comments="")
+    return folder
+
+
+def write_polycam(folder, frames):
+    inside = folder / "keyframes"
+    write_files(inside, frames, images="corrected_images/{}.jpg", masks="../masks/{}.png")
+    write_confidence(inside / "confidence", frames)
+    for k, frame in enumerate(frames):
+        pose, (fx, fy), (cx, cy) = to_world(frame) @ OPENGL, frame.camera.focal_length, frame.camera.principal_point
+        camera = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+        path = inside / f"corrected_cameras/{k:06d}.json"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps(camera | {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "blur_score": 1.5}))
+    (inside / "cameras").mkdir()
+    return folder
+
+
+def write_record3d(folder, frames):
+    height, width = frames[0].camera.size
+    poses = [to_world(frame) @ OPENGL for frame in frames]
+    metadata = {"w": width, "h": height, "dw": width, "dh": height, "K": frames[0].camera.K.T.ravel().tolist(),
+                "poses": [[*quaternion(pose), *pose[:3, 3]] for pose in poses]}  # fmt: skip
+    path = folder.with_suffix(".r3d")
+    with zipfile.ZipFile(path, "w") as zipped:
+        zipped.writestr("metadata", json.dumps(metadata))
+        for k, frame in enumerate(frames):
+            zipped.writestr(f"rgbd/{k}.jpg", cv2.imencode(".jpg", frame.rgb[..., ::-1])[1].tobytes())
+            zipped.writestr(f"rgbd/{k}.depth", np.where(frame.depth > 0, frame.depth, np.nan).tobytes())
+            zipped.writestr(f"rgbd/{k}.conf", np.full(frame.depth.shape, 2, np.uint8).tobytes())
+            zipped.writestr(f"masks/{k}.png", cv2.imencode(".png", np.uint8(255 * frame.mask))[1].tobytes())
+    return path
+
+
+def write_tum(folder, frames):
+    write_files(folder, frames, unit=1 / 5000)
+    for kind, ending in (("rgb", "images/{:06d}.jpg"), ("depth", "depth/{:06d}.png")):
+        lines = [f"{10 + k + 0.01 * (kind == 'depth')} {ending.format(k)}" for k in range(len(frames))]
+        (folder / f"{kind}.txt").write_text("# time file\n" + "\n".join(lines))
+    rows = [[10.005 + k, *to_world(one)[:3, 3], *quaternion(to_world(one))] for k, one in enumerate(frames)]
+    np.savetxt(folder / "groundtruth.txt", rows, header="time tx ty tz qx qy qz qw")
+    return folder
+
+
+def write_bop(folder, frames, objects=(5,)):
+    write_files(folder, frames, "rgb/{}.jpg", unit=0.0005, masks="mask_visib/{}_" + f"{len(objects) - 1:06d}.png")
+    scene, cameras = {}, {}
+    for k, frame in enumerate(frames):
+        pose = {"cam_R_m2c": frame.camera.R.ravel().tolist(), "cam_t_m2c": (1000 * frame.camera.t).tolist()}
+        scene[k] = [pose | {"obj_id": number} for number in objects]
+        K = frame.camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        cameras[k] = {"cam_K": K.ravel().tolist(), "depth_scale": 0.5}
+    (folder / "scene_gt.json").write_text(json.dumps(scene))
+    (folder / "scene_camera.json").write_text(json.dumps(cameras))
+    return folder
+
+
+def write_scannet(folder, frames):
+    write_files(folder, frames, "color/{}.jpg")
+    for name in ("pose", "intrinsic"):
+        (folder / name).mkdir()
+    for k, frame in enumerate(frames):
+        np.savetxt(folder / f"pose/{k:06d}.txt", to_world(frame))
+    whole = np.eye(4)
+    whole[:3, :3] = frames[0].camera.K
+    np.savetxt(folder / "intrinsic/intrinsic_color.txt", whole)
+    return folder
+
+
+def write_open3d(folder, frames):
+    write_files(folder, frames, "color/{}.jpg")
+    K = frames[0].camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    (folder / "intrinsic.json").write_text(json.dumps({"intrinsic_matrix": K.T.ravel().tolist()}))
+    with open(folder / "trajectory.log", "w") as log:
+        for k, frame in enumerate(frames):
+            np.savetxt(log, to_world(frame), header=f"{k} {k} {k + 1}", comments="")
+    return folder
+
+
+def write_zip_of_nerfstudio(folder, frames):
+    """As an app shares it: with one folder in the zip."""
+    write_nerfstudio(folder, frames)
+    path = folder.with_suffix(".zip")
+    with zipfile.ZipFile(path, "w") as zipped:
+        for file in filter(Path.is_file, folder.rglob("*")):
+            zipped.write(file, Path("my scan") / file.relative_to(folder))
+    return path
+
+
+def write_lists_with_masks(folder, frames):
+    write_lists(folder, frames)
+    for frame in frames:
+        write_mask(folder / f"masks/{frame.name}.png", frame.mask)
+    return folder
+
+
+WRITERS = {
+    "nerfstudio": write_zip_of_nerfstudio, "lists": write_lists_with_masks, "stray": write_stray,
+    "polycam": write_polycam, "record3d": write_record3d, "tum": write_tum, "bop": write_bop, "scannet": write_scannet,
+    "open3d": write_open3d,
+}  # fmt: skip
+
+
+def write(layout, folder, frames):
+    """Write a scan; returns its path, and the options by which it is read."""
+    folder.mkdir()
+    (fx, fy), (cx, cy) = frames[0].camera.focal_length, frames[0].camera.principal_point
+    return WRITERS[layout](folder, frames), {"intrinsics": (fx, fy, cx, cy)} if layout == "tum" else {}
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_each_layout_is_recognised_and_gives_the_cameras_the_depth_and_the_masks(tmp_path, views, layout):
+    path, options = write(layout, tmp_path / "scan", views)
+    capture = open_capture(path, **options)
+    assert capture.format == layout and not capture.left_out
+    for one, view in zip(capture.frames, views, strict=True):
+        frame, known = one.load(), view.depth > 0
+        np.testing.assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
+        np.testing.assert_allclose(frame.camera.K, view.camera.K, atol=1e-6)
+        np.testing.assert_allclose(frame.depth[known], view.depth[known], atol=6e-4)
+        np.testing.assert_array_equal(frame.mask > 0.5, view.mask > 0.5)
+        assert np.abs(frame.rgb.astype(int) - view.rgb).mean() < 8
+
+
+@pytest.fixture(scope="module")
+def scooter():
+    """Two frames of a sample sequence, and its pose to another one."""
+    dataset = Co3D(sample_data())
+    annotations = dataset.frames("motorcycle", "scooter")
+    frames = [replace(dataset.load(annotations[12 * k]), name=f"{k:04d}") for k in (0, 1)]
+    return frames, pose_to_scooter2(dataset.root / "motorcycle/scooter")
+
+
+def pose_to_scooter2(source):
+    options = {"references": 1, "reference_frame": 0}
+    found = estimate_pose(source, sample_data() / "motorcycle/scooter2", **options)
+    return found.estimates["verified"].world_sim3.R
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_each_layout_gives_the_pose_of_the_data_folder(tmp_path, scooter, layout):
+    frames, expected = scooter
+    path, options = write(layout, tmp_path / "scan", frames)
+    assert rotation_error(pose_to_scooter2(open_source(path, **options)), expected) < 3
+
+
+def edited(*changes, encoding="utf-8", name="transforms.json"):
+    """Change transforms.json, or each frame of it where `changes` are of two arguments."""
+
+    def apply(folder):
+        content = json.loads((folder / "transforms.json").read_text())
+        for change in changes:
+            change(content)
+        (folder / "transforms.json").unlink()
+        (folder / name).write_text(json.dumps(content), encoding=encoding)
+        return folder
+
+    return apply
+
+
+def each(change):
+    return lambda content: [change(frame) for frame in content["frames"]]
+
+
+def linked(folder):
+    (folder / "images").rename(folder.parent / "large disk")
+    (folder / "images").symlink_to(folder.parent / "large disk")
+    return folder
+
+
+def angle(side, focal):
+    return 2 * np.arctan(side / 2 / focal)
+
+
+def absolute(folder):
+    return edited(each(lambda f: f.update(file_path=str(folder / f["file_path"]))))(folder)
+
+
+RELATIVES = {
+    "camera_angle_x": edited(lambda c: c.update(camera_angle_x=angle(c.pop("w"), c.pop("fl_x"))),
+                             lambda c: [c.pop(name) for name in ("fl_y", "h", "cx", "cy")]),
+    "depth_path": edited(each(lambda f: f.update(depth_path=f.pop("depth_file_path"))),
+                         lambda c: c.update(integer_depth_scale=0.001, depth_unit_scale_factor=5)),
+    "names without extension": edited(each(lambda f: f.update(file_path="./" + f["file_path"][:-4]))),
+    "3 x 4": edited(each(lambda f: f["transform_matrix"].pop())),
+    "byte-order mark": edited(encoding="utf-8-sig"),
+    "the file itself": lambda folder: folder / "transforms.json",
+    "transforms_train.json": edited(name="transforms_train.json"),
+    "back slashes": edited(each(lambda f: f.update(file_path=f["file_path"].replace("/", "\\")))),
+    "absolute paths": absolute, "a linked folder": linked, "shuffled": edited(lambda c: c["frames"].reverse()),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", RELATIVES)
+def test_relatives_of_nerfstudio_are_read(tmp_path, views, kind, links):
+    (tmp_path / "scan").mkdir()
+    write_nerfstudio(tmp_path / "scan", views)
+    capture = open_capture(RELATIVES[kind](tmp_path / "scan"))
+    for one, view in zip(capture.frames, views, strict=True):
+        frame = one.load()
+        np.testing.assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
+        np.testing.assert_allclose(frame.camera.K, view.camera.K, rtol=0.02)  # 0.6 pixels off the middle
+        np.testing.assert_allclose(frame.depth[view.mask > 0], view.depth[view.mask > 0], atol=6e-4)
+
+
+def first(change):
+    return edited(lambda c: change(c["frames"][0]))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (first(lambda f: f["transform_matrix"][0].__setitem__(0, float("nan"))), "frame 0: pose is .*None"),
+        (first(lambda f: f["transform_matrix"][0].__setitem__(0, 5.0)), "frame 0: .*expected a rotation"),
+        (first(lambda f: f.update(file_path="images/lost.jpg")), "frame 0: images/lost.jpg is missing in"),
+        (first(lambda f: f.update(depth_file_path="lost")), "frame 0: lost is missing in"),
+        (first(lambda f: f.update(k4=1)), "frame 0: camera_model is .* with k4 = 1"),
+    ],
+)
+def test_a_frame_that_cannot_be_used_is_left_out_and_named(tmp_path, views, damage, message):
+    write_nerfstudio(tmp_path, views)
+    damage(tmp_path)
+    capture = open_capture(tmp_path)
+    assert [one.image.name for one in capture.frames] == ["0001.jpg", "0002.jpg", "0003.jpg"]
+    source = open_source(tmp_path)
+    (flag,) = source.flags(source.load([0]))
+    for line in (*capture.left_out, flag):
+        with pytest.raises(InputError, match=message):
+            raise InputError(line)
+    assert "1 frames are left out: " in flag
+
+
+def test_a_damaged_picture_is_left_out_and_named_unless_too_few_remain(tmp_path, views, capsys):
+    (tmp_path / "scan").mkdir()
+    write_nerfstudio(tmp_path / "scan", views)
+    images = sorted((tmp_path / "scan/images").iterdir())
+    images[2].write_bytes(images[2].read_bytes()[:500])
+    found = estimate_pose(*2 * [tmp_path / "scan"], "paper", backbone=CoordinateBackbone())
+    assert len(found.targets) == 3
+    assert sum("1 frames are left out: image" in flag for flag in found.estimates["paper"].flags) == 2
+    arguments = ["data", "import", str(tmp_path / "scan"), "--root", str(tmp_path / "mine"), "--category", "teapot"]
+    assert main([*arguments, "--sequence", "one"]) == 0
+    text = capsys.readouterr().out
+    assert "3 frames" in text and "flag: 1 frames are left out: image" in text
+    images[1].write_bytes(b"")
+    assert main([*arguments, "--sequence", "two"]) == 2
+    assert "2 frames remain, expected 3: image" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("path", ["../../etc/passwd", "/etc/passwd", "images/../../x.jpg", "C:\\x.jpg", "..\\x.jpg"])
+def test_a_path_that_leads_out_of_the_capture_is_refused(tmp_path, views, path):
+    write_nerfstudio(tmp_path, views)
+    first(lambda f: f.update(file_path=path))(tmp_path)
+    with pytest.raises(InputError, match="leads out of the folder .*, expected a path inside, relative or absolute"):
+        open_capture(tmp_path)
+
+
+def test_masks_belong_to_images_by_relative_path_then_name_then_stem(tmp_path):
+    for name in ("a/1.png", "2.jpg.png", "2.png", "3.png", "4.png"):
+        write_mask(tmp_path / name, np.ones((4, 4), np.float32))
+    names = ("a/1.jpg", "b/1.jpg", "a/2.jpg", "a/3.jpg", "a/4.jpg", "b/4.jpg")
+    found = find_masks(tmp_path, [Path("scan/images", name) for name in names])
+    assert found == [tmp_path / "a/1.png", None, tmp_path / "2.jpg.png", tmp_path / "3.png", None, None]
+
+
+def test_lists_have_names_with_signs_a_camera_for_each_image_and_images_of_several_sizes(tmp_path, views):
+    upright = replace(views[1], rgb=views[1].rgb[:, :64], depth=views[1].depth[:, :64], mask=views[1].mask[:, :64],
+                      camera=views[1].camera.crop((0, 0, 96, 64)))  # fmt: skip
+    frames = [replace(views[0], name="cup #10"), replace(upright, name="cup #9")]
+    write_lists(tmp_path, frames)
+    np.savetxt(tmp_path / "intrinsics.txt", [[300, 301, 60, 48], [200, 201, 40, 48]])
+    nine, ten = (one.load().camera for one in open_capture(tmp_path).frames)
+    assert (nine.size, ten.size) == ((96, 64), (96, 128))
+    assert (nine.focal_length.tolist(), ten.focal_length.tolist()) == ([200, 201], [300, 301])
+    (tmp_path / "intrinsics.txt").write_text("300 301 60 48\n")
+    assert {one.camera.focal_length[0] for one in open_capture(tmp_path).frames} == {300}
+    (tmp_path / "intrinsics.txt").write_text("300 301 60 48\n" * 3)
+    with pytest.raises(InputError, match="rgb.txt 2, depth.txt 2, poses.txt 2, intrinsics 3; expected equal"):
+        open_capture(tmp_path)
+
+
+def test_options_of_formats(tmp_path, views):
+    write("tum", tmp_path / "tum", views)
+    assert open_capture(tmp_path / "tum").frames[0].camera.principal_point.tolist() == [320, 240]
+    write_bop(tmp_path / "bop", views, objects=(3, 5))
+    with pytest.raises(InputError, match="has the objects 3, 5, expected one of them as --object N"):
+        open_source(tmp_path / "bop")
+    source = open_source(tmp_path / "bop", object=5, depth_unit=0.01)
+    assert source.mask == "given" and source.load([0])[0].depth.max() > 15 * views[0].depth.max()
+    with pytest.raises(InputError, match="--object does not go with .*tum, of the format tum"):
+        open_source(tmp_path / "tum", object=5)
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        (["sparse/0/images.bin"], "has COLMAP's poses, but no measured depth, expected raw data .* Stray Scanner"),
+        (["scan.mp4"], "is a video without depth and poses"),
+        (["model.obj", "model.mtl"], "is a model as Luma or KIRI export it"),
+        (["notes.doc"], "expected a folder or zip with the files of nerfstudio.*; Stray.*; TUM.*; BOP.*; Open3D"),
+        (["intrinsic.json", "color/0.png"], "has no trajectory.log, expected poses: run Open3D's"),
+    ],
+)
+def test_what_is_no_capture_is_answered_with_what_it_lacks(tmp_path, files, message):
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match=message):
+        open_capture(tmp_path)
+
+
+def zipped(path, name="rgb.txt", mode=0o644, data=b"", flag=0):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        member = zipfile.ZipInfo(name)
+        member.external_attr, member.compress_type = mode << 16, zipfile.ZIP_DEFLATED
+        file.writestr(member, data)
+        member.flag_bits |= flag
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda path: path.write_bytes(b"PK\3\4" + bytes(99)), "is damaged"),
+        (lambda path: zipped(path, "../../climbs"), "has a path that leads out of it, '../../climbs'"),
+        (lambda path: zipped(path, "/etc/x"), "has a path that leads out of it"),
+        (
+            lambda path: zipped(path, "images", stat.S_IFLNK | 0o777, b"/etc"),
+            "has an encrypted file or a link, 'images",
+        ),
+        (lambda path: zipped(path, flag=1), "has an encrypted file or a link, 'rgb.txt'"),
+        (lambda path: zipped(path, data=bytes(60_000)), "of 1.. bytes unpacks to 60,000"),
+    ],
+)
+def test_a_zip_that_is_damaged_malicious_or_large_is_refused(tmp_path, monkeypatch, make, message):
+    monkeypatch.setattr("zsp_lite.importers.unpacked._LARGE", 20_000)
+    make(tmp_path / "scan.zip")
+    with pytest.raises(InputError, match=f"zip .*scan.zip {message}") as caught:
+        recognise(tmp_path / "scan.zip")
+    assert "\n" not in str(caught.value)
+
+
+def test_the_sharpest_frames_of_a_video_and_of_images_are_chosen(tmp_path, views):
+    read = []
+    blank = np.zeros((8, 8), np.uint8)
+    chosen = list(sharpest(range(1000), 100, lambda k: read.append(k) or blank, []))
+    assert len(chosen) == 100 and len(read) <= 400
+    blurred = [replace(views[0], rgb=cv2.GaussianBlur(views[0].rgb, (15, 15), 3), name=f"{k:04d}") for k in range(9)]
+    for sharp in (3, 8):
+        blurred[sharp] = replace(blurred[sharp], rgb=views[0].rgb)
+    for layout in ("stray", "lists", "record3d"):
+        path, _ = write(layout, tmp_path / layout, blurred)
+        assert [int(one.image.stem) for one in open_capture(path, count=3).frames] == [0, 3, 8]
+
+
+def test_the_scans_of_record3d_without_tracking_or_without_the_package_are_refused(tmp_path, views, monkeypatch):
+    path, _ = write("record3d", tmp_path / "scan", [replace(view, camera=views[0].camera) for view in views])
+    monkeypatch.setitem(sys.modules, "lzfse", None)
+    with pytest.raises(InputError, match="compressed by LZFSE, expected its package: pip install lzfse"):
+        open_capture(path)
+    metadata = {"K": [1.0] * 9, "dw": 4, "dh": 4, "poses": [[0.0] * 7] * 3}
+    (tmp_path / "scan/rgbd").mkdir()
+    (tmp_path / "scan/metadata").write_text(json.dumps(metadata))
+    with pytest.raises(InputError, match="all 3 poses are zero: the tracking failed"):
+        open_capture(tmp_path / "scan")
+
+
+def test_depth_of_middle_confidence_is_dropped_in_thin_bands_only():
+    """Smeared silhouettes: the depth map is low-pass filtered, and its confidence is 1 where it is wrong."""
+    y, x = np.mgrid[:192, :256]
+    disc = (y - 96) ** 2 + (x - 128) ** 2 < 50**2
+    true = np.where(disc, 0.5, 1.2)
+    smeared = cv2.blur(true, (5, 5))
+    wrong = np.abs(smeared - true) > 0.01
+    levels = np.where(wrong, 1, 2).astype(np.uint8)
+    kept = trusted(levels)
+    assert wrong.mean() > 0.01 and not (kept & wrong).any() and kept[~wrong].all()
+    # A dark surface is all of the middle level, and is kept; level 0 never is. The levels of Polycam reach 255.
+    dark = np.where(disc & ~wrong, 1, levels).astype(np.uint8)
+    assert trusted(dark)[disc & ~wrong].mean() > 0.95
+    np.testing.assert_array_equal(trusted(dark * np.uint8(127) + (dark == 2)), trusted(dark))
+    dark[:20] = 0
+    assert not trusted(dark)[:20].any()
+
+
+def test_a_confidence_map_hides_depth_and_has_its_size(tmp_path, views):
+    path, _ = write("stray", tmp_path / "scan", views)
+    levels = np.full(views[0].depth.shape, 2, np.uint8)
+    levels[:40] = 0
+    cv2.imwrite(str(path / "confidence/000001.png"), levels)
+    depth = open_capture(path).frames[1].load().depth
+    assert not depth[:40].any() and (depth[40:] > 0).any()
+    cv2.imwrite(str(path / "confidence/000001.png"), levels[::2])
+    with pytest.raises(InputError, match=r"000001.png is \(48, 128\) pixels, expected \(H, W\) = \(96, 128\)"):
+        open_capture(path).frames[1].load()
+
+
+def circle(degrees):
+    """Cameras around the origin."""
+    turns = Rotation.from_euler("y", degrees[:, None], degrees=True).as_matrix()
+    return [Camera(turn, np.array([0, 0, 2.0]), np.array([90.0, 90]), np.array([32.0, 32]), (64, 64)) for turn in turns]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8])
+def test_views_are_spread_evenly_whatever_their_order(count):
+    degrees = np.arange(0, 360, 10.0)
+    chosen = np.sort(degrees[spread_views(circle(degrees), count)])
+    gaps = np.diff(chosen, append=chosen[0] + 360)
+    assert len(chosen) == count and chosen[0] == 0 and np.abs(gaps - 360 / count).max() <= 15
+    shuffled = np.array([0, *np.random.default_rng(0).permutation(degrees[1:])])
+    np.testing.assert_array_equal(np.sort(shuffled[spread_views(circle(shuffled), count)]), chosen)
+    dense = np.sort([*np.linspace(0, 60, 60), 120, 180, 240, 300])
+    assert count < 3 or np.diff(np.sort(dense[spread_views(circle(dense), count)])).max() <= 185

@@ -1,0 +1,92 @@
+"""nerfstudio's transforms.json and its relatives: Blender's synthetic scenes, NeRFCapture, instant-ngp."""
+
+import math
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+
+from zsp_lite.data.frames import image_size
+from zsp_lite.errors import MAX_LENGTH, InputError
+from zsp_lite.importers.capture import FROM_OPENGL, CaptureFrame, Makers, make_frame, read_capture_json
+from zsp_lite.io.files import decode_json, find_inside
+
+_NAMES = ("transforms.json", "transforms_train.json")
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
+_FISHEYE = "OPENCV_FISHEYE"
+_Row = tuple[float | None, float | None, float | None, float | None]  # None: not finite
+_Side = Annotated[float, msgspec.Meta(multiple_of=1)]  # pixels; exporters write 640 or 640.0
+_Angle = Annotated[float, msgspec.Meta(gt=0, lt=math.pi)]  # radians
+_Unit = Annotated[float, msgspec.Meta(gt=0, le=MAX_LENGTH)]
+_Coefficient = Annotated[float, msgspec.Meta(ge=-100, le=100)]  # of the distortion
+
+
+class _Frame(msgspec.Struct):
+    """A frame, together with what the file gives for all frames."""
+
+    file_path: str
+    transform_matrix: Annotated[list[_Row], msgspec.Meta(min_length=3, max_length=4)]
+    fl_x: float | None = None
+    fl_y: float | None = None
+    camera_angle_x: _Angle | None = None
+    camera_angle_y: _Angle | None = None
+    cx: float | None = None
+    cy: float | None = None
+    w: _Side | None = None
+    h: _Side | None = None
+    depth_file_path: str | None = None
+    depth_path: str | None = None
+    mask_path: str | None = None
+    k1: _Coefficient = 0.0
+    k2: _Coefficient = 0.0
+    p1: _Coefficient = 0.0
+    p2: _Coefficient = 0.0
+    k3: _Coefficient = 0.0
+    k4: _Coefficient = 0.0
+    camera_model: str = "OPENCV"
+    depth_unit_scale_factor: _Unit = 0.001
+    integer_depth_scale: _Unit | None = None  # has precedence
+
+
+def read_nerfstudio(path: str | Path) -> Makers:
+    """Read the frames with depth of a folder with transforms.json, or of such a file.
+
+    The depth is in millimetres unless the file has `integer_depth_scale` or `depth_unit_scale_factor`.
+    """
+    path = Path(path)
+    if path.suffix != ".json":
+        path = next((path / name for name in _NAMES if (path / name).is_file()), path / _NAMES[0])
+    common = read_capture_json(path, dict[str, Any])
+    listed = decode_json(msgspec.json.encode(common.pop("frames", None)), list[dict[str, Any]], f"{path}, frames")
+    with_depth = [k for k, own in enumerate(listed) if own.get("depth_file_path") or own.get("depth_path")]
+    if not with_depth:
+        raise InputError(f"{path}: none of {len(listed)} frames has depth_file_path or depth_path, expected depth")
+    for number in with_depth:
+        yield partial(_make, path.parent, common | listed[number], f"{path}, frame {number}")
+
+
+def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
+    """Make a frame of its values and those of all frames."""
+    frame = decode_json(msgspec.json.encode(values), _Frame, where)
+    fisheye = frame.camera_model == _FISHEYE
+    if not fisheye and (frame.camera_model not in _MODELS or frame.k4):
+        found = f"{frame.camera_model!r} with k4 = {frame.k4:g}"
+        expected = f"one of {', '.join(_MODELS)} with k4 = 0, or {_FISHEYE}"
+        raise InputError(f"{where}: camera_model is {found}, expected {expected}")
+    image = find_inside(folder, frame.file_path)
+    if image is None:
+        raise InputError(f"{where}: {frame.file_path} is missing in {folder}")
+    height, width = (int(frame.h), int(frame.w)) if frame.h and frame.w else image_size(image)
+    if not (frame.fl_x or frame.camera_angle_x):
+        raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
+    fx = frame.fl_x or width / 2 / math.tan(frame.camera_angle_x / 2)
+    fy = frame.fl_y or (height / 2 / math.tan(frame.camera_angle_y / 2) if frame.camera_angle_y else fx)
+    cx, cy = (width / 2 if frame.cx is None else frame.cx), (height / 2 if frame.cy is None else frame.cy)
+    # OpenCV's order of the coefficients; its model has no r^8 term, k4.
+    last = (frame.k3, frame.k4) if fisheye else (frame.p1, frame.p2, frame.k3)
+    return make_frame(
+        folder, image, frame.depth_file_path or frame.depth_path, frame.transform_matrix,
+        (fx, fy, cx, cy), where, FROM_OPENGL, (height, width), frame.mask_path, fisheye=fisheye,
+        depth_unit=frame.integer_depth_scale or frame.depth_unit_scale_factor, distortion=(frame.k1, frame.k2, *last),
+    )  # fmt: skip

@@ -1,0 +1,105 @@
+"""Scans of phones as their apps export them, after the apps' documents: Stray Scanner, Polycam, Record3D."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+import msgspec
+import numpy as np
+
+from zsp_lite.data.frames import write_image
+from zsp_lite.errors import InputError
+from zsp_lite.importers.capture import (
+    FROM_OPENGL,
+    CaptureFrame,
+    Makers,
+    make_frame,
+    read_capture_json,
+    read_numbers,
+    sharpest,
+)
+from zsp_lite.importers.unpacked import new_folder, open_video
+from zsp_lite.io.files import read_bytes
+
+
+def read_stray(folder: Path, count: int) -> Makers:
+    """Read a scan of Stray Scanner, at most `count` sharp frames of its video."""
+    rows = read_numbers(folder / "odometry.csv", (9,), delimiter=",", skiprows=1)
+    K = read_numbers(folder / "camera_matrix.csv", (3,), delimiter=",")
+    names = [f"{number:06.0f}.png" for number in rows[:, 1]]
+    with_depth = sorted({int(name[:-4]) for name in names if (folder / "depth" / name).is_file()})
+    pictures, images, left_out = new_folder(), {}, []
+    for number, image in sharpest(with_depth, count, open_video(folder / "rgb.mp4"), left_out):
+        images[number] = pictures / f"{number:06d}.jpg"
+        write_image(images[number], image, 95)
+    if left_out and not images:
+        raise InputError(left_out[0])
+    for row, name in zip(rows, names):
+        if row[1] in images or row[1] not in with_depth:
+            files = images.get(row[1], "rgb.mp4"), f"depth/{name}"
+            where, confidence = f"{folder}/odometry.csv, frame {row[1]:g}", f"confidence/{name}"
+            yield partial(make_frame, folder, *files, row[2:], K, where, confidence=confidence)
+
+
+def read_polycam(folder: Path) -> Makers:
+    """Read Polycam's raw data: its corrected images and cameras, if they are there."""
+    folder = folder / "keyframes"
+    prefix = "corrected_" if all((folder / f"corrected_{one}").is_dir() for one in ("cameras", "images")) else ""
+    for path in sorted((folder / f"{prefix}cameras").glob("*.json")):
+        camera = read_capture_json(path, dict[str, Any])
+        pose = [camera.get(f"t_{row}{column}") for row in range(3) for column in range(4)]
+        intrinsics = [camera.get(name) for name in ("fx", "fy", "cx", "cy")]
+        files = f"{prefix}images/{path.stem}", f"depth/{path.stem}"
+        confidence = f"confidence/{path.stem}"
+        yield partial(make_frame, folder, *files, pose, intrinsics, f"{path}", FROM_OPENGL, confidence=confidence)
+
+
+_Side = Annotated[int, msgspec.Meta(ge=1, le=10_000)]  # pixels
+
+
+class _Record3D(msgspec.Struct):
+    """The file `metadata` of a Record3D scan; numbers of a pose that are not finite are None."""
+
+    K: Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)]  # in column-major order
+    poses: list[list[float | None]]  # qx, qy, qz, qw, tx, ty, tz
+    dw: _Side = 256  # of the depth maps; by default those of the LiDAR
+    dh: _Side = 192
+    perFrameIntrinsicCoeffs: list[list[float | None]] | None = None
+
+
+def read_record3d(folder: Path) -> Makers:
+    """Read a scan of Record3D; its depth is decompressed to a temporary folder."""
+    scan, unpacked = read_capture_json(folder / "metadata", _Record3D), new_folder()
+    if not any(number for pose in scan.poses for number in pose):
+        found = f"all {len(scan.poses)} poses are zero: the tracking failed"
+        raise InputError(f"{folder}/metadata: {found}, expected another scan")
+    every = scan.perFrameIntrinsicCoeffs or [[scan.K[k] for k in (0, 4, 6, 7)]] * len(scan.poses)
+    for number, intrinsics in enumerate(every[: len(scan.poses)]):
+        yield partial(_make_record3d, folder, unpacked / f"{number}", scan, intrinsics)
+
+
+def _make_record3d(folder: Path, unpacked: Path, scan: _Record3D, intrinsics: list[float | None]) -> CaptureFrame:
+    """Decompress depth and confidence of a frame to files `unpacked`.npy and .png."""
+    name, pose = f"rgbd/{unpacked.name}", scan.poses[int(unpacked.name)]
+    depth, confidence = unpacked.with_suffix(".npy"), unpacked.with_suffix(".png")
+    np.save(depth, _decompressed(folder / f"{name}.depth", np.float32, scan))
+    if (folder / f"{name}.conf").is_file():
+        cv2.imwrite(str(confidence), _decompressed(folder / f"{name}.conf", np.uint8, scan))
+    return make_frame(
+        folder, f"{name}.jpg", depth, pose[4:] + pose[:4], intrinsics, f"{folder}, frame {unpacked.name}", FROM_OPENGL,
+        confidence=confidence if confidence.is_file() else None, depth_unit=1.0,
+    )  # fmt: skip
+
+
+def _decompressed(path: Path, kind: type, scan: _Record3D) -> np.ndarray:
+    """Decompress a map of numbers by LZFSE."""
+    try:
+        import lzfse
+    except ImportError as error:
+        raise InputError(f"{path} is compressed by LZFSE, expected its package: pip install lzfse") from error
+    data = read_bytes(path, "depth")
+    try:
+        return np.frombuffer(lzfse.decompress(data), kind).reshape(scan.dh, scan.dw)
+    except (lzfse.error, MemoryError, ValueError) as error:
+        raise InputError(f"{path} is no map of {scan.dh} x {scan.dw} numbers: {error}") from error

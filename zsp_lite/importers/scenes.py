@@ -1,0 +1,74 @@
+"""Scenes of benchmarks and of depth cameras: BOP, ScanNet, Open3D's recorder."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from zsp_lite.errors import InputError, real_array
+from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, Makers, make_frame, read_capture_json, read_numbers
+
+_MILLIMETRES = 0.001
+
+
+class _Annotation(msgspec.Struct):
+    """Pose of an object in an image of BOP."""
+
+    obj_id: int
+    cam_R_m2c: Any
+    cam_t_m2c: Any
+
+
+def read_bop(folder: Path, object: int | None = None) -> Makers:
+    """Read a scene in BOP's format, in the frame of one of its objects, in each image the first with its number."""
+    scene = read_capture_json(folder / "scene_gt.json", dict[str, list[_Annotation]])
+    cameras = read_capture_json(folder / "scene_camera.json", dict[str, dict[str, Any]])
+    numbers = {image: [one.obj_id for one in placed] for image, placed in scene.items()}
+    known = sorted({number for some in numbers.values() for number in some})
+    if object is None and len(known) == 1:
+        object = known[0]
+    if object not in known:
+        raise InputError(f"{folder} has the objects {', '.join(map(str, known))}, expected one of them as --object N")
+    for image, some in numbers.items():
+        if object in some and image in cameras:
+            index = some.index(object)
+            yield partial(_make_bop, folder, image, index, scene[image][index], cameras[image])
+
+
+def _make_bop(folder: Path, image: str, index: int, placed: _Annotation, camera: dict[str, Any]) -> CaptureFrame:
+    """Make a frame of an annotation and a camera; pixel centres are at integers, lengths in millimetres."""
+    where, name = f"{folder}, image {image}", f"{image:0>6}"
+    R = real_array(f"{where}: cam_R_m2c", placed.cam_R_m2c, (9,))
+    t = real_array(f"{where}: cam_t_m2c", placed.cam_t_m2c, (3,))
+    K = real_array(f"{where}: cam_K", camera.get("cam_K"), (9,))
+    pose = np.column_stack([R.reshape(3, 3).T, -_MILLIMETRES * R.reshape(3, 3).T @ t])
+    unit = _MILLIMETRES * float(real_array(f"{where}: depth_scale", camera.get("depth_scale", 1), ()))
+    mask = f"mask_visib/{name}_{index:06d}"
+    files = f"rgb/{name}", f"depth/{name}"
+    return make_frame(folder, *files, pose, K.reshape(3, 3) + HALF_PIXEL, where, mask=mask, depth_unit=unit)
+
+
+def read_scannet(folder: Path) -> Makers:
+    """Read a scene in ScanNet's format, with a text file for the pose of each image."""
+    K = read_numbers(folder / "intrinsic/intrinsic_color.txt", (3, 4))
+    for path in sorted((folder / "pose").glob("*.txt")):
+        files = f"color/{path.stem}", f"depth/{path.stem}"
+        yield partial(make_frame, folder, *files, read_numbers(path, (4,)), K, str(path))
+
+
+def read_open3d(folder: Path) -> Makers:
+    """Read frames of Open3D's recorder, with the trajectory that its reconstruction writes."""
+    log = next((one for one in (folder / "trajectory.log", folder / "scene/trajectory.log") if one.is_file()), None)
+    if log is None:
+        raise InputError(f"{folder} has no trajectory.log, expected poses: run Open3D's reconstruction system on it")
+    camera = read_capture_json(folder / "intrinsic.json", dict[str, Any])
+    K = real_array(f"{folder}/intrinsic.json: intrinsic_matrix", camera.get("intrinsic_matrix"), (9,))
+    images = sorted(path.stem for path in (folder / "color").iterdir() if path.suffix.lower() in (".jpg", ".png"))
+    lines = read_numbers(log, (4,), usecols=(0, 1, 2, -1))  # three frame numbers, and four lines of a matrix
+    if len(lines) != 5 * len(images):
+        raise InputError(f"{log} has {len(lines)} lines, expected 5 for each of {len(images)} images")
+    for image, pose in zip(images, lines.reshape(-1, 5, 4)[:, 1:]):
+        files = f"color/{image}", f"depth/{image}"
+        yield partial(make_frame, folder, *files, pose, K.reshape(3, 3).T + HALF_PIXEL, f"{log}, frame {image}")
