@@ -43,9 +43,13 @@ class ObjectPose(msgspec.Struct):
     def R(self) -> Float[np.ndarray, "3 3"]:
         return np.array(self.trans)[:3, :3]
 
+    @property
+    def t(self) -> Float[np.ndarray, "3"]:
+        return np.array(self.trans)[:3, 3]
+
     def to_object(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Map world points to object coordinates (front +x, left +y, up +z, surface of unit standard deviation)."""
-        return (np.asarray(world, np.float64) - np.array(self.trans)[:, 3]) @ self.R / self.scale
+        return (np.asarray(world, np.float64) - self.t) @ self.R / self.scale
 
     def to_box(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Map world points to box coordinates, 0 to 1 along each object axis."""
