@@ -89,7 +89,7 @@ WRONG = [
     (["synth", "--category", "sofa", "--out", "x"], "sofa"),
     (["data", "check", "/nowhere"], "does not exist"),
     ([*IMPORT, "lists", "/nowhere"], "rgb.txt"),
-    ([*IMPORT, "nerfstudio", "x", "--depth-unit=2"], "--depth-unit does not go with the format nerfstudio"),
+    ([*IMPORT, "nerfstudio", "x", "--object=2"], "--object does not go with the format nerfstudio"),
     ([*IMPORT, "lists", "x", "--box=1,1,9,9", "--masks=m"], "--masks does not go with --box"),
 ]
 
@@ -273,16 +273,16 @@ def test_options_of_the_import_reach_the_library(monkeypatch, capsys):
         return ImportResult(1, 0, 1, 1.0, ("the masks may be wrong: why",))
 
     monkeypatch.setattr("zsp_lite.importers.recognise", lambda path: ("bop", path))
-    monkeypatch.setattr("zsp_lite.importers.open_capture", lambda *a, **b: Capture("", (a, b), ["lost: a.jpg"]))
+    monkeypatch.setattr("zsp_lite.importers.open_capture", lambda *a, **b: Capture("", [a, b, 0], ["lost: a.jpg"]))
     monkeypatch.setattr("zsp_lite.importers.import_capture", import_capture)
     words = "--root mine --category cup --sequence one --frames 7".split()
     assert main(["data", "import", "nerfstudio", "scan", *words, "--box", "1,2,3,4"]) == 0
-    capture = (Path("scan"), "nerfstudio", 7), {}
+    capture = [(Path("scan"), "nerfstudio", 7), {}, 0]
     assert given.pop() == (capture, Path("mine"), "cup", "one", (1, 2, 3, 4), None, 7)
     text = capsys.readouterr().out
     assert "flag: 1 frames are left out: lost: a.jpg\nflag: the masks may be wrong: why\n" in text
     assert main(["data", "import", "scan", *words, "--depth-unit", "0.5", "--object", "0", "--masks", "there"]) == 0
-    capture = (Path("scan"), "bop", 7), {"depth_unit": 0.5, "object": 0}
+    capture = [(Path("scan"), "bop", 7), {"depth_unit": 0.5, "object": 0}, 0]
     assert given.pop() == (capture, Path("mine"), "cup", "one", None, Path("there"), 7)
     for wrong in (["lists", "scan", "--object", "0"], ["folder", "scan"]):
         assert main(["data", "import", *wrong, *words]) == 2

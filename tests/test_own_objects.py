@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, inside, look_at, render, true_pose
-from test_importers import write_lists, write_nerfstudio
+from test_importers import write_lists
 from test_masks import overlap
 
 import zsp_lite
@@ -63,20 +63,6 @@ def test_a_sequence_of_a_data_folder_is_read_with_its_numbers_and_masks(ellipsoi
         source.select(1, 1, 7)
     monkeypatch.chdir(source.path)
     assert open_source(".").name == "b"
-
-
-WRITERS = {"nerfstudio": (write_nerfstudio, "given"), "lists": (write_lists, "auto")}
-
-
-@pytest.mark.parametrize("layout", WRITERS)
-def test_a_capture_is_recognised_by_its_files(tmp_path, frames, layout):
-    write, mask = WRITERS[layout]
-    write(tmp_path, frames)
-    source = open_source(tmp_path)
-    assert (source.format, source.numbers, source.mask) == (layout, (0, 1, 2, 3), mask)
-    camera = source.load([2])[0].camera
-    np.testing.assert_allclose(camera.K, frames[2].camera.K)
-    np.testing.assert_allclose(camera.centre, frames[2].camera.centre, atol=1e-4)
 
 
 def test_a_box_gives_masks_to_every_frame(tmp_path, frames):

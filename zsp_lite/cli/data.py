@@ -208,7 +208,7 @@ def import_(source, root, category, sequence, box, masks, frames, **options) -> 
         raise click.UsageError(f"{' '.join(map(str, source))}: expected SCAN, or one of {', '.join(FORMATS)} before it")
     given = {name: value for name, value in options.items() if value is not None}
     refuse_options({"masks": box and masks}, (), "--box")
-    refuse_options(given, FORMATS[layout].options, f"the format {layout}")
+    refuse_options(dict.fromkeys(given, True), FORMATS[layout].options, f"the format {layout}")
     capture = open_capture(source[-1], layout, frames, **given)
     if capture.left_out and len(capture.frames) < 3:
         raise InputError(f"{source[-1]}: {len(capture.frames)} frames remain, expected 3: {capture.left_out[0]}")
