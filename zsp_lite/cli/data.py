@@ -8,7 +8,8 @@ from typing import Any
 
 import click
 
-from zsp_lite.cli.common import BOX, COUNT, LENGTH, PATH, examples, refuse_options, replace_option
+from zsp_lite.choices import MASKS
+from zsp_lite.cli.common import BOX, COUNT, INDEX, LENGTH, ORIENTATION, PATH, examples, refuse_options, replace_option
 from zsp_lite.errors import InputError
 
 _LICENCE = "CO3D is under CC BY-NC 4.0: no commercial use."
@@ -171,11 +172,14 @@ def transfer(v1, v2, category, replace) -> None:
 @root_option
 @click.option("--category", metavar="NAME", required=True, help="Category of the object.")
 @click.option("--sequence", metavar="NAME", required=True, help="Name of the new sequence.")
+@click.option("--mask", type=click.Choice(MASKS), help="Origin of the masks, see below.")
+@click.option("--label", type=INDEX, help="Number of the object in masks that label several.")
+@click.option("--orientation", type=ORIENTATION, help="Form of what belongs to turned photographs.")
 @click.option("--box", type=BOX, help="Bounding box of the object in the first image in pixels.")
 @click.option("--masks", type=PATH, help="Folder of mask files named like the images, instead of --box.")
 @click.option("--frames", type=COUNT, default=100, help="Maximum number of frames, evenly spaced.")
 @click.option("--depth-unit", type=LENGTH, show_default="0.001", help="World units per stored depth value, for lists.")
-def import_(layout, folder, root, category, sequence, box, masks, frames, depth_unit) -> None:
+def import_(layout, folder, root, category, sequence, mask, box, masks, frames, depth_unit, label, orientation) -> None:
     """Import an RGB-D capture, images with depth and camera poses in one world, as a sequence of a data folder.
 
     The first argument is the format of FOLDER, which holds:
@@ -184,7 +188,7 @@ def import_(layout, folder, root, category, sequence, box, masks, frames, depth_
       nerfstudio  transforms.json         intrinsics, and per frame file_path, depth_file_path and
                                           transform_matrix; phone scanners export it; depth in mm,
                                           or depth_unit_scale_factor; mask_path is used if present
-      lists       rgb.txt, depth.txt      one file per line; depth as 16-bit PNG or .npy
+      lists       rgb.txt, depth.txt      one file per line; depth as 16-bit PNG, TIFF, .npy, ...
                   masks/                  if present, mask files named like the images
                   poses.txt               lines of 12 or 16 numbers: camera to world, OpenCV's axes
                   intrinsics.txt          3 x 3 matrix in pixels, pixel centres at half-integers
@@ -192,13 +196,15 @@ def import_(layout, folder, root, category, sequence, box, masks, frames, depth_
 
     Depth maps must be registered to the images: a pixel of both shows the same point. The object is given by --box, by
     which GrabCut segments it in all images, by --masks, or by masks of the capture; frames without it are left out.
+    --mask auto finds it by depth and colours, as is done for single frames without a mask, too.
     """
     from zsp_lite.importers import READERS, import_capture
 
     given = {} if depth_unit is None else {"depth_unit": depth_unit}
-    refuse_options({"masks": box and masks}, (), "--box")
+    refuse_options({"masks": masks and (box or mask == "auto")}, (), "--box or --mask auto")
     refuse_options(given, ("depth_unit",) if layout == "lists" else (), f"the format {layout}")
-    done = import_capture(READERS[layout](folder, **given), root, category, sequence, box, masks, frames)
+    capture = READERS[layout](folder, **given)
+    done = import_capture(capture, root, category, sequence, box, masks, frames, mask, label, orientation)
     print(
         f"Written: {root / category / sequence}: {done.frames} frames, {done.points:,} points, "
         f"scaled by {done.scale:.4g}" + (f"; {done.empty} frames without the object left out" if done.empty else "")

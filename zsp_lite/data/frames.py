@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float32, Real, UInt8, UInt16
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose
+from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose, split_intrinsics
 from zsp_lite.data.depth import decode_depth, encode_depth
 from zsp_lite.errors import MAX_LENGTH, InputError, check_number, real_array
 from zsp_lite.io.files import read_bytes, write_atomic
@@ -82,18 +82,14 @@ class Frame:
         Raises:
             InputError: Arrays that are none of these, or do not fit together.
         """
-        label, image, matrix = f"frame {name}".rstrip(), np.asarray(rgb), np.asarray(K)
+        label, image = f"frame {name}".rstrip(), np.asarray(rgb)
         if image.ndim == 2:
             image = np.repeat(image[..., None], 3, axis=2)
         if image.ndim != 3 or image.shape[2] not in (3, 4):
             raise InputError(f"{label} rgb has shape {image.shape}, expected (H, W), (H, W, 3) or (H, W, 4)")
         image, size = image[..., :3], image.shape[:2]
-        if matrix.shape == (3, 3):
-            if np.abs(matrix[[0, 1, 2, 2], [1, 0, 0, 1]]).max() > 0 or matrix[2, 2] != 1:
-                raise InputError(f"{label} K is {matrix.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
-            matrix = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
-        intrinsics = real_array(f"{label} K", matrix, (4,)) + (0, 0, *[0.0 if half_pixels else 0.5] * 2)
-        camera = camera_from_pose(np.eye(4) if pose is None else pose, intrinsics, size, label, uncropped=True)
+        intrinsics = split_intrinsics(f"{label} K", K) + (0, 0, *[0.0 if half_pixels else 0.5] * 2)
+        camera = camera_from_pose(np.eye(4) if pose is None else pose, intrinsics, size, label)
         if image.dtype.kind == "f" and 0 <= image.min() and image.max() <= 1:
             image = np.rint(255 * image).astype(np.uint8)
         check_number("depth_unit", depth_unit, above=0)
@@ -176,6 +172,13 @@ def turn_frame(frame: Frame, quarters: int) -> Frame:
     return _changed(frame, turned, lambda image: np.ascontiguousarray(np.rot90(image, quarters)))
 
 
+def mirror_frame(frame: Frame) -> Frame:
+    """Mirror a frame left to right, with its intrinsics; its camera's axes stay, so that world points are mirrored."""
+    x, y = frame.camera.principal_point
+    camera = replace(frame.camera, principal_point=np.array([frame.camera.size[1] - x, y]))
+    return _changed(frame, camera, lambda image: np.ascontiguousarray(np.fliplr(image)))
+
+
 def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     """Resize a frame without keeping its aspect ratio; colours are averaged along a side that shrinks."""
     camera = frame.camera.resize(size)
@@ -196,13 +199,13 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
 def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
     """Read the colours (H, W, 3) of an image file; InputError if it is damaged."""
     # An orientation tag is ignored, because the camera refers to the pixels as stored.
-    image = _decode(path, "image", cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = decode_image(path, "image", cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.ascontiguousarray(image[..., ::-1])
 
 
 def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
     """Read an 8-bit or 1-bit mask file as probabilities (H, W) in [0, 1]; InputError if it is damaged."""
-    return _decode(path, "mask", cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
+    return decode_image(path, "mask", cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
 
 
 def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.ndarray, "h w"]:
@@ -212,7 +215,7 @@ def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.nd
 
 def read_grey16(path: str | Path) -> UInt16[np.ndarray, "h w"]:
     """Read the values (H, W) of a 16-bit greyscale PNG; InputError if the file is no such."""
-    bits = _decode(path, "depth", cv2.IMREAD_UNCHANGED)
+    bits = decode_image(path, "depth", cv2.IMREAD_UNCHANGED)
     if bits.dtype != np.uint16 or bits.ndim != 2:
         raise InputError(f"depth {path} holds {bits.dtype} of shape {bits.shape}, expected a 16-bit greyscale PNG")
     return bits
@@ -253,7 +256,7 @@ def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
     return max(0, int(np.floor(first - margin))), min(len(inside), int(np.ceil(last + 1 + margin)))
 
 
-def _decode(path: str | Path, what: str, flags: int) -> np.ndarray:
+def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
     """Decode a JPEG or PNG file by OpenCV with its flags; InputError if it is damaged or too large."""
     data = read_bytes(path, what)
     is_jpeg = data[:2] == b"\xff\xd8"

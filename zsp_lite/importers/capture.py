@@ -1,6 +1,5 @@
 """RGB-D captures: the files and camera of a frame, how they become a `Frame`, and a reader for each format."""
 
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +11,22 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.data.cameras import Camera, camera_from_pose
-from zsp_lite.data.frames import Frame, check_pixels, enlarge_depth, read_grey16, read_image, read_mask
+from zsp_lite.data.frames import Frame, check_pixels, enlarge_depth, read_image
 from zsp_lite.errors import MAX_LENGTH, InputError
+from zsp_lite.importers.files import (
+    display_frame,
+    lies_as_stored,
+    read_depth_file,
+    read_mask_file,
+    read_picture,
+    turn_image,
+)
 from zsp_lite.io.files import decode_json, path_inside, read_bytes, read_json
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # +y up, looking along -z
+_FARTHEST = 1e4  # greatest known depth, in units of the world
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 _Row = tuple[float, float, float, float]
 _Side = Annotated[float, msgspec.Meta(multiple_of=1)]  # pixels; exporters write 640 or 640.0
@@ -30,28 +38,52 @@ class CaptureFrame:
     """Files and camera of a frame."""
 
     image: Path
-    depth: Path  # a 16-bit PNG or .npy, of the image's aspect ratio; phones store it smaller than the image
+    depth: Path  # of the image's aspect ratio; phones store it smaller than the image
     camera: Camera
     depth_unit: float = 0.001  # world units per stored depth value
     distortion: tuple[float, ...] = ()  # OpenCV's k1, k2, p1, p2, k3; image, depth and mask are undistorted
     mask: Path | None = None
+    label: int | None = None  # of the object, where masks have the labels of several
+    orientation: str | None = None  # "stored" or "displayed": how camera, depth and mask refer to a turned photograph
+    posed: bool = True  # False for a single image, whose world is its camera's frame
 
     def load(self) -> Frame:
-        """Load the frame; InputError if a file is missing, damaged or of another size than the camera's image."""
+        """Load the frame as viewers display it; InputError if a file is missing, damaged or of another size."""
         height, width = self.camera.size
-        rgb, depth = read_image(self.image), _read_depth(self.depth) * np.float32(self.depth_unit)
-        depth = enlarge_depth(depth, (height, width))
-        mask = None if self.mask is None else read_mask(self.mask)
-        for path, pixels in ((self.image, rgb), (self.depth, depth), (self.mask, mask)):
+        rgb, turn = read_picture(self.image)
+
+        def is_stored(size: tuple[int, int]) -> bool:
+            return lies_as_stored(size, stored_size, turn, self.orientation, self.image)
+
+        def laid(pixels: np.ndarray) -> np.ndarray:
+            lies = is_stored(pixels.shape)
+            return pixels if lies == stored else turn_image(pixels, turn, back=stored)
+
+        stored_size = rgb.shape[:2]
+        stored = is_stored(self.camera.size)
+        rgb = rgb if stored else turn_image(rgb, turn)
+        depth = laid(read_depth_file(self.depth)) * np.float32(self.depth_unit)
+        enlarged = enlarge_depth(np.where(depth > _FARTHEST, np.float32(0), depth), (height, width))
+        mask = laid(read_mask_file(self.mask, self.label)) if self.has_mask else None
+        for path, pixels in ((self.image, rgb), (self.mask, mask)):
             if pixels is not None:
                 check_pixels(path, pixels, (height, width))
+        if enlarged.shape != self.camera.size:
+            expected = f"(H, W) = {self.camera.size} as the image, or smaller with its aspect ratio"
+            raise InputError(f"depth {self.depth} is {depth.shape} pixels, expected {expected}")
         if any(self.distortion):
             matrix, coefficients = self.camera.K - HALF_PIXEL, np.array(self.distortion)
             maps = cv2.initUndistortRectifyMap(matrix, coefficients, None, matrix, (width, height), cv2.CV_32FC1)
             rgb = cv2.remap(rgb, *maps, cv2.INTER_LINEAR)
-            depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
+            enlarged = cv2.remap(enlarged, *maps, cv2.INTER_NEAREST)
             mask = None if mask is None else cv2.remap(mask, *maps, cv2.INTER_LINEAR)
-        return Frame(rgb, depth, mask, self.camera, self.image.name)
+        frame = Frame(rgb, enlarged, mask, self.camera, self.image.name)
+        return display_frame(frame, turn if stored else 1, self.posed)
+
+    @property
+    def has_mask(self) -> bool:
+        """Whether there is a file of the frame's mask."""
+        return self.mask is not None and self.mask.is_file()
 
 
 def evenly_spaced(frames: Sequence[CaptureFrame], count: int) -> list[CaptureFrame]:
@@ -63,22 +95,6 @@ def evenly_spaced(frames: Sequence[CaptureFrame], count: int) -> list[CaptureFra
 def files_by_stem(folder: str | Path) -> dict[str, Path]:
     """Return the files of a folder by their names without extension; links may not lead out of it."""
     return {path.stem: path_inside(folder, path.name) for path in sorted(Path(folder).glob("*"))}
-
-
-def _read_depth(path: Path) -> Float[np.ndarray, "h w"]:
-    """Read the stored values of a depth map, 0 where unknown."""
-    if path.suffix != ".npy":
-        return read_grey16(path).astype(np.float32)
-    data = read_bytes(path, "depth")
-    try:
-        values = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-        found = f"{values.dtype} of shape {values.shape}" if values.ndim != 2 or values.dtype.kind not in "fiu" else ""
-    except (ValueError, OSError, EOFError, MemoryError) as error:
-        found = f"no array ({error})"
-    if found:
-        raise InputError(f"depth {path} holds {found}, expected an .npy file of numbers (H, W)")
-    values = values.astype(np.float32)
-    return np.where(np.isfinite(values) & (values > 0), values, np.float32(0))
 
 
 class _NerfstudioFrame(msgspec.Struct):

@@ -52,6 +52,13 @@ _LYING = 0.5  # share of the object's points that may lie in the plane around it
 Plane = tuple[Float[np.ndarray, "3"], float]  # unit normal, to the side of the cameras, and offset: normal @ x = offset
 
 
+def check_origin(where: object, mask: str | None, box: Box | None) -> None:
+    """Raise InputError if masks of an origin do not go with a box, or the lack of one."""
+    if mask not in (None, *(("box",) if box is not None else ("given", "auto"))):
+        expected = "--mask given, --mask auto, or --mask box with --box TOP,LEFT,HEIGHT,WIDTH"
+        raise InputError(f"{where}: mask is {mask!r} and box is {box}, expected {expected}")
+
+
 def masks_from_box(frames: Iterable[Frame], box: Box) -> Iterator[Frame]:
     """Segment the object in the frames of a capture, given its box (top, left, height, width) in the first one.
 
@@ -178,6 +185,14 @@ def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
     if usable and plane is None:
         signs.append("no plane is found that the object stands on")
     return (f"the masks may be wrong: {', '.join(signs)}",) if signs else ()
+
+
+def border_flags(frames: Collection[Frame]) -> tuple[str, ...]:
+    """Question the masks of frames that cover most of the image's border, as those of a background do."""
+    masks = [frame.mask > ON_OBJECT for frame in frames]
+    borders = [np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]) for mask in masks]
+    count = sum(border.mean() > _MOST for border in borders)
+    return (f"the masks of {count} of {len(masks)} frames cover most of the border: inverted?",) if count else ()
 
 
 def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:
