@@ -276,13 +276,15 @@ def test_options_of_the_import_reach_the_library(monkeypatch, capsys):
         given.append(arguments)
         return ImportResult(1, 0, 1, 1.0, ("the masks may be wrong: why",))
 
+    more = ["--mask", "given", "--label", "3", "--orientation", "stored"]
+
     for layout in READERS:
         monkeypatch.setitem(READERS, layout, lambda folder, **options: (folder, options))
     monkeypatch.setattr("zsp_lite.importers.import_capture", import_capture)
     words = "--root mine --category cup --sequence one --frames 7".split()
     assert main(["data", "import", "nerfstudio", "scan", *words, "--box", "1,2,3,4"]) == 0
-    assert given.pop() == ((Path("scan"), {}), Path("mine"), "cup", "one", (1, 2, 3, 4), None, 7)
+    assert given.pop() == ((Path("scan"), {}), Path("mine"), "cup", "one", (1, 2, 3, 4), None, 7, None, None, None)
     assert "flag: the masks may be wrong: why\n" in capsys.readouterr().out
-    assert main(["data", "import", "lists", "scan", *words, "--depth-unit", "0.5", "--masks", "there"]) == 0
+    assert main(["data", "import", "lists", "scan", *words, "--depth-unit", "0.5", "--masks", "there", *more]) == 0
     capture = (Path("scan"), {"depth_unit": 0.5})
-    assert given.pop() == (capture, Path("mine"), "cup", "one", None, Path("there"), 7)
+    assert given.pop() == (capture, Path("mine"), "cup", "one", None, Path("there"), 7, "given", 3, "stored")

@@ -117,7 +117,7 @@ def test_options_go_to_the_sources_that_take_them(image, tmp_path, ellipsoids, f
             "mask is 'auto' and box is .*, expected --mask",
         ),
         ({"intrinsics": (0.0, 190.0, 1.0, 1.0)}, "image .*.jpg: camera focal_length is 0.0, expected"),
-        ({"intrinsics": (1.0, 1.0, 90.0, 70.0)}, ".jpg: intrinsics 1,1,90,70 have a field of view of 179 degrees"),
+        ({"intrinsics": (1.0, 1.0, 90.0, 70.0)}, ".jpg: the intrinsics 1,1,90,70 have a field of view of 179 degrees"),
         ({"intrinsics": INTRINSICS, "depth": "lost.png"}, "lost.png"),
     ],
 )

@@ -30,7 +30,7 @@ from zsp_lite.estimates import Hypothesis, PairResult, PoseEstimate, Vote, label
 from zsp_lite.importers.capture import READERS, SIGNS, CaptureFrame
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.files import CO3D_DEPTH, DEPTHS, MASKS, PICTURES, question_intrinsics, read_picture
-from zsp_lite.importers.masks import border_flags, check_origin, mask_flags, masks_from_box, masks_from_depth
+from zsp_lite.importers.masks import check_origin, given_mask_flags, mask_flags, masks_from_box, masks_from_depth
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.metrics import rotation_angle, rotation_error
@@ -47,7 +47,7 @@ _TAKEN |= {"sequence": ("mask", "box"), "frames": ("mask", "box"), "nerfstudio":
 _UNIT_GIVEN_BY = {"nerfstudio": "depth_unit_scale_factor in transforms.json"}  # for others by --depth-unit
 _NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
 _ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
-_TARGETS = 5  # target views
+_TARGETS = 5
 _REFERENCES = 4  # frames of each object that are solved against views of the other
 _LEAST_PROBABLE = 0.005  # an alternative is named above this
 _Ends = tuple[int, int, int]  # numbers of two objects, and the position of a frame of the first
@@ -64,8 +64,8 @@ class Source:
     read: Callable[[int], Frame]  # reads the frame at a position of `numbers`, with the mask that comes with it, if any
     mask: str  # where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours)
     box: Box | None = None  # bounding box of the object in the first frame, for "box"
-    unmasked: tuple[int, ...] = ()  # positions of frames that have no mask, which is made by depth where others have
-    doubt: str = ""  # what speaks against the intrinsics
+    missing: tuple[int, ...] = ()  # numbers of frames without a mask where others have one; it is made by depth
+    doubts: tuple[str, ...] = ()  # what speaks against the intrinsics
 
     @property
     def name(self) -> str:
@@ -89,23 +89,15 @@ class Source:
         if self.mask != "given":
             masked = masks_from_box(some, self.box) if self.box else masks_from_depth(some)
             frames = dict(zip(frames, masked, strict=True))
-        elif without := [k for k, frame in frames.items() if frame.mask is None]:
-            if len(self.unmasked) == len(self.numbers):
-                where = f"{self.path}, frame {self.numbers[without[0]]}"
-                raise InputError(f"{where}: no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH")
+        elif any(frame.mask is None for frame in some):
             made = dict(zip(frames, replace(self, mask="auto").load(list(frames)), strict=True))
-            frames |= {k: made[k] for k in without}
+            frames = {k: made[k] if frame.mask is None else frame for k, frame in frames.items()}
         return [frames[position] for position in positions]
 
     def flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
         """Question the masks, the intrinsics, and the unit of length where the object is implausibly far."""
-        found = list(border_flags(frames) if self.mask == "given" else mask_flags(frames))
-        if self.mask == "given" and self.unmasked:
-            names = ", ".join(str(self.numbers[position]) for position in self.unmasked)
-            found.append(
-                f"{len(self.unmasked)} of {len(self.numbers)} frames have no mask, it is made by depth: {names}"
-            )
-        found += [self.doubt] if self.doubt else []
+        found = [*self.doubts]
+        found += given_mask_flags(frames, self.missing) if self.mask == "given" else mask_flags(frames)
         depth = np.concatenate([frame.depth[object_pixels(frame)] for frame in frames])
         distance = float(np.quantile(depth, 0.25)) if len(depth) else _NEAREST
         if self.format not in ("sequence", "frames") and not _NEAREST <= distance <= _FARTHEST:
@@ -394,9 +386,9 @@ def open_source(
 
     Args:
         path: ROOT/CATEGORY/SEQUENCE of a data folder; the folder of a capture in a format of `importers.READERS`; or a
-            JPEG, PNG, WebP or HEIC file NAME.EXT. Depth of an image is NAME_depth.png (16 bit), or .npy or another
-            format of `read_depth_file`, registered to its colours, and its mask, if there is one, NAME_mask.png or
-            .jpg. Or frames, such as of `Frame.from_arrays`.
+            JPEG, PNG, WebP or HEIC file NAME.EXT. Depth of an image is NAME_depth.png (16 bit), .npy, .tiff, ...,
+            registered to its colours, and its mask, if there is one, NAME_mask.png. Or frames, such as of
+            `Frame.from_arrays`.
         intrinsics: fx, fy, cx, cy of an image in pixels, or K as 3 x 3, with pixel centres at half-integers (0.5 more
             than OpenCV's cx and cy).
         depth: Depth file of an image, if it is named otherwise.
@@ -424,7 +416,7 @@ def open_source(
     check_origin(path, mask, box)
     if layout == "frames":
         numbers, read = tuple(range(len(frames))), frames.__getitem__
-        masked, doubt = [frame.mask is not None for frame in frames], question_intrinsics(frames[0].camera, str(path))
+        masked, doubts = [frame.mask is not None for frame in frames], question_intrinsics(frames[0].camera, str(path))
     elif layout == "sequence":
         folder = _sequence_folder(path)
         dataset = Co3D(folder.parents[1])
@@ -432,17 +424,19 @@ def open_source(
         if not (frames := [one for one in every if one.viewpoint is not None and one.depth is not None]):
             raise InputError(f"{path}: no frame has a camera and depth, expected some")
         numbers, read = tuple(one.frame_number for one in frames), lambda k: dataset.load(frames[k])
-        masked, doubt = [one.mask is not None for one in frames], ""
+        masked, doubts = [one.mask is not None for one in frames], ()
     else:
         files = {name: options.pop(name) for name in ("label", "orientation") if name in options}
         capture = [_open_image(path, **options)] if layout == "image" else READERS[layout](path, **options)
         capture = [replace(frame, **files) for frame in capture]
         numbers, read = tuple(range(len(capture))), lambda k: capture[k].load()
-        masked, doubt = [frame.has_mask for frame in capture], question_intrinsics(capture[0].camera, str(path))
+        masked, doubts = [frame.has_mask for frame in capture], question_intrinsics(capture[0].camera, str(path))
     if mask is None:
         mask = "box" if box is not None else "given" if any(masked) else "auto"
-    unmasked = tuple(position for position, one in enumerate(masked) if not one)
-    return Source(path, layout, numbers, read, mask, box, unmasked, doubt)
+    if mask == "given" and not any(masked):
+        raise InputError(f"{path}: no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH")
+    missing = tuple(number for number, has_mask in zip(numbers, masked) if not has_mask)
+    return Source(path, layout, numbers, read, mask, box, missing, doubts)
 
 
 def open_pair(

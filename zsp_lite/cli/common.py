@@ -38,9 +38,7 @@ PATH = Parsed("path", Path, lambda path: "\0" not in str(path), "a path")
 NAMES = Parsed("a,b", lambda text: [name for name in text.split(",") if name], bool, "names separated by commas")
 LENGTH = Parsed("metres", float, lambda length: 0 < length < 1e9, "a positive number below 1e9")
 BOX = Parsed("top,left,height,width", lambda text: tuple(map(int, text.split(","))), _finite(4), "four integers")
-INTRINSICS = Parsed(
-    "fx,fy,cx,cy", lambda text: tuple(map(float, text.split(","))), _finite(4, 9), "4 numbers, or 9 of K"
-)
+INTRINSICS = Parsed("fx,fy,cx,cy", lambda text: tuple(map(float, text.split(","))), _finite(4, 9), "four numbers, or K")
 ORIENTATION = click.Choice(("stored", "displayed"))
 
 

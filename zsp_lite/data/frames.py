@@ -172,13 +172,6 @@ def turn_frame(frame: Frame, quarters: int) -> Frame:
     return _changed(frame, turned, lambda image: np.ascontiguousarray(np.rot90(image, quarters)))
 
 
-def mirror_frame(frame: Frame) -> Frame:
-    """Mirror a frame left to right, with its intrinsics; its camera's axes stay, so that world points are mirrored."""
-    x, y = frame.camera.principal_point
-    camera = replace(frame.camera, principal_point=np.array([frame.camera.size[1] - x, y]))
-    return _changed(frame, camera, lambda image: np.ascontiguousarray(np.fliplr(image)))
-
-
 def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     """Resize a frame without keeping its aspect ratio; colours are averaged along a side that shrinks."""
     camera = frame.camera.resize(size)

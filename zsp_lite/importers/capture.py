@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,14 +14,7 @@ from jaxtyping import Float
 from zsp_lite.data.cameras import Camera, camera_from_pose
 from zsp_lite.data.frames import Frame, check_pixels, enlarge_depth, read_image
 from zsp_lite.errors import MAX_LENGTH, InputError
-from zsp_lite.importers.files import (
-    display_frame,
-    lies_as_stored,
-    read_depth_file,
-    read_mask_file,
-    read_picture,
-    turn_image,
-)
+from zsp_lite.importers import files
 from zsp_lite.io.files import decode_json, path_inside, read_bytes, read_json
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
@@ -49,36 +43,34 @@ class CaptureFrame:
 
     def load(self) -> Frame:
         """Load the frame as viewers display it; InputError if a file is missing, damaged or of another size."""
-        height, width = self.camera.size
-        rgb, turn = read_picture(self.image)
-
-        def is_stored(size: tuple[int, int]) -> bool:
-            return lies_as_stored(size, stored_size, turn, self.orientation, self.image)
-
-        def laid(pixels: np.ndarray) -> np.ndarray:
-            lies = is_stored(pixels.shape)
-            return pixels if lies == stored else turn_image(pixels, turn, back=stored)
-
-        stored_size = rgb.shape[:2]
-        stored = is_stored(self.camera.size)
-        rgb = rgb if stored else turn_image(rgb, turn)
-        depth = laid(read_depth_file(self.depth)) * np.float32(self.depth_unit)
-        enlarged = enlarge_depth(np.where(depth > _FARTHEST, np.float32(0), depth), (height, width))
-        mask = laid(read_mask_file(self.mask, self.label)) if self.has_mask else None
+        rgb, turn = files.read_picture(self.image)
+        depth = files.read_depth_file(self.depth) * np.float32(self.depth_unit)
+        mask = files.read_mask_file(self.mask, self.label) if self.has_mask else None
+        lies_stored = partial(files.lies_as_stored, rgb.shape, turn, self.orientation, self.image)
+        camera = self.camera
+        if lies_stored(camera.size):
+            camera = files.display_camera(camera, turn, self.image.name, self.posed)
+        if lies_stored(depth.shape):
+            depth = files.display_image(depth, turn)
+        if mask is not None and lies_stored(mask.shape):
+            mask = files.display_image(mask, turn)
+        rgb, size = files.display_image(rgb, turn), camera.size
+        enlarged = enlarge_depth(np.where(depth > _FARTHEST, np.float32(0), depth), size)
         for path, pixels in ((self.image, rgb), (self.mask, mask)):
             if pixels is not None:
-                check_pixels(path, pixels, (height, width))
-        if enlarged.shape != self.camera.size:
-            expected = f"(H, W) = {self.camera.size} as the image, or smaller with its aspect ratio"
+                check_pixels(path, pixels, size)
+        if enlarged.shape != size:
+            expected = f"(H, W) = {size} as the image, or smaller with its aspect ratio"
             raise InputError(f"depth {self.depth} is {depth.shape} pixels, expected {expected}")
         if any(self.distortion):
-            matrix, coefficients = self.camera.K - HALF_PIXEL, np.array(self.distortion)
-            maps = cv2.initUndistortRectifyMap(matrix, coefficients, None, matrix, (width, height), cv2.CV_32FC1)
+            k1, k2, p1, p2, k3 = self.distortion
+            p2, p1 = (camera.R @ self.camera.R.T)[:2, :2] @ (p2, p1)  # a vector, which turns with the image
+            matrix, coefficients = camera.K - HALF_PIXEL, np.array([k1, k2, p1, p2, k3])
+            maps = cv2.initUndistortRectifyMap(matrix, coefficients, None, matrix, size[::-1], cv2.CV_32FC1)
             rgb = cv2.remap(rgb, *maps, cv2.INTER_LINEAR)
             enlarged = cv2.remap(enlarged, *maps, cv2.INTER_NEAREST)
             mask = None if mask is None else cv2.remap(mask, *maps, cv2.INTER_LINEAR)
-        frame = Frame(rgb, enlarged, mask, self.camera, self.image.name)
-        return display_frame(frame, turn if stored else 1, self.posed)
+        return Frame(rgb, enlarged, mask, camera, self.image.name)
 
     @property
     def has_mask(self) -> bool:

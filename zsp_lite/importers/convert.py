@@ -13,7 +13,7 @@ from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, files_by_stem
 from zsp_lite.importers.files import question_intrinsics
-from zsp_lite.importers.masks import border_flags, check_origin, mask_flags, masks_from_box, masks_from_depth
+from zsp_lite.importers.masks import check_origin, given_mask_flags, mask_flags, masks_from_box, masks_from_depth
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import load_open3d
@@ -75,6 +75,7 @@ def import_capture(
     if folder.exists() and not unfinished.is_file():
         raise InputError(f"{folder} exists already, expected another sequence name")
     capture = [replace(frame, label=label, orientation=orientation) for frame in evenly_spaced(capture, max_frames)]
+    flags = question_intrinsics(capture[0].camera, capture[0].image.name)
     if box is not None or mask == "auto":
         capture = [replace(frame, mask=None) for frame in capture]
     elif masks is not None:
@@ -103,13 +104,8 @@ def import_capture(
     if not seen:
         raise InputError(f"the masks of all {len(capture)} frames are empty, expected an object")
     frames = LazyFrames(load, seen)
-    if len(bits) == len(capture):
-        flags = list(mask_flags(frames))
-    else:
-        names = ", ".join(capture[index].image.name for index in bits)
-        flags = [f"{len(bits)} of {len(capture)} frames have no mask, it is made by depth: {names}"] if bits else []
-        flags += border_flags(frames)
-    flags += filter(None, [question_intrinsics(capture[0].camera, capture[0].image.name)])
+    missing = [capture[index].image.name for index in bits]
+    flags += mask_flags(frames) if len(bits) == len(capture) else given_mask_flags(frames, missing)
     points, colours, normals = fuse(frames)
     scale = 1 / axis_deviation(points)
     scaled = LazyFrames(lambda index: scale_frame(load(index), scale), seen)
@@ -119,7 +115,7 @@ def import_capture(
         unfinished.touch()
         write_co3d(root, category, [data])
         unfinished.unlink()
-    return ImportResult(len(seen), len(capture) - len(seen), len(points), scale, tuple(flags))
+    return ImportResult(len(seen), len(capture) - len(seen), len(points), scale, flags)
 
 
 def _masks_by_depth(capture: Sequence[CaptureFrame], wanted: Sequence[int]) -> dict[int, UInt8[np.ndarray, " bytes"]]:

@@ -5,6 +5,7 @@ may refer to the pixels as stored or as displayed.
 """
 
 import io
+import tokenize
 import warnings
 import zipfile
 import zlib
@@ -15,11 +16,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Shaped, UInt8
+from jaxtyping import Float, Float32, Shaped, UInt8
 from PIL import ExifTags, Image
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import MAX_PIXELS, Frame, decode_image, mirror_frame, read_depth, turn_frame
+from zsp_lite.data.frames import MAX_PIXELS, decode_image, read_depth
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import MAX_FILE, read_bytes
 
@@ -28,20 +29,18 @@ DEPTHS = (".png", ".npy", ".npz", ".tiff", ".tif", ".pfm", ".exr")
 MASKS = (".png", ".jpg", ".jpeg", ".webp", ".tiff", ".tif", ".npy")
 CO3D_DEPTH = ".geometric.png"  # float16 bits
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, MemoryError, RuntimeError, zlib.error, zipfile.BadZipFile,
-            cv2.error, Image.DecompressionBombError)  # fmt: skip
+            tokenize.TokenError, cv2.error, Image.DecompressionBombError)  # fmt: skip
 # By EXIF orientation: the number of quarter turns, as in `numpy.rot90`, before an image is mirrored left to right.
 _QUARTERS = dict(enumerate((0, 0, 2, 2, 3, 3, 1, 1), 1))
 _MIRRORED = (2, 4, 5, 7)
-_INVERSE = {6: 8, 8: 6}  # the others are their own
 _LOSSY = (".jpg", ".jpeg", ".webp")
 _MOST_LABELS, _LARGEST_LABEL, _VOID = 32, 50, 255
 _LEAST_VIEW, _LARGEST_VIEW = 10.0, 120.0  # field of view of a camera, degrees
 _OFF_MIDDLE = 0.3  # distance of the principal point from the middle, relative to half of the side
-_SAME_ASPECT = 0.05  # relative difference
 
 
 def read_picture(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], int]:
-    """Read the colours of a JPEG, PNG, WebP or HEIC file as stored, and its EXIF orientation, from 1 to 8."""
+    """Read the colours of a JPEG, PNG, WebP or HEIC file as stored, HEIC as displayed, and its EXIF orientation."""
     with _decoding("image", path):
         file = _open(path, "image", ("JPEG", "PNG", "WEBP"))
         orientation = file.getexif().get(ExifTags.Base.Orientation) if "exif" in file.info else 1
@@ -60,7 +59,7 @@ def read_depth_file(path: str | Path) -> Float32[np.ndarray, "h w"]:
     values = _read_values(path, "depth")
     if values.ndim == 3 and (values.shape[2] == 1 or path.suffix.lower() == ".exr"):  # Blender repeats it as colours
         values = values[..., 0]
-    if values.ndim != 2 or values.dtype.kind not in "fiu" or not values.size:
+    if values.ndim != 2 or values.dtype.kind not in "fiu" or values.dtype.itemsize < 2 or not values.size:
         expected = "numbers (H, W): a 16-bit greyscale PNG or TIFF, .npy, .npz with one array, or float .tiff or .pfm"
         raise InputError(f"depth {path} holds {values.dtype} of shape {values.shape}, expected {expected}")
     with np.errstate(over="ignore", invalid="ignore"):
@@ -104,13 +103,14 @@ def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
             file = _open(path, "mask", ("PNG",))
             if file.mode == "P" and np.ptp(np.array(file.convert("RGB")), axis=2).any():
                 return np.array(file), True
-    if values.ndim == 3 and values.shape[2] <= 4:
+    if values.ndim == 3 and values.shape[2] in (1, 3, 4):
         colours, alpha = values[..., :3], values[..., 3:]
         if alpha.size and np.ptp(alpha) and len(np.unique(colours)) != 2:
             return alpha[..., 0], False
-        kinds, numbers = np.unique(colours.reshape(-1, colours.shape[2]), axis=0, return_inverse=True)
-        if np.ptp(kinds, axis=1).any() and len(kinds) <= _MOST_LABELS and path.suffix.lower() not in _LOSSY:
-            return numbers.reshape(colours.shape[:2]), True
+        if path.suffix.lower() not in _LOSSY and (colours != colours[..., :1]).any():
+            kinds, numbers = np.unique(colours @ np.array([1 << 32, 1 << 16, 1]), return_inverse=True)
+            if len(kinds) <= _MOST_LABELS:
+                return numbers.reshape(colours.shape[:2]), True
         values = colours.max(axis=2)
     if values.ndim != 2 or values.dtype.kind not in "fiub" or not values.size:
         raise InputError(f"mask {path} holds {values.dtype} of shape {values.shape}, expected one value per pixel")
@@ -168,7 +168,7 @@ def _decoding(what: str, path: str | Path) -> Iterator[None]:
         raise InputError(f"{what} {path} cannot be decoded ({type(error).__name__}), expected {expected}") from error
 
 
-def lies_as_stored(size: Sequence[int], stored: Sequence[int], orientation: int, form: str | None, path: Path) -> bool:
+def lies_as_stored(stored: Sequence[int], orientation: int, form: str | None, path: Path, size: Sequence[int]) -> bool:
     """Tell by its size whether an image of a photograph lies as the stored pixels, or as displayed; else by `form`."""
     if orientation == 1:
         return True
@@ -180,44 +180,48 @@ def lies_as_stored(size: Sequence[int], stored: Sequence[int], orientation: int,
     return form == "stored"
 
 
-def turn_image(image: Shaped[np.ndarray, "..."], orientation: int, back: bool = False) -> Shaped[np.ndarray, "..."]:
-    """Turn and mirror an image from its stored form to the displayed one, or `back`."""
-    orientation = _INVERSE.get(orientation, orientation) if back else orientation
+def display_image(image: Shaped[np.ndarray, "..."], orientation: int) -> Shaped[np.ndarray, "..."]:
+    """Turn and mirror an image from its stored form to the one that viewers display."""
     turned = np.rot90(image, _QUARTERS[orientation])
     return np.ascontiguousarray(np.fliplr(turned) if orientation in _MIRRORED else turned)
 
 
-def display_frame(frame: Frame, orientation: int, posed: bool) -> Frame:
-    """Turn a frame of stored pixels as viewers do; world points stay the same, or follow a camera that has no pose."""
+def display_camera(camera: Camera, orientation: int, where: str, posed: bool) -> Camera:
+    """Turn the camera of a stored image with it; one without a pose stays upright, and may be mirrored."""
+    turned = camera.turn(_QUARTERS[orientation])
     if posed and orientation in _MIRRORED:
-        found = f"image {frame.name} is mirrored by its EXIF orientation {orientation}"
+        found = f"image {where} is mirrored by its EXIF orientation {orientation}"
         raise InputError(f"{found}, which its camera pose is not, expected orientation 1, 3, 6 or 8")
-    turned = turn_frame(frame, _QUARTERS[orientation])
-    turned = mirror_frame(turned) if orientation in _MIRRORED else turned
-    return turned if posed else replace(turned, camera=replace(turned.camera, R=np.eye(3)))
+    x, y = turned.principal_point
+    centre = np.array([turned.size[1] - x if orientation in _MIRRORED else x, y])
+    return replace(turned, R=turned.R if posed else np.eye(3), principal_point=centre)
 
 
-def question_intrinsics(camera: Camera, where: str) -> str:
-    """Say what speaks against the intrinsics of an image, "" if nothing; InputError for a field of view of no camera.
+def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
+    """Say what speaks against the intrinsics of an image; InputError for a field of view that no camera has.
 
     The principal point of an image is near its middle, unless it is a crop of a larger one.
     """
     side, values = np.array(camera.size[::-1]), np.concatenate([camera.focal_length, camera.principal_point])
-    focal, centre, likely, doubt = values[:2], values[2:], None, ""
+    focal, centre = values[:2], values[2:]
     ratios = 2 * centre / side  # of the image that the intrinsics fit to this one
+    doubts = [f"the intrinsics {_listed(values)}"]
     if max(*centre, *focal / 5) <= 1:
-        doubt, likely = "look normalised", values * np.tile(side, 2)
-    elif min(ratios) > 0 and abs(ratios[0] / ratios[1] - 1) < _SAME_ASPECT and abs(ratios.mean() - 1) > _OFF_MIDDLE:
-        doubt = "fit an image, or a sensor in millimetres, of {:.4g} x {:.4g}, not of {} x {} pixels"
-        doubt, likely = doubt.format(*2 * centre, *side), values / ratios.mean()
+        doubts.append(f"look normalised: for this image they would be {_listed(values * np.tile(side, 2))}")
+    elif min(ratios) > 0 and np.ptp(ratios) < 0.05 * ratios.mean() and abs(ratios.mean() - 1) > _OFF_MIDDLE:
+        fitted = "fit an image, or a sensor in millimetres, of {:.4g} x {:.4g}, not {} x {} pixels".format(
+            *2 * centre, *side
+        )
+        doubts.append(f"{fitted}: for this image they would be {_listed(values / ratios.mean())}")
     elif np.abs(ratios - 1).max() > _OFF_MIDDLE:
-        doubt = f"have their principal point far from the middle of {side[0]} x {side[1]} pixels, as a crop has"
-    given, expected = (",".join(f"{n:.6g}" for n in some) for some in (values, () if likely is None else likely))
-    doubt += f": for this image they would be {expected}" if expected else ""
+        doubts.append("have their principal point far from the middle, as those of a crop")
     whole = 2 * np.maximum(centre, side - centre)  # of the smallest image around this one with its centre there
     view = np.degrees(2 * np.arctan(whole / focal / 2)).max()
     if not _LEAST_VIEW <= view <= _LARGEST_VIEW:
-        found = f"{where}: intrinsics {given} have a field of view of {view:.3g} degrees"
-        expected = f"{_LEAST_VIEW:g} to {_LARGEST_VIEW:g}, by focal lengths in pixels"
-        raise InputError(f"{found}, expected {expected}" + (f"; they {doubt}" if doubt else ""))
-    return f"the intrinsics {given} {doubt}" if doubt else ""
+        found = f"have a field of view of {view:.3g} degrees, expected {_LEAST_VIEW:g} to {_LARGEST_VIEW:g}"
+        raise InputError(f"{where}: {' '.join(doubts)}{'; they' if doubts[1:] else ''} {found}")
+    return (" ".join(doubts),) if len(doubts) > 1 else ()
+
+
+def _listed(values: Float[np.ndarray, " n"]) -> str:
+    return ",".join(f"{value:.6g}" for value in values)
