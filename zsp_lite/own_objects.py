@@ -30,7 +30,7 @@ from zsp_lite.estimates import Hypothesis, PairResult, PoseEstimate, Vote, label
 from zsp_lite.importers.capture import READERS, SIGNS, CaptureFrame
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.files import CO3D_DEPTH, DEPTHS, MASKS, PICTURES, question_intrinsics, read_picture
-from zsp_lite.importers.masks import check_origin, given_mask_flags, mask_flags, masks_from_box, masks_from_depth
+from zsp_lite.importers.masks import given_mask_flags, mask_flags, masks_from_box, masks_from_depth
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.metrics import rotation_angle, rotation_error
@@ -200,7 +200,7 @@ def estimate_pose(
         reference_frame: Frame number of the reference, in whose camera the pose is; by default its first frame with
             known depth and an object.
         targets: Number of target views, evenly spaced over the target's frames; 5 by default, or as many as there are.
-        mask: Where the masks of both come from: "given", "auto", or as `open_source` decides.
+        mask: Where the masks of all come from: "given", "auto", or as `open_source` decides.
         intrinsics: Camera intrinsics of all images (see `open_source`).
         backbone: Backbone, or what `load_backbone` takes.
         out: Folder for the report and the point clouds (see `write_pair`); None writes nothing.
@@ -413,7 +413,9 @@ def open_source(
     for name in options:
         if name not in _TAKEN[layout]:
             raise InputError(f"--{name.replace('_', '-')} does not go with {path}, of the format {layout}")
-    check_origin(path, mask, box)
+    if mask not in (None, *(("box",) if box is not None else ("given", "auto"))):
+        expected = "--mask given, --mask auto, or --mask box with --box TOP,LEFT,HEIGHT,WIDTH"
+        raise InputError(f"{path}: mask is {mask!r} and box is {box}, expected {expected}")
     if layout == "frames":
         numbers, read = tuple(range(len(frames))), frames.__getitem__
         masked, doubts = [frame.mask is not None for frame in frames], question_intrinsics(frames[0].camera, str(path))

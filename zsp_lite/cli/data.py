@@ -202,6 +202,8 @@ def import_(layout, folder, root, category, sequence, mask, box, masks, frames, 
 
     given = {} if depth_unit is None else {"depth_unit": depth_unit}
     refuse_options({"masks": masks and (box or mask == "auto")}, (), "--box or --mask auto")
+    if mask and (mask == "box") != bool(box):
+        raise click.UsageError("--mask box goes with --box, the others without")
     refuse_options(given, ("depth_unit",) if layout == "lists" else (), f"the format {layout}")
     capture = READERS[layout](folder, **given)
     done = import_capture(capture, root, category, sequence, box, masks, frames, mask, label, orientation)

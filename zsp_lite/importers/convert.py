@@ -13,7 +13,7 @@ from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, files_by_stem
 from zsp_lite.importers.files import question_intrinsics
-from zsp_lite.importers.masks import check_origin, given_mask_flags, mask_flags, masks_from_box, masks_from_depth
+from zsp_lite.importers.masks import given_mask_flags, mask_flags, masks_from_box, masks_from_depth
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import load_open3d
@@ -69,7 +69,6 @@ def import_capture(
     Raises:
         InputError: The capture cannot be read, segmented or fused, or the sequence exists. Nothing is written then.
     """
-    check_origin(sequence, mask, box)
     folder = Path(root) / plain_name(category, "category") / plain_name(sequence, "sequence")
     unfinished = folder / ".unfinished"
     if folder.exists() and not unfinished.is_file():
@@ -125,9 +124,8 @@ def _masks_by_depth(capture: Sequence[CaptureFrame], wanted: Sequence[int]) -> d
         group = wanted[first::groups]
         others = np.linspace(0, len(capture) - 1, _GROUP - len(group)).round().astype(int)
         chosen = sorted({*group, *others.tolist()})
-        masked = masks_from_depth([capture[index].load() for index in chosen])
-        found = {index: np.packbits(frame.mask > ON_OBJECT) for index, frame in zip(chosen, masked, strict=True)}
-        bits |= {index: found[index] for index in group}
+        masked = zip(chosen, masks_from_depth([capture[index].load() for index in chosen]), strict=True)
+        bits |= {index: np.packbits(frame.mask > ON_OBJECT) for index, frame in masked if index in group}
     return bits
 
 

@@ -100,7 +100,7 @@ def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
     values = _read_values(path, "mask")
     if path.suffix.lower() == ".png":
         with _decoding("mask", path):
-            file = _open(path, "mask", ("PNG",))
+            file = _open(path, "mask", ("PNG", "JPEG"))
             if file.mode == "P" and np.ptp(np.array(file.convert("RGB")), axis=2).any():
                 return np.array(file), True
     if values.ndim == 3 and values.shape[2] in (1, 3, 4):
@@ -190,11 +190,11 @@ def display_camera(camera: Camera, orientation: int, where: str, posed: bool) ->
     """Turn the camera of a stored image with it; one without a pose stays upright, and may be mirrored."""
     turned = camera.turn(_QUARTERS[orientation])
     if posed and orientation in _MIRRORED:
-        found = f"image {where} is mirrored by its EXIF orientation {orientation}"
-        raise InputError(f"{found}, which its camera pose is not, expected orientation 1, 3, 6 or 8")
-    x, y = turned.principal_point
-    centre = np.array([turned.size[1] - x if orientation in _MIRRORED else x, y])
-    return replace(turned, R=turned.R if posed else np.eye(3), principal_point=centre)
+        raise InputError(f"image {where} is mirrored by its EXIF orientation {orientation}, expected 1, 3, 6 or 8")
+    if orientation in _MIRRORED:
+        x, y = turned.principal_point
+        turned = replace(turned, principal_point=np.array([turned.size[1] - x, y]))
+    return turned if posed else replace(turned, R=np.eye(3))
 
 
 def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
@@ -202,16 +202,14 @@ def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
 
     The principal point of an image is near its middle, unless it is a crop of a larger one.
     """
-    side, values = np.array(camera.size[::-1]), np.concatenate([camera.focal_length, camera.principal_point])
+    side, values = np.array(camera.size[::-1], float), np.concatenate([camera.focal_length, camera.principal_point])
     focal, centre = values[:2], values[2:]
     ratios = 2 * centre / side  # of the image that the intrinsics fit to this one
     doubts = [f"the intrinsics {_listed(values)}"]
     if max(*centre, *focal / 5) <= 1:
         doubts.append(f"look normalised: for this image they would be {_listed(values * np.tile(side, 2))}")
     elif min(ratios) > 0 and np.ptp(ratios) < 0.05 * ratios.mean() and abs(ratios.mean() - 1) > _OFF_MIDDLE:
-        fitted = "fit an image, or a sensor in millimetres, of {:.4g} x {:.4g}, not {} x {} pixels".format(
-            *2 * centre, *side
-        )
+        fitted = f"fit an image, or a sensor in millimetres, of {_listed(2 * centre)}, not {_listed(side)} pixels"
         doubts.append(f"{fitted}: for this image they would be {_listed(values / ratios.mean())}")
     elif np.abs(ratios - 1).max() > _OFF_MIDDLE:
         doubts.append("have their principal point far from the middle, as those of a crop")

@@ -52,13 +52,6 @@ _LYING = 0.5  # share of the object's points that may lie in the plane around it
 Plane = tuple[Float[np.ndarray, "3"], float]  # unit normal, to the side of the cameras, and offset: normal @ x = offset
 
 
-def check_origin(where: object, mask: str | None, box: Box | None) -> None:
-    """Raise InputError if masks of an origin do not go with a box, or the lack of one."""
-    if mask not in (None, *(("box",) if box is not None else ("given", "auto"))):
-        expected = "--mask given, --mask auto, or --mask box with --box TOP,LEFT,HEIGHT,WIDTH"
-        raise InputError(f"{where}: mask is {mask!r} and box is {box}, expected {expected}")
-
-
 def masks_from_box(frames: Iterable[Frame], box: Box) -> Iterator[Frame]:
     """Segment the object in the frames of a capture, given its box (top, left, height, width) in the first one.
 
