@@ -278,12 +278,13 @@ def test_options_of_the_import_reach_the_library(monkeypatch, capsys):
     words = "--root mine --category cup --sequence one --frames 7".split()
     assert main(["data", "import", "nerfstudio", "scan", *words, "--box", "1,2,3,4"]) == 0
     capture = [(Path("scan"), "nerfstudio", 7), {}, 0]
-    assert given.pop() == (capture, Path("mine"), "cup", "one", (1, 2, 3, 4), None, 7)
+    assert given.pop() == (capture, Path("mine"), "cup", "one", (1, 2, 3, 4), None, 7, None, None, None)
     text = capsys.readouterr().out
     assert "flag: 1 frames are left out: lost: a.jpg\nflag: the masks may be wrong: why\n" in text
-    assert main(["data", "import", "scan", *words, "--depth-unit", "0.5", "--object", "0", "--masks", "there"]) == 0
+    more = ["--depth-unit", "0.5", "--object", "0", "--mask", "given", "--label", "3", "--orientation", "stored"]
+    assert main(["data", "import", "scan", *words, "--masks", "there", *more]) == 0
     capture = [(Path("scan"), "bop", 7), {"depth_unit": 0.5, "object": 0}, 0]
-    assert given.pop() == (capture, Path("mine"), "cup", "one", None, Path("there"), 7)
+    assert given.pop() == (capture, Path("mine"), "cup", "one", None, Path("there"), 7, "given", 3, "stored")
     for wrong in (["lists", "scan", "--object", "0"], ["folder", "scan"]):
         assert main(["data", "import", *wrong, *words]) == 2
     assert "folder scan: expected SCAN, or one of nerfstudio, stray, " in capsys.readouterr().err

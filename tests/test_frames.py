@@ -151,7 +151,6 @@ def test_a_mask_holds_booleans_zeros_and_ones_or_up_to_255():
         ({"depth_unit": 0.0}, "depth_unit is 0.0, expected a finite number greater than 0"),
         ({"K": np.eye(4)}, r"K has shape \(4, 4\), expected real numbers of shape \(4,\)"),
         ({"K": np.array([[40, 0, 16], [1, 41, 12], [0, 0, 1]])}, "expected fx 0 cx, 0 fy cy, 0 0 1 in pixels"),
-        ({"K": (40, 41, 640, 360)}, r"CX,CY is \(640.5, 360.5\), expected a point inside its \(32, 24\) pixels"),
         ({"K": (-40, 41, 16, 12)}, "focal_length is -40.0"),
         ({"mask": np.full(SIZE, 7)}, "mask has 7 at most, expected booleans, 0 and 1, or 0 to 255"),
         ({"mask": np.ones((12, 16))}, "mask has shape"),

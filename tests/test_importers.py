@@ -155,12 +155,9 @@ def test_masks_come_from_files_by_name(tmp_path, views):
     capture = open_capture(folder, "lists").frames
     with pytest.raises(InputError, match=r"0000.jpg has no mask, expected .*\(--masks DIR\)"):
         import_capture(capture, tmp_path / "data", "teapot", "mine")
-    for view in views[1:]:
-        write_mask(tmp_path / f"masks/{view.name}.png", view.mask)
-    with pytest.raises(InputError, match="0000.jpg has no mask"):
-        import_capture(capture, tmp_path / "data", "teapot", "mine", masks=tmp_path / "masks")
     assert not (tmp_path / "data").exists(), "nothing is written"
-    write_mask(tmp_path / "masks/0000.png", views[0].mask)
+    for view in views:
+        write_mask(tmp_path / f"masks/{view.name}.png", view.mask)
     import_capture(capture, tmp_path / "data", "teapot", "mine", masks=tmp_path / "masks")
     assert Co3D(tmp_path / "data").categories() == ["teapot"]
 
@@ -223,12 +220,12 @@ def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
         frame.load()
 
 
-@pytest.mark.parametrize("values", [np.array(["x"]), np.float32(3), np.ones((4, 4, 3))])
+@pytest.mark.parametrize("values", [np.array(["x"]), np.float32(3), np.ones((4, 4, 3)), np.ones((0, 4))])
 def test_an_npy_file_that_is_no_depth_map_is_refused(tmp_path, views, values):
     write_lists(tmp_path, views[:1])
     np.save(tmp_path / f"z/{views[0].name}.npy", values)
-    with pytest.raises(InputError, match=r"expected an .npy file of numbers \(H, W\)"):
-        open_capture(tmp_path, "lists").frames[0].load()
+    with pytest.raises(InputError, match=r"expected numbers \(H, W\): .* .npy"):
+        open_capture(tmp_path, "lists")
 
 
 def test_a_single_frame_is_fused_and_a_surface_that_one_of_many_frames_saw_is_left_out(views):

@@ -103,13 +103,13 @@ def test_options_go_to_the_sources_that_take_them(image, tmp_path, ellipsoids, f
             "mask is 'auto' and box is .*, expected --mask",
         ),
         ({"intrinsics": (0.0, 190.0, 1.0, 1.0)}, "image .*.jpg: camera focal_length is 0.0, expected"),
-        ({"intrinsics": (190.0, 190.0, 900.0, 1.0)}, r"image .*.jpg: CX,CY is \(900.0, 1.0\), expected a point inside"),
+        ({"intrinsics": (1.0, 1.0, 90.0, 70.0)}, ".jpg: the intrinsics 1,1,90,70 have a field of view of 179 degrees"),
         ({"intrinsics": INTRINSICS, "depth": "lost.png"}, "lost.png"),
     ],
 )
 def test_what_an_image_lacks_is_named_with_the_option_that_gives_it(image, options, message):
     with pytest.raises(InputError, match=message):
-        open_source(image, **options)
+        open_source(image, **options).load([0])
 
 
 def test_masks_and_depth_that_are_not_there_are_named_with_the_option_that_cures(tmp_path, frames):

@@ -22,15 +22,16 @@ from zsp_lite.backbones.load import DEFAULT, BackboneLike, as_backbone
 from zsp_lite.category import SAME_ANGLE, references_per_pair, synchronise, world_hypotheses
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.annotations import FRAMES_FILE
-from zsp_lite.data.cameras import Box, Camera, camera_from_pose, view_span
+from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose, view_span
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.frames import Frame, frame_defect, read_image, turn_frame
+from zsp_lite.data.frames import Frame, frame_defect, turn_frame
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
 from zsp_lite.estimates import Hypothesis, PairResult, PoseEstimate, Vote, label_errors, timed
 from zsp_lite.importers import FORMATS, open_capture, recognise
 from zsp_lite.importers.capture import CaptureFrame, left_out_flags
 from zsp_lite.importers.convert import scale_frame
-from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth
+from zsp_lite.importers.files import CO3D_DEPTH, DEPTHS, MASKS, PICTURES, question_intrinsics, read_picture
+from zsp_lite.importers.masks import given_mask_flags, mask_flags, masks_from_box, masks_from_depth
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.metrics import rotation_angle, rotation_error
@@ -40,13 +41,14 @@ from zsp_lite.verified.confidence import reliability_flags
 from zsp_lite.verified.solver import measured_inliers
 from zsp_lite.views import View
 
-_IMAGES = (".jpg", ".jpeg", ".png")
 # Options that each format takes; "open" is a source that is open already.
 _MASKED = ("mask", "box")
-_TAKEN = {"open": (), "image": (*_MASKED, "intrinsics", "depth", "depth_unit"), "sequence": _MASKED, "frames": _MASKED}
-_TAKEN |= {name: (*_MASKED, *one.options) for name, one in FORMATS.items()}
+_FILES = (*_MASKED, "label", "orientation")
+_TAKEN = {"open": (), "image": (*_FILES, "intrinsics", "depth", "depth_unit"), "sequence": _MASKED, "frames": _MASKED}
+_TAKEN |= {name: (*_FILES, *one.options) for name, one in FORMATS.items()}
 _NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
 _ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
+_TARGETS = 5
 _REFERENCES = 4  # frames of each object that are solved against views of the other
 _LEAST_PROBABLE = 0.005  # an alternative is named above this
 _Ends = tuple[int, int, int]  # numbers of two objects, and the position of a frame of the first
@@ -66,6 +68,8 @@ class Source:
     box: Box | None = None  # bounding box of the object in the first frame, for "box"
     cameras: tuple[Camera, ...] = ()  # of the frames, where these are chosen by their directions, not by their order
     left_out: tuple[str, ...] = ()  # what is wrong with each frame that cannot be used
+    missing: tuple[int, ...] = ()  # numbers of frames without a mask where others have one; it is made by depth
+    doubts: tuple[str, ...] = ()  # what speaks against the intrinsics
 
     @property
     def name(self) -> str:
@@ -89,14 +93,15 @@ class Source:
         if self.mask != "given":
             masked = masks_from_box(some, self.box) if self.box else masks_from_depth(some)
             frames = dict(zip(frames, masked, strict=True))
-        elif without := [self.numbers[k] for k, frame in frames.items() if frame.mask is None]:
-            where = f"{self.path}, frame {without[0]}"
-            raise InputError(f"{where}: no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH")
+        elif any(frame.mask is None for frame in some):
+            made = dict(zip(frames, replace(self, mask="auto").load(list(frames)), strict=True))
+            frames = {k: made[k] if frame.mask is None else frame for k, frame in frames.items()}
         return [frames[position] for position in positions]
 
     def flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
-        """Question the unit of length where the object is implausibly far, and the masks of frames if not given."""
-        found = [] if self.mask == "given" else list(mask_flags(frames))
+        """Question the masks, the intrinsics, and the unit of length where the object is implausibly far."""
+        found = [*self.doubts]
+        found += given_mask_flags(frames, self.missing) if self.mask == "given" else mask_flags(frames)
         depth = np.concatenate([frame.depth[object_pixels(frame)] for frame in frames])
         distance = float(np.quantile(depth, 0.25)) if len(depth) else _NEAREST
         if self.format not in ("sequence", "frames") and not _NEAREST <= distance <= _FARTHEST:
@@ -181,9 +186,9 @@ def estimate_pose(
     target: _Object,
     solver: str = "verified",
     reference_frame: int | None = None,
-    targets: int = 5,
+    targets: int | None = None,
     mask: str | None = None,
-    intrinsics: tuple[float, float, float, float] | None = None,
+    intrinsics: Values | None = None,
     backbone: BackboneLike = DEFAULT,
     out: str | Path | None = None,
     upright: bool = True,
@@ -205,9 +210,9 @@ def estimate_pose(
         solver: "verified", "paper" or "both".
         reference_frame: Frame number of the reference, in whose camera the pose is; by default its first frame with
             known depth and an object.
-        targets: Number of target views, evenly spaced over the target's frames.
-        mask: Where the masks of both come from: "given", "auto", or as `open_source` decides.
-        intrinsics: Camera intrinsics of both, where they are images (see `open_source`).
+        targets: Number of target views, evenly spaced over the target's frames; 5 by default, or as many as there are.
+        mask: Where the masks of all come from: "given", "auto", or as `open_source` decides.
+        intrinsics: Camera intrinsics of all images (see `open_source`).
         backbone: Backbone, or what `load_backbone` takes.
         out: Folder for the report and the point clouds (see `write_pair`); None writes nothing.
         upright: Whether the reference images are upright; False tries four turns by 90 degrees, since phones may store
@@ -221,6 +226,7 @@ def estimate_pose(
         InputError: An input or an option is missing or wrong, or the pose cannot be estimated.
     """
     check_choice("solver", solver, SOLVERS)
+    wanted, targets = targets, _TARGETS if targets is None else targets
     check_integer("targets", targets, 1)
     check_integer("workers", workers, 1)
     if references is None:
@@ -230,7 +236,7 @@ def estimate_pose(
     several = "verified" in SOLVERS[solver] and (references > 1 or bool(helpers))
     given = {name: (one,) for name, one in (("mask", mask), ("intrinsics", intrinsics)) if one is not None}
     with nullcontext() if out is None else writing(out):  # a folder that cannot be written is an error at once
-        sources = [*open_pair(reference, target, given), *map(_opened, helpers)]
+        sources = open_pair(reference, target, given, helpers)
         if helpers and len({one.path.resolve() for one in sources}) < len(sources):
             raise InputError(f"{', '.join(str(one.path) for one in sources)}: expected different objects")
         model = as_backbone(backbone)
@@ -242,6 +248,8 @@ def estimate_pose(
             scans = [_Scan.of(sources[0], method, *counts, reference_frame)]
             scans += [_Scan.of(one, method, references if several else 0, targets) for one in sources[1:]]
         flags = _pair_flags(scans)
+        if wanted and wanted > len(scans[1].targets):
+            flags = *flags, f"the target has {len(scans[1].targets)} frames: these are used, not {wanted}"
         if not upright:
             with timed(before, "turns"):
                 scans[0], turn = _stood_up(*scans[:2], replace(method, solver=SOLVERS[solver][-1]))
@@ -355,11 +363,14 @@ def write_pair(result: PairResult, out: str | Path) -> list[Path]:
     They are `report.html`; `target.ply`, the points of the target object in all its views; and for each solver
     `aligned_SOLVER.ply`, the points of the reference object after the pose, and `aligned_SOLVER_2.ply`, after the first
     alternative, where the answer is one of two. The clouds are in the world of the target views, which for an image is
-    its camera's frame.
+    its camera's frame. Files of these names that an earlier run left are removed.
     """
     from zsp_lite.viz.report import write_pair_report
 
     out = Path(out)
+    for solver in SOLVERS["both"]:
+        for name in (f"aligned_{solver}.ply", f"aligned_{solver}_2.ply"):
+            (out / name).unlink(missing_ok=True)
     paths = [out / "target.ply"]
     write_ply(paths[0], *world_cloud(result.targets))
     points, colours = world_cloud([result.reference])
@@ -374,26 +385,32 @@ def write_pair(result: PairResult, out: str | Path) -> list[Path]:
 
 def open_source(
     path: str | Path | Frame | Sequence[Frame],
-    intrinsics: tuple[float, float, float, float] | None = None,
+    intrinsics: Values | None = None,
     depth: str | Path | None = None,
     depth_unit: float | None = None,
     mask: str | None = None,
     box: Box | None = None,
+    label: int | None = None,
+    orientation: str | None = None,
     object: int | None = None,
 ) -> Source:
     """Open a sequence of a data folder, a folder with a capture, an image, or frames of one object in one world.
 
     Args:
         path: ROOT/CATEGORY/SEQUENCE of a data folder; the folder or zip of a capture (see `importers.recognise`); or a
-            JPEG or PNG file NAME.EXT. Depth of an image is NAME_depth.png (16 bit) or NAME_depth.npy, registered to
-            its colours, and its mask, if there is one, NAME_mask.png. Or frames, such as of `Frame.from_arrays`.
-        intrinsics: fx, fy, cx, cy of an image or of TUM RGB-D in pixels, with pixel centres at half-integers (0.5 more
-            than OpenCV's cx and cy).
+            JPEG, PNG, WebP or HEIC file NAME.EXT. Depth of an image is NAME_depth.png (16 bit), .npy, .tiff, ...,
+            registered to its colours, and its mask, if there is one, NAME_mask.png. Or frames, such as of
+            `Frame.from_arrays`.
+        intrinsics: fx, fy, cx, cy of an image or of TUM RGB-D in pixels, or K as 3 x 3, with pixel centres at
+            half-integers (0.5 more than OpenCV's cx and cy).
         depth: Depth file of an image, if it is named otherwise.
         depth_unit: World units per stored depth value; by default the format's own, and 0.001 of an image.
-        mask: "given", "box" or "auto". By default "box" if there is a box, "given" if the first frame has a mask, and
+        mask: "given", "box" or "auto". By default "box" if there is a box, "given" if some frame has a mask, and
             "auto" otherwise.
         box: Bounding box (top, left, height, width) of the object in the first frame, pixels.
+        label: Number of the object in masks that label several.
+        orientation: "stored" or "displayed": how depth, mask and intrinsics refer to an image that its EXIF
+            orientation turns, where their sizes do not tell. Frames are as displayed.
         object: Number of the object in a scene of BOP.
 
     Raises:
@@ -401,6 +418,7 @@ def open_source(
     """
     layout = _format(path)
     options = {"intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit, "object": object}
+    options |= {"label": label, "orientation": orientation}
     options = {name: value for name, value in options.items() if value is not None}
     if layout == "frames":
         frames = _check_frames([path] if isinstance(path, Frame) else path)
@@ -415,44 +433,56 @@ def open_source(
     cameras, left_out = (), ()
     if layout == "frames":
         numbers, read = tuple(range(len(frames))), frames.__getitem__
+        masked, doubts = [frame.mask is not None for frame in frames], question_intrinsics(frames[0].camera, str(path))
     elif layout == "sequence":
-        folder = Path(os.path.abspath(path))
+        folder = _sequence_folder(path)
         dataset = Co3D(folder.parents[1])
         every = dataset.frames(folder.parent.name, folder.name)
         if not (frames := [one for one in every if one.viewpoint is not None and one.depth is not None]):
             raise InputError(f"{path}: no frame has a camera and depth, expected some")
         numbers, read = tuple(one.frame_number for one in frames), lambda k: dataset.load(frames[k])
+        masked, doubts = [one.mask is not None for one in frames], ()
     else:
+        files = {name: options.pop(name) for name in ("label", "orientation") if name in options}
         if layout == "image":
             capture = [_open_image(path, **options)]
         else:
             _, capture, left_out = open_capture(path, **options)
+        capture = [replace(frame, **files) for frame in capture]
         numbers, read = tuple(range(len(capture))), lambda k: capture[k].load()
         cameras = tuple(frame.camera for frame in capture)
+        masked, doubts = [frame.has_mask for frame in capture], question_intrinsics(capture[0].camera, str(path))
     if mask is None:
-        mask = "box" if box is not None else "auto" if read(0).mask is None else "given"
-    return Source(path, layout, numbers, read, mask, box, cameras, tuple(left_out))
+        mask = "box" if box is not None else "given" if any(masked) else "auto"
+    if mask == "given" and not any(masked):
+        raise InputError(f"{path}: no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH")
+    missing = tuple(number for number, has_mask in zip(numbers, masked) if not has_mask)
+    return Source(path, layout, numbers, read, mask, box, cameras, tuple(left_out), missing, doubts)
 
 
-def open_pair(reference: _Object, target: _Object, options: Mapping[str, Sequence]) -> list[Source]:
-    """Open two sources with the options of a command line, by the names of arguments of `open_source`.
+def open_pair(
+    reference: _Object, target: _Object, options: Mapping[str, Sequence], helpers: Sequence[_Object] = ()
+) -> list[Source]:
+    """Open two sources and helpers with the options of a command line, by the names of arguments of `open_source`.
 
-    An option has one value for each path that takes it (`depth`: each image), or one for all of them. A single `box` is
-    for the first path whose `mask` is "box", if any, or the first of both. An open source takes none.
+    An option has one value for each path that takes it (`depth`: each image), or one for all of them. There may be
+    fewer values, for the reference and the target alone. A single `box` is for the first path whose `mask` is "box", if
+    any, or the first of all. An open source takes none.
     """
-    sides = reference, target
+    sides = reference, target, *helpers
     formats = [_format(side) for side in sides]
-    given: list[dict] = [{}, {}]
+    given: list[dict] = [{} for _ in sides]
     for name, values in options.items():
-        takers = [k for k in (0, 1) if name in _TAKEN[formats[k]]]
-        counts = sorted({len(takers), len(takers) if name == "depth" else min(len(takers), 1)})
+        takers = [k for k, one in enumerate(formats) if name in _TAKEN[one]]
+        pair = [k for k in takers if k < 2]
+        counts = sorted({len(takers), len(pair), len(takers) if name == "depth" else min(len(takers), 1)})
         if values and len(values) not in counts:
             option, expected = f"--{name.replace('_', '-')}", " or ".join(map(str, counts))
             raise InputError(f"{option}: {len(values)} values with {' and '.join(formats)}, expected {expected}")
         if len(values) == 1 and name == "box":
             boxed = [k for k, way in enumerate(options.get("mask", ())) if way == "box" and k in takers]
             takers = (boxed or takers)[:1]
-        for k, value in zip(takers, values if len(values) == 2 else [*values] * 2):
+        for k, value in zip(takers, values if len(values) > 1 or name == "depth" else [*values] * len(takers)):
             given[k][name] = value
     return [_opened(side, **some) for side, some in zip(sides, given)]
 
@@ -478,28 +508,43 @@ def _format(side: _Object) -> str:
     if not isinstance(side, str | Path):
         return "open" if isinstance(side, Source) else "frames"
     path = Path(side)
-    if path.is_file() and path.suffix.lower() in _IMAGES:
+    if path.is_file() and path.suffix.lower() in PICTURES:
         return "image"
-    whole = Path(os.path.abspath(path))  # for the names of "." and of "mine/cup/.."
-    if path.is_dir() and (whole.parent / FRAMES_FILE).is_file():
+    if _sequence_folder(path):
         return "sequence"
     return recognise(path, "a JPEG or PNG file, CATEGORY/SEQUENCE of a data folder, or ")[0]
 
 
+def _sequence_folder(path: Path) -> Path | None:
+    """Return the folder of a sequence in its data folder, also where the path is a link to it; None if it is none."""
+    folders = Path(os.path.abspath(path)), path.resolve()  # absolute for the names of "." and of "mine/cup/.."
+    return next((one for one in folders if one.is_dir() and (one.parent / FRAMES_FILE).is_file()), None)
+
+
 def _open_image(
-    path: Path, intrinsics: tuple[float, ...] | None = None, depth: str | Path | None = None, depth_unit: float = 0.001
+    path: Path, intrinsics: Values | None = None, depth: str | Path | None = None, depth_unit: float | None = None
 ) -> CaptureFrame:
     """Name the files and the camera of an image, whose world is its camera's frame."""
     if intrinsics is None:
         raise InputError(f"image {path}: no intrinsics, expected --intrinsics FX,FY,CX,CY in pixels")
-    beside = [path.with_name(f"{path.stem}_depth{suffix}") for suffix in (".png", ".npy")]
-    found = [Path(depth)] if depth is not None else [file for file in beside if file.is_file()]
-    if not found:
-        names = " or ".join(file.name for file in beside)
+    depth = _beside(path, "depth", DEPTHS) if depth is None else Path(depth)
+    if depth is None:
+        names = f"{path.stem}_depth.png or {path.stem}_depth.npy"
         raise InputError(f"image {path}: no {names} beside it, expected its depth there or as --depth FILE")
-    camera = camera_from_pose(np.eye(4), intrinsics, read_image(path).shape[:2], f"image {path}", uncropped=True)
-    mask = path.with_name(f"{path.stem}_mask.png")
-    return CaptureFrame(path, found[0], camera, depth_unit, mask=mask if mask.is_file() else None)
+    if depth_unit is None:
+        depth_unit = 1.0 if depth.name.endswith(CO3D_DEPTH) else 0.001
+    rgb, orientation = read_picture(path)
+    camera = camera_from_pose(np.eye(4), intrinsics, rgb.shape[:2], f"image {path}")
+    stored, displayed = (np.linalg.norm(2 * camera.principal_point - side) for side in (camera.size[::-1], camera.size))
+    if orientation > 4 and displayed < stored:  # the principal point is nearer to the middle of the displayed form
+        camera = replace(camera, size=camera.size[::-1])
+    return CaptureFrame(path, depth, camera, depth_unit, mask=_beside(path, "mask", MASKS), posed=False)
+
+
+def _beside(path: Path, kind: str, suffixes: Sequence[str]) -> Path | None:
+    """Find the file of a kind, such as NAME_depth.png, beside an image."""
+    files = [path.with_name(f"{path.stem}_{kind}{suffix}") for suffix in suffixes]
+    return next((file for file in files if file.is_file()), None)
 
 
 def spread(count: int, length: int) -> list[int]:

@@ -29,16 +29,17 @@ class Parsed(click.ParamType):
         self.fail(f"got {value!r}, expected {self.expected}", parameter, context)
 
 
-def _four_finite(values: tuple[float, ...]) -> bool:
-    return len(values) == 4 and all(map(math.isfinite, values))
+def _finite(*counts: int) -> Callable[[tuple[float, ...]], bool]:
+    return lambda values: len(values) in counts and all(map(math.isfinite, values))
 
 
 COUNT, INDEX = click.IntRange(1, 1_000_000), click.IntRange(min=0)
 PATH = Parsed("path", Path, lambda path: "\0" not in str(path), "a path")
 NAMES = Parsed("a,b", lambda text: [name for name in text.split(",") if name], bool, "names separated by commas")
 LENGTH = Parsed("metres", float, lambda length: 0 < length < 1e9, "a positive number below 1e9")
-BOX = Parsed("top,left,height,width", lambda text: tuple(map(int, text.split(","))), _four_finite, "four integers")
-INTRINSICS = Parsed("fx,fy,cx,cy", lambda text: tuple(map(float, text.split(","))), _four_finite, "four numbers")
+BOX = Parsed("top,left,height,width", lambda text: tuple(map(int, text.split(","))), _finite(4), "four integers")
+INTRINSICS = Parsed("fx,fy,cx,cy", lambda text: tuple(map(float, text.split(","))), _finite(4, 9), "four numbers, or K")
+ORIENTATION = click.Choice(("stored", "displayed"))
 
 
 def examples(*lines: str) -> str:

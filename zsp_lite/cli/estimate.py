@@ -5,7 +5,9 @@ from typing import Any
 import click
 
 from zsp_lite.choices import MASKS, SOLVERS
-from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, backbone_options, examples
+from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, ORIENTATION, PATH, backbone_options, examples
+
+_ONCE_PER_OBJECT = ("mask", "box", "intrinsics", "label", "orientation", "depth", "depth_unit", "object")
 
 
 @click.command(
@@ -27,10 +29,12 @@ from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, PATH, bac
 @click.option(
     "--references", type=COUNT, show_default="4; 1 with --reference-frame", help="Reference frames of each object."
 )
-@click.option("--targets", type=COUNT, default=5, help="Number of target views, evenly spaced.")
+@click.option("--targets", type=COUNT, show_default="5", help="Number of target views, evenly spaced.")
 @click.option("--mask", type=click.Choice(MASKS), multiple=True, help="Origin of the objects' masks, see above.")
 @click.option("--box", type=BOX, multiple=True, help="Bounding box of the object in the first image in pixels.")
 @click.option("--intrinsics", type=INTRINSICS, multiple=True, help="Camera intrinsics in pixels, see above.")
+@click.option("--label", type=INDEX, multiple=True, help="Number of the object in masks that label several.")
+@click.option("--orientation", type=ORIENTATION, multiple=True, help="Form of what belongs to a turned photograph.")
 @click.option("--depth", type=PATH, multiple=True, help="Depth of an image, if it is not beside it. Once per image.")
 @click.option("--depth-unit", type=LENGTH, multiple=True, show_default="0.001", help="Metres per stored depth value.")
 @click.option("--object", type=INDEX, multiple=True, help="Number of the object in a scene of BOP.")
@@ -43,23 +47,27 @@ def estimate(reference, target, others, helpers, not_upright, as_json, backbone,
     """Estimate the pose between two objects of one category; no label is needed.
 
     REFERENCE and TARGET are each a sequence of a data folder (ROOT/CATEGORY/SEQUENCE), the folder or zip of a capture
-    (see `zsp-lite data import --help`), or an image NAME.jpg with its depth NAME_depth.png and, if there is one, its
-    mask NAME_mask.png.
+    (see `zsp-lite data import --help`), or an image NAME.jpg, .png, .webp or .heic with its depth NAME_depth.png and,
+    if there is one, its mask NAME_mask.png or .jpg.
 
-    --mask, --box, --intrinsics and --depth-unit may be given twice: for REFERENCE, then for TARGET. A single value is
-    for both, a single --box for REFERENCE, or for the one whose --mask is box.
+    --mask, --box, --intrinsics, --depth-unit, --label and --orientation may be given once for each object: REFERENCE,
+    TARGET, then helpers. A single value is for all, a single --box for REFERENCE, or for the one whose --mask is box.
 
     \b
     --mask        given: with the images; box: by GrabCut from --box, the default with a box;
                   auto: what stands on a plane, by depth and colours, the default without masks
-    --intrinsics  of an image, or of TUM RGB-D; pixel centres at half-integers, 0.5 more than OpenCV's cx and cy
+    --intrinsics  of an image, or of TUM RGB-D, or the 9 numbers of K in rows; pixel centres at half-integers,
+                  0.5 more than OpenCV's cx and cy
     --depth-unit  of an image, or of a capture, whose own it replaces: 0.001 for millimetres, 1 for metres
-    --depth       16-bit PNG or .npy, registered to the colours
+    --depth       16-bit PNG or TIFF, .npy, .npz, float .tiff or .pfm, registered to the colours
+    --orientation stored or displayed: how depth, mask and intrinsics refer to a photograph that its
+                  EXIF orientation turns; asked for where their sizes do not tell
 
     --helpers are scans of other objects of the category, without labels: what the pair alone cannot tell, such as
     front from back, all objects together mostly can.
 
-    The pose maps points of the reference camera to points of the camera of the chosen target view. OUT gets
+    The pose maps points of the reference camera to points of the camera of the chosen target view; both cameras are
+    those of the images as viewers display them, by their EXIF orientation, which makes a portrait upright. OUT gets
     report.html and point clouds: target.ply, and aligned_SOLVER.ply, the reference after the pose. Where the verified
     solver cannot decide between two poses, the report shows both, and aligned_SOLVER_2.ply is the other. Where both
     are labelled sequences of one category, the rotation error is shown too.
@@ -75,9 +83,10 @@ def estimate(reference, target, others, helpers, not_upright, as_json, backbone,
     if others and not helpers:
         raise click.UsageError(f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers")
     with writing(out):
-        given = {name: settings.pop(name) for name in ("mask", "box", "intrinsics", "depth", "depth_unit", "object")}
-        settings |= {"backbone": load_backbone(backbone), "upright": not not_upright, "helpers": (*helpers, *others)}
-        found = estimate_pose(*open_pair(reference, target, given), **settings)
+        given = {name: settings.pop(name) for name in _ONCE_PER_OBJECT}
+        sources = open_pair(reference, target, given, (*helpers, *others))
+        settings |= {"backbone": load_backbone(backbone), "upright": not not_upright, "helpers": sources[2:]}
+        found = estimate_pose(*sources[:2], **settings)
         files = write_pair(found, out)
     if as_json:
         print(json.dumps(found.as_json() | {"files": [str(path) for path in files]}, indent=1, allow_nan=False))

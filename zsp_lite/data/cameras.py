@@ -156,20 +156,23 @@ class Camera:
         return camera
 
 
-def camera_from_pose(
-    pose: Values, intrinsics: Values, size: tuple[int, int], where: str, uncropped: bool = False
-) -> Camera:
-    """Create a camera from fx, fy, cx, cy and its camera-to-world pose in OpenCV's axes; errors begin with `where`.
+def split_intrinsics(name: str, values: Values) -> Float[np.ndarray, "4"]:
+    """Return fx, fy, cx, cy, which may be given as a matrix (3, 3) or its 9 numbers; InputError for anything else."""
+    matrix = real_array(name, values)
+    if matrix.shape in ((3, 3), (9,)):
+        fx, skew, cx, *zeros, one = matrix.ravel().tolist()
+        zero, fy, cy, *zeros = zeros
+        if any((skew, zero, *zeros)) or one != 1:
+            raise InputError(f"{name} is {matrix.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
+        matrix = np.array([fx, fy, cx, cy])
+    return real_array(name, matrix, (4,))
 
-    The principal point of an `uncropped` image lies inside it.
-    """
+
+def camera_from_pose(pose: Values, intrinsics: Values, size: tuple[int, int], where: str) -> Camera:
+    """Create a camera from its intrinsics and its camera-to-world pose in OpenCV's axes; errors begin with `where`."""
     pose = rigid_matrix(f"{where}: camera-to-world pose", pose)
     rotation = pose[:3, :3]
-    values = real_array(f"{where}: intrinsics", intrinsics, (4,))
-    if uncropped and not all(0 < place < side for place, side in zip(values[2:], size[::-1])):
-        raise InputError(
-            f"{where}: CX,CY is {(*values[2:].tolist(),)}, expected a point inside its {size[::-1]} pixels"
-        )
+    values = split_intrinsics(f"{where}: intrinsics", intrinsics)
     try:
         return Camera(rotation.T, -rotation.T @ pose[:3, 3], values[:2], values[2:], size)
     except InputError as error:

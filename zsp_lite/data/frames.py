@@ -15,10 +15,10 @@ from jaxtyping import Bool, Float32, Real, UInt8, UInt16
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose
+from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose, split_intrinsics
 from zsp_lite.data.depth import decode_depth, encode_depth
 from zsp_lite.errors import MAX_LENGTH, InputError, check_number, real_array
-from zsp_lite.io.files import file_size, read_bytes, write_atomic
+from zsp_lite.io.files import read_bytes, write_atomic
 
 MAX_PIXELS = 1 << 26  # of an image file
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
@@ -78,18 +78,14 @@ class Frame:
         Raises:
             InputError: Arrays that are none of these, or do not fit together.
         """
-        label, image, matrix = f"frame {name}".rstrip(), np.asarray(rgb), np.asarray(K)
+        label, image = f"frame {name}".rstrip(), np.asarray(rgb)
         if image.ndim == 2:
             image = np.repeat(image[..., None], 3, axis=2)
         if image.ndim != 3 or image.shape[2] not in (3, 4):
             raise InputError(f"{label} rgb has shape {image.shape}, expected (H, W), (H, W, 3) or (H, W, 4)")
         image, size = image[..., :3], image.shape[:2]
-        if matrix.shape == (3, 3):
-            if np.abs(matrix[[0, 1, 2, 2], [1, 0, 0, 1]]).max() > 0 or matrix[2, 2] != 1:
-                raise InputError(f"{label} K is {matrix.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
-            matrix = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
-        intrinsics = real_array(f"{label} K", matrix, (4,)) + (0, 0, *[0.0 if half_pixels else 0.5] * 2)
-        camera = camera_from_pose(np.eye(4) if pose is None else pose, intrinsics, size, label, uncropped=True)
+        intrinsics = split_intrinsics(f"{label} K", K) + (0, 0, *[0.0 if half_pixels else 0.5] * 2)
+        camera = camera_from_pose(np.eye(4) if pose is None else pose, intrinsics, size, label)
         if image.dtype.kind == "f" and 0 <= image.min() and image.max() <= 1:
             image = np.rint(255 * image).astype(np.uint8)
         check_number("depth_unit", depth_unit, above=0)
@@ -192,13 +188,13 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
 def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
     """Read the colours (H, W, 3) of an image file; InputError if it is damaged."""
     # An orientation tag is ignored, because the camera refers to the pixels as stored.
-    image = _decode(path, "image", cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = decode_image(path, "image", cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.ascontiguousarray(image[..., ::-1])
 
 
 def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
     """Read an 8-bit or 1-bit mask file as probabilities (H, W) in [0, 1]; InputError if it is damaged."""
-    return _decode(path, "mask", cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
+    return decode_image(path, "mask", cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
 
 
 def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.ndarray, "h w"]:
@@ -208,23 +204,15 @@ def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.nd
 
 def read_grey16(path: str | Path) -> UInt16[np.ndarray, "h w"]:
     """Read the values (H, W) of a 16-bit greyscale PNG; InputError if the file is no such."""
-    bits = _decode(path, "depth", cv2.IMREAD_UNCHANGED)
+    bits = decode_image(path, "depth", cv2.IMREAD_UNCHANGED)
     if bits.dtype != np.uint16 or bits.ndim != 2:
         raise InputError(f"depth {path} holds {bits.dtype} of shape {bits.shape}, expected a 16-bit greyscale PNG")
     return bits
 
 
-def read_grey(path: str | Path, half: bool = False) -> UInt8[np.ndarray, "h w"]:
-    """Read an 8-bit image file in grey, or at half its size; InputError if it is damaged."""
-    return _decode(path, "image", cv2.IMREAD_REDUCED_GRAYSCALE_2 if half else cv2.IMREAD_GRAYSCALE)
-
-
-def image_size(path: str | Path) -> tuple[int, int]:
-    """Read the size (H, W) of a JPEG or PNG file from its header."""
-    file_size(path, "image")
-    with open(path, "rb") as file, suppress(OSError, SyntaxError):
-        return (JpegImageFile if file.peek(2)[:2] == b"\xff\xd8" else PngImageFile)(file).size[::-1]
-    raise InputError(f"image {path} cannot be decoded, expected a complete JPEG or PNG")
+def read_grey(path: str | Path) -> UInt8[np.ndarray, "h w"]:
+    """Read an 8-bit image file in grey; InputError if it is damaged."""
+    return decode_image(path, "image", cv2.IMREAD_GRAYSCALE)
 
 
 def check_pixels(path: str | Path, image: np.ndarray, size: tuple[int, int]) -> None:
@@ -262,7 +250,7 @@ def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
     return max(0, int(np.floor(first - margin))), min(len(inside), int(np.ceil(last + 1 + margin)))
 
 
-def _decode(path: str | Path, what: str, flags: int) -> np.ndarray:
+def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
     """Decode a JPEG or PNG file by OpenCV with its flags; InputError if it is damaged or too large."""
     data = read_bytes(path, what)
     is_jpeg = data[:2] == b"\xff\xd8"

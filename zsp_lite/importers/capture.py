@@ -1,36 +1,29 @@
 """RGB-D captures: the files and camera of a frame, how they become a `Frame`, and what the readers of formats share."""
 
 import codecs
-import io
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.data.cameras import Camera, Values, camera_from_pose
-from zsp_lite.data.frames import (
-    Frame,
-    check_pixels,
-    enlarge_depth,
-    image_size,
-    read_grey,
-    read_grey16,
-    read_image,
-    read_mask,
-)
+from zsp_lite.data.frames import Frame, check_pixels, enlarge_depth, read_grey
 from zsp_lite.errors import InputError, real_array
+from zsp_lite.importers import files
 from zsp_lite.io.files import OutsideError, decode_json, find_inside, read_bytes
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # +y up, looking along -z
+_FARTHEST = 1e4  # greatest known depth, in units of the world
 MOST_FRAMES = 100  # of a capture; the sharp ones are chosen where there are more
 _CANDIDATES = 4  # frames of which the sharpest is chosen
 _SHARPNESS_SIDE = 640  # pixels of an image whose sharpness is measured
@@ -42,35 +35,70 @@ class CaptureFrame:
     """Files and camera of a frame."""
 
     image: Path
-    depth: Path  # a 16-bit PNG or .npy, of the image's aspect ratio; phones store it smaller than the image
+    depth: Path  # of the image's aspect ratio; phones store it smaller than the image
     camera: Camera
     depth_unit: float = 0.001  # world units per stored depth value
     distortion: tuple[float, ...] = ()  # OpenCV's k1, k2, p1, p2, k3; image, depth and mask are undistorted
     mask: Path | None = None
     fisheye: bool = False  # whether the distortion is that of OpenCV's fisheye cameras, k1, k2, k3, k4
     confidence: Path | None = None  # of each pixel of the depth map, see `trusted`
+    label: int | None = None  # of the object, where masks have the labels of several
+    orientation: str | None = None  # "stored" or "displayed": how camera, depth and mask refer to a turned photograph
+    posed: bool = True  # False for a single image, whose world is its camera's frame
 
     def load(self) -> Frame:
-        """Load the frame; InputError if a file is missing, damaged or of another size than the camera's image."""
-        height, width = self.camera.size
-        rgb, depth = read_image(self.image), _read_depth(self.depth) * np.float32(self.depth_unit)
+        """Load the frame as viewers display it; InputError if a file is missing, damaged or of another size."""
+        rgb, turn = files.read_picture(self.image)
+        depth = self._read_depth()
+        mask = files.read_mask_file(self.mask, self.label) if self.has_mask else None
+        lies_stored = partial(files.lies_as_stored, rgb.shape, turn, self.orientation, self.image)
+        camera = self.camera
+        if lies_stored(camera.size):
+            camera = files.display_camera(camera, turn, self.image.name, self.posed)
+        if lies_stored(depth.shape):
+            depth = files.display_image(depth, turn)
+        if mask is not None and lies_stored(mask.shape):
+            mask = files.display_image(mask, turn)
+        rgb, size = files.display_image(rgb, turn), camera.size
+        enlarged = enlarge_depth(depth, size)
+        for path, pixels in ((self.image, rgb), (self.mask, mask)):
+            if pixels is not None:
+                check_pixels(path, pixels, size)
+        if enlarged.shape != size:
+            expected = f"(H, W) = {size} as the image, or smaller with its aspect ratio"
+            raise InputError(f"depth {self.depth} is {depth.shape} pixels, expected {expected}")
+        if any(self.distortion):
+            maps = self._undistortion(camera)
+            rgb = cv2.remap(rgb, *maps, cv2.INTER_LINEAR)
+            enlarged = cv2.remap(enlarged, *maps, cv2.INTER_NEAREST)
+            mask = None if mask is None else cv2.remap(mask, *maps, cv2.INTER_LINEAR)
+        return Frame(rgb, enlarged, mask, camera, self.image.name)
+
+    @property
+    def has_mask(self) -> bool:
+        """Whether there is a file of the frame's mask."""
+        return self.mask is not None and self.mask.is_file()
+
+    def _read_depth(self) -> Float32[np.ndarray, "h w"]:
+        """Read the depth, 0 where it is unknown, implausibly far or not trusted."""
+        depth = files.read_depth_file(self.depth) * np.float32(self.depth_unit)
+        known = depth <= _FARTHEST
         if self.confidence is not None:
             levels = read_grey(self.confidence)
             check_pixels(self.confidence, levels, depth.shape)
-            depth = np.where(trusted(levels), depth, np.float32(0))
-        depth = enlarge_depth(depth, (height, width))
-        mask = None if self.mask is None else read_mask(self.mask)
-        for path, pixels in ((self.image, rgb), (self.depth, depth), (self.mask, mask)):
-            if pixels is not None:
-                check_pixels(path, pixels, (height, width))
-        if any(self.distortion):
-            matrix, coefficients = self.camera.K - HALF_PIXEL, np.array(self.distortion)
-            undistorted = cv2.fisheye.initUndistortRectifyMap if self.fisheye else cv2.initUndistortRectifyMap
-            maps = undistorted(matrix, coefficients, np.eye(3), matrix, (width, height), cv2.CV_32FC1)
-            rgb = cv2.remap(rgb, *maps, cv2.INTER_LINEAR)
-            depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
-            mask = None if mask is None else cv2.remap(mask, *maps, cv2.INTER_LINEAR)
-        return Frame(rgb, depth, mask, self.camera, self.image.name)
+            known &= trusted(levels)
+        return np.where(known, depth, np.float32(0))
+
+    def _undistortion(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Return OpenCV's maps that undistort the image, of which `camera` is the camera after turning."""
+        matrix, coefficients = camera.K - HALF_PIXEL, np.array(self.distortion)
+        if self.fisheye:
+            undistortion = cv2.fisheye.initUndistortRectifyMap
+        else:
+            undistortion = cv2.initUndistortRectifyMap
+            p1, p2 = coefficients[2:4]
+            coefficients[[3, 2]] = (camera.R @ self.camera.R.T)[:2, :2] @ (p2, p1)  # a vector: it turns with the image
+        return undistortion(matrix, coefficients, np.eye(3), matrix, camera.size[::-1], cv2.CV_32FC1)
 
 
 class Capture(NamedTuple):
@@ -112,7 +140,7 @@ def make_frame(
         if K.shape not in ((3, 3), (4, 4)) or K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]].tolist() != [0, 0, 0, 0, 1]:
             raise InputError(f"{where}: intrinsics are {K.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
         K = K[[0, 1, 0, 1], [0, 1, 2, 2]]
-    camera = camera_from_pose(pose.reshape(-1, 4) @ axes, K, size or image_size(paths[0]), where)
+    camera = camera_from_pose(pose.reshape(-1, 4) @ axes, K, size or files.picture_size(paths[0]), where)
     return CaptureFrame(paths[0], paths[1], camera, mask=paths[2], confidence=paths[3], **others)
 
 
@@ -176,10 +204,10 @@ def _sharpness(image: UInt8[np.ndarray, "..."]) -> float:
     return float(cv2.Laplacian(small, cv2.CV_32F).var())
 
 
-def read_sample(frame: CaptureFrame) -> UInt8[np.ndarray, "h w"]:
-    """Read the image of a frame at half its size; InputError if it or the depth cannot be decoded."""
-    _read_depth(frame.depth)
-    return read_grey(frame.image, half=True)
+def read_sample(frame: CaptureFrame) -> UInt8[np.ndarray, "h w 3"]:
+    """Read the image of a frame; InputError if it or the depth cannot be decoded."""
+    files.read_depth_file(frame.depth)
+    return files.read_picture(frame.image)[0]
 
 
 def trusted(levels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -235,19 +263,3 @@ def read_numbers(path: Path, columns: tuple[int, ...], **options: Any) -> Float[
     if values.shape[1] not in columns:
         raise InputError(f"{path}: {values.shape[1]} numbers per line, expected {' or '.join(map(str, columns))}")
     return values
-
-
-def _read_depth(path: Path) -> Float[np.ndarray, "h w"]:
-    """Read the stored values of a depth map, 0 where unknown."""
-    if path.suffix != ".npy":
-        return read_grey16(path).astype(np.float32)
-    data = read_bytes(path, "depth")
-    try:
-        values = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-        found = f"{values.dtype} of shape {values.shape}" if values.ndim != 2 or values.dtype.kind not in "fiu" else ""
-    except (ValueError, OSError, EOFError, MemoryError) as error:
-        found = f"no array ({error})"
-    if found:
-        raise InputError(f"depth {path} holds {found}, expected an .npy file of numbers (H, W)")
-    values = values.astype(np.float32)
-    return np.where(np.isfinite(values) & (values > 0), values, np.float32(0))

@@ -12,7 +12,8 @@ from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, find_masks
-from zsp_lite.importers.masks import mask_flags, masks_from_box
+from zsp_lite.importers.files import question_intrinsics
+from zsp_lite.importers.masks import given_mask_flags, mask_flags, masks_from_box, masks_from_depth
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import load_open3d
@@ -21,6 +22,7 @@ from zsp_lite.points import axis_deviation, object_pixels, sampling_step, world_
 _VOXELS = 96  # voxels per three standard deviations of the object; finer than the noise of depth cameras
 _MAX_POINTS = 50_000
 _LEAST_STEP = 7  # between the pixels by which the size of the object is estimated
+_GROUP = 8  # frames that are segmented by depth at once
 _MIN_VIEWS = 3  # number of frames that must see a surface, if there are that many frames
 
 
@@ -32,7 +34,7 @@ class ImportResult:
     empty: int  # frames that were left out because their masks are empty
     points: int
     scale: float  # factor from the capture's lengths to those of the sequence
-    flags: tuple[str, ...]  # what speaks against the masks
+    flags: tuple[str, ...]  # what speaks against the masks and the intrinsics
 
 
 def import_capture(
@@ -43,6 +45,9 @@ def import_capture(
     box: Box | None = None,
     masks: str | Path | None = None,
     max_frames: int = 100,
+    mask: str | None = None,
+    label: int | None = None,
+    orientation: str | None = None,
 ) -> ImportResult:
     """Write a capture as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused point cloud.
 
@@ -57,6 +62,9 @@ def import_capture(
         box: Bounding box (top, left, height, width) of the object in the first frame, pixels (see `masks_from_box`).
         masks: Folder of mask files, named like the images, if there is no box. Without both, those of the capture.
         max_frames: Maximum number of frames, evenly spaced; CO3D's sequences have about 100.
+        mask: "auto" makes the masks of all frames by depth, "given" and None only those that are missing in some.
+        label: Number of the object in masks that label several.
+        orientation: How camera, depth and masks refer to turned photographs (see `open_source`).
 
     Raises:
         InputError: The capture cannot be read, segmented or fused, or the sequence exists. Nothing is written then.
@@ -65,35 +73,38 @@ def import_capture(
     unfinished = folder / ".unfinished"
     if folder.exists() and not unfinished.is_file():
         raise InputError(f"{folder} exists already, expected another sequence name")
-    capture = evenly_spaced(capture, max_frames)
-    if box is not None:
+    capture = [replace(frame, label=label, orientation=orientation) for frame in evenly_spaced(capture, max_frames)]
+    flags = question_intrinsics(capture[0].camera, capture[0].image.name)
+    if box is not None or mask == "auto":
         capture = [replace(frame, mask=None) for frame in capture]
     elif masks is not None:
-        files = find_masks(masks, [frame.image for frame in capture])
-        capture = [replace(frame, mask=mask) for frame, mask in zip(capture, files)]
-    if box is None and (missing := [frame.image.name for frame in capture if frame.mask is None]):
+        found = find_masks(masks, [frame.image for frame in capture])
+        capture = [replace(frame, mask=path) for frame, path in zip(capture, found)]
+    missing = [index for index, frame in enumerate(capture) if not frame.has_mask]
+    if box is None and mask != "auto" and len(missing) == len(capture):
         raise InputError(
-            f"{missing[0]} has no mask, expected a box in the first picture (--box TOP,LEFT,HEIGHT,WIDTH), or a folder "
-            "of masks that are named like the pictures (--masks DIR)"
+            f"{capture[0].image.name} has no mask, expected a box in the first picture (--box TOP,LEFT,HEIGHT,WIDTH), "
+            "a folder of masks that are named like the pictures (--masks DIR), or --mask auto"
         )
     if box is None:
-        bits, seen = [], [index for index, frame in enumerate(capture) if frame.load().shows_object]
+        bits = _masks_by_depth(capture, missing)
     else:
         found = masks_from_box((frame.load() for frame in capture), box)
-        bits = [np.packbits(frame.mask > ON_OBJECT) for frame in found]
-        seen = [index for index, mask in enumerate(bits) if mask.any()]
-    if not seen:
-        raise InputError(f"the masks of all {len(capture)} frames are empty, expected an object")
+        bits = dict(enumerate(np.packbits(frame.mask > ON_OBJECT) for frame in found))
 
     def load(index: int) -> Frame:
         frame = capture[index].load()
-        if box is None:
+        if index not in bits:
             return frame
-        mask = np.unpackbits(bits[index], count=frame.depth.size).reshape(frame.depth.shape)
-        return replace(frame, mask=mask.astype(np.float32))
+        made = np.unpackbits(bits[index], count=frame.depth.size).reshape(frame.depth.shape)
+        return replace(frame, mask=made.astype(np.float32))
 
+    seen = [k for k in range(len(capture)) if (bits[k].any() if k in bits else load(k).shows_object)]
+    if not seen:
+        raise InputError(f"the masks of all {len(capture)} frames are empty, expected an object")
     frames = LazyFrames(load, seen)
-    flags = mask_flags(frames) if box is not None else ()
+    missing = [capture[index].image.name for index in bits]
+    flags += mask_flags(frames) if len(bits) == len(capture) else given_mask_flags(frames, missing)
     points, colours, normals = fuse(frames)
     scale = 1 / axis_deviation(points)
     scaled = LazyFrames(lambda index: scale_frame(load(index), scale), seen)
@@ -104,6 +115,18 @@ def import_capture(
         write_co3d(root, category, [data])
         unfinished.unlink()
     return ImportResult(len(seen), len(capture) - len(seen), len(points), scale, flags)
+
+
+def _masks_by_depth(capture: Sequence[CaptureFrame], wanted: Sequence[int]) -> dict[int, UInt8[np.ndarray, " bytes"]]:
+    """Segment some frames of a capture by depth, in groups all around the object; return the bits of the masks."""
+    bits, groups = {}, -(-len(wanted) // _GROUP)
+    for first in range(groups):
+        group = wanted[first::groups]
+        others = np.linspace(0, len(capture) - 1, _GROUP - len(group)).round().astype(int)
+        chosen = sorted({*group, *others.tolist()})
+        masked = zip(chosen, masks_from_depth([capture[index].load() for index in chosen]), strict=True)
+        bits |= {index: np.packbits(frame.mask > ON_OBJECT) for index, frame in masked if index in group}
+    return bits
 
 
 class LazyFrames(Sequence[Frame]):

@@ -180,6 +180,16 @@ def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
     return (f"the masks may be wrong: {', '.join(signs)}",) if signs else ()
 
 
+def given_mask_flags(frames: Collection[Frame], missing: Sequence[object]) -> tuple[str, ...]:
+    """Name the frames whose masks were made, and question masks that cover most of the image's border."""
+    flags = [f"no mask is given for {', '.join(map(str, missing))}: made by depth"] if missing else []
+    masks = (frame.mask > ON_OBJECT for frame in frames)
+    borders = [np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean() for mask in masks]
+    if count := sum(share > _MOST for share in borders):
+        flags.append(f"the masks of {count} of {len(borders)} frames cover most of the border: inverted?")
+    return tuple(flags)
+
+
 def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:
     """Fit the plane that an object stands on to points outside of its masks; return also the cameras' distance."""
     on_object, around, centres = [], [], []

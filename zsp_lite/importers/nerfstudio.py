@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import msgspec
 
-from zsp_lite.data.frames import image_size
 from zsp_lite.errors import MAX_LENGTH, InputError
 from zsp_lite.importers.capture import FROM_OPENGL, CaptureFrame, Makers, make_frame, read_capture_json
+from zsp_lite.importers.files import picture_size
 from zsp_lite.io.files import decode_json, find_inside
 
 _NAMES = ("transforms.json", "transforms_train.json")
@@ -77,7 +77,7 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     image = find_inside(folder, frame.file_path)
     if image is None:
         raise InputError(f"{where}: {frame.file_path} is missing in {folder}")
-    height, width = (int(frame.h), int(frame.w)) if frame.h and frame.w else image_size(image)
+    height, width = (int(frame.h), int(frame.w)) if frame.h and frame.w else picture_size(image)
     if not (frame.fl_x or frame.camera_angle_x):
         raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
     fx = frame.fl_x or width / 2 / math.tan(frame.camera_angle_x / 2)

@@ -20,6 +20,8 @@ def writing(folder: str | Path) -> Iterator[None]:
     made = [one for one in (folder, *folder.parents) if not os.path.exists(one)]
     path = folder / ".writing.lock"
     lock = FileLock(path, timeout=0)
+    if folder.resolve() == Path(folder.resolve().anchor):
+        raise InputError(f"{folder} is the root of the disk, expected a folder for what is written")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire()
