@@ -27,9 +27,10 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, frame_defect, read_image, turn_frame
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
 from zsp_lite.estimates import Hypothesis, PairResult, PoseEstimate, Vote, label_errors, timed
+from zsp_lite.importers.agreement import disagreement, neighbours
 from zsp_lite.importers.capture import READERS, SIGNS, CaptureFrame
 from zsp_lite.importers.convert import scale_frame
-from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth
+from zsp_lite.importers.masks import DOUBTFUL, depth_flags, mask_flags, masks_from_box, masks_from_depth
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.metrics import rotation_angle, rotation_error
@@ -49,6 +50,7 @@ _UNIT_GIVEN_BY = {"nerfstudio": "depth_unit_scale_factor in transforms.json"}  #
 _NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
 _ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
 _REFERENCES = 4  # frames of each object that are solved against views of the other
+_MOST_DOUBTFUL = 0.8  # largest confidence by masks that are flagged
 _LEAST_PROBABLE = 0.005  # an alternative is named above this
 _Ends = tuple[int, int, int]  # numbers of two objects, and the position of a frame of the first
 _CONTEXT = 8  # frames of a source that are segmented together with the reference frame, or tried as the reference
@@ -64,6 +66,7 @@ class Source:
     read: Callable[[int], Frame]  # reads the frame at a position of `numbers`, with the mask that comes with it, if any
     mask: str  # where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours)
     box: Box | None = None  # bounding box of the object in the first frame, for "box"
+    depth_unit: float | None = None  # world units per stored depth value, if an option or the capture gives it
 
     @property
     def name(self) -> str:
@@ -85,7 +88,10 @@ class Source:
         frames = {position: self.read(position) for position in sorted({*positions, *map(int, others)})}
         some = list(frames.values())
         if self.mask != "given":
-            masked = masks_from_box(some, self.box) if self.box else masks_from_depth(some)
+            try:
+                masked = list(masks_from_box(some, self.box) if self.box else masks_from_depth(some))
+            except InputError as error:
+                raise InputError("; ".join(filter(None, (str(error), self._disagreement(some))))) from error
             frames = dict(zip(frames, masked, strict=True))
         elif without := [self.numbers[k] for k, frame in frames.items() if frame.mask is None]:
             where = f"{self.path}, frame {without[0]}"
@@ -93,8 +99,14 @@ class Source:
         return [frames[position] for position in positions]
 
     def flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
-        """Question the unit of length where the object is implausibly far, and the masks of frames if not given."""
+        """Question units, depth and poses of frames and of some more, and the masks of frames if not given."""
         found = [] if self.mask == "given" else list(mask_flags(frames))
+        found += depth_flags(frames)
+        more = []
+        for position in neighbours(len(self.numbers)):
+            with suppress(InputError):  # a damaged file that the estimate does not use
+                more.append(self.read(position))
+        found += filter(None, [self._disagreement(more)])
         depth = np.concatenate([frame.depth[object_pixels(frame)] for frame in frames])
         distance = float(np.quantile(depth, 0.25)) if len(depth) else _NEAREST
         if self.format not in ("sequence", "frames") and not _NEAREST <= distance <= _FARTHEST:
@@ -102,6 +114,13 @@ class Source:
             expected = f"expected {_NEAREST:g} to {_FARTHEST:g} m; the unit of its depth is given by {cure}"
             found.insert(0, f"the object is {distance:.3g} m from the camera, {expected}")
         return tuple(f"{self.path}: {flag}" for flag in found)
+
+    def _disagreement(self, frames: Sequence[Frame]) -> str:
+        """Say how depth and poses of frames contradict each other (see `disagreement`)."""
+        if self.mask != "given":  # masks that follow from wrong poses are wrong
+            frames = [replace(frame, mask=None) for frame in frames]
+        cure = _UNIT_GIVEN_BY.get(self.format, "--depth-unit")
+        return disagreement(frames, self.depth_unit, cure, self.format == "nerfstudio")
 
     def select(
         self, references: int, targets: int, first: int | None = None
@@ -388,7 +407,7 @@ def open_source(
     Raises:
         InputError: The path is none of these, a file cannot be read, or an option is missing or does not fit.
     """
-    layout, options = _format(path), {"intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit}
+    unit, layout, options = None, _format(path), {"intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit}
     options = {name: value for name, value in options.items() if value is not None}
     if layout == "frames":
         frames = _check_frames([path] if isinstance(path, Frame) else path)
@@ -411,10 +430,10 @@ def open_source(
         numbers, read = tuple(one.frame_number for one in frames), lambda k: dataset.load(frames[k])
     else:
         capture = [_open_image(path, **options)] if layout == "image" else READERS[layout](path, **options)
-        numbers, read = tuple(range(len(capture))), lambda k: capture[k].load()
+        numbers, read, unit = tuple(range(len(capture))), lambda k: capture[k].load(), capture[0].depth_unit
     if mask is None:
         mask = "box" if box is not None else "auto" if read(0).mask is None else "given"
-    return Source(path, layout, numbers, read, mask, box)
+    return Source(path, layout, numbers, read, mask, box, unit)
 
 
 def open_pair(reference: _Object, target: _Object, options: Mapping[str, Sequence]) -> list[Source]:
@@ -517,17 +536,20 @@ def _pair_flags(scans: Sequence[_Scan]) -> tuple[str, ...]:
 def _in_units(
     estimate: PoseEstimate, reference_scale: float, target_scale: float, flags: tuple[str, ...]
 ) -> PoseEstimate:
-    """Express an estimate on scaled frames in the lengths before scaling, and add flags."""
+    """Express an estimate on scaled frames in the lengths before scaling, and add flags, which limit its confidence."""
 
     def unscaled(sim3: Sim3) -> Sim3:
         return Sim3(sim3.scale * reference_scale / target_scale, sim3.R, sim3.t / target_scale)
 
+    most = _MOST_DOUBTFUL if any(DOUBTFUL in flag for flag in flags) else 1.0
     reference, targets = estimate.reference_view, estimate.target_views
     return replace(
         estimate,
         flags=(*estimate.flags, *flags),
         sim3=unscaled(estimate.sim3),
-        hypotheses=tuple(replace(one, sim3=unscaled(one.sim3)) for one in estimate.hypotheses),
+        hypotheses=tuple(
+            replace(one, sim3=unscaled(one.sim3), confidence=min(one.confidence, most)) for one in estimate.hypotheses
+        ),
         reference_view=replace(reference, frame=scale_frame(reference.frame, 1 / reference_scale)),
         target_views=tuple(replace(one, frame=scale_frame(one.frame, 1 / target_scale)) for one in targets),
     )

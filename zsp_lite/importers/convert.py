@@ -11,6 +11,7 @@ from zsp_lite.data.cameras import Box
 from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import InputError
+from zsp_lite.importers.agreement import disagreement, neighbours
 from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, files_by_stem
 from zsp_lite.importers.masks import mask_flags, masks_from_box
 from zsp_lite.io.files import plain_name
@@ -76,6 +77,8 @@ def import_capture(
             f"{missing[0]} has no mask, expected a box in the first picture (--box TOP,LEFT,HEIGHT,WIDTH), or a folder "
             "of masks that are named like the pictures (--masks DIR)"
         )
+    if line := disagreement([capture[index].load() for index in neighbours(len(capture))], capture[0].depth_unit):
+        raise InputError(f"{capture[0].image}: {line}")
     if box is None:
         bits, seen = [], [index for index, frame in enumerate(capture) if frame.load().shows_object]
     else:
