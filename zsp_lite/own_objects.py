@@ -119,8 +119,7 @@ class Source:
         """Say how depth and poses of frames contradict each other (see `disagreement`)."""
         if self.mask != "given":  # masks that follow from wrong poses are wrong
             frames = [replace(frame, mask=None) for frame in frames]
-        cure = _UNIT_GIVEN_BY.get(self.format, "--depth-unit")
-        return disagreement(frames, self.depth_unit, cure, self.format == "nerfstudio")
+        return disagreement(frames, self.depth_unit)
 
     def select(
         self, references: int, targets: int, first: int | None = None

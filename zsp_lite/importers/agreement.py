@@ -4,7 +4,7 @@ Points of the object in one frame are moved into another. The share of them that
 and poses are right, also with noise and holes: about 0.9 for cameras 15 degrees apart, and 0.8 for 45 degrees.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -20,7 +20,7 @@ from zsp_lite.importers.masks import masks_from_depth
 from zsp_lite.metrics import rotation_angle
 from zsp_lite.points import object_pixels, world_points
 
-_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _POINTS, _LEAST_POINTS, _PAIRS = 500, 50, 8  # points of a frame, at most and at least, and pairs of frames
 _NEAREST, _BEST, _FARTHEST = 4.0, 20.0, 50.0  # angle between two cameras that are compared, degrees
 _TOLERANCE = 0.05  # of depth, relative to that of the object
@@ -72,29 +72,29 @@ class _Surface:
 _Pair = tuple[_Surface, _Surface]
 
 
-def disagreement(
-    frames: Sequence[Frame], unit: float | None = None, cure: str = "--depth-unit", opengl: bool = False
-) -> str:
+def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     """Say that frames of one object do not agree, and which usual mistake explains it; "" if they do, or none overlap.
 
     Args:
-        frames: A few frames with depth; masks are found where there are none.
-        unit: Metres per stored depth value, where it can be changed.
-        cure: The option or the field that changes the unit.
-        opengl: Whether the poses are given in OpenGL's axes; otherwise in OpenCV's.
+        frames: A few frames; masks are found where there are none.
+        unit: World units per stored depth value, if it can be changed.
     """
-    frames = [frame for frame in frames if not frame_defect(frame)]
-    pairs = _pairs([_Surface.of(_masked(frame)) for frame in frames])
+    objects, scenes = [], []
+    for frame in frames:
+        if not frame_defect(frame):
+            objects.append(_Surface.of(_masked(frame)))
+            scenes.append(_Surface.of(replace(frame, mask=None)))
+    pairs, whole = _pairs(objects), _pairs(scenes)
     if not pairs:
         return ""
-    (given, overlap), whole = _shares(pairs), _pairs([_Surface.of(replace(frame, mask=None)) for frame in frames])
-    found, everywhere = f"{given:.0%} of the points of a frame lie on the surface of another", _shares(whole)[0]
+    (given, overlap), (everywhere, _) = _shares(pairs), _shares(whole)
+    found = f"{given:.0%} of the object's points in a frame lie on its surface in another"
     along_ray = [_shares(some, along_ray=True)[0] for some in (whole, pairs)]
     if along_ray[0] > _RAY_GAIN * everywhere and min(along_ray) > _FITTING:
-        return f"{found}; the frames agree if the depth is distance along the ray of each pixel: divide by its length"
+        return f"{found}; the frames agree if depth is distance along the ray: divide it by the length of (x, y, 1)"
     if given > _AGREEING:
         return ""
-    for some in _explanations(pairs, unit, cure, opengl):
+    for some in _explanations(pairs, unit):
         share, text = max(some)
         if share > max(_FITTING, given + _GAIN):
             return f"{found}; the frames agree ({share:.0%}) if {text}"
@@ -139,37 +139,36 @@ def _shares(
     return agreeing, overlapping
 
 
-def _explanations(
-    pairs: Sequence[_Pair], unit: float | None, cure: str, opengl: bool
-) -> Iterator[list[tuple[float, str]]]:
+def _explanations(pairs: Sequence[_Pair], unit: float | None) -> Iterator[list[tuple[float, str]]]:
     """Give the shares of agreeing points after corrections of mistakes, with their names, likelier ones first."""
 
     def scaled(factor: float) -> str:
-        new = None if unit is None else float(f"{unit * factor:.3g}")
-        what = f"is taken in {_UNITS[new]}" if new in _UNITS else f"is multiplied by {factor:.3g}"
-        return f"the depth {what}" + (f": {cure} {new:g}" if new else "")
+        new = float(f"{factor * (unit or 0):.3g}")
+        what = f"taken in {_UNITS[new]}" if new in _UNITS else f"multiplied by {factor:.3g}"
+        cure = f": --depth-unit {new:g} (in transforms.json: depth_unit_scale_factor)"
+        return f"the depth is {what}{cure if new else ''}"
 
-    yield [(_shares(pairs, correct)[0], f"the poses are {text}") for text, correct in _corrections(opengl)]
-    yield [(_shares(pairs, scale=factor)[0], scaled(factor)) for factor in _FACTORS]
-    yield [(_shares(pairs, scale=factor)[0], scaled(factor)) for factor in _SCALES]
+    yield [(_shares(pairs, correct)[0], f"the poses {text}") for text, correct in _CORRECTIONS]
+    for factors in (_FACTORS, _SCALES):
+        yield [(_shares(pairs, scale=factor)[0], scaled(factor)) for factor in factors]
 
 
-def _corrections(opengl: bool) -> list[tuple[str, _Correction]]:
-    """Name what the poses of the source may be in fact, with the functions from wrong to right matrices."""
-    axes = _FROM_OPENGL if opengl else np.eye(4)  # of the file
-    others = "OpenCV's axes" if opengl else "OpenGL's axes"
+def _reorder(pose: _Pose) -> _Pose:
+    """Take the first number of the quaternion from camera to world as w, in place of the last."""
+    to_world = np.linalg.inv(pose)
+    quaternion = Rotation.from_matrix(to_world[:3, :3]).as_quat()
+    to_world[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+    return np.linalg.inv(to_world)
 
-    def inverted(pose: _Pose) -> _Pose:
-        return axes @ np.linalg.inv(pose) @ axes
 
-    def reordered(pose: _Pose) -> _Pose:
-        stored = np.linalg.inv(pose) @ axes
-        stored[:3, :3] = Rotation.from_quat(np.roll(Rotation.from_matrix(stored[:3, :3]).as_quat(), -1)).as_matrix()
-        return np.linalg.inv(stored @ axes)
-
-    return [
-        ("world to camera", inverted),
-        (f"in {others}", lambda pose: _FROM_OPENGL @ pose),
-        (f"world to camera, in {others}", lambda pose: _FROM_OPENGL @ inverted(pose)),
-        ("from quaternions with w first", reordered),
-    ]
+_OTHER_AXES = "have the other axes, OpenGL's for OpenCV's or the reverse: negate the columns y and z"
+_INVERSE, _BOTH = "are world to camera", "are world to camera, in the other axes (OpenGL's for OpenCV's or the reverse)"
+# From wrong to right matrices; those of a file may be in OpenGL's axes.
+_CORRECTIONS: list[tuple[str, _Correction]] = [
+    (_INVERSE, np.linalg.inv),
+    (_INVERSE, lambda pose: _FLIP @ np.linalg.inv(pose) @ _FLIP),
+    (_OTHER_AXES, lambda pose: _FLIP @ pose),
+    (_BOTH, lambda pose: _FLIP @ np.linalg.inv(pose)),
+    (_BOTH, lambda pose: np.linalg.inv(pose) @ _FLIP),
+    ("are from quaternions with w first", _reorder),
+]

@@ -13,7 +13,7 @@ from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import InputError
 from zsp_lite.importers.agreement import disagreement, neighbours
 from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, files_by_stem
-from zsp_lite.importers.masks import mask_flags, masks_from_box
+from zsp_lite.importers.masks import depth_flags, mask_flags, masks_from_box
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import load_open3d
@@ -77,7 +77,8 @@ def import_capture(
             f"{missing[0]} has no mask, expected a box in the first picture (--box TOP,LEFT,HEIGHT,WIDTH), or a folder "
             "of masks that are named like the pictures (--masks DIR)"
         )
-    if line := disagreement([capture[index].load() for index in neighbours(len(capture))], capture[0].depth_unit):
+    some = (capture[index].load() for index in neighbours(len(capture)))
+    if line := disagreement(some, capture[0].depth_unit):
         raise InputError(f"{capture[0].image}: {line}")
     if box is None:
         bits, seen = [], [index for index, frame in enumerate(capture) if frame.load().shows_object]
@@ -97,6 +98,7 @@ def import_capture(
 
     frames = LazyFrames(load, seen)
     flags = mask_flags(frames) if box is not None else ()
+    flags += depth_flags(frames[position] for position in neighbours(len(seen)))
     points, colours, normals = fuse(frames)
     scale = 1 / axis_deviation(points)
     scaled = LazyFrames(lambda index: scale_frame(load(index), scale), seen)

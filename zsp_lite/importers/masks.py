@@ -190,12 +190,13 @@ def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
     return (f"{DOUBTFUL}: {', '.join(signs)}",) if signs else ()
 
 
-def depth_flags(frames: Collection[Frame]) -> tuple[str, ...]:
-    """Say in one line if most of the object has no known depth; frames with a defect do not count."""
-    seen = [frame.mask > ON_OBJECT for frame in frames if frame.mask is not None and not frame_defect(frame)]
-    known = [object_pixels(frame) for frame in frames if frame.mask is not None and not frame_defect(frame)]
-    share = sum(map(np.sum, known)) / max(1, sum(map(np.sum, seen)))
-    return (f"depth is known on {share:.0%} of the object only",) if seen and share < _LEAST_KNOWN else ()
+def depth_flags(frames: Iterable[Frame]) -> tuple[str, ...]:
+    """Say in one line if most of the object has no known depth in frames with masks."""
+    seen = known = 0
+    for frame in frames:
+        seen += (frame.mask > ON_OBJECT).sum()
+        known += object_pixels(frame).sum()
+    return (f"depth is known on {known / seen:.0%} of the object only",) if known < _LEAST_KNOWN * seen else ()
 
 
 def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:
