@@ -28,10 +28,18 @@ from zsp_lite.data.frames import Frame, frame_defect, turn_frame
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
 from zsp_lite.estimates import Hypothesis, PairResult, PoseEstimate, Vote, label_errors, timed
 from zsp_lite.importers import FORMATS, open_capture, recognise
+from zsp_lite.importers.agreement import disagreement, neighbours
 from zsp_lite.importers.capture import CaptureFrame, left_out_flags
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.files import CO3D_DEPTH, DEPTHS, MASKS, PICTURES, question_intrinsics, read_picture
-from zsp_lite.importers.masks import given_mask_flags, mask_flags, masks_from_box, masks_from_depth
+from zsp_lite.importers.masks import (
+    DOUBTFUL,
+    depth_flags,
+    given_mask_flags,
+    mask_flags,
+    masks_from_box,
+    masks_from_depth,
+)
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.metrics import rotation_angle, rotation_error
@@ -50,6 +58,7 @@ _NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
 _ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
 _TARGETS = 5
 _REFERENCES = 4  # frames of each object that are solved against views of the other
+_MOST_DOUBTFUL = 0.8  # largest confidence by masks that are flagged
 _LEAST_PROBABLE = 0.005  # an alternative is named above this
 _Ends = tuple[int, int, int]  # numbers of two objects, and the position of a frame of the first
 _SWEEPS = 20  # over the chosen views, which mostly stay after ten
@@ -70,6 +79,7 @@ class Source:
     left_out: tuple[str, ...] = ()  # what is wrong with each frame that cannot be used
     missing: tuple[int, ...] = ()  # numbers of frames without a mask where others have one; it is made by depth
     doubts: tuple[str, ...] = ()  # what speaks against the intrinsics
+    depth_unit: float | None = None  # world units per stored depth value, of an image or a capture
 
     @property
     def name(self) -> str:
@@ -91,7 +101,10 @@ class Source:
         frames = {position: self.read(position) for position in sorted({*positions, *map(int, others)})}
         some = list(frames.values())
         if self.mask != "given":
-            masked = masks_from_box(some, self.box) if self.box else masks_from_depth(some)
+            try:
+                masked = list(masks_from_box(some, self.box) if self.box else masks_from_depth(some))
+            except InputError as error:
+                raise InputError("; ".join(filter(None, (str(error), self._disagreement(some))))) from error
             frames = dict(zip(frames, masked, strict=True))
         elif any(frame.mask is None for frame in some):
             made = dict(zip(frames, replace(self, mask="auto").load(list(frames)), strict=True))
@@ -99,9 +112,15 @@ class Source:
         return [frames[position] for position in positions]
 
     def flags(self, frames: Sequence[Frame]) -> tuple[str, ...]:
-        """Question the masks, the intrinsics, and the unit of length where the object is implausibly far."""
+        """Question units, intrinsics, depth and poses of frames and of some more, and masks."""
         found = [*self.doubts]
         found += given_mask_flags(frames, self.missing) if self.mask == "given" else mask_flags(frames)
+        found += depth_flags(frames)
+        more = []
+        for position in neighbours(len(self.numbers)):
+            with suppress(InputError):  # a damaged file that the estimate does not use
+                more.append(self.read(position))
+        found += filter(None, [self._disagreement(more)])
         depth = np.concatenate([frame.depth[object_pixels(frame)] for frame in frames])
         distance = float(np.quantile(depth, 0.25)) if len(depth) else _NEAREST
         if self.format not in ("sequence", "frames") and not _NEAREST <= distance <= _FARTHEST:
@@ -109,6 +128,12 @@ class Source:
             expected = f"expected {_NEAREST:g} to {_FARTHEST:g} m; {cure}"
             found.insert(0, f"the object is {distance:.3g} m from the camera, {expected}")
         return tuple(f"{self.path}: {flag}" for flag in (*left_out_flags(self.left_out), *found))
+
+    def _disagreement(self, frames: Sequence[Frame]) -> str:
+        """Say how depth and poses of frames contradict each other (see `disagreement`)."""
+        if self.mask != "given":  # masks that follow from wrong poses are wrong
+            frames = [replace(frame, mask=None) for frame in frames]
+        return disagreement(frames, self.depth_unit)
 
     def select(
         self, references: int, targets: int, first: int | None = None
@@ -416,7 +441,7 @@ def open_source(
     Raises:
         InputError: The path is none of these, a file cannot be read, or an option is missing or does not fit.
     """
-    layout = _format(path)
+    layout, unit = _format(path), None
     options = {"intrinsics": intrinsics, "depth": depth, "depth_unit": depth_unit, "object": object}
     options |= {"label": label, "orientation": orientation}
     options = {name: value for name, value in options.items() if value is not None}
@@ -449,7 +474,7 @@ def open_source(
         else:
             _, capture, left_out = open_capture(path, **options)
         capture = [replace(frame, **files) for frame in capture]
-        numbers, read = tuple(range(len(capture))), lambda k: capture[k].load()
+        numbers, read, unit = tuple(range(len(capture))), lambda k: capture[k].load(), capture[0].depth_unit
         cameras = tuple(frame.camera for frame in capture)
         masked, doubts = [frame.has_mask for frame in capture], question_intrinsics(capture[0].camera, str(path))
     if mask is None:
@@ -457,7 +482,7 @@ def open_source(
     if mask == "given" and not any(masked):
         raise InputError(f"{path}: no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH")
     missing = tuple(number for number, has_mask in zip(numbers, masked) if not has_mask)
-    return Source(path, layout, numbers, read, mask, box, cameras, tuple(left_out), missing, doubts)
+    return Source(path, layout, numbers, read, mask, box, cameras, tuple(left_out), missing, doubts, unit)
 
 
 def open_pair(
@@ -594,17 +619,20 @@ def _pair_flags(scans: Sequence[_Scan]) -> tuple[str, ...]:
 def _in_units(
     estimate: PoseEstimate, reference_scale: float, target_scale: float, flags: tuple[str, ...]
 ) -> PoseEstimate:
-    """Express an estimate on scaled frames in the lengths before scaling, and add flags."""
+    """Express an estimate on scaled frames in the lengths before scaling, and add flags, which limit its confidence."""
 
     def unscaled(sim3: Sim3) -> Sim3:
         return Sim3(sim3.scale * reference_scale / target_scale, sim3.R, sim3.t / target_scale)
 
+    most = _MOST_DOUBTFUL if any(DOUBTFUL in flag for flag in flags) else 1.0
     reference, targets = estimate.reference_view, estimate.target_views
     return replace(
         estimate,
         flags=(*estimate.flags, *flags),
         sim3=unscaled(estimate.sim3),
-        hypotheses=tuple(replace(one, sim3=unscaled(one.sim3)) for one in estimate.hypotheses),
+        hypotheses=tuple(
+            replace(one, sim3=unscaled(one.sim3), confidence=min(one.confidence, most)) for one in estimate.hypotheses
+        ),
         reference_view=replace(reference, frame=scale_frame(reference.frame, 1 / reference_scale)),
         target_views=tuple(replace(one, frame=scale_frame(one.frame, 1 / target_scale)) for one in targets),
     )

@@ -11,9 +11,16 @@ from zsp_lite.data.cameras import Box
 from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import InputError
+from zsp_lite.importers.agreement import disagreement, neighbours
 from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, find_masks
 from zsp_lite.importers.files import question_intrinsics
-from zsp_lite.importers.masks import given_mask_flags, mask_flags, masks_from_box, masks_from_depth
+from zsp_lite.importers.masks import (
+    depth_flags,
+    given_mask_flags,
+    mask_flags,
+    masks_from_box,
+    masks_from_depth,
+)
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import load_open3d
@@ -86,6 +93,9 @@ def import_capture(
             f"{capture[0].image.name} has no mask, expected a box in the first picture (--box TOP,LEFT,HEIGHT,WIDTH), "
             "a folder of masks that are named like the pictures (--masks DIR), or --mask auto"
         )
+    some = (capture[index].load() for index in neighbours(len(capture)))
+    if line := disagreement(some, capture[0].depth_unit):
+        raise InputError(f"{capture[0].image}: {line}")
     if box is None:
         bits = _masks_by_depth(capture, missing)
     else:
@@ -105,6 +115,7 @@ def import_capture(
     frames = LazyFrames(load, seen)
     missing = [capture[index].image.name for index in bits]
     flags += mask_flags(frames) if len(bits) == len(capture) else given_mask_flags(frames, missing)
+    flags += depth_flags(frames[position] for position in neighbours(len(seen)))
     points, colours, normals = fuse(frames)
     scale = 1 / axis_deviation(points)
     scaled = LazyFrames(lambda index: scale_frame(load(index), scale), seen)

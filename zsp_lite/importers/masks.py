@@ -37,6 +37,10 @@ _PLANES = 3  # planes to try: the largest may be a wall or a side of the object
 _MAX_BELOW = 0.05  # share of the points that may lie below the supporting plane
 _MIN_ON_PLANE = 0.05  # share of the points that must lie on it
 _MIN_SPREAD = 0.7  # least deviation of the points on it, relative to that of the others: sides of objects are smaller
+# Two objects are alike if the ratios of their points, which count less far from the focus, and of their extents exceed
+# these values. Gaps between them may be smaller than `_VOXEL` by this factor, if there are so many views: an object
+# that hides parts of itself has gaps in a few views.
+_COMPARABLE, _ALIKE, _FINER, _MANY = 0.5, 0.7, 4, 4
 _CLOUD_POINTS = 20_000
 _MIN_PIXELS = 100
 # The bounding box of the object in known depth grows by these shares of its sides, half of it on each side: pixels of
@@ -46,8 +50,12 @@ _UNKNOWN_PADDING, _CONTEXT_PADDING = 0.1, 0.8
 _BORDERS = 2  # number of the image's borders that a mask may not touch at once
 _MOST = 0.5  # share of the image
 _PARTS = 0.25  # share of the mask outside its largest region
-_COLOUR_IOU = 0.4  # least overlap with the mask that GrabCut finds in the padded bounding box
+_COLOUR_IOU = 0.5  # least overlap with the mask that GrabCut finds in the padded bounding box
 _LYING = 0.5  # share of the object's points that may lie in the plane around it
+_CARRYING, _CARRIED = 0.4, 0.05  # shares of the object's points in and above one plane, such as a table's
+
+_LEAST_KNOWN = 0.3  # share of the pixels on the object
+DOUBTFUL = "the masks may be wrong"
 
 Plane = tuple[Float[np.ndarray, "3"], float]  # unit normal, to the side of the cameras, and offset: normal @ x = offset
 
@@ -142,7 +150,7 @@ def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box:
 
 
 def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
-    """Segment the object in frames of one world; InputError if nothing stands out where the cameras look."""
+    """Segment the object in frames of one world; InputError if nothing, or two alike, stand where the cameras look."""
     if not any((frame.depth > 0).any() for frame in frames):
         raise InputError(f"no depth is known in any of {len(frames)} frames, expected some to find the object")
     focus, distance = _focus(frames)
@@ -157,6 +165,8 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
         for frame, near in zip(frames, pixels, strict=True):
             near[near] = world_points(frame, near) @ plane[0] - plane[1] > _CLEARANCE * distance
     parts = _part_at(focus, frames, pixels, _VOXEL * distance)
+    if len(frames) >= _MANY:
+        _part_at(focus, frames, parts, _VOXEL / _FINER * distance)  # refuses a part that is two objects close together
     masked = [replace(frame, mask=_with_unknown(frame, part)) for frame, part in zip(frames, parts, strict=True)]
     if not any(frame.mask.sum() >= _MIN_PIXELS for frame in masked):
         raise InputError(
@@ -175,9 +185,18 @@ def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
             usable += 1
             found.update(_signs(frame, plane, distance))
     signs = [f"{sign} ({count} of {usable} frames)" for sign, count in found.items()]
-    if usable and plane is None:
+    if signs and plane is None:  # alone it is no reason: many objects fill the image, or stand on a dark turntable
         signs.append("no plane is found that the object stands on")
-    return (f"the masks may be wrong: {', '.join(signs)}",) if signs else ()
+    return (f"{DOUBTFUL}: {', '.join(signs)}",) if signs else ()
+
+
+def depth_flags(frames: Iterable[Frame]) -> tuple[str, ...]:
+    """Say in one line if most of the object has no known depth in frames with masks."""
+    seen = known = 0
+    for frame in frames:
+        seen += (frame.mask > ON_OBJECT).sum()
+        known += object_pixels(frame).sum()
+    return (f"depth is known on {known / seen:.0%} of the object only",) if known < _LEAST_KNOWN * seen else ()
 
 
 def given_mask_flags(frames: Collection[Frame], missing: Sequence[object]) -> tuple[str, ...]:
@@ -260,7 +279,10 @@ def _focus(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"], float]:
 def _part_at(
     focus: Float[np.ndarray, "3"], frames: Sequence[Frame], pixels: Sequence[np.ndarray], voxel: float
 ) -> list[Bool[np.ndarray, "_ _"]]:
-    """Select the pixels in the connected part with the most points, which count less far from the focus."""
+    """Select the pixels in the connected part with the most points, which count less far from the focus.
+
+    InputError if a second part is alike.
+    """
     clouds = [partial(world_points, *one) for one in zip(frames, pixels, strict=True)]  # to be computed twice, not kept
     corners = [(cloud.min(axis=0), cloud.max(axis=0)) for cloud in (make() for make in clouds) if len(cloud)]
     if not corners:
@@ -273,7 +295,17 @@ def _part_at(
         near = np.exp(-np.square(np.linalg.norm(points - focus, axis=1) / (8 * voxel)))
         weight += np.bincount(cells[-1], near, len(weight))
     part = ndimage.label(weight.reshape(shape) > 0, np.ones((3, 3, 3)))[0].ravel()
-    chosen = part == np.bincount(part, weight).argmax()
+    sizes = np.bincount(part, weight)
+    first = sizes.argmax()
+    large = np.flatnonzero(sizes > _COMPARABLE * sizes[first])
+    extents = np.array([np.argwhere((part == one).reshape(shape)).std(axis=0).mean() for one in large])
+    likeness = extents / extents[large == first]
+    if ((likeness > _ALIKE) & (likeness < 1 / _ALIKE)).sum() > 1:
+        raise InputError(
+            f"{frames[0].name or 'frame'}: two objects of like size stand where the camera looks, expected "
+            "--box TOP,LEFT,HEIGHT,WIDTH around one of them"
+        )
+    chosen = part == first
     selected = [some.copy() for some in pixels]
     for mask, cell in zip(selected, cells, strict=True):
         mask[mask] = chosen[cell]
@@ -311,7 +343,13 @@ def _signs(frame: Frame, plane: Plane | None, distance: float) -> Iterator[str]:
     found = largest_region(_colours_around(frame, mask, certain=False))
     if (found & mask).sum() / (found | mask).sum() < _COLOUR_IOU:
         yield "colours disagree"
+    points = world_points(frame, mask & (frame.depth > 0))
     if plane is not None:
-        height = world_points(frame, mask & (frame.depth > 0)) @ plane[0] - plane[1]
+        height = points @ plane[0] - plane[1]
         if (height < _PLANE_DISTANCE * distance).sum() > _LYING * len(height):
             yield "much of it lies in the plane around it"
+    own_plane = _supporting_plane([frame.camera.centre], points, distance)
+    if own_plane is not None:
+        height = (points @ own_plane[0] - own_plane[1]) / (_PLANE_DISTANCE * distance)
+        if (np.abs(height) < 1).mean() > _CARRYING and (height > 3).mean() > _CARRIED:
+            yield "part of it is a surface that the rest stands on"

@@ -1,0 +1,82 @@
+"""Depth and poses of a few frames that agree, and each usual mistake, which is named."""
+
+import re
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic_views import ELSEWHERE, look_at, render
+
+from zsp_lite.data.frames import Frame
+from zsp_lite.importers.agreement import disagreement
+
+FLIP = np.diag([1.0, -1, -1, 1])
+
+
+@pytest.fixture(scope="module")
+def frames():
+    turns = np.radians([0, 25, 50, 75])
+    directions = np.column_stack([np.cos(turns), np.sin(turns), [0.3, 0.5, 0.2, 0.6]])
+    return [
+        render(look_at(one, distance), ELSEWHERE, f"{k}")
+        for k, (one, distance) in enumerate(zip(directions, (3.5, 4.0, 4.6, 4.2)))
+    ]
+
+
+def posed(frame, to_camera) -> Frame:
+    return replace(frame, camera=replace(frame.camera, R=to_camera[:3, :3], t=to_camera[:3, 3]))
+
+
+def inverted(frame):
+    return posed(frame, np.linalg.inv(frame.camera.matrix))
+
+
+def flipped(frame):
+    return posed(frame, FLIP @ frame.camera.matrix)
+
+
+def reordered(frame):
+    """The pose if a quaternion w, x, y, z is read as x, y, z, w."""
+    to_world = np.linalg.inv(frame.camera.matrix)
+    x, y, z, w = Rotation.from_matrix(to_world[:3, :3]).as_quat()
+    to_world[:3, :3] = Rotation.from_quat([w, x, y, z]).as_matrix()
+    return posed(frame, np.linalg.inv(to_world))
+
+
+def scaled(factor, frame):
+    return replace(frame, depth=frame.depth * np.float32(factor))
+
+
+def along_ray(frame):
+    height, width = frame.camera.size
+    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+    lengths = np.linalg.norm(frame.camera.unproject_camera(pixels, np.ones((height, width))), axis=-1)
+    return replace(frame, depth=(frame.depth * lengths).astype(np.float32))
+
+
+def shifted(frame):
+    return replace(frame, camera=replace(frame.camera, t=frame.camera.t + (3 * float(frame.name) - 4.5, 0, 0)))
+
+
+@pytest.mark.parametrize(
+    ("mistake", "named"),
+    [
+        (inverted, r"agree \(\d+%\) if the poses are world to camera$"),
+        (flipped, "if the poses have the other axes, OpenGL's for OpenCV's or the reverse"),
+        (lambda frame: inverted(flipped(frame)), "if the poses are world to camera$"),
+        (reordered, "if the poses are from quaternions with w first"),
+        (partial(scaled, 0.001), r"if the depth is taken in metres: --depth-unit 1$"),
+        (partial(scaled, 5), "if the depth is taken in 1/5000 m: --depth-unit 0.0002$"),
+        (partial(scaled, 1000), "if the depth is multiplied by 0.001: --depth-unit 1e-06$"),
+        (partial(scaled, 1.8), "if the depth is multiplied by 0.5[2-9]"),
+    ],
+)
+def test_each_mistake_is_named(frames, mistake, named):
+    line = disagreement([mistake(frame) for frame in frames], 0.001)
+    assert re.search(named, line)
+
+
+def test_right_frames_agree(frames):
+    assert disagreement(frames, 0.001) == ""

@@ -1,0 +1,173 @@
+"""Check that the depth of a few frames agrees by their poses, and name the usual mistake that explains if it does not.
+
+Points of the object in one frame are moved into another. The share of them that lies on its surface is high if units
+and poses are right, also with noise and holes: about 0.9 for cameras 15 degrees apart, and 0.8 for 45 degrees.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from zsp_lite.data.cameras import Camera
+from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
+from zsp_lite.errors import InputError
+from zsp_lite.importers.masks import masks_from_depth
+from zsp_lite.metrics import rotation_angle
+from zsp_lite.points import object_pixels, world_points
+
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+_POINTS, _LEAST_POINTS, _PAIRS = 500, 50, 8  # points of a frame, at most and at least, and pairs of frames
+_NEAREST, _BEST, _FARTHEST = 4.0, 20.0, 50.0  # angle between two cameras that are compared, degrees
+_TOLERANCE = 0.05  # of depth, relative to that of the object
+_AGREEING = 0.6  # share of points above which frames agree without doubt
+_FITTING, _GAIN = 0.35, 0.25  # least share of points by the right correction, and its least gain
+_ALIKE = 0.03  # difference of shares below which the likelier correction is named
+_RAY_GAIN = 1.2  # least ratio of the share if depth is along the ray, which changes little near the axis
+_CONTRADICTING, _OVERLAP = 0.15, 0.3  # shares of points in the other image that agree at most, and that are there
+_UNITS = {1.0: "metres", 0.001: "millimetres", 0.0002: "1/5000 m"}
+_FACTORS = (1000.0, 0.001, 5.0, 0.2, 10.0, 0.1)  # from one common unit to another
+_SCALES = [scale for scale in np.geomspace(1e-3, 1e3, 280).tolist() if not 0.87 < scale < 1.15]  # steps of 5 %
+
+_Pose = Float[np.ndarray, "4 4"]  # world to camera
+_Correction = Callable[[_Pose], _Pose]
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """The object in one frame."""
+
+    points: Float[np.ndarray, "n 3"]  # some of its points in the camera's frame
+    depth: Float[np.ndarray, "h w"]  # 0 where unknown, infinite off the object
+    camera: Camera
+    distance: float
+
+    @classmethod
+    def of(cls, frame: Frame) -> "_Surface":
+        """Gather some points of the object in a frame; without a mask, all is object."""
+        mask = np.ones(frame.depth.shape, np.float32) if frame.mask is None else frame.mask
+        pixels = object_pixels(frame)
+        points = frame.camera.to_camera(world_points(frame, pixels, int(pixels.sum()) // _POINTS + 1))
+        depth = np.where(cv2.dilate(mask, np.ones((5, 5))) > ON_OBJECT, frame.depth, np.inf)
+        return cls(points, depth, frame.camera, float(np.median(points[:, 2])) if len(points) else 0.0)
+
+    def shares(self, other: "_Surface", motion: _Pose, along_ray: bool) -> tuple[float, float]:
+        """Return the shares of points that a motion between cameras takes onto another surface, and into its image."""
+        camera, points = replace(other.camera, R=motion[:3, :3], t=motion[:3, 3]), self.points
+        if along_ray:
+            points = points * points[:, 2:] / np.linalg.norm(points, axis=1, keepdims=True)
+        pixels, depth = camera.project(points)
+        inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < other.depth.shape[::-1]).all(axis=1)
+        stored = np.linalg.norm(camera.to_camera(points), axis=1) if along_ray else depth
+        columns, rows = pixels[inside].astype(int).T
+        surface = other.depth[rows, columns]
+        agreeing = np.abs(stored[inside] - surface) < _TOLERANCE * other.distance
+        known = max(1, len(inside) - (surface == 0).sum())
+        return agreeing.sum() / known, (surface > 0).sum() / known
+
+
+_Pair = tuple[_Surface, _Surface]
+
+
+def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
+    """Say that frames of one object do not agree, and which usual mistake explains it; "" if they do, or none overlap.
+
+    Args:
+        frames: A few frames; masks are found where there are none.
+        unit: World units per stored depth value, if it can be changed.
+    """
+    objects, scenes = [], []
+    for frame in frames:
+        if not frame_defect(frame):
+            objects.append(_Surface.of(_masked(frame)))
+            scenes.append(_Surface.of(replace(frame, mask=None)))
+    pairs, whole = _pairs(objects), _pairs(scenes)
+    if not pairs:
+        return ""
+    (given, overlap), (everywhere, _) = _shares(pairs), _shares(whole)
+    found = f"{given:.0%} of the object's points in a frame lie on its surface in another"
+    along_ray = [_shares(some, along_ray=True)[0] for some in (whole, pairs)]
+    if along_ray[0] > _RAY_GAIN * everywhere and min(along_ray) > _FITTING:
+        return f"{found}; the frames agree if depth is distance along the ray: divide it by the length of (x, y, 1)"
+    if given > _AGREEING:
+        return ""
+    for some in _explanations(pairs, unit):
+        best = max(share for share, _ in some)
+        share, text = next(one for one in some if one[0] > best - _ALIKE)
+        if share > max(_FITTING, given + _GAIN):
+            return f"{found}; the frames agree ({share:.0%}) if {text}"
+    contradict = max(given, everywhere) < _CONTRADICTING and overlap > _OVERLAP
+    return f"{found}, and no usual mistake in units or poses explains it" if contradict else ""
+
+
+def neighbours(count: int) -> list[int]:
+    """Choose up to six positions among `count` frames that go once around an object: three and those beside them."""
+    return sorted({(k * count // 3 + beside) % count for k in range(3) for beside in (0, max(1, count // 18))})
+
+
+def _masked(frame: Frame) -> Frame:
+    """Find the object in a frame without a mask, by its own depth alone."""
+    if frame.mask is None:
+        with suppress(InputError):
+            (frame,) = masks_from_depth([frame])
+    return frame
+
+
+def _pairs(surfaces: Sequence[_Surface]) -> list[_Pair]:
+    """Pair each surface with that of a camera turned by about `_BEST` degrees, an angle that no mistake changes."""
+    pairs, surfaces = [], [one for one in surfaces if len(one.points) >= _LEAST_POINTS]
+    for one in surfaces:
+        angles = np.array([rotation_angle(one.camera.R, other.camera.R) for other in surfaces])
+        angles[(angles < _NEAREST) | (angles > _FARTHEST)] = np.inf
+        if np.isfinite(angles).any():
+            pairs.append((one, surfaces[int(np.abs(angles - _BEST).argmin())]))
+    return pairs[:: len(pairs) // _PAIRS + 1]
+
+
+def _shares(
+    pairs: Sequence[_Pair], corrected: _Correction = np.array, scale: float = 1.0, along_ray: bool = False
+) -> tuple[float, float]:
+    """Return the median shares of agreeing and of overlapping points, by corrected poses and with scaled depth."""
+    shares = []
+    for one, other in pairs:
+        motion = corrected(other.camera.matrix) @ np.linalg.inv(corrected(one.camera.matrix))
+        motion[:3, 3] /= scale
+        shares.append(one.shares(other, motion, along_ray))
+    agreeing, overlapping = np.median(shares, axis=0).tolist()
+    return agreeing, overlapping
+
+
+def _explanations(pairs: Sequence[_Pair], unit: float | None) -> Iterator[list[tuple[float, str]]]:
+    """Give the shares of agreeing points after corrections of mistakes, with their names, likelier ones first."""
+
+    def scaled(factor: float) -> str:
+        new = float(f"{factor * (unit or 0):.3g}")
+        what = f"taken in {_UNITS[new]}" if new in _UNITS else f"multiplied by {factor:.3g}"
+        return f"the depth is {what}" + (f": --depth-unit {new:g}" if new else "")
+
+    yield [(_shares(pairs, correct)[0], f"the poses {text}") for text, correct in _CORRECTIONS]
+    for factors in (_FACTORS, _SCALES):
+        yield [(_shares(pairs, scale=factor)[0], scaled(factor)) for factor in factors]
+
+
+def _reorder(pose: _Pose) -> _Pose:
+    """Take the first number of the quaternion from camera to world as w, in place of the last."""
+    to_world = np.linalg.inv(pose)
+    quaternion = Rotation.from_matrix(to_world[:3, :3]).as_quat()
+    to_world[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+    return np.linalg.inv(to_world)
+
+
+_OTHER_AXES = "have the other axes, OpenGL's for OpenCV's or the reverse: negate the columns y and z"
+_INVERSE = "are world to camera"
+# From wrong to right matrices. Those of a file may be in OpenGL's axes; the axes of the world are of no account.
+_CORRECTIONS: list[tuple[str, _Correction]] = [
+    (_INVERSE, np.linalg.inv),
+    (_INVERSE, lambda pose: _FLIP @ np.linalg.inv(pose)),
+    (_OTHER_AXES, lambda pose: _FLIP @ pose),
+    ("are from quaternions with w first", _reorder),
+]
