@@ -318,14 +318,12 @@ def test_frames_that_are_no_views_of_one_object_are_refused(frames, message):
         open_source(frames)
 
 
-def test_a_target_that_is_seen_from_one_side_and_masks_without_a_plane_are_flagged(pictures, tmp_path):
+def test_a_target_that_is_seen_from_one_side_is_flagged(pictures, tmp_path):
     cup, mug, _ = pictures
     write_lists(tmp_path, around(ELSEWHERE, 5, 90))
     options = {"mask": "auto", "intrinsics": INTRINSICS, "backbone": CoordinateBackbone()}
     for target, degrees in ((mug, "0"), (tmp_path, "7[0-5]")):
-        *masks, flag = estimate_pose(cup, target, "paper", **options).estimates["paper"].flags
-        assert [one.split(": ")[0] for one in masks] == [str(cup), str(target)]
-        assert all("no plane is found that the object stands on" in one for one in masks)
+        (flag,) = estimate_pose(cup, target, "paper", **options).estimates["paper"].flags
         assert re.fullmatch(rf"the target was seen from one side only \({degrees} degrees\): if .* is wrong", flag)
 
 
