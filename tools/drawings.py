@@ -806,6 +806,45 @@ def draw_ransac() -> str:
     )  # fmt: skip
 
 
+def draw_scan() -> str:
+    """Draw where a phone goes: once around, looking down; and an arc, which leaves a side unseen."""
+    width, height, radius = 860, 280, 82
+    drawn = ""
+    for x, title, turns in (
+        (150, "once around: good", range(0, 360, 30)),
+        (710, "an arc: one side", range(30, 151, 30)),
+    ):
+        middle = np.array([x, 166])
+        drawn += ring(middle, LINE, radius, 1.4)
+        drawn += rect(x - 20, 146, 40, 40, BLUE, corner=6)
+        for turn in np.radians(turns):
+            away = np.array([np.cos(turn), -np.sin(turn)])
+            drawn += _phone(middle + radius * away, -away)
+        drawn += text(title, x, 40, 15, anchor="middle", bold=True) + text("from above", x, 60, 13, GREY, "middle")
+    x, table, turn = 430, 226, np.radians(30)
+    object_at = np.array([x + 60, table - 20])
+    camera_at = object_at + 150 * np.array([-np.cos(turn), -np.sin(turn)])
+    drawn += curve(f"M{x - 120} {table}H{x + 120}", INK, 2) + rect(x + 40, table - 40, 40, 40, BLUE, corner=6)
+    drawn += curve(straight(camera_at, object_at, 24), GREY, 1.4, "5 4") + _phone(camera_at, object_at - camera_at)
+    drawn += text("looking down by 30°", x, 40, 15, anchor="middle", bold=True)
+    drawn += text("from the side; ½ to 1 m away", x, 60, 13, GREY, "middle")
+    return svg(
+        drawn, width, height, "How to scan an object",
+        "A phone goes once around an object in a circle and looks down at it by 30 degrees. An arc of a third of the "
+        "circle shows one side only.",
+    )  # fmt: skip
+
+
+def _phone(place: np.ndarray, towards: np.ndarray) -> str:
+    """Draw a phone that looks in a direction."""
+    towards = towards / np.linalg.norm(towards)
+    across = np.array([-towards[1], towards[0]])
+    view = np.stack([place, place + 26 * towards + 12 * across, place + 26 * towards - 12 * across])
+    sides = [(-4, -11), (4, -11), (4, 11), (-4, 11)]
+    body = np.stack([place + along * towards + side * across for along, side in sides])
+    return polygon(view, PALE, LINE) + polygon(body, ORANGE)
+
+
 DRAWINGS: dict[str, Callable[[], str]] = {
     "method": draw_method,
     "query_key_value": draw_query_key_value,
@@ -814,6 +853,7 @@ DRAWINGS: dict[str, Callable[[], str]] = {
     "mirror": draw_mirror,
     "three": draw_three,
     "ransac": draw_ransac,
+    "scan": draw_scan,
     **{f"here_{notebook}": (lambda notebook=notebook: draw_here(notebook)) for notebook in sorted(HERE)},
 }
 
