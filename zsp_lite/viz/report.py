@@ -36,7 +36,7 @@ _MEANINGS = {
     "view": "the target view that the pose leads to",
     "inliers": "matches of that view that agree with the pose, which the verified solver does not need",
     "error": "angle to the labelled rotation",
-    "confidence": "probability of an error below 30°",
+    "confidence": "probability of an error below 30°, calibrated on renderings",
 }
 _RIGHT = 30.0  # degrees; a pose with a smaller error is marked as right
 _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark ground
