@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Real, UInt8, UInt16
+from jaxtyping import Bool, Float32, Real, UInt8
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
@@ -199,20 +199,10 @@ def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
 
 def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.ndarray, "h w"]:
     """Read a CO3D depth file (see `decode_depth`) as (H, W), 0 where unknown; InputError if it is no such file."""
-    return decode_depth(read_grey16(path), scale_adjustment)
-
-
-def read_grey16(path: str | Path) -> UInt16[np.ndarray, "h w"]:
-    """Read the values (H, W) of a 16-bit greyscale PNG; InputError if the file is no such."""
     bits = decode_image(path, "depth", cv2.IMREAD_UNCHANGED)
     if bits.dtype != np.uint16 or bits.ndim != 2:
         raise InputError(f"depth {path} holds {bits.dtype} of shape {bits.shape}, expected a 16-bit greyscale PNG")
-    return bits
-
-
-def read_grey(path: str | Path) -> UInt8[np.ndarray, "h w"]:
-    """Read an 8-bit image file in grey; InputError if it is damaged."""
-    return decode_image(path, "image", cv2.IMREAD_GRAYSCALE)
+    return decode_depth(bits, scale_adjustment)
 
 
 def check_pixels(path: str | Path, image: np.ndarray, size: tuple[int, int]) -> None:

@@ -16,14 +16,13 @@ from zsp_lite.importers.capture import (
     read_sample,
     sharpest,
 )
-from zsp_lite.importers.convert import import_capture
 from zsp_lite.importers.lists import read_lists, read_tum
 from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.importers.phones import read_polycam, read_record3d, read_stray
 from zsp_lite.importers.scenes import read_bop, read_open3d, read_scannet
 from zsp_lite.importers.unpacked import unpack
 
-__all__ = ["FORMATS", "Capture", "CaptureFrame", "import_capture", "open_capture", "recognise"]
+__all__ = ["FORMATS", "Capture", "CaptureFrame", "open_capture", "recognise"]
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
 
 def open_capture(
     path: str | Path, layout: str | None = None, count: int = MOST_FRAMES, depth_unit: float | None = None,
-    **options: Any,
+    masks: str | Path | None = None, **options: Any,
 ) -> Capture:  # fmt: skip
     """Read the frames of a capture, with the masks of its folder masks/, if it has one.
 
@@ -95,6 +94,7 @@ def open_capture(
         layout: Name of its format in `FORMATS`; by default, it is recognised.
         count: Number of frames to choose, the sharp ones of each stretch, where the capture has more.
         depth_unit: World units per stored depth value, by default the format's own.
+        masks: Folder of masks, named like the images, in place of those of the capture.
         options: `intrinsics` or `object`, where the format takes them.
 
     Raises:
@@ -110,8 +110,10 @@ def open_capture(
     if not frames:
         found = f"none of {len(left_out)} frames can be used: {left_out[0]}" if left_out else "no frame, expected some"
         raise InputError(f"capture {source}: {found}")
-    masks = find_masks((path if path.is_dir() else path.parent) / "masks", [frame.image for frame in frames])
-    frames = [replace(frame, mask=frame.mask or mask) for frame, mask in zip(frames, masks)]
+    if masks is not None:
+        frames = [replace(frame, mask=None) for frame in frames]
+    found = find_masks(masks or (path if path.is_dir() else path.parent) / "masks", [frame.image for frame in frames])
+    frames = [replace(frame, mask=frame.mask or mask) for frame, mask in zip(frames, found)]
     if depth_unit is not None:
         frames = [replace(frame, depth_unit=depth_unit) for frame in frames]
     return Capture(layout, frames, left_out)

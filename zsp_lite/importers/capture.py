@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.data.cameras import Camera, Values, camera_from_pose
-from zsp_lite.data.frames import Frame, check_pixels, enlarge_depth, read_grey
+from zsp_lite.data.frames import Frame, check_pixels, decode_image, enlarge_depth
 from zsp_lite.errors import InputError, real_array
 from zsp_lite.importers import files
 from zsp_lite.io.files import OutsideError, decode_json, find_inside, read_bytes
@@ -84,7 +84,7 @@ class CaptureFrame:
         depth = files.read_depth_file(self.depth) * np.float32(self.depth_unit)
         known = depth <= _FARTHEST
         if self.confidence is not None:
-            levels = read_grey(self.confidence)
+            levels = decode_image(self.confidence, "confidence", cv2.IMREAD_GRAYSCALE)
             check_pixels(self.confidence, levels, depth.shape)
             known &= trusted(levels)
         return np.where(known, depth, np.float32(0))
@@ -126,7 +126,7 @@ def make_frame(
     paths = [find_inside(folder, name) if isinstance(name, str) else name for name in names]
     if None in paths[:2]:
         raise InputError(f"{where}: {names[paths.index(None)]} is missing in {folder}")
-    pose, K = (real_array(f"{where}: {name}", one) for name, one in (("pose", pose), ("intrinsics", intrinsics)))
+    pose = real_array(f"{where}: pose", pose)
     if pose.size not in (7, 12, 16):
         raise InputError(f"{where}: the pose has {pose.size} numbers, expected 7, 12 or 16")
     if pose.size == 7:
@@ -136,11 +136,7 @@ def make_frame(
         pose = np.column_stack([Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]])
     if pose.size == 12:
         pose = np.vstack([pose.reshape(3, 4), (0, 0, 0, 1)])
-    if K.ndim == 2:
-        if K.shape not in ((3, 3), (4, 4)) or K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]].tolist() != [0, 0, 0, 0, 1]:
-            raise InputError(f"{where}: intrinsics are {K.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
-        K = K[[0, 1, 0, 1], [0, 1, 2, 2]]
-    camera = camera_from_pose(pose.reshape(-1, 4) @ axes, K, size or files.picture_size(paths[0]), where)
+    camera = camera_from_pose(pose.reshape(-1, 4) @ axes, intrinsics, size or files.picture_size(paths[0]), where)
     return CaptureFrame(paths[0], paths[1], camera, mask=paths[2], confidence=paths[3], **others)
 
 
@@ -157,22 +153,10 @@ def collect(makers: Iterable[Callable[[], CaptureFrame]]) -> tuple[list[CaptureF
     return sorted(frames, key=lambda frame: _natural_order(frame.image)), left_out
 
 
-def left_out_flags(left_out: Sequence[str]) -> tuple[str, ...]:
-    """Name the frames that are left out in one flag, if there are any."""
-    more = f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
-    return (f"{len(left_out)} frames are left out: {'; '.join(left_out[:3])}{more}",) if left_out else ()
-
-
 def _natural_order(path: Path) -> tuple[list[str | int], str]:
     """Order paths such that frame 10 follows frame 9."""
     text = path.as_posix()
     return [int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", text))], text
-
-
-def evenly_spaced(frames: Sequence[CaptureFrame], count: int) -> list[CaptureFrame]:
-    """Select at most `count` evenly spaced frames, with the first and the last."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
-    return [frames[index] for index in chosen]
 
 
 def sharpest(

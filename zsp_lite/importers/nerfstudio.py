@@ -74,9 +74,7 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
         found = f"{frame.camera_model!r} with k4 = {frame.k4:g}"
         expected = f"one of {', '.join(_MODELS)} with k4 = 0, or {_FISHEYE}"
         raise InputError(f"{where}: camera_model is {found}, expected {expected}")
-    image = find_inside(folder, frame.file_path)
-    if image is None:
-        raise InputError(f"{where}: {frame.file_path} is missing in {folder}")
+    image = find_inside(folder, frame.file_path) or folder / frame.file_path
     height, width = (int(frame.h), int(frame.w)) if frame.h and frame.w else picture_size(image)
     if not (frame.fl_x or frame.camera_angle_x):
         raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
@@ -86,7 +84,7 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     # OpenCV's order of the coefficients; its model has no r^8 term, k4.
     last = (frame.k3, frame.k4) if fisheye else (frame.p1, frame.p2, frame.k3)
     return make_frame(
-        folder, image, frame.depth_file_path or frame.depth_path, frame.transform_matrix,
+        folder, frame.file_path, frame.depth_file_path or frame.depth_path, frame.transform_matrix,
         (fx, fy, cx, cy), where, FROM_OPENGL, (height, width), frame.mask_path, fisheye=fisheye,
         depth_unit=frame.integer_depth_scale or frame.depth_unit_scale_factor, distortion=(frame.k1, frame.k2, *last),
     )  # fmt: skip

@@ -52,7 +52,7 @@ def _make_bop(folder: Path, image: str, index: int, placed: _Annotation, camera:
 
 def read_scannet(folder: Path) -> Makers:
     """Read a scene in ScanNet's format, with a text file for the pose of each image."""
-    K = read_numbers(folder / "intrinsic/intrinsic_color.txt", (3, 4))
+    K = read_numbers(folder / "intrinsic/intrinsic_color.txt", (3, 4))[:3, :3]
     for path in sorted((folder / "pose").glob("*.txt")):
         files = f"color/{path.stem}", f"depth/{path.stem}"
         yield partial(make_frame, folder, *files, read_numbers(path, (4,)), K, str(path))
