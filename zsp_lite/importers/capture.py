@@ -49,35 +49,29 @@ class CaptureFrame:
     def load(self) -> Frame:
         """Load the frame as viewers display it; InputError if a file is missing, damaged or of another size."""
         rgb, turn = files.read_picture(self.image)
-        depth = self._read_depth()
-        mask = files.read_mask_file(self.mask, self.label) if self.has_mask else None
         lies_stored = partial(files.lies_as_stored, rgb.shape, turn, self.orientation, self.image)
+
+        def displayed(image: np.ndarray) -> np.ndarray:
+            return files.display_image(image, turn) if lies_stored(image.shape) else image
+
         camera = self.camera
         if lies_stored(camera.size):
             camera = files.display_camera(camera, turn, self.image.name, self.posed)
-        if lies_stored(depth.shape):
-            depth = files.display_image(depth, turn)
-        if mask is not None and lies_stored(mask.shape):
-            mask = files.display_image(mask, turn)
-        rgb, size = files.display_image(rgb, turn), camera.size
-        enlarged = enlarge_depth(depth, size)
-        for path, pixels in ((self.image, rgb), (self.mask, mask)):
-            if pixels is not None:
-                check_pixels(path, pixels, size)
-        if enlarged.shape != size:
-            expected = f"(H, W) = {size} as the image, or smaller with its aspect ratio"
+        rgb, depth, mask = files.display_image(rgb, turn), displayed(self._read_depth()), None
+        check_pixels(self.image, rgb, camera.size)
+        enlarged = enlarge_depth(depth, camera.size)
+        if enlarged.shape != camera.size:
+            expected = f"(H, W) = {camera.size} as the image, or smaller with its aspect ratio"
             raise InputError(f"depth {self.depth} is {depth.shape} pixels, expected {expected}")
+        if self.mask is not None:
+            mask = displayed(files.read_mask_file(self.mask, self.label))
+            check_pixels(self.mask, mask, camera.size)
         if any(self.distortion):
             maps = self._undistortion(camera)
             rgb = cv2.remap(rgb, *maps, cv2.INTER_LINEAR)
             enlarged = cv2.remap(enlarged, *maps, cv2.INTER_NEAREST)
             mask = None if mask is None else cv2.remap(mask, *maps, cv2.INTER_LINEAR)
         return Frame(rgb, enlarged, mask, camera, self.image.name)
-
-    @property
-    def has_mask(self) -> bool:
-        """Whether there is a file of the frame's mask."""
-        return self.mask is not None and self.mask.is_file()
 
     def _read_depth(self) -> Float32[np.ndarray, "h w"]:
         """Read the depth, 0 where it is unknown, implausibly far or not trusted."""

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -231,7 +230,7 @@ def open_source(
         else:
             _, capture, left_out = open_capture(path, layout, **options)
         capture = [replace(frame, **files) for frame in capture]
-        read, masked = (lambda k: capture[k].load()), [frame.has_mask for frame in capture]
+        read, masked = (lambda k: capture[k].load()), [frame.mask is not None for frame in capture]
         names, numbers = [frame.image.name for frame in capture], range(len(capture))
         cameras, unit = tuple(frame.camera for frame in capture), capture[0].depth_unit
         doubts = question_intrinsics(capture[0].camera, str(path))
@@ -257,21 +256,16 @@ def open_pair(
     given: list[dict] = [{} for _ in sides]
     for name, values in options.items():
         takers = [k for k, one in enumerate(formats) if name in _TAKEN[one]]
-        pair = [k for k in takers if k < 2]
-        counts = sorted({len(takers), len(pair), len(takers) if name == "depth" else min(len(takers), 1)})
+        counts = {len(takers), sum(k < 2 for k in takers)} | ({1} if takers and name != "depth" else set())
         if values and len(values) not in counts:
-            option, expected = f"--{name.replace('_', '-')}", " or ".join(map(str, counts))
+            option, expected = f"--{name.replace('_', '-')}", " or ".join(map(str, sorted(counts)))
             raise InputError(f"{option}: {len(values)} values with {' and '.join(formats)}, expected {expected}")
         if len(values) == 1 and name == "box":
             boxed = [k for k, way in enumerate(options.get("mask", ())) if way == "box" and k in takers]
             takers = (boxed or takers)[:1]
         for k, value in zip(takers, values if len(values) > 1 or name == "depth" else [*values] * len(takers)):
             given[k][name] = value
-    return [_opened(side, **some) for side, some in zip(sides, given)]
-
-
-def _opened(side: SourceLike, **options: Any) -> Source:
-    return side if isinstance(side, Source) else open_source(side, **options)
+    return [side if isinstance(side, Source) else open_source(side, **some) for side, some in zip(sides, given)]
 
 
 def _check_frames(frames: Sequence[Frame]) -> list[Frame]:
