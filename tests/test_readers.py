@@ -402,7 +402,7 @@ def zipped(path, name="rgb.txt", data=b"", flag=0):
         (lambda path: path.write_bytes(b"PK\3\4" + bytes(99)), "File is not a zip file"),
         (lambda path: zipped(path, "../../climbs"), "path ../../climbs leads out of"),
         (lambda path: zipped(path, "/etc/x"), "path /etc/x leads out of"),
-        (lambda path: zipped(path, flag=1), "File 'rgb.txt' is encrypted"),
+        (lambda path: zipped(path, flag=1), "File .*'rgb.txt' .* is encrypted"),
         (lambda path: zipped(path, data=bytes(60_000)), "1.. bytes unpack to 60,000"),
     ],
 )

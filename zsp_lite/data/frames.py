@@ -245,24 +245,17 @@ def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
     data = read_bytes(path, what)
     is_jpeg = data[:2] == b"\xff\xd8"
     image, expected = None, "a complete JPEG or PNG"
-    with suppress(OSError, SyntaxError, cv2.error):  # SyntaxError: of Pillow, for another format
+    with suppress(OSError, SyntaxError, ValueError, cv2.error):  # of Pillow, for another format or a damaged header
         opened = (JpegImageFile if is_jpeg else PngImageFile)(io.BytesIO(data))  # reads the header only
         width, height = opened.size
         if width * height > MAX_PIXELS:
             expected = f"at most {MAX_PIXELS} pixels, not {height} x {width}"
-        elif opened.load() if is_jpeg else _has_png_end(data):  # OpenCV fills missing parts of an image with grey
+        else:
+            (opened.load if is_jpeg else opened.verify)()  # OpenCV fills missing parts of an image with grey
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         raise InputError(f"{what} {path} cannot be decoded ({len(data)} bytes), expected {expected}")
     return image
-
-
-def _has_png_end(data: bytes) -> bool:
-    """Say whether a PNG file has its last chunk; any data may follow."""
-    position = 8  # after the signature
-    while data[position + 4 : position + 8] not in (b"IEND", b""):
-        position += 12 + int.from_bytes(data[position : position + 4])  # length, kind and checksum have 4 bytes each
-    return len(data) >= position + 12
 
 
 def _encode(path: str | Path, extension: str, image: np.ndarray, options: list[int]) -> None:

@@ -108,8 +108,8 @@ class Source:
         found = given_mask_flags(frames, self.missing.values()) if self.mask == "given" else mask_flags(frames)
         found = [*depth_flags(frames, metric), *self.doubts, *found, self.contradiction()]
         if self.left_out:
-            lines = [*self.left_out[:3], *[f"and {len(self.left_out) - 3} more"][: len(self.left_out) - 3]]
-            found.insert(0, f"{len(self.left_out)} frames are left out: {'; '.join(lines)}")
+            more = f"; and {len(self.left_out) - 3} more" if len(self.left_out) > 3 else ""
+            found.insert(0, f"{len(self.left_out)} frames are left out: {'; '.join(self.left_out[:3])}{more}")
         return list(filter(None, found))
 
     def contradiction(self) -> str:
