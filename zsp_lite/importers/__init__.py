@@ -6,16 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import (
-    MOST_FRAMES,
-    Capture,
-    CaptureFrame,
-    Makers,
-    collect,
-    find_masks,
-    read_sample,
-    sharpest,
-)
+from zsp_lite.importers.capture import MOST_FRAMES, Capture, CaptureFrame, Makers, collect, find_masks, sharpest
 from zsp_lite.importers.lists import read_lists, read_tum
 from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.importers.phones import read_polycam, read_record3d, read_stray
@@ -106,7 +97,7 @@ def open_capture(
         layout = layout or found
     options |= {"count": count} if layout == "stray" else {}
     frames, left_out = collect(FORMATS[layout].read(path, **options))
-    frames = [frame for frame, _ in sharpest(frames, count, read_sample, left_out)]
+    frames = [frame for frame, _ in sharpest(frames, count, CaptureFrame.sample, left_out)]
     if not frames:
         found = f"none of {len(left_out)} frames can be used: {left_out[0]}" if left_out else "no frame, expected some"
         raise InputError(f"capture {source}: {found}")

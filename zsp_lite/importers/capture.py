@@ -1,6 +1,5 @@
 """RGB-D captures: the files and camera of a frame, how they become a `Frame`, and what the readers of formats share."""
 
-import codecs
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,7 +17,7 @@ from zsp_lite.data.cameras import Camera, Values, camera_from_pose
 from zsp_lite.data.frames import Frame, check_pixels, decode_image, enlarge_depth
 from zsp_lite.errors import InputError, real_array
 from zsp_lite.importers import files
-from zsp_lite.io.files import OutsideError, decode_json, find_inside, read_bytes
+from zsp_lite.io.files import OutsideError, find_inside, read_bytes
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
@@ -27,7 +26,6 @@ _FARTHEST = 1e4  # greatest known depth, in units of the world
 MOST_FRAMES = 100  # of a capture; the sharp ones are chosen where there are more
 _CANDIDATES = 4  # frames of which the sharpest is chosen
 _SHARPNESS_SIDE = 640  # pixels of an image whose sharpness is measured
-_NO_NUMBER = re.compile(rb"(?<=[\s,:\[])(?:-?Infinity|NaN)(?=[\s,\]}])")  # Python writes these into JSON
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +70,11 @@ class CaptureFrame:
             enlarged = cv2.remap(enlarged, *maps, cv2.INTER_NEAREST)
             mask = None if mask is None else cv2.remap(mask, *maps, cv2.INTER_LINEAR)
         return Frame(rgb, enlarged, mask, camera, self.image.name)
+
+    def sample(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Read the image; InputError if it or the depth cannot be decoded."""
+        files.read_depth_file(self.depth)
+        return files.read_picture(self.image)[0]
 
     def _read_depth(self) -> Float32[np.ndarray, "h w"]:
         """Read the depth, 0 where it is unknown, implausibly far or not trusted."""
@@ -182,12 +185,6 @@ def _sharpness(image: UInt8[np.ndarray, "..."]) -> float:
     return float(cv2.Laplacian(small, cv2.CV_32F).var())
 
 
-def read_sample(frame: CaptureFrame) -> UInt8[np.ndarray, "h w 3"]:
-    """Read the image of a frame; InputError if it or the depth cannot be decoded."""
-    files.read_depth_file(frame.depth)
-    return files.read_picture(frame.image)[0]
-
-
 def trusted(levels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Tell measured depth from smeared depth by levels of confidence: 0, 1, 2, or 0 to 255.
 
@@ -215,12 +212,6 @@ def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
         own = [name for tail in tails(image) if shared[tail] == 1 for name in (tail + image.suffix, tail)]
         found.append(next((files[name] for name in own if name in files), None))
     return found
-
-
-def read_capture_json(path: Path, kind: Any) -> Any:
-    """Read a JSON file of a capture; numbers that are not finite, which are not JSON, are null."""
-    data = _NO_NUMBER.sub(b"null", read_bytes(path, "capture").removeprefix(codecs.BOM_UTF8))
-    return decode_json(data, kind, f"capture {path}")
 
 
 def read_lines(path: Path) -> list[str]:

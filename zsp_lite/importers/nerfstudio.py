@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import msgspec
 
 from zsp_lite.errors import MAX_LENGTH, InputError
-from zsp_lite.importers.capture import FROM_OPENGL, CaptureFrame, Makers, make_frame, read_capture_json
+from zsp_lite.importers.capture import FROM_OPENGL, CaptureFrame, Makers, make_frame
 from zsp_lite.importers.files import picture_size
-from zsp_lite.io.files import decode_json, find_inside
+from zsp_lite.io.files import decode_json, find_inside, read_json
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
@@ -57,7 +57,7 @@ def read_nerfstudio(path: str | Path) -> Makers:
     path = Path(path)
     if path.suffix != ".json":
         path = next((path / name for name in _NAMES if (path / name).is_file()), path / _NAMES[0])
-    common = read_capture_json(path, dict[str, Any])
+    common = read_json(path, dict[str, Any], "capture")
     listed = decode_json(msgspec.json.encode(common.pop("frames", None)), list[dict[str, Any]], f"{path}, frames")
     with_depth = [k for k, own in enumerate(listed) if own.get("depth_file_path") or own.get("depth_path")]
     if not with_depth:
