@@ -193,17 +193,17 @@ def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
 
 def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
     """Question the object's distance, if lengths are metres, and whether most of it has known depth."""
-    distances, seen = [np.zeros(0)], 0
+    distances, seen, known = [], 0, 0
     for frame in frames:
-        seen += (frame.mask > ON_OBJECT).sum()
-        distances.append(frame.depth[object_pixels(frame)])
-    known = np.concatenate(distances)
-    distance = float(np.quantile(known, 0.25)) if len(known) else _NEAREST
+        depth = frame.depth[object_pixels(frame)]
+        seen, known = seen + (frame.mask > ON_OBJECT).sum(), known + len(depth)
+        distances.append(np.quantile(depth, 0.25) if len(depth) else np.nan)
+    distance = float(np.nanmedian(distances)) if known else _NEAREST
     if metric and not _NEAREST <= distance <= _FARTHEST:
         cure = "the unit of its depth is given by --depth-unit (0.001: millimetres, 1: metres)"
         yield f"the object is {distance:.3g} m from the camera, expected {_NEAREST:g} to {_FARTHEST:g} m; {cure}"
-    if len(known) < _LEAST_KNOWN * seen:
-        yield f"depth is known on {len(known) / seen:.0%} of the object only"
+    if known < _LEAST_KNOWN * seen:
+        yield f"depth is known on {known / seen:.0%} of the object only"
 
 
 def given_mask_flags(frames: Collection[Frame], missing: Collection[str]) -> tuple[str, ...]:

@@ -22,9 +22,9 @@ from zsp_lite.importers.masks import depth_flags, given_mask_flags, mask_flags, 
 
 # Options that each format takes; "open" is a source that is open already.
 _MASKED = ("mask", "box")
-_FILES = (*_MASKED, "label", "orientation")
-_TAKEN = {"open": (), "image": (*_FILES, "intrinsics", "depth", "depth_unit"), "sequence": _MASKED, "frames": _MASKED}
-_TAKEN |= {name: (*_FILES, "masks", "count", *one.options) for name, one in FORMATS.items()}
+_FILES = ("label", "orientation", "depth_unit")  # values of `CaptureFrame`
+_TAKEN = {"open": (), "image": (*_MASKED, *_FILES, "intrinsics", "depth"), "sequence": _MASKED, "frames": _MASKED}
+_TAKEN |= {name: (*_MASKED, *_FILES, "masks", "count", *one.options) for name, one in FORMATS.items()}
 _SWEEPS = 20  # over the chosen views, which mostly stay after ten
 _CONTEXT = 8  # frames of a source that are segmented together, or tried as the reference
 
@@ -167,7 +167,7 @@ def open_source(
     label: int | None = None,
     orientation: str | None = None,
     object: int | None = None,
-    masks: str | Path | None = None,
+    masks: Path | None = None,
     count: int | None = None,
     layout: str | None = None,
 ) -> Source:
@@ -224,7 +224,7 @@ def open_source(
         read, masked = (lambda k: dataset.load(frames[k])), [one.mask is not None for one in frames]
         names = numbers = [one.frame_number for one in frames]
     else:
-        files = {name: options.pop(name) for name in ("label", "orientation") if name in options}
+        files = {name: options.pop(name) for name in _FILES if name in options}
         if layout == "image":
             capture = [_open_image(path, **options)]
         else:
@@ -298,9 +298,7 @@ def _sequence_folder(path: Path) -> Path | None:
     return next((one for one in folders if one.is_dir() and (one.parent / FRAMES_FILE).is_file()), None)
 
 
-def _open_image(
-    path: Path, intrinsics: Values | None = None, depth: str | Path | None = None, depth_unit: float | None = None
-) -> CaptureFrame:
+def _open_image(path: Path, intrinsics: Values | None = None, depth: str | Path | None = None) -> CaptureFrame:
     """Name the files and the camera of an image, whose world is its camera's frame."""
     if intrinsics is None:
         raise InputError(f"image {path}: no intrinsics, expected --intrinsics FX,FY,CX,CY in pixels")
@@ -308,8 +306,7 @@ def _open_image(
     if depth is None:
         names = f"{path.stem}_depth.png or {path.stem}_depth.npy"
         raise InputError(f"image {path}: no {names} beside it, expected its depth there or as --depth FILE")
-    if depth_unit is None:
-        depth_unit = 1.0 if depth.name.endswith(CO3D_DEPTH) else 0.001
+    depth_unit = 1.0 if depth.name.endswith(CO3D_DEPTH) else 0.001
     rgb, orientation = read_picture(path)
     camera = camera_from_pose(np.eye(4), intrinsics, rgb.shape[:2], f"image {path}")
     stored, displayed = (np.linalg.norm(2 * camera.principal_point - side) for side in (camera.size[::-1], camera.size))
