@@ -22,7 +22,7 @@ from zsp_lite.cli.main import cli, main
 from zsp_lite.data.co3d import Co3D, write_co3d
 from zsp_lite.data.frames import write_mask
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
-from zsp_lite.importers import FORMATS, Capture
+from zsp_lite.importers import FORMATS
 from zsp_lite.importers.convert import ImportResult
 
 IMPORT = ("data", "import", "--root=x", "--category=c", "--sequence=s")
@@ -89,7 +89,7 @@ WRONG = [
     (["synth", "--category", "sofa", "--out", "x"], "sofa"),
     (["data", "check", "/nowhere"], "does not exist"),
     ([*IMPORT, "lists", "/nowhere"], "rgb.txt"),
-    ([*IMPORT, "nerfstudio", "x", "--object=2"], "--object does not go with the format nerfstudio"),
+    ([*IMPORT, "nerfstudio", "x", "--object=2"], "--object does not go with x, of the format nerfstudio"),
     ([*IMPORT, "lists", "x", "--box=1,1,9,9", "--masks=m"], "--masks does not go with --box"),
 ]
 
@@ -268,26 +268,28 @@ def test_a_capture_is_imported(tmp_path, capsys):
 def test_options_of_the_import_reach_the_library(monkeypatch, capsys):
     given = []
 
-    def import_capture(*arguments):
-        given.append(arguments)
+    def open_source(path, **options):
+        given.append((path, {name: value for name, value in options.items() if value is not None}))
+        return "source"
+
+    def import_source(*arguments):
+        assert arguments == ("source", Path("mine"), "cup", "one")
         return ImportResult(1, 0, 1, 1.0, ("the masks may be wrong: why",))
 
-    monkeypatch.setattr("zsp_lite.importers.recognise", lambda path: ("bop", path))
-    monkeypatch.setattr("zsp_lite.importers.open_capture", lambda *a, **b: Capture("", [a, b, 0], ["lost: a.jpg"]))
-    monkeypatch.setattr("zsp_lite.importers.import_capture", import_capture)
+    monkeypatch.setattr("zsp_lite.importers.sources.open_source", open_source)
+    monkeypatch.setattr("zsp_lite.importers.convert.import_source", import_source)
     words = "--root mine --category cup --sequence one --frames 7".split()
     assert main(["data", "import", "nerfstudio", "scan", *words, "--box", "1,2,3,4"]) == 0
-    capture = [(Path("scan"), "nerfstudio", 7), {}, 0]
-    assert given.pop() == (capture, Path("mine"), "cup", "one", (1, 2, 3, 4), None, 7, None, None, None)
-    text = capsys.readouterr().out
-    assert "flag: 1 frames are left out: lost: a.jpg\nflag: the masks may be wrong: why\n" in text
-    more = ["--depth-unit", "0.5", "--object", "0", "--mask", "given", "--label", "3", "--orientation", "stored"]
+    assert given.pop() == (Path("scan"), {"layout": "nerfstudio", "count": 7, "mask": "box", "box": (1, 2, 3, 4)})
+    assert "flag: the masks may be wrong: why\n" in capsys.readouterr().out
+    more = ["--depth-unit", "0.5", "--object", "0", "--label", "3", "--orientation", "stored"]
     assert main(["data", "import", "scan", *words, "--masks", "there", *more]) == 0
-    capture = [(Path("scan"), "bop", 7), {"depth_unit": 0.5, "object": 0}, 0]
-    assert given.pop() == (capture, Path("mine"), "cup", "one", None, Path("there"), 7, "given", 3, "stored")
+    options = {"depth_unit": 0.5, "object": 0, "label": 3, "orientation": "stored", "masks": Path("there")}
+    assert given.pop() == (Path("scan"), {"count": 7, "mask": "given"} | options)
+    monkeypatch.undo()
     for wrong in (["lists", "scan", "--object", "0"], ["folder", "scan"]):
         assert main(["data", "import", *wrong, *words]) == 2
     assert "folder scan: expected SCAN, or one of nerfstudio, stray, " in capsys.readouterr().err
     assert main(["data", "import", "--help"]) == 0
     text = capsys.readouterr().out
-    assert all(f"  {name} " in text for name in FORMATS)
+    assert all(name in text for name in FORMATS)

@@ -57,7 +57,7 @@ BAD_FILES = [
       for name, read in (("x.jpg", read_image), ("mask.png", read_mask), ("depth.png", read_depth))
       for damage, data in {
           "empty": b"", "text": b"text", "GIF": b"GIF89a" + bytes(20), "JPEG cut": JPEG[: len(JPEG) // 2],
-          "PNG cut": PNG[: len(PNG) // 2], "PNG header": PNG[:33],
+          "PNG cut": PNG[: len(PNG) // 2], "PNG header": PNG[:33], "PNG length": PNG[:11] + b"\5" + PNG[12:],
           "PNG with a wrong checksum": PNG[:60] + b"\0\0\0\0" + PNG[64:],
       }.items()),
     ("depth.png", read_depth, "8 bits", PNG, "expected a 16-bit greyscale PNG"),

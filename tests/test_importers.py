@@ -13,9 +13,10 @@ from zsp_lite.data.check import check_folder
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, write_image, write_mask
 from zsp_lite.errors import InputError
-from zsp_lite.importers import CaptureFrame, import_capture, open_capture
-from zsp_lite.importers.convert import fuse
+from zsp_lite.importers import CaptureFrame, open_capture
+from zsp_lite.importers.convert import fuse, import_source
 from zsp_lite.importers.masks import masks_from_box
+from zsp_lite.importers.sources import open_source
 from zsp_lite.synthetic.export import make_object
 from zsp_lite.synthetic.sequences import render_sequence
 
@@ -83,19 +84,18 @@ WRITERS = {"nerfstudio": write_nerfstudio, "lists": write_lists}
 @pytest.fixture
 def scan(tmp_path, views):
     write_nerfstudio(tmp_path / "scan", views)
-    return open_capture(tmp_path / "scan").frames
+    return tmp_path / "scan"
 
 
 def test_an_import_reads_as_a_data_folder_of_unit_scale(tmp_path, scan, views):
-    done = import_capture(scan, tmp_path / "data", "teapot", "mine", max_frames=6)
+    done = import_source(open_source(scan), tmp_path / "data", "teapot", "mine")
     dataset = Co3D(tmp_path / "data")
     (check,) = check_folder(tmp_path / "data", deep=True)
     assert not check.problems and check.complete == 1
     points, _ = dataset.point_cloud("teapot", "mine")
-    assert done.frames == 6 and done.points == len(points) > 500
+    assert done.frames == 8 and done.points == len(points) > 500
     assert points.std(axis=0).mean() == pytest.approx(1, rel=1e-3)
-    chosen = [views[index] for index in (0, 1, 3, 4, 6, 7)]
-    for annotation, view in zip(dataset.frames("teapot", "mine"), chosen, strict=True):
+    for annotation, view in zip(dataset.frames("teapot", "mine"), views, strict=True):
         frame = dataset.load(annotation)
         inside = (frame.mask > 0.9) & (frame.depth > 0)
         np.testing.assert_allclose(frame.depth[inside], done.scale * view.depth[inside], rtol=5e-3)
@@ -116,7 +116,7 @@ def test_an_import_holds_a_few_frames_at_once(tmp_path, scan, monkeypatch, box):
 
     load, images, held = CaptureFrame.load, [], []
     monkeypatch.setattr(CaptureFrame, "load", load_counted)
-    assert import_capture(scan, tmp_path / "data", "teapot", "mine", box).frames == 8
+    assert import_source(open_source(scan, box=box), tmp_path / "data", "teapot", "mine").frames == 8
     assert max(held) <= 3
 
 
@@ -152,13 +152,11 @@ def test_distortion_is_corrected(tmp_path, views, model):
 def test_masks_come_from_files_by_name(tmp_path, views):
     folder = tmp_path / "scan"
     write_lists(folder, views)
-    capture = open_capture(folder, "lists").frames
-    with pytest.raises(InputError, match=r"0000.jpg has no mask, expected .*\(--masks DIR\)"):
-        import_capture(capture, tmp_path / "data", "teapot", "mine")
-    assert not (tmp_path / "data").exists(), "nothing is written"
+    with pytest.raises(InputError, match="no mask, expected --masks DIR, --mask auto or --box"):
+        open_source(folder, mask="given")
     for view in views:
         write_mask(tmp_path / f"masks/{view.name}.png", view.mask)
-    import_capture(capture, tmp_path / "data", "teapot", "mine", masks=tmp_path / "masks")
+    import_source(open_source(folder, masks=tmp_path / "masks"), tmp_path / "data", "teapot", "mine")
     assert Co3D(tmp_path / "data").categories() == ["teapot"]
 
 
@@ -247,9 +245,9 @@ def test_bad_boxes_empty_depth_and_frames_without_overlap_are_refused(views):
 def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(tmp_path, views):
     folder = tmp_path / "scan"
     write_nerfstudio(folder, [*views[:5], replace(views[5], mask=np.zeros_like(views[5].mask))])
-    capture = open_capture(folder, "nerfstudio").frames
-    done = import_capture(capture, tmp_path / "data", "teapot", "mine")
+    source = open_source(folder)
+    done = import_source(source, tmp_path / "data", "teapot", "mine")
     assert (done.frames, done.empty) == (5, 1)
     assert len(Co3D(tmp_path / "data").frames("teapot", "mine")) == 5
     with pytest.raises(InputError, match="mine exists already, expected another sequence name"):
-        import_capture(capture, tmp_path / "data", "teapot", "mine")
+        import_source(source, tmp_path / "data", "teapot", "mine")

@@ -19,9 +19,10 @@ from zsp_lite.data.co3d import Pair
 from zsp_lite.data.frames import write_image, write_mask
 from zsp_lite.errors import InputError
 from zsp_lite.importers.convert import scale_frame
+from zsp_lite.importers.sources import open_pair, open_source, spread
 from zsp_lite.io.ply import read_ply
 from zsp_lite.metrics import rotation_error
-from zsp_lite.own_objects import estimate_pose, open_pair, open_source, spread, write_pair
+from zsp_lite.own_objects import estimate_pose, write_pair
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.samples import sample_data
 
@@ -114,7 +115,7 @@ def test_what_an_image_lacks_is_named_with_the_option_that_gives_it(image, optio
 
 def test_masks_and_depth_that_are_not_there_are_named_with_the_option_that_cures(tmp_path, frames):
     bare = write_picture(tmp_path / "bare.jpg", frames[0], mask=False)
-    with pytest.raises(InputError, match="no mask, expected --mask auto or --box TOP,LEFT,HEIGHT,WIDTH"):
+    with pytest.raises(InputError, match="no mask, expected --masks DIR, --mask auto or --box TOP,LEFT,HEIGHT,WIDTH"):
         open_source(bare, INTRINSICS, mask="given").load([0])
     (tmp_path / "bare_depth.png").unlink()
     with pytest.raises(InputError, match="bare_depth.png or bare_depth.npy beside it, expected .* --depth FILE"):

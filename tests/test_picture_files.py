@@ -14,10 +14,12 @@ from test_masks import DIRECTIONS, ball_on_floor, overlap
 from zsp_lite.data.cameras import camera_from_pose
 from zsp_lite.data.frames import encode_depth, write_mask
 from zsp_lite.errors import InputError
-from zsp_lite.importers import import_capture, open_capture
+from zsp_lite.importers import open_capture
+from zsp_lite.importers.convert import import_source
 from zsp_lite.importers.files import display_image, question_intrinsics, read_depth_file, read_mask_file, read_picture
+from zsp_lite.importers.sources import open_pair, open_source
 from zsp_lite.metrics import rotation_error
-from zsp_lite.own_objects import estimate_pose, open_pair, open_source
+from zsp_lite.own_objects import estimate_pose
 
 DISC = np.hypot(*np.mgrid[-16:16, -20:20]) < 9  # the object, at (32, 40) pixels
 RING = (np.hypot(*np.mgrid[-16:16, -20:20]) < 11) & ~DISC
@@ -184,10 +186,7 @@ def test_frames_without_a_mask_get_one_by_depth_and_are_named(tmp_path):
     scenes = [ball_on_floor(direction) for direction in DIRECTIONS]
     views = [replace(frame, mask=truth.astype(np.float32), name=str(k)) for k, (frame, truth) in enumerate(scenes)]
     write_lists(tmp_path, views)
-    capture = open_capture(tmp_path, "lists").frames
-    with pytest.raises(InputError, match="0.jpg has no mask, expected .* or --mask auto"):
-        import_capture(capture, tmp_path / "none", "ball", "one")
-    done = import_capture(capture, tmp_path / "auto", "ball", "one", mask="auto")
+    done = import_source(open_source(tmp_path), tmp_path / "auto", "ball", "one")
     assert (done.frames, done.flags) == (4, ())
     for view in views[1:]:
         write_mask(tmp_path / f"masks/{view.name}.png", 1 - view.mask if view.name == "3" else view.mask)
@@ -197,8 +196,8 @@ def test_frames_without_a_mask_get_one_by_depth_and_are_named(tmp_path):
     np.testing.assert_array_equal(frames[1].mask, views[1].mask)
     missing, inverted = source.flags(source.load([0, 1, 3]))
     assert inverted.endswith("the masks of 1 of 3 frames cover most of the border: inverted?")
-    assert missing.endswith("no mask is given for 0: made by depth")
-    done = import_capture(open_capture(tmp_path, "lists").frames, tmp_path / "some", "ball", "one")
+    assert missing.endswith("no mask is given for 0.jpg: made by depth")
+    done = import_source(source, tmp_path / "some", "ball", "one")
     assert done.frames == 4 and done.flags[0] == "no mask is given for 0.jpg: made by depth"
     assert done.flags[1].startswith("the masks of 1 of 4 frames cover most of the border")
 

@@ -42,9 +42,9 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.data.pairs import sample_pairs
 from zsp_lite.errors import InputError, NoPoseError
+from zsp_lite.importers.sources import spread
 from zsp_lite.io.files import stable_hash
 from zsp_lite.metrics import rotation_error
-from zsp_lite.own_objects import spread
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.verified.confidence import Calibration, evidence, hidden_share, modes

@@ -55,9 +55,10 @@ from zsp_lite.data.frames import Frame as Frame
 from zsp_lite.errors import InputError as InputError
 from zsp_lite.estimates import PoseEstimate as PoseEstimate
 from zsp_lite.features import FeatureMap as FeatureMap
+from zsp_lite.importers.sources import open_source as open_source
 from zsp_lite.io import download as download, files as files, ply as ply
 from zsp_lite.matching import Matches as Matches
-from zsp_lite.own_objects import estimate_pose as estimate_pose, open_source as open_source
+from zsp_lite.own_objects import estimate_pose as estimate_pose
 from zsp_lite.pipeline import ZeroShotPose as ZeroShotPose
 from zsp_lite.viz import plots as plots, report as report, scene3d as scene3d
 

@@ -7,13 +7,13 @@ pydantic.
 import math
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from functools import wraps
+from functools import partial, reduce, wraps
 from pathlib import Path
 from typing import Any
 
 import click
 
-from zsp_lite.choices import FACETS
+from zsp_lite.choices import FACETS, MASKS
 
 
 class Parsed(click.ParamType):
@@ -74,15 +74,27 @@ def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return with_backbone
 
 
-_RUN_OPTIONS = (
+def _options(*options: Callable[..., Any]) -> Callable[..., Any]:
+    """Combine options to one decorator of commands."""
+    return lambda command: reduce(lambda one, option: option(one), reversed(options), command)
+
+
+run_options = _options(
     click.option("--workers", type=COUNT, default=1, help="Worker processes on this machine."),
     click.option("--executor", metavar="dask://HOST:PORT", help="Dask cluster in place of worker processes."),
     click.option("--allow-other-version", is_flag=True, help="Continue a run of another version; run.json lists both."),
 )
 
 
-def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add --workers, --executor and --allow-other-version."""
-    for option in reversed(_RUN_OPTIONS):
-        command = option(command)
-    return command
+def source_options(multiple: bool) -> Callable[..., Any]:
+    """Add the options of `open_source` that images and captures have, once or for each of several objects."""
+    option = partial(click.option, multiple=multiple)
+    return _options(
+        option("--mask", type=click.Choice(MASKS), help="given: mask files; box: by GrabCut; auto: by depth, colours."),
+        option("--box", type=BOX, help="Bounding box of the object in the first image in pixels, for GrabCut."),
+        option("--intrinsics", type=INTRINSICS, help="Of an image or TUM; pixel centres at half-integers."),
+        option("--label", type=INDEX, help="Number of the object in masks that label several."),
+        option("--orientation", type=ORIENTATION, help="How depth, mask and camera refer to a photograph with EXIF."),
+        option("--depth-unit", type=LENGTH, help="Metres per stored depth value: 0.001 for millimetres."),
+        option("--object", type=INDEX, help="Number of the object in a scene of BOP."),
+    )

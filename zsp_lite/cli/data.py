@@ -8,19 +8,7 @@ from typing import Any
 
 import click
 
-from zsp_lite.choices import MASKS
-from zsp_lite.cli.common import (
-    BOX,
-    COUNT,
-    INDEX,
-    INTRINSICS,
-    LENGTH,
-    ORIENTATION,
-    PATH,
-    examples,
-    refuse_options,
-    replace_option,
-)
+from zsp_lite.cli.common import COUNT, PATH, examples, refuse_options, replace_option, source_options
 from zsp_lite.errors import InputError
 
 _LICENCE = "CO3D is under CC BY-NC 4.0: no commercial use."
@@ -182,58 +170,42 @@ def transfer(v1, v2, category, replace) -> None:
 @root_option
 @click.option("--category", metavar="NAME", required=True, help="Category of the object.")
 @click.option("--sequence", metavar="NAME", required=True, help="Name of the new sequence.")
-@click.option("--mask", type=click.Choice(MASKS), help="Origin of the masks, see below.")
-@click.option("--label", type=INDEX, help="Number of the object in masks that label several.")
-@click.option("--orientation", type=ORIENTATION, help="Form of what belongs to turned photographs.")
-@click.option("--box", type=BOX, help="Bounding box of the object in the first image in pixels.")
+@source_options(multiple=False)
 @click.option("--masks", type=PATH, help="Folder of mask files named like the images, instead of --box.")
-@click.option("--frames", type=COUNT, default=100, help="Maximum number of frames, evenly spaced and sharp.")
-@click.option("--depth-unit", type=LENGTH, show_default="the format's own", help="Metres per stored depth value.")
-@click.option("--intrinsics", type=INTRINSICS, show_default="525,525,320,240", help="Camera of tum in pixels.")
-@click.option("--object", type=INDEX, help="Number of the object, for bop.")
-def import_(source, root, category, sequence, mask, box, masks, frames, label, orientation, **options) -> None:
+@click.option("--frames", "count", type=COUNT, default=100, help="Maximum number of frames, evenly spaced and sharp.")
+def import_(source, root, category, sequence, mask, box, **options) -> None:
     """Import an RGB-D capture, images with depth and camera poses in one world, as a sequence of a data folder.
 
-    SCAN is a folder, or the zip file that an app has exported. Its FORMAT is recognised by its files, if it is not
-    given:
+    SCAN is a folder, or the zip file that an app has exported. Its FORMAT is recognised, if it is not given:
+    nerfstudio (also of Blender, NeRFCapture and instant-ngp), stray (Stray Scanner), polycam (its raw data), record3d
+    (needs `pip install lzfse`), tum (RGB-D benchmark), bop, scannet, open3d (recorder, with the trajectory of its
+    reconstruction), or lists of your own:
 
     \b
-      nerfstudio  transforms.json: nerfstudio, Blender, NeRFCapture, instant-ngp
-      stray       rgb.mp4, odometry.csv: Stray Scanner
-      polycam     keyframes/cameras: Polycam's raw data
-      record3d    metadata, rgbd: Record3D's .r3d; needs `pip install lzfse`
-      lists       rgb.txt, depth.txt      one file per line; depth as 16-bit PNG, TIFF, .npy, ...
-                  poses.txt               lines of 12 or 16 numbers: camera to world, OpenCV's axes
-                  intrinsics.txt          3 x 3 matrix in pixels, or fx fy cx cy, once or in each line;
-                                          pixel centres at half-integers
-      tum         groundtruth.txt, rgb.txt: TUM RGB-D
-      bop         scene_gt.json, scene_camera.json: a scene of BOP
-      scannet     pose/, intrinsic/: ScanNet
-      open3d      intrinsic.json, color/, trajectory.log: Open3D's recorder and reconstruction
+      rgb.txt, depth.txt  one file per line; depth as 16-bit PNG, TIFF, .npy, ...
+      poses.txt           lines of 12 or 16 numbers: camera to world, OpenCV's axes
+      intrinsics.txt      3 x 3 matrix in pixels, or fx fy cx cy, once or in each line;
+                          pixel centres at half-integers
 
     Depth maps must be registered to the images: a pixel of both shows the same point. The object is given by --box, by
     which GrabCut segments it in all images, by --masks, or by masks of the capture, in masks/ with the names of the
     images; frames without it are left out. --mask auto finds it by depth and colours, as is done for single frames
     without a mask, too.
     """
-    from zsp_lite.importers import FORMATS, import_capture, open_capture, recognise
-    from zsp_lite.importers.capture import left_out_flags
+    from zsp_lite.importers import FORMATS
+    from zsp_lite.importers.convert import import_source
+    from zsp_lite.importers.sources import open_source
 
-    layout = recognise(source[-1])[0] if len(source) == 1 else str(source[0])
-    if layout not in FORMATS or len(source) > 2:
+    layout = str(source[0]) if len(source) > 1 else None
+    if layout not in (None, *FORMATS) or len(source) > 2:
         raise click.UsageError(f"{' '.join(map(str, source))}: expected SCAN, or one of {', '.join(FORMATS)} before it")
-    given = {name: value for name, value in options.items() if value is not None}
-    refuse_options({"masks": masks and (box or mask == "auto")}, (), "--box or --mask auto")
-    if mask and (mask == "box") != bool(box):
-        raise click.UsageError("--mask box goes with --box, the others without")
-    refuse_options(dict.fromkeys(given, True), FORMATS[layout].options, f"the format {layout}")
-    capture = open_capture(source[-1], layout, frames, **given)
-    if capture.left_out and len(capture.frames) < 3:
-        raise InputError(f"{source[-1]}: {len(capture.frames)} frames remain, expected 3: {capture.left_out[0]}")
-    done = import_capture(capture.frames, root, category, sequence, box, masks, frames, mask, label, orientation)
+    refuse_options({"masks": options["masks"] and (box or mask == "auto")}, (), "--box or --mask auto")
+    mask = mask or ("box" if box else "given")
+    opened = open_source(source[-1], mask=mask, box=box, layout=layout, **options)
+    done = import_source(opened, root, category, sequence)
     print(
         f"Written: {root / category / sequence}: {done.frames} frames, {done.points:,} points, "
         f"scaled by {done.scale:.4g}" + (f"; {done.empty} frames without the object left out" if done.empty else "")
     )
-    for flag in (*left_out_flags(capture.left_out), *done.flags):
+    for flag in done.flags:
         print(f"flag: {flag}")

@@ -4,8 +4,8 @@ from typing import Any
 
 import click
 
-from zsp_lite.choices import MASKS, SOLVERS
-from zsp_lite.cli.common import BOX, COUNT, INDEX, INTRINSICS, LENGTH, ORIENTATION, PATH, backbone_options, examples
+from zsp_lite.choices import SOLVERS
+from zsp_lite.cli.common import COUNT, INDEX, PATH, backbone_options, examples, source_options
 
 _ONCE_PER_OBJECT = ("mask", "box", "intrinsics", "label", "orientation", "depth", "depth_unit", "object")
 
@@ -30,14 +30,8 @@ _ONCE_PER_OBJECT = ("mask", "box", "intrinsics", "label", "orientation", "depth"
     "--references", type=COUNT, show_default="4; 1 with --reference-frame", help="Reference frames of each object."
 )
 @click.option("--targets", type=COUNT, show_default="5", help="Number of target views, evenly spaced.")
-@click.option("--mask", type=click.Choice(MASKS), multiple=True, help="Origin of the objects' masks, see above.")
-@click.option("--box", type=BOX, multiple=True, help="Bounding box of the object in the first image in pixels.")
-@click.option("--intrinsics", type=INTRINSICS, multiple=True, help="Camera intrinsics in pixels, see above.")
-@click.option("--label", type=INDEX, multiple=True, help="Number of the object in masks that label several.")
-@click.option("--orientation", type=ORIENTATION, multiple=True, help="Form of what belongs to a turned photograph.")
+@source_options(multiple=True)
 @click.option("--depth", type=PATH, multiple=True, help="Depth of an image, if it is not beside it. Once per image.")
-@click.option("--depth-unit", type=LENGTH, multiple=True, show_default="0.001", help="Metres per stored depth value.")
-@click.option("--object", type=INDEX, multiple=True, help="Number of the object in a scene of BOP.")
 @click.option("--workers", type=COUNT, default=1, help="Frames that are solved at once.")
 @click.option("--not-upright", is_flag=True, help="Try four turns by 90 degrees of the reference images.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
@@ -50,18 +44,10 @@ def estimate(reference, target, others, helpers, not_upright, as_json, backbone,
     (see `zsp-lite data import --help`), or an image NAME.jpg, .png, .webp or .heic with its depth NAME_depth.png and,
     if there is one, its mask NAME_mask.png or .jpg.
 
-    --mask, --box, --intrinsics, --depth-unit, --label and --orientation may be given once for each object: REFERENCE,
-    TARGET, then helpers. A single value is for all, a single --box for REFERENCE, or for the one whose --mask is box.
-
-    \b
-    --mask        given: with the images; box: by GrabCut from --box, the default with a box;
-                  auto: what stands on a plane, by depth and colours, the default without masks
-    --intrinsics  of an image, or of TUM RGB-D, or the 9 numbers of K in rows; pixel centres at half-integers,
-                  0.5 more than OpenCV's cx and cy
-    --depth-unit  of an image, or of a capture, whose own it replaces: 0.001 for millimetres, 1 for metres
-    --depth       16-bit PNG or TIFF, .npy, .npz, float .tiff or .pfm, registered to the colours
-    --orientation stored or displayed: how depth, mask and intrinsics refer to a photograph that its
-                  EXIF orientation turns; asked for where their sizes do not tell
+    The options from --mask to --object may be given once for each object: REFERENCE, TARGET, then helpers. A single
+    value is for all, a single --box for REFERENCE, or for the one whose --mask is box. By default, masks are given, or
+    made by depth where there are none. Intrinsics may also be the 9 numbers of K in rows; cx and cy are 0.5 more than
+    OpenCV's. Depth is a 16-bit PNG or TIFF, .npy, .npz, float .tiff or .pfm, registered to the colours.
 
     --helpers are scans of other objects of the category, without labels: what the pair alone cannot tell, such as
     front from back, all objects together mostly can.
@@ -75,8 +61,9 @@ def estimate(reference, target, others, helpers, not_upright, as_json, backbone,
     import json
 
     from zsp_lite.backbones.load import load_backbone
+    from zsp_lite.importers.sources import open_pair
     from zsp_lite.io.locks import writing
-    from zsp_lite.own_objects import estimate_pose, open_pair, write_pair
+    from zsp_lite.own_objects import estimate_pose, write_pair
 
     if helpers and settings["solver"] != "verified":
         raise click.UsageError("--helpers goes with --solver verified only")

@@ -6,7 +6,6 @@ name and number of each frame only; `FrameIndex.frame` decodes and validates a w
 
 import gzip
 import io
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,7 +14,7 @@ import msgspec
 
 from zsp_lite.data.cameras import NDC_NORM_IMAGE_BOUNDS
 from zsp_lite.errors import MAX_LENGTH, InputError
-from zsp_lite.io.files import decode_json, decompress, read_bytes
+from zsp_lite.io.files import decode_json, decompress, read_bytes, without_nan
 
 FRAMES_FILE, SEQUENCES_FILE = "frame_annotations.jgz", "sequence_annotations.jgz"
 Row = tuple[float, float, float]
@@ -126,12 +125,7 @@ def read_sequences(path: Path) -> list[SequenceAnnotation]:
 
 def read_annotations(path: Path) -> bytes:
     """Read the JSON of a gzipped annotation file, with null in place of NaN and Infinity."""
-    data = decompress(read_bytes(path, "annotations"), f"annotations {path}")
-    # Python's json writes NaN and Infinity, which are not valid JSON. Null is then accepted by optional fields, and
-    # refused by the others with the name of the field.
-    if b"NaN" in data or b"Infinity" in data:
-        data = re.sub(rb"(?<=[:,\[\s])-?(?:NaN|Infinity)(?=[,\]}\s])", b"null", data)
-    return data
+    return without_nan(decompress(read_bytes(path, "annotations"), f"annotations {path}"))
 
 
 def compress(data: bytes) -> bytes:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Real, UInt8, UInt16
+from jaxtyping import Bool, Float32, Real, UInt8
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
@@ -199,20 +199,10 @@ def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
 
 def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.ndarray, "h w"]:
     """Read a CO3D depth file (see `decode_depth`) as (H, W), 0 where unknown; InputError if it is no such file."""
-    return decode_depth(read_grey16(path), scale_adjustment)
-
-
-def read_grey16(path: str | Path) -> UInt16[np.ndarray, "h w"]:
-    """Read the values (H, W) of a 16-bit greyscale PNG; InputError if the file is no such."""
     bits = decode_image(path, "depth", cv2.IMREAD_UNCHANGED)
     if bits.dtype != np.uint16 or bits.ndim != 2:
         raise InputError(f"depth {path} holds {bits.dtype} of shape {bits.shape}, expected a 16-bit greyscale PNG")
-    return bits
-
-
-def read_grey(path: str | Path) -> UInt8[np.ndarray, "h w"]:
-    """Read an 8-bit image file in grey; InputError if it is damaged."""
-    return decode_image(path, "image", cv2.IMREAD_GRAYSCALE)
+    return decode_depth(bits, scale_adjustment)
 
 
 def check_pixels(path: str | Path, image: np.ndarray, size: tuple[int, int]) -> None:
@@ -255,24 +245,17 @@ def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
     data = read_bytes(path, what)
     is_jpeg = data[:2] == b"\xff\xd8"
     image, expected = None, "a complete JPEG or PNG"
-    with suppress(OSError, SyntaxError, cv2.error):  # SyntaxError: of Pillow, for another format
+    with suppress(OSError, SyntaxError, ValueError, cv2.error):  # of Pillow, for another format or a damaged header
         opened = (JpegImageFile if is_jpeg else PngImageFile)(io.BytesIO(data))  # reads the header only
         width, height = opened.size
         if width * height > MAX_PIXELS:
             expected = f"at most {MAX_PIXELS} pixels, not {height} x {width}"
-        elif opened.load() if is_jpeg else _has_png_end(data):  # OpenCV fills missing parts of an image with grey
+        else:
+            (opened.load if is_jpeg else opened.verify)()  # OpenCV fills missing parts of an image with grey
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         raise InputError(f"{what} {path} cannot be decoded ({len(data)} bytes), expected {expected}")
     return image
-
-
-def _has_png_end(data: bytes) -> bool:
-    """Say whether a PNG file has its last chunk; any data may follow."""
-    position = 8  # after the signature
-    while data[position + 4 : position + 8] not in (b"IEND", b""):
-        position += 12 + int.from_bytes(data[position : position + 4])  # length, kind and checksum have 4 bytes each
-    return len(data) >= position + 12
 
 
 def _encode(path: str | Path, extension: str, image: np.ndarray, options: list[int]) -> None:

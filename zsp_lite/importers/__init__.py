@@ -6,24 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import (
-    MOST_FRAMES,
-    Capture,
-    CaptureFrame,
-    Makers,
-    collect,
-    find_masks,
-    read_sample,
-    sharpest,
-)
-from zsp_lite.importers.convert import import_capture
+from zsp_lite.importers.capture import MOST_FRAMES, Capture, CaptureFrame, Makers, collect, find_masks, sharpest
 from zsp_lite.importers.lists import read_lists, read_tum
 from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.importers.phones import read_polycam, read_record3d, read_stray
 from zsp_lite.importers.scenes import read_bop, read_open3d, read_scannet
 from zsp_lite.importers.unpacked import unpack
 
-__all__ = ["FORMATS", "Capture", "CaptureFrame", "import_capture", "open_capture", "recognise"]
+__all__ = ["FORMATS", "Capture", "CaptureFrame", "open_capture", "recognise"]
 
 
 @dataclass(frozen=True)
@@ -33,7 +23,7 @@ class Format:
     signs: tuple[str, ...]  # patterns of files; a folder of the format has all
     what: str
     read: Callable[..., Makers]
-    options: tuple[str, ...] = ("depth_unit",)  # of `open_capture`
+    options: tuple[str, ...] = ()  # of `read`, without `count`
 
 
 # A folder has the first format whose signs it has.
@@ -43,8 +33,8 @@ FORMATS = {
     "polycam": Format(("keyframes/*cameras",), "Polycam's raw data", read_polycam),
     "record3d": Format(("metadata", "rgbd"), "Record3D", read_record3d),
     "lists": Format(("poses.txt",), "lists", read_lists),
-    "tum": Format(("groundtruth.txt", "rgb.txt"), "TUM RGB-D", read_tum, ("depth_unit", "intrinsics")),
-    "bop": Format(("scene_gt.json", "scene_camera.json"), "BOP", read_bop, ("depth_unit", "object")),
+    "tum": Format(("groundtruth.txt", "rgb.txt"), "TUM RGB-D", read_tum, ("intrinsics",)),
+    "bop": Format(("scene_gt.json", "scene_camera.json"), "BOP", read_bop, ("object",)),
     "scannet": Format(("pose", "intrinsic/intrinsic_color.txt"), "ScanNet", read_scannet),
     "open3d": Format(("intrinsic.json", "color"), "Open3D's recorder", read_open3d),
 }
@@ -85,16 +75,15 @@ def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
 
 
 def open_capture(
-    path: str | Path, layout: str | None = None, count: int = MOST_FRAMES, depth_unit: float | None = None,
-    **options: Any,
-) -> Capture:  # fmt: skip
+    path: str | Path, layout: str | None = None, count: int = MOST_FRAMES, masks: Path | None = None, **options: Any
+) -> Capture:
     """Read the frames of a capture, with the masks of its folder masks/, if it has one.
 
     Args:
         path: A folder, zip or file (see `recognise`).
         layout: Name of its format in `FORMATS`; by default, it is recognised.
         count: Number of frames to choose, the sharp ones of each stretch, where the capture has more.
-        depth_unit: World units per stored depth value, by default the format's own.
+        masks: Folder of masks, named like the images, in place of those of the capture.
         options: `intrinsics` or `object`, where the format takes them.
 
     Raises:
@@ -106,12 +95,12 @@ def open_capture(
         layout = layout or found
     options |= {"count": count} if layout == "stray" else {}
     frames, left_out = collect(FORMATS[layout].read(path, **options))
-    frames = [frame for frame, _ in sharpest(frames, count, read_sample, left_out)]
+    frames = [frame for frame, _ in sharpest(frames, count, CaptureFrame.sample, left_out)]
     if not frames:
         found = f"none of {len(left_out)} frames can be used: {left_out[0]}" if left_out else "no frame, expected some"
         raise InputError(f"capture {source}: {found}")
-    masks = find_masks((path if path.is_dir() else path.parent) / "masks", [frame.image for frame in frames])
-    frames = [replace(frame, mask=frame.mask or mask) for frame, mask in zip(frames, masks)]
-    if depth_unit is not None:
-        frames = [replace(frame, depth_unit=depth_unit) for frame in frames]
+    if masks is not None:
+        frames = [replace(frame, mask=None) for frame in frames]
+    found = find_masks(masks or (path if path.is_dir() else path.parent) / "masks", [frame.image for frame in frames])
+    frames = [replace(frame, mask=frame.mask or mask) for frame, mask in zip(frames, found)]
     return Capture(layout, frames, left_out)

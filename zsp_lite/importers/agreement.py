@@ -82,9 +82,13 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     """
     objects, scenes = [], []
     for frame in frames:
-        if not frame_defect(frame):
-            objects.append(_Surface.of(_masked(frame)))
-            scenes.append(_Surface.of(replace(frame, mask=None)))
+        if frame_defect(frame):
+            continue
+        scenes.append(_Surface.of(replace(frame, mask=None)))
+        if frame.mask is None:
+            with suppress(InputError):
+                (frame,) = masks_from_depth([frame])
+        objects.append(_Surface.of(frame))
     pairs, whole = _pairs(objects), _pairs(scenes)
     if not pairs:
         return ""
@@ -107,14 +111,6 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
 def neighbours(count: int) -> list[int]:
     """Choose up to six positions among `count` frames that go once around an object: three and those beside them."""
     return sorted({(k * count // 3 + beside) % count for k in range(3) for beside in (0, max(1, count // 18))})
-
-
-def _masked(frame: Frame) -> Frame:
-    """Find the object in a frame without a mask, by its own depth alone."""
-    if frame.mask is None:
-        with suppress(InputError):
-            (frame,) = masks_from_depth([frame])
-    return frame
 
 
 def _pairs(surfaces: Sequence[_Surface]) -> list[_Pair]:

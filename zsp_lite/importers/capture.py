@@ -1,6 +1,5 @@
 """RGB-D captures: the files and camera of a frame, how they become a `Frame`, and what the readers of formats share."""
 
-import codecs
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -15,10 +14,10 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.data.cameras import Camera, Values, camera_from_pose
-from zsp_lite.data.frames import Frame, check_pixels, enlarge_depth, read_grey
+from zsp_lite.data.frames import Frame, check_pixels, decode_image, enlarge_depth
 from zsp_lite.errors import InputError, real_array
 from zsp_lite.importers import files
-from zsp_lite.io.files import OutsideError, decode_json, find_inside, read_bytes
+from zsp_lite.io.files import OutsideError, find_inside, read_bytes
 
 # OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
@@ -27,7 +26,6 @@ _FARTHEST = 1e4  # greatest known depth, in units of the world
 MOST_FRAMES = 100  # of a capture; the sharp ones are chosen where there are more
 _CANDIDATES = 4  # frames of which the sharpest is chosen
 _SHARPNESS_SIDE = 640  # pixels of an image whose sharpness is measured
-_NO_NUMBER = re.compile(rb"(?<=[\s,:\[])(?:-?Infinity|NaN)(?=[\s,\]}])")  # Python writes these into JSON
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,24 +47,23 @@ class CaptureFrame:
     def load(self) -> Frame:
         """Load the frame as viewers display it; InputError if a file is missing, damaged or of another size."""
         rgb, turn = files.read_picture(self.image)
-        depth = self._read_depth()
-        mask = files.read_mask_file(self.mask, self.label) if self.has_mask else None
         lies_stored = partial(files.lies_as_stored, rgb.shape, turn, self.orientation, self.image)
+
+        def displayed(image: np.ndarray) -> np.ndarray:
+            return files.display_image(image, turn) if lies_stored(image.shape) else image
+
         camera = self.camera
         if lies_stored(camera.size):
             camera = files.display_camera(camera, turn, self.image.name, self.posed)
-        if lies_stored(depth.shape):
-            depth = files.display_image(depth, turn)
-        if mask is not None and lies_stored(mask.shape):
-            mask = files.display_image(mask, turn)
-        rgb, size = files.display_image(rgb, turn), camera.size
-        enlarged = enlarge_depth(depth, size)
-        for path, pixels in ((self.image, rgb), (self.mask, mask)):
-            if pixels is not None:
-                check_pixels(path, pixels, size)
-        if enlarged.shape != size:
-            expected = f"(H, W) = {size} as the image, or smaller with its aspect ratio"
+        rgb, depth, mask = files.display_image(rgb, turn), displayed(self._read_depth()), None
+        check_pixels(self.image, rgb, camera.size)
+        enlarged = enlarge_depth(depth, camera.size)
+        if enlarged.shape != camera.size:
+            expected = f"(H, W) = {camera.size} as the image, or smaller with its aspect ratio"
             raise InputError(f"depth {self.depth} is {depth.shape} pixels, expected {expected}")
+        if self.mask is not None:
+            mask = displayed(files.read_mask_file(self.mask, self.label))
+            check_pixels(self.mask, mask, camera.size)
         if any(self.distortion):
             maps = self._undistortion(camera)
             rgb = cv2.remap(rgb, *maps, cv2.INTER_LINEAR)
@@ -74,17 +71,17 @@ class CaptureFrame:
             mask = None if mask is None else cv2.remap(mask, *maps, cv2.INTER_LINEAR)
         return Frame(rgb, enlarged, mask, camera, self.image.name)
 
-    @property
-    def has_mask(self) -> bool:
-        """Whether there is a file of the frame's mask."""
-        return self.mask is not None and self.mask.is_file()
+    def sample(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Read the image; InputError if it or the depth cannot be decoded."""
+        files.read_depth_file(self.depth)
+        return files.read_picture(self.image)[0]
 
     def _read_depth(self) -> Float32[np.ndarray, "h w"]:
         """Read the depth, 0 where it is unknown, implausibly far or not trusted."""
         depth = files.read_depth_file(self.depth) * np.float32(self.depth_unit)
         known = depth <= _FARTHEST
         if self.confidence is not None:
-            levels = read_grey(self.confidence)
+            levels = decode_image(self.confidence, "confidence", cv2.IMREAD_GRAYSCALE)
             check_pixels(self.confidence, levels, depth.shape)
             known &= trusted(levels)
         return np.where(known, depth, np.float32(0))
@@ -126,7 +123,7 @@ def make_frame(
     paths = [find_inside(folder, name) if isinstance(name, str) else name for name in names]
     if None in paths[:2]:
         raise InputError(f"{where}: {names[paths.index(None)]} is missing in {folder}")
-    pose, K = (real_array(f"{where}: {name}", one) for name, one in (("pose", pose), ("intrinsics", intrinsics)))
+    pose = real_array(f"{where}: pose", pose)
     if pose.size not in (7, 12, 16):
         raise InputError(f"{where}: the pose has {pose.size} numbers, expected 7, 12 or 16")
     if pose.size == 7:
@@ -136,11 +133,7 @@ def make_frame(
         pose = np.column_stack([Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]])
     if pose.size == 12:
         pose = np.vstack([pose.reshape(3, 4), (0, 0, 0, 1)])
-    if K.ndim == 2:
-        if K.shape not in ((3, 3), (4, 4)) or K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]].tolist() != [0, 0, 0, 0, 1]:
-            raise InputError(f"{where}: intrinsics are {K.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
-        K = K[[0, 1, 0, 1], [0, 1, 2, 2]]
-    camera = camera_from_pose(pose.reshape(-1, 4) @ axes, K, size or files.picture_size(paths[0]), where)
+    camera = camera_from_pose(pose.reshape(-1, 4) @ axes, intrinsics, size or files.picture_size(paths[0]), where)
     return CaptureFrame(paths[0], paths[1], camera, mask=paths[2], confidence=paths[3], **others)
 
 
@@ -157,22 +150,10 @@ def collect(makers: Iterable[Callable[[], CaptureFrame]]) -> tuple[list[CaptureF
     return sorted(frames, key=lambda frame: _natural_order(frame.image)), left_out
 
 
-def left_out_flags(left_out: Sequence[str]) -> tuple[str, ...]:
-    """Name the frames that are left out in one flag, if there are any."""
-    more = f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
-    return (f"{len(left_out)} frames are left out: {'; '.join(left_out[:3])}{more}",) if left_out else ()
-
-
 def _natural_order(path: Path) -> tuple[list[str | int], str]:
     """Order paths such that frame 10 follows frame 9."""
     text = path.as_posix()
     return [int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", text))], text
-
-
-def evenly_spaced(frames: Sequence[CaptureFrame], count: int) -> list[CaptureFrame]:
-    """Select at most `count` evenly spaced frames, with the first and the last."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
-    return [frames[index] for index in chosen]
 
 
 def sharpest(
@@ -204,12 +185,6 @@ def _sharpness(image: UInt8[np.ndarray, "..."]) -> float:
     return float(cv2.Laplacian(small, cv2.CV_32F).var())
 
 
-def read_sample(frame: CaptureFrame) -> UInt8[np.ndarray, "h w 3"]:
-    """Read the image of a frame; InputError if it or the depth cannot be decoded."""
-    files.read_depth_file(frame.depth)
-    return files.read_picture(frame.image)[0]
-
-
 def trusted(levels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Tell measured depth from smeared depth by levels of confidence: 0, 1, 2, or 0 to 255.
 
@@ -237,12 +212,6 @@ def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
         own = [name for tail in tails(image) if shared[tail] == 1 for name in (tail + image.suffix, tail)]
         found.append(next((files[name] for name in own if name in files), None))
     return found
-
-
-def read_capture_json(path: Path, kind: Any) -> Any:
-    """Read a JSON file of a capture; numbers that are not finite, which are not JSON, are null."""
-    data = _NO_NUMBER.sub(b"null", read_bytes(path, "capture").removeprefix(codecs.BOM_UTF8))
-    return decode_json(data, kind, f"capture {path}")
 
 
 def read_lines(path: Path) -> list[str]:

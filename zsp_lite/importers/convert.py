@@ -1,4 +1,4 @@
-"""Conversion of a capture to a sequence of a data folder in CO3D's layout, with a fused point cloud (Open3D)."""
+"""Conversion of a source to a sequence of a data folder in CO3D's layout, with a fused point cloud (Open3D)."""
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
@@ -7,20 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from zsp_lite.data.cameras import Box
 from zsp_lite.data.co3d import SequenceData, write_co3d
-from zsp_lite.data.frames import ON_OBJECT, Frame
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.importers.agreement import disagreement, neighbours
-from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, evenly_spaced, find_masks
-from zsp_lite.importers.files import question_intrinsics
-from zsp_lite.importers.masks import (
-    depth_flags,
-    given_mask_flags,
-    mask_flags,
-    masks_from_box,
-    masks_from_depth,
-)
+from zsp_lite.importers.capture import HALF_PIXEL
+from zsp_lite.importers.sources import Source
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import load_open3d
@@ -29,7 +20,6 @@ from zsp_lite.points import axis_deviation, object_pixels, sampling_step, world_
 _VOXELS = 96  # voxels per three standard deviations of the object; finer than the noise of depth cameras
 _MAX_POINTS = 50_000
 _LEAST_STEP = 7  # between the pixels by which the size of the object is estimated
-_GROUP = 8  # frames that are segmented by depth at once
 _MIN_VIEWS = 3  # number of frames that must see a surface, if there are that many frames
 
 
@@ -44,100 +34,38 @@ class ImportResult:
     flags: tuple[str, ...]  # what speaks against the masks and the intrinsics
 
 
-def import_capture(
-    capture: Sequence[CaptureFrame],
-    root: str | Path,
-    category: str,
-    sequence: str,
-    box: Box | None = None,
-    masks: str | Path | None = None,
-    max_frames: int = 100,
-    mask: str | None = None,
-    label: int | None = None,
-    orientation: str | None = None,
-) -> ImportResult:
-    """Write a capture as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused point cloud.
+def import_source(source: Source, root: str | Path, category: str, sequence: str) -> ImportResult:
+    """Write the frames of a source as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused point cloud.
 
     Lengths are scaled so that the point cloud has unit standard deviation, averaged over the axes, as in CO3D. Frames
     whose mask is empty are left out. An interrupted import can be repeated.
 
-    Args:
-        capture: Frames of a capture (see `open_capture`).
-        root: The data folder, new or existing.
-        category: Name of the category.
-        sequence: Name of the new sequence.
-        box: Bounding box (top, left, height, width) of the object in the first frame, pixels (see `masks_from_box`).
-        masks: Folder of mask files, named like the images, if there is no box. Without both, those of the capture.
-        max_frames: Maximum number of frames, evenly spaced; CO3D's sequences have about 100.
-        mask: "auto" makes the masks of all frames by depth, "given" and None only those that are missing in some.
-        label: Number of the object in masks that label several.
-        orientation: How camera, depth and masks refer to turned photographs (see `open_source`).
-
     Raises:
-        InputError: The capture cannot be read, segmented or fused, or the sequence exists. Nothing is written then.
+        InputError: The source cannot be read, segmented or fused, or the sequence exists. Nothing is written then.
     """
     folder = Path(root) / plain_name(category, "category") / plain_name(sequence, "sequence")
-    unfinished = folder / ".unfinished"
+    unfinished, count = folder / ".unfinished", len(source.numbers)
     if folder.exists() and not unfinished.is_file():
         raise InputError(f"{folder} exists already, expected another sequence name")
-    capture = [replace(frame, label=label, orientation=orientation) for frame in evenly_spaced(capture, max_frames)]
-    flags = question_intrinsics(capture[0].camera, capture[0].image.name)
-    if box is not None or mask == "auto":
-        capture = [replace(frame, mask=None) for frame in capture]
-    elif masks is not None:
-        found = find_masks(masks, [frame.image for frame in capture])
-        capture = [replace(frame, mask=path) for frame, path in zip(capture, found)]
-    missing = [index for index, frame in enumerate(capture) if not frame.has_mask]
-    if box is None and mask != "auto" and len(missing) == len(capture):
-        raise InputError(
-            f"{capture[0].image.name} has no mask, expected a box in the first picture (--box TOP,LEFT,HEIGHT,WIDTH), "
-            "a folder of masks that are named like the pictures (--masks DIR), or --mask auto"
-        )
-    some = (capture[index].load() for index in neighbours(len(capture)))
-    if line := disagreement(some, capture[0].depth_unit):
-        raise InputError(f"{capture[0].image}: {line}")
-    if box is None:
-        bits = _masks_by_depth(capture, missing)
-    else:
-        found = masks_from_box((frame.load() for frame in capture), box)
-        bits = dict(enumerate(np.packbits(frame.mask > ON_OBJECT) for frame in found))
-
-    def load(index: int) -> Frame:
-        frame = capture[index].load()
-        if index not in bits:
-            return frame
-        made = np.unpackbits(bits[index], count=frame.depth.size).reshape(frame.depth.shape)
-        return replace(frame, mask=made.astype(np.float32))
-
-    seen = [k for k in range(len(capture)) if (bits[k].any() if k in bits else load(k).shows_object)]
+    if source.left_out and count < _MIN_VIEWS:
+        raise InputError(f"{source.path}: {count} frames remain, expected {_MIN_VIEWS}: {source.left_out[0]}")
+    if line := source.contradiction():
+        raise InputError(f"{source.path}: {line}")
+    source = source.segmented()
+    seen = [position for position in range(count) if source.read(position).shows_object]
     if not seen:
-        raise InputError(f"the masks of all {len(capture)} frames are empty, expected an object")
-    frames = LazyFrames(load, seen)
-    missing = [capture[index].image.name for index in bits]
-    flags += mask_flags(frames) if len(bits) == len(capture) else given_mask_flags(frames, missing)
-    flags += depth_flags(frames[position] for position in neighbours(len(seen)))
+        raise InputError(f"the masks of all {count} frames are empty, expected an object")
+    frames = LazyFrames(source.read, seen)
     points, colours, normals = fuse(frames)
     scale = 1 / axis_deviation(points)
-    scaled = LazyFrames(lambda index: scale_frame(load(index), scale), seen)
-    data = SequenceData(sequence, scaled, [float(index) for index in seen], points * scale, colours, normals)
+    scaled = LazyFrames(lambda position: scale_frame(source.read(position), scale), seen)
+    data = SequenceData(sequence, scaled, [float(position) for position in seen], points * scale, colours, normals)
     with writing(root):
         folder.mkdir(parents=True, exist_ok=True)
         unfinished.touch()
         write_co3d(root, category, [data])
         unfinished.unlink()
-    return ImportResult(len(seen), len(capture) - len(seen), len(points), scale, flags)
-
-
-def _masks_by_depth(capture: Sequence[CaptureFrame], wanted: Sequence[int]) -> dict[int, UInt8[np.ndarray, " bytes"]]:
-    """Segment some frames of a capture by depth, in groups all around the object; return the bits of the masks."""
-    bits, groups = {}, -(-len(wanted) // _GROUP)
-    for first in range(groups):
-        group = wanted[first::groups]
-        others = np.linspace(0, len(capture) - 1, _GROUP - len(group)).round().astype(int)
-        chosen = sorted({*group, *others.tolist()})
-        masked = zip(chosen, masks_from_depth([capture[index].load() for index in chosen]), strict=True)
-        bits |= {index: np.packbits(frame.mask > ON_OBJECT) for index, frame in masked if index in group}
-    return bits
+    return ImportResult(len(seen), count - len(seen), len(points), scale, tuple(source.flags(frames)))
 
 
 class LazyFrames(Sequence[Frame]):

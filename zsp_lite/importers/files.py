@@ -20,7 +20,7 @@ from jaxtyping import Float, Float32, Shaped, UInt8
 from PIL import ExifTags, Image
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import MAX_PIXELS, decode_image, read_depth
+from zsp_lite.data.frames import MAX_PIXELS, decode_image, read_depth, read_image
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import MAX_FILE, read_bytes
 
@@ -48,7 +48,7 @@ def read_picture(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], int]:
         if file.format in ("WEBP", "HEIF"):
             rgb = np.array(file.convert("RGB"))
         else:
-            rgb = decode_image(path, "image", cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)[..., ::-1].copy()
+            rgb = read_image(path)
     return rgb, orientation if orientation in _QUARTERS else 1
 
 

@@ -54,6 +54,7 @@ _COLOUR_IOU = 0.5  # least overlap with the mask that GrabCut finds in the padde
 _LYING = 0.5  # share of the object's points that may lie in the plane around it
 _CARRYING, _CARRIED = 0.4, 0.05  # shares of the object's points in and above one plane, such as a table's
 
+_NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
 _LEAST_KNOWN = 0.3  # share of the pixels on the object
 DOUBTFUL = "the masks may be wrong"
 
@@ -190,18 +191,24 @@ def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
     return (f"{DOUBTFUL}: {', '.join(signs)}",) if signs else ()
 
 
-def depth_flags(frames: Iterable[Frame]) -> tuple[str, ...]:
-    """Say in one line if most of the object has no known depth in frames with masks."""
-    seen = known = 0
+def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
+    """Question the object's distance, if lengths are metres, and whether most of it has known depth."""
+    distances, seen, known = [], 0, 0
     for frame in frames:
-        seen += (frame.mask > ON_OBJECT).sum()
-        known += object_pixels(frame).sum()
-    return (f"depth is known on {known / seen:.0%} of the object only",) if known < _LEAST_KNOWN * seen else ()
+        depth = frame.depth[object_pixels(frame)]
+        seen, known = seen + (frame.mask > ON_OBJECT).sum(), known + len(depth)
+        distances.append(np.quantile(depth, 0.25) if len(depth) else np.nan)
+    distance = float(np.nanmedian(distances)) if known else _NEAREST
+    if metric and not _NEAREST <= distance <= _FARTHEST:
+        cure = "the unit of its depth is given by --depth-unit (0.001: millimetres, 1: metres)"
+        yield f"the object is {distance:.3g} m from the camera, expected {_NEAREST:g} to {_FARTHEST:g} m; {cure}"
+    if known < _LEAST_KNOWN * seen:
+        yield f"depth is known on {known / seen:.0%} of the object only"
 
 
-def given_mask_flags(frames: Collection[Frame], missing: Sequence[object]) -> tuple[str, ...]:
+def given_mask_flags(frames: Collection[Frame], missing: Collection[str]) -> tuple[str, ...]:
     """Name the frames whose masks were made, and question masks that cover most of the image's border."""
-    flags = [f"no mask is given for {', '.join(map(str, missing))}: made by depth"] if missing else []
+    flags = [f"no mask is given for {', '.join(missing)}: made by depth"] if missing else []
     masks = (frame.mask > ON_OBJECT for frame in frames)
     borders = [np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean() for mask in masks]
     if count := sum(share > _MOST for share in borders):

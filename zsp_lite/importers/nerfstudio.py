@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import msgspec
 
 from zsp_lite.errors import MAX_LENGTH, InputError
-from zsp_lite.importers.capture import FROM_OPENGL, CaptureFrame, Makers, make_frame, read_capture_json
+from zsp_lite.importers.capture import FROM_OPENGL, CaptureFrame, Makers, make_frame
 from zsp_lite.importers.files import picture_size
-from zsp_lite.io.files import decode_json, find_inside
+from zsp_lite.io.files import decode_json, find_inside, read_json
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
@@ -57,7 +57,7 @@ def read_nerfstudio(path: str | Path) -> Makers:
     path = Path(path)
     if path.suffix != ".json":
         path = next((path / name for name in _NAMES if (path / name).is_file()), path / _NAMES[0])
-    common = read_capture_json(path, dict[str, Any])
+    common = read_json(path, dict[str, Any], "capture")
     listed = decode_json(msgspec.json.encode(common.pop("frames", None)), list[dict[str, Any]], f"{path}, frames")
     with_depth = [k for k, own in enumerate(listed) if own.get("depth_file_path") or own.get("depth_path")]
     if not with_depth:
@@ -74,9 +74,7 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
         found = f"{frame.camera_model!r} with k4 = {frame.k4:g}"
         expected = f"one of {', '.join(_MODELS)} with k4 = 0, or {_FISHEYE}"
         raise InputError(f"{where}: camera_model is {found}, expected {expected}")
-    image = find_inside(folder, frame.file_path)
-    if image is None:
-        raise InputError(f"{where}: {frame.file_path} is missing in {folder}")
+    image = find_inside(folder, frame.file_path) or folder / frame.file_path
     height, width = (int(frame.h), int(frame.w)) if frame.h and frame.w else picture_size(image)
     if not (frame.fl_x or frame.camera_angle_x):
         raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
@@ -86,7 +84,7 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     # OpenCV's order of the coefficients; its model has no r^8 term, k4.
     last = (frame.k3, frame.k4) if fisheye else (frame.p1, frame.p2, frame.k3)
     return make_frame(
-        folder, image, frame.depth_file_path or frame.depth_path, frame.transform_matrix,
+        folder, frame.file_path, frame.depth_file_path or frame.depth_path, frame.transform_matrix,
         (fx, fy, cx, cy), where, FROM_OPENGL, (height, width), frame.mask_path, fisheye=fisheye,
         depth_unit=frame.integer_depth_scale or frame.depth_unit_scale_factor, distortion=(frame.k1, frame.k2, *last),
     )  # fmt: skip

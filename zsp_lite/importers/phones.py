@@ -10,17 +10,9 @@ import numpy as np
 
 from zsp_lite.data.frames import write_image
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import (
-    FROM_OPENGL,
-    CaptureFrame,
-    Makers,
-    make_frame,
-    read_capture_json,
-    read_numbers,
-    sharpest,
-)
+from zsp_lite.importers.capture import FROM_OPENGL, CaptureFrame, Makers, make_frame, read_numbers, sharpest
 from zsp_lite.importers.unpacked import new_folder, open_video
-from zsp_lite.io.files import read_bytes
+from zsp_lite.io.files import read_bytes, read_json
 
 
 def read_stray(folder: Path, count: int) -> Makers:
@@ -47,7 +39,7 @@ def read_polycam(folder: Path) -> Makers:
     folder = folder / "keyframes"
     prefix = "corrected_" if all((folder / f"corrected_{one}").is_dir() for one in ("cameras", "images")) else ""
     for path in sorted((folder / f"{prefix}cameras").glob("*.json")):
-        camera = read_capture_json(path, dict[str, Any])
+        camera = read_json(path, dict[str, Any], "capture")
         pose = [camera.get(f"t_{row}{column}") for row in range(3) for column in range(4)]
         intrinsics = [camera.get(name) for name in ("fx", "fy", "cx", "cy")]
         files = f"{prefix}images/{path.stem}", f"depth/{path.stem}"
@@ -70,7 +62,7 @@ class _Record3D(msgspec.Struct):
 
 def read_record3d(folder: Path) -> Makers:
     """Read a scan of Record3D; its depth is decompressed to a temporary folder."""
-    scan, unpacked = read_capture_json(folder / "metadata", _Record3D), new_folder()
+    scan, unpacked = read_json(folder / "metadata", _Record3D, "capture"), new_folder()
     if not any(number for pose in scan.poses for number in pose):
         found = f"all {len(scan.poses)} poses are zero: the tracking failed"
         raise InputError(f"{folder}/metadata: {found}, expected another scan")

@@ -8,7 +8,8 @@ import msgspec
 import numpy as np
 
 from zsp_lite.errors import InputError, real_array
-from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, Makers, make_frame, read_capture_json, read_numbers
+from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, Makers, make_frame, read_numbers
+from zsp_lite.io.files import read_json
 
 _MILLIMETRES = 0.001
 
@@ -23,8 +24,8 @@ class _Annotation(msgspec.Struct):
 
 def read_bop(folder: Path, object: int | None = None) -> Makers:
     """Read a scene in BOP's format, in the frame of one of its objects, in each image the first with its number."""
-    scene = read_capture_json(folder / "scene_gt.json", dict[str, list[_Annotation]])
-    cameras = read_capture_json(folder / "scene_camera.json", dict[str, dict[str, Any]])
+    scene = read_json(folder / "scene_gt.json", dict[str, list[_Annotation]], "capture")
+    cameras = read_json(folder / "scene_camera.json", dict[str, dict[str, Any]], "capture")
     numbers = {image: [one.obj_id for one in placed] for image, placed in scene.items()}
     known = sorted({number for some in numbers.values() for number in some})
     if object is None and len(known) == 1:
@@ -52,7 +53,7 @@ def _make_bop(folder: Path, image: str, index: int, placed: _Annotation, camera:
 
 def read_scannet(folder: Path) -> Makers:
     """Read a scene in ScanNet's format, with a text file for the pose of each image."""
-    K = read_numbers(folder / "intrinsic/intrinsic_color.txt", (3, 4))
+    K = read_numbers(folder / "intrinsic/intrinsic_color.txt", (3, 4))[:3, :3]
     for path in sorted((folder / "pose").glob("*.txt")):
         files = f"color/{path.stem}", f"depth/{path.stem}"
         yield partial(make_frame, folder, *files, read_numbers(path, (4,)), K, str(path))
@@ -63,7 +64,7 @@ def read_open3d(folder: Path) -> Makers:
     log = next((one for one in (folder / "trajectory.log", folder / "scene/trajectory.log") if one.is_file()), None)
     if log is None:
         raise InputError(f"{folder} has no trajectory.log, expected poses: run Open3D's reconstruction system on it")
-    camera = read_capture_json(folder / "intrinsic.json", dict[str, Any])
+    camera = read_json(folder / "intrinsic.json", dict[str, Any], "capture")
     K = real_array(f"{folder}/intrinsic.json: intrinsic_matrix", camera.get("intrinsic_matrix"), (9,))
     images = sorted(path.stem for path in (folder / "color").iterdir() if path.suffix.lower() in (".jpg", ".png"))
     lines = read_numbers(log, (4,), usecols=(0, 1, 2, -1))  # three frame numbers, and four lines of a matrix

@@ -1,12 +1,11 @@
 """Zips and videos of captures, unpacked to a temporary folder that lives as long as the process."""
 
 import os
-import stat
 import struct
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from lzma import LZMAError
 from pathlib import Path
@@ -17,7 +16,7 @@ from jaxtyping import UInt8
 
 from zsp_lite.data.frames import MAX_PIXELS
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import file_size
+from zsp_lite.io.files import file_size, path_inside
 
 _MOST, _LARGE, _RATIO = 20e9, 1e9, 200  # bytes of an unpacked zip; above the second at most 200 times those of the zip
 _DAMAGE = (zipfile.BadZipFile, zlib.error, LZMAError, struct.error, OSError, EOFError, RuntimeError, ValueError)
@@ -37,31 +36,19 @@ def new_folder() -> Path:
 
 @cache
 def unpack(path: Path) -> Path:
-    """Unpack a zip to a temporary folder; InputError if it is damaged, encrypted, malicious or too large."""
+    """Unpack a zip to a temporary folder; InputError if it is damaged, encrypted, too large, or has paths out of it."""
     size, folder = file_size(path, "zip"), new_folder()
     try:
         with zipfile.ZipFile(path) as zipped:
-            if not (problem := _problem(zipped.infolist(), size)):
-                zipped.extractall(folder)
+            total = sum(one.file_size for one in zipped.infolist())
+            if total > min(_MOST, max(_LARGE, _RATIO * size)):
+                raise InputError(f"{size:,} bytes unpack to {total:,}")
+            for one in zipped.infolist():
+                path_inside(folder, one.filename)
+            zipped.extractall(folder)  # makes no links
     except _DAMAGE as error:
-        problem = f"is damaged: {error}"
-    if problem:
-        raise InputError(f"zip {path} {problem}, expected a capture as an app exports it")
+        raise InputError(f"zip {path} cannot be unpacked: {error}, expected a capture as an app exports it") from error
     return folder
-
-
-def _problem(members: Sequence[zipfile.ZipInfo], size: int) -> str:
-    """Say why a zip of `size` bytes is not to be unpacked; "" if it is."""
-    total = sum(one.file_size for one in members)
-    if total > min(_MOST, max(_LARGE, _RATIO * size)):
-        return f"of {size:,} bytes unpacks to {total:,}"
-    for one in members:
-        name = one.filename.replace("\\", "/")
-        if name.startswith("/") or ":" in name or ".." in name.split("/"):
-            return f"has a path that leads out of it, {name[:100]!r}"
-        if one.flag_bits & 1 or stat.S_ISLNK(one.external_attr >> 16):
-            return f"has an encrypted file or a link, {name[:100]!r}"
-    return ""
 
 
 def open_video(path: Path) -> Callable[[int], UInt8[np.ndarray, "h w 3"]]:

@@ -1,10 +1,12 @@
 """Atomic writes, reads with limits and errors that name the file, JSON, and checks of paths and names."""
 
+import codecs
 import gzip
 import hashlib
 import io
 import math
 import os
+import re
 import secrets
 import stat
 import zlib
@@ -46,7 +48,15 @@ def read_bytes(path: str | Path, what: str) -> bytes:
 
 def read_json(path: str | Path, kind: Any, what: str) -> Any:
     """Read a JSON file as a type of msgspec; InputError, which names its kind `what`, its path and the field."""
-    return decode_json(read_bytes(path, what), kind, f"{what} {path}")
+    return decode_json(without_nan(read_bytes(path, what)).removeprefix(codecs.BOM_UTF8), kind, f"{what} {path}")
+
+
+def without_nan(data: bytes) -> bytes:
+    """Replace NaN and Infinity, which Python's json writes but which are not valid JSON, by null."""
+    # Null is then accepted by optional fields, and refused by the others with the name of the field.
+    if b"NaN" in data or b"Infinity" in data:
+        data = re.sub(rb"(?<=[:,\[\s])-?(?:NaN|Infinity)(?=[,\]}\s])", b"null", data)
+    return data
 
 
 def decode_json(data: bytes | msgspec.Raw, kind: Any, what: str) -> Any:
