@@ -71,6 +71,8 @@ def shifted(frame):
         (partial(scaled, 5), "if the depth is taken in 1/5000 m: --depth-unit 0.0002$"),
         (partial(scaled, 1000), "if the depth is multiplied by 0.001: --depth-unit 1e-06$"),
         (partial(scaled, 1.8), "if the depth is multiplied by 0.5[2-9]"),
+        (along_ray, "if depth is distance along the ray"),
+        (shifted, "no usual mistake in units or poses explains it"),
     ],
 )
 def test_each_mistake_is_named(frames, mistake, named):

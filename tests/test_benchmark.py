@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from benchmark_folder import BACKBONE, own_method, run_rows, small_folder
+from refusals import refused
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite.benchmark.run import evaluate
@@ -15,7 +16,6 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import write_mask
 from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.data.pairs import category_pairs, sample_pairs, write_published_pairs
-from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.synthetic.ground_truth import POSES_FILE, ObjectPose, object_poses
 
@@ -123,8 +123,7 @@ def test_unknown_methods_categories_and_folders_and_the_folder_of_another_run_ar
         (small_folder(), BACKBONE, new | {"targets": 0}, "targets is 0"),
         (tmp_path / "nowhere", BACKBONE, new, "nowhere"),
     ):  # fmt: skip
-        with pytest.raises(InputError, match=told):
-            evaluate(root, backbone, **options)
+        refused(told, evaluate, root, backbone, **options)
     assert not (tmp_path / "a").exists()
 
 
@@ -165,5 +164,4 @@ def test_object_poses_of_another_layout_cost_a_warning_and_the_figure_that_needs
     assert found["n"] == 3 and found["failed"] == 0 and "symmetric_acc30" not in found
     (told,) = caplog.messages
     assert str(path) in told and expected in told and told.endswith(": without it there is no symmetric_acc30")
-    with pytest.raises(InputError, match=POSES_FILE):
-        object_poses(dataset, "lump")
+    refused(POSES_FILE, object_poses, dataset, "lump")

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from benchmark_folder import BACKBONE, exact_keypoints, own_matcher, own_method, placement, run_rows, small_folder
+from refusals import refused
 from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone, true_pose
 
@@ -84,8 +85,7 @@ def test_the_number_of_arguments_without_a_default_or_the_attribute_kind_tells_w
     problem.kind = "problem"  # comes before the two arguments
     found = lambda one, other=None, *, third=3: 0, lambda one, two, three=3, **options: 0, Network(), problem
     assert [kind_of("mine", one) for one in found] == ["problem", "keypoints", "keypoints", "problem"]
-    with pytest.raises(InputError, match="no methods, expected some"):
-        resolve([])
+    refused("no methods, expected some", resolve, [])
     views = resolve(["ours-n4", "near=ours-bv-n2", "far=benchmark_folder:own_method"])
     assert [(name, row.targets) for name, row in views.items()] == [("ours-n4", 4), ("near", 2), ("far", None)]
 
@@ -152,10 +152,8 @@ def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
         assert np.isnan(known).all() if name == "rotations" else np.allclose(known, (0, 1), atol=1e-9)
         assert found.loc[pairs[3].key, ["error", "failed"]].tolist() == [180, f"{path} has no pose"]
     (tmp_path / "exact.csv").write_text("\n".join(lines[:2]))  # other poses under the same name
-    with pytest.raises(InputError, match="a run with methods of exact"):
-        run_rows(rows, tmp_path / "run", 4, 3)
-    with pytest.raises(InputError, match="exact.csv has no pose for any of the pairs"):
-        run_rows(rows, tmp_path / "other", 6, 2, "pebble")
+    refused("a run with methods of exact", run_rows, rows, tmp_path / "run", 4, 3)
+    refused("exact.csv has no pose for any of the pairs", run_rows, rows, tmp_path / "other", 6, 2, "pebble")
     end = f"{pairs[0].target_sequence},{pairs[0].target_frames[1]}"
     second = lines[1].replace(end, f"{pairs[0].target_sequence},{pairs[0].target_frames[0]}")
     (tmp_path / "two.csv").write_text("\n".join([*lines, second]))
@@ -230,8 +228,7 @@ RIGHT = "lump,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1"
 def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_path):
     path = tmp_path / "poses.csv"
     path.write_text(text, encoding="latin-1")
-    with pytest.raises(InputError, match=f"poses {re.escape(str(path))}.*{told}"):
-        resolve([f"theirs={path}"])
+    refused(f"poses {re.escape(str(path))}.*{told}", resolve, [f"theirs={path}"])
     saved = f"{COLUMNS.title()},,\n,,,,,,,,,\n{RIGHT.replace('a,0,b,1', 'a,0.0,b,0001')},,\n".replace("_", " ")
     path.write_text(saved, encoding="utf-16")
     assert resolve([f"theirs={path}"])["theirs"].solve._poses.keys() == {("lump", "a", 0, "b", 1)}
@@ -275,8 +272,7 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])  # as a console script has it
     (tmp_path / "row_that_exits.py").write_text("raise SystemExit(3)")
-    with pytest.raises(InputError, match="'row_that_exits:a' cannot be imported: .*py, line 1: SystemExit: 3"):
-        resolve(["row_that_exits:a"])
+    refused("'row_that_exits:a' cannot be imported: .*py, line 1: SystemExit: 3", resolve, ["row_that_exits:a"])
     assert resolve(["rows_of_my_own:still"])["rows_of_my_own:still"].solve.__name__ == "still"
 
 

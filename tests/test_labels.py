@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from co3d_folders import contents, convert_to_v2, random_camera, seeds, sequence_data
 from hypothesis import given
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
@@ -49,8 +50,7 @@ def test_labels_and_pairs_are_imported_and_replace_others_only_on_request(clone,
     mine[:3, 3] = 0.1
     write_label(root, "chair", PoseLabel(mine, "b", "a"))
     before = contents(root)
-    with pytest.raises(InputError, match=r"b\.json would be replaced by other content, expected --replace"):
-        import_labels(clone, root)
+    refused(r"b\.json would be replaced by other content, expected --replace", import_labels, clone, root)
     assert contents(root) == before
     import_labels(clone, root, replace=True)
     assert np.array_equal(read_labels(root, "chair")["b"].trans, np.eye(4))
@@ -69,20 +69,16 @@ def test_nothing_is_written_if_one_file_is_bad(clone, root, tmp_path, file, cont
     (root / "class_labels/chair").mkdir(parents=True)
     (tmp_path / file).write_bytes(content)
     before = contents(root)
-    with pytest.raises(InputError, match=message):
-        import_labels(clone, root)
+    refused(message, import_labels, clone, root)
     assert contents(root) == before
 
 
 def test_sources_without_labels_are_refused(root, tmp_path):
     (tmp_path / "labels.zip").write_bytes(b"text")
     for source in ("none", "labels.zip"):
-        with pytest.raises(InputError, match=f"{source} holds no class_labels.*, expected a clone"):
-            import_labels(tmp_path / source, root)
-    with pytest.raises(InputError, match="does not exist"):
-        import_labels(tmp_path, tmp_path / "nowhere")
-    with pytest.raises(InputError, match="has no labels of category chair"):
-        transfer_labels(root, root, "chair")
+        refused(f"{source} holds no class_labels.*, expected a clone", import_labels, tmp_path / source, root)
+    refused("does not exist", import_labels, tmp_path, tmp_path / "nowhere")
+    refused("has no labels of category chair", transfer_labels, root, root, "chair")
 
 
 def moved(sequence, world: Sim3, noise: float = 0.0):

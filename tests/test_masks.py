@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from refusals import refused
 from synthetic_views import look_at
 
 from zsp_lite.data.frames import Frame
@@ -55,8 +56,7 @@ def test_the_object_on_a_floor_is_found_without_a_box_in_any_unit_of_length(coun
 def test_depth_without_an_object_is_refused_and_a_frame_without_depth_gets_an_empty_mask():
     frame, truth = ball_on_floor(DIRECTIONS[0])
     blind = replace(frame, depth=np.zeros_like(frame.depth))
-    with pytest.raises(InputError, match="no depth is known"):
-        masks_from_depth([blind])
+    refused("no depth is known", masks_from_depth, [blind])
     with pytest.raises(InputError, match="nothing stands out .* expected --box TOP,LEFT,HEIGHT,WIDTH"):
         masks_from_depth([replace(frame, depth=np.full_like(frame.depth, 2))])
     empty, found = masks_from_depth([blind, frame])

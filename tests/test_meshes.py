@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from model_files import painted, studio, view, wedge, write_quad, write_wedge
+from refusals import refused
 
 from zsp_lite.errors import InputError
 from zsp_lite.synthetic import meshes
@@ -108,8 +109,7 @@ def test_orientations_are_rotations_to_front_x_and_up_z():
     oblique = ModelInfo(front=(1, 1, 0), up=(0, 0, 2)).axes(".ply")
     assert oblique @ oblique.T == pytest.approx(np.eye(3)) and np.linalg.det(oblique) == pytest.approx(1)
     for info in (ModelInfo(front="+y", up="+y"), ModelInfo(up=(0, 0, 0))):
-        with pytest.raises(InputError, match="expected"):
-            info.axes(".obj")
+        refused("expected", info.axes, ".obj")
 
 
 @pytest.mark.parametrize(
@@ -125,8 +125,7 @@ def test_orientations_are_rotations_to_front_x_and_up_z():
 def test_a_folder_without_models_and_a_wrong_list_are_refused(tmp_path, folder, entries, message):
     write_wedge(tmp_path / "chair" / "a.obj")
     (tmp_path / "models.json").write_text(entries)
-    with pytest.raises(InputError, match=message):
-        list_models(tmp_path / folder)
+    refused(message, list_models, tmp_path / folder)
 
 
 # Pictures

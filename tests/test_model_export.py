@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 from model_files import write_quad, write_wedge
+from refusals import refused
 
 from zsp_lite.cli import main as cli
 from zsp_lite.data.cameras import Camera
@@ -91,8 +92,7 @@ def test_complete_sequences_stay_and_turned_models_are_rendered_again(data, fold
     export_models(folder, out, **SETTINGS, front="+x")  # of `high` alone: models.json orients the other one
     assert rendered == ["high"]
     assert not np.allclose(read_labels(out, "chair")["low"].trans, before)
-    with pytest.raises(InputError, match="was written with"):
-        export_models(folder, out, **{**SETTINGS, "seed": 4})
+    refused("was written with", export_models, folder, out, **{**SETTINGS, "seed": 4})
 
 
 def test_a_folder_of_other_data_or_without_a_usable_model_is_refused(data, folder, tmp_path):
@@ -101,8 +101,7 @@ def test_a_folder_of_other_data_or_without_a_usable_model_is_refused(data, folde
         export_models(tmp_path / "models", tmp_path / "out")
     shutil.copytree(data[0].root, tmp_path / "other")
     (tmp_path / "other" / RENDERED_FILE).unlink()
-    with pytest.raises(InputError, match="holds other data"):
-        export_models(folder, tmp_path / "other")
+    refused("holds other data", export_models, folder, tmp_path / "other")
 
 
 def test_the_command_line_renders_models_and_names_those_left_out(folder, tmp_path, capsys):

@@ -10,10 +10,10 @@ from email.parser import Parser
 from pathlib import Path
 
 import pytest
+from refusals import refused
 
 import zsp_lite
 from zsp_lite import samples
-from zsp_lite.errors import InputError
 
 REPOSITORY = Path(__file__).parents[1]
 FILES = ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", "CHANGELOG.md", "CITATION.cff")
@@ -111,5 +111,4 @@ def test_samples_are_made_in_the_cache_and_completed_after_an_interruption(tmp_p
         assert calls == [("demo", []), ("demo", ["made 1"])]
     (tmp_path / "file").touch()
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "file"))
-    with pytest.raises(InputError, match="set ZSP_LITE_CACHE to a folder that can be written"):
-        samples.sample_data()
+    refused("set ZSP_LITE_CACHE to a folder that can be written", samples.sample_data)

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 from co3d_folders import contents
+from refusals import refused
 
 from tools.synthetic import SPLITS
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
-from zsp_lite.errors import InputError
 from zsp_lite.io.files import stable_hash
 from zsp_lite.synthetic import export
 from zsp_lite.synthetic.assembly import make_shape
@@ -131,11 +131,9 @@ def test_an_interrupted_export_is_completed_and_complete_sequences_stay(tmp_path
 
 
 def test_folders_with_other_or_damaged_settings_are_input_errors(folder, tmp_path):
-    with pytest.raises(InputError, match="was written with"):
-        export_categories(["chair"], folder, 2, FRAMES, SEED + 1, SIZE)
+    refused("was written with", export_categories, ["chair"], folder, 2, FRAMES, SEED + 1, SIZE)
     (tmp_path / "synthetic.json").write_text('{"seed": ')
-    with pytest.raises(InputError, match="synthetic.json"):
-        export_categories(["chair"], tmp_path, 1, 2, SEED, 48)
+    refused("synthetic.json", export_categories, ["chair"], tmp_path, 1, 2, SEED, 48)
 
 
 def test_turns_after_which_a_shape_is_the_same_are_known():

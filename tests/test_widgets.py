@@ -8,10 +8,10 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from refusals import refused
 
 from zsp_lite.alignment import Sim3, ransac, umeyama
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.errors import InputError
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.metrics import rotation_error
 from zsp_lite.synthetic.ground_truth import correct_matches
@@ -66,8 +66,7 @@ def test_no_module_imports_ipywidgets_before_a_widget_is_made():
 
 def test_without_ipywidgets_the_error_has_the_command_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "ipywidgets", None)
-    with pytest.raises(InputError, match="pip install ipywidgets"):
-        common.slider("x", 0, 1, 0)
+    refused("pip install ipywidgets", common.slider, "x", 0, 1, 0)
 
 
 # features and matches
