@@ -145,9 +145,3 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
     assert found.sources[1].endswith(f"helpers: {sources[2]}")
     assert one.flags[-1].startswith("4 of 4 frames vote for another pose: frame 0 of")
     refused("expected different objects", estimate_pose, *sources[:2], helpers=sources[1:], **settings)
-
-
-def test_paths_after_the_pair_belong_to_helpers(capsys):
-    assert cli.main(["estimate", "a", "b", "c"]) == 2
-    assert "1 more paths, expected these after --helpers" in capsys.readouterr().err
-    assert cli.main(["estimate", "a", "b", "--helpers", "c", "--solver", "paper"]) == 2

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.alignment import Sim3, _draw_samples, ransac, umeyama
+from zsp_lite.alignment import Sim3, ransac, umeyama
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import PoseLabel
-from zsp_lite.errors import InputError, rotation_matrix
+from zsp_lite.errors import rotation_matrix
 from zsp_lite.features import FeatureMap
 
 seeds = st.integers(0, 2**32 - 1)
@@ -59,8 +59,7 @@ def test_composition_is_the_product_of_the_matrices_and_application_in_turn(seed
     ],
 )
 def test_what_is_no_similarity_is_refused(scale, R, t):
-    with pytest.raises(InputError):
-        Sim3(scale, R, t)
+    refused("", Sim3, scale, R, t)
 
 
 @pytest.mark.parametrize("rounded", [lambda R: R.astype(np.float16), lambda R: R.round(4), lambda R: R.round(2)])
@@ -142,9 +141,7 @@ DEGENERATE = {
 @pytest.mark.parametrize("points", DEGENERATE)
 @pytest.mark.parametrize("solver", [umeyama, ransac])
 def test_degenerate_or_malformed_points_are_refused_in_one_line(solver, points):
-    with pytest.raises(InputError) as error:
-        solver(*DEGENERATE[points])
-    assert "\n" not in str(error.value)
+    refused("", solver, *DEGENERATE[points])
 
 
 # RANSAC
@@ -223,11 +220,3 @@ def test_the_final_fit_keeps_to_the_scale_range():
 def test_settings_of_ransac_out_of_range_are_refused(settings):
     refused(next(iter(settings)), lambda: ransac(cloud(0), cloud(0), **settings))
     refused("at least 4", lambda: ransac(cloud(0, 3), cloud(0, 3)))
-
-
-def test_every_sample_is_equally_likely():
-    samples = np.sort(_draw_samples(5, 3, 100_000, np.random.default_rng(0)), axis=1)
-    _, counts = np.unique(samples, axis=0, return_counts=True)
-    assert len(counts) == 10
-    # 10 subsets of 100,000 draws: standard deviation sqrt(1e5 * 0.1 * 0.9) = 95.
-    assert np.abs(counts - 10_000).max() < 5 * 95

@@ -245,19 +245,3 @@ def test_a_disk_that_is_too_small_is_found_before_the_download(server, tmp_path,
     assert "GB free" in capsys.readouterr().err and server.ranges == [] and not (tmp_path / "co3d").exists()
     monkeypatch.setattr("shutil.disk_usage", lambda path: usage._replace(free=needed))
     assert download(tmp_path / "co3d") == 0
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["co3d", "--category", "spaceship"], "co3d (full) is 'spaceship', expected one of toaster"),
-        (["co3d-v1", "--category", "toaster", "--single-sequence"], "--single-sequence does not go with co3d-v1"),
-        (["co3d-v1", "--category", "toaster", "--labelled-only"], "--labelled-only goes with --labels"),
-        (["co3d", "--category", "toaster", "--labels", "x"], "--labels does not go with co3d: labels are of v1"),
-    ],
-)
-def test_bad_requests_give_one_line_and_exit_code_2(server, tmp_path, monkeypatch, capsys, words, message):
-    monkeypatch.chdir(tmp_path)
-    assert main(["data", "download", *words, "--yes"]) == 2
-    error = capsys.readouterr().err
-    assert message in error and len(error.splitlines()) == 1 and files_of(tmp_path) == ["catalogue.json"]

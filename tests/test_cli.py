@@ -13,18 +13,17 @@ import numpy as np
 import pytest
 from co3d_folders import convert_to_v2, sequence_data
 from synthetic_views import CoordinateBackbone
-from test_importers import hairdryer_views, write_lists
 
 from zsp_lite import __version__, errors
 from zsp_lite.backbones.load import BackboneConfig
 from zsp_lite.cli import demo, doctor
 from zsp_lite.cli.main import cli, main
 from zsp_lite.data.co3d import Co3D, write_co3d
-from zsp_lite.data.frames import write_mask
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.importers import FORMATS, Capture
 from zsp_lite.importers.convert import ImportResult
 
+DOWNLOAD = ("data", "download", "--yes")
 IMPORT = ("data", "import", "--root=x", "--category=c", "--sequence=s")
 
 
@@ -80,6 +79,8 @@ WRONG = [
     (["estimate", "a", "b", "--depth-unit", "0"], "got '0', expected a positive number"),
     (["estimate", "a", "b", "--box", "1,2,3,4.5"], "got '1,2,3,4.5', expected four integers"),
     (["estimate", "a", "b", "--intrinsics", "inf,1,2,3"], "got 'inf,1,2,3', expected four numbers"),
+    (["estimate", "a", "b", "c"], "1 more paths, expected these after --helpers"),
+    (["estimate", "a", "b", "--helpers", "c", "--solver", "paper"], "--helpers"),
     (["demo", "--data", "no/such/folder"], str(Path("no/such/folder"))),
     (["demo", "--backbone", "resnet"], "resnet"),
     (["demo", "--layer", "block12"], "'block0' to 'block11'"),
@@ -88,6 +89,13 @@ WRONG = [
     (["tables", "."], "run.json"),
     (["synth", "--category", "sofa", "--out", "x"], "sofa"),
     (["data", "check", "/nowhere"], "does not exist"),
+    ([*DOWNLOAD, "co3d", "--category", "spaceship"], "co3d (full) is 'spaceship', expected one of "),
+    (
+        [*DOWNLOAD, "co3d-v1", "--category", "toaster", "--single-sequence"],
+        "--single-sequence does not go with co3d-v",
+    ),
+    ([*DOWNLOAD, "co3d-v1", "--category", "toaster", "--labelled-only"], "--labelled-only goes with --labels"),
+    ([*DOWNLOAD, "co3d", "--category", "toaster", "--labels", "x"], "--labels does not go with co3d: labels are of v1"),
     ([*IMPORT, "lists", "/nowhere"], "rgb.txt"),
     ([*IMPORT, "nerfstudio", "x", "--object=2"], "--object does not go with the format nerfstudio"),
     ([*IMPORT, "lists", "x", "--box=1,1,9,9", "--masks=m"], "--masks does not go with --box"),
@@ -250,19 +258,6 @@ def test_labels_are_imported_and_transferred(root, tmp_path, capsys):
     assert main([*transfer, "--replace"]) == 0
     assert "camera centres differ by 0.00 %" in capsys.readouterr().out
     assert list(read_labels(tmp_path / "v2", "chair")) == ["a", "b"]
-
-
-def test_a_capture_is_imported(tmp_path, capsys):
-    source = tmp_path / "scan"
-    source.mkdir()
-    frames = hairdryer_views()
-    for frame in frames:
-        write_mask(tmp_path / f"masks/{frame.name}.png", frame.mask)
-    write_lists(source, frames)
-    arguments = ["data", "import", "lists", str(source), "--root", str(tmp_path / "mine"), "--category", "teapot"]
-    assert main([*arguments, "--sequence", "one", "--masks", str(tmp_path / "masks")]) == 0
-    assert "8 frames" in capsys.readouterr().out
-    assert len(Co3D(tmp_path / "mine").frames("teapot", "one")) == 8
 
 
 def test_options_of_the_import_reach_the_library(monkeypatch, capsys):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import transformers
+from refusals import refused
 from safetensors.torch import load, load_file, save_file
 from small_backbones import ARCHITECTURES, DEPTH, DIM, HEADS, configuration, save_all, save_model
 from transformers import AutoModel
@@ -21,7 +22,6 @@ from zsp_lite.backbones.backbone import prepare_images
 from zsp_lite.backbones.load import download
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.choices import FACETS
-from zsp_lite.errors import InputError
 
 
 @pytest.fixture(scope="module")
@@ -134,15 +134,9 @@ def test_the_image_processors_mean_and_deviation_are_taken(file, content, mean, 
 # what is refused
 
 
-def refused(name, match: str, **options):
-    with pytest.raises(InputError, match=match) as caught:
-        load_backbone(name, "cpu", **options)
-    assert len(str(caught.value).splitlines()) == 1
-
-
 def test_without_transformers_the_package_is_named(folders, monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
-    refused(f"hf:{folders['vit']}", r"pip install transformers")
+    refused(r"pip install transformers", load_backbone, f"hf:{folders['vit']}", "cpu")
 
 
 @pytest.mark.parametrize(
@@ -158,7 +152,7 @@ def test_without_transformers_the_package_is_named(folders, monkeypatch):
 )
 def test_models_that_cannot_be_read_are_refused(kind, settings, match, tmp_path):
     config = transformers.ResNetConfig(**settings) if kind == "resnet" else configuration(kind, **settings)
-    refused(f"hf:{save_model(tmp_path / 'model', config)}", match, image_size=32)
+    refused(match, load_backbone, f"hf:{save_model(tmp_path / 'model', config)}", "cpu", image_size=32)
 
 
 def test_missing_weights_are_refused_and_not_made_up(tmp_path):
@@ -171,15 +165,15 @@ def test_missing_weights_are_refused_and_not_made_up(tmp_path):
     del kept["layernorm.weight"]
     other = shutil.copytree(folder, tmp_path / "other")  # Windows keeps a file whose tensors are in use
     save_file(kept, other / "model.safetensors", metadata={"format": "pt"})
-    refused(f"hf:{other}", "1 weights are not in the file, first layernorm.weight")
+    refused("1 weights are not in the file, first layernorm.weight", load_backbone, f"hf:{other}", "cpu")
 
 
 def test_pickles_are_not_read(tmp_path):
     folder = save_model(tmp_path / "vit", configuration("vit"))
     torch.save(load_file(folder / "model.safetensors"), folder / "pytorch_model.bin")
     (folder / "model.safetensors").unlink()
-    refused(f"hf:{folder}", "no model.safetensors")
-    refused(f"hf:{tmp_path}", "no config.json")
+    refused("no model.safetensors", load_backbone, f"hf:{folder}", "cpu")
+    refused("no config.json", load_backbone, f"hf:{tmp_path}", "cpu")
 
 
 @pytest.mark.parametrize(
@@ -193,7 +187,12 @@ def test_pickles_are_not_read(tmp_path):
 def test_damaged_folders_are_refused_in_one_line(file, content, match, tmp_path):
     folder = save_model(tmp_path / "vit", configuration("vit"))
     (folder / file).write_bytes(content)
-    refused(f"hf:{folder}", re.escape(f"hf:{folder}") + f": cannot be loaded by the package transformers .*{match}")
+    refused(
+        re.escape(f"hf:{folder}") + f": cannot be loaded by the package transformers .*{match}",
+        load_backbone,
+        f"hf:{folder}",
+        "cpu",
+    )
 
 
 # the hub
@@ -220,4 +219,4 @@ def test_what_is_in_the_cache_needs_no_hub(offline, pictures):
 
 @pytest.mark.parametrize("name", ["hf:", "hf:../nowhere", "hf:facebook/dinov2-small"])
 def test_what_is_neither_a_folder_nor_a_name_is_refused(name, offline):
-    refused(name, "neither a folder nor a model OWNER/MODEL that the Hugging Face hub gives")
+    refused("neither a folder nor a model OWNER/MODEL that the Hugging Face hub gives", load_backbone, name, "cpu")

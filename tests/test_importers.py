@@ -150,19 +150,6 @@ def test_distortion_is_corrected(tmp_path, views, model):
         assert np.hypot((patch * columns).sum() / patch.sum() - x, (patch * rows).sum() / patch.sum() - y) < 0.35
 
 
-def test_masks_come_from_files_by_name(tmp_path, views):
-    folder = tmp_path / "scan"
-    write_lists(folder, views)
-    capture = open_capture(folder, "lists").frames
-    with pytest.raises(InputError, match=r"0000.jpg has no mask, expected .*\(--masks DIR\)"):
-        import_capture(capture, tmp_path / "data", "teapot", "mine")
-    assert not (tmp_path / "data").exists(), "nothing is written"
-    for view in views:
-        write_mask(tmp_path / f"masks/{view.name}.png", view.mask)
-    import_capture(capture, tmp_path / "data", "teapot", "mine", masks=tmp_path / "masks")
-    assert Co3D(tmp_path / "data").categories() == ["teapot"]
-
-
 def test_the_fused_cloud_lies_on_the_surface(views):
     points, colours, normals = fuse(views)
     seen = np.concatenate([
@@ -179,11 +166,16 @@ def replaced(name, content):
     return lambda folder: (folder / name).write_text(content)
 
 
-def edited(change):
+def edited(*changes, encoding="utf-8", name="transforms.json"):
+    """Change transforms.json, or each frame of it where `changes` are of two arguments."""
+
     def apply(folder):
         content = json.loads((folder / "transforms.json").read_text())
-        change(content)
-        (folder / "transforms.json").write_text(json.dumps(content))
+        for change in changes:
+            change(content)
+        (folder / "transforms.json").unlink()
+        (folder / name).write_text(json.dumps(content), encoding=encoding)
+        return folder
 
     return apply
 
@@ -204,9 +196,7 @@ def edited(change):
 def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(tmp_path, views, kind, damage, message):
     WRITERS[kind](tmp_path, views)
     damage(tmp_path)
-    with pytest.raises(InputError, match=message) as caught:
-        open_capture(tmp_path, kind).frames
-    assert "\n" not in str(caught.value)
+    refused(message, open_capture, tmp_path, kind)
 
 
 def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
@@ -214,17 +204,8 @@ def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
     height, width = views[0].camera.size
     plane = np.repeat(np.arange(500, 500 + height // 2), width // 2).reshape(height // 2, width // 2)
     write_depth16(tmp_path / f"depths/{views[0].name}.png", plane / 1000)
-    frame = open_capture(tmp_path, "nerfstudio").frames[0]
-    np.testing.assert_allclose(frame.load().depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
-    write_depth16(tmp_path / f"depths/{views[0].name}.png", plane[:, ::2] / 1000)
-    refused(r"expected .* = \(96, 128\)", frame.load)
-
-
-@pytest.mark.parametrize("values", [np.array(["x"]), np.float32(3), np.ones((4, 4, 3)), np.ones((0, 4))])
-def test_an_npy_file_that_is_no_depth_map_is_refused(tmp_path, views, values):
-    write_lists(tmp_path, views[:1])
-    np.save(tmp_path / f"z/{views[0].name}.npy", values)
-    refused(r"expected numbers \(H, W\): .* .npy", open_capture, tmp_path, "lists")
+    frame = open_capture(tmp_path, "nerfstudio").frames[0].load()
+    np.testing.assert_allclose(frame.depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
 
 
 def test_a_single_frame_is_fused_and_a_surface_that_one_of_many_frames_saw_is_left_out(views):

@@ -1,15 +1,12 @@
 """Similarity against materialised descriptors, cyclical distances against loops, and `match`'s promises."""
 
-import cv2
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from threadpoolctl import threadpool_info
 
-from zsp_lite import matching
 from zsp_lite.features import FeatureMap, log_bin
 from zsp_lite.matching import cyclical_distances, key_similarities, match, similarities, similarity
 
@@ -172,15 +169,3 @@ def test_cycles_from_the_target_are_the_published_cycles_of_the_swapped_pair():
     np.testing.assert_allclose(-matches.distance, cycles[tuple(matches.target.T)])
     forth = sim.argmax(0).numpy()
     np.testing.assert_array_equal(matches.reference @ (9, 1), forth[matches.target @ (10, 1)])
-
-
-def test_clusters_are_computed_by_one_thread(monkeypatch):
-    class Observed(matching.KMeans):
-        def fit(self, points):
-            threads.update([cv2.getNumThreads(), *(one["num_threads"] for one in threadpool_info())])
-            return super().fit(points)
-
-    threads = set()
-    monkeypatch.setattr(matching, "KMeans", Observed)
-    matching._cluster(np.eye(8), 4, np.random.default_rng(0))
-    assert threads == {1}

@@ -21,7 +21,7 @@ from zsp_lite.estimates import PoseEstimate, match_points
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, align_best_view, view_alignment
-from zsp_lite.verified import VerifiedSolver, solver
+from zsp_lite.verified import VerifiedSolver
 from zsp_lite.views import View, extract_views, object_crop, patch_mask
 
 
@@ -242,15 +242,6 @@ def test_a_backbone_that_does_not_return_a_map_for_each_image_is_refused(referen
         method.estimate(reference, targets)
 
 
-def test_a_solver_has_a_score_for_each_usable_view(views):
-    def one_score(reference, targets, matched, *, seed, threshold):
-        found = align_best_view(reference, targets, matched)
-        return replace(found, view_scores=found.view_scores[:1])
-
-    with pytest.raises(ValueError, match="size 1 into shape"):
-        ZeroShotPose(CoordinateBackbone(), solver=one_score).estimate_from_views(views[0], views[1:])
-
-
 def test_a_solver_says_whether_kmeans_selects_its_matches(views):
     def matches(**settings):
         method = replace(BASE, **settings)
@@ -276,16 +267,8 @@ def scores(estimate: PoseEstimate) -> list[float]:
     return [one.score for one in estimate.hypotheses]
 
 
-def test_the_seed_reaches_the_verified_proposals_and_refinement(views, verified, monkeypatch):
-    propose, refine = solver.poses_from_matches, solver.refine_coarse_to_fine
-    with monkeypatch.context() as patch:
-        patch.setattr(solver, "poses_from_matches", lambda *args: propose(*args[:2], np.random.default_rng(0)))
-        assert scores(estimate_noisy(views, VERIFIED)) != scores(estimate_noisy(views, VERIFIED, seed=1))
-    monkeypatch.setattr(solver, "refine_coarse_to_fine", lambda *args: refine(*args[:2], np.random.default_rng(0)))
-    assert scores(estimate_noisy(views, VERIFIED)) != scores(estimate_noisy(views, VERIFIED, seed=1))
-
-
-def test_the_threshold_reaches_the_verified_solver(views, verified):
+def test_seed_and_threshold_reach_the_verified_solver(views, verified):
+    assert scores(estimate_noisy(views, VERIFIED, seed=1)) != scores(verified)
     wide = estimate_noisy(views, VERIFIED, threshold=2.0)
     assert wide.inliers.sum() > verified.inliers.sum() and (wide.sim3.matrix == verified.sim3.matrix).all()
 
@@ -338,9 +321,7 @@ def test_unusable_frames_are_refused_in_one_line(method, reference, targets):
     no_depth = replace(reference, depth=None)
     no_known = replace(reference, depth=np.zeros_like(reference.depth))
     for frame, word in ((empty, "mask"), (no_depth, "depth"), (no_known, "depth")):
-        with pytest.raises(InputError, match=word) as error:
-            method.estimate(frame, targets)
-        assert "reference" in str(error.value) and "\n" not in str(error.value)
+        assert "reference" in refused(word, method.estimate, frame, targets)
     refused("no target", method.estimate, reference, [])
     refused("mask", lambda: replace(method, foreground="mask").estimate(replace(reference, mask=None), targets))
 

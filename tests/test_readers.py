@@ -1,6 +1,7 @@
 """Scans in the layouts of apps and depth cameras, made of rendered frames: what is read, refused and left out."""
 
 import json
+import re
 import stat
 import sys
 import types
@@ -14,7 +15,7 @@ import pytest
 from refusals import refused
 from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone
-from test_importers import hairdryer_views, to_world, write_depth16, write_lists, write_nerfstudio
+from test_importers import edited, hairdryer_views, to_world, write_depth16, write_lists, write_nerfstudio
 
 from zsp_lite.cli.main import main
 from zsp_lite.data.cameras import Camera
@@ -223,20 +224,6 @@ def test_each_layout_gives_the_pose_of_the_data_folder(tmp_path, scooter, layout
     assert rotation_error(pose_to_scooter2(open_source(path, **options)), expected) < 3
 
 
-def edited(*changes, encoding="utf-8", name="transforms.json"):
-    """Change transforms.json, or each frame of it where `changes` are of two arguments."""
-
-    def apply(folder):
-        content = json.loads((folder / "transforms.json").read_text())
-        for change in changes:
-            change(content)
-        (folder / "transforms.json").unlink()
-        (folder / name).write_text(json.dumps(content), encoding=encoding)
-        return folder
-
-    return apply
-
-
 def each(change):
     return lambda content: [change(frame) for frame in content["frames"]]
 
@@ -303,10 +290,7 @@ def test_a_frame_that_cannot_be_used_is_left_out_and_named(tmp_path, views, dama
     assert [one.image.name for one in capture.frames] == ["0001.jpg", "0002.jpg", "0003.jpg"]
     source = open_source(tmp_path)
     (flag,) = source.flags(source.load([0]))
-    for line in (*capture.left_out, flag):
-        with pytest.raises(InputError, match=message):
-            raise InputError(line)
-    assert "1 frames are left out: " in flag
+    assert all(re.search(message, line) for line in (*capture.left_out, flag)) and "1 frames are left out: " in flag
 
 
 def test_a_damaged_picture_is_left_out_and_named_unless_too_few_remain(tmp_path, views, capsys):
@@ -398,10 +382,7 @@ def zipped(path, name="rgb.txt", mode=0o644, data=b"", flag=0):
         (lambda path: path.write_bytes(b"PK\3\4" + bytes(99)), "is damaged"),
         (lambda path: zipped(path, "../../climbs"), "has a path that leads out of it, '../../climbs'"),
         (lambda path: zipped(path, "/etc/x"), "has a path that leads out of it"),
-        (
-            lambda path: zipped(path, "images", stat.S_IFLNK | 0o777, b"/etc"),
-            "has an encrypted file or a link, 'images",
-        ),
+        (lambda path: zipped(path, "images", stat.S_IFLNK | 0o777, b"/"), "has an encrypted file or a link, 'images"),
         (lambda path: zipped(path, flag=1), "has an encrypted file or a link, 'rgb.txt'"),
         (lambda path: zipped(path, data=bytes(60_000)), "of 1.. bytes unpacks to 60,000"),
     ],
@@ -409,9 +390,7 @@ def zipped(path, name="rgb.txt", mode=0o644, data=b"", flag=0):
 def test_a_zip_that_is_damaged_malicious_or_large_is_refused(tmp_path, monkeypatch, make, message):
     monkeypatch.setattr("zsp_lite.importers.unpacked._LARGE", 20_000)
     make(tmp_path / "scan.zip")
-    with pytest.raises(InputError, match=f"zip .*scan.zip {message}") as caught:
-        recognise(tmp_path / "scan.zip")
-    assert "\n" not in str(caught.value)
+    refused(f"zip .*scan.zip {message}", recognise, tmp_path / "scan.zip")
 
 
 def test_the_sharpest_frames_of_a_video_and_of_images_are_chosen(tmp_path, views):
