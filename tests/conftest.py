@@ -59,6 +59,15 @@ def links(tmp_path_factory):
         pytest.skip(f"no symbolic links here: {error}")
 
 
+@pytest.fixture
+def closed_figures():
+    """Closes the figures of a test at its end."""
+    import matplotlib.pyplot as plt
+
+    yield
+    plt.close("all")
+
+
 @pytest.fixture(scope="session")
 def ellipsoids(tmp_path_factory):
     """A labelled data set with the category "ellipsoid": two sequences of seven views of one object.

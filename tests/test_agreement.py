@@ -65,20 +65,17 @@ def farther(frame):
     return replace(frame, camera=replace(frame.camera, t=frame.camera.t * (1, 1, 1 + int(frame.name) % 2 / 2)))
 
 
-@pytest.mark.parametrize(
-    ("mistake", "named"),
-    [
-        (inverted, r"agree \(\d+%\) if the poses are world to camera$"),
-        (flipped, "if the poses have the other axes, OpenGL's for OpenCV's or the reverse"),
-        (lambda frame: inverted(flipped(frame)), "if the poses are world to camera$"),
-        (reordered, "if the poses are from quaternions with w first"),
-        (partial(scaled, 0.001), r"if the depth is taken in metres: --depth-unit 1$"),
-        (partial(scaled, 5), "if the depth is taken in 1/5000 m: --depth-unit 0.0002$"),
-        (partial(scaled, 1000), "if the depth is multiplied by 0.001: --depth-unit 1e-06$"),
-        (partial(scaled, 1.8), "if the depth is multiplied by 0.5[2-9]"),
-        (farther, "no usual mistake in units or poses explains it"),
-    ],
-)
+@pytest.mark.parametrize(("mistake", "named"), [
+    (inverted, r"agree \(\d+%\) if the poses are world to camera$"),
+    (flipped, "if the poses have the other axes, OpenGL's for OpenCV's or the reverse"),
+    (lambda frame: inverted(flipped(frame)), "if the poses are world to camera$"),
+    (reordered, "if the poses are from quaternions with w first"),
+    (partial(scaled, 0.001), r"if the depth is taken in metres: --depth-unit 1$"),
+    (partial(scaled, 5), "if the depth is taken in 1/5000 m: --depth-unit 0.0002$"),
+    (partial(scaled, 1000), "if the depth is multiplied by 0.001: --depth-unit 1e-06$"),
+    (partial(scaled, 1.8), "if the depth is multiplied by 0.5[2-9]"),
+    (farther, "no usual mistake in units or poses explains it"),
+])  # fmt: skip
 def test_each_mistake_is_named(frames, mistake, named):
     line = disagreement([mistake(frame) for frame in frames], 0.001)
     assert re.search(named, line)

@@ -47,17 +47,14 @@ def test_composition_is_the_product_of_the_matrices_and_application_in_turn(seed
     np.testing.assert_allclose(a.apply(points), homogeneous[:, :3], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("scale", "R", "t"),
-    [
-        (0.0, np.eye(3), np.zeros(3)),
-        (np.nan, np.eye(3), np.zeros(3)),
-        (1.0, np.diag([1.0, 1.0, -1.0]), np.zeros(3)),
-        (1.0, 2 * np.eye(3), np.zeros(3)),
-        (1.0, np.eye(4), np.zeros(3)),
-        (1.0, np.eye(3), np.array([0.0, np.inf, 0.0])),
-    ],
-)
+@pytest.mark.parametrize(("scale", "R", "t"), [
+    (0.0, np.eye(3), np.zeros(3)),
+    (np.nan, np.eye(3), np.zeros(3)),
+    (1.0, np.diag([1.0, 1.0, -1.0]), np.zeros(3)),
+    (1.0, 2 * np.eye(3), np.zeros(3)),
+    (1.0, np.eye(4), np.zeros(3)),
+    (1.0, np.eye(3), np.array([0.0, np.inf, 0.0])),
+])  # fmt: skip
 def test_what_is_no_similarity_is_refused(scale, R, t):
     refused("", Sim3, scale, R, t)
 

@@ -185,19 +185,16 @@ def test_the_embedded_backbone_is_found_by_its_name(vit, tmp_path, monkeypatch):
     assert load.as_backbone(path).embed_dim == load.as_backbone(str(path)).embed_dim == vit.embed_dim
 
 
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        (lambda w: {k: x for k, x in w.items() if k != "pos_embed"}, "DINO layout"),
-        (lambda w: {k: x for k, x in w.items() if "1.norm1.bias" not in k}, "not fit: .* Missing .*1.norm1.bias"),
-        (lambda w: w | {"norm.weight": torch.zeros(3)}, "not fit: .* size mismatch for norm.weight"),
-        (lambda w: w | {"extra": torch.zeros(1)}, "not fit: .* Unexpected .*extra"),
-        (lambda w: w | {"blocks.100000000.norm1.bias": torch.zeros(1)}, "Missing .*blocks.3.norm1.weight"),
-        (lambda w: w | {"norm.weight": torch.full((64,), torch.nan)}, "norm.weight holds values that are not finite"),
-        (lambda w: [1, 2], "state dict"),
-        (lambda w: {"epoch": 3}, "state dict"),
-    ],
-)
+@pytest.mark.parametrize("change, message", [
+    (lambda w: {k: x for k, x in w.items() if k != "pos_embed"}, "DINO layout"),
+    (lambda w: {k: x for k, x in w.items() if "1.norm1.bias" not in k}, "not fit: .* Missing .*1.norm1.bias"),
+    (lambda w: w | {"norm.weight": torch.zeros(3)}, "not fit: .* size mismatch for norm.weight"),
+    (lambda w: w | {"extra": torch.zeros(1)}, "not fit: .* Unexpected .*extra"),
+    (lambda w: w | {"blocks.100000000.norm1.bias": torch.zeros(1)}, "Missing .*blocks.3.norm1.weight"),
+    (lambda w: w | {"norm.weight": torch.full((64,), torch.nan)}, "norm.weight holds values that are not finite"),
+    (lambda w: [1, 2], "state dict"),
+    (lambda w: {"epoch": 3}, "state dict"),
+])  # fmt: skip
 def test_other_models_weights_are_refused_naming_what_differs(vit, tmp_path, change, message):
     torch.save(change(dict(vit.state_dict())), tmp_path / "other.pth")
     refused(message, load_backbone, tmp_path / "other.pth", "cpu")

@@ -149,13 +149,10 @@ def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(tmp_pa
         assert summary["methods"]["mine"]["symmetric_acc30"] == 100 * (expected < 30)
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ('{"100_a": {"trans": [[1, 0, 0, 0]], "scale": 1}}', "Expected"),
-        (json.dumps({"100_a": _object_pose(1.05 * np.eye(4))}), "100_a is"),
-    ],
-)
+@pytest.mark.parametrize(("text", "expected"), [
+    ('{"100_a": {"trans": [[1, 0, 0, 0]], "scale": 1}}', "Expected"),
+    (json.dumps({"100_a": _object_pose(1.05 * np.eye(4))}), "100_a is"),
+])  # fmt: skip
 def test_object_poses_of_another_layout_cost_a_warning_and_the_figure_that_needs_them(tmp_path, caplog, text, expected):
     dataset = Co3D(shutil.copytree(small_folder(), tmp_path / "copy"))
     path = dataset.root / "lump" / POSES_FILE

@@ -59,17 +59,14 @@ def test_ones_own_things_of_every_kind_are_rows_by_object_and_by_name(tmp_path):
     assert list(run_rows(["benchmark_folder:own_method"], tmp_path / "c")) == ["benchmark_folder:own_method"]
 
 
-@pytest.mark.parametrize(
-    ("thing", "told"),
-    [
-        (3, "'mine' is of type int, expected"), (ZeroShotPose, "'mine' is of type type, expected"),
-        (lambda: 0, "a function of one"), (lambda a, b, c, d: 0, "a function of one"), (lambda *all: 0, "of one"),
-        (lambda one, *, other: 0, "a function of one"), ("benchmark_folder:nothing", "has no attribute 'nothing'"),
-        ("nowhere:nothing", "No module named 'nowhere'"), ("./here.py:x", "cannot be imported"), ("", "''|no methods"),
-        ("our-bv", "'our-bv' is unknown; `zsp-lite benchmark --list`"), ("no/such.csv", "no/such.csv"),
-        ("ours-n0", "'ours-n0' is unknown"), ("ours-n99999", "unknown"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("thing", "told"), [
+    (3, "'mine' is of type int, expected"), (ZeroShotPose, "'mine' is of type type, expected"),
+    (lambda: 0, "a function of one"), (lambda a, b, c, d: 0, "a function of one"), (lambda *all: 0, "of one"),
+    (lambda one, *, other: 0, "a function of one"), ("benchmark_folder:nothing", "has no attribute 'nothing'"),
+    ("nowhere:nothing", "No module named 'nowhere'"), ("./here.py:x", "cannot be imported"), ("", "''|no methods"),
+    ("our-bv", "'our-bv' is unknown; `zsp-lite benchmark --list`"), ("no/such.csv", "no/such.csv"),
+    ("ours-n0", "'ours-n0' is unknown"), ("ours-n99999", "unknown"),
+])  # fmt: skip
 def test_what_is_no_method_is_refused_by_one_line_before_anything_is_computed(thing, told, tmp_path):
     refused(told, run_rows, {"mine": thing}, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -209,21 +206,18 @@ def test_sequences_without_their_leading_zeros_are_found_where_one_fits(monkeypa
 RIGHT = "lump,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1"
 
 
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("", "a CSV file"), ("\xff", "codec.* a CSV file"), (f"{COLUMNS}\nlump,a,0", "line 2: "),
-        ("category,target_frame", "columns reference_sequence, .*rotation"), (f"{COLUMNS}\n{RIGHT}x", "line 2: .*1x"),
-        (f"{COLUMNS}\n{RIGHT}\n{RIGHT.replace('0 0 0 1,', '0 0 0,')}", "line 3: rotation has shape .8,., exp"),
-        (f"{COLUMNS}\n\n{RIGHT.replace(',1 0', ',nan 0')}", "line 3: rotation holds nan"),
-        (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',-1 0')}", "line 2: "), (f"{COLUMNS}\n{RIGHT[:-1]}0", "scale is 0.0"),
-        (f"{COLUMNS}\n{RIGHT.replace(',b,1,', ',b,1.000,')}", "line 2: .*'1.000'"),  # or a thousand
-        (f"{COLUMNS}\n{RIGHT.replace(',0 0 1,', ',0 0,')}", "line 2: translation has shape .2,., expected"),
-        (f"{COLUMNS}\n{RIGHT}\n{RIGHT}", "line 3: second pose of the same frames"),
-        (f"{COLUMNS}\n{RIGHT},surplus", "line 2: more than the 8 fields of the header"),
-        (f"{COLUMNS},Scale,ROTATION\n{RIGHT},,", "columns rotation"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("text", "told"), [
+    ("", "a CSV file"), ("\xff", "codec.* a CSV file"), (f"{COLUMNS}\nlump,a,0", "line 2: "),
+    ("category,target_frame", "columns reference_sequence, .*rotation"), (f"{COLUMNS}\n{RIGHT}x", "line 2: .*1x"),
+    (f"{COLUMNS}\n{RIGHT}\n{RIGHT.replace('0 0 0 1,', '0 0 0,')}", "line 3: rotation has shape .8,., exp"),
+    (f"{COLUMNS}\n\n{RIGHT.replace(',1 0', ',nan 0')}", "line 3: rotation holds nan"),
+    (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',-1 0')}", "line 2: "), (f"{COLUMNS}\n{RIGHT[:-1]}0", "scale is 0.0"),
+    (f"{COLUMNS}\n{RIGHT.replace(',b,1,', ',b,1.000,')}", "line 2: .*'1.000'"),  # or a thousand
+    (f"{COLUMNS}\n{RIGHT.replace(',0 0 1,', ',0 0,')}", "line 2: translation has shape .2,., expected"),
+    (f"{COLUMNS}\n{RIGHT}\n{RIGHT}", "line 3: second pose of the same frames"),
+    (f"{COLUMNS}\n{RIGHT},surplus", "line 2: more than the 8 fields of the header"),
+    (f"{COLUMNS},Scale,ROTATION\n{RIGHT},,", "columns rotation"),
+])  # fmt: skip
 def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_path):
     path = tmp_path / "poses.csv"
     path.write_text(text, encoding="latin-1")
@@ -365,9 +359,8 @@ def test_a_matcher_of_keypoints_gets_the_same_reference_for_every_view(tmp_path)
 def test_workers_may_have_another_current_folder_than_the_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with ProcessPoolExecutor(1, get_context("spawn"), os.chdir, ("/",)) as executor:
-        assert (
-            evaluate(small_folder(), "zsp-tiny", ["icp"], {"lump": 2}, 2, "run", executor)["methods"]["icp"]["n"] == 2
-        )
+        found = evaluate(small_folder(), "zsp-tiny", ["icp"], {"lump": 2}, 2, "run", executor)
+    assert found["methods"]["icp"]["n"] == 2
 
 
 def fails(problem):
@@ -395,14 +388,11 @@ class Broken(CoordinateBackbone):
         return type(self).wrong(super().__call__(images))
 
 
-@pytest.mark.parametrize(
-    ("wrong", "told"),
-    [
-        (lambda maps: [replace(one, keys=one.keys * float("nan")) for one in maps], "values that are not finite"),
-        (lambda maps: [replace(one, keys=one.keys[:, :0]) for one in maps], "have shapes"),
-        (lambda maps: maps[1:], r"returned \d of"), (lambda maps: maps[9], "IndexError"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("wrong", "told"), [
+    (lambda maps: [replace(one, keys=one.keys * float("nan")) for one in maps], "values that are not finite"),
+    (lambda maps: [replace(one, keys=one.keys[:, :0]) for one in maps], "have shapes"),
+    (lambda maps: maps[1:], r"returned \d of"), (lambda maps: maps[9], "IndexError"),
+])  # fmt: skip
 @pytest.mark.parametrize(
     "run", ["ours", "category", lambda problem: problem.views() and np.eye(3), "estimator", "align"]
 )

@@ -120,9 +120,8 @@ def body_of(table):
     """The lines between the rules of a LaTeX table, divided into cells."""
     text = as_latex(table)
     lines = text[text.index(r"\toprule") : text.index(r"\bottomrule")].splitlines()
-    return [
-        [part.strip() for part in re.split(r"(?<!\\)&", line.removesuffix(r" \\"))] for line in lines if "&" in line
-    ]
+    rows = [re.split(r"(?<!\\)&", line.removesuffix(r" \\")) for line in lines if "&" in line]
+    return [[part.strip() for part in row] for row in rows]
 
 
 def test_a_latex_table_has_four_columns_and_the_best_of_each_in_bold():

@@ -63,18 +63,15 @@ def test_cropping_shifts_pixels_and_resizing_scales_them(seed, top, left, height
     np.testing.assert_array_equal(resized.project(points)[1], depth)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"R": np.eye(2)}, r"R has shape \(2, 2\)"),
-        ({"R": 2 * np.eye(3)}, "expected a rotation"),
-        ({"R": np.diag([1.0, 1.0, -1.0])}, "expected a rotation"),
-        ({"t": [0, 0, np.inf]}, "t holds inf"),
-        ({"t": [0, 0, 1e155]}, r"t holds 1e\+155"),
-        ({"focal_length": [500, 0]}, "focal_length is .*0.0.*, expected .*greater than 0.001"),
-        ({"size": (0, 5)}, "image size .* is 0, expected an integer from 1"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"R": np.eye(2)}, r"R has shape \(2, 2\)"),
+    ({"R": 2 * np.eye(3)}, "expected a rotation"),
+    ({"R": np.diag([1.0, 1.0, -1.0])}, "expected a rotation"),
+    ({"t": [0, 0, np.inf]}, "t holds inf"),
+    ({"t": [0, 0, 1e155]}, r"t holds 1e\+155"),
+    ({"focal_length": [500, 0]}, "focal_length is .*0.0.*, expected .*greater than 0.001"),
+    ({"size": (0, 5)}, "image size .* is 0, expected an integer from 1"),
+])  # fmt: skip
 def test_invalid_cameras_are_refused(changes, message):
     refused(message, view, **changes)
 

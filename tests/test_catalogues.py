@@ -22,15 +22,12 @@ ATTRIBUTION = WEIGHTS / "ATTRIBUTION.md"
 CC = {"CC0 1.0", "CC BY 3.0", "CC BY 3.0 US"}
 
 
-@pytest.mark.parametrize(
-    ("path", "categories", "count", "licences"),
-    [
-        (ARTISTS, 8, 59, CC | {"Public Domain Mark 1.0", "GPL-2+"}),
-        (SAMPLES, 4, 16, CC),
-        (TRAINED, 49, 320, LICENCES.keys() - {"Public Domain Mark 1.0"}),
-        (CHOSEN_BY, 10, 28, LICENCES.keys() - {"Public Domain Mark 1.0"}),
-    ],
-)
+@pytest.mark.parametrize(("path", "categories", "count", "licences"), [
+    (ARTISTS, 8, 59, CC | {"Public Domain Mark 1.0", "GPL-2+"}),
+    (SAMPLES, 4, 16, CC),
+    (TRAINED, 49, 320, LICENCES.keys() - {"Public Domain Mark 1.0"}),
+    (CHOSEN_BY, 10, 28, LICENCES.keys() - {"Public Domain Mark 1.0"}),
+])  # fmt: skip
 def test_every_model_of_a_catalogue_has_a_free_licence_and_names_its_author(path, categories, count, licences):
     catalogue = read_catalogue(path)
     entries = [entry for models in catalogue.models.values() for entry in models.values()]

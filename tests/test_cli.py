@@ -112,14 +112,11 @@ def test_bad_input_is_one_line_exit_code_2_and_no_file(arguments, part, capsys, 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("error", "code"),
-    [
-        (errors.InputError("two\nlines"), 2),
-        (PermissionError(13, "Permission denied", "/there"), 2),
-        (KeyboardInterrupt(), 130),
-    ],
-)
+@pytest.mark.parametrize(("error", "code"), [
+    (errors.InputError("two\nlines"), 2),
+    (PermissionError(13, "Permission denied", "/there"), 2),
+    (KeyboardInterrupt(), 130),
+])  # fmt: skip
 def test_an_error_inside_a_command_is_one_line(error, code, monkeypatch, capsys):
     def fail():
         raise error

@@ -94,19 +94,16 @@ def test_optional_fields_may_be_null_and_unknown_ones_are_ignored(root):
     refused("chair/b_2 has no point cloud", dataset.point_cloud, "chair", "b_2")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda frame: frame.pop("sequence_name"), r"frame_annotations\.jgz: .*missing required field `sequence_name`"),
-        (lambda frame: frame.pop("image"), r"frame_annotations\.jgz .*frame 0 of b_2.*required field `image`"),
-        (lambda frame: frame["viewpoint"].pop("T"), r"frame 0 of b_2.*required field `T` - at `\$\.viewpoint`"),
-        (lambda frame: frame["viewpoint"].update(T=[0, float("nan"), 1]), r"got `null` - at `\$\.viewpoint\.T"),
-        (lambda frame: frame["viewpoint"].update(intrinsics_format="pixels"), "Invalid enum value 'pixels'"),
-        (lambda frame: frame["viewpoint"].update(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "frame b_2/0: camera R"),
-        (lambda frame: frame["depth"].update(scale_adjustment=0), r"Expected `float` > 0.* - at `\$\.depth"),
-        (lambda frame: frame.update(viewpoint=None), "frame b_2/0 has no viewpoint"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda frame: frame.pop("sequence_name"), r"frame_annotations\.jgz: .*missing required field `sequence_name`"),
+    (lambda frame: frame.pop("image"), r"frame_annotations\.jgz .*frame 0 of b_2.*required field `image`"),
+    (lambda frame: frame["viewpoint"].pop("T"), r"frame 0 of b_2.*required field `T` - at `\$\.viewpoint`"),
+    (lambda frame: frame["viewpoint"].update(T=[0, float("nan"), 1]), r"got `null` - at `\$\.viewpoint\.T"),
+    (lambda frame: frame["viewpoint"].update(intrinsics_format="pixels"), "Invalid enum value 'pixels'"),
+    (lambda frame: frame["viewpoint"].update(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "frame b_2/0: camera R"),
+    (lambda frame: frame["depth"].update(scale_adjustment=0), r"Expected `float` > 0.* - at `\$\.depth"),
+    (lambda frame: frame.update(viewpoint=None), "frame b_2/0 has no viewpoint"),
+])  # fmt: skip
 def test_an_invalid_frame_fails_by_name_and_field(root, change, message):
     edit_first(root, change)
     refused(message, lambda: Co3D(root).load(first(root)))

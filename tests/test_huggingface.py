@@ -115,13 +115,10 @@ def test_a_model_that_nobody_thought_of_is_read_by_the_names_of_its_parts(tmp_pa
 # settings
 
 
-@pytest.mark.parametrize(
-    "file, content, mean, std",
-    [
-        ("preprocessor_config.json", {"image_mean": [0.5] * 3, "image_std": [0.25] * 3}, 0.5, 0.25),
-        ("preprocessor_config.json", {"do_normalize": False, "image_mean": [0.5] * 3, "image_std": [1] * 3}, 0, 1),
-    ],
-)
+@pytest.mark.parametrize("file, content, mean, std", [
+    ("preprocessor_config.json", {"image_mean": [0.5] * 3, "image_std": [0.25] * 3}, 0.5, 0.25),
+    ("preprocessor_config.json", {"do_normalize": False, "image_mean": [0.5] * 3, "image_std": [1] * 3}, 0, 1),
+])  # fmt: skip
 def test_the_image_processors_mean_and_deviation_are_taken(file, content, mean, std, tmp_path, pictures):
     folder = save_model(tmp_path / "vit", configuration("vit"))
     plain = load_backbone(f"hf:{folder}", "cpu", image_size=48)
@@ -139,17 +136,14 @@ def test_without_transformers_the_package_is_named(folders, monkeypatch):
     refused(r"pip install transformers", load_backbone, f"hf:{folders['vit']}", "cpu")
 
 
-@pytest.mark.parametrize(
-    "kind, settings, match",
-    [
-        ("siglip", {}, "a siglip_vision_model model, expected .* a CLS token"),
-        ("blip", {}, "a blip_vision_model model, expected .* the projections q_proj or query"),
-        ("vit", {"num_channels": 1}, "does not run"),
-        ("vit", {"patch_size": [8, 16]}, "one square patch_size"),
-        ("yolos", {"image_size": [32, 32], "num_detection_tokens": 7}, "11 tokens without"),
-        ("resnet", {"embedding_size": 8, "hidden_sizes": [8, 8], "depths": [1, 1]}, "a resnet model"),
-    ],
-)
+@pytest.mark.parametrize("kind, settings, match", [
+    ("siglip", {}, "a siglip_vision_model model, expected .* a CLS token"),
+    ("blip", {}, "a blip_vision_model model, expected .* the projections q_proj or query"),
+    ("vit", {"num_channels": 1}, "does not run"),
+    ("vit", {"patch_size": [8, 16]}, "one square patch_size"),
+    ("yolos", {"image_size": [32, 32], "num_detection_tokens": 7}, "11 tokens without"),
+    ("resnet", {"embedding_size": 8, "hidden_sizes": [8, 8], "depths": [1, 1]}, "a resnet model"),
+])  # fmt: skip
 def test_models_that_cannot_be_read_are_refused(kind, settings, match, tmp_path):
     config = transformers.ResNetConfig(**settings) if kind == "resnet" else configuration(kind, **settings)
     refused(match, load_backbone, f"hf:{save_model(tmp_path / 'model', config)}", "cpu", image_size=32)
@@ -176,23 +170,16 @@ def test_pickles_are_not_read(tmp_path):
     refused("no config.json", load_backbone, f"hf:{tmp_path}", "cpu")
 
 
-@pytest.mark.parametrize(
-    "file, content, match",
-    [
-        ("model.safetensors", b"<html>404</html>" + bytes(1 << 20), ""),
-        ("config.json", b"{", "config.json"),
-        ("preprocessor_config.json", b'{"image_mean": [0.5], "image_std": [1]}', "expected three numbers"),
-    ],
-)
+@pytest.mark.parametrize("file, content, match", [
+    ("model.safetensors", b"<html>404</html>" + bytes(1 << 20), ""),
+    ("config.json", b"{", "config.json"),
+    ("preprocessor_config.json", b'{"image_mean": [0.5], "image_std": [1]}', "expected three numbers"),
+])  # fmt: skip
 def test_damaged_folders_are_refused_in_one_line(file, content, match, tmp_path):
     folder = save_model(tmp_path / "vit", configuration("vit"))
     (folder / file).write_bytes(content)
-    refused(
-        re.escape(f"hf:{folder}") + f": cannot be loaded by the package transformers .*{match}",
-        load_backbone,
-        f"hf:{folder}",
-        "cpu",
-    )
+    told = re.escape(f"hf:{folder}") + f": cannot be loaded by the package transformers .*{match}"
+    refused(told, load_backbone, f"hf:{folder}", "cpu")
 
 
 # the hub

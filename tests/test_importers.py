@@ -180,19 +180,16 @@ def edited(*changes, encoding="utf-8", name="transforms.json"):
     return apply
 
 
-@pytest.mark.parametrize(
-    ("kind", "damage", "message"),
-    [
-        ("nerfstudio", edited(lambda c: c.update(camera_model="PANORAMA")), "none of 8 frames .* 'PANORAMA'"),
-        ("nerfstudio", edited(lambda c: c.pop("fl_x")), "frame 0: no focal length, expected fl_x or"),
-        ("nerfstudio", edited(lambda c: [f.pop("depth_file_path") for f in c["frames"]]), "none of 8 frames has depth"),
-        ("nerfstudio", edited(lambda c: c.update(w=31.5)), "multiple of 1"),
-        ("nerfstudio", edited(lambda c: c.update(k4=0.01)), "frame 0: .* with k4 = 0.01, expected .* with k4 = 0"),
-        ("lists", replaced("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "rgb.txt 8, depth.txt 8, poses.txt 1"),
-        ("lists", replaced("poses.txt", 8 * ("1 0 0 0 " * 3 + "1 0 0 1\n")), "off the expected 0 0 0 1"),
-        ("lists", replaced("intrinsics.txt", "60 0 0\n0 60 0\n32 24 1\n"), "expected fx 0 cx, 0 fy cy, 0 0 1"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "damage", "message"), [
+    ("nerfstudio", edited(lambda c: c.update(camera_model="PANORAMA")), "none of 8 frames .* 'PANORAMA'"),
+    ("nerfstudio", edited(lambda c: c.pop("fl_x")), "frame 0: no focal length, expected fl_x or"),
+    ("nerfstudio", edited(lambda c: [f.pop("depth_file_path") for f in c["frames"]]), "none of 8 frames has depth"),
+    ("nerfstudio", edited(lambda c: c.update(w=31.5)), "multiple of 1"),
+    ("nerfstudio", edited(lambda c: c.update(k4=0.01)), "frame 0: .* with k4 = 0.01, expected .* with k4 = 0"),
+    ("lists", replaced("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "rgb.txt 8, depth.txt 8, poses.txt 1"),
+    ("lists", replaced("poses.txt", 8 * ("1 0 0 0 " * 3 + "1 0 0 1\n")), "off the expected 0 0 0 1"),
+    ("lists", replaced("intrinsics.txt", "60 0 0\n0 60 0\n32 24 1\n"), "expected fx 0 cx, 0 fy cy, 0 0 1"),
+])  # fmt: skip
 def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(tmp_path, views, kind, damage, message):
     WRITERS[kind](tmp_path, views)
     damage(tmp_path)

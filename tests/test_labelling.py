@@ -43,15 +43,12 @@ def test_residuals_are_relative_to_the_spread_of_the_keypoints():
     assert small.argmax() == 4
 
 
-@pytest.mark.parametrize(
-    ("reference", "picks", "message"),
-    [
-        (corners()[:3], corners()[:3], "3 keypoints picked and 3 on the reference, expected equally many, at least 4"),
-        (corners(), corners()[:4], "4 keypoints picked and 5"),
-        (np.outer(np.arange(4), (1, 2, 3)), corners()[:4], "equal or collinear"),
-        (corners()[:4] * np.nan, corners()[:4], "finite"),
-    ],
-)
+@pytest.mark.parametrize(("reference", "picks", "message"), [
+    (corners()[:3], corners()[:3], "3 keypoints picked and 3 on the reference, expected equally many, at least 4"),
+    (corners(), corners()[:4], "4 keypoints picked and 5"),
+    (np.outer(np.arange(4), (1, 2, 3)), corners()[:4], "equal or collinear"),
+    (corners()[:4] * np.nan, corners()[:4], "finite"),
+])  # fmt: skip
 def test_bad_picks_are_refused(reference, picks, message):
     refused(message, align_picks, reference, picks)
 

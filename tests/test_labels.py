@@ -56,15 +56,12 @@ def test_labels_and_pairs_are_imported_and_replace_others_only_on_request(clone,
     assert np.array_equal(read_labels(root, "chair")["b"].trans, np.eye(4))
 
 
-@pytest.mark.parametrize(
-    ("file", "content", "message"),
-    [
-        ("clone/data/class_labels/chair/b.json", b"{", "Input data was truncated"),
-        ("clone/data/determ_eval/200samples_2tgt/chair.pt", b"pickle", "contains more than tensors"),
-        ("data/class_labels/chair/z.json", json.dumps({"trans": np.eye(4).tolist(), "seq": "z", "reference_seq": "z"}
-                                                      ).encode(), "have reference sequences a, z, expected one"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("file", "content", "message"), [
+    ("clone/data/class_labels/chair/b.json", b"{", "Input data was truncated"),
+    ("clone/data/determ_eval/200samples_2tgt/chair.pt", b"pickle", "contains more than tensors"),
+    ("data/class_labels/chair/z.json", json.dumps({"trans": np.eye(4).tolist(), "seq": "z", "reference_seq": "z"}
+                                                  ).encode(), "have reference sequences a, z, expected one"),
+])  # fmt: skip
 def test_nothing_is_written_if_one_file_is_bad(clone, root, tmp_path, file, content, message):
     (root / "class_labels/chair").mkdir(parents=True)
     (tmp_path / file).write_bytes(content)
@@ -169,16 +166,13 @@ def test_labels_are_read_back_from_files_in_the_published_format(tmp_path):
         assert (label.seq, label.reference_seq) == (name, "zero")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"trans": np.diag([2.0, 2, 2, 1]).tolist()}, "a.json: trans is .*, 1 off the nearest rotation"),
-        ({"trans": np.diag([1.0, 1, -1, 1]).tolist()}, "expected a rotation"),
-        ({"trans": [[1.0, 0], [0, 1]]}, r"of length 4 - at `\$.trans"),
-        ({"seq": "b"}, "has seq 'b', expected seq as in its name"),
-        ({"seq": None}, r"got `null` - at `\$.seq`"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"trans": np.diag([2.0, 2, 2, 1]).tolist()}, "a.json: trans is .*, 1 off the nearest rotation"),
+    ({"trans": np.diag([1.0, 1, -1, 1]).tolist()}, "expected a rotation"),
+    ({"trans": [[1.0, 0], [0, 1]]}, r"of length 4 - at `\$.trans"),
+    ({"seq": "b"}, "has seq 'b', expected seq as in its name"),
+    ({"seq": None}, r"got `null` - at `\$.seq`"),
+])  # fmt: skip
 def test_an_invalid_label_is_refused_with_its_file(tmp_path, change, message):
     path = write_label(tmp_path, "chair", PoseLabel(np.eye(4), "a", "a"))
     path.write_text(json.dumps(json.loads(path.read_text()) | change))

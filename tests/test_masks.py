@@ -90,15 +90,12 @@ def on_the_floor_too(mask):
     mask[box[0].stop - 15 : box[0].stop + 25, box[1].start - 20 : box[1].stop + 20] = True
 
 
-@pytest.mark.parametrize(
-    ("spoil", "sign"),
-    [
-        (in_the_corner, "several borders of the image are touched"),
-        (in_two_parts, "several separate parts"),
-        (around_the_object, "colours disagree"),
-        (on_the_floor_too, "much of it lies in the plane around it"),
-    ],
-)
+@pytest.mark.parametrize(("spoil", "sign"), [
+    (in_the_corner, "several borders of the image are touched"),
+    (in_two_parts, "several separate parts"),
+    (around_the_object, "colours disagree"),
+    (on_the_floor_too, "much of it lies in the plane around it"),
+])  # fmt: skip
 def test_a_mask_that_may_be_wrong_is_flagged_with_the_reason_and_the_number_of_frames(spoil, sign):
     (first, truth), (second, _) = (ball_on_floor(direction) for direction in DIRECTIONS[:2])
     good = masks_from_depth([first, second])

@@ -93,20 +93,14 @@ def test_options_go_to_the_sources_that_take_them(image, tmp_path, ellipsoids, f
     np.testing.assert_allclose(pair[0].load([0])[0].depth, frames[1].depth, atol=6e-4)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({}, "no intrinsics, expected --intrinsics FX,FY,CX,CY"),
-        ({"intrinsics": INTRINSICS, "mask": "box"}, "--mask box with --box TOP,LEFT,HEIGHT,WIDTH"),
-        (
-            {"intrinsics": INTRINSICS, "mask": "auto", "box": (1, 1, 9, 9)},
-            "mask is 'auto' and box is .*, expected --mask",
-        ),
-        ({"intrinsics": (0.0, 190.0, 1.0, 1.0)}, "image .*.jpg: camera focal_length is 0.0, expected"),
-        ({"intrinsics": (1.0, 1.0, 90.0, 70.0)}, ".jpg: the intrinsics 1,1,90,70 have a field of view of 179 degrees"),
-        ({"intrinsics": INTRINSICS, "depth": "lost.png"}, "lost.png"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    ({}, "no intrinsics, expected --intrinsics FX,FY,CX,CY"),
+    ({"intrinsics": INTRINSICS, "mask": "box"}, "--mask box with --box TOP,LEFT,HEIGHT,WIDTH"),
+    ({"intrinsics": INTRINSICS, "mask": "auto", "box": (1, 1, 9, 9)}, "mask is 'auto' and box is .*, expected --mask"),
+    ({"intrinsics": (0.0, 190.0, 1.0, 1.0)}, "image .*.jpg: camera focal_length is 0.0, expected"),
+    ({"intrinsics": (1.0, 1.0, 90.0, 70.0)}, ".jpg: the intrinsics 1,1,90,70 have a field of view of 179 degrees"),
+    ({"intrinsics": INTRINSICS, "depth": "lost.png"}, "lost.png"),
+])  # fmt: skip
 def test_what_an_image_lacks_is_named_with_the_option_that_gives_it(image, options, message):
     refused(message, lambda: open_source(image, **options).load([0]))
 
@@ -144,11 +138,8 @@ def test_options_that_no_source_takes_are_refused(ellipsoids, image):
 def own(ellipsoids, tmp_path_factory):
     """Both solvers on two labelled sequences, and the folder of their files."""
     out = tmp_path_factory.mktemp("own") / "deep" / "out"
-    folder = ellipsoids.root / "ellipsoid"
-    found = estimate_pose(
-        folder / "a", folder / "b", "both", reference_frame=2, targets=3, backbone=CoordinateBackbone(), out=out
-    )
-    return found, out
+    settings = {"reference_frame": 2, "targets": 3, "backbone": CoordinateBackbone(), "out": out}
+    return estimate_pose(*(ellipsoids.root / "ellipsoid" / name for name in "ab"), "both", **settings), out
 
 
 @pytest.fixture(scope="module")
@@ -298,15 +289,12 @@ def test_one_reference_frame_is_the_papers_setting(ellipsoids):
     assert found.reference.name == "a/0" and found.votes == ()
 
 
-@pytest.mark.parametrize(
-    ("frames", "message"),
-    [
-        ([], r"frames are \[\], expected a sequence of zsp_lite.Frame"),
-        ([1.0], r"frames are \[1.0\], expected"),
-        ("same", "all 2 frames have the same camera pose, expected their poses in one world"),
-        ("no depth", "frame 0 0000 has no depth map, expected one"),
-    ],
-)
+@pytest.mark.parametrize(("frames", "message"), [
+    ([], r"frames are \[\], expected a sequence of zsp_lite.Frame"),
+    ([1.0], r"frames are \[1.0\], expected"),
+    ("same", "all 2 frames have the same camera pose, expected their poses in one world"),
+    ("no depth", "frame 0 0000 has no depth map, expected one"),
+])  # fmt: skip
 def test_frames_that_are_no_views_of_one_object_are_refused(frames, message):
     first = around(AT_HOME, 1)[0]
     frames = {"same": [first, first], "no depth": [replace(first, depth=None)]}.get(str(frames), frames)

@@ -154,21 +154,18 @@ def test_a_capture_of_turned_photographs_keeps_its_world_and_refuses_mirrored_on
     refused("0001.jpg is mirrored by its EXIF orientation 5", second.load)
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ((600, 600, 320, 240), None),
-        ((600, 600, 280, 260), None),
-        ((1200, 1200, 640, 480), "fit an image.* of 1280,960, not 640,480 .*: .* 600,600,320,240$"),
-        ((300, 300, 160, 120), "fit an image.* of 320,240, not 640,480 .*: .* 600,600,320,240$"),
-        ((240, 240, 128, 96), "256,192, not 640,480 .*: .* 600,600,320,240; .* view of 130 degrees"),
-        ((1200, 1200, 900, -200), "far from the middle, as those of a crop$"),
-        ((0.9375, 1.25, 0.5, 0.5), "look normalised: .* 600,600,320,240; .* view of"),
-        ((4.2, 4.2, 2.8, 2.1), "millimetres, of 5.6,4.2, .*: .* 480,480,320,240; .* view of"),
-        ((1, 1, 320, 240), "a.jpg: the intrinsics 1,1,320,240 have a field of view of 180 degrees, expected 10 to 120"),
-        ((9000, 0, 320, 0, 9000, 240, 0, 0, 1), "view of 4.07 degrees"),
-    ],
-)
+@pytest.mark.parametrize(("values", "message"), [
+    ((600, 600, 320, 240), None),
+    ((600, 600, 280, 260), None),
+    ((1200, 1200, 640, 480), "fit an image.* of 1280,960, not 640,480 .*: .* 600,600,320,240$"),
+    ((300, 300, 160, 120), "fit an image.* of 320,240, not 640,480 .*: .* 600,600,320,240$"),
+    ((240, 240, 128, 96), "256,192, not 640,480 .*: .* 600,600,320,240; .* view of 130 degrees"),
+    ((1200, 1200, 900, -200), "far from the middle, as those of a crop$"),
+    ((0.9375, 1.25, 0.5, 0.5), "look normalised: .* 600,600,320,240; .* view of"),
+    ((4.2, 4.2, 2.8, 2.1), "millimetres, of 5.6,4.2, .*: .* 480,480,320,240; .* view of"),
+    ((1, 1, 320, 240), "a.jpg: the intrinsics 1,1,320,240 have a field of view of 180 degrees, expected 10 to 120"),
+    ((9000, 0, 320, 0, 9000, 240, 0, 0, 1), "view of 4.07 degrees"),
+])  # fmt: skip
 def test_intrinsics_of_another_image_or_unit_are_questioned_with_the_corrected_numbers(values, message):
     camera = camera_from_pose(np.eye(4), values, (480, 640), "a.jpg")
     if message and "view of" in message:

@@ -129,17 +129,14 @@ def by_stage(estimate: PoseEstimate) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize(
-    "setting, value, first_changed",
-    [
-        ("foreground", "mask", "foreground"), ("k", 20, "scores"),
-        ("kmeans", False, "scores"), ("seed", 1, "scores"), ("cycle_from", "target", "scores"),
-        ("matcher", "dual softmax", "scores"), ("binning", False, "scores"), ("view_selector", "global", "scores"),
-        ("view_selector", "saliency", "scores"), ("view_selector", "cyclical", "scores"),
-        ("threshold", 0.02, "inliers"), ("trials", 100, "inliers"),
-        ("sample_size", 8, "inliers"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("setting, value, first_changed", [
+    ("foreground", "mask", "foreground"), ("k", 20, "scores"),
+    ("kmeans", False, "scores"), ("seed", 1, "scores"), ("cycle_from", "target", "scores"),
+    ("matcher", "dual softmax", "scores"), ("binning", False, "scores"), ("view_selector", "global", "scores"),
+    ("view_selector", "saliency", "scores"), ("view_selector", "cyclical", "scores"),
+    ("threshold", 0.02, "inliers"), ("trials", 100, "inliers"),
+    ("sample_size", 8, "inliers"),
+])  # fmt: skip
 def test_a_setting_reaches_its_stage_and_no_earlier_one(reference, targets, setting, value, first_changed):
     frames = reference, targets[::2]
     base, found = (by_stage(one.estimate(*frames)) for one in (BASE, replace(BASE, **{setting: value})))
@@ -165,9 +162,8 @@ def test_a_given_matcher_selector_and_solver_are_called(views):
 
     def first_view(reference, targets, matched, *, seed, threshold):
         sim3, inliers = ransac(*match_points(reference, targets[0], matched[0].matches), threshold, seed=seed)
-        return PoseEstimate(
-            sim3, 0, matched[0].matches, inliers, np.zeros(len(targets)), reference, tuple(targets), {"solver": 1.0}
-        )
+        views = np.zeros(len(targets)), reference, tuple(targets)
+        return PoseEstimate(sim3, 0, matched[0].matches, inliers, *views, {"solver": 1.0})
 
     estimate = estimate_noisy(views, solver=first_view, seed=5, threshold=0.3)
     alone = estimate_noisy(views[:2], trials=1000, seed=5, threshold=0.3)

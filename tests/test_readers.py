@@ -273,16 +273,13 @@ def first(change):
     return edited(lambda c: change(c["frames"][0]))
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (first(lambda f: f["transform_matrix"][0].__setitem__(0, float("nan"))), "frame 0: pose is .*None"),
-        (first(lambda f: f["transform_matrix"][0].__setitem__(0, 5.0)), "frame 0: .*expected a rotation"),
-        (first(lambda f: f.update(file_path="images/lost.jpg")), "frame 0: images/lost.jpg is missing in"),
-        (first(lambda f: f.update(depth_file_path="lost")), "frame 0: lost is missing in"),
-        (first(lambda f: f.update(k4=1)), "frame 0: camera_model is .* with k4 = 1"),
-    ],
-)
+@pytest.mark.parametrize(("damage", "message"), [
+    (first(lambda f: f["transform_matrix"][0].__setitem__(0, float("nan"))), "frame 0: pose is .*None"),
+    (first(lambda f: f["transform_matrix"][0].__setitem__(0, 5.0)), "frame 0: .*expected a rotation"),
+    (first(lambda f: f.update(file_path="images/lost.jpg")), "frame 0: images/lost.jpg is missing in"),
+    (first(lambda f: f.update(depth_file_path="lost")), "frame 0: lost is missing in"),
+    (first(lambda f: f.update(k4=1)), "frame 0: camera_model is .* with k4 = 1"),
+])  # fmt: skip
 def test_a_frame_that_cannot_be_used_is_left_out_and_named(tmp_path, views, damage, message):
     write_nerfstudio(tmp_path, views)
     damage(tmp_path)
@@ -350,16 +347,13 @@ def test_options_of_formats(tmp_path, views):
     refused("--object does not go with .*tum, of the format tum", open_source, tmp_path / "tum", object=5)
 
 
-@pytest.mark.parametrize(
-    ("files", "message"),
-    [
-        (["sparse/0/images.bin"], "has COLMAP's poses, but no measured depth, expected raw data .* Stray Scanner"),
-        (["scan.mp4"], "is a video without depth and poses"),
-        (["model.obj", "model.mtl"], "is a model as Luma or KIRI export it"),
-        (["notes.doc"], "expected a folder or zip with the files of nerfstudio.*; Stray.*; TUM.*; BOP.*; Open3D"),
-        (["intrinsic.json", "color/0.png"], "has no trajectory.log, expected poses: run Open3D's"),
-    ],
-)
+@pytest.mark.parametrize(("files", "message"), [
+    (["sparse/0/images.bin"], "has COLMAP's poses, but no measured depth, expected raw data .* Stray Scanner"),
+    (["scan.mp4"], "is a video without depth and poses"),
+    (["model.obj", "model.mtl"], "is a model as Luma or KIRI export it"),
+    (["notes.doc"], "expected a folder or zip with the files of nerfstudio.*; Stray.*; TUM.*; BOP.*; Open3D"),
+    (["intrinsic.json", "color/0.png"], "has no trajectory.log, expected poses: run Open3D's"),
+])  # fmt: skip
 def test_what_is_no_capture_is_answered_with_what_it_lacks(tmp_path, files, message):
     for name in files:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -376,17 +370,14 @@ def zipped(path, name="rgb.txt", mode=0o644, data=b"", flag=0):
     return path
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda path: path.write_bytes(b"PK\3\4" + bytes(99)), "is damaged"),
-        (lambda path: zipped(path, "../../climbs"), "has a path that leads out of it, '../../climbs'"),
-        (lambda path: zipped(path, "/etc/x"), "has a path that leads out of it"),
-        (lambda path: zipped(path, "images", stat.S_IFLNK | 0o777, b"/"), "has an encrypted file or a link, 'images"),
-        (lambda path: zipped(path, flag=1), "has an encrypted file or a link, 'rgb.txt'"),
-        (lambda path: zipped(path, data=bytes(60_000)), "of 1.. bytes unpacks to 60,000"),
-    ],
-)
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda path: path.write_bytes(b"PK\3\4" + bytes(99)), "is damaged"),
+    (lambda path: zipped(path, "../../climbs"), "has a path that leads out of it, '../../climbs'"),
+    (lambda path: zipped(path, "/etc/x"), "has a path that leads out of it"),
+    (lambda path: zipped(path, "images", stat.S_IFLNK | 0o777, b"/"), "has an encrypted file or a link, 'images"),
+    (lambda path: zipped(path, flag=1), "has an encrypted file or a link, 'rgb.txt'"),
+    (lambda path: zipped(path, data=bytes(60_000)), "of 1.. bytes unpacks to 60,000"),
+])  # fmt: skip
 def test_a_zip_that_is_damaged_malicious_or_large_is_refused(tmp_path, monkeypatch, make, message):
     monkeypatch.setattr("zsp_lite.importers.unpacked._LARGE", 20_000)
     make(tmp_path / "scan.zip")

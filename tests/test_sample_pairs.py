@@ -36,19 +36,14 @@ def dataset():
 def solved(dataset):
     """The estimates of both solvers for each pair of `sample_poses.json`, by category, with shared features."""
     method = zsp_lite.ZeroShotPose(load_backbone())
-    return {
-        category: [
-            solve_pair(method, *dataset.load_pair(pair), SOLVERS["both"])
-            for pair in shipped_pairs(dataset, category, 5)[: len(stored)]
-        ]
-        for category, stored in STORED.items()
-    }
+    pairs = {category: shipped_pairs(dataset, category, 5)[: len(stored)] for category, stored in STORED.items()}
+    both = SOLVERS["both"]
+    return {name: [solve_pair(method, *dataset.load_pair(pair), both) for pair in some] for name, some in pairs.items()}
 
 
 def as_crop(view) -> minimal.Crop:
-    return minimal.Crop(
-        view.features.keys.numpy(), view.features.saliency.numpy(), view.frame.depth, view.frame.camera.K
-    )
+    features, frame = view.features, view.frame
+    return minimal.Crop(features.keys.numpy(), features.saliency.numpy(), frame.depth, frame.camera.K)
 
 
 def check_pair(method, reference, targets, name, **settings) -> None:

@@ -142,9 +142,8 @@ def test_exercises_are_shown_and_offered_without_solutions_hidden_tests_and_guid
             assert not [secret for secret in secrets if secret in text], path.name
     for path in site.rglob("*"):
         if path.suffix in (".html", ".ipynb", ".js", ".txt"):
-            assert not re.search("BEGIN (SOLUTION|HIDDEN TESTS)|Guide for marking", path.read_text(encoding="utf-8")), (
-                path.name
-            )
+            text = path.read_text(encoding="utf-8")
+            assert not re.search("BEGIN (SOLUTION|HIDDEN TESTS)|Guide for marking", text), path.name
 
 
 def test_the_reference_describes_every_public_class_and_function(pages):

@@ -176,9 +176,8 @@ def test_a_few_steps_teach_a_network_where_the_object_is(renders):
     batch = sample_batch(renders, np.random.default_rng(5), 2, VIEWS, 48, (0.8, 1.0))
     with torch.no_grad():
         total, figures = losses(model, batch, torch.Generator().manual_seed(0), helpers=0.5)
-    assert float(total) == pytest.approx(
-        figures["match"] + 0.5 * (figures["geometry"] + figures["attention"]), rel=1e-5
-    )
+    expected = figures["match"] + 0.5 * (figures["geometry"] + figures["attention"])
+    assert float(total) == pytest.approx(expected, rel=1e-5)
     with torch.no_grad():
         attention, iou = attention_loss(model(batch.images).cls_logits, batch.coverage)
     assert (float(attention), iou) == pytest.approx((figures["attention"], figures["iou"]))

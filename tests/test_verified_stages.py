@@ -20,13 +20,7 @@ from zsp_lite.estimates import Hypothesis
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.verified.confidence import Calibration, evidence, modes, reliability_flags
-from zsp_lite.verified.poses import (
-    Poses,
-    concatenate,
-    non_maximum_suppression,
-    rotation_angles,
-    rotation_matrices,
-)
+from zsp_lite.verified.poses import Poses, concatenate, non_maximum_suppression, rotation_angles, rotation_matrices
 from zsp_lite.verified.proposals import poses_from_matches, poses_from_views
 from zsp_lite.verified.refinement import SearchSchedule, refine
 from zsp_lite.verified.scene import build_maps, build_scene, project_points, surface_weights
@@ -157,9 +151,8 @@ def test_matches_with_outliers_propose_the_true_pose(seed):
     source = rng.normal(size=(30, 3))
     target = pose.apply(source)
     target[:12] = rng.normal(size=(12, 3))
-    found = poses_from_matches(
-        *(torch.tensor(part, dtype=torch.float32) for part in (source, target)), np.random.default_rng(seed)
-    )
+    points = (torch.tensor(part, dtype=torch.float32) for part in (source, target))
+    found = poses_from_matches(*points, np.random.default_rng(seed))
     assert rotation_error(found.rotation[0].double().numpy(), pose.R) < 1
     assert len(found) <= 6 and (rotation_angles(found.rotation, found.rotation).fill_diagonal_(180) >= 20).all()
 

@@ -5,7 +5,6 @@ import sys
 from pathlib import Path
 
 import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from refusals import refused
@@ -22,15 +21,9 @@ matplotlib.use("agg")
 from tools import widget_examples as examples  # noqa: E402
 from zsp_lite.widgets import alignment, common, features, matching  # noqa: E402
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("closed_figures")]
 
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-
-
-@pytest.fixture(autouse=True)
-def closed_figures():
-    yield
-    plt.close("all")
 
 
 def values_of(control) -> list:
@@ -94,9 +87,8 @@ def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim
     widget.controls["kind"].value, widget.controls["row"].value, widget.controls["col"].value = "one", 15, 9
     row, col = cells[15 * 28 + 9]
     assert f"nearest neighbour ({row}, {col}), cosine {sim[15 * 28 + 9].max():.2f}" in widget.caption.value
-    assert (
-        f"{correct_matches(cells.reshape(28, 28, 2), pair.cells)[pair.valid].mean():.0%} have" in widget.caption.value
-    )
+    right = correct_matches(cells.reshape(28, 28, 2), pair.cells)[pair.valid].mean()
+    assert f"{right:.0%} have" in widget.caption.value
 
 
 def test_saliency_counts_the_patches_above_the_threshold_and_an_empty_box_has_no_mask():
