@@ -26,7 +26,7 @@ def views(focal: float, nearer: float = 1.0) -> list[Frame]:
 
 @pytest.fixture(scope="module")
 def frames():
-    return views(190)
+    return views(190.0)
 
 
 def posed(frame, to_camera) -> Frame:
@@ -86,4 +86,4 @@ def test_right_frames_agree(frames):
 
 
 def test_depth_along_the_ray_is_named():
-    assert re.search("if depth is distance along the ray", disagreement(map(along_ray, views(45, 1.6)), 0.001))
+    assert re.search("if depth is distance along the ray", disagreement(map(along_ray, views(45.0, 1.6)), 0.001))

@@ -56,7 +56,7 @@ def test_composition_is_the_product_of_the_matrices_and_application_in_turn(seed
     (1.0, np.eye(3), np.array([0.0, np.inf, 0.0])),
 ])  # fmt: skip
 def test_what_is_no_similarity_is_refused(scale, R, t):
-    refused("", Sim3, scale, R, t)
+    refused(".", Sim3, scale, R, t)
 
 
 @pytest.mark.parametrize("rounded", [lambda R: R.astype(np.float16), lambda R: R.round(4), lambda R: R.round(2)])
@@ -138,7 +138,7 @@ DEGENERATE = {
 @pytest.mark.parametrize("points", DEGENERATE)
 @pytest.mark.parametrize("solver", [umeyama, ransac])
 def test_degenerate_or_malformed_points_are_refused_in_one_line(solver, points):
-    refused("", solver, *DEGENERATE[points])
+    refused(".", solver, *DEGENERATE[points])
 
 
 # RANSAC

@@ -278,6 +278,6 @@ def test_a_file_that_is_not_the_released_one_is_refused(vit, cache):
 @pytest.mark.parametrize("address", ["{url}/missing", "http://127.0.0.1:9/"])
 def test_without_the_server_one_line_says_what_to_do(server, cache, monkeypatch, address):
     monkeypatch.setenv("ZSP_LITE_DINO_URL", address.format(url=server.url))
-    message = refused("", load_backbone, "dino_vits8")
+    message = refused(".", load_backbone, "dino_vits8")
     for part in (load.PRETRAINED["dino_vits8"].url, str(cache / "dino_deitsmall8_pretrain.pth"), "zsp-tiny"):
         assert part in message

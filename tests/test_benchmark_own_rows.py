@@ -344,17 +344,6 @@ def test_rows_do_not_reach_each_other_in_any_order(tmp_path):
             assert found.drop(columns="seconds").equals(expected.drop(columns="seconds")), name
 
 
-def test_a_matcher_of_keypoints_gets_the_same_reference_for_every_view(tmp_path):
-    def overwriting(first, second):
-        seen.append(int(first.sum()))
-        first[:] = 0
-        return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
-
-    seen = []
-    run_rows({"mine": overwriting}, tmp_path, 1, 3)
-    assert len(seen) == 3 and len(set(seen)) == 1 and seen[0] > 0
-
-
 @pytest.mark.slow
 def test_workers_may_have_another_current_folder_than_the_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -1,5 +1,6 @@
 """The exercises: given cells run, the solutions pass every test, the students' version none, typical mistakes fail."""
 
+import json
 import os
 import re
 import shutil
@@ -27,94 +28,7 @@ EXERCISES = Path(__file__).parents[1] / "notebooks" / "exercises"
 ASSIGNMENTS = sorted(folder.name for folder in (EXERCISES / "source").iterdir())
 
 # For each assignment and task: the name of a mistake, the part of the solution to replace, and its replacement.
-MISTAKES = {
-    "01_features": {
-        "patches": {
-            "column by column": ("transpose(0, 1, 3, 4, 2)", "transpose(1, 0, 3, 4, 2)"),
-            "stride forgotten": ("[::stride, ::stride]", "[::p, ::p]"),
-        },
-        "attention_head": {
-            "scale forgotten": (" / np.sqrt(query.shape[1])", ""),
-            "softmax over the columns": ("axis=1", "axis=0"),
-            "overflow": (" - logits.max(axis=1, keepdims=True)", ""),
-            "background gets 0 before the softmax": ("-np.inf", "0"),
-        },
-        "turn_parts": {
-            "the other way round": ("reshape(3, 3))", "reshape(3, 3), -1)"),
-            "near parts only": ("np.rot90(ring)", "ring"),
-        },
-    },
-    "02_cyclical_maps": {
-        "ratio_test": {
-            "similarities for distances": ("np.sqrt(np.maximum(2 - 2 * sim, 0))", "1 - sim"),
-            "nothing over nothing": ("second, 1), 1.0)", "second, 1), 0.0)"),
-            "cosine above one": ("np.maximum(2 - 2 * sim, 0)", "(2 - 2 * sim)"),
-        },
-        "two_way": {
-            "one end only": ("np.maximum(", "(lambda one, other: one)("),
-            "columns of the other grid": ("v_end, fg2.shape[1]", "v_end, fg1.shape[1]"),
-            "return not checked": (" & on1[u_end]", ""),
-        },
-        "spread": {
-            "far from the last one only": ("free &= np", "free = ~np.isin(scores, scores[chosen]) & np"),
-            "gap excluded": (">= gap", "> gap"),
-            "what is no match": ("np.isfinite(scores)", "np.ones(len(scores), bool)"),
-        },
-    },
-    "03_best_view": {
-        "score": {
-            "sum, not mean": ("-distances.mean()", "-distances.sum()"),
-            "missing matches cost nothing": (" - penalty * (k - len(distances)) / k", ""),
-            "cosine above one": ("np.maximum(2 - 2 * np.asarray(cosines, dtype=float), 0)", "2 - 2 * cosines"),
-        },
-        "regret": {
-            "angle, not regret": (" - angles.min(axis=1)", ""),
-            "nearest of all pairs": ("angles.min(axis=1)", "angles.min()"),
-            "few matches are fine": ("counts >= minimum", "counts >= 0"),
-            "a pair without a view": ("regrets[allowed.any(axis=1)]", "regrets"),
-        },
-        "self_fit": {
-            "turned about the origin": ("points - points.mean(axis=0)", "points"),
-            "one way only": ("max(there, back)", "there"),
-        },
-    },
-    "04_umeyama_ransac": {
-        "umeyama": {
-            "forgotten reflection": ("np.sign(np.linalg.det(left @ right))", "1"),
-            "sign forgotten in the scale": ("(sign * singular).sum()", "singular.sum()"),
-            "means without weights": ("share @ x, share @ y", "x.mean(axis=0), y.mean(axis=0)"),
-            "weights not normalised": ("weights / weights.sum()", "weights"),
-            "rotation transposed": ("left @ np.diag(sign) @ right", "(left @ np.diag(sign) @ right).T"),
-        },
-        "trials": {
-            "the same match twice": ("(right - i) / (k - i)", "right / k"),
-            "chance of failure for success": ("math.log(1 - confidence)", "math.log(confidence)"),
-            "fewer right matches than a sample": ("if right >= size else 0", "+ 1e-30"),
-        },
-        "consensus": {
-            "last trial, not the best": ("if (residuals < threshold).sum() > best.sum():", "if True:"),
-            "no fit to all inliers": ("fit(x[best], y[best])", "fit(x[sample], y[sample])"),
-            "the same match twice in a sample": ("replace=False", "replace=True"),
-            "last count, not the best": ("needed(best.sum())", "needed(done and (residuals < threshold).sum())"),
-            "never stops early": (" and done < needed(best.sum())", ""),
-        },
-    },
-    "05_metrics": {
-        "symmetric_error": {
-            "turned in the wrong frame": ("R @ turn(axis, 360 * i / n)", "turn(axis, 360 * i / n) @ R"),
-            "either end of the axis": ("a @ b", "abs(a @ b)"),
-        },
-        "new_label": {
-            "wrong order": ("np.linalg.inv(camera_b) @ estimate", "estimate @ np.linalg.inv(camera_b)"),
-            "scale removed": ("@ estimate", "@ (estimate / np.cbrt(np.linalg.det(estimate[:3, :3])))"),
-        },
-        "accuracy": {
-            "pairs drawn": ("np.unique(objects", "np.unique(np.arange(len(errors))"),
-            "object means": ("right[drawn].sum(axis=1) / number[drawn].sum(axis=1)", "(right / number)[drawn].mean(1)"),
-            "30 degrees count as below 30": ("< threshold", "<= threshold"),
-        },
-    },
-}
+MISTAKES = json.loads(Path(__file__).with_name("exercise_mistakes.json").read_text(encoding="utf-8"))
 
 # For each assignment: a statement of a marking guide, and a check of it on what the given cells computed.
 STATEMENTS = {

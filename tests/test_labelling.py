@@ -168,9 +168,7 @@ def test_a_large_residual_is_accepted_only_if_confirmed(root):
     assert "a" in read_labels(root, "chair")
 
 
-def test_the_reference_is_that_of_the_labels_or_the_best(root):
-    write_co3d(root, "chair", [sequence_data("c", quality=3.5)])
-    assert Labelling(root, "chair").reference == "c"
+def test_the_reference_is_that_of_the_labels(root):
     write_label(root, "chair", PoseLabel(np.eye(4), "b", "b"))
     assert Labelling(root, "chair").reference == "b"
 

@@ -31,11 +31,6 @@ def test_every_promised_name_is_an_attribute_after_a_bare_import_which_does_not_
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_an_unknown_name_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        zsp_lite.nothing  # noqa: B018
-
-
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     """The wheel, built from a copy of the repository."""

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import stat
 import sys
 import types
@@ -17,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone
 from test_importers import edited, hairdryer_views, to_world, write_depth16, write_lists, write_nerfstudio
 
-from zsp_lite.cli.main import main
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import write_image, write_mask
@@ -158,12 +158,8 @@ def write_open3d(folder, frames):
 
 def write_zip_of_nerfstudio(folder, frames):
     """As an app shares it: with one folder in the zip."""
-    write_nerfstudio(folder, frames)
-    path = folder.with_suffix(".zip")
-    with zipfile.ZipFile(path, "w") as zipped:
-        for file in filter(Path.is_file, folder.rglob("*")):
-            zipped.write(file, Path("my scan") / file.relative_to(folder))
-    return path
+    write_nerfstudio(folder / "my scan", frames)
+    return shutil.make_archive(folder, "zip", folder)
 
 
 def write_lists_with_masks(folder, frames):
@@ -290,7 +286,7 @@ def test_a_frame_that_cannot_be_used_is_left_out_and_named(tmp_path, views, dama
     assert all(re.search(message, line) for line in (*capture.left_out, flag)) and "1 frames are left out: " in flag
 
 
-def test_a_damaged_picture_is_left_out_and_named_unless_too_few_remain(tmp_path, views, capsys):
+def test_a_damaged_picture_is_left_out_and_named_unless_too_few_remain(tmp_path, views, run):
     (tmp_path / "scan").mkdir()
     write_nerfstudio(tmp_path / "scan", views)
     images = sorted((tmp_path / "scan/images").iterdir())
@@ -299,12 +295,10 @@ def test_a_damaged_picture_is_left_out_and_named_unless_too_few_remain(tmp_path,
     assert len(found.targets) == 3
     assert sum("1 frames are left out: image" in flag for flag in found.estimates["paper"].flags) == 2
     arguments = ["data", "import", str(tmp_path / "scan"), "--root", str(tmp_path / "mine"), "--category", "teapot"]
-    assert main([*arguments, "--sequence", "one"]) == 0
-    text = capsys.readouterr().out
+    text = run([*arguments, "--sequence", "one"])
     assert "3 frames" in text and "flag: 1 frames are left out: image" in text
     images[1].write_bytes(b"")
-    assert main([*arguments, "--sequence", "two"]) == 2
-    assert "2 frames remain, expected 3: image" in capsys.readouterr().err
+    assert "2 frames remain, expected 3: image" in run([*arguments, "--sequence", "two"], 2)
 
 
 @pytest.mark.parametrize("path", ["../../etc/passwd", "/etc/passwd", "images/../../x.jpg", "C:\\x.jpg", "..\\x.jpg"])
