@@ -2,6 +2,9 @@
 
 import contextlib
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -98,3 +101,14 @@ def ellipsoids(tmp_path_factory):
         write_label(root, "ellipsoid", PoseLabel(placement.matrix, name, "a"))
     write_co3d(root, "ellipsoid", sequences, quality=98)
     return Co3D(root)
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory):
+    """Folder with the built course site. A warning of Sphinx, such as an unknown link in a source, is an error."""
+    folder = tmp_path_factory.mktemp("site")
+    options = ["-q", "-W", "--keep-going", "-c", "docs/site", "-d", folder / "doctrees"]
+    command = [sys.executable, "-m", "sphinx", *options, ".", folder / "html"]
+    result = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
+    assert result.returncode == 0, f"warnings of Sphinx:\n{result.stderr}"
+    return folder / "html"

@@ -117,7 +117,6 @@ def test_unknown_methods_categories_and_folders_and_the_folder_of_another_run_ar
     for root, backbone, options, told in (
         (small_folder(), BACKBONE, {"out": run[0], "targets": 3}, "a run with targets 5, this is 3"),
         (small_folder(), Renamed(grid=8), {"out": run[0]}, "a run with backbone .*Renamed"),
-        (small_folder(), BACKBONE, new | {"methods": ("nonesuch",)}, "'nonesuch' is unknown; `zsp-lite"),
         (small_folder(), BACKBONE, new | {"pairs": {"teapot": 1}}, "category is 'teapot', expected one of lump"),
         (small_folder(), BACKBONE, new | {"pairs": {"lump": 0}}, "pairs of lump is 0"),
         (small_folder(), BACKBONE, new | {"targets": 0}, "targets is 0"),

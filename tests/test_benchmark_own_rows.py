@@ -119,11 +119,18 @@ def test_keypoints_that_fit_no_pose_are_noted_and_those_that_are_none_fail(tmp_p
     assert read_run(tmp_path).row("none")["note"].iloc[0].startswith("pose is the best view's, not a fit: ")
     told = "matched points are 9 and 8, expected as many in both images"
     assert read_run(tmp_path).row("uneven")["failed"].iloc[0] == told
-    with pytest.raises(FatalError, match="scores of matches are negative, expected 0 or more"):  # less than no match
-        run_rows({"distances": lambda first, second: (ones, ones, -ones[:, 0])}, tmp_path)
+    distances = {"distances": lambda first, second: (ones, ones, -ones[:, 0])}  # less than no match
+    refused("scores of matches are negative, expected 0 or more", run_rows, distances, tmp_path, error=FatalError)
 
 
 COLUMNS = "category,reference_sequence,reference_frame,target_sequence,target_frame,rotation,translation,scale"
+
+
+def question(dataset, pair):
+    """Sequence and frame of the reference and of the second target view, and the true pose between them."""
+    ends = (pair.reference_sequence, pair.reference_frame), (pair.target_sequence, pair.target_frames[1])
+    known = ((dataset.camera(dataset.frame("lump", *end)), placement("lump", end[0])) for end in ends)
+    return ends, true_pose(*(part for one in known for part in one))
 
 
 def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
@@ -131,9 +138,7 @@ def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
     dataset, lines = Co3D(small_folder()), [COLUMNS]
     pairs = category_pairs(dataset, "lump", 4, 3)
     for pair in pairs[:3]:
-        ends = (pair.reference_sequence, pair.reference_frame), (pair.target_sequence, pair.target_frames[1])
-        known = ((dataset.camera(dataset.frame("lump", *end)), placement("lump", end[0])) for end in ends)
-        pose = true_pose(*(part for one in known for part in one))
+        ends, pose = question(dataset, pair)
         numbers = (" ".join(map(repr, part.ravel().tolist())) for part in (pose.R, pose.t))
         lines.append(",".join(map(str, ("lump", *ends[0], *ends[1], *numbers, "1.0"))))
     (tmp_path / "exact.csv").write_text("\n".join(lines))
@@ -153,8 +158,8 @@ def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
     end = f"{pairs[0].target_sequence},{pairs[0].target_frames[1]}"
     second = lines[1].replace(end, f"{pairs[0].target_sequence},{pairs[0].target_frames[0]}")
     (tmp_path / "two.csv").write_text("\n".join([*lines, second]))
-    with pytest.raises(FatalError, match="two.csv has 2 poses of the pair lump/.*, expected one"):
-        run_rows([f"two={tmp_path / 'two.csv'}"], tmp_path / "other", 4, 3)
+    two = [f"two={tmp_path / 'two.csv'}"]
+    refused("two.csv has 2 poses of the pair lump/.*, expected one", run_rows, two, tmp_path, 4, 3, error=FatalError)
 
 
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -169,12 +174,10 @@ CONVENTIONS = {
 def test_a_spreadsheets_poses_are_read_and_the_note_names_their_convention(tmp_path, caplog, convention):
     dataset, lines = Co3D(small_folder()), [COLUMNS.replace(",", ";"), "lump;x;1;y;2;1 0 0 0 1 0 0 0 1;;"]
     for pair in category_pairs(dataset, "lump", 12, 3):
-        ends = (pair.reference_sequence, pair.reference_frame), (pair.target_sequence, pair.target_frames[1])
-        known = ((dataset.camera(dataset.frame("lump", *end)), placement("lump", end[0])) for end in ends)
-        true = true_pose(*(part for one in known for part in one)).R
-        mixed = true.T if len(lines) < 10 else true  # as of a method that confuses left and right
+        ends, pose = question(dataset, pair)
+        mixed = pose.R.T if len(lines) < 10 else pose.R  # as of a method that confuses left and right
         other = Rotation.random(random_state=len(lines)).as_matrix() if convention == "none" else mixed
-        rotation = CONVENTIONS.get(convention, lambda R, other=other: other)(true)
+        rotation = CONVENTIONS.get(convention, lambda R, other=other: other)(pose.R)
         numbers = " ".join(f"{value:.4f}".replace(".", ",") for value in rotation.ravel())
         lines.append(f"lump;{ends[0][0]};{ends[0][1]:06d};{ends[1][0]};{ends[1][1]:06d};{numbers};;")
     (tmp_path / "mine.csv").write_text("\ufeff" + "\r\n".join(lines), encoding="utf-8")
@@ -361,10 +364,9 @@ def test_a_row_with_a_bug_ends_the_run_with_one_line_that_says_where(tmp_path):
     own = SimpleNamespace(estimate=lambda reference, targets: fails(None))
     rows = fails, own, lambda first, second: fails(None), lambda similarity, first, second: fails(None)
     for number, row in enumerate(rows):
-        with pytest.raises(FatalError, match=where):
-            run_rows({f"mine {number}": row}, tmp_path)
-    with pytest.raises(FatalError, match="ValueError: invalid literal"):
-        run_rows({"mine": lambda problem: (np.eye(3), "first")}, tmp_path)
+        refused(where, run_rows, {f"mine {number}": row}, tmp_path, error=FatalError)
+    wrong = {"mine": lambda problem: (np.eye(3), "first")}
+    refused("ValueError: invalid literal", run_rows, wrong, tmp_path, error=FatalError)
     assert not read_lines(tmp_path)
 
 

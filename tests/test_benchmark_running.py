@@ -9,9 +9,9 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -190,23 +190,17 @@ def test_numbers_of_threads_are_restored_after_blocks_that_overlap():
     def counts():
         return cv2.getNumThreads(), {one["filepath"]: one["num_threads"] for one in threadpool_info()}
 
-    def block(waits_for, then):
-        with one_thread():
-            started.wait()
-            waits_for.wait()
-            inside = counts()
-        then.set()
-        return inside
-
-    started, go, ended = threading.Barrier(2), threading.Event(), threading.Event()
-    go.set()
     with threadpool_limits(2, "blas"):
         before = counts()
-        with ThreadPoolExecutor(2) as executor:  # the first block to start may be the first or the last to end
-            inside = [one.result() for one in (executor.submit(block, go, ended), executor.submit(block, ended, go))]
-        assert [one[0] for one in inside] == [1, 1]
-        assert all(set(numbers.values()) == {1} for _, numbers in inside)
-        assert counts() == before and 2 in before[1].values()
+        for order in ((0, 1), (1, 0)):  # the first block to start may be the first or the last to end
+            blocks = ExitStack(), ExitStack()
+            for block in blocks:
+                block.enter_context(one_thread())
+            blocks[order[0]].close()
+            inside = counts()
+            blocks[order[1]].close()
+            assert inside[0] == 1 and set(inside[1].values()) == {1}
+            assert counts() == before and 2 in before[1].values()
 
 
 def test_unusable_executors_are_refused(monkeypatch):
@@ -251,10 +245,8 @@ def test_a_folder_that_holds_no_run_is_neither_read_nor_continued(undisturbed, t
     with pytest.raises(InputError, match="settings of a run .*run.json cannot be read"):
         again(run)  # it has results
     for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(
-            InputError, match=f"settings of a run {re.escape(str(folder / SETTINGS))} cannot be read: no such file"
-        ):
-            read_run(folder)
+        told = f"settings of a run {re.escape(str(folder / SETTINGS))} cannot be read: no such file"
+        refused(told, read_run, folder)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no device that is always full")

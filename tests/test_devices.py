@@ -48,3 +48,10 @@ def test_a_backbone_on_another_device_gives_the_pose_of_the_cpu(ellipsoids, sett
     np.testing.assert_array_equal(first.sim3.matrix, second.sim3.matrix)
     pair = second.reference_view, second.target_views[0]
     matching.cycle(*pair, similarity(*(view.features for view in pair)))
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_a_matcher_does_not_ask_another_device_for_float64(name):
+    arguments = torch.rand(12, 15), torch.arange(12) % 4 > 0, torch.arange(15) % 3 > 0
+    expected, found = (MATCHERS[name](*some) for some in (arguments, [x.as_subclass(Elsewhere) for x in arguments]))
+    assert torch.equal(found[0], expected[0]) and torch.equal(found[1], expected[1])

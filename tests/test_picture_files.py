@@ -78,7 +78,7 @@ def test_files_that_hold_something_else_are_refused_in_one_line(tmp_path):
     np.savez(tmp_path / "two.npz", a=DEPTH, b=DEPTH)
     for name, values in (("text", ["x"]), ("number", 3.0), ("colours", np.ones((4, 4, 3))), ("empty", np.ones((0, 4)))):
         np.save(tmp_path / f"{name}.npy", values)
-        refused(rf"expected numbers \(H, W\): .*{name}.npy", read_depth_file, tmp_path / f"{name}.npy")
+        refused(rf"{name}.npy holds .*, expected numbers \(H, W\)", read_depth_file, tmp_path / f"{name}.npy")
     (tmp_path / "d.exr").write_bytes(b"v/1\x01" + bytes(99))
     (tmp_path / "a.heic").write_bytes(bytes(99))
     Image.fromarray(SMOOTH).convert("RGB").save(tmp_path / "a.webp")

@@ -2,8 +2,6 @@
 
 import importlib
 import re
-import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -42,17 +40,6 @@ class Page(HTMLParser):
 
     def handle_data(self, data):
         self.text += data
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """Folder with the built site. A warning of Sphinx, such as an unknown link in a source, is an error."""
-    folder = tmp_path_factory.mktemp("site")
-    options = ["-q", "-W", "--keep-going", "-c", "docs/site", "-d", folder / "doctrees"]
-    command = [sys.executable, "-m", "sphinx", *options, ".", folder / "html"]
-    result = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
-    assert result.returncode == 0, f"warnings of Sphinx:\n{result.stderr}"
-    return folder / "html"
 
 
 @pytest.fixture(scope="module")
