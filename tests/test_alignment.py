@@ -34,9 +34,6 @@ def assert_same(first: Sim3, second: Sim3, atol: float = 1e-9):
     np.testing.assert_allclose(first.matrix, second.matrix, atol=atol)
 
 
-# Sim3
-
-
 @given(seeds, scales)
 def test_composition_is_the_product_of_the_matrices_and_application_in_turn(seed, scale):
     a, b, points = similarity(seed, scale), similarity(seed + 7), cloud(seed)
@@ -85,9 +82,6 @@ def test_records_keep_their_values_when_the_arrays_that_they_were_made_of_change
     assert_same(sim3, Sim3.identity())
     assert np.array_equal(label.trans, np.eye(4)) and np.array_equal(camera.matrix, np.eye(4))
     assert not frame.rgb.any() and not frame.depth.any() and not frame.mask.any() and not features.keys.any()
-
-
-# Umeyama
 
 
 @given(seeds, scales, st.integers(4, 40))
@@ -139,9 +133,6 @@ DEGENERATE = {
 @pytest.mark.parametrize("solver", [umeyama, ransac])
 def test_degenerate_or_malformed_points_are_refused_in_one_line(solver, points):
     refused(".", solver, *DEGENERATE[points])
-
-
-# RANSAC
 
 
 def contaminated(seed: int, outliers: float = 0.6):

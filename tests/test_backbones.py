@@ -39,11 +39,9 @@ def assert_same_features(first, second):
             torch.testing.assert_close(getattr(a, name), getattr(b, name), atol=2e-5, rtol=1e-4)
 
 
-# every backbone: the embedded one, a checkpoint in DINO's layout, a model of each architecture of Hugging Face's format
-
-
 @pytest.fixture(scope="module")
 def places(tmp_path_factory, vit) -> dict[str, str]:
+    """The embedded backbone, a checkpoint in DINO's layout, a model of each architecture of Hugging Face's format."""
     root = tmp_path_factory.mktemp("backbones")
     torch.save(vit.state_dict(), root / "checkpoint.pth")
     models = {kind: f"hf:{folder}" for kind, folder in save_all(root).items()}
@@ -101,9 +99,6 @@ def test_options_out_of_range_are_refused_by_every_backbone(place, options):
     refused(f"{name} is .*expected [^\n]+$", load_backbone, place, "cpu", **options)
 
 
-# the class
-
-
 def test_features_are_the_models_keys_saliency_and_cls(pictures):
     vit = small_vit(num_heads=4)
     features = Backbone(vit, "small", layer=1, saliency_heads=(0, 3), device="cpu", batch_size=2)(pictures)
@@ -142,9 +137,6 @@ BAD_IMAGES = [
 def test_bad_images_are_refused_by_number(vit, image):
     with pytest.raises(InputError, match="^image 1 is .*, expected [^\n]+$"):
         Backbone(vit, "small", device="cpu", batch_size=1)([np.zeros((8, 8, 3), np.uint8), image])
-
-
-# checkpoints
 
 
 @pytest.mark.parametrize("wrapping", ["plain", "teacher", "state_dict", "prefixed"])
@@ -209,9 +201,6 @@ def test_metadata_that_does_not_fit_is_refused(vit, tmp_path, key, value):
 def test_an_unknown_name_or_device_is_refused():
     refused("'resnet'.*zsp-tiny, .*dino_vits8", load_backbone, "resnet")
     refused("device", load_backbone, device="nowhere")
-
-
-# downloads
 
 
 @pytest.fixture()

@@ -225,9 +225,6 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
         assert given.pop() == common + last and not given
 
 
-# Data
-
-
 @pytest.fixture
 def root(tmp_path):
     write_co3d(tmp_path / "data", "chair", [sequence_data("a"), sequence_data("b")])

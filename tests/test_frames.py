@@ -219,9 +219,6 @@ def test_the_two_spreads_average_deviations_and_variances_of_the_axes():
     assert standard_deviation(points) == pytest.approx(np.sqrt((1 + 4 + 9) / 3))
 
 
-# Depth
-
-
 def frontal(size):
     centre = np.array([size[1] / 2, size[0] / 2])
     return Camera(np.eye(3), np.zeros(3), np.array([50.0, 60.0]), centre, size)

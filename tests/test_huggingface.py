@@ -70,9 +70,6 @@ def projection(architecture, block, x, facet: str):
     return project(block.get_submodule(architecture.norm)(x)).detach()
 
 
-# what it computes
-
-
 @pytest.mark.parametrize("facet", FACETS)
 def test_facets_are_the_projections_of_the_normalised_input_of_the_block_and_its_output(kind, folders, pictures, facet):
     architecture = ARCHITECTURES[kind]
@@ -112,9 +109,6 @@ def test_a_model_that_nobody_thought_of_is_read_by_the_names_of_its_parts(tmp_pa
     assert [features.grid for features in backbone(pictures)] == [(3, 3), (3, 3)]
 
 
-# settings
-
-
 @pytest.mark.parametrize("file, content, mean, std", [
     ("preprocessor_config.json", {"image_mean": [0.5] * 3, "image_std": [0.25] * 3}, 0.5, 0.25),
     ("preprocessor_config.json", {"do_normalize": False, "image_mean": [0.5] * 3, "image_std": [1] * 3}, 0, 1),
@@ -126,9 +120,6 @@ def test_the_image_processors_mean_and_deviation_are_taken(file, content, mean, 
     backbone = load_backbone(f"hf:{folder}", "cpu", image_size=48)
     assert (backbone.mean, backbone.std) == ((mean,) * 3, (std,) * 3)
     assert not torch.allclose(backbone(pictures)[0].keys, plain(pictures)[0].keys)
-
-
-# what is refused
 
 
 def test_without_transformers_the_package_is_named(folders, monkeypatch):
@@ -180,9 +171,6 @@ def test_damaged_folders_are_refused_in_one_line(file, content, match, tmp_path)
     (folder / file).write_bytes(content)
     told = re.escape(f"hf:{folder}") + f": cannot be loaded by the package transformers .*{match}"
     refused(told, load_backbone, f"hf:{folder}", "cpu")
-
-
-# the hub
 
 
 @pytest.fixture()

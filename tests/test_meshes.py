@@ -119,9 +119,6 @@ def test_a_folder_without_models_and_a_wrong_list_are_refused(tmp_path, folder, 
     refused(message, list_models, tmp_path / folder)
 
 
-# Pictures
-
-
 def render(mesh, camera, samples=1):
     return MeshScene(mesh, STUDIO, 0, samples=samples).render(camera)
 

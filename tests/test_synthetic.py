@@ -44,9 +44,6 @@ def chairs():
     return [recorded(0), recorded(1)]
 
 
-# Categories
-
-
 @pytest.mark.parametrize("category", sorted(ALL))
 def test_objects_of_a_category_are_unit_sized_vary_and_do_not_coincide_with_themselves_after_half_a_turn(category):
     shapes = [make_shape(ALL[category], seed) for seed in range(4)]
@@ -58,9 +55,6 @@ def test_objects_of_a_category_are_unit_sized_vary_and_do_not_coincide_with_them
     assert (extents.std(0) / extents.mean(0)).max() > 0.02
     turned = shapes[3].vertices * [-1, -1, 1]
     assert np.linalg.norm(shapes[3].vertices[:, None] - turned[None, ::3], axis=-1).min(0).max() > 0.2
-
-
-# Sensor
 
 
 def test_depth_has_holes_and_noise_and_masks_are_soft_and_accurate_to_two_pixels(chairs):
@@ -95,9 +89,6 @@ def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):
             pixels, depth = frame.camera.project(scale * view.canonical[row, col].astype(float) @ R.T + t)
             assert np.abs(pixels - np.stack([col + 0.5, row + 0.5], 1)).max() < 0.02
             np.testing.assert_allclose(depth, scale * view.depth[row, col], rtol=1e-4)
-
-
-# Export
 
 
 def test_an_export_reads_back(folder, chairs):

@@ -73,9 +73,6 @@ def truth(frames, scene):
     return working_pose(scene, first, 0)
 
 
-# Poses
-
-
 @given(seeds)
 def test_suppression_keeps_the_best_of_each_neighbourhood(seed):
     rng = np.random.default_rng(seed)
@@ -88,9 +85,6 @@ def test_suppression_keeps_the_best_of_each_neighbourhood(seed):
     for dropped in set(range(12)) - set(kept.tolist()):
         assert any(apart[dropped, k] < 25 and score[k] >= score[dropped] for k in kept)
     assert non_maximum_suppression(rotation, score, 25.0, 2).tolist() == kept[:2].tolist()
-
-
-# Maps and scene
 
 
 def test_an_object_cut_off_by_the_border_is_not_known_to_end_there():
@@ -134,9 +128,6 @@ def test_outliers_far_behind_the_object_are_left_out(views):
     assert float(without.reference_points.abs().max()) < 4
 
 
-# Proposals
-
-
 @pytest.mark.slow
 @given(seeds)
 def test_matches_with_outliers_propose_the_true_pose(seed):
@@ -173,9 +164,6 @@ def test_the_first_view_is_turned_about_the_vertical_in_steps_of_30_degrees(scen
     assert (np.abs(in_cameras[:, 1]) > 0.7).all()
 
 
-# Soft ICP
-
-
 def test_soft_icp_approaches_the_true_pose_and_keeps_it(scene, truth):
     turn = rotation_matrices(torch.deg2rad(torch.tensor([[14.0, -14, 10]])))
     start = Poses(truth.scale * 0.8, turn @ truth.rotation, truth.translation + 0.15)
@@ -184,9 +172,6 @@ def test_soft_icp_approaches_the_true_pose_and_keeps_it(scene, truth):
     assert float(rotation_angles(start.rotation, truth.rotation)) > 20
     assert errors.max() < 10
     assert (aligned.scale / truth.scale - 1).abs().max() < 0.12
-
-
-# Verification
 
 
 EVERY = (5, 10)  # by hand it takes a while
@@ -290,9 +275,6 @@ def test_the_viewpoint_term_is_highest_from_the_viewpoint_of_the_most_similar_vi
     np.testing.assert_allclose(score_terms(scene, sides)[:, -1], [expected, -expected], atol=1e-3)
 
 
-# Refinement
-
-
 def test_refinement_never_lowers_the_score():
     rng = np.random.default_rng(5)
     goal = as_poses(Sim3(1.1, some_rotation(rng), np.array([0.1, -0.2, 0.05])))
@@ -315,9 +297,6 @@ def test_bad_scenes_are_refused_in_one_line(views):
     empty = replace(reference, foreground=torch.zeros(28, 28, dtype=torch.bool))
     refused("reference: 0 foreground patches of known depth, expected at least 8", featureless_scene, [empty, *targets])
     refused("target views: 0 foreground patches", featureless_scene, [reference, empty])
-
-
-# Confidence
 
 
 def test_auroc_counts_pairs_of_a_right_and_a_wrong_answer():

@@ -49,9 +49,6 @@ def test_every_control_changes_the_picture_and_going_back_restores_it(name):
         assert (widget.picture.value, widget.caption.value) == (before, caption)
 
 
-# building blocks
-
-
 def test_no_module_imports_ipywidgets_before_a_widget_is_made():
     for path in Path(common.__file__).parent.glob("*.py"):
         assert not re.search("^(from|import) ipywidgets", path.read_text(encoding="utf-8"), re.MULTILINE), path.name
@@ -60,9 +57,6 @@ def test_no_module_imports_ipywidgets_before_a_widget_is_made():
 def test_without_ipywidgets_the_error_has_the_command_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "ipywidgets", None)
     refused("pip install ipywidgets", common.slider, "x", 0, 1, 0)
-
-
-# features and matches
 
 
 @pytest.fixture(scope="module")
@@ -111,9 +105,6 @@ def test_the_cycle_has_the_cyclical_distance_and_names_the_background(sim):
         assert f"u ({row}, {col}) →" in widget.caption.value
         assert f"d(u, u') = {distances[row, col]:.1f} patches" in widget.caption.value
         assert ("not on the foreground" in widget.caption.value) == (not valid[row, col])
-
-
-# alignment
 
 
 def test_the_caption_agrees_with_ransac():
