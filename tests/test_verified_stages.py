@@ -23,7 +23,7 @@ from zsp_lite.verified.confidence import Calibration, evidence, modes, reliabili
 from zsp_lite.verified.poses import Poses, concatenate, non_maximum_suppression, rotation_angles, rotation_matrices
 from zsp_lite.verified.proposals import poses_from_matches, poses_from_views
 from zsp_lite.verified.refinement import SearchSchedule, refine
-from zsp_lite.verified.scene import build_maps, build_scene, project_points
+from zsp_lite.verified.scene import build_maps, build_scene, project_points, surface_weights
 from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients, score_terms
 from zsp_lite.views import View, extract_views, object_crop
@@ -297,6 +297,15 @@ def test_bad_scenes_are_refused_in_one_line(views):
     empty = replace(reference, foreground=torch.zeros(28, 28, dtype=torch.bool))
     refused("reference: 0 foreground patches of known depth, expected at least 8", featureless_scene, [empty, *targets])
     refused("target views: 0 foreground patches", featureless_scene, [reference, empty])
+
+
+def test_surface_weights_do_not_depend_on_the_sampling_density():
+    rng = np.random.default_rng(6)
+    angle = np.concatenate([rng.uniform(0, np.pi, 400), rng.uniform(np.pi, 2 * np.pi, 100)])
+    ring = torch.tensor(np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) * 2, dtype=torch.float32)
+    share = surface_weights(ring)
+    assert float(share.sum()) == pytest.approx(1, abs=1e-5)
+    assert float(share[:400].sum()) == pytest.approx(0.5, abs=0.05)
 
 
 def test_auroc_counts_pairs_of_a_right_and_a_wrong_answer():
