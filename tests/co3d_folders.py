@@ -11,7 +11,6 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import SequenceData
 from zsp_lite.data.frames import Frame
 
-coordinates = st.floats(-10, 10, allow_subnormal=False)
 seeds = st.integers(0, 2**32 - 1)
 
 

@@ -2,7 +2,9 @@
 
 import contextlib
 import os
-from functools import wraps
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -25,26 +27,18 @@ _raises = pytest.raises
 
 
 @contextlib.contextmanager
-def _unchecked_raises(expectation):
-    before = config.jaxtyping_disable
-    config.update("jaxtyping_disable", True)
-    try:
-        with expectation as caught:
-            yield caught
-    finally:
-        config.update("jaxtyping_disable", before)
-
-
-@wraps(_raises)
-def raises(expected, *args, **kwargs):
+def raises(expected, **options):
     """`pytest.raises`, but inside `raises(InputError)` and `raises(FatalError)` annotations are not checked.
 
     Bad input violates the annotations as well, but these tests are about the library's own error.
     """
-    expectation = _raises(expected, *args, **kwargs)
-    if expected in (InputError, FatalError) and not args:
-        return _unchecked_raises(expectation)
-    return expectation
+    before = config.jaxtyping_disable
+    config.update("jaxtyping_disable", before or expected in (InputError, FatalError))
+    try:
+        with _raises(expected, **options) as caught:
+            yield caught
+    finally:
+        config.update("jaxtyping_disable", before)
 
 
 pytest.raises = raises
@@ -57,6 +51,28 @@ def links(tmp_path_factory):
         (tmp_path_factory.mktemp("links") / "link").symlink_to("nowhere")
     except OSError as error:
         pytest.skip(f"no symbolic links here: {error}")
+
+
+@pytest.fixture
+def run(capsys):
+    """Runs a command that ends with an exit code; returns what it printed, to stderr where the code is 2."""
+    from zsp_lite.cli.main import main
+
+    def run_command(words, code=0) -> str:
+        assert main([str(word) for word in words]) == code
+        out, error = capsys.readouterr()
+        return error if code == 2 else out
+
+    return run_command
+
+
+@pytest.fixture
+def closed_figures():
+    """Closes the figures of a test at its end."""
+    import matplotlib.pyplot as plt
+
+    yield
+    plt.close("all")
 
 
 @pytest.fixture(scope="session")
@@ -85,3 +101,14 @@ def ellipsoids(tmp_path_factory):
         write_label(root, "ellipsoid", PoseLabel(placement.matrix, name, "a"))
     write_co3d(root, "ellipsoid", sequences, quality=98)
     return Co3D(root)
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory):
+    """Folder with the built course site. A warning of Sphinx, such as an unknown link in a source, is an error."""
+    folder = tmp_path_factory.mktemp("site")
+    options = ["-q", "-W", "--keep-going", "-c", "docs/site", "-d", folder / "doctrees"]
+    command = [sys.executable, "-m", "sphinx", *options, ".", folder / "html"]
+    result = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
+    assert result.returncode == 0, f"warnings of Sphinx:\n{result.stderr}"
+    return folder / "html"

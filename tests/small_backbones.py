@@ -66,7 +66,5 @@ def save_model(folder: Path, config) -> Path:
 
 
 def save_all(root: Path) -> dict[str, Path]:
-    return {
-        kind: save_model(root / kind, configuration(kind, one.patch, **one.settings))
-        for kind, one in ARCHITECTURES.items()
-    }
+    configurations = {kind: configuration(kind, one.patch, **one.settings) for kind, one in ARCHITECTURES.items()}
+    return {kind: save_model(root / kind, one) for kind, one in configurations.items()}

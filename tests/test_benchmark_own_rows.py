@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from benchmark_folder import BACKBONE, exact_keypoints, own_matcher, own_method, placement, run_rows, small_folder
+from refusals import refused
 from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone, true_pose
 
@@ -58,21 +59,17 @@ def test_ones_own_things_of_every_kind_are_rows_by_object_and_by_name(tmp_path):
     assert list(run_rows(["benchmark_folder:own_method"], tmp_path / "c")) == ["benchmark_folder:own_method"]
 
 
-@pytest.mark.parametrize(
-    ("thing", "told"),
-    [
-        (3, "'mine' is of type int, expected"), (ZeroShotPose, "'mine' is of type type, expected"),
-        (lambda: 0, "a function of one"), (lambda a, b, c, d: 0, "a function of one"), (lambda *all: 0, "of one"),
-        (lambda one, *, other: 0, "a function of one"), ("benchmark_folder:nothing", "has no attribute 'nothing'"),
-        ("nowhere:nothing", "No module named 'nowhere'"), ("./here.py:x", "cannot be imported"), ("", "''|no methods"),
-        ("our-bv", "'our-bv' is unknown; `zsp-lite benchmark --list`"), ("no/such.csv", "no/such.csv"),
-        ("ours-n0", "'ours-n0' is unknown"), ("ours-n99999", "unknown"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("thing", "told"), [
+    (3, "'mine' is of type int, expected"), (ZeroShotPose, "'mine' is of type type, expected"),
+    (lambda: 0, "a function of one"), (lambda a, b, c, d: 0, "a function of one"), (lambda *all: 0, "of one"),
+    (lambda one, *, other: 0, "a function of one"), ("benchmark_folder:nothing", "has no attribute 'nothing'"),
+    ("nowhere:nothing", "No module named 'nowhere'"), ("./here.py:x", "cannot be imported"), ("", "''|no methods"),
+    ("our-bv", "'our-bv' is unknown; `zsp-lite benchmark --list`"), ("no/such.csv", "no/such.csv"),
+    ("ours-n0", "'ours-n0' is unknown"), ("ours-n99999", "unknown"),
+])  # fmt: skip
 def test_what_is_no_method_is_refused_by_one_line_before_anything_is_computed(thing, told, tmp_path):
-    with pytest.raises(InputError, match=told) as caught:
-        run_rows({"mine": thing}, tmp_path / "out")
-    assert "\n" not in str(caught.value) and not (tmp_path / "out").exists()
+    refused(told, run_rows, {"mine": thing}, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_number_of_arguments_without_a_default_or_the_attribute_kind_tells_what_a_function_is():
@@ -84,8 +81,7 @@ def test_the_number_of_arguments_without_a_default_or_the_attribute_kind_tells_w
     problem.kind = "problem"  # comes before the two arguments
     found = lambda one, other=None, *, third=3: 0, lambda one, two, three=3, **options: 0, Network(), problem
     assert [kind_of("mine", one) for one in found] == ["problem", "keypoints", "keypoints", "problem"]
-    with pytest.raises(InputError, match="no methods, expected some"):
-        resolve([])
+    refused("no methods, expected some", resolve, [])
     views = resolve(["ours-n4", "near=ours-bv-n2", "far=benchmark_folder:own_method"])
     assert [(name, row.targets) for name, row in views.items()] == [("ours-n4", 4), ("near", 2), ("far", None)]
 
@@ -123,11 +119,18 @@ def test_keypoints_that_fit_no_pose_are_noted_and_those_that_are_none_fail(tmp_p
     assert read_run(tmp_path).row("none")["note"].iloc[0].startswith("pose is the best view's, not a fit: ")
     told = "matched points are 9 and 8, expected as many in both images"
     assert read_run(tmp_path).row("uneven")["failed"].iloc[0] == told
-    with pytest.raises(FatalError, match="scores of matches are negative, expected 0 or more"):  # less than no match
-        run_rows({"distances": lambda first, second: (ones, ones, -ones[:, 0])}, tmp_path)
+    distances = {"distances": lambda first, second: (ones, ones, -ones[:, 0])}  # less than no match
+    refused("scores of matches are negative, expected 0 or more", run_rows, distances, tmp_path, error=FatalError)
 
 
 COLUMNS = "category,reference_sequence,reference_frame,target_sequence,target_frame,rotation,translation,scale"
+
+
+def question(dataset, pair):
+    """Sequence and frame of the reference and of the second target view, and the true pose between them."""
+    ends = (pair.reference_sequence, pair.reference_frame), (pair.target_sequence, pair.target_frames[1])
+    known = ((dataset.camera(dataset.frame("lump", *end)), placement("lump", end[0])) for end in ends)
+    return ends, true_pose(*(part for one in known for part in one))
 
 
 def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
@@ -135,9 +138,7 @@ def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
     dataset, lines = Co3D(small_folder()), [COLUMNS]
     pairs = category_pairs(dataset, "lump", 4, 3)
     for pair in pairs[:3]:
-        ends = (pair.reference_sequence, pair.reference_frame), (pair.target_sequence, pair.target_frames[1])
-        known = ((dataset.camera(dataset.frame("lump", *end)), placement("lump", end[0])) for end in ends)
-        pose = true_pose(*(part for one in known for part in one))
+        ends, pose = question(dataset, pair)
         numbers = (" ".join(map(repr, part.ravel().tolist())) for part in (pose.R, pose.t))
         lines.append(",".join(map(str, ("lump", *ends[0], *ends[1], *numbers, "1.0"))))
     (tmp_path / "exact.csv").write_text("\n".join(lines))
@@ -152,15 +153,13 @@ def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
         assert np.isnan(known).all() if name == "rotations" else np.allclose(known, (0, 1), atol=1e-9)
         assert found.loc[pairs[3].key, ["error", "failed"]].tolist() == [180, f"{path} has no pose"]
     (tmp_path / "exact.csv").write_text("\n".join(lines[:2]))  # other poses under the same name
-    with pytest.raises(InputError, match="a run with methods of exact"):
-        run_rows(rows, tmp_path / "run", 4, 3)
-    with pytest.raises(InputError, match="exact.csv has no pose for any of the pairs"):
-        run_rows(rows, tmp_path / "other", 6, 2, "pebble")
+    refused("a run with methods of exact", run_rows, rows, tmp_path / "run", 4, 3)
+    refused("exact.csv has no pose for any of the pairs", run_rows, rows, tmp_path / "other", 6, 2, "pebble")
     end = f"{pairs[0].target_sequence},{pairs[0].target_frames[1]}"
     second = lines[1].replace(end, f"{pairs[0].target_sequence},{pairs[0].target_frames[0]}")
     (tmp_path / "two.csv").write_text("\n".join([*lines, second]))
-    with pytest.raises(FatalError, match="two.csv has 2 poses of the pair lump/.*, expected one"):
-        run_rows([f"two={tmp_path / 'two.csv'}"], tmp_path / "other", 4, 3)
+    two = [f"two={tmp_path / 'two.csv'}"]
+    refused("two.csv has 2 poses of the pair lump/.*, expected one", run_rows, two, tmp_path, 4, 3, error=FatalError)
 
 
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -175,12 +174,10 @@ CONVENTIONS = {
 def test_a_spreadsheets_poses_are_read_and_the_note_names_their_convention(tmp_path, caplog, convention):
     dataset, lines = Co3D(small_folder()), [COLUMNS.replace(",", ";"), "lump;x;1;y;2;1 0 0 0 1 0 0 0 1;;"]
     for pair in category_pairs(dataset, "lump", 12, 3):
-        ends = (pair.reference_sequence, pair.reference_frame), (pair.target_sequence, pair.target_frames[1])
-        known = ((dataset.camera(dataset.frame("lump", *end)), placement("lump", end[0])) for end in ends)
-        true = true_pose(*(part for one in known for part in one)).R
-        mixed = true.T if len(lines) < 10 else true  # as of a method that confuses left and right
+        ends, pose = question(dataset, pair)
+        mixed = pose.R.T if len(lines) < 10 else pose.R  # as of a method that confuses left and right
         other = Rotation.random(random_state=len(lines)).as_matrix() if convention == "none" else mixed
-        rotation = CONVENTIONS.get(convention, lambda R, other=other: other)(true)
+        rotation = CONVENTIONS.get(convention, lambda R, other=other: other)(pose.R)
         numbers = " ".join(f"{value:.4f}".replace(".", ",") for value in rotation.ravel())
         lines.append(f"lump;{ends[0][0]};{ends[0][1]:06d};{ends[1][0]};{ends[1][1]:06d};{numbers};;")
     (tmp_path / "mine.csv").write_text("\ufeff" + "\r\n".join(lines), encoding="utf-8")
@@ -212,26 +209,22 @@ def test_sequences_without_their_leading_zeros_are_found_where_one_fits(monkeypa
 RIGHT = "lump,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1"
 
 
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("", "a CSV file"), ("\xff", "codec.* a CSV file"), (f"{COLUMNS}\nlump,a,0", "line 2: "),
-        ("category,target_frame", "columns reference_sequence, .*rotation"), (f"{COLUMNS}\n{RIGHT}x", "line 2: .*1x"),
-        (f"{COLUMNS}\n{RIGHT}\n{RIGHT.replace('0 0 0 1,', '0 0 0,')}", "line 3: rotation has shape .8,., exp"),
-        (f"{COLUMNS}\n\n{RIGHT.replace(',1 0', ',nan 0')}", "line 3: rotation holds nan"),
-        (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',-1 0')}", "line 2: "), (f"{COLUMNS}\n{RIGHT[:-1]}0", "scale is 0.0"),
-        (f"{COLUMNS}\n{RIGHT.replace(',b,1,', ',b,1.000,')}", "line 2: .*'1.000'"),  # or a thousand
-        (f"{COLUMNS}\n{RIGHT.replace(',0 0 1,', ',0 0,')}", "line 2: translation has shape .2,., expected"),
-        (f"{COLUMNS}\n{RIGHT}\n{RIGHT}", "line 3: second pose of the same frames"),
-        (f"{COLUMNS}\n{RIGHT},surplus", "line 2: more than the 8 fields of the header"),
-        (f"{COLUMNS},Scale,ROTATION\n{RIGHT},,", "columns rotation"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("text", "told"), [
+    ("", "a CSV file"), ("\xff", "codec.* a CSV file"), (f"{COLUMNS}\nlump,a,0", "line 2: "),
+    ("category,target_frame", "columns reference_sequence, .*rotation"), (f"{COLUMNS}\n{RIGHT}x", "line 2: .*1x"),
+    (f"{COLUMNS}\n{RIGHT}\n{RIGHT.replace('0 0 0 1,', '0 0 0,')}", "line 3: rotation has shape .8,., exp"),
+    (f"{COLUMNS}\n\n{RIGHT.replace(',1 0', ',nan 0')}", "line 3: rotation holds nan"),
+    (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',-1 0')}", "line 2: "), (f"{COLUMNS}\n{RIGHT[:-1]}0", "scale is 0.0"),
+    (f"{COLUMNS}\n{RIGHT.replace(',b,1,', ',b,1.000,')}", "line 2: .*'1.000'"),  # or a thousand
+    (f"{COLUMNS}\n{RIGHT.replace(',0 0 1,', ',0 0,')}", "line 2: translation has shape .2,., expected"),
+    (f"{COLUMNS}\n{RIGHT}\n{RIGHT}", "line 3: second pose of the same frames"),
+    (f"{COLUMNS}\n{RIGHT},surplus", "line 2: more than the 8 fields of the header"),
+    (f"{COLUMNS},Scale,ROTATION\n{RIGHT},,", "columns rotation"),
+])  # fmt: skip
 def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_path):
     path = tmp_path / "poses.csv"
     path.write_text(text, encoding="latin-1")
-    with pytest.raises(InputError, match=f"poses {re.escape(str(path))}.*{told}"):
-        resolve([f"theirs={path}"])
+    refused(f"poses {re.escape(str(path))}.*{told}", resolve, [f"theirs={path}"])
     saved = f"{COLUMNS.title()},,\n,,,,,,,,,\n{RIGHT.replace('a,0,b,1', 'a,0.0,b,0001')},,\n".replace("_", " ")
     path.write_text(saved, encoding="utf-16")
     assert resolve([f"theirs={path}"])["theirs"].solve._poses.keys() == {("lump", "a", 0, "b", 1)}
@@ -275,8 +268,7 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])  # as a console script has it
     (tmp_path / "row_that_exits.py").write_text("raise SystemExit(3)")
-    with pytest.raises(InputError, match="'row_that_exits:a' cannot be imported: .*py, line 1: SystemExit: 3"):
-        resolve(["row_that_exits:a"])
+    refused("'row_that_exits:a' cannot be imported: .*py, line 1: SystemExit: 3", resolve, ["row_that_exits:a"])
     assert resolve(["rows_of_my_own:still"])["rows_of_my_own:still"].solve.__name__ == "still"
 
 
@@ -355,24 +347,12 @@ def test_rows_do_not_reach_each_other_in_any_order(tmp_path):
             assert found.drop(columns="seconds").equals(expected.drop(columns="seconds")), name
 
 
-def test_a_matcher_of_keypoints_gets_the_same_reference_for_every_view(tmp_path):
-    def overwriting(first, second):
-        seen.append(int(first.sum()))
-        first[:] = 0
-        return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
-
-    seen = []
-    run_rows({"mine": overwriting}, tmp_path, 1, 3)
-    assert len(seen) == 3 and len(set(seen)) == 1 and seen[0] > 0
-
-
 @pytest.mark.slow
 def test_workers_may_have_another_current_folder_than_the_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with ProcessPoolExecutor(1, get_context("spawn"), os.chdir, ("/",)) as executor:
-        assert (
-            evaluate(small_folder(), "zsp-tiny", ["icp"], {"lump": 2}, 2, "run", executor)["methods"]["icp"]["n"] == 2
-        )
+        found = evaluate(small_folder(), "zsp-tiny", ["icp"], {"lump": 2}, 2, "run", executor)
+    assert found["methods"]["icp"]["n"] == 2
 
 
 def fails(problem):
@@ -384,10 +364,9 @@ def test_a_row_with_a_bug_ends_the_run_with_one_line_that_says_where(tmp_path):
     own = SimpleNamespace(estimate=lambda reference, targets: fails(None))
     rows = fails, own, lambda first, second: fails(None), lambda similarity, first, second: fails(None)
     for number, row in enumerate(rows):
-        with pytest.raises(FatalError, match=where):
-            run_rows({f"mine {number}": row}, tmp_path)
-    with pytest.raises(FatalError, match="ValueError: invalid literal"):
-        run_rows({"mine": lambda problem: (np.eye(3), "first")}, tmp_path)
+        refused(where, run_rows, {f"mine {number}": row}, tmp_path, error=FatalError)
+    wrong = {"mine": lambda problem: (np.eye(3), "first")}
+    refused("ValueError: invalid literal", run_rows, wrong, tmp_path, error=FatalError)
     assert not read_lines(tmp_path)
 
 
@@ -400,14 +379,11 @@ class Broken(CoordinateBackbone):
         return type(self).wrong(super().__call__(images))
 
 
-@pytest.mark.parametrize(
-    ("wrong", "told"),
-    [
-        (lambda maps: [replace(one, keys=one.keys * float("nan")) for one in maps], "values that are not finite"),
-        (lambda maps: [replace(one, keys=one.keys[:, :0]) for one in maps], "have shapes"),
-        (lambda maps: maps[1:], r"returned \d of"), (lambda maps: maps[9], "IndexError"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("wrong", "told"), [
+    (lambda maps: [replace(one, keys=one.keys * float("nan")) for one in maps], "values that are not finite"),
+    (lambda maps: [replace(one, keys=one.keys[:, :0]) for one in maps], "have shapes"),
+    (lambda maps: maps[1:], r"returned \d of"), (lambda maps: maps[9], "IndexError"),
+])  # fmt: skip
 @pytest.mark.parametrize(
     "run", ["ours", "category", lambda problem: problem.views() and np.eye(3), "estimator", "align"]
 )
@@ -487,3 +463,14 @@ def test_the_library_is_known_by_version_and_commit(tmp_path, monkeypatch):
     assert found[:2] == [None, None] and len(commit) == 40
     (tmp_path / "__init__.py").write_text("x = 1")
     assert version()["commit"] == f"{commit}-dirty"
+
+
+def test_a_matcher_of_keypoints_gets_the_same_reference_for_every_view(tmp_path):
+    def overwriting(first, second):
+        seen.append(int(first.sum()))
+        first[:] = 0
+        return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
+
+    seen = []
+    run_rows({"mine": overwriting}, tmp_path, 1, 3)
+    assert len(seen) == 3 and len(set(seen)) == 1 and seen[0] > 0

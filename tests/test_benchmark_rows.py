@@ -4,16 +4,15 @@ from dataclasses import replace
 
 import pytest
 from benchmark_folder import BACKBONE, run_rows, small_folder
+from refusals import refused
 
 from zsp_lite.baselines.sift import Sift
-from zsp_lite.benchmark import problem
 from zsp_lite.benchmark.methods import GROUPS, METHODS, resolve
 from zsp_lite.benchmark.problem import FrameStore, Problem
 from zsp_lite.benchmark.runs import read_run
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import category_pairs
-from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 
@@ -68,13 +67,5 @@ def test_a_pair_without_depth_fails(row, monkeypatch):
     one = Problem(*category_pairs(dataset, "pebble", 1, 2), FrameStore(dataset, "pebble", {"sift": Sift()}))
     crops = {key: replace(one.store.frame(key), depth=None) for key in one.keys}
     monkeypatch.setattr(one.store, "frame", crops.get)
-    with pytest.raises(InputError, match="no depth map: 100_a"):
-        METHODS[row].solve(one)
+    refused("no depth map: 100_a", METHODS[row].solve, one)
     assert one.frames() == [*crops.values()]
-
-
-def test_similarities_are_computed_once_for_all_rows_of_a_pair(tmp_path, monkeypatch):
-    calls, similarities = [], problem.similarities
-    monkeypatch.setattr(problem, "similarities", lambda *args: (calls.append(args), similarities(*args))[1])
-    run_rows(("ours", "ours-bv", "ours-globalsim", "ours-trials500", "ours-k30", "ours-n3"), tmp_path, 2, 3)
-    assert len(calls) == 2 * 3

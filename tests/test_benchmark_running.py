@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 import torch
 from benchmark_folder import BACKBONE, SlowBackbone, after_each_save, run_rows, small_folder
+from refusals import refused
 from synthetic_views import CoordinateBackbone
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -110,8 +111,7 @@ def test_a_line_cut_off_by_a_kill_is_neither_read_nor_continued(undisturbed, tmp
 def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monkeypatch):
     out, summary = undisturbed
     shutil.copy(out / SETTINGS, tmp_path)  # of a run that was killed before its first result
-    with pytest.raises(InputError, match="no pair that all its rows have finished"):
-        read_run(tmp_path)
+    refused("no pair that all its rows have finished", read_run, tmp_path)
     packed = tmp_path / f"{LINES}.gz"
     packed.write_bytes(gzip.compress((out / LINES).read_bytes()))
     assert read_run(tmp_path).table.equals(read_run(out).table) and read_run(tmp_path).summary == summary
@@ -132,8 +132,7 @@ def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tabl
 
     monkeypatch.setattr("zsp_lite.benchmark.run.add_lines", after_each_save(kill_a_worker))
     arguments = (small_folder(), SlowBackbone(grid=8), ROWS, 6, 3, tmp_path)
-    with pytest.raises(InputError, match="finished pairs are stored: run again to continue, with fewer workers"):
-        evaluate(*arguments, executor=2)
+    refused("finished pairs are stored: run again to continue, with fewer workers", evaluate, *arguments, executor=2)
     assert seen[-1] == len(pairs_in(tmp_path)) < 12
     assert evaluate(*arguments)["methods"] == undisturbed[1]["methods"]
     assert seen[-1] == len(pairs_in(tmp_path)) == len(set(pairs_in(tmp_path))) == 12
@@ -164,8 +163,7 @@ def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch
         seen.append(read_run(tmp_path).summary["methods"]["ours-bv"]["n"])
         if len(seen) == 3:
             assert main(["tables", str(tmp_path), "--out", str(tmp_path / "reports")]) == 0
-            with pytest.raises(InputError, match="another process is writing"):
-                evaluate(*arguments)
+            refused("another process is writing", evaluate, *arguments)
 
     arguments = (small_folder(), QUICK, ["ours-bv"], 2, 3, tmp_path)
     monkeypatch.setattr("zsp_lite.benchmark.run.add_lines", after_each_save(look))
@@ -240,8 +238,7 @@ def test_a_run_is_not_continued_by_another_version_of_the_library_unless_it_is_a
     run(["ours-bv"])
     first, other = library_version(), {"version": "1", "commit": "0123abc"}
     monkeypatch.setattr("zsp_lite.benchmark.run.library_version", lambda: other)
-    with pytest.raises(InputError, match="this is .*0123abc.*; choose another folder, or .*--allow-other-version"):
-        run(["ours"])
+    refused("this is .*0123abc.*; choose another folder, or .*--allow-other-version", run, ["ours"])
     run(["ours"], allow_other_version=True)
     assert json.loads((tmp_path / SETTINGS).read_text())["library"] == [first, other]
     assert [call.rows for call in read_run(tmp_path).settings.calls] == [["ours-bv"], ["ours"]]
@@ -254,10 +251,8 @@ def test_a_folder_that_holds_no_run_is_neither_read_nor_continued(undisturbed, t
     with pytest.raises(InputError, match="settings of a run .*run.json cannot be read"):
         again(run)  # it has results
     for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(
-            InputError, match=f"settings of a run {re.escape(str(folder / SETTINGS))} cannot be read: no such file"
-        ):
-            read_run(folder)
+        told = f"settings of a run {re.escape(str(folder / SETTINGS))} cannot be read: no such file"
+        refused(told, read_run, folder)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no device that is always full")
@@ -289,8 +284,7 @@ def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
     labels = read_labels(root, "lump")
     name = next(name for name, label in labels.items() if name != label.reference_seq)
     write_label(root, "lump", replace(labels[name], trans=labels[name].trans @ np.diag([-1.0, -1.0, 1.0, 1.0])))
-    with pytest.raises(InputError, match="a run with labels of lump"):
-        run(tmp_path / "run")
+    refused("a run with labels of lump", run, tmp_path / "run")
     run(tmp_path / "other")
 
 

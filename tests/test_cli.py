@@ -13,18 +13,17 @@ import numpy as np
 import pytest
 from co3d_folders import convert_to_v2, sequence_data
 from synthetic_views import CoordinateBackbone
-from test_importers import hairdryer_views, write_lists
 
 from zsp_lite import __version__, errors
 from zsp_lite.backbones.load import BackboneConfig
 from zsp_lite.cli import demo, doctor
 from zsp_lite.cli.main import cli, main
 from zsp_lite.data.co3d import Co3D, write_co3d
-from zsp_lite.data.frames import write_mask
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.importers import FORMATS
 from zsp_lite.importers.convert import ImportResult
 
+DOWNLOAD = ("data", "download", "--yes")
 IMPORT = ("data", "import", "--root=x", "--category=c", "--sequence=s")
 
 
@@ -37,23 +36,20 @@ def commands(group: click.Group = cli, path: tuple[str, ...] = ()) -> Iterator[t
 
 
 @pytest.mark.parametrize("command", list(commands()), ids=" ".join)
-def test_help_of_every_command_has_an_example_and_an_unknown_option_is_one_line(command, capsys):
+def test_help_of_every_command_has_an_example_and_an_unknown_option_is_one_line(command, capsys, run):
     name = " ".join(("zsp-lite", *command))
-    assert main([*command, "--help"]) == 0
-    text = capsys.readouterr().out
+    text = run([*command, "--help"])
     assert text.startswith(f"Usage: {name}") and "Examples:" in text and f"    {name}" in text
     assert main([*command, "--unknown"]) == 2
     line = assert_one_line(capsys)
     assert "--unknown" in line and line.endswith(f"(see: {name} --help)\n")
 
 
-def test_the_help_lists_every_command_and_the_version_is_told(capsys):
-    assert main(["--help"]) == 0
-    text = capsys.readouterr().out
+def test_the_help_lists_every_command_and_the_version_is_told(run):
+    text = run(["--help"])
     names = "demo estimate align benchmark tables compare synth weights data doctor".split()
     assert set(names) == set(cli.commands) and all(f"\n  {name} " in text for name in names)
-    assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"zsp-lite, version {__version__}\n"
+    assert run(["--version"]) == f"zsp-lite, version {__version__}\n"
 
 
 def test_help_imports_no_large_library():
@@ -80,6 +76,8 @@ WRONG = [
     (["estimate", "a", "b", "--depth-unit", "0"], "got '0', expected a positive number"),
     (["estimate", "a", "b", "--box", "1,2,3,4.5"], "got '1,2,3,4.5', expected four integers"),
     (["estimate", "a", "b", "--intrinsics", "inf,1,2,3"], "got 'inf,1,2,3', expected four numbers"),
+    (["estimate", "a", "b", "c"], "1 more paths, expected these after --helpers"),
+    (["estimate", "a", "b", "--helpers", "c", "--solver", "paper"], "--helpers"),
     (["demo", "--data", "no/such/folder"], str(Path("no/such/folder"))),
     (["demo", "--backbone", "resnet"], "resnet"),
     (["demo", "--layer", "block12"], "'block0' to 'block11'"),
@@ -88,6 +86,13 @@ WRONG = [
     (["tables", "."], "run.json"),
     (["synth", "--category", "sofa", "--out", "x"], "sofa"),
     (["data", "check", "/nowhere"], "does not exist"),
+    ([*DOWNLOAD, "co3d", "--category", "spaceship"], "co3d (full) is 'spaceship', expected one of "),
+    (
+        [*DOWNLOAD, "co3d-v1", "--category", "toaster", "--single-sequence"],
+        "--single-sequence does not go with co3d-v",
+    ),
+    ([*DOWNLOAD, "co3d-v1", "--category", "toaster", "--labelled-only"], "--labelled-only goes with --labels"),
+    ([*DOWNLOAD, "co3d", "--category", "toaster", "--labels", "x"], "--labels does not go with co3d: labels are of v1"),
     ([*IMPORT, "lists", "/nowhere"], "rgb.txt"),
     ([*IMPORT, "nerfstudio", "x", "--object=2"], "--object does not go with x, of the format nerfstudio"),
     ([*IMPORT, "lists", "x", "--box=1,1,9,9", "--masks=m"], "--masks does not go with --box"),
@@ -104,14 +109,11 @@ def test_bad_input_is_one_line_exit_code_2_and_no_file(arguments, part, capsys, 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("error", "code"),
-    [
-        (errors.InputError("two\nlines"), 2),
-        (PermissionError(13, "Permission denied", "/there"), 2),
-        (KeyboardInterrupt(), 130),
-    ],
-)
+@pytest.mark.parametrize(("error", "code"), [
+    (errors.InputError("two\nlines"), 2),
+    (PermissionError(13, "Permission denied", "/there"), 2),
+    (KeyboardInterrupt(), 130),
+])  # fmt: skip
 def test_an_error_inside_a_command_is_one_line(error, code, monkeypatch, capsys):
     def fail():
         raise error
@@ -131,9 +133,8 @@ def loaded(monkeypatch) -> list[Any]:
 
 
 @pytest.mark.slow
-def test_the_demo_prints_a_table_and_writes_its_report(ellipsoids, tmp_path, loaded, capsys):
-    assert main(["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)]) == 0
-    text = capsys.readouterr().out
+def test_the_demo_prints_a_table_and_writes_its_report(ellipsoids, tmp_path, loaded, run):
+    text = run(["demo", "--data", str(ellipsoids.root), "--out", str(tmp_path)])
     assert "ellipsoid" in text and " of 5" in text and "°" in text and demo.USER_NOTE in text
     assert "paper" in text and "verified" in text
     assert (tmp_path / "report.html").stat().st_size > 1_000_000  # plotly's script and the pictures
@@ -157,9 +158,8 @@ def test_synth_writes_a_co3d_folder(tmp_path):
     assert [key.frame_number for key in Co3D(tmp_path).frame_list("mouse")] == [0, 1]
 
 
-def test_weights_list_has_every_backbone(capsys):
-    assert main(["weights", "list"]) == 0
-    text = capsys.readouterr().out
+def test_weights_list_has_every_backbone(run):
+    text = run(["weights", "list"])
     assert all(name in text for name in ("zsp-tiny", "dino_vits8", "dino_vits16", "dino_vitb8", "dino_vitb16"))
 
 
@@ -170,11 +170,10 @@ def assert_one_line(capsys) -> str:
     return captured.err
 
 
-def test_benchmark_list_has_every_method_and_group_in_100_columns(capsys):
+def test_benchmark_list_has_every_method_and_group_in_100_columns(run):
     from zsp_lite.benchmark.methods import GROUPS, METHODS
 
-    assert main(["benchmark", "--list"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = run(["benchmark", "--list"]).splitlines()
     assert {*METHODS, *(f"{name}:" for name in GROUPS)} <= {line.split()[0] for line in lines if line.strip()}
     assert max(map(len, lines)) <= 100
 
@@ -188,17 +187,15 @@ def test_a_reader_that_ends_early_ends_the_output_without_an_error():
 
 
 @pytest.mark.slow
-def test_a_run_is_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, capsys):
+def test_a_run_is_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, capsys, run):
     monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: CoordinateBackbone())
     monkeypatch.setenv("COLUMNS", "200")
     rows = ["benchmark", "--data", str(ellipsoids.root), "--pairs", "2", "--targets", "3", "--methods", "table3"]
     for name, options in (("a", []), ("b", ["--quiet"])):
-        assert main([*rows, "--out", str(tmp_path / name), *options]) == 0
-        assert ("ours-globalsim" in capsys.readouterr().out) == (name == "a")
+        assert ("ours-globalsim" in run([*rows, "--out", str(tmp_path / name), *options])) == (name == "a")
     methods = json.loads((tmp_path / "a/summary.json").read_text())["methods"]
     assert methods["ours"]["n"] == methods["ours-globalsim"]["n"] == 2
-    assert main(["tables", str(tmp_path / "a"), "--out", str(tmp_path / "c")]) == 0
-    assert "GlobalSim" in capsys.readouterr().out
+    assert "GlobalSim" in run(["tables", str(tmp_path / "a"), "--out", str(tmp_path / "c")])
     for made in ("tables/table_3.md", "summary.json"):
         assert len({(tmp_path / name / made).read_bytes() for name in "ac"}) == 1
     assert len({(tmp_path / name / "tables/table_3.md").read_bytes() for name in "ab"}) == 1
@@ -228,44 +225,26 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
         assert given.pop() == common + last and not given
 
 
-# Data
-
-
 @pytest.fixture
 def root(tmp_path):
     write_co3d(tmp_path / "data", "chair", [sequence_data("a"), sequence_data("b")])
     return tmp_path / "data"
 
 
-def test_labels_are_imported_and_transferred(root, tmp_path, capsys):
+def test_labels_are_imported_and_transferred(root, tmp_path, run):
     for name in "ab":
         write_label(tmp_path / "clone/data", "chair", PoseLabel(np.eye(4), name, "a"))
-    assert main(["data", "labels", str(tmp_path / "clone"), "--root", str(root)]) == 0
-    assert "2 labels, 0 files of pairs" in capsys.readouterr().out
+    assert "2 labels, 0 files of pairs" in run(["data", "labels", str(tmp_path / "clone"), "--root", str(root)])
     shutil.copytree(root / "chair", tmp_path / "v2/chair")
     convert_to_v2(tmp_path / "v2/chair")
     write_label(tmp_path / "v2", "chair", PoseLabel(np.diag([-1.0, -1, 1, 1]), "b", "a"))
     transfer = ["data", "transfer", str(root), str(tmp_path / "v2"), "chair"]
-    assert main(transfer) == 2 and "expected --replace" in capsys.readouterr().err
-    assert main([*transfer, "--replace"]) == 0
-    assert "camera centres differ by 0.00 %" in capsys.readouterr().out
+    assert "expected --replace" in run(transfer, 2)
+    assert "camera centres differ by 0.00 %" in run([*transfer, "--replace"])
     assert list(read_labels(tmp_path / "v2", "chair")) == ["a", "b"]
 
 
-def test_a_capture_is_imported(tmp_path, capsys):
-    source = tmp_path / "scan"
-    source.mkdir()
-    frames = hairdryer_views()
-    for frame in frames:
-        write_mask(tmp_path / f"masks/{frame.name}.png", frame.mask)
-    write_lists(source, frames)
-    arguments = ["data", "import", "lists", str(source), "--root", str(tmp_path / "mine"), "--category", "teapot"]
-    assert main([*arguments, "--sequence", "one", "--masks", str(tmp_path / "masks")]) == 0
-    assert "8 frames" in capsys.readouterr().out
-    assert len(Co3D(tmp_path / "mine").frames("teapot", "one")) == 8
-
-
-def test_options_of_the_import_reach_the_library(monkeypatch, capsys):
+def test_options_of_the_import_reach_the_library(monkeypatch, capsys, run):
     given = []
 
     def open_source(path, **options):
@@ -287,9 +266,7 @@ def test_options_of_the_import_reach_the_library(monkeypatch, capsys):
     options = {"depth_unit": 0.5, "object": 0, "label": 3, "orientation": "stored", "masks": Path("there")}
     assert given.pop() == (Path("scan"), {"count": 7, "mask": "given"} | options)
     monkeypatch.undo()
-    for wrong in (["lists", "scan", "--object", "0"], ["folder", "scan"]):
-        assert main(["data", "import", *wrong, *words]) == 2
-    assert "folder scan: expected SCAN, or one of nerfstudio, stray, " in capsys.readouterr().err
-    assert main(["data", "import", "--help"]) == 0
-    text = capsys.readouterr().out
+    assert "--object does not go with" in run(["data", "import", "lists", "scan", "--object", "0", *words], 2)
+    assert "folder scan: expected SCAN, or one of nerfstudio, " in run(["data", "import", "folder", "scan", *words], 2)
+    text = run(["data", "import", "--help"])
     assert all(name in text for name in FORMATS)

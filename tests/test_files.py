@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from co3d_folders import sequence_data
+from refusals import refused
 from safetensors.torch import save
 
 from zsp_lite.backbones.checkpoints import read_checkpoint
@@ -93,9 +94,7 @@ BAD_FILES = [
 def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path, monkeypatch, name, read, data, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / name).write_bytes(data)
-    with pytest.raises(InputError, match=message) as caught:
-        read(tmp_path / name)
-    assert name in str(caught.value) and "\n" not in str(caught.value)
+    assert name in refused(message, read, tmp_path / name)
     assert not (tmp_path / "executed").exists()
 
 
@@ -105,26 +104,22 @@ def test_what_is_no_file_is_refused_without_being_opened(tmp_path, read):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "cycle").symlink_to(tmp_path / "cycle")
     for name, reason in (("pipe", "a pipe or a device"), (".", "is a directory"), ("gone", "no such"), ("cycle", "")):
-        with pytest.raises(InputError, match=f"cannot be read: {reason}"):
-            read(tmp_path / name)
+        refused(f"cannot be read: {reason}", read, tmp_path / name)
 
 
 def test_a_path_with_a_null_byte_is_refused_in_one_printable_line():
-    with pytest.raises(InputError, match=r"image 'a\\x00b'\.\.\. cannot be read: .*embedded null [^\n]+$"):
-        read_bytes("a\0b", "image")
+    refused(r"image 'a\\x00b'\.\.\. cannot be read: .*embedded null [^\n]+$", read_bytes, "a\0b", "image")
 
 
 @pytest.mark.parametrize("path", ["../x", "/etc/passwd", "a\0b", "x" * 5000, "link/x"])
 def test_paths_out_of_a_folder_are_refused(tmp_path, path, links):
     (tmp_path / "link").symlink_to("/etc")
-    with pytest.raises(InputError, match="path .* (leads out of the data folder|is invalid)"):
-        path_inside(tmp_path, path)
+    refused("path .* (leads out of the data folder|is invalid)", path_inside, tmp_path, path)
 
 
 @pytest.mark.parametrize("name", ["", "..", ".x", "a/b", "a\\b", "C:", "a\0", "x" * 256])
 def test_names_that_are_no_plain_names_are_refused(name):
-    with pytest.raises(InputError, match="category name"):
-        plain_name(name, "category")
+    refused("category name", plain_name, name, "category")
 
 
 @pytest.mark.parametrize(
@@ -133,8 +128,7 @@ def test_names_that_are_no_plain_names_are_refused(name):
 def test_a_file_above_the_limit_is_refused_before_it_is_read(tmp_path, name, read):
     with open(tmp_path / name, "wb") as file:
         file.truncate(5 << 30)
-    with pytest.raises(InputError, match=f"{name} cannot be read: {5 << 30} bytes, expected at most"):
-        read(tmp_path / name)
+    refused(f"{name} cannot be read: {5 << 30} bytes, expected at most", read, tmp_path / name)
 
 
 def test_gzip_data_of_several_members_is_read():
@@ -147,20 +141,9 @@ def test_the_limit_on_pixels_is_compared_with_the_header(tmp_path, monkeypatch, 
     path = tmp_path / f"x{extension}"
     path.write_bytes(JPEG if extension == ".jpg" else PNG)
     monkeypatch.setattr(frames, "MAX_PIXELS", 14_399)
-    with pytest.raises(InputError, match="expected at most 14399 pixels, not 90 x 160"):
-        read_image(path)
+    refused("expected at most 14399 pixels, not 90 x 160", read_image, path)
     monkeypatch.setattr(frames, "MAX_PIXELS", 14_400)
     assert read_image(path).shape == (90, 160, 3)
-
-
-def test_a_jpeg_with_a_preview_in_its_header_is_read_and_refused_if_it_is_cut(tmp_path):
-    preview = b"Exif\0\0" + cv2.imencode(".jpg", PICTURE[:8, :8])[1].tobytes()
-    header = b"\xff\xe1" + (len(preview) + 2).to_bytes(2, "big") + preview
-    (tmp_path / "x.jpg").write_bytes(JPEG[:2] + header + JPEG[2:])
-    assert read_image(tmp_path / "x.jpg").shape == PICTURE.shape
-    (tmp_path / "x.jpg").write_bytes(JPEG[:2] + header + JPEG[2 : len(JPEG) // 2])
-    with pytest.raises(InputError, match="expected a complete JPEG"):
-        read_image(tmp_path / "x.jpg")
 
 
 def test_a_long_message_keeps_its_beginning_and_end():
@@ -207,8 +190,7 @@ def test_written_data_is_read_back(path):
     write_ply(path, POINTS, COLOURS, POINTS)
     np.testing.assert_array_equal(read_ply(path)[0], POINTS)
     np.testing.assert_array_equal(read_ply(path)[1], COLOURS)
-    with pytest.raises(InputError, match="expected finite"):
-        write_ply(path, np.full((5, 3), np.nan), COLOURS)
+    refused("expected finite", write_ply, path, np.full((5, 3), np.nan), COLOURS)
 
 
 _HOLD = "import sys; from zsp_lite.io.locks import writing\nwith writing(sys.argv[1]): print(1, flush=True); input()"
@@ -218,8 +200,7 @@ def test_a_category_has_one_writer_until_that_is_killed(tmp_path):
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     writer = subprocess.Popen([sys.executable, "-c", _HOLD, str(tmp_path / "cup")], **pipes)
     assert writer.stdout.readline()
-    with pytest.raises(InputError, match="cup: another process is writing to it"):
-        write_co3d(tmp_path, "cup", [sequence_data("a", 2)])
+    refused("cup: another process is writing to it", lambda: write_co3d(tmp_path, "cup", [sequence_data("a", 2)]))
     writer.kill()
     writer.wait()
     write_co3d(tmp_path, "cup", [sequence_data("a", 2)])

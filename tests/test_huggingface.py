@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import transformers
+from refusals import refused
 from safetensors.torch import load, load_file, save_file
 from small_backbones import ARCHITECTURES, DEPTH, DIM, HEADS, configuration, save_all, save_model
 from transformers import AutoModel
@@ -21,7 +22,6 @@ from zsp_lite.backbones.backbone import prepare_images
 from zsp_lite.backbones.load import download
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.choices import FACETS
-from zsp_lite.errors import InputError
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +70,6 @@ def projection(architecture, block, x, facet: str):
     return project(block.get_submodule(architecture.norm)(x)).detach()
 
 
-# what it computes
-
-
 @pytest.mark.parametrize("facet", FACETS)
 def test_facets_are_the_projections_of_the_normalised_input_of_the_block_and_its_output(kind, folders, pictures, facet):
     architecture = ARCHITECTURES[kind]
@@ -112,16 +109,10 @@ def test_a_model_that_nobody_thought_of_is_read_by_the_names_of_its_parts(tmp_pa
     assert [features.grid for features in backbone(pictures)] == [(3, 3), (3, 3)]
 
 
-# settings
-
-
-@pytest.mark.parametrize(
-    "file, content, mean, std",
-    [
-        ("preprocessor_config.json", {"image_mean": [0.5] * 3, "image_std": [0.25] * 3}, 0.5, 0.25),
-        ("preprocessor_config.json", {"do_normalize": False, "image_mean": [0.5] * 3, "image_std": [1] * 3}, 0, 1),
-    ],
-)
+@pytest.mark.parametrize("file, content, mean, std", [
+    ("preprocessor_config.json", {"image_mean": [0.5] * 3, "image_std": [0.25] * 3}, 0.5, 0.25),
+    ("preprocessor_config.json", {"do_normalize": False, "image_mean": [0.5] * 3, "image_std": [1] * 3}, 0, 1),
+])  # fmt: skip
 def test_the_image_processors_mean_and_deviation_are_taken(file, content, mean, std, tmp_path, pictures):
     folder = save_model(tmp_path / "vit", configuration("vit"))
     plain = load_backbone(f"hf:{folder}", "cpu", image_size=48)
@@ -131,34 +122,22 @@ def test_the_image_processors_mean_and_deviation_are_taken(file, content, mean, 
     assert not torch.allclose(backbone(pictures)[0].keys, plain(pictures)[0].keys)
 
 
-# what is refused
-
-
-def refused(name, match: str, **options):
-    with pytest.raises(InputError, match=match) as caught:
-        load_backbone(name, "cpu", **options)
-    assert len(str(caught.value).splitlines()) == 1
-
-
 def test_without_transformers_the_package_is_named(folders, monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
-    refused(f"hf:{folders['vit']}", r"pip install transformers")
+    refused(r"pip install transformers", load_backbone, f"hf:{folders['vit']}", "cpu")
 
 
-@pytest.mark.parametrize(
-    "kind, settings, match",
-    [
-        ("siglip", {}, "a siglip_vision_model model, expected .* a CLS token"),
-        ("blip", {}, "a blip_vision_model model, expected .* the projections q_proj or query"),
-        ("vit", {"num_channels": 1}, "does not run"),
-        ("vit", {"patch_size": [8, 16]}, "one square patch_size"),
-        ("yolos", {"image_size": [32, 32], "num_detection_tokens": 7}, "11 tokens without"),
-        ("resnet", {"embedding_size": 8, "hidden_sizes": [8, 8], "depths": [1, 1]}, "a resnet model"),
-    ],
-)
+@pytest.mark.parametrize("kind, settings, match", [
+    ("siglip", {}, "a siglip_vision_model model, expected .* a CLS token"),
+    ("blip", {}, "a blip_vision_model model, expected .* the projections q_proj or query"),
+    ("vit", {"num_channels": 1}, "does not run"),
+    ("vit", {"patch_size": [8, 16]}, "one square patch_size"),
+    ("yolos", {"image_size": [32, 32], "num_detection_tokens": 7}, "11 tokens without"),
+    ("resnet", {"embedding_size": 8, "hidden_sizes": [8, 8], "depths": [1, 1]}, "a resnet model"),
+])  # fmt: skip
 def test_models_that_cannot_be_read_are_refused(kind, settings, match, tmp_path):
     config = transformers.ResNetConfig(**settings) if kind == "resnet" else configuration(kind, **settings)
-    refused(f"hf:{save_model(tmp_path / 'model', config)}", match, image_size=32)
+    refused(match, load_backbone, f"hf:{save_model(tmp_path / 'model', config)}", "cpu", image_size=32)
 
 
 def test_missing_weights_are_refused_and_not_made_up(tmp_path):
@@ -171,32 +150,27 @@ def test_missing_weights_are_refused_and_not_made_up(tmp_path):
     del kept["layernorm.weight"]
     other = shutil.copytree(folder, tmp_path / "other")  # Windows keeps a file whose tensors are in use
     save_file(kept, other / "model.safetensors", metadata={"format": "pt"})
-    refused(f"hf:{other}", "1 weights are not in the file, first layernorm.weight")
+    refused("1 weights are not in the file, first layernorm.weight", load_backbone, f"hf:{other}", "cpu")
 
 
 def test_pickles_are_not_read(tmp_path):
     folder = save_model(tmp_path / "vit", configuration("vit"))
     torch.save(load_file(folder / "model.safetensors"), folder / "pytorch_model.bin")
     (folder / "model.safetensors").unlink()
-    refused(f"hf:{folder}", "no model.safetensors")
-    refused(f"hf:{tmp_path}", "no config.json")
+    refused("no model.safetensors", load_backbone, f"hf:{folder}", "cpu")
+    refused("no config.json", load_backbone, f"hf:{tmp_path}", "cpu")
 
 
-@pytest.mark.parametrize(
-    "file, content, match",
-    [
-        ("model.safetensors", b"<html>404</html>" + bytes(1 << 20), ""),
-        ("config.json", b"{", "config.json"),
-        ("preprocessor_config.json", b'{"image_mean": [0.5], "image_std": [1]}', "expected three numbers"),
-    ],
-)
+@pytest.mark.parametrize("file, content, match", [
+    ("model.safetensors", b"<html>404</html>" + bytes(1 << 20), ""),
+    ("config.json", b"{", "config.json"),
+    ("preprocessor_config.json", b'{"image_mean": [0.5], "image_std": [1]}', "expected three numbers"),
+])  # fmt: skip
 def test_damaged_folders_are_refused_in_one_line(file, content, match, tmp_path):
     folder = save_model(tmp_path / "vit", configuration("vit"))
     (folder / file).write_bytes(content)
-    refused(f"hf:{folder}", re.escape(f"hf:{folder}") + f": cannot be loaded by the package transformers .*{match}")
-
-
-# the hub
+    told = re.escape(f"hf:{folder}") + f": cannot be loaded by the package transformers .*{match}"
+    refused(told, load_backbone, f"hf:{folder}", "cpu")
 
 
 @pytest.fixture()
@@ -220,4 +194,4 @@ def test_what_is_in_the_cache_needs_no_hub(offline, pictures):
 
 @pytest.mark.parametrize("name", ["hf:", "hf:../nowhere", "hf:facebook/dinov2-small"])
 def test_what_is_neither_a_folder_nor_a_name_is_refused(name, offline):
-    refused(name, "neither a folder nor a model OWNER/MODEL that the Hugging Face hub gives")
+    refused("neither a folder nor a model OWNER/MODEL that the Hugging Face hub gives", load_backbone, name, "cpu")

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from refusals import refused
 from scipy.spatial import cKDTree
 
 from zsp_lite.data.check import check_folder
@@ -149,17 +150,6 @@ def test_distortion_is_corrected(tmp_path, views, model):
         assert np.hypot((patch * columns).sum() / patch.sum() - x, (patch * rows).sum() / patch.sum() - y) < 0.35
 
 
-def test_masks_come_from_files_by_name(tmp_path, views):
-    folder = tmp_path / "scan"
-    write_lists(folder, views)
-    with pytest.raises(InputError, match="no mask, expected --masks DIR, --mask auto or --box"):
-        open_source(folder, mask="given")
-    for view in views:
-        write_mask(tmp_path / f"masks/{view.name}.png", view.mask)
-    import_source(open_source(folder, masks=tmp_path / "masks"), tmp_path / "data", "teapot", "mine")
-    assert Co3D(tmp_path / "data").categories() == ["teapot"]
-
-
 def test_the_fused_cloud_lies_on_the_surface(views):
     points, colours, normals = fuse(views)
     seen = np.concatenate([
@@ -176,34 +166,34 @@ def replaced(name, content):
     return lambda folder: (folder / name).write_text(content)
 
 
-def edited(change):
+def edited(*changes, encoding="utf-8", name="transforms.json"):
+    """Change transforms.json, or each frame of it where `changes` are of two arguments."""
+
     def apply(folder):
         content = json.loads((folder / "transforms.json").read_text())
-        change(content)
-        (folder / "transforms.json").write_text(json.dumps(content))
+        for change in changes:
+            change(content)
+        (folder / "transforms.json").unlink()
+        (folder / name).write_text(json.dumps(content), encoding=encoding)
+        return folder
 
     return apply
 
 
-@pytest.mark.parametrize(
-    ("kind", "damage", "message"),
-    [
-        ("nerfstudio", edited(lambda c: c.update(camera_model="PANORAMA")), "none of 8 frames .* 'PANORAMA'"),
-        ("nerfstudio", edited(lambda c: c.pop("fl_x")), "frame 0: no focal length, expected fl_x or"),
-        ("nerfstudio", edited(lambda c: [f.pop("depth_file_path") for f in c["frames"]]), "none of 8 frames has depth"),
-        ("nerfstudio", edited(lambda c: c.update(w=31.5)), "multiple of 1"),
-        ("nerfstudio", edited(lambda c: c.update(k4=0.01)), "frame 0: .* with k4 = 0.01, expected .* with k4 = 0"),
-        ("lists", replaced("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "rgb.txt 8, depth.txt 8, poses.txt 1"),
-        ("lists", replaced("poses.txt", 8 * ("1 0 0 0 " * 3 + "1 0 0 1\n")), "off the expected 0 0 0 1"),
-        ("lists", replaced("intrinsics.txt", "60 0 0\n0 60 0\n32 24 1\n"), "expected fx 0 cx, 0 fy cy, 0 0 1"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "damage", "message"), [
+    ("nerfstudio", edited(lambda c: c.update(camera_model="PANORAMA")), "none of 8 frames .* 'PANORAMA'"),
+    ("nerfstudio", edited(lambda c: c.pop("fl_x")), "frame 0: no focal length, expected fl_x or"),
+    ("nerfstudio", edited(lambda c: [f.pop("depth_file_path") for f in c["frames"]]), "none of 8 frames has depth"),
+    ("nerfstudio", edited(lambda c: c.update(w=31.5)), "multiple of 1"),
+    ("nerfstudio", edited(lambda c: c.update(k4=0.01)), "frame 0: .* with k4 = 0.01, expected .* with k4 = 0"),
+    ("lists", replaced("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "rgb.txt 8, depth.txt 8, poses.txt 1"),
+    ("lists", replaced("poses.txt", 8 * ("1 0 0 0 " * 3 + "1 0 0 1\n")), "off the expected 0 0 0 1"),
+    ("lists", replaced("intrinsics.txt", "60 0 0\n0 60 0\n32 24 1\n"), "expected fx 0 cx, 0 fy cy, 0 0 1"),
+])  # fmt: skip
 def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(tmp_path, views, kind, damage, message):
     WRITERS[kind](tmp_path, views)
     damage(tmp_path)
-    with pytest.raises(InputError, match=message) as caught:
-        open_capture(tmp_path, kind).frames
-    assert "\n" not in str(caught.value)
+    refused(message, open_capture, tmp_path, kind)
 
 
 def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
@@ -211,19 +201,8 @@ def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
     height, width = views[0].camera.size
     plane = np.repeat(np.arange(500, 500 + height // 2), width // 2).reshape(height // 2, width // 2)
     write_depth16(tmp_path / f"depths/{views[0].name}.png", plane / 1000)
-    frame = open_capture(tmp_path, "nerfstudio").frames[0]
-    np.testing.assert_allclose(frame.load().depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
-    write_depth16(tmp_path / f"depths/{views[0].name}.png", plane[:, ::2] / 1000)
-    with pytest.raises(InputError, match=r"expected .* = \(96, 128\)"):
-        frame.load()
-
-
-@pytest.mark.parametrize("values", [np.array(["x"]), np.float32(3), np.ones((4, 4, 3)), np.ones((0, 4))])
-def test_an_npy_file_that_is_no_depth_map_is_refused(tmp_path, views, values):
-    write_lists(tmp_path, views[:1])
-    np.save(tmp_path / f"z/{views[0].name}.npy", values)
-    with pytest.raises(InputError, match=r"expected numbers \(H, W\): .* .npy"):
-        open_capture(tmp_path, "lists")
+    frame = open_capture(tmp_path, "nerfstudio").frames[0].load()
+    np.testing.assert_allclose(frame.depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
 
 
 def test_a_single_frame_is_fused_and_a_surface_that_one_of_many_frames_saw_is_left_out(views):
@@ -234,8 +213,7 @@ def test_a_single_frame_is_fused_and_a_surface_that_one_of_many_frames_saw_is_le
 
 
 def test_bad_boxes_empty_depth_and_frames_without_overlap_are_refused(views):
-    with pytest.raises(InputError, match="expected one inside"):
-        masks_from_box(views, (0, 0, 5, 9999))
+    refused("expected one inside", masks_from_box, views, (0, 0, 5, 9999))
     with pytest.raises(InputError, match="no known depth on the object"):
         fuse([replace(view, depth=np.zeros_like(view.depth)) for view in views])
     with pytest.raises(InputError, match="expected overlapping depth maps"):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from refusals import refused
 from synthetic_views import look_at
 
 from zsp_lite.data.frames import Frame
@@ -55,8 +56,7 @@ def test_the_object_on_a_floor_is_found_without_a_box_in_any_unit_of_length(coun
 def test_depth_without_an_object_is_refused_and_a_frame_without_depth_gets_an_empty_mask():
     frame, truth = ball_on_floor(DIRECTIONS[0])
     blind = replace(frame, depth=np.zeros_like(frame.depth))
-    with pytest.raises(InputError, match="no depth is known"):
-        masks_from_depth([blind])
+    refused("no depth is known", masks_from_depth, [blind])
     with pytest.raises(InputError, match="nothing stands out .* expected --box TOP,LEFT,HEIGHT,WIDTH"):
         masks_from_depth([replace(frame, depth=np.full_like(frame.depth, 2))])
     empty, found = masks_from_depth([blind, frame])
@@ -90,15 +90,12 @@ def on_the_floor_too(mask):
     mask[box[0].stop - 15 : box[0].stop + 25, box[1].start - 20 : box[1].stop + 20] = True
 
 
-@pytest.mark.parametrize(
-    ("spoil", "sign"),
-    [
-        (in_the_corner, "several borders of the image are touched"),
-        (in_two_parts, "several separate parts"),
-        (around_the_object, "colours disagree"),
-        (on_the_floor_too, "much of it lies in the plane around it"),
-    ],
-)
+@pytest.mark.parametrize(("spoil", "sign"), [
+    (in_the_corner, "several borders of the image are touched"),
+    (in_two_parts, "several separate parts"),
+    (around_the_object, "colours disagree"),
+    (on_the_floor_too, "much of it lies in the plane around it"),
+])  # fmt: skip
 def test_a_mask_that_may_be_wrong_is_flagged_with_the_reason_and_the_number_of_frames(spoil, sign):
     (first, truth), (second, _) = (ball_on_floor(direction) for direction in DIRECTIONS[:2])
     good = masks_from_depth([first, second])

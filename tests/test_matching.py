@@ -41,9 +41,6 @@ def cycles_by_loops(sim: np.ndarray, grid1, grid2, fg1, fg2, published=False) ->
     return result
 
 
-# similarity
-
-
 @settings(max_examples=40)
 @given(sides, sides, sides, sides, seeds)
 def test_similarity_is_the_cosine_of_materialised_descriptors(h1, w1, h2, w2, seed):
@@ -75,9 +72,6 @@ def test_descriptors_without_length_are_similar_to_nothing():
     assert bool((similarity(torch.zeros(4, 4, 3), torch.ones(4, 4, 3)) == 0).all())
 
 
-# cyclical distances
-
-
 @settings(max_examples=40)
 @given(sides, sides, sides, sides, seeds)
 def test_cyclical_distances_follow_equation_2(h1, w1, h2, w2, seed):
@@ -87,9 +81,6 @@ def test_cyclical_distances_follow_equation_2(h1, w1, h2, w2, seed):
     expected = cycles_by_loops(sim, (h1, w1), (h2, w2), fg1, fg2)
     cyclical = cyclical_distances(sim, (h1, w1), (h2, w2), fg1, fg2)
     np.testing.assert_allclose(cyclical.numpy(), expected, rtol=1e-6)
-
-
-# match
 
 
 def test_matches_are_cycles_with_their_similarity_and_distance():

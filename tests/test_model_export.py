@@ -7,8 +7,8 @@ import shutil
 import numpy as np
 import pytest
 from model_files import write_quad, write_wedge
+from refusals import refused
 
-from zsp_lite.cli import main as cli
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D, SequenceData
 from zsp_lite.data.frames import Frame
@@ -91,8 +91,7 @@ def test_complete_sequences_stay_and_turned_models_are_rendered_again(data, fold
     export_models(folder, out, **SETTINGS, front="+x")  # of `high` alone: models.json orients the other one
     assert rendered == ["high"]
     assert not np.allclose(read_labels(out, "chair")["low"].trans, before)
-    with pytest.raises(InputError, match="was written with"):
-        export_models(folder, out, **{**SETTINGS, "seed": 4})
+    refused("was written with", export_models, folder, out, **{**SETTINGS, "seed": 4})
 
 
 def test_a_folder_of_other_data_or_without_a_usable_model_is_refused(data, folder, tmp_path):
@@ -101,17 +100,15 @@ def test_a_folder_of_other_data_or_without_a_usable_model_is_refused(data, folde
         export_models(tmp_path / "models", tmp_path / "out")
     shutil.copytree(data[0].root, tmp_path / "other")
     (tmp_path / "other" / RENDERED_FILE).unlink()
-    with pytest.raises(InputError, match="holds other data"):
-        export_models(folder, tmp_path / "other")
+    refused("holds other data", export_models, folder, tmp_path / "other")
 
 
-def test_the_command_line_renders_models_and_names_those_left_out(folder, tmp_path, capsys):
+def test_the_command_line_renders_models_and_names_those_left_out(folder, tmp_path, run):
     out, mine = tmp_path / "data", tmp_path / "mine"
     write_wedge(mine / "chair" / "a.obj")
     shutil.copytree(folder / "sign", mine / "sign")
     arguments = ["--frames", "1", "--image-size", "48", "--front", "-x", "--up", "+z", "--out", str(out)]
-    assert cli.main(["synth", "--models", str(mine), *arguments]) == 0
-    assert "Left out sign/stop" in capsys.readouterr().out
+    assert "Left out sign/stop" in run(["synth", "--models", str(mine), *arguments])
     rotation = json.loads((out / RENDERED_FILE).read_text())["sequences"]["chair"]["a"]["rotation"]
     assert rotation == [-1, 0, 0, 0, -1, 0, 0, 0, 1]
 

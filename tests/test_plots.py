@@ -1,6 +1,5 @@
 """Figures draw what they are given where it belongs: pixels, projections, orientations, signs, counts and intervals."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -11,13 +10,8 @@ from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, PointTe
 from zsp_lite.viz import plots, verified
 
 IMAGE = np.zeros((60, 80, 3), np.uint8)
+pytestmark = pytest.mark.usefixtures("closed_figures")
 CAMERA = Camera(np.eye(3), np.zeros(3), np.array([100.0, 100.0]), np.array([40.0, 30.0]), (60, 80))
-
-
-@pytest.fixture(autouse=True)
-def close_figures():
-    yield
-    plt.close("all")
 
 
 def test_patches_are_marked_at_their_centres_in_pixels_x_y():

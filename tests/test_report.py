@@ -4,7 +4,6 @@ import json
 import re
 from dataclasses import replace
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from plotly.offline import get_plotlyjs
@@ -17,13 +16,7 @@ from zsp_lite.samples import REPOSITORY
 from zsp_lite.viz.plots import object_cloud
 from zsp_lite.viz.report import _two_poses_figure, overview, table_rows, write_overview, write_report
 
-pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(autouse=True)
-def close_figures():
-    yield
-    plt.close("all")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("closed_figures")]
 
 
 @pytest.fixture

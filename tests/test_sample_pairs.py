@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 
 import zsp_lite
 from zsp_lite import minimal
@@ -19,7 +20,6 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.pairs import labelled_categories, shipped_pairs
-from zsp_lite.errors import InputError
 from zsp_lite.features import log_bin
 from zsp_lite.pipeline import solve_pair
 from zsp_lite.samples import REPOSITORY
@@ -36,19 +36,14 @@ def dataset():
 def solved(dataset):
     """The estimates of both solvers for each pair of `sample_poses.json`, by category, with shared features."""
     method = zsp_lite.ZeroShotPose(load_backbone())
-    return {
-        category: [
-            solve_pair(method, *dataset.load_pair(pair), SOLVERS["both"])
-            for pair in shipped_pairs(dataset, category, 5)[: len(stored)]
-        ]
-        for category, stored in STORED.items()
-    }
+    pairs = {category: shipped_pairs(dataset, category, 5)[: len(stored)] for category, stored in STORED.items()}
+    both = SOLVERS["both"]
+    return {name: [solve_pair(method, *dataset.load_pair(pair), both) for pair in some] for name, some in pairs.items()}
 
 
 def as_crop(view) -> minimal.Crop:
-    return minimal.Crop(
-        view.features.keys.numpy(), view.features.saliency.numpy(), view.frame.depth, view.frame.camera.K
-    )
+    features, frame = view.features, view.frame
+    return minimal.Crop(features.keys.numpy(), features.saliency.numpy(), frame.depth, frame.camera.K)
 
 
 def check_pair(method, reference, targets, name, **settings) -> None:
@@ -101,8 +96,7 @@ def test_its_descriptors_are_the_librarys(grid):
 
 def test_too_few_matches_are_refused():
     crop = minimal.Crop(np.ones((4, 4, 2)), np.zeros((4, 4)), np.ones((32, 32), np.float32), np.eye(3))
-    with pytest.raises(InputError, match="0 matches"):
-        minimal.estimate_pose(crop, [crop])
+    refused("0 matches", minimal.estimate_pose, crop, [crop])
 
 
 @pytest.mark.slow

@@ -7,8 +7,8 @@ import sys
 import pytest
 from IPython.core.interactiveshell import InteractiveShell
 from IPython.utils.capture import capture_output
+from refusals import refused
 
-from zsp_lite.errors import InputError
 from zsp_lite.widgets import self_check
 from zsp_lite.widgets.quiz import QUESTIONS, read_questions
 
@@ -41,13 +41,10 @@ def test_the_questions_are_in_the_output_itself(number):
 
 
 def test_an_unknown_self_check_is_named():
-    with pytest.raises(InputError, match="notebook is '99', expected one of 00"):
-        self_check("99", 1)
-    with pytest.raises(InputError, match="number is 3, expected an integer from 1 to 2"):
-        self_check("00", 3)
+    refused("notebook is '99', expected one of 00", self_check, "99", 1)
+    refused("number is 3, expected an integer from 1 to 2", self_check, "00", 3)
 
 
 def test_without_jupyterquiz_the_error_has_the_command_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "jupyterquiz", None)
-    with pytest.raises(InputError, match=r"needs jupyterquiz, which is not installed; pip install jupyterquiz"):
-        self_check("00", 1)
+    refused(r"needs jupyterquiz, which is not installed; pip install jupyterquiz", self_check, "00", 1)

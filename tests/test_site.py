@@ -2,8 +2,6 @@
 
 import importlib
 import re
-import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -42,17 +40,6 @@ class Page(HTMLParser):
 
     def handle_data(self, data):
         self.text += data
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """Folder with the built site. A warning of Sphinx, such as an unknown link in a source, is an error."""
-    folder = tmp_path_factory.mktemp("site")
-    options = ["-q", "-W", "--keep-going", "-c", "docs/site", "-d", folder / "doctrees"]
-    command = [sys.executable, "-m", "sphinx", *options, ".", folder / "html"]
-    result = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
-    assert result.returncode == 0, f"warnings of Sphinx:\n{result.stderr}"
-    return folder / "html"
 
 
 @pytest.fixture(scope="module")
@@ -142,9 +129,8 @@ def test_exercises_are_shown_and_offered_without_solutions_hidden_tests_and_guid
             assert not [secret for secret in secrets if secret in text], path.name
     for path in site.rglob("*"):
         if path.suffix in (".html", ".ipynb", ".js", ".txt"):
-            assert not re.search("BEGIN (SOLUTION|HIDDEN TESTS)|Guide for marking", path.read_text(encoding="utf-8")), (
-                path.name
-            )
+            text = path.read_text(encoding="utf-8")
+            assert not re.search("BEGIN (SOLUTION|HIDDEN TESTS)|Guide for marking", text), path.name
 
 
 def test_the_reference_describes_every_public_class_and_function(pages):

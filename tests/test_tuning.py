@@ -4,11 +4,11 @@ from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from tools import tuning
 from tools.concepts import check_sides
 from tools.tuning import Outcome, fit_calibration, fit_weights, leave_out
-from zsp_lite.errors import InputError
 from zsp_lite.verified.confidence import Calibration
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 
@@ -66,8 +66,7 @@ def test_the_coefficients_of_the_calibration_are_recovered():
         assert getattr(found, name)[4] == pytest.approx(getattr(TRUE_CALIBRATION, name)[4], abs=2)  # of view_std
     assert found.unseen == pytest.approx(0.2, abs=0.1)
     right = [one for one in outcomes if one.errors.min() < 30]
-    with pytest.raises(InputError, match="all have a right pose or none has"):
-        fit_calibration(right, FIRST_TERMS)
+    refused("all have a right pose or none has", fit_calibration, right, FIRST_TERMS)
 
 
 def test_no_fit_sees_the_category_it_is_evaluated_on():
@@ -80,9 +79,7 @@ def test_categories_of_another_side_are_refused(tmp_path, capsys):
     for name in ("camera", "drill"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "frame_annotations.jgz").write_bytes(b"")
-    with pytest.raises(InputError, match="category drill is for validation, expected training"):
-        check_sides([tmp_path], "training")
-    with pytest.raises(InputError, match="category camera is for training, expected validation"):
-        check_sides([tmp_path], "validation")
+    refused("category drill is for validation, expected training", check_sides, [tmp_path], "training")
+    refused("category camera is for training, expected validation", check_sides, [tmp_path], "validation")
     assert tuning.main(["weights", f"{tmp_path}:2"]) == 2
     assert "category drill is for validation" in capsys.readouterr().err

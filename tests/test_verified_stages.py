@@ -9,24 +9,18 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refused
 from scipy.spatial.transform import Rotation
 from synthetic_views import ELSEWHERE, CoordinateBackbone, matched_scene, reference_and_targets, true_pose, working_pose
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
-from zsp_lite.errors import InputError
 from zsp_lite.estimates import Hypothesis
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.verified.confidence import Calibration, evidence, modes, reliability_flags
-from zsp_lite.verified.poses import (
-    Poses,
-    concatenate,
-    non_maximum_suppression,
-    rotation_angles,
-    rotation_matrices,
-)
+from zsp_lite.verified.poses import Poses, concatenate, non_maximum_suppression, rotation_angles, rotation_matrices
 from zsp_lite.verified.proposals import poses_from_matches, poses_from_views
 from zsp_lite.verified.refinement import SearchSchedule, refine
 from zsp_lite.verified.scene import build_maps, build_scene, project_points, surface_weights
@@ -79,15 +73,6 @@ def truth(frames, scene):
     return working_pose(scene, first, 0)
 
 
-# Poses
-
-
-def test_rotation_vectors_become_the_matrices_of_scipy():
-    vectors = np.random.default_rng(0).normal(size=(9, 3))
-    expected = Rotation.from_rotvec(vectors).as_matrix()
-    np.testing.assert_allclose(rotation_matrices(torch.tensor(vectors)), expected, atol=1e-6)
-
-
 @given(seeds)
 def test_suppression_keeps_the_best_of_each_neighbourhood(seed):
     rng = np.random.default_rng(seed)
@@ -100,9 +85,6 @@ def test_suppression_keeps_the_best_of_each_neighbourhood(seed):
     for dropped in set(range(12)) - set(kept.tolist()):
         assert any(apart[dropped, k] < 25 and score[k] >= score[dropped] for k in kept)
     assert non_maximum_suppression(rotation, score, 25.0, 2).tolist() == kept[:2].tolist()
-
-
-# Maps and scene
 
 
 def test_an_object_cut_off_by_the_border_is_not_known_to_end_there():
@@ -146,9 +128,6 @@ def test_outliers_far_behind_the_object_are_left_out(views):
     assert float(without.reference_points.abs().max()) < 4
 
 
-# Proposals
-
-
 @pytest.mark.slow
 @given(seeds)
 def test_matches_with_outliers_propose_the_true_pose(seed):
@@ -157,9 +136,8 @@ def test_matches_with_outliers_propose_the_true_pose(seed):
     source = rng.normal(size=(30, 3))
     target = pose.apply(source)
     target[:12] = rng.normal(size=(12, 3))
-    found = poses_from_matches(
-        *(torch.tensor(part, dtype=torch.float32) for part in (source, target)), np.random.default_rng(seed)
-    )
+    points = (torch.tensor(part, dtype=torch.float32) for part in (source, target))
+    found = poses_from_matches(*points, np.random.default_rng(seed))
     assert rotation_error(found.rotation[0].double().numpy(), pose.R) < 1
     assert len(found) <= 6 and (rotation_angles(found.rotation, found.rotation).fill_diagonal_(180) >= 20).all()
 
@@ -186,9 +164,6 @@ def test_the_first_view_is_turned_about_the_vertical_in_steps_of_30_degrees(scen
     assert (np.abs(in_cameras[:, 1]) > 0.7).all()
 
 
-# Soft ICP
-
-
 def test_soft_icp_approaches_the_true_pose_and_keeps_it(scene, truth):
     turn = rotation_matrices(torch.deg2rad(torch.tensor([[14.0, -14, 10]])))
     start = Poses(truth.scale * 0.8, turn @ truth.rotation, truth.translation + 0.15)
@@ -197,9 +172,6 @@ def test_soft_icp_approaches_the_true_pose_and_keeps_it(scene, truth):
     assert float(rotation_angles(start.rotation, truth.rotation)) > 20
     assert errors.max() < 10
     assert (aligned.scale / truth.scale - 1).abs().max() < 0.12
-
-
-# Verification
 
 
 EVERY = (5, 10)  # by hand it takes a while
@@ -303,9 +275,6 @@ def test_the_viewpoint_term_is_highest_from_the_viewpoint_of_the_most_similar_vi
     np.testing.assert_allclose(score_terms(scene, sides)[:, -1], [expected, -expected], atol=1e-3)
 
 
-# Refinement
-
-
 def test_refinement_never_lowers_the_score():
     rng = np.random.default_rng(5)
     goal = as_poses(Sim3(1.1, some_rotation(rng), np.array([0.1, -0.2, 0.05])))
@@ -326,10 +295,8 @@ def test_refinement_never_lowers_the_score():
 def test_bad_scenes_are_refused_in_one_line(views):
     reference, *targets = views
     empty = replace(reference, foreground=torch.zeros(28, 28, dtype=torch.bool))
-    with pytest.raises(InputError, match="reference: 0 foreground patches of known depth, expected at least 8"):
-        featureless_scene([empty, *targets])
-    with pytest.raises(InputError, match="target views: 0 foreground patches"):
-        featureless_scene([reference, empty])
+    refused("reference: 0 foreground patches of known depth, expected at least 8", featureless_scene, [empty, *targets])
+    refused("target views: 0 foreground patches", featureless_scene, [reference, empty])
 
 
 def test_surface_weights_do_not_depend_on_the_sampling_density():
@@ -339,9 +306,6 @@ def test_surface_weights_do_not_depend_on_the_sampling_density():
     share = surface_weights(ring)
     assert float(share.sum()) == pytest.approx(1, abs=1e-5)
     assert float(share[:400].sum()) == pytest.approx(0.5, abs=0.05)
-
-
-# Confidence
 
 
 def test_auroc_counts_pairs_of_a_right_and_a_wrong_answer():

@@ -5,13 +5,12 @@ import sys
 from pathlib import Path
 
 import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from refusals import refused
 
 from zsp_lite.alignment import Sim3, ransac, umeyama
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.errors import InputError
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.metrics import rotation_error
 from zsp_lite.synthetic.ground_truth import correct_matches
@@ -22,15 +21,9 @@ matplotlib.use("agg")
 from tools import widget_examples as examples  # noqa: E402
 from zsp_lite.widgets import alignment, common, features, matching  # noqa: E402
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("closed_figures")]
 
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-
-
-@pytest.fixture(autouse=True)
-def closed_figures():
-    yield
-    plt.close("all")
 
 
 def values_of(control) -> list:
@@ -56,9 +49,6 @@ def test_every_control_changes_the_picture_and_going_back_restores_it(name):
         assert (widget.picture.value, widget.caption.value) == (before, caption)
 
 
-# building blocks
-
-
 def test_no_module_imports_ipywidgets_before_a_widget_is_made():
     for path in Path(common.__file__).parent.glob("*.py"):
         assert not re.search("^(from|import) ipywidgets", path.read_text(encoding="utf-8"), re.MULTILINE), path.name
@@ -66,11 +56,7 @@ def test_no_module_imports_ipywidgets_before_a_widget_is_made():
 
 def test_without_ipywidgets_the_error_has_the_command_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "ipywidgets", None)
-    with pytest.raises(InputError, match="pip install ipywidgets"):
-        common.slider("x", 0, 1, 0)
-
-
-# features and matches
+    refused("pip install ipywidgets", common.slider, "x", 0, 1, 0)
 
 
 @pytest.fixture(scope="module")
@@ -95,9 +81,8 @@ def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim
     widget.controls["kind"].value, widget.controls["row"].value, widget.controls["col"].value = "one", 15, 9
     row, col = cells[15 * 28 + 9]
     assert f"nearest neighbour ({row}, {col}), cosine {sim[15 * 28 + 9].max():.2f}" in widget.caption.value
-    assert (
-        f"{correct_matches(cells.reshape(28, 28, 2), pair.cells)[pair.valid].mean():.0%} have" in widget.caption.value
-    )
+    right = correct_matches(cells.reshape(28, 28, 2), pair.cells)[pair.valid].mean()
+    assert f"{right:.0%} have" in widget.caption.value
 
 
 def test_saliency_counts_the_patches_above_the_threshold_and_an_empty_box_has_no_mask():
@@ -120,9 +105,6 @@ def test_the_cycle_has_the_cyclical_distance_and_names_the_background(sim):
         assert f"u ({row}, {col}) →" in widget.caption.value
         assert f"d(u, u') = {distances[row, col]:.1f} patches" in widget.caption.value
         assert ("not on the foreground" in widget.caption.value) == (not valid[row, col])
-
-
-# alignment
 
 
 def test_the_caption_agrees_with_ransac():

@@ -5,18 +5,18 @@ import re
 import numpy as np
 import pytest
 from co3d_folders import sequence_data
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
-from zsp_lite.errors import InputError
 from zsp_lite.labelling import Labelling
 from zsp_lite.metrics import rotation_error
 
 pytest.importorskip("anywidget", reason="the labelling widget is optional: pip install anywidget")
 
-from zsp_lite.widgets.cloud_view import point_under, subsample, view_units  # noqa: E402
+from zsp_lite.widgets.cloud_view import point_under, view_units  # noqa: E402
 from zsp_lite.widgets.labelling import label_poses  # noqa: E402
 
 TURN = Rotation.random(random_state=4).as_matrix()
@@ -175,20 +175,9 @@ def test_a_click_selects_the_nearest_of_the_front_points():
     assert point_under(points, np.eye(3), np.array([-0.4, 0]), 0.05) is None
 
 
-def test_subsampling_is_deterministic_and_keeps_neighbours_together():
-    points = np.random.default_rng(3).uniform(size=(9000, 3))
-    kept = subsample(points)
-    assert len(kept) == 6000 == len(np.unique(kept))
-    np.testing.assert_array_equal(kept, subsample(points.copy()))
-    steps = np.linalg.norm(np.diff(points[kept], axis=0), axis=1)
-    assert np.median(steps) < 0.25 * np.median(np.linalg.norm(points[kept][1:] - points[kept][::-1][1:], axis=1))
-    assert len(subsample(points[:5])) == 5
-
-
 def test_outliers_do_not_change_the_scale_and_bad_clouds_are_input_errors():
     points = np.random.default_rng(3).uniform(size=(1000, 3))
     points[0] = 1000
     assert view_units(points).scale > 1
     for bad in (np.full((4, 3), np.nan), np.ones((4, 3))):
-        with pytest.raises(InputError, match="not finite|no extent"):
-            view_units(bad)
+        refused("not finite|no extent", view_units, bad)

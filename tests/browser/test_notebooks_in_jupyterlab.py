@@ -6,24 +6,13 @@ A self-check gives feedback, and asks nothing of the network.
 import shutil
 from pathlib import Path
 
+import lab_in_browser as reader
 import nbformat
 import pytest
-from lab_in_browser import (
-    REPOSITORY,
-    errors,
-    label_by_clicks,
-    open_notebook,
-    photograph,
-    run_all,
-    saved,
-    serve,
-    slider_moves_picture,
-    slider_outputs,
-)
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
-NOTEBOOKS = sorted(path.name for path in (REPOSITORY / "notebooks").glob("*.ipynb"))
-PICTURES = REPOSITORY / "outputs" / "browser"
+NOTEBOOKS = sorted(path.name for path in (reader.REPOSITORY / "notebooks").glob("*.ipynb"))
+PICTURES = reader.REPOSITORY / "outputs" / "browser"
 LABELLING = {"08_label_poses.ipynb"}  # have a 3D view that a click labels
 WIDGET = "application/vnd.jupyter.widget-view+json"
 MINUTES = 20  # a notebook may take on a busy machine
@@ -33,8 +22,9 @@ MINUTES = 20  # a notebook may take on a busy machine
 def lab(browser, tmp_path_factory):
     """JupyterLab on copies of notebooks, without their outputs, and data."""
     folder = tmp_path_factory.mktemp("lab")
-    shutil.copytree(REPOSITORY / "notebooks", folder / "notebooks", ignore=shutil.ignore_patterns("exercises", ".*"))
-    shutil.copytree(REPOSITORY / "data_samples", folder / "data_samples")
+    left_out = shutil.ignore_patterns("exercises", ".*")
+    shutil.copytree(reader.REPOSITORY / "notebooks", folder / "notebooks", ignore=left_out)
+    shutil.copytree(reader.REPOSITORY / "data_samples", folder / "data_samples")
     for path in (folder / "notebooks").glob("*.ipynb"):
         notebook = nbformat.read(path, as_version=4)
         for cell in notebook.cells:
@@ -45,7 +35,7 @@ def lab(browser, tmp_path_factory):
     check = new_code_cell('from zsp_lite.widgets import self_check\nself_check("00", 1)')
     asking = new_notebook(cells=[new_markdown_cell("A formula, for MathJax: $x^2$"), check], metadata=python)
     nbformat.write(asking, folder / "notebooks" / "asking.ipynb")
-    with serve(folder / "notebooks", folder, folder / "data_samples") as running:
+    with reader.serve(folder / "notebooks", folder, folder / "data_samples") as running:
         yield running
 
 
@@ -61,8 +51,8 @@ def page(browser, lab):
 def test_a_self_check_gives_feedback_without_a_network(page, lab):
     asked = []
     page.on("request", lambda request: asked.append(request.url))
-    open_notebook(page, lab, "asking.ipynb")
-    run_all(page, patience=300)
+    reader.open_notebook(page, lab, "asking.ipynb")
+    reader.run_all(page, patience=300)
     feedback = page.locator(".Feedback").first
     for answer, words in (("CAD model", "No CAD model is used."), ("one image of the first object", "Yes.")):
         page.locator(".MCButton", has_text=answer).click()
@@ -74,19 +64,19 @@ def test_a_self_check_gives_feedback_without_a_network(page, lab):
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_a_notebook_runs_and_its_widgets_react(page, lab, name):
-    open_notebook(page, lab, name)
-    run_all(page, patience=60 * MINUTES)
+    reader.open_notebook(page, lab, name)
+    reader.run_all(page, patience=60 * MINUTES)
     try:
-        notebook = saved(page, lab, name)
-        wrong = errors(page, notebook)
+        notebook = reader.saved(page, lab, name)
+        wrong = reader.errors(page, notebook)
         assert not wrong
         outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
         widgets = sum(WIDGET in output.get("data", {}) for output in outputs)
         shown = page.locator(".jp-Notebook .jp-OutputArea-output", has=page.locator(".jupyter-widgets"))
         assert shown.count() >= widgets, f"{shown.count()} widgets in the page, expected {widgets}"
-        silent = [number for number, output in enumerate(slider_outputs(page)) if not slider_moves_picture(output)]
-        assert not silent, f"pictures of widgets {silent} of {name} did not change when their sliders were moved"
+        moved = [reader.slider_moves_picture(output) for output in reader.slider_outputs(page)]
+        assert all(moved), f"which pictures of widgets of {name} changed when their sliders were moved: {moved}"
         if name in LABELLING:
-            label_by_clicks(page)
+            reader.label_by_clicks(page)
     finally:
-        photograph(page, PICTURES / f"{Path(name).stem}.png")
+        reader.photograph(page, PICTURES / f"{Path(name).stem}.png")

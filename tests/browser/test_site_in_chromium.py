@@ -1,20 +1,5 @@
 """The course site in Chromium: pages fit a phone, fields can be read, the class does not see the presenter's notes."""
 
-import subprocess
-import sys
-
-import pytest
-from lab_in_browser import REPOSITORY
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """Folder of the site, without the data of the playground, which has a test of its own."""
-    folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "sphinx", "-q", "-c", "docs/site", "-d", folder / "doctrees", ".", folder / "html"]
-    subprocess.run(command, cwd=REPOSITORY, check=True)
-    return folder / "html"
-
 
 def test_no_page_is_wider_than_the_screen_of_a_phone(browser, site):
     page, wide = browser.new_page(viewport={"width": 390, "height": 800}), {}

@@ -1,6 +1,7 @@
 """What a process must withstand: endless, oversized and malicious files and options, for every reader and command."""
 
 import gzip
+import io
 import json
 import struct
 import sys
@@ -8,15 +9,19 @@ import zipfile
 import zlib
 from dataclasses import replace
 
+import numpy as np
 from co3d_folders import sequence_data
+from PIL import Image
 from test_readers import write as write_scan
 
 from tests.hostile.harness import (
     BENCHMARK,
+    CASES,
     FRAMES,
     READERS_OF,
     RESULTS,
     STRANGE,
+    Case,
     case,
     command,
     gzip_bomb,
@@ -25,6 +30,7 @@ from tests.hostile.harness import (
     written,
 )
 from zsp_lite.importers import open_capture
+from zsp_lite.importers.files import read_depth_file, read_mask_file, read_picture
 
 COMMANDS_OF = {
     "picture": ("a.png", ("estimate", "ROOT/a.png", "ROOT/b.png", "--intrinsics", "60,60,32,32", "--out", "ROOT/e")),
@@ -153,6 +159,47 @@ for name, layout, change in (
     ("matrix of nothing", "open3d", written("intrinsic.json", '{"intrinsic_matrix": [[], [[]]]}')),
 ):  # fmt: skip
     case("scan", f"{layout}: {name}", read_scan, scan(layout, change))
+
+
+# pictures, depth maps and masks of other kinds
+def encoded(values: np.ndarray, kind: str, palette: bool = False, **options) -> bytes:
+    image, file = Image.fromarray(values), io.BytesIO()
+    if palette:
+        image.putpalette(range(256))
+    image.save(file, kind, **options)
+    return file.getvalue()
+
+
+def npz(*members: np.ndarray) -> bytes:
+    np.savez_compressed(file := io.BytesIO(), *members)
+    return file.getvalue()
+
+
+def exif(kind: int, count: int, value: bytes) -> bytes:
+    """A JPEG whose EXIF orientation has a type, a number of values and a value or an offset; its directory repeats."""
+    directory = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + struct.pack("<HHI4sI", 0x0112, kind, count, value, 8)
+    jpeg = encoded(np.zeros((8, 8, 3), np.uint8), "JPEG")
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(directory) + 2) + directory + jpeg[2:]
+
+
+TIFF, LABELS = encoded(np.ones((32, 32), np.float32), "TIFF"), np.arange(4096, dtype=np.uint16).reshape(64, 64) % 300
+for name, read, data in (
+    ("cut.webp", read_picture, encoded(np.zeros((32, 32, 3), np.uint8), "WEBP")[:-9]),
+    ("cut.tiff", read_depth_file, TIFF[:2000]), ("wild.tiff", read_depth_file, TIFF[:4] + b"\xff" * 4 + TIFF[8:]),
+    ("bomb.tiff", read_depth_file, lambda: encoded(np.zeros((20_000, 20_000), np.uint16), "TIFF", compression="tiff_lzw")),
+    ("cut.pfm", read_depth_file, b"Pf\n32 32\n-1.0\n" + bytes(99)), ("bomb.pfm", read_depth_file, b"Pf\n99999 99999\n-1.0\n"),
+    ("two.npz", read_depth_file, npz(LABELS, LABELS)), ("objects.npz", read_depth_file, npz(np.array([{}]))),
+    ("palette.png", read_mask_file, encoded(LABELS.astype(np.uint8), "PNG", palette=True)),
+    ("cut.tif", read_mask_file, TIFF[:2000]),
+):  # fmt: skip
+    case("picture", name, lambda folder, name=name, read=read: read(folder / name), written(name, data))
+case("picture", "npz of 3 GB", READERS_OF["depth file"][1], lambda folder: zip_of("a.npy", 3 << 30)(folder / "z.npz"))
+MASK_OF_300_LABELS = written("a_mask.png", encoded(LABELS, "PNG"))
+command("picture", "mask of 300 labels", *COMMANDS_OF["picture"][1], change=MASK_OF_300_LABELS)
+for tag in ((3, 1, b"\x60\xea\0\0"), (2, 4, b"abc\0"), (5, 1, b"\xff" * 4), (3, 1 << 31, bytes(4)), (99, 1, bytes(4))):
+    CASES.append(Case("picture", f"EXIF orientation {tag}", lambda folder, tag=tag: (
+        written("e.jpg", exif(*tag))(folder), ("right" if read_picture(folder / "e.jpg")[1] == 1 else "wrong", ""))[1]))  # fmt: skip
+
 ON_DATA = (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/new")
 for option, value in (("--executor", "dask://\0"), ("--methods", "os:_exit"), ("--methods", "raises:now"),
                       ("--methods", "a=/dev/zero/x.csv"), ("--categories", "../.."), ("--list-pairs", "/dev/null/x")):  # fmt: skip

@@ -24,6 +24,7 @@ from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.data.published import import_labels
 from zsp_lite.importers import open_capture
+from zsp_lite.importers.files import read_depth_file
 
 CASES: list["Case"] = []
 
@@ -101,6 +102,7 @@ READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
     "image": ("a.png", lambda folder: read_image(folder / "a.png")),
     "mask": ("a_mask.png", lambda folder: read_mask(folder / "a_mask.png")),
     "depth": ("a_depth.png", lambda folder: read_depth(folder / "a_depth.png")),
+    "depth file": ("z.npz", lambda folder: read_depth_file(folder / "z.npz")),
     "frame annotations": (FRAMES, read_frames),
     "sequence annotations": (SEQUENCES, lambda folder: Co3D(folder / "data").sequences("cup")),
     "point cloud": ("data/cup/a/pointcloud.ply", lambda folder: Co3D(folder / "data").point_cloud("cup", "a")),
