@@ -86,4 +86,16 @@ def test_right_frames_agree(frames):
 
 
 def test_depth_along_the_ray_is_named():
-    assert re.search("if depth is distance along the ray", disagreement(map(along_ray, views(45.0, 1.6)), 0.001))
+    assert re.search(
+        "if depth is the distance along the ray of a pixel", disagreement(map(along_ray, views(45.0, 1.6)), 0.001)
+    )
+
+
+def test_positions_of_another_unit_are_named_where_the_depth_is_plausible(frames):
+    wrong = [replace(frame, camera=replace(frame.camera, t=1000 * frame.camera.t)) for frame in frames]
+    assert "if the positions of the cameras are multiplied by 0.001" in disagreement(wrong, 0.001)
+
+
+def test_a_small_error_of_scale_is_given_by_its_number(frames):
+    line = disagreement([scaled(1.3, frame) for frame in frames], 0.001)
+    assert 0.72 < float(re.search(r"multiplied by ([\d.]+)", line)[1]) < 0.82

@@ -15,7 +15,7 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, write_image, write_mask
 from zsp_lite.errors import InputError
 from zsp_lite.importers import CaptureFrame, open_capture
-from zsp_lite.importers.convert import fuse, import_source
+from zsp_lite.importers.convert import fuse, import_captures, import_source
 from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.importers.sources import open_source
 from zsp_lite.synthetic.export import make_object
@@ -229,3 +229,13 @@ def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(t
     assert len(Co3D(tmp_path / "data").frames("teapot", "mine")) == 5
     with pytest.raises(InputError, match="mine exists already, expected another sequence name"):
         import_source(source, tmp_path / "data", "teapot", "mine")
+
+
+def test_every_capture_in_a_folder_is_imported_once(tmp_path, views):
+    for name in ("one", "two"):
+        write_lists(tmp_path / "scans" / name, views)
+        for view in views:
+            write_mask(tmp_path / f"scans/{name}/masks/{view.name}.png", view.mask)
+    done = dict(import_captures(tmp_path / "scans", tmp_path / "data", "teapot"))
+    assert [(name, one.frames) for name, one in done.items()] == [("one", len(views)), ("two", len(views))]
+    assert not list(import_captures(tmp_path / "scans", tmp_path / "data", "teapot"))

@@ -87,7 +87,7 @@ def test_files_that_hold_something_else_are_refused_in_one_line(tmp_path):
     (tmp_path / "half.webp").write_bytes((tmp_path / "a.webp").read_bytes()[:-40])
     assert read_picture(tmp_path / "a.webp")[0].shape == (32, 40, 3)
     for name, read, message in (
-        ("two.npz", read_depth_file, "two.npz cannot be decoded"),
+        ("two.npz", read_depth_file, "two.npz holds 2 arrays, expected one"),
         ("d.exr", read_depth_file, "expected an OpenCV that reads .exr, or the depth as .npy or a float .tiff"),
         ("a.webp", read_depth_file, "holds uint8 of shape .*, expected numbers"),
         ("half.webp", read_picture, "half.webp cannot be decoded"),
@@ -159,12 +159,12 @@ def test_a_capture_of_turned_photographs_keeps_its_world_and_refuses_mirrored_on
 @pytest.mark.parametrize(("values", "message"), [
     ((600, 600, 320, 240), None),
     ((600, 600, 280, 260), None),
-    ((1200, 1200, 640, 480), "fit an image.* of 1280,960, not 640,480 .*: .* 600,600,320,240$"),
-    ((300, 300, 160, 120), "fit an image.* of 320,240, not 640,480 .*: .* 600,600,320,240$"),
-    ((240, 240, 128, 96), "256,192, not 640,480 .*: .* 600,600,320,240; .* view of 130 degrees"),
+    ((1200, 1200, 640, 480), "fit an image.* of 1280 x 960, not 640 x 480 .*: .* 600,600,320,240$"),
+    ((300, 300, 160, 120), "fit an image.* of 320 x 240, not 640 x 480 .*: .* 600,600,320,240$"),
+    ((240, 240, 128, 96), "256 x 192, not 640 x 480 .*: .* 600,600,320,240; .* view of 130 degrees"),
     ((1200, 1200, 900, -200), "far from the middle, as those of a crop$"),
     ((0.9375, 1.25, 0.5, 0.5), "look normalised: .* 600,600,320,240; .* view of"),
-    ((4.2, 4.2, 2.8, 2.1), "millimetres, of 5.6,4.2, .*: .* 480,480,320,240; .* view of"),
+    ((4.2, 4.2, 2.8, 2.1), "millimetres of 5.6 x 4.2, .*: .* 480,480,320,240; .* view of"),
     ((1, 1, 320, 240), "a.jpg: the intrinsics 1,1,320,240 have a field of view of 180 degrees, expected 10 to 120"),
     ((9000, 0, 320, 0, 9000, 240, 0, 0, 1), "view of 4.07 degrees"),
 ])  # fmt: skip
@@ -191,12 +191,12 @@ def test_frames_without_a_mask_get_one_by_depth_and_are_named(tmp_path):
     assert source.mask == "given" and overlap(frames[0].mask, scenes[0][1]) > 0.95
     np.testing.assert_array_equal(frames[1].mask, views[1].mask)
     missing, inverted = source.flags(source.load([0, 1, 3]))
-    assert inverted.endswith("the masks of 1 of 3 frames cover most of the border: inverted?")
-    assert missing.endswith("no mask is given for 0.jpg: made by depth")
+    assert inverted.endswith("the masks may be wrong: those of 1 of 3 frames cover most of the border: inverted?")
+    assert missing.endswith("masks made by depth, as none that can be read is given: 0.jpg")
     (tmp_path / "masks").rename(tmp_path / "others")
     done = import_source(open_source(tmp_path, masks=tmp_path / "others"), tmp_path / "some", "ball", "one")
-    assert done.frames == 4 and done.flags[0] == "no mask is given for 0.jpg: made by depth"
-    assert done.flags[1].startswith("the masks of 1 of 4 frames cover most of the border")
+    assert done.frames == 4 and done.flags[0] == "masks made by depth, as none that can be read is given: 0.jpg"
+    assert done.flags[1].startswith("the masks may be wrong: those of 1 of 4 frames cover most of the border")
 
 
 def test_depth_of_another_shape_is_refused_with_what_is_allowed(tmp_path, portrait):
@@ -221,7 +221,7 @@ def test_the_pose_of_a_sideways_portrait_is_that_of_the_upright_one(tmp_path, po
     for image, helpers in ((images[0], ()), (images[1], ()), (images[1], images[2:])):
         found = estimate_pose(image, tmp_path / "scan", targets=9, helpers=helpers, **options)
         poses.append(found.world_sim3.R)
-        assert any("the target has 4 frames: these are used, not 9" in flag for flag in found.estimate.flags)
+        assert any("number of target views: 4, all that there are, not 9" in flag for flag in found.estimate.flags)
     assert rotation_error(poses[0], poses[1]) < 3 and rotation_error(poses[0], poses[2]) < 15
     assert {path.name for path in out.iterdir()} == {"report.html", "target.ply", "aligned_verified.ply"}
     pair = open_pair(*images[:2], {"intrinsics": (given, given, (200, 200, 70, 90))}, images[2:])

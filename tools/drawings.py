@@ -807,7 +807,6 @@ def draw_ransac() -> str:
 
 
 def draw_scan() -> str:
-    """Draw where a phone goes: once around, looking down; and an arc, which leaves a side unseen."""
     width, height, radius = 860, 280, 82
     drawn = ""
     for x, title, turns in (
@@ -815,8 +814,7 @@ def draw_scan() -> str:
         (710, "an arc: one side", range(30, 151, 30)),
     ):
         middle = np.array([x, 166])
-        drawn += ring(middle, LINE, radius, 1.4)
-        drawn += rect(x - 20, 146, 40, 40, BLUE, corner=6)
+        drawn += ring(middle, LINE, radius, 1.4) + rect(x - 20, 146, 40, 40, BLUE, corner=6)
         for turn in np.radians(turns):
             away = np.array([np.cos(turn), -np.sin(turn)])
             drawn += _phone(middle + radius * away, -away)
@@ -830,18 +828,16 @@ def draw_scan() -> str:
     drawn += text("from the side; ½ to 1 m away", x, 60, 13, GREY, "middle")
     return svg(
         drawn, width, height, "How to scan an object",
-        "A phone goes once around an object in a circle and looks down at it by 30 degrees. An arc of a third of the "
-        "circle shows one side only.",
+        "A phone goes once around an object and looks down at it by 30 degrees; an arc shows one side only.",
     )  # fmt: skip
 
 
 def _phone(place: np.ndarray, towards: np.ndarray) -> str:
     """Draw a phone that looks in a direction."""
     towards = towards / np.linalg.norm(towards)
-    across = np.array([-towards[1], towards[0]])
-    view = np.stack([place, place + 26 * towards + 12 * across, place + 26 * towards - 12 * across])
-    sides = [(-4, -11), (4, -11), (4, 11), (-4, 11)]
-    body = np.stack([place + along * towards + side * across for along, side in sides])
+    axes = np.stack([towards, (-towards[1], towards[0])])
+    view = place + np.array([(0, 0), (26, 12), (26, -12)]) @ axes
+    body = place + np.array([(-4, -11), (4, -11), (4, 11), (-4, 11)]) @ axes
     return polygon(view, PALE, LINE) + polygon(body, ORANGE)
 
 

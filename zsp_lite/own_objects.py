@@ -147,7 +147,7 @@ def estimate_pose(
             scans += [_Scan.of(one, method, references if several else 0, targets) for one in sources[1:]]
         flags = _pair_flags(scans)
         if wanted and wanted > len(scans[1].targets):
-            flags = *flags, f"the target has {len(scans[1].targets)} frames: these are used, not {wanted}"
+            flags = *flags, f"number of target views: {len(scans[1].targets)}, all that there are, not {wanted}"
         if not upright:
             with timed(before, "turns"):
                 scans[0], turn = _stood_up(*scans[:2], replace(method, solver=SOLVERS[solver][-1]))

@@ -10,6 +10,7 @@ from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, 
 @click.command(
     epilog=examples(
         "align data_samples --category car --out outputs/cars",
+        "align path/to/scans --category cup",
         "align path/to/co3d --category teddybear --pairs 4 --workers 8 --out outputs/teddybears --propose",
     )
 )
@@ -30,6 +31,8 @@ def align(
 ) -> None:
     """Align all objects of a category in one frame; no label is needed.
 
+    DATA is a data folder, or a folder with a capture of each object (see `zsp-lite data import --help`).
+
     Every object gets a similarity from its world to the common frame, and the probability that its rotation is within
     30 degrees of the one that most objects agree with. OUT gets them as alignment.json, as pose labels in
     class_labels/CATEGORY/, which `zsp-lite data labels OUT --root DATA` takes, and as pictures in report.html. With
@@ -41,10 +44,17 @@ def align(
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.labels import read_labels
+    from zsp_lite.importers.convert import import_captures
     from zsp_lite.viz.category_sheet import COLUMNS, object_rows
     from zsp_lite.viz.report import write_category_report
 
-    dataset, out, executor = Co3D(data), out or Path("outputs/align") / category, executor or workers
+    out, executor = out or Path("outputs/align") / category, executor or workers
+    if data.is_dir() and not Co3D(data).categories():
+        for name, imported in import_captures(data, out / "data", category):
+            for flag in imported.flags:
+                print(f"{name}: {flag}")
+        data = out / "data"
+    dataset = Co3D(data)
     found = align_category(dataset, category, backbone, sequences, pairs, targets, out, executor, allow_other_version)
     written = [write_alignment(found, out), write_labels(found, out, category, replace=True)]
     written.append(write_category_report(out / "report.html", found, dataset, category))

@@ -65,8 +65,8 @@ class Frame:
 
         Args:
             rgb: Colours (H, W, 3), with or without alpha, or grey (H, W): uint8, or floats from 0 to 1.
-            depth: Numbers (h, w) along +z, registered to the colours, of their size, or smaller and of the same aspect
-                ratio; unknown where NaN, infinite, zero or negative.
+            depth: Numbers (h, w) or (h, w, 1) along +z, registered to the colours, of their size, or smaller and of the
+                same aspect ratio; unknown where NaN, infinite, zero or negative.
             K: Intrinsics of the colours, (3, 3) or (fx, fy, cx, cy), pixels; the first pixel's centre is (0, 0).
             mask: The object's pixels (H, W): booleans, 0 and 1, or 0 to 255. None leaves it to `estimate_pose`.
             pose: Rigid transform (4, 4) from camera to world in OpenCV's axes (x right, y down, z forward), in units of
@@ -89,6 +89,8 @@ class Frame:
         if image.dtype.kind == "f" and 0 <= image.min() and image.max() <= 1:
             image = np.rint(255 * image).astype(np.uint8)
         check_number("depth_unit", depth_unit, above=0)
+        depth = np.asarray(depth)
+        depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
         values = real_array(f"{label} depth", depth, (None, None)) * depth_unit
         values = np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
         if mask is not None:

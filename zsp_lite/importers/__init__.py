@@ -7,6 +7,7 @@ from typing import Any
 
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import MOST_FRAMES, Capture, CaptureFrame, Makers, collect, find_masks, sharpest
+from zsp_lite.importers.files import is_mask
 from zsp_lite.importers.lists import read_lists, read_tum
 from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.importers.phones import read_polycam, read_record3d, read_stray
@@ -42,6 +43,9 @@ _HOW = "expected raw data with depth and poses, as Stray Scanner, Record3D or Po
 # What is near to a capture, by names and extensions of its files.
 _INCOMPLETE = {
     ("sparse", "images.bin", "images.txt", "database.db"): "has COLMAP's poses, but no measured depth",
+    ("rgb.txt", "depth.txt", "depth"): "has images and depth, but no poses (groundtruth.txt, poses.txt, pose/, ...)",
+    ("scene_camera.json", "scene_gt.json"): "lacks scene_gt.json or scene_camera.json of a BOP scene",
+    (".sens",): "is ScanNet's packed scan: unpack it by ScanNet's SensReader",
     (".mp4", ".mov", ".m4v"): "is a video without depth and poses",
     (".ply", ".splat", ".obj", ".glb", ".usdz"): "is a model as Luma or KIRI export it, without depth and poses",
 }
@@ -102,5 +106,6 @@ def open_capture(
     if masks is not None:
         frames = [replace(frame, mask=None) for frame in frames]
     found = find_masks(masks or (path if path.is_dir() else path.parent) / "masks", [frame.image for frame in frames])
-    frames = [replace(frame, mask=frame.mask or mask) for frame, mask in zip(frames, found)]
+    every = [frame.mask or mask for frame, mask in zip(frames, found)]
+    frames = [replace(frame, mask=mask if mask and is_mask(mask) else None) for frame, mask in zip(frames, every)]
     return Capture(layout, frames, left_out)

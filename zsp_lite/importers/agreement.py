@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
 from zsp_lite.errors import InputError
-from zsp_lite.importers.masks import masks_from_depth
+from zsp_lite.importers.masks import PLAUSIBLE, masks_from_depth
 from zsp_lite.metrics import rotation_angle
 from zsp_lite.points import object_pixels, world_points
 
@@ -25,13 +25,13 @@ _POINTS, _LEAST_POINTS, _PAIRS = 500, 50, 8  # points of a frame, at most and at
 _NEAREST, _BEST, _FARTHEST = 4.0, 20.0, 50.0  # angle between two cameras that are compared, degrees
 _TOLERANCE = 0.05  # of depth, relative to that of the object
 _AGREEING = 0.6  # share of points above which frames agree without doubt
-_FITTING, _GAIN = 0.35, 0.25  # least share of points by the right correction, and its least gain
+_FITTING, _GAIN = 0.5, 0.25  # least share of points by the right correction, and its least gain
 _ALIKE = 0.03  # difference of shares below which the likelier correction is named
 _RAY_GAIN = 1.2  # least ratio of the share if depth is along the ray, which changes little near the axis
-_CONTRADICTING, _OVERLAP = 0.15, 0.3  # shares of points in the other image that agree at most, and that are there
+_CONTRADICTING, _OVERLAP = 0.3, 0.3  # shares of points in the other image that agree at most, and that are there
 _UNITS = {1.0: "metres", 0.001: "millimetres", 0.0002: "1/5000 m"}
 _FACTORS = (1000.0, 0.001, 5.0, 0.2, 10.0, 0.1)  # from one common unit to another
-_SCALES = [scale for scale in np.geomspace(1e-3, 1e3, 280).tolist() if not 0.87 < scale < 1.15]  # steps of 5 %
+_SCALES = [scale for scale in np.geomspace(1e-3, 1e3, 280).tolist() if not 0.96 < scale < 1.04]  # steps of 5 %
 
 _Pose = Float[np.ndarray, "4 4"]  # world to camera
 _Correction = Callable[[_Pose], _Pose]
@@ -95,13 +95,12 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     (given, overlap), (everywhere, _) = _shares(pairs), _shares(whole)
     found = f"{given:.0%} of the object's points in a frame lie on its surface in another"
     along_ray = [_shares(some, along_ray=True)[0] for some in (whole, pairs)]
-    if along_ray[0] > _RAY_GAIN * everywhere and min(along_ray) > _FITTING:
-        return f"{found}; the frames agree if depth is distance along the ray: divide it by the length of (x, y, 1)"
+    if along_ray[0] > _RAY_GAIN * everywhere and min(along_ray) > _FITTING and along_ray[1] > _AGREEING:
+        mistake = "depth is the distance along the ray of a pixel, not along the optical axis"
+        return f"{found}; all that is seen agrees better ({along_ray[0]:.0%} for {everywhere:.0%}) if {mistake}"
     if given > _AGREEING:
         return ""
-    for some in _explanations(pairs, unit):
-        best = max(share for share, _ in some)
-        share, text = next(one for one in some if one[0] > best - _ALIKE)
+    for share, text in _explanations(pairs, unit):
         if share > max(_FITTING, given + _GAIN):
             return f"{found}; the frames agree ({share:.0%}) if {text}"
     contradict = max(given, everywhere) < _CONTRADICTING and overlap > _OVERLAP
@@ -137,17 +136,26 @@ def _shares(
     return agreeing, overlapping
 
 
-def _explanations(pairs: Sequence[_Pair], unit: float | None) -> Iterator[list[tuple[float, str]]]:
-    """Give the shares of agreeing points after corrections of mistakes, with their names, likelier ones first."""
-
-    def scaled(factor: float) -> str:
-        new = float(f"{factor * (unit or 0):.3g}")
-        what = f"taken in {_UNITS[new]}" if new in _UNITS else f"multiplied by {factor:.3g}"
-        return f"the depth is {what}" + (f": --depth-unit {new:g}" if new else "")
-
-    yield [(_shares(pairs, correct)[0], f"the poses {text}") for text, correct in _CORRECTIONS]
+def _explanations(pairs: Sequence[_Pair], unit: float | None) -> Iterator[tuple[float, str]]:
+    """Give the best correction of poses, by a common factor and by any factor, and the share of points that agree."""
+    shares = np.array([_shares(pairs, correct)[0] for _, correct in _CORRECTIONS])
+    likeliest = int(np.argmax(shares > shares.max() - _ALIKE))
+    yield shares[likeliest], f"the poses {_CORRECTIONS[likeliest][0]}"
+    distance = float(np.median([one.distance for one, _ in pairs]))
     for factors in (_FACTORS, _SCALES):
-        yield [(_shares(pairs, scale=factor)[0], scaled(factor)) for factor in factors]
+        shares = np.array([_shares(pairs, scale=factor)[0] for factor in factors])
+        alike = np.flatnonzero(shares > shares.max() - _ALIKE)
+        yield shares.max(), _scaled(factors[alike[len(alike) // 2]], distance, unit)
+
+
+def _scaled(factor: float, distance: float, unit: float | None) -> str:
+    """Say that the depth, or the positions of the cameras, are to be scaled: what leaves the distance plausible."""
+    nearest, farthest = PLAUSIBLE
+    if unit and nearest <= distance <= farthest and not nearest <= factor * distance <= farthest:
+        return f"the positions of the cameras are multiplied by {1 / factor:.3g}"
+    new = float(f"{factor * (unit or 0):.3g}")
+    what = f"taken in {_UNITS[new]}" if new in _UNITS else f"multiplied by {factor:.3g}"
+    return f"the depth is {what}" + (f": --depth-unit {new:g}" if new else "")
 
 
 def _reorder(pose: _Pose) -> _Pose:

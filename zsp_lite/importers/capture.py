@@ -24,7 +24,7 @@ HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # +y up, looking along -z
 _FARTHEST = 1e4  # greatest known depth, in units of the world
 MOST_FRAMES = 100  # of a capture; the sharp ones are chosen where there are more
-_CANDIDATES = 4  # frames of which the sharpest is chosen
+_CANDIDATES = 10  # frames of which the sharpest is chosen
 _SHARPNESS_SIDE = 640  # pixels of an image whose sharpness is measured
 
 
@@ -133,7 +133,9 @@ def make_frame(
         pose = np.column_stack([Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]])
     if pose.size == 12:
         pose = np.vstack([pose.reshape(3, 4), (0, 0, 0, 1)])
-    camera = camera_from_pose(pose.reshape(-1, 4) @ axes, intrinsics, size or files.picture_size(paths[0]), where)
+    with np.errstate(invalid="ignore"):  # what is not finite is refused below
+        pose = pose.reshape(-1, 4) @ axes
+    camera = camera_from_pose(pose, intrinsics, size or files.picture_size(paths[0]), where)
     return CaptureFrame(paths[0], paths[1], camera, mask=paths[2], confidence=paths[3], **others)
 
 

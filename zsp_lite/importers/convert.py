@@ -1,6 +1,6 @@
 """Conversion of a source to a sequence of a data folder in CO3D's layout, with a fused point cloud (Open3D)."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import HALF_PIXEL
-from zsp_lite.importers.sources import Source
+from zsp_lite.importers.sources import Source, open_source
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import load_open3d
@@ -20,6 +20,7 @@ from zsp_lite.points import axis_deviation, object_pixels, sampling_step, world_
 _VOXELS = 96  # voxels per three standard deviations of the object; finer than the noise of depth cameras
 _MAX_POINTS = 50_000
 _LEAST_STEP = 7  # between the pixels by which the size of the object is estimated
+_UNFINISHED = ".unfinished"  # file in the folder of a sequence whose import goes on, or was interrupted
 _MIN_VIEWS = 3  # number of frames that must see a surface, if there are that many frames
 
 
@@ -44,7 +45,7 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
         InputError: The source cannot be read, segmented or fused, or the sequence exists. Nothing is written then.
     """
     folder = Path(root) / plain_name(category, "category") / plain_name(sequence, "sequence")
-    unfinished, count = folder / ".unfinished", len(source.numbers)
+    unfinished, count = folder / _UNFINISHED, len(source.numbers)
     if folder.exists() and not unfinished.is_file():
         raise InputError(f"{folder} exists already, expected another sequence name")
     if source.left_out and count < _MIN_VIEWS:
@@ -66,6 +67,14 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
         write_co3d(root, category, [data])
         unfinished.unlink()
     return ImportResult(len(seen), count - len(seen), len(points), scale, tuple(source.flags(frames)))
+
+
+def import_captures(folder: str | Path, root: str | Path, category: str) -> Iterator[tuple[str, ImportResult]]:
+    """Import each capture in a folder as a sequence of its name, but for those that are there; give what was done."""
+    for path in sorted(Path(folder).iterdir()):
+        place = Path(root) / category / path.stem
+        if not path.name.startswith(".") and (not place.exists() or (place / _UNFINISHED).is_file()):
+            yield path.stem, import_source(open_source(path), root, category, path.stem)
 
 
 class LazyFrames(Sequence[Frame]):

@@ -10,7 +10,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,6 +37,8 @@ _MIRRORED = (2, 4, 5, 7)
 _LOSSY = (".jpg", ".jpeg", ".webp")
 _MOST_LABELS, _LARGEST_LABEL, _VOID = 32, 50, 255
 _LEAST_VIEW, _LARGEST_VIEW = 10.0, 120.0  # field of view of a camera, degrees
+_LARGEST_SENSOR = 60  # millimetres
+_UNEQUAL = 1.3  # ratio of the focal lengths
 _OFF_MIDDLE = 0.3  # distance of the principal point from the middle, relative to half of the side
 
 
@@ -102,6 +104,13 @@ def read_mask_file(path: str | Path, label: int | None = None) -> Float32[np.nda
     return mask.astype(np.float32)
 
 
+def is_mask(path: Path) -> bool:
+    """Tell whether a mask file can be read."""
+    with suppress(InputError):
+        return bool(_mask_values(path))
+    return False
+
+
 def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
     """Read the values of a mask file, and whether they are numbers of colours: of a palette, or of a few colours."""
     values = _read_values(path, "mask")
@@ -131,6 +140,8 @@ def _read_values(path: Path, what: str) -> Shaped[np.ndarray, "..."]:
         if suffix in (".npy", ".npz"):
             values = np.load(io.BytesIO(data), allow_pickle=False)
             if isinstance(values, np.lib.npyio.NpzFile):
+                if len(values.files) != 1:
+                    raise InputError(f"{what} {path} holds {len(values.files)} arrays, expected one")
                 (member,) = values.zip.infolist()
                 values = values[values.files[0]] if member.file_size <= MAX_FILE else None
         elif suffix == ".exr":  # None, or an error where the variable OPENCV_IO_ENABLE_OPENEXR is not set
@@ -216,10 +227,14 @@ def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
     if max(*centre, *focal / 5) <= 1:
         doubts.append(f"look normalised: for this image they would be {_listed(values * np.tile(side, 2))}")
     elif min(ratios) > 0 and np.ptp(ratios) < 0.05 * ratios.mean() and abs(ratios.mean() - 1) > _OFF_MIDDLE:
-        fitted = f"fit an image, or a sensor in millimetres, of {_listed(2 * centre)}, not {_listed(side)} pixels"
+        fitted_to = "an image" if max(2 * centre) > _LARGEST_SENSOR else "a sensor in millimetres"
+        wide, high = 2 * centre
+        fitted = f"fit {fitted_to} of {wide:.4g} x {high:.4g}, not {side[0]:.0f} x {side[1]:.0f} pixels"
         doubts.append(f"{fitted}: for this image they would be {_listed(values / ratios.mean())}")
     elif np.abs(ratios - 1).max() > _OFF_MIDDLE:
         doubts.append("have their principal point far from the middle, as those of a crop")
+    elif focal.max() > _UNEQUAL * focal.min():
+        doubts.append("have unequal focal lengths")
     whole = 2 * np.maximum(centre, side - centre)  # of the smallest image around this one with its centre there
     view = np.degrees(2 * np.arctan(whole / focal / 2)).max()
     if not _LEAST_VIEW <= view <= _LARGEST_VIEW:
@@ -229,4 +244,4 @@ def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
 
 
 def _listed(values: Float[np.ndarray, " n"]) -> str:
-    return ",".join(f"{value:.6g}" for value in values)
+    return ",".join(f"{value:.4g}" for value in values)

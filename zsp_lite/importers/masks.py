@@ -40,7 +40,7 @@ _MIN_SPREAD = 0.7  # least deviation of the points on it, relative to that of th
 # Two objects are alike if the ratios of their points, which count less far from the focus, and of their extents exceed
 # these values. Gaps between them may be smaller than `_VOXEL` by this factor, if there are so many views: an object
 # that hides parts of itself has gaps in a few views.
-_COMPARABLE, _ALIKE, _FINER, _MANY = 0.5, 0.7, 4, 4
+_COMPARABLE, _ALIKE, _FINER, _MANY = 0.5, 0.7, 4, 8
 _CLOUD_POINTS = 20_000
 _MIN_PIXELS = 100
 # The bounding box of the object in known depth grows by these shares of its sides, half of it on each side: pixels of
@@ -54,8 +54,8 @@ _COLOUR_IOU = 0.5  # least overlap with the mask that GrabCut finds in the padde
 _LYING = 0.5  # share of the object's points that may lie in the plane around it
 _CARRYING, _CARRIED = 0.4, 0.05  # shares of the object's points in and above one plane, such as a table's
 
-_NEAREST, _FARTHEST = 0.05, 20.0  # plausible distance of an object, metres
-_LEAST_KNOWN = 0.3  # share of the pixels on the object
+PLAUSIBLE = 0.05, 20.0  # distance of an object, metres
+_LEAST_KNOWN = 0.5  # share of the pixels on the object
 DOUBTFUL = "the masks may be wrong"
 
 Plane = tuple[Float[np.ndarray, "3"], float]  # unit normal, to the side of the cameras, and offset: normal @ x = offset
@@ -198,21 +198,21 @@ def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
         depth = frame.depth[object_pixels(frame)]
         seen, known = seen + (frame.mask > ON_OBJECT).sum(), known + len(depth)
         distances.append(np.quantile(depth, 0.25) if len(depth) else np.nan)
-    distance = float(np.nanmedian(distances)) if known else _NEAREST
-    if metric and not _NEAREST <= distance <= _FARTHEST:
+    distance = float(np.nanmedian(distances)) if known else PLAUSIBLE[0]
+    if metric and not PLAUSIBLE[0] <= distance <= PLAUSIBLE[1]:
         cure = "the unit of its depth is given by --depth-unit (0.001: millimetres, 1: metres)"
-        yield f"the object is {distance:.3g} m from the camera, expected {_NEAREST:g} to {_FARTHEST:g} m; {cure}"
+        yield f"the object is {distance:.3g} m from the camera, expected {PLAUSIBLE[0]:g} to {PLAUSIBLE[1]:g} m; {cure}"
     if known < _LEAST_KNOWN * seen:
         yield f"depth is known on {known / seen:.0%} of the object only"
 
 
 def given_mask_flags(frames: Collection[Frame], missing: Collection[str]) -> tuple[str, ...]:
     """Name the frames whose masks were made, and question masks that cover most of the image's border."""
-    flags = [f"no mask is given for {', '.join(missing)}: made by depth"] if missing else []
+    flags = [f"masks made by depth, as none that can be read is given: {', '.join(missing)}"] if missing else []
     masks = (frame.mask > ON_OBJECT for frame in frames)
     borders = [np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean() for mask in masks]
     if count := sum(share > _MOST for share in borders):
-        flags.append(f"the masks of {count} of {len(borders)} frames cover most of the border: inverted?")
+        flags.append(f"{DOUBTFUL}: those of {count} of {len(borders)} frames cover most of the border: inverted?")
     return tuple(flags)
 
 

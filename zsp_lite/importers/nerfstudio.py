@@ -75,12 +75,17 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
         expected = f"one of {', '.join(_MODELS)} with k4 = 0, or {_FISHEYE}"
         raise InputError(f"{where}: camera_model is {found}, expected {expected}")
     image = find_inside(folder, frame.file_path) or folder / frame.file_path
-    height, width = (int(frame.h), int(frame.w)) if frame.h and frame.w else picture_size(image)
+    found = picture_size(image) if image.is_file() or not (frame.h and frame.w) else None
+    height, width = (int(frame.h), int(frame.w)) if frame.h and frame.w else found
     if not (frame.fl_x or frame.camera_angle_x):
         raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
     fx = frame.fl_x or width / 2 / math.tan(frame.camera_angle_x / 2)
     fy = frame.fl_y or (height / 2 / math.tan(frame.camera_angle_y / 2) if frame.camera_angle_y else fx)
     cx, cy = (width / 2 if frame.cx is None else frame.cx), (height / 2 if frame.cy is None else frame.cy)
+    if found not in (None, (height, width)) and math.isclose(height * found[1], width * found[0], rel_tol=0.01):
+        fitted = ", ".join(f"{value * found[1] / width:.4g}" for value in (fx, fy, cx, cy))
+        expected = f"its own size {found[1]} x {found[0]} with the intrinsics {fitted}"
+        raise InputError(f"{where}: w and h of {image} are {width} x {height}, expected {expected}")
     # OpenCV's order of the coefficients; its model has no r^8 term, k4.
     last = (frame.k3, frame.k4) if fisheye else (frame.p1, frame.p2, frame.k3)
     return make_frame(

@@ -89,7 +89,7 @@ def _decompressed(path: Path, kind: type, scan: _Record3D) -> np.ndarray:
     try:
         import lzfse
     except ImportError as error:
-        raise InputError(f"{path} is compressed by LZFSE, expected its package: pip install lzfse") from error
+        raise InputError(f"{path.name} is compressed by LZFSE, expected its package: pip install lzfse") from error
     data = read_bytes(path, "depth")
     try:
         return np.frombuffer(lzfse.decompress(data), kind).reshape(scan.dh, scan.dw)

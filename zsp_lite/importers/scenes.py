@@ -23,7 +23,7 @@ class _Annotation(msgspec.Struct):
 
 
 def read_bop(folder: Path, object: int | None = None) -> Makers:
-    """Read a scene in BOP's format, in the frame of one of its objects, in each image the first with its number."""
+    """Read a scene in BOP's format, in the frame of one of its objects."""
     scene = read_json(folder / "scene_gt.json", dict[str, list[_Annotation]], "capture")
     cameras = read_json(folder / "scene_camera.json", dict[str, dict[str, Any]], "capture")
     numbers = {image: [one.obj_id for one in placed] for image, placed in scene.items()}
@@ -34,13 +34,16 @@ def read_bop(folder: Path, object: int | None = None) -> Makers:
         raise InputError(f"{folder} has the objects {', '.join(map(str, known))}, expected one of them as --object N")
     for image, some in numbers.items():
         if object in some and image in cameras:
-            index = some.index(object)
-            yield partial(_make_bop, folder, image, index, scene[image][index], cameras[image])
+            yield partial(_make_bop, folder, image, object, scene[image], cameras[image])
 
 
-def _make_bop(folder: Path, image: str, index: int, placed: _Annotation, camera: dict[str, Any]) -> CaptureFrame:
-    """Make a frame of an annotation and a camera; pixel centres are at integers, lengths in millimetres."""
+def _make_bop(folder: Path, image: str, object: int, scene: list[_Annotation], camera: dict[str, Any]) -> CaptureFrame:
+    """Make a frame of an object and a camera; pixel centres are at integers, lengths in millimetres."""
     where, name = f"{folder}, image {image}", f"{image:0>6}"
+    indices = [index for index, one in enumerate(scene) if one.obj_id == object]
+    if len(indices) > 1:
+        raise InputError(f"{where} shows object {object} {len(indices)} times, expected once")
+    index, placed = indices[0], scene[indices[0]]
     R = real_array(f"{where}: cam_R_m2c", placed.cam_R_m2c, (9,))
     t = real_array(f"{where}: cam_t_m2c", placed.cam_t_m2c, (3,))
     K = real_array(f"{where}: cam_K", camera.get("cam_K"), (9,))

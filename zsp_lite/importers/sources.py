@@ -109,7 +109,7 @@ class Source:
         found = [*depth_flags(frames, metric), *self.doubts, *found, self.contradiction()]
         if self.left_out:
             more = f"; and {len(self.left_out) - 3} more" if len(self.left_out) > 3 else ""
-            found.insert(0, f"{len(self.left_out)} frames are left out: {'; '.join(self.left_out[:3])}{more}")
+            found.insert(0, f"frames left out: {len(self.left_out)}: {'; '.join(self.left_out[:3])}{more}")
         return list(filter(None, found))
 
     def contradiction(self) -> str:
@@ -204,6 +204,8 @@ def open_source(
         frames = _check_frames([path] if isinstance(path, Frame) else path)
         path = frames[0].name or f"{len(frames)} frames"
     path = Path(path)
+    if masks is not None and not Path(masks).is_dir():
+        raise InputError(f"--masks {masks} is no folder, expected one with masks that are named like the images")
     for name in options:
         if name not in _TAKEN[layout]:
             raise InputError(f"--{name.replace('_', '-')} does not go with {path}, of the format {layout}")
@@ -230,6 +232,7 @@ def open_source(
         else:
             _, capture, left_out = open_capture(path, layout, **options)
         capture = [replace(frame, **files) for frame in capture]
+        _check_poses([frame.camera for frame in capture], path)
         read, masked = (lambda k: capture[k].load()), [frame.mask is not None for frame in capture]
         names, numbers = [frame.image.name for frame in capture], range(len(capture))
         cameras, unit = tuple(frame.camera for frame in capture), capture[0].depth_unit
@@ -275,9 +278,14 @@ def _check_frames(frames: Sequence[Frame]) -> list[Frame]:
     for number, frame in enumerate(frames):
         if frame.depth is None:
             raise InputError(f"frame {number} {frame.name} has no depth map, expected one")
-    if len({frame.camera.matrix.tobytes() for frame in frames}) == 1 < len(frames):
-        raise InputError(f"all {len(frames)} frames have the same camera pose, expected their poses in one world")
+    _check_poses([frame.camera for frame in frames], "in memory")
     return list(frames)
+
+
+def _check_poses(cameras: Sequence[Camera], where: str | Path) -> None:
+    """Refuse several frames with one pose, as those of a program without tracking."""
+    if len({camera.matrix.tobytes() for camera in cameras}) == 1 < len(cameras):
+        raise InputError(f"{where}: all {len(cameras)} frames have one camera pose, expected their poses in one world")
 
 
 def _format(side: SourceLike) -> str:
@@ -289,7 +297,7 @@ def _format(side: SourceLike) -> str:
         return "image"
     if _sequence_folder(path):
         return "sequence"
-    return recognise(path, "a JPEG or PNG file, CATEGORY/SEQUENCE of a data folder, or ")[0]
+    return recognise(path, "a picture (.jpg, .png, .webp, .heic), CATEGORY/SEQUENCE of a data folder, or ")[0]
 
 
 def _sequence_folder(path: Path) -> Path | None:
@@ -341,6 +349,7 @@ def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
     order = [0, *(1 + np.lexsort(directions[1:].T.round(6)))]  # the same for every order of the other cameras
     gaps = directions[order][:, None] - directions[order]
     energy = 1 / (np.sum(gaps**2, axis=-1) + 1e-9)
+    np.fill_diagonal(energy, np.inf)  # no camera is chosen twice
     chosen = [0]
     for _ in range(_SWEEPS):
         for k in range(1, count):  # in the first sweep, they are added
