@@ -28,7 +28,7 @@ _AGREEING = 0.6  # share of points above which frames agree without doubt
 _FITTING, _GAIN = 0.5, 0.25  # least share of points by the right correction, and its least gain
 _ALIKE = 0.03  # difference of shares below which the likelier correction is named
 _RAY_GAIN = 1.2  # least ratio of the share if depth is along the ray, which changes little near the axis
-_CONTRADICTING, _OVERLAP = 0.3, 0.3  # shares of points in the other image that agree at most, and that are there
+_CONTRADICTING = 0.4  # share of points below which frames contradict each other
 _UNITS = {1.0: "metres", 0.001: "millimetres", 0.0002: "1/5000 m"}
 _FACTORS = (1000.0, 0.001, 5.0, 0.2, 10.0, 0.1)  # from one common unit to another
 _SCALES = [scale for scale in np.geomspace(1e-3, 1e3, 280).tolist() if not 0.96 < scale < 1.04]  # steps of 5 %
@@ -55,8 +55,8 @@ class _Surface:
         depth = np.where(cv2.dilate(mask, np.ones((5, 5))) > ON_OBJECT, frame.depth, np.inf)
         return cls(points, depth, frame.camera, float(np.median(points[:, 2])) if len(points) else 0.0)
 
-    def shares(self, other: "_Surface", motion: _Pose, along_ray: bool) -> tuple[float, float]:
-        """Return the shares of points that a motion between cameras takes onto another surface, and into its image."""
+    def share(self, other: "_Surface", motion: _Pose, along_ray: bool) -> float:
+        """Return the share of points that a motion between cameras takes onto another surface."""
         camera, points = replace(other.camera, R=motion[:3, :3], t=motion[:3, 3]), self.points
         if along_ray:
             points = points * points[:, 2:] / np.linalg.norm(points, axis=1, keepdims=True)
@@ -66,8 +66,7 @@ class _Surface:
         columns, rows = pixels[inside].astype(int).T
         surface = other.depth[rows, columns]
         agreeing = np.abs(stored[inside] - surface) < _TOLERANCE * other.distance
-        known = max(1, len(inside) - (surface == 0).sum())
-        return agreeing.sum() / known, (surface > 0).sum() / known
+        return agreeing.sum() / max(1, len(inside) - (surface == 0).sum())
 
 
 _Pair = tuple[_Surface, _Surface]
@@ -92,9 +91,9 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     pairs, whole = _pairs(objects), _pairs(scenes)
     if not pairs:
         return ""
-    (given, overlap), (everywhere, _) = _shares(pairs), _shares(whole)
+    given, everywhere = _share(pairs), _share(whole)
     found = f"{given:.0%} of the object's points in a frame lie on its surface in another"
-    along_ray = [_shares(some, along_ray=True)[0] for some in (whole, pairs)]
+    along_ray = [_share(some, along_ray=True) for some in (whole, pairs)]
     if along_ray[0] > _RAY_GAIN * everywhere and min(along_ray) > _FITTING and along_ray[1] > _AGREEING:
         mistake = "depth is the distance along the ray of a pixel, not along the optical axis"
         return f"{found}; all that is seen agrees better ({along_ray[0]:.0%} for {everywhere:.0%}) if {mistake}"
@@ -103,7 +102,7 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     for share, text in _explanations(pairs, unit):
         if share > max(_FITTING, given + _GAIN):
             return f"{found}; the frames agree ({share:.0%}) if {text}"
-    contradict = max(given, everywhere) < _CONTRADICTING and overlap > _OVERLAP
+    contradict = max(given, everywhere) < _CONTRADICTING
     return f"{found}, and no usual mistake in units or poses explains it" if contradict else ""
 
 
@@ -123,27 +122,26 @@ def _pairs(surfaces: Sequence[_Surface]) -> list[_Pair]:
     return pairs[:: len(pairs) // _PAIRS + 1]
 
 
-def _shares(
+def _share(
     pairs: Sequence[_Pair], corrected: _Correction = np.array, scale: float = 1.0, along_ray: bool = False
-) -> tuple[float, float]:
-    """Return the median shares of agreeing and of overlapping points, by corrected poses and with scaled depth."""
+) -> float:
+    """Return the median share of agreeing points, by corrected poses and with scaled depth."""
     shares = []
     for one, other in pairs:
         motion = corrected(other.camera.matrix) @ np.linalg.inv(corrected(one.camera.matrix))
         motion[:3, 3] /= scale
-        shares.append(one.shares(other, motion, along_ray))
-    agreeing, overlapping = np.median(shares, axis=0).tolist()
-    return agreeing, overlapping
+        shares.append(one.share(other, motion, along_ray))
+    return float(np.median(shares))
 
 
 def _explanations(pairs: Sequence[_Pair], unit: float | None) -> Iterator[tuple[float, str]]:
     """Give the best correction of poses, by a common factor and by any factor, and the share of points that agree."""
-    shares = np.array([_shares(pairs, correct)[0] for _, correct in _CORRECTIONS])
+    shares = np.array([_share(pairs, correct) for _, correct in _CORRECTIONS])
     likeliest = int(np.argmax(shares > shares.max() - _ALIKE))
     yield shares[likeliest], f"the poses {_CORRECTIONS[likeliest][0]}"
     distance = float(np.median([one.distance for one, _ in pairs]))
     for factors in (_FACTORS, _SCALES):
-        shares = np.array([_shares(pairs, scale=factor)[0] for factor in factors])
+        shares = np.array([_share(pairs, scale=factor) for factor in factors])
         alike = np.flatnonzero(shares > shares.max() - _ALIKE)
         yield shares.max(), _scaled(factors[alike[len(alike) // 2]], distance, unit)
 

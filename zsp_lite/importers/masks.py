@@ -55,7 +55,7 @@ _LYING = 0.5  # share of the object's points that may lie in the plane around it
 _CARRYING, _CARRIED = 0.4, 0.05  # shares of the object's points in and above one plane, such as a table's
 
 PLAUSIBLE = 0.05, 20.0  # distance of an object, metres
-_LEAST_KNOWN = 0.5  # share of the pixels on the object
+_LEAST_KNOWN = 0.4  # share of the pixels on the object
 DOUBTFUL = "the masks may be wrong"
 
 Plane = tuple[Float[np.ndarray, "3"], float]  # unit normal, to the side of the cameras, and offset: normal @ x = offset
