@@ -36,6 +36,9 @@ class PoseLabel:
     seq: str
     reference_seq: str
 
+    def __post_init__(self):
+        object.__setattr__(self, "trans", np.array(self.trans, dtype=np.float64))
+
 
 def label_folder(root: str | Path, category: str) -> Path:
     """Return ROOT/class_labels/CATEGORY."""
