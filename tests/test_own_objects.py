@@ -105,7 +105,9 @@ def test_what_an_image_lacks_is_named_with_the_option_that_gives_it(image, optio
 
 def test_masks_and_depth_that_are_not_there_are_named_with_the_option_that_cures(tmp_path, frames):
     bare = write_picture(tmp_path / "bare.jpg", frames[0], mask=False)
-    with pytest.raises(InputError, match="no mask, expected --masks DIR, --mask auto or --box TOP,LEFT,HEIGHT,WIDTH"):
+    with pytest.raises(
+        InputError, match="no mask, expected masks named like the images, --mask auto or --box TOP,LEFT,HEIGHT,WIDTH"
+    ):
         open_source(bare, INTRINSICS, mask="given").load([0])
     (tmp_path / "bare_depth.png").unlink()
     refused("bare_depth.png or bare_depth.npy beside it, expected .* --depth FILE", open_source, bare, INTRINSICS)

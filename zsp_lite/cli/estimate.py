@@ -41,7 +41,7 @@ def estimate(reference, target, others, helpers, not_upright, as_json, backbone,
     """Estimate the pose between two objects of one category; no label is needed.
 
     REFERENCE and TARGET are each a sequence of a data folder (ROOT/CATEGORY/SEQUENCE), the folder or zip of a capture
-    (see `zsp-lite data import --help`), or an image NAME.jpg, .png, .webp or .heic with its depth NAME_depth.png and,
+    (see `zsp-lite data import --help`), or an image NAME.jpg, .png or .webp with its depth NAME_depth.png and,
     if there is one, its mask NAME_mask.png or .jpg.
 
     The options from --mask to --object may be given once for each object: REFERENCE, TARGET, then helpers. A single

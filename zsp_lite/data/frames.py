@@ -1,7 +1,4 @@
-"""RGB-D frames with object masks: cropping, resizing, and reading and writing of image files.
-
-All image files are opened here.
-"""
+"""RGB-D frames with object masks: cropping, resizing, and reading and writing of image files of data folders."""
 
 import io
 from collections.abc import Callable

@@ -1,13 +1,13 @@
 """Import of RGB-D captures: the formats that are read, object masks, and sequences in CO3D's layout."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import MOST_FRAMES, Capture, CaptureFrame, Makers, collect, find_masks, sharpest
-from zsp_lite.importers.files import is_mask
 from zsp_lite.importers.lists import read_lists, read_tum
 from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.importers.phones import read_polycam, read_record3d, read_stray
@@ -79,8 +79,9 @@ def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
 
 
 def open_capture(
-    path: str | Path, layout: str | None = None, count: int = MOST_FRAMES, masks: Path | None = None, **options: Any
-) -> Capture:
+    path: str | Path, layout: str | None = None, count: int = MOST_FRAMES, masks: Path | None = None,
+    files: Mapping[str, Any] = {}, **options: Any,
+) -> Capture:  # fmt: skip
     """Read the frames of a capture, with the masks of its folder masks/, if it has one.
 
     Args:
@@ -88,24 +89,27 @@ def open_capture(
         layout: Name of its format in `FORMATS`; by default, it is recognised.
         count: Number of frames to choose, the sharp ones of each stretch, where the capture has more.
         masks: Folder of masks, named like the images, in place of those of the capture.
+        files: Members that replace those of each `CaptureFrame`.
         options: `intrinsics` or `object`, where the format takes them.
 
     Raises:
         InputError: The capture cannot be read, or none of its frames can be used.
     """
     source = path = Path(path)
-    if layout is None or path.is_file():
-        found, path = recognise(path)
+    with suppress(InputError if layout else ()):
+        found, place = recognise(path)
         layout = layout or found
+        path = place if found == layout else path
     options |= {"count": count} if layout == "stray" else {}
     frames, left_out = collect(FORMATS[layout].read(path, **options))
-    frames = [frame for frame, _ in sharpest(frames, count, CaptureFrame.sample, left_out)]
+    images = [frame.image for frame in frames]
+    found = find_masks(masks or (path if path.is_dir() else path.parent) / "masks", images)
+    if masks is not None and not any(found):
+        raise InputError(f"--masks {masks} has no mask that is named like an image, such as {images[0].stem}.png")
+    own = [None if masks else frame.mask for frame in frames]
+    frames = [replace(frame, mask=one or mask, **files) for frame, one, mask in zip(frames, own, found)]
+    frames = [frame for frame, _ in sharpest(frames, count, lambda frame: frame.load().rgb, left_out)]
     if not frames:
         found = f"none of {len(left_out)} frames can be used: {left_out[0]}" if left_out else "no frame, expected some"
         raise InputError(f"capture {source}: {found}")
-    if masks is not None:
-        frames = [replace(frame, mask=None) for frame in frames]
-    found = find_masks(masks or (path if path.is_dir() else path.parent) / "masks", [frame.image for frame in frames])
-    every = [frame.mask or mask for frame, mask in zip(frames, found)]
-    frames = [replace(frame, mask=mask if mask and is_mask(mask) else None) for frame, mask in zip(frames, every)]
-    return Capture(layout, frames, left_out)
+    return Capture(frames, left_out)

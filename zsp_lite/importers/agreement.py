@@ -92,16 +92,16 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     if not pairs:
         return ""
     given, everywhere = _share(pairs), _share(whole)
-    found = f"{given:.0%} of the object's points in a frame lie on its surface in another"
+    found = f"depth and poses of the frames do not agree ({given:.0%} of the object's points do)"
     along_ray = [_share(some, along_ray=True) for some in (whole, pairs)]
     if along_ray[0] > _RAY_GAIN * everywhere and min(along_ray) > _FITTING and along_ray[1] > _AGREEING:
         mistake = "depth is the distance along the ray of a pixel, not along the optical axis"
-        return f"{found}; all that is seen agrees better ({along_ray[0]:.0%} for {everywhere:.0%}) if {mistake}"
+        return f"{found}; all that is seen agrees better ({along_ray[0]:.0%}, not {everywhere:.0%}) if {mistake}"
     if given > _AGREEING:
         return ""
     for share, text in _explanations(pairs, unit):
         if share > max(_FITTING, given + _GAIN):
-            return f"{found}; the frames agree ({share:.0%}) if {text}"
+            return f"{found}; they agree ({share:.0%}) if {text}"
     contradict = max(given, everywhere) < _CONTRADICTING
     return f"{found}, and no usual mistake in units or poses explains it" if contradict else ""
 
@@ -123,7 +123,7 @@ def _pairs(surfaces: Sequence[_Surface]) -> list[_Pair]:
 
 
 def _share(
-    pairs: Sequence[_Pair], corrected: _Correction = np.array, scale: float = 1.0, along_ray: bool = False
+    pairs: Sequence[_Pair], corrected: _Correction = np.asarray, scale: float = 1.0, along_ray: bool = False
 ) -> float:
     """Return the median share of agreeing points, by corrected poses and with scaled depth."""
     shares = []
@@ -166,7 +166,7 @@ def _reorder(pose: _Pose) -> _Pose:
 
 _OTHER_AXES = "have the other axes, OpenGL's for OpenCV's or the reverse: negate the columns y and z"
 _INVERSE = "are world to camera"
-# From wrong to right matrices. Those of a file may be in OpenGL's axes; the axes of the world are of no account.
+# From wrong to right matrices. Those of a file may be in OpenGL's axes; the choice of the world's axes does not matter.
 _CORRECTIONS: list[tuple[str, _Correction]] = [
     (_INVERSE, np.linalg.inv),
     (_INVERSE, lambda pose: _FLIP @ np.linalg.inv(pose)),

@@ -71,11 +71,6 @@ class CaptureFrame:
             mask = None if mask is None else cv2.remap(mask, *maps, cv2.INTER_LINEAR)
         return Frame(rgb, enlarged, mask, camera, self.image.name)
 
-    def sample(self) -> UInt8[np.ndarray, "h w 3"]:
-        """Read the image; InputError if it or the depth cannot be decoded."""
-        files.read_depth_file(self.depth)
-        return files.read_picture(self.image)[0]
-
     def _read_depth(self) -> Float32[np.ndarray, "h w"]:
         """Read the depth, 0 where it is unknown, implausibly far or not trusted."""
         depth = files.read_depth_file(self.depth) * np.float32(self.depth_unit)
@@ -101,7 +96,6 @@ class CaptureFrame:
 class Capture(NamedTuple):
     """Frames of a capture in the natural order of their image names, whatever the order in its files."""
 
-    format: str
     frames: list[CaptureFrame]
     left_out: list[str]  # what is wrong with each frame that is left out
 
@@ -139,15 +133,20 @@ def make_frame(
     return CaptureFrame(paths[0], paths[1], camera, mask=paths[2], confidence=paths[3], **others)
 
 
+def refuse(problem: str) -> CaptureFrame:
+    """Raise InputError, in place of a frame that cannot be made."""
+    raise InputError(problem)
+
+
 def collect(makers: Iterable[Callable[[], CaptureFrame]]) -> tuple[list[CaptureFrame], list[str]]:
-    """Return the frames that can be made, in natural order, and what is wrong with each of the others."""
+    """Return the frames that can be made, in the natural order of their images, and what is wrong with the others."""
     frames, left_out = [], []
     for make in makers:
         try:
             frames.append(make())
         except OutsideError:
             raise
-        except InputError as error:
+        except (InputError, OSError) as error:  # OSError: of a name that is too long
             left_out.append(str(error))
     return sorted(frames, key=lambda frame: _natural_order(frame.image)), left_out
 
@@ -161,23 +160,26 @@ def _natural_order(path: Path) -> tuple[list[str | int], str]:
 def sharpest(
     items: Sequence[Any], count: int, read: Callable[[Any], np.ndarray], left_out: list[str]
 ) -> Iterator[tuple[Any, np.ndarray]]:
-    """Yield at most `count` items, the sharpest of the candidates of each stretch, with the images that are read.
+    """Split the items into `count` stretches, and yield the sharpest candidate of each with its image.
 
-    What is wrong with unreadable ones is added to `left_out`. The first frame is chosen, because a box may be for it.
+    What is wrong with unreadable ones is added to `left_out`. The first item is chosen, because a box may be for it.
     """
     parts = [[position] for position in range(len(items))]
     if len(items) > count:
         later = np.array_split(np.arange(1, len(items)), max(count - 1, 1))
         parts = [[0], *(part[:: -(-len(part) // _CANDIDATES)].tolist() for part in later)][:count]
     for part in parts:
-        images = []
+        best, chosen = -1.0, None
         for position in part:
             try:
-                images.append((items[position], read(items[position])))
+                image = read(items[position])
             except InputError as error:
                 left_out.append(str(error))
-        if images:
-            yield max(images, key=lambda one: _sharpness(one[1]))
+                continue
+            if (sharpness := _sharpness(image)) > best:
+                best, chosen = sharpness, (items[position], image)
+        if chosen:
+            yield chosen
 
 
 def _sharpness(image: UInt8[np.ndarray, "..."]) -> float:
@@ -203,7 +205,8 @@ def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
 
     The longest path that both share decides. Images of one name in several folders do not share a mask.
     """
-    files = {path.relative_to(folder).with_suffix("").as_posix(): path for path in sorted(Path(folder).rglob("*.*"))}
+    every = [path for path in sorted(Path(folder).rglob("*.*")) if path.suffix.lower() in files.MASKS]
+    named = {path.relative_to(folder).with_suffix("").as_posix(): path for path in every}
 
     def tails(image: Path) -> list[str]:
         return ["/".join(image.with_suffix("").parts[-count:]) for count in range(len(image.parts), 0, -1)]
@@ -212,7 +215,7 @@ def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
     found = []
     for image in images:
         own = [name for tail in tails(image) if shared[tail] == 1 for name in (tail + image.suffix, tail)]
-        found.append(next((files[name] for name in own if name in files), None))
+        found.append(next((named[name] for name in own if name in named), None))
     return found
 
 

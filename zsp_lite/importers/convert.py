@@ -72,9 +72,10 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
 def import_captures(folder: str | Path, root: str | Path, category: str) -> Iterator[tuple[str, ImportResult]]:
     """Import each capture in a folder as a sequence of its name, but for those that are there; give what was done."""
     for path in sorted(Path(folder).iterdir()):
-        place = Path(root) / category / path.stem
+        name = path.stem if path.is_file() else path.name
+        place = Path(root) / category / name
         if not path.name.startswith(".") and (not place.exists() or (place / _UNFINISHED).is_file()):
-            yield path.stem, import_source(open_source(path), root, category, path.stem)
+            yield name, import_source(open_source(path), root, category, name)
 
 
 class LazyFrames(Sequence[Frame]):

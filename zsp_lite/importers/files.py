@@ -10,7 +10,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,11 +43,11 @@ _OFF_MIDDLE = 0.3  # distance of the principal point from the middle, relative t
 
 
 def read_picture(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], int]:
-    """Read the colours of a JPEG, PNG, WebP or HEIC file as stored, HEIC as displayed, and its EXIF orientation."""
+    """Read the colours of a JPEG, PNG or WebP file as stored, and its EXIF orientation."""
     with _decoding("image", path):
         file = _open(path, "image", _FORMATS)
         orientation = file.getexif().get(ExifTags.Base.Orientation) if "exif" in file.info else 1
-        if file.format in ("WEBP", "HEIF"):
+        if file.format == "WEBP":
             rgb = np.array(file.convert("RGB"))
         else:
             rgb = read_image(path)
@@ -87,9 +87,9 @@ def read_mask_file(path: str | Path, label: int | None = None) -> Float32[np.nda
     values, indexed = _mask_values(Path(path))
     found, integers = np.unique(values), values.dtype.kind in "iu"
     lossy = Path(path).suffix.lower() in _LOSSY
-    few = integers and not lossy and len(found) <= _MOST_LABELS and found[-1] <= _LARGEST_LABEL
     labels = found[(found > 0) & (found != _VOID)]
-    if label is not None and (indexed or few or label in found):
+    few = integers and not lossy and len(found) <= _MOST_LABELS and max(labels, default=0) <= _LARGEST_LABEL
+    if label is not None:
         mask = values == label
     elif len(found) <= 2:
         mask = (values == found[-1]) & (values > 0)
@@ -104,13 +104,6 @@ def read_mask_file(path: str | Path, label: int | None = None) -> Float32[np.nda
     return mask.astype(np.float32)
 
 
-def is_mask(path: Path) -> bool:
-    """Tell whether a mask file can be read."""
-    with suppress(InputError):
-        return bool(_mask_values(path))
-    return False
-
-
 def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
     """Read the values of a mask file, and whether they are numbers of colours: of a palette, or of a few colours."""
     values = _read_values(path, "mask")
@@ -121,7 +114,7 @@ def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
                 return np.array(file), True
     if values.ndim == 3 and values.shape[2] in (1, 3, 4):
         colours, alpha = values[..., :3], values[..., 3:]
-        if alpha.size and np.ptp(alpha) and len(np.unique(colours)) != 2:
+        if alpha.size and np.ptp(alpha):
             return alpha[..., 0], False
         if path.suffix.lower() not in _LOSSY and (colours != colours[..., :1]).any():
             kinds, numbers = np.unique(colours @ np.array([1 << 32, 1 << 16, 1]), return_inverse=True)
@@ -156,15 +149,9 @@ def _read_values(path: Path, what: str) -> Shaped[np.ndarray, "..."]:
 
 
 def _open(path: str | Path, what: str, formats: Sequence[str]) -> Image.Image:
-    """Open an image file of some formats, or HEIC, without decoding its pixels."""
+    """Open an image file of some formats without decoding its pixels."""
     if Path(path).suffix.lower() in (".heic", ".heif"):
-        try:
-            from pillow_heif import register_heif_opener
-        except ImportError as error:
-            expected = "`pip install pillow-heif`, or the photograph as JPEG"
-            raise InputError(f"{what} {path}: HEIC is not read here, expected {expected}") from error
-        register_heif_opener()
-        formats = ("HEIF",)
+        raise InputError(f"{what} {path}: HEIC is not read, expected the photograph as JPEG")
     file = Image.open(io.BytesIO(read_bytes(path, what)), formats=formats)
     if file.width * file.height > MAX_PIXELS:
         raise ValueError
@@ -193,8 +180,9 @@ def lies_as_stored(stored: Sequence[int], orientation: int, form: str | None, pa
     if orientation > 4 and stored[0] != stored[1]:
         return (size[0] < size[1]) == (stored[0] < stored[1])
     if form is None:
-        expected = "--orientation stored or --orientation displayed: how the camera, depth and mask refer to its pixels"
-        raise InputError(f"{path} has EXIF orientation {orientation}, and its size does not tell, expected {expected}")
+        unclear = "turns it, and sizes do not show whether depth, mask and intrinsics are turned, too"
+        expected = "--orientation stored or --orientation displayed"
+        raise InputError(f"{path}: EXIF orientation {orientation} {unclear}, expected {expected}")
     return form == "stored"
 
 

@@ -208,7 +208,7 @@ def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
 
 def given_mask_flags(frames: Collection[Frame], missing: Collection[str]) -> tuple[str, ...]:
     """Name the frames whose masks were made, and question masks that cover most of the image's border."""
-    flags = [f"masks made by depth, as none that can be read is given: {', '.join(missing)}"] if missing else []
+    flags = [f"no mask is given for {', '.join(missing)}: found by depth"] if missing else []
     masks = (frame.mask > ON_OBJECT for frame in frames)
     borders = [np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean() for mask in masks]
     if count := sum(share > _MOST for share in borders):

@@ -10,7 +10,7 @@ import numpy as np
 
 from zsp_lite.data.frames import write_image
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import FROM_OPENGL, CaptureFrame, Makers, make_frame, read_numbers, sharpest
+from zsp_lite.importers.capture import FROM_OPENGL, CaptureFrame, Makers, make_frame, read_numbers, refuse, sharpest
 from zsp_lite.importers.unpacked import new_folder, open_video
 from zsp_lite.io.files import read_bytes, read_json
 
@@ -19,19 +19,16 @@ def read_stray(folder: Path, count: int) -> Makers:
     """Read a scan of Stray Scanner, at most `count` sharp frames of its video."""
     rows = read_numbers(folder / "odometry.csv", (9,), delimiter=",", skiprows=1)
     K = read_numbers(folder / "camera_matrix.csv", (3,), delimiter=",")
-    names = [f"{number:06.0f}.png" for number in rows[:, 1]]
-    with_depth = sorted({int(name[:-4]) for name in names if (folder / "depth" / name).is_file()})
-    pictures, images, left_out = new_folder(), {}, []
-    for number, image in sharpest(with_depth, count, open_video(folder / "rgb.mp4"), left_out):
-        images[number] = pictures / f"{number:06d}.jpg"
-        write_image(images[number], image, 95)
-    if left_out and not images:
-        raise InputError(left_out[0])
-    for row, name in zip(rows, names):
-        if row[1] in images or row[1] not in with_depth:
-            files = images.get(row[1], "rgb.mp4"), f"depth/{name}"
-            where, confidence = f"{folder}/odometry.csv, frame {row[1]:g}", f"confidence/{name}"
-            yield partial(make_frame, folder, *files, row[2:], K, where, confidence=confidence)
+    rows[:, 1] = np.nan_to_num(rows[:, 1], nan=-1)  # numbers of the video's frames
+    pictures, read, left_out = new_folder(), open_video(folder / "rgb.mp4"), []
+    for row, image in sharpest(list(rows), count, lambda row: read(int(row[1])), left_out):
+        name, where = f"{row[1]:06.0f}.png", f"{folder}/odometry.csv, frame {row[1]:.0f}"
+        picture = (pictures / name).with_suffix(".jpg")
+        write_image(picture, image, 95)
+        files = picture, f"depth/{name}"
+        yield partial(make_frame, folder, *files, row[2:], K, where, confidence=f"confidence/{name}")
+    for problem in left_out:
+        yield partial(refuse, problem)
 
 
 def read_polycam(folder: Path) -> Makers:
@@ -39,12 +36,16 @@ def read_polycam(folder: Path) -> Makers:
     folder = folder / "keyframes"
     prefix = "corrected_" if all((folder / f"corrected_{one}").is_dir() for one in ("cameras", "images")) else ""
     for path in sorted((folder / f"{prefix}cameras").glob("*.json")):
-        camera = read_json(path, dict[str, Any], "capture")
-        pose = [camera.get(f"t_{row}{column}") for row in range(3) for column in range(4)]
-        intrinsics = [camera.get(name) for name in ("fx", "fy", "cx", "cy")]
-        files = f"{prefix}images/{path.stem}", f"depth/{path.stem}"
-        confidence = f"confidence/{path.stem}"
-        yield partial(make_frame, folder, *files, pose, intrinsics, f"{path}", FROM_OPENGL, confidence=confidence)
+        yield partial(_make_polycam, folder, path, f"{prefix}images/{path.stem}")
+
+
+def _make_polycam(folder: Path, path: Path, image: str) -> CaptureFrame:
+    camera = read_json(path, dict[str, Any], "capture")
+    pose = [camera.get(f"t_{row}{column}") for row in range(3) for column in range(4)]
+    intrinsics = [camera.get(name) for name in ("fx", "fy", "cx", "cy")]
+    files = image, f"depth/{path.stem}"
+    confidence = f"confidence/{path.stem}"
+    return make_frame(folder, *files, pose, intrinsics, f"{path}", FROM_OPENGL, confidence=confidence)
 
 
 _Side = Annotated[int, msgspec.Meta(ge=1, le=10_000)]  # pixels
@@ -67,7 +68,8 @@ def read_record3d(folder: Path) -> Makers:
         found = f"all {len(scan.poses)} poses are zero: the tracking failed"
         raise InputError(f"{folder}/metadata: {found}, expected another scan")
     every = scan.perFrameIntrinsicCoeffs or [[scan.K[k] for k in (0, 4, 6, 7)]] * len(scan.poses)
-    for number, intrinsics in enumerate(every[: len(scan.poses)]):
+    for number in range(len(scan.poses)):
+        intrinsics = every[number] if number < len(every) else []
         yield partial(_make_record3d, folder, unpacked / f"{number}", scan, intrinsics)
 
 
@@ -92,6 +94,8 @@ def _decompressed(path: Path, kind: type, scan: _Record3D) -> np.ndarray:
         raise InputError(f"{path.name} is compressed by LZFSE, expected its package: pip install lzfse") from error
     data = read_bytes(path, "depth")
     try:
+        if len(data) > 2 * scan.dh * scan.dw * np.dtype(kind).itemsize:
+            raise ValueError(f"{len(data)} compressed bytes")
         return np.frombuffer(lzfse.decompress(data), kind).reshape(scan.dh, scan.dw)
     except (lzfse.error, MemoryError, ValueError) as error:
-        raise InputError(f"{path} is no map of {scan.dh} x {scan.dw} numbers: {error}") from error
+        raise InputError(f"{path.name} is no map of {scan.dh} x {scan.dw} numbers ({error or 'damaged'})") from error

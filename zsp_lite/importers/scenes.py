@@ -6,8 +6,9 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from jaxtyping import Float
 
-from zsp_lite.errors import InputError, real_array
+from zsp_lite.errors import InputError, check_number, real_array
 from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, Makers, make_frame, read_numbers
 from zsp_lite.io.files import read_json
 
@@ -49,6 +50,7 @@ def _make_bop(folder: Path, image: str, object: int, scene: list[_Annotation], c
     K = real_array(f"{where}: cam_K", camera.get("cam_K"), (9,))
     pose = np.column_stack([R.reshape(3, 3).T, -_MILLIMETRES * R.reshape(3, 3).T @ t])
     unit = _MILLIMETRES * float(real_array(f"{where}: depth_scale", camera.get("depth_scale", 1), ()))
+    check_number(f"{where}: depth_scale", unit, above=0)
     mask = f"mask_visib/{name}_{index:06d}"
     files = f"rgb/{name}", f"depth/{name}"
     return make_frame(folder, *files, pose, K.reshape(3, 3) + HALF_PIXEL, where, mask=mask, depth_unit=unit)
@@ -58,8 +60,11 @@ def read_scannet(folder: Path) -> Makers:
     """Read a scene in ScanNet's format, with a text file for the pose of each image."""
     K = read_numbers(folder / "intrinsic/intrinsic_color.txt", (3, 4))[:3, :3]
     for path in sorted((folder / "pose").glob("*.txt")):
-        files = f"color/{path.stem}", f"depth/{path.stem}"
-        yield partial(make_frame, folder, *files, read_numbers(path, (4,)), K, str(path))
+        yield partial(_make_scannet, folder, path, K)
+
+
+def _make_scannet(folder: Path, path: Path, K: Float[np.ndarray, "3 3"]) -> CaptureFrame:
+    return make_frame(folder, f"color/{path.stem}", f"depth/{path.stem}", read_numbers(path, (4,)), K, str(path))
 
 
 def read_open3d(folder: Path) -> Makers:
@@ -69,7 +74,7 @@ def read_open3d(folder: Path) -> Makers:
         raise InputError(f"{folder} has no trajectory.log, expected poses: run Open3D's reconstruction system on it")
     camera = read_json(folder / "intrinsic.json", dict[str, Any], "capture")
     K = real_array(f"{folder}/intrinsic.json: intrinsic_matrix", camera.get("intrinsic_matrix"), (9,))
-    images = sorted(path.stem for path in (folder / "color").iterdir() if path.suffix.lower() in (".jpg", ".png"))
+    images = sorted(path.stem for path in (folder / "color").glob("*") if path.suffix.lower() in (".jpg", ".png"))
     lines = read_numbers(log, (4,), usecols=(0, 1, 2, -1))  # three frame numbers, and four lines of a matrix
     if len(lines) != 5 * len(images):
         raise InputError(f"{log} has {len(lines)} lines, expected 5 for each of {len(images)} images")

@@ -59,7 +59,7 @@ class Source:
         return f"{kind} {self.path}, frame{'s' if len(positions) > 1 else ''} {frames}"
 
     def load(self, positions: Sequence[int], context: int = _CONTEXT) -> list[Frame]:
-        """Load frames with masks of the object, which are better with more frames as `context` where they are made.
+        """Load frames with masks of the object; those that have to be made use up to `context` frames together.
 
         InputError if a file cannot be read, or no frame shows the object.
         """
@@ -175,7 +175,7 @@ def open_source(
 
     Args:
         path: ROOT/CATEGORY/SEQUENCE of a data folder; the folder or zip of a capture (see `importers.recognise`); or a
-            JPEG, PNG, WebP or HEIC file NAME.EXT. Depth of an image is NAME_depth.png (16 bit), .npy, .tiff, ...,
+            JPEG, PNG or WebP file NAME.EXT. Depth of an image is NAME_depth.png (16 bit), .npy, .tiff, ...,
             registered to its colours, and its mask, if there is one, NAME_mask.png. Or frames, such as of
             `Frame.from_arrays`.
         intrinsics: fx, fy, cx, cy of an image or of TUM RGB-D in pixels, or K as 3 x 3, with pixel centres at
@@ -208,7 +208,8 @@ def open_source(
         raise InputError(f"--masks {masks} is no folder, expected one with masks that are named like the images")
     for name in options:
         if name not in _TAKEN[layout]:
-            raise InputError(f"--{name.replace('_', '-')} does not go with {path}, of the format {layout}")
+            option = {"count": "frames"}.get(name, name.replace("_", "-"))
+            raise InputError(f"--{option} does not go with {path}, of the format {layout}")
     if mask not in (None, *(("box",) if box is not None else ("given", "auto"))):
         expected = "--mask given, --mask auto, or --mask box with --box TOP,LEFT,HEIGHT,WIDTH"
         raise InputError(f"{path}: mask is {mask!r} and box is {box}, expected {expected}")
@@ -228,19 +229,21 @@ def open_source(
     else:
         files = {name: options.pop(name) for name in _FILES if name in options}
         if layout == "image":
-            capture = [_open_image(path, **options)]
+            capture = [replace(_open_image(path, **options), **files)]
         else:
-            _, capture, left_out = open_capture(path, layout, **options)
-        capture = [replace(frame, **files) for frame in capture]
+            capture, left_out = open_capture(path, layout, files=files, **options)
         _check_poses([frame.camera for frame in capture], path)
         read, masked = (lambda k: capture[k].load()), [frame.mask is not None for frame in capture]
         names, numbers = [frame.image.name for frame in capture], range(len(capture))
         cameras, unit = tuple(frame.camera for frame in capture), capture[0].depth_unit
-        doubts = question_intrinsics(capture[0].camera, str(path))
+        different = {camera.K.tobytes(): camera for camera in reversed(cameras)}.values()
+        doubts = tuple(line for one in different for line in question_intrinsics(one, str(path)))
     if mask is None:
         mask = "box" if box is not None else "given" if any(masked) else "auto"
     if mask == "given" and not any(masked):
-        raise InputError(f"{path}: no mask, expected --masks DIR, --mask auto or --box TOP,LEFT,HEIGHT,WIDTH")
+        raise InputError(
+            f"{path}: no mask, expected masks named like the images, --mask auto or --box TOP,LEFT,HEIGHT,WIDTH"
+        )
     missing = {k: str(name) for k, name in enumerate(names) if not masked[k]}
     return Source(path, layout, tuple(numbers), read, mask, box, cameras, left_out, missing, doubts, unit)
 
@@ -297,7 +300,7 @@ def _format(side: SourceLike) -> str:
         return "image"
     if _sequence_folder(path):
         return "sequence"
-    return recognise(path, "a picture (.jpg, .png, .webp, .heic), CATEGORY/SEQUENCE of a data folder, or ")[0]
+    return recognise(path, "a picture (.jpg, .png, .webp), CATEGORY/SEQUENCE of a data folder, or ")[0]
 
 
 def _sequence_folder(path: Path) -> Path | None:

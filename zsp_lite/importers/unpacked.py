@@ -1,6 +1,8 @@
 """Zips and videos of captures, unpacked to a temporary folder that lives as long as the process."""
 
+import atexit
 import os
+import shutil
 import struct
 import tempfile
 import zipfile
@@ -23,15 +25,11 @@ _DAMAGE = (zipfile.BadZipFile, zlib.error, LZMAError, struct.error, OSError, EOF
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # silent
 
 
-@cache
-def _workplace() -> tempfile.TemporaryDirectory:
-    """Make the temporary folder of this process."""
-    return tempfile.TemporaryDirectory(prefix="zsp-lite-", ignore_cleanup_errors=True)
-
-
 def new_folder() -> Path:
     """Make a folder that is removed at the end of the process."""
-    return Path(tempfile.mkdtemp(dir=_workplace().name))
+    folder = tempfile.mkdtemp(prefix="zsp-lite-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
 
 
 @cache

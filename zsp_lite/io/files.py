@@ -149,7 +149,7 @@ def find_inside(root: str | Path, text: str) -> Path | None:
     """
     root, text = os.path.abspath(root), text.replace("\\", "/")
     path = os.path.normpath(text if PureWindowsPath(text).drive else os.path.join(root, text))
-    if not path.startswith((os.path.join(root, ""), os.path.join(os.path.realpath(root), ""))):
+    if text and not path.startswith((os.path.join(root, ""), os.path.join(os.path.realpath(root), ""))):
         expected = "a path inside, relative or absolute; a link inside may lead elsewhere"
         raise OutsideError(f"path {_shown(text)} leads out of the folder {root}, expected {expected}")
     return next((Path(path + end) for end in ("", ".png", ".jpg", ".jpeg") if os.path.isfile(path + end)), None)
