@@ -51,6 +51,7 @@ _BORDERS = 2  # number of the image's borders that a mask may not touch at once
 _MOST = 0.5  # share of the image
 _PARTS = 0.25  # share of the mask outside its largest region
 _COLOUR_IOU = 0.5  # least overlap with the mask that GrabCut finds in the padded bounding box
+_LEAST_SIGNS = 0.5  # per frame, below which masks are not flagged
 _LYING = 0.5  # share of the object's points that may lie in the plane around it
 _CARRYING, _CARRIED = 0.4, 0.05  # shares of the object's points in and above one plane, such as a table's
 
@@ -185,6 +186,8 @@ def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
         if not frame_defect(frame):
             usable += 1
             found.update(_signs(frame, plane, distance))
+    if found.total() < _LEAST_SIGNS * usable:
+        return ()
     signs = [f"{sign} ({count} of {usable} frames)" for sign, count in found.items()]
     if signs and plane is None:  # alone it is no reason: many objects fill the image, or stand on a dark turntable
         signs.append("no plane is found that the object stands on")
