@@ -5,6 +5,7 @@ import io
 import json
 import struct
 import sys
+import warnings
 import zipfile
 import zlib
 from dataclasses import replace
@@ -128,6 +129,11 @@ def zip_of(name: str, size: int):
     return write
 
 
+def without_lzfse(path):
+    with zipfile.ZipFile(path, "a") as zipped, warnings.catch_warnings(action="ignore"):
+        zipped.writestr("rgbd/0.depth", bytes(range(256)))  # the last of equal names is unpacked
+
+
 def ten_hours(data: bytes) -> bytes:
     """The duration of the header of an MP4 file and of its media, in their time scale."""
     for kind, at in ((b"mvhd", 16), (b"mdhd", 16)):
@@ -151,7 +157,7 @@ for name, layout, change in (
         written("depth/900000.png", "")(path))),
     ("video that is a list of addresses", "stray", written("rgb.mp4", "#EXTM3U\n#EXTINF:9,\n/etc/passwd\n")),
     ("camera of objects", "polycam", written("keyframes/corrected_cameras/000000.json", '{"fx": {}, "t_00": "x"}')),
-    ("depth of an archive that is no LZFSE", "record3d", lambda path: None),
+    ("depth that is no LZFSE", "record3d", without_lzfse),
     ("quaternion of zeros", "tum", written("groundtruth.txt", "10 0 0 0 0 0 0 0\n")),
     ("times that are no numbers", "tum", written("rgb.txt", "nan a.jpg\ninf b.jpg\n-1e308 c.jpg\n")),
     ("objects that are lists", "bop", written("scene_gt.json", '{"0": [{"obj_id": [], "cam_R_m2c": {}, "cam_t_m2c": "x"}]}')),
