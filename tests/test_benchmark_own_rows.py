@@ -39,7 +39,6 @@ from zsp_lite.data.pairs import category_pairs
 from zsp_lite.errors import FatalError, InputError
 from zsp_lite.pipeline import ZeroShotPose
 
-VERIFIED = METHODS["verified"]
 OWN = ("own_method", "own_estimator", "own_matcher", "own_keypoints")
 
 
@@ -93,19 +92,16 @@ def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path):
         run_rows({"mine": lambda problem: np.eye(3)}, tmp_path)
 
 
-@pytest.mark.parametrize(
-    "name", ["ours", "sift", "ours-n3", "verified-n0", "category", "table1", "SIFT", "Ours (K=50)"]
-)
+TAKEN = ["ours", "sift", "ours-n3", "verified-n0", "category", "table1", "SIFT", "Ours (K=50)"]
+
+
+@pytest.mark.parametrize("name", TAKEN)
 def test_nothing_takes_the_name_of_a_row_of_the_library_or_the_paper(name):
     told = re.escape(f"method {name!r} ") + "(has the name of another row or of a group|is unknown)"
     for thing in ("benchmark_folder:own_method", own_method, "ours-k30", Method(settings={"k": 3})):
         refused(told, resolve, {name: thing})
-    kept = {
-        "ours": Method(),
-        "ours-bv-n2": "ours-bv-n2",
-        "ours-k30": "ours-k30",
-        "verified-n3": replace(VERIFIED, targets=3),
-    }
+    refused("'sift' has the name", resolve, ["sift=benchmark_folder:own_method"])
+    kept = {"ours": Method(), "ours-bv-n2": "ours-bv-n2", "verified-n3": replace(METHODS["verified"], targets=3)}
     assert list(resolve(kept | {"ours2": own_method})) == [*kept, "ours2"]
 
 

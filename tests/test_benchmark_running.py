@@ -11,8 +11,9 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import cloudpickle
@@ -37,7 +38,7 @@ from zsp_lite.benchmark.tables import compare
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels, write_label
-from zsp_lite.errors import InputError
+from zsp_lite.errors import FatalError, InputError
 from zsp_lite.threads import one_thread
 
 pytestmark = pytest.mark.slow
@@ -154,6 +155,36 @@ def test_a_dask_cluster_that_loses_its_worker_and_starts_another_finds_the_same(
         address = "dask://" + cluster.scheduler_address.removeprefix("tcp://")
         summary = evaluate(small_folder(), SlowBackbone(grid=8), ROWS, 6, 3, tmp_path, address)
     assert killed and killed[0] < 12 and summary["methods"] == undisturbed[1]["methods"]
+
+
+def test_modules_of_the_current_folder_travel_to_workers_and_what_they_lack_is_one_line(tmp_path, monkeypatch):
+    from distributed import LocalCluster
+
+    lock = "import threading\nlock = threading.Lock()\ndef half(problem):\n    return lock and None"
+    modules = {
+        "turns_of_mine": "import numpy as np\nHALF = np.diag([1.0, -1.0, -1.0])",
+        "rows_of_mine": "import turns_of_mine\ndef half(problem):\n    return turns_of_mine.HALF",
+        "installed/package_of_mine": "def half(problem):\n    return None",
+        "lock_of_mine": lock,
+        "same_of_mine": lock,
+    }
+    (tmp_path / "installed").mkdir()
+    for name, text in modules.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
+        monkeypatch.chdir(tmp_path)  # after the worker has its path
+        monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "installed")])
+        address = "dask://" + cluster.scheduler_address.removeprefix("tcp://")
+
+        def run(module: str) -> dict:
+            return evaluate(small_folder(), QUICK, [f"mine={module}:half"], {"lump": 2}, 2, module, address)
+
+        mine = run("rows_of_mine")["methods"]["mine"]
+        assert (mine["n"], mine["failed"]) == (2, 0)
+        refused("a worker cannot import the rows: No module named 'package_of_mine', expected", run, "package_of_mine")
+        refused("sending the rows to workers failed: .*cannot pickle", run, "lock_of_mine", error=FatalError)
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:  # imports what is not sent
+        evaluate(small_folder(), QUICK, ["mine=same_of_mine:half"], {"lump": 1}, 2, tmp_path / "pool", pool)
 
 
 def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch):
@@ -275,6 +306,22 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
     frames = {key for pair in pairs_to_evaluate(rows, 4, 3) for key in Problem(pair, store).keys}
     assert sum(calls) == len(frames)
     assert set(calls) == {1}  # a frame's features do not depend, in their last bits, on the rest of a batch
+
+
+def test_the_same_data_by_another_path_continue_a_run_and_other_data_do_not(tmp_path, monkeypatch, links):
+    for name in ("data", "elsewhere/data"):
+        shutil.copytree(small_folder(), tmp_path / name)
+    (tmp_path / "link").symlink_to(tmp_path / "data")
+
+    def run(data, row: str) -> str:
+        return evaluate(data, BACKBONE, [row], {"lump": 1}, 2, tmp_path / "run")["data"]["root"]
+
+    monkeypatch.chdir(tmp_path)
+    assert run("data", "icp") == "data" and run(tmp_path / "data", "ours-bv") == str(tmp_path / "data")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert run("../link", "ours") == "../link"
+    refused("a run with data .*data, this is .*elsewhere/data; choose another folder", run, "data", "ours")
+    assert len(read_run(tmp_path / "run").settings.methods) == 3
 
 
 def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
