@@ -61,12 +61,10 @@ def evaluate_chunks(
     except ImportError as error:
         raise InputError(f"a worker cannot import the rows: {error}, expected the module there, too") from error
     except Exception as error:
-        if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # the latter is Dask's
-            raise InputError(
-                "a worker ended abruptly, perhaps out of memory; finished pairs are stored: run again to continue, "
-                "with fewer workers"
-            ) from error
-        raise
+        if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":  # the latter is Dask's
+            raise
+        advice = "finished pairs are stored: run again to continue, with fewer workers"
+        raise InputError(f"a worker ended abruptly, perhaps out of memory; {advice}") from error
     finally:
         for future in futures:
             future.cancel()

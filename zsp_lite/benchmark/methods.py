@@ -113,8 +113,7 @@ def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Metho
 
     Names are those of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, "module:thing",
     "poses.csv", or NAME=one of these. A mapping leads from names to these, to `Method`s, or to objects of one's own.
-    InputError if a name is unknown, or is that of another row; or a thing cannot be imported or read, or is of no kind
-    (see `own.kind_of`).
+    InputError if a name is unknown or another row's, or a thing cannot be imported or read, or is of no kind.
     """
     if not isinstance(methods, Mapping):
         names = [methods] if isinstance(methods, str) else methods
