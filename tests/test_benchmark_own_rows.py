@@ -31,7 +31,6 @@ from zsp_lite.benchmark.problem import Answer, FrameStore, Problem
 from zsp_lite.benchmark.run import evaluate, evaluate_pair
 from zsp_lite.benchmark.runs import LINES, read_lines, read_run
 from zsp_lite.benchmark.tables import every_table
-from zsp_lite.data import exchange
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.exchange import write_questions
@@ -93,6 +92,19 @@ def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path):
         run_rows({"mine": lambda problem: np.eye(3)}, tmp_path)
 
 
+TAKEN = ["ours", "sift", "ours-n3", "verified-n0", "category", "table1", "SIFT", "Ours (K=50)"]
+
+
+@pytest.mark.parametrize("name", TAKEN)
+def test_nothing_takes_the_name_of_a_row_of_the_library_or_the_paper(name):
+    told = re.escape(f"method {name!r} ") + "(has the name of another row or of a group|is unknown)"
+    for thing in ("benchmark_folder:own_method", own_method, "ours-k30", Method(settings={"k": 3})):
+        refused(told, resolve, {name: thing})
+    refused("'sift' has the name", resolve, ["sift=benchmark_folder:own_method"])
+    kept = {"ours": Method(), "ours-bv-n2": "ours-bv-n2", "verified-n3": replace(METHODS["verified"], targets=3)}
+    assert list(resolve(kept)) == list(kept)
+
+
 def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
     dataset = Co3D(small_folder())
     store = FrameStore(dataset, "lump", {"backbone": BACKBONE})
@@ -123,14 +135,14 @@ def test_keypoints_that_fit_no_pose_are_noted_and_those_that_are_none_fail(tmp_p
     refused("scores of matches are negative, expected 0 or more", run_rows, distances, tmp_path, error=FatalError)
 
 
-COLUMNS = "category,reference_sequence,reference_frame,target_sequence,target_frame,rotation,translation,scale"
+COLUMNS = "pair,target_frame,rotation,translation,scale"
 
 
-def question(dataset, pair):
-    """Sequence and frame of the reference and of the second target view, and the true pose between them."""
+def exact_pose(dataset, pair):
+    """The true pose of a pair in its second target view."""
     ends = (pair.reference_sequence, pair.reference_frame), (pair.target_sequence, pair.target_frames[1])
     known = ((dataset.camera(dataset.frame("lump", *end)), placement("lump", end[0])) for end in ends)
-    return ends, true_pose(*(part for one in known for part in one))
+    return true_pose(*(part for one in known for part in one))
 
 
 def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
@@ -138,9 +150,9 @@ def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
     dataset, lines = Co3D(small_folder()), [COLUMNS]
     pairs = category_pairs(dataset, "lump", 4, 3)
     for pair in pairs[:3]:
-        ends, pose = question(dataset, pair)
+        pose = exact_pose(dataset, pair)
         numbers = (" ".join(map(repr, part.ravel().tolist())) for part in (pose.R, pose.t))
-        lines.append(",".join(map(str, ("lump", *ends[0], *ends[1], *numbers, "1.0"))))
+        lines.append(f'"{pair.key}",{pair.target_frames[1]},{",".join(numbers)},1.0')
     (tmp_path / "exact.csv").write_text("\n".join(lines))
     (tmp_path / "rotations.csv").write_text("\r\n".join(line.rsplit(",", 2)[0] for line in lines))
     rows = {name: f"{tmp_path / name}.csv" for name in ("exact", "rotations")}
@@ -155,11 +167,25 @@ def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
     (tmp_path / "exact.csv").write_text("\n".join(lines[:2]))  # other poses under the same name
     refused("a run with methods of exact", run_rows, rows, tmp_path / "run", 4, 3)
     refused("exact.csv has no pose for any of the pairs", run_rows, rows, tmp_path / "other", 6, 2, "pebble")
-    end = f"{pairs[0].target_sequence},{pairs[0].target_frames[1]}"
-    second = lines[1].replace(end, f"{pairs[0].target_sequence},{pairs[0].target_frames[0]}")
-    (tmp_path / "two.csv").write_text("\n".join([*lines, second]))
-    two = [f"two={tmp_path / 'two.csv'}"]
-    refused("two.csv has 2 poses of the pair lump/.*, expected one", run_rows, two, tmp_path, 4, 3, error=FatalError)
+    (tmp_path / "views.csv").write_text("\n".join(lines).replace(f'",{pairs[0].target_frames[1]},', '",99,', 1))
+    view = [f"view={tmp_path / 'views.csv'}"]
+    refused("views.csv, line 2: target_frame is 99, expected one of .*, ", run_rows, view, tmp_path / "other", 4, 3)
+
+
+def test_each_pair_has_its_own_pose_and_missing_ones_are_told(tmp_path, monkeypatch):
+    """Here the pairs differ in a target frame, and both are answered in the frame that they share."""
+    pairs = [Pair("lump", "100_a", 0, "200_b", (3, last)) for last in (4, 5)]
+    monkeypatch.setattr("zsp_lite.benchmark.run.pairs_of_rows", lambda *_: dict.fromkeys(pairs, ["both", "one"]))
+    turns = "1 0 0 0 1 0 0 0 1", "0 -1 0 1 0 0 0 0 1"
+    lines = [COLUMNS, *(f'"{pair.key}",3,{turn},,' for pair, turn in zip(pairs, turns))]
+    for name, text in (("both", lines), ("one", lines[:2])):
+        (tmp_path / f"{name}.csv").write_text("\n".join(text))
+    rows = run_rows({name: f"{tmp_path / name}.csv" for name in ("both", "one")}, tmp_path / "run", 2)
+    found = read_run(tmp_path / "run")
+    assert [(row["n"], row["failed"]) for row in rows.values()] == [(2, 0), (2, 1)]
+    assert found.row("both")["error"].nunique() == 2
+    note = next(iter(every_table(found.summary))).note
+    assert note.startswith("one: 1 of 2 pairs has no pose. one failed on 1 of 2 pairs") and "both" not in note
 
 
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -172,14 +198,14 @@ CONVENTIONS = {
 
 @pytest.mark.parametrize("convention", [*CONVENTIONS, "none", "inverted in eight of twelve"])
 def test_a_spreadsheets_poses_are_read_and_the_note_names_their_convention(tmp_path, caplog, convention):
-    dataset, lines = Co3D(small_folder()), [COLUMNS.replace(",", ";"), "lump;x;1;y;2;1 0 0 0 1 0 0 0 1;;"]
+    dataset, lines = Co3D(small_folder()), [COLUMNS.replace(",", ";"), "lump/x:1/y:2;2;1 0 0 0 1 0 0 0 1;;"]
     for pair in category_pairs(dataset, "lump", 12, 3):
-        ends, pose = question(dataset, pair)
+        pose = exact_pose(dataset, pair)
         mixed = pose.R.T if len(lines) < 10 else pose.R  # as of a method that confuses left and right
         other = Rotation.random(random_state=len(lines)).as_matrix() if convention == "none" else mixed
         rotation = CONVENTIONS.get(convention, lambda R, other=other: other)(pose.R)
         numbers = " ".join(f"{value:.4f}".replace(".", ",") for value in rotation.ravel())
-        lines.append(f"lump;{ends[0][0]};{ends[0][1]:06d};{ends[1][0]};{ends[1][1]:06d};{numbers};;")
+        lines.append(f"{pair.key};{pair.target_frames[1]};{numbers};;")
     (tmp_path / "mine.csv").write_text("\ufeff" + "\r\n".join(lines), encoding="utf-8")
     run_rows({"mine": str(tmp_path / "mine.csv")}, tmp_path / "run", 12, 3)
     found = read_run(tmp_path / "run")
@@ -192,42 +218,29 @@ def test_a_spreadsheets_poses_are_read_and_the_note_names_their_convention(tmp_p
     assert (found.row("mine")["error"].max() < 0.01) == (convention == "")
 
 
-def test_sequences_without_their_leading_zeros_are_found_where_one_fits(monkeypatch):
-    monkeypatch.setattr(exchange, "other_convention", lambda *_: "")
-    pairs = [Pair("cup", "0012", 1, "000", (2,)), Pair("cup", "0_b", 1, "0012", (2,))]
-    saved = ("cup", "0_b", 1, "12", 2), ("cup", "12", 1, "0", 2)  # a spreadsheet changes what is a number only
-    poses, dataset = dict.fromkeys(saved, exchange.StoredPose(np.eye(3), None, None)), Co3D(small_folder())
-    full = [("cup", "0_b", 1, "0012", 2), ("cup", "0012", 1, "000", 2)]
-    assert list(exchange.fit_poses("p", poses, dataset, pairs)[0]) == full
-    pairs.append(Pair("cup", "012", 1, "000", (2,)))
-    assert exchange.fit_poses("p", dict.fromkeys(full, poses[saved[0]]), dataset, pairs)[0].keys() == set(full)
-    for wrong in (poses, dict.fromkeys([*full, ("cup", "00_b", 1, "0012", 2)], poses[saved[0]])):
-        with pytest.raises(InputError, match="poses p: .* fits .*'0.*, expected one pair that has no other line"):
-            exchange.fit_poses("p", wrong, dataset, pairs)
-
-
-RIGHT = "lump,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1"
+RIGHT = '"lump/a:0/b:1,5",1,1 0 0 0 1 0 0 0 1,0 0 1,1'
 
 
 @pytest.mark.parametrize(("text", "told"), [
-    ("", "a CSV file"), ("\xff", "codec.* a CSV file"), (f"{COLUMNS}\nlump,a,0", "line 2: "),
-    ("category,target_frame", "columns reference_sequence, .*rotation"), (f"{COLUMNS}\n{RIGHT}x", "line 2: .*1x"),
+    ("", "a CSV file"), ("\xff", "codec.* a CSV file"), (f"{COLUMNS}\nlump/a:0/b:1", "line 2: "),
+    ("pair,scale", "columns target_frame, rotation"), (f"{COLUMNS}\n{RIGHT}x", "line 2: .*1x"),
     (f"{COLUMNS}\n{RIGHT}\n{RIGHT.replace('0 0 0 1,', '0 0 0,')}", "line 3: rotation has shape .8,., exp"),
     (f"{COLUMNS}\n\n{RIGHT.replace(',1 0', ',nan 0')}", "line 3: rotation holds nan"),
     (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',-1 0')}", "line 2: "), (f"{COLUMNS}\n{RIGHT[:-1]}0", "scale is 0.0"),
-    (f"{COLUMNS}\n{RIGHT.replace(',b,1,', ',b,1.000,')}", "line 2: .*'1.000'"),  # or a thousand
+    (f"{COLUMNS}\n{RIGHT.replace(',1,', ',1.000,')}", "line 2: .*'1.000'"),  # or a thousand
     (f"{COLUMNS}\n{RIGHT.replace(',0 0 1,', ',0 0,')}", "line 2: translation has shape .2,., expected"),
-    (f"{COLUMNS}\n{RIGHT}\n{RIGHT}", "line 3: second pose of the same frames"),
-    (f"{COLUMNS}\n{RIGHT},surplus", "line 2: more than the 8 fields of the header"),
+    (f"{COLUMNS}\n{RIGHT}\n\n{RIGHT.replace(',1,1', ',5,1')}", "line 4: second pose of the pair of line 2"),
+    (f"{COLUMNS}\n{RIGHT},surplus", "line 2: more fields than the header"),
+    (f"{COLUMNS}\n{RIGHT}".replace('"', ""), "line 2: more fields than the header; a pair has commas and needs quotes"),
     (f"{COLUMNS},Scale,ROTATION\n{RIGHT},,", "columns rotation"),
 ])  # fmt: skip
 def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_path):
     path = tmp_path / "poses.csv"
     path.write_text(text, encoding="latin-1")
     refused(f"poses {re.escape(str(path))}.*{told}", resolve, [f"theirs={path}"])
-    saved = f"{COLUMNS.title()},,\n,,,,,,,,,\n{RIGHT.replace('a,0,b,1', 'a,0.0,b,0001')},,\n".replace("_", " ")
+    saved = f"{COLUMNS.title()},,\n,,,,,,\n{RIGHT},,\n".replace("_", " ")
     path.write_text(saved, encoding="utf-16")
-    assert resolve([f"theirs={path}"])["theirs"].solve._poses.keys() == {("lump", "a", 0, "b", 1)}
+    assert resolve([f"theirs={path}"])["theirs"].solve._poses.keys() == {"lump/a:0/b:1,5"}
 
 
 def test_the_questions_have_a_line_for_each_frame_with_its_files_and_camera(tmp_path):
@@ -236,9 +249,9 @@ def test_the_questions_have_a_line_for_each_frame_with_its_files_and_camera(tmp_
     with open(write_questions(tmp_path / "pairs.csv", dataset, pairs), newline="") as file:
         lines = list(csv.DictReader(file))
     asked = []
-    for number, pair in enumerate(pairs):
-        asked += [(f"{number}", "reference", pair.category, pair.reference_sequence, f"{pair.reference_frame}")]
-        asked += [(f"{number}", "target", pair.category, pair.target_sequence, f"{n}") for n in pair.target_frames]
+    for pair in pairs:
+        asked += [(pair.key, "reference", pair.category, pair.reference_sequence, f"{pair.reference_frame}")]
+        asked += [(pair.key, "target", pair.category, pair.target_sequence, f"{n}") for n in pair.target_frames]
     assert [tuple(line.values())[:5] for line in lines] == asked
     points = np.random.default_rng(0).normal(size=(20, 3))
     for line in lines:

@@ -37,7 +37,7 @@ from zsp_lite.benchmark.tables import compare
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels, write_label
-from zsp_lite.errors import InputError
+from zsp_lite.errors import FatalError, InputError
 from zsp_lite.threads import one_thread
 
 pytestmark = pytest.mark.slow
@@ -154,6 +154,31 @@ def test_a_dask_cluster_that_loses_its_worker_and_starts_another_finds_the_same(
         address = "dask://" + cluster.scheduler_address.removeprefix("tcp://")
         summary = evaluate(small_folder(), SlowBackbone(grid=8), ROWS, 6, 3, tmp_path, address)
     assert killed and killed[0] < 12 and summary["methods"] == undisturbed[1]["methods"]
+
+
+def test_modules_of_the_current_folder_travel_to_workers_and_what_they_lack_is_one_line(tmp_path, monkeypatch):
+    from distributed import LocalCluster
+
+    lock = "import threading\nlock = threading.Lock()\ndef half(problem):\n    return lock and None"
+    for name, text in {
+        "turns_of_mine": "import numpy as np\nHALF = np.diag([1.0, -1.0, -1.0])",
+        "rows_of_mine": "import turns_of_mine\ndef half(problem):\n    return turns_of_mine.HALF",
+        "installed/package_of_mine": "def half(problem):\n    return None", "lock_of_mine": lock, "other_lock": lock,
+    }.items():  # fmt: skip
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.py").write_text(text)
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
+        monkeypatch.chdir(tmp_path)  # after the worker has its path
+        monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "installed")])
+
+        def run(module: str, executor="dask://" + cluster.scheduler_address.removeprefix("tcp://")) -> int:
+            rows = [f"mine={module}:half"]
+            return evaluate(small_folder(), QUICK, rows, {"lump": 2}, 2, module, executor)["methods"]["mine"]["failed"]
+
+        assert run("rows_of_mine") == 0
+        refused("a worker cannot import the rows: No module named 'package_of_mine', expected", run, "package_of_mine")
+        refused("sending the rows to workers failed: .*cannot pickle", run, "lock_of_mine", error=FatalError)
+        assert run("other_lock", executor=2) == 2  # processes of this machine import the module
 
 
 def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch):
@@ -277,6 +302,22 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
     assert set(calls) == {1}  # a frame's features do not depend, in their last bits, on the rest of a batch
 
 
+def test_the_same_data_by_another_path_continue_a_run_and_other_data_do_not(tmp_path, monkeypatch, links):
+    for name in ("data", "elsewhere/data"):
+        shutil.copytree(small_folder(), tmp_path / name)
+    (tmp_path / "link").symlink_to(tmp_path / "data")
+
+    def run(data, row: str) -> str:
+        return evaluate(data, BACKBONE, [row], {"lump": 1}, 2, tmp_path / "run")["data"]["root"]
+
+    monkeypatch.chdir(tmp_path)
+    assert run("data", "icp") == "data" and run(tmp_path / "data", "ours-bv") == str(tmp_path / "data")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert run("../link", "ours") == "../link"
+    refused("a run with data .*data, this is .*elsewhere/data; choose another folder", run, "data", "ours")
+    assert len(read_run(tmp_path / "run").settings.methods) == 3
+
+
 def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
     root = shutil.copytree(small_folder(), tmp_path / "data")
     run = functools.partial(evaluate, root, BACKBONE, ["ours-bv"], {"lump": 2}, 2)
@@ -305,6 +346,6 @@ def test_the_tables_of_an_unfinished_run_say_so(tmp_path, monkeypatch):
     # Tables that the last call has no rows for are removed, and nothing else.
     assert not list((tmp_path / "tables").glob("table_a_depth*")) and (tmp_path / "tables" / "mine.csv").exists()
     assert "Not finished" not in (tmp_path / "tables" / "all_rows.md").read_text()
-    run_rows({"category": lambda problem: np.eye(3)}, tmp_path, 4)
+    run_rows(["category"], tmp_path, 4)
     write_reports(tmp_path)
     assert not list((tmp_path / "tables").glob("all_rows*")) and (tmp_path / "tables" / "with_others.md").exists()

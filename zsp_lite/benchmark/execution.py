@@ -4,7 +4,9 @@ A chunk is a few pairs of one category that share frames. A killed run loses the
 """
 
 import os
+import pkgutil
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
@@ -16,7 +18,7 @@ from typing import Any
 import cloudpickle
 
 from zsp_lite.data.co3d import Pair
-from zsp_lite.errors import InputError, check_integer
+from zsp_lite.errors import InputError, check_integer, ends_the_run
 from zsp_lite.io.files import digest, read_bytes, write_atomic
 from zsp_lite.threads import one_thread
 
@@ -49,26 +51,34 @@ def evaluate_chunks(
             for chunk in chunks:
                 yield from ([line] for line in evaluator.lines(chunk))
         return
-    # cloudpickle: methods and backbones that are defined in a notebook travel by value. In a file, because a backbone
-    # has megabytes, and each worker reads it once.
-    pickled = cloudpickle.dumps(make)
+    pickled = _pickle(make, executor)  # in a file, because a backbone has megabytes, and each worker reads it once
     futures = []
     try:
         write_atomic(shared, pickled)
         futures += [executor.submit(_evaluate_chunk, str(shared), digest(pickled), chunk) for chunk in chunks]
         for future in as_completed(futures):
             yield future.result()
+    except ImportError as error:
+        raise InputError(f"a worker cannot import the rows: {error}, expected the module there, too") from error
     except Exception as error:
-        if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # the latter is Dask's
-            raise InputError(
-                "a worker ended abruptly, perhaps out of memory; finished pairs are stored: run again to continue, "
-                "with fewer workers"
-            ) from error
-        raise
+        if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":  # the latter is Dask's
+            raise
+        advice = "finished pairs are stored: run again to continue, with fewer workers"
+        raise InputError(f"a worker ended abruptly, perhaps out of memory; {advice}") from error
     finally:
         for future in futures:
             future.cancel()
         shared.unlink(missing_ok=True)
+
+
+def _pickle(make: Callable[[], Any], executor: Executor) -> bytes:
+    """Pickle by value what a notebook, or a module in the current folder, defines: workers need not see it."""
+    if not isinstance(executor, ProcessPoolExecutor):  # whose processes import what this one can import
+        found = {name for _, name, _ in pkgutil.iter_modules([os.getcwd()])} - {"zsp_lite"}
+        for name in found & sys.modules.keys():
+            cloudpickle.register_pickle_by_value(sys.modules[name])
+    with ends_the_run("sending the rows to workers"):
+        return cloudpickle.dumps(make)
 
 
 _worker = threading.local()  # an executor's workers may be threads

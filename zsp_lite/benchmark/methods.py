@@ -113,7 +113,7 @@ def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Metho
 
     Names are those of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, "module:thing",
     "poses.csv", or NAME=one of these. A mapping leads from names to these, to `Method`s, or to objects of one's own.
-    InputError if a name is unknown, or a thing cannot be imported or read, or is of no kind (see `own.kind_of`).
+    InputError if a name is unknown or another row's, or a thing cannot be imported or read, or is of no kind.
     """
     if not isinstance(methods, Mapping):
         names = [methods] if isinstance(methods, str) else methods
@@ -121,7 +121,13 @@ def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Metho
         methods = {name: meant or name for name, _, meant in members}
     if not methods:
         raise InputError("no methods, expected some; `zsp-lite benchmark --list` lists them")
-    return {str(name): _method(str(name), meant) for name, meant in methods.items()}
+    rows = {str(name): _method(str(name), meant) for name, meant in methods.items()}
+    taken = {*METHODS, *GROUPS, *(line["label"] for table in read_paper_tables() for line in table["rows"])}
+    for name, row in rows.items():
+        plain = re.sub(r"-n\d+$", "", name)
+        if taken & {name, plain} and not (plain in METHODS and row == _method(name, name)):
+            raise InputError(f"method {name!r} has the name of another row or of a group, expected its own")
+    return rows
 
 
 def _method(name: str, meant: Any) -> Method:

@@ -4,9 +4,9 @@ import inspect
 import os
 import pkgutil
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from zsp_lite.alignment import SCALE_RANGE, ransac
 from zsp_lite.baselines.sift import unproject_pixels
 from zsp_lite.benchmark.problem import Answer, Problem
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.exchange import PairKey, StoredPose, fit_poses
+from zsp_lite.data.exchange import StoredPose, check_poses
 from zsp_lite.errors import FatalError, InputError, describe_failure, ends_the_run, real_array
 
 KINDS = ("problem", "keypoints", "matcher")  # functions of one, two and three arguments
@@ -101,21 +101,15 @@ class StoredPoses:
     """Row of poses that another program computed (see `exchange`)."""
 
     path: str
-    _poses: Mapping[PairKey, StoredPose]
+    _poses: Mapping[str, StoredPose]  # by the key of the pair
     digest: str  # of the file
 
     def __call__(self, problem: Problem) -> Answer:
-        pair = problem.pair
-        key = pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence
-        found = [view for view, frame in enumerate(pair.target_frames) if (*key, frame) in self._poses]
-        if not found:
+        if (pose := self._poses.get(problem.pair.key)) is None:
             raise InputError(f"{self.path} has no pose")
-        if len(found) > 1:
-            raise FatalError(f"{self.path} has {len(found)} poses of the pair {pair.key}, expected one")
-        pose = self._poses[*key, pair.target_frames[found[0]]]
-        return Answer(pose.rotation, found[0], pose.translation, pose.scale)
+        view = problem.pair.target_frames.index(pose.target_frame)
+        return Answer(pose.rotation, view, pose.translation, pose.scale)
 
-    def fitted(self, dataset: Co3D, pairs: Iterable[Pair]) -> tuple["StoredPoses", str]:
-        """Return the row of the poses of some pairs, and a remark (see `exchange.fit_poses`)."""
-        poses, remark = fit_poses(self.path, self._poses, dataset, pairs)
-        return replace(self, _poses=poses), remark
+    def remark(self, dataset: Co3D, pairs: Sequence[Pair]) -> str:
+        """Return what is to be said of the poses of pairs (see `exchange.check_poses`)."""
+        return check_poses(self.path, self._poses, dataset, pairs)

@@ -80,8 +80,7 @@ def evaluate(
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
         elif isinstance(row.solve, StoredPoses):
-            solve, remark = row.solve.fitted(dataset, [pair for pair, names in work.items() if name in names])
-            rows[name] = replace(row, solve=solve)
+            remark = row.solve.remark(dataset, [pair for pair, names in work.items() if name in names])
             remarks[name] = f"{name}: {remark}." if remark else ""
     others = {name: f"; {fingerprint(one)}" for name, one in extractors.items() if name != "backbone"}
     with execution.open_workers(executor) as (pool, workers):

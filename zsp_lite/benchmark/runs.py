@@ -4,6 +4,7 @@ run.json holds what decides the results, and every call of `evaluate`. A line of
 `evaluate_pair` returned for a pair. One process writes to a folder; others can read it meanwhile.
 """
 
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -48,6 +49,7 @@ class Settings(msgspec.Struct):
     labels: dict[str, str]  # hash of the pose labels by category
     origins: dict[str, str]  # of the pairs: an evaluation set of the folder, or sampled
     calls: Annotated[list[Call], msgspec.Meta(min_length=1)]
+    folder: str = ""  # absolute path of the data, without links
 
 
 class _Result(msgspec.Struct):
@@ -116,6 +118,7 @@ def open_run(out: str | Path, settings: Settings, allow_other_version: bool = Fa
     """Be the only writer of a run's folder, which is new or holds a run with these settings; then `add_lines` adds."""
     with writing(out):
         out, packed = Path(out), Path(out) / f"{LINES}.gz"
+        settings.folder = os.path.realpath(settings.data).encode(errors="replace").decode()
         if any(path.exists() for path in (out / SETTINGS, out / LINES, packed)):
             settings = _continued(out, settings, allow_other_version)
         write_atomic(out / LINES, _finished_lines(out))
@@ -151,7 +154,8 @@ def _compared(settings: Settings) -> dict[str, Any]:
     """What has to be equal in two calls that add to one run, where both have it, by its name."""
     groups = {name: getattr(settings, name) for name in ("methods", "labels", "origins")}
     parts = {f"{name} of {key}": value for name, group in groups.items() for key, value in group.items()}
-    whole = {name: getattr(settings, name) for name in ("data", "backbone", "targets")}
+    whole = {name: getattr(settings, name) for name in ("backbone", "targets")}
+    whole["data"] = settings.folder or os.path.realpath(settings.data)
     version = "{version} (commit {commit})".format(**settings.library[-1])
     command = "align" if "alignment" in settings.methods else "benchmark"
     return {"command": command} | whole | parts | {"version": version}
