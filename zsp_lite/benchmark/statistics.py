@@ -24,8 +24,8 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
     """Summarise the results of a run (see `runs.Run`).
 
     "methods" has by row, over all pairs and "per_category", what `figures_of` returns, and where they are known
-    "symmetric_acc30" and the medians "translation" and "scale" of the pairs that have them. "against" has the
-    `paired_difference` of each row of the same problems to "ours". All draws resample objects.
+    "symmetric_acc30" and the medians "translation", "scale" and "milliseconds" of the pairs that have them. "against"
+    has the `paired_difference` of each row of the same problems to "ours". All draws resample objects.
     """
     rows = {str(name): row for name, row in table.groupby("row", sort=False)}
     methods, against, ours = {}, {}, rows.get("ours")
@@ -38,7 +38,8 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
                 for category in dict.fromkeys(categories) for members in [categories == category]
             },
         }  # fmt: skip
-        methods[name] |= row[["translation", "scale"]].astype(float).median().dropna().to_dict()
+        known = row[["translation", "scale"]].assign(milliseconds=1000 * row["seconds"].astype(float))
+        methods[name] |= known.astype(float).median().dropna().to_dict()
         if row["symmetric_error"].notna().any():
             known = row["symmetric_error"].fillna(row["error"]).to_numpy(np.float64)
             methods[name]["symmetric_acc30"] = float(accuracy(known, 30))
@@ -114,11 +115,11 @@ def figures_of(errors: ArrayLike, weights: Draws | None = None, categories: np.n
         "median": median,
         "acc30": lambda errors, weights=None: accuracy(errors, 30, weights),
         "acc15": lambda errors, weights=None: accuracy(errors, 15, weights),
+        "above150": lambda errors, weights=None: 100 * weighted_mean(errors > 150, weights),
+        "auc30": lambda errors, weights=None: 100 * weighted_mean(np.clip(1 - errors / 30, 0, None), weights),
     } | ({} if categories is None else {"mean_category_median": mean_category_median})
     found = {"n": int(errors.size)} | {name: float(figure(errors)) for name, figure in figures.items()}
-    found |= {f"{name}_ci": bootstrap_ci(errors, figure, weights) for name, figure in figures.items()}
-    above150, auc30 = 100 * np.mean(errors > 150), 100 * np.mean(np.clip(1 - errors / 30, 0, None))
-    return found | {"above150": float(above150), "auc30": float(auc30)}
+    return found | {f"{name}_ci": bootstrap_ci(errors, figure, weights) for name, figure in figures.items()}
 
 
 def paired_difference(first: ArrayLike, second: ArrayLike, threshold: float = 30, weights: Draws | None = None) -> dict:
