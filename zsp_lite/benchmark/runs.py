@@ -96,7 +96,9 @@ class Run:
         data |= {"pairs": int(self.table["row"].value_counts().max()), "targets": self.settings.targets}
         notes = " ".join(filter(None, [self.note, *self.failures]))
         note = {"note": notes} if notes else {}
-        return {"data": data, "backbone": backbone} | note | summarise(self.table) | {"timings": dict(self.timings)}
+        seconds = self.table.astype({"seconds": float}).groupby("row", sort=False)["seconds"].median().dropna()
+        times = {"timings": dict(self.timings), "milliseconds": (1000 * seconds).to_dict()}
+        return {"data": data, "backbone": backbone} | note | summarise(self.table) | times
 
     @cached_property
     def failures(self) -> list[str]:

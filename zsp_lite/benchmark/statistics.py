@@ -24,8 +24,8 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
     """Summarise the results of a run (see `runs.Run`).
 
     "methods" has by row, over all pairs and "per_category", what `figures_of` returns, and where they are known
-    "symmetric_acc30" and the medians "translation", "scale" and "milliseconds" of the pairs that have them. "against"
-    has the `paired_difference` of each row of the same problems to "ours". All draws resample objects.
+    "symmetric_acc30" and the medians "translation" and "scale" of the pairs that have them. "against" has the
+    `paired_difference` of each row of the same problems to "ours". All draws resample objects.
     """
     rows = {str(name): row for name, row in table.groupby("row", sort=False)}
     methods, against, ours = {}, {}, rows.get("ours")
@@ -38,8 +38,7 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
                 for category in dict.fromkeys(categories) for members in [categories == category]
             },
         }  # fmt: skip
-        known = row[["translation", "scale"]].assign(milliseconds=1000 * row["seconds"].astype(float))
-        methods[name] |= known.astype(float).median().dropna().to_dict()
+        methods[name] |= row[["translation", "scale"]].astype(float).median().dropna().to_dict()
         if row["symmetric_error"].notna().any():
             known = row["symmetric_error"].fillna(row["error"]).to_numpy(np.float64)
             methods[name]["symmetric_acc30"] = float(accuracy(known, 30))

@@ -82,8 +82,9 @@ class Table:
 
 def choose(run: Run, rows: Sequence[str]) -> dict[str, Any]:
     """Return the summary of a run with some rows, in this order, for the tables; InputError for an unknown row."""
-    methods = {name: run.summary["methods"][name] for name in rows if len(run.row(name))}
-    return run.summary | {"methods": methods, "chosen": list(methods)}
+    for name in rows:
+        run.row(name)
+    return run.summary | {"methods": {name: run.summary["methods"][name] for name in rows}, "chosen": list(rows)}
 
 
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
@@ -102,7 +103,7 @@ def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN,
         names = [*(name for name in summary["methods"] if name == "verified"), *names]
     rows = {}
     for name in names:
-        row = summary["methods"][name]
+        row = _row(summary, name)
         pairs, failed = (Cell(row[count], decimals=0) for count in ("n", "failed"))
         difference = _difference(summary.get("against", {}).get(name))
         rows[name] = [pairs, *(_cell(row, metric) for metric in metrics), failed, *difference]
@@ -132,7 +133,7 @@ def _paper_table(spec: Mapping[str, Any], summary: Mapping[str, Any], metrics: S
     titles = [*(METRICS[metric] for metric in metrics), *(f"{category} Acc30" for category in featured)]
     rows = {}
     for name, line in lines:
-        row = methods.get(name)
+        row = _row(summary, name)
         cells = [_cell(row, metric) for metric in metrics]
         cells += [_cell(row and row["per_category"].get(category), "acc30") for category in featured]
         rows[line["label"]] = cells + [Cell(line["published"][k]) if line["published"] else None for k in kept]
@@ -208,6 +209,12 @@ def _plain(name: str) -> str:
 
 def _sees_more(name: str) -> bool:
     return any(_plain(name) in rows for _, rows in SEE_MORE.values())
+
+
+def _row(summary: Mapping[str, Any], name: str) -> dict[str, Any] | None:
+    """The figures of a row with its time, or None."""
+    row = summary["methods"].get(name)
+    return row and row | {"milliseconds": summary["milliseconds"].get(name)}
 
 
 def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:

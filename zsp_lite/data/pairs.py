@@ -77,10 +77,10 @@ def labelled_categories(dataset: Co3D) -> list[str]:
     )
 
 
-def true_poses(dataset: Co3D, pairs: Sequence[Pair], views: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
+def true_poses(root: str | Path, pairs: Sequence[Pair], views: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
     """Compute the labelled pose of each pair, from its reference's camera to that of the target view with an index."""
-    labels = {category: read_labels(dataset.root, category) for category in {pair.category for pair in pairs}}
-    poses = []
+    dataset, poses = Co3D(root), []
+    labels = {category: read_labels(root, category) for category in {pair.category for pair in pairs}}
     for pair, view in zip(pairs, views, strict=True):
         first, second = pair.reference_sequence, pair.target_sequence
         reference = dataset.frame(pair.category, first, pair.reference_frame)
