@@ -1,7 +1,6 @@
 """The benchmark on a small CO3D folder whose features are perfect, so that every figure is known."""
 
 import json
-import re
 import shutil
 from dataclasses import replace
 
@@ -88,36 +87,31 @@ def test_stored_poses_give_the_errors_again(run):
     for name in ROWS:
         pairs, views, rotations, positions = found.poses(name)
         truths = true_poses(small_folder(), pairs, views)
-        keys = [pair.key for pair in pairs]
-        errors = found.row(name)["error"][keys]
+        errors = found.row(name)["error"][[pair.key for pair in pairs]]
         np.testing.assert_allclose(rotation_error(rotations, truths[:, :3, :3]), errors, atol=2e-4)
     solved = errors < 1  # of "oracle-view"
     np.testing.assert_allclose(positions[solved], truths[solved, :3, 3], atol=0.1)
 
 
-def test_the_picture_of_a_pair_shows_each_rows_pose_in_its_target_view(tmp_path, closed_figures, monkeypatch):
+def test_the_picture_of_a_pair_shows_each_rows_pose_in_its_target_view(tmp_path, closed_figures):
     def blind(problem):
         raise InputError("sees nothing")
 
     run_rows({"ours": "ours", "turned": own_method, "blind": blind}, tmp_path)
-    found = read_run(tmp_path)
+    found, dataset = read_run(tmp_path), Co3D(small_folder())
     (pair,), (view,), _, _ = found.poses("ours")
-    figure = pair_figure(found, pair.key, Co3D(small_folder()))
+    figure = pair_figure(found, pair.key, dataset)
     error, other = (f"{found.row(name)['error'][pair.key]:.0f}° off" for name in ("ours", "turned"))
-    titles = ["reference", "ours", "turned", "its points", error, other]
-    assert [axis.get_title() for axis in figure.axes] == titles
-    crop = object_crop(Co3D(small_folder()).load_pair(pair)[1][view])
+    assert [one.get_title() for one in figure.axes] == ["reference", "ours", "turned", "its points", error, other]
+    crop = object_crop(dataset.load_pair(pair)[1][view])
     assert np.array_equal(figure.axes[1].get_images()[0].get_array(), crop.rgb)
-    drawn = figure.axes[4].collections[0].get_offsets()
+    drawn, turned = (axis.collections[0].get_offsets() for axis in figure.axes[4:])
     x, y = np.floor(drawn.data).astype(int).clip(0, 223).T
     assert np.mean(crop.mask[y, x] > 0.5) > 0.9  # the pose is nearly exact
-    # A rotation alone is drawn in the middle of the object.
-    middle = figure.axes[5].collections[0].get_offsets().mean(axis=0)
-    assert np.abs(middle - 112).max() < 40
-    example = re.escape(f"expected a key such as {pair.key}")
-    refused(f"pair 'lump' has no pose in the run, {example}", pair_figure, found, "lump", Co3D(small_folder()))
-    refused("has no pose in the run", pair_figure, found, pair.key, Co3D(small_folder()), ["blind"])
-    refused("row 'nobody' is not in the run", pair_figure, found, pair.key, Co3D(small_folder()), ["nobody"])
+    assert np.abs(turned.mean(axis=0) - 112).max() < 40  # a rotation alone is drawn in the middle of the object
+    refused("pair 'lump' has no pose in the run, expected a key such as lump/", pair_figure, found, "lump", dataset)
+    refused("has no pose in the run", pair_figure, found, pair.key, dataset, ["blind"])
+    refused("row 'nobody' is not in the run", pair_figure, found, pair.key, dataset, ["nobody"])
 
 
 def test_shipped_pairs_come_first_and_only_where_there_are_enough(tmp_path):

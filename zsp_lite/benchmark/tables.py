@@ -89,6 +89,9 @@ def choose(run: Run, rows: Sequence[str]) -> dict[str, Any]:
 
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
     """Return all tables of a run; `metrics` are the figures of the table of all rows (see `METRICS`)."""
+    times = summary["milliseconds"]
+    methods = {name: row | {"milliseconds": times.get(name)} for name, row in summary["methods"].items()}
+    summary = {**summary, "methods": methods}
     first = (all_rows(summary, metrics, name) for name in ("all_rows", *SEE_MORE))
     shown = *PAPER, *(metric for metric in metrics if metric == "milliseconds")
     tables = *first, *paper_tables(summary, shown), *(by_category(summary, one) for one in PAPER)
@@ -103,7 +106,7 @@ def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN,
         names = [*(name for name in summary["methods"] if name == "verified"), *names]
     rows = {}
     for name in names:
-        row = _row(summary, name)
+        row = summary["methods"][name]
         pairs, failed = (Cell(row[count], decimals=0) for count in ("n", "failed"))
         difference = _difference(summary.get("against", {}).get(name))
         rows[name] = [pairs, *(_cell(row, metric) for metric in metrics), failed, *difference]
@@ -133,7 +136,7 @@ def _paper_table(spec: Mapping[str, Any], summary: Mapping[str, Any], metrics: S
     titles = [*(METRICS[metric] for metric in metrics), *(f"{category} Acc30" for category in featured)]
     rows = {}
     for name, line in lines:
-        row = _row(summary, name)
+        row = methods.get(name)
         cells = [_cell(row, metric) for metric in metrics]
         cells += [_cell(row and row["per_category"].get(category), "acc30") for category in featured]
         rows[line["label"]] = cells + [Cell(line["published"][k]) if line["published"] else None for k in kept]
@@ -209,12 +212,6 @@ def _plain(name: str) -> str:
 
 def _sees_more(name: str) -> bool:
     return any(_plain(name) in rows for _, rows in SEE_MORE.values())
-
-
-def _row(summary: Mapping[str, Any], name: str) -> dict[str, Any] | None:
-    """The figures of a row with its time, or None."""
-    row = summary["methods"].get(name)
-    return row and row | {"milliseconds": summary["milliseconds"].get(name)}
 
 
 def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:
