@@ -12,12 +12,15 @@ from synthetic_views import CoordinateBackbone
 
 from zsp_lite.benchmark.run import evaluate
 from zsp_lite.benchmark.runs import read_run
+from zsp_lite.benchmark.tables import pair_figure
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import write_mask
 from zsp_lite.data.labels import read_labels, relative_pose
-from zsp_lite.data.pairs import category_pairs, sample_pairs, write_published_pairs
+from zsp_lite.data.pairs import category_pairs, sample_pairs, true_poses, write_published_pairs
+from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.synthetic.ground_truth import POSES_FILE, ObjectPose, object_poses
+from zsp_lite.views import object_crop
 
 ROWS = ("ours", "ours-bv", "oracle-view")
 
@@ -77,6 +80,38 @@ def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(run):
             best_view = found.row("ours-bv").loc[pair.key]
             assert best_view["error"] == pytest.approx(angles[int(best_view["view"])], abs=1e-4)
     assert run[1]["methods"]["oracle-view"]["acc30"] >= 90
+
+
+def test_stored_poses_give_the_errors_again(run):
+    found = read_run(run[0])
+    for name in ROWS:
+        pairs, views, rotations, positions = found.poses(name)
+        truths = true_poses(small_folder(), pairs, views)
+        errors = found.row(name)["error"][[pair.key for pair in pairs]]
+        np.testing.assert_allclose(rotation_error(rotations, truths[:, :3, :3]), errors, atol=2e-4)
+    solved = errors < 1  # of "oracle-view"
+    np.testing.assert_allclose(positions[solved], truths[solved, :3, 3], atol=0.1)
+
+
+def test_the_picture_of_a_pair_shows_each_rows_pose_in_its_target_view(tmp_path, closed_figures):
+    def blind(problem):
+        raise InputError("sees nothing")
+
+    run_rows({"ours": "ours", "turned": own_method, "blind": blind}, tmp_path)
+    found, dataset = read_run(tmp_path), Co3D(small_folder())
+    (pair,), (view,), _, _ = found.poses("ours")
+    figure = pair_figure(found, pair.key, dataset)
+    error, other = (f"{found.row(name)['error'][pair.key]:.0f}° off" for name in ("ours", "turned"))
+    assert [one.get_title() for one in figure.axes] == ["reference", "ours", "turned", "its points", error, other]
+    crop = object_crop(dataset.load_pair(pair)[1][view])
+    assert np.array_equal(figure.axes[1].get_images()[0].get_array(), crop.rgb)
+    drawn, turned = (axis.collections[0].get_offsets() for axis in figure.axes[4:])
+    x, y = np.floor(drawn.data).astype(int).clip(0, 223).T
+    assert np.mean(crop.mask[y, x] > 0.5) > 0.9  # the pose is nearly exact
+    assert np.abs(turned.mean(axis=0) - 112).max() < 40  # a rotation alone is drawn in the middle of the object
+    refused("pair 'lump' has no pose in the run, expected a key such as lump/", pair_figure, found, "lump", dataset)
+    refused("has no pose in the run", pair_figure, found, pair.key, dataset, ["blind"])
+    refused("row 'nobody' is not in the run", pair_figure, found, pair.key, dataset, ["nobody"])
 
 
 def test_shipped_pairs_come_first_and_only_where_there_are_enough(tmp_path):

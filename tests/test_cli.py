@@ -203,6 +203,17 @@ def test_a_run_is_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, caps
     assert main(["tables", str(tmp_path / "b"), "--metrics", "scale"]) == 0
     headings = [(tmp_path / name / "tables/all_rows.md").read_text().splitlines()[2] for name in "ab"]
     assert ["scale ratio" in text for text in headings] == ["Acc15" not in text for text in headings] == [False, True]
+    more = ["--rows", "ours-globalsim,ours", "--latex", "intervals,time", "--size", "3,2", "--out", tmp_path / "d"]
+    assert "ms per pair" in run(["tables", tmp_path / "a", *more])
+    text = (tmp_path / "d/tables/all_rows.tex").read_text()
+    assert text.index("ours-globalsim") < text.index("ours &") and "ms per pair" in text and " [" in text
+    key = json.loads((tmp_path / "a/run.jsonl").read_text().splitlines()[0])["pair"]
+    drawn = run(["tables", tmp_path / "a", "--pair", key, "--rows", "ours"]).removeprefix("Written: ").strip()
+    name = key.replace("/", "_").replace(":", "_")
+    assert Path(drawn).name == f"pair_{name}.png" and Path(drawn).with_suffix(".pdf").is_file()
+    assert "nowhere" in run(["tables", tmp_path / "a", "--pair", key, "--data", "nowhere"], 2)
+    for wrong in ("3", "3,2,1", "0,2", "nan,2", "a,b"):
+        assert f"got '{wrong}', expected two numbers from 1 to 100" in run(["tables", "a", "--size", wrong], 2)
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--rows", "ours,ours:ours-globalsim"]) == 0
     assert "ours:ours-globalsim" in capsys.readouterr().out
 

@@ -172,6 +172,7 @@ def test_the_examples_of_methods_of_ones_own_run_as_they_stand(tmp_path, monkeyp
         elif program == "python":
             runpy.run_path(words[0])
     assert list(rows) == ["ours", "ratio", "orb", "theirs"]
+    assert float(capsys.readouterr().out.splitlines()[-1]) == pytest.approx(rows["ratio"]["median"], abs=1e-3)
     assert all(row["n"] == 1 and row["failed"] == 0 for row in rows.values())
 
 

@@ -103,25 +103,27 @@ def evaluate(
     return _write_summary(found, out)
 
 
-def write_reports(run: str | Path, out: str | Path | None = None, metrics: Sequence[str] = METRICS_SHOWN) -> dict:
-    """Write summary.json, tables/ and figures/ of a run, by default into its folder, and return the summary.
+def write_reports(
+    run: str | Path, out: str | Path | None = None, metrics: Sequence[str] = METRICS_SHOWN,
+    rows: Sequence[str] | None = None, intervals: bool = False, size: tuple[float, float] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Write summary.json, tables/ and figures/ of a run, by default into its folder, and return what tables show.
 
-    `metrics` are the figures of the table of all rows. Tables of an earlier call which have no rows now are removed.
+    `metrics` are the figures of the table of all rows, `rows` those of tables and figures, in order, by default all;
+    `intervals` puts intervals into LaTeX, `size` is that of figures (W, H) in inches. Tables of an earlier call which
+    have no rows now are removed.
     """
-    from zsp_lite.benchmark.tables import (  # workers need no matplotlib
-        SEE_MORE,
-        every_table,
-        write_figures,
-        write_tables,
-    )
+    from zsp_lite.benchmark import tables  # workers need no matplotlib
 
     found, out = read_run(run), Path(out or run)
-    for name in ("all_rows", *SEE_MORE, *(spec["name"] for spec in read_paper_tables())):
+    shown = tables.choose(found, rows) if rows else found.summary
+    for name in ("all_rows", *tables.SEE_MORE, *(spec["name"] for spec in read_paper_tables())):
         for path in (out / "tables").glob(f"{name}.*"):
             path.unlink()
-    write_tables(every_table(found.summary, metrics), out / "tables")
-    write_figures(found, out / "figures")
-    return _write_summary(found, out)
+    tables.write_tables(tables.every_table(shown, metrics), out / "tables", intervals)
+    tables.write_figures(found, out / "figures", rows, size)
+    _write_summary(found, out)
+    return shown
 
 
 def _write_summary(run: Run, out: str | Path) -> dict[str, Any]:
@@ -228,6 +230,7 @@ def _measure(answer: Answer, problem: Problem, truth: Float[np.ndarray, "4 4"]) 
     """Measure an answer: "error", and what is known of the other members of a stored result."""
     known = {name: getattr(answer, name) for name in ("view", "note", "scale", "inliers", "confidence")}
     known["error"] = rotation_error(answer.rotation, truth[:3, :3])
+    known["rotation"] = answer.rotation.ravel().round(6).tolist()
     reference, *targets = (frame.camera for frame in problem.frames())
     names = problem.pair.reference_sequence, problem.pair.target_sequence
     if (turns := common_turns(problem.store.dataset.root, problem.pair.category, *names)) is not None:
@@ -235,6 +238,8 @@ def _measure(answer: Answer, problem: Problem, truth: Float[np.ndarray, "4 4"]) 
         turned = to_camera @ turns @ to_camera.T @ truth[:3, :3]
         known["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
     ends = [problem.store.extent(name) for name in names]
+    if answer.translation is not None:
+        known["position"] = answer.translation.round(6).tolist()
     if answer.translation is not None and None not in ends:
         (first, _), (_, diameter) = ends
         centre, scale = reference.to_camera(first), 1.0 if answer.scale is None else answer.scale

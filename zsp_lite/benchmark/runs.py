@@ -13,9 +13,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
+import numpy as np
 import pandas as pd
+from jaxtyping import Float, Int
 
 from zsp_lite.benchmark.statistics import summarise
+from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import decode_json, decompress, read_bytes, read_json, write_atomic
 from zsp_lite.io.locks import writing
@@ -61,6 +64,8 @@ class _Result(msgspec.Struct):
     translation: float | None = None  # error of the object's centre in diameters of the target
     scale: float | None = None  # estimated over labelled, which is 1
     view: int | None = None
+    rotation: Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)] | None = None  # row by row
+    position: Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)] | None = None  # the pose's translation
     inliers: int | None = None
     seconds: float | None = None
     note: str = ""
@@ -93,7 +98,9 @@ class Run:
         data |= {"pairs": int(self.table["row"].value_counts().max()), "targets": self.settings.targets}
         notes = " ".join(filter(None, [self.note, *self.failures]))
         note = {"note": notes} if notes else {}
-        return {"data": data, "backbone": backbone} | note | summarise(self.table) | {"timings": dict(self.timings)}
+        seconds = self.table.astype({"seconds": float}).groupby("row", sort=False)["seconds"].median().dropna()
+        times = {"timings": dict(self.timings), "milliseconds": (1000 * seconds).to_dict()}
+        return {"data": data, "backbone": backbone} | note | summarise(self.table) | times
 
     @cached_property
     def failures(self) -> list[str]:
@@ -111,6 +118,17 @@ class Run:
         if found.empty:
             raise InputError(f"row {name!r} is not in the run, expected one of {', '.join(self.table['row'].unique())}")
         return found.set_index("pair")
+
+    def poses(
+        self, name: str
+    ) -> tuple[list[Pair], Int[np.ndarray, " n"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
+        """Return the pairs for which a row has a pose, the target views, the rotations and the translations, or NaN."""
+        found = self.row(name).dropna(subset=["rotation", "view"])
+        if found.empty:
+            raise InputError(f"row {name!r} has no poses in the run")
+        rotations = np.array(found["rotation"].tolist()).reshape(-1, 3, 3)
+        positions = np.array([position or [np.nan] * 3 for position in found["position"]])
+        return [Pair.from_key(key) for key in found.index], found["view"].to_numpy(int), rotations, positions
 
 
 @contextmanager

@@ -114,11 +114,11 @@ def figures_of(errors: ArrayLike, weights: Draws | None = None, categories: np.n
         "median": median,
         "acc30": lambda errors, weights=None: accuracy(errors, 30, weights),
         "acc15": lambda errors, weights=None: accuracy(errors, 15, weights),
+        "above150": lambda errors, weights=None: 100 * weighted_mean(errors > 150, weights),
+        "auc30": lambda errors, weights=None: 100 * weighted_mean(np.clip(1 - errors / 30, 0, None), weights),
     } | ({} if categories is None else {"mean_category_median": mean_category_median})
     found = {"n": int(errors.size)} | {name: float(figure(errors)) for name, figure in figures.items()}
-    found |= {f"{name}_ci": bootstrap_ci(errors, figure, weights) for name, figure in figures.items()}
-    above150, auc30 = 100 * np.mean(errors > 150), 100 * np.mean(np.clip(1 - errors / 30, 0, None))
-    return found | {"above150": float(above150), "auc30": float(auc30)}
+    return found | {f"{name}_ci": bootstrap_ci(errors, figure, weights) for name, figure in figures.items()}
 
 
 def paired_difference(first: ArrayLike, second: ArrayLike, threshold: float = 30, weights: Draws | None = None) -> dict:

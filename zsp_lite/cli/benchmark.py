@@ -8,6 +8,10 @@ import click
 from zsp_lite.choices import METRICS, METRICS_SHOWN
 from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples, run_options
 
+SIZE = Parsed(
+    "W,H", lambda text: tuple(map(float, text.split(","))),
+    lambda size: len(size) == 2 and all(1 <= side <= 100 for side in size), "two numbers from 1 to 100",
+)  # fmt: skip
 _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 metrics_option = click.option(
     "--metrics",
@@ -98,11 +102,26 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
 @click.argument("run", type=PATH)
 @click.option("--out", type=PATH, show_default="the run's folder", help="Folder to write.")
 @metrics_option
-def tables(run, out, metrics) -> None:
+@click.option("--rows", type=NAMES, show_default="all", help="Rows of the tables and figures, in order.")
+@click.option("--latex", type=click.Choice(("intervals", "time", "intervals,time")), help="Add these to LaTeX tables.")
+@click.option("--size", type=SIZE, help="Width and height of the figures in inches.")
+@click.option("--pair", metavar="KEY", help="Only draw this pair of run.jsonl, with the pose of each row.")
+@click.option("--data", type=PATH, show_default="the run's", help="Data folder, for --pair.")
+def tables(run, out, metrics, rows, latex, size, pair, data) -> None:
     """Write tables and figures of a benchmark run, also of one that goes on."""
-    from zsp_lite.benchmark.run import write_reports
+    from zsp_lite.benchmark.run import read_run, write_reports
+    from zsp_lite.benchmark.tables import pair_figure, save_figure
+    from zsp_lite.data.co3d import Co3D
 
-    _print_summary(write_reports(run, out, metrics), metrics, with_paper=True)
+    latex = latex or ""
+    if pair:
+        found = read_run(run)
+        figure = pair_figure(found, pair, Co3D(data or found.settings.data), rows)
+        print(f"Written: {save_figure(figure, (out or run) / 'figures', f'pair_{pair}', size)}")
+        return
+    if "time" in latex and "milliseconds" not in metrics:
+        metrics = [*metrics, "milliseconds"]
+    _print_summary(write_reports(run, out, metrics, rows, "intervals" in latex, size), metrics, with_paper=True)
 
 
 @click.command(epilog=examples("compare outputs/a outputs/b", "compare outputs/a outputs/a --rows ours:rootsift"))

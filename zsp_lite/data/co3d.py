@@ -38,6 +38,14 @@ class Pair:
         reference = f"{self.category}/{self.reference_sequence}:{self.reference_frame}"
         return f"{reference}/{self.target_sequence}:{targets}"
 
+    @classmethod
+    def from_key(cls, key: str) -> "Pair":
+        """Return the pair with a `key`."""
+        category, reference, target = key.split("/")
+        first, _, frame = reference.rpartition(":")
+        second, _, frames = target.rpartition(":")
+        return cls(category, first, int(frame), second, tuple(map(int, frames.split(","))))
+
     @property
     def seed(self) -> int:
         """Seed of all random draws for this pair; it depends on the key only."""

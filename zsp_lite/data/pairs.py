@@ -13,9 +13,10 @@ from typing import Annotated
 import msgspec
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.labels import read_labels
+from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import load_torch, plain_name, stable_hash, write_atomic
 
@@ -74,6 +75,19 @@ def labelled_categories(dataset: Co3D) -> list[str]:
         f"{dataset.root}: none of {len(categories)} categories has pose labels of two sequences, expected them in "
         "class_labels/CATEGORY/SEQUENCE.json; `zsp-lite data labels` imports published labels"
     )
+
+
+def true_poses(root: str | Path, pairs: Sequence[Pair], views: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
+    """Compute the labelled pose of each pair, from its reference's camera to that of the target view with an index."""
+    dataset, poses = Co3D(root), []
+    labels = {category: read_labels(root, category) for category in {pair.category for pair in pairs}}
+    for pair, view in zip(pairs, views, strict=True):
+        first, second = pair.reference_sequence, pair.target_sequence
+        reference = dataset.frame(pair.category, first, pair.reference_frame)
+        target = dataset.frame(pair.category, second, pair.target_frames[view])
+        of_pair = labels[pair.category]
+        poses.append(relative_pose(of_pair[first], dataset.camera(reference), of_pair[second], dataset.camera(target)))
+    return np.stack(poses)
 
 
 def pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:
