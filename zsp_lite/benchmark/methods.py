@@ -37,6 +37,7 @@ class Method:
     targets: int | None = None  # number of target views per pair; None for that of the run
     # Function of a `Problem` that replaces the paper's method; `features` is then the extractor that it uses.
     solve: Callable[[Any], Any] | None = None
+    seconds: int = field(default=60, compare=False)  # limit of a row of one's own for a pair
 
 
 _MASK = {"foreground": "mask"}
@@ -143,8 +144,9 @@ def _method(name: str, meant: Any) -> Method:
     kind = kind_of(name, meant)
     if kind == "matcher":
         return Method(settings={"matcher": meant})
-    wrap = {"estimator": Estimator, "keypoints": KeypointMatcher}.get(kind)
-    return Method(solve=wrap(meant) if wrap else meant)
+    if kind == "estimator":
+        return Method("none", solve=Estimator(meant))
+    return Method(solve=KeypointMatcher(meant) if kind == "keypoints" else meant)
 
 
 def make_extractors(backbone: FeatureExtractor, methods: Mapping[str, Method]) -> dict[str, Any]:
