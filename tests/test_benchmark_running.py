@@ -30,7 +30,6 @@ from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.execution import make_chunks, open_workers
 from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
-from zsp_lite.benchmark.problem import FrameStore, PairProblem
 from zsp_lite.benchmark.run import Evaluator, evaluate, pairs_of_rows, write_reports
 from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, read_lines, read_run
 from zsp_lite.benchmark.tables import compare
@@ -271,8 +270,10 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
             return super().__call__(images)
 
     run_rows(rows, tmp_path, 4, 3, backbone=Counting(grid=8))
-    store = FrameStore(Co3D(small_folder()), "lump", {})
-    frames = {key for pair in pairs_to_evaluate(rows, 4, 3) for key in PairProblem(pair, store).keys}
+    frames = set()
+    for pair in pairs_to_evaluate(rows, 4, 3):
+        frames |= {(pair.target_sequence, number) for number in pair.target_frames}
+        frames.add((pair.reference_sequence, pair.reference_frame))
     assert sum(calls) == len(frames)
     assert set(calls) == {1}  # a frame's features do not depend, in their last bits, on the rest of a batch
 

@@ -41,7 +41,7 @@ def icp_best_view(problem: PairProblem) -> Answer:
 def sift(problem: PairProblem) -> Answer:
     """Run "SIFT": select the view by the similarity of its mutual nearest neighbours, and fit the pose by RANSAC."""
     first: Keypoints
-    first, *others = problem.describe("sift")
+    first, *others = (crop.described["sift"] for crop in problem.crops)
     found = [mutual_matches(first, other, _K) for other in others]
     view = int(np.argmax([score_from_cosines(torch.from_numpy(similarity), _K) for *_, similarity in found]))
     one, two, _ = found[view]

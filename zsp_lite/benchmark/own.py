@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -86,18 +87,17 @@ def fails_alone(seconds: int) -> Iterator[None]:
             ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, None)
     except (InputError, KeyboardInterrupt, MemoryError):
         raise
-    except OutOfTime as error:
-        raise InputError(f"takes more than {seconds} s") from error
     except BaseException as error:
-        raise InputError(describe_failure(error)) from error
+        late = f"takes more than {seconds} s"
+        raise InputError(late if isinstance(error, OutOfTime) else describe_failure(error)) from error
 
 
 def given(method: Any, problem: PairProblem) -> Any:
-    """Return what the row of a method of one's own gets: nothing in it leads to the data set, and so to labels."""
+    """Return what the row of a method of one's own gets: copies; nothing in them leads to the data set and labels."""
     if isinstance(method, Estimator):
         with ends_the_run("reading frames"):
             return problem.store.dataset.load_pair(problem.pair), problem.seed
-    return problem.for_own_row()
+    return Problem(problem.seed, deepcopy(problem.crops), problem.store.extractors, {})
 
 
 @dataclass(frozen=True)

@@ -2,15 +2,13 @@
 
 import inspect
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
@@ -24,7 +22,6 @@ from zsp_lite.matching import key_similarities, similarities
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import IMAGE_SIZE, View, feature_maps, frame_view, object_crop
 
-FrameKey = tuple[str, int]  # sequence name and frame number
 CAPACITY = 128  # frames in memory
 
 
@@ -41,27 +38,12 @@ class Answer:
     confidence: float | None = None  # probability that the rotation error is below 30 degrees
 
 
-class Row(Protocol):
-    """A row of the benchmark's tables: any callable from a `Problem` to a pose.
-
-    A row that takes the pose of the target view whose global feature is most similar to the reference's:
-
-        def most_similar(problem):
-            first, *others = (view.features.global_feature for view in problem.views())
-            return np.eye(3), int(np.argmax([torch.cosine_similarity(first, other, dim=0) for other in others]))
-    """
-
-    def __call__(self, problem: "Problem") -> Answer | PoseEstimate | Sim3 | np.ndarray | tuple[Sim3 | np.ndarray, int]:
-        """Estimate the pose of the reference object in one of the target views.
-
-        A Sim3 or a rotation (3, 3) stands alone (target view 0) or with the view's index. InputError says that there is
-        no pose: the pair counts as failed, with an error of 180 degrees.
-        """
-        ...
-
-
 def as_answer(found: Any) -> Answer:
-    """Convert what a row returns to an Answer; InputError if it is none of what `Row` allows."""
+    """Convert what a row returns to an Answer.
+
+    It is an Answer, a PoseEstimate, or a Sim3 or rotation (3, 3), alone (target view 0) or with the view's index.
+    InputError if it is none of these.
+    """
     if isinstance(found, PoseEstimate):
         sim3, inliers = found.sim3, int(found.inliers.sum())
         return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, inliers, found.confidence)
@@ -95,29 +77,18 @@ def _timed(timings: dict[str, list[float]], stage: str, function: Callable[..., 
     return found
 
 
+@dataclass(frozen=True, eq=False)
 class Crop:
-    """A frame's object crop, resized to the backbone's input, with what extractors compute from it, each once."""
+    """A frame's object crop, resized to the backbone's input, with what extractors compute from it, by their names."""
 
-    def __init__(self, frame: Frame, extractors: Mapping[str, Any], threads: int | None, timings: dict):
-        self.frame, self.extractors = frame, extractors
-        self._threads, self._timings = threads, timings
-        self._described: dict[str, Any] = {}
-        self._views: dict[tuple[str, str], View] = {}
-
-    def describe(self, features: str) -> Any:
-        """Return what an extractor computes from the crop."""
-        if features not in self._described:
-            extractor = self.extractors[features]
-            extract = getattr(extractor, "describe", None) or partial(feature_maps, extractor)
-            # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
-            with threadpool_limits(self._threads), ends_the_run(f"features {features!r}"):
-                self._described[features] = _timed(self._timings, features, extract, [self.frame])[0]
-        return self._described[features]
+    frame: Frame
+    described: dict[str, Any] = field(default_factory=dict)
+    _views: dict[tuple[str, str], View] = field(default_factory=dict)
 
     def view(self, features: str, foreground: str) -> View:
         """Return the crop with its features and foreground (see `views.frame_view`)."""
         if (features, foreground) not in self._views:
-            self._views[features, foreground] = frame_view(self.frame, self.describe(features), foreground)
+            self._views[features, foreground] = frame_view(self.frame, self.described[features], foreground)
         return self._views[features, foreground]
 
 
@@ -131,44 +102,56 @@ class FrameStore:
         self.dataset, self.category, self.extractors, self.threads = dataset, category, extractors, threads
         self.timings: dict[str, list[float]] = {}
         self.kept: dict[Any, Any] = {}
-        self.crop = lru_cache(CAPACITY)(self._crop)
+        self._read = lru_cache(CAPACITY)(self._crop)
         self.extent = cache(partial(dataset.extent, category))
 
-    def _crop(self, key: FrameKey) -> Crop:
+    def _crop(self, sequence: str, number: int) -> Crop:
         size = getattr(self.extractors.get("backbone"), "image_size", IMAGE_SIZE)
-        with ends_the_run(f"reading frame {key[0]}/{key[1]}"):
-            annotation = self.dataset.frame(self.category, *key)
-            frame = _timed(self.timings, "reading", lambda: object_crop(self.dataset.load(annotation), size))
-        return Crop(frame, self.extractors, self.threads, self.timings)
+        with ends_the_run(f"reading frame {sequence}/{number}"):
+            annotation = self.dataset.frame(self.category, sequence, number)
+            return Crop(_timed(self.timings, "reading", lambda: object_crop(self.dataset.load(annotation), size)))
+
+    def crop(self, sequence: str, number: int, features: Iterable[str] = ()) -> Crop:
+        """Return a frame's crop with what some extractors compute from it, each once."""
+        crop = self._read(sequence, number)
+        for name in features:
+            if name not in crop.described:
+                extract = getattr(self.extractors[name], "describe", partial(feature_maps, self.extractors[name]))
+                # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
+                with threadpool_limits(self.threads), ends_the_run(f"features {name!r}"):
+                    crop.described[name] = _timed(self.timings, name, extract, [crop.frame])[0]
+        return crop
 
 
-@dataclass(eq=False)
 class Problem:
-    """One pair as a row of one's own sees it: images, depth, masks, cameras and features of both objects, and a seed.
+    """One pair as a row sees it: images, depth, masks, cameras and features of both objects, and a seed.
 
-    Nothing in it leads to the data set. Results are computed once for all rows, which get copies from `_hand_over`.
+    Nothing in it leads to the data set. A row that takes the pose of the target view whose global feature is most
+    similar to the reference's:
+
+        def most_similar(problem):
+            first, *others = (view.features.global_feature for view in problem.views())
+            return np.eye(3), int(np.argmax([torch.cosine_similarity(first, other, dim=0) for other in others]))
     """
 
-    seed: int
-    _crops: Sequence[Crop] = field(repr=False)  # the reference's first
-    _timings: dict[str, list[float]] = field(repr=False)
-    _hand_over: Callable[[Any], Any] = field(default=lambda shared: shared, repr=False)
-    _estimates: dict[tuple, PoseEstimate] = field(default_factory=dict, repr=False)
-    _similarities: dict[tuple, list[torch.Tensor]] = field(default_factory=dict, repr=False)
+    def __init__(self, seed: int, crops: Sequence[Crop], extractors: Mapping[str, Any], timings: dict[str, list]):
+        self.seed, self.crops = seed, crops  # the reference's crop first
+        self._extractors, self._timings = extractors, timings
+        self._found: dict[tuple, Any] = {}  # estimates and similarities
 
     def frames(self, depth: bool = False) -> list[Frame]:
         """Return the object crops, the reference's first, resized to the backbone's input.
 
         With `depth`, InputError, which fails the pair, if one has no depth map.
         """
-        frames = [crop.frame for crop in self._crops]
+        frames = [crop.frame for crop in self.crops]
         if depth and (missing := [frame.name for frame in frames if frame.depth is None]):
             raise InputError(f"no depth map: {', '.join(missing)}")
-        return self._hand_over(frames)
+        return frames
 
     def views(self) -> list[View]:
         """Return the crops with the features of the run's backbone, and the foreground that its saliency finds."""
-        return self._hand_over([crop.view("backbone", "saliency") for crop in self._crops])
+        return [crop.view("backbone", "saliency") for crop in self.crops]
 
     def estimate(
         self, features: str = "backbone", settings: Mapping[str, Any] | None = None, target: int | None = None
@@ -176,38 +159,34 @@ class Problem:
         """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the one with an index."""
         settings = settings or {}
         name = (features, target, *sorted(settings.items()))
-        if name not in self._estimates:
-            first, *others = self._crops if target is None else (self._crops[0], self._crops[1 + target])
+        if name not in self._found:
             plugins = {key: seeded(value, self.seed) for key, value in settings.items() if key != "solver"}
-            method = ZeroShotPose(first.extractors[features], **{**settings, **plugins}, seed=self.seed)
-            reference, *targets = (crop.view(features, method.foreground) for crop in (first, *others))
+            method = ZeroShotPose(self._extractors[features], **{**settings, **plugins}, seed=self.seed)
+            crops = self.crops if target is None else (self.crops[0], self.crops[1 + target])
+            reference, *targets = (crop.view(features, method.foreground) for crop in crops)
             matched = [self._match(method, reference, view) for view in targets]
-            self._estimates[name] = method.estimate_from_views(reference, targets, matched)
-            for stage, seconds in self._estimates[name].timings.items():
+            self._found[name] = method.estimate_from_views(reference, targets, matched)
+            for stage, seconds in self._found[name].timings.items():
                 self._timings.setdefault(stage, []).append(seconds)
-        return self._hand_over(self._estimates[name])
+        return self._found[name]
 
     def _match(self, method: ZeroShotPose, reference: View, target: View) -> ViewMatch:
         key = first, second, _ = reference.features, target.features, method.binning
-        if key not in self._similarities:
+        if key not in self._found:
             compare = similarities if method.binning else key_similarities
-            self._similarities[key] = _timed(self._timings, "similarity", compare, first, [second])
-        return _timed(self._timings, "matching", method.match_views, reference, [target], self._similarities[key])[0]
+            self._found[key] = _timed(self._timings, "similarity", compare, first, [second])
+        return _timed(self._timings, "matching", method.match_views, reference, [target], self._found[key])[0]
 
 
 class PairProblem(Problem):
-    """A problem with its pair and data set, for rows of the library."""
+    """A problem with its pair and data set, for rows of the library: results are computed once for all of these.
 
-    def __init__(self, pair: Pair, store: FrameStore):
+    `features` are the names of the extractors that the rows use.
+    """
+
+    def __init__(self, pair: Pair, store: FrameStore, features: Iterable[str] = ("backbone",)):
         self.pair, self.store = pair, store
-        targets = [(pair.target_sequence, number) for number in pair.target_frames]
-        self.keys: tuple[FrameKey, ...] = (pair.reference_sequence, pair.reference_frame), *targets
-        super().__init__(pair.seed, [store.crop(key) for key in self.keys], store.timings)
-
-    def describe(self, features: str) -> list[Any]:
-        """Return what an extractor computes from each crop."""
-        return [crop.describe(features) for crop in self._crops]
-
-    def for_own_row(self) -> Problem:
-        """Return the problem for a row of one's own: what it returns are copies, which the row may overwrite."""
-        return Problem(self.seed, self._crops, self._timings, deepcopy, self._estimates, self._similarities)
+        frames = [(pair.target_sequence, number) for number in pair.target_frames]
+        frames.insert(0, (pair.reference_sequence, pair.reference_frame))
+        crops = [store.crop(*frame, features) for frame in frames]
+        super().__init__(pair.seed, crops, store.extractors, store.timings)

@@ -25,7 +25,7 @@ from zsp_lite.benchmark.identity import environment, fingerprint, library_versio
 from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, description, make_extractors, read_paper_tables, resolve
 from zsp_lite.benchmark.own import StoredPoses, fails_alone, given
 from zsp_lite.benchmark.problem import Answer, FrameStore, PairProblem, as_answer, seeded
-from zsp_lite.benchmark.runs import Call, Result, ResultLine, Run, Settings, add_lines, open_run, read_lines, read_run
+from zsp_lite.benchmark.runs import Call, ResultLine, Run, Settings, add_lines, open_run, read_lines, read_run
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
@@ -114,19 +114,14 @@ def write_reports(run: str | Path, out: str | Path | None = None, metrics: Seque
 
     `metrics` are the figures of the table of all rows. Tables of an earlier call which have no rows now are removed.
     """
-    from zsp_lite.benchmark.tables import (  # workers need no matplotlib
-        SEE_MORE,
-        every_table,
-        write_figures,
-        write_tables,
-    )
+    from zsp_lite.benchmark import tables  # workers need no matplotlib
 
     found, out = read_run(run), Path(out or run)
-    for name in ("all_rows", *SEE_MORE, *(spec["name"] for spec in read_paper_tables())):
+    for name in ("all_rows", *tables.SEE_MORE, *(spec["name"] for spec in read_paper_tables())):
         for path in (out / "tables").glob(f"{name}.*"):
             path.unlink()
-    write_tables(every_table(found.summary, metrics), out / "tables")
-    write_figures(found, out / "figures")
+    tables.write_tables(tables.every_table(found.summary, metrics), out / "tables")
+    tables.write_figures(found, out / "figures")
     return _write_summary(found, out)
 
 
@@ -201,10 +196,10 @@ def evaluate_pair(
 ) -> dict[str, Any]:
     """Evaluate rows on a pair: a line of the run's results (see `runs.ResultLine`), with median seconds by stage."""
     store.timings.clear()
-    problem = PairProblem(pair, store)
-    for features in sorted({method.features for method in methods.values()} - {"none"}):
-        problem.describe(features)  # before the rows: its time and its failure are not those of a row
+    problem = PairProblem(pair, store, {method.features for method in methods.values()} - {"none"})
     first, second = labels[pair.reference_sequence], labels[pair.target_sequence]
+    for sequence in (pair.reference_sequence, pair.target_sequence):
+        store.extent(sequence)  # an unreadable point cloud is no failure of a row
     reference, *targets = problem.frames()
     # Ground truth from the reference's camera to each target's.
     truths = np.stack([relative_pose(first, reference.camera, second, target.camera) for target in targets])
@@ -223,27 +218,20 @@ def _evaluate(name: str, method: Method, problem: PairProblem, truths: Float[np.
             answer = as_answer(solve(seen)) if solve else _answer(method, problem, truths)
             if not 0 <= answer.view < len(truths):
                 raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
-            known = _known(answer)
+            result = {"seconds": time.perf_counter() - start} | _measure(answer, problem, truths[answer.view])
+            line = {"pair": problem.pair.key, "results": {name: result}}
+            msgspec.json.decode(msgspec.json.encode(line), type=ResultLine)  # refuses what could not be read again
     except InputError as error:  # there is no pose: without these pairs, methods that fail often would look better
         return {"error": 180.0, "failed": str(error).encode(errors="replace").decode()}
     except MemoryError as error:
         raise FatalError(f"method {name!r} failed: {describe_failure(error)}") from error
-    result = {"seconds": time.perf_counter() - start} | known | _measure(answer, problem, truths[answer.view])
     return {name: round(value, 4) if isinstance(value, float) else value for name, value in result.items()}
 
 
-def _known(answer: Answer) -> dict[str, Any]:
-    """Return what an answer says besides its pose, as members of a stored result."""
-    said = {name: getattr(answer, name) for name in ("view", "note", "scale", "inliers", "confidence")}
-    known = {name: value for name, value in said.items() if value is not None}
-    plain = msgspec.json.decode(msgspec.json.encode(known, enc_hook=np.generic.item))
-    msgspec.convert({"error": 0.0} | plain, Result)
-    return plain
-
-
-def _measure(answer: Answer, problem: PairProblem, truth: Float[np.ndarray, "4 4"]) -> dict[str, float]:
-    """Measure an answer: "error", and what is known of the other errors of a stored result."""
-    known = {"error": rotation_error(answer.rotation, truth[:3, :3])}
+def _measure(answer: Answer, problem: PairProblem, truth: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
+    """Measure an answer: "error", and what is known of the other members of a stored result."""
+    known = {name: getattr(answer, name) for name in ("view", "note", "scale", "inliers", "confidence")}
+    known["error"] = rotation_error(answer.rotation, truth[:3, :3])
     reference, *targets = (frame.camera for frame in problem.frames())
     names = problem.pair.reference_sequence, problem.pair.target_sequence
     if (turns := common_turns(problem.store.dataset.root, problem.pair.category, *names)) is not None:
@@ -256,7 +244,8 @@ def _measure(answer: Answer, problem: PairProblem, truth: Float[np.ndarray, "4 4
         centre, scale = reference.to_camera(first), 1.0 if answer.scale is None else answer.scale
         found = scale * answer.rotation @ centre + answer.translation
         known["translation"] = np.linalg.norm(found - truth[:3, :3] @ centre - truth[:3, 3]) / diameter
-    return {name: float(value) for name, value in known.items()}
+    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in known.items()}
+    return {name: value for name, value in plain.items() if value is not None}
 
 
 def _answer(method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:

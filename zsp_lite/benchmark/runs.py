@@ -50,7 +50,7 @@ class Settings(msgspec.Struct):
     calls: Annotated[list[Call], msgspec.Meta(min_length=1)]
 
 
-class Result(msgspec.Struct):
+class _Result(msgspec.Struct):
     """What a row found for a pair (see `evaluate_pair`); other members are not part of the table."""
 
     error: _Degrees
@@ -67,7 +67,7 @@ class Result(msgspec.Struct):
 
 class ResultLine(msgspec.Struct):
     pair: Annotated[str, msgspec.Meta(pattern=_KEY)]
-    results: dict[str, Result]
+    results: dict[str, _Result]
     timings: dict[str, float] = {}
 
 
@@ -77,7 +77,7 @@ class Run:
 
     settings: Settings
     # A line for each row and pair, by row, category and pair: "row", "category", "pair" (its key), "problem" (the key
-    # without target frames), "reference" and "target" (the objects, CATEGORY/SEQUENCE), and the members of `Result`.
+    # without target frames), "reference" and "target" (the objects, CATEGORY/SEQUENCE), and the members of `_Result`.
     table: pd.DataFrame
     timings: Mapping[str, float]  # median seconds by stage
     note: str = ""  # what is missing
@@ -209,7 +209,7 @@ def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
         {"row": row, "pair": line.pair} | msgspec.structs.asdict(one)
         for line in lines for row, one in line.results.items()
     ]  # fmt: skip
-    table = pd.DataFrame(results, columns=["row", "pair", *Result.__struct_fields__])
+    table = pd.DataFrame(results, columns=["row", "pair", *_Result.__struct_fields__])
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
     table["target"] = table["category"] + "/" + table["target"]
     orders = {"row": settings.methods, "category": settings.calls[-1].pairs}
