@@ -361,63 +361,54 @@ def fails(problem):
     raise KeyError("angle")
 
 
-def leaves(problem):
-    sys.exit("\udcff")
-
-
-def breaks_its_own_backbone(problem):
-    raise FatalError("my backbone")
-
-
 def never_ends(problem):
+    with suppress(BaseException):  # catches what ends it, the first time
+        while True:
+            pass
     while True:
-        try:
-            time.sleep(0.01)
-        except BaseException:  # also what ends it, the first time
-            if not problem.seed:
-                raise
-            problem.seed = 0
+        pass
 
 
-def still(problem, seed):
-    return np.eye(3)
-
-
-FAILURES = {
-    "problem": (fails, r".*test_benchmark_own_rows.py, line \d+: KeyError: 'angle'"),
-    "estimator": (SimpleNamespace(estimate=lambda reference, targets: fails(None)), ".*KeyError: 'angle'"),
-    "keypoints": (lambda first, second: fails(None), ".*KeyError: 'angle'"),
-    "matcher": (lambda similarity, first, second: fails(None), ".*KeyError: 'angle'"),
-    "answer": (lambda problem: (np.eye(3), "first"), ".*ValueError: invalid literal"),
-    "exit": (leaves, r".*SystemExit: \?"), "fatal": (breaks_its_own_backbone, ".*FatalError: my backbone"),
-    "estimator's backbone": (ZeroShotPose(lambda images: []), ".*FatalError: backbone .* returned 0"),
-    "endless": (never_ends, "takes more than 1 s"),
-}  # fmt: skip
+def keep(handed, name, answer, *things):
+    """A row that keeps what it gets."""
+    handed.setdefault(name, things)
+    return answer
 
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_row_that_fails_does_not_stop_the_others(workers, tmp_path, caplog):
-    rows = {name: row for name, (row, _) in FAILURES.items()} | {"still": still, "ours": "ours"}
-    found = evaluate(small_folder(), BACKBONE, rows, {"lump": 2}, 2, tmp_path, workers, row_seconds=1)["methods"]
-    assert [row["failed"] for row in found.values()] == [2] * len(FAILURES) + [0, 0]
-    for name, (_, told) in FAILURES.items():
+    rows = {
+        "problem": (fails, r"/.*test_benchmark_own_rows.py, line \d+: KeyError: 'angle'"),
+        "estimator": (SimpleNamespace(estimate=lambda reference, targets: fails(None)), ".*KeyError"),
+        "keypoints": (lambda first, second: fails(None), ".*KeyError"),
+        "matcher": (lambda similarity, first, second: fails(None), ".*KeyError"),
+        "answer": (lambda problem: (np.eye(3), "first"), ".*ValueError: invalid literal"),
+        "exit": (lambda problem: sys.exit("\udcff"), r".*SystemExit: \?"),
+        "backbone": (ZeroShotPose(lambda images: []), ".*FatalError: backbone .* returned 0"),
+        "endless": (never_ends, "takes more than 1 s"),
+    }  # fmt: skip
+    every = {name: row for name, (row, _) in rows.items()} | {"ours": "ours"}
+    found = evaluate(small_folder(), BACKBONE, every, {"lump": 2}, 2, tmp_path, workers, row_seconds=1)["methods"]
+    assert found.pop("ours") == run_rows(["ours"], tmp_path / "alone", 2)["ours"]
+    for name, (_, told) in rows.items():
         assert re.match(told, read_run(tmp_path).row(name)["failed"].iloc[0]) and found[name]["median"] == 180
         assert f"{name} failed on 2 of 2 pairs" in caplog.text
-    alone = run_rows(["ours"], tmp_path / "alone", 2)
-    assert found["ours"] == alone["ours"]
 
 
-def test_a_full_memory_ends_the_run_and_the_time_limit_leaves_nothing_behind(tmp_path):
+def test_a_full_memory_ends_the_run(tmp_path):
     def full(problem):
         raise MemoryError
 
     refused("'full' failed: .*MemoryError", run_rows, {"full": full, "ours": "ours"}, tmp_path, error=FatalError)
     assert not read_lines(tmp_path)
-    before = threading.active_count()
-    for delay in np.linspace(0.998, 1.002, 9):  # around the limit
+
+
+def test_a_row_that_ends_at_its_time_limit_leaves_nothing_behind():
+    threads = threading.active_count()
+    for delay in np.linspace(0.998, 1.002, 7):
         with suppress(InputError), own.fails_alone(1):
             time.sleep(delay)
-    assert threading.active_count() == before and sum(range(100_000))
+    assert threading.active_count() == threads and sum(range(100_000))
 
 
 INNER = ("__dict__", "__self__", "__func__", "__wrapped__", "func", "args", "keywords", "__closure__", "cell_contents",
@@ -433,58 +424,44 @@ def reached(thing) -> list:
         if id(thing) in seen or isinstance(thing, ENDS):
             continue
         seen[id(thing)] = thing
-        if isinstance(thing, FunctionType) and "site-packages" in thing.__code__.co_filename:
-            continue
-        todo += [getattr(thing, name) for name in (*INNER, *getattr(thing, "__slots__", ())) if hasattr(thing, name)]
-        if isinstance(thing, Mapping):
-            todo += [*thing.keys(), *thing.values()]
-        elif isinstance(thing, list | tuple | set):
-            todo += thing
+        if not isinstance(thing, FunctionType) or "site-packages" not in thing.__code__.co_filename:
+            names = *INNER, *getattr(thing, "__slots__", ())
+            todo += [getattr(thing, name) for name in names if hasattr(thing, name)]
+            todo += [*thing.keys(), *thing.values()] if isinstance(thing, Mapping) else []
+            todo += thing if isinstance(thing, list | tuple | set) else []
     return list(seen.values())
+
+
+NONE = np.zeros((0, 2)), np.zeros((0, 2)), 0.0  # no keypoints
 
 
 def test_nothing_that_a_row_of_ones_own_gets_leads_to_a_label(tmp_path):
     handed = {}
-
-    def keep(kind, *arguments, answer):
-        handed.setdefault(kind, []).extend(reached(arguments))
-        return answer
-
-    none = np.zeros((0, 2)), np.zeros((0, 2)), 0.0
     rows = {
-        "problem": lambda problem: keep("problem", problem, problem.estimate(), problem.views(), answer=np.eye(3)),
-        "estimator": SimpleNamespace(estimate=lambda *frames: keep("estimator", frames, answer=np.eye(3))),
-        "keypoints": lambda first, second: keep("keypoints", first, second, answer=none),
-        "matcher": lambda cosines, one, two: keep("matcher", cosines, one, two, answer=own_matcher(cosines, one, two)),
-        "method": Method(solve=lambda problem: keep("method", problem, answer=np.eye(3))),
+        "problem": lambda one: keep(handed, "problem", np.eye(3), one, one.frames(), one.views(), one.estimate()),
+        "method": Method(solve=lambda one: keep(handed, "method", np.eye(3), one)),
+        "estimator": SimpleNamespace(estimate=lambda *frames: keep(handed, "estimator", np.eye(3), frames)),
+        "keypoints": lambda one, two: keep(handed, "keypoints", NONE, one, two),
+        "matcher": lambda one, two, three: keep(handed, "matcher", own_matcher(one, two, three), one, two, three),
     }
-    assert not any(row["failed"] for row in run_rows({"icp": "icp", "scans-2": "scans-2"} | rows, tmp_path).values())
-    assert list(handed) == list(rows) and len(handed["problem"]) > 100
-    for kind, seen in handed.items():
-        for thing in seen:
-            assert not isinstance(thing, Co3D | Path | PoseLabel | Pair), (kind, thing)
-            assert not (isinstance(thing, str) and str(small_folder()) in thing), (kind, thing)
+    found = run_rows({"icp": "icp", "scans-2": "scans-2"} | rows, tmp_path)
+    assert not any(row["failed"] for row in found.values()) and handed.keys() == rows.keys()
+    for thing in reached(handed):
+        assert not isinstance(thing, Co3D | Path | PoseLabel | Pair), thing
+        assert not (isinstance(thing, str) and str(small_folder()) in thing), thing
 
 
 def test_the_pairs_seed_goes_to_every_row_that_takes_one(tmp_path):
     seeds, (pair,) = {}, category_pairs(Co3D(small_folder()), "lump", 1, 2)
-
-    def keep(kind, seed, answer):
-        seeds[kind] = seed
-        return answer
-
-    none = np.zeros((0, 2)), np.zeros((0, 2)), 0.0
     rows = {
-        "problem": lambda problem, seed: keep("problem", (seed, problem.seed), np.eye(3)),
-        "estimator": SimpleNamespace(estimate=lambda one, others, seed=0: keep("estimator", seed, np.eye(3))),
-        "keypoints": lambda first, second, *, seed: keep("keypoints", seed, none),
-        "matcher": lambda one, two, three, seed=0: keep("matcher", seed, own_matcher(one, two, three)),
-        "pipeline": ZeroShotPose(BACKBONE), "ours": "ours",
-    }  # fmt: skip
-    run_rows(rows, tmp_path)
-    found = read_run(tmp_path)
-    assert seeds == dict.fromkeys(("estimator", "keypoints", "matcher"), pair.seed) | {"problem": (pair.seed,) * 2}
-    assert found.row("pipeline")["error"].equals(found.row("ours")["error"])
+        "problem": lambda problem, seed: keep(seeds, "problem", np.eye(3), seed) if seed == problem.seed else None,
+        "estimator": SimpleNamespace(estimate=lambda one, others, seed=0: keep(seeds, "estimator", np.eye(3), seed)),
+        "keypoints": lambda first, second, *, seed: keep(seeds, "keypoints", NONE, seed),
+        "matcher": lambda one, two, three, seed=0: keep(seeds, "matcher", own_matcher(one, two, three), seed),
+    }
+    run_rows(rows | {"pipeline": ZeroShotPose(BACKBONE), "ours": "ours"}, tmp_path)
+    assert seeds == dict.fromkeys(rows, (pair.seed,))
+    assert read_run(tmp_path).row("pipeline")["error"].equals(read_run(tmp_path).row("ours")["error"])
 
 
 class Broken(CoordinateBackbone):

@@ -138,6 +138,19 @@ def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tabl
 
 
 @needs_signals
+def test_an_interrupt_ends_a_run_and_its_workers_with_one_line_and_the_run_can_be_continued(tmp_path):
+    words = ["benchmark", "--data", str(small_folder()), "--pairs", "12", "--methods", "ours", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "zsp_lite", *words, "--workers", "2"]
+    with subprocess.Popen(command, env=PATHS, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        while not (tmp_path / LINES).exists() or not pairs_in(tmp_path):
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.communicate()[1] == "zsp-lite: interrupted\n" and process.returncode == 130
+    stored = pairs_in(tmp_path)
+    assert 0 < len(stored) < 24 and main(words) == 0 and pairs_in(tmp_path)[: len(stored)] == stored
+
+
+@needs_signals
 def test_a_dask_cluster_that_loses_its_worker_and_starts_another_finds_the_same(undisturbed, tmp_path, monkeypatch):
     from distributed import LocalCluster
 
