@@ -63,10 +63,7 @@ class OutOfTime(BaseException):
 
 @contextmanager
 def fails_alone(seconds: int) -> Iterator[None]:
-    """Turn what code of one's own raises in the block, or that it takes too long, into an InputError: it has no pose.
-
-    A call of compiled code is not interrupted.
-    """
+    """Turn an error of the block, or that it takes too long between two calls of compiled code, into an InputError."""
     thread, ended = ctypes.c_ulong(threading.get_ident()), threading.Lock()
 
     def watch() -> None:

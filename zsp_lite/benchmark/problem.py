@@ -179,10 +179,7 @@ class Problem:
 
 
 class PairProblem(Problem):
-    """A problem with its pair and data set, for rows of the library: results are computed once for all of these.
-
-    `features` are the names of the extractors that the rows use.
-    """
+    """A problem with its pair and data set, for rows of the library; `features` are the extractors that they use."""
 
     def __init__(self, pair: Pair, store: FrameStore, features: Iterable[str] = ("backbone",)):
         self.pair, self.store = pair, store
