@@ -106,7 +106,7 @@ def exact_keypoints(store):
     """Return a matcher of the frames of a store that knows the geometry: every visible pixel and its place."""
     crops = {}
     for name in SEQUENCES:
-        for frame in (store.frame((name, number)) for number in range(FRAMES)):
+        for frame in (store.crop(name, number).frame for number in range(FRAMES)):
             crops[frame.rgb.tobytes()] = frame, placement(store.category, name)
 
     def exact(first, second):

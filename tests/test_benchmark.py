@@ -170,9 +170,9 @@ def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(tmp_pa
     labels = read_labels(small_folder(), "lump")
 
     def half_turned(problem):
-        pair, (first, second) = problem.pair, [frame.camera for frame in problem.frames()]
-        truth = relative_pose(labels[pair.reference_sequence], first, labels[pair.target_sequence], second)
-        return second.R @ np.diag([-1.0, -1, 1]) @ second.R.T @ truth[:3, :3]
+        first, second = ((labels[frame.name.partition("/")[0]], frame.camera) for frame in problem.frames())
+        truth = relative_pose(*first, *second)
+        return second[1].R @ np.diag([-1.0, -1, 1]) @ second[1].R.T @ truth[:3, :3]
 
     for turns, expected in (((180,), 0), ((90,), 90), ((), 180)):
         pose = ObjectPose(np.eye(4)[:3].tolist(), 1.0, (0, 0, 0), (1, 1, 1), turns)

@@ -5,10 +5,15 @@ import os
 import re
 import subprocess
 import sys
+import threading
+import time
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from multiprocessing import get_context
-from types import SimpleNamespace
+from pathlib import Path
+from types import FunctionType, ModuleType, SimpleNamespace
 
 import benchmark_folder
 import numpy as np
@@ -23,18 +28,18 @@ from zsp_lite.align import align_category
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark import identity
+from zsp_lite.benchmark import identity, own
 from zsp_lite.benchmark.identity import fingerprint
-from zsp_lite.benchmark.methods import EXTRACTORS, GROUPS, METHODS, Method, description, resolve
+from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, description, make_extractors, resolve
 from zsp_lite.benchmark.own import kind_of
-from zsp_lite.benchmark.problem import Answer, FrameStore, Problem
+from zsp_lite.benchmark.problem import Answer, FrameStore, PairProblem
 from zsp_lite.benchmark.run import evaluate, evaluate_pair
 from zsp_lite.benchmark.runs import LINES, read_lines, read_run
 from zsp_lite.benchmark.tables import every_table
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.exchange import write_questions
-from zsp_lite.data.labels import read_labels
+from zsp_lite.data.labels import PoseLabel, read_labels
 from zsp_lite.data.pairs import category_pairs
 from zsp_lite.errors import FatalError, InputError
 from zsp_lite.pipeline import ZeroShotPose
@@ -111,7 +116,7 @@ def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
     exact = exact_keypoints(store)
     rows = resolve({"exact": exact, "one score": lambda first, second: (*exact(first, second)[:2], 0.5)})
     for pair in category_pairs(dataset, "lump", 4, 3):
-        problem = Problem(pair, store)
+        problem = PairProblem(pair, store)
         found = evaluate_pair(pair, rows, store, read_labels(small_folder(), "lump"))["results"]
         counts = [len(exact(problem.frames()[0].rgb, target.rgb)[0]) for target in problem.frames()[1:]]
         one = found["exact"]
@@ -131,8 +136,9 @@ def test_keypoints_that_fit_no_pose_are_noted_and_those_that_are_none_fail(tmp_p
     assert read_run(tmp_path).row("none")["note"].iloc[0].startswith("pose is the best view's, not a fit: ")
     told = "matched points are 9 and 8, expected as many in both images"
     assert read_run(tmp_path).row("uneven")["failed"].iloc[0] == told
-    distances = {"distances": lambda first, second: (ones, ones, -ones[:, 0])}  # less than no match
-    refused("scores of matches are negative, expected 0 or more", run_rows, distances, tmp_path, error=FatalError)
+    run_rows({"distances": lambda first, second: (ones, ones, -ones[:, 0])}, tmp_path)  # less than no match
+    told = "scores of matches are negative, expected 0 or more"
+    assert read_run(tmp_path).row("distances")["failed"].iloc[0] == told
 
 
 COLUMNS = "pair,target_frame,rotation,translation,scale"
@@ -296,10 +302,10 @@ def test_an_answer_is_a_rotation_in_a_view_or_the_pair_fails_and_its_numbers_can
     assert told in caplog.text and told in next(iter(every_table(read_run(tmp_path).summary))).note
     run_rows({"sure": lambda problem: Answer(np.eye(3), inliers=4, confidence=1 / 3)}, tmp_path)
     assert read_run(tmp_path).row("sure")[["inliers", "confidence"]].to_numpy().tolist() == [[4, 0.3333]]
-    for wrong in ({"inliers": "many"}, {"confidence": 2.0}, {"note": "\udcff"}):
-        with pytest.raises(InputError, match="run.jsonl cannot be written: "):
-            run_rows({"wrong": lambda problem, wrong=wrong: Answer(np.eye(3), **wrong)}, tmp_path)
-        assert not [line for line in read_lines(tmp_path) if "wrong" in line.results]
+    for wrong in ({"inliers": "many"}, {"confidence": 2.0}, {"note": "\udcff"}, {"view": 0.5}):
+        (name,) = wrong
+        run_rows({name: lambda problem, wrong=wrong: Answer(np.eye(3), **wrong)}, tmp_path)
+        assert read_run(tmp_path).row(name)["failed"].str.contains("Error: ").all()
 
 
 def test_a_row_may_answer_in_few_digits(tmp_path):
@@ -323,15 +329,11 @@ class Vandal:
     """Rows of every kind that overwrite all that they get."""
 
     def problem(self, problem):
-        overwrite(*problem.frames())
-        for view in (*problem.views(), *problem.estimate().target_views):
-            view.features.keys[:], view.features.saliency[:], view.foreground[:] = 0, 0, False
-        overwrite(*map(problem.store.frame, problem.keys))
-        problem.store.extent(problem.pair.target_sequence)[0][:] = 9
-        problem.store.kept[problem.pair] = np.zeros(3)
-        problem.store.view("backbone", problem.keys[0], "saliency").features.keys[:] = 0
         found = problem.estimate(settings={"solver": "verified"})
         found.matches.reference[:], found.sim3.R[:] = 0, np.eye(3)
+        for view in (*problem.views(), *problem.estimate().target_views):
+            view.features.keys[:], view.features.saliency[:], view.foreground[:] = 0, 0, False
+        overwrite(*problem.frames())
         return np.eye(3)
 
     def matcher(self, similarity, first, second):
@@ -372,15 +374,107 @@ def fails(problem):
     raise KeyError("angle")
 
 
-def test_a_row_with_a_bug_ends_the_run_with_one_line_that_says_where(tmp_path):
-    where = r"failed: .*test_benchmark_own_rows.py, line \d+: KeyError: 'angle'"
-    own = SimpleNamespace(estimate=lambda reference, targets: fails(None))
-    rows = fails, own, lambda first, second: fails(None), lambda similarity, first, second: fails(None)
-    for number, row in enumerate(rows):
-        refused(where, run_rows, {f"mine {number}": row}, tmp_path, error=FatalError)
-    wrong = {"mine": lambda problem: (np.eye(3), "first")}
-    refused("ValueError: invalid literal", run_rows, wrong, tmp_path, error=FatalError)
+def never_ends(problem):
+    with suppress(BaseException):  # catches what ends it, the first time
+        while True:
+            pass
+    while True:
+        pass
+
+
+def keep(handed, name, answer, *things):
+    """A row that keeps what it gets."""
+    handed.setdefault(name, things)
+    return answer
+
+
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_row_that_fails_does_not_stop_the_others(workers, tmp_path, caplog):
+    rows = {
+        "problem": (fails, r"/.*test_benchmark_own_rows.py, line \d+: KeyError: 'angle'"),
+        "estimator": (SimpleNamespace(estimate=lambda reference, targets: fails(None)), ".*KeyError"),
+        "keypoints": (lambda first, second: fails(None), ".*KeyError"),
+        "matcher": (lambda similarity, first, second: fails(None), ".*KeyError"),
+        "answer": (lambda problem: (np.eye(3), "first"), ".*ValueError: invalid literal"),
+        "exit": (lambda problem: sys.exit("\udcff"), r".*SystemExit: \?"),
+        "backbone": (ZeroShotPose(lambda images: []), ".*FatalError: backbone .* returned 0"),
+        "endless": (never_ends, "takes more than 1 s"),
+    }  # fmt: skip
+    every = {name: row for name, (row, _) in rows.items()} | {"ours": "ours"}
+    found = evaluate(small_folder(), BACKBONE, every, {"lump": 2}, 2, tmp_path, workers, row_seconds=1)["methods"]
+    assert found.pop("ours") == run_rows(["ours"], tmp_path / "alone", 2)["ours"]
+    for name, (_, told) in rows.items():
+        assert re.match(told, read_run(tmp_path).row(name)["failed"].iloc[0]) and found[name]["median"] == 180
+        assert f"{name} failed on 2 of 2 pairs" in caplog.text
+
+
+def test_a_full_memory_ends_the_run(tmp_path):
+    def full(problem):
+        raise MemoryError
+
+    refused("'full' failed: .*MemoryError", run_rows, {"full": full, "ours": "ours"}, tmp_path, error=FatalError)
     assert not read_lines(tmp_path)
+
+
+def test_a_row_that_ends_at_its_time_limit_leaves_nothing_behind():
+    threads = threading.active_count()
+    for delay in np.linspace(0.998, 1.002, 7):
+        with suppress(InputError), own.fails_alone(1):
+            time.sleep(delay)
+    assert threading.active_count() == threads and sum(range(100_000))
+
+
+INNER = ("__dict__", "__self__", "__func__", "__wrapped__", "func", "args", "keywords", "__closure__", "cell_contents",
+         "__defaults__", "__kwdefaults__")  # fmt: skip
+ENDS = ModuleType | type | torch.nn.Module | torch.Tensor | np.ndarray
+
+
+def reached(thing) -> list:
+    """Return all that an object leads to, up to torch's modules, arrays and functions of installed packages."""
+    seen, todo = {}, [thing]
+    while todo:
+        thing = todo.pop()
+        if id(thing) in seen or isinstance(thing, ENDS):
+            continue
+        seen[id(thing)] = thing
+        if not isinstance(thing, FunctionType) or "site-packages" not in thing.__code__.co_filename:
+            names = *INNER, *getattr(thing, "__slots__", ())
+            todo += [getattr(thing, name) for name in names if hasattr(thing, name)]
+            todo += [*thing.keys(), *thing.values()] if isinstance(thing, Mapping) else []
+            todo += thing if isinstance(thing, list | tuple | set) else []
+    return list(seen.values())
+
+
+NONE = np.zeros((0, 2)), np.zeros((0, 2)), 0.0  # no keypoints
+
+
+def test_nothing_that_a_row_of_ones_own_gets_leads_to_a_label(tmp_path):
+    handed = {}
+    rows = {
+        "problem": lambda one: keep(handed, "problem", np.eye(3), one, one.frames(), one.views(), one.estimate()),
+        "method": Method(solve=lambda one: keep(handed, "method", np.eye(3), one)),
+        "estimator": SimpleNamespace(estimate=lambda *frames: keep(handed, "estimator", np.eye(3), frames)),
+        "keypoints": lambda one, two: keep(handed, "keypoints", NONE, one, two),
+        "matcher": lambda one, two, three: keep(handed, "matcher", own_matcher(one, two, three), one, two, three),
+    }
+    found = run_rows({"icp": "icp", "scans-2": "scans-2"} | rows, tmp_path)
+    assert not any(row["failed"] for row in found.values()) and handed.keys() == rows.keys()
+    for thing in reached(handed):
+        assert not isinstance(thing, Co3D | Path | PoseLabel | Pair), thing
+        assert not (isinstance(thing, str) and str(small_folder()) in thing), thing
+
+
+def test_the_pairs_seed_goes_to_every_row_that_takes_one(tmp_path):
+    seeds, (pair,) = {}, category_pairs(Co3D(small_folder()), "lump", 1, 2)
+    rows = {
+        "problem": lambda problem, seed: keep(seeds, "problem", np.eye(3), seed) if seed == problem.seed else None,
+        "estimator": SimpleNamespace(estimate=lambda one, others, seed=0: keep(seeds, "estimator", np.eye(3), seed)),
+        "keypoints": lambda first, second, *, seed: keep(seeds, "keypoints", NONE, seed),
+        "matcher": lambda one, two, three, seed=0: keep(seeds, "matcher", own_matcher(one, two, three), seed),
+    }
+    run_rows(rows | {"pipeline": ZeroShotPose(BACKBONE), "ours": "ours"}, tmp_path)
+    assert seeds == dict.fromkeys(rows, (pair.seed,))
+    assert read_run(tmp_path).row("pipeline")["error"].equals(read_run(tmp_path).row("ours")["error"])
 
 
 class Broken(CoordinateBackbone):
@@ -398,7 +492,7 @@ class Broken(CoordinateBackbone):
     (lambda maps: maps[1:], r"returned \d of"), (lambda maps: maps[9], "IndexError"),
 ])  # fmt: skip
 @pytest.mark.parametrize(
-    "run", ["ours", "category", lambda problem: problem.views() and np.eye(3), "estimator", "align"]
+    "run", ["ours", "category", lambda problem: problem.views() and np.eye(3), own_matcher, "align"]
 )
 def test_a_broken_backbone_ends_the_run_and_nothing_is_stored(tmp_path, monkeypatch, wrong, told, run):
     monkeypatch.setattr(Broken, "wrong", staticmethod(wrong))
@@ -407,7 +501,7 @@ def test_a_broken_backbone_ends_the_run_and_nothing_is_stored(tmp_path, monkeypa
         if run == "align":
             align_category(Co3D(small_folder()), "lump", backbone, targets=2, out=tmp_path)
         else:
-            run_rows({"row": ZeroShotPose(backbone) if run == "estimator" else run}, tmp_path, backbone=backbone)
+            run_rows({"row": run}, tmp_path, backbone=backbone)
     assert not (tmp_path / LINES).read_bytes()
 
 
@@ -431,7 +525,7 @@ def test_an_unreadable_frame_ends_the_run_and_nothing_is_stored_for_its_pairs(tm
 def test_groups_are_made_of_rows_and_rows_of_known_features():
     rows = {name: set(resolve(name)) for name in GROUPS}
     assert all(row in METHODS or row.rpartition("-n")[0] in METHODS for row in set().union(*rows.values()))
-    assert all(method.features in EXTRACTORS for method in METHODS.values())
+    assert make_extractors(BACKBONE, METHODS)["backbone"] is BACKBONE
     assert not GROUPS.keys() & METHODS.keys()  # a name is a row or a group, never both
     assert list(resolve(["table3", "ours"])) == list(GROUPS["table3"])
 

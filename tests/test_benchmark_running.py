@@ -30,7 +30,6 @@ from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.execution import make_chunks, open_workers
 from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
-from zsp_lite.benchmark.problem import FrameStore, Problem
 from zsp_lite.benchmark.run import Evaluator, evaluate, pairs_of_rows, write_reports
 from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, read_lines, read_run
 from zsp_lite.benchmark.tables import compare
@@ -136,6 +135,19 @@ def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tabl
     assert seen[-1] == len(pairs_in(tmp_path)) < 12
     assert evaluate(*arguments)["methods"] == undisturbed[1]["methods"]
     assert seen[-1] == len(pairs_in(tmp_path)) == len(set(pairs_in(tmp_path))) == 12
+
+
+@needs_signals
+def test_an_interrupt_ends_a_run_and_its_workers_with_one_line_and_the_run_can_be_continued(tmp_path):
+    words = ["benchmark", "--data", str(small_folder()), "--pairs", "12", "--methods", "ours", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "zsp_lite", *words, "--workers", "2"]
+    with subprocess.Popen(command, env=PATHS, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        while not (tmp_path / LINES).exists() or not pairs_in(tmp_path):
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.communicate()[1] == "zsp-lite: interrupted\n" and process.returncode == 130
+    stored = pairs_in(tmp_path)
+    assert 0 < len(stored) < 24 and main(words) == 0 and pairs_in(tmp_path)[: len(stored)] == stored
 
 
 @needs_signals
@@ -296,8 +308,10 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
             return super().__call__(images)
 
     run_rows(rows, tmp_path, 4, 3, backbone=Counting(grid=8))
-    store = FrameStore(Co3D(small_folder()), "lump", {})
-    frames = {key for pair in pairs_to_evaluate(rows, 4, 3) for key in Problem(pair, store).keys}
+    frames = set()
+    for pair in pairs_to_evaluate(rows, 4, 3):
+        frames |= {(pair.target_sequence, number) for number in pair.target_frames}
+        frames.add((pair.reference_sequence, pair.reference_frame))
     assert sum(calls) == len(frames)
     assert set(calls) == {1}  # a frame's features do not depend, in their last bits, on the rest of a batch
 

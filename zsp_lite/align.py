@@ -19,7 +19,7 @@ from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.benchmark.baseline_rows import hypotheses
 from zsp_lite.benchmark.execution import Chunk, open_workers
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
-from zsp_lite.benchmark.problem import FrameStore, Problem
+from zsp_lite.benchmark.problem import FrameStore, PairProblem
 from zsp_lite.benchmark.run import evaluate_pairs
 from zsp_lite.benchmark.runs import Call, Settings, open_run, read_lines
 from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
@@ -55,7 +55,7 @@ class PairSolver:
         for pair, _ in chunk:
             line: dict[str, Any] = {"pair": pair.key}
             with suppress(NoPoseError):
-                found = hypotheses(Problem(pair, self._store))
+                found = hypotheses(PairProblem(pair, self._store))
                 line |= {"centre": found.centre.tolist(), "matrices": [one.matrix.tolist() for one in found.sim3s]}
                 line |= {"probabilities": found.probabilities.tolist(), "span": found.span}
             yield line

@@ -28,6 +28,10 @@ _DASK_TIMEOUT = 15  # seconds to wait for a scheduler
 _UNKNOWN_WORKERS = 256  # of an executor that does not tell
 
 
+class _Processes(ProcessPoolExecutor):
+    """Processes that `open_workers` ends; the pool's thread would print a traceback if their futures were cancelled."""
+
+
 def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[Chunk]:
     """Divide pairs into chunks of one category and at most `size` pairs, which share frames."""
     chunks: list[Chunk] = []
@@ -66,8 +70,9 @@ def evaluate_chunks(
         advice = "finished pairs are stored: run again to continue, with fewer workers"
         raise InputError(f"a worker ended abruptly, perhaps out of memory; {advice}") from error
     finally:
-        for future in futures:
-            future.cancel()
+        if not isinstance(executor, _Processes):
+            for future in futures:
+                future.cancel()
         shared.unlink(missing_ok=True)
 
 
@@ -115,7 +120,7 @@ def open_workers(executor: Executor | str | int = 1) -> Iterator[tuple[Executor 
         return
     before = set(active_children())
     # Spawned, not forked: a fork of a process whose threads have already computed may hang.
-    with ProcessPoolExecutor(executor, get_context("spawn"), _start_worker) as pool:
+    with _Processes(executor, get_context("spawn"), _start_worker) as pool:
         try:
             yield pool, executor
         except BaseException:  # ends at once, without waiting for what is being evaluated

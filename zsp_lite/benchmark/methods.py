@@ -16,20 +16,12 @@ from zsp_lite.data.exchange import read_poses
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureExtractor
 
-# Feature extractors by name, as functions of the backbone under test. They are called on images, or `describe` frames.
-EXTRACTORS: dict[str, Callable[[Any], Any]] = {
-    "none": lambda backbone: None,  # for rows that use depth only
-    "backbone": lambda backbone: backbone,
-    "rootsift": lambda backbone: RootSift(),
-    "sift": lambda backbone: Sift(),
-}
-
 
 @dataclass(frozen=True)
 class Method:
     """A row of the tables: the paper's method with some settings changed, or a function of one's own."""
 
-    features: str = "backbone"  # name of the feature extractor in `EXTRACTORS`
+    features: str = "backbone"  # name of the feature extractor in `make_extractors`
     # The fitted pose; the best view without a fit ("Ours-BV"); the pose fitted in the target view that is nearest in
     # rotation to the ground truth; or the rotation between the reference and the best view without depth.
     answer: Literal["pose", "best view", "true view", "essential matrix"] = "pose"
@@ -37,6 +29,7 @@ class Method:
     targets: int | None = None  # number of target views per pair; None for that of the run
     # Function of a `Problem` that replaces the paper's method; `features` is then the extractor that it uses.
     solve: Callable[[Any], Any] | None = None
+    seconds: int = field(default=60, compare=False)  # limit of a row of one's own for a pair
 
 
 _MASK = {"foreground": "mask"}
@@ -149,13 +142,14 @@ def _method(name: str, meant: Any) -> Method:
     kind = kind_of(name, meant)
     if kind == "matcher":
         return Method(settings={"matcher": meant})
-    wrap = {"estimator": Estimator, "keypoints": KeypointMatcher}.get(kind)
-    return Method(solve=wrap(meant) if wrap else meant)
+    wrap = {"estimator": Estimator, "keypoints": KeypointMatcher}.get(kind, lambda own: own)
+    return Method("none" if kind == "estimator" else "backbone", solve=wrap(meant))
 
 
 def make_extractors(backbone: FeatureExtractor, methods: Mapping[str, Method]) -> dict[str, Any]:
-    """Make the feature extractors of rows, by name."""
-    return {name: EXTRACTORS[name](backbone) for name in dict.fromkeys(method.features for method in methods.values())}
+    """Make the feature extractors of rows, by name. They are called on images, or `describe` frames."""
+    every = {"none": None, "backbone": backbone, "rootsift": RootSift(), "sift": Sift()}
+    return {method.features: every[method.features] for method in methods.values()}
 
 
 def description(method: Method) -> str:

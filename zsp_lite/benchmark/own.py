@@ -1,22 +1,26 @@
-"""Methods of one's own: which kind of method an object is, and poses that another program computed."""
+"""Methods of one's own: which kind of method an object is, what it gets, and poses that another program computed."""
 
-import inspect
+import ctypes
 import os
 import pkgutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from zsp_lite.alignment import SCALE_RANGE, ransac
 from zsp_lite.baselines.sift import unproject_pixels
-from zsp_lite.benchmark.problem import Answer, Problem
+from zsp_lite.benchmark.problem import Answer, PairProblem, Problem, parameters, seeded
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.exchange import StoredPose, check_poses
-from zsp_lite.errors import FatalError, InputError, describe_failure, ends_the_run, real_array
+from zsp_lite.data.frames import Frame
+from zsp_lite.errors import InputError, describe_failure, ends_the_run, real_array
+from zsp_lite.pipeline import ZeroShotPose
 
 KINDS = ("problem", "keypoints", "matcher")  # functions of one, two and three arguments
 
@@ -24,20 +28,19 @@ KINDS = ("problem", "keypoints", "matcher")  # functions of one, two and three a
 def kind_of(name: str, thing: Any) -> str:
     """Tell what the thing of a row is: "estimator" (has `estimate`), or the function of one of `KINDS`.
 
-    The number of arguments without a default tells the kinds apart; an attribute `kind` of the thing comes before it.
-    InputError if it is none of these.
+    The number of arguments without a default, but for `seed`, tells the kinds apart; an attribute `kind` of the thing
+    comes before it. InputError if it is none of these.
     """
     if not isinstance(thing, type):
         if callable(getattr(thing, "estimate", None)):
             return "estimator"
         if (kind := getattr(thing, "kind", None)) in KINDS:
             return kind
-        with suppress(TypeError, ValueError):  # no function, or one of a compiled module, which has no signature
-            parameters = inspect.signature(getattr(thing, "forward", thing)).parameters.values()
-            needed = [one for one in parameters if one.default is one.empty and one.kind is not one.VAR_KEYWORD]
-            positional = all(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed)
-            if positional and len(needed) in (1, 2, 3):
-                return KINDS[len(needed) - 1]
+        others = [one for one in parameters(thing).values() if one.name != "seed"]
+        needed = [one for one in others if one.default is one.empty and one.kind is not one.VAR_KEYWORD]
+        positional = all(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed)
+        if positional and len(needed) in (1, 2, 3):
+            return KINDS[len(needed) - 1]
     raise InputError(
         f"method {name!r} is of type {type(thing).__name__}, expected a function of one argument (problem), two (two "
         "images) or three (similarities, two foregrounds), or an object with estimate(reference, targets)"
@@ -54,16 +57,56 @@ def import_object(path: str) -> Any:
         raise InputError(f"{path!r} cannot be imported: {describe_failure(error)}") from error
 
 
+class OutOfTime(BaseException):
+    """Raised in a row of one's own that takes too long; no Exception, which the row might catch."""
+
+
+@contextmanager
+def fails_alone(seconds: int) -> Iterator[None]:
+    """Turn an error of the block, or that it takes too long between two calls of compiled code, into an InputError."""
+    thread, ended = ctypes.c_ulong(threading.get_ident()), threading.Lock()
+
+    def watch() -> None:
+        wait: float = seconds
+        while not ended.acquire(timeout=wait):
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(OutOfTime))
+            wait = 1  # and again, for a block that goes on
+
+    ended.acquire()
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        try:
+            yield
+        finally:
+            ended.release()  # compiled: nothing can be raised before it has ended the watch
+            watcher.join()
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, None)
+    except (InputError, KeyboardInterrupt, MemoryError):
+        raise
+    except BaseException as error:
+        late = f"takes more than {seconds} s"
+        raise InputError(late if isinstance(error, OutOfTime) else describe_failure(error)) from error
+
+
+def given(method: Any, problem: PairProblem) -> Any:
+    """Return what the row of a method of one's own gets: copies; nothing in them leads to the data set and labels."""
+    if isinstance(method, Estimator):
+        with ends_the_run("reading frames"):
+            return problem.store.dataset.load_pair(problem.pair), problem.seed
+    return Problem(problem.seed, deepcopy(problem.crops), problem.store.extractors, {})
+
+
 @dataclass(frozen=True)
 class Estimator:
     """Row of an object with `estimate(reference, targets)`, which gets the whole frames."""
 
     own: Any
 
-    def __call__(self, problem: Problem) -> Any:
-        with ends_the_run("reading frames"):
-            frames = problem.store.dataset.load_pair(problem.pair)
-        return self.own.estimate(*frames)
+    def __call__(self, frames_and_seed: tuple[tuple[Frame, list[Frame]], int]) -> Any:
+        frames, seed = frames_and_seed
+        own = replace(self.own, seed=seed) if isinstance(self.own, ZeroShotPose) else self.own
+        return seeded(own.estimate, seed)(*frames)
 
 
 @dataclass(frozen=True)
@@ -74,10 +117,11 @@ class KeypointMatcher:
 
     def __call__(self, problem: Problem) -> Answer:
         reference, *targets = problem.frames()
-        found = [self.own(reference.rgb.copy(), target.rgb) for target in targets]
+        own = seeded(self.own, problem.seed)
+        found = [own(reference.rgb.copy(), target.rgb) for target in targets]
         scores = [real_array("scores of matches", score) for _, _, score in found]
         if any((one < 0).any() for one in scores):  # the view of the highest sum is chosen
-            raise FatalError("scores of matches are negative, expected 0 or more")
+            raise InputError("scores of matches are negative, expected 0 or more")
         view = int(np.argmax([one.sum() for one in scores]))
         return fit_keypoints(problem, view, *found[view][:2])
 
@@ -104,7 +148,7 @@ class StoredPoses:
     _poses: Mapping[str, StoredPose]  # by the key of the pair
     digest: str  # of the file
 
-    def __call__(self, problem: Problem) -> Answer:
+    def __call__(self, problem: PairProblem) -> Answer:
         if (pose := self._poses.get(problem.pair.key)) is None:
             raise InputError(f"{self.path} has no pose")
         view = problem.pair.target_frames.index(pose.target_frame)

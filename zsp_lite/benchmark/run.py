@@ -5,13 +5,14 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 from torch import get_num_threads
@@ -22,8 +23,8 @@ from zsp_lite.baselines.geometry import essential_rotation
 from zsp_lite.benchmark import execution
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
 from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, description, make_extractors, read_paper_tables, resolve
-from zsp_lite.benchmark.own import StoredPoses
-from zsp_lite.benchmark.problem import Answer, FrameStore, Problem, as_answer
+from zsp_lite.benchmark.own import StoredPoses, fails_alone, given
+from zsp_lite.benchmark.problem import Answer, FrameStore, PairProblem, as_answer, seeded
 from zsp_lite.benchmark.runs import Call, ResultLine, Run, Settings, add_lines, open_run, read_lines, read_run
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
@@ -47,6 +48,7 @@ def evaluate(
     out: str | Path = "outputs/benchmark",
     executor: Executor | str | int = 1,
     allow_other_version: bool = False,
+    row_seconds: int = 60,
 ) -> dict[str, Any]:
     """Evaluate rows on pairs of every category, and store every finished pair in the folder of the run at once.
 
@@ -62,16 +64,19 @@ def evaluate(
         out: Folder of the run.
         executor: Number of processes; "dask://HOST:PORT"; or any `Executor`, which gets chunks of pairs.
         allow_other_version: Continue a run of another version of the library; run.json then lists both.
+        row_seconds: Time limit of a row of one's own for a pair, which fails beyond it.
 
     Returns:
         The content of OUT/summary.json (see `statistics.summarise`); `write_reports` writes tables and figures.
 
     Raises:
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds another run.
-        FatalError: A backbone or a row is broken, or a frame cannot be read.
+        FatalError: The backbone is broken, a frame cannot be read, or the memory is full.
     """
     check_integer("targets", targets, 1)
-    rows, dataset, remarks = resolve(methods), Co3D(data), {}
+    check_integer("row_seconds", row_seconds, 1, 1_000_000)
+    rows = {name: replace(row, seconds=row_seconds) for name, row in resolve(methods).items()}
+    dataset, remarks = Co3D(data), {}
     numbers = pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
     work = pairs_of_rows(dataset, rows, numbers, targets)
     loaded = as_backbone(backbone)
@@ -197,8 +202,10 @@ def evaluate_pair(
 ) -> dict[str, Any]:
     """Evaluate rows on a pair: a line of the run's results (see `runs.ResultLine`), with median seconds by stage."""
     store.timings.clear()
-    problem = Problem(pair, store)
+    problem = PairProblem(pair, store, {method.features for method in methods.values()} - {"none"})
     first, second = labels[pair.reference_sequence], labels[pair.target_sequence]
+    for sequence in (pair.reference_sequence, pair.target_sequence):
+        store.extent(sequence)  # an unreadable point cloud is no failure of a row
     reference, *targets = problem.frames()
     # Ground truth from the reference's camera to each target's.
     truths = np.stack([relative_pose(first, reference.camera, second, target.camera) for target in targets])
@@ -207,26 +214,27 @@ def evaluate_pair(
     return {"pair": pair.key, "results": results, "timings": timings}
 
 
-def _evaluate(name: str, method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -> dict[str, Any]:
-    start, own = time.perf_counter(), replace(method, targets=None) not in METHODS.values()
-    given = problem.with_copies() if own else problem
+def _evaluate(name: str, method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]) -> dict[str, Any]:
+    own = replace(method, targets=None) not in METHODS.values() and not isinstance(method.solve, StoredPoses)
+    seen = given(method.solve, problem) if own else problem
+    start = time.perf_counter()
     try:
-        answer = as_answer(method.solve(given)) if method.solve else _answer(method, problem, truths)
-        if not 0 <= answer.view < len(truths):
-            raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
-    except FatalError:
-        raise
+        with fails_alone(method.seconds) if own else nullcontext():
+            solve = seeded(method.solve, problem.seed)
+            answer = as_answer(solve(seen)) if solve else _answer(method, problem, truths)
+            if not 0 <= answer.view < len(truths):
+                raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
+            result = {"seconds": time.perf_counter() - start} | _measure(answer, problem, truths[answer.view])
+            line = {"pair": problem.pair.key, "results": {name: result}}
+            msgspec.json.decode(msgspec.json.encode(line), type=ResultLine)  # refuses what could not be read again
     except InputError as error:  # there is no pose: without these pairs, methods that fail often would look better
-        return {"error": 180.0, "failed": str(error)}
-    except Exception as error:  # a row of one's own may raise anything; a mistake of the library keeps its traceback
-        if not own:
-            raise
+        return {"error": 180.0, "failed": str(error).encode(errors="replace").decode()}
+    except MemoryError as error:
         raise FatalError(f"method {name!r} failed: {describe_failure(error)}") from error
-    result = {"seconds": time.perf_counter() - start} | _measure(answer, problem, truths[answer.view])
     return {name: round(value, 4) if isinstance(value, float) else value for name, value in result.items()}
 
 
-def _measure(answer: Answer, problem: Problem, truth: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
+def _measure(answer: Answer, problem: PairProblem, truth: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
     """Measure an answer: "error", and what is known of the other members of a stored result."""
     known = {name: getattr(answer, name) for name in ("view", "note", "scale", "inliers", "confidence")}
     known["error"] = rotation_error(answer.rotation, truth[:3, :3])
@@ -249,7 +257,7 @@ def _measure(answer: Answer, problem: Problem, truth: Float[np.ndarray, "4 4"]) 
     return {name: value for name, value in plain.items() if value is not None}
 
 
-def _answer(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:
+def _answer(method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:
     """Answer of a row that is the paper's method with other settings."""
     if method.answer == "true view":
         nearest = int(rotation_error(np.eye(3), truths[:, :3, :3]).argmin())

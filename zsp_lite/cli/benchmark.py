@@ -43,11 +43,12 @@ metrics_option = click.option(
 @click.option("--list-pairs", type=PATH, help="Only write the pairs to this CSV file, for another program.")
 @click.option("--out", type=PATH, default="outputs/benchmark", help="Folder; an existing run is continued.")
 @run_options
+@click.option("--row-seconds", type=COUNT, default=60, help="Time limit of a method of your own for a pair.")
 @metrics_option
 @click.option("--quiet", is_flag=True, help="Print no progress bar and no tables.")
 def benchmark(
     data, backbone, categories, pairs, targets, methods, list_only, list_pairs, out, workers, executor, metrics, quiet,
-    allow_other_version,
+    allow_other_version, row_seconds,
 ) -> None:  # fmt: skip
     """Measure rotation errors over many pairs, and write tables, figures and results."""
     if list_only:
@@ -67,7 +68,8 @@ def benchmark(
         asked = pairs_of_rows(dataset, resolve(methods), numbers, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
-    evaluate(dataset.root, backbone, methods, numbers, targets, out, executor or workers, allow_other_version)
+    options = executor or workers, allow_other_version, row_seconds
+    evaluate(dataset.root, backbone, methods, numbers, targets, out, *options)
     summary = write_reports(out, metrics=metrics)
     if not quiet:
         print(f"{dataset.root}, backbone {summary['backbone']}, {targets} target views")
