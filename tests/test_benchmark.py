@@ -10,7 +10,7 @@ from benchmark_folder import BACKBONE, own_method, run_rows, small_folder
 from refusals import refused
 from synthetic_views import CoordinateBackbone
 
-from zsp_lite.benchmark.run import evaluate
+from zsp_lite.benchmark.run import evaluate, write_reports
 from zsp_lite.benchmark.runs import read_run
 from zsp_lite.benchmark.tables import pair_figure
 from zsp_lite.data.co3d import Co3D
@@ -196,3 +196,23 @@ def test_object_poses_of_another_layout_cost_a_warning_and_the_figure_that_needs
     (told,) = caplog.messages
     assert str(path) in told and expected in told and told.endswith(": without it there is no symmetric_acc30")
     refused(POSES_FILE, object_poses, dataset, "lump")
+
+
+def test_seeds_repeat_every_pair_with_other_draws_and_tables_average_over_them(tmp_path):
+    arguments = (small_folder(), BACKBONE, ["ours", "ours-bv"], 3, 3)
+    evaluate(*arguments, tmp_path / "one")
+    once = read_run(tmp_path / "one")
+    evaluate(*arguments, tmp_path / "three")
+    summary = evaluate(*arguments, tmp_path / "three", seeds=3)
+    found = read_run(tmp_path / "three")
+    first = found.table[found.table["repeat"] == 0].reset_index(drop=True)
+    assert first["error"].equals(once.table["error"]), "the first seed is that of a run with one"
+    assert found.table.groupby(["row", "pair"]).size().eq(3).all()
+    assert found.table[found.table["row"] == "ours"].groupby("pair")["error"].nunique().max() > 1
+    ours, before = (one["methods"]["ours"] for one in (summary, once.summary))
+    assert ours["n"] == before["n"] and summary["data"]["pairs"] == once.summary["data"]["pairs"]
+    by_seed = [100 * (errors < 30).mean() for _, errors in found.row("ours").groupby("repeat")["error"]]
+    assert ours["acc30"] == pytest.approx(np.mean(by_seed))
+    assert ours["acc30_sd_of_seeds"] == pytest.approx(np.std(by_seed, ddof=1))
+    write_reports(tmp_path / "three")
+    assert "Acc30 of ours has a standard deviation of" in (tmp_path / "three/tables/all_rows.md").read_text()

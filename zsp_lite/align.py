@@ -37,6 +37,7 @@ class _Line(msgspec.Struct):
     """Hypotheses of a pair (see `PairHypotheses`); none if the views determine no pose."""
 
     results: ClassVar[tuple[str]] = ("alignment",)  # the rows of a line, as in `ResultLine`
+    repeat: ClassVar[int] = 0
     pair: str
     centre: list[float] = []
     matrices: list[list[list[float]]] = []

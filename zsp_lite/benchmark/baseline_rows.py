@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -67,7 +67,7 @@ class Scans:
 def _agreed(problem: PairProblem, pairs: Sequence[Pair]) -> Answer:
     """Return the pose that the hypotheses of pairs of frames agree on, those of the problem's own pair among them."""
     own, kept = hypotheses(problem), problem.store.kept
-    others = [pair for pair in pairs if pair != problem.pair]
+    others = [pair for pair in (replace(one, repeat=problem.pair.repeat) for one in pairs) if pair != problem.pair]
     for key in ((hypotheses, pair) for pair in others):
         if key not in kept:  # for other rows, and for other pairs of the same objects
             kept[key] = None

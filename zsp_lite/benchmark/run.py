@@ -49,6 +49,7 @@ def evaluate(
     executor: Executor | str | int = 1,
     allow_other_version: bool = False,
     row_seconds: int = 60,
+    seeds: int = 1,
 ) -> dict[str, Any]:
     """Evaluate rows on pairs of every category, and store every finished pair in the folder of the run at once.
 
@@ -65,6 +66,7 @@ def evaluate(
         executor: Number of processes; "dask://HOST:PORT"; or any `Executor`, which gets chunks of pairs.
         allow_other_version: Continue a run of another version of the library; run.json then lists both.
         row_seconds: Time limit of a row of one's own for a pair, which fails beyond it.
+        seeds: Number of evaluations of each pair, with other random draws of k-means and RANSAC.
 
     Returns:
         The content of OUT/summary.json (see `statistics.summarise`); `write_reports` writes tables and figures.
@@ -75,6 +77,7 @@ def evaluate(
     """
     check_integer("targets", targets, 1)
     check_integer("row_seconds", row_seconds, 1, 1_000_000)
+    check_integer("seeds", seeds, 1, 1000)
     rows = {name: replace(row, seconds=row_seconds) for name, row in resolve(methods).items()}
     dataset, remarks = Co3D(data), {}
     numbers = pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
@@ -97,11 +100,13 @@ def evaluate(
                 f"{category}, N = {n}": "evaluation set" if shipped_pairs(dataset, category, n, number) else "sampled"
                 for category, number in numbers.items() for n in {row.targets or targets for row in rows.values()}
             },
-            calls=[Call(**environment(), workers=workers, rows=list(rows), pairs=dict(numbers), remarks=remarks)],
+            calls=[Call(**environment(), workers=workers, rows=list(rows), pairs=dict(numbers), seeds=seeds,
+                        remarks=remarks)],
         )  # fmt: skip
         with open_run(out, settings, allow_other_version):
             make = partial(Evaluator, str(Path(data).resolve()), rows, backbone if pool else loaded)
-            evaluate_pairs(out, make, work, pool, workers)
+            repeated = {replace(pair, repeat=k): names for k in range(seeds) for pair, names in work.items()}
+            evaluate_pairs(out, make, repeated, pool, workers)
     found = read_run(out)
     for remark in filter(None, [*remarks.values(), *found.failures]):
         logger.warning("%s", remark)
@@ -144,8 +149,8 @@ def evaluate_pairs(
 
     `make` makes what evaluates chunks, such as an `Evaluator`, from a number of threads.
     """
-    known = {(row, line.pair) for line in read_lines(out, kind) for row in line.results}
-    new = {pair: [name for name in names if (name, pair.key) not in known] for pair, names in work.items()}
+    known = {(row, line.pair, line.repeat) for line in read_lines(out, kind) for row in line.results}
+    new = {pair: [name for name in names if (name, pair.key, pair.repeat) not in known] for pair, names in work.items()}
     todo = {pair: names for pair, names in new.items() if names}
     chunks = execution.make_chunks(todo, max(1, min(execution.CHUNK_SIZE, len(todo) // (4 * workers))))
     make = partial(make, max(1, get_num_threads() // workers))
@@ -211,7 +216,7 @@ def evaluate_pair(
     truths = np.stack([relative_pose(first, reference.camera, second, target.camera) for target in targets])
     results = {name: _evaluate(name, method, problem, truths) for name, method in methods.items()}
     timings = {stage: round(float(np.median(seconds)), 5) for stage, seconds in store.timings.items()}
-    return {"pair": pair.key, "results": results, "timings": timings}
+    return {"pair": pair.key, "results": results, "repeat": pair.repeat, "timings": timings}
 
 
 def _evaluate(name: str, method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]) -> dict[str, Any]:

@@ -37,6 +37,7 @@ class Call(msgspec.Struct):
     workers: int
     rows: list[str]
     pairs: dict[str, int]  # by category
+    seeds: int = 1  # evaluations of each pair
     finished: bool = True
     remarks: dict[str, str] = {}  # on poses from a file, by row
 
@@ -75,6 +76,7 @@ class _Result(msgspec.Struct):
 class ResultLine(msgspec.Struct):
     pair: Annotated[str, msgspec.Meta(pattern=_KEY)]
     results: dict[str, _Result]
+    repeat: int = 0
     timings: dict[str, float] = {}
 
 
@@ -83,8 +85,9 @@ class Run:
     """Results of a run on the pairs that the rows of the last call have finished (see `read_run`)."""
 
     settings: Settings
-    # A line for each row and pair, by row, category and pair: "row", "category", "pair" (its key), "problem" (the key
-    # without target frames), "reference" and "target" (the objects, CATEGORY/SEQUENCE), and the members of `_Result`.
+    # A line for each row, pair and seed, in this order: "row", "category", "pair" (its key), "repeat" (of the seed),
+    # "problem" (the key without target frames), "reference" and "target" (the objects, CATEGORY/SEQUENCE), and the
+    # members of `_Result`.
     table: pd.DataFrame
     timings: Mapping[str, float]  # median seconds by stage
     note: str = ""  # what is missing
@@ -95,7 +98,7 @@ class Run:
         # A backbone's fingerprint is its name and a hash.
         backbone = self.settings.backbone.rpartition(" ")[0] or self.settings.backbone
         data = {"root": self.settings.data, "categories": list(self.table["category"].unique())}
-        data |= {"pairs": int(self.table["row"].value_counts().max()), "targets": self.settings.targets}
+        data |= {"pairs": int(self.table.groupby("row")["pair"].nunique().max()), "targets": self.settings.targets}
         notes = " ".join(filter(None, [self.note, *self.failures]))
         note = {"note": notes} if notes else {}
         seconds = self.table.astype({"seconds": float}).groupby("row", sort=False)["seconds"].median().dropna()
@@ -106,9 +109,9 @@ class Run:
     def failures(self) -> list[str]:
         """Of each row that failed on pairs: on how many, and the reason of the first."""
         failed = self.table[self.table["failed"] != ""].groupby("row", sort=False)["failed"]
-        pairs = self.table["row"].value_counts()
+        cases = self.table["row"].value_counts()
         return [
-            f"{name} failed on {len(reasons)} of {pairs[name]} pairs, counted as 180°; the first: {reasons.iloc[0]}."
+            f"{name} failed on {len(reasons)} of {cases[name]} pairs, counted as 180°; the first: {reasons.iloc[0]}."
             for name, reasons in failed
         ]
 
@@ -218,7 +221,9 @@ def read_run(out: str | Path) -> Run:
     timings = pd.DataFrame([line.timings for line in lines]).median().to_dict()
     notes, rows = [], table["row"].unique()
     if not last.finished:
-        notes.append(f"Not finished: {table['row'].value_counts().max()} of {sum(last.pairs.values())} pairs.")
+        notes.append(
+            f"Not finished: {table['row'].value_counts().max()} of {last.seeds * sum(last.pairs.values())} pairs."
+        )
     if hidden := [name for name in settings.methods if name not in rows]:
         notes.append(f"Without {', '.join(hidden)}, which lack pairs of the last call.")
     remarks = {name: remark for call in settings.calls for name, remark in call.remarks.items() if name in rows}
@@ -228,16 +233,17 @@ def read_run(out: str | Path) -> Run:
 def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
     """Tabulate the results in the categories of the last call, by row, category and pair."""
     results = [
-        {"row": row, "pair": line.pair} | msgspec.structs.asdict(one)
+        {"row": row, "pair": line.pair, "repeat": line.repeat} | msgspec.structs.asdict(one)
         for line in lines for row, one in line.results.items()
     ]  # fmt: skip
-    table = pd.DataFrame(results, columns=["row", "pair", *_Result.__struct_fields__])
+    table = pd.DataFrame(results, columns=["row", "pair", "repeat", *_Result.__struct_fields__])
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
     table["target"] = table["category"] + "/" + table["target"]
     orders = {"row": settings.methods, "category": settings.calls[-1].pairs}
     for column, names in orders.items():
         table = table[table[column].isin(names)].astype({column: pd.CategoricalDtype(list(names))})
-    return table.sort_values(["row", "category", "problem", "pair"]).astype(dict.fromkeys(orders, object))
+    table = table[table["repeat"] < settings.calls[-1].seeds]
+    return table.sort_values(["row", "category", "problem", "pair", "repeat"]).astype(dict.fromkeys(orders, object))
 
 
 def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
@@ -245,8 +251,9 @@ def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
     views = table["pair"].str.count(",")  # one less than the target views
     finished = {}  # by number of views
     for number, found in table[table["row"].isin(settings.calls[-1].rows)].groupby(views):
-        rows_of_pair = found.groupby("pair")["row"].nunique()
-        finished[number] = set(rows_of_pair.index[rows_of_pair == found["row"].nunique()])
+        cases_of_pair = found.groupby("pair").size()
+        wanted = found["row"].nunique() * settings.calls[-1].seeds
+        finished[number] = set(cases_of_pair.index[cases_of_pair == wanted])
     problems = set(table["problem"][table["pair"].isin(set().union(*finished.values()))])
     kept = [table[:0]]
     for _, found in table.groupby("row", sort=False):

@@ -31,6 +31,7 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
     methods, against, ours = {}, {}, rows.get("ours")
     for name, row in rows.items():
         errors, drawn, categories = row["error"].to_numpy(), draws_of(row), row["category"].to_numpy(str)
+        seeds = row["repeat"].nunique()
         methods[name] = figures_of(errors, drawn, categories) | {
             "failed": int((row["failed"] != "").sum()),
             "per_category": {
@@ -38,6 +39,11 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
                 for category in dict.fromkeys(categories) for members in [categories == category]
             },
         }  # fmt: skip
+        for found in (methods[name], *methods[name]["per_category"].values()):
+            found["n"] //= seeds
+        if seeds > 1:
+            by_seed = row.groupby("repeat")["error"].apply(lambda errors: 100 * (errors < 30).mean())
+            methods[name]["acc30_sd_of_seeds"] = float(by_seed.std())
         methods[name] |= row[["translation", "scale"]].astype(float).median().dropna().to_dict()
         if row["symmetric_error"].notna().any():
             known = row["symmetric_error"].fillna(row["error"]).to_numpy(np.float64)
@@ -48,8 +54,12 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
 
 
 def draws_of(row: pd.DataFrame) -> Draws:
-    """Draw bootstrap weights of a row's pairs from resampled objects."""
-    return object_draws(row[["reference", "target"]].to_numpy(), row["category"].to_numpy())
+    """Draw bootstrap weights of a row's pairs from resampled objects, and from resampled seeds if there are several."""
+    drawn = object_draws(row[["reference", "target"]].to_numpy(), row["category"].to_numpy())
+    seeds, repeat = np.unique(row["repeat"], return_inverse=True)
+    if len(seeds) == 1:
+        return drawn
+    return drawn * _multiplicities(len(seeds), RESAMPLES, np.random.default_rng([0, len(seeds)]))[:, repeat]
 
 
 def object_draws(objects: ArrayLike, categories: ArrayLike | None = None, resamples: int = RESAMPLES) -> Draws:

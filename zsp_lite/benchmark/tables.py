@@ -169,7 +169,10 @@ def compare(first: Run, second: Run, rows: Sequence[str] | None = None, names: S
         raise InputError(f"runs have no row in common: {', '.join(of_first)} and {', '.join(of_second)}")
     for text in rows:
         one, _, other = (text, "", text) if text in of_first else text.partition(":")
-        both = first.row(one).join(second.row(other)["error"].rename("other"), how="inner").sort_index()
+        lines = (
+            run.row(name).set_index("repeat", append=True, drop=False) for run, name in ((first, one), (second, other))
+        )
+        both = next(lines).join(next(lines)["error"].rename("other"), how="inner").sort_index()
         if both.empty:
             raise InputError(f"rows {one} and {other} have no pair in common: other data or number of views")
         errors = both[["error", "other"]].to_numpy().T
@@ -236,11 +239,23 @@ def _table(
         notes.append("Translation and scale: medians of the pairs for which a row has them.")
     if "milliseconds" in metrics:
         notes.append("ms per pair: median; what rows share, such as features, counts for the first that needs it.")
-    notes += ["Intervals: 95 %, bootstrap over objects.", *more]
+    notes += ["Intervals: 95 %, bootstrap over objects.", *_note_on_seeds(summary), *more]
     pairs = f"{data['pairs']} pairs" + (" of an unfinished run" if "Not finished" in notes[0] else "")
     what = f"{Path(data['root']).name}, {pairs}, {data['targets']} target views, backbone {summary['backbone']}"
     cells = pd.DataFrame.from_dict(rows, "index", object, titles)
     return Table(name, title, cells, " ".join(filter(None, notes)), what, across)
+
+
+def _note_on_seeds(summary: Mapping[str, Any]) -> list[str]:
+    """Say how much the draws of k-means and RANSAC alone change Acc30, if there are several of each pair."""
+    spread = {name: row["acc30_sd_of_seeds"] for name, row in summary["methods"].items() if "acc30_sd_of_seeds" in row}
+    if not spread:
+        return []
+    name = "ours" if "ours" in spread else next(iter(spread))
+    return [
+        f"Means over seeds, which the intervals hold; Acc30 of {name} has a standard deviation of "
+        f"{spread[name]:.1f} points over seeds."
+    ]
 
 
 def as_csv(table: Table) -> str:

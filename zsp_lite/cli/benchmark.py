@@ -39,6 +39,7 @@ metrics_option = click.option(
     "--methods", type=NAMES, default="default",
     help="Rows or groups of rows, see --list; NAME=module:thing or NAME=poses.csv for your own.",
 )  # fmt: skip
+@click.option("--seeds", type=COUNT, default=1, help="Evaluations of each pair, with other random draws.")
 @click.option("--list", "list_only", is_flag=True, help="Print every method and group, and exit.")
 @click.option("--list-pairs", type=PATH, help="Only write the pairs to this CSV file, for another program.")
 @click.option("--out", type=PATH, default="outputs/benchmark", help="Folder; an existing run is continued.")
@@ -48,7 +49,7 @@ metrics_option = click.option(
 @click.option("--quiet", is_flag=True, help="Print no progress bar and no tables.")
 def benchmark(
     data, backbone, categories, pairs, targets, methods, list_only, list_pairs, out, workers, executor, metrics, quiet,
-    allow_other_version, row_seconds,
+    allow_other_version, row_seconds, seeds,
 ) -> None:  # fmt: skip
     """Measure rotation errors over many pairs, and write tables, figures and results."""
     if list_only:
@@ -68,7 +69,7 @@ def benchmark(
         asked = pairs_of_rows(dataset, resolve(methods), numbers, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
-    options = executor or workers, allow_other_version, row_seconds
+    options = executor or workers, allow_other_version, row_seconds, seeds
     evaluate(dataset.root, backbone, methods, numbers, targets, out, *options)
     summary = write_reports(out, metrics=metrics)
     if not quiet:

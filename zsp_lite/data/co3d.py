@@ -30,6 +30,7 @@ class Pair:
     reference_frame: int
     target_sequence: str
     target_frames: tuple[int, ...]
+    repeat: int = 0  # number of the evaluation, with random draws of its own
 
     @property
     def key(self) -> str:
@@ -48,8 +49,8 @@ class Pair:
 
     @property
     def seed(self) -> int:
-        """Seed of all random draws for this pair; it depends on the key only."""
-        return stable_hash(self.key) >> 1
+        """Seed of all random draws for this pair; it depends on the key and the repeat only."""
+        return stable_hash(f"{self.key} {self.repeat}" if self.repeat else self.key) >> 1
 
 
 class Co3D:
