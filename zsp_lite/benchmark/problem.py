@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -38,12 +38,27 @@ class Answer:
     confidence: float | None = None  # probability that the rotation error is below 30 degrees
 
 
-def as_answer(found: Any) -> Answer:
-    """Convert what a row returns to an Answer.
+class Row(Protocol):
+    """A row of the benchmark's tables: any callable from a `Problem` to a pose.
 
-    It is an Answer, a PoseEstimate, or a Sim3 or rotation (3, 3), alone (target view 0) or with the view's index.
-    InputError if it is none of these.
+    A row that takes the pose of the target view whose global feature is most similar to the reference's:
+
+        def most_similar(problem):
+            first, *others = (view.features.global_feature for view in problem.views())
+            return np.eye(3), int(np.argmax([torch.cosine_similarity(first, other, dim=0) for other in others]))
     """
+
+    def __call__(self, problem: "Problem") -> Answer | PoseEstimate | Sim3 | np.ndarray | tuple[Sim3 | np.ndarray, int]:
+        """Estimate the pose of the reference object in one of the target views.
+
+        A Sim3 or a rotation (3, 3) stands alone (target view 0) or with the view's index. InputError says that there is
+        no pose: the pair counts as failed, with an error of 180 degrees.
+        """
+        ...
+
+
+def as_answer(found: Any) -> Answer:
+    """Convert what a row returns to an Answer; InputError if it is none of what `Row` allows."""
     if isinstance(found, PoseEstimate):
         sim3, inliers = found.sim3, int(found.inliers.sum())
         return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, inliers, found.confidence)
@@ -126,12 +141,7 @@ class FrameStore:
 class Problem:
     """One pair as a row sees it: images, depth, masks, cameras and features of both objects, and a seed.
 
-    Nothing in it leads to the data set. A row that takes the pose of the target view whose global feature is most
-    similar to the reference's:
-
-        def most_similar(problem):
-            first, *others = (view.features.global_feature for view in problem.views())
-            return np.eye(3), int(np.argmax([torch.cosine_similarity(first, other, dim=0) for other in others]))
+    Nothing in it leads to the data set.
     """
 
     def __init__(self, seed: int, crops: Sequence[Crop], extractors: Mapping[str, Any], timings: dict[str, list]):
