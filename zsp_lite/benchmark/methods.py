@@ -103,14 +103,12 @@ def _members(name: str) -> list[str]:
     return [row for member in GROUPS[name] for row in _members(member)] if name in GROUPS else [name]
 
 
-def resolve(
-    methods: str | Sequence[str] | Mapping[str, Any], thresholds: Sequence[float] | None = None
-) -> dict[str, Method]:
+def resolve(methods: str | Sequence[str] | Mapping[str, Any], sweep: Sequence[float] = ()) -> dict[str, Method]:
     """Resolve names to rows, in order and without duplicates.
 
     Names are those of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, "module:thing",
     "poses.csv", or NAME=one of these. A mapping leads from names to these, to `Method`s, or to objects of one's own.
-    Each of several RANSAC thresholds V makes a row NAME@threshold=V of each.
+    Each RANSAC threshold V of a sweep makes a row NAME@threshold=V of each.
     InputError if a name is unknown or another row's, or a thing cannot be imported or read, or is of no kind.
     """
     if not isinstance(methods, Mapping):
@@ -125,7 +123,7 @@ def resolve(
         base = base_name(name)
         if taken & {name, base} and not (base in METHODS and row == _method(name, name)):
             raise InputError(f"method {name!r} has the name of another row or of a group, expected its own")
-    return _sweep(rows, thresholds) if thresholds else rows
+    return _swept(rows, sweep) if sweep else rows
 
 
 def _method(name: str, meant: Any) -> Method:
@@ -156,7 +154,7 @@ def base_name(name: str) -> str:
     return re.sub(r"(-n\d+)?(@.*)?$", "", name)
 
 
-def _sweep(rows: Mapping[str, Method], thresholds: Sequence[float]) -> dict[str, Method]:
+def _swept(rows: Mapping[str, Method], thresholds: Sequence[float]) -> dict[str, Method]:
     """Return each row with each RANSAC threshold; InputError for a row that has none."""
     swept = {}
     for (name, row), value in product(rows.items(), thresholds):

@@ -50,7 +50,7 @@ def evaluate(
     allow_other_version: bool = False,
     row_seconds: int = 60,
     seeds: int = 1,
-    sweep: Sequence[float] | None = None,
+    sweep: Sequence[float] = (),
 ) -> dict[str, Any]:
     """Evaluate rows on pairs of every category, and store every finished pair in the folder of the run at once.
 

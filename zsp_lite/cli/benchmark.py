@@ -73,7 +73,7 @@ def benchmark(
         asked = pairs_of_rows(dataset, resolve(methods), numbers, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
-    options = executor or workers, allow_other_version, row_seconds, seeds, sweep
+    options = executor or workers, allow_other_version, row_seconds, seeds, sweep or ()
     evaluate(dataset.root, backbone, methods, numbers, targets, out, *options)
     summary = write_reports(out, metrics=metrics)
     if not quiet:
