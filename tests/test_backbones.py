@@ -1,6 +1,7 @@
 """What every backbone must do, checkpoints in all their wrappings, names, downloads, images good and bad."""
 
 import hashlib
+import sys
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from torch import nn
 
 from zsp_lite.backbones import load
 from zsp_lite.backbones.backbone import Backbone
-from zsp_lite.backbones.load import PretrainedWeights, available_backbones, load_backbone, obtained_by
+from zsp_lite.backbones.load import BackboneConfig, PretrainedWeights, available_backbones, load_backbone, obtained_by
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.choices import FACETS
@@ -270,3 +271,21 @@ def test_without_the_server_one_line_says_what_to_do(server, cache, monkeypatch,
     message = refused(".", load_backbone, "dino_vits8")
     for part in (load.PRETRAINED["dino_vits8"].url, str(cache / "dino_deitsmall8_pretrain.pth"), "zsp-tiny"):
         assert part in message
+
+
+def test_a_backbone_of_ones_own_is_named_by_its_module_and_takes_no_options(tmp_path, monkeypatch):
+    text = "class Maps:\n    def __call__(self, images): ...\n\nmaps, size = Maps(), 3"
+    (tmp_path / "my_backbone_file.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])  # as a console script has it
+    named = load.named_backbone
+    assert type(named("my_backbone_file:maps", None, "key", None)).__name__ == "Maps"
+    for thing, told in (
+        ("Maps", "is of type type, expected"),
+        ("size", "is of type int, expected"),
+        ("no", "imported"),
+    ):
+        refused(told, named, f"my_backbone_file:{thing}", None, "key", None)
+    refused("is your own, expected no layer, facet or image size", named, "my_backbone_file:maps", "last", "key", None)
+    assert named("hf:gpt2", None, "key", None) == "hf:gpt2"
+    assert named("hf:gpt2", None, "key", 96) == BackboneConfig("hf:gpt2", image_size=96)

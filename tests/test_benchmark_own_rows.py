@@ -32,29 +32,33 @@ from zsp_lite.benchmark import identity, own
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, description, make_extractors, resolve
 from zsp_lite.benchmark.own import kind_of
-from zsp_lite.benchmark.problem import Answer, FrameStore, PairProblem
+from zsp_lite.benchmark.problem import Answer, FrameStore
 from zsp_lite.benchmark.run import evaluate, evaluate_pair
 from zsp_lite.benchmark.runs import LINES, read_lines, read_run
 from zsp_lite.benchmark.tables import every_table
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.exchange import write_questions
+from zsp_lite.data.frames import mask_to_bbox
 from zsp_lite.data.labels import PoseLabel, read_labels
 from zsp_lite.data.pairs import category_pairs
 from zsp_lite.errors import FatalError, InputError
-from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.pipeline import ZeroShotPose, align_best_view
+from zsp_lite.verified import VerifiedSolver
+from zsp_lite.views import object_crop
 
-OWN = ("own_method", "own_estimator", "own_matcher", "own_keypoints")
+OWN = ("own_method", "own_estimator", "own_matcher", "own_keypoints", "own_solver")
 
 
 def test_ones_own_things_of_every_kind_are_rows_by_object_and_by_name(tmp_path):
     by_object = {name: getattr(benchmark_folder, name) for name in OWN}
-    assert [kind_of(*own) for own in by_object.items()] == ["problem", "estimator", "matcher", "keypoints"]
+    assert [kind_of(*own) for own in by_object.items()] == ["problem", "estimator", "matcher", "keypoints", "solver"]
     more = {"pipeline": ZeroShotPose(BACKBONE), "row": Method(settings={"matcher": own_matcher}), "ours": "ours"}
     methods, found = run_rows(by_object | more, tmp_path / "a", 3), read_run(tmp_path / "a")
     assert list(methods) == [*OWN, *more] and all(row["failed"] == 0 for row in methods.values())
     assert set(found.row("own_method")["view"]) == {0} and set(found.row("own_estimator")["view"]) == {1}
     assert found.row("own_matcher")["error"].equals(found.row("row")["error"])
+    assert set(found.row("own_solver")["view"]) == {0} and (found.row("own_solver")["inliers"] > 3).all()
     # The pixels of two views are no matches: what they fit is far from the truth, but is fitted.
     assert (found.row("own_keypoints")["inliers"] > 3).all()
     run_rows([f"{name}=benchmark_folder:{name}" for name in OWN], tmp_path / "b", 3)
@@ -85,6 +89,9 @@ def test_the_number_of_arguments_without_a_default_or_the_attribute_kind_tells_w
     problem.kind = "problem"  # comes before the two arguments
     found = lambda one, other=None, *, third=3: 0, lambda one, two, three=3, **options: 0, Network(), problem
     assert [kind_of("mine", one) for one in found] == ["problem", "keypoints", "keypoints", "problem"]
+    solvers = align_best_view, VerifiedSolver(), lambda one, two, three, seed, threshold: 0
+    assert [kind_of("mine", one) for one in solvers] == ["solver"] * 3
+    assert kind_of("mine", lambda one, two, three, *, seed, level=0.2: 0) == "matcher"
     refused("no methods, expected some", resolve, [])
     views = resolve(["ours-n4", "near=ours-bv-n2", "far=benchmark_folder:own_method"])
     assert [(name, row.targets) for name, row in views.items()] == [("ours-n4", 4), ("near", 2), ("far", None)]
@@ -97,7 +104,8 @@ def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path):
         run_rows({"mine": lambda problem: np.eye(3)}, tmp_path)
 
 
-TAKEN = ["ours", "sift", "ours-n3", "verified-n0", "category", "table1", "SIFT", "Ours (K=50)"]
+TAKEN = ["ours", "sift", "ours-n3", "verified-n0", "category", "table1", "SIFT", "Ours (K=50)",
+         "ours@threshold=0.1", "verified-n3@threshold=0.1"]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", TAKEN)
@@ -113,16 +121,45 @@ def test_nothing_takes_the_name_of_a_row_of_the_library_or_the_paper(name):
 def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
     dataset = Co3D(small_folder())
     store = FrameStore(dataset, "lump", {"backbone": BACKBONE})
-    exact = exact_keypoints(store)
+    exact = exact_keypoints(dataset, "lump")
     rows = resolve({"exact": exact, "one score": lambda first, second: (*exact(first, second)[:2], 0.5)})
     for pair in category_pairs(dataset, "lump", 4, 3):
-        problem = PairProblem(pair, store)
         found = evaluate_pair(pair, rows, store, read_labels(small_folder(), "lump"))["results"]
-        counts = [len(exact(problem.frames()[0].rgb, target.rgb)[0]) for target in problem.frames()[1:]]
+        reference, targets = dataset.load_pair(pair)
+        reference, *targets = (object_crop(frame, None).rgb for frame in (reference, *targets))
+        counts = [len(exact(reference, target)[0]) for target in targets]
         one = found["exact"]
         assert one["view"] == np.argmax(counts) and one["inliers"] == max(counts) > 20
         assert one["error"] < 0.1 and one["scale"] == pytest.approx(1, abs=1e-3) and one["translation"] < 1e-3
         assert found["one score"]["view"] == 0 and found["one score"]["inliers"] == counts[0]
+
+
+def test_a_matcher_of_keypoints_gets_the_crops_at_the_resolution_of_the_frames(tmp_path):
+    seen, dataset = {}, Co3D(small_folder())
+    run_rows({"mine": lambda first, second: keep(seen, len(seen), NONE, first, second)}, tmp_path, 1, 1)
+    (pair,) = category_pairs(dataset, "lump", 1, 1)
+    reference, (target,) = dataset.load_pair(pair)
+    for image, frame in zip(seen[0], (reference, target), strict=True):
+        top, left, height, width = mask_to_bbox(frame.mask)
+        np.testing.assert_array_equal(image, frame.rgb[top : top + height, left : left + width])
+
+
+def test_a_sweep_makes_a_row_of_each_threshold_and_says_where_it_belongs(tmp_path):
+    keypoints, solver, values = benchmark_folder.own_keypoints, benchmark_folder.own_solver, [0.001, 0.2]
+    rows = {"mine": keypoints, "solved": solver, "verified-n2": "verified-n2"}
+    assert list(resolve(rows, values)) == [f"{name}@threshold={value}" for name in rows for value in values]
+    evaluate(small_folder(), BACKBONE, rows, {"lump": 2}, 2, tmp_path, sweep=values)
+    found = read_run(tmp_path)
+    for name in ("mine", "solved"):
+        few, many = (found.row(f"{name}@threshold={value}")["inliers"] for value in values)
+        assert (few < many).all(), name
+    assert "on validation categories, never on those that are evaluated" in next(iter(every_table(found.summary))).note
+    run_rows(rows, tmp_path / "default", 2)
+    for name in rows:
+        default = read_run(tmp_path / "default").row(name)["error"]
+        assert default.equals(found.row(f"{name}@threshold=0.2")["error"]), name
+    refused("'own' has no threshold, expected a matcher or a solver", resolve, {"own": own_method}, [0.1])
+    refused("threshold is -1, expected", resolve, {"mine": keypoints}, [-1])
 
 
 def test_keypoints_that_fit_no_pose_are_noted_and_those_that_are_none_fail(tmp_path):
@@ -395,6 +432,8 @@ def test_a_row_that_fails_does_not_stop_the_others(workers, tmp_path, caplog):
         "estimator": (SimpleNamespace(estimate=lambda reference, targets: fails(None)), ".*KeyError"),
         "keypoints": (lambda first, second: fails(None), ".*KeyError"),
         "matcher": (lambda similarity, first, second: fails(None), ".*KeyError"),
+        "solver": (lambda reference, targets, matched, seed, threshold: fails(None), ".*KeyError"),
+        "no estimate": (lambda reference, targets, matched, seed, threshold: np.eye(3), ".*AttributeError"),
         "answer": (lambda problem: (np.eye(3), "first"), ".*ValueError: invalid literal"),
         "exit": (lambda problem: sys.exit("\udcff"), r".*SystemExit: \?"),
         "backbone": (ZeroShotPose(lambda images: []), ".*FatalError: backbone .* returned 0"),
@@ -449,13 +488,14 @@ NONE = np.zeros((0, 2)), np.zeros((0, 2)), 0.0  # no keypoints
 
 
 def test_nothing_that_a_row_of_ones_own_gets_leads_to_a_label(tmp_path):
-    handed = {}
+    handed, solve = {}, benchmark_folder.own_solver
     rows = {
         "problem": lambda one: keep(handed, "problem", np.eye(3), one, one.frames(), one.views(), one.estimate()),
         "method": Method(solve=lambda one: keep(handed, "method", np.eye(3), one)),
         "estimator": SimpleNamespace(estimate=lambda *frames: keep(handed, "estimator", np.eye(3), frames)),
         "keypoints": lambda one, two: keep(handed, "keypoints", NONE, one, two),
         "matcher": lambda one, two, three: keep(handed, "matcher", own_matcher(one, two, three), one, two, three),
+        "solver": lambda a, b, c, seed, threshold: keep(handed, "solver", solve(a, b, c), a, b, c),
     }
     found = run_rows({"icp": "icp", "scans-2": "scans-2"} | rows, tmp_path)
     assert not any(row["failed"] for row in found.values()) and handed.keys() == rows.keys()
@@ -465,12 +505,13 @@ def test_nothing_that_a_row_of_ones_own_gets_leads_to_a_label(tmp_path):
 
 
 def test_the_pairs_seed_goes_to_every_row_that_takes_one(tmp_path):
-    seeds, (pair,) = {}, category_pairs(Co3D(small_folder()), "lump", 1, 2)
+    seeds, solve, (pair,) = {}, benchmark_folder.own_solver, category_pairs(Co3D(small_folder()), "lump", 1, 2)
     rows = {
         "problem": lambda problem, seed: keep(seeds, "problem", np.eye(3), seed) if seed == problem.seed else None,
         "estimator": SimpleNamespace(estimate=lambda one, others, seed=0: keep(seeds, "estimator", np.eye(3), seed)),
         "keypoints": lambda first, second, *, seed: keep(seeds, "keypoints", NONE, seed),
         "matcher": lambda one, two, three, seed=0: keep(seeds, "matcher", own_matcher(one, two, three), seed),
+        "solver": lambda a, b, c, *, seed, threshold: keep(seeds, "solver", solve(a, b, c), seed),
     }
     run_rows(rows | {"pipeline": ZeroShotPose(BACKBONE), "ours": "ours"}, tmp_path)
     assert seeds == dict.fromkeys(rows, (pair.seed,))

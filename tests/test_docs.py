@@ -167,11 +167,12 @@ def test_the_examples_of_methods_of_ones_own_run_as_they_stand(tmp_path, monkeyp
         program, *words = shlex.split(line) or [""]
         if program == "zsp-lite":
             assert main(words + few * (words[0] == "benchmark")) == 0, line
-            if own := re.search(r"ours,(\w+)=.* --out (.+)", line):
-                rows |= json.loads(Path(own[2], "summary.json").read_text())["methods"]
+            if words[0] == "benchmark" and "--out" in words:
+                rows |= json.loads(Path(words[-1], "summary.json").read_text())["methods"]
         elif program == "python":
             runpy.run_path(words[0])
-    assert list(rows) == ["ours", "ratio", "orb", "theirs"]
+    swept = [f"orb@threshold={value}" for value in (0.1, 0.2)]
+    assert list(rows) == ["ours", "ratio", "orb", *swept, "most", "ours-mask", "theirs"]
     assert float(capsys.readouterr().out.splitlines()[-1]) == pytest.approx(rows["ratio"]["median"], abs=1e-3)
     assert all(row["n"] == 1 and row["failed"] == 0 for row in rows.values())
 

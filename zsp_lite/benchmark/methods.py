@@ -5,16 +5,18 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
 from zsp_lite.baselines.sift import RootSift, Sift
 from zsp_lite.benchmark import baseline_rows
 from zsp_lite.benchmark.identity import described
-from zsp_lite.benchmark.own import Estimator, KeypointMatcher, StoredPoses, import_object, kind_of
+from zsp_lite.benchmark.own import Estimator, KeypointMatcher, StoredPoses, kind_of
 from zsp_lite.data.exchange import read_poses
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_number
 from zsp_lite.features import FeatureExtractor
+from zsp_lite.io.modules import import_object
 
 
 @dataclass(frozen=True)
@@ -101,11 +103,12 @@ def _members(name: str) -> list[str]:
     return [row for member in GROUPS[name] for row in _members(member)] if name in GROUPS else [name]
 
 
-def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Method]:
+def resolve(methods: str | Sequence[str] | Mapping[str, Any], sweep: Sequence[float] = ()) -> dict[str, Method]:
     """Resolve names to rows, in order and without duplicates.
 
     Names are those of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, "module:thing",
     "poses.csv", or NAME=one of these. A mapping leads from names to these, to `Method`s, or to objects of one's own.
+    Each RANSAC threshold V of a sweep makes a row NAME@threshold=V of each.
     InputError if a name is unknown or another row's, or a thing cannot be imported or read, or is of no kind.
     """
     if not isinstance(methods, Mapping):
@@ -117,10 +120,10 @@ def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Metho
     rows = {str(name): _method(str(name), meant) for name, meant in methods.items()}
     taken = {*METHODS, *GROUPS, *(line["label"] for table in read_paper_tables() for line in table["rows"])}
     for name, row in rows.items():
-        plain = re.sub(r"-n\d+$", "", name)
-        if taken & {name, plain} and not (plain in METHODS and row == _method(name, name)):
+        base = base_name(name)
+        if taken & {name, base} and not (base in METHODS and row == _method(name, name)):
             raise InputError(f"method {name!r} has the name of another row or of a group, expected its own")
-    return rows
+    return _swept(rows, sweep) if sweep else rows
 
 
 def _method(name: str, meant: Any) -> Method:
@@ -140,10 +143,30 @@ def _method(name: str, meant: Any) -> Method:
     if isinstance(meant, Method):
         return meant
     kind = kind_of(name, meant)
-    if kind == "matcher":
-        return Method(settings={"matcher": meant})
-    wrap = {"estimator": Estimator, "keypoints": KeypointMatcher}.get(kind, lambda own: own)
-    return Method("none" if kind == "estimator" else "backbone", solve=wrap(meant))
+    if kind in ("matcher", "solver"):
+        return Method(settings={kind: meant})
+    wrap = {"estimator": Estimator, "keypoints": KeypointMatcher}.get(kind)
+    return Method("none", solve=wrap(meant)) if wrap else Method(solve=meant)
+
+
+def base_name(name: str) -> str:
+    """ROW of "ROW-nN@threshold=V"."""
+    return re.sub(r"(-n\d+)?(@.*)?$", "", name)
+
+
+def _swept(rows: Mapping[str, Method], thresholds: Sequence[float]) -> dict[str, Method]:
+    """Return each row with each RANSAC threshold; InputError for a row that has none."""
+    swept = {}
+    for (name, row), value in product(rows.items(), thresholds):
+        check_number("threshold", value, above=0)
+        if row.solve is None:
+            changed = replace(row, settings={**row.settings, "threshold": value})
+        elif isinstance(row.solve, KeypointMatcher):
+            changed = replace(row, solve=replace(row.solve, threshold=value))
+        else:
+            raise InputError(f"method {name!r} has no threshold, expected a matcher or a solver")
+        swept[f"{name}@threshold={value}"] = changed
+    return swept
 
 
 def make_extractors(backbone: FeatureExtractor, methods: Mapping[str, Method]) -> dict[str, Any]:

@@ -1,9 +1,6 @@
 """Methods of one's own: which kind of method an object is, what it gets, and poses that another program computed."""
 
 import ctypes
-import os
-import pkgutil
-import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,46 +12,38 @@ import numpy as np
 
 from zsp_lite.alignment import SCALE_RANGE, ransac
 from zsp_lite.baselines.sift import unproject_pixels
-from zsp_lite.benchmark.problem import Answer, PairProblem, Problem, parameters, seeded
+from zsp_lite.benchmark.problem import Answer, Crop, PairProblem, Problem, parameters, seeded
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.exchange import StoredPose, check_poses
-from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, describe_failure, ends_the_run, real_array
 from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.views import object_crop
 
-KINDS = ("problem", "keypoints", "matcher")  # functions of one, two and three arguments
+KINDS = ("problem", "keypoints", "matcher", "solver")  # functions of one, two and three arguments, and a solver
 
 
 def kind_of(name: str, thing: Any) -> str:
     """Tell what the thing of a row is: "estimator" (has `estimate`), or the function of one of `KINDS`.
 
-    The number of arguments without a default, but for `seed`, tells the kinds apart; an attribute `kind` of the thing
-    comes before it. InputError if it is none of these.
+    The number of arguments without a default, but for `seed` and `threshold`, tells the kinds apart, and a solver has
+    both of these; an attribute `kind` of the thing comes before it. InputError if it is none of these.
     """
     if not isinstance(thing, type):
         if callable(getattr(thing, "estimate", None)):
             return "estimator"
         if (kind := getattr(thing, "kind", None)) in KINDS:
             return kind
-        others = [one for one in parameters(thing).values() if one.name != "seed"]
+        known = parameters(thing)
+        others = [one for name, one in known.items() if name not in ("seed", "threshold")]
         needed = [one for one in others if one.default is one.empty and one.kind is not one.VAR_KEYWORD]
         positional = all(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed)
         if positional and len(needed) in (1, 2, 3):
-            return KINDS[len(needed) - 1]
+            solves = len(needed) == 3 and known.keys() >= {"seed", "threshold"}
+            return "solver" if solves else KINDS[len(needed) - 1]
     raise InputError(
         f"method {name!r} is of type {type(thing).__name__}, expected a function of one argument (problem), two (two "
-        "images) or three (similarities, two foregrounds), or an object with estimate(reference, targets)"
+        "images) or three (similarities, two foregrounds), a solver, or an object with estimate(reference, targets)"
     )
-
-
-def import_object(path: str) -> Any:
-    """Import the object "module:name" from an installed module or a module in the current folder."""
-    if "" not in sys.path and os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # the path of a console script lacks the current folder
-    try:
-        return pkgutil.resolve_name(path)
-    except (Exception, SystemExit) as error:  # a module may raise anything
-        raise InputError(f"{path!r} cannot be imported: {describe_failure(error)}") from error
 
 
 class OutOfTime(BaseException):
@@ -91,10 +80,14 @@ def fails_alone(seconds: int) -> Iterator[None]:
 
 def given(method: Any, problem: PairProblem) -> Any:
     """Return what the row of a method of one's own gets: copies; nothing in them leads to the data set and labels."""
-    if isinstance(method, Estimator):
-        with ends_the_run("reading frames"):
-            return problem.store.dataset.load_pair(problem.pair), problem.seed
-    return Problem(problem.seed, deepcopy(problem.crops), problem.store.extractors, {})
+    if not isinstance(method, Estimator | KeypointMatcher):
+        return Problem(problem.seed, deepcopy(problem.crops), problem.store.extractors, {})
+    with ends_the_run("reading frames"):
+        reference, targets = problem.store.dataset.load_pair(problem.pair)
+    frames = [reference, *targets]
+    if isinstance(method, KeypointMatcher):
+        frames = [object_crop(frame, size=None) for frame in frames]
+    return Problem(problem.seed, [Crop(frame) for frame in frames], {}, {})
 
 
 @dataclass(frozen=True)
@@ -103,10 +96,10 @@ class Estimator:
 
     own: Any
 
-    def __call__(self, frames_and_seed: tuple[tuple[Frame, list[Frame]], int]) -> Any:
-        frames, seed = frames_and_seed
-        own = replace(self.own, seed=seed) if isinstance(self.own, ZeroShotPose) else self.own
-        return seeded(own.estimate, seed)(*frames)
+    def __call__(self, problem: Problem) -> Any:
+        reference, *targets = problem.frames()
+        own = replace(self.own, seed=problem.seed) if isinstance(self.own, ZeroShotPose) else self.own
+        return seeded(own.estimate, problem.seed)(reference, targets)
 
 
 @dataclass(frozen=True)
@@ -114,6 +107,7 @@ class KeypointMatcher:
     """Row of a matcher of keypoints in two images, followed by RANSAC; docs/benchmark_your_own.md has its protocol."""
 
     own: Callable[[np.ndarray, np.ndarray], tuple[Any, Any, Any]]
+    threshold: float = 0.2  # of RANSAC
 
     def __call__(self, problem: Problem) -> Answer:
         reference, *targets = problem.frames()
@@ -123,10 +117,10 @@ class KeypointMatcher:
         if any((one < 0).any() for one in scores):  # the view of the highest sum is chosen
             raise InputError("scores of matches are negative, expected 0 or more")
         view = int(np.argmax([one.sum() for one in scores]))
-        return fit_keypoints(problem, view, *found[view][:2])
+        return fit_keypoints(problem, view, *found[view][:2], self.threshold)
 
 
-def fit_keypoints(problem: Problem, view: int, first: Any, second: Any) -> Answer:
+def fit_keypoints(problem: Problem, view: int, first: Any, second: Any, threshold: float = 0.2) -> Answer:
     """Fit the pose to matched pixels of the reference's crop and of a target's: depth, then RANSAC (sec. 4.3)."""
     reference, *targets = problem.frames(depth=True)
     first, second = (real_array("matched points", points).reshape(-1, 2) for points in (first, second))
@@ -134,7 +128,7 @@ def fit_keypoints(problem: Problem, view: int, first: Any, second: Any) -> Answe
         raise InputError(f"matched points are {len(first)} and {len(second)}, expected as many in both images")
     try:
         points = unproject_pixels(reference, first), unproject_pixels(targets[view], second)
-        sim3, inliers = ransac(*points, seed=problem.seed, scale_range=SCALE_RANGE)
+        sim3, inliers = ransac(*points, threshold=threshold, seed=problem.seed, scale_range=SCALE_RANGE)
     except InputError as error:
         return Answer(np.eye(3), view, note=f"pose is the best view's, not a fit: {error}", inliers=0)
     return Answer(sim3.R, view, sim3.t, sim3.scale, inliers=int(inliers.sum()))

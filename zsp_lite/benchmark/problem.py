@@ -94,7 +94,7 @@ def _timed(timings: dict[str, list[float]], stage: str, function: Callable[..., 
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """A frame's object crop, resized to the backbone's input, with what extractors compute from it, by their names."""
+    """A frame's object crop with what extractors compute from it, by their names."""
 
     frame: Frame
     described: dict[str, Any] = field(default_factory=dict)

@@ -50,6 +50,7 @@ def evaluate(
     allow_other_version: bool = False,
     row_seconds: int = 60,
     seeds: int = 1,
+    sweep: Sequence[float] = (),
 ) -> dict[str, Any]:
     """Evaluate rows on pairs of every category, and store every finished pair in the folder of the run at once.
 
@@ -67,6 +68,7 @@ def evaluate(
         allow_other_version: Continue a run of another version of the library; run.json then lists both.
         row_seconds: Time limit of a row of one's own for a pair, which fails beyond it.
         seeds: Number of evaluations of each pair, with other random draws of k-means and RANSAC.
+        sweep: RANSAC thresholds V; each row is evaluated with each, as NAME@threshold=V.
 
     Returns:
         The content of OUT/summary.json (see `statistics.summarise`); `write_reports` writes tables and figures.
@@ -78,7 +80,7 @@ def evaluate(
     check_integer("targets", targets, 1)
     check_integer("row_seconds", row_seconds, 1, 1_000_000)
     check_integer("seeds", seeds, 1, 1000)
-    rows = {name: replace(row, seconds=row_seconds) for name, row in resolve(methods).items()}
+    rows = {name: replace(row, seconds=row_seconds) for name, row in resolve(methods, sweep).items()}
     dataset, remarks = Co3D(data), {}
     numbers = pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
     work = pairs_of_rows(dataset, rows, numbers, targets)

@@ -18,7 +18,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.benchmark.methods import GROUPS, METHODS, read_paper_tables
+from zsp_lite.benchmark.methods import GROUPS, METHODS, base_name, read_paper_tables
 from zsp_lite.benchmark.runs import Run
 from zsp_lite.benchmark.statistics import draws_of, paired_difference
 from zsp_lite.choices import METRICS, METRICS_SHOWN
@@ -101,7 +101,7 @@ def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHO
 def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN, table: str = "all_rows") -> Table:
     """Return every row that sees the pair only, or those of a table of `SEE_MORE` below "verified", which does, too."""
     title, members = SEE_MORE.get(table, ("All rows", []))
-    names = [name for name in summary["methods"] if _plain(name) in members or not members and not _sees_more(name)]
+    names = [name for name in summary["methods"] if base_name(name) in members or not members and not _sees_more(name)]
     if members and names:  # what they add to
         names = [*(name for name in summary["methods"] if name == "verified"), *names]
     rows = {}
@@ -196,7 +196,7 @@ def _difference(test: Mapping[str, Any] | None) -> tuple[Cell | None, Cell | Non
 
 def own_rows(summary: Mapping[str, Any]) -> list[str]:
     """List the rows of a run that are not the library's, with any number of target views."""
-    return [name for name in summary["methods"] if _plain(name) not in METHODS]
+    return [name for name in summary["methods"] if base_name(name) not in METHODS]
 
 
 def important_rows(summary: Mapping[str, Any]) -> list[str]:
@@ -208,13 +208,8 @@ def important_rows(summary: Mapping[str, Any]) -> list[str]:
     return sorted(names or summary["methods"], key=lambda name: first.index(name) if name in first else len(first))
 
 
-def _plain(name: str) -> str:
-    """ROW of "ROW-nN"."""
-    return re.sub(r"-n\d+$", "", name)
-
-
 def _sees_more(name: str) -> bool:
-    return any(_plain(name) in rows for _, rows in SEE_MORE.values())
+    return any(base_name(name) in rows for _, rows in SEE_MORE.values())
 
 
 def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:
@@ -237,6 +232,8 @@ def _table(
         notes.append("Med. err.: mean of the categories' medians.")
     if {"translation", "scale"} & set(metrics):
         notes.append("Translation and scale: medians of the pairs for which a row has them.")
+    if any("@threshold=" in name for name in summary["methods"]):
+        notes.append("A threshold is to be chosen on validation categories, never on those that are evaluated.")
     if "milliseconds" in metrics:
         notes.append("ms per pair: median; what rows share, such as features, counts for the first that needs it.")
     notes += ["Intervals: 95 %, bootstrap over objects.", *_note_on_seeds(summary), *more]

@@ -12,6 +12,9 @@ SIZE = Parsed(
     "W,H", lambda text: tuple(map(float, text.split(","))),
     lambda size: len(size) == 2 and all(1 <= side <= 100 for side in size), "two numbers from 1 to 100",
 )  # fmt: skip
+THRESHOLDS = Parsed(
+    "threshold=V,V", lambda text: [*map(float, text.removeprefix("threshold=").split(","))], bool, "threshold=V,V"
+)
 _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 metrics_option = click.option(
     "--metrics",
@@ -40,6 +43,7 @@ metrics_option = click.option(
     help="Rows or groups of rows, see --list; NAME=module:thing or NAME=poses.csv for your own.",
 )  # fmt: skip
 @click.option("--seeds", type=COUNT, default=1, help="Evaluations of each pair, with other random draws.")
+@click.option("--sweep", type=THRESHOLDS, help="Evaluate each row with each of these thresholds of RANSAC.")
 @click.option("--list", "list_only", is_flag=True, help="Print every method and group, and exit.")
 @click.option("--list-pairs", type=PATH, help="Only write the pairs to this CSV file, for another program.")
 @click.option("--out", type=PATH, default="outputs/benchmark", help="Folder; an existing run is continued.")
@@ -49,7 +53,7 @@ metrics_option = click.option(
 @click.option("--quiet", is_flag=True, help="Print no progress bar and no tables.")
 def benchmark(
     data, backbone, categories, pairs, targets, methods, list_only, list_pairs, out, workers, executor, metrics, quiet,
-    allow_other_version, row_seconds, seeds,
+    allow_other_version, row_seconds, seeds, sweep,
 ) -> None:  # fmt: skip
     """Measure rotation errors over many pairs, and write tables, figures and results."""
     if list_only:
@@ -69,7 +73,7 @@ def benchmark(
         asked = pairs_of_rows(dataset, resolve(methods), numbers, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
-    options = executor or workers, allow_other_version, row_seconds, seeds
+    options = executor or workers, allow_other_version, row_seconds, seeds, sweep or ()
     evaluate(dataset.root, backbone, methods, numbers, targets, out, *options)
     summary = write_reports(out, metrics=metrics)
     if not quiet:

@@ -58,18 +58,17 @@ replace_option = click.option("--replace", is_flag=True, help="Replace existing 
 
 
 def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add --backbone, --layer, --facet and --image-size; the command gets `backbone`, which `load_backbone` takes."""
+    """Add --backbone, --layer, --facet and --image-size; the command gets `backbone`, which `as_backbone` takes."""
 
-    @click.option("--backbone", "name", default="zsp-tiny", help="A name of `weights list`, a file, or hf:NAME.")
+    @click.option("--backbone", "name", default="zsp-tiny", help="Name of `weights list`, file, hf:NAME, module:thing.")
     @click.option("--layer", show_default="the backbone's own", help="Block of the descriptors: block0, ..., last.")
     @click.option("--facet", type=click.Choice(FACETS), default="key", help="Activation of that block to use.")
     @click.option("--image-size", type=COUNT, show_default="usually 224", help="Side of the network's input in pixels.")
     @wraps(command)
     def with_backbone(name, layer, facet, image_size, **others):
-        from zsp_lite.backbones.load import BackboneConfig
+        from zsp_lite.backbones.load import named_backbone
 
-        config = BackboneConfig(name, layer, facet, image_size)
-        return command(backbone=name if config == BackboneConfig(name) else config, **others)
+        return command(backbone=named_backbone(name, layer, facet, image_size), **others)
 
     return with_backbone
 

@@ -60,7 +60,6 @@ def estimate(reference, target, others, helpers, not_upright, as_json, backbone,
     """
     import json
 
-    from zsp_lite.backbones.load import load_backbone
     from zsp_lite.importers.sources import open_pair
     from zsp_lite.io.locks import writing
     from zsp_lite.own_objects import estimate_pose, write_pair
@@ -72,7 +71,7 @@ def estimate(reference, target, others, helpers, not_upright, as_json, backbone,
     with writing(out):
         given = {name: settings.pop(name) for name in _ONCE_PER_OBJECT}
         sources = open_pair(reference, target, given, (*helpers, *others))
-        settings |= {"backbone": load_backbone(backbone), "upright": not not_upright, "helpers": sources[2:]}
+        settings |= {"backbone": backbone, "upright": not not_upright, "helpers": sources[2:]}
         found = estimate_pose(*sources[:2], **settings)
         files = write_pair(found, out)
     if as_json:
