@@ -372,7 +372,7 @@ def test_a_zip_that_is_damaged_malicious_or_large_is_refused(tmp_path, monkeypat
 def test_the_sharpest_frames_of_a_video_and_of_images_are_chosen(tmp_path, views):
     read = []
     blank = np.zeros((8, 8), np.uint8)
-    chosen = list(sharpest(range(1000), 100, lambda k: read.append(k) or blank, []))
+    chosen = list(sharpest(range(2000), 100, lambda k: read.append(k) or blank, []))
     assert len(chosen) == 100 and len(read) <= 1000
     blurred = [replace(views[0], rgb=cv2.GaussianBlur(views[0].rgb, (15, 15), 3), name=f"{k:04d}") for k in range(9)]
     for sharp in (3, 8):

@@ -51,7 +51,7 @@ def ring_figure(result: PairResult) -> Figure:
             axis.scatter(angle, 1, 260 * one.confidence, plots.BLUE if near else plots.VERMILLION, alpha=0.45)
     for one in (answer.hypotheses[0], *answer.alternatives):
         angle = turn(answer.between_worlds(one.sim3, one.view).R)
-        axis.scatter(angle, 0.5, 400 * one.confidence, plots.ORANGE, "*", edgecolors="black", linewidths=0.5)
+        axis.scatter(angle, 0.5, 400 * one.confidence, plots.ORANGE, marker="*", edgecolors="black", linewidths=0.5)
         axis.text(angle, 0.24, f"{one.confidence:.2f}", ha="center", va="center", fontsize=9)
     axis.set(theta_zero_location="N", ylim=(0, 1.15), yticks=[], xticks=np.radians([0, 90, 180, 270]))
     return figure
