@@ -40,7 +40,7 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.exchange import write_questions
 from zsp_lite.data.frames import mask_to_bbox
-from zsp_lite.data.labels import PoseLabel, read_labels
+from zsp_lite.data.labels import PoseLabel
 from zsp_lite.data.pairs import category_pairs
 from zsp_lite.errors import FatalError, InputError
 from zsp_lite.pipeline import ZeroShotPose, align_best_view
@@ -120,11 +120,11 @@ def test_nothing_takes_the_name_of_a_row_of_the_library_or_the_paper(name):
 
 def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
     dataset = Co3D(small_folder())
-    store = FrameStore(dataset, "lump", {"backbone": BACKBONE})
+    store = FrameStore(dataset, {"backbone": BACKBONE})
     exact = exact_keypoints(dataset, "lump")
     rows = resolve({"exact": exact, "one score": lambda first, second: (*exact(first, second)[:2], 0.5)})
     for pair in category_pairs(dataset, "lump", 4, 3):
-        found = evaluate_pair(pair, rows, store, read_labels(small_folder(), "lump"))["results"]
+        found = evaluate_pair(pair, rows, store)["results"]
         reference, targets = dataset.load_pair(pair)
         reference, *targets = (object_crop(frame, None).rgb for frame in (reference, *targets))
         counts = [len(exact(reference, target)[0]) for target in targets]

@@ -65,7 +65,7 @@ def test_rows_differ_as_their_names_say(run):
 def test_a_pair_without_depth_fails(row, monkeypatch):
     dataset, load = Co3D(small_folder()), Co3D.load
     monkeypatch.setattr(Co3D, "load", lambda *frame: replace(load(*frame), depth=None))
-    store = FrameStore(dataset, "pebble", {"sift": Sift()})
+    store = FrameStore(dataset, {"sift": Sift()})
     one = PairProblem(*category_pairs(dataset, "pebble", 1, 2), store, ["sift"])
     refused("no depth map: 100_a", METHODS[row].solve, one)
     assert [frame.depth for frame in one.frames()] == [None] * 3

@@ -30,7 +30,7 @@ from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.execution import make_chunks, open_workers
 from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
-from zsp_lite.benchmark.run import Evaluator, evaluate, pairs_of_rows, write_reports
+from zsp_lite.benchmark.run import evaluate, pair_evaluator, pairs_of_rows, write_reports
 from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, read_lines, read_run
 from zsp_lite.benchmark.tables import compare
 from zsp_lite.cli.main import main
@@ -152,9 +152,12 @@ def test_an_interrupt_ends_a_run_and_its_workers_with_one_line_and_the_run_can_b
 
 @needs_signals
 def test_a_dask_cluster_that_loses_its_worker_and_starts_another_finds_the_same(undisturbed, tmp_path, monkeypatch):
-    from distributed import LocalCluster
+    from distributed import Client, LocalCluster
 
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
+        Client(cluster) as client,
+    ):
         killed = []
 
         def kill_once() -> None:
@@ -163,13 +166,13 @@ def test_a_dask_cluster_that_loses_its_worker_and_starts_another_finds_the_same(
                 killed.append(len(pairs_in(tmp_path)))
 
         monkeypatch.setattr("zsp_lite.benchmark.run.add_lines", after_each_save(kill_once))
-        address = "dask://" + cluster.scheduler_address.removeprefix("tcp://")
-        summary = evaluate(small_folder(), SlowBackbone(grid=8), ROWS, 6, 3, tmp_path, address)
+        executor = client.get_executor(pure=False)
+        summary = evaluate(small_folder(), SlowBackbone(grid=8), ROWS, 6, 3, tmp_path, executor)
     assert killed and killed[0] < 12 and summary["methods"] == undisturbed[1]["methods"]
 
 
 def test_modules_of_the_current_folder_travel_to_workers_and_what_they_lack_is_one_line(tmp_path, monkeypatch):
-    from distributed import LocalCluster
+    from distributed import Client, LocalCluster
 
     lock = "import threading\nlock = threading.Lock()\ndef half(problem):\n    return lock and None"
     for name, text in {
@@ -179,11 +182,14 @@ def test_modules_of_the_current_folder_travel_to_workers_and_what_they_lack_is_o
     }.items():  # fmt: skip
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / f"{name}.py").write_text(text)
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
+        Client(cluster) as client,
+    ):
         monkeypatch.chdir(tmp_path)  # after the worker has its path
         monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "installed")])
 
-        def run(module: str, executor="dask://" + cluster.scheduler_address.removeprefix("tcp://")) -> int:
+        def run(module: str, executor=client.get_executor(pure=False)) -> int:
             rows = [f"mine={module}:half"]
             return evaluate(small_folder(), QUICK, rows, {"lump": 2}, 2, module, executor)["methods"]["mine"]["failed"]
 
@@ -246,14 +252,10 @@ def test_numbers_of_threads_are_restored_after_blocks_that_overlap():
         assert counts() == before and 2 in before[1].values()
 
 
-def test_unusable_executors_are_refused(monkeypatch):
-    monkeypatch.setattr("zsp_lite.benchmark.execution._DASK_TIMEOUT", 1)
-    for executor, message in (
-        ("dask://127.0.0.1:1", "expected Dask and a scheduler"), ("nowhere:Pool", "expected a number of processes, dask://"),
-        (0, "workers"), (10**11, "workers"), (1.5, "workers"), (True, "workers"), (None, "workers"),
-    ):  # fmt: skip
-        with pytest.raises(InputError, match=message), open_workers(executor):
-            pass
+@pytest.mark.parametrize("executor", ["nowhere:Pool", 0, 10**11, 1.5, True, None])
+def test_unusable_executors_are_refused(executor):
+    with pytest.raises(InputError, match="workers"), open_workers(executor):
+        pass
 
 
 def pairs_to_evaluate(rows, pairs: int, targets: int) -> dict:
@@ -265,21 +267,22 @@ def test_a_vision_transformers_features_do_not_depend_on_threads():
         torch.manual_seed(0)
         backbone = Backbone(VisionTransformer(32, 8, 24, 2, 3), "small", layer=1, device="cpu")
     (chunk,) = make_chunks(pairs_to_evaluate(["ours"], 2, 2))
-    evaluators = (Evaluator(str(small_folder()), resolve(["ours"]), backbone, threads) for threads in (1, 2))
-    one, two = ([line["results"]["ours"]["error"] for line in evaluator.lines(chunk)] for evaluator in evaluators)
-    assert one == two
+    errors = []
+    for threads in (1, 2):
+        evaluate_one = pair_evaluator(str(small_folder()), resolve(["ours"]), backbone, threads)
+        errors.append([evaluate_one(pair, names)["results"]["ours"]["error"] for pair, names in chunk])
+    assert errors[0] == errors[1]
 
 
-def test_a_run_is_not_continued_by_another_version_of_the_library_unless_it_is_allowed(tmp_path, monkeypatch):
+def test_the_note_of_a_run_says_that_several_versions_of_the_library_evaluated_it(tmp_path, monkeypatch):
     run = functools.partial(evaluate, small_folder(), BACKBONE, pairs={"lump": 1}, targets=2, out=tmp_path)
     run(["ours-bv"])
     first, other = library_version(), {"version": "1", "commit": "0123abc"}
     monkeypatch.setattr("zsp_lite.benchmark.run.library_version", lambda: other)
-    refused("this is .*0123abc.*; choose another folder, or .*--allow-other-version", run, ["ours"])
-    run(["ours"], allow_other_version=True)
+    assert "note" not in read_run(tmp_path).summary
+    run(["ours"])
     assert json.loads((tmp_path / SETTINGS).read_text())["library"] == [first, other]
-    assert [call.rows for call in read_run(tmp_path).settings.calls] == [["ours-bv"], ["ours"]]
-    run(["ours"])  # both are now known
+    assert "several versions of zsp-lite" in read_run(tmp_path).summary["note"]
 
 
 def test_a_folder_that_holds_no_run_is_neither_read_nor_continued(undisturbed, tmp_path):

@@ -24,7 +24,7 @@ def icp(problem: PairProblem, view: int = 0) -> Answer:
     """Run "ICP", in the first target view; the worlds start where the first cameras of both sequences coincide."""
     reference, *targets = problem.frames(depth=True)
     sequences = problem.pair.reference_sequence, problem.pair.target_sequence
-    dataset, category = problem.store.dataset, problem.store.category
+    dataset, category = problem.store.dataset, problem.pair.category
     first = tuple(dataset.camera(dataset.frames(category, sequence)[0]) for sequence in sequences)
     try:
         sim3 = align(reference, targets, view, first, problem.seed)
@@ -50,7 +50,7 @@ def sift(problem: PairProblem) -> Answer:
 
 def category(problem: PairProblem) -> Answer:
     """Run "category": the pose by the alignment of all objects of the category, which needs no label of any."""
-    pairs = object_pairs(problem.store.dataset, problem.store.category, None, None, len(problem.pair.target_frames))
+    pairs = object_pairs(problem.store.dataset, problem.pair.category, None, None, len(problem.pair.target_frames))
     return _agreed(problem, [problem.pair, *pairs])
 
 

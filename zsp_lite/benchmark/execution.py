@@ -1,4 +1,4 @@
-"""Evaluate chunks of pairs in this process, a pool of processes, a Dask cluster, or any `concurrent.futures.Executor`.
+"""Evaluate chunks of pairs in this process, a pool of processes, or any `concurrent.futures.Executor`.
 
 A chunk is a few pairs of one category that share frames. A killed run loses the chunks that were being evaluated.
 """
@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+from itertools import chain
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,8 @@ from zsp_lite.io.files import digest, read_bytes, write_atomic
 from zsp_lite.threads import one_thread
 
 Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
+Evaluate = Callable[[Pair, list[str]], dict[str, Any]]  # finds the line of a run for a pair
 CHUNK_SIZE = 16  # pairs
-_DASK_TIMEOUT = 15  # seconds to wait for a scheduler
 _UNKNOWN_WORKERS = 256  # of an executor that does not tell
 
 
@@ -43,17 +44,14 @@ def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[
 
 
 def evaluate_chunks(
-    make: Callable[[], Any], chunks: Sequence[Chunk], executor: Executor | None, shared: Path
+    make: Callable[[], Evaluate], chunks: Sequence[Chunk], executor: Executor | None, shared: Path
 ) -> Iterator[list[dict[str, Any]]]:
-    """Yield the lines that the method `lines` of what `make` makes, such as a `run.Evaluator`, finds.
-
-    `shared` is a new file in a folder that all workers see.
-    """
+    """Yield the lines that what `make` makes finds; `shared` is a new file in a folder that all workers see."""
     if executor is None:
-        evaluator = make()
+        evaluate = make()
         with one_thread():
-            for chunk in chunks:
-                yield from ([line] for line in evaluator.lines(chunk))
+            for pair, rows in chain.from_iterable(chunks):
+                yield [evaluate(pair, rows)]
         return
     pickled = _pickle(make, executor)  # in a file, because a backbone has megabytes, and each worker reads it once
     futures = []
@@ -90,29 +88,24 @@ _worker = threading.local()  # an executor's workers may be threads
 
 
 def _evaluate_chunk(shared: str, digest_of_it: str, chunk: Chunk) -> list[dict[str, Any]]:
-    """Evaluate a chunk in a worker, which keeps its evaluator for the next one of the same call."""
+    """Evaluate a chunk in a worker, which keeps what evaluates it for the next one of the same call."""
     if getattr(_worker, "shared", None) != shared:
         pickled = read_bytes(shared, "rows of the run")
         if digest(pickled) != digest_of_it:  # never unpickle what somebody else has written
             raise InputError(f"rows of the run {shared} have changed, expected the file that this run wrote")
-        _worker.evaluator, _worker.shared = cloudpickle.loads(pickled)(), shared
+        _worker.evaluate, _worker.shared = cloudpickle.loads(pickled)(), shared
     with one_thread():
-        return list(_worker.evaluator.lines(chunk))
+        return [_worker.evaluate(pair, rows) for pair, rows in chunk]
 
 
 @contextmanager
-def open_workers(executor: Executor | str | int = 1) -> Iterator[tuple[Executor | None, int]]:
+def open_workers(executor: Executor | int = 1) -> Iterator[tuple[Executor | None, int]]:
     """Open an executor (None: this process) with its number of workers, and close it after the block.
 
-    It is a number of processes, 1 for this one; "dask://HOST:PORT"; or an Executor, which stays open.
+    It is a number of processes, 1 for this one, or an Executor, which stays open.
     """
     if isinstance(executor, Executor):
         yield executor, getattr(executor, "_max_workers", None) or getattr(executor, "num_workers", _UNKNOWN_WORKERS)
-        return
-    if isinstance(executor, str):
-        with _dask(executor) as client:
-            # A chunk depends on files: equal arguments need not give equal results.
-            yield client.get_executor(pure=False), sum(client.nthreads().values())
         return
     check_integer("workers", executor, 1, 4096)
     if executor == 1:
@@ -138,17 +131,3 @@ def _start_worker() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def _dask(address: str) -> Any:
-    """Connect to a Dask cluster."""
-    if not address.startswith("dask://"):
-        raise InputError(f"executor is {address!r}, expected a number of processes, dask://HOST:PORT or an Executor")
-    try:
-        from distributed import Client
-
-        client = Client(f"tcp://{address.removeprefix('dask://')}", timeout=_DASK_TIMEOUT)
-        client.wait_for_workers(1, timeout=_DASK_TIMEOUT)
-    except (ImportError, OSError, ValueError) as error:
-        raise InputError(f"executor {address}: {error}; expected Dask and a scheduler with workers") from error
-    return client

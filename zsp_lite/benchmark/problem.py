@@ -16,6 +16,7 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.best_view import ViewMatch
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
+from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError, ends_the_run, real_array, rotation_matrix
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.matching import key_similarities, similarities
@@ -108,27 +109,28 @@ class Crop:
 
 
 class FrameStore:
-    """Crops of one category, of which the last used are kept; `timings` are the seconds of their pair by stage.
+    """Crops, of which the last used are kept; `timings` are the seconds of their pair by stage.
 
     `kept` is what a row keeps for all pairs. `threads` are those of feature extraction, None leaves them as they are.
     """
 
-    def __init__(self, dataset: Co3D, category: str, extractors: Mapping[str, Any], threads: int | None = None):
-        self.dataset, self.category, self.extractors, self.threads = dataset, category, extractors, threads
+    def __init__(self, dataset: Co3D, extractors: Mapping[str, Any], threads: int | None = None):
+        self.dataset, self.extractors, self.threads = dataset, extractors, threads
         self.timings: dict[str, list[float]] = {}
         self.kept: dict[Any, Any] = {}
         self._read = lru_cache(CAPACITY)(self._crop)
-        self.extent = cache(partial(dataset.extent, category))
+        self.extent = cache(dataset.extent)
+        self.labels = cache(partial(read_labels, dataset.root))
 
-    def _crop(self, sequence: str, number: int) -> Crop:
+    def _crop(self, category: str, sequence: str, number: int) -> Crop:
         size = getattr(self.extractors.get("backbone"), "image_size", IMAGE_SIZE)
         with ends_the_run(f"reading frame {sequence}/{number}"):
-            annotation = self.dataset.frame(self.category, sequence, number)
+            annotation = self.dataset.frame(category, sequence, number)
             return Crop(_timed(self.timings, "reading", lambda: object_crop(self.dataset.load(annotation), size)))
 
-    def crop(self, sequence: str, number: int, features: Iterable[str] = ()) -> Crop:
+    def crop(self, category: str, sequence: str, number: int, features: Iterable[str] = ()) -> Crop:
         """Return a frame's crop with what some extractors compute from it, each once."""
-        crop = self._read(sequence, number)
+        crop = self._read(category, sequence, number)
         for name in features:
             if name not in crop.described:
                 extract = getattr(self.extractors[name], "describe", partial(feature_maps, self.extractors[name]))
@@ -195,5 +197,5 @@ class PairProblem(Problem):
         self.pair, self.store = pair, store
         frames = [(pair.target_sequence, number) for number in pair.target_frames]
         frames.insert(0, (pair.reference_sequence, pair.reference_frame))
-        crops = [store.crop(*frame, features) for frame in frames]
+        crops = [store.crop(pair.category, *frame, features) for frame in frames]
         super().__init__(pair.seed, crops, store.extractors, store.timings)

@@ -3,7 +3,7 @@
 import json
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, nullcontext
 from dataclasses import replace
@@ -28,8 +28,8 @@ from zsp_lite.benchmark.problem import Answer, FrameStore, PairProblem, as_answe
 from zsp_lite.benchmark.runs import Call, ResultLine, Run, Settings, add_lines, open_run, read_lines, read_run
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
-from zsp_lite.data.pairs import category_pairs, labelled_categories, shipped_pairs
+from zsp_lite.data.labels import read_labels
+from zsp_lite.data.pairs import category_pairs, labelled_categories, true_pose
 from zsp_lite.errors import FatalError, InputError, check_integer, describe_failure
 from zsp_lite.io.files import digest, write_atomic
 from zsp_lite.metrics import rotation_error
@@ -46,8 +46,7 @@ def evaluate(
     pairs: int | Mapping[str, int] = 100,
     targets: int = 5,
     out: str | Path = "outputs/benchmark",
-    executor: Executor | str | int = 1,
-    allow_other_version: bool = False,
+    executor: Executor | int = 1,
     row_seconds: int = 60,
     seeds: int = 1,
     sweep: Sequence[float] = (),
@@ -64,8 +63,7 @@ def evaluate(
         pairs: Number of pairs per category, of all with pose labels; or by category.
         targets: Number of target views per pair, for rows that do not fix it.
         out: Folder of the run.
-        executor: Number of processes; "dask://HOST:PORT"; or any `Executor`, which gets chunks of pairs.
-        allow_other_version: Continue a run of another version of the library; run.json then lists both.
+        executor: Number of processes, or any `Executor`, which gets chunks of pairs.
         row_seconds: Time limit of a row of one's own for a pair, which fails beyond it.
         seeds: Number of evaluations of each pair, with other random draws of k-means and RANSAC.
         sweep: RANSAC thresholds V; each row is evaluated with each, as NAME@threshold=V.
@@ -92,21 +90,16 @@ def evaluate(
         elif isinstance(row.solve, StoredPoses):
             remark = row.solve.remark(dataset, [pair for pair, names in work.items() if name in names])
             remarks[name] = f"{name}: {remark}." if remark else ""
-    others = {name: f"; {fingerprint(one)}" for name, one in extractors.items() if name != "backbone"}
     with execution.open_workers(executor) as (pool, workers):
         settings = Settings(
             data=str(data).encode(errors="replace").decode(), backbone=fingerprint(loaded), targets=targets,
             library=[library_version()], labels={category: _labels(dataset, category) for category in numbers},
-            methods={name: description(row) + others.get(row.features, "") for name, row in rows.items()},
-            origins={
-                f"{category}, N = {n}": "evaluation set" if shipped_pairs(dataset, category, n, number) else "sampled"
-                for category, number in numbers.items() for n in {row.targets or targets for row in rows.values()}
-            },
+            methods={name: description(row) for name, row in rows.items()},
             calls=[Call(**environment(), workers=workers, rows=list(rows), pairs=dict(numbers), seeds=seeds,
                         remarks=remarks)],
         )  # fmt: skip
-        with open_run(out, settings, allow_other_version):
-            make = partial(Evaluator, str(Path(data).resolve()), rows, backbone if pool else loaded)
+        with open_run(out, settings):
+            make = partial(pair_evaluator, str(Path(data).resolve()), rows, backbone if pool else loaded)
             repeated = {replace(pair, repeat=k): names for k in range(seeds) for pair, names in work.items()}
             evaluate_pairs(out, make, repeated, pool, workers)
     found = read_run(out)
@@ -144,12 +137,12 @@ def _write_summary(run: Run, out: str | Path) -> dict[str, Any]:
 
 
 def evaluate_pairs(
-    out: str | Path, make: Callable[[int], Any], work: Mapping[Pair, list[str]], pool: Any, workers: int,
+    out: str | Path, make: Callable[[int], execution.Evaluate], work: Mapping[Pair, list[str]], pool: Any, workers: int,
     kind: type = ResultLine,
 ) -> None:  # fmt: skip
     """Evaluate the rows and pairs that a run lacks, and add what is found, lines of a `kind`, to it at once.
 
-    `make` makes what evaluates chunks, such as an `Evaluator`, from a number of threads.
+    `make`, such as `pair_evaluator`, makes what evaluates a pair, from a number of threads.
     """
     known = {(row, line.pair, line.repeat) for line in read_lines(out, kind) for row in line.results}
     new = {pair: [name for name in names if (name, pair.key, pair.repeat) not in known] for pair, names in work.items()}
@@ -187,35 +180,21 @@ def _labels(dataset: Co3D, category: str) -> str:
     return digest(*(part for name, label in labels for part in (name, label.trans.tobytes(), label.reference_seq)))
 
 
-class Evaluator:
-    """Evaluates chunks in one process; frames, and features by some `threads`, are kept from chunk to chunk."""
-
-    def __init__(self, root: str, methods: Mapping[str, Method], backbone: Any, threads: int):
-        self._dataset, self._methods, self._threads = Co3D(root), methods, threads
-        self._extractors, self._store = make_extractors(as_backbone(backbone), methods), None
-
-    def lines(self, chunk: Sequence[tuple[Pair, list[str]]]) -> Iterator[dict[str, Any]]:
-        """Evaluate the pairs of a chunk, all of one category (see `evaluate_pair`)."""
-        category = chunk[0][0].category
-        if self._store is None or self._store.category != category:
-            self._store = FrameStore(self._dataset, category, self._extractors, self._threads)
-            self._labels = read_labels(self._dataset.root, category)
-        for pair, names in chunk:
-            yield evaluate_pair(pair, {name: self._methods[name] for name in names}, self._store, self._labels)
+def pair_evaluator(root: str, methods: Mapping[str, Method], backbone: Any, threads: int) -> execution.Evaluate:
+    """Make what evaluates pairs in one process; frames, and features by some `threads`, are kept from pair to pair."""
+    store = FrameStore(Co3D(root), make_extractors(as_backbone(backbone), methods), threads)
+    return lambda pair, names: evaluate_pair(pair, {name: methods[name] for name in names}, store)
 
 
-def evaluate_pair(
-    pair: Pair, methods: Mapping[str, Method], store: FrameStore, labels: Mapping[str, PoseLabel]
-) -> dict[str, Any]:
+def evaluate_pair(pair: Pair, methods: Mapping[str, Method], store: FrameStore) -> dict[str, Any]:
     """Evaluate rows on a pair: a line of the run's results (see `runs.ResultLine`), with median seconds by stage."""
     store.timings.clear()
     problem = PairProblem(pair, store, {method.features for method in methods.values()} - {"none"})
-    first, second = labels[pair.reference_sequence], labels[pair.target_sequence]
     for sequence in (pair.reference_sequence, pair.target_sequence):
-        store.extent(sequence)  # an unreadable point cloud is no failure of a row
-    reference, *targets = problem.frames()
+        store.extent(pair.category, sequence)  # an unreadable point cloud is no failure of a row
+    labels = store.labels(pair.category)
     # Ground truth from the reference's camera to each target's.
-    truths = np.stack([relative_pose(first, reference.camera, second, target.camera) for target in targets])
+    truths = np.stack([true_pose(store.dataset, labels, pair, view) for view in range(len(pair.target_frames))])
     results = {name: _evaluate(name, method, problem, truths) for name, method in methods.items()}
     timings = {stage: round(float(np.median(seconds)), 5) for stage, seconds in store.timings.items()}
     return {"pair": pair.key, "results": results, "repeat": pair.repeat, "timings": timings}
@@ -252,7 +231,7 @@ def _measure(answer: Answer, problem: PairProblem, truth: Float[np.ndarray, "4 4
         to_camera = targets[answer.view].R
         turned = to_camera @ turns @ to_camera.T @ truth[:3, :3]
         known["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
-    ends = [problem.store.extent(name) for name in names]
+    ends = [problem.store.extent(problem.pair.category, name) for name in names]
     if answer.translation is not None:
         known["position"] = answer.translation.round(6).tolist()
     if answer.translation is not None and None not in ends:

@@ -43,7 +43,7 @@ class Call(msgspec.Struct):
 
 
 class Settings(msgspec.Struct):
-    """What decides the results of a run; a later call may add to methods, labels, origins, and versions."""
+    """What decides the results of a run; a later call may add to methods, labels, and versions."""
 
     data: str
     backbone: str  # fingerprint
@@ -51,7 +51,6 @@ class Settings(msgspec.Struct):
     library: Annotated[list[dict[str, str | None]], msgspec.Meta(min_length=1)]  # version and commit
     methods: dict[str, str]  # description by row
     labels: dict[str, str]  # hash of the pose labels by category
-    origins: dict[str, str]  # of the pairs: an evaluation set of the folder, or sampled
     calls: Annotated[list[Call], msgspec.Meta(min_length=1)]
     folder: str = ""  # absolute path of the data, without links
 
@@ -86,8 +85,8 @@ class Run:
 
     settings: Settings
     # A line for each row, pair and seed, in this order: "row", "category", "pair" (its key), "repeat" (of the seed),
-    # "problem" (the key without target frames), "reference" and "target" (the objects, CATEGORY/SEQUENCE), and the
-    # members of `_Result`.
+    # "problem" (the key without target frames), "reference" and "target" (the objects, CATEGORY/SEQUENCE), the
+    # members of `_Result`, and "milliseconds".
     table: pd.DataFrame
     timings: Mapping[str, float]  # median seconds by stage
     note: str = ""  # what is missing
@@ -101,9 +100,7 @@ class Run:
         data |= {"pairs": int(self.table.groupby("row")["pair"].nunique().max()), "targets": self.settings.targets}
         notes = " ".join(filter(None, [self.note, *self.failures]))
         note = {"note": notes} if notes else {}
-        seconds = self.table.astype({"seconds": float}).groupby("row", sort=False)["seconds"].median().dropna()
-        times = {"timings": dict(self.timings), "milliseconds": (1000 * seconds).to_dict()}
-        return {"data": data, "backbone": backbone} | note | summarise(self.table) | times
+        return {"data": data, "backbone": backbone} | note | summarise(self.table) | {"timings": dict(self.timings)}
 
     @cached_property
     def failures(self) -> list[str]:
@@ -135,13 +132,13 @@ class Run:
 
 
 @contextmanager
-def open_run(out: str | Path, settings: Settings, allow_other_version: bool = False) -> Iterator[None]:
+def open_run(out: str | Path, settings: Settings) -> Iterator[None]:
     """Be the only writer of a run's folder, which is new or holds a run with these settings; then `add_lines` adds."""
     with writing(out):
         out, packed = Path(out), Path(out) / f"{LINES}.gz"
         settings.folder = os.path.realpath(settings.data).encode(errors="replace").decode()
         if any(path.exists() for path in (out / SETTINGS, out / LINES, packed)):
-            settings = _continued(out, settings, allow_other_version)
+            settings = _continued(out, settings)
         write_atomic(out / LINES, _finished_lines(out))
         packed.unlink(missing_ok=True)
         settings.calls[-1].finished = False
@@ -155,31 +152,28 @@ def _write_settings(out: Path, settings: Settings) -> None:
     write_atomic(out / SETTINGS, msgspec.json.format(msgspec.json.encode(settings), indent=1))
 
 
-def _continued(out: Path, now: Settings, allow_other_version: bool) -> Settings:
+def _continued(out: Path, now: Settings) -> Settings:
     """Merge settings with those of the run that a folder holds; InputError if they do not go together."""
     before = read_json(out / SETTINGS, Settings, "settings of a run")
     held, asked = _compared(before), _compared(now)
-    if allow_other_version:
-        held["version"] = asked["version"]
     for name in asked:
         if held.get(name, asked[name]) != asked[name]:
-            more = ", or continue with --allow-other-version" if name == "version" else ""
-            told = f"{name} {held[name]}, this is {asked[name]}; choose another folder{more}"
-            raise InputError(f"{out} holds a run with {told}")
-    merged = {name: getattr(before, name) | getattr(now, name) for name in ("methods", "labels", "origins")}
+            raise InputError(
+                f"{out} holds a run with {name} {held[name]}, this is {asked[name]}; choose another folder"
+            )
+    merged = {name: getattr(before, name) | getattr(now, name) for name in ("methods", "labels")}
     library = [*(one for one in before.library if one != now.library[0]), *now.library]
     return msgspec.structs.replace(now, library=library, calls=before.calls + now.calls, **merged)
 
 
 def _compared(settings: Settings) -> dict[str, Any]:
     """What has to be equal in two calls that add to one run, where both have it, by its name."""
-    groups = {name: getattr(settings, name) for name in ("methods", "labels", "origins")}
+    groups = {name: getattr(settings, name) for name in ("methods", "labels")}
     parts = {f"{name} of {key}": value for name, group in groups.items() for key, value in group.items()}
     whole = {name: getattr(settings, name) for name in ("backbone", "targets")}
     whole["data"] = settings.folder or os.path.realpath(settings.data)
-    version = "{version} (commit {commit})".format(**settings.library[-1])
     command = "align" if "alignment" in settings.methods else "benchmark"
-    return {"command": command} | whole | parts | {"version": version}
+    return {"command": command} | whole | parts
 
 
 def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]], kind: type = ResultLine) -> None:
@@ -224,6 +218,8 @@ def read_run(out: str | Path) -> Run:
         notes.append(
             f"Not finished: {table['row'].value_counts().max()} of {last.seeds * sum(last.pairs.values())} pairs."
         )
+    if len(settings.library) > 1:
+        notes.append("Evaluated by several versions of zsp-lite (run.json lists them).")
     if hidden := [name for name in settings.methods if name not in rows]:
         notes.append(f"Without {', '.join(hidden)}, which lack pairs of the last call.")
     remarks = {name: remark for call in settings.calls for name, remark in call.remarks.items() if name in rows}
@@ -238,6 +234,7 @@ def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
     ]  # fmt: skip
     table = pd.DataFrame(results, columns=["row", "pair", "repeat", *_Result.__struct_fields__])
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
+    table["milliseconds"] = 1000 * table["seconds"].astype(float)
     table["target"] = table["category"] + "/" + table["target"]
     orders = {"row": settings.methods, "category": settings.calls[-1].pairs}
     for column, names in orders.items():

@@ -89,9 +89,6 @@ def choose(run: Run, rows: Sequence[str]) -> dict[str, Any]:
 
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
     """Return all tables of a run; `metrics` are the figures of the table of all rows (see `METRICS`)."""
-    times = summary["milliseconds"]
-    methods = {name: row | {"milliseconds": times.get(name)} for name, row in summary["methods"].items()}
-    summary = {**summary, "methods": methods}
     first = (all_rows(summary, metrics, name) for name in ("all_rows", *SEE_MORE))
     shown = *PAPER, *(metric for metric in metrics if metric == "milliseconds")
     tables = *first, *paper_tables(summary, shown), *(by_category(summary, one) for one in PAPER)

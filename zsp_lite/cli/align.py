@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, replace_option, run_options
+from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, replace_option, workers_option
 
 
 @click.command(
@@ -24,11 +24,9 @@ from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, 
 @click.option("--out", type=PATH, show_default="outputs/align/NAME", help="Folder; an existing run is continued.")
 @click.option("--propose", is_flag=True, help="Write the labels into DATA as proposals, which notebook 08 shows.")
 @replace_option
-@run_options
+@workers_option
 @backbone_options
-def align(
-    data, category, sequences, pairs, targets, out, propose, replace, backbone, workers, executor, allow_other_version
-) -> None:
+def align(data, category, sequences, pairs, targets, out, propose, replace, backbone, workers) -> None:
     """Align all objects of a category in one frame; no label is needed.
 
     DATA is a data folder, or a folder with a capture of each object (see `zsp-lite data import --help`).
@@ -48,14 +46,14 @@ def align(
     from zsp_lite.viz.category_sheet import COLUMNS, object_rows
     from zsp_lite.viz.report import write_category_report
 
-    out, executor = out or Path("outputs/align") / category, executor or workers
+    out = out or Path("outputs/align") / category
     if data.is_dir() and not Co3D(data).categories():
         for name, imported in import_captures(data, out / "data", category):
             for flag in imported.flags:
                 print(f"{name}: {flag}")
         data = out / "data"
     dataset = Co3D(data)
-    found = align_category(dataset, category, backbone, sequences, pairs, targets, out, executor, allow_other_version)
+    found = align_category(dataset, category, backbone, sequences, pairs, targets, out, workers)
     written = [write_alignment(found, out), write_labels(found, out, category, replace=True)]
     written.append(write_category_report(out / "report.html", found, dataset, category))
     if propose:

@@ -6,7 +6,7 @@ import textwrap
 import click
 
 from zsp_lite.choices import METRICS, METRICS_SHOWN
-from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples, run_options
+from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples, workers_option
 
 SIZE = Parsed(
     "W,H", lambda text: tuple(map(float, text.split(","))),
@@ -47,13 +47,13 @@ metrics_option = click.option(
 @click.option("--list", "list_only", is_flag=True, help="Print every method and group, and exit.")
 @click.option("--list-pairs", type=PATH, help="Only write the pairs to this CSV file, for another program.")
 @click.option("--out", type=PATH, default="outputs/benchmark", help="Folder; an existing run is continued.")
-@run_options
+@workers_option
 @click.option("--row-seconds", type=COUNT, default=60, help="Time limit of a method of your own for a pair.")
 @metrics_option
 @click.option("--quiet", is_flag=True, help="Print no progress bar and no tables.")
 def benchmark(
-    data, backbone, categories, pairs, targets, methods, list_only, list_pairs, out, workers, executor, metrics, quiet,
-    allow_other_version, row_seconds, seeds, sweep,
+    data, backbone, categories, pairs, targets, methods, list_only, list_pairs, out, workers, metrics, quiet,
+    row_seconds, seeds, sweep,
 ) -> None:  # fmt: skip
     """Measure rotation errors over many pairs, and write tables, figures and results."""
     if list_only:
@@ -73,8 +73,7 @@ def benchmark(
         asked = pairs_of_rows(dataset, resolve(methods), numbers, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
-    options = executor or workers, allow_other_version, row_seconds, seeds, sweep or ()
-    evaluate(dataset.root, backbone, methods, numbers, targets, out, *options)
+    evaluate(dataset.root, backbone, methods, numbers, targets, out, workers, row_seconds, seeds, sweep or ())
     summary = write_reports(out, metrics=metrics)
     if not quiet:
         print(f"{dataset.root}, backbone {summary['backbone']}, {targets} target views")

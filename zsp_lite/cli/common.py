@@ -78,11 +78,7 @@ def _options(*options: Callable[..., Any]) -> Callable[..., Any]:
     return lambda command: reduce(lambda one, option: option(one), reversed(options), command)
 
 
-run_options = _options(
-    click.option("--workers", type=COUNT, default=1, help="Worker processes on this machine."),
-    click.option("--executor", metavar="dask://HOST:PORT", help="Dask cluster in place of worker processes."),
-    click.option("--allow-other-version", is_flag=True, help="Continue a run of another version; run.json lists both."),
-)
+workers_option = click.option("--workers", type=COUNT, default=1, help="Worker processes.")
 
 
 def source_options(multiple: bool) -> Callable[..., Any]:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.stats import binom
 
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.labels import read_labels, relative_pose
+from zsp_lite.data.pairs import true_poses
 from zsp_lite.errors import InputError, check_choice, check_magnitude, check_number, real_array, rotation_matrix
 from zsp_lite.io.files import digest, read_bytes, write_atomic
 from zsp_lite.metrics import rotation_error
@@ -126,18 +126,14 @@ def other_convention(dataset: Co3D, poses: Mapping[Pair, StoredPose]) -> str:
 
     Those of other programs may be inverted, or conjugated, for cameras in OpenGL's or PyTorch3D's axes.
     """
-    truths, labels = [], {category: read_labels(dataset.root, category) for category in {one.category for one in poses}}
-    for pair, pose in poses.items():
-        one, other = labels[pair.category][pair.reference_sequence], labels[pair.category][pair.target_sequence]
-        reference = dataset.frame(pair.category, pair.reference_sequence, pair.reference_frame)
-        target = dataset.frame(pair.category, pair.target_sequence, pose.target_frame)
-        truths.append(relative_pose(one, dataset.camera(reference), other, dataset.camera(target))[:3, :3])
+    views = [pair.target_frames.index(pose.target_frame) for pair, pose in poses.items()]
+    truths = true_poses(dataset.root, list(poses), np.array(views))[:, :3, :3]
     given = np.stack([pose.rotation for pose in poses.values()])
     readings = {"": given}
     for signs in ((1, -1, -1), (-1, -1, 1)):
         readings[f"conjugated by diag{signs}"] = given * np.outer(signs, signs)
     readings |= {f"inverted and {name}".removesuffix(" and "): one.swapaxes(1, 2) for name, one in readings.items()}
-    errors = {name: rotation_error(rotations, np.stack(truths)) for name, rotations in readings.items()}
+    errors = {name: rotation_error(rotations, truths) for name, rotations in readings.items()}
     medians = {name: float(np.median(error)) for name, error in errors.items()}
     best = min(medians, key=medians.get)
     # Rows that confuse left and right, or turn little, have small errors in either reading: that of most pairs counts.
