@@ -199,6 +199,7 @@ def test_object_poses_of_another_layout_cost_a_warning_and_the_figure_that_needs
 
 def test_seeds_repeat_every_pair_with_other_draws_and_tables_average_over_them(tmp_path):
     arguments = (small_folder(), BACKBONE, ["ours", "ours-bv"], 3, 3)
+    evaluate(small_folder(), BACKBONE, ["ours-mask"], 3, 3, tmp_path / "three")
     evaluate(*arguments, tmp_path / "one")
     once = read_run(tmp_path / "one")
     evaluate(*arguments, tmp_path / "three")
@@ -215,3 +216,7 @@ def test_seeds_repeat_every_pair_with_other_draws_and_tables_average_over_them(t
     assert ours["acc30_sd_of_seeds"] == pytest.approx(np.std(by_seed, ddof=1))
     write_reports(tmp_path / "three")
     assert "Acc30 of ours has a standard deviation of" in (tmp_path / "three/tables/all_rows.md").read_text()
+    mask = found.row("ours-mask")["error"]
+    gain = 100 * ((mask < 30).mean() - (once.row("ours")["error"] < 30).mean())
+    assert summary["against"]["ours-mask"]["accuracy_gain"] == pytest.approx(gain), "a row with the first seed only"
+    assert len(pair_figure(found, mask.index[0], Co3D(small_folder())).axes) == 8

@@ -48,8 +48,10 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
         if row["symmetric_error"].notna().any():
             known = row["symmetric_error"].fillna(row["error"]).to_numpy(np.float64)
             methods[name]["symmetric_acc30"] = float(accuracy(known, 30))
-        if ours is not None and name != "ours" and row["problem"].tolist() == ours["problem"].tolist():
-            against[name] = paired_difference(ours["error"], errors, weights=drawn)
+        if ours is not None and name != "ours":
+            common = ours[ours["repeat"].isin(row["repeat"])]
+            if row["problem"].tolist() == common["problem"].tolist():
+                against[name] = paired_difference(common["error"], errors, weights=drawn)
     return {"methods": methods} | ({} if ours is None else {"against": against})
 
 

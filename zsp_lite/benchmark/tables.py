@@ -339,7 +339,7 @@ def pair_figure(run: Run, key: str, dataset: Co3D, rows: Sequence[str] | None = 
     Without a translation, they are moved to the middle of the target's points. InputError if no row has a pose.
     """
     stored = {name: run.row(name).dropna(subset=["rotation", "view"]) for name in rows or run.table["row"].unique()}
-    found = {name: row.loc[key] for name, row in stored.items() if key in row.index}
+    found = {name: row.loc[[key]].iloc[0] for name, row in stored.items() if key in row.index}  # of the first seed
     if not found:
         raise InputError(f"pair {key!r} has no pose in the run, expected a key such as {run.table['pair'].iloc[0]}")
     reference, targets = dataset.load_pair(Pair.from_key(key))
