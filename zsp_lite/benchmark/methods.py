@@ -107,7 +107,7 @@ def resolve(methods: str | Sequence[str] | Mapping[str, Any], sweep: Sequence[fl
     """Resolve names to rows, in order and without duplicates.
 
     Names are those of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, "module:thing",
-    "poses.csv", or NAME=one of these. A mapping leads from names to these, to `Method`s, or to objects of one's own.
+    "poses.csv", or NAME=one of these. A mapping leads from names to these, to a `Method`, or to objects of one's own.
     Each RANSAC threshold V of a sweep makes a row NAME@threshold=V of each.
     InputError if a name is unknown or another row's, or a thing cannot be imported or read, or is of no kind.
     """
