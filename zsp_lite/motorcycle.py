@@ -8,7 +8,6 @@ from jaxtyping import Float32, UInt8
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.depth import fit_plane, unproject_depth
 from zsp_lite.data.frames import Frame, largest_region
-from zsp_lite.points import axis_deviation, object_points
 
 CATEGORY, TARGET = "motorcycle", "scooter"  # the synthetic object that tells the directions
 # Directions of the photographed motorcycle in camera coordinates. There is no measured ground truth. The front was
@@ -38,7 +37,8 @@ def load_photograph() -> Frame:
 
     rgb, _, disparity = skimage.data.stereo_motorcycle()
     frame = motorcycle_frame(rgb, disparity)
-    return replace(frame, depth=frame.depth / np.float32(axis_deviation(object_points(frame))))
+    points = unproject_depth(frame.depth, frame.camera)[(frame.mask > 0) & (frame.depth > 0)]
+    return replace(frame, depth=frame.depth / np.float32(points.std(axis=0).mean()))
 
 
 def motorcycle_frame(rgb: UInt8[np.ndarray, "h w 3"], disparity: Float32[np.ndarray, "h w"]) -> Frame:
