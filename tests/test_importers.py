@@ -121,18 +121,22 @@ def test_an_import_holds_a_few_frames_at_once(tmp_path, scan, monkeypatch, box):
     assert max(held) <= 3
 
 
-def test_distortion_is_corrected(tmp_path, views):
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_distortion_is_corrected(tmp_path, views, model):
     folder = tmp_path / "scan"
     write_nerfstudio(folder, views[:1])
     names, coefficients = ("k1", "k2", "p1", "p2", "k3"), np.array([0.12, -0.03, 0.002, -0.001, 2.0])
-    edited(lambda content: content.update(zip(names, coefficients)))(folder)
+    if model == "OPENCV_FISHEYE":
+        names, coefficients = ("k1", "k2", "k3", "k4"), np.array([0.12, -0.03, 0.02, -0.01])
+    edited(lambda content: content.update(zip(names, coefficients), camera_model=model))(folder)
     # A distorted image of a grid of dots, projected by OpenCV.
     view, camera = views[0], views[0].camera
     height, width = camera.size
     wanted = np.mgrid[20 : width - 20 : 12, 20 : height - 20 : 12].reshape(2, -1).T + 0.5
     rays = camera.unproject_camera(wanted, np.ones(len(wanted)))
     matrix = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-    stored, _ = cv2.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), matrix, coefficients)
+    project = cv2.projectPoints if model == "OPENCV" else cv2.fisheye.projectPoints
+    stored, _ = project(rays[:, None], np.zeros(3), np.zeros(3), matrix, coefficients)
     picture = np.zeros((height, width, 3), np.float32)
     for x, y in stored.reshape(-1, 2):
         grid_y, grid_x = np.mgrid[:height, :width]

@@ -1,5 +1,6 @@
-"""One's own pair: sources opened by their path, masks, poses, report, point clouds, by command and by call."""
+"""One's own pair: sources opened by their path, masks, poses, report, point clouds, JSON, by command and by call."""
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -170,11 +171,24 @@ def test_the_aligned_cloud_lies_on_the_target_object_in_its_world(own, ellipsoid
         assert len(np.unique(colours, axis=0)) > 100
 
 
-def test_both_solvers_are_right_and_agree(own):
+def test_json_has_every_number_of_the_estimates(own):
     found, _ = own
     assert list(found.errors) == ["paper", "verified"] and max(found.errors.values()) < 25
-    assert found.disagreement < 20 and len(found.estimates["verified"].alternatives) > 0
     assert "paper: PoseEstimate(" in repr(found) and "verified: PoseEstimate(" in repr(found)
+    content = json.loads(json.dumps(found.as_json(), allow_nan=False))
+    assert content["target"]["views"] == ["b/0", "b/2", "b/4"] and content["reference"]["masks"] == "given"
+    for solver, estimate in found.estimates.items():
+        one = content["estimates"][solver]
+        np.testing.assert_array_equal(one["matrix"], estimate.sim3.matrix)
+        np.testing.assert_allclose(one["scale"] * np.array(one["rotation"]), np.array(one["matrix"])[:3, :3])
+        assert one["view_name"] == found.targets[one["view"]].name and one["flags"] == list(estimate.flags)
+        assert one["error_degrees"] == found.errors[solver] and one["confidence"] == estimate.confidence
+        assert one["one_of_two"] == estimate.one_of_two
+        for other, alternative in zip(one["alternatives"], estimate.alternatives, strict=True):
+            assert other["probability"] == alternative.confidence > 0
+            np.testing.assert_array_equal(other["matrix"], alternative.sim3.matrix)
+        assert len(one["alternatives"]) > 0 or solver == "paper"
+    assert content["degrees_between_solvers"] == found.disagreement < 20
 
 
 def test_where_the_answer_is_one_of_two_both_clouds_are_written(own, tmp_path, monkeypatch):
@@ -253,6 +267,9 @@ def test_several_frames_of_both_objects_agree_on_the_similarity_between_their_wo
     assert again.errors == {} and len(again.estimate.flags) == 1 and again.masks == ("given", "given")
     assert rotation_error(again.world_sim3.R, found.world_sim3.R) < 3
     assert again.world_sim3.scale == pytest.approx(1000 * found.world_sim3.scale, rel=0.05)
+    numbers = found.as_json()
+    np.testing.assert_array_equal(numbers["estimates"]["verified"]["world_matrix"], found.world_sim3.matrix)
+    assert [one["frame"] for one in numbers["votes"]] == [vote.name for vote in found.votes]
 
 
 def test_one_reference_frame_is_the_papers_setting(ellipsoids):
@@ -312,10 +329,14 @@ def test_the_command_prints_the_poses_and_names_its_files(backbone, ellipsoids, 
         assert f"Written: {tmp_path / name}" in text.replace("\n", "") and (tmp_path / name).is_file()
 
 
-def test_the_command_says_that_there_are_no_labels(backbone, pictures, tmp_path, monkeypatch, run):
+def test_the_command_prints_json_alone_or_that_there_are_no_labels(backbone, pictures, tmp_path, monkeypatch, run):
     cup, mug, _ = pictures
     monkeypatch.setattr("zsp_lite.viz.report.write_report", lambda path, *_, **__: path)
     words = ["--intrinsics", ",".join(map(str, INTRINSICS)), "--solver", "paper", "--out", str(tmp_path)]
-    text = run(["estimate", str(cup), str(mug), *words, "--mask", "given", "--mask", "auto"])
+    content = json.loads(run(["estimate", str(cup), str(mug), *words, "--mask", "given", "--mask", "auto", "--json"]))
+    assert content["estimates"]["paper"]["error_degrees"] is None
+    assert (content["reference"]["masks"], content["target"]["masks"]) == ("given", "auto")
+    assert content["files"] == [str(tmp_path / name) for name in ("report.html", "target.ply", "aligned_paper.ply")]
+    text = run(["estimate", str(cup), str(mug), *words])
     assert "No pose labels: the rotation error is unknown." in text and "error:" not in text
     assert "(masks: auto)" in text and "flag: the target was seen from one side only (0 degrees)" in text

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -170,6 +170,47 @@ class PairResult:
 
     def __repr__(self) -> str:
         return "\n".join(f"{solver}: {estimate!r}" for solver, estimate in self.estimates.items())
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all numbers in the types of JSON. Matrices are for column vectors; `null` marks what is unknown."""
+        solved = {}
+        for solver, estimate in self.estimates.items():
+            solved[solver] = {
+                "view": estimate.view,
+                "view_name": self.targets[estimate.view].name,
+                "matrix": estimate.sim3.matrix.tolist(),
+                "rotation": estimate.sim3.R.tolist(),
+                "translation": estimate.sim3.t.tolist(),
+                "scale": float(estimate.sim3.scale),
+                "inliers": int(estimate.inliers.sum()),
+                "matches": len(estimate.matches),
+                "world_matrix": estimate.world_sim3.matrix.tolist(),
+                "confidence": estimate.confidence,
+                "error_degrees": self.errors.get(solver),
+                "flags": list(estimate.flags),
+                "one_of_two": estimate.one_of_two,
+                "alternatives": [
+                    {
+                        "view": one.view, "matrix": one.sim3.matrix.tolist(), "probability": one.confidence,
+                        "degrees_from_best": estimate.angle_to(one),
+                        "score_below_best": estimate.hypotheses[0].score - one.score,
+                    }
+                    for one in estimate.alternatives
+                ],
+                "seconds": dict(estimate.timings),
+            }  # fmt: skip
+        views = [frame.name for frame in self.targets]
+        return {
+            "reference": {"source": self.sources[0], "masks": self.masks[0]},
+            "target": {"source": self.sources[1], "masks": self.masks[1], "views": views},
+            "backbone": self.backbone,
+            "estimates": solved,
+            "degrees_between_solvers": self.disagreement,
+            "votes": [
+                {"frame": one.name, "confidence": one.estimate.confidence, "degrees_from_answer": one.degrees}
+                for one in self.votes
+            ],
+        }
 
 
 def label_errors(found: PairResult, category: Path, sequences: Sequence[str]) -> dict[str, float]:

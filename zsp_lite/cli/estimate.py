@@ -14,7 +14,7 @@ _ONCE_PER_OBJECT = ("mask", "box", "intrinsics", "label", "orientation", "depth"
     epilog=examples(
         "estimate data_samples/motorcycle/scooter data_samples/motorcycle/scooter2",
         "estimate path/to/scan path/to/other_scan --box 120,200,300,280 --box 90,160,320,300",
-        "estimate my_cup.jpg path/to/scan --intrinsics 600,600,320,240 --mask auto",
+        "estimate my_cup.jpg path/to/scan --intrinsics 600,600,320,240 --mask auto --json",
         "estimate path/to/scan path/to/other_scan --helpers path/to/third_scan path/to/fourth_scan",
     )
 )
@@ -30,9 +30,10 @@ _ONCE_PER_OBJECT = ("mask", "box", "intrinsics", "label", "orientation", "depth"
 @click.option("--depth", type=PATH, multiple=True, help="Depth of an image, if it is not beside it. Once per image.")
 @click.option("--workers", type=COUNT, default=1, help="Frames that are solved at once.")
 @click.option("--not-upright", is_flag=True, help="Try four turns by 90 degrees of the reference images.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 @backbone_options
 @click.option("--out", type=PATH, default="outputs/estimate", help="Folder for the report and the point clouds.")
-def estimate(reference, target, others, helpers, not_upright, backbone, out, **settings) -> None:
+def estimate(reference, target, others, helpers, not_upright, as_json, backbone, out, **settings) -> None:
     """Estimate the pose between two objects of one category; no label is needed.
 
     REFERENCE and TARGET are each a sequence of a data folder (ROOT/CATEGORY/SEQUENCE), the folder or zip of a capture
@@ -53,6 +54,8 @@ def estimate(reference, target, others, helpers, not_upright, backbone, out, **s
     solver cannot decide between two poses, the report shows both, and aligned_SOLVER_2.ply is the other. Where both
     are labelled sequences of one category, the rotation error is shown too.
     """
+    import json
+
     from zsp_lite.importers.sources import open_pair
     from zsp_lite.io.locks import writing
     from zsp_lite.own_objects import estimate_pose, write_pair
@@ -67,9 +70,12 @@ def estimate(reference, target, others, helpers, not_upright, backbone, out, **s
         settings |= {"backbone": backbone, "upright": not not_upright, "helpers": sources[2:]}
         found = estimate_pose(*sources[:2], **settings)
         files = write_pair(found, out)
-    _print_tables(found)
-    for path in files:
-        print(f"Written: {path}")
+    if as_json:
+        print(json.dumps(found.as_json() | {"files": [str(path) for path in files]}, indent=1, allow_nan=False))
+    else:
+        _print_tables(found)
+        for path in files:
+            print(f"Written: {path}")
 
 
 def _print_tables(found: Any) -> None:

@@ -38,6 +38,7 @@ class CaptureFrame:
     depth_unit: float = 0.001  # world units per stored depth value
     distortion: tuple[float, ...] = ()  # OpenCV's k1, k2, p1, p2, k3; image, depth and mask are undistorted
     mask: Path | None = None
+    fisheye: bool = False  # whether the distortion is that of OpenCV's fisheye cameras, k1, k2, k3, k4
     confidence: Path | None = None  # of each pixel of the depth map, see `trusted`
     label: int | None = None  # of the object, where masks have the labels of several
     orientation: str | None = None  # "stored" or "displayed": how camera, depth and mask refer to a turned photograph
@@ -83,10 +84,13 @@ class CaptureFrame:
     def _undistortion(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Return OpenCV's maps that undistort the image, of which `camera` is the camera after turning."""
         matrix, coefficients = camera.K - HALF_PIXEL, np.array(self.distortion)
-        p1, p2 = coefficients[2:4]
-        coefficients[[3, 2]] = (camera.R @ self.camera.R.T)[:2, :2] @ (p2, p1)  # a vector: it turns with the image
-        size = camera.size[::-1]
-        return cv2.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
+        if self.fisheye:
+            undistortion = cv2.fisheye.initUndistortRectifyMap
+        else:
+            undistortion = cv2.initUndistortRectifyMap
+            p1, p2 = coefficients[2:4]
+            coefficients[[3, 2]] = (camera.R @ self.camera.R.T)[:2, :2] @ (p2, p1)  # a vector: it turns with the image
+        return undistortion(matrix, coefficients, np.eye(3), matrix, camera.size[::-1], cv2.CV_32FC1)
 
 
 class Capture(NamedTuple):

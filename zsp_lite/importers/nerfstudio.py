@@ -14,6 +14,7 @@ from zsp_lite.io.files import decode_json, find_inside, read_json
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
+_FISHEYE = "OPENCV_FISHEYE"
 _Row = tuple[float | None, float | None, float | None, float | None]  # None: not finite
 _Side = Annotated[float, msgspec.Meta(multiple_of=1)]  # pixels; exporters write 640 or 640.0
 _Angle = Annotated[float, msgspec.Meta(gt=0, lt=math.pi)]  # radians
@@ -68,9 +69,11 @@ def read_nerfstudio(path: str | Path) -> Makers:
 def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     """Make a frame of its values and those of all frames."""
     frame = decode_json(msgspec.json.encode(values), _Frame, where)
-    if frame.camera_model not in _MODELS or frame.k4:
+    fisheye = frame.camera_model == _FISHEYE
+    if not fisheye and (frame.camera_model not in _MODELS or frame.k4):
         found = f"{frame.camera_model!r} with k4 = {frame.k4:g}"
-        raise InputError(f"{where}: camera_model is {found}, expected one of {', '.join(_MODELS)} with k4 = 0")
+        expected = f"one of {', '.join(_MODELS)} with k4 = 0, or {_FISHEYE}"
+        raise InputError(f"{where}: camera_model is {found}, expected {expected}")
     image = find_inside(folder, frame.file_path) or folder / frame.file_path
     found = picture_size(image) if image.is_file() or not (frame.h and frame.w) else None
     height, width = (int(frame.h), int(frame.w)) if frame.h and frame.w else found
@@ -83,9 +86,10 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
         fitted = ", ".join(f"{value * found[1] / width:.4g}" for value in (fx, fy, cx, cy))
         expected = f"its own size {found[1]} x {found[0]} with the intrinsics {fitted}"
         raise InputError(f"{where}: w and h of {image} are {width} x {height}, expected {expected}")
-    distortion = frame.k1, frame.k2, frame.p1, frame.p2, frame.k3  # in OpenCV's order, without an r^8 term, k4
+    # OpenCV's order of the coefficients; its model has no r^8 term, k4.
+    last = (frame.k3, frame.k4) if fisheye else (frame.p1, frame.p2, frame.k3)
     return make_frame(
         folder, frame.file_path, frame.depth_file_path or frame.depth_path, frame.transform_matrix,
-        (fx, fy, cx, cy), where, FROM_OPENGL, (height, width), frame.mask_path,
-        depth_unit=frame.integer_depth_scale or frame.depth_unit_scale_factor, distortion=distortion,
+        (fx, fy, cx, cy), where, FROM_OPENGL, (height, width), frame.mask_path, fisheye=fisheye,
+        depth_unit=frame.integer_depth_scale or frame.depth_unit_scale_factor, distortion=(frame.k1, frame.k2, *last),
     )  # fmt: skip
