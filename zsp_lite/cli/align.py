@@ -9,17 +9,13 @@ from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, 
 
 @click.command(
     epilog=examples(
-        "align data_samples --category car --out outputs/cars",
-        "align path/to/scans --category cup",
-        "align path/to/co3d --category teddybear --pairs 4 --workers 8 --out outputs/teddybears --propose",
+        "align path/to/scans --category cup", "align data_samples --category car --out outputs/cars --propose"
     )
 )
 @click.argument("data", type=PATH)
 @click.option("--category", metavar="NAME", required=True, help="Category of the objects.")
 @click.option("--sequences", type=NAMES, show_default="all of the category", help="Sequences, one per object.")
-@click.option(
-    "--pairs", type=COUNT, show_default="all; 6 from twelve objects on", help="Objects that each is compared with."
-)
+@click.option("--pairs", type=COUNT, show_default="all; 6 from twelve objects on", help="Partners of each object.")
 @click.option("--targets", type=COUNT, default=5, help="Target views per pair.")
 @click.option("--out", type=PATH, show_default="outputs/align/NAME", help="Folder; an existing run is continued.")
 @click.option("--propose", is_flag=True, help="Write the labels into DATA as proposals, which notebook 08 shows.")

@@ -1,8 +1,4 @@
-"""Types of options, options that several commands share, and the examples below a help text.
-
-The command line uses click and not typer: `main` prints click's usage errors as one line, and `--help` does not import
-pydantic.
-"""
+"""Types of options, options that several commands share, and the examples below a help text."""
 
 import math
 from collections.abc import Callable, Collection, Mapping

@@ -21,14 +21,10 @@ _ONCE_PER_OBJECT = ("mask", "box", "intrinsics", "label", "orientation", "depth"
 @click.argument("reference", type=PATH)
 @click.argument("target", type=PATH)
 @click.argument("others", type=PATH, nargs=-1, metavar="")
-@click.option(
-    "--helpers", type=PATH, multiple=True, metavar="C [D ...]", help="Other objects of the category, last of all."
-)
+@click.option("--helpers", type=PATH, multiple=True, metavar="C [D ...]", help="Other objects, last of all.")
 @click.option("--solver", type=click.Choice(SOLVERS), default="verified", help="Solver of the pose.")
 @click.option("--reference-frame", type=INDEX, show_default="first usable", help="Its number in REFERENCE.")
-@click.option(
-    "--references", type=COUNT, show_default="4; 1 with --reference-frame", help="Reference frames of each object."
-)
+@click.option("--references", type=COUNT, show_default="4; 1 with --reference-frame", help="Frames of each object.")
 @click.option("--targets", type=COUNT, show_default="5", help="Number of target views, evenly spaced.")
 @source_options(multiple=True)
 @click.option("--depth", type=PATH, multiple=True, help="Depth of an image, if it is not beside it. Once per image.")
