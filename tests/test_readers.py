@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone
 from test_importers import edited, hairdryer_views, to_world, write_depth16, write_lists, write_nerfstudio
 
+from zsp_lite.course.samples import sample_data
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import write_image, write_mask
@@ -25,7 +26,6 @@ from zsp_lite.importers.capture import find_masks, sharpest, trusted
 from zsp_lite.importers.sources import open_source, spread_views
 from zsp_lite.metrics import rotation_error
 from zsp_lite.own_objects import estimate_pose
-from zsp_lite.samples import sample_data
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 

@@ -19,9 +19,9 @@ from pathlib import Path
 
 import msgspec
 
+from zsp_lite.course.synthetic.meshes import MODELS_FILE, ModelInfo
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import plain_name, read_json, write_atomic
-from zsp_lite.synthetic.meshes import MODELS_FILE, ModelInfo
 
 try:
     from tools.ac3d import convert

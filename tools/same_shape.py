@@ -15,9 +15,9 @@ from pathlib import Path
 
 import msgspec
 
+from zsp_lite.course.synthetic.meshes import MODELS_FILE, read_infos
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import write_atomic
-from zsp_lite.synthetic.meshes import MODELS_FILE, read_infos
 
 CATALOGUE = Path(__file__).with_suffix(".json")
 

@@ -20,13 +20,13 @@ import torch.nn.functional as F
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
+from zsp_lite.course.demo import example_pair
+from zsp_lite.course.samples import sample_data
 from zsp_lite.data.annotations import FRAMES_FILE, SEQUENCES_FILE
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.demo import example_pair
 from zsp_lite.features import log_bin
 from zsp_lite.matching import similarities
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.samples import sample_data
 
 REPEATS, FRAMES = 7, 86_000
 

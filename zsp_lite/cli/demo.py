@@ -24,12 +24,12 @@ def demo(data, solver, backbone, out) -> None:
 
     from zsp_lite.backbones.load import as_backbone
     from zsp_lite.cli.terminal import print_rows
+    from zsp_lite.course.demo import run_demo
+    from zsp_lite.course.photograph import PHOTOGRAPH_COLUMNS, photograph_rows, run_photograph
+    from zsp_lite.course.samples import sample_data
+    from zsp_lite.course.synthetic.export import RENDERED_FILE, SETTINGS_FILE
     from zsp_lite.data.co3d import Co3D
-    from zsp_lite.demo import run_demo
     from zsp_lite.io.locks import writing
-    from zsp_lite.samples import sample_data
-    from zsp_lite.synthetic.export import RENDERED_FILE, SETTINGS_FILE
-    from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, photograph_rows, run_photograph
     from zsp_lite.viz.report import COLUMNS, legend, table_rows, write_overview, write_report
 
     folder = data or sample_data()

@@ -9,15 +9,15 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from zsp_lite import motorcycle
+from zsp_lite.course import motorcycle
+from zsp_lite.course.demo import N_TARGETS
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
-from zsp_lite.demo import N_TARGETS
+from zsp_lite.data.ground_truth import POSES_FILE, object_poses
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import object_points
-from zsp_lite.synthetic.ground_truth import POSES_FILE, object_poses
 from zsp_lite.viz import plots
 
 PHOTOGRAPH_COLUMNS = ("foreground", "solver", "front off by", "up off by", "confidence")

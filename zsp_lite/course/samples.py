@@ -22,7 +22,7 @@ def sample_data() -> Path:
     for folder in folders:
         if folder.is_dir():
             return folder
-    from zsp_lite.synthetic.export import export_preset
+    from zsp_lite.course.synthetic.export import export_preset
 
     # A warning, because a program without logging settings shows nothing else.
     logger.warning("No data_samples/ here: making synthetic samples in %s, once", folder)

@@ -20,13 +20,13 @@ from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
 from zsp_lite.category import CategoryAlignment
+from zsp_lite.course.photograph import PHOTOGRAPH_COLUMNS, PhotographResult, photograph_figure, photograph_rows
+from zsp_lite.course.samples import REPOSITORY
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.estimates import PairResult, PoseEstimate
 from zsp_lite.io.files import write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
-from zsp_lite.samples import REPOSITORY
 from zsp_lite.viz import category_sheet, plots
-from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, PhotographResult, photograph_figure, photograph_rows
 from zsp_lite.viz.pose_picture import pose_picture
 from zsp_lite.viz.scene3d import aligned_clouds
 from zsp_lite.viz.votes import ring_figure, votes_figure

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.synthetic.meshes import Material, TexturedMesh, smooth_normals
-from zsp_lite.synthetic.primitives import Mesh, cylinder, extrusion, joined, surface_spread
-from zsp_lite.synthetic.textures import hsv
+from zsp_lite.course.synthetic.meshes import Material, TexturedMesh, smooth_normals
+from zsp_lite.course.synthetic.primitives import Mesh, cylinder, extrusion, joined, surface_spread
+from zsp_lite.course.synthetic.textures import hsv
 
 Y = (0.0, 1.0, 0.0)
 

@@ -11,16 +11,16 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from tqdm import tqdm
 
+from zsp_lite.course.synthetic.assembly import Builder, make_shape, random_materials
+from zsp_lite.course.synthetic.categories import CATEGORIES
+from zsp_lite.course.synthetic.meshes import TexturedMesh, canonical_mesh, list_models, read_mesh
+from zsp_lite.course.synthetic.sequences import HEIGHTS, record_sequence
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
+from zsp_lite.data.ground_truth import POSES_FILE, ObjectPose, read_poses
 from zsp_lite.data.labels import PoseLabel, write_label
 from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
-from zsp_lite.synthetic.assembly import Builder, make_shape, random_materials
-from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.ground_truth import POSES_FILE, ObjectPose, read_poses
-from zsp_lite.synthetic.meshes import TexturedMesh, canonical_mesh, list_models, read_mesh
-from zsp_lite.synthetic.sequences import HEIGHTS, record_sequence
 
 SETTINGS_FILE = "synthetic.json"  # in the data folder of procedural objects: the settings of the export
 RENDERED_FILE = "rendered_models.json"  # in that of models: the settings, and the model of each sequence

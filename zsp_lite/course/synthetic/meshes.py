@@ -13,10 +13,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from zsp_lite.course.synthetic.primitives import Mesh, joined, surface_spread, unit
+from zsp_lite.course.synthetic.textures import linear_to_srgb
 from zsp_lite.errors import InputError, check_magnitude, rotation_matrix
 from zsp_lite.io.files import file_size, plain_name, read_bytes, read_json
-from zsp_lite.synthetic.primitives import Mesh, joined, surface_spread, unit
-from zsp_lite.synthetic.textures import linear_to_srgb
 
 EXTENSIONS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".dae")
 MAX_BYTES = 300_000_000  # of a model file

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from zsp_lite.course.synthetic.meshes import TexturedMesh
+from zsp_lite.course.synthetic.primitives import unit
+from zsp_lite.course.synthetic.room import FLOOR_REACH, Room
+from zsp_lite.course.synthetic.textures import pyramid, sample_image, sample_pyramid, srgb_to_linear
 from zsp_lite.data.cameras import Camera
 from zsp_lite.io.ply import load_open3d
-from zsp_lite.synthetic.meshes import TexturedMesh
-from zsp_lite.synthetic.primitives import unit
-from zsp_lite.synthetic.room import FLOOR_REACH, Room
-from zsp_lite.synthetic.textures import pyramid, sample_image, sample_pyramid, srgb_to_linear
 
 _LAYERS = 4  # surfaces with holes that a ray passes through
 _OFFSET = 2e-3  # of the start of a ray from the surface that it leaves, in units

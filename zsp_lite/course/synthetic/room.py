@@ -9,7 +9,15 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from zsp_lite.synthetic.textures import blur, hsv, linear_to_srgb, pyramid, sample_pyramid, srgb_to_linear, surface
+from zsp_lite.course.synthetic.textures import (
+    blur,
+    hsv,
+    linear_to_srgb,
+    pyramid,
+    sample_pyramid,
+    srgb_to_linear,
+    surface,
+)
 
 FLOOR_REACH = 25.0  # distance in units up to which the floor has depth
 _FLOOR, _CEILING = 4, 5  # among the faces of a room

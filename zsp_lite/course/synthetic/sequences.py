@@ -11,15 +11,15 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from zsp_lite.course.synthetic.meshes import TexturedMesh
+from zsp_lite.course.synthetic.primitives import TAU
+from zsp_lite.course.synthetic.raytracing import MeshScene, Rendering
+from zsp_lite.course.synthetic.room import random_room
+from zsp_lite.course.synthetic.textures import blur, smooth_noise
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import SequenceData
 from zsp_lite.data.frames import Frame
 from zsp_lite.points import axis_deviation
-from zsp_lite.synthetic.meshes import TexturedMesh
-from zsp_lite.synthetic.primitives import TAU
-from zsp_lite.synthetic.raytracing import MeshScene, Rendering
-from zsp_lite.synthetic.room import random_room
-from zsp_lite.synthetic.textures import blur, smooth_noise
 
 _ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
 HEIGHTS = (19.0, 30.0)  # lowest and highest mean elevation of a sequence's cameras above the object, degrees

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from zsp_lite.training.renders import VIEWS, RenderSet
+from zsp_lite.course.training.renders import VIEWS, RenderSet
 
 PATCH_SIZE = 8  # pixels
 MEAN, STD = 0.45, 0.25  # normalisation of RGB values in [0, 1] during training

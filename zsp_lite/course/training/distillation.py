@@ -19,7 +19,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.training.batches import crop_grids, recolour
+from zsp_lite.course.training.batches import crop_grids, recolour
 
 GLOBAL_SCALE, LOCAL_SCALE = (0.6, 1.0), (0.25, 0.6)  # widths of the crops as a fraction of the image's
 HIDDEN, BOTTLENECK = 256, 64  # widths of the head's layers

@@ -9,8 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from zsp_lite.training.batches import Batch
-from zsp_lite.training.trainee import Trainee
+from zsp_lite.course.training.batches import Batch
+from zsp_lite.course.training.trainee import Trainee
 
 RADIUS = 0.15  # standard deviation of the correspondence targets, in object units
 TEMPERATURE = 0.1  # of the correspondence loss

@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from zsp_lite.course.synthetic.assembly import Assembly, make_shape, random_materials
+from zsp_lite.course.synthetic.meshes import TexturedMesh
+from zsp_lite.course.synthetic.primitives import TAU, Mesh, box, capsule, cylinder, ellipsoid, extrusion, torus
+from zsp_lite.course.synthetic.raytracing import MeshScene, Rendering
+from zsp_lite.course.synthetic.room import Room, random_room
+from zsp_lite.course.synthetic.sequences import orbit_pose
 from zsp_lite.data.cameras import Camera
-from zsp_lite.synthetic.assembly import Assembly, make_shape, random_materials
-from zsp_lite.synthetic.meshes import TexturedMesh
-from zsp_lite.synthetic.primitives import TAU, Mesh, box, capsule, cylinder, ellipsoid, extrusion, torus
-from zsp_lite.synthetic.raytracing import MeshScene, Rendering
-from zsp_lite.synthetic.room import Room, random_room
-from zsp_lite.synthetic.sequences import orbit_pose
 
 VIEWS = 8  # per object
 SIZE = 192  # of a view, pixels

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from zsp_lite.backbones.vit import TrainingTokens, VisionTransformer
-from zsp_lite.training.batches import PATCH_SIZE, sample_batch
-from zsp_lite.training.renders import VIEWS, RenderSet
+from zsp_lite.course.training.batches import PATCH_SIZE, sample_batch
+from zsp_lite.course.training.renders import VIEWS, RenderSet
 
 
 class Trainee(nn.Module):

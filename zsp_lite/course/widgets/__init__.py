@@ -3,6 +3,6 @@
 `self_check` shows questions with instant feedback. `tools/widget_examples.py` builds every widget on sample data.
 """
 
-from zsp_lite.widgets.quiz import self_check
+from zsp_lite.course.widgets.quiz import self_check
 
 __all__ = ["self_check"]

@@ -6,10 +6,10 @@ from jaxtyping import Float, Real
 from matplotlib.collections import LineCollection
 
 from zsp_lite.alignment import SCALE_RANGE, ransac, umeyama
+from zsp_lite.course.widgets.common import Widget, interactive_figure, load_package, redrawing, slider
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION, draw_image, draw_matches, show_points
-from zsp_lite.widgets.common import Widget, interactive_figure, load_package, redrawing, slider
 
 _FARTHEST = 6.0  # that `one_outlier` moves the point, scene units
 _TRIALS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)

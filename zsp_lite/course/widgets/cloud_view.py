@@ -13,9 +13,9 @@ from jaxtyping import Float, Int, Real, UInt8
 from scipy.spatial import KDTree
 
 from zsp_lite.alignment import Sim3
+from zsp_lite.course.widgets.common import load_package
 from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, ORANGE
-from zsp_lite.widgets.common import load_package
 
 MAX_POINTS = 6000  # points drawn; more are slow in the browser
 _DEPTH_TOLERANCE = 0.15  # points farther behind the front point under the pointer cannot be clicked; in view units

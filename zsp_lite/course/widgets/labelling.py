@@ -1,7 +1,7 @@
 """Widget for labelling poses: keypoints by clicks on point clouds, residuals, overlay, accept.
 
-The widget only displays and forwards. `zsp_lite.labelling.Labelling` holds the keypoints and writes every change at
-once, so that the work continues after a restart.
+The widget only displays and forwards. `zsp_lite.course.labelling.Labelling` holds the keypoints and writes every change
+at once, so that the work continues after a restart.
 """
 
 import html
@@ -12,12 +12,12 @@ import numpy as np
 import pandas as pd
 
 from zsp_lite.alignment import Sim3
+from zsp_lite.course.labelling.session import ACCEPTED, MIN_KEYPOINTS, OPEN, SKIPPED, Alignment, Labelling, Progress
+from zsp_lite.course.widgets.cloud_view import CloudView, subsample
+from zsp_lite.course.widgets.common import Widget, load_package
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
-from zsp_lite.labelling.session import ACCEPTED, MIN_KEYPOINTS, OPEN, SKIPPED, Alignment, Labelling, Progress
 from zsp_lite.viz.plots import BLUE, ORANGE
-from zsp_lite.widgets.cloud_view import CloudView, subsample
-from zsp_lite.widgets.common import Widget, load_package
 
 _STATE_SYMBOLS = {ACCEPTED: "✓", OPEN: "○", SKIPPED: "–"}
 _PROPOSED = "A proposal is laid over the cloud: accept it if both clouds agree; otherwise click keypoints, or skip."

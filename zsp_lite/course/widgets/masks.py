@@ -3,11 +3,11 @@
 import numpy as np
 from matplotlib.patches import Rectangle
 
+from zsp_lite.course.widgets.common import Widget, interactive_figure, slider
 from zsp_lite.data.cameras import Box
 from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.importers.masks import grab_cut
 from zsp_lite.viz.plots import ORANGE, show_images
-from zsp_lite.widgets.common import Widget, interactive_figure, slider
 
 
 def box_to_mask(frame: Frame, box: Box) -> Widget:

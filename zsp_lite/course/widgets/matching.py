@@ -4,10 +4,10 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from zsp_lite.course.widgets.common import Widget, interactive_figure, patch_sliders, redrawing
 from zsp_lite.matching import nearest_neighbours
 from zsp_lite.views import View
 from zsp_lite.viz import plots
-from zsp_lite.widgets.common import Widget, interactive_figure, patch_sliders, redrawing
 
 
 def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:

@@ -7,9 +7,9 @@ types "multiple_choice", "many_choice" and "numeric"). Texts are HTML: `<i>K</i>
 import json
 from pathlib import Path
 
+from zsp_lite.course.widgets.common import load_package
 from zsp_lite.errors import InputError, check_choice, check_integer
 from zsp_lite.viz.plots import BLUE
-from zsp_lite.widgets.common import load_package
 
 QUESTIONS = Path(__file__).parent / "questions"
 # Also legible on dark pages; blue-green and orange differ for colour-blind readers too.

@@ -3,11 +3,11 @@
 No backbone is trained on them, and no setting is chosen by them.
 """
 
-from zsp_lite.synthetic.assembly import Builder
-from zsp_lite.synthetic.categories.belongings import backpack, book, handbag, keyboard, laptop, mouse, remote
-from zsp_lite.synthetic.categories.household import chair, hairdryer, toaster, toilet
-from zsp_lite.synthetic.categories.street import bicycle, car, hydrant, motorcycle
-from zsp_lite.synthetic.categories.toys import teddybear, toybus, toyplane, toytrain, toytruck
+from zsp_lite.course.synthetic.assembly import Builder
+from zsp_lite.course.synthetic.categories.belongings import backpack, book, handbag, keyboard, laptop, mouse, remote
+from zsp_lite.course.synthetic.categories.household import chair, hairdryer, toaster, toilet
+from zsp_lite.course.synthetic.categories.street import bicycle, car, hydrant, motorcycle
+from zsp_lite.course.synthetic.categories.toys import teddybear, toybus, toyplane, toytrain, toytruck
 
 _BUILDERS = (
     backpack, bicycle, book, car, chair, hairdryer, handbag, hydrant, keyboard, laptop, motorcycle, mouse, remote,

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from zsp_lite.synthetic.assembly import Assembly, Y, rounded_box, tapered
-from zsp_lite.synthetic.primitives import TAU, Mesh, box, capsule, cylinder, ellipsoid, extrusion, lathe, torus
+from zsp_lite.course.synthetic.assembly import Assembly, Y, rounded_box, tapered
+from zsp_lite.course.synthetic.primitives import TAU, Mesh, box, capsule, cylinder, ellipsoid, extrusion, lathe, torus
 
 
 def backpack(a: Assembly) -> None:

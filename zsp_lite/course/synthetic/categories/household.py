@@ -2,8 +2,19 @@
 
 import numpy as np
 
-from zsp_lite.synthetic.assembly import Assembly, rounded_box
-from zsp_lite.synthetic.primitives import TAU, Mesh, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
+from zsp_lite.course.synthetic.assembly import Assembly, rounded_box
+from zsp_lite.course.synthetic.primitives import (
+    TAU,
+    Mesh,
+    box,
+    capsule,
+    cylinder,
+    ellipsoid,
+    extrusion,
+    lathe,
+    rod,
+    torus,
+)
 
 
 def chair(a: Assembly) -> None:

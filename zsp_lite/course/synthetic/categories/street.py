@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from zsp_lite.synthetic.assembly import Assembly, Y, add_wheels, disc, pane, rounded_box, tapered
-from zsp_lite.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
+from zsp_lite.course.synthetic.assembly import Assembly, Y, add_wheels, disc, pane, rounded_box, tapered
+from zsp_lite.course.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
 
 
 def bicycle(a: Assembly) -> None:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from zsp_lite.synthetic.assembly import Assembly, add_wheels, disc, pane, rounded_box
-from zsp_lite.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod
+from zsp_lite.course.synthetic.assembly import Assembly, add_wheels, disc, pane, rounded_box
+from zsp_lite.course.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod
 
 
 def teddybear(a: Assembly) -> None:
