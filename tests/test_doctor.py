@@ -8,7 +8,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from zsp_lite.cli.main import main
-from zsp_lite.course.samples import REPOSITORY
+from zsp_lite.io.files import REPOSITORY
 
 
 def test_the_tested_environment_pins_every_dependency_within_its_range():

@@ -19,9 +19,9 @@ from zsp_lite import minimal
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.choices import SOLVERS
-from zsp_lite.course.samples import REPOSITORY
 from zsp_lite.data.pairs import labelled_categories, shipped_pairs
 from zsp_lite.features import log_bin
+from zsp_lite.io.files import REPOSITORY
 from zsp_lite.pipeline import solve_pair
 
 STORED = json.loads(Path(__file__).with_name("sample_poses.json").read_text(encoding="utf-8"))

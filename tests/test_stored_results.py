@@ -7,7 +7,7 @@ import pytest
 
 from tools import results_page
 from zsp_lite.benchmark.runs import read_run
-from zsp_lite.course.samples import REPOSITORY
+from zsp_lite.io.files import REPOSITORY
 from zsp_lite.verified.verification import ScoreCoefficients
 from zsp_lite.viz.reliability import reliability
 

@@ -11,7 +11,7 @@ from refusals import refused
 
 from zsp_lite.alignment import Sim3, ransac, umeyama
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.data.ground_truth import correct_matches
+from zsp_lite.course.true_matches import correct_matches
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.metrics import rotation_error
 

@@ -15,11 +15,11 @@ from zsp_lite.backbones.load import load_backbone
 from zsp_lite.course.demo import demo_pairs
 from zsp_lite.course.labelling.session import Labelling
 from zsp_lite.course.samples import sample_data
+from zsp_lite.course.true_matches import GroundTruthPair, ground_truth_pair
 from zsp_lite.course.widgets import alignment as alignment_widgets
 from zsp_lite.course.widgets import features, labelling, masks, matching
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import mask_to_bbox
-from zsp_lite.data.ground_truth import GroundTruthPair, ground_truth_pair
 from zsp_lite.estimates import match_points
 from zsp_lite.matching import key_similarities, match, similarity
 from zsp_lite.views import View, extract_views

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -19,8 +20,9 @@ from zsp_lite.features import FeatureExtractor
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import object_points
 from zsp_lite.viz import plots
+from zsp_lite.viz.report import PhotographSection
 
-PHOTOGRAPH_COLUMNS = ("foreground", "solver", "front off by", "up off by", "confidence")
+_COLUMNS = ("foreground", "solver", "front off by", "up off by", "confidence")
 _FOREGROUNDS = {"mask": "mask", "saliency": "own saliency"}  # settings of `ZeroShotPose`, and their names here
 _SOLVERS = ("paper", "verified")
 _POINTS = 1500  # drawn of the aligned cloud
@@ -69,14 +71,14 @@ def run_photograph(dataset: Co3D, backbone: FeatureExtractor) -> Iterator[Photog
             yield PhotographResult(photograph, sequence, foreground, solver, estimate, axes, cloud, along, *errors)
 
 
-def photograph_rows(results: Sequence[PhotographResult]) -> list[tuple[str, str, str, str, str]]:
-    """Format each result: foreground, solver, errors and confidence (see `PHOTOGRAPH_COLUMNS`)."""
+def photograph_section(results: Sequence[PhotographResult]) -> PhotographSection:
+    """Return what the report of the demo shows of the results."""
     rows = []
     for result in results:
         confidence = "–" if result.estimate.confidence is None else f"{result.estimate.confidence:.2f}"
         errors = f"{result.front_error:.0f}°", f"{result.up_error:.0f}°"
         rows.append((_FOREGROUNDS[result.foreground], result.solver, *errors, confidence))
-    return rows
+    return PhotographSection(results[0].sequence, _COLUMNS, rows, partial(photograph_figure, results))
 
 
 def photograph_figure(results: Sequence[PhotographResult]) -> Figure:

@@ -5,11 +5,10 @@ from pathlib import Path
 
 from zsp_lite.errors import InputError
 from zsp_lite.io.download import cache_folder
+from zsp_lite.io.files import REPOSITORY
 from zsp_lite.io.locks import writing
 
 logger = logging.getLogger(__name__)
-
-REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 def sample_data() -> Path:

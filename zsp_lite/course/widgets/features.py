@@ -13,8 +13,8 @@ from zsp_lite.backbones.backbone import Backbone, normalize, prepare_images
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.best_view import mask_iou
 from zsp_lite.choices import FACETS
+from zsp_lite.course.true_matches import correct_matches
 from zsp_lite.course.widgets.common import Widget, interactive_figure, load_package, patch_sliders, redrawing, slider
-from zsp_lite.data.ground_truth import correct_matches
 from zsp_lite.errors import InputError
 from zsp_lite.views import View, patch_mask
 from zsp_lite.viz import plots
