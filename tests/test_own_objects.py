@@ -234,9 +234,7 @@ def test_a_capture_is_a_target_of_several_views_without_those_that_are_black_or_
     views = around(ELSEWHERE, 6)
     views[2] = replace(views[2], rgb=np.zeros_like(views[2].rgb))
     views[3] = replace(views[3], mask=np.zeros_like(views[3].mask))
-    write_lists(tmp_path, views)
-    for view in views:
-        write_mask(tmp_path / f"masks/{view.name}.png", view.mask)
+    write_lists(tmp_path, views, masks=True)
     found = estimate_pose(cup, tmp_path, targets=6, intrinsics=INTRINSICS, backbone=CoordinateBackbone())
     estimate = found.estimates["verified"]
     truth = true_pose(look_at((1, 0.3, 0.3)), AT_HOME, views[estimate.view].camera, ELSEWHERE)
