@@ -45,12 +45,6 @@ def test_projection_agrees_with_pytorch3ds_own_row_vector_formula(seed, intrinsi
     np.testing.assert_allclose(depth, row[:, 2], rtol=1e-9)
 
 
-@given(seeds)
-def test_unproject_undoes_project(seed):
-    camera, points = visible_points(seed)
-    np.testing.assert_allclose(camera.unproject(*camera.project(points)), points, rtol=1e-9, atol=1e-9)
-
-
 @given(seeds, st.integers(0, 50), st.integers(0, 50), st.integers(1, 300), st.integers(1, 300))
 def test_cropping_shifts_pixels_and_resizing_scales_them(seed, top, left, height, width):
     camera, points = visible_points(seed)

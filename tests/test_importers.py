@@ -218,8 +218,7 @@ def test_a_single_frame_is_fused_and_a_surface_that_one_of_many_frames_saw_is_le
 
 def test_bad_boxes_empty_depth_and_frames_without_overlap_are_refused(views):
     refused("expected one inside", masks_from_box, views, (0, 0, 5, 9999))
-    with pytest.raises(InputError, match="no known depth on the object"):
-        fuse([replace(view, depth=np.zeros_like(view.depth)) for view in views])
+    refused("no known depth on the object", fuse, [replace(view, depth=np.zeros_like(view.depth)) for view in views])
     with pytest.raises(InputError, match="expected overlapping depth maps"):
         fuse([replace(v, camera=replace(v.camera, t=v.camera.t + 100 * i)) for i, v in enumerate(views[:3])])
 
