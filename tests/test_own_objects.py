@@ -152,12 +152,6 @@ def pictures(tmp_path_factory):
     return folder / "cup.jpg", folder / "mug.jpg", true_pose(first, AT_HOME, second, ELSEWHERE)
 
 
-@pytest.fixture
-def backbone(monkeypatch):
-    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda choice: CoordinateBackbone())
-    monkeypatch.setenv("COLUMNS", "160")
-
-
 def test_the_aligned_cloud_lies_on_the_target_object_in_its_world(own, ellipsoids):
     found, out = own
     names = ["aligned_paper.ply", "aligned_verified.ply", "report.html", "target.ply"]
@@ -318,7 +312,7 @@ def test_depth_in_another_unit_is_questioned(image, frames, tmp_path):
     np.testing.assert_array_equal(frame.depth, frames[0].depth)
 
 
-def test_the_command_prints_the_poses_and_names_its_files(backbone, ellipsoids, tmp_path, run):
+def test_the_command_prints_the_poses_and_names_its_files(loaded, ellipsoids, tmp_path, run):
     folder = ellipsoids.root / "ellipsoid"
     words = [str(folder / "a"), str(folder / "b"), "--targets", "3", "--out", str(tmp_path)]
     text = run(["estimate", *words, "--solver", "both", "--reference-frame", "2"])
@@ -327,7 +321,7 @@ def test_the_command_prints_the_poses_and_names_its_files(backbone, ellipsoids, 
         assert f"Written: {tmp_path / name}" in text.replace("\n", "") and (tmp_path / name).is_file()
 
 
-def test_the_command_prints_json_alone_or_that_there_are_no_labels(backbone, pictures, tmp_path, monkeypatch, run):
+def test_the_command_prints_json_alone_or_that_there_are_no_labels(loaded, pictures, tmp_path, monkeypatch, run):
     cup, mug, _ = pictures
     monkeypatch.setattr("zsp_lite.viz.report.write_report", lambda path, *_, **__: path)
     words = ["--intrinsics", ",".join(map(str, INTRINSICS)), "--solver", "paper", "--out", str(tmp_path)]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from refusals import refused
-from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, reference_and_targets, true_pose
+from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, true_pose
 
 from zsp_lite import pipeline
 from zsp_lite.alignment import ransac
@@ -28,11 +28,6 @@ from zsp_lite.views import extract_views, object_crop, patch_mask
 @pytest.fixture(scope="module")
 def method():
     return ZeroShotPose(CoordinateBackbone())
-
-
-@pytest.fixture(scope="module")
-def frames():
-    return reference_and_targets(5)
 
 
 @pytest.fixture(scope="module")

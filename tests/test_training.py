@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -26,33 +27,25 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module", autouse=True)
 def two_rooms():
     """Rooms take five times as long as a view."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rendering, "ROOMS", 2)
+    with patch.object(rendering, "ROOMS", 2):
         yield
 
 
 @pytest.fixture(scope="module")
-def azimuths() -> list[float]:
-    """Of every view of `renders`, one object after the other."""
-    return []
+def rendered():
+    """The renders of three training objects, and the azimuth of every view, one object after the other."""
+    with patch.object(rendering, "orbit_pose", wraps=orbit_pose) as poses:
+        return render_set(range(3)), [call.kwargs["azimuth"] for call in poses.call_args_list]
 
 
 @pytest.fixture(scope="module")
-def renders(azimuths):
-    """The renders of three training objects."""
-
-    def kept(azimuth, **others):
-        azimuths.append(azimuth)
-        return orbit_pose(azimuth, **others)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rendering, "orbit_pose", kept)
-        return render_set(range(3))
+def renders(rendered):
+    return rendered[0]
 
 
-def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(renders, azimuths):
+def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(rendered):
     partner = np.arange(VIEWS) ^ 1
-    for of_object in np.reshape(azimuths, (3, VIEWS)):
+    for of_object in np.reshape(rendered[1], (3, VIEWS)):
         turns = np.subtract.outer(of_object, of_object)
         apart = np.degrees(np.abs((turns + np.pi) % (2 * np.pi) - np.pi))
         found = apart[np.arange(VIEWS), partner]
