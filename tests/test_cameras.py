@@ -9,12 +9,6 @@ from synthetic_views import level_camera
 from zsp_lite.data.cameras import Camera, view_span
 
 FORMATS = ["ndc_norm_image_bounds", "ndc_isotropic"]
-SIZE = (480, 640)
-
-
-def view(**changes):
-    values = {"R": np.eye(3), "t": [0, 0, 2], "focal_length": [500, 500], "principal_point": [320, 240], "size": SIZE}
-    return Camera(**(values | changes))
 
 
 def visible_points(seed: int) -> tuple[Camera, np.ndarray]:
@@ -67,7 +61,8 @@ def test_cropping_shifts_pixels_and_resizing_scales_them(seed, top, left, height
     ({"size": (0, 5)}, "image size .* is 0, expected an integer from 1"),
 ])  # fmt: skip
 def test_invalid_cameras_are_refused(changes, message):
-    refused(message, view, **changes)
+    valid = {"R": np.eye(3), "t": [0, 0, 2], "focal_length": [500, 500], "principal_point": [32, 24], "size": (48, 64)}
+    refused(message, lambda: Camera(**(valid | changes)))
 
 
 @pytest.mark.parametrize("roll", [0, 1])

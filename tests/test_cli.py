@@ -214,13 +214,9 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
         assert given.pop() == common + last and not given
 
 
-@pytest.fixture
-def root(tmp_path):
-    write_co3d(tmp_path / "data", "chair", [sequence_data("a"), sequence_data("b")])
-    return tmp_path / "data"
-
-
-def test_labels_are_imported_and_transferred(root, tmp_path, run):
+def test_labels_are_imported_and_transferred(tmp_path, run):
+    root = tmp_path / "data"
+    write_co3d(root, "chair", [sequence_data("a"), sequence_data("b")])
     for name in "ab":
         write_label(tmp_path / "clone/data", "chair", PoseLabel(np.eye(4), name, "a"))
     assert "2 labels, 0 files of pairs" in run(["data", "labels", str(tmp_path / "clone"), "--root", str(root)])

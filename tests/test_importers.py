@@ -230,8 +230,7 @@ def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(t
     done = import_source(source, tmp_path / "data", "teapot", "mine")
     assert (done.frames, done.empty) == (5, 1)
     assert len(Co3D(tmp_path / "data").frames("teapot", "mine")) == 5
-    with pytest.raises(InputError, match="mine exists already, expected another sequence name"):
-        import_source(source, tmp_path / "data", "teapot", "mine")
+    refused("mine exists already, expected another", import_source, source, tmp_path / "data", "teapot", "mine")
 
 
 def test_every_capture_in_a_folder_is_imported_once(tmp_path, views):

@@ -15,7 +15,6 @@ from zsp_lite.data.co3d import Co3D, SequenceData
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import shipped_pairs
-from zsp_lite.errors import InputError
 from zsp_lite.samples import REPOSITORY
 from zsp_lite.synthetic import export
 from zsp_lite.synthetic.export import RENDERED_FILE, export_models
@@ -92,8 +91,7 @@ def test_complete_sequences_stay_and_turned_models_are_rendered_again(data, fold
 
 def test_a_folder_of_other_data_or_without_a_usable_model_is_refused(data, folder, tmp_path):
     write_quad(tmp_path / "models" / "sign" / "stop.obj", opacity=0)
-    with pytest.raises(InputError, match="holds no usable model; sign/stop: .* no visible face"):
-        export_models(tmp_path / "models", tmp_path / "out")
+    refused("no usable model; sign/stop: .* no visible face", export_models, tmp_path / "models", tmp_path / "out")
     shutil.copytree(data[0].root, tmp_path / "other")
     (tmp_path / "other" / RENDERED_FILE).unlink()
     refused("holds other data", export_models, folder, tmp_path / "other")

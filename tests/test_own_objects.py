@@ -128,8 +128,7 @@ def test_paths_that_are_no_source_are_refused(tmp_path, ellipsoids, frames):
 def test_options_that_no_source_takes_are_refused(ellipsoids, image):
     sequence = ellipsoids.root / "ellipsoid/a"
     refused("--depth-unit does not go with .* of the format sequence", open_source, sequence, depth_unit=1.0)
-    with pytest.raises(InputError, match="--mask: 3 values with sequence and sequence, expected 1 or 2"):
-        open_pair(sequence, sequence, {"mask": ("auto",) * 3})
+    refused("--mask: 3 values with .*, expected 1 or 2", open_pair, sequence, sequence, {"mask": ("auto",) * 3})
     with pytest.raises(InputError, match="--depth: 1 values with image and image, expected 2"):
         open_pair(image, image, {"intrinsics": (INTRINSICS,), "depth": ("z.png",)})
 

@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 from small_backbones import small_vit
 
-from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.synthetic.assembly import make_shape, random_materials
 from zsp_lite.synthetic.categories import CATEGORIES
 from zsp_lite.synthetic.sequences import orbit_pose
@@ -200,11 +199,6 @@ def pictures() -> np.ndarray:
     return rgb
 
 
-@pytest.fixture(scope="module")
-def backbone() -> VisionTransformer:
-    return small_vit(1, embed_dim=24, depth=2, num_heads=2)
-
-
 def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_crop():
     rng = np.random.default_rng(0)
     student, teacher, centre = rng.normal(size=(4, 3, 5)), rng.normal(size=(2, 3, 5)), rng.normal(size=5)
@@ -225,7 +219,8 @@ def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_cro
     assert figures["kl"] == pytest.approx(np.mean(terms) - np.mean(entropies))
 
 
-def test_a_run_depends_on_its_seed_alone_and_leaves_the_given_backbone_as_it_was(pictures, backbone):
+def test_a_run_depends_on_its_seed_alone_and_leaves_the_given_backbone_as_it_was(pictures):
+    backbone = small_vit(1, embed_dim=24, depth=2, num_heads=2)
     before = copy.deepcopy(backbone.state_dict())
     runs = [Distillation(replace(TINY, seed=seed), backbone, pictures) for seed in (0, 0, 1)]
     figures = [[run.step() for _ in range(3)] for run in runs]
