@@ -99,7 +99,7 @@ def test_with_perfect_features_the_directions_and_the_cloud_are_those_of_the_obj
     points = photograph.camera.to_camera(np.random.default_rng(0).uniform(-1, 1, (400, 3)))
     by_eye = np.array([FRONT, UP])
     results = list(run_photograph(motorcycles, CoordinateBackbone()))
-    assert len(results) == 2
+    assert len(results) == 4  # two foregrounds, two solvers
     for result in results:
         relative = result.estimate.target_camera.R @ ELSEWHERE.R @ photograph.camera.R.T
         error = rotation_error(result.estimate.sim3.R, relative)
