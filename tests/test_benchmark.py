@@ -205,9 +205,10 @@ def test_seeds_repeat_every_pair_with_other_draws_and_tables_average_over_them(t
     evaluate(*arguments, tmp_path / "three")
     summary = evaluate(*arguments, tmp_path / "three", seeds=3)
     found = read_run(tmp_path / "three")
-    first = found.table[found.table["repeat"] == 0].reset_index(drop=True)
-    assert first["error"].equals(once.table["error"]), "the first seed is that of a run with one"
-    assert found.table.groupby(["row", "pair"]).size().eq(3).all()
+    repeated = found.table[found.table["row"].isin(["ours", "ours-bv"])]
+    first = repeated[repeated["repeat"] == 0]["error"].tolist()
+    assert first == once.table["error"].tolist(), "the first seed is that of a run with one"
+    assert repeated.groupby(["row", "pair"]).size().eq(3).all()
     assert found.table[found.table["row"] == "ours"].groupby("pair")["error"].nunique().max() > 1
     ours, before = (one["methods"]["ours"] for one in (summary, once.summary))
     assert ours["n"] == before["n"] and summary["data"]["pairs"] == once.summary["data"]["pairs"]

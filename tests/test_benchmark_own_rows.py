@@ -611,14 +611,3 @@ def test_the_library_is_known_by_version_and_commit(tmp_path, monkeypatch):
     assert found[:2] == [None, None] and len(commit) == 40
     (tmp_path / "__init__.py").write_text("x = 1")
     assert version()["commit"] == f"{commit}-dirty"
-
-
-def test_a_matcher_of_keypoints_gets_the_same_reference_for_every_view(tmp_path):
-    def overwriting(first, second):
-        seen.append(int(first.sum()))
-        first[:] = 0
-        return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
-
-    seen = []
-    run_rows({"mine": overwriting}, tmp_path, 1, 3)
-    assert len(seen) == 3 and len(set(seen)) == 1 and seen[0] > 0
