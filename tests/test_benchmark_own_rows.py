@@ -31,7 +31,7 @@ from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark import identity, own
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, description, make_extractors, resolve
-from zsp_lite.benchmark.own import kind_of
+from zsp_lite.benchmark.own import StoredPoses, kind_of
 from zsp_lite.benchmark.problem import Answer, FrameStore
 from zsp_lite.benchmark.run import evaluate, evaluate_pair
 from zsp_lite.benchmark.runs import LINES, read_lines, read_run
@@ -73,7 +73,7 @@ def test_ones_own_things_of_every_kind_are_rows_by_object_and_by_name(tmp_path):
     (lambda one, *, other: 0, "a function of one"), ("benchmark_folder:nothing", "has no attribute 'nothing'"),
     ("nowhere:nothing", "No module named 'nowhere'"), ("./here.py:x", "cannot be imported"), ("", "''|no methods"),
     ("our-bv", "'our-bv' is unknown; `zsp-lite benchmark --list`"), ("no/such.csv", "no/such.csv"),
-    ("ours-n0", "'ours-n0' is unknown"), ("ours-n99999", "unknown"),
+    ("ours-n0", "a library row another name"),
 ])  # fmt: skip
 def test_what_is_no_method_is_refused_by_one_line_before_anything_is_computed(thing, told, tmp_path):
     refused(told, run_rows, {"mine": thing}, tmp_path / "out")
@@ -93,8 +93,10 @@ def test_the_number_of_arguments_without_a_default_or_the_attribute_kind_tells_w
     assert [kind_of("mine", one) for one in solvers] == ["solver"] * 3
     assert kind_of("mine", lambda one, two, three, *, seed, level=0.2: 0) == "matcher"
     refused("no methods, expected some", resolve, [])
-    views = resolve(["ours-n4", "near=ours-bv-n2", "far=benchmark_folder:own_method"])
-    assert [(name, row.targets) for name, row in views.items()] == [("ours-n4", 4), ("near", 2), ("far", None)]
+    for name in ("ours-n0", "ours-n99999"):
+        refused(f"{name!r} is unknown", resolve, [name])
+    views = resolve(["ours-n4", "ours-bv-n2", "far=benchmark_folder:own_method"])
+    assert [(name, row.targets) for name, row in views.items()] == [("ours-n4", 4), ("ours-bv-n2", 2), ("far", None)]
 
 
 def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path):
@@ -105,17 +107,34 @@ def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path):
 
 
 TAKEN = ["ours", "sift", "ours-n3", "verified-n0", "category", "table1", "SIFT", "Ours (K=50)",
-         "ours@threshold=0.1", "verified-n3@threshold=0.1"]  # fmt: skip
+         "ours@threshold=0.1", "verified-n3@threshold=0.1", " ours", "Sift", "OURS (k=50)"]  # fmt: skip
+
+
+class Posing(StoredPoses):
+    """A row that equals every row of the library, and is poses of a file, too."""
+
+    def __eq__(self, other):
+        return True
+
+    def __call__(self, problem):
+        return keep(self._poses, "posing", np.eye(3), problem)
+
+    def remark(self, dataset, pairs):
+        return ""
 
 
 @pytest.mark.parametrize("name", TAKEN)
 def test_nothing_takes_the_name_of_a_row_of_the_library_or_the_paper(name):
-    told = re.escape(f"method {name!r} ") + "(has the name of another row or of a group|is unknown)"
-    for thing in ("benchmark_folder:own_method", own_method, "ours-k30", Method(settings={"k": 3})):
+    told = re.escape(f"method {name!r} gives a library row another name, or a name of its or the paper's away")
+    for thing in ("benchmark_folder:own_method", own_method, "ours-k30", Method(settings={"k": 3}), Posing("", {}, "")):
         refused(told, resolve, {name: thing})
-    refused("'sift' has the name", resolve, ["sift=benchmark_folder:own_method"])
-    kept = {"ours": Method(), "ours-bv-n2": "ours-bv-n2", "verified-n3": replace(METHODS["verified"], targets=3)}
-    assert list(resolve(kept)) == list(kept)
+    refused("or a name of its", resolve, [" sift=benchmark_folder:own_method"])
+    refused("'mine' gives a library row another name", resolve, ["mine=oracle-view-n3"])
+    assert list(resolve(["ours", "default", "verified-n3"])) == ["ours", "ours-bv", "rootsift", "verified-n3"]
+
+
+def test_of_two_methods_with_one_name_none_is_lost():
+    refused("mine=.*own_method, mine=.* are two of one name", resolve, [f"mine=benchmark_folder:{one}" for one in OWN])
 
 
 def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
@@ -393,10 +412,11 @@ def test_rows_do_not_reach_each_other_in_any_order(tmp_path):
     for name, rows in (("alone", library), ("last", own | library), ("first", library | own)):
         run_rows(rows, tmp_path / name, 2)
     alone, *others = (read_run(tmp_path / name) for name in ("alone", "last", "first"))
+    times = ["seconds", "milliseconds"]
     for name in library:
         for run in others:
             found, expected = run.row(name), alone.row(name)
-            assert found.drop(columns="seconds").equals(expected.drop(columns="seconds")), name
+            assert found.drop(columns=times).equals(expected.drop(columns=times)), name
 
 
 @pytest.mark.slow
@@ -492,6 +512,7 @@ def test_nothing_that_a_row_of_ones_own_gets_leads_to_a_label(tmp_path):
     rows = {
         "problem": lambda one: keep(handed, "problem", np.eye(3), one, one.frames(), one.views(), one.estimate()),
         "method": Method(solve=lambda one: keep(handed, "method", np.eye(3), one)),
+        "posing": Method(solve=Posing("", handed, "")),
         "estimator": SimpleNamespace(estimate=lambda *frames: keep(handed, "estimator", np.eye(3), frames)),
         "keypoints": lambda one, two: keep(handed, "keypoints", NONE, one, two),
         "matcher": lambda one, two, three: keep(handed, "matcher", own_matcher(one, two, three), one, two, three),

@@ -22,7 +22,7 @@ from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.baselines.geometry import essential_rotation
 from zsp_lite.benchmark import execution
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
-from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, description, make_extractors, read_paper_tables, resolve
+from zsp_lite.benchmark.methods import GROUPS, Method, description, is_own, make_extractors, read_paper_tables, resolve
 from zsp_lite.benchmark.own import StoredPoses, fails_alone, given
 from zsp_lite.benchmark.problem import Answer, FrameStore, PairProblem, as_answer, seeded
 from zsp_lite.benchmark.runs import Call, ResultLine, Run, Settings, add_lines, open_run, read_lines, read_run
@@ -201,7 +201,7 @@ def evaluate_pair(pair: Pair, methods: Mapping[str, Method], store: FrameStore) 
 
 
 def _evaluate(name: str, method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]) -> dict[str, Any]:
-    own = replace(method, targets=None) not in METHODS.values() and not isinstance(method.solve, StoredPoses)
+    own = is_own(name) and type(method.solve) is not StoredPoses
     seen = given(method.solve, problem) if own else problem
     start = time.perf_counter()
     try:

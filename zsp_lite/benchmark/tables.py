@@ -18,7 +18,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.benchmark.methods import GROUPS, METHODS, base_name, read_paper_tables
+from zsp_lite.benchmark.methods import GROUPS, base_name, is_own, read_paper_tables
 from zsp_lite.benchmark.runs import Run
 from zsp_lite.benchmark.statistics import draws_of, paired_difference
 from zsp_lite.choices import METRICS, METRICS_SHOWN
@@ -192,8 +192,8 @@ def _difference(test: Mapping[str, Any] | None) -> tuple[Cell | None, Cell | Non
 
 
 def own_rows(summary: Mapping[str, Any]) -> list[str]:
-    """List the rows of a run that are not the library's, with any number of target views."""
-    return [name for name in summary["methods"] if base_name(name) not in METHODS]
+    """List the rows of a run that are not the library's."""
+    return [*filter(is_own, summary["methods"])]
 
 
 def important_rows(summary: Mapping[str, Any]) -> list[str]:
