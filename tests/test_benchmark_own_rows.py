@@ -34,7 +34,7 @@ from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, description, mak
 from zsp_lite.benchmark.own import StoredPoses, kind_of
 from zsp_lite.benchmark.problem import Answer, FrameStore
 from zsp_lite.benchmark.run import evaluate, evaluate_pair
-from zsp_lite.benchmark.runs import LINES, read_lines, read_run
+from zsp_lite.benchmark.runs import LINES, read_run
 from zsp_lite.benchmark.tables import every_table
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D, Pair
@@ -339,12 +339,13 @@ def test_a_row_is_remembered_by_its_settings_and_the_names_of_its_functions():
 
 
 def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
-    (tmp_path / "rows_of_my_own.py").write_text("def still(problem):\n    return None\n")
+    (tmp_path / "rows_of_my_own.py").write_text("import os\nos.chdir('/')\ndef still(problem):\n    return None\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])  # as a console script has it
     (tmp_path / "row_that_exits.py").write_text("raise SystemExit(3)")
     refused("'row_that_exits:a' cannot be imported: .*py, line 1: SystemExit: 3", resolve, ["row_that_exits:a"])
     assert resolve(["rows_of_my_own:still"])["rows_of_my_own:still"].solve.__name__ == "still"
+    assert Path.cwd() == tmp_path
 
 
 def test_an_answer_is_a_rotation_in_a_view_or_the_pair_fails_and_its_numbers_can_be_stored(tmp_path, caplog):
@@ -356,8 +357,9 @@ def test_an_answer_is_a_rotation_in_a_view_or_the_pair_fails_and_its_numbers_can
     assert all(row["failed"] == 1 and row["median"] == 180 for row in run_rows(rows, tmp_path).values())
     told = "large failed on 1 of 1 pairs, counted as 180°; the first: Sim3: R is [[2.0, 0.0, 0.0], "
     assert told in caplog.text and told in next(iter(every_table(read_run(tmp_path).summary))).note
-    run_rows({"sure": lambda problem: Answer(np.eye(3), inliers=4, confidence=1 / 3)}, tmp_path)
-    assert read_run(tmp_path).row("sure")[["inliers", "confidence"]].to_numpy().tolist() == [[4, 0.3333]]
+    run_rows({"sure": lambda problem: Answer(np.eye(3), note="x" * 10**6, inliers=4, confidence=1 / 3)}, tmp_path)
+    found = read_run(tmp_path).row("sure")
+    assert found[["inliers", "confidence"]].to_numpy().tolist() == [[4, 0.3333]] and len(found["note"].iloc[0]) == 1000
     for wrong in ({"inliers": "many"}, {"confidence": 2.0}, {"note": "\udcff"}, {"view": 0.5}):
         (name,) = wrong
         run_rows({name: lambda problem, wrong=wrong: Answer(np.eye(3), **wrong)}, tmp_path)
@@ -431,6 +433,19 @@ def fails(problem):
     raise KeyError("angle")
 
 
+class Untold(Exception):
+    def __str__(self):
+        return None
+
+
+def untold(problem):
+    raise Untold
+
+
+def leaves_a_thread(problem):
+    threading.Thread(target=time.sleep, args=[600]).start()
+
+
 def never_ends(problem):
     with suppress(BaseException):  # catches what ends it, the first time
         while True:
@@ -446,7 +461,7 @@ def keep(handed, name, answer, *things):
 
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_row_that_fails_does_not_stop_the_others(workers, tmp_path, caplog):
+def test_a_row_that_fails_does_not_stop_the_others(workers, tmp_path, monkeypatch, caplog):
     rows = {
         "problem": (fails, r"/.*test_benchmark_own_rows.py, line \d+: KeyError: 'angle'"),
         "estimator": (SimpleNamespace(estimate=lambda reference, targets: fails(None)), ".*KeyError"),
@@ -457,22 +472,18 @@ def test_a_row_that_fails_does_not_stop_the_others(workers, tmp_path, caplog):
         "answer": (lambda problem: (np.eye(3), "first"), ".*ValueError: invalid literal"),
         "exit": (lambda problem: sys.exit("\udcff"), r".*SystemExit: \?"),
         "backbone": (ZeroShotPose(lambda images: []), ".*FatalError: backbone .* returned 0"),
-        "endless": (never_ends, "takes more than 1 s"),
+        "endless": (never_ends, "takes more than 1 s"), "untold": (untold, ".*Untold: <exception str"),
+        "memory": (lambda problem: np.zeros(10**15), ".*MemoryError: "), "else": (lambda problem: os.chdir("/"), ""),
+        "unsure": (lambda problem: Answer(np.eye(3), confidence=np.nan), ".*Error: Expected `float`"),
+        **({"thread": (leaves_a_thread, "pose of the row is None")} if workers > 1 else {}),
     }  # fmt: skip
+    monkeypatch.chdir(tmp_path)
     every = {name: row for name, (row, _) in rows.items()} | {"ours": "ours"}
-    found = evaluate(small_folder(), BACKBONE, every, {"lump": 2}, 2, tmp_path, workers, row_seconds=1)["methods"]
+    found = evaluate(small_folder(), BACKBONE, every, {"lump": 2}, 2, "run", workers, row_seconds=1)["methods"]
     assert found.pop("ours") == run_rows(["ours"], tmp_path / "alone", 2)["ours"]
     for name, (_, told) in rows.items():
-        assert re.match(told, read_run(tmp_path).row(name)["failed"].iloc[0]) and found[name]["median"] == 180
+        assert re.match(told, read_run("run").row(name)["failed"].iloc[0]) and found[name]["median"] == 180
         assert f"{name} failed on 2 of 2 pairs" in caplog.text
-
-
-def test_a_full_memory_ends_the_run(tmp_path):
-    def full(problem):
-        raise MemoryError
-
-    refused("'full' failed: .*MemoryError", run_rows, {"full": full, "ours": "ours"}, tmp_path, error=FatalError)
-    assert not read_lines(tmp_path)
 
 
 def test_a_row_that_ends_at_its_time_limit_leaves_nothing_behind():

@@ -89,6 +89,9 @@ def choose(run: Run, rows: Sequence[str]) -> dict[str, Any]:
 
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
     """Return all tables of a run; `metrics` are the figures of the table of all rows (see `METRICS`)."""
+    times = summary["milliseconds"]
+    methods = {name: row | {"milliseconds": times.get(name)} for name, row in summary["methods"].items()}
+    summary = {**summary, "methods": methods}
     first = (all_rows(summary, metrics, name) for name in ("all_rows", *SEE_MORE))
     shown = *PAPER, *(metric for metric in metrics if metric == "milliseconds")
     tables = *first, *paper_tables(summary, shown), *(by_category(summary, one) for one in PAPER)
@@ -243,13 +246,8 @@ def _table(
 def _note_on_seeds(summary: Mapping[str, Any]) -> list[str]:
     """Say how much the draws of k-means and RANSAC alone change Acc30, if there are several of each pair."""
     spread = {name: row["acc30_sd_of_seeds"] for name, row in summary["methods"].items() if "acc30_sd_of_seeds" in row}
-    if not spread:
-        return []
-    name = "ours" if "ours" in spread else next(iter(spread))
-    return [
-        f"Means over seeds, which the intervals hold; Acc30 of {name} has a standard deviation of "
-        f"{spread[name]:.1f} points over seeds."
-    ]
+    note = "Means over seeds, which the intervals hold; by seed, Acc30 of {} has a standard deviation of {:.1f} points."
+    return [note.format(name, spread[name]) for name in sorted(spread, key="ours".__ne__)[:1]]
 
 
 def as_csv(table: Table) -> str:
