@@ -216,7 +216,7 @@ def test_seeds_repeat_every_pair_with_other_draws_and_tables_average_over_them(t
     assert ours["acc30"] == pytest.approx(np.mean(by_seed))
     assert ours["acc30_sd_of_seeds"] == pytest.approx(np.std(by_seed, ddof=1))
     write_reports(tmp_path / "three")
-    assert "Acc30 of ours has a standard deviation of" in (tmp_path / "three/tables/all_rows.md").read_text()
+    assert "by seed, Acc30 of ours has a standard deviation of" in (tmp_path / "three/tables/all_rows.md").read_text()
     mask = found.row("ours-mask")["error"]
     gain = 100 * ((mask < 30).mean() - (once.row("ours")["error"] < 30).mean())
     assert summary["against"]["ours-mask"]["accuracy_gain"] == pytest.approx(gain), "a row with the first seed only"
