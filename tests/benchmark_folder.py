@@ -14,11 +14,13 @@ from pathlib import Path
 import numpy as np
 from synthetic_views import CoordinateBackbone, look_at, render, true_pose
 
-from zsp_lite.alignment import Sim3
+from zsp_lite.alignment import Sim3, ransac
 from zsp_lite.benchmark.run import evaluate
 from zsp_lite.benchmark.runs import Call, Settings, add_lines, open_run, read_run
 from zsp_lite.data.co3d import Pair, SequenceData, write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.estimates import PoseEstimate, match_points
+from zsp_lite.views import object_crop
 
 SEQUENCES = ("100_a", "200_b", "300_c")
 FRAMES = 8
@@ -92,8 +94,17 @@ def own_matcher(similarity, on_reference, on_target):
 
 def own_keypoints(first, second):
     """A user's matcher of pixels: every tenth one, where it is."""
-    grid = np.stack(np.mgrid[: len(first) : 10, : len(first) : 10], -1).reshape(-1, 2) + 0.5
+    side = min(first.shape[:2])
+    grid = np.stack(np.mgrid[:side:10, :side:10], -1).reshape(-1, 2) + 0.5
     return grid, grid, np.ones(len(grid))
+
+
+def own_solver(reference, targets, matched, *, seed=0, threshold=0.2):
+    """A user's solver: the pose in the first target view."""
+    first, second = match_points(reference, targets[0], matched[0].matches)
+    scores = np.zeros(len(targets))
+    sim3, inliers = ransac(first, second, threshold=threshold, seed=seed)
+    return PoseEstimate(sim3, 0, matched[0].matches, inliers, scores, reference, tuple(targets))
 
 
 def placement(category, sequence) -> Sim3:
@@ -102,12 +113,13 @@ def placement(category, sequence) -> Sim3:
     return Sim3(1.0, trans[:3, :3], trans[:3, 3])
 
 
-def exact_keypoints(store):
-    """Return a matcher of the frames of a store that knows the geometry: every visible pixel and its place."""
+def exact_keypoints(dataset, category):
+    """Return a matcher of the full crops of a category that knows the geometry: every visible pixel and its place."""
     crops = {}
     for name in SEQUENCES:
-        for frame in (store.frame((name, number)) for number in range(FRAMES)):
-            crops[frame.rgb.tobytes()] = frame, placement(store.category, name)
+        for frame in (dataset.load(dataset.frame(category, name, number)) for number in range(FRAMES)):
+            crop = object_crop(frame, None)
+            crops[crop.rgb.tobytes()] = crop, placement(category, name)
 
     def exact(first, second):
         (reference, here), (target, there) = crops[first.tobytes()], crops[second.tobytes()]
@@ -117,7 +129,7 @@ def exact_keypoints(store):
         points = true_pose(reference.camera, here, target.camera, there).apply(points)
         places, depth = target.camera.project(target.camera.to_world(points))
         x, y = np.floor(places).astype(int).T
-        inside = (np.minimum(x, y) >= 0) & (np.maximum(x, y) < len(second))
+        inside = (np.minimum(x, y) >= 0) & (x < second.shape[1]) & (y < second.shape[0])
         seen = inside & (np.abs(target.depth[y * inside, x * inside] - depth) < 0.002)
         return pixels[seen], places[seen], np.ones(seen.sum())
 
@@ -131,7 +143,7 @@ PAIRS = 8
 def write_run(out, rows, categories=CATEGORIES, **settings):
     """Write a run's folder with results by row and pair."""
     call = Call("now", [], {}, 1, list(rows), dict.fromkeys(categories, PAIRS))
-    settings = {"data": "made up", "backbone": "none 0", "targets": 5, "labels": {}, "origins": {}} | settings
+    settings = {"data": "made up", "backbone": "none 0", "targets": 5, "labels": {}} | settings
     methods, library = dict.fromkeys(rows, "x"), [{"version": "0", "commit": None}]
     with open_run(out, Settings(methods=methods, library=library, calls=[call], **settings)):
         for name, results in rows.items():

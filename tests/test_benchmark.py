@@ -10,14 +10,17 @@ from benchmark_folder import BACKBONE, own_method, run_rows, small_folder
 from refusals import refused
 from synthetic_views import CoordinateBackbone
 
-from zsp_lite.benchmark.run import evaluate
+from zsp_lite.benchmark.run import evaluate, write_reports
 from zsp_lite.benchmark.runs import read_run
+from zsp_lite.benchmark.tables import pair_figure
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import write_mask
 from zsp_lite.data.labels import read_labels, relative_pose
-from zsp_lite.data.pairs import category_pairs, sample_pairs, write_published_pairs
+from zsp_lite.data.pairs import category_pairs, sample_pairs, true_poses, write_published_pairs
+from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.synthetic.ground_truth import POSES_FILE, ObjectPose, object_poses
+from zsp_lite.views import object_crop
 
 ROWS = ("ours", "ours-bv", "oracle-view")
 
@@ -44,7 +47,6 @@ def test_the_summary_has_the_fixed_form_and_is_what_the_call_returned(run):
         assert row["acc30_ci"][0] <= row["acc30"] <= row["acc30_ci"][1]
     assert {"reading", "backbone", "similarity", "matching", "view", "alignment"} <= summary["timings"].keys()
     settings = read_run(out).settings
-    assert settings.origins == {"lump, N = 5": "sampled", "pebble, N = 5": "sampled"}
     (call,) = settings.calls
     assert call.versions["numpy"] == np.__version__ and (call.rows, call.pairs) == ([*ROWS], {"lump": 6, "pebble": 6})
 
@@ -77,6 +79,38 @@ def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(run):
             best_view = found.row("ours-bv").loc[pair.key]
             assert best_view["error"] == pytest.approx(angles[int(best_view["view"])], abs=1e-4)
     assert run[1]["methods"]["oracle-view"]["acc30"] >= 90
+
+
+def test_stored_poses_give_the_errors_again(run):
+    found = read_run(run[0])
+    for name in ROWS:
+        pairs, views, rotations, positions = found.poses(name)
+        truths = true_poses(small_folder(), pairs, views)
+        errors = found.row(name)["error"][[pair.key for pair in pairs]]
+        np.testing.assert_allclose(rotation_error(rotations, truths[:, :3, :3]), errors, atol=2e-4)
+    solved = errors < 1  # of "oracle-view"
+    np.testing.assert_allclose(positions[solved], truths[solved, :3, 3], atol=0.1)
+
+
+def test_the_picture_of_a_pair_shows_each_rows_pose_in_its_target_view(tmp_path, closed_figures):
+    def blind(problem):
+        raise InputError("sees nothing")
+
+    run_rows({"ours": "ours", "turned": own_method, "blind": blind}, tmp_path)
+    found, dataset = read_run(tmp_path), Co3D(small_folder())
+    (pair,), (view,), _, _ = found.poses("ours")
+    figure = pair_figure(found, pair.key, dataset)
+    error, other = (f"{found.row(name)['error'][pair.key]:.0f}° off" for name in ("ours", "turned"))
+    assert [one.get_title() for one in figure.axes] == ["reference", "ours", "turned", "its points", error, other]
+    crop = object_crop(dataset.load_pair(pair)[1][view])
+    assert np.array_equal(figure.axes[1].get_images()[0].get_array(), crop.rgb)
+    drawn, turned = (axis.collections[0].get_offsets() for axis in figure.axes[4:])
+    x, y = np.floor(drawn.data).astype(int).clip(0, 223).T
+    assert np.mean(crop.mask[y, x] > 0.5) > 0.9  # the pose is nearly exact
+    assert np.abs(turned.mean(axis=0) - 112).max() < 40  # a rotation alone is drawn in the middle of the object
+    refused("pair 'lump' has no pose in the run, expected a key such as lump/", pair_figure, found, "lump", dataset)
+    refused("has no pose in the run", pair_figure, found, pair.key, dataset, ["blind"])
+    refused("row 'nobody' is not in the run", pair_figure, found, pair.key, dataset, ["nobody"])
 
 
 def test_shipped_pairs_come_first_and_only_where_there_are_enough(tmp_path):
@@ -135,9 +169,9 @@ def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(tmp_pa
     labels = read_labels(small_folder(), "lump")
 
     def half_turned(problem):
-        pair, (first, second) = problem.pair, [frame.camera for frame in problem.frames()]
-        truth = relative_pose(labels[pair.reference_sequence], first, labels[pair.target_sequence], second)
-        return second.R @ np.diag([-1.0, -1, 1]) @ second.R.T @ truth[:3, :3]
+        first, second = ((labels[frame.name.partition("/")[0]], frame.camera) for frame in problem.frames())
+        truth = relative_pose(*first, *second)
+        return second[1].R @ np.diag([-1.0, -1, 1]) @ second[1].R.T @ truth[:3, :3]
 
     for turns, expected in (((180,), 0), ((90,), 90), ((), 180)):
         pose = ObjectPose(np.eye(4)[:3].tolist(), 1.0, (0, 0, 0), (1, 1, 1), turns)
@@ -161,3 +195,29 @@ def test_object_poses_of_another_layout_cost_a_warning_and_the_figure_that_needs
     (told,) = caplog.messages
     assert str(path) in told and expected in told and told.endswith(": without it there is no symmetric_acc30")
     refused(POSES_FILE, object_poses, dataset, "lump")
+
+
+def test_seeds_repeat_every_pair_with_other_draws_and_tables_average_over_them(tmp_path):
+    arguments = (small_folder(), BACKBONE, ["ours", "ours-bv"], 3, 3)
+    evaluate(small_folder(), BACKBONE, ["ours-mask"], 3, 3, tmp_path / "three")
+    evaluate(*arguments, tmp_path / "one")
+    once = read_run(tmp_path / "one")
+    evaluate(*arguments, tmp_path / "three")
+    summary = evaluate(*arguments, tmp_path / "three", seeds=3)
+    found = read_run(tmp_path / "three")
+    repeated = found.table[found.table["row"].isin(["ours", "ours-bv"])]
+    first = repeated[repeated["repeat"] == 0]["error"].tolist()
+    assert first == once.table["error"].tolist(), "the first seed is that of a run with one"
+    assert repeated.groupby(["row", "pair"]).size().eq(3).all()
+    assert found.table[found.table["row"] == "ours"].groupby("pair")["error"].nunique().max() > 1
+    ours, before = (one["methods"]["ours"] for one in (summary, once.summary))
+    assert ours["n"] == before["n"] and summary["data"]["pairs"] == once.summary["data"]["pairs"]
+    by_seed = [100 * (errors < 30).mean() for _, errors in found.row("ours").groupby("repeat")["error"]]
+    assert ours["acc30"] == pytest.approx(np.mean(by_seed))
+    assert ours["acc30_sd_of_seeds"] == pytest.approx(np.std(by_seed, ddof=1))
+    write_reports(tmp_path / "three")
+    assert "by seed, Acc30 of ours has a standard deviation of" in (tmp_path / "three/tables/all_rows.md").read_text()
+    mask = found.row("ours-mask")["error"]
+    gain = 100 * ((mask < 30).mean() - (once.row("ours")["error"] < 30).mean())
+    assert summary["against"]["ours-mask"]["accuracy_gain"] == pytest.approx(gain), "a row with the first seed only"
+    assert len(pair_figure(found, mask.index[0], Co3D(small_folder())).axes) == 8

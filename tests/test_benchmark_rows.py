@@ -8,7 +8,7 @@ from refusals import refused
 
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.benchmark.methods import GROUPS, METHODS, resolve
-from zsp_lite.benchmark.problem import FrameStore, Problem
+from zsp_lite.benchmark.problem import FrameStore, PairProblem
 from zsp_lite.benchmark.runs import read_run
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
@@ -63,9 +63,9 @@ def test_rows_differ_as_their_names_say(run):
 
 @pytest.mark.parametrize("row", ["icp", "sift"])
 def test_a_pair_without_depth_fails(row, monkeypatch):
-    dataset = Co3D(small_folder())
-    one = Problem(*category_pairs(dataset, "pebble", 1, 2), FrameStore(dataset, "pebble", {"sift": Sift()}))
-    crops = {key: replace(one.store.frame(key), depth=None) for key in one.keys}
-    monkeypatch.setattr(one.store, "frame", crops.get)
+    dataset, load = Co3D(small_folder()), Co3D.load
+    monkeypatch.setattr(Co3D, "load", lambda *frame: replace(load(*frame), depth=None))
+    store = FrameStore(dataset, {"sift": Sift()})
+    one = PairProblem(*category_pairs(dataset, "pebble", 1, 2), store, ["sift"])
     refused("no depth map: 100_a", METHODS[row].solve, one)
-    assert one.frames() == [*crops.values()]
+    assert [frame.depth for frame in one.frames()] == [None] * 3

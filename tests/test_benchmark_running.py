@@ -30,14 +30,13 @@ from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.execution import make_chunks, open_workers
 from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
-from zsp_lite.benchmark.problem import FrameStore, Problem
-from zsp_lite.benchmark.run import Evaluator, evaluate, pairs_of_rows, write_reports
+from zsp_lite.benchmark.run import evaluate, pair_evaluator, pairs_of_rows, write_reports
 from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, read_lines, read_run
 from zsp_lite.benchmark.tables import compare
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels, write_label
-from zsp_lite.errors import InputError
+from zsp_lite.errors import FatalError, InputError
 from zsp_lite.threads import one_thread
 
 pytestmark = pytest.mark.slow
@@ -139,21 +138,44 @@ def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tabl
 
 
 @needs_signals
-def test_a_dask_cluster_that_loses_its_worker_and_starts_another_finds_the_same(undisturbed, tmp_path, monkeypatch):
-    from distributed import LocalCluster
+def test_an_interrupt_ends_a_run_and_its_workers_with_one_line_and_the_run_can_be_continued(tmp_path):
+    words = ["benchmark", "--data", str(small_folder()), "--pairs", "12", "--methods", "ours", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "zsp_lite", *words, "--workers", "2"]
+    with subprocess.Popen(command, env=PATHS, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        while not (tmp_path / LINES).exists() or not pairs_in(tmp_path):
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.communicate()[1] == "zsp-lite: interrupted\n" and process.returncode == 130
+    stored = pairs_in(tmp_path)
+    assert 0 < len(stored) < 24 and main(words) == 0 and pairs_in(tmp_path)[: len(stored)] == stored
 
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
-        killed = []
 
-        def kill_once() -> None:
-            if not killed:
-                os.kill(cluster.workers[0].pid, signal.SIGKILL)
-                killed.append(len(pairs_in(tmp_path)))
+def test_modules_of_the_current_folder_travel_to_workers_and_what_they_lack_is_one_line(tmp_path, monkeypatch):
+    from distributed import Client, LocalCluster
 
-        monkeypatch.setattr("zsp_lite.benchmark.run.add_lines", after_each_save(kill_once))
-        address = "dask://" + cluster.scheduler_address.removeprefix("tcp://")
-        summary = evaluate(small_folder(), SlowBackbone(grid=8), ROWS, 6, 3, tmp_path, address)
-    assert killed and killed[0] < 12 and summary["methods"] == undisturbed[1]["methods"]
+    lock = "import threading\nlock = threading.Lock()\ndef half(problem):\n    return lock and None"
+    for name, text in {
+        "turns_of_mine": "import numpy as np\nHALF = np.diag([1.0, -1.0, -1.0])",
+        "rows_of_mine": "import turns_of_mine\ndef half(problem):\n    return turns_of_mine.HALF",
+        "installed/package_of_mine": "def half(problem):\n    return None", "lock_of_mine": lock, "other_lock": lock,
+    }.items():  # fmt: skip
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.py").write_text(text)
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
+        Client(cluster) as client,
+    ):
+        monkeypatch.chdir(tmp_path)  # after the worker has its path
+        monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "installed")])
+
+        def run(module: str, executor=client.get_executor(pure=False)) -> int:
+            rows = [f"mine={module}:half"]
+            return evaluate(small_folder(), QUICK, rows, {"lump": 2}, 2, module, executor)["methods"]["mine"]["failed"]
+
+        assert run("rows_of_mine") == 0
+        refused("a worker cannot import the rows: No module named 'package_of_mine', expected", run, "package_of_mine")
+        refused("sending the rows to workers failed: .*cannot pickle", run, "lock_of_mine", error=FatalError)
+        assert run("other_lock", executor=2) == 2  # processes of this machine import the module
 
 
 def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch):
@@ -209,14 +231,10 @@ def test_numbers_of_threads_are_restored_after_blocks_that_overlap():
         assert counts() == before and 2 in before[1].values()
 
 
-def test_unusable_executors_are_refused(monkeypatch):
-    monkeypatch.setattr("zsp_lite.benchmark.execution._DASK_TIMEOUT", 1)
-    for executor, message in (
-        ("dask://127.0.0.1:1", "expected Dask and a scheduler"), ("nowhere:Pool", "expected a number of processes, dask://"),
-        (0, "workers"), (10**11, "workers"), (1.5, "workers"), (True, "workers"), (None, "workers"),
-    ):  # fmt: skip
-        with pytest.raises(InputError, match=message), open_workers(executor):
-            pass
+@pytest.mark.parametrize("executor", ["nowhere:Pool", 0, 10**11, 1.5, True, None])
+def test_unusable_executors_are_refused(executor):
+    with pytest.raises(InputError, match="workers"), open_workers(executor):
+        pass
 
 
 def pairs_to_evaluate(rows, pairs: int, targets: int) -> dict:
@@ -228,21 +246,22 @@ def test_a_vision_transformers_features_do_not_depend_on_threads():
         torch.manual_seed(0)
         backbone = Backbone(VisionTransformer(32, 8, 24, 2, 3), "small", layer=1, device="cpu")
     (chunk,) = make_chunks(pairs_to_evaluate(["ours"], 2, 2))
-    evaluators = (Evaluator(str(small_folder()), resolve(["ours"]), backbone, threads) for threads in (1, 2))
-    one, two = ([line["results"]["ours"]["error"] for line in evaluator.lines(chunk)] for evaluator in evaluators)
-    assert one == two
+    errors = []
+    for threads in (1, 2):
+        evaluate_one = pair_evaluator(str(small_folder()), resolve(["ours"]), backbone, threads)
+        errors.append([evaluate_one(pair, names)["results"]["ours"]["error"] for pair, names in chunk])
+    assert errors[0] == errors[1]
 
 
-def test_a_run_is_not_continued_by_another_version_of_the_library_unless_it_is_allowed(tmp_path, monkeypatch):
+def test_the_note_of_a_run_says_that_several_versions_of_the_library_evaluated_it(tmp_path, monkeypatch):
     run = functools.partial(evaluate, small_folder(), BACKBONE, pairs={"lump": 1}, targets=2, out=tmp_path)
     run(["ours-bv"])
     first, other = library_version(), {"version": "1", "commit": "0123abc"}
     monkeypatch.setattr("zsp_lite.benchmark.run.library_version", lambda: other)
-    refused("this is .*0123abc.*; choose another folder, or .*--allow-other-version", run, ["ours"])
-    run(["ours"], allow_other_version=True)
+    assert "note" not in read_run(tmp_path).summary
+    run(["ours"])
     assert json.loads((tmp_path / SETTINGS).read_text())["library"] == [first, other]
-    assert [call.rows for call in read_run(tmp_path).settings.calls] == [["ours-bv"], ["ours"]]
-    run(["ours"])  # both are now known
+    assert "several versions of zsp-lite" in read_run(tmp_path).summary["note"]
 
 
 def test_a_folder_that_holds_no_run_is_neither_read_nor_continued(undisturbed, tmp_path):
@@ -271,10 +290,28 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
             return super().__call__(images)
 
     run_rows(rows, tmp_path, 4, 3, backbone=Counting(grid=8))
-    store = FrameStore(Co3D(small_folder()), "lump", {})
-    frames = {key for pair in pairs_to_evaluate(rows, 4, 3) for key in Problem(pair, store).keys}
+    frames = set()
+    for pair in pairs_to_evaluate(rows, 4, 3):
+        frames |= {(pair.target_sequence, number) for number in pair.target_frames}
+        frames.add((pair.reference_sequence, pair.reference_frame))
     assert sum(calls) == len(frames)
     assert set(calls) == {1}  # a frame's features do not depend, in their last bits, on the rest of a batch
+
+
+def test_the_same_data_by_another_path_continue_a_run_and_other_data_do_not(tmp_path, monkeypatch, links):
+    for name in ("data", "elsewhere/data"):
+        shutil.copytree(small_folder(), tmp_path / name)
+    (tmp_path / "link").symlink_to(tmp_path / "data")
+
+    def run(data, row: str) -> str:
+        return evaluate(data, BACKBONE, [row], {"lump": 1}, 2, tmp_path / "run")["data"]["root"]
+
+    monkeypatch.chdir(tmp_path)
+    assert run("data", "icp") == "data" and run(tmp_path / "data", "ours-bv") == str(tmp_path / "data")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert run("../link", "ours") == "../link"
+    refused("a run with data .*data, this is .*elsewhere/data; choose another folder", run, "data", "ours")
+    assert len(read_run(tmp_path / "run").settings.methods) == 3
 
 
 def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
@@ -305,6 +342,6 @@ def test_the_tables_of_an_unfinished_run_say_so(tmp_path, monkeypatch):
     # Tables that the last call has no rows for are removed, and nothing else.
     assert not list((tmp_path / "tables").glob("table_a_depth*")) and (tmp_path / "tables" / "mine.csv").exists()
     assert "Not finished" not in (tmp_path / "tables" / "all_rows.md").read_text()
-    run_rows({"category": lambda problem: np.eye(3)}, tmp_path, 4)
+    run_rows(["category"], tmp_path, 4)
     write_reports(tmp_path)
     assert not list((tmp_path / "tables").glob("all_rows*")) and (tmp_path / "tables" / "with_others.md").exists()

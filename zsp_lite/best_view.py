@@ -60,8 +60,7 @@ def score_from_cosines(cosines: Float[torch.Tensor, " n"], k: int) -> float:
 
 def global_score(reference: FeatureMap, target: FeatureMap) -> float:
     """Compute the cosine of the two images' global features ("GlobalSim")."""
-    first, second = torch.as_tensor(reference.global_feature), torch.as_tensor(target.global_feature)
-    return float(F.cosine_similarity(first, second, dim=0))
+    return float(F.cosine_similarity(reference.global_feature, target.global_feature, dim=0))
 
 
 def mask_iou(first: Mask, second: Mask) -> float:

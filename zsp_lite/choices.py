@@ -21,5 +21,6 @@ METRICS = {
     "symmetric_acc30": "Acc30 up to symmetries (%)",
     "translation": "transl. err. (diameters)",
     "scale": "scale ratio",
+    "milliseconds": "ms per pair",
 }
 METRICS_SHOWN = ("mean_category_median", "acc30", "acc15", "auc30")  # by default: the paper's, and one more

@@ -122,11 +122,7 @@ def average_pool(x: Tensor, axes: tuple[int, int]) -> Tensor:
 
 
 def log_bin(x: Float[Tensor, "b h w d"] | Float[np.ndarray, "b h w d"]) -> Float[Tensor, "b h w 17*d"]:
-    """Compute the log-binned descriptor of every patch: its 17 bins, concatenated in the order of `bin_indices`.
-
-    Args:
-        x: (B, H, W, D) keys.
-    """
+    """Compute the descriptors of all patches from keys x: 17 bins, concatenated in the order of `bin_indices`."""
     x = torch.as_tensor(x)
     b, h, w, d = x.shape
     pooled = average_pool(x, (1, 2))

@@ -138,7 +138,6 @@ def match(
         seed: Seed or generator of k-means.
         cycle_from: Image in which cycles start and whose patches are clustered and compared in saliency. "reference"
             is the paper's; "target" follows the cycle step of the published code, with its masking.
-            docs/published_code.md lists all differences.
         ref_foreground: (H1, W1) foreground of the reference; by default `ref.foreground()`.
         target_foreground: (H2, W2) foreground of the target.
         sim: (H1 * W1, H2 * W2) similarities, if they are computed already.

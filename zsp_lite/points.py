@@ -12,10 +12,10 @@ _FAR = 4.0  # points of a frame farther from their median than this multiple of 
 _SAMPLE = 1 << 21  # points of many frames that are held at once; 50 MB
 
 
-def object_pixels(frame: Frame, threshold: float = ON_OBJECT) -> Bool[np.ndarray, "height width"]:
+def object_pixels(frame: Frame) -> Bool[np.ndarray, "height width"]:
     """Select the pixels on the object that have known depth; a frame without a mask is all object."""
     known = frame.depth > 0
-    return known if frame.mask is None else known & (frame.mask > threshold)
+    return known if frame.mask is None else known & (frame.mask > ON_OBJECT)
 
 
 def object_points(frame: Frame) -> Float[np.ndarray, "n 3"]:

@@ -45,13 +45,13 @@ class View:
         return self.foreground.numpy() & self.measured_points[1]
 
 
-def object_crop(frame: Frame, size: int = IMAGE_SIZE) -> Frame:
-    """Crop a frame to its object and resize it to size x size pixels (supplement, "Object crops").
+def object_crop(frame: Frame, size: int | None = IMAGE_SIZE) -> Frame:
+    """Crop a frame to its object and resize it to size x size pixels, if given (supplement, "Object crops").
 
     The aspect is not kept. A frame without a mask, or with an empty one, is not cropped.
     """
     cropped = crop_to_object(frame) if frame.mask is not None and frame.shows_object else frame
-    return resize_frame(cropped, (size, size))
+    return resize_frame(cropped, (size, size)) if size else cropped
 
 
 def extract_views(backbone: FeatureExtractor, crops: Sequence[Frame], foreground: str = "saliency") -> list[View]:

@@ -116,8 +116,8 @@ READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
     "poses": ("poses.csv", lambda folder: read_poses(folder / "poses.csv")),
 }  # fmt: skip
 BENCHMARK = ("benchmark", "--pairs", "2", "--targets", "2", "--methods", "icp")
-POSES = """category,reference_sequence,reference_frame,target_sequence,target_frame,rotation,translation,scale
-cup,a,0,b,1,1 0 0 0 1 0 0 0 1,0 0 1,1.5
+POSES = """pair,target_frame,rotation,translation,scale
+"cup/a:0/b:1,4",1,1 0 0 0 1 0 0 0 1,0 0 1,1.5
 """
 
 

@@ -4,6 +4,7 @@ The names are those of the embedded one, and of the DINO models released by Caro
 """
 
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from zsp_lite.choices import Facet
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash
+from zsp_lite.io.modules import import_object
 
 DINO_URL = "https://dl.fbaipublicfiles.com/dino/"  # the environment variable ZSP_LITE_DINO_URL overrides it
 MOST_BYTES = 400_000_000  # of a released file: a ViT-B, the largest, has 86 million weights of 4 bytes
@@ -118,6 +120,20 @@ def load_backbone(
 def as_backbone(backbone: BackboneLike) -> FeatureExtractor:
     """Return a backbone as it is, and load one that is given by name, by the path of its file or by its config."""
     return load_backbone(backbone) if isinstance(backbone, str | Path | BackboneConfig) else backbone
+
+
+def named_backbone(name: str, layer: str | None, facet: Facet, image_size: int | None) -> BackboneLike:
+    """Return what `as_backbone` takes for a name with options; it may be "module:thing", of a backbone of one's own."""
+    config = BackboneConfig(name, layer, facet, image_size)
+    plain = config == BackboneConfig(name)
+    if name.startswith(PREFIX) or os.path.isfile(name) or not re.fullmatch(r"[\w.]+:[\w.]+", name):
+        return name if plain else config
+    found = import_object(name)
+    if isinstance(found, type) or not callable(found):
+        raise InputError(f"backbone {name!r} is of type {type(found).__name__}, expected a function of images")
+    if not plain:
+        raise InputError(f"backbone {name!r} is your own, expected no layer, facet or image size beside it")
+    return found
 
 
 def available_backbones() -> dict[str, Path | None]:

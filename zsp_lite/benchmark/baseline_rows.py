@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.baselines.geometry import align
 from zsp_lite.baselines.sift import Keypoints, mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints
-from zsp_lite.benchmark.problem import Answer, Problem
+from zsp_lite.benchmark.problem import Answer, PairProblem
 from zsp_lite.best_view import score_from_cosines
 from zsp_lite.category import PairHypotheses, object_pairs, scan_pairs, synchronise, world_hypotheses
 from zsp_lite.data.co3d import Pair
@@ -20,11 +20,11 @@ from zsp_lite.errors import InputError, NoPoseError
 _K = 50  # number of matches, as in "Ours"
 
 
-def icp(problem: Problem, view: int = 0) -> Answer:
+def icp(problem: PairProblem, view: int = 0) -> Answer:
     """Run "ICP", in the first target view; the worlds start where the first cameras of both sequences coincide."""
     reference, *targets = problem.frames(depth=True)
     sequences = problem.pair.reference_sequence, problem.pair.target_sequence
-    dataset, category = problem.store.dataset, problem.store.category
+    dataset, category = problem.store.dataset, problem.pair.category
     first = tuple(dataset.camera(dataset.frames(category, sequence)[0]) for sequence in sequences)
     try:
         sim3 = align(reference, targets, view, first, problem.seed)
@@ -33,24 +33,24 @@ def icp(problem: Problem, view: int = 0) -> Answer:
     return Answer(sim3.R, view, sim3.t, sim3.scale)
 
 
-def icp_best_view(problem: Problem) -> Answer:
+def icp_best_view(problem: PairProblem) -> Answer:
     """Run "ICP + BV", the same in the best view of the paper's method."""
     return icp(problem, problem.estimate().view)
 
 
-def sift(problem: Problem) -> Answer:
+def sift(problem: PairProblem) -> Answer:
     """Run "SIFT": select the view by the similarity of its mutual nearest neighbours, and fit the pose by RANSAC."""
     first: Keypoints
-    first, *others = (problem.store.describe("sift", key) for key in problem.keys)
+    first, *others = (crop.described["sift"] for crop in problem.crops)
     found = [mutual_matches(first, other, _K) for other in others]
     view = int(np.argmax([score_from_cosines(torch.from_numpy(similarity), _K) for *_, similarity in found]))
     one, two, _ = found[view]
     return fit_keypoints(problem, view, first.pixels[one], others[view].pixels[two])
 
 
-def category(problem: Problem) -> Answer:
+def category(problem: PairProblem) -> Answer:
     """Run "category": the pose by the alignment of all objects of the category, which needs no label of any."""
-    pairs = object_pairs(problem.store.dataset, problem.store.category, None, None, len(problem.pair.target_frames))
+    pairs = object_pairs(problem.store.dataset, problem.pair.category, None, None, len(problem.pair.target_frames))
     return _agreed(problem, [problem.pair, *pairs])
 
 
@@ -60,26 +60,26 @@ class Scans:
 
     references: int
 
-    def __call__(self, problem: Problem) -> Answer:
+    def __call__(self, problem: PairProblem) -> Answer:
         return _agreed(problem, scan_pairs(problem.store.dataset, problem.pair, self.references))
 
 
-def _agreed(problem: Problem, pairs: Sequence[Pair]) -> Answer:
+def _agreed(problem: PairProblem, pairs: Sequence[Pair]) -> Answer:
     """Return the pose that the hypotheses of pairs of frames agree on, those of the problem's own pair among them."""
     own, kept = hypotheses(problem), problem.store.kept
-    others = [pair for pair in pairs if pair != problem.pair]
+    others = [pair for pair in (replace(one, repeat=problem.pair.repeat) for one in pairs) if pair != problem.pair]
     for key in ((hypotheses, pair) for pair in others):
         if key not in kept:  # for other rows, and for other pairs of the same objects
             kept[key] = None
             with suppress(NoPoseError):
-                kept[key] = hypotheses(Problem(key[1], problem.store))
+                kept[key] = hypotheses(PairProblem(key[1], problem.store))
     alignment = synchronise([own, *filter(None, (kept[hypotheses, pair] for pair in others))])
     reference, target = (Sim3(1.0, one.camera.R, one.camera.t) for one in problem.frames()[:2])
     sim3 = target @ alignment.between(own.reference, own.target) @ reference.inverse()
     return Answer(sim3.R, 0, sim3.t, sim3.scale, confidence=alignment.objects[own.target].probability)
 
 
-def hypotheses(problem: Problem) -> PairHypotheses:
+def hypotheses(problem: PairProblem) -> PairHypotheses:
     """Find the hypotheses of the verified solver between the worlds of both objects."""
     ends = problem.pair.reference_sequence, problem.pair.target_sequence
     return world_hypotheses(*ends, problem.estimate(settings={"solver": "verified"}))

@@ -1,14 +1,17 @@
-"""Evaluate chunks of pairs in this process, a pool of processes, a Dask cluster, or any `concurrent.futures.Executor`.
+"""Evaluate chunks of pairs in this process, a pool of processes, or any `concurrent.futures.Executor`.
 
 A chunk is a few pairs of one category that share frames. A killed run loses the chunks that were being evaluated.
 """
 
 import os
+import pkgutil
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+from itertools import chain
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import Any
@@ -16,14 +19,18 @@ from typing import Any
 import cloudpickle
 
 from zsp_lite.data.co3d import Pair
-from zsp_lite.errors import InputError, check_integer
+from zsp_lite.errors import InputError, check_integer, ends_the_run
 from zsp_lite.io.files import digest, read_bytes, write_atomic
 from zsp_lite.threads import one_thread
 
 Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
+Evaluate = Callable[[Pair, list[str]], dict[str, Any]]  # finds the line of a run for a pair
 CHUNK_SIZE = 16  # pairs
-_DASK_TIMEOUT = 15  # seconds to wait for a scheduler
 _UNKNOWN_WORKERS = 256  # of an executor that does not tell
+
+
+class _Processes(ProcessPoolExecutor):
+    """Processes that `open_workers` ends; the pool's thread would print a traceback if their futures were cancelled."""
 
 
 def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[Chunk]:
@@ -37,67 +44,68 @@ def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[
 
 
 def evaluate_chunks(
-    make: Callable[[], Any], chunks: Sequence[Chunk], executor: Executor | None, shared: Path
+    make: Callable[[], Evaluate], chunks: Sequence[Chunk], executor: Executor | None, shared: Path
 ) -> Iterator[list[dict[str, Any]]]:
-    """Yield the lines that the method `lines` of what `make` makes, such as a `run.Evaluator`, finds.
-
-    `shared` is a new file in a folder that all workers see.
-    """
+    """Yield the lines that what `make` makes finds; `shared` is a new file in a folder that all workers see."""
     if executor is None:
-        evaluator = make()
+        evaluate = make()
         with one_thread():
-            for chunk in chunks:
-                yield from ([line] for line in evaluator.lines(chunk))
+            for pair, rows in chain.from_iterable(chunks):
+                yield [evaluate(pair, rows)]
         return
-    # cloudpickle: methods and backbones that are defined in a notebook travel by value. In a file, because a backbone
-    # has megabytes, and each worker reads it once.
-    pickled = cloudpickle.dumps(make)
+    pickled = _pickle(make, executor)  # in a file, because a backbone has megabytes, and each worker reads it once
     futures = []
     try:
         write_atomic(shared, pickled)
         futures += [executor.submit(_evaluate_chunk, str(shared), digest(pickled), chunk) for chunk in chunks]
         for future in as_completed(futures):
             yield future.result()
+    except ImportError as error:
+        raise InputError(f"a worker cannot import the rows: {error}, expected the module there, too") from error
     except Exception as error:
-        if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # the latter is Dask's
-            raise InputError(
-                "a worker ended abruptly, perhaps out of memory; finished pairs are stored: run again to continue, "
-                "with fewer workers"
-            ) from error
-        raise
+        if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":  # the latter is Dask's
+            raise
+        advice = "finished pairs are stored: run again to continue, with fewer workers"
+        raise InputError(f"a worker ended abruptly, perhaps out of memory; {advice}") from error
     finally:
-        for future in futures:
-            future.cancel()
+        if not isinstance(executor, _Processes):
+            for future in futures:
+                future.cancel()
         shared.unlink(missing_ok=True)
+
+
+def _pickle(make: Callable[[], Any], executor: Executor) -> bytes:
+    """Pickle by value what a notebook, or a module in the current folder, defines: workers need not see it."""
+    if not isinstance(executor, ProcessPoolExecutor):  # whose processes import what this one can import
+        found = {name for _, name, _ in pkgutil.iter_modules([os.getcwd()])} - {"zsp_lite"}
+        for name in found & sys.modules.keys():
+            cloudpickle.register_pickle_by_value(sys.modules[name])
+    with ends_the_run("sending the rows to workers"):
+        return cloudpickle.dumps(make)
 
 
 _worker = threading.local()  # an executor's workers may be threads
 
 
 def _evaluate_chunk(shared: str, digest_of_it: str, chunk: Chunk) -> list[dict[str, Any]]:
-    """Evaluate a chunk in a worker, which keeps its evaluator for the next one of the same call."""
+    """Evaluate a chunk in a worker, which keeps what evaluates it for the next one of the same call."""
     if getattr(_worker, "shared", None) != shared:
         pickled = read_bytes(shared, "rows of the run")
         if digest(pickled) != digest_of_it:  # never unpickle what somebody else has written
             raise InputError(f"rows of the run {shared} have changed, expected the file that this run wrote")
-        _worker.evaluator, _worker.shared = cloudpickle.loads(pickled)(), shared
+        _worker.evaluate, _worker.shared = cloudpickle.loads(pickled)(), shared
     with one_thread():
-        return list(_worker.evaluator.lines(chunk))
+        return [_worker.evaluate(pair, rows) for pair, rows in chunk]
 
 
 @contextmanager
-def open_workers(executor: Executor | str | int = 1) -> Iterator[tuple[Executor | None, int]]:
+def open_workers(executor: Executor | int = 1) -> Iterator[tuple[Executor | None, int]]:
     """Open an executor (None: this process) with its number of workers, and close it after the block.
 
-    It is a number of processes, 1 for this one; "dask://HOST:PORT"; or an Executor, which stays open.
+    It is a number of processes, 1 for this one, or an Executor, which stays open.
     """
     if isinstance(executor, Executor):
         yield executor, getattr(executor, "_max_workers", None) or getattr(executor, "num_workers", _UNKNOWN_WORKERS)
-        return
-    if isinstance(executor, str):
-        with _dask(executor) as client:
-            # A chunk depends on files: equal arguments need not give equal results.
-            yield client.get_executor(pure=False), sum(client.nthreads().values())
         return
     check_integer("workers", executor, 1, 4096)
     if executor == 1:
@@ -105,13 +113,12 @@ def open_workers(executor: Executor | str | int = 1) -> Iterator[tuple[Executor 
         return
     before = set(active_children())
     # Spawned, not forked: a fork of a process whose threads have already computed may hang.
-    with ProcessPoolExecutor(executor, get_context("spawn"), _start_worker) as pool:
+    with _Processes(executor, get_context("spawn"), _start_worker) as pool:
         try:
             yield pool, executor
-        except BaseException:  # ends at once, without waiting for what is being evaluated
+        finally:  # ends at once, without waiting for what is being evaluated or a thread of a row
             for child in set(active_children()) - before:
                 child.terminate()
-            raise
 
 
 def _start_worker() -> None:
@@ -123,17 +130,3 @@ def _start_worker() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def _dask(address: str) -> Any:
-    """Connect to a Dask cluster."""
-    if not address.startswith("dask://"):
-        raise InputError(f"executor is {address!r}, expected a number of processes, dask://HOST:PORT or an Executor")
-    try:
-        from distributed import Client
-
-        client = Client(f"tcp://{address.removeprefix('dask://')}", timeout=_DASK_TIMEOUT)
-        client.wait_for_workers(1, timeout=_DASK_TIMEOUT)
-    except (ImportError, OSError, ValueError) as error:
-        raise InputError(f"executor {address}: {error}; expected Dask and a scheduler with workers") from error
-    return client

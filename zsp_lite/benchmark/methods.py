@@ -5,31 +5,25 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
 from zsp_lite.baselines.sift import RootSift, Sift
 from zsp_lite.benchmark import baseline_rows
 from zsp_lite.benchmark.identity import described
-from zsp_lite.benchmark.own import Estimator, KeypointMatcher, StoredPoses, import_object, kind_of
+from zsp_lite.benchmark.own import Estimator, KeypointMatcher, StoredPoses, kind_of
 from zsp_lite.data.exchange import read_poses
-from zsp_lite.errors import InputError
+from zsp_lite.errors import InputError, check_number
 from zsp_lite.features import FeatureExtractor
-
-# Feature extractors by name, as functions of the backbone under test. They are called on images, or `describe` frames.
-EXTRACTORS: dict[str, Callable[[Any], Any]] = {
-    "none": lambda backbone: None,  # for rows that use depth only
-    "backbone": lambda backbone: backbone,
-    "rootsift": lambda backbone: RootSift(),
-    "sift": lambda backbone: Sift(),
-}
+from zsp_lite.io.modules import import_object
 
 
 @dataclass(frozen=True)
 class Method:
     """A row of the tables: the paper's method with some settings changed, or a function of one's own."""
 
-    features: str = "backbone"  # name of the feature extractor in `EXTRACTORS`
+    features: str = "backbone"  # name of the feature extractor in `make_extractors`
     # The fitted pose; the best view without a fit ("Ours-BV"); the pose fitted in the target view that is nearest in
     # rotation to the ground truth; or the rotation between the reference and the best view without depth.
     answer: Literal["pose", "best view", "true view", "essential matrix"] = "pose"
@@ -37,6 +31,7 @@ class Method:
     targets: int | None = None  # number of target views per pair; None for that of the run
     # Function of a `Problem` that replaces the paper's method; `features` is then the extractor that it uses.
     solve: Callable[[Any], Any] | None = None
+    seconds: int = field(default=60, compare=False)  # limit of a row of one's own for a pair
 
 
 _MASK = {"foreground": "mask"}
@@ -108,20 +103,30 @@ def _members(name: str) -> list[str]:
     return [row for member in GROUPS[name] for row in _members(member)] if name in GROUPS else [name]
 
 
-def resolve(methods: str | Sequence[str] | Mapping[str, Any]) -> dict[str, Method]:
+def resolve(methods: str | Sequence[str] | Mapping[str, Any], sweep: Sequence[float] = ()) -> dict[str, Method]:
     """Resolve names to rows, in order and without duplicates.
 
-    Names are those of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, "module:thing",
-    "poses.csv", or NAME=one of these. A mapping leads from names to these, to `Method`s, or to objects of one's own.
-    InputError if a name is unknown, or a thing cannot be imported or read, or is of no kind (see `own.kind_of`).
+    Names are those of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, or NAME=module:thing or
+    NAME=poses.csv, also without NAME=. A mapping leads from names to these, to a `Method`, or to objects of one's own.
+    Each RANSAC threshold V of a sweep makes a row NAME@threshold=V of each.
+    InputError if a name is unknown or another row's, or a thing cannot be imported or read, or is of no kind.
     """
     if not isinstance(methods, Mapping):
         names = [methods] if isinstance(methods, str) else methods
-        members = [row.partition("=") for name in names for row in _members(name)]
-        methods = {name: meant or name for name, _, meant in members}
+        parts = (row.partition("=") for name in names for row in _members(name))
+        meanings = {(name.strip(), meant or name): None for name, _, meant in parts}
+        if len(methods := dict(meanings.keys())) < len(meanings):
+            raise InputError(f"methods {', '.join(names)} are two of one name, expected one of each")
     if not methods:
         raise InputError("no methods, expected some; `zsp-lite benchmark --list` lists them")
-    return {str(name): _method(str(name), meant) for name, meant in methods.items()}
+    taken = {*METHODS, *GROUPS, *(line["label"] for table in read_paper_tables() for line in table["rows"])}
+    taken = {*map(str.casefold, taken)}
+    for name, meant in methods.items():
+        plain, text = str(name).strip().casefold(), meant if isinstance(meant, str) else ""
+        if text != name and taken & {plain, base_name(plain), base_name(text)}:
+            raise InputError(f"method {name!r} gives a library row another name, or a name of its or the paper's away")
+    rows = {str(name): _method(str(name), meant) for name, meant in methods.items()}
+    return _swept(rows, sweep) if sweep else rows
 
 
 def _method(name: str, meant: Any) -> Method:
@@ -138,18 +143,44 @@ def _method(name: str, meant: Any) -> Method:
                 "NAME=poses.csv are your own"
             )
         meant = import_object(meant)
-    if isinstance(meant, Method):
+    elif isinstance(meant, Method):
         return meant
     kind = kind_of(name, meant)
-    if kind == "matcher":
-        return Method(settings={"matcher": meant})
+    if kind in ("matcher", "solver"):
+        return Method(settings={kind: meant})
     wrap = {"estimator": Estimator, "keypoints": KeypointMatcher}.get(kind)
-    return Method(solve=wrap(meant) if wrap else meant)
+    return Method("none", solve=wrap(meant)) if wrap else Method(solve=meant)
+
+
+def base_name(name: str) -> str:
+    """ROW of "ROW-nN@threshold=V"."""
+    return re.sub(r"(-n\d+)?(@.*)?$", "", name)
+
+
+def is_own(name: str) -> bool:
+    """Tell whether a row is not the library's, with any number of target views (see `resolve`)."""
+    return base_name(name) not in METHODS
+
+
+def _swept(rows: Mapping[str, Method], thresholds: Sequence[float]) -> dict[str, Method]:
+    """Return each row with each RANSAC threshold; InputError for a row that has none."""
+    swept = {}
+    for (name, row), value in product(rows.items(), thresholds):
+        check_number("threshold", value, above=0)
+        if row.solve is None:
+            changed = replace(row, settings={**row.settings, "threshold": value})
+        elif isinstance(row.solve, KeypointMatcher):
+            changed = replace(row, solve=replace(row.solve, threshold=value))
+        else:
+            raise InputError(f"method {name!r} has no threshold, expected a matcher or a solver")
+        swept[f"{name}@threshold={value}"] = changed
+    return swept
 
 
 def make_extractors(backbone: FeatureExtractor, methods: Mapping[str, Method]) -> dict[str, Any]:
-    """Make the feature extractors of rows, by name."""
-    return {name: EXTRACTORS[name](backbone) for name in dict.fromkeys(method.features for method in methods.values())}
+    """Make the feature extractors of rows, by name. They are called on images, or `describe` frames."""
+    every = {"none": None, "backbone": backbone, "rootsift": RootSift(), "sift": Sift()}
+    return {method.features: every[method.features] for method in methods.values()}
 
 
 def description(method: Method) -> str:

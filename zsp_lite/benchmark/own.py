@@ -1,11 +1,10 @@
-"""Methods of one's own: which kind of method an object is, and poses that another program computed."""
+"""Methods of one's own: which kind of method an object is, what it gets, and poses that another program computed."""
 
-import inspect
-import os
-import pkgutil
-import sys
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+import ctypes
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import chdir, contextmanager
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,45 +12,83 @@ import numpy as np
 
 from zsp_lite.alignment import SCALE_RANGE, ransac
 from zsp_lite.baselines.sift import unproject_pixels
-from zsp_lite.benchmark.problem import Answer, Problem
+from zsp_lite.benchmark.problem import Answer, Crop, PairProblem, Problem, parameters, seeded
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.exchange import PairKey, StoredPose, fit_poses
-from zsp_lite.errors import FatalError, InputError, describe_failure, ends_the_run, real_array
+from zsp_lite.data.exchange import StoredPose, check_poses
+from zsp_lite.errors import InputError, describe_failure, ends_the_run, real_array
+from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.views import object_crop
 
-KINDS = ("problem", "keypoints", "matcher")  # functions of one, two and three arguments
+KINDS = ("problem", "keypoints", "matcher", "solver")  # functions of one, two and three arguments, and a solver
 
 
 def kind_of(name: str, thing: Any) -> str:
     """Tell what the thing of a row is: "estimator" (has `estimate`), or the function of one of `KINDS`.
 
-    The number of arguments without a default tells the kinds apart; an attribute `kind` of the thing comes before it.
-    InputError if it is none of these.
+    The number of arguments without a default, but for `seed` and `threshold`, tells the kinds apart, and a solver has
+    both of these; an attribute `kind` of the thing comes before it. InputError if it is none of these.
     """
     if not isinstance(thing, type):
         if callable(getattr(thing, "estimate", None)):
             return "estimator"
         if (kind := getattr(thing, "kind", None)) in KINDS:
             return kind
-        with suppress(TypeError, ValueError):  # no function, or one of a compiled module, which has no signature
-            parameters = inspect.signature(getattr(thing, "forward", thing)).parameters.values()
-            needed = [one for one in parameters if one.default is one.empty and one.kind is not one.VAR_KEYWORD]
-            positional = all(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed)
-            if positional and len(needed) in (1, 2, 3):
-                return KINDS[len(needed) - 1]
+        known = parameters(thing)
+        others = [one for name, one in known.items() if name not in ("seed", "threshold")]
+        needed = [one for one in others if one.default is one.empty and one.kind is not one.VAR_KEYWORD]
+        positional = all(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed)
+        if positional and len(needed) in (1, 2, 3):
+            solves = len(needed) == 3 and known.keys() >= {"seed", "threshold"}
+            return "solver" if solves else KINDS[len(needed) - 1]
     raise InputError(
         f"method {name!r} is of type {type(thing).__name__}, expected a function of one argument (problem), two (two "
-        "images) or three (similarities, two foregrounds), or an object with estimate(reference, targets)"
+        "images) or three (similarities, two foregrounds), a solver, or an object with estimate(reference, targets)"
     )
 
 
-def import_object(path: str) -> Any:
-    """Import the object "module:name" from an installed module or a module in the current folder."""
-    if "" not in sys.path and os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # the path of a console script lacks the current folder
+class OutOfTime(BaseException):
+    """Raised in a row of one's own that takes too long; no Exception, which the row might catch."""
+
+
+@contextmanager
+def fails_alone(seconds: int) -> Iterator[None]:
+    """Turn an error of the block, or that it takes too long between two calls of compiled code, into an InputError."""
+    thread, ended = ctypes.c_ulong(threading.get_ident()), threading.Lock()
+
+    def watch() -> None:
+        wait: float = seconds
+        while not ended.acquire(timeout=wait):
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(OutOfTime))
+            wait = 1  # and again, for a block that goes on
+
+    ended.acquire()
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
     try:
-        return pkgutil.resolve_name(path)
-    except (Exception, SystemExit) as error:  # a module may raise anything
-        raise InputError(f"{path!r} cannot be imported: {describe_failure(error)}") from error
+        try:
+            with chdir("."):  # and back, wherever the block goes
+                yield
+        finally:
+            ended.release()  # compiled: nothing can be raised before it has ended the watch
+            watcher.join()
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, None)
+    except (InputError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        late = f"takes more than {seconds} s"
+        raise InputError(late if isinstance(error, OutOfTime) else describe_failure(error)) from error
+
+
+def given(method: Any, problem: PairProblem) -> Any:
+    """Return what the row of a method of one's own gets: copies; nothing in them leads to the data set and labels."""
+    if not isinstance(method, Estimator | KeypointMatcher):
+        return Problem(problem.seed, deepcopy(problem.crops), problem.store.extractors, {})
+    with ends_the_run("reading frames"):
+        reference, targets = problem.store.dataset.load_pair(problem.pair)
+    frames = [reference, *targets]
+    if isinstance(method, KeypointMatcher):
+        frames = [object_crop(frame, size=None) for frame in frames]
+    return Problem(problem.seed, [Crop(frame) for frame in frames], {}, {})
 
 
 @dataclass(frozen=True)
@@ -61,9 +98,9 @@ class Estimator:
     own: Any
 
     def __call__(self, problem: Problem) -> Any:
-        with ends_the_run("reading frames"):
-            frames = problem.store.dataset.load_pair(problem.pair)
-        return self.own.estimate(*frames)
+        reference, *targets = problem.frames()
+        own = replace(self.own, seed=problem.seed) if isinstance(self.own, ZeroShotPose) else self.own
+        return seeded(own.estimate, problem.seed)(reference, targets)
 
 
 @dataclass(frozen=True)
@@ -71,18 +108,20 @@ class KeypointMatcher:
     """Row of a matcher of keypoints in two images, followed by RANSAC; docs/benchmark_your_own.md has its protocol."""
 
     own: Callable[[np.ndarray, np.ndarray], tuple[Any, Any, Any]]
+    threshold: float = 0.2  # of RANSAC
 
     def __call__(self, problem: Problem) -> Answer:
         reference, *targets = problem.frames()
-        found = [self.own(reference.rgb.copy(), target.rgb) for target in targets]
+        own = seeded(self.own, problem.seed)
+        found = [own(reference.rgb.copy(), target.rgb) for target in targets]
         scores = [real_array("scores of matches", score) for _, _, score in found]
         if any((one < 0).any() for one in scores):  # the view of the highest sum is chosen
-            raise FatalError("scores of matches are negative, expected 0 or more")
+            raise InputError("scores of matches are negative, expected 0 or more")
         view = int(np.argmax([one.sum() for one in scores]))
-        return fit_keypoints(problem, view, *found[view][:2])
+        return fit_keypoints(problem, view, *found[view][:2], self.threshold)
 
 
-def fit_keypoints(problem: Problem, view: int, first: Any, second: Any) -> Answer:
+def fit_keypoints(problem: Problem, view: int, first: Any, second: Any, threshold: float = 0.2) -> Answer:
     """Fit the pose to matched pixels of the reference's crop and of a target's: depth, then RANSAC (sec. 4.3)."""
     reference, *targets = problem.frames(depth=True)
     first, second = (real_array("matched points", points).reshape(-1, 2) for points in (first, second))
@@ -90,7 +129,7 @@ def fit_keypoints(problem: Problem, view: int, first: Any, second: Any) -> Answe
         raise InputError(f"matched points are {len(first)} and {len(second)}, expected as many in both images")
     try:
         points = unproject_pixels(reference, first), unproject_pixels(targets[view], second)
-        sim3, inliers = ransac(*points, seed=problem.seed, scale_range=SCALE_RANGE)
+        sim3, inliers = ransac(*points, threshold=threshold, seed=problem.seed, scale_range=SCALE_RANGE)
     except InputError as error:
         return Answer(np.eye(3), view, note=f"pose is the best view's, not a fit: {error}", inliers=0)
     return Answer(sim3.R, view, sim3.t, sim3.scale, inliers=int(inliers.sum()))
@@ -101,21 +140,15 @@ class StoredPoses:
     """Row of poses that another program computed (see `exchange`)."""
 
     path: str
-    _poses: Mapping[PairKey, StoredPose]
+    _poses: Mapping[str, StoredPose]  # by the key of the pair
     digest: str  # of the file
 
-    def __call__(self, problem: Problem) -> Answer:
-        pair = problem.pair
-        key = pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence
-        found = [view for view, frame in enumerate(pair.target_frames) if (*key, frame) in self._poses]
-        if not found:
+    def __call__(self, problem: PairProblem) -> Answer:
+        if (pose := self._poses.get(problem.pair.key)) is None:
             raise InputError(f"{self.path} has no pose")
-        if len(found) > 1:
-            raise FatalError(f"{self.path} has {len(found)} poses of the pair {pair.key}, expected one")
-        pose = self._poses[*key, pair.target_frames[found[0]]]
-        return Answer(pose.rotation, found[0], pose.translation, pose.scale)
+        view = problem.pair.target_frames.index(pose.target_frame)
+        return Answer(pose.rotation, view, pose.translation, pose.scale)
 
-    def fitted(self, dataset: Co3D, pairs: Iterable[Pair]) -> tuple["StoredPoses", str]:
-        """Return the row of the poses of some pairs, and a remark (see `exchange.fit_poses`)."""
-        poses, remark = fit_poses(self.path, self._poses, dataset, pairs)
-        return replace(self, _poses=poses), remark
+    def remark(self, dataset: Co3D, pairs: Sequence[Pair]) -> str:
+        """Return what is to be said of the poses of pairs (see `exchange.check_poses`)."""
+        return check_poses(self.path, self._poses, dataset, pairs)

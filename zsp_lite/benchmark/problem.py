@@ -1,14 +1,14 @@
 """Argument and results of a benchmark row: `Problem`, whose frames a `FrameStore` keeps, and `Answer`."""
 
+import inspect
 import time
-from collections.abc import Callable, Mapping
-from copy import copy, deepcopy
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
@@ -16,14 +16,13 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.best_view import ViewMatch
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
+from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError, ends_the_run, real_array, rotation_matrix
 from zsp_lite.estimates import PoseEstimate
-from zsp_lite.features import FeatureMap
 from zsp_lite.matching import key_similarities, similarities
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import IMAGE_SIZE, View, feature_maps, frame_view, object_crop
 
-FrameKey = tuple[str, int]  # sequence name and frame number
 CAPACITY = 128  # frames in memory
 
 
@@ -71,93 +70,100 @@ def as_answer(found: Any) -> Answer:
     pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
     if isinstance(pose, Sim3):
         return Answer(pose.R, int(view), pose.t, pose.scale)
-    return Answer(_rotation(pose), int(view))
+    return Answer(rotation_matrix("pose of the row", real_array("pose of the row", pose, (3, 3))), int(view))
 
 
-def _rotation(pose: Any) -> Float[np.ndarray, "3 3"]:
-    return rotation_matrix("pose of the row", real_array("pose of the row", pose, (3, 3)))
+def parameters(plugin: Any) -> Mapping[str, inspect.Parameter]:
+    """Return the parameters of a plug-in by name; none if it has no signature, as some of compiled modules."""
+    with suppress(TypeError, ValueError):
+        return inspect.signature(getattr(plugin, "forward", plugin)).parameters
+    return {}
+
+
+def seeded(plugin: Any, seed: int) -> Any:
+    """Give a seed to a plug-in that has a parameter `seed`; others stay as they are."""
+    return partial(plugin, seed=seed) if "seed" in parameters(plugin) else plugin
+
+
+def _timed(timings: dict[str, list[float]], stage: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function, and add the time that it takes to the timings of a stage."""
+    start = time.perf_counter()
+    found = function(*arguments)
+    timings.setdefault(stage, []).append(time.perf_counter() - start)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """A frame's object crop with what extractors compute from it, by their names."""
+
+    frame: Frame
+    described: dict[str, Any] = field(default_factory=dict)
+    _views: dict[tuple[str, str], View] = field(default_factory=dict)
+
+    def view(self, features: str, foreground: str) -> View:
+        """Return the crop with its features and foreground (see `views.frame_view`)."""
+        if (features, foreground) not in self._views:
+            self._views[features, foreground] = frame_view(self.frame, self.described[features], foreground)
+        return self._views[features, foreground]
 
 
 class FrameStore:
-    """Frames of one category and their features; `timings` are the seconds of all that was `timed`, by stage.
+    """Crops, of which the last used are kept; `timings` are the seconds of their pair by stage.
 
-    `frame`, `describe` and `view` compute once what they return, and keep it while it is among the last used; `kept` is
-    what a row keeps for all pairs. `threads` are those of feature extraction, None leaves them as they are.
+    `kept` is what a row keeps for all pairs. `threads` are those of feature extraction, None leaves them as they are.
     """
 
-    def __init__(self, dataset: Co3D, category: str, extractors: Mapping[str, Any], threads: int | None = None):
-        self.dataset, self.category, self.extractors, self.threads = dataset, category, extractors, threads
+    def __init__(self, dataset: Co3D, extractors: Mapping[str, Any], threads: int | None = None):
+        self.dataset, self.extractors, self.threads = dataset, extractors, threads
         self.timings: dict[str, list[float]] = {}
         self.kept: dict[Any, Any] = {}
-        self.frame = lru_cache(CAPACITY)(self._frame)
-        self.describe = lru_cache(CAPACITY * len(extractors))(self._describe)
-        self.view = lru_cache(CAPACITY * len(extractors))(self._view)
-        self.extent = cache(partial(dataset.extent, category))
+        self._read = lru_cache(CAPACITY)(self._crop)
+        self.extent = cache(dataset.extent)
+        self.labels = cache(partial(read_labels, dataset.root))
 
-    def _frame(self, key: FrameKey) -> Frame:
-        """Return a frame's object crop, resized to the backbone's input."""
+    def _crop(self, category: str, sequence: str, number: int) -> Crop:
         size = getattr(self.extractors.get("backbone"), "image_size", IMAGE_SIZE)
-        with ends_the_run(f"reading frame {key[0]}/{key[1]}"):
-            annotation = self.dataset.frame(self.category, *key)
-            return self.timed("reading", lambda: object_crop(self.dataset.load(annotation), size))
+        with ends_the_run(f"reading frame {sequence}/{number}"):
+            annotation = self.dataset.frame(category, sequence, number)
+            return Crop(_timed(self.timings, "reading", lambda: object_crop(self.dataset.load(annotation), size)))
 
-    def _describe(self, features: str, key: FrameKey) -> Any:
-        """Return what an extractor computes from a frame's crop."""
-        extractor, crop = self.extractors[features], self.frame(key)
-        extract = getattr(extractor, "describe", None) or partial(feature_maps, extractor)
-        # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
-        with threadpool_limits(self.threads), ends_the_run(f"features {features!r}"):
-            return self.timed(features, extract, [crop])[0]
-
-    def _view(self, features: str, key: FrameKey, foreground: str) -> View:
-        """Return a frame's crop with its features and foreground (see `views.frame_view`)."""
-        return frame_view(self.frame(key), self.describe(features, key), foreground)
-
-    def with_copies(self) -> "FrameStore":
-        """Return the store for a row of one's own: what it returns are copies, which the row may overwrite."""
-        store = copy(self)
-        for name in ("frame", "describe", "view", "extent"):
-            setattr(store, name, lambda *key, shared=getattr(self, name): deepcopy(shared(*key)))
-        return store
-
-    def timed(self, stage: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a function, and add the time that it takes to the `timings` of a stage."""
-        start = time.perf_counter()
-        found = function(*arguments)
-        self.timings.setdefault(stage, []).append(time.perf_counter() - start)
-        return found
+    def crop(self, category: str, sequence: str, number: int, features: Iterable[str] = ()) -> Crop:
+        """Return a frame's crop with what some extractors compute from it, each once."""
+        crop = self._read(category, sequence, number)
+        for name in features:
+            if name not in crop.described:
+                extract = getattr(self.extractors[name], "describe", partial(feature_maps, self.extractors[name]))
+                # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
+                with threadpool_limits(self.threads), ends_the_run(f"features {name!r}"):
+                    crop.described[name] = _timed(self.timings, name, extract, [crop.frame])[0]
+        return crop
 
 
 class Problem:
-    """One pair as a method sees it: everything but the true pose. Results are computed once for all methods."""
+    """One pair as a row sees it: images, depth, masks, cameras and features of both objects, and a seed.
 
-    def __init__(self, pair: Pair, store: FrameStore):
-        self.pair, self.seed, self.store, self._store = pair, pair.seed, store, store
-        targets = [(pair.target_sequence, number) for number in pair.target_frames]
-        self.keys: tuple[FrameKey, ...] = (pair.reference_sequence, pair.reference_frame), *targets
-        self._estimates: dict[tuple, PoseEstimate] = {}
-        self._similarity = cache(self._compare)
-        self._hand_over: Callable[[Any], Any] = lambda shared: shared
+    Nothing in it leads to the data set.
+    """
 
-    def with_copies(self) -> "Problem":
-        """Return the problem for a row of one's own: what it returns are copies, which the row may overwrite."""
-        problem = copy(self)
-        problem.store, problem._hand_over = self.store.with_copies(), deepcopy
-        return problem
+    def __init__(self, seed: int, crops: Sequence[Crop], extractors: Mapping[str, Any], timings: dict[str, list]):
+        self.seed, self.crops = seed, crops  # the reference's crop first
+        self._extractors, self._timings = extractors, timings
+        self._found: dict[tuple, Any] = {}  # estimates and similarities
 
     def frames(self, depth: bool = False) -> list[Frame]:
         """Return the object crops, the reference's first, resized to the backbone's input.
 
         With `depth`, InputError, which fails the pair, if one has no depth map.
         """
-        frames = [self._store.frame(key) for key in self.keys]
+        frames = [crop.frame for crop in self.crops]
         if depth and (missing := [frame.name for frame in frames if frame.depth is None]):
             raise InputError(f"no depth map: {', '.join(missing)}")
-        return self._hand_over(frames)
+        return frames
 
     def views(self) -> list[View]:
         """Return the crops with the features of the run's backbone, and the foreground that its saliency finds."""
-        return self._hand_over([self._store.view("backbone", key, "saliency") for key in self.keys])
+        return [crop.view("backbone", "saliency") for crop in self.crops]
 
     def estimate(
         self, features: str = "backbone", settings: Mapping[str, Any] | None = None, target: int | None = None
@@ -165,20 +171,31 @@ class Problem:
         """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the one with an index."""
         settings = settings or {}
         name = (features, target, *sorted(settings.items()))
-        if name not in self._estimates:
-            method = ZeroShotPose(self._store.extractors[features], **settings, seed=self.seed)
-            keys = self.keys if target is None else [self.keys[0], self.keys[1 + target]]
-            reference, *targets = (self._store.view(features, key, method.foreground) for key in keys)
+        if name not in self._found:
+            plugins = {key: seeded(value, self.seed) for key, value in settings.items() if key != "solver"}
+            method = ZeroShotPose(self._extractors[features], **{**settings, **plugins}, seed=self.seed)
+            crops = self.crops if target is None else (self.crops[0], self.crops[1 + target])
+            reference, *targets = (crop.view(features, method.foreground) for crop in crops)
             matched = [self._match(method, reference, view) for view in targets]
-            self._estimates[name] = method.estimate_from_views(reference, targets, matched)
-            for stage, seconds in self._estimates[name].timings.items():
-                self._store.timings.setdefault(stage, []).append(seconds)
-        return self._hand_over(self._estimates[name])
+            self._found[name] = method.estimate_from_views(reference, targets, matched)
+            for stage, seconds in self._found[name].timings.items():
+                self._timings.setdefault(stage, []).append(seconds)
+        return self._found[name]
 
     def _match(self, method: ZeroShotPose, reference: View, target: View) -> ViewMatch:
-        similarity = self._similarity(reference.features, target.features, method.binning)
-        return self._store.timed("matching", method.match_views, reference, [target], similarity)[0]
+        key = first, second, _ = reference.features, target.features, method.binning
+        if key not in self._found:
+            compare = similarities if method.binning else key_similarities
+            self._found[key] = _timed(self._timings, "similarity", compare, first, [second])
+        return _timed(self._timings, "matching", method.match_views, reference, [target], self._found[key])[0]
 
-    def _compare(self, reference: FeatureMap, target: FeatureMap, binning: bool) -> list[torch.Tensor]:
-        compare = similarities if binning else key_similarities
-        return self._store.timed("similarity", compare, reference, [target])
+
+class PairProblem(Problem):
+    """A problem with its pair and data set, for rows of the library; `features` are the extractors that they use."""
+
+    def __init__(self, pair: Pair, store: FrameStore, features: Iterable[str] = ("backbone",)):
+        self.pair, self.store = pair, store
+        frames = [(pair.target_sequence, number) for number in pair.target_frames]
+        frames.insert(0, (pair.reference_sequence, pair.reference_frame))
+        crops = [store.crop(pair.category, *frame, features) for frame in frames]
+        super().__init__(pair.seed, crops, store.extractors, store.timings)

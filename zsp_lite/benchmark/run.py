@@ -3,15 +3,16 @@
 import json
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 from torch import get_num_threads
@@ -21,15 +22,15 @@ from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.baselines.geometry import essential_rotation
 from zsp_lite.benchmark import execution
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
-from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, description, make_extractors, read_paper_tables, resolve
-from zsp_lite.benchmark.own import StoredPoses
-from zsp_lite.benchmark.problem import Answer, FrameStore, Problem, as_answer
+from zsp_lite.benchmark.methods import GROUPS, Method, description, is_own, make_extractors, read_paper_tables, resolve
+from zsp_lite.benchmark.own import StoredPoses, fails_alone, given
+from zsp_lite.benchmark.problem import Answer, FrameStore, PairProblem, as_answer, seeded
 from zsp_lite.benchmark.runs import Call, ResultLine, Run, Settings, add_lines, open_run, read_lines, read_run
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
-from zsp_lite.data.pairs import category_pairs, labelled_categories, shipped_pairs
-from zsp_lite.errors import FatalError, InputError, check_integer, describe_failure
+from zsp_lite.data.labels import read_labels
+from zsp_lite.data.pairs import category_pairs, labelled_categories, true_pose
+from zsp_lite.errors import InputError, check_integer
 from zsp_lite.io.files import digest, write_atomic
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, view_alignment
@@ -45,8 +46,10 @@ def evaluate(
     pairs: int | Mapping[str, int] = 100,
     targets: int = 5,
     out: str | Path = "outputs/benchmark",
-    executor: Executor | str | int = 1,
-    allow_other_version: bool = False,
+    executor: Executor | int = 1,
+    row_seconds: int = 60,
+    seeds: int = 1,
+    sweep: Sequence[float] = (),
 ) -> dict[str, Any]:
     """Evaluate rows on pairs of every category, and store every finished pair in the folder of the run at once.
 
@@ -60,18 +63,23 @@ def evaluate(
         pairs: Number of pairs per category, of all with pose labels; or by category.
         targets: Number of target views per pair, for rows that do not fix it.
         out: Folder of the run.
-        executor: Number of processes; "dask://HOST:PORT"; or any `Executor`, which gets chunks of pairs.
-        allow_other_version: Continue a run of another version of the library; run.json then lists both.
+        executor: Number of processes, or any `Executor`, which gets chunks of pairs.
+        row_seconds: Time limit of a row of one's own for a pair, which fails beyond it.
+        seeds: Number of evaluations of each pair, with other random draws of k-means and RANSAC.
+        sweep: RANSAC thresholds V; each row is evaluated with each, as NAME@threshold=V.
 
     Returns:
         The content of OUT/summary.json (see `statistics.summarise`); `write_reports` writes tables and figures.
 
     Raises:
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds another run.
-        FatalError: A backbone or a row is broken, or a frame cannot be read.
+        FatalError: The backbone is broken, or a frame cannot be read.
     """
     check_integer("targets", targets, 1)
-    rows, dataset, remarks = resolve(methods), Co3D(data), {}
+    check_integer("row_seconds", row_seconds, 1, 1_000_000)
+    check_integer("seeds", seeds, 1, 1000)
+    rows = {name: replace(row, seconds=row_seconds) for name, row in resolve(methods, sweep).items()}
+    dataset, remarks = Co3D(data), {}
     numbers = pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
     work = pairs_of_rows(dataset, rows, numbers, targets)
     loaded = as_backbone(backbone)
@@ -80,49 +88,47 @@ def evaluate(
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
         elif isinstance(row.solve, StoredPoses):
-            solve, remark = row.solve.fitted(dataset, [pair for pair, names in work.items() if name in names])
-            rows[name] = replace(row, solve=solve)
+            remark = row.solve.remark(dataset, [pair for pair, names in work.items() if name in names])
             remarks[name] = f"{name}: {remark}." if remark else ""
-    others = {name: f"; {fingerprint(one)}" for name, one in extractors.items() if name != "backbone"}
     with execution.open_workers(executor) as (pool, workers):
         settings = Settings(
             data=str(data).encode(errors="replace").decode(), backbone=fingerprint(loaded), targets=targets,
             library=[library_version()], labels={category: _labels(dataset, category) for category in numbers},
-            methods={name: description(row) + others.get(row.features, "") for name, row in rows.items()},
-            origins={
-                f"{category}, N = {n}": "evaluation set" if shipped_pairs(dataset, category, n, number) else "sampled"
-                for category, number in numbers.items() for n in {row.targets or targets for row in rows.values()}
-            },
-            calls=[Call(**environment(), workers=workers, rows=list(rows), pairs=dict(numbers), remarks=remarks)],
+            methods={name: description(row) for name, row in rows.items()},
+            calls=[Call(**environment(), workers=workers, rows=list(rows), pairs=dict(numbers), seeds=seeds,
+                        remarks=remarks)],
         )  # fmt: skip
-        with open_run(out, settings, allow_other_version):
-            make = partial(Evaluator, str(Path(data).resolve()), rows, backbone if pool else loaded)
-            evaluate_pairs(out, make, work, pool, workers)
+        with open_run(out, settings):
+            make = partial(pair_evaluator, str(Path(data).resolve()), rows, backbone if pool else loaded)
+            repeated = {replace(pair, repeat=k): names for k in range(seeds) for pair, names in work.items()}
+            evaluate_pairs(out, make, repeated, pool, workers)
     found = read_run(out)
     for remark in filter(None, [*remarks.values(), *found.failures]):
         logger.warning("%s", remark)
     return _write_summary(found, out)
 
 
-def write_reports(run: str | Path, out: str | Path | None = None, metrics: Sequence[str] = METRICS_SHOWN) -> dict:
-    """Write summary.json, tables/ and figures/ of a run, by default into its folder, and return the summary.
+def write_reports(
+    run: str | Path, out: str | Path | None = None, metrics: Sequence[str] = METRICS_SHOWN,
+    rows: Sequence[str] | None = None, intervals: bool = False, size: tuple[float, float] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Write summary.json, tables/ and figures/ of a run, by default into its folder, and return what tables show.
 
-    `metrics` are the figures of the table of all rows. Tables of an earlier call which have no rows now are removed.
+    `metrics` are the figures of the table of all rows, `rows` those of tables and figures, in order, by default all;
+    `intervals` puts intervals into LaTeX, `size` is that of figures (W, H) in inches. Tables of an earlier call which
+    have no rows now are removed.
     """
-    from zsp_lite.benchmark.tables import (  # workers need no matplotlib
-        SEE_MORE,
-        every_table,
-        write_figures,
-        write_tables,
-    )
+    from zsp_lite.benchmark import tables  # workers need no matplotlib
 
     found, out = read_run(run), Path(out or run)
-    for name in ("all_rows", *SEE_MORE, *(spec["name"] for spec in read_paper_tables())):
+    shown = tables.choose(found, rows) if rows else found.summary
+    for name in ("all_rows", *tables.SEE_MORE, *(spec["name"] for spec in read_paper_tables())):
         for path in (out / "tables").glob(f"{name}.*"):
             path.unlink()
-    write_tables(every_table(found.summary, metrics), out / "tables")
-    write_figures(found, out / "figures")
-    return _write_summary(found, out)
+    tables.write_tables(tables.every_table(shown, metrics), out / "tables", intervals)
+    tables.write_figures(found, out / "figures", rows, size)
+    _write_summary(found, out)
+    return shown
 
 
 def _write_summary(run: Run, out: str | Path) -> dict[str, Any]:
@@ -131,15 +137,15 @@ def _write_summary(run: Run, out: str | Path) -> dict[str, Any]:
 
 
 def evaluate_pairs(
-    out: str | Path, make: Callable[[int], Any], work: Mapping[Pair, list[str]], pool: Any, workers: int,
+    out: str | Path, make: Callable[[int], execution.Evaluate], work: Mapping[Pair, list[str]], pool: Any, workers: int,
     kind: type = ResultLine,
 ) -> None:  # fmt: skip
     """Evaluate the rows and pairs that a run lacks, and add what is found, lines of a `kind`, to it at once.
 
-    `make` makes what evaluates chunks, such as an `Evaluator`, from a number of threads.
+    `make`, such as `pair_evaluator`, makes what evaluates a pair, from a number of threads.
     """
-    known = {(row, line.pair) for line in read_lines(out, kind) for row in line.results}
-    new = {pair: [name for name in names if (name, pair.key) not in known] for pair, names in work.items()}
+    known = {(row, line.pair, line.repeat) for line in read_lines(out, kind) for row in line.results}
+    new = {pair: [name for name in names if (name, pair.key, pair.repeat) not in known] for pair, names in work.items()}
     todo = {pair: names for pair, names in new.items() if names}
     chunks = execution.make_chunks(todo, max(1, min(execution.CHUNK_SIZE, len(todo) // (4 * workers))))
     make = partial(make, max(1, get_num_threads() // workers))
@@ -174,68 +180,59 @@ def _labels(dataset: Co3D, category: str) -> str:
     return digest(*(part for name, label in labels for part in (name, label.trans.tobytes(), label.reference_seq)))
 
 
-class Evaluator:
-    """Evaluates chunks in one process; frames, and features by some `threads`, are kept from chunk to chunk."""
-
-    def __init__(self, root: str, methods: Mapping[str, Method], backbone: Any, threads: int):
-        self._dataset, self._methods, self._threads = Co3D(root), methods, threads
-        self._extractors, self._store = make_extractors(as_backbone(backbone), methods), None
-
-    def lines(self, chunk: Sequence[tuple[Pair, list[str]]]) -> Iterator[dict[str, Any]]:
-        """Evaluate the pairs of a chunk, all of one category (see `evaluate_pair`)."""
-        category = chunk[0][0].category
-        if self._store is None or self._store.category != category:
-            self._store = FrameStore(self._dataset, category, self._extractors, self._threads)
-            self._labels = read_labels(self._dataset.root, category)
-        for pair, names in chunk:
-            yield evaluate_pair(pair, {name: self._methods[name] for name in names}, self._store, self._labels)
+def pair_evaluator(root: str, methods: Mapping[str, Method], backbone: Any, threads: int) -> execution.Evaluate:
+    """Make what evaluates pairs in one process; frames, and features by some `threads`, are kept from pair to pair."""
+    store = FrameStore(Co3D(root), make_extractors(as_backbone(backbone), methods), threads)
+    return lambda pair, names: evaluate_pair(pair, {name: methods[name] for name in names}, store)
 
 
-def evaluate_pair(
-    pair: Pair, methods: Mapping[str, Method], store: FrameStore, labels: Mapping[str, PoseLabel]
-) -> dict[str, Any]:
+def evaluate_pair(pair: Pair, methods: Mapping[str, Method], store: FrameStore) -> dict[str, Any]:
     """Evaluate rows on a pair: a line of the run's results (see `runs.ResultLine`), with median seconds by stage."""
     store.timings.clear()
-    problem = Problem(pair, store)
-    first, second = labels[pair.reference_sequence], labels[pair.target_sequence]
-    reference, *targets = problem.frames()
+    problem = PairProblem(pair, store, {method.features for method in methods.values()} - {"none"})
+    for sequence in (pair.reference_sequence, pair.target_sequence):
+        store.extent(pair.category, sequence)  # an unreadable point cloud is no failure of a row
+    labels = store.labels(pair.category)
     # Ground truth from the reference's camera to each target's.
-    truths = np.stack([relative_pose(first, reference.camera, second, target.camera) for target in targets])
+    truths = np.stack([true_pose(store.dataset, labels, pair, view) for view in range(len(pair.target_frames))])
     results = {name: _evaluate(name, method, problem, truths) for name, method in methods.items()}
     timings = {stage: round(float(np.median(seconds)), 5) for stage, seconds in store.timings.items()}
-    return {"pair": pair.key, "results": results, "timings": timings}
+    return {"pair": pair.key, "results": results, "repeat": pair.repeat, "timings": timings}
 
 
-def _evaluate(name: str, method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -> dict[str, Any]:
-    start, own = time.perf_counter(), replace(method, targets=None) not in METHODS.values()
-    given = problem.with_copies() if own else problem
+def _evaluate(name: str, method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]) -> dict[str, Any]:
+    own = is_own(name) and type(method.solve) is not StoredPoses
+    seen = given(method.solve, problem) if own else problem
+    start = time.perf_counter()
     try:
-        answer = as_answer(method.solve(given)) if method.solve else _answer(method, problem, truths)
-        if not 0 <= answer.view < len(truths):
-            raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
-    except FatalError:
-        raise
+        with fails_alone(method.seconds) if own else nullcontext():
+            solve = seeded(method.solve, problem.seed)
+            answer = as_answer(solve(seen)) if solve else _answer(method, problem, truths)
+            if not 0 <= answer.view < len(truths):
+                raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
+            result = {"seconds": time.perf_counter() - start} | _measure(answer, problem, truths[answer.view])
+            line = {"pair": problem.pair.key, "results": {name: result}}
+            msgspec.json.encode(msgspec.convert(line, ResultLine))  # refuses what could not be stored
     except InputError as error:  # there is no pose: without these pairs, methods that fail often would look better
-        return {"error": 180.0, "failed": str(error)}
-    except Exception as error:  # a row of one's own may raise anything; a mistake of the library keeps its traceback
-        if not own:
-            raise
-        raise FatalError(f"method {name!r} failed: {describe_failure(error)}") from error
-    result = {"seconds": time.perf_counter() - start} | _measure(answer, problem, truths[answer.view])
+        return {"error": 180.0, "failed": str(error).encode(errors="replace").decode()}
     return {name: round(value, 4) if isinstance(value, float) else value for name, value in result.items()}
 
 
-def _measure(answer: Answer, problem: Problem, truth: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
+def _measure(answer: Answer, problem: PairProblem, truth: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
     """Measure an answer: "error", and what is known of the other members of a stored result."""
     known = {name: getattr(answer, name) for name in ("view", "note", "scale", "inliers", "confidence")}
+    known["note"] = answer.note[:1000]
     known["error"] = rotation_error(answer.rotation, truth[:3, :3])
+    known["rotation"] = answer.rotation.ravel().round(6).tolist()
     reference, *targets = (frame.camera for frame in problem.frames())
     names = problem.pair.reference_sequence, problem.pair.target_sequence
     if (turns := common_turns(problem.store.dataset.root, problem.pair.category, *names)) is not None:
         to_camera = targets[answer.view].R
         turned = to_camera @ turns @ to_camera.T @ truth[:3, :3]
         known["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
-    ends = [problem.store.extent(name) for name in names]
+    ends = [problem.store.extent(problem.pair.category, name) for name in names]
+    if answer.translation is not None:
+        known["position"] = answer.translation.round(6).tolist()
     if answer.translation is not None and None not in ends:
         (first, _), (_, diameter) = ends
         centre, scale = reference.to_camera(first), 1.0 if answer.scale is None else answer.scale
@@ -245,7 +242,7 @@ def _measure(answer: Answer, problem: Problem, truth: Float[np.ndarray, "4 4"]) 
     return {name: value for name, value in plain.items() if value is not None}
 
 
-def _answer(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:
+def _answer(method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:
     """Answer of a row that is the paper's method with other settings."""
     if method.answer == "true view":
         nearest = int(rotation_error(np.eye(3), truths[:, :3, :3]).argmin())

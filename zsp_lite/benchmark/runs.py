@@ -4,6 +4,7 @@ run.json holds what decides the results, and every call of `evaluate`. A line of
 `evaluate_pair` returned for a pair. One process writes to a folder; others can read it meanwhile.
 """
 
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,9 +13,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
+import numpy as np
 import pandas as pd
+from jaxtyping import Float, Int
 
 from zsp_lite.benchmark.statistics import summarise
+from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import decode_json, decompress, read_bytes, read_json, write_atomic
 from zsp_lite.io.locks import writing
@@ -33,12 +37,13 @@ class Call(msgspec.Struct):
     workers: int
     rows: list[str]
     pairs: dict[str, int]  # by category
+    seeds: int = 1  # evaluations of each pair
     finished: bool = True
     remarks: dict[str, str] = {}  # on poses from a file, by row
 
 
 class Settings(msgspec.Struct):
-    """What decides the results of a run; a later call may add to methods, labels, origins, and versions."""
+    """What decides the results of a run; a later call may add to methods, labels, and versions."""
 
     data: str
     backbone: str  # fingerprint
@@ -46,8 +51,8 @@ class Settings(msgspec.Struct):
     library: Annotated[list[dict[str, str | None]], msgspec.Meta(min_length=1)]  # version and commit
     methods: dict[str, str]  # description by row
     labels: dict[str, str]  # hash of the pose labels by category
-    origins: dict[str, str]  # of the pairs: an evaluation set of the folder, or sampled
     calls: Annotated[list[Call], msgspec.Meta(min_length=1)]
+    folder: str = ""  # absolute path of the data, without links
 
 
 class _Result(msgspec.Struct):
@@ -59,6 +64,8 @@ class _Result(msgspec.Struct):
     translation: float | None = None  # error of the object's centre in diameters of the target
     scale: float | None = None  # estimated over labelled, which is 1
     view: int | None = None
+    rotation: Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)] | None = None  # row by row
+    position: Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)] | None = None  # the pose's translation
     inliers: int | None = None
     seconds: float | None = None
     note: str = ""
@@ -68,6 +75,7 @@ class _Result(msgspec.Struct):
 class ResultLine(msgspec.Struct):
     pair: Annotated[str, msgspec.Meta(pattern=_KEY)]
     results: dict[str, _Result]
+    repeat: int = 0
     timings: dict[str, float] = {}
 
 
@@ -76,8 +84,9 @@ class Run:
     """Results of a run on the pairs that the rows of the last call have finished (see `read_run`)."""
 
     settings: Settings
-    # A line for each row and pair, by row, category and pair: "row", "category", "pair" (its key), "problem" (the key
-    # without target frames), "reference" and "target" (the objects, CATEGORY/SEQUENCE), and the members of `_Result`.
+    # A line for each row, pair and seed, in this order: "row", "category", "pair" (its key), "repeat" (of the seed),
+    # "problem" (the key without target frames), "reference" and "target" (the objects, CATEGORY/SEQUENCE), the
+    # members of `_Result`, and "milliseconds".
     table: pd.DataFrame
     timings: Mapping[str, float]  # median seconds by stage
     note: str = ""  # what is missing
@@ -88,7 +97,7 @@ class Run:
         # A backbone's fingerprint is its name and a hash.
         backbone = self.settings.backbone.rpartition(" ")[0] or self.settings.backbone
         data = {"root": self.settings.data, "categories": list(self.table["category"].unique())}
-        data |= {"pairs": int(self.table["row"].value_counts().max()), "targets": self.settings.targets}
+        data |= {"pairs": int(self.table.groupby("row")["pair"].nunique().max()), "targets": self.settings.targets}
         notes = " ".join(filter(None, [self.note, *self.failures]))
         note = {"note": notes} if notes else {}
         return {"data": data, "backbone": backbone} | note | summarise(self.table) | {"timings": dict(self.timings)}
@@ -97,9 +106,9 @@ class Run:
     def failures(self) -> list[str]:
         """Of each row that failed on pairs: on how many, and the reason of the first."""
         failed = self.table[self.table["failed"] != ""].groupby("row", sort=False)["failed"]
-        pairs = self.table["row"].value_counts()
+        cases = self.table["row"].value_counts()
         return [
-            f"{name} failed on {len(reasons)} of {pairs[name]} pairs, counted as 180°; the first: {reasons.iloc[0]}."
+            f"{name} failed on {len(reasons)} of {cases[name]} pairs, counted as 180°; the first: {reasons.iloc[0]}."
             for name, reasons in failed
         ]
 
@@ -110,14 +119,26 @@ class Run:
             raise InputError(f"row {name!r} is not in the run, expected one of {', '.join(self.table['row'].unique())}")
         return found.set_index("pair")
 
+    def poses(
+        self, name: str
+    ) -> tuple[list[Pair], Int[np.ndarray, " n"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
+        """Return the pairs for which a row has a pose, the target views, the rotations and the translations, or NaN."""
+        found = self.row(name).dropna(subset=["rotation", "view"])
+        if found.empty:
+            raise InputError(f"row {name!r} has no poses in the run")
+        rotations = np.array(found["rotation"].tolist()).reshape(-1, 3, 3)
+        positions = np.array([position or [np.nan] * 3 for position in found["position"]])
+        return [Pair.from_key(key) for key in found.index], found["view"].to_numpy(int), rotations, positions
+
 
 @contextmanager
-def open_run(out: str | Path, settings: Settings, allow_other_version: bool = False) -> Iterator[None]:
+def open_run(out: str | Path, settings: Settings) -> Iterator[None]:
     """Be the only writer of a run's folder, which is new or holds a run with these settings; then `add_lines` adds."""
     with writing(out):
         out, packed = Path(out), Path(out) / f"{LINES}.gz"
+        settings.folder = os.path.realpath(settings.data).encode(errors="replace").decode()
         if any(path.exists() for path in (out / SETTINGS, out / LINES, packed)):
-            settings = _continued(out, settings, allow_other_version)
+            settings = _continued(out, settings)
         write_atomic(out / LINES, _finished_lines(out))
         packed.unlink(missing_ok=True)
         settings.calls[-1].finished = False
@@ -131,30 +152,28 @@ def _write_settings(out: Path, settings: Settings) -> None:
     write_atomic(out / SETTINGS, msgspec.json.format(msgspec.json.encode(settings), indent=1))
 
 
-def _continued(out: Path, now: Settings, allow_other_version: bool) -> Settings:
+def _continued(out: Path, now: Settings) -> Settings:
     """Merge settings with those of the run that a folder holds; InputError if they do not go together."""
     before = read_json(out / SETTINGS, Settings, "settings of a run")
     held, asked = _compared(before), _compared(now)
-    if allow_other_version:
-        held["version"] = asked["version"]
     for name in asked:
         if held.get(name, asked[name]) != asked[name]:
-            more = ", or continue with --allow-other-version" if name == "version" else ""
-            told = f"{name} {held[name]}, this is {asked[name]}; choose another folder{more}"
-            raise InputError(f"{out} holds a run with {told}")
-    merged = {name: getattr(before, name) | getattr(now, name) for name in ("methods", "labels", "origins")}
+            raise InputError(
+                f"{out} holds a run with {name} {held[name]}, this is {asked[name]}; choose another folder"
+            )
+    merged = {name: getattr(before, name) | getattr(now, name) for name in ("methods", "labels")}
     library = [*(one for one in before.library if one != now.library[0]), *now.library]
     return msgspec.structs.replace(now, library=library, calls=before.calls + now.calls, **merged)
 
 
 def _compared(settings: Settings) -> dict[str, Any]:
     """What has to be equal in two calls that add to one run, where both have it, by its name."""
-    groups = {name: getattr(settings, name) for name in ("methods", "labels", "origins")}
+    groups = {name: getattr(settings, name) for name in ("methods", "labels")}
     parts = {f"{name} of {key}": value for name, group in groups.items() for key, value in group.items()}
-    whole = {name: getattr(settings, name) for name in ("data", "backbone", "targets")}
-    version = "{version} (commit {commit})".format(**settings.library[-1])
+    whole = {name: getattr(settings, name) for name in ("backbone", "targets")}
+    whole["data"] = settings.folder or os.path.realpath(settings.data)
     command = "align" if "alignment" in settings.methods else "benchmark"
-    return {"command": command} | whole | parts | {"version": version}
+    return {"command": command} | whole | parts
 
 
 def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]], kind: type = ResultLine) -> None:
@@ -196,7 +215,11 @@ def read_run(out: str | Path) -> Run:
     timings = pd.DataFrame([line.timings for line in lines]).median().to_dict()
     notes, rows = [], table["row"].unique()
     if not last.finished:
-        notes.append(f"Not finished: {table['row'].value_counts().max()} of {sum(last.pairs.values())} pairs.")
+        notes.append(
+            f"Not finished: {table['row'].value_counts().max()} of {last.seeds * sum(last.pairs.values())} pairs."
+        )
+    if len(settings.library) > 1:
+        notes.append("Evaluated by several versions of zsp-lite (run.json lists them).")
     if hidden := [name for name in settings.methods if name not in rows]:
         notes.append(f"Without {', '.join(hidden)}, which lack pairs of the last call.")
     remarks = {name: remark for call in settings.calls for name, remark in call.remarks.items() if name in rows}
@@ -206,16 +229,18 @@ def read_run(out: str | Path) -> Run:
 def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
     """Tabulate the results in the categories of the last call, by row, category and pair."""
     results = [
-        {"row": row, "pair": line.pair} | msgspec.structs.asdict(one)
+        {"row": row, "pair": line.pair, "repeat": line.repeat} | msgspec.structs.asdict(one)
         for line in lines for row, one in line.results.items()
     ]  # fmt: skip
-    table = pd.DataFrame(results, columns=["row", "pair", *_Result.__struct_fields__])
+    table = pd.DataFrame(results, columns=["row", "pair", "repeat", *_Result.__struct_fields__])
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
+    table["milliseconds"] = 1000 * table["seconds"].astype(float)
     table["target"] = table["category"] + "/" + table["target"]
     orders = {"row": settings.methods, "category": settings.calls[-1].pairs}
     for column, names in orders.items():
         table = table[table[column].isin(names)].astype({column: pd.CategoricalDtype(list(names))})
-    return table.sort_values(["row", "category", "problem", "pair"]).astype(dict.fromkeys(orders, object))
+    table = table[table["repeat"] < settings.calls[-1].seeds]
+    return table.sort_values(["row", "category", "problem", "pair", "repeat"]).astype(dict.fromkeys(orders, object))
 
 
 def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
@@ -223,8 +248,9 @@ def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
     views = table["pair"].str.count(",")  # one less than the target views
     finished = {}  # by number of views
     for number, found in table[table["row"].isin(settings.calls[-1].rows)].groupby(views):
-        rows_of_pair = found.groupby("pair")["row"].nunique()
-        finished[number] = set(rows_of_pair.index[rows_of_pair == found["row"].nunique()])
+        cases_of_pair = found.groupby("pair").size()
+        wanted = found["row"].nunique() * settings.calls[-1].seeds
+        finished[number] = set(cases_of_pair.index[cases_of_pair == wanted])
     problems = set(table["problem"][table["pair"].isin(set().union(*finished.values()))])
     kept = [table[:0]]
     for _, found in table.groupby("row", sort=False):

@@ -25,12 +25,14 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
 
     "methods" has by row, over all pairs and "per_category", what `figures_of` returns, and where they are known
     "symmetric_acc30" and the medians "translation" and "scale" of the pairs that have them. "against" has the
-    `paired_difference` of each row of the same problems to "ours". All draws resample objects.
+    `paired_difference` of each row of the same problems to "ours". "milliseconds" are medians, too, apart because they
+    differ from run to run. All draws resample objects.
     """
     rows = {str(name): row for name, row in table.groupby("row", sort=False)}
     methods, against, ours = {}, {}, rows.get("ours")
     for name, row in rows.items():
         errors, drawn, categories = row["error"].to_numpy(), draws_of(row), row["category"].to_numpy(str)
+        seeds = row["repeat"].nunique()
         methods[name] = figures_of(errors, drawn, categories) | {
             "failed": int((row["failed"] != "").sum()),
             "per_category": {
@@ -38,18 +40,30 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
                 for category in dict.fromkeys(categories) for members in [categories == category]
             },
         }  # fmt: skip
+        for found in (methods[name], *methods[name]["per_category"].values()):
+            found["n"] //= seeds
+        if seeds > 1:
+            by_seed = row.groupby("repeat")["error"].apply(lambda errors: 100 * (errors < 30).mean())
+            methods[name]["acc30_sd_of_seeds"] = float(by_seed.std())
         methods[name] |= row[["translation", "scale"]].astype(float).median().dropna().to_dict()
         if row["symmetric_error"].notna().any():
             known = row["symmetric_error"].fillna(row["error"]).to_numpy(np.float64)
             methods[name]["symmetric_acc30"] = float(accuracy(known, 30))
-        if ours is not None and name != "ours" and row["problem"].tolist() == ours["problem"].tolist():
-            against[name] = paired_difference(ours["error"], errors, weights=drawn)
-    return {"methods": methods} | ({} if ours is None else {"against": against})
+        if ours is not None and name != "ours":
+            common = ours[ours["repeat"].isin(row["repeat"])]
+            if row["problem"].tolist() == common["problem"].tolist():
+                against[name] = paired_difference(common["error"], errors, weights=drawn)
+    times = table.groupby("row", sort=False)["milliseconds"].median().dropna().to_dict()
+    return {"methods": methods, "milliseconds": times} | ({} if ours is None else {"against": against})
 
 
 def draws_of(row: pd.DataFrame) -> Draws:
-    """Draw bootstrap weights of a row's pairs from resampled objects."""
-    return object_draws(row[["reference", "target"]].to_numpy(), row["category"].to_numpy())
+    """Draw bootstrap weights of a row's pairs from resampled objects, and from resampled seeds if there are several."""
+    drawn = object_draws(row[["reference", "target"]].to_numpy(), row["category"].to_numpy())
+    seeds, repeat = np.unique(row["repeat"], return_inverse=True)
+    if len(seeds) == 1:
+        return drawn
+    return drawn * _multiplicities(len(seeds), RESAMPLES, np.random.default_rng([0, len(seeds)]))[:, repeat]
 
 
 def object_draws(objects: ArrayLike, categories: ArrayLike | None = None, resamples: int = RESAMPLES) -> Draws:
@@ -114,11 +128,11 @@ def figures_of(errors: ArrayLike, weights: Draws | None = None, categories: np.n
         "median": median,
         "acc30": lambda errors, weights=None: accuracy(errors, 30, weights),
         "acc15": lambda errors, weights=None: accuracy(errors, 15, weights),
+        "above150": lambda errors, weights=None: 100 * weighted_mean(errors > 150, weights),
+        "auc30": lambda errors, weights=None: 100 * weighted_mean(np.clip(1 - errors / 30, 0, None), weights),
     } | ({} if categories is None else {"mean_category_median": mean_category_median})
     found = {"n": int(errors.size)} | {name: float(figure(errors)) for name, figure in figures.items()}
-    found |= {f"{name}_ci": bootstrap_ci(errors, figure, weights) for name, figure in figures.items()}
-    above150, auc30 = 100 * np.mean(errors > 150), 100 * np.mean(np.clip(1 - errors / 30, 0, None))
-    return found | {"above150": float(above150), "auc30": float(auc30)}
+    return found | {f"{name}_ci": bootstrap_ci(errors, figure, weights) for name, figure in figures.items()}
 
 
 def paired_difference(first: ArrayLike, second: ArrayLike, threshold: float = 30, weights: Draws | None = None) -> dict:

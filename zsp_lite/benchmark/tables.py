@@ -7,7 +7,7 @@ the rows of each table, and what the paper published for CO3D (20 categories wit
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import methodcaller
 from pathlib import Path
 from typing import Any
@@ -17,14 +17,18 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from zsp_lite.benchmark.methods import GROUPS, METHODS, read_paper_tables
+from zsp_lite.alignment import Sim3
+from zsp_lite.benchmark.methods import GROUPS, base_name, is_own, read_paper_tables
 from zsp_lite.benchmark.runs import Run
 from zsp_lite.benchmark.statistics import draws_of, paired_difference
 from zsp_lite.choices import METRICS, METRICS_SHOWN
+from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import write_atomic
 from zsp_lite.metrics import accuracy, median
-from zsp_lite.viz.plots import COLOURS, show_dots, show_panels
+from zsp_lite.views import object_crop
+from zsp_lite.viz.plots import COLOURS, draw_moved_cloud, frame_cloud, pale, show_dots, show_images, show_panels
 
 PAPER = METRICS_SHOWN[:3]
 PUBLISHED = "paper, CO3D"
@@ -34,7 +38,7 @@ SEE_MORE = {
     "with_scans": ("With several frames of the reference object", GROUPS["scans"]),
     "with_others": ("With other unlabelled objects of the category", ["category"]),
 }
-_LOWEST_IS_BEST = ("mean_category_median", "median", "above150", "translation")
+_LOWEST_IS_BEST = ("mean_category_median", "median", "above150", "translation", "milliseconds")
 _SYMBOLS = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _SYMBOLS |= {"°": r"$^\circ$", "−": "$-$"}
 _SYMBOLS |= {one: f"\\{one}" for one in "%_&#${}"} | {one: f"${one}$" for one in "<>|"}
@@ -76,17 +80,28 @@ class Table:
         return self.cells.map(lambda cell: "–" if cell is None else str(cell))
 
 
+def choose(run: Run, rows: Sequence[str]) -> dict[str, Any]:
+    """Return the summary of a run with some rows, in this order, for the tables; InputError for an unknown row."""
+    for name in rows:
+        run.row(name)
+    return run.summary | {"methods": {name: run.summary["methods"][name] for name in rows}, "chosen": list(rows)}
+
+
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
     """Return all tables of a run; `metrics` are the figures of the table of all rows (see `METRICS`)."""
+    times = summary["milliseconds"]
+    methods = {name: row | {"milliseconds": times.get(name)} for name, row in summary["methods"].items()}
+    summary = {**summary, "methods": methods}
     first = (all_rows(summary, metrics, name) for name in ("all_rows", *SEE_MORE))
-    tables = *first, *paper_tables(summary), *(by_category(summary, one) for one in PAPER)
+    shown = *PAPER, *(metric for metric in metrics if metric == "milliseconds")
+    tables = *first, *paper_tables(summary, shown), *(by_category(summary, one) for one in PAPER)
     return [table for table in tables if table.cells.size]
 
 
 def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN, table: str = "all_rows") -> Table:
     """Return every row that sees the pair only, or those of a table of `SEE_MORE` below "verified", which does, too."""
     title, members = SEE_MORE.get(table, ("All rows", []))
-    names = [name for name in summary["methods"] if _plain(name) in members or not members and not _sees_more(name)]
+    names = [name for name in summary["methods"] if base_name(name) in members or not members and not _sees_more(name)]
     if members and names:  # what they add to
         names = [*(name for name in summary["methods"] if name == "verified"), *names]
     rows = {}
@@ -100,32 +115,34 @@ def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN,
     return _table(summary, table, title, rows, titles, metrics, gain)
 
 
-def paper_tables(summary: Mapping[str, Any]) -> list[Table]:
+def paper_tables(summary: Mapping[str, Any], metrics: Sequence[str] = PAPER) -> list[Table]:
     """Return tables 1 to 3, those of the supplement and more, where the run has two of their rows."""
-    tables = [_paper_table(spec, summary) for spec in read_paper_tables()]
+    tables = [_paper_table(spec, summary, metrics) for spec in read_paper_tables()]
     return [table for table in tables if table.cells[METRICS["acc30"]].count() > 1]
 
 
-def _paper_table(spec: Mapping[str, Any], summary: Mapping[str, Any]) -> Table:
+def _paper_table(spec: Mapping[str, Any], summary: Mapping[str, Any], metrics: Sequence[str]) -> Table:
     """A table with the run's rows, the published figures, and in Table 1, rows of one's own below the paper's."""
-    lines, categories, methods = list(spec["rows"]), summary["data"]["categories"], summary["methods"]
+    categories, methods, views = summary["data"]["categories"], summary["methods"], f"-n{summary['data']['targets']}"
+    lines = [(one["row"] if one["row"] in methods else one["row"].removesuffix(views), one) for one in spec["rows"]]
     if spec["name"] == "table_1":
-        lines += [{"label": name, "row": name, "published": []} for name in own_rows(summary)]
+        lines += [(name, {"label": name, "published": []}) for name in own_rows(summary)]
+    if chosen := summary.get("chosen"):
+        lines = sorted((line for line in lines if line[0] in chosen), key=lambda line: chosen.index(line[0]))
     # Of the single categories with a published Acc30, those of the run are shown.
     names = [title.removesuffix(" Acc30") for title in spec["published"]]
     kept = [k for k, (name, title) in enumerate(zip(names, spec["published"])) if name in (title, *categories)]
     featured = [names[k] for k in kept if names[k] in categories]
-    titles = [*(METRICS[metric] for metric in PAPER), *(f"{category} Acc30" for category in featured)]
+    titles = [*(METRICS[metric] for metric in metrics), *(f"{category} Acc30" for category in featured)]
     rows = {}
-    for line in lines:
-        plain = line["row"].removesuffix(f"-n{summary['data']['targets']}")  # of as many views as the run has
-        row = methods.get(line["row"], methods.get(plain))
-        cells = [_cell(row, metric) for metric in PAPER]
+    for name, line in lines:
+        row = methods.get(name)
+        cells = [_cell(row, metric) for metric in metrics]
         cells += [_cell(row and row["per_category"].get(category), "acc30") for category in featured]
         rows[line["label"]] = cells + [Cell(line["published"][k]) if line["published"] else None for k in kept]
     titles += [f"{PUBLISHED}: {spec['published'][k]}" for k in kept]
     notes = _PUBLISHED_NOTE if kept else "", spec.get("note", "")
-    return _table(summary, spec["name"], spec["title"], rows, titles, PAPER, *notes)
+    return _table(summary, spec["name"], spec["title"], rows, titles, metrics, *notes)
 
 
 def by_category(summary: Mapping[str, Any], metric: str = "acc30", most: int | None = None) -> Table:
@@ -152,7 +169,10 @@ def compare(first: Run, second: Run, rows: Sequence[str] | None = None, names: S
         raise InputError(f"runs have no row in common: {', '.join(of_first)} and {', '.join(of_second)}")
     for text in rows:
         one, _, other = (text, "", text) if text in of_first else text.partition(":")
-        both = first.row(one).join(second.row(other)["error"].rename("other"), how="inner").sort_index()
+        lines = (
+            run.row(name).set_index("repeat", append=True, drop=False) for run, name in ((first, one), (second, other))
+        )
+        both = next(lines).join(next(lines)["error"].rename("other"), how="inner").sort_index()
         if both.empty:
             raise InputError(f"rows {one} and {other} have no pair in common: other data or number of views")
         errors = both[["error", "other"]].to_numpy().T
@@ -175,24 +195,21 @@ def _difference(test: Mapping[str, Any] | None) -> tuple[Cell | None, Cell | Non
 
 
 def own_rows(summary: Mapping[str, Any]) -> list[str]:
-    """List the rows of a run that are not the library's, with any number of target views."""
-    return [name for name in summary["methods"] if _plain(name) not in METHODS]
+    """List the rows of a run that are not the library's."""
+    return [*filter(is_own, summary["methods"])]
 
 
 def important_rows(summary: Mapping[str, Any]) -> list[str]:
-    """List the rows of a run that see the pair only, or all if none does, "ours" and one's own first."""
+    """List the rows of a run that see the pair only, or all if none does, "ours" and one's own first; or the chosen."""
+    if "chosen" in summary:
+        return summary["chosen"]
     first = ["ours", *own_rows(summary), "ours-bv", "verified"]
     names = [name for name in summary["methods"] if not _sees_more(name)]
     return sorted(names or summary["methods"], key=lambda name: first.index(name) if name in first else len(first))
 
 
-def _plain(name: str) -> str:
-    """ROW of "ROW-nN"."""
-    return re.sub(r"-n\d+$", "", name)
-
-
 def _sees_more(name: str) -> bool:
-    return any(_plain(name) in rows for _, rows in SEE_MORE.values())
+    return any(base_name(name) in rows for _, rows in SEE_MORE.values())
 
 
 def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:
@@ -215,11 +232,27 @@ def _table(
         notes.append("Med. err.: mean of the categories' medians.")
     if {"translation", "scale"} & set(metrics):
         notes.append("Translation and scale: medians of the pairs for which a row has them.")
-    notes += ["Intervals: 95 %, bootstrap over objects.", *more]
+    if any("@threshold=" in name for name in summary["methods"]):
+        notes.append("A threshold is to be chosen on validation categories, never on those that are evaluated.")
+    if "milliseconds" in metrics:
+        notes.append("ms per pair: median; what rows share, such as features, counts for the first that needs it.")
+    notes += ["Intervals: 95 %, bootstrap over objects.", *_note_on_seeds(summary), *more]
     pairs = f"{data['pairs']} pairs" + (" of an unfinished run" if "Not finished" in notes[0] else "")
     what = f"{Path(data['root']).name}, {pairs}, {data['targets']} target views, backbone {summary['backbone']}"
     cells = pd.DataFrame.from_dict(rows, "index", object, titles)
     return Table(name, title, cells, " ".join(filter(None, notes)), what, across)
+
+
+def _note_on_seeds(summary: Mapping[str, Any]) -> list[str]:
+    """Say how much the draws of k-means and RANSAC alone change Acc30, if there are several of each pair."""
+    spread = {name: row["acc30_sd_of_seeds"] for name, row in summary["methods"].items() if "acc30_sd_of_seeds" in row}
+    if not spread:
+        return []
+    name = "ours" if "ours" in spread else next(iter(spread))
+    return [
+        f"Means over seeds, which the intervals hold; by seed, Acc30 of {name} has a standard deviation of "
+        f"{spread[name]:.1f} points."
+    ]
 
 
 def as_csv(table: Table) -> str:
@@ -239,14 +272,15 @@ def as_markdown(table: Table) -> str:
     return "\n\n".join(filter(None, [f"**{table.title}**", lines, table.note])) + "\n"
 
 
-def as_latex(table: Table) -> str:
-    """Format three columns as a booktabs table: no intervals, the best value of a metric in bold.
+def as_latex(table: Table, intervals: bool = False) -> str:
+    """Format three columns and the time as a booktabs table, the best value of a metric in bold.
 
     The paper's figures of these columns follow in lines of their own.
     """
-    titles = [title for title in table.cells if title != "pairs"][:3]
+    time = METRICS["milliseconds"]
+    titles = [title for title in table.cells if title not in ("pairs", time)][:3] + [time] * (time in table.cells)
     shown = table.cells[titles].dropna(how="all")
-    texts, best = shown.map(_number), shown.apply(_are_best, axis=int(table.across))
+    texts, best = shown.map(_number, interval=intervals), shown.apply(_are_best, axis=int(table.across))
     published = table.cells.reindex(columns=[f"{PUBLISHED}: {title}" for title in titles]).dropna(how="all")
     published = published.set_axis(titles, axis="columns").rename(lambda label: f"{PUBLISHED}: {label}")
     lines = pd.concat([texts.mask(best, r"\textbf{" + texts + "}"), published.map(_number)])
@@ -265,15 +299,19 @@ def _are_best(cells: pd.Series) -> pd.Series:
     return (values == (values.min() if lowest else values.max())) & (len(rivals) > 1)
 
 
-def _number(cell: Any) -> str:
-    return f"{cell.value:.{cell.decimals}f}".replace("-", "$-$") if isinstance(cell, Cell) else "--"
+def _number(cell: Any, interval: bool = False) -> str:
+    if not isinstance(cell, Cell):
+        return "--"
+    text = str(cell) if interval else str(replace(cell, low=None))
+    return text.replace("-", "$-$")
 
 
-def write_tables(tables: Iterable[Table], folder: str | Path) -> None:
-    """Write each table as NAME.csv, NAME.md and NAME.tex."""
+def write_tables(tables: Iterable[Table], folder: str | Path, intervals: bool = False) -> None:
+    """Write each table as NAME.csv, NAME.md and NAME.tex, this with `intervals` or without."""
     for table in tables:
-        for suffix, render in ((".csv", as_csv), (".md", as_markdown), (".tex", as_latex)):
-            write_atomic(Path(folder) / f"{table.name}{suffix}", render(table).encode())
+        texts = {".csv": as_csv(table), ".md": as_markdown(table), ".tex": as_latex(table, intervals)}
+        for suffix, text in texts.items():
+            write_atomic(Path(folder) / f"{table.name}{suffix}", text.encode())
 
 
 def error_distribution(run: Run, row: str = "ours") -> Figure:
@@ -282,8 +320,8 @@ def error_distribution(run: Run, row: str = "ours") -> Figure:
     A second cluster near 180 degrees consists of confusions of front and back.
     """
     groups = {str(name): errors for name, errors in run.row(row).groupby("category")["error"]}
-    labels = {"xlabel": "rotation error (degrees)", "xlim": (-3, 183), "xticks": range(0, 181, 30)}
-    return show_dots({row: groups}, title=f'Errors of "{row}" by category; the bar is the median', **labels)
+    labels = {"xlabel": f"rotation error of {row} (degrees)", "xlim": (-3, 183), "xticks": range(0, 181, 30)}
+    return show_dots({row: groups}, **labels)
 
 
 def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
@@ -298,13 +336,51 @@ def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
     return show_panels({"": curves}, size=(6.5, 4), **labels)
 
 
-def write_figures(run: Run, folder: str | Path) -> None:
-    """Write the errors of the first row by category, and the error curves, as PDF and PNG files."""
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    first = [*own_rows(run.summary), *important_rows(run.summary)][0]
+def pair_figure(run: Run, key: str, dataset: Co3D, rows: Sequence[str] | None = None) -> Figure:
+    """Draw the reference of a pair, and for each row with a pose its target view, below it under the moved points.
+
+    Without a translation, they are moved to the middle of the target's points. InputError if no row has a pose.
+    """
+    stored = {name: run.row(name).dropna(subset=["rotation", "view"]) for name in rows or run.table["row"].unique()}
+    found = {name: row.loc[[key]].iloc[0] for name, row in stored.items() if key in row.index}  # of the first seed
+    if not found:
+        raise InputError(f"pair {key!r} has no pose in the run, expected a key such as {run.table['pair'].iloc[0]}")
+    reference, targets = dataset.load_pair(Pair.from_key(key))
+    crops = [object_crop(reference), *(object_crop(targets[int(result["view"])]) for result in found.values())]
+    cloud, images = frame_cloud(crops[0]), [crop.rgb for crop in crops]
+    poses = [Sim3.identity(), *(_pose(result, cloud, crop) for result, crop in zip(found.values(), crops[1:]))]
+    titles = ["reference", *found, "its points", *(f"{result['error']:.0f}° off" for result in found.values())]
+    figure, axes = show_images([*images, *map(pale, images)], titles, len(crops))
+    draw_moved_cloud(axes[len(crops) :], [crop.camera for crop in crops], cloud, poses)
+    return figure
+
+
+def _pose(result: pd.Series, cloud: np.ndarray, target: Frame) -> Sim3:
+    scale, position = 1.0 if pd.isna(result["scale"]) else result["scale"], result["position"]
+    rotation = np.reshape(result["rotation"], (3, 3))
+    if position is None:
+        position = frame_cloud(target).mean(axis=0) - scale * rotation @ cloud.mean(axis=0)
+    return Sim3(scale, rotation, np.array(position))
+
+
+def write_figures(
+    run: Run, folder: str | Path, rows: Sequence[str] | None = None, size: tuple[float, float] | None = None
+) -> None:
+    """Write the errors of the first row by category, and the error curves (see `save_figure`)."""
+    first = [*(rows or own_rows(run.summary)), *important_rows(run.summary)][0]
     with plt.rc_context({"text.parse_math": False}):  # names of rows and categories are no TeX
-        figures = {"error_distribution": error_distribution(run, first), "error_curves": error_curves(run)}
-        for name, figure in figures.items():
-            figure.savefig(Path(folder) / f"{name}.pdf", metadata={"CreationDate": None})
-            figure.savefig(Path(folder) / f"{name}.png", dpi=150)
-            plt.close(figure)
+        save_figure(error_distribution(run, first), folder, "error_distribution", size)
+        save_figure(error_curves(run, rows), folder, "error_curves", size)
+
+
+def save_figure(figure: Figure, folder: str | Path, name: str, size: tuple[float, float] | None = None) -> Path:
+    """Write and close a figure of a size in inches as NAME.pdf and NAME.png, whose path is returned."""
+    path = Path(folder) / f"{re.sub('[^A-Za-z0-9.,-]', '_', name)[:200]}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if size is not None:
+        figure.set_size_inches(size)
+    with plt.rc_context({"pdf.fonttype": 42, "ps.fonttype": 42}):  # publishers refuse fonts of type 3
+        figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+    return path

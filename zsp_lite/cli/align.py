@@ -4,31 +4,25 @@ from pathlib import Path
 
 import click
 
-from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, replace_option, run_options
+from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, replace_option, workers_option
 
 
 @click.command(
     epilog=examples(
-        "align data_samples --category car --out outputs/cars",
-        "align path/to/scans --category cup",
-        "align path/to/co3d --category teddybear --pairs 4 --workers 8 --out outputs/teddybears --propose",
+        "align path/to/scans --category cup", "align data_samples --category car --out outputs/cars --propose"
     )
 )
 @click.argument("data", type=PATH)
 @click.option("--category", metavar="NAME", required=True, help="Category of the objects.")
 @click.option("--sequences", type=NAMES, show_default="all of the category", help="Sequences, one per object.")
-@click.option(
-    "--pairs", type=COUNT, show_default="all; 6 from twelve objects on", help="Objects that each is compared with."
-)
+@click.option("--pairs", type=COUNT, show_default="all; 6 from twelve objects on", help="Partners of each object.")
 @click.option("--targets", type=COUNT, default=5, help="Target views per pair.")
 @click.option("--out", type=PATH, show_default="outputs/align/NAME", help="Folder; an existing run is continued.")
 @click.option("--propose", is_flag=True, help="Write the labels into DATA as proposals, which notebook 08 shows.")
 @replace_option
-@run_options
+@workers_option
 @backbone_options
-def align(
-    data, category, sequences, pairs, targets, out, propose, replace, backbone, workers, executor, allow_other_version
-) -> None:
+def align(data, category, sequences, pairs, targets, out, propose, replace, backbone, workers) -> None:
     """Align all objects of a category in one frame; no label is needed.
 
     DATA is a data folder, or a folder with a capture of each object (see `zsp-lite data import --help`).
@@ -48,14 +42,14 @@ def align(
     from zsp_lite.viz.category_sheet import COLUMNS, object_rows
     from zsp_lite.viz.report import write_category_report
 
-    out, executor = out or Path("outputs/align") / category, executor or workers
+    out = out or Path("outputs/align") / category
     if data.is_dir() and not Co3D(data).categories():
         for name, imported in import_captures(data, out / "data", category):
             for flag in imported.flags:
                 print(f"{name}: {flag}")
         data = out / "data"
     dataset = Co3D(data)
-    found = align_category(dataset, category, backbone, sequences, pairs, targets, out, executor, allow_other_version)
+    found = align_category(dataset, category, backbone, sequences, pairs, targets, out, workers)
     written = [write_alignment(found, out), write_labels(found, out, category, replace=True)]
     written.append(write_category_report(out / "report.html", found, dataset, category))
     if propose:

@@ -6,8 +6,15 @@ import textwrap
 import click
 
 from zsp_lite.choices import METRICS, METRICS_SHOWN
-from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples, run_options
+from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples, workers_option
 
+SIZE = Parsed(
+    "W,H", lambda text: tuple(map(float, text.split(","))),
+    lambda size: len(size) == 2 and all(1 <= side <= 100 for side in size), "two numbers from 1 to 100",
+)  # fmt: skip
+THRESHOLDS = Parsed(
+    "threshold=V,V", lambda text: [*map(float, text.removeprefix("threshold=").split(","))], bool, "threshold=V,V"
+)
 _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 metrics_option = click.option(
     "--metrics",
@@ -35,15 +42,18 @@ metrics_option = click.option(
     "--methods", type=NAMES, default="default",
     help="Rows or groups of rows, see --list; NAME=module:thing or NAME=poses.csv for your own.",
 )  # fmt: skip
+@click.option("--seeds", type=COUNT, default=1, help="Evaluations of each pair, with other random draws.")
+@click.option("--sweep", type=THRESHOLDS, help="Evaluate each row with each of these thresholds of RANSAC.")
 @click.option("--list", "list_only", is_flag=True, help="Print every method and group, and exit.")
 @click.option("--list-pairs", type=PATH, help="Only write the pairs to this CSV file, for another program.")
 @click.option("--out", type=PATH, default="outputs/benchmark", help="Folder; an existing run is continued.")
-@run_options
+@workers_option
+@click.option("--row-seconds", type=COUNT, default=60, help="Time limit of a method of your own for a pair.")
 @metrics_option
 @click.option("--quiet", is_flag=True, help="Print no progress bar and no tables.")
 def benchmark(
-    data, backbone, categories, pairs, targets, methods, list_only, list_pairs, out, workers, executor, metrics, quiet,
-    allow_other_version,
+    data, backbone, categories, pairs, targets, methods, list_only, list_pairs, out, workers, metrics, quiet,
+    row_seconds, seeds, sweep,
 ) -> None:  # fmt: skip
     """Measure rotation errors over many pairs, and write tables, figures and results."""
     if list_only:
@@ -63,7 +73,7 @@ def benchmark(
         asked = pairs_of_rows(dataset, resolve(methods), numbers, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
-    evaluate(dataset.root, backbone, methods, numbers, targets, out, executor or workers, allow_other_version)
+    evaluate(dataset.root, backbone, methods, numbers, targets, out, workers, row_seconds, seeds, sweep or ())
     summary = write_reports(out, metrics=metrics)
     if not quiet:
         print(f"{dataset.root}, backbone {summary['backbone']}, {targets} target views")
@@ -98,11 +108,26 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
 @click.argument("run", type=PATH)
 @click.option("--out", type=PATH, show_default="the run's folder", help="Folder to write.")
 @metrics_option
-def tables(run, out, metrics) -> None:
+@click.option("--rows", type=NAMES, show_default="all", help="Rows of the tables and figures, in order.")
+@click.option("--latex", type=click.Choice(("intervals", "time", "intervals,time")), help="Add these to LaTeX tables.")
+@click.option("--size", type=SIZE, help="Width and height of the figures in inches.")
+@click.option("--pair", metavar="KEY", help="Only draw this pair of run.jsonl, with the pose of each row.")
+@click.option("--data", type=PATH, show_default="the run's", help="Data folder, for --pair.")
+def tables(run, out, metrics, rows, latex, size, pair, data) -> None:
     """Write tables and figures of a benchmark run, also of one that goes on."""
-    from zsp_lite.benchmark.run import write_reports
+    from zsp_lite.benchmark.run import read_run, write_reports
+    from zsp_lite.benchmark.tables import pair_figure, save_figure
+    from zsp_lite.data.co3d import Co3D
 
-    _print_summary(write_reports(run, out, metrics), metrics, with_paper=True)
+    latex = latex or ""
+    if pair:
+        found = read_run(run)
+        figure = pair_figure(found, pair, Co3D(data or found.settings.data), rows)
+        print(f"Written: {save_figure(figure, (out or run) / 'figures', f'pair_{pair}', size)}")
+        return
+    if "time" in latex and "milliseconds" not in metrics:
+        metrics = [*metrics, "milliseconds"]
+    _print_summary(write_reports(run, out, metrics, rows, "intervals" in latex, size), metrics, with_paper=True)
 
 
 @click.command(epilog=examples("compare outputs/a outputs/b", "compare outputs/a outputs/a --rows ours:rootsift"))

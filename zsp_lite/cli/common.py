@@ -1,8 +1,4 @@
-"""Types of options, options that several commands share, and the examples below a help text.
-
-The command line uses click and not typer: `main` prints click's usage errors as one line, and `--help` does not import
-pydantic.
-"""
+"""Types of options, options that several commands share, and the examples below a help text."""
 
 import math
 from collections.abc import Callable, Collection, Mapping
@@ -58,18 +54,17 @@ replace_option = click.option("--replace", is_flag=True, help="Replace existing 
 
 
 def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add --backbone, --layer, --facet and --image-size; the command gets `backbone`, which `load_backbone` takes."""
+    """Add --backbone, --layer, --facet and --image-size; the command gets `backbone`, which `as_backbone` takes."""
 
-    @click.option("--backbone", "name", default="zsp-tiny", help="A name of `weights list`, a file, or hf:NAME.")
+    @click.option("--backbone", "name", default="zsp-tiny", help="Name of `weights list`, file, hf:NAME, module:thing.")
     @click.option("--layer", show_default="the backbone's own", help="Block of the descriptors: block0, ..., last.")
     @click.option("--facet", type=click.Choice(FACETS), default="key", help="Activation of that block to use.")
     @click.option("--image-size", type=COUNT, show_default="usually 224", help="Side of the network's input in pixels.")
     @wraps(command)
     def with_backbone(name, layer, facet, image_size, **others):
-        from zsp_lite.backbones.load import BackboneConfig
+        from zsp_lite.backbones.load import named_backbone
 
-        config = BackboneConfig(name, layer, facet, image_size)
-        return command(backbone=name if config == BackboneConfig(name) else config, **others)
+        return command(backbone=named_backbone(name, layer, facet, image_size), **others)
 
     return with_backbone
 
@@ -79,11 +74,7 @@ def _options(*options: Callable[..., Any]) -> Callable[..., Any]:
     return lambda command: reduce(lambda one, option: option(one), reversed(options), command)
 
 
-run_options = _options(
-    click.option("--workers", type=COUNT, default=1, help="Worker processes on this machine."),
-    click.option("--executor", metavar="dask://HOST:PORT", help="Dask cluster in place of worker processes."),
-    click.option("--allow-other-version", is_flag=True, help="Continue a run of another version; run.json lists both."),
-)
+workers_option = click.option("--workers", type=COUNT, default=1, help="Worker processes.")
 
 
 def source_options(multiple: bool) -> Callable[..., Any]:

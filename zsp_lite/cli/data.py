@@ -68,7 +68,6 @@ def _print_checks(root: Path, checks: Sequence[Any]) -> int:
 @data.command(
     epilog=examples(
         "data download co3d --category toaster --single-sequence",
-        "data download co3d --category toaster --chunks 1",
         "data download co3d-v1 --category toaster --labels path/to/clone --labelled-only --root path/to/co3d",
     )
 )

@@ -22,7 +22,7 @@ def demo(data, solver, backbone, out) -> None:
     """
     from rich.console import Console
 
-    from zsp_lite.backbones.load import load_backbone
+    from zsp_lite.backbones.load import as_backbone
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.demo import run_demo
@@ -36,10 +36,10 @@ def demo(data, solver, backbone, out) -> None:
     notes = {SETTINGS_FILE: SYNTHETIC_NOTE, RENDERED_FILE: MODELS_NOTE}
     note = next((text for file, text in notes.items() if (folder / file).is_file()), USER_NOTE)
     with writing(out), Console().status("estimating poses"):
-        dataset, model = Co3D(folder), load_backbone(backbone)
+        dataset, model = Co3D(folder), as_backbone(backbone)
         photograph = list(run_photograph(dataset, model))
         results = list(run_demo(dataset, model, SOLVERS[solver]))
-        path = write_report(out / "report.html", results, model.name, str(folder), note, photograph)
+        path = write_report(out / "report.html", results, getattr(model, "name", ""), str(folder), note, photograph)
         write_overview(out / "overview.jpg", results)
     if photograph:
         title = f"Photographed motorcycle: directions from the rendered {photograph[0].sequence}, compared by eye"

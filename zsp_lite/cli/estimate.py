@@ -21,14 +21,10 @@ _ONCE_PER_OBJECT = ("mask", "box", "intrinsics", "label", "orientation", "depth"
 @click.argument("reference", type=PATH)
 @click.argument("target", type=PATH)
 @click.argument("others", type=PATH, nargs=-1, metavar="")
-@click.option(
-    "--helpers", type=PATH, multiple=True, metavar="C [D ...]", help="Other objects of the category, last of all."
-)
+@click.option("--helpers", type=PATH, multiple=True, metavar="C [D ...]", help="Other objects, last of all.")
 @click.option("--solver", type=click.Choice(SOLVERS), default="verified", help="Solver of the pose.")
 @click.option("--reference-frame", type=INDEX, show_default="first usable", help="Its number in REFERENCE.")
-@click.option(
-    "--references", type=COUNT, show_default="4; 1 with --reference-frame", help="Reference frames of each object."
-)
+@click.option("--references", type=COUNT, show_default="4; 1 with --reference-frame", help="Frames of each object.")
 @click.option("--targets", type=COUNT, show_default="5", help="Number of target views, evenly spaced.")
 @source_options(multiple=True)
 @click.option("--depth", type=PATH, multiple=True, help="Depth of an image, if it is not beside it. Once per image.")
@@ -60,7 +56,6 @@ def estimate(reference, target, others, helpers, not_upright, as_json, backbone,
     """
     import json
 
-    from zsp_lite.backbones.load import load_backbone
     from zsp_lite.importers.sources import open_pair
     from zsp_lite.io.locks import writing
     from zsp_lite.own_objects import estimate_pose, write_pair
@@ -72,7 +67,7 @@ def estimate(reference, target, others, helpers, not_upright, as_json, backbone,
     with writing(out):
         given = {name: settings.pop(name) for name in _ONCE_PER_OBJECT}
         sources = open_pair(reference, target, given, (*helpers, *others))
-        settings |= {"backbone": load_backbone(backbone), "upright": not not_upright, "helpers": sources[2:]}
+        settings |= {"backbone": backbone, "upright": not not_upright, "helpers": sources[2:]}
         found = estimate_pose(*sources[:2], **settings)
         files = write_pair(found, out)
     if as_json:

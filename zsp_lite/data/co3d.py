@@ -30,6 +30,7 @@ class Pair:
     reference_frame: int
     target_sequence: str
     target_frames: tuple[int, ...]
+    repeat: int = 0  # number of the evaluation, with random draws of its own
 
     @property
     def key(self) -> str:
@@ -38,10 +39,18 @@ class Pair:
         reference = f"{self.category}/{self.reference_sequence}:{self.reference_frame}"
         return f"{reference}/{self.target_sequence}:{targets}"
 
+    @classmethod
+    def from_key(cls, key: str) -> "Pair":
+        """Return the pair with a `key`."""
+        category, reference, target = key.split("/")
+        first, _, frame = reference.rpartition(":")
+        second, _, frames = target.rpartition(":")
+        return cls(category, first, int(frame), second, tuple(map(int, frames.split(","))))
+
     @property
     def seed(self) -> int:
-        """Seed of all random draws for this pair; it depends on the key only."""
-        return stable_hash(self.key) >> 1
+        """Seed of all random draws for this pair; it depends on the key and the repeat only."""
+        return stable_hash(f"{self.key} {self.repeat}" if self.repeat else self.key) >> 1
 
 
 class Co3D:

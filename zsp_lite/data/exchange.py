@@ -2,8 +2,7 @@
 
 import csv
 import io
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,19 +12,20 @@ from jaxtyping import Float
 from scipy.stats import binom
 
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.labels import read_labels, relative_pose
-from zsp_lite.errors import InputError, check_magnitude, check_number, real_array, rotation_matrix
+from zsp_lite.data.pairs import true_poses
+from zsp_lite.errors import InputError, check_choice, check_magnitude, check_number, real_array, rotation_matrix
 from zsp_lite.io.files import digest, read_bytes, write_atomic
 from zsp_lite.metrics import rotation_error
 
-PairKey = tuple[str, str, int, str, int]  # category, reference sequence and frame, target sequence and frame
-_KEY = ("category", "reference_sequence", "reference_frame", "target_sequence", "target_frame")
+_REQUIRED = ("pair", "target_frame", "rotation")  # columns
 _CHANCE = 0.01  # largest p value of the sign test by which another convention is named
 
 
 class StoredPose(NamedTuple):
     """Pose of the reference object in the camera of a target frame."""
 
+    line: int  # of the file
+    target_frame: int
     rotation: Float[np.ndarray, "3 3"]
     translation: Float[np.ndarray, "3"] | None  # in the target's unit
     scale: float | None
@@ -34,7 +34,7 @@ class StoredPose(NamedTuple):
 def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> Path:
     """Write pairs, with a line for each frame."""
     lines = []
-    for number, pair in enumerate(pairs):
+    for pair in pairs:
         targets = [("target", pair.target_sequence, frame) for frame in pair.target_frames]
         for role, sequence, frame in [("reference", pair.reference_sequence, pair.reference_frame), *targets]:
             found = dataset.frame(pair.category, sequence, frame)
@@ -42,7 +42,7 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
             (fx, fy), (cx, cy) = camera.focal_length.tolist(), camera.principal_point.tolist()
             R, t = (" ".join(map(repr, part.ravel().tolist())) for part in (camera.R, camera.t))
             lines.append({
-                "pair": number, "role": role, "category": pair.category, "sequence": sequence, "frame": frame,
+                "pair": pair.key, "role": role, "category": pair.category, "sequence": sequence, "frame": frame,
                 "image": found.image.path, "depth": depth and depth.path,
                 "depth_scale": depth and depth.scale_adjustment, "mask": mask and mask.path,
                 "fx": fx, "fy": fy, "cx": cx, "cy": cy, "R": R, "t": t,
@@ -51,9 +51,22 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
     return Path(path)
 
 
-def read_poses(path: str | Path) -> tuple[dict[PairKey, StoredPose], str]:
-    """Read poses, with a line for each pair, and the hash of the file."""
+def read_poses(path: str | Path) -> tuple[dict[str, StoredPose], str]:
+    """Read poses by the key of their pair, and the hash of the file."""
     data, poses = read_bytes(path, "poses"), {}
+    for number, line in _read_lines(path, data):
+        try:
+            key, pose = line["pair"].strip(), _read_pose(number, line)
+            if key in poses:
+                raise ValueError(f"second pose of the pair of line {poses[key].line}")
+        except ValueError as error:  # an InputError is one, too
+            raise InputError(f"poses {path}, line {number}: {error}") from error
+        poses[key] = pose
+    return poses, digest(data)
+
+
+def _read_lines(path: str | Path, data: bytes) -> list[tuple[int, dict]]:
+    """Read the lines of a CSV file that are not blank, each with its number."""
     try:
         # A redirection in PowerShell writes UTF-16 with its byte-order mark.
         text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
@@ -64,26 +77,22 @@ def read_poses(path: str | Path) -> tuple[dict[PairKey, StoredPose], str]:
         lines = [(reader.reader.line_num, line) for line in reader if any(line.values())]
     except (ValueError, csv.Error) as error:
         raise InputError(f"poses {path}: {error}, expected a CSV file") from error
-    if wrong := [name for name in (*_KEY, "rotation") if reader.fieldnames.count(name) != 1]:
+    if wrong := [name for name in _REQUIRED if reader.fieldnames.count(name) != 1]:
         raise InputError(f"poses {path}: no or two columns {', '.join(wrong)}, expected a CSV file with one of each")
-    for number, line in lines:
-        try:
-            if any(line.pop(None, ())):
-                raise ValueError(f"more than the {len(reader.fieldnames)} fields of the header")
-            rotation = rotation_matrix("rotation", _numbers("rotation", line["rotation"], 9).reshape(3, 3))
-            translation, scale = (line.get(name, "").strip() for name in ("translation", "scale"))
-            translation = _numbers("translation", translation, 3) if translation else None
-            scale = float(_numbers("scale", scale, 1)[0]) if scale else None
-            if scale is not None:
-                check_number("scale", scale, above=0)
-            line |= {name: re.sub(r"[.,]0$", "", line[name].strip()) for name in _KEY if name.endswith("frame")}
-            key = tuple(int(line[name]) if name.endswith("frame") else line[name].strip() for name in _KEY)
-            if key in poses:
-                raise ValueError("second pose of the same frames")
-            poses[key] = StoredPose(rotation, translation, scale)
-        except ValueError as error:  # an InputError is one, too
-            raise InputError(f"poses {path}, line {number}: {error}") from error
-    return poses, digest(data)
+    return lines
+
+
+def _read_pose(number: int, line: dict) -> StoredPose:
+    """Read the pose of a line; ValueError for a wrong field."""
+    if any(line.pop(None, ())):
+        raise ValueError("more fields than the header; a pair has commas and needs quotes")
+    rotation = rotation_matrix("rotation", _numbers("rotation", line["rotation"], 9).reshape(3, 3))
+    translation, scale = (line.get(name, "").strip() for name in ("translation", "scale"))
+    translation = _numbers("translation", translation, 3) if translation else None
+    scale = float(_numbers("scale", scale, 1)[0]) if scale else None
+    if scale is not None:
+        check_number("scale", scale, above=0)
+    return StoredPose(number, int(line["target_frame"]), rotation, translation, scale)
 
 
 def _numbers(name: str, text: str, size: int) -> np.ndarray:
@@ -93,53 +102,38 @@ def _numbers(name: str, text: str, size: int) -> np.ndarray:
     return values
 
 
-def fit_poses(
-    path: str | Path, poses: Mapping[PairKey, StoredPose], dataset: Co3D, pairs: Iterable[Pair]
-) -> tuple[dict[PairKey, StoredPose], str]:
-    """Return the poses of pairs, and what is to be said of the others and of the convention.
+def check_poses(path: str | Path, poses: Mapping[str, StoredPose], dataset: Co3D, pairs: Sequence[Pair]) -> str:
+    """Say how many of the pairs have no pose, how many poses have no pair, and which convention fits better.
 
-    Names may lack leading zeros, as after a spreadsheet. InputError if such a name is ambiguous, or no pose has a pair.
+    InputError if no pose is of any of the pairs, or if one is in none of its pair's target frames.
     """
-    asked: dict[PairKey, set[PairKey]] = {}  # by names without leading zeros
-    for pair in pairs:
-        for frame in pair.target_frames:
-            key = pair.category, pair.reference_sequence, pair.reference_frame, pair.target_sequence, frame
-            asked.setdefault(_shortened(key), set()).add(key)
-    found: dict[PairKey, StoredPose] = {}
-    for key in sorted(poses):  # by category: a data set keeps the frames of one
-        fits = asked.get(_shortened(key), set())
-        fits = fits & {key} or fits
-        if len(fits) > 1 or fits & found.keys():
-            raise InputError(f"poses {path}: {key} fits {sorted(fits)}, expected one pair that has no other line")
-        found |= dict.fromkeys(fits, poses[key])
+    found = {pair: poses[pair.key] for pair in pairs if pair.key in poses}
     if not found:
         raise InputError(f"{path} has no pose for any of the pairs of --list-pairs")
-    surplus = len(poses) - len(found)
-    remarks = f"{surplus} of {len(poses)} poses fit no pair" if surplus else "", other_convention(dataset, found)
-    return found, "; ".join(filter(None, remarks))
+    for pair, pose in found.items():
+        check_choice(f"poses {path}, line {pose.line}: target_frame", pose.target_frame, pair.target_frames)
+    missing, surplus = len(pairs) - len(found), len(poses) - len(found)
+    remarks = [
+        f"{missing} of {len(pairs)} pairs {'has' if missing == 1 else 'have'} no pose" if missing else "",
+        f"{surplus} of {len(poses)} poses fit no pair" if surplus else "",
+        other_convention(dataset, found),
+    ]
+    return "; ".join(filter(None, remarks))
 
 
-def _shortened(key: PairKey) -> PairKey:
-    """Remove leading zeros from the names of a key."""
-    return tuple(part.lstrip("0") if isinstance(part, str) else part for part in key)
-
-
-def other_convention(dataset: Co3D, poses: Mapping[PairKey, StoredPose]) -> str:
+def other_convention(dataset: Co3D, poses: Mapping[Pair, StoredPose]) -> str:
     """Name another convention by which rotations clearly agree with the labels, or return "".
 
     Those of other programs may be inverted, or conjugated, for cameras in OpenGL's or PyTorch3D's axes.
     """
-    truths, labels = [], {category: read_labels(dataset.root, category) for category in {key[0] for key in poses}}
-    for category, first, number, second, target in poses:
-        frames = dataset.frame(category, first, number), dataset.frame(category, second, target)
-        reference, other = map(dataset.camera, frames)
-        truths.append(relative_pose(labels[category][first], reference, labels[category][second], other)[:3, :3])
+    views = [pair.target_frames.index(pose.target_frame) for pair, pose in poses.items()]
+    truths = true_poses(dataset.root, list(poses), np.array(views))[:, :3, :3]
     given = np.stack([pose.rotation for pose in poses.values()])
     readings = {"": given}
     for signs in ((1, -1, -1), (-1, -1, 1)):
         readings[f"conjugated by diag{signs}"] = given * np.outer(signs, signs)
     readings |= {f"inverted and {name}".removesuffix(" and "): one.swapaxes(1, 2) for name, one in readings.items()}
-    errors = {name: rotation_error(rotations, np.stack(truths)) for name, rotations in readings.items()}
+    errors = {name: rotation_error(rotations, truths) for name, rotations in readings.items()}
     medians = {name: float(np.median(error)) for name, error in errors.items()}
     best = min(medians, key=medians.get)
     # Rows that confuse left and right, or turn little, have small errors in either reading: that of most pairs counts.

@@ -56,7 +56,7 @@ class Frame:
     @classmethod
     def from_arrays(
         cls, rgb: np.ndarray, depth: np.ndarray, K: Values, mask: np.ndarray | None = None, pose: Values | None = None,
-        depth_unit: float = 1.0, name: str = "", half_pixels: bool = False,
+        depth_unit: float = 1.0, name: str = "",
     ) -> "Frame":  # fmt: skip
         """Make a frame of arrays as a camera gives them, in any unit of length.
 
@@ -70,7 +70,6 @@ class Frame:
                 the world. By default, the world is the camera's frame.
             depth_unit: World units per unit of `depth`.
             name: Name for messages and reports.
-            half_pixels: Whether K has the first pixel's centre at (0.5, 0.5) in place of (0, 0), as `Camera` has.
 
         Raises:
             InputError: Arrays that are none of these, or do not fit together.
@@ -81,7 +80,7 @@ class Frame:
         if image.ndim != 3 or image.shape[2] not in (3, 4):
             raise InputError(f"{label} rgb has shape {image.shape}, expected (H, W), (H, W, 3) or (H, W, 4)")
         image, size = image[..., :3], image.shape[:2]
-        intrinsics = split_intrinsics(f"{label} K", K) + (0, 0, *[0.0 if half_pixels else 0.5] * 2)
+        intrinsics = split_intrinsics(f"{label} K", K) + (0, 0, 0.5, 0.5)
         camera = camera_from_pose(np.eye(4) if pose is None else pose, intrinsics, size, label)
         if image.dtype.kind == "f" and 0 <= image.min() and image.max() <= 1:
             image = np.rint(255 * image).astype(np.uint8)
@@ -152,9 +151,9 @@ def largest_region(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return regions == 1 + areas.argmax() if len(areas) else np.zeros_like(inside)
 
 
-def crop_to_object(frame: Frame, threshold: float = 0.4, padding: float = 0.1) -> Frame:
+def crop_to_object(frame: Frame) -> Frame:
     """Crop a frame and its camera to the bounding box of its object mask (see `mask_to_bbox`)."""
-    box = top, left, height, width = mask_to_bbox(frame.mask, threshold, padding)
+    box = top, left, height, width = mask_to_bbox(frame.mask)
     inside = np.s_[top : top + height, left : left + width]
     return _changed(frame, frame.camera.crop(box), lambda image: image[inside])
 

@@ -6,16 +6,18 @@ These sets are torch files that refer to frames by their positions in the catego
 import io
 import itertools
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.labels import read_labels
+from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import load_torch, plain_name, stable_hash, write_atomic
 
@@ -74,6 +76,21 @@ def labelled_categories(dataset: Co3D) -> list[str]:
         f"{dataset.root}: none of {len(categories)} categories has pose labels of two sequences, expected them in "
         "class_labels/CATEGORY/SEQUENCE.json; `zsp-lite data labels` imports published labels"
     )
+
+
+def true_poses(root: str | Path, pairs: Sequence[Pair], views: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
+    """Compute the labelled pose of each pair, from its reference's camera to that of the target view with an index."""
+    dataset, labels = Co3D(root), cache(partial(read_labels, root))
+    return np.stack([
+        true_pose(dataset, labels(pair.category), pair, int(view)) for pair, view in zip(pairs, views, strict=True)
+    ])  # fmt: skip
+
+
+def true_pose(dataset: Co3D, labels: Mapping[str, PoseLabel], pair: Pair, view: int) -> Float[np.ndarray, "4 4"]:
+    """Compute the labelled pose of a pair from its reference's camera to that of a target view, by its index."""
+    frames = (pair.reference_sequence, pair.reference_frame), (pair.target_sequence, pair.target_frames[view])
+    reference, target = (dataset.camera(dataset.frame(pair.category, *frame)) for frame in frames)
+    return relative_pose(labels[pair.reference_sequence], reference, labels[pair.target_sequence], target)
 
 
 def pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:

@@ -52,13 +52,10 @@ _INCOMPLETE = {
 
 
 def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
-    """Recognise a capture: a folder, the zip or .r3d file of an app, or a transforms.json.
+    """Return the format of a capture, a name in `FORMATS`, and the folder or file that its reader takes.
 
-    Returns:
-        The name of its format in `FORMATS`, and the folder or file that the reader takes.
-
-    Raises:
-        InputError: The path is no capture; the message says what it lacks, or what is expected, and `also`.
+    A capture is a folder, the zip or .r3d file of an app, or a transforms.json. InputError for anything else; it says
+    what is missing, or what is expected, and `also`.
     """
     path, folder = Path(path), Path(path)
     if path.is_file() and path.suffix.lower() in (".zip", ".r3d"):
@@ -82,18 +79,9 @@ def open_capture(
     path: str | Path, layout: str | None = None, count: int = MOST_FRAMES, masks: Path | None = None,
     files: Mapping[str, Any] = {}, **options: Any,
 ) -> Capture:  # fmt: skip
-    """Read the frames of a capture, with the masks of its folder masks/, if it has one.
+    """Read the frames of a capture, with the masks of its folder masks/, if it has one (see `open_source`).
 
-    Args:
-        path: A folder, zip or file (see `recognise`).
-        layout: Name of its format in `FORMATS`; by default, it is recognised.
-        count: Number of frames to choose, the sharp ones of each stretch, where the capture has more.
-        masks: Folder of masks, named like the images, in place of those of the capture.
-        files: Members that replace those of each `CaptureFrame`.
-        options: `intrinsics` or `object`, where the format takes them.
-
-    Raises:
-        InputError: The capture cannot be read, or none of its frames can be used.
+    `files` replaces members of each `CaptureFrame`. InputError if the capture cannot be read, or no frame can be used.
     """
     source = path = Path(path)
     with suppress(InputError if layout else ()):

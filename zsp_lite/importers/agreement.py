@@ -75,9 +75,7 @@ _Pair = tuple[_Surface, _Surface]
 def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     """Say that frames of one object do not agree, and which usual mistake explains it; "" if they do, or none overlap.
 
-    Args:
-        frames: A few frames; masks are found where there are none.
-        unit: World units per stored depth value, if it can be changed.
+    Masks are found where there are none. `unit` is the world units per stored depth value, if it can be changed.
     """
     objects, scenes = [], []
     for frame in frames:

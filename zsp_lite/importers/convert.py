@@ -39,10 +39,8 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
     """Write the frames of a source as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused point cloud.
 
     Lengths are scaled so that the point cloud has unit standard deviation, averaged over the axes, as in CO3D. Frames
-    whose mask is empty are left out. An interrupted import can be repeated.
-
-    Raises:
-        InputError: The source cannot be read, segmented or fused, or the sequence exists. Nothing is written then.
+    whose mask is empty are left out. An interrupted import can be repeated. InputError, and nothing is written, if the
+    source cannot be read, segmented or fused, or the sequence exists.
     """
     folder = Path(root) / plain_name(category, "category") / plain_name(sequence, "sequence")
     unfinished, count = folder / _UNFINISHED, len(source.numbers)

@@ -14,13 +14,7 @@ _TUM_UNIT, _TUM_TOLERANCE = 1 / 5000, 0.02  # metres per stored depth value; sec
 
 
 def read_lists(folder: Path) -> Makers:
-    """Read a capture given as plain text lists: line n of each describes frame n.
-
-    rgb.txt, depth.txt: one file name per line
-    poses.txt: one camera-to-world matrix per line, 12 or 16 numbers in row-major order, in OpenCV's axes
-    intrinsics.txt: the 3 x 3 matrix K in pixels, or fx fy cx cy, once or in a line per frame; pixel centres are at
-    half-integers
-    """
+    """Read a capture given as plain text lists, of which line n describes frame n (see `zsp-lite data import -h`)."""
     images, depths = (read_lines(folder / name) for name in ("rgb.txt", "depth.txt"))
     poses = read_numbers(folder / "poses.txt", (12, 16))
     intrinsics = read_numbers(folder / "intrinsics.txt", (3, 4))

@@ -1,4 +1,7 @@
-"""Labelling session of a category, stored on disk after every change.
+"""Labelling session of a category, stored on disk after every change, and the alignment of two clouds by keypoints.
+
+See "Labelling pose for evaluation" in the paper's supplement: at least four keypoints are picked in the same order on
+the clouds of the reference sequence and of another sequence, and aligned by Umeyama's method with scale.
 
 ROOT/label_picks/CATEGORY.json holds the names of the keypoints and all picks; ROOT/class_labels/CATEGORY/SEQ.json holds
 the accepted labels in the format of the published code; ROOT/label_proposals/CATEGORY/SEQ.json, in the same format,
@@ -12,20 +15,50 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from jaxtyping import Float, Real
+from numpy.typing import ArrayLike
 
-from zsp_lite.alignment import Sim3
+from zsp_lite.alignment import Sim3, umeyama
 from zsp_lite.data.annotations import Row
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, label_folder, read_label_folder, read_labels, rigid_label, write_label
 from zsp_lite.errors import InputError, check_choice, check_magnitude, real_array
 from zsp_lite.io.files import plain_name, read_json, write_atomic
-from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment, align_picks
 
 Point = Real[np.ndarray, "3"] | Sequence[float]
+MIN_KEYPOINTS = 4
 # A label whose RMS residual is above this fraction of the object's size is accepted on request only: usually two
 # keypoints are confused. The size is the longest side of the point cloud without outliers.
 MAX_RESIDUAL = 0.15
 OPEN, ACCEPTED, SKIPPED, REFERENCE = "open", "accepted", "skipped", "reference"
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Alignment of the reference sequence with another sequence."""
+
+    sim3: Sim3  # from the world of the reference sequence to that of the sequence
+    # Distance of each transformed keypoint from its pick, relative to the spread of the picks (their standard
+    # deviation, averaged over the axes), so that objects of any size can be compared.
+    residuals: Float[np.ndarray, " n"]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals."""
+        return float(np.sqrt(np.square(self.residuals).mean()))
+
+
+def align_picks(reference: ArrayLike, picks: ArrayLike) -> Alignment:
+    """Align keypoints (n, 3) of the reference sequence, n >= 4, and of another one by Umeyama's method with scale.
+
+    InputError if the numbers differ or are below 4, a keypoint is not finite, or all are equal or collinear.
+    """
+    reference, picks = (np.asarray(points, dtype=np.float64) for points in (reference, picks))
+    if len(reference) != len(picks) or len(picks) < MIN_KEYPOINTS:
+        found = f"{len(picks)} keypoints picked and {len(reference)} on the reference"
+        raise InputError(f"{found}, expected equally many, at least {MIN_KEYPOINTS}")
+    sim3 = umeyama(reference, picks)
+    distance = np.linalg.norm(sim3.apply(reference) - picks, axis=1)
+    return Alignment(sim3, distance / np.sqrt(picks.var(axis=0).mean()))
 
 
 class _Picks(msgspec.Struct):
@@ -113,8 +146,7 @@ class Labelling:
     def pick(self, sequence: str, point: Point, name: str = "") -> None:
         """Add the next keypoint (3,) of a sequence, in its world coordinates; on the reference, a new one of that name.
 
-        Raises:
-            InputError: All keypoints are picked, or the reference's keypoints are in use on other sequences.
+        InputError if all are picked, or the reference's keypoints are in use on other sequences.
         """
         picks = self.picks(sequence)
         if sequence != self.reference and len(picks) >= len(self.names):

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.depth import unproject_depth
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.matching import Matches
@@ -457,8 +458,16 @@ def object_cloud(view: View, most: int = 2000) -> Float[np.ndarray, "n 3"]:
 
     The object is where the mask is above 0.9, which leaves out its border; without a mask, the foreground patches.
     """
-    frame = view.frame
-    inside = view.soft_mask > 0.5 if frame.mask is None else frame.mask > 0.9
+    return frame_cloud(view.frame, view.soft_mask > 0.5, most)
+
+
+def frame_cloud(
+    frame: Frame, inside: Bool[np.ndarray, "height width"] | bool = True, most: int = 2000
+) -> Float[np.ndarray, "n 3"]:
+    """Gather a frame's object points as `object_cloud` does; without a mask, the points of the pixels `inside`."""
+    if frame.depth is None:
+        raise InputError(f"{frame.name or 'frame'}: no depth map")
+    inside = inside if frame.mask is None else frame.mask > 0.9
     points = unproject_depth(frame.depth, frame.camera)[inside & (frame.depth > 0)]
     if len(points) == 0:
         raise InputError(f"{frame.name or 'frame'}: no pixel of the object has a known depth")

@@ -14,8 +14,7 @@ import pandas as pd
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
-from zsp_lite.labelling.keypoints import MIN_KEYPOINTS, Alignment
-from zsp_lite.labelling.session import ACCEPTED, OPEN, SKIPPED, Labelling, Progress
+from zsp_lite.labelling.session import ACCEPTED, MIN_KEYPOINTS, OPEN, SKIPPED, Alignment, Labelling, Progress
 from zsp_lite.viz.plots import BLUE, ORANGE
 from zsp_lite.widgets.cloud_view import CloudView, subsample
 from zsp_lite.widgets.common import Widget, load_package

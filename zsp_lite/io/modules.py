@@ -1,0 +1,20 @@
+"""Import of objects of the user's own."""
+
+import os
+import pkgutil
+import sys
+from contextlib import chdir
+from typing import Any
+
+from zsp_lite.errors import InputError, describe_failure
+
+
+def import_object(path: str) -> Any:
+    """Import the object "module:name" from an installed module or a module in the current folder."""
+    if "" not in sys.path and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # the path of a console script lacks the current folder
+    try:
+        with chdir("."):  # and back, wherever the module goes
+            return pkgutil.resolve_name(path)
+    except (Exception, SystemExit) as error:  # a module may raise anything
+        raise InputError(f"{path!r} cannot be imported: {describe_failure(error)}") from error
