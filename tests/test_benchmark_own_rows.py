@@ -247,7 +247,8 @@ def test_each_pair_has_its_own_pose_and_missing_ones_are_told(tmp_path, monkeypa
     assert [(row["n"], row["failed"]) for row in rows.values()] == [(2, 0), (2, 1)]
     assert found.row("both")["error"].nunique() == 2
     note = next(iter(every_table(found.summary))).note
-    assert note.startswith("one: 1 of 2 pairs has no pose. one failed on 1 of 2 pairs") and "both" not in note
+    assert re.match("one failed on 1 of 2 pairs, counted as 180°; the first: .*one.csv has no pose", note)
+    assert "both" not in note
 
 
 FLIP = np.diag([1.0, -1.0, -1.0])
