@@ -107,7 +107,7 @@ def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path):
 
 
 TAKEN = ["ours", "sift", "ours-n3", "verified-n0", "category", "table1", "SIFT", "Ours (K=50)",
-         "ours@threshold=0.1", "verified-n3@threshold=0.1", " ours", "Sift", "OURS (k=50)"]  # fmt: skip
+         "ours@threshold=0.1", "verified-n3@threshold=0.1", "alignment", " ours", "Sift", "OURS (k=50)"]  # fmt: skip
 
 
 class Posing(StoredPoses):
@@ -579,7 +579,7 @@ def test_a_broken_backbone_ends_the_run_and_nothing_is_stored(tmp_path, monkeypa
         if run == "align":
             align_category(Co3D(small_folder()), "lump", backbone, targets=2, out=tmp_path)
         else:
-            run_rows({"row": run}, tmp_path, backbone=backbone)
+            run_rows([run] if isinstance(run, str) else {"row": run}, tmp_path, backbone=backbone)
     assert not (tmp_path / LINES).read_bytes()
 
 
