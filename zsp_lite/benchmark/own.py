@@ -70,8 +70,7 @@ def fails_alone(seconds: int) -> Iterator[None]:
                 yield
         finally:
             ended.release()  # compiled: nothing can be raised before it has ended the watch
-            watcher.join()
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, None)
+            watcher.join()  # what it has raised comes here at the latest
     except (InputError, KeyboardInterrupt):
         raise
     except BaseException as error:

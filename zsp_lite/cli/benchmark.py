@@ -122,7 +122,7 @@ def tables(run, out, metrics, rows, latex, size, pair, data) -> None:
 
     if pair:
         found = read_run(run)
-        figure = pair_figure(found, pair, Co3D(data or found.settings.data), rows)
+        figure = pair_figure(found, pair, Co3D(data or found.settings.folder or found.settings.data), rows)
         print(f"Written: {save_figure(figure, (out or run) / 'figures', f'pair_{pair}', size)}")
         return
     if "time" in latex and "milliseconds" not in metrics:
