@@ -179,7 +179,7 @@ def test_a_run_is_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, load
     assert main(["tables", str(tmp_path / "b"), "--metrics", "scale"]) == 0
     headings = [(tmp_path / name / "tables/all_rows.md").read_text().splitlines()[2] for name in "ab"]
     assert ["scale ratio" in text for text in headings] == ["Acc15" not in text for text in headings] == [False, True]
-    more = ["--rows", "ours-globalsim,ours", "--latex", "intervals,time", "--size", "3,2", "--out", tmp_path / "d"]
+    more = ["--rows", "ours-globalsim,ours", "--latex", "time,intervals", "--size", "3,2", "--out", tmp_path / "d"]
     assert "ms per pair" in run(["tables", tmp_path / "a", *more])
     text = (tmp_path / "d/tables/all_rows.tex").read_text()
     assert text.index("ours-globalsim") < text.index("ours &") and "ms per pair" in text and " [" in text

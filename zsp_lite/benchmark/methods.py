@@ -119,8 +119,8 @@ def resolve(methods: str | Sequence[str] | Mapping[str, Any], sweep: Sequence[fl
             raise InputError(f"methods {', '.join(names)} are two of one name, expected one of each")
     if not methods:
         raise InputError("no methods, expected some; `zsp-lite benchmark --list` lists them")
-    taken = {*METHODS, *GROUPS, *(line["label"] for table in read_paper_tables() for line in table["rows"])}
-    taken = {*map(str.casefold, taken)}
+    labels = [line["label"] for table in read_paper_tables() for line in table["rows"]]
+    taken = {*map(str.casefold, [*METHODS, *GROUPS, *labels, "alignment"])}  # the last is the row of `align`
     for name, meant in methods.items():
         plain, text = str(name).strip().casefold(), meant if isinstance(meant, str) else ""
         if text != name and taken & {plain, base_name(plain), base_name(text)}:

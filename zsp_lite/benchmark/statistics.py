@@ -34,7 +34,7 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
         errors, drawn, categories = row["error"].to_numpy(), draws_of(row), row["category"].to_numpy(str)
         seeds = row["repeat"].nunique()
         methods[name] = figures_of(errors, drawn, categories) | {
-            "failed": int((row["failed"] != "").sum()),
+            "failed": row.loc[row["failed"] != "", "pair"].nunique(),
             "per_category": {
                 category: figures_of(errors[members], drawn[:, members])
                 for category in dict.fromkeys(categories) for members in [categories == category]
