@@ -55,13 +55,13 @@ def links(tmp_path_factory):
 
 @pytest.fixture
 def run(capsys):
-    """Runs a command that ends with an exit code; returns what it printed, to stderr where the code is 2."""
+    """Runs a command that ends with an exit code; returns what it printed, with stderr where it did not succeed."""
     from zsp_lite.cli.main import main
 
     def run_command(words, code=0) -> str:
         assert main([str(word) for word in words]) == code
         out, error = capsys.readouterr()
-        return error if code == 2 else out
+        return out + error if code > 1 else out
 
     return run_command
 
@@ -101,6 +101,25 @@ def ellipsoids(tmp_path_factory):
         write_label(root, "ellipsoid", PoseLabel(placement.matrix, name, "a"))
     write_co3d(root, "ellipsoid", sequences, quality=98)
     return Co3D(root)
+
+
+@pytest.fixture(scope="session")
+def frames():
+    """A frame of the object of `synthetic_views`, and five frames of it elsewhere."""
+    from synthetic_views import reference_and_targets
+
+    return reference_and_targets(5)
+
+
+@pytest.fixture
+def loaded(monkeypatch):
+    """What the commands ask `load_backbone` for; they get a backbone that needs no weights."""
+    from synthetic_views import CoordinateBackbone
+
+    asked = []
+    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda one: asked.append(one) or CoordinateBackbone())
+    monkeypatch.setattr(CoordinateBackbone, "name", "coordinates", raising=False)
+    return asked
 
 
 @pytest.fixture(scope="session")

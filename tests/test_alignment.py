@@ -1,4 +1,4 @@
-"""Umeyama and RANSAC: recovery, equivariance, reflections, degenerate input."""
+"""Umeyama and RANSAC: recovery, reflections, outliers, degenerate input."""
 
 import tracemalloc
 
@@ -85,26 +85,9 @@ def test_records_keep_their_values_when_the_arrays_that_they_were_made_of_change
 
 
 @given(seeds, scales, st.integers(4, 40))
-def test_umeyama_recovers_the_similarity_that_made_the_target(seed, scale, n):
-    truth, source = similarity(seed, scale), cloud(seed + 2, n)
-    assert_same(umeyama(source, truth.apply(source)), truth, atol=1e-7)
-
-
-@settings(max_examples=30)
-@given(seeds, scales)
-def test_umeyama_is_equivariant_under_similarities_of_source_and_target(seed, scale):
-    source, a, b = cloud(seed), similarity(seed + 3, scale), similarity(seed + 5)
-    target = cloud(seed) + 0.1 * cloud(seed + 1)
-    plain = umeyama(source, target)
-    # Moving the target composes; the least-squares scale is exactly equivariant in both arguments.
-    assert_same(umeyama(source, b.apply(target)), b @ plain, atol=1e-7)
-    assert_same(umeyama(a.apply(source), target), plain @ a.inverse(), atol=1e-7)
-
-
-@given(seeds)
-def test_umeyama_is_the_best_rotation_by_scipy_also_for_a_mirrored_target(seed):
-    source = cloud(seed)
-    for target in (similarity(seed).apply(source) + 0.2 * cloud(seed + 1), source * (1, 1, -1)):
+def test_umeyama_is_the_best_rotation_by_scipy_also_for_a_mirrored_target(seed, scale, n):
+    source = cloud(seed, n)
+    for target in (similarity(seed, scale).apply(source) + 0.2 * cloud(seed + 1, n), source * (1, 1, -1)):
         sim3 = umeyama(source, target)
         x, y = source - source.mean(axis=0), target - target.mean(axis=0)
         np.testing.assert_allclose(sim3.R, Rotation.align_vectors(y, x)[0].as_matrix(), atol=1e-6)

@@ -150,27 +150,6 @@ def test_an_interrupt_ends_a_run_and_its_workers_with_one_line_and_the_run_can_b
     assert 0 < len(stored) < 24 and main(words) == 0 and pairs_in(tmp_path)[: len(stored)] == stored
 
 
-@needs_signals
-def test_a_dask_cluster_that_loses_its_worker_and_starts_another_finds_the_same(undisturbed, tmp_path, monkeypatch):
-    from distributed import Client, LocalCluster
-
-    with (
-        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
-        Client(cluster) as client,
-    ):
-        killed = []
-
-        def kill_once() -> None:
-            if not killed:
-                os.kill(cluster.workers[0].pid, signal.SIGKILL)
-                killed.append(len(pairs_in(tmp_path)))
-
-        monkeypatch.setattr("zsp_lite.benchmark.run.add_lines", after_each_save(kill_once))
-        executor = client.get_executor(pure=False)
-        summary = evaluate(small_folder(), SlowBackbone(grid=8), ROWS, 6, 3, tmp_path, executor)
-    assert killed and killed[0] < 12 and summary["methods"] == undisturbed[1]["methods"]
-
-
 def test_modules_of_the_current_folder_travel_to_workers_and_what_they_lack_is_one_line(tmp_path, monkeypatch):
     from distributed import Client, LocalCluster
 

@@ -7,7 +7,6 @@ import tomllib
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from zsp_lite.cli.main import main
 from zsp_lite.io.files import REPOSITORY
 
 
@@ -30,18 +29,17 @@ def test_the_tested_environment_pins_every_dependency_within_its_range():
             assert pins[canonicalize_name(requirement.name)] in requirement.specifier, requirement
 
 
-def test_missing_embedded_weights_fail_and_a_cache_that_cannot_be_written_is_noted(tmp_path, monkeypatch, capsys):
+def test_missing_embedded_weights_fail_and_a_cache_that_cannot_be_written_is_noted(tmp_path, monkeypatch, run):
     (tmp_path / "file").write_text("mine")
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "file"))
     monkeypatch.setattr("zsp_lite.backbones.load.available_backbones", lambda: {"zsp-tiny": None})
-    assert main(["doctor"]) == 1
-    python, torch, tiny, _, cache, cure, last = capsys.readouterr().out.splitlines()
+    python, torch, tiny, _, cache, cure, last = run(["doctor"], 1).splitlines()
     assert [line.split()[0] for line in (python, torch, tiny, cache)] == ["ok", "ok", "bad", "note"]
     assert "-> set ZSP_LITE_CACHE" in cure and last == "Missing or broken: weights zsp-tiny."
 
 
-def test_the_doctor_passes_here(capsys):
-    assert main(["doctor"]) == 0 and "Everything required is installed." in capsys.readouterr().out
+def test_the_doctor_passes_here(run):
+    assert "Everything required is installed." in run(["doctor"])
 
 
 def test_open3d_prints_nothing_in_a_notebook():

@@ -16,7 +16,6 @@ from refusals import refused
 from safetensors.torch import save
 
 from zsp_lite.backbones.checkpoints import read_checkpoint
-from zsp_lite.cli.main import main
 from zsp_lite.data import frames
 from zsp_lite.data.annotations import read_frame_index
 from zsp_lite.data.co3d import Co3D, write_co3d
@@ -215,9 +214,9 @@ def test_a_category_has_one_writer_until_that_is_killed(tmp_path):
     assert not list((tmp_path / "cup").glob(".*"))
 
 
-def test_a_folder_is_free_after_an_error_and_else_a_command_that_writes_to_it_is_refused(tmp_path, capsys):
+def test_a_folder_is_free_after_an_error_and_else_a_command_that_writes_to_it_is_refused(tmp_path, run):
     with pytest.raises(ZeroDivisionError), writing(tmp_path / "out"):
         raise ZeroDivisionError
     with writing(tmp_path / "out"):
-        assert main(["synth", "--category", "chair", "--out", str(tmp_path / "out")]) == 2
-    assert "another process is writing to it" in capsys.readouterr().err
+        error = run(["synth", "--category", "chair", "--out", tmp_path / "out"], 2)
+    assert "another process is writing to it" in error

@@ -29,36 +29,26 @@ def folders(tmp_path_factory) -> dict[str, Path]:
     return save_all(tmp_path_factory.mktemp("models"))
 
 
-@pytest.fixture(params=ARCHITECTURES)
-def kind(request) -> str:
-    return request.param
-
-
 SHAPES = (64, 64, 3), (50, 90, 3)
 PICTURES = [np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8) for shape in SHAPES]
-
-
-@pytest.fixture()
-def pictures() -> list[np.ndarray]:
-    return PICTURES
 
 
 @functools.cache
 def by_transformers(folder: Path, kind: str, size: int):
     """For `PICTURES`, return input and output of every block of the eager model, its output, and its blocks."""
-    architecture, pictures = ARCHITECTURES[kind], PICTURES
+    architecture = ARCHITECTURES[kind]
     model = AutoModel.from_pretrained(folder, attn_implementation="eager", dtype=torch.float32)
     model = getattr(model, "vision_model", model).eval()
     mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
     options = {"interpolate_pos_encoding": True} if architecture.interpolates else {}
     if kind == "vit_mae":
         model.config.mask_ratio = 0.0
-        options["noise"] = torch.arange((size // architecture.patch) ** 2).float().repeat(len(pictures), 1)
+        options["noise"] = torch.arange((size // architecture.patch) ** 2).float().repeat(len(PICTURES), 1)
     (blocks,), seen = [module for module in model.modules() if isinstance(module, torch.nn.ModuleList)], []
     for block in blocks:
         block.register_forward_hook(lambda module, inputs, output: seen.append((inputs[0], output)))
     with torch.no_grad():
-        images = (prepare_images(pictures, size) - mean.view(3, 1, 1)) / std.view(3, 1, 1)
+        images = (prepare_images(PICTURES, size) - mean.view(3, 1, 1)) / std.view(3, 1, 1)
         output = model(images, output_attentions=True, **options)
     return [(x, y if torch.is_tensor(y) else y[0]) for x, y in seen], output, blocks
 
@@ -70,8 +60,9 @@ def projection(architecture, block, x, facet: str):
     return project(block.get_submodule(architecture.norm)(x)).detach()
 
 
+@pytest.mark.parametrize("kind", ARCHITECTURES)
 @pytest.mark.parametrize("facet", FACETS)
-def test_facets_are_the_projections_of_the_normalised_input_of_the_block_and_its_output(kind, folders, pictures, facet):
+def test_facets_are_the_projections_of_the_normalised_input_of_the_block_and_its_output(kind, folders, facet):
     architecture = ARCHITECTURES[kind]
     size = 4 * architecture.patch
     seen, _, blocks = by_transformers(folders[kind], kind, size)
@@ -79,11 +70,12 @@ def test_facets_are_the_projections_of_the_normalised_input_of_the_block_and_its
         before, after = seen[layer]
         expected = after if facet == "token" else projection(architecture, blocks[layer], before, facet)
         backbone = load_backbone(f"hf:{folders[kind]}", "cpu", layer=layer, facet=facet, image_size=size)
-        for features, values in zip(backbone(pictures), expected[:, architecture.special :], strict=True):
+        for features, values in zip(backbone(PICTURES), expected[:, architecture.special :], strict=True):
             torch.testing.assert_close(features.keys, values.view(4, 4, DIM), atol=2e-5, rtol=1e-4)
 
 
-def test_saliency_is_the_last_cls_attention_and_the_global_feature_the_cls_output(kind, folders, pictures):
+@pytest.mark.parametrize("kind", ARCHITECTURES)
+def test_saliency_is_the_last_cls_attention_and_the_global_feature_the_cls_output(kind, folders):
     architecture = ARCHITECTURES[kind]
     size = 4 * architecture.patch
     seen, output, blocks = by_transformers(folders[kind], kind, size)
@@ -98,28 +90,28 @@ def test_saliency_is_the_last_cls_attention_and_the_global_feature_the_cls_outpu
     expected = attention[:, :, architecture.special :].mean(1)
     expected = expected - expected.amin(1, keepdim=True)
     expected = (expected / expected.amax(1, keepdim=True)).view(-1, 4, 4)
-    features = load_backbone(f"hf:{folders[kind]}", "cpu", image_size=size)(pictures)
+    features = load_backbone(f"hf:{folders[kind]}", "cpu", image_size=size)(PICTURES)
     for one, saliency, cls in zip(features, expected, output.last_hidden_state[:, 0], strict=True):
         torch.testing.assert_close(one.saliency, saliency, atol=2e-5, rtol=1e-4)
         torch.testing.assert_close(one.global_feature, cls, atol=2e-5, rtol=1e-4)
 
 
-def test_a_model_that_nobody_thought_of_is_read_by_the_names_of_its_parts(tmp_path, pictures):
+def test_a_model_that_nobody_thought_of_is_read_by_the_names_of_its_parts(tmp_path):
     backbone = load_backbone(f"hf:{save_model(tmp_path, configuration('beit'))}", "cpu", image_size=48)
-    assert [features.grid for features in backbone(pictures)] == [(3, 3), (3, 3)]
+    assert [features.grid for features in backbone(PICTURES)] == [(3, 3), (3, 3)]
 
 
 @pytest.mark.parametrize("file, content, mean, std", [
     ("preprocessor_config.json", {"image_mean": [0.5] * 3, "image_std": [0.25] * 3}, 0.5, 0.25),
     ("preprocessor_config.json", {"do_normalize": False, "image_mean": [0.5] * 3, "image_std": [1] * 3}, 0, 1),
 ])  # fmt: skip
-def test_the_image_processors_mean_and_deviation_are_taken(file, content, mean, std, tmp_path, pictures):
+def test_the_image_processors_mean_and_deviation_are_taken(file, content, mean, std, tmp_path):
     folder = save_model(tmp_path / "vit", configuration("vit"))
     plain = load_backbone(f"hf:{folder}", "cpu", image_size=48)
     (folder / file).write_text(json.dumps(content))
     backbone = load_backbone(f"hf:{folder}", "cpu", image_size=48)
     assert (backbone.mean, backbone.std) == ((mean,) * 3, (std,) * 3)
-    assert not torch.allclose(backbone(pictures)[0].keys, plain(pictures)[0].keys)
+    assert not torch.allclose(backbone(PICTURES)[0].keys, plain(PICTURES)[0].keys)
 
 
 def test_without_transformers_the_package_is_named(folders, monkeypatch):
@@ -181,14 +173,14 @@ def offline(tmp_path, monkeypatch) -> Path:
     return tmp_path / "cache"
 
 
-def test_what_is_in_the_cache_needs_no_hub(offline, pictures):
+def test_what_is_in_the_cache_needs_no_hub(offline):
     repository = offline / "models--someone--small"
     (repository / "refs").mkdir(parents=True)
     (repository / "refs" / "main").write_text("0" * 40)
     folder = save_model(repository / "snapshots" / ("0" * 40), configuration("vit"))
     backbone = load_backbone("hf:someone/small", "cpu")
     assert backbone.name == "hf:someone/small"
-    assert backbone(pictures)[0].grid == (14, 14)
+    assert backbone(PICTURES)[0].grid == (14, 14)
     assert download("hf:someone/small").samefile(folder)
 
 

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,7 +19,6 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.data.ground_truth import object_poses
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import shipped_pairs
-from zsp_lite.errors import InputError
 from zsp_lite.io.files import REPOSITORY
 
 FRAMES, SIZE = 5, 64
@@ -77,28 +77,22 @@ def test_labels_map_the_front_of_the_reference_to_the_front_of_every_object(data
 
 
 def test_complete_sequences_stay_and_turned_models_are_rendered_again(data, folder, tmp_path, monkeypatch):
-    rendered, record_sequence = [], export.record_sequence
-
-    def counting(mesh, name, *rest):
-        rendered.append(name)
-        return record_sequence(mesh, name, *rest)
-
-    monkeypatch.setattr(export, "record_sequence", counting)
+    record = Mock(wraps=export.record_sequence)
+    monkeypatch.setattr(export, "record_sequence", record)
     out = tmp_path / "data"
     shutil.copytree(data[0].root, out)
     before = read_labels(out, "chair")["low"].trans
     export_models(folder, out, **SETTINGS)
-    assert not rendered
+    assert not record.called
     export_models(folder, out, **SETTINGS, front="+x")  # of `high` alone: models.json orients the other one
-    assert rendered == ["high"]
+    assert [call.args[1] for call in record.call_args_list] == ["high"]
     assert not np.allclose(read_labels(out, "chair")["low"].trans, before)
     refused("was written with", export_models, folder, out, **{**SETTINGS, "seed": 4})
 
 
 def test_a_folder_of_other_data_or_without_a_usable_model_is_refused(data, folder, tmp_path):
     write_quad(tmp_path / "models" / "sign" / "stop.obj", opacity=0)
-    with pytest.raises(InputError, match="holds no usable model; sign/stop: .* no visible face"):
-        export_models(tmp_path / "models", tmp_path / "out")
+    refused("no usable model; sign/stop: .* no visible face", export_models, tmp_path / "models", tmp_path / "out")
     shutil.copytree(data[0].root, tmp_path / "other")
     (tmp_path / "other" / RENDERED_FILE).unlink()
     refused("holds other data", export_models, folder, tmp_path / "other")

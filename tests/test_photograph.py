@@ -7,7 +7,6 @@ import pytest
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, look_at, render
 
 from zsp_lite.cli.demo import MODELS_NOTE
-from zsp_lite.cli.main import main
 from zsp_lite.course.motorcycle import FRONT, UP, load_photograph, motorcycle_frame
 from zsp_lite.course.photograph import run_photograph
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
@@ -95,15 +94,12 @@ def photograph():
         yield rendered
 
 
-@pytest.fixture(scope="module")
-def results(motorcycles, photograph):
-    return list(run_photograph(motorcycles, CoordinateBackbone()))
-
-
-def test_with_perfect_features_the_directions_and_the_cloud_are_those_of_the_object(results, photograph):
+def test_with_perfect_features_the_directions_and_the_cloud_are_those_of_the_object(motorcycles, photograph):
     truth = photograph.camera.R @ CANONICAL
     points = photograph.camera.to_camera(np.random.default_rng(0).uniform(-1, 1, (400, 3)))
     by_eye = np.array([FRONT, UP])
+    results = list(run_photograph(motorcycles, CoordinateBackbone()))
+    assert len(results) == 4  # two foregrounds, two solvers
     for result in results:
         relative = result.estimate.target_camera.R @ ELSEWHERE.R @ photograph.camera.R.T
         error = rotation_error(result.estimate.sim3.R, relative)
@@ -118,13 +114,11 @@ def test_a_folder_without_synthetic_motorcycles_gives_no_result(ellipsoids):
     assert list(run_photograph(ellipsoids, CoordinateBackbone())) == []
 
 
-def test_the_demo_begins_with_the_photograph_and_credits_it(motorcycles, photograph, tmp_path, monkeypatch, capsys):
+def test_the_demo_begins_with_the_credited_photograph(motorcycles, photograph, tmp_path, monkeypatch, loaded, run):
     monkeypatch.setattr("zsp_lite.course.demo.run_demo", lambda dataset, backbone, solvers: iter(()))
-    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda name: CoordinateBackbone())
-    monkeypatch.setattr(CoordinateBackbone, "name", "coordinates", raising=False)
     monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)
-    assert main(["demo", "--data", str(motorcycles.root), "--out", str(tmp_path)]) == 0
-    text, page = capsys.readouterr().out, (tmp_path / "report.html").read_text(encoding="utf-8")
+    text = run(["demo", "--data", motorcycles.root, "--out", tmp_path])
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert text.index("Photographed motorcycle") < text.index("One pair per category")
     assert text.count("│ verified ") == 2 and MODELS_NOTE in " ".join(text.split())
     assert "Which way does a real motorcycle stand?" in page and "Middlebury" in page

@@ -130,8 +130,7 @@ def test_a_photograph_is_upright_with_its_depth_mask_and_camera_in_either_form(t
     for intrinsics in [form] if ambiguous else ["stored", "displayed"]:
         given = (190, 190, column, row) if intrinsics == "stored" else (190, 190, 74, 99)
         if ambiguous:
-            with pytest.raises(InputError, match=f"orientation {tag} .* --orientation stored or --orientation disp"):
-                open_source(path, given).load([0])
+            refused(f"orientation {tag} .* --orientation stored or", lambda: open_source(path, given).load([0]))
         (frame,) = open_source(path, given, orientation=form if ambiguous else None).load([0])
         np.testing.assert_allclose(frame.depth, portrait.depth, atol=6e-4)
         np.testing.assert_array_equal(frame.mask, portrait.mask)
@@ -232,5 +231,4 @@ def test_a_link_to_a_sequence_is_one_and_the_root_of_the_disk_is_no_folder_for_r
     (tmp_path / "mine").symlink_to(ellipsoids.root / "ellipsoid/a")
     source = open_source(tmp_path / "mine")
     assert (source.format, source.name, len(source.numbers)) == ("sequence", "mine", 7)
-    with pytest.raises(InputError, match="is the root of the disk, expected a folder"):
-        estimate_pose(tmp_path / "mine", tmp_path / "mine", out=tmp_path.anchor)
+    refused("is the root of the disk", estimate_pose, tmp_path / "mine", tmp_path / "mine", out=tmp_path.anchor)

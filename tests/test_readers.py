@@ -6,6 +6,7 @@ import shutil
 import sys
 import zipfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -17,14 +18,11 @@ from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone
 from test_importers import edited, hairdryer_views, to_world, write_depth16, write_lists, write_nerfstudio
 
-from zsp_lite.course.samples import sample_data
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import write_image, write_mask
 from zsp_lite.importers import open_capture, recognise
 from zsp_lite.importers.capture import find_masks, sharpest, trusted
 from zsp_lite.importers.sources import open_source, spread_views
-from zsp_lite.metrics import rotation_error
 from zsp_lite.own_objects import estimate_pose
 
 OPENGL = np.diag([1.0, -1, -1, 1])
@@ -154,15 +152,8 @@ def write_zip_of_nerfstudio(folder, frames):
     return shutil.make_archive(folder, "zip", folder)
 
 
-def write_lists_with_masks(folder, frames):
-    write_lists(folder, frames)
-    for frame in frames:
-        write_mask(folder / f"masks/{frame.name}.png", frame.mask)
-    return folder
-
-
 WRITERS = {
-    "nerfstudio": write_zip_of_nerfstudio, "lists": write_lists_with_masks, "stray": write_stray,
+    "nerfstudio": write_zip_of_nerfstudio, "lists": partial(write_lists, masks=True), "stray": write_stray,
     "polycam": write_polycam, "record3d": write_record3d, "tum": write_tum, "bop": write_bop, "scannet": write_scannet,
     "open3d": write_open3d,
 }  # fmt: skip
@@ -190,28 +181,6 @@ def test_each_layout_is_recognised_and_gives_the_cameras_the_depth_and_the_masks
         assert np.abs(frame.rgb.astype(int) - view.rgb).mean() < 8
 
 
-@pytest.fixture(scope="module")
-def scooter():
-    """Two frames of a sample sequence, and its pose to another one."""
-    dataset = Co3D(sample_data())
-    annotations = dataset.frames("motorcycle", "scooter")
-    frames = [replace(dataset.load(annotations[12 * k]), name=f"{k:04d}") for k in (0, 1)]
-    return frames, pose_to_scooter2(dataset.root / "motorcycle/scooter")
-
-
-def pose_to_scooter2(source):
-    options = {"references": 1, "reference_frame": 0}
-    found = estimate_pose(source, sample_data() / "motorcycle/scooter2", **options)
-    return found.estimates["verified"].world_sim3.R
-
-
-@pytest.mark.parametrize("layout", WRITERS)
-def test_each_layout_gives_the_pose_of_the_data_folder(tmp_path, scooter, layout):
-    frames, expected = scooter
-    path, options = write(layout, tmp_path / "scan", frames)
-    assert rotation_error(pose_to_scooter2(open_source(path, **options)), expected) < 3
-
-
 def each(change):
     return lambda content: [change(frame) for frame in content["frames"]]
 
@@ -222,16 +191,8 @@ def linked(folder):
     return folder
 
 
-def angle(side, focal):
-    return 2 * np.arctan(side / 2 / focal)
-
-
-def absolute(folder):
-    return edited(each(lambda f: f.update(file_path=str(folder / f["file_path"]))))(folder)
-
-
 RELATIVES = {
-    "camera_angle_x": edited(lambda c: c.update(camera_angle_x=angle(c.pop("w"), c.pop("fl_x"))),
+    "camera_angle_x": edited(lambda c: c.update(camera_angle_x=2 * np.arctan(c.pop("w") / 2 / c.pop("fl_x"))),
                              lambda c: [c.pop(name) for name in ("fl_y", "h", "cx", "cy")]),
     "depth_path": edited(each(lambda f: f.update(depth_path=f.pop("depth_file_path"))),
                          lambda c: c.update(integer_depth_scale=0.001, depth_unit_scale_factor=5)),
@@ -241,7 +202,8 @@ RELATIVES = {
     "the file itself": lambda folder: folder / "transforms.json",
     "transforms_train.json": edited(name="transforms_train.json"),
     "back slashes": edited(each(lambda f: f.update(file_path=f["file_path"].replace("/", "\\")))),
-    "absolute paths": absolute, "a linked folder": linked, "shuffled": edited(lambda c: c["frames"].reverse()),
+    "absolute paths": lambda folder: edited(each(lambda f: f.update(file_path=f"{folder}/{f['file_path']}")))(folder),
+    "a linked folder": linked, "shuffled": edited(lambda c: c["frames"].reverse()),
 }  # fmt: skip
 
 
@@ -266,7 +228,7 @@ def first(change):
     (first(lambda f: f["transform_matrix"][0].__setitem__(0, 5.0)), "frame 0: .*expected a rotation"),
     (first(lambda f: f.update(file_path="images/lost.jpg")), "frame 0: images/lost.jpg is missing in"),
     (first(lambda f: f.update(depth_file_path="lost")), "frame 0: lost is missing in"),
-    (first(lambda f: f.update(k4=1)), "frame 0: camera_model is .* with k4 = 1"),
+    (lambda folder: (folder / "masks/0000.png").write_bytes(b""), "mask .*0000.png cannot be decoded"),
 ])  # fmt: skip
 def test_a_frame_that_cannot_be_used_is_left_out_and_named(tmp_path, views, damage, message):
     write_nerfstudio(tmp_path, views)
@@ -319,8 +281,6 @@ def test_lists_have_names_with_signs_a_camera_for_each_image_and_images_of_sever
     assert (nine.focal_length.tolist(), ten.focal_length.tolist()) == ([200, 201], [300, 301])
     (tmp_path / "intrinsics.txt").write_text("300 301 60 48\n")
     assert {one.camera.focal_length[0] for one in open_capture(tmp_path).frames} == {300}
-    (tmp_path / "intrinsics.txt").write_text("300 301 60 48\n" * 3)
-    refused("rgb.txt 2, depth.txt 2, poses.txt 2, intrinsics 3; expected equal", open_capture, tmp_path)
 
 
 def test_options_of_formats(tmp_path, views):
@@ -330,7 +290,6 @@ def test_options_of_formats(tmp_path, views):
     refused("has the objects 3, 5, expected one of them as --object N", open_source, tmp_path / "bop")
     source = open_source(tmp_path / "bop", object=5, depth_unit=0.01)
     assert source.mask == "given" and source.load([0])[0].depth.max() > 15 * views[0].depth.max()
-    refused("--object does not go with .*tum, of the format tum", open_source, tmp_path / "tum", object=5)
 
 
 @pytest.mark.parametrize(("files", "message"), [
@@ -450,16 +409,6 @@ def test_an_object_that_is_twice_in_an_image_of_bop_leaves_it_out(tmp_path, view
 def test_frames_with_one_pose_are_refused(tmp_path, views):
     write_lists(tmp_path, [replace(frame, camera=views[0].camera) for frame in views])
     refused(r"all \d frames have one camera pose", open_source, tmp_path)
-
-
-def test_a_frame_with_a_damaged_mask_is_left_out(tmp_path, views):
-    write_lists(tmp_path, views)
-    for view in views:
-        write_mask(tmp_path / f"masks/{view.name}.png", view.mask)
-    damaged = tmp_path / f"masks/{views[1].name}.png"
-    damaged.write_bytes(damaged.read_bytes()[:40])
-    (line,) = open_capture(tmp_path).left_out
-    assert "0001.png cannot be decoded" in line
 
 
 def test_a_folder_of_masks_with_other_names_is_refused(tmp_path, views):

@@ -2,12 +2,12 @@
 
 import importlib
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import nbformat
 import pytest
+from bs4 import BeautifulSoup
 
 import zsp_lite
 
@@ -17,29 +17,17 @@ EXERCISES = sorted((REPOSITORY / "notebooks" / "exercises" / "source").glob("*/*
 DECKS = sorted((REPOSITORY / "docs" / "slides").glob("*.md"))
 
 
-class Page(HTMLParser):
+class Page:
     """Links, loaded files, anchors and pictures of an HTML page."""
 
     def __init__(self, path: Path):
-        super().__init__()
-        self.links, self.loaded, self.anchors, self.pictures, self.text = [], [], set(), [], ""
-        self.html = path.read_text(encoding="utf-8")
-        self.feed(self.html)
-
-    def handle_starttag(self, tag, attributes):
-        attributes = dict(attributes)
-        self.anchors |= {attributes[key] for key in ("id", "name") if attributes.get(key)}
-        if tag == "a" and "href" in attributes:
-            self.links.append(attributes["href"])
-        elif tag in ("img", "script", "iframe") and "src" in attributes:
-            self.loaded.append(attributes["src"])
-        elif tag == "link" and attributes.get("rel") not in ("next", "prev", "canonical", "search", "index"):
-            self.loaded.append(attributes["href"])
-        if tag == "img":
-            self.pictures.append(attributes)
-
-    def handle_data(self, data):
-        self.text += data
+        html = BeautifulSoup(path.read_bytes(), "html.parser")
+        self.links = [one["href"] for one in html.find_all("a", href=True)]
+        self.pictures, self.text = html.find_all("img"), html.get_text()
+        self.loaded = [one["src"] for one in html.select("img[src], script[src], iframe[src]")]
+        leading_on = {"next", "prev", "canonical", "search", "index"}
+        self.loaded += [one["href"] for one in html.find_all("link") if not leading_on & {*one["rel"]}]
+        self.anchors = {one[key] for key in ("id", "name") for one in html.find_all(attrs={key: True})}
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,9 @@ import pytest
 
 from tools import results_page
 from zsp_lite.benchmark.runs import read_run
+from zsp_lite.benchmark.statistics import object_draws
 from zsp_lite.io.files import REPOSITORY
+from zsp_lite.metrics import accuracy
 from zsp_lite.verified.verification import ScoreCoefficients
 from zsp_lite.viz.reliability import reliability
 
@@ -37,6 +39,19 @@ def test_the_readme_has_the_figures_of_both_runs(runs):
         found = [run.summary["methods"][row] for run in runs.values()]
         expected = [value for one in found for value in (one["acc30"], *one["acc30_ci"], one["above150"])]
         assert numbers(line.split("|", 2)[2]) == pytest.approx(expected, abs=0.051), row
+
+
+def test_the_page_says_how_much_objects_and_seeds_change_the_accuracy(runs):
+    """Standard deviations of Acc30 of `ours`, by objects and by seeds."""
+    text = page("docs/results.md").replace("\n  ", " ")
+    stated = re.search(r"standard deviation of Acc30 of `ours` by (.*?) models\.", text)[1]
+    expected = []
+    for run in runs.values():
+        row = run.row("ours")
+        drawn = object_draws(row[["reference", "target"]].to_numpy(), row["category"].to_numpy())
+        by_seed = run.summary["methods"]["ours"]["acc30_sd_of_seeds"]
+        expected += [accuracy(row["error"].to_numpy(), 30, drawn).std(), by_seed]
+    assert numbers(stated) == pytest.approx(expected, abs=0.051)
 
 
 def test_the_table_of_artist_made_models_has_the_figures(runs):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import DEFAULT, Mock
 
 import cv2
 import numpy as np
@@ -103,20 +104,13 @@ def test_an_export_reads_back(folder, chairs):
 
 
 def test_an_interrupted_export_is_completed_and_complete_sequences_stay(tmp_path, monkeypatch):
-    made = []
-
-    def interrupt_second(mesh, name, *rest):
-        if len(made) == 1:
-            made.append("interrupted")
-            raise KeyboardInterrupt
-        made.append(name)
-        return record_sequence(mesh, name, *rest)
-
-    monkeypatch.setattr(export, "record_sequence", interrupt_second)
-    with pytest.raises(KeyboardInterrupt):
+    record = Mock(wraps=record_sequence, side_effect=[DEFAULT, KeyboardInterrupt, DEFAULT])
+    with monkeypatch.context() as context:
+        context.setattr(export, "record_sequence", record)
+        with pytest.raises(KeyboardInterrupt):
+            export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
         export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
-    export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
-    assert made == [sequence_name(1, "mouse", 0), "interrupted", sequence_name(1, "mouse", 1)]
+    assert [call.args[1] for call in record.call_args_list] == [sequence_name(1, "mouse", k) for k in (0, 1, 1)]
     export_categories(["mouse"], tmp_path / "b", 2, 2, 1, 48)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -9,7 +10,6 @@ import torch
 import torch.nn.functional as F
 from small_backbones import small_vit
 
-from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.course.synthetic.assembly import make_shape, random_materials
 from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.course.synthetic.sequences import orbit_pose
@@ -26,33 +26,25 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module", autouse=True)
 def two_rooms():
     """Rooms take five times as long as a view."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rendering, "ROOMS", 2)
+    with patch.object(rendering, "ROOMS", 2):
         yield
 
 
 @pytest.fixture(scope="module")
-def azimuths() -> list[float]:
-    """Of every view of `renders`, one object after the other."""
-    return []
+def rendered():
+    """The renders of three training objects, and the azimuth of every view, one object after the other."""
+    with patch.object(rendering, "orbit_pose", wraps=orbit_pose) as poses:
+        return render_set(range(3)), [call.kwargs["azimuth"] for call in poses.call_args_list]
 
 
 @pytest.fixture(scope="module")
-def renders(azimuths):
-    """The renders of three training objects."""
-
-    def kept(azimuth, **others):
-        azimuths.append(azimuth)
-        return orbit_pose(azimuth, **others)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rendering, "orbit_pose", kept)
-        return render_set(range(3))
+def renders(rendered):
+    return rendered[0]
 
 
-def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(renders, azimuths):
+def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(rendered):
     partner = np.arange(VIEWS) ^ 1
-    for of_object in np.reshape(azimuths, (3, VIEWS)):
+    for of_object in np.reshape(rendered[1], (3, VIEWS)):
         turns = np.subtract.outer(of_object, of_object)
         apart = np.degrees(np.abs((turns + np.pi) % (2 * np.pi) - np.pi))
         found = apart[np.arange(VIEWS), partner]
@@ -207,11 +199,6 @@ def pictures() -> np.ndarray:
     return rgb
 
 
-@pytest.fixture(scope="module")
-def backbone() -> VisionTransformer:
-    return small_vit(1, embed_dim=24, depth=2, num_heads=2)
-
-
 def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_crop():
     rng = np.random.default_rng(0)
     student, teacher, centre = rng.normal(size=(4, 3, 5)), rng.normal(size=(2, 3, 5)), rng.normal(size=5)
@@ -232,7 +219,8 @@ def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_cro
     assert figures["kl"] == pytest.approx(np.mean(terms) - np.mean(entropies))
 
 
-def test_a_run_depends_on_its_seed_alone_and_leaves_the_given_backbone_as_it_was(pictures, backbone):
+def test_a_run_depends_on_its_seed_alone_and_leaves_the_given_backbone_as_it_was(pictures):
+    backbone = small_vit(1, embed_dim=24, depth=2, num_heads=2)
     before = copy.deepcopy(backbone.state_dict())
     runs = [Distillation(replace(TINY, seed=seed), backbone, pictures) for seed in (0, 0, 1)]
     figures = [[run.step() for _ in range(3)] for run in runs]

@@ -35,7 +35,7 @@ class NoPoseError(InputError):
 
 
 class FatalError(ValueError):
-    """An error that ends a benchmark run: a broken backbone, an unreadable frame, a mistake in the code of a row.
+    """An error that ends a benchmark run: a broken backbone or an unreadable frame.
 
     It is no InputError, by which a row says that a pair has no pose, and nothing is stored for the pair that it hits.
     """
@@ -44,7 +44,8 @@ class FatalError(ValueError):
 def describe_failure(error: BaseException) -> str:
     """Describe an exception of somebody else's code in one line: where it was raised, its type and its message."""
     *_, last = traceback.extract_tb(error.__traceback__)
-    return " ".join(f"{last.filename}, line {last.lineno}: {type(error).__name__}: {error}".split())
+    told = "".join(traceback.format_exception_only(error))  # also where its own str() fails
+    return " ".join(f"{last.filename}, line {last.lineno}: {told}".split())
 
 
 @contextmanager

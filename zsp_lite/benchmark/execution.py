@@ -116,10 +116,9 @@ def open_workers(executor: Executor | int = 1) -> Iterator[tuple[Executor | None
     with _Processes(executor, get_context("spawn"), _start_worker) as pool:
         try:
             yield pool, executor
-        except BaseException:  # ends at once, without waiting for what is being evaluated
+        finally:  # ends at once, without waiting for what is being evaluated or a thread of a row
             for child in set(active_children()) - before:
                 child.terminate()
-            raise
 
 
 def _start_worker() -> None:

@@ -106,23 +106,26 @@ def _members(name: str) -> list[str]:
 def resolve(methods: str | Sequence[str] | Mapping[str, Any], sweep: Sequence[float] = ()) -> dict[str, Method]:
     """Resolve names to rows, in order and without duplicates.
 
-    Names are those of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, "module:thing",
-    "poses.csv", or NAME=one of these. A mapping leads from names to these, to a `Method`, or to objects of one's own.
+    Names are those of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, or NAME=module:thing or
+    NAME=poses.csv, also without NAME=. A mapping leads from names to these, to a `Method`, or to objects of one's own.
     Each RANSAC threshold V of a sweep makes a row NAME@threshold=V of each.
     InputError if a name is unknown or another row's, or a thing cannot be imported or read, or is of no kind.
     """
     if not isinstance(methods, Mapping):
         names = [methods] if isinstance(methods, str) else methods
-        members = [row.partition("=") for name in names for row in _members(name)]
-        methods = {name: meant or name for name, _, meant in members}
+        parts = (row.partition("=") for name in names for row in _members(name))
+        meanings = {(name.strip(), meant or name): None for name, _, meant in parts}
+        if len(methods := dict(meanings.keys())) < len(meanings):
+            raise InputError(f"methods {', '.join(names)} are two of one name, expected one of each")
     if not methods:
         raise InputError("no methods, expected some; `zsp-lite benchmark --list` lists them")
+    labels = [line["label"] for table in read_paper_tables() for line in table["rows"]]
+    taken = {*map(str.casefold, [*METHODS, *GROUPS, *labels, "alignment"])}  # the last is the row of `align`
+    for name, meant in methods.items():
+        plain, text = str(name).strip().casefold(), meant if isinstance(meant, str) else ""
+        if text != name and taken & {plain, base_name(plain), base_name(text)}:
+            raise InputError(f"method {name!r} gives a library row another name, or a name of its or the paper's away")
     rows = {str(name): _method(str(name), meant) for name, meant in methods.items()}
-    taken = {*METHODS, *GROUPS, *(line["label"] for table in read_paper_tables() for line in table["rows"])}
-    for name, row in rows.items():
-        base = base_name(name)
-        if taken & {name, base} and not (base in METHODS and row == _method(name, name)):
-            raise InputError(f"method {name!r} has the name of another row or of a group, expected its own")
     return _swept(rows, sweep) if sweep else rows
 
 
@@ -140,7 +143,7 @@ def _method(name: str, meant: Any) -> Method:
                 "NAME=poses.csv are your own"
             )
         meant = import_object(meant)
-    if isinstance(meant, Method):
+    elif isinstance(meant, Method):
         return meant
     kind = kind_of(name, meant)
     if kind in ("matcher", "solver"):
@@ -152,6 +155,11 @@ def _method(name: str, meant: Any) -> Method:
 def base_name(name: str) -> str:
     """ROW of "ROW-nN@threshold=V"."""
     return re.sub(r"(-n\d+)?(@.*)?$", "", name)
+
+
+def is_own(name: str) -> bool:
+    """Tell whether a row is not the library's, with any number of target views (see `resolve`)."""
+    return base_name(name) not in METHODS
 
 
 def _swept(rows: Mapping[str, Method], thresholds: Sequence[float]) -> dict[str, Method]:

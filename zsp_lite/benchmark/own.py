@@ -3,7 +3,7 @@
 import ctypes
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -66,12 +66,12 @@ def fails_alone(seconds: int) -> Iterator[None]:
     watcher.start()
     try:
         try:
-            yield
+            with chdir("."):  # and back, wherever the block goes
+                yield
         finally:
             ended.release()  # compiled: nothing can be raised before it has ended the watch
-            watcher.join()
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, None)
-    except (InputError, KeyboardInterrupt, MemoryError):
+            watcher.join()  # what it has raised comes here at the latest
+    except (InputError, KeyboardInterrupt):
         raise
     except BaseException as error:
         late = f"takes more than {seconds} s"
@@ -114,8 +114,8 @@ class KeypointMatcher:
         own = seeded(self.own, problem.seed)
         found = [own(reference.rgb.copy(), target.rgb) for target in targets]
         scores = [real_array("scores of matches", score) for _, _, score in found]
-        if any((one < 0).any() for one in scores):  # the view of the highest sum is chosen
-            raise InputError("scores of matches are negative, expected 0 or more")
+        if not all((one >= 0).all() for one in scores):  # the view of the highest sum is chosen
+            raise InputError("scores of matches are negative or NaN, expected 0 or more")
         view = int(np.argmax([one.sum() for one in scores]))
         return fit_keypoints(problem, view, *found[view][:2], self.threshold)
 
@@ -123,7 +123,8 @@ class KeypointMatcher:
 def fit_keypoints(problem: Problem, view: int, first: Any, second: Any, threshold: float = 0.2) -> Answer:
     """Fit the pose to matched pixels of the reference's crop and of a target's: depth, then RANSAC (sec. 4.3)."""
     reference, *targets = problem.frames(depth=True)
-    first, second = (real_array("matched points", points).reshape(-1, 2) for points in (first, second))
+    empty = np.zeros((0, 2))
+    first, second = (real_array("matched points", one if len(one) else empty, (None, 2)) for one in (first, second))
     if len(first) != len(second):
         raise InputError(f"matched points are {len(first)} and {len(second)}, expected as many in both images")
     try:

@@ -22,7 +22,7 @@ from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.baselines.geometry import essential_rotation
 from zsp_lite.benchmark import execution
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
-from zsp_lite.benchmark.methods import GROUPS, METHODS, Method, description, make_extractors, read_paper_tables, resolve
+from zsp_lite.benchmark.methods import GROUPS, Method, description, is_own, make_extractors, read_paper_tables, resolve
 from zsp_lite.benchmark.own import StoredPoses, fails_alone, given
 from zsp_lite.benchmark.problem import Answer, FrameStore, PairProblem, as_answer, seeded
 from zsp_lite.benchmark.runs import Call, ResultLine, Run, Settings, add_lines, open_run, read_lines, read_run
@@ -31,7 +31,7 @@ from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.ground_truth import common_turns
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import category_pairs, labelled_categories, true_pose
-from zsp_lite.errors import FatalError, InputError, check_integer, describe_failure
+from zsp_lite.errors import InputError, check_integer
 from zsp_lite.io.files import digest, write_atomic
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, view_alignment
@@ -73,7 +73,7 @@ def evaluate(
 
     Raises:
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds another run.
-        FatalError: The backbone is broken, a frame cannot be read, or the memory is full.
+        FatalError: The backbone is broken, or a frame cannot be read.
     """
     check_integer("targets", targets, 1)
     check_integer("row_seconds", row_seconds, 1, 1_000_000)
@@ -201,7 +201,7 @@ def evaluate_pair(pair: Pair, methods: Mapping[str, Method], store: FrameStore) 
 
 
 def _evaluate(name: str, method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]) -> dict[str, Any]:
-    own = replace(method, targets=None) not in METHODS.values() and not isinstance(method.solve, StoredPoses)
+    own = is_own(name) and type(method.solve) is not StoredPoses
     seen = given(method.solve, problem) if own else problem
     start = time.perf_counter()
     try:
@@ -212,17 +212,16 @@ def _evaluate(name: str, method: Method, problem: PairProblem, truths: Float[np.
                 raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
             result = {"seconds": time.perf_counter() - start} | _measure(answer, problem, truths[answer.view])
             line = {"pair": problem.pair.key, "results": {name: result}}
-            msgspec.json.decode(msgspec.json.encode(line), type=ResultLine)  # refuses what could not be read again
+            msgspec.json.encode(msgspec.convert(line, ResultLine))  # refuses what could not be stored
     except InputError as error:  # there is no pose: without these pairs, methods that fail often would look better
         return {"error": 180.0, "failed": str(error).encode(errors="replace").decode()}
-    except MemoryError as error:
-        raise FatalError(f"method {name!r} failed: {describe_failure(error)}") from error
     return {name: round(value, 4) if isinstance(value, float) else value for name, value in result.items()}
 
 
 def _measure(answer: Answer, problem: PairProblem, truth: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
     """Measure an answer: "error", and what is known of the other members of a stored result."""
     known = {name: getattr(answer, name) for name in ("view", "note", "scale", "inliers", "confidence")}
+    known["note"] = answer.note[:1000]
     known["error"] = rotation_error(answer.rotation, truth[:3, :3])
     known["rotation"] = answer.rotation.ravel().round(6).tolist()
     reference, *targets = (frame.camera for frame in problem.frames())

@@ -105,11 +105,11 @@ class Run:
     @cached_property
     def failures(self) -> list[str]:
         """Of each row that failed on pairs: on how many, and the reason of the first."""
-        failed = self.table[self.table["failed"] != ""].groupby("row", sort=False)["failed"]
-        cases = self.table["row"].value_counts()
+        failed = self.table[self.table["failed"] != ""].groupby("row", sort=False)
+        counts, pairs = failed["pair"].nunique(), self.table.groupby("row")["pair"].nunique()
         return [
-            f"{name} failed on {len(reasons)} of {cases[name]} pairs, counted as 180°; the first: {reasons.iloc[0]}."
-            for name, reasons in failed
+            f"{name} failed on {counts[name]} of {pairs[name]} pairs, counted as 180°; the first: {reason}."
+            for name, reason in failed["failed"].first().items()
         ]
 
     def row(self, name: str) -> pd.DataFrame:
@@ -215,9 +215,8 @@ def read_run(out: str | Path) -> Run:
     timings = pd.DataFrame([line.timings for line in lines]).median().to_dict()
     notes, rows = [], table["row"].unique()
     if not last.finished:
-        notes.append(
-            f"Not finished: {table['row'].value_counts().max()} of {last.seeds * sum(last.pairs.values())} pairs."
-        )
+        most = table.groupby("row")["pair"].nunique().max()
+        notes.append(f"Not finished: {most} of {sum(last.pairs.values())} pairs.")
     if len(settings.library) > 1:
         notes.append("Evaluated by several versions of zsp-lite (run.json lists them).")
     if hidden := [name for name in settings.methods if name not in rows]:
@@ -240,11 +239,12 @@ def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
     for column, names in orders.items():
         table = table[table[column].isin(names)].astype({column: pd.CategoricalDtype(list(names))})
     table = table[table["repeat"] < settings.calls[-1].seeds]
-    return table.sort_values(["row", "category", "problem", "pair", "repeat"]).astype(dict.fromkeys(orders, object))
+    table = table.sort_values(["row", "category", "problem", "pair", "repeat"], ignore_index=True)
+    return table.astype(dict.fromkeys(orders, object))
 
 
 def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
-    """Keep the pairs that all rows of the last call have finished, and the rows that have all of these."""
+    """Keep the pairs that all rows of the last call have finished, and the rows, by seed, that have all of these."""
     views = table["pair"].str.count(",")  # one less than the target views
     finished = {}  # by number of views
     for number, found in table[table["row"].isin(settings.calls[-1].rows)].groupby(views):
@@ -253,10 +253,10 @@ def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
         finished[number] = set(cases_of_pair.index[cases_of_pair == wanted])
     problems = set(table["problem"][table["pair"].isin(set().union(*finished.values()))])
     kept = [table[:0]]
-    for _, found in table.groupby("row", sort=False):
+    for _, found in table.groupby(["row", "repeat"]):
         number = views[found.index[0]]
         column, wanted = ("pair", finished[number]) if number in finished else ("problem", problems)
         found = found[found[column].isin(wanted)]
         if wanted <= set(found[column]):
             kept.append(found)
-    return pd.concat(kept, ignore_index=True)
+    return pd.concat(kept).sort_index(ignore_index=True)

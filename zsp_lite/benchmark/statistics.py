@@ -24,8 +24,9 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
     """Summarise the results of a run (see `runs.Run`).
 
     "methods" has by row, over all pairs and "per_category", what `figures_of` returns, and where they are known
-    "symmetric_acc30" and the medians "translation", "scale" and "milliseconds" of the pairs that have them. "against"
-    has the `paired_difference` of each row of the same problems to "ours". All draws resample objects.
+    "symmetric_acc30" and the medians "translation" and "scale" of the pairs that have them. "against" has the
+    `paired_difference` of each row of the same problems to "ours". "milliseconds" are medians, too, apart because they
+    differ from run to run. All draws resample objects.
     """
     rows = {str(name): row for name, row in table.groupby("row", sort=False)}
     methods, against, ours = {}, {}, rows.get("ours")
@@ -33,7 +34,7 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
         errors, drawn, categories = row["error"].to_numpy(), draws_of(row), row["category"].to_numpy(str)
         seeds = row["repeat"].nunique()
         methods[name] = figures_of(errors, drawn, categories) | {
-            "failed": int((row["failed"] != "").sum()),
+            "failed": row.loc[row["failed"] != "", "pair"].nunique(),
             "per_category": {
                 category: figures_of(errors[members], drawn[:, members])
                 for category in dict.fromkeys(categories) for members in [categories == category]
@@ -44,7 +45,7 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
         if seeds > 1:
             by_seed = row.groupby("repeat")["error"].apply(lambda errors: 100 * (errors < 30).mean())
             methods[name]["acc30_sd_of_seeds"] = float(by_seed.std())
-        methods[name] |= row[["translation", "scale", "milliseconds"]].astype(float).median().dropna().to_dict()
+        methods[name] |= row[["translation", "scale"]].astype(float).median().dropna().to_dict()
         if row["symmetric_error"].notna().any():
             known = row["symmetric_error"].fillna(row["error"]).to_numpy(np.float64)
             methods[name]["symmetric_acc30"] = float(accuracy(known, 30))
@@ -52,7 +53,8 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
             common = ours[ours["repeat"].isin(row["repeat"])]
             if row["problem"].tolist() == common["problem"].tolist():
                 against[name] = paired_difference(common["error"], errors, weights=drawn)
-    return {"methods": methods} | ({} if ours is None else {"against": against})
+    times = table.groupby("row", sort=False)["milliseconds"].median().dropna().to_dict()
+    return {"methods": methods, "milliseconds": times} | ({} if ours is None else {"against": against})
 
 
 def draws_of(row: pd.DataFrame) -> Draws:

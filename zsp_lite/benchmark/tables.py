@@ -18,7 +18,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.benchmark.methods import GROUPS, METHODS, base_name, read_paper_tables
+from zsp_lite.benchmark.methods import GROUPS, base_name, is_own, read_paper_tables
 from zsp_lite.benchmark.runs import Run
 from zsp_lite.benchmark.statistics import draws_of, paired_difference
 from zsp_lite.choices import METRICS, METRICS_SHOWN
@@ -89,6 +89,9 @@ def choose(run: Run, rows: Sequence[str]) -> dict[str, Any]:
 
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
     """Return all tables of a run; `metrics` are the figures of the table of all rows (see `METRICS`)."""
+    times = summary["milliseconds"]
+    methods = {name: row | {"milliseconds": times.get(name)} for name, row in summary["methods"].items()}
+    summary = {**summary, "methods": methods}
     first = (all_rows(summary, metrics, name) for name in ("all_rows", *SEE_MORE))
     shown = *PAPER, *(metric for metric in metrics if metric == "milliseconds")
     tables = *first, *paper_tables(summary, shown), *(by_category(summary, one) for one in PAPER)
@@ -192,8 +195,8 @@ def _difference(test: Mapping[str, Any] | None) -> tuple[Cell | None, Cell | Non
 
 
 def own_rows(summary: Mapping[str, Any]) -> list[str]:
-    """List the rows of a run that are not the library's, with any number of target views."""
-    return [name for name in summary["methods"] if base_name(name) not in METHODS]
+    """List the rows of a run that are not the library's."""
+    return [*filter(is_own, summary["methods"])]
 
 
 def important_rows(summary: Mapping[str, Any]) -> list[str]:
@@ -247,8 +250,8 @@ def _note_on_seeds(summary: Mapping[str, Any]) -> list[str]:
         return []
     name = "ours" if "ours" in spread else next(iter(spread))
     return [
-        f"Means over seeds, which the intervals hold; Acc30 of {name} has a standard deviation of "
-        f"{spread[name]:.1f} points over seeds."
+        f"Means over seeds, which the intervals hold; by seed, Acc30 of {name} has a standard deviation of "
+        f"{spread[name]:.1f} points."
     ]
 
 

@@ -15,6 +15,7 @@ SIZE = Parsed(
 THRESHOLDS = Parsed(
     "threshold=V,V", lambda text: [*map(float, text.removeprefix("threshold=").split(","))], bool, "threshold=V,V"
 )
+LATEX = Parsed("intervals,time", lambda text: text.split(","), {"", "intervals", "time"}.issuperset, "intervals, time")
 _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 metrics_option = click.option(
     "--metrics",
@@ -109,7 +110,7 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
 @click.option("--out", type=PATH, show_default="the run's folder", help="Folder to write.")
 @metrics_option
 @click.option("--rows", type=NAMES, show_default="all", help="Rows of the tables and figures, in order.")
-@click.option("--latex", type=click.Choice(("intervals", "time", "intervals,time")), help="Add these to LaTeX tables.")
+@click.option("--latex", type=LATEX, default="", show_default="none", help="Add these to LaTeX tables.")
 @click.option("--size", type=SIZE, help="Width and height of the figures in inches.")
 @click.option("--pair", metavar="KEY", help="Only draw this pair of run.jsonl, with the pose of each row.")
 @click.option("--data", type=PATH, show_default="the run's", help="Data folder, for --pair.")
@@ -119,10 +120,9 @@ def tables(run, out, metrics, rows, latex, size, pair, data) -> None:
     from zsp_lite.benchmark.tables import pair_figure, save_figure
     from zsp_lite.data.co3d import Co3D
 
-    latex = latex or ""
     if pair:
         found = read_run(run)
-        figure = pair_figure(found, pair, Co3D(data or found.settings.data), rows)
+        figure = pair_figure(found, pair, Co3D(data or found.settings.folder or found.settings.data), rows)
         print(f"Written: {save_figure(figure, (out or run) / 'figures', f'pair_{pair}', size)}")
         return
     if "time" in latex and "milliseconds" not in metrics:

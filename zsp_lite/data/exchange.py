@@ -103,7 +103,7 @@ def _numbers(name: str, text: str, size: int) -> np.ndarray:
 
 
 def check_poses(path: str | Path, poses: Mapping[str, StoredPose], dataset: Co3D, pairs: Sequence[Pair]) -> str:
-    """Say how many of the pairs have no pose, how many poses have no pair, and which convention fits better.
+    """Say how many of the poses have no pair, and which convention fits better.
 
     InputError if no pose is of any of the pairs, or if one is in none of its pair's target frames.
     """
@@ -112,12 +112,8 @@ def check_poses(path: str | Path, poses: Mapping[str, StoredPose], dataset: Co3D
         raise InputError(f"{path} has no pose for any of the pairs of --list-pairs")
     for pair, pose in found.items():
         check_choice(f"poses {path}, line {pose.line}: target_frame", pose.target_frame, pair.target_frames)
-    missing, surplus = len(pairs) - len(found), len(poses) - len(found)
-    remarks = [
-        f"{missing} of {len(pairs)} pairs {'has' if missing == 1 else 'have'} no pose" if missing else "",
-        f"{surplus} of {len(poses)} poses fit no pair" if surplus else "",
-        other_convention(dataset, found),
-    ]
+    surplus = len(poses) - len(found)
+    remarks = f"{surplus} of {len(poses)} poses fit no pair" if surplus else "", other_convention(dataset, found)
     return "; ".join(filter(None, remarks))
 
 

@@ -3,6 +3,7 @@
 import os
 import pkgutil
 import sys
+from contextlib import chdir
 from typing import Any
 
 from zsp_lite.errors import InputError, describe_failure
@@ -13,6 +14,7 @@ def import_object(path: str) -> Any:
     if "" not in sys.path and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # the path of a console script lacks the current folder
     try:
-        return pkgutil.resolve_name(path)
+        with chdir("."):  # and back, wherever the module goes
+            return pkgutil.resolve_name(path)
     except (Exception, SystemExit) as error:  # a module may raise anything
         raise InputError(f"{path!r} cannot be imported: {describe_failure(error)}") from error
