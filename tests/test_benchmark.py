@@ -15,11 +15,11 @@ from zsp_lite.benchmark.runs import add_lines, read_lines, read_run
 from zsp_lite.benchmark.tables import pair_figure
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import write_mask
+from zsp_lite.data.ground_truth import POSES_FILE, ObjectPose, object_poses
 from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.data.pairs import category_pairs, sample_pairs, true_poses, write_published_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
-from zsp_lite.synthetic.ground_truth import POSES_FILE, ObjectPose, object_poses
 from zsp_lite.views import object_crop
 
 ROWS = ("ours", "ours-bv", "oracle-view")
@@ -175,7 +175,7 @@ def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(tmp_pa
 
     for turns, expected in (((180,), 0), ((90,), 90), ((), 180)):
         pose = ObjectPose(np.eye(4)[:3].tolist(), 1.0, (0, 0, 0), (1, 1, 1), turns)
-        monkeypatch.setattr("zsp_lite.synthetic.ground_truth.read_poses", lambda *_: dict.fromkeys(labels, pose))
+        monkeypatch.setattr("zsp_lite.data.ground_truth.read_poses", lambda *_: dict.fromkeys(labels, pose))
         summary = evaluate(small_folder(), BACKBONE, {"mine": half_turned}, {"lump": 2}, 1, tmp_path / str(expected))
         found = read_run(tmp_path / str(expected)).row("mine")[["symmetric_error", "error"]]
         np.testing.assert_allclose(found, [[expected, 180]] * 2, atol=1e-5)

@@ -10,8 +10,8 @@ from tools.models import LICENCES, attribution, read_catalogue
 from tools.training_categories import TRAINING
 from tools.validation_categories import VALIDATION
 from zsp_lite.backbones.load import WEIGHTS
-from zsp_lite.samples import REPOSITORY
-from zsp_lite.synthetic.categories import CATEGORIES
+from zsp_lite.course.synthetic.categories import CATEGORIES
+from zsp_lite.io.files import REPOSITORY
 
 TOOLS = REPOSITORY / "tools"
 ARTISTS, SAMPLES = TOOLS / "artists.json", TOOLS / "samples.json"

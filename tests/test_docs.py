@@ -16,7 +16,7 @@ import nbformat
 import numpy as np
 import pytest
 
-from tools import drawings
+from tools import drawings, size
 from zsp_lite.cli.main import cli, main
 from zsp_lite.data.labels import read_labels
 from zsp_lite.metrics import rotation_error
@@ -221,6 +221,13 @@ def test_the_stored_drawings_are_those_of_the_script():
     assert {path.stem for path in drawings.FOLDER.iterdir()} == set(drawings.DRAWINGS)
     for name, draw in drawings.DRAWINGS.items():
         assert (drawings.FOLDER / f"{name}.svg").read_text(encoding="utf-8") == draw(), name
+    assert drawings.ROOMS_FILE.read_text(encoding="utf-8") == drawings.draw_rooms(), "run python -m tools.drawings"
+
+
+def test_the_readme_says_how_many_lines_the_library_has_without_the_course():
+    (claimed,) = re.findall(r"the library has about ([\d,]+) lines", markdown(REPOSITORY / "README.md"))
+    (counted,) = [room.size for room in size.rooms() if room.name == "library without the course"]
+    assert abs(int(claimed.replace(",", "")) - counted) <= 500
 
 
 def code_lines(cell) -> list[str]:

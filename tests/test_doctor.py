@@ -7,7 +7,7 @@ import tomllib
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from zsp_lite.samples import REPOSITORY
+from zsp_lite.io.files import REPOSITORY
 
 
 def test_the_tested_environment_pins_every_dependency_within_its_range():

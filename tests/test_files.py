@@ -185,6 +185,13 @@ def test_colours_of_8_bits_or_from_0_to_1_are_read_as_8_bit(path, kind, code, sc
     np.testing.assert_array_equal(colours, COLOURS)
 
 
+def test_faces_behind_the_vertices_of_a_mesh_are_left_out(path):
+    faces = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    data = _ply(len(POINTS), POINTS.tobytes() + b"\3" + bytes(12)).replace(b"end_header\n", faces, 1)
+    path.write_bytes(data)
+    np.testing.assert_array_equal(read_ply(path)[0], POINTS)
+
+
 def test_written_data_is_read_back(path):
     write_ply(path, POINTS, COLOURS, POINTS)
     np.testing.assert_array_equal(read_ply(path)[0], POINTS)

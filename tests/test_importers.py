@@ -10,6 +10,8 @@ import pytest
 from refusals import refused
 from scipy.spatial import cKDTree
 
+from zsp_lite.course.synthetic.export import make_object
+from zsp_lite.course.synthetic.sequences import render_sequence
 from zsp_lite.data.check import check_folder
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, write_image, write_mask
@@ -18,8 +20,6 @@ from zsp_lite.importers import CaptureFrame, open_capture
 from zsp_lite.importers.convert import fuse, import_captures, import_source
 from zsp_lite.importers.masks import masks_from_box
 from zsp_lite.importers.sources import open_source
-from zsp_lite.synthetic.export import make_object
-from zsp_lite.synthetic.sequences import render_sequence
 
 METRES = 0.13  # per unit of the rendered world: the object is about 30 cm wide
 

@@ -10,11 +10,11 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
+from zsp_lite.course.labelling import Labelling, align_picks
+from zsp_lite.course.labelling.session import MAX_RESIDUAL
 from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.labels import PoseLabel, label_bytes, read_labels, write_label
 from zsp_lite.io.files import write_atomic
-from zsp_lite.labelling import Labelling, align_picks
-from zsp_lite.labelling.session import MAX_RESIDUAL
 
 
 @pytest.fixture

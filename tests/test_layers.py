@@ -1,84 +1,63 @@
 """The structure of the code: no module imports from a layer above its own, and no room is above its limit of lines."""
 
-import ast
-from collections.abc import Iterator
-from pathlib import Path
-
-import zsp_lite
 from tools import size
-from zsp_lite import _HOME_OF
+from tools.rooms import ROOMS, flows, imports, modules
 
-PACKAGE = Path(zsp_lite.__file__).parent
-
-# From the bottom to the top. A module imports from lower layers and from its own subpackage only. Imports inside
-# functions, which delay the loading of large libraries, follow the same rule.
+# From the bottom to the top. A module imports from lower layers and from its own subpackage only, and so does a part of
+# the course. Imports inside functions, which delay the loading of large libraries, follow the same rule.
 LAYERS = [
     "choices errors threads",
     "io",
     "alignment features matchers metrics minimal",
     "data",
     "matching views",
-    "best_view motorcycle points",
+    "best_view points",
     "estimates",
     "pipeline backbones",
-    "verified labelling importers synthetic baselines",
-    "samples",
-    "category demo",
-    "viz training",
+    "verified importers baselines",
+    "category",
+    "viz",
     "benchmark own_objects",
     "align",
-    "widgets",
+    "course course.synthetic course.labelling course.motorcycle course.true_matches",
+    "course.samples course.demo",
+    "course.photograph course.training",
+    "course.widgets",
     "cli",
     "__main__",
 ]
+# Packages that the course alone imports.
+OF_THE_COURSE = {"anywidget", "ipywidgets", "IPython", "jupyterquiz", "skimage", "trimesh"}
 LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names.split()}
 
 
-def read_sources() -> dict[str, str]:
-    """Read the source of every module of the package but its `__init__`, by dotted name without "zsp_lite."."""
-    sources = {}
-    for path in sorted(PACKAGE.rglob("*.py")):
-        name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
-        if name != "__init__":
-            sources[name] = path.read_text(encoding="utf-8")
-    return sources
-
-
-def imports(source: str, modules: set[str]) -> Iterator[tuple[str, int]]:
-    """Find the modules of the package that a source imports, each with its line."""
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            assert not node.level, f"line {node.lineno}: relative import, expected the full name"
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
-        else:
-            continue
-        for name in names:
-            package, _, name = name.partition(".")
-            if package != "zsp_lite":
-                continue
-            # Where a public name of the package is defined.
-            name = f"{_HOME_OF.get(name, package)}.{name}".removeprefix("zsp_lite.")
-            while name and name not in modules:  # a function or a class: the module that holds it
-                name = name.rpartition(".")[0]
-            if name:
-                yield name, node.lineno
+def layer_name(module: str) -> str:
+    """The name that a module or something in it has in `LAYERS`."""
+    return next(name for name in (".".join(module.split(".")[:2]), module.partition(".")[0]) if name in LAYER_OF)
 
 
 def test_every_module_has_a_layer():
-    names = {module.partition(".")[0] for module in read_sources()}
-    assert names == set(LAYER_OF)
+    assert {layer_name(module) for module in modules()} == set(LAYER_OF)
 
 
 def test_no_module_imports_from_a_higher_layer_or_from_another_name_of_its_own():
-    sources = read_sources()
-    for module, source in sources.items():
-        own = module.partition(".")[0]
-        for imported, line in imports(source, set(sources)):
-            other = imported.partition(".")[0]
+    for module, imported, line in imports():
+        package, _, name = imported.partition(".")
+        if package == "zsp_lite" and name != "__version__":
+            own, other = layer_name(module), layer_name(name)
             allowed = other == own or LAYER_OF[other] < LAYER_OF[own]
-            assert allowed, f"zsp_lite.{module}, line {line}, imports zsp_lite.{imported}: {other} is not below {own}"
+            assert allowed, f"zsp_lite.{module}, line {line}, imports {imported}: {other} is not below {own}"
+
+
+def test_the_course_alone_imports_its_packages_and_but_for_the_commands_nothing_imports_the_course():
+    for module, imported, line in imports():
+        room, where = module.partition(".")[0], f"zsp_lite.{module}, line {line}, imports {imported}"
+        assert room == "course" or imported.partition(".")[0] not in OF_THE_COURSE, where
+        assert room in ("course", "cli") or not imported.startswith("zsp_lite.course"), where
+
+
+def test_nothing_flows_back_between_the_rooms_of_the_drawing():
+    assert all(list(ROOMS).index(giver) < list(ROOMS).index(taker) for giver, taker in flows())
 
 
 def test_every_room_is_within_its_limit():

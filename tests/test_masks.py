@@ -8,11 +8,11 @@ import pytest
 from refusals import refused
 from synthetic_views import look_at
 
+from zsp_lite.course.motorcycle import load_photograph
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth, separate_colours
-from zsp_lite.motorcycle import load_photograph
 
 RADIUS = 0.3
 DIRECTIONS = [(1, 0.2, 0.6), (0.4, 1, 0.5), (0.7, -0.8, 0.4), (1, 0.5, 1.5)]

@@ -6,13 +6,13 @@ import trimesh
 from model_files import painted, studio, view, wedge, write_quad, write_wedge
 from refusals import refused
 
-from zsp_lite.synthetic import meshes
-from zsp_lite.synthetic.meshes import ModelInfo, canonical_mesh, list_models, read_mesh
-from zsp_lite.synthetic.primitives import box, surface_spread
-from zsp_lite.synthetic.raytracing import MeshScene
-from zsp_lite.synthetic.sequences import orbit_pose
-from zsp_lite.synthetic.textures import srgb_to_linear
-from zsp_lite.training.renders import framed_camera
+from zsp_lite.course.synthetic import meshes
+from zsp_lite.course.synthetic.meshes import ModelInfo, canonical_mesh, list_models, read_mesh
+from zsp_lite.course.synthetic.primitives import box, surface_spread
+from zsp_lite.course.synthetic.raytracing import MeshScene
+from zsp_lite.course.synthetic.sequences import orbit_pose
+from zsp_lite.course.synthetic.textures import srgb_to_linear
+from zsp_lite.course.training.renders import framed_camera
 
 STUDIO = studio()
 CHECKS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)

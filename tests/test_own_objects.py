@@ -15,6 +15,7 @@ from test_masks import overlap
 
 import zsp_lite
 from zsp_lite.alignment import Sim3
+from zsp_lite.course.samples import sample_data
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.frames import write_image, write_mask
 from zsp_lite.errors import InputError
@@ -24,7 +25,6 @@ from zsp_lite.io.ply import read_ply
 from zsp_lite.metrics import rotation_error
 from zsp_lite.own_objects import estimate_pose, write_pair
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.samples import sample_data
 
 pytestmark = pytest.mark.slow
 

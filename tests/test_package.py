@@ -13,7 +13,7 @@ import pytest
 from refusals import refused
 
 import zsp_lite
-from zsp_lite import samples
+from zsp_lite.course import samples
 
 REPOSITORY = Path(__file__).parents[1]
 FILES = ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", "CHANGELOG.md", "CITATION.cff")
@@ -68,7 +68,7 @@ def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
     (example, *_) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
     code = (
         f"import zsp_lite; assert zsp_lite.__file__.startswith({str(site)!r})\n"
-        "from dataclasses import replace; from zsp_lite.synthetic.export import PRESETS\n"
+        "from dataclasses import replace; from zsp_lite.course.synthetic.export import PRESETS\n"
         "PRESETS['demo'] = replace(PRESETS['demo'], categories=('motorcycle',), frames=6, image_size=96)\n"
         f"{example}\nassert len(targets) == 5\n"
         "from zsp_lite.cli.main import main\n"
@@ -95,7 +95,7 @@ def test_samples_are_made_in_the_cache_and_completed_after_an_interruption(tmp_p
         if len(calls) == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("zsp_lite.synthetic.export.export_preset", export)
+    monkeypatch.setattr("zsp_lite.course.synthetic.export.export_preset", export)
     with pytest.raises(KeyboardInterrupt):
         samples.sample_data()
     made = tmp_path / "cache" / "samples"

@@ -7,12 +7,12 @@ import pytest
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, look_at, render
 
 from zsp_lite.cli.demo import MODELS_NOTE
+from zsp_lite.course.motorcycle import FRONT, UP, load_photograph, motorcycle_frame
+from zsp_lite.course.photograph import run_photograph
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
 from zsp_lite.data.depth import fit_plane, unproject_depth
 from zsp_lite.metrics import rotation_error
-from zsp_lite.motorcycle import FRONT, UP, load_photograph, motorcycle_frame
 from zsp_lite.points import axis_deviation, object_points
-from zsp_lite.viz.photograph import run_photograph
 
 pytestmark = pytest.mark.slow
 
@@ -90,7 +90,7 @@ def photograph():
     """Stands in for the photograph in all that follows."""
     rendered = render(look_at((-0.7, 1, 0.35)), AT_HOME, "photograph")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("zsp_lite.motorcycle.load_photograph", lambda: rendered)
+        patch.setattr("zsp_lite.course.motorcycle.load_photograph", lambda: rendered)
         yield rendered
 
 
@@ -115,7 +115,7 @@ def test_a_folder_without_synthetic_motorcycles_gives_no_result(ellipsoids):
 
 
 def test_the_demo_begins_with_the_credited_photograph(motorcycles, photograph, tmp_path, monkeypatch, loaded, run):
-    monkeypatch.setattr("zsp_lite.demo.run_demo", lambda dataset, backbone, solvers: iter(()))
+    monkeypatch.setattr("zsp_lite.course.demo.run_demo", lambda dataset, backbone, solvers: iter(()))
     monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)
     text = run(["demo", "--data", motorcycles.root, "--out", tmp_path])
     page = (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -10,8 +10,8 @@ import torch
 
 from docs.playground.build import KEY_STEP, pair_data, stored_pairs
 from zsp_lite import Co3D, ZeroShotPose, load_backbone
+from zsp_lite.course.samples import sample_data
 from zsp_lite.matching import key_similarities, similarity
-from zsp_lite.samples import sample_data
 
 
 @pytest.mark.slow

@@ -10,9 +10,9 @@ from plotly.offline import get_plotlyjs
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite.choices import SOLVERS
-from zsp_lite.demo import N_TARGETS, demo_pairs, run_demo
+from zsp_lite.course.demo import N_TARGETS, demo_pairs, run_demo
+from zsp_lite.io.files import REPOSITORY
 from zsp_lite.metrics import rotation_error
-from zsp_lite.samples import REPOSITORY
 from zsp_lite.viz.plots import object_cloud
 from zsp_lite.viz.report import _two_poses_figure, overview, table_rows, write_overview, write_report
 

@@ -21,8 +21,8 @@ from zsp_lite.backbones.load import load_backbone
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.pairs import labelled_categories, shipped_pairs
 from zsp_lite.features import log_bin
+from zsp_lite.io.files import REPOSITORY
 from zsp_lite.pipeline import solve_pair
-from zsp_lite.samples import REPOSITORY
 
 STORED = json.loads(Path(__file__).with_name("sample_poses.json").read_text(encoding="utf-8"))
 

@@ -9,8 +9,8 @@ from IPython.core.interactiveshell import InteractiveShell
 from IPython.utils.capture import capture_output
 from refusals import refused
 
-from zsp_lite.widgets import self_check
-from zsp_lite.widgets.quiz import QUESTIONS, read_questions
+from zsp_lite.course.widgets import self_check
+from zsp_lite.course.widgets.quiz import QUESTIONS, read_questions
 
 FILES = sorted(QUESTIONS.glob("*.json"))
 

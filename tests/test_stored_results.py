@@ -8,8 +8,8 @@ import pytest
 from tools import results_page
 from zsp_lite.benchmark.runs import read_run
 from zsp_lite.benchmark.statistics import object_draws
+from zsp_lite.io.files import REPOSITORY
 from zsp_lite.metrics import accuracy
-from zsp_lite.samples import REPOSITORY
 from zsp_lite.verified.verification import ScoreCoefficients
 from zsp_lite.viz.reliability import reliability
 

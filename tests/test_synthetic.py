@@ -11,15 +11,15 @@ from co3d_folders import contents
 from refusals import refused
 
 from tools.synthetic import SPLITS
+from zsp_lite.course.synthetic import export
+from zsp_lite.course.synthetic.assembly import make_shape
+from zsp_lite.course.synthetic.categories import CATEGORIES
+from zsp_lite.course.synthetic.export import export_categories, make_object, sequence_name, shape_turns
+from zsp_lite.course.synthetic.primitives import surface_spread
+from zsp_lite.course.synthetic.sequences import record_sequence, render_sequence, soft_mask, stereo_depth
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.io.files import stable_hash
-from zsp_lite.synthetic import export
-from zsp_lite.synthetic.assembly import make_shape
-from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.export import export_categories, make_object, sequence_name, shape_turns
-from zsp_lite.synthetic.primitives import surface_spread
-from zsp_lite.synthetic.sequences import record_sequence, render_sequence, soft_mask, stereo_depth
 
 ALL = {name: build for builders in (*SPLITS.values(), CATEGORIES) for name, build in builders.items()}
 SEED, FRAMES, SIZE = 5, 6, 72

@@ -10,15 +10,15 @@ import torch
 import torch.nn.functional as F
 from small_backbones import small_vit
 
-from zsp_lite.synthetic.assembly import make_shape, random_materials
-from zsp_lite.synthetic.categories import CATEGORIES
-from zsp_lite.synthetic.sequences import orbit_pose
-from zsp_lite.training import renders as rendering
-from zsp_lite.training.batches import crop_grids, sample_batch
-from zsp_lite.training.distillation import Distillation, DistillationConfig, distillation_loss
-from zsp_lite.training.objectives import attention_loss, correspondence_loss, losses
-from zsp_lite.training.renders import GRID, SIZE, VIEWS, render_object, render_set
-from zsp_lite.training.trainee import Trainee, initial_backbone
+from zsp_lite.course.synthetic.assembly import make_shape, random_materials
+from zsp_lite.course.synthetic.categories import CATEGORIES
+from zsp_lite.course.synthetic.sequences import orbit_pose
+from zsp_lite.course.training import renders as rendering
+from zsp_lite.course.training.batches import crop_grids, sample_batch
+from zsp_lite.course.training.distillation import Distillation, DistillationConfig, distillation_loss
+from zsp_lite.course.training.objectives import attention_loss, correspondence_loss, losses
+from zsp_lite.course.training.renders import GRID, SIZE, VIEWS, render_object, render_set
+from zsp_lite.course.training.trainee import Trainee, initial_backbone
 
 pytestmark = pytest.mark.slow
 

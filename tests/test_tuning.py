@@ -7,8 +7,7 @@ import pytest
 from refusals import refused
 
 from tools import tuning
-from tools.concepts import check_sides
-from tools.tuning import Outcome, fit_calibration, fit_weights, leave_out
+from tools.tuning import Outcome, check_sides, fit_calibration, fit_weights, leave_out
 from zsp_lite.verified.confidence import Calibration
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 

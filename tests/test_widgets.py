@@ -11,15 +11,15 @@ from refusals import refused
 
 from zsp_lite.alignment import Sim3, ransac, umeyama
 from zsp_lite.backbones.load import load_backbone
+from zsp_lite.course.true_matches import correct_matches
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.metrics import rotation_error
-from zsp_lite.synthetic.ground_truth import correct_matches
 
 pytest.importorskip("ipywidgets", reason="widgets are optional: pip install ipywidgets anywidget")
 matplotlib.use("agg")
 
 from tools import widget_examples as examples  # noqa: E402
-from zsp_lite.widgets import alignment, common, features, matching  # noqa: E402
+from zsp_lite.course.widgets import alignment, common, features, matching  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("closed_figures")]
 

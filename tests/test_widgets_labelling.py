@@ -9,15 +9,15 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3
+from zsp_lite.course.labelling import Labelling
 from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
-from zsp_lite.labelling import Labelling
 from zsp_lite.metrics import rotation_error
 
 pytest.importorskip("anywidget", reason="the labelling widget is optional: pip install anywidget")
 
-from zsp_lite.widgets.cloud_view import point_under, view_units  # noqa: E402
-from zsp_lite.widgets.labelling import label_poses  # noqa: E402
+from zsp_lite.course.widgets.cloud_view import point_under, view_units  # noqa: E402
+from zsp_lite.course.widgets.labelling import label_poses  # noqa: E402
 
 TURN = Rotation.random(random_state=4).as_matrix()
 

@@ -1,12 +1,9 @@
 """Conversion of AC3D models, FlightGear's format, to OBJ files with materials and textures.
 
-    python tools/ac3d.py MODEL.ac OUT.obj [TEXTURE_FOLDER ...]
-
 Textures are looked for beside the model and in the given folders, and written as PNG beside the OBJ file.
 """
 
 import shlex
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +20,8 @@ class Ac3dObject:
 
     vertices: np.ndarray  # (v, 3)
     texture: str | None  # its name
-    faces: list[
-        tuple[int, list[tuple[int, float, float]]]
-    ]  # polygons: index of the material, (vertex, u, v) of corners
+    # Polygons: index of the material, (vertex, u, v) of corners
+    faces: list[tuple[int, list[tuple[int, float, float]]]]
 
 
 def read_ac3d(path: Path) -> tuple[list[dict[str, list[float]]], list[Ac3dObject]]:
@@ -147,7 +143,3 @@ def _write_texture(texture: str, model: Path, out: Path, folders: Sequence[Path]
                 image.convert("RGBA").save(out / written)
             return written
     raise InputError(f"model {model} lacks its texture {name!r}")
-
-
-if __name__ == "__main__":
-    convert(Path(sys.argv[1]), Path(sys.argv[2]), [Path(folder) for folder in sys.argv[3:]])

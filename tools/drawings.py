@@ -1,4 +1,4 @@
-"""The drawings of the course: `python -m tools.drawings` writes them as SVG to notebooks/figures/.
+"""The drawings of the course: `python -m tools.drawings` writes them as SVG to notebooks/figures/ and docs/rooms.svg.
 
 One picture of the whole method (`method.svg`), a strip of its stages for the top of each notebook (`here_NN.svg`), and
 small drawings of single ideas. Two chairs made of boxes play the reference (blue) and the target (orange). The colours
@@ -6,7 +6,7 @@ are those of the figures (Okabe and Ito), and a white ground makes the drawings 
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -16,9 +16,11 @@ import numpy as np
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.path import Path as Polygon
 
+from tools.rooms import ROOMS, flows
 from zsp_lite.viz.plots import BLUE, GREEN, ORANGE, VERMILLION
 
 FOLDER = Path(__file__).parents[1] / "notebooks" / "figures"
+ROOMS_FILE = FOLDER.parents[1] / "docs" / "rooms.svg"
 INK, GREY, PALE, LINE = "#1A1A1A", "#595959", "#F4F4F1", "#B8B8B0"
 SKY, PINK = "#56B4E9", "#CC79A7"
 WIDTH = 940  # of the two large drawings, in pixels
@@ -350,20 +352,15 @@ def draw_depth(words: bool = True) -> str:
     return drawn + polygon(np.array([[100, 51], [100, 65], [114, 58]]), INK)
 
 
-def _matched() -> tuple[np.ndarray, np.ndarray]:
-    """Five points and their partners after a rotation; the last is a wrong match."""
+@cache
+def draw_fit(words: bool = True) -> str:
     first = np.array([[20, 24], [66, 18], [18, 70], [62, 66], [40, 94]], float)
     angle = np.radians(18)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     second = (first - first.mean(0)) @ turn.T * 0.95 + [158, 56]
-    second[4] = [196, 18]
-    return first, second
-
-
-@cache
-def draw_fit(words: bool = True) -> str:
+    second[4] = [196, 18]  # a wrong match
     drawn = ""
-    for i, (a, b) in enumerate(zip(*_matched(), strict=True)):
+    for i, (a, b) in enumerate(zip(first, second, strict=True)):
         wrong = i == 4
         drawn += curve(straight(a, b, 6), VERMILLION if wrong else GREEN, 1.8, "4 4" if wrong else None)
         if wrong:
@@ -668,13 +665,6 @@ def draw_frames() -> str:
     )  # fmt: skip
 
 
-def move(points: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Move points (N, 2) by the best rotation and translation from x to y."""
-    a, b = x - x.mean(0), y - y.mean(0)
-    u, _, vt = np.linalg.svd(b.T @ a)
-    return (points - x.mean(0)) @ (u * [1, np.sign(np.linalg.det(u @ vt))] @ vt).T + y.mean(0)
-
-
 def _frame_of(chair: Chair) -> np.ndarray:
     """Return the corners (10, 3) of a chair: feet, seat and top, back before front; left and right alternate."""
     feet = np.array([chair[f"leg {side}{end}"][0] for end in ("", " front") for side in ("left", "right")]) * [1, 1, 0]
@@ -773,7 +763,9 @@ def draw_ransac() -> str:
     for i, title in enumerate(("A sample with wrong matches", "A sample of right matches", "Fitted to all inliers")):
         left = 10 + panel * i
         sample = np.array(samples[i]) if i < 2 else good
-        moved = move(x, x[sample], y[sample])
+        a, b = x[sample].mean(0), y[sample].mean(0)
+        u, _, vt = np.linalg.svd((y[sample] - b).T @ (x[sample] - a))
+        moved = (x - a) @ (u * [1, np.sign(np.linalg.det(u @ vt))] @ vt).T + b
         inside = np.linalg.norm(moved - y, axis=1) < radius
         good = np.flatnonzero(inside)
         picture = ""
@@ -841,6 +833,56 @@ def _phone(place: np.ndarray, towards: np.ndarray) -> str:
     return polygon(view, PALE, LINE) + polygon(body, ORANGE)
 
 
+# The rooms of the library
+
+
+def _types(names: Iterable[str]) -> list[str]:
+    """Return the first of the types among imported names, at most two, in at most three lines of 11 letters."""
+    lines = []
+    for name in [name for name in names if name[0].isupper() and not name.isupper()][:2]:
+        own = [""]
+        for part in re.findall("[A-Z][a-z0-9]*", name):
+            if len(own[-1] + part) > 11:
+                own.append("")
+            own[-1] += part
+        if len(lines + own) <= 3:
+            lines += own
+    return lines
+
+
+def draw_rooms() -> str:
+    """Draw the rooms on a diagonal; what one gives to another is at the right of the one and above the other."""
+    across, down, wide, high = 74, 50, 68, 40
+    centre = {room: np.array([51 + across * i, 34 + down * i]) for i, room in enumerate(ROOMS)}
+    wires = parcels = boxes = ""
+    for (giver, taker), names in sorted(flows().items()):
+        (x, _), (_, y) = centre[taker], centre[giver]
+        wires += curve(straight(centre[giver], (x, y)) + straight((x, y), centre[taker]), LINE, 1.2)
+        wires += curve(f"M{x} {centre[taker][1] - high / 2 - 8:g}v7", GREY, 1.6, head=True)
+        lines = _types(sorted(names, key=lambda name: (-names[name], name)))
+        ground = rect(x - wide / 2, y - high / 2, wide, high, "white", LINE, 1, 3)
+        parcels += ground if lines else dot(np.array([x, y]), GREY)
+        for i, line in enumerate(lines):
+            parcels += text(line, x, y + 4 + 11 * (i - (len(lines) - 1) / 2), 10, anchor="middle")
+    for room, (x, y) in centre.items():
+        boxes += rect(x - wide / 2, y - high / 2, wide, high, mix(SKY, "white", 0.3), BLUE, 1.5, 5)
+        boxes += text(room, x, y + 4, 12, anchor="middle", bold=True)
+    words = (
+        "A room gives what is at its right, and takes what is above it.",
+        "Shown are the types that are imported most; a dot: functions or constants only.",
+        "Nothing flows back: the half below the rooms is empty.",
+        "",
+        *(f"{room}: {modules.replace(' ', ', ')}" for room, modules in ROOMS.items() if room != modules),
+    )
+    foot = down * len(ROOMS)
+    legend = text("The rooms of zsp_lite", 20, foot - 18 * len(words) - 8, 15, bold=True)
+    legend += "".join(text(line, 20, foot - 18 * (len(words) - 1 - i), 13) for i, line in enumerate(words))
+    return svg(
+        wires + parcels + boxes + legend, 102 + across * (len(ROOMS) - 1), foot + 18, "The rooms of the library",
+        "The rooms on a diagonal, and the types that flow from each room to those after it, as the imports say.",
+    )  # fmt: skip
+
+
 DRAWINGS: dict[str, Callable[[], str]] = {
     "method": draw_method,
     "query_key_value": draw_query_key_value,
@@ -855,9 +897,9 @@ DRAWINGS: dict[str, Callable[[], str]] = {
 
 
 def main() -> None:
-    FOLDER.mkdir(exist_ok=True)
     for name, draw in DRAWINGS.items():
         (FOLDER / f"{name}.svg").write_text(draw(), encoding="utf-8")
+    ROOMS_FILE.write_text(draw_rooms(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     apt-get download sweethome3d-furniture flightgear-data-ai
     mkdir packages
     for file in *.deb; do dpkg-deb -x $file packages/${file%%_*}; done
-    python tools/models.py tools/artists.json packages outputs/artists_models
+    python -m tools.models tools/artists.json packages outputs/artists_models
 
 A catalogue names every model: package, file, licence, author and orientation. `artists.json` is that of the evaluation
 preset `artists`, `samples.json` that of `data_samples/`, `training.json` that of training, and `validation.json` that
@@ -19,14 +19,10 @@ from pathlib import Path
 
 import msgspec
 
+from tools.ac3d import convert
+from zsp_lite.course.synthetic.meshes import MODELS_FILE, ModelInfo
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import plain_name, read_json, write_atomic
-from zsp_lite.synthetic.meshes import MODELS_FILE, ModelInfo
-
-try:
-    from tools.ac3d import convert
-except ModuleNotFoundError:  # run as a script
-    from ac3d import convert
 
 LICENCES = {
     "CC0 1.0": "https://creativecommons.org/publicdomain/zero/1.0/",
@@ -57,22 +53,16 @@ class Source(msgspec.Struct, frozen=True, omit_defaults=True):
             raise InputError(f"{path} is missing, expected the unpacked package {self.package}")
         return path
 
-    def check(self, data: bytes, where: Path) -> bytes:
-        """Return the content of the work. Raises InputError if its checksum is another one."""
-        found = hashlib.sha256(data).hexdigest()
-        if found != self.sha256:
-            raise InputError(f"{where} {self.member}: checksum {found}, expected {self.sha256} as in the catalogue")
-        return data
-
     def read(self, packages: Path) -> bytes:
         """Return the content of the work. Raises InputError if it is missing or another one."""
         path = self.path(packages)
-        if not self.member:
-            return self.check(path.read_bytes(), path)
-        with zipfile.ZipFile(path) as files:
-            if self.member not in files.namelist():
-                raise InputError(f"{path} has no {self.member}")
-            return self.check(files.read(self.member), path)
+        place = zipfile.Path(path, self.member) if self.member else path
+        if not place.is_file():
+            raise InputError(f"{path} has no {self.member}")
+        data = place.read_bytes()
+        if (found := hashlib.sha256(data).hexdigest()) != self.sha256:
+            raise InputError(f"{path} {self.member}: checksum {found}, expected {self.sha256} as in the catalogue")
+        return data
 
 
 class Entry(Source, frozen=True, omit_defaults=True):
@@ -163,7 +153,4 @@ def _extract(archive: Path, entry: Entry, model: bytes, target: Path, name: str)
 if __name__ == "__main__":
     if len(sys.argv) != 4:
         sys.exit(__doc__)
-    try:
-        build(Path(sys.argv[2]), Path(sys.argv[3]), read_catalogue(Path(sys.argv[1])))
-    except InputError as error:
-        sys.exit(str(error))
+    build(Path(sys.argv[2]), Path(sys.argv[3]), read_catalogue(Path(sys.argv[1])))

@@ -9,8 +9,7 @@ import re
 from zsp_lite.benchmark.runs import read_run
 from zsp_lite.benchmark.tables import PAPER, Table, as_markdown, every_table
 from zsp_lite.choices import METRICS
-from zsp_lite.io.files import write_atomic
-from zsp_lite.samples import REPOSITORY
+from zsp_lite.io.files import REPOSITORY, write_atomic
 
 RUNS = REPOSITORY / "notebooks" / "results" / "paper_run"
 PAGE = REPOSITORY / "docs" / "results.md"

@@ -3,32 +3,25 @@
 All estimates are of one pair of the sample data with five target views. Times are medians; run it on an idle machine.
 """
 
-import gzip
-import json
 import resource
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.data.annotations import FRAMES_FILE, SEQUENCES_FILE
+from zsp_lite.course.demo import example_pair
+from zsp_lite.course.samples import sample_data
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.demo import example_pair
-from zsp_lite.features import log_bin
 from zsp_lite.matching import similarities
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.samples import sample_data
 
-REPEATS, FRAMES = 7, 86_000
+REPEATS = 7
 
 
 def seconds(function: Callable[[], object], repeats: int = REPEATS) -> float:
@@ -39,17 +32,6 @@ def seconds(function: Callable[[], object], repeats: int = REPEATS) -> float:
         function()
         times.append(time.perf_counter() - start)
     return float(np.median(times[1:]))
-
-
-def write_category(root: Path, frames: int) -> None:
-    """Write the annotations of a made-up category: those of a sample frame, in sequences of 100 frames."""
-    folder = root / "category"
-    folder.mkdir()
-    source = next(sample_data().glob(f"*/{FRAMES_FILE}"))
-    entry = json.loads(gzip.decompress(source.read_bytes()))[0]
-    copies = (entry | {"sequence_name": f"sequence_{i // 100}", "frame_number": i % 100} for i in range(frames))
-    (folder / FRAMES_FILE).write_bytes(gzip.compress(json.dumps(list(copies)).encode(), compresslevel=1))
-    (folder / SEQUENCES_FILE).write_bytes(gzip.compress(b"[]"))
 
 
 def one_estimate() -> None:
@@ -81,19 +63,12 @@ def main() -> None:
     report("reading and features, per frame", 1000 * seconds(lambda: method.views([dataset.load(frame)])))
 
     keys = [torch.randn(28, 28, 384, generator=torch.Generator().manual_seed(i)) for i in range(6)]
-    first, second = (log_bin(one[None])[0].flatten(0, 1) for one in keys[:2])
     fast = seconds(lambda: similarities(keys[0], keys[1:]))
-    loop = 5 * len(first) * seconds(lambda: F.cosine_similarity(first[:1], second))  # of one descriptor, scaled
     report("similarity of log-binned descriptors, 5 targets", 1000 * fast)
-    report("the same by a loop over the descriptors, times", loop / fast, "x")
 
     command = [sys.executable, "-c", "from tools.speed import one_estimate; one_estimate()"]
     peak = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     report("peak memory of a process that makes one estimate", int(peak) / 1e9, "GB")
-    with TemporaryDirectory() as folder:
-        write_category(Path(folder), FRAMES)
-        opened = seconds(lambda: Co3D(folder).frame_list("category"), 3)
-    report(f"opening a CO3D category of {FRAMES:,} annotated frames", opened, "s")
 
 
 if __name__ == "__main__":

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from tools.training_categories import TRAINING
 from tools.validation_categories import VALIDATION
+from zsp_lite.course.synthetic.export import export_categories
+from zsp_lite.course.synthetic.sequences import HEIGHTS
 from zsp_lite.io.locks import writing
-from zsp_lite.synthetic.export import export_categories
-from zsp_lite.synthetic.sequences import HEIGHTS
 
 SPLITS = {"training": TRAINING, "validation": VALIDATION}
 

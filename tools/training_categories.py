@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from zsp_lite.synthetic.assembly import Assembly, disc
-from zsp_lite.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
+from zsp_lite.course.synthetic.assembly import Assembly, disc
+from zsp_lite.course.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
 
 
 def quadruped(a: Assembly) -> None:

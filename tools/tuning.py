@@ -17,11 +17,11 @@ is correct is the softmax of their scores. They are fitted to hypotheses that th
 """
 
 import argparse
-import logging
+import csv
 import os
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass, replace
@@ -33,8 +33,8 @@ from typing import TypeVar
 import numpy as np
 import torch
 from jaxtyping import Float
+from tqdm import tqdm
 
-from tools.concepts import DATA_HELP, check_sides, folder_and_pairs
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.category import _build_nodes, compare_two, synchronise, world_hypotheses
 from zsp_lite.data.cameras import view_span
@@ -52,6 +52,7 @@ from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 from zsp_lite.views import View, usable_targets
 from zsp_lite.viz.reliability import reliability
 
+CONCEPTS = Path(__file__).with_name("concepts.csv")  # the side of every name of a category
 CORRECT_ANGLE = 30.0  # degrees
 # A hypothesis counts as correct to the degree exp(-(error / 12 degrees)^2); pairs without one above 0.3 are not used.
 _SOFT_ANGLE, _MIN_CORRECTNESS = 12.0, 0.3
@@ -70,7 +71,6 @@ _SETTINGS = {
     ),
 }  # fmt: skip
 _FRAMES = 1, 2, 4, 8  # reference frames of each object
-_log = logging.getLogger("zsp_lite.tuning")
 _Fit = TypeVar("_Fit")
 
 
@@ -92,11 +92,6 @@ class Outcome:
     def correctness(self) -> Float[np.ndarray, " m"]:
         """How correct each hypothesis is, in [0, 1]."""
         return np.exp(-np.square(self.errors / _SOFT_ANGLE))
-
-    @property
-    def informative(self) -> bool:
-        """Whether there are several hypotheses, one of them correct enough to learn from."""
-        return len(self.errors) > 1 and bool(self.correctness.max() > _MIN_CORRECTNESS)
 
     def ranked(self, weights: ScoreCoefficients) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Return by how many nats each different pose is below the best under the weights, and its error."""
@@ -130,7 +125,6 @@ def collect_outcomes(
 
     for n_targets, arc in settings:
         setting = f"{n_targets} views all around" if arc == ALL_AROUND else f"views within {arc:.0f} degrees"
-        found = []
         for pair in sample_pairs(dataset, category, pairs, n_targets, seed):
             targets = [view(pair.target_sequence, number) for number in pair.target_frames]
             if arc < ALL_AROUND:
@@ -138,10 +132,7 @@ def collect_outcomes(
                 targets = views_within(around, arc, np.random.default_rng(pair.seed))
             reference = view(pair.reference_sequence, pair.reference_frame)
             ends = labels[pair.reference_sequence], labels[pair.target_sequence]
-            found.append(solve_views(replace(method, seed=pair.seed), (name, setting), reference, targets, ends))
-        outcomes += found
-        accuracy = np.mean([one.errors[0] < CORRECT_ANGLE for one in found])
-        _log.info("%s: %d pairs of %s, Acc30 %.0f %%", name, len(found), setting, 100 * accuracy)
+            outcomes.append(solve_views(replace(method, seed=pair.seed), (name, setting), reference, targets, ends))
     return outcomes
 
 
@@ -251,31 +242,20 @@ def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> Sc
     Raises:
         InputError: No pair has a correct hypothesis among several.
     """
-    used = [one for one in outcomes if one.informative]
+    used = [one for one in outcomes if len(one.errors) > 1 and one.correctness.max() > _MIN_CORRECTNESS]
     if not used:
         raise InputError(f"{len(outcomes)} pairs, none with a correct hypothesis among several, expected some")
     std = np.concatenate([one.terms - one.terms.mean(axis=0) for one in used]).std(axis=0) + 1e-9
-    columns, correctness = [one.terms / std for one in used], [one.correctness for one in used]
-    return ScoreCoefficients(*(conditional_logit(columns, correctness, ridge) / std).tolist())
-
-
-def conditional_logit(
-    columns: Sequence[Float[np.ndarray, "_ k"]], correctness: Sequence[Float[np.ndarray, " _"]],
-    ridge: float,
-) -> Float[np.ndarray, " k"]:  # fmt: skip
-    r"""Fit weights w of hypotheses' columns x so that softmax(x w) is the probability of being correct.
-
-    Minimises -mean_pairs \log \sum_i softmax(x w)_i c_i + ridge |w|^2; c in [0, 1] is the `correctness`.
-    """
     # One row per pair, padded to the longest list with hypotheses of probability 0.
-    shape = len(columns), max(map(len, correctness))
-    x = torch.zeros(*shape, columns[0].shape[1], dtype=torch.float64)
+    shape = len(used), max(len(one.errors) for one in used)
+    x = torch.zeros(*shape, len(std), dtype=torch.float64)
     log_correctness = torch.full(shape, -torch.inf, dtype=torch.float64)
     padding = torch.full(shape, -torch.inf, dtype=torch.float64)
-    for row, (some, c) in enumerate(zip(columns, correctness)):
-        x[row, : len(c)] = torch.from_numpy(some - some.mean(axis=0))
-        log_correctness[row, : len(c)] = torch.from_numpy(np.log(c.clip(1e-12)))
-        padding[row, : len(c)] = 0
+    for row, one in enumerate(used):
+        number, columns = len(one.errors), one.terms / std
+        x[row, :number] = torch.from_numpy(columns - columns.mean(axis=0))
+        log_correctness[row, :number] = torch.from_numpy(np.log(one.correctness.clip(1e-12)))
+        padding[row, :number] = 0
     w = torch.zeros(x.shape[2], dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.LBFGS([w], max_iter=200, line_search_fn="strong_wolfe")
 
@@ -289,7 +269,7 @@ def conditional_logit(
 
     with torch.enable_grad():
         optimiser.step(loss)
-    return w.detach().numpy()
+    return ScoreCoefficients(*(w.detach().numpy() / std).tolist())
 
 
 def fit_calibration(
@@ -358,7 +338,6 @@ def report_weights(outcomes: Sequence[Outcome], present: ScoreCoefficients) -> l
         f"{len(outcomes)} pairs of {len({one.category for one in outcomes})} categories",
         *(f"{name:35s}{_accuracy(np.array(errors))}" for name, errors in rows),
         "fitted weights: " + ", ".join(f"{name} {value:.1f}" for name, value in asdict(fitted).items()),
-        *(f"  best {k} different poses: one is right in {_share(outcomes, present, k):.1f} %" for k in (1, 2, 3, 6)),
     ]
 
 
@@ -400,35 +379,42 @@ def _numbers(values: Sequence[float]) -> str:
     return ", ".join(f"{value:.3f}" for value in values)
 
 
-def _share(outcomes: Sequence[Outcome], weights: ScoreCoefficients, k: int) -> float:
-    return 100 * float(np.mean([(one.ranked(weights)[1][:k] < CORRECT_ANGLE).any() for one in outcomes]))
-
-
 def _accuracy(errors: Float[np.ndarray, " n"]) -> str:
-    return (
-        f"median {np.median(errors):.1f} degrees, Acc30 {100 * np.mean(errors < 30):.1f} %, "
-        f"Acc15 {100 * np.mean(errors < 15):.1f} %"
-    )
+    return f"median {np.median(errors):.1f} degrees, Acc30 {100 * np.mean(errors < 30):.1f} %"
 
 
-def _log_progress() -> None:
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+def folder_and_pairs(text: str) -> tuple[Path, int]:
+    """Parse a tool's argument FOLDER:PAIRS, a data folder and the number of pairs of each of its categories."""
+    folder, _, pairs = text.rpartition(":")
+    if not folder or not pairs.isdecimal() or int(pairs) < 1:
+        raise argparse.ArgumentTypeError(f"{text}: expected FOLDER:PAIRS, PAIRS at least 1")
+    return Path(folder), int(pairs)
+
+
+def check_sides(folders: Iterable[str | Path], side: str) -> None:
+    """Raise InputError if a data folder has a category that `concepts.csv` does not list for a side."""
+    with CONCEPTS.open(newline="") as file:
+        sides = {row["name"]: row["side"] for row in csv.DictReader(file)}
+    for folder in folders:
+        for category in Co3D(folder).categories():
+            if (found := sides.get(category.partition("-")[0], "no side")) != side:
+                raise InputError(f"{folder}: category {category} is for {found}, expected {side}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     parser = argparse.ArgumentParser(prog="python -m tools.tuning", description=__doc__.split("\n")[0])
     parser.add_argument("constants", choices=_SETTINGS, help="what to fit")
-    parser.add_argument("data", nargs="+", type=folder_and_pairs, metavar="FOLDER:PAIRS", help=DATA_HELP)
+    parser.add_argument("data", nargs="+", type=folder_and_pairs, metavar="FOLDER:PAIRS")
     given = parser.parse_args(arguments)
     fit = given.constants
     try:
         check_sides([folder for folder, _ in given.data], "training" if fit == "weights" else "validation")
         jobs = [(root, category, pairs) for root, pairs in given.data for category in Co3D(root).categories()]
-        with ProcessPoolExecutor(os.cpu_count(), initializer=_log_progress) as pool:
+        with ProcessPoolExecutor(os.cpu_count()) as pool:
             collect = collect_scans if fit == "scans" else collect_outcomes
             parts = pool.map(collect, *zip(*jobs), [_SETTINGS[fit]] * len(jobs))
-            outcomes = [one for part in parts for one in part]
+            outcomes = [one for part in tqdm(parts, "categories", len(jobs)) for one in part]
         report = report_weights if fit == "weights" else report_calibration
         print("\n".join(report(outcomes, ScoreCoefficients())))
         if fit == "scans":

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from zsp_lite.synthetic.assembly import Assembly, disc
-from zsp_lite.synthetic.primitives import box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
+from zsp_lite.course.synthetic.assembly import Assembly, disc
+from zsp_lite.course.synthetic.primitives import box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
 
 
 def _wheel(a: Assembly, x: float, y: float, radius: float, width: float, mirror: bool = True) -> None:

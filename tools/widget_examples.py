@@ -5,28 +5,25 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import load_backbone
+from zsp_lite.course.demo import demo_pairs
+from zsp_lite.course.labelling.session import Labelling
+from zsp_lite.course.samples import sample_data
+from zsp_lite.course.true_matches import GroundTruthPair, ground_truth_pair
+from zsp_lite.course.widgets import alignment as alignment_widgets
+from zsp_lite.course.widgets import features, labelling, masks, matching
+from zsp_lite.course.widgets.common import Widget
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import mask_to_bbox
-from zsp_lite.demo import demo_pairs
 from zsp_lite.estimates import match_points
-from zsp_lite.labelling.session import Labelling
 from zsp_lite.matching import key_similarities, match, similarity
-from zsp_lite.samples import sample_data
-from zsp_lite.synthetic.ground_truth import GroundTruthPair, ground_truth_pair
 from zsp_lite.views import View, extract_views
 from zsp_lite.viz.plots import match_pixels
-from zsp_lite.widgets import alignment as alignment_widgets
-from zsp_lite.widgets import features, labelling, masks, matching
-
-if TYPE_CHECKING:
-    from ipywidgets import VBox
 
 GRID = (28, 28)  # patches of zsp-tiny
 
@@ -45,7 +42,7 @@ def sample_views() -> tuple[View, View]:
     return reference, target
 
 
-def attention() -> "VBox":
+def attention() -> Widget:
     """`features.attention` on a sample object."""
     image, backbone = sample_pair().reference.rgb, _backbone()
     facets = features.all_facets(backbone, [image])
@@ -55,7 +52,7 @@ def attention() -> "VBox":
     return features.attention(image, queries, keys, GRID, backbone.model.num_heads)
 
 
-def patch_similarities() -> "VBox":
+def patch_similarities() -> Widget:
     """`features.patch_similarities` on a sample pair: the keys of two layers, and those of the last with context."""
     pair, (first, second) = sample_pair(), sample_views()
     tokens = features.all_facets(_backbone(), [pair.reference.rgb, pair.target.rgb])
@@ -64,17 +61,17 @@ def patch_similarities() -> "VBox":
     return features.patch_similarities(pair.reference.rgb, pair.target.rgb, sims, pair.cells, pair.valid)
 
 
-def saliency() -> "VBox":
+def saliency() -> Widget:
     """`features.saliency` on a sample object."""
     return features.saliency(sample_views()[0])
 
 
-def cycle() -> "VBox":
+def cycle() -> Widget:
     """`matching.cycle` on a sample pair."""
     return matching.cycle(*sample_views(), similarity(*(view.features for view in sample_views())))
 
 
-def ransac_settings() -> "VBox":
+def ransac_settings() -> Widget:
     """`alignment.ransac_settings` on a sample pair."""
     pair = sample_views()
     found = match(pair[0].features, pair[1].features)
@@ -82,13 +79,13 @@ def ransac_settings() -> "VBox":
     return alignment_widgets.ransac_settings(images, tuple(match_pixels(pair, found)), match_points(*pair, found))
 
 
-def one_outlier() -> "VBox":
+def one_outlier() -> Widget:
     """`alignment.one_outlier` on random points."""
     points = np.random.default_rng(0).normal(size=(12, 3))
     return alignment_widgets.one_outlier(points, points)
 
 
-def box_to_mask() -> "VBox":
+def box_to_mask() -> Widget:
     """`masks.box_to_mask` on a sample frame."""
     dataset = Co3D(sample_data())
     category = dataset.categories()[0]
@@ -96,7 +93,7 @@ def box_to_mask() -> "VBox":
     return masks.box_to_mask(frame, mask_to_bbox(frame.mask))
 
 
-def label_poses() -> "VBox":
+def label_poses() -> Widget:
     """`labelling.label_poses` on a temporary copy of a sample category, with four keypoints on two objects."""
     folder = TemporaryDirectory(prefix="zsp-lite-")
     category = Co3D(sample_data()).categories()[0]
@@ -112,7 +109,7 @@ def label_poses() -> "VBox":
     return box
 
 
-WIDGETS: dict[str, Callable[[], "VBox"]] = {
+WIDGETS: dict[str, Callable[[], Widget]] = {
     build.__name__: build
     for build in (
         attention, patch_similarities, saliency, cycle, ransac_settings, one_outlier, box_to_mask, label_poses,

@@ -16,12 +16,12 @@ Read the files in this order:
     points       points of the object
     estimates    the results, and the protocol of solvers
     metrics      rotation errors, medians and accuracies
-    demo         one pair of each category, from data folder to pose error
     own_objects  one pair of your own, from files to files
     category     all objects of a category in one frame, by the verified solver
 
-    data, backbones, viz, io, benchmark, baselines, labelling, importers, synthetic, training, widgets, cli
+    data, backbones, viz, io, benchmark, baselines, importers, cli
     verified     a solver beyond the paper that tests many poses in all target views
+    course       what the notebooks need besides: demo, samples, synthetic, labelling, training, widgets
 """
 
 import ast

@@ -16,14 +16,15 @@ import numpy as np
 import torch
 
 from zsp_lite import Backbone, Co3D, InputError, ZeroShotPose, load_backbone
+from zsp_lite.course.samples import sample_data
+from zsp_lite.course.true_matches import ground_truth_matches, patch_coordinates
 from zsp_lite.data.co3d import Pair
+from zsp_lite.data.ground_truth import object_poses
 from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.io.download import cache_folder, fetch
 from zsp_lite.metrics import rotation_error
 from zsp_lite.points import near_median
-from zsp_lite.samples import sample_data
-from zsp_lite.synthetic.ground_truth import ground_truth_matches, object_poses, patch_coordinates
 from zsp_lite.views import View
 
 # Of each category the first evaluation pair, whatever its result, and the next with an error below 15 degrees.

@@ -17,10 +17,10 @@ from docs.playground.build import stored_pairs, write_page_data
 from zsp_lite import Co3D, FeatureMap, ZeroShotPose, load_backbone
 from zsp_lite.alignment import ransac
 from zsp_lite.best_view import correspondence_score
-from zsp_lite.demo import run_pair
+from zsp_lite.course.demo import run_pair
+from zsp_lite.course.samples import sample_data
 from zsp_lite.matching import cyclical_distances, key_similarities, match, similarity
 from zsp_lite.metrics import rotation_error
-from zsp_lite.samples import sample_data
 
 DEFAULTS = {"saliency": 0.05, "binned": True, "cycle": True, "k": 50, "kmeans": True, "trials": 1000, "threshold": 0.2}
 SOLVE = """(chosen) => {

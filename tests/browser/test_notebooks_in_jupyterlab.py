@@ -32,7 +32,7 @@ def lab(browser, tmp_path_factory):
                 cell.outputs, cell.execution_count = [], None
         nbformat.write(notebook, path)
     python = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
-    check = new_code_cell('from zsp_lite.widgets import self_check\nself_check("00", 1)')
+    check = new_code_cell('from zsp_lite.course.widgets import self_check\nself_check("00", 1)')
     asking = new_notebook(cells=[new_markdown_cell("A formula, for MathJax: $x^2$"), check], metadata=python)
     nbformat.write(asking, folder / "notebooks" / "asking.ipynb")
     with reader.serve(folder / "notebooks", folder, folder / "data_samples") as running:

@@ -17,8 +17,7 @@ import torch
 
 from zsp_lite import __version__
 from zsp_lite.backbones.backbone import Backbone
-from zsp_lite.io.files import digest
-from zsp_lite.samples import REPOSITORY
+from zsp_lite.io.files import REPOSITORY, digest
 
 
 def described(value: Any) -> str:

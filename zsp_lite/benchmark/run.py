@@ -28,13 +28,13 @@ from zsp_lite.benchmark.problem import Answer, FrameStore, PairProblem, as_answe
 from zsp_lite.benchmark.runs import Call, ResultLine, Run, Settings, add_lines, open_run, read_lines, read_run
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.ground_truth import common_turns
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import category_pairs, labelled_categories, true_pose
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.io.files import digest, write_atomic
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, view_alignment
-from zsp_lite.synthetic.ground_truth import common_turns
 
 logger = logging.getLogger(__name__)
 

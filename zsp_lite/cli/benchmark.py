@@ -61,10 +61,10 @@ def benchmark(
         return _list_methods()
     from zsp_lite.benchmark.methods import resolve
     from zsp_lite.benchmark.run import evaluate, pairs_of_rows, write_reports
+    from zsp_lite.course.samples import sample_data
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.exchange import write_questions
     from zsp_lite.data.pairs import labelled_categories
-    from zsp_lite.samples import sample_data
 
     if quiet:
         logging.getLogger("zsp_lite").setLevel(logging.WARNING)

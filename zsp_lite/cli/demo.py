@@ -24,12 +24,12 @@ def demo(data, solver, backbone, out) -> None:
 
     from zsp_lite.backbones.load import as_backbone
     from zsp_lite.cli.terminal import print_rows
+    from zsp_lite.course.demo import run_demo
+    from zsp_lite.course.photograph import photograph_section, run_photograph
+    from zsp_lite.course.samples import sample_data
+    from zsp_lite.course.synthetic.export import RENDERED_FILE, SETTINGS_FILE
     from zsp_lite.data.co3d import Co3D
-    from zsp_lite.demo import run_demo
     from zsp_lite.io.locks import writing
-    from zsp_lite.samples import sample_data
-    from zsp_lite.synthetic.export import RENDERED_FILE, SETTINGS_FILE
-    from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, photograph_rows, run_photograph
     from zsp_lite.viz.report import COLUMNS, legend, table_rows, write_overview, write_report
 
     folder = data or sample_data()
@@ -37,13 +37,14 @@ def demo(data, solver, backbone, out) -> None:
     note = next((text for file, text in notes.items() if (folder / file).is_file()), USER_NOTE)
     with writing(out), Console().status("estimating poses"):
         dataset, model = Co3D(folder), as_backbone(backbone)
-        photograph = list(run_photograph(dataset, model))
+        found = list(run_photograph(dataset, model))
+        photograph = photograph_section(found) if found else None
         results = list(run_demo(dataset, model, SOLVERS[solver]))
         path = write_report(out / "report.html", results, getattr(model, "name", ""), str(folder), note, photograph)
         write_overview(out / "overview.jpg", results)
     if photograph:
-        title = f"Photographed motorcycle: directions from the rendered {photograph[0].sequence}, compared by eye"
-        print_rows(title, PHOTOGRAPH_COLUMNS, photograph_rows(photograph), texts=2)
+        title = f"Photographed motorcycle: directions from the rendered {photograph.sequence}, compared by eye"
+        print_rows(title, photograph.columns, photograph.rows, texts=2)
     rows = [row for result in results for row in table_rows(result)]
     print_rows(f"One pair per category in {folder}, backbone {model.name}", COLUMNS, rows, texts=2)
     print(legend(), f"Data: {note}", f"Report with pictures of every stage: {path}", sep="\n")

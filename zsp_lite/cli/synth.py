@@ -38,8 +38,8 @@ def synth(preset, categories, models_folder, seed, out, **given) -> None:
     """
     if bool(preset) + bool(categories) + bool(models_folder) != 1:
         raise click.UsageError("expected either --preset or --category or --models")
+    from zsp_lite.course.synthetic.export import export_categories, export_models, export_preset
     from zsp_lite.io.locks import writing
-    from zsp_lite.synthetic.export import export_categories, export_models, export_preset
 
     sequences, frames, left_out = given["sequences"] or 4, given["frames"] or 24, {}
     with writing(out):

@@ -17,6 +17,7 @@ import msgspec
 
 from zsp_lite.errors import InputError
 
+REPOSITORY = Path(__file__).resolve().parents[2]  # of an installed copy: the folder of the packages
 MAX_FILE = 1 << 30  # bytes of a file that is read at once, and of what is decompressed from it
 MAX_WEIGHTS = 4 << 30  # bytes of a file of weights
 # Compressed data may grow to this many bytes, or by this factor if that is more. Annotations grow by 10.

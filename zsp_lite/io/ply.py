@@ -2,7 +2,6 @@
 
 import ctypes
 import functools
-import io
 import os
 import sys
 from pathlib import Path
@@ -15,6 +14,11 @@ from zsp_lite.io.files import read_bytes, write_atomic
 
 _VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])
 _PROPERTIES = [*(f"float {one}" for one in "x y z nx ny nz".split()), "uchar red", "uchar green", "uchar blue"]
+# The names of PLY for numpy's types; some programs write numpy's own, such as float32.
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8",
+}  # fmt: skip
 
 
 def write_ply(
@@ -36,19 +40,54 @@ def write_ply(
 
 def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
     """Read the positions and 8-bit colours (None if there are none) of a PLY file; InputError if it is damaged."""
-    from trimesh.exchange.ply import load_ply  # takes 0.5 s to import
-    from trimesh.visual.color import to_rgba
-
     data = read_bytes(path, "point cloud")
     try:
-        loaded = load_ply(io.BytesIO(data), fix_texture=False, skip_materials=True)
-        points, colours = loaded["vertices"].astype(np.float64), loaded["vertex_colors"]
-        if colours is not None:
-            colours = to_rgba(colours)[:, :3]
-    except Exception as error:  # trimesh raises IndexError, KeyError and others for malformed files
+        columns = _vertex_columns(data)
+        points = np.stack([columns[axis] for axis in "xyz"], axis=-1).astype(np.float64)
+        colours = _colours(columns)
+    except Exception as error:  # ValueError, KeyError, TypeError and others, whatever is malformed
         raise InputError(f"point cloud {path} ({len(data)} bytes) is not a complete PLY file: {error!r}") from error
     check_magnitude(f"point cloud {path}", points)
     return points, colours
+
+
+def _vertex_columns(data: bytes) -> dict[str, np.ndarray]:
+    """Return the properties of the vertices, which must be the first element of a PLY file. ValueError and others."""
+    header, _, rest = data.partition(b"end_header")
+    body = rest[rest.index(b"\n") + 1 :]
+    encoding, elements, types = "", [], {}
+    for line in header.decode("latin-1").splitlines():
+        match line.split():
+            case ["format", encoding, _]:
+                pass
+            case ["element", name, count]:
+                elements.append((name, int(count)))
+            case ["property", kind, name] if len(elements) == 1:
+                types[name] = np.dtype(_TYPES.get(kind, kind))
+            case ["property", *_] if len(elements) == 1:
+                raise ValueError(f"{line!r} for a vertex, expected one value")
+    (name, count), *others = elements
+    if name != "vertex" or count < 1:
+        raise ValueError(f"{count} x {name!r} first, expected vertices")
+    if encoding == "ascii":
+        table = np.array(body.split()[: count * len(types)], np.float64).reshape(count, len(types))
+        return {name: column.astype(kind) for (name, kind), column in zip(types.items(), table.T)}
+    order = {"binary_little_endian": "<", "binary_big_endian": ">"}[encoding]
+    vertex = np.dtype([(name, kind.newbyteorder(order)) for name, kind in types.items()])
+    if not others and len(body) != count * vertex.itemsize:
+        raise ValueError(f"{len(body)} bytes for {count} vertices of {vertex.itemsize}")
+    vertices = np.frombuffer(body, vertex, count)
+    return {name: vertices[name] for name in types}
+
+
+def _colours(columns: dict[str, np.ndarray]) -> UInt8[np.ndarray, "n 3"] | None:
+    """Return the colours of vertices, integers of 8 bits or numbers from 0 to 1; None if they have none."""
+    if not {"red", "green", "blue"} <= columns.keys():
+        return None
+    colours = np.stack([columns[name] for name in ("red", "green", "blue")], axis=-1)
+    if colours.dtype.kind == "f":
+        colours = (np.where(np.isfinite(colours), colours, 0) * 255).clip(0, 255).round()
+    return colours.astype(np.uint8)
 
 
 @functools.cache

@@ -7,10 +7,10 @@ follows the colour scheme of the browser: figures are transparent, with text in 
 import base64
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -22,11 +22,9 @@ from plotly.offline import get_plotlyjs
 from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.estimates import PairResult, PoseEstimate
-from zsp_lite.io.files import write_atomic
+from zsp_lite.io.files import REPOSITORY, write_atomic
 from zsp_lite.matching import cyclical_distances, similarity
-from zsp_lite.samples import REPOSITORY
 from zsp_lite.viz import category_sheet, plots
-from zsp_lite.viz.photograph import PHOTOGRAPH_COLUMNS, PhotographResult, photograph_figure, photograph_rows
 from zsp_lite.viz.pose_picture import pose_picture
 from zsp_lite.viz.scene3d import aligned_clouds
 from zsp_lite.viz.votes import ring_figure, votes_figure
@@ -42,6 +40,15 @@ _RIGHT = 30.0  # degrees; a pose with a smaller error is marked as right
 _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark ground
 _TEMPLATES = Environment(loader=PackageLoader("zsp_lite.viz"), autoescape=True, undefined=StrictUndefined)
 _COLOURED = "text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"
+
+
+class PhotographSection(NamedTuple):
+    """What the page of the demo shows of a photographed motorcycle, whose directions a synthetic one tells."""
+
+    sequence: str  # of the synthetic motorcycle
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    draw: Callable[[], Figure]  # called with the colours of the page
 
 
 def write_pair_report(path: Path, result: PairResult) -> Path:
@@ -73,18 +80,16 @@ def write_report(
     backbone: str,
     data: str = "",
     data_note: str = "",
-    photograph: Sequence[PhotographResult] = (),
+    photograph: PhotographSection | None = None,
     own: bool = False,
 ) -> Path:
     """Write the page of the demo, or of a pair of the user's `own`."""
     with plt.rc_context(dict.fromkeys(_COLOURED, _GREY)):
         pairs = [_pair_parts(result, f"scene-{index}") for index, result in enumerate(results, 1)]
-        picture = _data_uri(photograph_figure(photograph)) if photograph else ""
+        picture = _data_uri(photograph.draw()) if photograph else ""
     page = _TEMPLATES.get_template("report.html").render(
         plotly=Markup(get_plotlyjs()), backbone=backbone, columns=COLUMNS, pairs=pairs, data=data, data_note=data_note,
-        own=own, photograph=photograph, photograph_columns=PHOTOGRAPH_COLUMNS,
-        photograph_rows=photograph_rows(photograph), photograph_picture=picture,
-        link=lambda name: _notebook_link(name, path.parent),
+        own=own, photograph=photograph, photograph_picture=picture, link=lambda name: _notebook_link(name, path.parent),
     )  # fmt: skip
     write_atomic(path, page.encode(errors="replace"))
     return path

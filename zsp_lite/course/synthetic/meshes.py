@@ -1,0 +1,268 @@
+"""Folders of models, `FOLDER/CATEGORY/NAME.obj` or `FOLDER/CATEGORY/NAME/FILE.obj`, as textured meshes.
+
+The optional file `models.json` gives the orientation and the origin of each model, see `ModelInfo`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from zsp_lite.course.synthetic.primitives import Mesh, joined, surface_spread, unit
+from zsp_lite.course.synthetic.textures import linear_to_srgb
+from zsp_lite.errors import InputError, check_magnitude, rotation_matrix
+from zsp_lite.io.files import file_size, plain_name, read_bytes, read_json
+
+EXTENSIONS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".dae")
+MAX_BYTES = 300_000_000  # of a model file
+MAX_FACES = 2_000_000
+_TEXTURE_SIZE = 1024  # longer side in pixels; larger textures are reduced
+_CREASE = np.cos(np.radians(40))  # edges sharper than this stay sharp
+_FACES_PER_POINT = 32  # that its normals take into account
+_INVISIBLE = 0.02  # opacity below which a face is removed
+MODELS_FILE = "models.json"
+_AXES = dict(zip(["+x", "+y", "+z", "-x", "-y", "-z"], np.vstack([np.eye(3), -np.eye(3)])))
+_Direction = Literal["+x", "-x", "+y", "-y", "+z", "-z"] | tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """Surface of a part of a mesh; its colour is the product of `colour`, `texture` and `pattern`, all sRGB."""
+
+    colour: Float[np.ndarray, "4"]  # with opacity, in [0, 1]; an opacity below 1 lets the room shine through
+    texture: UInt8[np.ndarray, "h w 4"] | None = None  # rows from top to bottom; opacity below 128 means a hole
+    pattern: Callable[[np.ndarray], np.ndarray] | None = None  # colours (n, 3) of points (n, 3) in object coordinates
+    specular: float = 0.04  # reflectance at normal incidence
+    roughness: float = 0.7  # as in glTF: 0 for a mirror, 1 for a matte surface
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedMesh:
+    """A triangle mesh with materials."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]  # indices of vertices
+    normals: Float[np.ndarray, "f 3 3"]  # unit shading normal of each corner of each face
+    uv: Float[np.ndarray, "f 3 2"]  # of each corner; (0, 0) is the lower left corner of the texture, which repeats
+    colours: Float[np.ndarray, "f 3 3"]  # sRGB in [0, 1] of each corner, a factor of the material's colour
+    material: Int[np.ndarray, " f"]  # index of each face
+    materials: tuple[Material, ...] = ()
+
+
+class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Entry of `models.json` for one model; every field is optional."""
+
+    front: _Direction | None = None  # in the axes of the file
+    up: _Direction | None = None
+    author: str = ""
+    licence: str = ""
+    source: str = ""
+    changes: str = ""  # with respect to the source
+
+    def axes(self, extension: str) -> Float[np.ndarray, "3 3"]:
+        """Return the rotation from the axes of the file to the canonical frame (front +x, left +y, up +z)."""
+        front, up = ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")  # the latter as in glTF
+        front, up = self.front or front, self.up or up
+        given = [_AXES[one] if isinstance(one, str) else np.array(one) for one in (front, up)]
+        x, z = (vector / max(np.linalg.norm(vector), 1e-6) for vector in given)
+        return rotation_matrix(f"front {front} and up {up}: the axes", np.stack([x, np.cross(z, x), z]))
+
+
+@dataclass(frozen=True)
+class Model:
+    """One model of a folder: its category, name, file and entry of `models.json`."""
+
+    category: str
+    name: str
+    path: Path
+    info: ModelInfo
+
+
+def list_models(folder: str | Path, front: str | None = None, up: str | None = None) -> list[Model]:
+    """Return the models of a folder by category and name; `front` and `up` where `models.json` does not give them."""
+    folder = Path(folder)
+    infos, models = read_infos(folder), {}
+    files = [(path.parent.name, path.stem, path) for path in folder.glob("*/*")]
+    files += [(path.parts[-3], path.parts[-2], path) for path in folder.glob("*/*/*")]
+    for category, name, path in sorted(files):
+        if path.suffix.lower() not in EXTENSIONS or not path.is_file():
+            continue
+        key = f"{category}/{name}"
+        if key in models:
+            raise InputError(f"model {key} has two files, {models[key].path.name} and {path.name}, expected one")
+        info = infos.pop(key, ModelInfo())
+        info = msgspec.structs.replace(info, front=info.front or front, up=info.up or up)
+        models[key] = Model(plain_name(category, "category"), plain_name(name, "model"), path, info)
+    if not models:
+        kinds = f"CATEGORY/NAME.EXT or CATEGORY/NAME/FILE.EXT with EXT one of {', '.join(EXTENSIONS)}"
+        raise InputError(f"{folder} {'holds no model' if folder.is_dir() else 'does not exist'}, expected {kinds}")
+    if infos:
+        raise InputError(f"{folder / MODELS_FILE} names {min(infos)!r}, which has no file in {folder}")
+    return [models[key] for key in sorted(models)]
+
+
+def read_infos(folder: str | Path) -> dict[str, ModelInfo]:
+    """Return the entries of a folder's `models.json` by "CATEGORY/NAME"; empty without the file."""
+    path = Path(folder) / MODELS_FILE
+    return read_json(path, dict[str, ModelInfo], "model list") if path.is_file() else {}
+
+
+def read_mesh(path: str | Path) -> TexturedMesh:
+    """Read a mesh file with its textures, in the axes and the unit of the file; InputError if it is unusable."""
+    import trimesh  # slow to import
+
+    path = Path(path)
+    file_size(path, "model", MAX_BYTES)
+    if missing := _missing(path):
+        raise InputError(f"model {path} lacks {missing}")
+    try:
+        scene = trimesh.load_scene(path, process=False)
+        placed = [scene.graph[node] for node in scene.graph.nodes_geometry]  # transforms and names of geometries
+        parts = [
+            _part(scene.geometry[name], transform)
+            for transform, name in placed
+            if len(getattr(scene.geometry[name], "faces", ()))
+        ]
+    except Exception as error:  # trimesh raises many types of exceptions for damaged files
+        raise InputError(f"model {path} cannot be read: {type(error).__name__}: {error}") from error
+    n_faces = [len(mesh.faces) for mesh, *_ in parts]
+    if not 0 < sum(n_faces) <= MAX_FACES:
+        raise InputError(f"model {path} has {sum(n_faces):,} faces, expected 1 to {MAX_FACES:,}")
+    meshes, uv, colours, materials = zip(*parts, strict=True)
+    (vertices, faces), material = joined(meshes), np.repeat(np.arange(len(parts)), n_faces)
+    check_magnitude(f"model {path}: vertices", vertices)
+    a, b, c = np.moveaxis(vertices[faces] / _size(vertices), 1, 0)
+    opacity = np.array([one.colour[3] for one in materials])
+    visible = (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12) & (opacity[material] >= _INVISIBLE)
+    if not visible.any():
+        raise InputError(f"model {path} has no visible face with an area")
+    used, faces = np.unique(faces[visible], return_inverse=True)
+    vertices, faces = vertices[used], faces.reshape(-1, 3)
+    uv, colours = (np.concatenate(corners)[visible] for corners in (uv, colours))
+    return TexturedMesh(vertices, faces, smooth_normals(vertices, faces), uv, colours, material[visible], materials)
+
+
+def canonical_mesh(mesh: TexturedMesh, rotation: Float[np.ndarray, "3 3"]) -> TexturedMesh:
+    """Rotate a mesh to front +x, left +y, up +z, centre its bounding box, and scale its surface to unit spread."""
+    vertices = mesh.vertices @ rotation.T
+    vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
+    spread = surface_spread(vertices, mesh.faces)
+    return replace(mesh, vertices=vertices / spread, normals=(mesh.normals @ rotation.T).astype(np.float32))
+
+
+def _missing(path: Path) -> str:
+    """Name what a file of this type needs and trimesh would not report: a package, or a file that it refers to."""
+    if path.suffix.lower() == ".dae" and not find_spec("collada"):
+        return "the package pycollada: pip install pycollada"
+    for name in _values(path, b"mtllib") if path.suffix.lower() == ".obj" else ():
+        library = path.parent / name
+        if not library.is_file():
+            return f"its material file {name!r}"
+        for texture in [*_values(library, b"map_kd"), *_values(library, b"map_d")]:
+            if not (library.parent / texture).is_file():
+                return f"its texture {texture!r}"
+    return ""
+
+
+def _values(path: Path, key: bytes) -> list[str]:
+    """Return the values of the lines that begin with a keyword."""
+    found = (line.strip().split(maxsplit=1) for line in read_bytes(path, "model").splitlines() if key in line.lower())
+    return [words[1].decode(errors="replace").strip() for words in found if len(words) == 2 and words[0].lower() == key]
+
+
+def _part(mesh, transform: np.ndarray) -> tuple[Mesh, np.ndarray, np.ndarray, Material]:
+    """Return one geometry of a trimesh scene, its texture coordinates and colours (f, 3, ...), and its material."""
+    faces, visual = np.asarray(mesh.faces, np.int64), mesh.visual
+    vertices = np.asarray(mesh.vertices, float) @ transform[:3, :3].T + transform[:3, 3]
+    uv, colours = np.zeros((len(faces), 3, 2), np.float32), np.ones((len(faces), 3, 3), np.float32)
+    material = Material(np.ones(4))
+    if visual.kind == "texture":
+        if visual.uv is not None and len(visual.uv) == len(vertices):
+            uv = np.nan_to_num(np.asarray(visual.uv, np.float32))[faces]
+        material = _material(visual.material)
+    elif visual.kind is None:
+        material = Material(np.array([0.6, 0.6, 0.6, 1.0]))
+    else:
+        colours = (np.asarray(visual.vertex_colors)[faces][..., :3] / 255).astype(np.float32)
+    return Mesh(vertices, faces), uv, colours, material
+
+
+def _material(given) -> Material:
+    """Convert a material of trimesh: Phong's of an OBJ or COLLADA file, or glTF's."""
+    if hasattr(given, "baseColorFactor"):
+        return _gltf_material(given)
+    colour, texture = _rgba(given.diffuse), _image(given.image)
+    if texture is not None and colour[:3].max() < 0.02:
+        colour[:3] = 1  # some exporters write black beside a texture, and mean white
+    keys = given.kwargs  # of the material file
+    opacity = keys["d"][-1] if "d" in keys else 1 - float(keys["tr"][-1]) if "tr" in keys else 1.0
+    colour[3] = np.clip(float(opacity), 0, 1)
+    specular = _rgba(given.specular)[:3].mean() if "ks" in keys else 0.2
+    # Phong's exponent n as roughness: n = 2 / roughness^4 - 2.
+    roughness = (2 / (max(float(given.glossiness), 1) + 2)) ** 0.25
+    return Material(colour, texture, specular=0.02 + 0.12 * float(specular), roughness=roughness)
+
+
+def _gltf_material(given) -> Material:
+    colour = np.ones(4) if given.baseColorFactor is None else _rgba(given.baseColorFactor)
+    colour[:3] = linear_to_srgb(colour[:3])
+    texture = _image(given.baseColorTexture)
+    if (given.alphaMode or "OPAQUE").upper() == "OPAQUE":
+        colour[3] = 1
+        if texture is not None:
+            texture[..., 3] = 255
+    factors = given.metallicFactor, given.roughnessFactor
+    metallic, roughness = (1.0 if factor is None else float(factor) for factor in factors)
+    if given.metallicRoughnessTexture is not None:
+        mean = _image(given.metallicRoughnessTexture).mean((0, 1)) / 255
+        metallic, roughness = metallic * float(mean[2]), roughness * float(mean[1])
+    return Material(colour, texture, specular=0.04 + 0.36 * metallic, roughness=roughness)
+
+
+def _rgba(colour) -> Float[np.ndarray, "4"]:
+    """Return a colour of three or four values in [0, 1]; bytes are divided by 255."""
+    colour = np.asarray(colour)
+    colour = colour / 255.0 if colour.dtype.kind in "ui" else colour.astype(float)
+    return np.clip(np.append(colour, 1.0)[:4], 0, 1)
+
+
+def _image(image) -> UInt8[np.ndarray, "h w 4"] | None:
+    """Return a PIL image as RGBA bytes, reduced to at most `_TEXTURE_SIZE` pixels along its longer side."""
+    if image is None:
+        return None
+    image = image.convert("RGBA")
+    image.thumbnail((_TEXTURE_SIZE, _TEXTURE_SIZE))
+    return np.array(image)
+
+
+def _size(vertices: np.ndarray) -> float:
+    """Return the longest side of the bounding box, at least a tiny one."""
+    return max(float(np.ptp(vertices, axis=0).max()), 1e-30)
+
+
+def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
+    """Return corner normals: the mean normal of the faces around the corner that meet at less than 40 degrees."""
+    size = _size(vertices)
+    a, b, c = np.moveaxis(vertices[faces] / size, 1, 0)
+    weighted = np.cross(b - a, c - a)  # by area
+    normal = unit(weighted)
+    # Corners in the order of their points, and in `first` the position of the first corner of the same point.
+    _, point = np.unique(np.round(vertices / size, 6), axis=0, return_inverse=True)
+    point = point.ravel()[faces.ravel()]
+    corner = np.argsort(point, kind="stable")
+    _, first, of, counts = np.unique(point[corner], return_index=True, return_inverse=True, return_counts=True)
+    face = corner // 3
+    total = np.zeros((len(corner), 3))
+    several = np.arange(len(corner))
+    for step in range(min(int(counts.max()), _FACES_PER_POINT)):  # every corner with the step-th corner of its point
+        several = several[counts[of[several]] > step]
+        other = face[first[of[several]] + step]
+        close = np.einsum("nd,nd->n", normal[face[several]], normal[other]) > _CREASE
+        total[corner[several[close]]] += weighted[other[close]]
+    normals = unit(np.where(total.any(1, keepdims=True), total, np.repeat(normal, 3, axis=0)))
+    return normals.reshape(-1, 3, 3).astype(np.float32)

@@ -1,0 +1,117 @@
+"""Training losses: correspondence, geometry per patch, and attention on the object.
+
+The losses use ground truth of the renderer for the views of one object. The object's proportions differ from view to
+view. No loss compares two objects or uses category names.
+"""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from zsp_lite.course.training.batches import Batch
+from zsp_lite.course.training.trainee import Trainee
+
+RADIUS = 0.15  # standard deviation of the correspondence targets, in object units
+TEMPERATURE = 0.1  # of the correspondence loss
+QUERIES = 256  # largest number of query patches per object
+
+
+def correspondence_loss(
+    descriptors: Float[Tensor, "crops n dim"], surface: Float[Tensor, "crops n 3"], objects: int,
+    radius: float, temperature: float, queries: int, generator: torch.Generator,
+) -> tuple[Tensor, float]:  # fmt: skip
+    """Compute InfoNCE between the views of each object, with soft targets by distance on its surface.
+
+    The target of a query patch is a distribution over the patches of the object's other views: a Gaussian of the
+    distance between the surface points with standard deviation `radius` (object units), 0 beyond 2.4 of these. At most
+    `queries` random patches of an object are queries. The descriptors are unit vectors, ordered by object and view.
+    The loss is the divergence from the targets, so that 0 is its minimum; the second result is the fraction of queries
+    whose nearest descriptor has a non-zero target.
+    """
+    crops, n, dim = descriptors.shape
+    views = crops // objects
+    z = descriptors.reshape(objects, views * n, dim)
+    points = surface.reshape(objects, views * n, 3)
+    view = torch.arange(views).repeat_interleave(n)
+    losses, hits = [], []
+    for k in range(objects):
+        on_object = (~points[k, :, 0].isnan()).nonzero()[:, 0]
+        query = on_object[torch.randperm(len(on_object), generator=generator)[:queries]]
+        if len(query) < 20:
+            continue
+        same_view = view[query][:, None] == view[None]
+        distance = torch.cdist(points[k, query], points[k].nan_to_num(nan=99.0))
+        target = torch.exp(-distance.square() / (2 * radius**2)).masked_fill(same_view, 0)
+        seen_again = target.amax(1) > 0.5
+        if seen_again.sum() < 5:
+            continue
+        target, query = target[seen_again], query[seen_again]
+        target = target * (target > 0.05)
+        target = target / target.sum(1, keepdim=True)
+        logits = (z[k, query] @ z[k].T / temperature).masked_fill(same_view[seen_again], -1e4)
+        losses.append(F.kl_div(logits.log_softmax(1), target, reduction="batchmean"))
+        hits.append((target.gather(1, logits.argmax(1, keepdim=True)) > 0).float().mean())
+    if not losses:
+        return descriptors.sum() * 0, 0.0
+    return torch.stack(losses).mean(), torch.stack(hits).mean().item()
+
+
+def geometry_loss(
+    prediction: Float[Tensor, "crops n 5"], geometry: Float[Tensor, "crops n 4"], on_object: Bool[Tensor, "crops n"]
+) -> Tensor:
+    """Compute the loss of predicted normals and relative depth (channels 0 to 3) and foreground logit (channel 4)."""
+    inside = on_object.float()
+    foreground = F.binary_cross_entropy_with_logits(prediction[..., 4], inside)
+    error = F.smooth_l1_loss(prediction[..., :4], geometry, beta=0.3, reduction="none").mean(-1)
+    return foreground + 2 * (error * inside).sum() / inside.sum().clamp_min(1)
+
+
+def attention_loss(
+    cls_logits: Float[Tensor, "crops heads tokens"], coverage: Float[Tensor, "crops n"]
+) -> tuple[Tensor, float]:
+    """Compute the loss of the CLS attention, averaged over heads, against the rendered mask; and an IoU.
+
+    The target is uniform on the object and zero elsewhere. The loss is the divergence between the normalised mask and
+    the attention over patches, plus a cross-entropy that separates object and background at 0.12 times the mean
+    attention on the object. The mean IoU is that of the mask with min-max normalised attention above 0.05.
+    """
+    attention = cls_logits.softmax(-1)[..., 1:].mean(1)
+    attention = attention / attention.sum(1, keepdim=True)
+    visible = coverage.sum(1) > 2
+    if not visible.any():
+        return cls_logits.sum() * 0, 0.0
+    attention, coverage = attention[visible].clamp_min(1e-8), coverage[visible]
+    target = coverage / coverage.sum(1, keepdim=True)
+    spread = F.kl_div(attention.log(), target, reduction="batchmean")
+    level = (attention * coverage).sum(1, keepdim=True) / coverage.sum(1, keepdim=True)
+    side = F.binary_cross_entropy_with_logits(attention.log() - (0.12 * level.detach()).log(), coverage)
+    with torch.no_grad():
+        low, high = attention.amin(1, keepdim=True), attention.amax(1, keepdim=True)
+        found, truth = (attention - low) / (high - low + 1e-12) > 0.05, coverage > 0.25
+        iou = ((found & truth).sum(1) / (found | truth).sum(1).clamp_min(1)).mean().item()
+    return spread + 0.25 * side, iou
+
+
+def losses(
+    model: Trainee, batch: Batch, generator: torch.Generator, helpers: float = 0.4
+) -> tuple[Tensor, dict[str, float]]:
+    """Compute the correspondence loss plus `helpers` times the geometry and attention losses of one batch.
+
+    The figures are the value of each loss, the match accuracy and the IoU of the saliency. The model's running mean of
+    the keys is updated.
+    """
+    out = model(batch.images)
+    on_object = ~batch.surface[..., 0].isnan()
+    geometry = 0.5 * sum(
+        geometry_loss(head(features), batch.geometry, on_object)
+        for head, features in ((model.geometry_of_tokens, out.tokens[:, 1:]), (model.geometry_of_keys, out.key_input))
+    )
+    attention, iou = attention_loss(out.cls_logits, batch.coverage)
+    descriptors = F.normalize(model.centred(out.keys, update_mean=True), dim=-1)
+    match, accuracy = correspondence_loss(
+        descriptors, batch.surface, batch.objects, RADIUS, TEMPERATURE, QUERIES, generator
+    )
+    total = match + helpers * (geometry + attention)
+    figures = {"loss": total, "match": match, "geometry": geometry, "attention": attention}
+    return total, {name: value.item() for name, value in figures.items()} | {"accuracy": accuracy, "iou": iou}

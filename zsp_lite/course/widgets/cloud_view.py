@@ -1,0 +1,148 @@
+"""A point cloud that the user can rotate and click, on a plain canvas without WebGL or network.
+
+The browser draws the points and sends clicks (`cloud_view.js`). Python finds the clicked point in the full cloud.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, Real, UInt8
+from scipy.spatial import KDTree
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.course.widgets.common import load_package
+from zsp_lite.errors import InputError
+from zsp_lite.viz.plots import BLUE, ORANGE
+
+MAX_POINTS = 6000  # points drawn; more are slow in the browser
+_DEPTH_TOLERANCE = 0.15  # points farther behind the front point under the pointer cannot be clicked; in view units
+
+_STYLE = """
+.zsp-cloud { border: 1px solid #888; background: white; cursor: crosshair; touch-action: none; }
+.zsp-cloud:focus { outline: 3px solid #0072B2; outline-offset: -3px; }
+"""
+
+
+def view_units(points: Real[np.ndarray, "n 3"]) -> Sim3:
+    """Return the similarity from the world to view units: the ball around a cloud becomes the unit ball.
+
+    The ball is from the 1st to the 99th percentile along each axis, robust to outliers.
+    """
+    low, high = np.percentile(points, [1, 99], axis=0) if len(points) else np.zeros((2, 3))
+    radius = float(np.linalg.norm(high - low)) / 2
+    if not radius >= 1e-12:  # not, because of NaN
+        raise InputError(f"point cloud of {len(points)} points has no extent, expected an object of finite points")
+    return Sim3(1 / radius, np.eye(3), -(low + high) / 2 / radius)
+
+
+def subsample(points: Real[np.ndarray, "n 3"], most: int = MAX_POINTS) -> Int[np.ndarray, " m"]:
+    """Return the indices of at most `most` points, neighbours after each other, as the slider goes through them."""
+    kept = np.arange(len(points))
+    if len(points) > most:
+        kept = np.random.default_rng(0).choice(len(points), most, replace=False)
+    return kept[KDTree(points[kept]).indices]  # leaf by leaf
+
+
+def point_under(
+    points: Float[np.ndarray, "n 3"], view: Real[np.ndarray, "3 3"], at: Real[np.ndarray, "2"], reach: float
+) -> int | None:
+    """Return the index of the clicked point, or None.
+
+    It is the nearest of the points (in view units) within `reach` of the click that are not far behind the front one.
+    The rows of `view` point right, down and forward; `at` is the click (right, down) from the centre of the canvas.
+    """
+    on_screen = points @ view.T
+    distance = np.hypot(*(on_screen[:, :2] - at).T)
+    near = np.flatnonzero(distance <= reach)
+    if not len(near):
+        return None
+    near = near[on_screen[near, 2] <= on_screen[near, 2].min() + _DEPTH_TOLERANCE]
+    return int(near[distance[near].argmin()])
+
+
+class CloudView:
+    """A canvas with one point cloud; `widget` is its Jupyter widget."""
+
+    def __init__(self, name: str, on_pick: Callable[[np.ndarray | None], Any]):
+        """Create an empty canvas, of class zsp-cloud-NAME; a click calls `on_pick` with the world point, or None."""
+        self.widget = _cloud_widget()()
+        self.widget.add_class(f"zsp-cloud-{name}")
+        self.widget.on_msg(self._clicked)
+        self.on_pick = on_pick
+        self._cloud = np.zeros((0, 3))
+        self._to_view: Sim3 | None = None  # None while the canvas is empty
+
+    def show(
+        self,
+        points: Real[np.ndarray, "n 3"],
+        colours: UInt8[np.ndarray, "n 3"],
+        view: Real[np.ndarray, "3 3"] | None,
+        alt: str,
+        overlay: Real[np.ndarray, "m 3"] | None = None,
+    ) -> None:
+        """Show a cloud of coloured world points, seen along `view` (see `point_under`; None keeps the present one).
+
+        With an `overlay`, the points of a second cloud, the first is orange discs, the second blue crosses.
+        """
+        self._cloud, self._to_view = np.asarray(points, dtype=np.float64), view_units(points)
+        kept = subsample(points, MAX_POINTS if overlay is None else MAX_POINTS // 2)
+        drawn, colours, crosses = points[kept], colours[kept], np.zeros(len(kept), np.uint8)
+        if overlay is not None:
+            other = overlay[subsample(overlay, MAX_POINTS // 2)]
+            crosses = np.repeat(np.uint8([0, 1]), [len(kept), len(other)])
+            two = np.array([list(bytes.fromhex(colour[1:])) for colour in (ORANGE, BLUE)], np.uint8)
+            drawn, colours = np.concatenate([drawn, other]), two[crosses]
+        with self.widget.hold_sync():
+            self.widget.points = self._to_view.apply(drawn).astype(np.float32).tobytes()
+            self.widget.colours, self.widget.crosses = colours.tobytes(), crosses.tobytes()
+            self.widget.alt = alt
+            if view is not None:
+                self.widget.view = np.asarray(view, dtype=np.float64).ravel().tolist()
+                self.widget.view_resets += 1
+
+    def clear(self, alt: str) -> None:
+        """Show an empty canvas; `alt` gives the reason."""
+        self._to_view = None
+        with self.widget.hold_sync():
+            self.widget.points = self.widget.colours = self.widget.crosses = b""
+            self.widget.marks, self.widget.cursor, self.widget.alt = [], [], alt
+
+    def mark(self, points: Real[np.ndarray, "k 3"]) -> None:
+        """Draw the numbers 1, 2, ... beside world points."""
+        self.widget.marks = self._to_view.apply(points).tolist()
+
+    def point_at(self, point: Real[np.ndarray, "3"] | None) -> None:
+        """Draw a cross-hair at a world point; None removes it."""
+        self.widget.cursor = [] if point is None or self._to_view is None else self._to_view.apply(point).tolist()
+
+    def _clicked(self, _, content: dict, buffers: list) -> None:
+        if self._to_view is not None:
+            view, at = np.array(content["view"]).reshape(3, 3), np.array(content["at"])
+            found = point_under(self._to_view.apply(self._cloud), view, at, content["reach"])
+            self.on_pick(None if found is None else self._cloud[found])
+
+
+@cache
+def _cloud_widget() -> type:
+    anywidget = load_package("anywidget")
+    from traitlets import Bytes, Float, Int, List, Unicode
+
+    class CloudCanvas(anywidget.AnyWidget):
+        """State shared with the browser, see `cloud_view.js`."""
+
+        _esm = (Path(__file__).parent / "cloud_view.js").read_text(encoding="utf-8")
+        _css = _STYLE
+        points = Bytes().tag(sync=True)  # float32 (n, 3), view units
+        colours = Bytes().tag(sync=True)  # uint8 (n, 3)
+        crosses = Bytes().tag(sync=True)  # uint8 (n): 1 a cross, 0 a disc
+        marks = List().tag(sync=True)
+        cursor = List(Float()).tag(sync=True)  # [] or a point
+        view = List(Float(), [1.0, 0, 0, 0, 1, 0, 0, 0, 1]).tag(sync=True)
+        view_resets = Int().tag(sync=True)  # increases when the browser must take over `view`
+        side = Int(400).tag(sync=True)
+        alt = Unicode().tag(sync=True)
+
+    return CloudCanvas

@@ -1,0 +1,334 @@
+"""Widget for labelling poses: keypoints by clicks on point clouds, residuals, overlay, accept.
+
+The widget only displays and forwards. `zsp_lite.course.labelling.Labelling` holds the keypoints and writes every change
+at once, so that the work continues after a restart.
+"""
+
+import html
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+import pandas as pd
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.course.labelling.session import ACCEPTED, MIN_KEYPOINTS, OPEN, SKIPPED, Alignment, Labelling, Progress
+from zsp_lite.course.widgets.cloud_view import CloudView, subsample
+from zsp_lite.course.widgets.common import Widget, load_package
+from zsp_lite.data.labels import read_labels
+from zsp_lite.errors import InputError
+from zsp_lite.viz.plots import BLUE, ORANGE
+
+_STATE_SYMBOLS = {ACCEPTED: "✓", OPEN: "○", SKIPPED: "–"}
+_PROPOSED = "A proposal is laid over the cloud: accept it if both clouds agree; otherwise click keypoints, or skip."
+_TOOLTIPS = {
+    "undo": "Remove the last keypoint of this sequence",
+    "redo": "Remove all keypoints of this sequence",
+    "accept": "Write the label of this sequence",
+    "skip": "Leave this sequence without a label",
+    "next": "Go to the next open sequence",
+    "pick": "Pick the point under the cross-hair",
+}
+_HELP = (
+    "Click: pick. Drag: rotate. Shift and drag: pan. Wheel: zoom, after a click on the cloud. Keyboard: arrows and + − "
+    "on a cloud; the slider chooses a point, the button picks it."
+)
+_STYLE = """<style>
+.zsp-label table { border-collapse: collapse; margin: 0 1.5em 0 0; }
+.zsp-label th, .zsp-label td { padding: 1px 8px; text-align: left; line-height: 1.4; }
+.zsp-label th { border-bottom: 1px solid; }
+.zsp-label td:nth-child(n+4) { text-align: right; }
+.zsp-progress tr:has(td:first-child:not(:empty)) td { font-weight: bold; }
+.zsp-label .widget-html-content { line-height: 1.4; }
+.zsp-message p { margin: 2px 0; min-height: 1.4em; line-height: 1.4; }
+.zsp-message .problem { border-left: 5px solid #D55E00; padding-left: 6px; }
+</style>"""
+
+
+def label_poses(labelling: Labelling) -> Widget:
+    """Label a category: the point cloud of the reference on the left, that of the current sequence on the right."""
+    return _LabellingWidget(labelling).box
+
+
+class _LabellingWidget:
+    """The parts of the widget, the action of each button, which returns the message to show, and the display."""
+
+    def __init__(self, labelling: Labelling):
+        self.labelling = labelling
+        self.shown: dict[str, object] = {}
+        self.asked: tuple[str, bytes] | None = None  # the label in doubt that accept was pressed for
+        self.refreshing = False
+        self.box = self._build()
+        started = any(row.picks for row in labelling.progress())
+        self.controls["sequence"].value = self._next_open(labelling.reference) if started else labelling.reference
+        self._do(lambda: "The earlier keypoints are loaded." if started else "")
+
+    def _build(self) -> Widget:
+        """Create the parts and arrange them; CSS classes begin with `zsp-`."""
+        widgets, style, narrow = load_package(), {"description_width": "initial"}, {"width": "auto"}
+        reference, *others = self.labelling.sequences
+        options = [(f"{reference} (reference)", reference), *((name, name) for name in others)]
+        self.controls = controls = {
+            "sequence": widgets.Dropdown(options=options, description="sequence", style=style),
+            "name": widgets.Text(description="name", placeholder="for example: left arm", continuous_update=False,
+                                 style=style, layout={"width": "16em"}),
+            "overlay": widgets.ToggleButton(description="overlay", tooltip="Show both clouds, aligned, in two colours",
+                                            layout=narrow),
+            "point": widgets.IntSlider(description="point", style=style, layout={"width": "32em"}),
+        }  # fmt: skip
+        self.buttons = buttons = {
+            name: widgets.Button(description=name, tooltip=tooltip, layout=narrow)
+            for name, tooltip in _TOOLTIPS.items()
+        }
+        self.views = {name: CloudView(name, partial(self._clicked, name)) for name in ("reference", "sequence")}
+        self.captions = {name: widgets.HTML() for name in self.views}
+        self.tables = {name: widgets.HTML() for name in ("progress", "keypoints")}
+        self.message = widgets.HTML()
+        for name, part in (controls | buttons | self.tables | {"message": self.message}).items():
+            part.add_class(f"zsp-{name}")
+        for name in ("sequence", "overlay", "point"):
+            controls[name].observe(self._changed, names="value")
+        for name, button in buttons.items():
+            button.on_click(lambda _, name=name: self._do(getattr(self, name)))
+
+        clouds = [
+            widgets.VBox([self.captions[name], view.widget], layout={"margin": "0 8px 0 0"})
+            for name, view in self.views.items()
+        ]
+        edit, finish = ([buttons[name] for name in names] for names in (("undo", "redo"), ("accept", "skip", "next")))
+        wrap = {"flex_flow": "row wrap"}
+        centred = wrap | {"align_items": "center"}
+        rows = [
+            widgets.HTML(_STYLE),
+            widgets.HBox([controls["sequence"], controls["name"]], layout=centred),
+            widgets.HBox([*edit, controls["overlay"], *finish], layout=centred),
+            self.message,
+            widgets.HBox(clouds, layout=wrap),
+            widgets.HTML(_HELP),
+            widgets.HBox([controls["point"], buttons["pick"]], layout=centred),
+            widgets.HBox(list(self.tables.values()), layout=wrap | {"align_items": "flex-start"}),
+        ]
+        box = widgets.VBox(rows)
+        box.add_class("zsp-label")
+        box.controls, box.buttons, box.views = controls, buttons, self.views
+        box.message, box.tables = self.message, self.tables
+        return box
+
+    @property
+    def current(self) -> str:
+        return self.controls["sequence"].value
+
+    @property
+    def on_reference(self) -> bool:
+        return self.current == self.labelling.reference
+
+    def pick(self) -> str:
+        return self._add(self.current, self._slider_point())
+
+    def undo(self) -> str:
+        self.labelling.undo(self.current)
+        return f"{len(self.labelling.picks(self.current))} keypoints on {self.current}."
+
+    def redo(self) -> str:
+        self.labelling.put(self.current, [])
+        return f"All keypoints of {self.current} removed."
+
+    def accept(self) -> str:
+        """Write the label; one in doubt only if accept is pressed twice in a row."""
+        sequence, doubt = self.current, self.labelling.doubt(self.current)
+        asked = sequence, self.labelling.picks(sequence).tobytes()
+        if doubt and self.asked != asked:
+            self.asked = asked
+            raise InputError(f"{doubt}. Correct the keypoints, or press accept again to write the label nevertheless")
+        path = self.labelling.accept(sequence, confirmed=True)
+        return f"Written: {'/'.join(path.parts[-3:])}. {self.next()}"
+
+    def skip(self) -> str:
+        self.labelling.skip(self.current)
+        return f"{self.current} is skipped. {self.next()}"
+
+    def next(self) -> str:
+        """Go to the next open sequence."""
+        following = self._next_open(self.current)
+        if len(self.labelling.names) < MIN_KEYPOINTS and not self._proposed(following):
+            self.controls["sequence"].value = self.labelling.reference
+            return f"Pick at least {MIN_KEYPOINTS} keypoints on the reference first."
+        is_open = any(row.state == OPEN for row in self.labelling.progress())
+        self.controls["sequence"].value = following
+        self.controls["overlay"].value |= self._proposed(following)
+        now = f"Now {following}. {_PROPOSED if self._proposed(following) else ''}".strip()
+        return now if is_open else "No sequence is open."
+
+    def _add(self, sequence: str, point: np.ndarray | None) -> str:
+        """Add the next keypoint."""
+        if point is None:
+            return "There is no point of the cloud at the click."
+        labelling, picks = self.labelling, self.labelling.picks(sequence)
+        same = np.flatnonzero((picks == point).all(axis=1))
+        if len(same):
+            raise InputError(f"keypoint {same[0] + 1}, {labelling.names[same[0]]}, is at this point already")
+        if sequence != labelling.reference and len(labelling.names) < MIN_KEYPOINTS:
+            raise InputError(f"the reference has {len(labelling.names)} keypoints, expected {MIN_KEYPOINTS} first")
+        labelling.pick(sequence, point, self.controls["name"].value.strip())
+        self.controls["name"].value = ""
+        if sequence != labelling.reference and len(picks) + 1 == len(labelling.names):
+            self.controls["overlay"].value = labelling.alignment(sequence) is not None
+            return self._instruction()
+        return f"Keypoint {len(picks) + 1}, {labelling.names[len(picks)]}, picked on {sequence}."
+
+    def _clicked(self, view: str, point: np.ndarray | None) -> None:
+        self._do(lambda: self._add(self.labelling.reference if view == "reference" else self.current, point))
+
+    def _changed(self, change) -> None:
+        if self.refreshing:
+            return
+        if change.owner is self.controls["point"]:
+            self._move_cursor()
+        else:
+            self._do(self._instruction)
+
+    def _do(self, action: Callable[[], str]) -> None:
+        """Run an action and update the display; an InputError is shown as a message."""
+        self.refreshing, text, problem = True, "", ""
+        try:
+            for step in (action, self._refresh):
+                try:
+                    text = step() or text
+                except InputError as error:
+                    problem = str(error)
+        finally:
+            self.refreshing = False
+        kind, shown = ("problem", f"Not done: {problem}") if problem else ("info", text or self._instruction())
+        # Announced by screen readers.
+        self.message.value = f'<p class="{kind}" role="status" aria-live="polite">{html.escape(shown)}</p>'
+
+    def _next_open(self, sequence: str) -> str:
+        """Return the next open sequence after this one, cyclically; itself if none is open."""
+        rows = self.labelling.progress()
+        index = [row.sequence for row in rows].index(sequence)
+        following = rows[index + 1 :] + rows[:index]
+        return next((row.sequence for row in following if row.state == OPEN), sequence)
+
+    def _proposed(self, sequence: str) -> bool:
+        """Whether a proposal for a sequence waits for confirmation."""
+        return not len(self.labelling.picks(sequence)) and self.labelling.proposal(sequence) is not None
+
+    def _instruction(self) -> str:
+        """Return what the user can do next."""
+        labelling, names = self.labelling, self.labelling.names
+        picked = len(labelling.picks(self.current))
+        if self.on_reference:
+            missing = MIN_KEYPOINTS - len(names)
+            more = f"at least {missing} more" if missing > 0 else "enough; add more, or go on with next"
+            return f"Click a point of the reference that all objects of the category have: {len(names)} so far, {more}."
+        if self._proposed(self.current):
+            return _PROPOSED
+        if picked < len(names):
+            return f"Click the right cloud: keypoint {picked + 1}, {names[picked]}."
+        if (alignment := labelling.alignment(self.current)) is None:
+            return f"Pick at least {MIN_KEYPOINTS} keypoints on the reference first."
+        rms = 100 * alignment.rms
+        return f"All {picked} keypoints are picked, residual {rms:.1f} %. Accept if both clouds agree, otherwise redo."
+
+    def _refresh(self) -> None:
+        labelling, controls = self.labelling, self.controls
+        rows = labelling.progress()
+        row = next(row for row in rows if row.sequence == self.current)
+        alignment = None if self.on_reference or row.problem else labelling.alignment(self.current)
+        aligned = self._aligned_reference(alignment)
+        controls["overlay"].value &= aligned is not None
+        controls["overlay"].disabled = aligned is None
+        controls["name"].disabled = not self.on_reference
+        waiting = not self.on_reference and self._proposed(self.current)
+        self.buttons["accept"].disabled = alignment is None and not waiting
+        self.buttons["skip"].disabled = self.on_reference
+        self.tables["progress"].value = _progress_table(rows, self.current)
+        self.tables["keypoints"].value = _keypoint_table(labelling.names, row.picks, alignment)
+        self.captions["reference"].value = f"{_dot(BLUE)} reference {html.escape(labelling.reference)}"
+        self._show_cloud("reference", labelling.reference, None)
+        if self.on_reference:
+            self.shown.pop("sequence", None)
+            self.views["sequence"].clear("Empty: no other sequence is chosen")
+            self.captions["sequence"].value = "choose another sequence above, or next"
+        else:
+            overlay = aligned if controls["overlay"].value else None
+            suffix = "" if overlay is None else f" and {_dot(BLUE, '✕')} the aligned reference"
+            self.captions["sequence"].value = f"{_dot(ORANGE)} {html.escape(self.current)}{suffix}"
+            self._show_cloud("sequence", self.current, overlay)
+        controls["point"].max = max(len(subsample(labelling.cloud(self.current)[0])) - 1, 0)
+        self._move_cursor(only_if_shown=True)
+        if row.problem:
+            raise InputError(row.problem)
+
+    def _aligned_reference(self, alignment: Alignment | None) -> np.ndarray | None:
+        """Return the reference cloud in the world of the sequence, by its keypoints, its label, or a proposal."""
+        if self.on_reference or alignment is None and len(self.labelling.picks(self.current)):
+            return None
+        label = read_labels(self.labelling.root, self.labelling.category).get(self.current)
+        if alignment is not None:
+            sim3 = alignment.sim3
+        elif label is not None:
+            sim3 = Sim3(1.0, label.trans[:3, :3], label.trans[:3, 3])
+        else:
+            sim3 = self.labelling.proposal(self.current)
+        return None if sim3 is None else sim3.apply(self.labelling.cloud(self.labelling.reference)[0])
+
+    def _show_cloud(self, name: str, sequence: str, overlay: np.ndarray | None) -> None:
+        """Show a cloud, unless it is on the canvas already, and the keypoints."""
+        before = self.shown.get(name, (None, None))
+        key = sequence, None if overlay is None else overlay.tobytes()
+        if before != key:
+            points, colours = self.labelling.cloud(sequence)
+            alt = (
+                f"Point cloud of {sequence}. The slider named point chooses a point by keyboard, the arrow keys rotate."
+            )
+            view = self.labelling.first_view(sequence) if before[0] != sequence else None
+            try:
+                self.views[name].show(points, colours, view, alt, overlay)
+            except InputError as error:
+                self.shown.pop(name, None)
+                self.views[name].clear(f"Empty: {error}")
+                raise InputError(f"sequence {sequence}: {error}") from error
+            self.shown[name] = key
+        self.views[name].mark(self.labelling.picks(sequence))
+
+    def _slider_point(self) -> np.ndarray:
+        """Return the point of the slider, which goes through neighbours after each other."""
+        points = self.labelling.cloud(self.current)[0]
+        kept = subsample(points)
+        return points[kept[min(self.controls["point"].value, len(kept) - 1)]]
+
+    def _move_cursor(self, only_if_shown: bool = False) -> None:
+        """Move the cross-hair to the point of the slider."""
+        current, other = ("reference", "sequence") if self.on_reference else ("sequence", "reference")
+        self.views[other].point_at(None)
+        if not only_if_shown or self.views[current].widget.cursor:
+            self.views[current].point_at(self._slider_point())
+
+
+def _progress_table(rows: Sequence[Progress], current: str) -> str:
+    cells = []
+    for row in rows:
+        residual = "see above" if row.problem else "" if row.rms is None else f"{100 * row.rms:.1f} %"
+        marker = "▸" if row.sequence == current else ""
+        cells.append((marker, row.sequence, f"{_STATE_SYMBOLS.get(row.state, '●')} {row.state}", row.picks, residual))
+    return _table(("", "sequence", "state", "keypoints", "residual"), cells)
+
+
+def _keypoint_table(names: Sequence[str], picked: int, alignment: Alignment | None) -> str:
+    """Return the table of keypoints, of which the first `picked` are picked on the current sequence."""
+    residuals = [""] * len(names) if alignment is None else [f"{100 * x:.1f} %" for x in alignment.residuals]
+    if alignment is not None:
+        residuals[int(alignment.residuals.argmax())] += " ← largest"
+    states = ["✓" if index < picked else "next" if index == picked else "" for index in range(len(names))]
+    cells = [*zip(range(1, len(names) + 1), names, states, residuals)]
+    return _table(("", "keypoint", "picked", "residual"), cells or [("", "none yet", "", "")])
+
+
+def _table(head: Sequence[str], rows: Sequence[tuple]) -> str:
+    with pd.option_context("display.max_colwidth", None):
+        return pd.DataFrame(rows, columns=head).to_html(index=False, border=0)
+
+
+def _dot(colour: str, symbol: str = "●") -> str:
+    return f'<b style="color:{colour}">{symbol}</b>'

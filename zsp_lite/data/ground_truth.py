@@ -1,0 +1,79 @@
+"""Object poses of synthetic data, for evaluation only: the file object_poses.json of a category."""
+
+import functools
+import logging
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.errors import InputError, rigid_matrix
+from zsp_lite.io.files import read_json
+
+_warn_once = functools.cache(logging.getLogger(__name__).warning)
+POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
+_Vector = tuple[float, float, float]
+_Row = tuple[float, float, float, float]
+
+
+class ObjectPose(msgspec.Struct):
+    """Pose of an object in its world, `world = scale * R @ object + t`, and its bounding box in object coordinates."""
+
+    trans: tuple[_Row, _Row, _Row, _Row]  # the matrix [R t]
+    scale: float
+    low: _Vector  # corners of the box
+    high: _Vector
+    turns: tuple[int, ...] = ()  # about the up axis, in degrees, after which the shape is the same; 0 is not among them
+
+    @property
+    def R(self) -> Float[np.ndarray, "3 3"]:
+        return np.array(self.trans)[:3, :3]
+
+    @property
+    def t(self) -> Float[np.ndarray, "3"]:
+        return np.array(self.trans)[:3, 3]
+
+    def to_object(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Map world points to object coordinates (front +x, left +y, up +z, surface of unit standard deviation)."""
+        return (np.asarray(world, np.float64) - self.t) @ self.R / self.scale
+
+    def to_box(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Map world points to box coordinates, 0 to 1 along each object axis."""
+        return (self.to_object(world) - self.low) / np.subtract(self.high, self.low)
+
+
+def read_poses(out: Path, category: str) -> dict[str, ObjectPose]:
+    """Return the object pose of every sequence of a category; none without the file."""
+    if not (path := out / category / POSES_FILE).is_file():
+        return {}
+    poses = read_json(path, dict[str, ObjectPose], "object poses")
+    exact = {name: rigid_matrix(f"object poses {path}: {name}", one.trans).tolist() for name, one in poses.items()}
+    return {name: msgspec.structs.replace(one, trans=exact[name]) for name, one in poses.items()}
+
+
+def common_turns(out: Path, category: str, first: str, second: str) -> Float[np.ndarray, "s 3 3"] | None:
+    """Return the turns in the world of the second object after which both look the same; None where nothing is known.
+
+    The first is the identity.
+    """
+    try:
+        poses = read_poses(out, category)
+    except InputError as error:  # a file of an older layout, for instance, costs one figure only
+        _warn_once("%s", f"{error}: without it there is no symmetric_acc30")
+        return None
+    if not {first, second} <= poses.keys():
+        return None
+    angles = [[0.0], *([turn] for turn in poses[first].turns if turn in poses[second].turns)]
+    world = poses[second].R
+    return world @ Rotation.from_euler("z", angles, degrees=True).as_matrix() @ world.T
+
+
+def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:
+    """Read the object pose of every sequence of a category; InputError if the folder is not a synthetic export."""
+    if not (poses := read_poses(dataset.root, category)):
+        path = dataset.root / category / POSES_FILE
+        raise InputError(f"{path} is missing, expected a synthetic export: other data has no exact object poses")
+    return poses
