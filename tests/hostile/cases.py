@@ -207,7 +207,7 @@ for tag in ((3, 1, b"\x60\xea\0\0"), (2, 4, b"abc\0"), (5, 1, b"\xff" * 4), (3, 
         written("e.jpg", exif(*tag))(folder), ("right" if read_picture(folder / "e.jpg")[1] == 1 else "wrong", ""))[1]))  # fmt: skip
 
 ON_DATA = (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/new")
-for option, value in (("--methods", "os:_exit"), ("--methods", "raises:now"),
+for option, value in (("--methods", "raises:now"),
                       ("--methods", "a=/dev/zero/x.csv"), ("--categories", "../.."), ("--list-pairs", "/dev/null/x")):  # fmt: skip
     command("malicious", f"benchmark {option} {value!r}", *ON_DATA, option, value, change=lambda folder: (
         sys.path.insert(0, str(folder)), written("raises.py", "raise SystemExit(3)")(folder)))  # fmt: skip
