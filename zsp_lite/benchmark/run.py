@@ -202,7 +202,7 @@ def evaluate_pair(pair: Pair, methods: Mapping[str, Method], store: FrameStore) 
 
 def _evaluate(name: str, method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]) -> dict[str, Any]:
     own = is_own(name) and type(method.solve) is not StoredPoses
-    seen = given(method.solve, problem) if own else problem
+    seen = given(method.solve, problem) if own and method.solve else problem
     start = time.perf_counter()
     try:
         with fails_alone(method.seconds) if own else nullcontext():

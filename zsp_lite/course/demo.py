@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.pairs import labelled_categories, sample_pairs, shipped_pairs
+from zsp_lite.data.pairs import category_pairs, labelled_categories
 from zsp_lite.estimates import PairResult, label_errors
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.pipeline import ZeroShotPose, solve_pair
@@ -14,11 +14,7 @@ N_TARGETS = 5
 
 def demo_pairs(dataset: Co3D) -> list[Pair]:
     """Select, independently of results, the first stored or sampled evaluation pair of every labelled category."""
-    pairs = []
-    for category in labelled_categories(dataset):
-        shipped = shipped_pairs(dataset, category, N_TARGETS)
-        pairs.append((shipped or sample_pairs(dataset, category, 1, N_TARGETS))[0])
-    return pairs
+    return [category_pairs(dataset, category, 1, N_TARGETS)[0] for category in labelled_categories(dataset)]
 
 
 def example_pair(dataset: Co3D) -> Pair:
