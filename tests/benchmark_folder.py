@@ -1,4 +1,5 @@
-"""A small CO3D folder for the tests of the benchmark, made once, what runs on it, and runs that are made up."""
+"""A small CO3D folder for the tests of the benchmark, made once, what runs on it, and runs that are
+made up."""
 
 import atexit
 import functools
@@ -28,20 +29,31 @@ FRAMES = 8
 
 @functools.cache
 def small_folder() -> Path:
-    """Two categories of three sequences of eight frames: one object, put into each sequence's world in its own way."""
+    """Two categories of three sequences of eight frames: one object, put into each sequence's world
+    in its own way."""
     root = Path(tempfile.mkdtemp(prefix="co3d-"))
     atexit.register(shutil.rmtree, root, ignore_errors=True)
     for offset, category in enumerate(("lump", "pebble")):
         sequences = []
         for index, name in enumerate(SEQUENCES):
-            turn = np.eye(3) if index == 0 else look_at(np.eye(3)[index] + (0.3, 0.2, 0.1 + offset)).R
+            turn = (
+                np.eye(3) if index == 0 else look_at(np.eye(3)[index] + (0.3, 0.2, 0.1 + offset)).R
+            )
             placement = Sim3(1.0, turn, np.zeros(3))
             angles = np.linspace(0, 2 * np.pi, FRAMES, endpoint=False) + 0.3 * index
             # Upright cameras around the object; the world they stand in is turned.
-            views = [look_at((np.cos(a), np.sin(a), 0.4), size=(90, 100), focal=120.0) for a in angles]
+            views = [
+                look_at((np.cos(a), np.sin(a), 0.4), size=(90, 100), focal=120.0) for a in angles
+            ]
             cameras = [replace(camera, R=camera.R @ turn.T) for camera in views]
-            frames = tuple(render(camera, placement, f"{name}/{i}") for i, camera in enumerate(cameras))
-            times, cloud, colours = tuple(map(float, range(FRAMES))), np.eye(3), np.zeros((3, 3), np.uint8)
+            frames = tuple(
+                render(camera, placement, f"{name}/{i}") for i, camera in enumerate(cameras)
+            )
+            times, cloud, colours = (
+                tuple(map(float, range(FRAMES))),
+                np.eye(3),
+                np.zeros((3, 3), np.uint8),
+            )
             sequences.append(SequenceData(name, frames, times, cloud, colours))
             trans = np.eye(4)
             trans[:3, :3] = turn
@@ -66,7 +78,9 @@ class SlowBackbone(CoordinateBackbone):
 BACKBONE = CoordinateBackbone(grid=8)
 
 
-def run_rows(rows, out, pairs: int = 1, targets: int = 2, category: str = "lump", backbone=BACKBONE):
+def run_rows(
+    rows, out, pairs: int = 1, targets: int = 2, category: str = "lump", backbone=BACKBONE
+):
     """Run the benchmark on one category; returns the figures by row."""
     return evaluate(small_folder(), backbone, rows, {category: pairs}, targets, out)["methods"]
 
@@ -114,10 +128,13 @@ def placement(category, sequence) -> Sim3:
 
 
 def exact_keypoints(dataset, category):
-    """Return a matcher of the full crops of a category that knows the geometry: every visible pixel and its place."""
+    """Return a matcher of the full crops of a category that knows the geometry: every visible pixel
+    and its place."""
     crops = {}
     for name in SEQUENCES:
-        for frame in (dataset.load(dataset.frame(category, name, number)) for number in range(FRAMES)):
+        for frame in (
+            dataset.load(dataset.frame(category, name, number)) for number in range(FRAMES)
+        ):
             crop = object_crop(frame, None)
             crops[crop.rgb.tobytes()] = crop, placement(category, name)
 
@@ -147,7 +164,9 @@ def write_run(out, rows, categories=CATEGORIES, **settings):
     methods, library = dict.fromkeys(rows, "x"), [{"version": "0", "commit": None}]
     with open_run(out, Settings(methods=methods, library=library, calls=[call], **settings)):
         for name, results in rows.items():
-            add_lines(out, ({"pair": key, "results": {name: found}} for key, found in results.items()))
+            add_lines(
+                out, ({"pair": key, "results": {name: found}} for key, found in results.items())
+            )
     return read_run(out)
 
 
@@ -156,9 +175,15 @@ def made_up_run(out, rows):
     rng, found = np.random.default_rng(0), {}
     for name in dict.fromkeys(rows):
         targets = tuple(range(int((re.findall(r"-n(\d+)$", name) or [5])[0])))
-        pairs = [Pair(category, f"{i}", i, f"{(i * i + 1) % PAIRS}", targets)
-                 for category in CATEGORIES for i in range(PAIRS)]  # fmt: skip
-        found[name] = {pair.key: {"error": round(rng.uniform(0, 180), 4), "view": 0, "inliers": 9} for pair in pairs}
+        pairs = [
+            Pair(category, f"{i}", i, f"{(i * i + 1) % PAIRS}", targets)
+            for category in CATEGORIES
+            for i in range(PAIRS)
+        ]
+        found[name] = {
+            pair.key: {"error": round(rng.uniform(0, 180), 4), "view": 0, "inliers": 9}
+            for pair in pairs
+        }
     return write_run(out, found)
 
 

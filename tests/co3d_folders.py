@@ -20,18 +20,25 @@ def random_camera(seed: int = 0, size: tuple[int, int] | None = None) -> Camera:
     size = size or tuple(int(side) for side in rng.integers(8, 2000, 2))
     rotation = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
     focal = rng.uniform(0.5, 3, 2) * max(size)
-    return Camera(rotation, rng.normal(size=3) * 3, focal, rng.uniform(0.2, 0.8, 2) * size[::-1], size)
+    return Camera(
+        rotation, rng.normal(size=3) * 3, focal, rng.uniform(0.2, 0.8, 2) * size[::-1], size
+    )
 
 
-def sequence_data(name: str, frames: int = 4, seed: int = 0, quality: float = 1.0, **options) -> SequenceData:
-    """`frames` views of 24 x 32 pixels with a smooth picture, a disc for a mask and depth with a hole."""
+def sequence_data(
+    name: str, frames: int = 4, seed: int = 0, quality: float = 1.0, **options
+) -> SequenceData:
+    """`frames` views of 24 x 32 pixels with a smooth picture, a disc for a mask and depth with a
+    hole."""
     rng = np.random.default_rng([seed, *name.encode()])
     height, width = 24, 32
     y, x = np.mgrid[:height, :width]
     made = []
     for number in range(frames):
         camera = random_camera(int(rng.integers(2**31)), (height, width))
-        rgb = np.stack([8 * x % 256, 10 * y % 256, np.full_like(x, 40 * number)], axis=-1).astype(np.uint8)
+        rgb = np.stack([8 * x % 256, 10 * y % 256, np.full_like(x, 40 * number)], axis=-1).astype(
+            np.uint8
+        )
         depth = rng.uniform(1, 4, (height, width)).astype(np.float32)
         depth[5:12, 3 : 9 + number] = 0
         mask = ((y - 12) ** 2 + (x - 16) ** 2 < 64).astype(np.float32)
@@ -44,7 +51,11 @@ def sequence_data(name: str, frames: int = 4, seed: int = 0, quality: float = 1.
 
 def contents(folder) -> dict[str, bytes]:
     """The files of a folder by their paths in it."""
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def edit_json(path, change) -> None:
@@ -55,14 +66,19 @@ def edit_json(path, change) -> None:
 
 
 def convert_to_v2(folder) -> None:
-    """Rewrite the cameras of a category in the format of CO3D v2, with the fields that only v2 has."""
+    """Rewrite the cameras of a category in the format of CO3D v2, with the fields that only
+    v2 has."""
 
     def convert(frames):
         for frame in frames:
             size = tuple(frame["image"]["size"])
-            camera = Camera.from_pytorch3d(**frame["viewpoint"], intrinsics_format="ndc_norm_image_bounds", size=size)
+            camera = Camera.from_pytorch3d(
+                **frame["viewpoint"], intrinsics_format="ndc_norm_image_bounds", size=size
+            )
             view = camera.to_pytorch3d("ndc_isotropic")
-            frame["viewpoint"] = {name: x if isinstance(x, str) else x.tolist() for name, x in view.items()}
+            frame["viewpoint"] = {
+                name: x if isinstance(x, str) else x.tolist() for name, x in view.items()
+            }
             frame["meta"] = {"frame_splits": ["train"], "eval_batch_maps": []}
 
     edit_json(folder / "frame_annotations.jgz", convert)

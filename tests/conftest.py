@@ -1,4 +1,5 @@
-"""Checks of the annotations in every test (shapes by jaxtyping, types by beartype), and a shared data set."""
+"""Checks of the annotations in every test (shapes by jaxtyping, types by beartype), and a shared
+data set."""
 
 import contextlib
 import os
@@ -16,8 +17,8 @@ os.environ.setdefault("MPLBACKEND", "Agg")  # without windows
 settings.register_profile("no deadline", deadline=None)
 settings.load_profile("no deadline")
 
-# Must precede the first import of zsp_lite. Outside the tests, and in `make check`, which is to be quick, nothing is
-# checked.
+# Must precede the first import of zsp_lite. Outside the tests, and in `make check`, which is to be
+# quick, nothing is checked.
 if os.environ.get("ZSP_LITE_CHECK_ANNOTATIONS") != "0":
     install_import_hook("zsp_lite", "typechecking.typechecker")
 
@@ -28,7 +29,8 @@ _raises = pytest.raises
 
 @contextlib.contextmanager
 def raises(expected, **options):
-    """`pytest.raises`, but inside `raises(InputError)` and `raises(FatalError)` annotations are not checked.
+    """`pytest.raises`, but inside `raises(InputError)` and `raises(FatalError)` annotations are not
+    checked.
 
     Bad input violates the annotations as well, but these tests are about the library's own error.
     """
@@ -46,7 +48,8 @@ pytest.raises = raises
 
 @pytest.fixture
 def links(tmp_path_factory):
-    """Skips the test where this user may not make symbolic links, as on Windows without its developer mode."""
+    """Skips the test where this user may not make symbolic links, as on Windows without its
+    developer mode."""
     try:
         (tmp_path_factory.mktemp("links") / "link").symlink_to("nowhere")
     except OSError as error:
@@ -55,7 +58,8 @@ def links(tmp_path_factory):
 
 @pytest.fixture
 def run(capsys):
-    """Runs a command that ends with an exit code; returns what it printed, with stderr where it did not succeed."""
+    """Runs a command that ends with an exit code; returns what it printed, with stderr where it did
+    not succeed."""
     from zsp_lite.cli.main import main
 
     def run_command(words, code=0) -> str:
@@ -77,9 +81,11 @@ def closed_figures():
 
 @pytest.fixture(scope="session")
 def ellipsoids(tmp_path_factory):
-    """A labelled data set with the category "ellipsoid": two sequences of seven views of one object.
+    """A labelled data set with the category "ellipsoid": two sequences of seven views of one
+    object.
 
-    The world of sequence "b" differs from that of "a", the reference of the labels, by a rigid transform.
+    The world of sequence "b" differs from that of "a", the reference of the labels, by a rigid
+    transform.
     """
     import numpy as np
     from synthetic_views import look_at, render
@@ -95,9 +101,16 @@ def ellipsoids(tmp_path_factory):
     sequences = []
     for name, placement in placements.items():
         angles = np.linspace(0, 2 * np.pi, 7, endpoint=False)
-        frames = [render(look_at((np.cos(a), np.sin(a), 0.3)), placement, f"{name}/{i}") for i, a in enumerate(angles)]
+        frames = [
+            render(look_at((np.cos(a), np.sin(a), 0.3)), placement, f"{name}/{i}")
+            for i, a in enumerate(angles)
+        ]
         colours = np.full((50, 3), 128, np.uint8)
-        sequences.append(SequenceData(name, frames, list(range(7)), placement.apply(points), colours, None, 2.0, 1.0))
+        sequences.append(
+            SequenceData(
+                name, frames, list(range(7)), placement.apply(points), colours, None, 2.0, 1.0
+            )
+        )
         write_label(root, "ellipsoid", PoseLabel(placement.matrix, name, "a"))
     write_co3d(root, "ellipsoid", sequences, quality=98)
     return Co3D(root)
@@ -117,14 +130,20 @@ def loaded(monkeypatch):
     from synthetic_views import CoordinateBackbone
 
     asked = []
-    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda one: asked.append(one) or CoordinateBackbone())
+    monkeypatch.setattr(
+        "zsp_lite.backbones.load.load_backbone",
+        lambda one: asked.append(one) or CoordinateBackbone(),
+    )
     monkeypatch.setattr(CoordinateBackbone, "name", "coordinates", raising=False)
     return asked
 
 
 @pytest.fixture(scope="session")
 def site(tmp_path_factory):
-    """Folder with the built course site. A warning of Sphinx, such as an unknown link in a source, is an error."""
+    """Folder with the built course site.
+
+    A warning of Sphinx, such as an unknown link in a source, is an error.
+    """
     folder = tmp_path_factory.mktemp("site")
     options = ["-q", "-W", "--keep-going", "-c", "docs/site", "-d", folder / "doctrees"]
     command = [sys.executable, "-m", "sphinx", *options, ".", folder / "html"]

@@ -28,8 +28,11 @@ f 1/1 3/3 4/4
 """
 
 
-def write_quad(path: Path, texture: np.ndarray | None = None, colour=(1, 1, 1), opacity: float = 1.0) -> Path:
-    """Write a textured square as OBJ, MTL and PNG; `texture` is RGB or RGBA, rows from top to bottom."""
+def write_quad(
+    path: Path, texture: np.ndarray | None = None, colour=(1, 1, 1), opacity: float = 1.0
+) -> Path:
+    """Write a textured square as OBJ, MTL and PNG; `texture` is RGB or RGBA, rows from top to
+    bottom."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(_QUAD.format(stem=path.stem))
     lines = ["newmtl paint", "Kd {} {} {}".format(*colour), "Ks 0 0 0", "Ns 1", f"d {opacity}"]
@@ -42,9 +45,16 @@ def write_quad(path: Path, texture: np.ndarray | None = None, colour=(1, 1, 1), 
 
 
 def wedge(seat: float = 0.5) -> Mesh:
-    """An object without symmetry, like a chair: a seat, a back at the rear and one arm on the left. Front +x, up +z."""
-    parts = (box((1.2, 1.0, 0.2), (0, 0, seat)), box((0.2, 1.0, 1.2), (-0.5, 0, seat + 0.6)),
-             box((0.8, 0.15, 0.4), (0.1, 0.45, seat + 0.25)), box((0.2, 0.2, seat), (0.3, 0, seat / 2)))  # fmt: skip
+    """An object without symmetry, like a chair: a seat, a back at the rear and one arm on the left.
+
+    Front +x, up +z.
+    """
+    parts = (
+        box((1.2, 1.0, 0.2), (0, 0, seat)),
+        box((0.2, 1.0, 1.2), (-0.5, 0, seat + 0.6)),
+        box((0.8, 0.15, 0.4), (0.1, 0.45, seat + 0.25)),
+        box((0.2, 0.2, seat), (0.3, 0, seat / 2)),
+    )
     return Mesh(*joined(parts))
 
 
@@ -61,12 +71,18 @@ def write_wedge(path: Path, seat: float = 0.5) -> Path:
 def painted(mesh: Mesh) -> TexturedMesh:
     """Return a textured mesh of one colour, with smooth normals except at sharp edges."""
     n, normals = len(mesh.faces), smooth_normals(mesh.vertices, mesh.faces)
-    uv, white, material = np.zeros((n, 3, 2), np.float32), np.ones((n, 3, 3), np.float32), np.zeros(n, int)
+    uv, white, material = (
+        np.zeros((n, 3, 2), np.float32),
+        np.ones((n, 3, 3), np.float32),
+        np.zeros(n, int),
+    )
     colour = Material(np.array((0.7, 0.4, 0.3, 1.0)))
     return TexturedMesh(mesh.vertices, mesh.faces, normals, uv, white, material, (colour,))
 
 
-def view(vertices: np.ndarray, azimuth: float = 40, elevation: float = 25, size: int = 64) -> Camera:
+def view(
+    vertices: np.ndarray, azimuth: float = 40, elevation: float = 25, size: int = 64
+) -> Camera:
     """A camera that frames the vertices; angles in degrees."""
     pose = orbit_pose(np.radians(azimuth), np.radians(elevation), 0.05, 6.0, vertices.mean(0))
     return framed_camera(vertices, *pose, size, margin=1.3)

@@ -1,4 +1,5 @@
-"""Small backbones with random weights: a DINO transformer, and one of each architecture in Hugging Face's format."""
+"""Small backbones with random weights: a DINO transformer, and one of each architecture in Hugging
+Face's format."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +29,8 @@ def with_large_weights(model: nn.Module) -> nn.Module:
 
 @dataclass(frozen=True)
 class Architecture:
-    """What the tests know of an architecture by themselves: what stands before the patches, and a part's name."""
+    """What the tests know of an architecture by themselves: what stands before the patches, and a
+    part's name."""
 
     patch: int
     special: int  # tokens before the patches
@@ -50,8 +52,14 @@ ARCHITECTURES = {
 
 
 def configuration(kind: str, patch: int = 16, **settings):
-    """Return a configuration; positions are stored for 3 x 3 patches, so every other image size interpolates them."""
-    sizes = {"hidden_size": DIM, "num_hidden_layers": DEPTH, "num_attention_heads": HEADS, "intermediate_size": 64}
+    """Return a configuration; positions are stored for 3 x 3 patches, so every other image size
+    interpolates them."""
+    sizes = {
+        "hidden_size": DIM,
+        "num_hidden_layers": DEPTH,
+        "num_attention_heads": HEADS,
+        "intermediate_size": 64,
+    }
     vision = sizes | {"patch_size": patch, "image_size": 3 * patch} | settings
     if kind in ("clip", "siglip", "blip"):
         text = sizes | {"vocab_size": 99, "bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 0}
@@ -66,5 +74,7 @@ def save_model(folder: Path, config) -> Path:
 
 
 def save_all(root: Path) -> dict[str, Path]:
-    configurations = {kind: configuration(kind, one.patch, **one.settings) for kind, one in ARCHITECTURES.items()}
+    configurations = {
+        kind: configuration(kind, one.patch, **one.settings) for kind, one in ARCHITECTURES.items()
+    }
     return {kind: save_model(root / kind, one) for kind, one in configurations.items()}

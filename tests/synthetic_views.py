@@ -1,7 +1,8 @@
-"""Views of an asymmetric implicit surface, and a backbone whose features are functions of the object coordinates.
+"""Views of an asymmetric implicit surface, and a backbone whose features are functions of the
+object coordinates.
 
-The colours of the images encode the object coordinates. Features computed from them are exact, so that any error is
-caused by the pipeline.
+The colours of the images encode the object coordinates. Features computed from them are exact, so
+that any error is caused by the pipeline.
 """
 
 from dataclasses import dataclass, replace
@@ -45,7 +46,13 @@ def level_camera(azimuth, height=0.0, distance=3.0):
     away = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
     right = np.array([-np.sin(turn), np.cos(turn), 0])
     R = np.stack([right, np.cross(-away, right), -away])
-    return Camera(R, np.array([0, 0, distance]) - R @ [1, 2, 3], np.full(2, 100.0), np.full(2, 50.0), (100, 100))
+    return Camera(
+        R,
+        np.array([0, 0, distance]) - R @ [1, 2, 3],
+        np.full(2, 100.0),
+        np.full(2, 50.0),
+        (100, 100),
+    )
 
 
 # Object poses of the two sequences of a pair, and directions of cameras.
@@ -64,9 +71,14 @@ def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
     height, width = camera.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width)))
-    middle, reach = camera.to_camera(placement.t), REACH * placement.scale  # of a ball that holds the object
+    middle, reach = (
+        camera.to_camera(placement.t),
+        REACH * placement.scale,
+    )  # of a ball that holds the object
     near = np.linalg.norm(np.cross(rays, middle), axis=-1) < reach * np.linalg.norm(rays, axis=-1)
-    start, *ends = placement.inverse().apply(camera.to_world(np.concatenate([np.zeros((1, 3)), rays[near]])))
+    start, *ends = placement.inverse().apply(
+        camera.to_world(np.concatenate([np.zeros((1, 3)), rays[near]]))
+    )
     along = ends - start  # per unit of depth, in object coordinates
     # From far to near, so that the last crossing found is the nearest one.
     far, behind = np.full(len(along), np.inf), np.zeros(len(along), dtype=bool)
@@ -89,7 +101,8 @@ def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
 
 
 def around(placement: Sim3, count: int = 7, arc: float = 360) -> list[Frame]:
-    """Render views of the object, evenly spaced in an arc of degrees about the vertical through it."""
+    """Render views of the object, evenly spaced in an arc of degrees about the vertical
+    through it."""
     angles = np.radians(np.arange(count) * arc / count)
     cameras = [look_at(placement.R @ (np.cos(a), np.sin(a), 0.3)) for a in angles]
     return [render(camera, placement, f"{k:04d}") for k, camera in enumerate(cameras)]
@@ -97,7 +110,8 @@ def around(placement: Sim3, count: int = 7, arc: float = 360) -> list[Frame]:
 
 @dataclass(frozen=True)
 class CoordinateBackbone:
-    """Fourier features of the object coordinates that are encoded in the colours; black is background."""
+    """Fourier features of the object coordinates that are encoded in the colours; black is
+    background."""
 
     grid: int = 28
     frequencies: int = 32
@@ -110,7 +124,9 @@ class CoordinateBackbone:
         patches = image.reshape(n, p, n, p, 3).swapaxes(1, 2).reshape(n, n, p * p, 3).astype(float)
         painted = patches.min(axis=-1) > 0
         share = painted.mean(axis=-1)
-        mean = (patches * painted[..., None]).sum(axis=2) / np.maximum(painted.sum(axis=-1), 1)[..., None]
+        mean = (patches * painted[..., None]).sum(axis=2) / np.maximum(painted.sum(axis=-1), 1)[
+            ..., None
+        ]
         coordinates = (mean / 127 - 1) * REACH
         waves = np.random.default_rng(5).normal(0, 1.6, (3, self.frequencies))
         keys = np.concatenate([np.sin(coordinates @ waves), np.cos(coordinates @ waves)], axis=-1)
@@ -127,8 +143,11 @@ def true_pose(reference: Camera, placement: Sim3, target: Camera, target_placeme
 
 
 def reference_and_targets(targets: int = 3) -> list[Frame]:
-    """A frame of the object at home, and some of the object elsewhere, by upright cameras turned with its world."""
-    cameras = [turned(look_at(direction, distance=4.5), ELSEWHERE.R) for direction in DIRECTIONS[:targets]]
+    """A frame of the object at home, and some of the object elsewhere, by upright cameras turned
+    with its world."""
+    cameras = [
+        turned(look_at(direction, distance=4.5), ELSEWHERE.R) for direction in DIRECTIONS[:targets]
+    ]
     elsewhere = [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras)]
     return [render(look_at((1, 0.6, 0.4)), AT_HOME, "reference"), *elsewhere]
 
@@ -137,14 +156,23 @@ def matched_scene(views: list[View]) -> Scene:
     """The verified solver's scene of a reference view and its target views."""
     reference, *targets = views
     found = similarities(reference.features, [target.features for target in targets])
-    matches = [match(reference.features, target.features, kmeans=False, sim=sim) for target, sim in zip(targets, found)]
+    matches = [
+        match(reference.features, target.features, kmeans=False, sim=sim)
+        for target, sim in zip(targets, found)
+    ]
     return build_scene(reference, targets, found, matches)
 
 
 def working_pose(scene: Scene, sim3: Sim3, view: int) -> Poses:
-    """A similarity from the reference's camera to that of a target view, in the scene's working units."""
+    """A similarity from the reference's camera to that of a target view, in the scene's working
+    units."""
     first, camera = scene.target_cameras[0], scene.target_cameras[view]
     rotation = first.R @ camera.R.T
     to_first = Sim3(1.0, rotation, first.t - rotation @ camera.t)
     pose = scene.target_to_working @ to_first @ sim3 @ scene.reference_to_working.inverse()
-    return Poses(*(torch.tensor(np.array(part)[None], dtype=torch.float32) for part in (pose.scale, pose.R, pose.t)))
+    return Poses(
+        *(
+            torch.tensor(np.array(part)[None], dtype=torch.float32)
+            for part in (pose.scale, pose.R, pose.t)
+        )
+    )

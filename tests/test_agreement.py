@@ -56,26 +56,33 @@ def scaled(factor, frame):
 def along_ray(frame):
     height, width = frame.camera.size
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
-    lengths = np.linalg.norm(frame.camera.unproject_camera(pixels, np.ones((height, width))), axis=-1)
+    lengths = np.linalg.norm(
+        frame.camera.unproject_camera(pixels, np.ones((height, width))), axis=-1
+    )
     return replace(frame, depth=(frame.depth * lengths).astype(np.float32))
 
 
 def farther(frame):
     """Every other camera is at another distance."""
-    return replace(frame, camera=replace(frame.camera, t=frame.camera.t * (1, 1, 1 + int(frame.name) % 2 / 2)))
+    return replace(
+        frame, camera=replace(frame.camera, t=frame.camera.t * (1, 1, 1 + int(frame.name) % 2 / 2))
+    )
 
 
-@pytest.mark.parametrize(("mistake", "named"), [
-    (inverted, r"agree \(\d+%\) if the poses are world to camera$"),
-    (flipped, "if the poses have the other axes, OpenGL's for OpenCV's or the reverse"),
-    (lambda frame: inverted(flipped(frame)), "if the poses are world to camera$"),
-    (reordered, "if the poses are from quaternions with w first"),
-    (partial(scaled, 0.001), r"if the depth is taken in metres: --depth-unit 1$"),
-    (partial(scaled, 5), "if the depth is taken in 1/5000 m: --depth-unit 0.0002$"),
-    (partial(scaled, 1000), "if the depth is multiplied by 0.001: --depth-unit 1e-06$"),
-    (partial(scaled, 1.8), "if the depth is multiplied by 0.5[2-9]"),
-    (farther, "no usual mistake in units or poses explains it"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("mistake", "named"),
+    [
+        (inverted, r"agree \(\d+%\) if the poses are world to camera$"),
+        (flipped, "if the poses have the other axes, OpenGL's for OpenCV's or the reverse"),
+        (lambda frame: inverted(flipped(frame)), "if the poses are world to camera$"),
+        (reordered, "if the poses are from quaternions with w first"),
+        (partial(scaled, 0.001), r"if the depth is taken in metres: --depth-unit 1$"),
+        (partial(scaled, 5), "if the depth is taken in 1/5000 m: --depth-unit 0.0002$"),
+        (partial(scaled, 1000), "if the depth is multiplied by 0.001: --depth-unit 1e-06$"),
+        (partial(scaled, 1.8), "if the depth is multiplied by 0.5[2-9]"),
+        (farther, "no usual mistake in units or poses explains it"),
+    ],
+)
 def test_each_mistake_is_named(frames, mistake, named):
     line = disagreement([mistake(frame) for frame in frames], 0.001)
     assert re.search(named, line)
@@ -87,12 +94,15 @@ def test_right_frames_agree(frames):
 
 def test_depth_along_the_ray_is_named():
     assert re.search(
-        "if depth is the distance along the ray of a pixel", disagreement(map(along_ray, views(45.0, 1.6)), 0.001)
+        "if depth is the distance along the ray of a pixel",
+        disagreement(map(along_ray, views(45.0, 1.6)), 0.001),
     )
 
 
 def test_positions_of_another_unit_are_named_where_the_depth_is_plausible(frames):
-    wrong = [replace(frame, camera=replace(frame.camera, t=1000 * frame.camera.t)) for frame in frames]
+    wrong = [
+        replace(frame, camera=replace(frame.camera, t=1000 * frame.camera.t)) for frame in frames
+    ]
     assert "if the positions of the cameras are multiplied by 0.001" in disagreement(wrong, 0.001)
 
 

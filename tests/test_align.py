@@ -1,4 +1,5 @@
-"""A category in one frame, from a folder to labels: the run, what is written, one's own pair with helpers."""
+"""A category in one frame, from a folder to labels: the run, what is written, one's own pair with
+helpers."""
 
 import json
 import shutil
@@ -40,10 +41,15 @@ def run(tmp_path_factory):
 
 def turns(root):
     labels = read_labels(root, "lump")
-    return {(a, b): labels[b].trans[:3, :3] @ labels[a].trans[:3, :3].T for a, b in permutations(SEQUENCES, 2)}
+    return {
+        (a, b): labels[b].trans[:3, :3] @ labels[a].trans[:3, :3].T
+        for a, b in permutations(SEQUENCES, 2)
+    }
 
 
-def test_objects_are_aligned_as_their_labels_say_and_the_labels_that_are_written_say_the_same(run, tmp_path):
+def test_objects_are_aligned_as_their_labels_say_and_the_labels_that_are_written_say_the_same(
+    run, tmp_path
+):
     _, found = run
     write_labels(found, tmp_path, "lump")
     written = turns(tmp_path)
@@ -51,7 +57,9 @@ def test_objects_are_aligned_as_their_labels_say_and_the_labels_that_are_written
         assert rotation_error(found.between(*pair).R, true) < 15
         np.testing.assert_allclose(written[pair], found.between(*pair).R, atol=1e-6)
     with pytest.raises(InputError, match="would be replaced by other content"):
-        write_labels(replace(found, objects=dict(reversed(found.objects.items()))), tmp_path, "lump")
+        write_labels(
+            replace(found, objects=dict(reversed(found.objects.items()))), tmp_path, "lump"
+        )
 
 
 def test_the_row_of_the_benchmark_takes_the_pose_from_the_alignment_of_all_objects(tmp_path):
@@ -66,7 +74,9 @@ def test_a_killed_run_is_continued_where_it_was_and_by_other_workers(run, tmp_pa
     (tmp_path / "run.json").write_text((out / "run.json").read_text())
     (tmp_path / "run.jsonl").write_text("".join(lines[:14]) + lines[14][:30])
     with ThreadPoolExecutor(2) as executor:
-        found = align_category(Co3D(small_folder()), "lump", BACKBONE, targets=3, out=tmp_path, executor=executor)
+        found = align_category(
+            Co3D(small_folder()), "lump", BACKBONE, targets=3, out=tmp_path, executor=executor
+        )
     assert sorted((tmp_path / "run.jsonl").read_text().splitlines(keepends=True)) == sorted(lines)
     monkeypatch.setattr(align, "hypotheses", None)  # nothing is left to compute
     again = align_category(Co3D(small_folder()), "lump", BACKBONE, targets=3, out=tmp_path)
@@ -88,39 +98,63 @@ def test_pairs_without_a_pose_are_left_out_until_none_is_left(monkeypatch):
 
     solve, everything = align.hypotheses, False
     monkeypatch.setattr(align, "hypotheses", fail)
-    assert list(align_category(Co3D(small_folder()), "lump", BACKBONE, SEQUENCES, targets=3).objects) == [A, B]
+    assert list(
+        align_category(Co3D(small_folder()), "lump", BACKBONE, SEQUENCES, targets=3).objects
+    ) == [A, B]
     everything = True
-    refused("none of 30 pairs determines a pose", align_category, Co3D(small_folder()), "lump", BACKBONE, targets=3)
+    refused(
+        "none of 30 pairs determines a pose",
+        align_category,
+        Co3D(small_folder()),
+        "lump",
+        BACKBONE,
+        targets=3,
+    )
 
 
-def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(run, tmp_path, monkeypatch, capsys):
+def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
+    run, tmp_path, monkeypatch, capsys
+):
     root, out = tmp_path / "data", tmp_path / "out"
     shutil.copytree(small_folder(), root)
     found = replace(run[1], disagreements={(A, C): 179.96})
     monkeypatch.setattr("zsp_lite.align.align_category", lambda *_, **__: found)
     assert cli.main(["align", str(root), "--category", "lump", "--out", str(out), "--propose"]) == 0
     text = capsys.readouterr().out
-    assert "lump: 3 objects in one frame" in text and "100.0% of 6 ordered pairs are within 30°" in text
+    assert (
+        "lump: 3 objects in one frame" in text
+        and "100.0% of 6 ordered pairs are within 30°" in text
+    )
     assert f"{A} to {C}: the best pose of the pair alone is 180° away" in text
-    assert (out / "report.html").read_bytes().count(b"<img") == 1 and (out / "objects.jpg").stat().st_size > 1000
+    assert (out / "report.html").read_bytes().count(b"<img") == 1 and (
+        out / "objects.jpg"
+    ).stat().st_size > 1000
     alignment = json.loads((out / "alignment.json").read_text())
     assert alignment["disagreements"] == [{"pair": [A, C], "degrees": 179.96}]
-    np.testing.assert_allclose(alignment["objects"][B]["world_to_frame"], run[1].objects[B].sim3.matrix)
+    np.testing.assert_allclose(
+        alignment["objects"][B]["world_to_frame"], run[1].objects[B].sim3.matrix
+    )
     labelling = Labelling(root, "lump")
     assert rotation_error(labelling.proposal(C).R, run[1].between(A, C).R) < 0.01
 
 
 def test_the_objects_of_a_category_without_masks_are_shown_in_whole_frames(run, monkeypatch):
     dataset, frames = Co3D(small_folder()), Co3D.frames
-    monkeypatch.setattr(Co3D, "frames", lambda *of: [msgspec.structs.replace(one, mask=None) for one in frames(*of)])
+    monkeypatch.setattr(
+        Co3D, "frames", lambda *of: [msgspec.structs.replace(one, mask=None) for one in frames(*of)]
+    )
     shown = [axis.images[0].get_array() for axis in objects_figure(dataset, "lump", run[1]).axes]
     assert len(shown) == 6
-    whole = [resize_frame(dataset.load(one), (224, 224)).rgb.tolist() for one in dataset.frames("lump", A)]
+    whole = [
+        resize_frame(dataset.load(one), (224, 224)).rgb.tolist()
+        for one in dataset.frames("lump", A)
+    ]
     assert shown[0].tolist() in whole
 
 
 def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
-    """Every frame of the pair itself votes for a half turn, which the third object shows to be wrong."""
+    """Every frame of the pair itself votes for a half turn, which the third object shows to be
+    wrong."""
 
     def misled(method, reference, targets, matched=None):
         one = estimate(method, reference, targets, matched)
@@ -128,10 +162,21 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
         if set(ends) != {A, B}:
             return one
         best = one.hypotheses[0]
-        turn, other = reference.frame.camera.R, targets[best.view].frame.camera.R  # the half turn is that of A's world
-        turned = best.sim3.R @ turn @ HALF_TURN @ turn.T if ends[0] == A else other @ HALF_TURN @ other.T @ best.sim3.R
+        turn, other = (
+            reference.frame.camera.R,
+            targets[best.view].frame.camera.R,
+        )  # the half turn is that of A's world
+        turned = (
+            best.sim3.R @ turn @ HALF_TURN @ turn.T
+            if ends[0] == A
+            else other @ HALF_TURN @ other.T @ best.sim3.R
+        )
         wrong = replace(best, sim3=replace(best.sim3, R=turned))
-        return replace(one, sim3=wrong.sim3, hypotheses=(replace(wrong, confidence=0.6), replace(best, confidence=0.3)))
+        return replace(
+            one,
+            sim3=wrong.sim3,
+            hypotheses=(replace(wrong, confidence=0.6), replace(best, confidence=0.3)),
+        )
 
     estimate = ZeroShotPose.estimate_from_views
     monkeypatch.setattr(ZeroShotPose, "estimate_from_views", misled)
@@ -143,4 +188,6 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
     assert found.errors["verified"] < 15 and one.confidence > 0.5 and not one.one_of_two
     assert found.sources[1].endswith(f"helpers: {sources[2]}")
     assert one.flags[-1].startswith("4 of 4 frames vote for another pose: frame 0 of")
-    refused("expected different objects", estimate_pose, *sources[:2], helpers=sources[1:], **settings)
+    refused(
+        "expected different objects", estimate_pose, *sources[:2], helpers=sources[1:], **settings
+    )

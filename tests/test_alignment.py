@@ -44,30 +44,50 @@ def test_composition_is_the_product_of_the_matrices_and_application_in_turn(seed
     np.testing.assert_allclose(a.apply(points), homogeneous[:, :3], atol=1e-9)
 
 
-@pytest.mark.parametrize(("scale", "R", "t"), [
-    (0.0, np.eye(3), np.zeros(3)),
-    (np.nan, np.eye(3), np.zeros(3)),
-    (1.0, np.diag([1.0, 1.0, -1.0]), np.zeros(3)),
-    (1.0, 2 * np.eye(3), np.zeros(3)),
-    (1.0, np.eye(4), np.zeros(3)),
-    (1.0, np.eye(3), np.array([0.0, np.inf, 0.0])),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("scale", "R", "t"),
+    [
+        (0.0, np.eye(3), np.zeros(3)),
+        (np.nan, np.eye(3), np.zeros(3)),
+        (1.0, np.diag([1.0, 1.0, -1.0]), np.zeros(3)),
+        (1.0, 2 * np.eye(3), np.zeros(3)),
+        (1.0, np.eye(4), np.zeros(3)),
+        (1.0, np.eye(3), np.array([0.0, np.inf, 0.0])),
+    ],
+)
 def test_what_is_no_similarity_is_refused(scale, R, t):
     refused(".", Sim3, scale, R, t)
 
 
-@pytest.mark.parametrize("rounded", [lambda R: R.astype(np.float16), lambda R: R.round(4), lambda R: R.round(2)])
-def test_a_rounded_rotation_becomes_the_nearest_one_and_another_is_refused_with_its_distance(rounded):
+@pytest.mark.parametrize(
+    "rounded", [lambda R: R.astype(np.float16), lambda R: R.round(4), lambda R: R.round(2)]
+)
+def test_a_rounded_rotation_becomes_the_nearest_one_and_another_is_refused_with_its_distance(
+    rounded,
+):
     exact = similarity(3).R
     R = rounded(exact)
     nearest = Rotation.from_matrix(R.astype(float)).as_matrix()
     found = Sim3.from_matrix(np.vstack([np.c_[2 * R.astype(float), np.ones(3)], [0, 0, 0, 1]]))
     camera = Camera(R, np.zeros(3), np.ones(2), np.ones(2), (2, 2))
-    for one in (Sim3(1.0, R, np.zeros(3)).R, rotation_matrix("R", np.stack([R, R]))[1], found.R, camera.R):
+    for one in (
+        Sim3(1.0, R, np.zeros(3)).R,
+        rotation_matrix("R", np.stack([R, R]))[1],
+        found.R,
+        camera.R,
+    ):
         np.testing.assert_allclose(one, nearest, atol=1e-12)
     assert found.scale == pytest.approx(2, abs=0.02)
-    np.testing.assert_array_equal(Sim3(1.0, exact.astype(np.float32), np.zeros(3)).R, exact.astype(np.float32))
-    refused(r"Sim3: R is .*, 0\.029 off the nearest rotation, expected", Sim3, 1.0, 1.03 * exact, np.zeros(3))
+    np.testing.assert_array_equal(
+        Sim3(1.0, exact.astype(np.float32), np.zeros(3)).R, exact.astype(np.float32)
+    )
+    refused(
+        r"Sim3: R is .*, 0\.029 off the nearest rotation, expected",
+        Sim3,
+        1.0,
+        1.03 * exact,
+        np.zeros(3),
+    )
 
 
 def test_records_keep_their_values_when_the_arrays_that_they_were_made_of_change():
@@ -81,17 +101,27 @@ def test_records_keep_their_values_when_the_arrays_that_they_were_made_of_change
         array[0] = 5
     assert_same(sim3, Sim3.identity())
     assert np.array_equal(label.trans, np.eye(4)) and np.array_equal(camera.matrix, np.eye(4))
-    assert not frame.rgb.any() and not frame.depth.any() and not frame.mask.any() and not features.keys.any()
+    assert (
+        not frame.rgb.any()
+        and not frame.depth.any()
+        and not frame.mask.any()
+        and not features.keys.any()
+    )
 
 
 @given(seeds, scales, st.integers(4, 40))
 def test_umeyama_is_the_best_rotation_by_scipy_also_for_a_mirrored_target(seed, scale, n):
     source = cloud(seed, n)
-    for target in (similarity(seed, scale).apply(source) + 0.2 * cloud(seed + 1, n), source * (1, 1, -1)):
+    for target in (
+        similarity(seed, scale).apply(source) + 0.2 * cloud(seed + 1, n),
+        source * (1, 1, -1),
+    ):
         sim3 = umeyama(source, target)
         x, y = source - source.mean(axis=0), target - target.mean(axis=0)
         np.testing.assert_allclose(sim3.R, Rotation.align_vectors(y, x)[0].as_matrix(), atol=1e-6)
-        assert sim3.scale == pytest.approx((x @ sim3.R.T * y).sum() / np.square(x).sum())  # the least-squares scale
+        assert sim3.scale == pytest.approx(
+            (x @ sim3.R.T * y).sum() / np.square(x).sum()
+        )  # the least-squares scale
         np.testing.assert_allclose(sim3.apply(source.mean(axis=0)), target.mean(axis=0), atol=1e-9)
 
 
@@ -105,11 +135,17 @@ line = np.linspace(0, 1, 8)[:, None] * (1.0, 2.0, 3.0)
 rounded = (line + (0.1, 0.7, 5.0)).astype(np.float32)
 not_finite = np.where(cloud(0) == cloud(0)[3, 1], np.nan, cloud(0))
 DEGENERATE = {
-    "two": (cloud(0, 2), cloud(0, 2)), "collinear": (line, line), "equal": (np.ones((5, 3)), np.ones((5, 3))),
-    "target line": (cloud(0, 8), line), "target point": (cloud(0), np.ones((20, 3))),
-    "rounded line": (rounded, cloud(0, 8)), "nan": (not_finite, cloud(0)), "nan target": (cloud(0), not_finite),
-    "lengths": (cloud(0, 5), cloud(0, 6)), "flat": (cloud(0)[:, :2], cloud(0)[:, :2]),
-}  # fmt: skip
+    "two": (cloud(0, 2), cloud(0, 2)),
+    "collinear": (line, line),
+    "equal": (np.ones((5, 3)), np.ones((5, 3))),
+    "target line": (cloud(0, 8), line),
+    "target point": (cloud(0), np.ones((20, 3))),
+    "rounded line": (rounded, cloud(0, 8)),
+    "nan": (not_finite, cloud(0)),
+    "nan target": (cloud(0), not_finite),
+    "lengths": (cloud(0, 5), cloud(0, 6)),
+    "flat": (cloud(0)[:, :2], cloud(0)[:, :2]),
+}
 
 
 @pytest.mark.parametrize("points", DEGENERATE)
@@ -139,12 +175,17 @@ def test_ransac_recovers_the_pose_with_sixty_percent_outliers(seed):
 
 def test_the_same_seed_gives_the_same_result_and_a_generator_will_do():
     source, target, _, _ = contaminated(4, outliers=0.8)
-    first, second = ransac(source, target, seed=5), ransac(source, target, seed=np.random.default_rng(5))
+    first, second = (
+        ransac(source, target, seed=5),
+        ransac(source, target, seed=np.random.default_rng(5)),
+    )
     assert_same(first[0], second[0], atol=0)
     assert (first[1] == second[1]).all()
 
 
-def test_many_trials_on_many_points_need_little_memory_and_one_that_is_better_wins_wherever_it_is(monkeypatch):
+def test_many_trials_on_many_points_need_little_memory_and_one_that_is_better_wins_wherever_it_is(
+    monkeypatch,
+):
     source, target, truth, right = contaminated(3, outliers=0.8)
     tracemalloc.start()
     found, inliers = ransac(np.tile(source, (20, 1)), np.tile(target, (20, 1)), trials=20_000)
@@ -180,14 +221,17 @@ def test_the_final_fit_keeps_to_the_scale_range():
     bounded, inliers = ransac(source, target, scale_range=(0.2, 5))
     assert bounded.scale == 0.2
 
-    # No other similarity of that scale fits the inliers better: the best rotation and translation by scipy.
+    # No other similarity of that scale fits the inliers better: the best rotation and translation
+    # by scipy.
     x, y = source[inliers], target[inliers]
     expected, _ = Rotation.align_vectors(y - y.mean(axis=0), x - x.mean(axis=0))
     np.testing.assert_allclose(bounded.R, expected.as_matrix(), atol=1e-9)
     np.testing.assert_allclose(bounded.apply(x).mean(axis=0), y.mean(axis=0), atol=1e-12)
 
 
-@pytest.mark.parametrize("settings", [{"trials": 0}, {"sample_size": 2}, {"scale_range": (2, 1)}, {"threshold": 0}])
+@pytest.mark.parametrize(
+    "settings", [{"trials": 0}, {"sample_size": 2}, {"scale_range": (2, 1)}, {"threshold": 0}]
+)
 def test_settings_of_ransac_out_of_range_are_refused(settings):
     refused(next(iter(settings)), lambda: ransac(cloud(0), cloud(0), **settings))
     refused("at least 4", lambda: ransac(cloud(0, 3), cloud(0, 3)))

@@ -1,4 +1,5 @@
-"""`data download`: small archives in CO3D's layout from a server on loopback, and everything that can go wrong."""
+"""`data download`: small archives in CO3D's layout from a server on loopback, and everything that
+can go wrong."""
 
 import hashlib
 import io
@@ -27,7 +28,8 @@ CHUNKS = ["/toaster_000.zip", "/toaster_001.zip"]
 
 
 def zipped(folder: Path, *names: str) -> bytes:
-    """A zip archive of the files and folders whose paths in `folder` begin with one of the names."""
+    """A zip archive of the files and folders whose paths in `folder` begin with one of the
+    names."""
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w") as archive:
         for path in sorted(folder.rglob("*")):
@@ -38,7 +40,8 @@ def zipped(folder: Path, *names: str) -> bytes:
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
-    """A labelled data folder of toasters with one evaluation pair, and a file that makes a long archive."""
+    """A labelled data folder of toasters with one evaluation pair, and a file that makes a long
+    archive."""
     folder = tmp_path_factory.mktemp("source")
     write_co3d(folder, "toaster", [sequence_data(name) for name in (*SEQUENCES, UNLABELLED)])
     (folder / "toaster" / UNLABELLED / "long").write_bytes(np.random.default_rng(0).bytes(1 << 20))
@@ -74,7 +77,9 @@ def server(source, tmp_path, monkeypatch):
 
 
 def write_catalogue(server) -> None:
-    chunk0, chunk1, single0, single1, v1 = (hashlib.sha256(one).hexdigest() for one in server.files.values())
+    chunk0, chunk1, single0, single1, v1 = (
+        hashlib.sha256(one).hexdigest() for one in server.files.values()
+    )
     v2 = {"full": {"toaster": [chunk0, chunk1]}, "single-sequence": {"toaster": [single0, single1]}}
     server.catalogue.write_text(json.dumps({"co3d": v2, "co3d-v1": {"full": {"toaster": [v1]}}}))
 
@@ -84,7 +89,20 @@ def download(run):
     """Downloads toasters by a command with an exit code; returns what it printed."""
 
     def command(root, *options, dataset="co3d", code=0) -> str:
-        return run(["data", "download", dataset, "--category", "toaster", "--root", root, *options, "--yes"], code)
+        return run(
+            [
+                "data",
+                "download",
+                dataset,
+                "--category",
+                "toaster",
+                "--root",
+                root,
+                *options,
+                "--yes",
+            ],
+            code,
+        )
 
     return command
 
@@ -96,7 +114,9 @@ def files_of(folder: Path) -> list[str]:
 def test_a_category_is_downloaded_verified_unpacked_and_checked(server, source, tmp_path, download):
     root = tmp_path / "co3d"
     text = download(root)
-    assert all(part in text for part in ("toaster_001.zip", "0.00 GB", "CC BY-NC 4.0", "No problems"))
+    assert all(
+        part in text for part in ("toaster_001.zip", "0.00 GB", "CC BY-NC 4.0", "No problems")
+    )
     assert contents(root / "toaster") == contents(source / "toaster")
     assert files_of(root / ".download") == ["unpacked.json"]  # the archives are removed
     requests = len(server.ranges)
@@ -106,10 +126,18 @@ def test_a_category_is_downloaded_verified_unpacked_and_checked(server, source, 
 
 def test_the_official_list_has_the_archives_of_every_category():
     """The numbers of archives as published; a category of the paper has them in every list."""
-    for category, count in {"toyplane": 4, "car": 6, "toaster": 6, "bicycle": 6, "chair": 14}.items():
+    for category, count in {
+        "toyplane": 4,
+        "car": 6,
+        "toaster": 6,
+        "bicycle": 6,
+        "chair": 14,
+    }.items():
         full, single = (list_archives("co3d", category, subset) for subset in (False, True))
         (old,) = list_archives("co3d-v1", category)
-        assert (len(full), len(single)) == (count, 2) and single[1].name == f"{category}_001_singlesequence.zip"
+        assert (len(full), len(single)) == (count, 2) and single[
+            1
+        ].name == f"{category}_001_singlesequence.zip"
         assert full[0].url == f"https://dl.fbaipublicfiles.com/co3dv2_231130/{category}_000.zip"
         assert old.url == f"https://dl.fbaipublicfiles.com/co3d/{category}.zip"
         assert all(len(bytes.fromhex(one.sha256)) == 32 for one in (*full, *single, old))
@@ -126,16 +154,27 @@ def test_the_first_chunk_can_be_used_alone_and_completed_later(server, source, t
     assert contents(root / "toaster") == contents(source / "toaster")
 
 
-def test_labelled_sequences_are_read_out_of_the_archive_on_the_server(server, source, tmp_path, download, monkeypatch):
+def test_labelled_sequences_are_read_out_of_the_archive_on_the_server(
+    server, source, tmp_path, download, monkeypatch
+):
     monkeypatch.setattr(archives, "_PART", 4_096)
     root, options = tmp_path / "v1", ("--labels", str(source), "--labelled-only")
     text = download(root, *options, dataset="co3d-v1")
-    assert "2 labels, 1 files of pairs" in text and list(read_labels(root, "toaster")) == list(SEQUENCES)
-    assert "2 sequences of toaster.zip" in text and "1 of 3 annotated sequences are not downloaded" in text
-    expected = {name: data for name, data in contents(source / "toaster").items() if UNLABELLED not in name}
+    assert "2 labels, 1 files of pairs" in text and list(read_labels(root, "toaster")) == list(
+        SEQUENCES
+    )
+    assert (
+        "2 sequences of toaster.zip" in text
+        and "1 of 3 annotated sequences are not downloaded" in text
+    )
+    expected = {
+        name: data for name, data in contents(source / "toaster").items() if UNLABELLED not in name
+    }
     assert contents(root / "toaster") == expected
     parts = [one.removeprefix("bytes=").split("-") for one in server.ranges]
-    assert sum(int(last) - int(first) for first, last in parts) < len(server.files["/toaster.zip"]) / 2
+    assert (
+        sum(int(last) - int(first) for first, last in parts) < len(server.files["/toaster.zip"]) / 2
+    )
     requests = len(server.ranges)
     text = download(root, *options, dataset="co3d-v1")
     assert len(server.ranges) == requests and "everything is unpacked already" in text
@@ -150,29 +189,41 @@ def test_sequences_of_an_archive_need_a_server_that_sends_parts(server, source, 
         text = download(tmp_path / "v1", *options, dataset="co3d-v1", code=2)
         assert "http://127.0.0.1:9/toaster.zip cannot be reached" in text
     server.knows_ranges = False
-    assert "expected range requests" in download(tmp_path / "v1", *options, dataset="co3d-v1", code=2)
+    assert "expected range requests" in download(
+        tmp_path / "v1", *options, dataset="co3d-v1", code=2
+    )
     server.knows_ranges, server.break_after = True, 1_000  # every response is cut off, and read on
     download(tmp_path / "v1", *options, dataset="co3d-v1")
 
 
 @pytest.mark.parametrize(("answer", "code"), [("\n", 1), ("Y\n", 0), ("", 130), (None, 2)])
-def test_the_user_is_asked_on_a_terminal_or_has_said_yes(server, tmp_path, capsys, monkeypatch, answer, code):
+def test_the_user_is_asked_on_a_terminal_or_has_said_yes(
+    server, tmp_path, capsys, monkeypatch, answer, code
+):
     monkeypatch.setattr("sys.stdin", io.StringIO(answer or ""))
     monkeypatch.setattr("sys.stdin.isatty", lambda: answer is not None)
     assert main([*COMMAND, str(tmp_path / "co3d")]) == code
     out, error = capsys.readouterr()
-    assert "toaster_001.zip" in out and ("expected --yes" in error) == (code == 2) and error.count("\n") == (code > 1)
+    assert (
+        "toaster_001.zip" in out
+        and ("expected --yes" in error) == (code == 2)
+        and error.count("\n") == (code > 1)
+    )
     assert (tmp_path / "co3d").exists() == (server.ranges != []) == (code == 0)
 
 
-def test_a_truncated_archive_is_completed_by_the_next_call_of_one_process(server, source, tmp_path, download):
+def test_a_truncated_archive_is_completed_by_the_next_call_of_one_process(
+    server, source, tmp_path, download
+):
     server.break_after = 1_000
     assert "at 3000 bytes; call again to resume" in download(tmp_path / "co3d", code=2)
     server.break_after = None
     with writing(tmp_path / "co3d/.download"):
         assert "another process is writing to it" in download(tmp_path / "co3d", code=2)
     download(tmp_path / "co3d")
-    assert "bytes=3000-" in server.ranges and contents(tmp_path / "co3d/toaster") == contents(source / "toaster")
+    assert "bytes=3000-" in server.ranges and contents(tmp_path / "co3d/toaster") == contents(
+        source / "toaster"
+    )
 
 
 def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkeypatch, download):
@@ -187,14 +238,18 @@ def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkey
 
     monkeypatch.setattr(zipfile.ZipFile, "read", stop_at_third)
     download(root, dataset="co3d-v1", code=130)
-    assert len(files_of(root / "toaster")) == 3 and Co3D(root).categories() == []  # annotations last
+    assert (
+        len(files_of(root / "toaster")) == 3 and Co3D(root).categories() == []
+    )  # annotations last
     monkeypatch.setattr(zipfile.ZipFile, "read", read)
     download(root, dataset="co3d-v1")
     assert contents(root / "toaster") == contents(source / "toaster")
     assert len(server.ranges) == 1  # the archive that was there is not downloaded again
 
 
-@pytest.mark.parametrize("name", ["../outside", "/outside", "toaster/../../outside", "toaster\\..\\x", "toaster//x"])
+@pytest.mark.parametrize(
+    "name", ["../outside", "/outside", "toaster/../../outside", "toaster\\..\\x", "toaster//x"]
+)
 def test_nothing_is_written_outside_the_folder_and_no_link_is_made(server, tmp_path, capsys, name):
     data, member = io.BytesIO(), zipfile.ZipInfo(name)
     member.external_attr = (stat.S_IFLNK | 0o777) << 16
@@ -205,9 +260,13 @@ def test_nothing_is_written_outside_the_folder_and_no_link_is_made(server, tmp_p
     write_catalogue(server)
     code, error = main([*COMMAND, str(tmp_path / "co3d"), "--yes"]), capsys.readouterr().err
     if name.startswith("toaster/.."):  # the others are no files of the category
-        assert code == 2 and "leads out of the data folder" in error and len(error.splitlines()) == 1
+        assert (
+            code == 2 and "leads out of the data folder" in error and len(error.splitlines()) == 1
+        )
         assert not (tmp_path / "co3d/toaster").exists()
-    assert {path.name for path in tmp_path.iterdir()} == {"co3d", "catalogue.json"} and not Path("/outside").exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"co3d", "catalogue.json"} and not Path(
+        "/outside"
+    ).exists()
     assert not any(path.is_symlink() for path in tmp_path.rglob("*"))
 
 
@@ -221,10 +280,12 @@ def test_a_link_in_the_folder_is_not_followed_out_of_it(server, tmp_path, downlo
 
 @pytest.mark.parametrize(
     ("damage", "listed", "message"),
-    [(lambda whole: b"not a zip archive", True, "is damaged or encrypted"),
-     (lambda whole: whole.replace(b"JFIF", b"XXXX"), True, "is damaged or encrypted"),
-     (lambda whole: whole[:-1] + b"x", False, "is another file")],
-)  # fmt: skip
+    [
+        (lambda whole: b"not a zip archive", True, "is damaged or encrypted"),
+        (lambda whole: whole.replace(b"JFIF", b"XXXX"), True, "is damaged or encrypted"),
+        (lambda whole: whole[:-1] + b"x", False, "is another file"),
+    ],
+)
 def test_a_damaged_archive_or_one_with_another_digest_is_not_unpacked(
     server, tmp_path, download, damage, listed, message
 ):
@@ -235,11 +296,17 @@ def test_a_damaged_archive_or_one_with_another_digest_is_not_unpacked(
     assert not list((tmp_path / "co3d").rglob("*.jgz"))  # without annotations there is no category
 
 
-def test_a_disk_that_is_too_small_is_found_before_the_download(server, tmp_path, download, monkeypatch):
+def test_a_disk_that_is_too_small_is_found_before_the_download(
+    server, tmp_path, download, monkeypatch
+):
     sizes = [len(server.files[name]) for name in CHUNKS]
     needed = sum(sizes) + max(sizes)  # both unpacked, and one archive
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr("shutil.disk_usage", lambda path: usage._replace(free=needed - 1))
-    assert "GB free" in download(tmp_path / "co3d", code=2) and server.ranges == [] and not (tmp_path / "co3d").exists()
+    assert (
+        "GB free" in download(tmp_path / "co3d", code=2)
+        and server.ranges == []
+        and not (tmp_path / "co3d").exists()
+    )
     monkeypatch.setattr("shutil.disk_usage", lambda path: usage._replace(free=needed))
     download(tmp_path / "co3d")

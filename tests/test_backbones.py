@@ -1,4 +1,5 @@
-"""What every backbone must do, checkpoints in all their wrappings, names, downloads, images good and bad."""
+"""What every backbone must do, checkpoints in all their wrappings, names, downloads, images good
+and bad."""
 
 import hashlib
 import sys
@@ -15,7 +16,13 @@ from torch import nn
 
 from zsp_lite.backbones import load
 from zsp_lite.backbones.backbone import Backbone
-from zsp_lite.backbones.load import BackboneConfig, PretrainedWeights, available_backbones, load_backbone, obtained_by
+from zsp_lite.backbones.load import (
+    BackboneConfig,
+    PretrainedWeights,
+    available_backbones,
+    load_backbone,
+    obtained_by,
+)
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.choices import FACETS
@@ -31,7 +38,10 @@ def vit() -> VisionTransformer:
 @pytest.fixture()
 def pictures() -> list[np.ndarray]:
     rng = np.random.default_rng(0)
-    return [rng.integers(0, 256, shape, dtype=np.uint8) for shape in ((32, 32, 3), (50, 40, 3), (9, 64, 3))]
+    return [
+        rng.integers(0, 256, shape, dtype=np.uint8)
+        for shape in ((32, 32, 3), (50, 40, 3), (9, 64, 3))
+    ]
 
 
 def assert_same_features(first, second):
@@ -42,7 +52,8 @@ def assert_same_features(first, second):
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory, vit) -> dict[str, str]:
-    """The embedded backbone, a checkpoint in DINO's layout, a model of each architecture of Hugging Face's format."""
+    """The embedded backbone, a checkpoint in DINO's layout, a model of each architecture of Hugging
+    Face's format."""
     root = tmp_path_factory.mktemp("backbones")
     torch.save(vit.state_dict(), root / "checkpoint.pth")
     models = {kind: f"hf:{folder}" for kind, folder in save_all(root).items()}
@@ -64,12 +75,15 @@ def test_features_depend_on_nothing_but_the_image(place, pictures):
     assert not torch.allclose(features[0].keys, features[1].keys)
     frozen = pictures[2].copy()
     frozen.flags.writeable = False
-    assert_same_features(backbone([torch.from_numpy(pictures[0]), pictures[1] / 255, frozen]), features)
+    assert_same_features(
+        backbone([torch.from_numpy(pictures[0]), pictures[1] / 255, frozen]), features
+    )
     assert_same_features(backbone([pictures[1][::-1][::-1]]), features[1:2])
     assert backbone([]) == []
     again = load_backbone(place, "cpu", image_size=size)
     assert fingerprint(again) == fingerprint(backbone)
-    # Ordinary tensors of their own: they do not keep the batch in memory, and can enter a graph with gradients.
+    # Ordinary tensors of their own: they do not keep the batch in memory, and can enter a graph
+    # with gradients.
     keys = features[0].keys
     assert keys.untyped_storage().nbytes() == keys.numel() * 4
     layer = nn.Linear(backbone.embed_dim, 2)
@@ -90,11 +104,17 @@ def test_layer_and_facet_change_the_keys_alone_and_stand_in_the_name(place, pict
     keys, (first, *others) = [one.keys for one in found], found
     assert all(not torch.allclose(a, b) for i, a in enumerate(keys) for b in keys[:i])
     for other in others:
-        torch.testing.assert_close((other.saliency, other.global_feature), (first.saliency, first.global_feature),
-                                   atol=1e-5, rtol=1e-4)  # fmt: skip
+        torch.testing.assert_close(
+            (other.saliency, other.global_feature),
+            (first.saliency, first.global_feature),
+            atol=1e-5,
+            rtol=1e-4,
+        )
 
 
-@pytest.mark.parametrize("options", [{"layer": 12}, {"facet": "keys"}, {"image_size": 0}, {"image_size": 2049}])
+@pytest.mark.parametrize(
+    "options", [{"layer": 12}, {"facet": "keys"}, {"image_size": 0}, {"image_size": 2049}]
+)
 def test_options_out_of_range_are_refused_by_every_backbone(place, options):
     (name,) = options
     refused(f"{name} is .*expected [^\n]+$", load_backbone, place, "cpu", **options)
@@ -102,7 +122,9 @@ def test_options_out_of_range_are_refused_by_every_backbone(place, options):
 
 def test_features_are_the_models_keys_saliency_and_cls(pictures):
     vit = small_vit(num_heads=4)
-    features = Backbone(vit, "small", layer=1, saliency_heads=(0, 3), device="cpu", batch_size=2)(pictures)
+    features = Backbone(vit, "small", layer=1, saliency_heads=(0, 3), device="cpu", batch_size=2)(
+        pictures
+    )
     pixels = torch.from_numpy(pictures[0]).permute(2, 0, 1)[None] / 255
     mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
     with torch.no_grad():
@@ -123,15 +145,22 @@ def test_uniform_attention_is_no_foreground():
 
 
 def test_of_dino_vits_four_heads_are_salient_and_of_others_all():
-    vits, other = (Backbone(vit, "x", device="cpu") for vit in (VisionTransformer(32, 8), small_vit(num_heads=4)))
+    vits, other = (
+        Backbone(vit, "x", device="cpu")
+        for vit in (VisionTransformer(32, 8), small_vit(num_heads=4))
+    )
     assert (vits.saliency_heads, vits.layer) == ((0, 2, 4, 5), 9)
     assert (other.saliency_heads, other.layer) == ((0, 1, 2, 3), 2)
 
 
 BAD_IMAGES = [
-    np.zeros((8, 8), np.uint8), np.zeros((8, 8, 4), np.uint8), np.zeros((0, 8, 3), np.uint8),
-    np.zeros((8, 8, 3), np.int64), np.full((8, 8, 3), 1.5), np.full((8, 8, 3), np.nan),
-]  # fmt: skip
+    np.zeros((8, 8), np.uint8),
+    np.zeros((8, 8, 4), np.uint8),
+    np.zeros((0, 8, 3), np.uint8),
+    np.zeros((8, 8, 3), np.int64),
+    np.full((8, 8, 3), 1.5),
+    np.full((8, 8, 3), np.nan),
+]
 
 
 @pytest.mark.parametrize("image", BAD_IMAGES)
@@ -148,11 +177,17 @@ def test_torch_checkpoints_load_however_they_are_wrapped(vit, pictures, tmp_path
         "plain": weights,
         "teacher": {"student": {}, "epoch": 3, "teacher": teacher},
         "state_dict": {"state_dict": {f"module.{k}": v for k, v in weights.items()}},
-        "prefixed": {f"backbone.{k}": v for k, v in weights.items()} | {"head.mlp.weight": torch.zeros(2, 2)},
+        "prefixed": {f"backbone.{k}": v for k, v in weights.items()}
+        | {"head.mlp.weight": torch.zeros(2, 2)},
     }[wrapping]
     torch.save(content, tmp_path / "mine.pth")
     loaded = load_backbone(tmp_path / "mine.pth", "cpu")
-    assert (loaded.name, loaded.patch_size, loaded.image_size, loaded.embed_dim) == ("mine", 8, 32, 64)
+    assert (loaded.name, loaded.patch_size, loaded.image_size, loaded.embed_dim) == (
+        "mine",
+        8,
+        32,
+        64,
+    )
     assert_same_features(loaded(pictures), Backbone(vit, "small", device="cpu")(pictures))
 
 
@@ -172,27 +207,50 @@ def test_safetensors_bring_their_settings_and_options_override_them(pictures, tm
 def test_the_embedded_backbone_is_found_by_its_name(vit, tmp_path, monkeypatch):
     path = tmp_path / "zsp-tiny.safetensors"
     monkeypatch.setattr(load, "TINY", path)
-    refused("checkpoint .*zsp-tiny.safetensors cannot be read: no such file", load_backbone, "zsp-tiny")
+    refused(
+        "checkpoint .*zsp-tiny.safetensors cannot be read: no such file", load_backbone, "zsp-tiny"
+    )
     save_file(vit.state_dict(), path, metadata={"num_heads": "1"})
-    assert load_backbone("zsp-tiny").name == "zsp-tiny" and available_backbones()["zsp-tiny"] == path
-    assert load.as_backbone(path).embed_dim == load.as_backbone(str(path)).embed_dim == vit.embed_dim
+    assert (
+        load_backbone("zsp-tiny").name == "zsp-tiny" and available_backbones()["zsp-tiny"] == path
+    )
+    assert (
+        load.as_backbone(path).embed_dim == load.as_backbone(str(path)).embed_dim == vit.embed_dim
+    )
 
 
-@pytest.mark.parametrize("change, message", [
-    (lambda w: {k: x for k, x in w.items() if k != "pos_embed"}, "DINO layout"),
-    (lambda w: {k: x for k, x in w.items() if "1.norm1.bias" not in k}, "not fit: .* Missing .*1.norm1.bias"),
-    (lambda w: w | {"norm.weight": torch.zeros(3)}, "not fit: .* size mismatch for norm.weight"),
-    (lambda w: w | {"extra": torch.zeros(1)}, "not fit: .* Unexpected .*extra"),
-    (lambda w: w | {"blocks.100000000.norm1.bias": torch.zeros(1)}, "Missing .*blocks.3.norm1.weight"),
-    (lambda w: w | {"norm.weight": torch.full((64,), torch.nan)}, "norm.weight holds values that are not finite"),
-    (lambda w: {"epoch": 3}, "state dict"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda w: {k: x for k, x in w.items() if k != "pos_embed"}, "DINO layout"),
+        (
+            lambda w: {k: x for k, x in w.items() if "1.norm1.bias" not in k},
+            "not fit: .* Missing .*1.norm1.bias",
+        ),
+        (
+            lambda w: w | {"norm.weight": torch.zeros(3)},
+            "not fit: .* size mismatch for norm.weight",
+        ),
+        (lambda w: w | {"extra": torch.zeros(1)}, "not fit: .* Unexpected .*extra"),
+        (
+            lambda w: w | {"blocks.100000000.norm1.bias": torch.zeros(1)},
+            "Missing .*blocks.3.norm1.weight",
+        ),
+        (
+            lambda w: w | {"norm.weight": torch.full((64,), torch.nan)},
+            "norm.weight holds values that are not finite",
+        ),
+        (lambda w: {"epoch": 3}, "state dict"),
+    ],
+)
 def test_other_models_weights_are_refused_naming_what_differs(vit, tmp_path, change, message):
     torch.save(change(dict(vit.state_dict())), tmp_path / "other.pth")
     refused(message, load_backbone, tmp_path / "other.pth", "cpu")
 
 
-@pytest.mark.parametrize("key, value", [("num_heads", "four"), ("num_heads", "0"), ("saliency_heads", "7")])
+@pytest.mark.parametrize(
+    "key, value", [("num_heads", "four"), ("num_heads", "0"), ("saliency_heads", "7")]
+)
 def test_metadata_that_does_not_fit_is_refused(vit, tmp_path, key, value):
     save_file(vit.state_dict(), tmp_path / "x.safetensors", metadata={key: value})
     refused(f"{key} .*expected", load_backbone, tmp_path / "x.safetensors", "cpu")
@@ -217,7 +275,9 @@ def server(monkeypatch):
 @pytest.mark.parametrize("size", [10_000, None])
 @pytest.mark.parametrize("received", [2_000, 10_000])
 @pytest.mark.parametrize("knows_ranges", [True, False])
-def test_whatever_part_is_there_the_file_is_complete_afterwards(server, tmp_path, size, received, knows_ranges):
+def test_whatever_part_is_there_the_file_is_complete_afterwards(
+    server, tmp_path, size, received, knows_ranges
+):
     (tmp_path / "file.part").write_bytes(server.content[:received])
     server.knows_ranges = knows_ranges
     fetch(f"{server.url}/file", tmp_path / "file", size, server.md5)
@@ -226,7 +286,8 @@ def test_whatever_part_is_there_the_file_is_complete_afterwards(server, tmp_path
 
 @pytest.mark.parametrize("chunked", [False, True])  # whether the server announces no size
 @pytest.mark.parametrize(
-    "expected", [{"size": 10_001}, {"size": 9_000}, {"most": 9_000}, {"size": 10_000, "md5_prefix": "000000"}]
+    "expected",
+    [{"size": 10_001}, {"size": 9_000}, {"most": 9_000}, {"size": 10_000, "md5_prefix": "000000"}],
 )
 def test_a_file_of_another_size_or_hash_is_refused_and_removed(server, tmp_path, expected, chunked):
     server.chunked = chunked
@@ -257,14 +318,23 @@ def test_dino_models_come_from_the_server(server, vit, pictures, tmp_path, cache
 def test_a_file_that_is_not_the_released_one_is_refused(vit, cache):
     cache.mkdir()
     torch.save(vit.state_dict(), cache / "dino_deitsmall16_pretrain.pth")
-    refused("dino_vits16: .*not the released file.*weights fetch dino_vits16", load_backbone, "dino_vits16", "cpu")
+    refused(
+        "dino_vits16: .*not the released file.*weights fetch dino_vits16",
+        load_backbone,
+        "dino_vits16",
+        "cpu",
+    )
 
 
 @pytest.mark.parametrize("address", ["{url}/missing", "http://127.0.0.1:9/"])
 def test_without_the_server_one_line_says_what_to_do(server, cache, monkeypatch, address):
     monkeypatch.setenv("ZSP_LITE_DINO_URL", address.format(url=server.url))
     message = refused(".", load_backbone, "dino_vits8")
-    for part in (load.PRETRAINED["dino_vits8"].url, str(cache / "dino_deitsmall8_pretrain.pth"), "zsp-tiny"):
+    for part in (
+        load.PRETRAINED["dino_vits8"].url,
+        str(cache / "dino_deitsmall8_pretrain.pth"),
+        "zsp-tiny",
+    ):
         assert part in message
 
 
@@ -272,7 +342,9 @@ def test_a_backbone_of_ones_own_is_named_by_its_module_and_takes_no_options(tmp_
     text = "class Maps:\n    def __call__(self, images): ...\n\nmaps, size = Maps(), 3"
     (tmp_path / "my_backbone_file.py").write_text(text)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])  # as a console script has it
+    monkeypatch.setattr(
+        sys, "path", [path for path in sys.path if path]
+    )  # as a console script has it
     named = load.named_backbone
     assert type(named("my_backbone_file:maps", None, "key", None)).__name__ == "Maps"
     for thing, told in (
@@ -281,6 +353,13 @@ def test_a_backbone_of_ones_own_is_named_by_its_module_and_takes_no_options(tmp_
         ("no", "imported"),
     ):
         refused(told, named, f"my_backbone_file:{thing}", None, "key", None)
-    refused("is your own, expected no layer, facet or image size", named, "my_backbone_file:maps", "last", "key", None)
+    refused(
+        "is your own, expected no layer, facet or image size",
+        named,
+        "my_backbone_file:maps",
+        "last",
+        "key",
+        None,
+    )
     assert named("hf:gpt2", None, "key", None) == "hf:gpt2"
     assert named("hf:gpt2", None, "key", 96) == BackboneConfig("hf:gpt2", image_size=96)

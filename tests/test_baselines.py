@@ -22,7 +22,9 @@ from zsp_lite.metrics import rotation_error
 def test_icp_finds_a_small_motion_of_a_cloud_and_its_scale():
     rng = np.random.default_rng(0)
     source = rng.normal(size=(400, 3)) * (1.5, 1.0, 0.6)
-    truth = Sim3(1.1, Rotation.from_rotvec([0.05, -0.08, 0.06]).as_matrix(), np.array([0.05, 0.02, -0.04]))
+    truth = Sim3(
+        1.1, Rotation.from_rotvec([0.05, -0.08, 0.06]).as_matrix(), np.array([0.05, 0.02, -0.04])
+    )
     found = icp(source, truth.apply(source))
     assert rotation_error(found.R, truth.R) < 0.1 and found.scale == pytest.approx(1.1, rel=1e-3)
     refused(".", icp, source, np.zeros((20, 3)))
@@ -31,7 +33,9 @@ def test_icp_finds_a_small_motion_of_a_cloud_and_its_scale():
 def test_icp_is_initialised_by_the_first_cameras(monkeypatch):
     """Two sequences of the same object, whose first cameras differ by a few degrees."""
     clouds = []
-    monkeypatch.setattr(geometry, "icp", lambda *points: (clouds.extend(points), Sim3.identity())[1])
+    monkeypatch.setattr(
+        geometry, "icp", lambda *points: (clouds.extend(points), Sim3.identity())[1]
+    )
     cameras = [look_at(side) for side in [(1.0, 0.1, 0.3), (0.95, 0.2, 0.35), (-0.2, 1.0, 0.3)]]
     # As in CO3D, the first camera has the same rotation in the world of every sequence.
     turn = cameras[0].R.T @ cameras[1].R
@@ -80,9 +84,13 @@ def test_the_essential_matrix_gives_the_rotation_between_cameras_with_other_intr
     rng = np.random.default_rng(0)
     grid = (224, 224)  # one patch per pixel, for nearly exact matches
     first = replace(look_at((1, 0, 0.3), size=(224, 224)), focal_length=np.array([300.0, 260.0]))
-    second = replace(look_at((0.9, 0.45, 0.3), size=(224, 224)), focal_length=np.array([350.0, 330.0]))
+    second = replace(
+        look_at((0.9, 0.45, 0.3), size=(224, 224)), focal_length=np.array([350.0, 330.0])
+    )
     points = rng.normal(size=(60, 3)) * 0.5
-    pixels = [np.floor(camera.project(points)[0]).astype(int)[:, ::-1] for camera in (first, second)]
+    pixels = [
+        np.floor(camera.project(points)[0]).astype(int)[:, ::-1] for camera in (first, second)
+    ]
     pixels[1][:15] = rng.integers(40, 180, (15, 2))  # a quarter of the matches are wrong
     image = np.zeros((224, 224, 3), np.uint8)
     frames = [Frame(image, None, None, camera) for camera in (first, second)]

@@ -18,7 +18,16 @@ from zsp_lite.pipeline import ZeroShotPose
 
 pytestmark = pytest.mark.slow
 
-ROWS = (*resolve("ablations"), "ours-n1", "ours-n3", "ours-n5", "ours-bv-n3", "icp", "icp-bv", "sift")
+ROWS = (
+    *resolve("ablations"),
+    "ours-n1",
+    "ours-n3",
+    "ours-n5",
+    "ours-bv-n3",
+    "icp",
+    "icp-bv",
+    "sift",
+)
 
 
 @pytest.fixture(scope="module")
@@ -27,11 +36,18 @@ def run(tmp_path_factory):
     return run_rows(ROWS, out, 6, 5, "pebble"), read_run(out).row
 
 
-def test_every_row_answers_every_pair_and_with_perfect_features_every_way_to_match_and_fit_is_right(run):
+def test_every_row_answers_every_pair_and_with_perfect_features_every_way_to_match_and_fit_is_right(
+    run,
+):
     rows, row = run
     assert set(rows) == set(ROWS)
     assert all(one["n"] == 6 and one["failed"] == 0 for one in rows.values())
-    exact = [*GROUPS["correspondences"], *GROUPS["matchers"], *GROUPS["trials"], *GROUPS["published"]]
+    exact = [
+        *GROUPS["correspondences"],
+        *GROUPS["matchers"],
+        *GROUPS["trials"],
+        *GROUPS["published"],
+    ]
     assert all(rows[name]["acc30"] >= 80 for name in exact)
     assert rows["ours-n1"]["acc30"] <= rows["ours-n3"]["acc30"] <= rows["ours-n5"]["acc30"]
     assert rows["ours-n5"] == rows["ours"] and row("ours-n5")["error"].equals(row("ours")["error"])
@@ -43,8 +59,16 @@ def test_a_row_is_the_method_with_its_settings_on_the_frames_themselves(run):
     dataset, labels = Co3D(small_folder()), read_labels(small_folder(), "pebble")
     (pair, *_) = category_pairs(dataset, "pebble", 6, 5)
     reference, targets = dataset.load_pair(pair)
-    for name in ("ours", "ours-published", "ours-k70-nokmeans", "ours-transport", "ours-saliencyiou"):
-        estimate = ZeroShotPose(BACKBONE, **METHODS[name].settings, seed=pair.seed).estimate(reference, targets)
+    for name in (
+        "ours",
+        "ours-published",
+        "ours-k70-nokmeans",
+        "ours-transport",
+        "ours-saliencyiou",
+    ):
+        estimate = ZeroShotPose(BACKBONE, **METHODS[name].settings, seed=pair.seed).estimate(
+            reference, targets
+        )
         camera = estimate.target_camera
         truth = camera.R @ labels[pair.target_sequence].trans[:3, :3]
         truth = truth @ labels[pair.reference_sequence].trans[:3, :3].T @ reference.camera.R.T
@@ -56,8 +80,12 @@ def test_a_row_is_the_method_with_its_settings_on_the_frames_themselves(run):
 def test_rows_differ_as_their_names_say(run):
     _, row = run
     fitted = row("ours-nodepth")[row("ours-nodepth")["note"] == ""]
-    assert len(fitted) >= 4 and fitted["translation"].isna().all() and (fitted["inliers"] >= 5).all()
-    assert row("ours")["translation"].median() < 0.2 and row("ours")["scale"].median() == pytest.approx(1, abs=0.1)
+    assert (
+        len(fitted) >= 4 and fitted["translation"].isna().all() and (fitted["inliers"] >= 5).all()
+    )
+    assert row("ours")["translation"].median() < 0.2 and row("ours")[
+        "scale"
+    ].median() == pytest.approx(1, abs=0.1)
     assert (row("icp")["view"] == 0).all() and row("icp-bv")["view"].equals(row("ours")["view"])
 
 

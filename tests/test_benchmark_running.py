@@ -1,4 +1,5 @@
-"""A run's results: the same whoever computes them, in whatever order, however often it is killed."""
+"""A run's results: the same whoever computes them, in whatever order, however often it is
+killed."""
 
 import functools
 import gzip
@@ -40,7 +41,9 @@ from zsp_lite.errors import FatalError, InputError
 from zsp_lite.threads import one_thread
 
 pytestmark = pytest.mark.slow
-needs_signals = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGSTOP, SIGKILL and pgrep")
+needs_signals = pytest.mark.skipif(
+    sys.platform == "win32", reason="Windows has no SIGSTOP, SIGKILL and pgrep"
+)
 
 QUICK = SlowBackbone(grid=8, _seconds=0)
 ROWS = ("ours", "ours-bv")
@@ -65,14 +68,25 @@ def pairs_in(out) -> list[str]:
 
 
 def _children(pid: int) -> set[int]:
-    return {int(child) for child in subprocess.run(["pgrep", "-P", str(pid)], capture_output=True).stdout.split()}
+    return {
+        int(child)
+        for child in subprocess.run(["pgrep", "-P", str(pid)], capture_output=True).stdout.split()
+    }
 
 
 @needs_signals
-def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_twice(undisturbed, tmp_path):
+def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_twice(
+    undisturbed, tmp_path
+):
     stored = 0
     for workers, more in ((2, 1), (1, 3)):
-        command = [sys.executable, str(TESTS / "benchmark_folder.py"), str(small_folder()), str(tmp_path), str(workers)]
+        command = [
+            sys.executable,
+            str(TESTS / "benchmark_folder.py"),
+            str(small_folder()),
+            str(tmp_path),
+            str(workers),
+        ]
         with subprocess.Popen(command, env=PATHS, stdout=subprocess.PIPE, text=True) as process:
             for _ in range(more):
                 assert process.stdout.readline()  # a line for each time that pairs are saved
@@ -82,7 +96,9 @@ def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_tw
         assert len(pairs_in(tmp_path)) >= stored + more
         stored = len(pairs_in(tmp_path))
         deadline = time.monotonic() + 20
-        for status in (Path(f"/proc/{pid}/stat") for pid in children):  # a killed run's workers end by themselves
+        for status in (
+            Path(f"/proc/{pid}/stat") for pid in children
+        ):  # a killed run's workers end by themselves
             while status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z":
                 assert time.monotonic() < deadline, f"{status}: a worker outlives its run"
                 time.sleep(0.05)
@@ -90,11 +106,16 @@ def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_tw
     # An interrupted run has tables, figures and comparisons of what is finished.
     assert main(["tables", str(tmp_path)]) == 0
     assert read_run(tmp_path).summary["methods"]["ours"]["n"] == stored
-    assert (tmp_path / "tables" / "all_rows.csv").is_file() and (tmp_path / "figures" / "error_curves.pdf").is_file()
+    assert (tmp_path / "tables" / "all_rows.csv").is_file() and (
+        tmp_path / "figures" / "error_curves.pdf"
+    ).is_file()
     compared = compare(read_run(tmp_path), read_run(undisturbed[0])).cells
     assert {one.value for one in compared["pairs"]} == {stored}
     assert again(tmp_path)["methods"] == undisturbed[1]["methods"]
-    assert sorted(pairs_in(tmp_path)) == sorted(pairs_in(undisturbed[0])) and len(set(pairs_in(tmp_path))) == 12
+    assert (
+        sorted(pairs_in(tmp_path)) == sorted(pairs_in(undisturbed[0]))
+        and len(set(pairs_in(tmp_path))) == 12
+    )
 
 
 def test_a_line_cut_off_by_a_kill_is_neither_read_nor_continued(undisturbed, tmp_path):
@@ -113,7 +134,10 @@ def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monke
     refused("no pair that all its rows have finished", read_run, tmp_path)
     packed = tmp_path / f"{LINES}.gz"
     packed.write_bytes(gzip.compress((out / LINES).read_bytes()))
-    assert read_run(tmp_path).table.equals(read_run(out).table) and read_run(tmp_path).summary == summary
+    assert (
+        read_run(tmp_path).table.equals(read_run(out).table)
+        and read_run(tmp_path).summary == summary
+    )
     with monkeypatch.context() as context:
         context.setattr("zsp_lite.benchmark.run.evaluate_pair", None)  # nothing is left to compute
         assert again(tmp_path) == summary
@@ -121,7 +145,9 @@ def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monke
 
 
 @needs_signals
-def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tables(undisturbed, tmp_path, monkeypatch):
+def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tables(
+    undisturbed, tmp_path, monkeypatch
+):
     seen, before = [], _children(os.getpid())
 
     def kill_a_worker() -> None:
@@ -131,17 +157,36 @@ def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tabl
 
     monkeypatch.setattr("zsp_lite.benchmark.run.add_lines", after_each_save(kill_a_worker))
     arguments = (small_folder(), SlowBackbone(grid=8), ROWS, 6, 3, tmp_path)
-    refused("finished pairs are stored: run again to continue, with fewer workers", evaluate, *arguments, executor=2)
+    refused(
+        "finished pairs are stored: run again to continue, with fewer workers",
+        evaluate,
+        *arguments,
+        executor=2,
+    )
     assert seen[-1] == len(pairs_in(tmp_path)) < 12
     assert evaluate(*arguments)["methods"] == undisturbed[1]["methods"]
     assert seen[-1] == len(pairs_in(tmp_path)) == len(set(pairs_in(tmp_path))) == 12
 
 
 @needs_signals
-def test_an_interrupt_ends_a_run_and_its_workers_with_one_line_and_the_run_can_be_continued(tmp_path):
-    words = ["benchmark", "--data", str(small_folder()), "--pairs", "12", "--methods", "ours", "--out", str(tmp_path)]
+def test_an_interrupt_ends_a_run_and_its_workers_with_one_line_and_the_run_can_be_continued(
+    tmp_path,
+):
+    words = [
+        "benchmark",
+        "--data",
+        str(small_folder()),
+        "--pairs",
+        "12",
+        "--methods",
+        "ours",
+        "--out",
+        str(tmp_path),
+    ]
     command = [sys.executable, "-m", "zsp_lite", *words, "--workers", "2"]
-    with subprocess.Popen(command, env=PATHS, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+    with subprocess.Popen(
+        command, env=PATHS, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
         while not (tmp_path / LINES).exists() or not pairs_in(tmp_path):
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGINT)
@@ -150,19 +195,25 @@ def test_an_interrupt_ends_a_run_and_its_workers_with_one_line_and_the_run_can_b
     assert 0 < len(stored) < 24 and main(words) == 0 and pairs_in(tmp_path)[: len(stored)] == stored
 
 
-def test_modules_of_the_current_folder_travel_to_workers_and_what_they_lack_is_one_line(tmp_path, monkeypatch):
+def test_modules_of_the_current_folder_travel_to_workers_and_what_they_lack_is_one_line(
+    tmp_path, monkeypatch
+):
     from distributed import Client, LocalCluster
 
     lock = "import threading\nlock = threading.Lock()\ndef half(problem):\n    return lock and None"
     for name, text in {
         "turns_of_mine": "import numpy as np\nHALF = np.diag([1.0, -1.0, -1.0])",
         "rows_of_mine": "import turns_of_mine\ndef half(problem):\n    return turns_of_mine.HALF",
-        "installed/package_of_mine": "def half(problem):\n    return None", "lock_of_mine": lock, "other_lock": lock,
-    }.items():  # fmt: skip
+        "installed/package_of_mine": "def half(problem):\n    return None",
+        "lock_of_mine": lock,
+        "other_lock": lock,
+    }.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / f"{name}.py").write_text(text)
     with (
-        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
+        LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50
+        ) as cluster,
         Client(cluster) as client,
     ):
         monkeypatch.chdir(tmp_path)  # after the worker has its path
@@ -170,11 +221,22 @@ def test_modules_of_the_current_folder_travel_to_workers_and_what_they_lack_is_o
 
         def run(module: str, executor=client.get_executor(pure=False)) -> int:
             rows = [f"mine={module}:half"]
-            return evaluate(small_folder(), QUICK, rows, {"lump": 2}, 2, module, executor)["methods"]["mine"]["failed"]
+            return evaluate(small_folder(), QUICK, rows, {"lump": 2}, 2, module, executor)[
+                "methods"
+            ]["mine"]["failed"]
 
         assert run("rows_of_mine") == 0
-        refused("a worker cannot import the rows: No module named 'package_of_mine', expected", run, "package_of_mine")
-        refused("sending the rows to workers failed: .*cannot pickle", run, "lock_of_mine", error=FatalError)
+        refused(
+            "a worker cannot import the rows: No module named 'package_of_mine', expected",
+            run,
+            "package_of_mine",
+        )
+        refused(
+            "sending the rows to workers failed: .*cannot pickle",
+            run,
+            "lock_of_mine",
+            error=FatalError,
+        )
         assert run("other_lock", executor=2) == 2  # processes of this machine import the module
 
 
@@ -210,7 +272,9 @@ def test_any_executor_will_do_and_gets_the_backbone_once(undisturbed, tmp_path):
 
 def test_numbers_of_threads_are_restored_after_blocks_that_overlap():
     def counts():
-        return cv2.getNumThreads(), {one["filepath"]: one["num_threads"] for one in threadpool_info()}
+        return cv2.getNumThreads(), {
+            one["filepath"]: one["num_threads"] for one in threadpool_info()
+        }
 
     def block(waits_for, then):
         with one_thread():
@@ -224,8 +288,13 @@ def test_numbers_of_threads_are_restored_after_blocks_that_overlap():
     go.set()
     with threadpool_limits(2, "blas"):
         before = counts()
-        with ThreadPoolExecutor(2) as executor:  # the first block to start may be the first or the last to end
-            inside = [one.result() for one in (executor.submit(block, go, ended), executor.submit(block, ended, go))]
+        with ThreadPoolExecutor(
+            2
+        ) as executor:  # the first block to start may be the first or the last to end
+            inside = [
+                one.result()
+                for one in (executor.submit(block, go, ended), executor.submit(block, ended, go))
+            ]
         assert [one[0] for one in inside] == [1, 1]
         assert all(set(numbers.values()) == {1} for _, numbers in inside)
         assert counts() == before and 2 in before[1].values()
@@ -249,12 +318,18 @@ def test_a_vision_transformers_features_do_not_depend_on_threads():
     errors = []
     for threads in (1, 2):
         evaluate_one = pair_evaluator(str(small_folder()), resolve(["ours"]), backbone, threads)
-        errors.append([evaluate_one(pair, names)["results"]["ours"]["error"] for pair, names in chunk])
+        errors.append(
+            [evaluate_one(pair, names)["results"]["ours"]["error"] for pair, names in chunk]
+        )
     assert errors[0] == errors[1]
 
 
-def test_the_note_of_a_run_says_that_several_versions_of_the_library_evaluated_it(tmp_path, monkeypatch):
-    run = functools.partial(evaluate, small_folder(), BACKBONE, pairs={"lump": 1}, targets=2, out=tmp_path)
+def test_the_note_of_a_run_says_that_several_versions_of_the_library_evaluated_it(
+    tmp_path, monkeypatch
+):
+    run = functools.partial(
+        evaluate, small_folder(), BACKBONE, pairs={"lump": 1}, targets=2, out=tmp_path
+    )
     run(["ours-bv"])
     first, other = library_version(), {"version": "1", "commit": "0123abc"}
     monkeypatch.setattr("zsp_lite.benchmark.run.library_version", lambda: other)
@@ -274,7 +349,9 @@ def test_a_folder_that_holds_no_run_is_neither_read_nor_continued(undisturbed, t
         refused(told, read_run, folder)
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no device that is always full")
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="this system has no device that is always full"
+)
 def test_a_full_disk_is_one_error(tmp_path):
     (tmp_path / LINES).symlink_to("/dev/full")
     with pytest.raises(InputError, match="run.jsonl cannot be written: .*No space left"):
@@ -295,10 +372,14 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
         frames |= {(pair.target_sequence, number) for number in pair.target_frames}
         frames.add((pair.reference_sequence, pair.reference_frame))
     assert sum(calls) == len(frames)
-    assert set(calls) == {1}  # a frame's features do not depend, in their last bits, on the rest of a batch
+    assert set(calls) == {
+        1
+    }  # a frame's features do not depend, in their last bits, on the rest of a batch
 
 
-def test_the_same_data_by_another_path_continue_a_run_and_other_data_do_not(tmp_path, monkeypatch, links):
+def test_the_same_data_by_another_path_continue_a_run_and_other_data_do_not(
+    tmp_path, monkeypatch, links
+):
     for name in ("data", "elsewhere/data"):
         shutil.copytree(small_folder(), tmp_path / name)
     (tmp_path / "link").symlink_to(tmp_path / "data")
@@ -307,10 +388,17 @@ def test_the_same_data_by_another_path_continue_a_run_and_other_data_do_not(tmp_
         return evaluate(data, BACKBONE, [row], {"lump": 1}, 2, tmp_path / "run")["data"]["root"]
 
     monkeypatch.chdir(tmp_path)
-    assert run("data", "icp") == "data" and run(tmp_path / "data", "ours-bv") == str(tmp_path / "data")
+    assert run("data", "icp") == "data" and run(tmp_path / "data", "ours-bv") == str(
+        tmp_path / "data"
+    )
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert run("../link", "ours") == "../link"
-    refused("a run with data .*data, this is .*elsewhere/data; choose another folder", run, "data", "ours")
+    refused(
+        "a run with data .*data, this is .*elsewhere/data; choose another folder",
+        run,
+        "data",
+        "ours",
+    )
     assert len(read_run(tmp_path / "run").settings.methods) == 3
 
 
@@ -320,7 +408,11 @@ def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
     run(tmp_path / "run")
     labels = read_labels(root, "lump")
     name = next(name for name, label in labels.items() if name != label.reference_seq)
-    write_label(root, "lump", replace(labels[name], trans=labels[name].trans @ np.diag([-1.0, -1.0, 1.0, 1.0])))
+    write_label(
+        root,
+        "lump",
+        replace(labels[name], trans=labels[name].trans @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+    )
     refused("a run with labels of lump", run, tmp_path / "run")
     run(tmp_path / "other")
 
@@ -340,8 +432,14 @@ def test_the_tables_of_an_unfinished_run_say_so(tmp_path, monkeypatch):
     (tmp_path / "tables" / "mine.csv").touch()
     write_reports(tmp_path)
     # Tables that the last call has no rows for are removed, and nothing else.
-    assert not list((tmp_path / "tables").glob("table_a_depth*")) and (tmp_path / "tables" / "mine.csv").exists()
+    assert (
+        not list((tmp_path / "tables").glob("table_a_depth*"))
+        and (tmp_path / "tables" / "mine.csv").exists()
+    )
     assert "Not finished" not in (tmp_path / "tables" / "all_rows.md").read_text()
     run_rows(["category"], tmp_path, 4)
     write_reports(tmp_path)
-    assert not list((tmp_path / "tables").glob("all_rows*")) and (tmp_path / "tables" / "with_others.md").exists()
+    assert (
+        not list((tmp_path / "tables").glob("all_rows*"))
+        and (tmp_path / "tables" / "with_others.md").exists()
+    )

@@ -24,7 +24,9 @@ def test_missing_matches_count_as_orthogonal():
     assert correspondence_score(matches([1.0]), 3) == pytest.approx(-2 * np.sqrt(2))
     assert correspondence_score(matches([]), 2) == pytest.approx(-2 * np.sqrt(2))
     # Two good matches of fifty do not beat fifty fair ones.
-    assert correspondence_score(matches([0.99] * 2), 50) < correspondence_score(matches([0.5] * 50), 50)
+    assert correspondence_score(matches([0.99] * 2), 50) < correspondence_score(
+        matches([0.5] * 50), 50
+    )
 
 
 def feature_map(global_feature) -> FeatureMap:
@@ -32,7 +34,9 @@ def feature_map(global_feature) -> FeatureMap:
 
 
 def test_the_global_score_is_the_cosine_whatever_the_lengths():
-    assert global_score(feature_map([3.0, 0.0]), feature_map([1.0, 1.0])) == pytest.approx(np.sqrt(0.5))
+    assert global_score(feature_map([3.0, 0.0]), feature_map([1.0, 1.0])) == pytest.approx(
+        np.sqrt(0.5)
+    )
 
 
 def test_mask_iou_counts_shared_patches():
@@ -43,9 +47,9 @@ def test_mask_iou_counts_shared_patches():
 
 
 def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
-    # Six patches in a row. Patches 0 to 2 are each other's nearest neighbours; everything else goes to
-    # reference patch 0, and so comes back to target patch 0: that is 3 to 5 patches off,
-    # and with the default threshold of 1.5 it does not count.
+    # Six patches in a row. Patches 0 to 2 are each other's nearest neighbours; everything else goes
+    # to reference patch 0, and so comes back to target patch 0: that is 3 to 5 patches off, and
+    # with the default threshold of 1.5 it does not count.
     similarity = torch.zeros(6, 6)
     similarity[[0, 1, 2], [0, 1, 2]] = torch.tensor([3.0, 2.0, 2.0])
     similarity[0, 3:] = 1.0
@@ -55,9 +59,12 @@ def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
     first_four[0, 4:] = False
     assert cyclical_iou(similarity, everything, first_four) == pytest.approx(3 / 4)
     # Off the reference's foreground a cycle does not count.
-    assert cyclical_iou(similarity, everything & (torch.arange(6) > 0), first_four) == pytest.approx(2 / 4)
+    assert cyclical_iou(
+        similarity, everything & (torch.arange(6) > 0), first_four
+    ) == pytest.approx(2 / 4)
     assert cyclical_iou(similarity, everything, everything, threshold=3.0) == pytest.approx(4 / 6)
-    # Target patch 5 goes to reference patch 0 and comes back: each foreground holds for its own view.
+    # Target patch 5 goes to reference patch 0 and comes back: each foreground holds for its own
+    # view.
     shifted = torch.eye(6).roll(1, 0)
     first, last = everything & (torch.arange(6) == 0), everything & (torch.arange(6) == 5)
     assert cyclical_iou(shifted, first, last) == 1 and cyclical_iou(shifted, last, first) == 0

@@ -33,9 +33,13 @@ def test_projection_agrees_with_pytorch3ds_own_row_vector_formula(seed, intrinsi
     row = points @ other["R"] + other["T"]
     ndc = other["focal_length"] * row[:, :2] / row[:, 2:] + other["principal_point"]
     height, width = camera.size
-    per_ndc = np.array([width, height]) / 2 if intrinsics_format == FORMATS[0] else min(height, width) / 2
+    per_ndc = (
+        np.array([width, height]) / 2 if intrinsics_format == FORMATS[0] else min(height, width) / 2
+    )
     pixels, depth = camera.project(points)
-    np.testing.assert_allclose(pixels, np.array([width, height]) / 2 - ndc * per_ndc, rtol=1e-9, atol=1e-7)
+    np.testing.assert_allclose(
+        pixels, np.array([width, height]) / 2 - ndc * per_ndc, rtol=1e-9, atol=1e-7
+    )
     np.testing.assert_allclose(depth, row[:, 2], rtol=1e-9)
 
 
@@ -51,29 +55,42 @@ def test_cropping_shifts_pixels_and_resizing_scales_them(seed, top, left, height
     np.testing.assert_array_equal(resized.project(points)[1], depth)
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"R": np.eye(2)}, r"R has shape \(2, 2\)"),
-    ({"R": 2 * np.eye(3)}, "expected a rotation"),
-    ({"R": np.diag([1.0, 1.0, -1.0])}, "expected a rotation"),
-    ({"t": [0, 0, np.inf]}, "t holds inf"),
-    ({"t": [0, 0, 1e155]}, r"t holds 1e\+155"),
-    ({"focal_length": [500, 0]}, "focal_length is .*0.0.*, expected .*greater than 0.001"),
-    ({"size": (0, 5)}, "image size .* is 0, expected an integer from 1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"R": np.eye(2)}, r"R has shape \(2, 2\)"),
+        ({"R": 2 * np.eye(3)}, "expected a rotation"),
+        ({"R": np.diag([1.0, 1.0, -1.0])}, "expected a rotation"),
+        ({"t": [0, 0, np.inf]}, "t holds inf"),
+        ({"t": [0, 0, 1e155]}, r"t holds 1e\+155"),
+        ({"focal_length": [500, 0]}, "focal_length is .*0.0.*, expected .*greater than 0.001"),
+        ({"size": (0, 5)}, "image size .* is 0, expected an integer from 1"),
+    ],
+)
 def test_invalid_cameras_are_refused(changes, message):
-    valid = {"R": np.eye(3), "t": [0, 0, 2], "focal_length": [500, 500], "principal_point": [32, 24], "size": (48, 64)}
+    valid = {
+        "R": np.eye(3),
+        "t": [0, 0, 2],
+        "focal_length": [500, 500],
+        "principal_point": [32, 24],
+        "size": (48, 64),
+    }
     refused(message, lambda: Camera(**(valid | changes)))
 
 
 @pytest.mark.parametrize("roll", [0, 1])
 def test_the_span_of_views_is_that_around_the_object(roll):
     def span(*angles):
-        return view_span([level_camera(*angle).turn(roll) for angle in angles], np.array([1.0, 2, 3]))
+        return view_span(
+            [level_camera(*angle).turn(roll) for angle in angles], np.array([1.0, 2, 3])
+        )
 
     assert span((40, 20)) == pytest.approx(0, abs=1e-5)
     assert span(*((az, 0) for az in range(0, 73, 18))) == pytest.approx(72)
     for height in (0, 30, 60):
         assert span(*((az, height) for az in range(0, 360, 72))) == pytest.approx(288)
     assert 15 < span((0, 60), (20, 60), (40, 60)) < 40  # a cluster above is one side, too
-    assert span((0, 20), (20, 25), (40, 15), (180, 85)) < 60  # a view from the top does not show the back
+    assert (
+        span((0, 20), (20, 25), (40, 15), (180, 85)) < 60
+    )  # a view from the top does not show the back
     assert span(*((az, 75) for az in range(0, 360, 72))) < 60

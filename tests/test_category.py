@@ -1,4 +1,5 @@
-"""A category in one frame: pairs of frames, recovery of known poses, equivariance, probabilities."""
+"""A category in one frame: pairs of frames, recovery of known poses, equivariance,
+probabilities."""
 
 from dataclasses import replace
 from unittest.mock import Mock
@@ -33,19 +34,29 @@ PROBABILITIES = np.array([0.6, 0.25, 0.05, 0.03])
 
 
 def similarity(rng):
-    return Sim3(np.exp(0.3 * rng.normal()), Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3))
+    return Sim3(
+        np.exp(0.3 * rng.normal()),
+        Rotation.random(random_state=rng).as_matrix(),
+        rng.normal(size=3),
+    )
 
 
 def problem(seed: int, flipped: float = 0.0) -> tuple[list[Sim3], list[PairHypotheses]]:
-    """Make six poses and hypotheses of all 30 pairs; the half turn comes first in the share `flipped` of the pairs."""
+    """Make six poses and hypotheses of all 30 pairs; the half turn comes first in the share
+    `flipped` of the pairs."""
     rng = np.random.default_rng(seed)
     truth, pairs = [similarity(rng) for _ in range(6)], []
     ends = [(a, (a + step) % 6) for step in 1 + rng.permutation(5) for a in range(6)]
     wrong = set(rng.permutation(len(ends))[: int(flipped * len(ends))].tolist())
     for k, (a, b) in enumerate(ends):
-        right_and_turned = [truth[b].inverse() @ truth[a], truth[b].inverse() @ HALF_TURN @ truth[a]]
+        right_and_turned = [
+            truth[b].inverse() @ truth[a],
+            truth[b].inverse() @ HALF_TURN @ truth[a],
+        ]
         sim3s = (*right_and_turned[:: -1 if k in wrong else 1], similarity(rng), similarity(rng))
-        pairs.append(PairHypotheses(f"{a:03d}", f"{b:03d}", sim3s, PROBABILITIES, rng.normal(size=3)))
+        pairs.append(
+            PairHypotheses(f"{a:03d}", f"{b:03d}", sim3s, PROBABILITIES, rng.normal(size=3))
+        )
     return truth, pairs
 
 
@@ -54,7 +65,9 @@ def problem(seed: int, flipped: float = 0.0) -> tuple[list[Sim3], list[PairHypot
 def test_poses_are_recovered_among_outliers_and_half_turns_whatever_the_order_of_the_pairs(seed):
     truth, pairs = problem(seed, flipped=0.1)
     alignment, again = synchronise(pairs), synchronise(pairs[::-1])
-    scale = np.exp(np.mean(np.log([one.scale for one in truth])))  # the mean log scale of the found poses is zero
+    scale = np.exp(
+        np.mean(np.log([one.scale for one in truth]))
+    )  # the mean log scale of the found poses is zero
     for (name, one), true in zip(alignment.objects.items(), truth, strict=True):
         expected = Sim3(truth[0].scale / scale, np.eye(3), np.zeros(3)) @ truth[0].inverse() @ true
         np.testing.assert_allclose(one.sim3.matrix, expected.matrix, atol=2e-2)
@@ -65,23 +78,37 @@ def test_poses_are_recovered_among_outliers_and_half_turns_whatever_the_order_of
 def test_contradictory_evidence_lowers_the_probability_and_names_the_other_turn():
     _, pairs = problem(3)
     before = synchronise(pairs).objects["004"]
-    for k in [k for k, one in enumerate(pairs) if "004" in (one.reference, one.target)][:4]:  # of ten: half turn first
+    for k in [k for k, one in enumerate(pairs) if "004" in (one.reference, one.target)][
+        :4
+    ]:  # of ten: half turn first
         pairs[k] = replace(pairs[k], sim3s=tuple(pairs[k].sim3s[m] for m in (1, 0, 2, 3)))
     after = synchronise(pairs).objects["004"]
-    assert after.probability < before.probability - 0.1 and rotation_error(after.sim3.R, after.alternative.R) > 170
+    assert (
+        after.probability < before.probability - 0.1
+        and rotation_error(after.sim3.R, after.alternative.R) > 170
+    )
     assert after.alternative_probability > before.alternative_probability + 0.1
-    np.testing.assert_allclose(after.alternative.apply(after.centre), after.sim3.apply(after.centre), atol=1e-6)
+    np.testing.assert_allclose(
+        after.alternative.apply(after.centre), after.sim3.apply(after.centre), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(("n", "per_object"), [(2, 1), (4, 3), (11, 10), (12, 6), (40, 6)])
 def test_pairs_connect_all_objects_and_see_each_reference_from_evenly_spaced_sides(n, per_object):
-    names = Mock(Co3D, frame_numbers=lambda category: {f"{k:02d}": list(range(12)) for k in range(n)})
+    names = Mock(
+        Co3D, frame_numbers=lambda category: {f"{k:02d}": list(range(12)) for k in range(n)}
+    )
     pairs = object_pairs(names, "cup", None, None, 4)
     assert pairs == object_pairs(names, "cup", None, None, 4)
     ends = np.array([[int(one.reference_sequence), int(one.target_sequence)] for one in pairs])
     count = references_per_pair(n)
     assert len(ends) == count * n * per_object and len(np.unique(ends, axis=0)) == n * per_object
-    assert connected_components(coo_array((np.ones(len(ends)), ends.T), (n, n)), connection="strong")[0] == 1
+    assert (
+        connected_components(coo_array((np.ones(len(ends)), ends.T), (n, n)), connection="strong")[
+            0
+        ]
+        == 1
+    )
     seen = [number for one in pairs[:count] for number in one.target_frames]
     around = np.sort([one.reference_frame for one in pairs[:count]])
     assert np.diff(around, append=around[0] + 12).max() == -(-12 // count) and len(set(seen)) == 12
@@ -98,13 +125,25 @@ def test_scans_shorter_than_the_number_of_frames_give_every_frame_once():
 
 def test_hypotheses_between_cameras_become_similarities_between_worlds(ellipsoids):
     pair = object_pairs(ellipsoids, "ellipsoid", ["b", "a"], 1, 3)[0]
-    estimate = ZeroShotPose(CoordinateBackbone(), solver="verified").estimate(*ellipsoids.load_pair(pair))
-    found, label = world_hypotheses("b", "a", estimate), read_labels(ellipsoids.root, "ellipsoid")["b"].trans
+    estimate = ZeroShotPose(CoordinateBackbone(), solver="verified").estimate(
+        *ellipsoids.load_pair(pair)
+    )
+    found, label = (
+        world_hypotheses("b", "a", estimate),
+        read_labels(ellipsoids.root, "ellipsoid")["b"].trans,
+    )
     assert rotation_error(found.sim3s[0].R, label[:3, :3]) < 10
-    assert np.linalg.norm(found.sim3s[0].apply(found.centre) - label[:3, :3] @ found.centre - label[:3, 3]) < 0.2
+    assert (
+        np.linalg.norm(
+            found.sim3s[0].apply(found.centre) - label[:3, :3] @ found.centre - label[:3, 3]
+        )
+        < 0.2
+    )
 
 
 def test_too_few_frames_and_pairs_that_do_not_connect_all_objects_are_refused(ellipsoids):
-    refused("has 7 frames, expected at least 8", object_pairs, ellipsoids, "ellipsoid", None, None, 8)
+    refused(
+        "has 7 frames, expected at least 8", object_pairs, ellipsoids, "ellipsoid", None, None, 8
+    )
     pair = problem(0)[1][0]
     refused("connect 2 of 4", lambda: synchronise([pair, replace(pair, reference="x", target="y")]))

@@ -30,7 +30,10 @@ def first(root):
 def test_a_pair_is_loaded_as_its_reference_frame_and_its_target_frames_in_order(root):
     reference, targets = Co3D(root).load_pair(Pair("chair", "a_1", 2, "b_2", (3, 0)))
     assert reference.name == "a_1/2" and [target.name for target in targets] == ["b_2/3", "b_2/0"]
-    refused("chair/b_2 has no frame number 9", lambda: Co3D(root).load_pair(Pair("chair", "a_1", 2, "b_2", (9,))))
+    refused(
+        "chair/b_2 has no frame number 9",
+        lambda: Co3D(root).load_pair(Pair("chair", "a_1", 2, "b_2", (9,))),
+    )
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -47,10 +50,14 @@ def test_written_data_is_read_back(root, version):
     for annotation, expected in zip(annotations, written.frames, strict=True):
         frame = dataset.load(annotation)
         for name in ("R", "t", "focal_length", "principal_point"):
-            np.testing.assert_allclose(getattr(frame.camera, name), getattr(expected.camera, name), atol=1e-9)
+            np.testing.assert_allclose(
+                getattr(frame.camera, name), getattr(expected.camera, name), atol=1e-9
+            )
         np.testing.assert_array_equal(frame.mask, expected.mask)
         np.testing.assert_allclose(frame.depth, expected.depth, rtol=2**-11)
-        assert np.abs(frame.rgb.astype(int) - expected.rgb).mean() < 8  # JPEG, colours at half resolution
+        assert (
+            np.abs(frame.rgb.astype(int) - expected.rgb).mean() < 8
+        )  # JPEG, colours at half resolution
     points, colours = dataset.point_cloud("chair", "b_2")
     np.testing.assert_allclose(points, written.points, rtol=1e-6)
     np.testing.assert_array_equal(colours, written.colours)
@@ -59,11 +66,22 @@ def test_written_data_is_read_back(root, version):
 def test_written_files_have_the_layout_of_co3d(root):
     names = {path.name for path in (root / "chair").iterdir()}
     assert names == {"a_1", "b_2", "frame_annotations.jgz", "sequence_annotations.jgz"}
-    for part in ("images/?.jpg", "masks/?.png", "depths/?.jpg.geometric.png", "depth_masks/?.png", "pointcloud.ply"):
+    for part in (
+        "images/?.jpg",
+        "masks/?.png",
+        "depths/?.jpg.geometric.png",
+        "depth_masks/?.png",
+        "pointcloud.ply",
+    ):
         assert (root / "chair/a_1" / part.replace("?", "frame000001")).is_file()
     entry = json.loads(gzip.decompress((root / "chair/frame_annotations.jgz").read_bytes()))[0]
     assert entry["image"] == {"path": "chair/b_2/images/frame000001.jpg", "size": [24, 32]}
-    assert set(entry["viewpoint"]) == {"R", "T", "focal_length", "principal_point"}  # v1 has no format
+    assert set(entry["viewpoint"]) == {
+        "R",
+        "T",
+        "focal_length",
+        "principal_point",
+    }  # v1 has no format
 
 
 def test_a_sequence_written_again_replaces_itself_and_nothing_else(root):
@@ -94,16 +112,40 @@ def test_optional_fields_may_be_null_and_unknown_ones_are_ignored(root):
     refused("chair/b_2 has no point cloud", dataset.point_cloud, "chair", "b_2")
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    (lambda frame: frame.pop("sequence_name"), r"frame_annotations\.jgz: .*missing required field `sequence_name`"),
-    (lambda frame: frame.pop("image"), r"frame_annotations\.jgz .*frame 0 of b_2.*required field `image`"),
-    (lambda frame: frame["viewpoint"].pop("T"), r"frame 0 of b_2.*required field `T` - at `\$\.viewpoint`"),
-    (lambda frame: frame["viewpoint"].update(T=[0, float("nan"), 1]), r"got `null` - at `\$\.viewpoint\.T"),
-    (lambda frame: frame["viewpoint"].update(intrinsics_format="pixels"), "Invalid enum value 'pixels'"),
-    (lambda frame: frame["viewpoint"].update(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "frame b_2/0: camera R"),
-    (lambda frame: frame["depth"].update(scale_adjustment=0), r"Expected `float` > 0.* - at `\$\.depth"),
-    (lambda frame: frame.update(viewpoint=None), "frame b_2/0 has no viewpoint"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda frame: frame.pop("sequence_name"),
+            r"frame_annotations\.jgz: .*missing required field `sequence_name`",
+        ),
+        (
+            lambda frame: frame.pop("image"),
+            r"frame_annotations\.jgz .*frame 0 of b_2.*required field `image`",
+        ),
+        (
+            lambda frame: frame["viewpoint"].pop("T"),
+            r"frame 0 of b_2.*required field `T` - at `\$\.viewpoint`",
+        ),
+        (
+            lambda frame: frame["viewpoint"].update(T=[0, float("nan"), 1]),
+            r"got `null` - at `\$\.viewpoint\.T",
+        ),
+        (
+            lambda frame: frame["viewpoint"].update(intrinsics_format="pixels"),
+            "Invalid enum value 'pixels'",
+        ),
+        (
+            lambda frame: frame["viewpoint"].update(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]),
+            "frame b_2/0: camera R",
+        ),
+        (
+            lambda frame: frame["depth"].update(scale_adjustment=0),
+            r"Expected `float` > 0.* - at `\$\.depth",
+        ),
+        (lambda frame: frame.update(viewpoint=None), "frame b_2/0 has no viewpoint"),
+    ],
+)
 def test_an_invalid_frame_fails_by_name_and_field(root, change, message):
     edit_first(root, change)
     refused(message, lambda: Co3D(root).load(first(root)))
@@ -115,7 +157,10 @@ def test_unknown_folders_categories_sequences_and_frames_are_named(root):
     dataset = Co3D(root)
     for call, message in (
         (lambda: Co3D(root / "nowhere"), "nowhere does not exist"),
-        (lambda: Co3D(root / "chair/frame_annotations.jgz"), "frame_annotations.jgz is not a folder"),
+        (
+            lambda: Co3D(root / "chair/frame_annotations.jgz"),
+            "frame_annotations.jgz is not a folder",
+        ),
         (lambda: dataset.frame_list("sofa"), "category is 'sofa', expected one of chair"),
         (lambda: dataset.frame_list("../chair"), "category is '../chair', expected one of chair"),
         (lambda: write_co3d(root, "../chair", []), "category name is '../chair', expected"),
@@ -144,25 +189,41 @@ def test_the_depth_mask_makes_depth_unknown(root):
     np.testing.assert_array_equal(Co3D(root).load(first(root)).depth, 2 * before)
 
 
-@pytest.mark.parametrize(("part", "write"), [("image", write_image), ("depth", write_depth), ("mask", write_mask)])
+@pytest.mark.parametrize(
+    ("part", "write"), [("image", write_image), ("depth", write_depth), ("mask", write_mask)]
+)
 def test_missing_files_and_files_of_another_size_are_refused(root, part, write):
     annotation = first(root)
     path = root / getattr(annotation, part).path
     path.unlink()
     refused(f"{part} .*{path.name} cannot be read", lambda: Co3D(root).load(annotation))
     write(path, np.ones((5, 6, 3) if part == "image" else (5, 6), np.uint8))
-    refused(r"is \(5, 6\) pixels, expected \(H, W\) = \(24, 32\)", lambda: Co3D(root).load(annotation))
+    refused(
+        r"is \(5, 6\) pixels, expected \(H, W\) = \(24, 32\)", lambda: Co3D(root).load(annotation)
+    )
 
 
 def test_selection_takes_the_best_clouds_above_both_bounds(tmp_path):
-    scores = {"good": (2.0, 0.9), "best": (1.3, 1.5), "fair": (2.0, 0.31), "blurred": (1.25, 2), "sparse": (3, 0.3)}
+    scores = {
+        "good": (2.0, 0.9),
+        "best": (1.3, 1.5),
+        "fair": (2.0, 0.31),
+        "blurred": (1.25, 2),
+        "sparse": (3, 0.3),
+    }
     write_co3d(tmp_path, "chair", [sequence_data(name, frames=1) for name in scores])
 
     def score(items):
         for item in items:
-            item["viewpoint_quality_score"], item["point_cloud"]["quality_score"] = scores[item["sequence_name"]]
+            item["viewpoint_quality_score"], item["point_cloud"]["quality_score"] = scores[
+                item["sequence_name"]
+            ]
 
     edit_json(tmp_path / "chair" / "sequence_annotations.jgz", score)
     dataset = Co3D(tmp_path)
-    assert [sequence.sequence_name for sequence in dataset.select("chair")] == ["best", "good", "fair"]
+    assert [sequence.sequence_name for sequence in dataset.select("chair")] == [
+        "best",
+        "good",
+        "fair",
+    ]
     assert [sequence.sequence_name for sequence in dataset.select("chair", top=1)] == ["best"]

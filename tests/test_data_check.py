@@ -26,14 +26,18 @@ def frame_file(root, part, sequence="a"):
 
 def test_a_complete_folder_has_no_problems(root):
     dataset = Co3D(root)
-    write_published_pairs(pairs_path(root, "chair", 3, 2), sample_pairs(dataset, "chair", 3, 2), dataset)
+    write_published_pairs(
+        pairs_path(root, "chair", 3, 2), sample_pairs(dataset, "chair", 3, 2), dataset
+    )
     write_co3d(root, "stool", [sequence_data("c")])
     convert_to_v2(root / "stool")
     check, stool = check_folder(root, deep=True)
     assert not check.problems and stool.layout == "v2"
     assert (check.category, check.layout, check.sequences, check.frames) == ("chair", "v1", 2, 8)
     assert (check.complete, check.labelled, check.usable, check.pairs) == (2, 2, 2, 1)
-    files = [path for path in (root / "chair").rglob("*") if path.is_file() and path.suffix != ".jgz"]
+    files = [
+        path for path in (root / "chair").rglob("*") if path.is_file() and path.suffix != ".jgz"
+    ]
     assert check.size == sum(path.stat().st_size for path in files)
 
 
@@ -44,9 +48,12 @@ def test_a_missing_and_an_empty_file_are_named(root, part):
     empty.write_bytes(b"")
     (check,) = check_folder(root)
     assert check.problems == [
-        f"{gone.relative_to(root).as_posix()} is missing", f"{empty.relative_to(root).as_posix()} is empty",
-    ]  # fmt: skip
-    assert check.complete == 0 and check.usable == 2, "three whole frames are enough to be evaluated"
+        f"{gone.relative_to(root).as_posix()} is missing",
+        f"{empty.relative_to(root).as_posix()} is empty",
+    ]
+    assert check.complete == 0 and check.usable == 2, (
+        "three whole frames are enough to be evaluated"
+    )
 
 
 def test_a_broken_file_is_found_by_a_deep_check_alone(root):
@@ -54,7 +61,9 @@ def test_a_broken_file_is_found_by_a_deep_check_alone(root):
         path.write_bytes(path.read_bytes()[:60])
     assert not check_folder(root)[0].problems
     problems = check_folder(root, deep=True)[0].problems
-    assert len(problems) == 2 and "cannot be decoded" in problems[0] and "point cloud" in problems[1]
+    assert (
+        len(problems) == 2 and "cannot be decoded" in problems[0] and "point cloud" in problems[1]
+    )
 
 
 def test_black_and_empty_frames_are_counted_by_a_deep_check(root, run):
@@ -64,23 +73,33 @@ def test_black_and_empty_frames_are_counted_by_a_deep_check(root, run):
     assert check_folder(root)[0].defects == {} and check_folder(root)[0].usable == 2
     (check,) = check_folder(root, deep=True)
     assert check.defects == {"black image": 3} and not check.problems and check.usable == 1
-    assert "chair: 3 of 8 frames cannot be used (black image 3)" in run(["data", "check", str(root), "--deep"])
+    assert "chair: 3 of 8 frames cannot be used (black image 3)" in run(
+        ["data", "check", str(root), "--deep"]
+    )
 
 
 def test_sequences_without_a_point_cloud_are_counted(root, run):
     """A cloud that the annotations lack is no problem, a file that is missing is one."""
-    edit_json(root / "chair" / "sequence_annotations.jgz", lambda found: found[0].update(point_cloud=None))
+    edit_json(
+        root / "chair" / "sequence_annotations.jgz", lambda found: found[0].update(point_cloud=None)
+    )
     write_co3d(root, "stool", [sequence_data("c")])
     check, stool = check_folder(root)
     assert (check.cloudless, check.problems, check.complete, stool.cloudless) == (1, [], 2, 0)
     assert "No problems" in run(["data", "check", str(root)])
     (root / "chair" / "b" / "pointcloud.ply").unlink()
     text = run(["data", "check", str(root)], 1)
-    assert "chair: 2 of 2 sequences have no point cloud" in text and "chair: chair/b/pointcloud.ply is missing" in text
+    assert (
+        "chair: 2 of 2 sequences have no point cloud" in text
+        and "chair: chair/b/pointcloud.ply is missing" in text
+    )
 
 
 def test_an_invalid_camera_is_named(root):
-    edit_json(root / "chair" / "frame_annotations.jgz", lambda frames: frames[1]["viewpoint"].update(T=[0, None, 1]))
+    edit_json(
+        root / "chair" / "frame_annotations.jgz",
+        lambda frames: frames[1]["viewpoint"].update(T=[0, None, 1]),
+    )
     (check,) = check_folder(root)
     assert len(check.problems) == 1 and "viewpoint" in check.problems[0]
 
@@ -88,7 +107,9 @@ def test_an_invalid_camera_is_named(root):
 def test_labels_of_unknown_sequences_and_of_two_references_are_named(root):
     write_label(root, "chair", PoseLabel(np.eye(4), "z", "q"))
     (check,) = check_folder(root)
-    assert len(check.problems) == 1 and "reference sequences a, q, expected one" in check.problems[0]
+    assert (
+        len(check.problems) == 1 and "reference sequences a, q, expected one" in check.problems[0]
+    )
     write_label(root, "chair", PoseLabel(np.eye(4), "z", "a"))
     (check,) = check_folder(root)
     assert check.problems == ["label of z is of a sequence that is not in the annotations"]

@@ -1,4 +1,5 @@
-"""Features of a backbone on another device, and matchers that get its tensors, without such a device."""
+"""Features of a backbone on another device, and matchers that get its tensors, without such a
+device."""
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from zsp_lite.pipeline import ZeroShotPose
 
 
 class Elsewhere(torch.Tensor):
-    """A tensor of a device without float64, which NumPy cannot read; `cpu` returns a plain tensor."""
+    """A tensor of a device without float64, which NumPy cannot read; `cpu` returns a plain
+    tensor."""
 
     @classmethod
     def __torch_function__(cls, function, types, args=(), kwargs=None):
@@ -38,7 +40,10 @@ class BackboneElsewhere(CoordinateBackbone):
 
 @pytest.mark.parametrize("solver", SOLVERS["both"])
 def test_a_backbone_on_another_device_gives_the_pose_of_the_cpu(ellipsoids, solver):
-    frames = [ellipsoids.load(ellipsoids.frame("ellipsoid", *end)) for end in (("a", 0), ("b", 0), ("b", 1))]
+    frames = [
+        ellipsoids.load(ellipsoids.frame("ellipsoid", *end))
+        for end in (("a", 0), ("b", 0), ("b", 1))
+    ]
     first, second = (
         ZeroShotPose(backbone, trials=50, solver=solver).estimate(frames[0], frames[1:])
         for backbone in (CoordinateBackbone(), BackboneElsewhere())
@@ -51,5 +56,7 @@ def test_a_backbone_on_another_device_gives_the_pose_of_the_cpu(ellipsoids, solv
 @pytest.mark.parametrize("name", MATCHERS)
 def test_a_matcher_does_not_ask_another_device_for_float64(name):
     arguments = torch.rand(12, 15), torch.arange(12) % 4 > 0, torch.arange(15) % 3 > 0
-    expected, found = (MATCHERS[name](*some) for some in (arguments, [x.as_subclass(Elsewhere) for x in arguments]))
+    expected, found = (
+        MATCHERS[name](*some) for some in (arguments, [x.as_subclass(Elsewhere) for x in arguments])
+    )
     assert torch.equal(found[0], expected[0]) and torch.equal(found[1], expected[1])

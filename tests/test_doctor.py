@@ -29,7 +29,9 @@ def test_the_tested_environment_pins_every_dependency_within_its_range():
             assert pins[canonicalize_name(requirement.name)] in requirement.specifier, requirement
 
 
-def test_missing_embedded_weights_fail_and_a_cache_that_cannot_be_written_is_noted(tmp_path, monkeypatch, run):
+def test_missing_embedded_weights_fail_and_a_cache_that_cannot_be_written_is_noted(
+    tmp_path, monkeypatch, run
+):
     (tmp_path / "file").write_text("mine")
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "file"))
     monkeypatch.setattr("zsp_lite.backbones.load.available_backbones", lambda: {"zsp-tiny": None})
@@ -46,5 +48,7 @@ def test_open3d_prints_nothing_in_a_notebook():
     """Open3D detects IPython's shell by the name of its class, and would start a web server."""
     notebook = "import builtins; builtins.get_ipython = type('ZMQInteractiveShell', (), {})\n"
     code = notebook + "from zsp_lite.io.ply import load_open3d; load_open3d()"
-    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    finished = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert finished.stdout == ""

@@ -1,4 +1,5 @@
-"""Gradients of log-binned descriptors (`test_sample_pairs.py` has their values), and the FeatureMap's own checks."""
+"""Gradients of log-binned descriptors (`test_sample_pairs.py` has their values), and the
+FeatureMap's own checks."""
 
 import pytest
 import torch
@@ -26,11 +27,19 @@ def test_foreground_is_saliency_above_the_threshold():
 
 @pytest.mark.parametrize("part", ["keys", "saliency"])
 def test_a_feature_map_refuses_what_is_not_finite(part):
-    parts = {"keys": torch.zeros(2, 3, 4), "saliency": torch.zeros(2, 3), "global_feature": torch.zeros(4)}
+    parts = {
+        "keys": torch.zeros(2, 3, 4),
+        "saliency": torch.zeros(2, 3),
+        "global_feature": torch.zeros(4),
+    }
     parts[part][1, 2] = torch.nan
     refused("not finite", FeatureMap, **parts)
 
 
-@pytest.mark.parametrize("keys, saliency", [((2, 3), (2, 3)), ((2, 3, 4), (3, 2)), ((0, 3, 4), (0, 3))])
+@pytest.mark.parametrize(
+    "keys, saliency", [((2, 3), (2, 3)), ((2, 3, 4), (3, 2)), ((0, 3, 4), (0, 3))]
+)
 def test_a_feature_map_refuses_parts_that_do_not_fit(keys, saliency):
-    refused("FeatureMap", lambda: FeatureMap(torch.zeros(keys), torch.zeros(saliency), torch.zeros(4)))
+    refused(
+        "FeatureMap", lambda: FeatureMap(torch.zeros(keys), torch.zeros(saliency), torch.zeros(4))
+    )

@@ -1,4 +1,5 @@
-"""Files: limits, one table of bad files, each refused by one line that names it, PLY files, one writer per folder."""
+"""Files: limits, one table of bad files, each refused by one line that names it, PLY files, one
+writer per folder."""
 
 import gzip
 import io
@@ -47,50 +48,145 @@ def _torch(content) -> bytes:
 
 def _ply(count, body: bytes, encoding="binary_little_endian", kind="") -> bytes:
     """A PLY file of positions and, if a type is given, of colours."""
-    columns = [f"property float {x}\n" for x in "xyz"] + [f"property {kind} {x}\n" for x in COLOUR_NAMES if kind]
-    return f"ply\nformat {encoding} 1.0\nelement vertex {count}\n{''.join(columns)}end_header\n".encode() + body
+    columns = [f"property float {x}\n" for x in "xyz"] + [
+        f"property {kind} {x}\n" for x in COLOUR_NAMES if kind
+    ]
+    return (
+        f"ply\nformat {encoding} 1.0\nelement vertex {count}\n{''.join(columns)}end_header\n"
+    ).encode() + body
 
 
 # Name of the file, its reader, what is wrong with it, its content, part of the message.
 BAD_FILES = [
-    *((name, read, damage, data, "cannot be decoded .*expected a complete JPEG or PNG")
-      for name, read in (("x.jpg", read_image), ("mask.png", read_mask), ("depth.png", read_depth))
-      for damage, data in {
-          "empty": b"", "text": b"text", "GIF": b"GIF89a" + bytes(20), "JPEG cut": JPEG[: len(JPEG) // 2],
-          "PNG cut": PNG[: len(PNG) // 2], "PNG header": PNG[:33], "PNG length": PNG[:11] + b"\5" + PNG[12:],
-          "PNG with a wrong checksum": PNG[:60] + b"\0\0\0\0" + PNG[64:],
-      }.items()),
+    *(
+        (name, read, damage, data, "cannot be decoded .*expected a complete JPEG or PNG")
+        for name, read in (
+            ("x.jpg", read_image),
+            ("mask.png", read_mask),
+            ("depth.png", read_depth),
+        )
+        for damage, data in {
+            "empty": b"",
+            "text": b"text",
+            "GIF": b"GIF89a" + bytes(20),
+            "JPEG cut": JPEG[: len(JPEG) // 2],
+            "PNG cut": PNG[: len(PNG) // 2],
+            "PNG header": PNG[:33],
+            "PNG length": PNG[:11] + b"\5" + PNG[12:],
+            "PNG with a wrong checksum": PNG[:60] + b"\0\0\0\0" + PNG[64:],
+        }.items()
+    ),
     ("depth.png", read_depth, "8 bits", PNG, "expected a 16-bit greyscale PNG"),
     ("frame_annotations.jgz", read_frame_index, "empty", b"", "Input data was truncated"),
-    ("frame_annotations.jgz", read_frame_index, "cut", gzip.compress(bytes(99))[:-6], "not complete gzip data"),
-    ("frame_annotations.jgz", read_frame_index, "bytes behind", gzip.compress(b"[]") + b"x", "not complete gzip data"),
-    ("frame_annotations.jgz", read_frame_index, "bomb", gzip.compress(bytes(GROWTH_ALLOWED + 1), 1), "grow to more"),
-    ("frame_annotations.jgz", read_frame_index, "no JSON", gzip.compress(b"[{]"), "JSON is malformed"),
-    ("frame_annotations.jgz", read_frame_index, "nested", gzip.compress(b"[" * 100_000), "annotations"),
-    ("frame_annotations.jgz", read_frame_index, "another structure", gzip.compress(b"[1, 2]"), "Expected `object`"),
-    ("frame_annotations.jgz", read_frame_index, "a frame twice",
-     gzip.compress(b"[" + FRAME % 1 + b"," + FRAME % 1 + b"]"), "entries 0 and 1 are both frame 1 of a"),
+    (
+        "frame_annotations.jgz",
+        read_frame_index,
+        "cut",
+        gzip.compress(bytes(99))[:-6],
+        "not complete gzip data",
+    ),
+    (
+        "frame_annotations.jgz",
+        read_frame_index,
+        "bytes behind",
+        gzip.compress(b"[]") + b"x",
+        "not complete gzip data",
+    ),
+    (
+        "frame_annotations.jgz",
+        read_frame_index,
+        "bomb",
+        gzip.compress(bytes(GROWTH_ALLOWED + 1), 1),
+        "grow to more",
+    ),
+    (
+        "frame_annotations.jgz",
+        read_frame_index,
+        "no JSON",
+        gzip.compress(b"[{]"),
+        "JSON is malformed",
+    ),
+    (
+        "frame_annotations.jgz",
+        read_frame_index,
+        "nested",
+        gzip.compress(b"[" * 100_000),
+        "annotations",
+    ),
+    (
+        "frame_annotations.jgz",
+        read_frame_index,
+        "another structure",
+        gzip.compress(b"[1, 2]"),
+        "Expected `object`",
+    ),
+    (
+        "frame_annotations.jgz",
+        read_frame_index,
+        "a frame twice",
+        gzip.compress(b"[" + FRAME % 1 + b"," + FRAME % 1 + b"]"),
+        "entries 0 and 1 are both frame 1 of a",
+    ),
     ("x.ply", read_ply, "empty", b"", "is not a complete PLY file"),
     ("x.ply", read_ply, "cut", _ply(3, bytes(35)), "is not a complete PLY file"),
     ("x.ply", read_ply, "too long", _ply(3, bytes(37)), "is not a complete PLY file"),
     ("x.ply", read_ply, "10^12 points", _ply(10**12, bytes(36)), "is not a complete PLY file"),
     ("x.ply", read_ply, "no points", _ply(0, b""), "is not a complete PLY file"),
-    ("x.ply", read_ply, "not finite", _ply(1, np.float32([0, np.nan, 0]).tobytes()), "expected finite numbers"),
-    ("x.pth", read_checkpoint, "cut", _torch({"a": torch.zeros(99)})[:-200], "damaged, or contains more than tensors"),
-    ("x.pth", read_checkpoint, "code", _torch({"a": Code()}), "damaged, or contains more than tensors"),
+    (
+        "x.ply",
+        read_ply,
+        "not finite",
+        _ply(1, np.float32([0, np.nan, 0]).tobytes()),
+        "expected finite numbers",
+    ),
+    (
+        "x.pth",
+        read_checkpoint,
+        "cut",
+        _torch({"a": torch.zeros(99)})[:-200],
+        "damaged, or contains more than tensors",
+    ),
+    (
+        "x.pth",
+        read_checkpoint,
+        "code",
+        _torch({"a": Code()}),
+        "damaged, or contains more than tensors",
+    ),
     ("x.pth", read_checkpoint, "a number", _torch(5), "expected a state dict of tensors, got int"),
-    ("x.safetensors", read_checkpoint, "cut", save({"a": torch.zeros(9)})[:-1], "damaged, or contains"),
-    ("x.safetensors", read_checkpoint, "giant header", struct.pack("<Q", 2**63) + b"{}", "damaged, or contains"),
+    (
+        "x.safetensors",
+        read_checkpoint,
+        "cut",
+        save({"a": torch.zeros(9)})[:-1],
+        "damaged, or contains",
+    ),
+    (
+        "x.safetensors",
+        read_checkpoint,
+        "giant header",
+        struct.pack("<Q", 2**63) + b"{}",
+        "damaged, or contains",
+    ),
     ("cup.pt", read_pair_file, "code", _torch([Code()]), "damaged, or contains more than tensors"),
     ("cup.pt", read_pair_file, "a dictionary", _torch({}), "Expected `array`, got `object`"),
-    ("cup.pt", read_pair_file, "another structure", _torch([{}]), "missing required field `class` - at"),
-]  # fmt: skip
+    (
+        "cup.pt",
+        read_pair_file,
+        "another structure",
+        _torch([{}]),
+        "missing required field `class` - at",
+    ),
+]
 
 
 @pytest.mark.parametrize(
-    "name, read, data, message", [pytest.param(*row[:2], *row[3:], id=f"{row[0]} {row[2]}") for row in BAD_FILES]
+    "name, read, data, message",
+    [pytest.param(*row[:2], *row[3:], id=f"{row[0]} {row[2]}") for row in BAD_FILES],
 )
-def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path, monkeypatch, name, read, data, message):
+def test_a_bad_file_is_refused_in_one_line_that_names_it(
+    tmp_path, monkeypatch, name, read, data, message
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / name).write_bytes(data)
     assert name in refused(message, read, tmp_path / name)
@@ -98,16 +194,28 @@ def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path, monkeypatch, 
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes in folders")
-@pytest.mark.parametrize("read", [read_image, read_depth, read_ply, read_checkpoint, read_frame_index])
+@pytest.mark.parametrize(
+    "read", [read_image, read_depth, read_ply, read_checkpoint, read_frame_index]
+)
 def test_what_is_no_file_is_refused_without_being_opened(tmp_path, read):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "cycle").symlink_to(tmp_path / "cycle")
-    for name, reason in (("pipe", "a pipe or a device"), (".", "is a directory"), ("gone", "no such"), ("cycle", "")):
+    for name, reason in (
+        ("pipe", "a pipe or a device"),
+        (".", "is a directory"),
+        ("gone", "no such"),
+        ("cycle", ""),
+    ):
         refused(f"cannot be read: {reason}", read, tmp_path / name)
 
 
 def test_a_path_with_a_null_byte_is_refused_in_one_printable_line():
-    refused(r"image 'a\\x00b'\.\.\. cannot be read: .*embedded null [^\n]+$", read_bytes, "a\0b", "image")
+    refused(
+        r"image 'a\\x00b'\.\.\. cannot be read: .*embedded null [^\n]+$",
+        read_bytes,
+        "a\0b",
+        "image",
+    )
 
 
 @pytest.mark.parametrize("path", ["../x", "/etc/passwd", "a\0b", "x" * 5000, "link/x"])
@@ -122,7 +230,8 @@ def test_names_that_are_no_plain_names_are_refused(name):
 
 
 @pytest.mark.parametrize(
-    "name, read", [("x", read_image), ("x.pth", read_checkpoint), ("x.safetensors", read_checkpoint)]
+    "name, read",
+    [("x", read_image), ("x.pth", read_checkpoint), ("x.safetensors", read_checkpoint)],
 )
 def test_a_file_above_the_limit_is_refused_before_it_is_read(tmp_path, name, read):
     with open(tmp_path / name, "wb") as file:
@@ -161,7 +270,11 @@ def path(tmp_path):
 
 
 TEXT = "\n".join(" ".join(map(repr, row)) for row in POINTS.tolist()).encode()
-ENCODED = {"ascii": TEXT, "binary_little_endian": POINTS.tobytes(), "binary_big_endian": POINTS.astype(">f4").tobytes()}
+ENCODED = {
+    "ascii": TEXT,
+    "binary_little_endian": POINTS.tobytes(),
+    "binary_big_endian": POINTS.astype(">f4").tobytes(),
+}
 
 
 @pytest.mark.parametrize("encoding", ENCODED)
@@ -187,7 +300,9 @@ def test_colours_of_8_bits_or_from_0_to_1_are_read_as_8_bit(path, kind, code, sc
 
 def test_faces_behind_the_vertices_of_a_mesh_are_left_out(path):
     faces = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    data = _ply(len(POINTS), POINTS.tobytes() + b"\3" + bytes(12)).replace(b"end_header\n", faces, 1)
+    data = _ply(len(POINTS), POINTS.tobytes() + b"\3" + bytes(12)).replace(
+        b"end_header\n", faces, 1
+    )
     path.write_bytes(data)
     np.testing.assert_array_equal(read_ply(path)[0], POINTS)
 
@@ -199,14 +314,20 @@ def test_written_data_is_read_back(path):
     refused("expected finite", write_ply, path, np.full((5, 3), np.nan), COLOURS)
 
 
-_HOLD = "import sys; from zsp_lite.io.locks import writing\nwith writing(sys.argv[1]): print(1, flush=True); input()"
+_HOLD = (
+    "import sys; from zsp_lite.io.locks import writing\nwith writing(sys.argv[1]): print(1, "
+    "flush=True); input()"
+)
 
 
 def test_a_category_has_one_writer_until_that_is_killed(tmp_path):
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     writer = subprocess.Popen([sys.executable, "-c", _HOLD, str(tmp_path / "cup")], **pipes)
     assert writer.stdout.readline()
-    refused("cup: another process is writing to it", lambda: write_co3d(tmp_path, "cup", [sequence_data("a", 2)]))
+    refused(
+        "cup: another process is writing to it",
+        lambda: write_co3d(tmp_path, "cup", [sequence_data("a", 2)]),
+    )
     writer.kill()
     writer.wait()
     write_co3d(tmp_path, "cup", [sequence_data("a", 2)])
@@ -214,7 +335,9 @@ def test_a_category_has_one_writer_until_that_is_killed(tmp_path):
     assert not list((tmp_path / "cup").glob(".*"))
 
 
-def test_a_folder_is_free_after_an_error_and_else_a_command_that_writes_to_it_is_refused(tmp_path, run):
+def test_a_folder_is_free_after_an_error_and_else_a_command_that_writes_to_it_is_refused(
+    tmp_path, run
+):
     with pytest.raises(ZeroDivisionError), writing(tmp_path / "out"):
         raise ZeroDivisionError
     with writing(tmp_path / "out"):

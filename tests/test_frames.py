@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from refusals import refused
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.depth import decode_depth, encode_depth, inpaint_depth, patch_points, unproject_depth
+from zsp_lite.data.depth import (
+    decode_depth,
+    encode_depth,
+    inpaint_depth,
+    patch_points,
+    unproject_depth,
+)
 from zsp_lite.data.frames import (
     Frame,
     crop_to_object,
@@ -26,19 +32,36 @@ from zsp_lite.data.frames import (
     write_mask,
 )
 from zsp_lite.io.files import write_atomic
-from zsp_lite.points import axis_deviation, object_pixels, object_points, standard_deviation, world_cloud
+from zsp_lite.points import (
+    axis_deviation,
+    object_pixels,
+    object_points,
+    standard_deviation,
+    world_cloud,
+)
 from zsp_lite.views import object_crop
 
 SIZE = (24, 32)
 
 
-@pytest.mark.parametrize(("parts", "padding", "box"), [
-    ([(20, 40, 40, 60, 1.0)], 0.1, (18, 37, 44, 66)),  # a tenth, half of it on each side
-    ([(0, 0, 100, 200, 1.0)], 0.1, (0, 0, 100, 200)),  # in the image
-    ([(0, 180, 40, 20, 1.0)], 0.1, (0, 179, 42, 21)),
-    ([(20, 40, 40, 60, 1.0), (0, 0, 5, 5, 0.4)], 0, (20, 40, 40, 60)),  # pixels at the threshold do not count
-    ([(20, 40, 40, 60, 0.1), (30, 50, 10, 10, 0.3)], 0, (30, 50, 10, 10)),  # a lowered threshold
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("parts", "padding", "box"),
+    [
+        ([(20, 40, 40, 60, 1.0)], 0.1, (18, 37, 44, 66)),  # a tenth, half of it on each side
+        ([(0, 0, 100, 200, 1.0)], 0.1, (0, 0, 100, 200)),  # in the image
+        ([(0, 180, 40, 20, 1.0)], 0.1, (0, 179, 42, 21)),
+        (
+            [(20, 40, 40, 60, 1.0), (0, 0, 5, 5, 0.4)],
+            0,
+            (20, 40, 40, 60),
+        ),  # pixels at the threshold do not count
+        (
+            [(20, 40, 40, 60, 0.1), (30, 50, 10, 10, 0.3)],
+            0,
+            (30, 50, 10, 10),
+        ),  # a lowered threshold
+    ],
+)
 def test_the_box_bounds_the_pixels_above_the_threshold(parts, padding, box):
     mask = np.zeros((100, 200), np.float32)
     for top, left, height, width, value in parts:
@@ -51,11 +74,19 @@ def test_cropping_keeps_every_pixels_world_point():
     whole = sequence_data("one").frames[0]
     cropped = crop_to_object(whole)
     top, left, height, width = mask_to_bbox(whole.mask)
-    assert cropped.camera.size == cropped.rgb.shape[:2] == cropped.depth.shape == cropped.mask.shape == (height, width)
+    assert (
+        cropped.camera.size
+        == cropped.rgb.shape[:2]
+        == cropped.depth.shape
+        == cropped.mask.shape
+        == (height, width)
+    )
     np.testing.assert_array_equal(cropped.rgb, whole.rgb[top : top + height, left : left + width])
     pixel = np.array([3.5, 2.5])
     np.testing.assert_allclose(
-        cropped.camera.unproject(pixel, 2.0), whole.camera.unproject(pixel + (left, top), 2.0), atol=1e-12
+        cropped.camera.unproject(pixel, 2.0),
+        whole.camera.unproject(pixel + (left, top), 2.0),
+        atol=1e-12,
     )
 
 
@@ -78,14 +109,17 @@ def test_colours_are_averaged_along_a_side_that_shrinks_while_the_other_grows(si
     assert (resized.rgb == 80).all()
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"rgb": np.zeros((*SIZE, 3))}, "rgb is float64"),
-    ({"rgb": np.zeros((5, 5, 3), np.uint8)}, r"rgb is uint8 \(5, 5, 3\)"),
-    ({"depth": np.zeros((5, 5), np.float32)}, r"depth has shape \(5, 5\)"),
-    ({"depth": np.full(SIZE, np.nan, np.float32)}, "depth has nan"),
-    ({"depth": np.full(SIZE, -1, np.float32)}, "depth has -1"),
-    ({"mask": np.full(SIZE, 1.5, np.float32)}, "mask has 1.5 to 1.5"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rgb": np.zeros((*SIZE, 3))}, "rgb is float64"),
+        ({"rgb": np.zeros((5, 5, 3), np.uint8)}, r"rgb is uint8 \(5, 5, 3\)"),
+        ({"depth": np.zeros((5, 5), np.float32)}, r"depth has shape \(5, 5\)"),
+        ({"depth": np.full(SIZE, np.nan, np.float32)}, "depth has nan"),
+        ({"depth": np.full(SIZE, -1, np.float32)}, "depth has -1"),
+        ({"mask": np.full(SIZE, 1.5, np.float32)}, "mask has 1.5 to 1.5"),
+    ],
+)
 def test_inconsistent_parts_are_refused_by_name(changes, message):
     values = {"rgb": np.zeros((*SIZE, 3), np.uint8), "depth": None, "mask": None} | changes
     refused(message, lambda: Frame(**values, camera=random_camera(0, SIZE)))
@@ -95,7 +129,11 @@ def arrays(**changes):
     """Arguments of `Frame.from_arrays`: an image of 24 x 32 pixels, with depth of half its size."""
     depth = np.full((12, 16), 2000.0)
     depth[0, :4] = np.nan, np.inf, 0, -1
-    given = {"rgb": np.full((*SIZE, 3), 128, np.uint8), "depth": depth, "K": [[40, 0, 15.5], [0, 41, 11.5], [0, 0, 1]]}
+    given = {
+        "rgb": np.full((*SIZE, 3), 128, np.uint8),
+        "depth": depth,
+        "K": [[40, 0, 15.5], [0, 41, 11.5], [0, 0, 1]],
+    }
     return given | {"depth_unit": 0.001} | changes
 
 
@@ -113,36 +151,55 @@ def test_arrays_of_a_camera_become_a_frame_with_half_integer_pixel_centres():
     np.testing.assert_array_equal(four.camera.K, camera.K)
 
 
-@pytest.mark.parametrize("rgb", [
-    np.full(SIZE, 128, np.uint8),
-    np.full((*SIZE, 4), 128, np.uint8),
-    np.full((*SIZE, 3), 128 / 255, np.float32),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "rgb",
+    [
+        np.full(SIZE, 128, np.uint8),
+        np.full((*SIZE, 4), 128, np.uint8),
+        np.full((*SIZE, 3), 128 / 255, np.float32),
+    ],
+)
 def test_grey_images_alpha_and_floats_are_colours(rgb):
-    np.testing.assert_array_equal(Frame.from_arrays(**arrays(rgb=rgb)).rgb, np.full((*SIZE, 3), 128))
+    np.testing.assert_array_equal(
+        Frame.from_arrays(**arrays(rgb=rgb)).rgb, np.full((*SIZE, 3), 128)
+    )
 
 
 def test_a_mask_holds_booleans_zeros_and_ones_or_up_to_255():
     inside = np.zeros(SIZE, bool)
     inside[5:9, 3:20] = True
-    for mask in (inside, inside.astype(np.int64), inside.astype(np.float32), 255 * inside.astype(np.uint8)):
+    for mask in (
+        inside,
+        inside.astype(np.int64),
+        inside.astype(np.float32),
+        255 * inside.astype(np.uint8),
+    ):
         np.testing.assert_array_equal(Frame.from_arrays(**arrays(mask=mask)).mask > 0.5, inside)
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"rgb": np.zeros((3, *SIZE), np.uint8)}, r"rgb has shape \(3, 24, 32\), expected \(H, W\), \(H, W, 3\)"),
-    ({"rgb": np.zeros(SIZE, np.uint16)}, "rgb is uint16"),
-    ({"rgb": np.full((*SIZE, 3), 128.0)}, "rgb is float64"),
-    ({"depth": np.ones((12, 12))}, r"depth has shape \(12, 12\), expected shape \(24, 32\)"),
-    ({"depth": np.full(SIZE, "far")}, "expected real numbers"),
-    ({"depth_unit": 0.0}, "depth_unit is 0.0, expected a finite number greater than 0"),
-    ({"K": np.eye(4)}, r"K has shape \(4, 4\), expected real numbers of shape \(4,\)"),
-    ({"K": np.array([[40, 0, 16], [1, 41, 12], [0, 0, 1]])}, "expected fx 0 cx, 0 fy cy, 0 0 1 in pixels"),
-    ({"K": (-40, 41, 16, 12)}, "focal_length is -40.0"),
-    ({"mask": np.full(SIZE, 7)}, "mask has 7 at most, expected booleans, 0 and 1, or 0 to 255"),
-    ({"mask": np.ones((12, 16))}, "mask has shape"),
-    ({"pose": np.diag([2.0, 2, 2, 1])}, "camera-to-world pose"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"rgb": np.zeros((3, *SIZE), np.uint8)},
+            r"rgb has shape \(3, 24, 32\), expected \(H, W\), \(H, W, 3\)",
+        ),
+        ({"rgb": np.zeros(SIZE, np.uint16)}, "rgb is uint16"),
+        ({"rgb": np.full((*SIZE, 3), 128.0)}, "rgb is float64"),
+        ({"depth": np.ones((12, 12))}, r"depth has shape \(12, 12\), expected shape \(24, 32\)"),
+        ({"depth": np.full(SIZE, "far")}, "expected real numbers"),
+        ({"depth_unit": 0.0}, "depth_unit is 0.0, expected a finite number greater than 0"),
+        ({"K": np.eye(4)}, r"K has shape \(4, 4\), expected real numbers of shape \(4,\)"),
+        (
+            {"K": np.array([[40, 0, 16], [1, 41, 12], [0, 0, 1]])},
+            "expected fx 0 cx, 0 fy cy, 0 0 1 in pixels",
+        ),
+        ({"K": (-40, 41, 16, 12)}, "focal_length is -40.0"),
+        ({"mask": np.full(SIZE, 7)}, "mask has 7 at most, expected booleans, 0 and 1, or 0 to 255"),
+        ({"mask": np.ones((12, 16))}, "mask has shape"),
+        ({"pose": np.diag([2.0, 2, 2, 1])}, "camera-to-world pose"),
+    ],
+)
 def test_arrays_that_cannot_be_a_frame_are_refused_by_one_line(changes, message):
     line = refused(message, Frame.from_arrays, **arrays(name="cup", **changes))
     assert line.startswith(("frame cup", "depth_unit"))
@@ -158,15 +215,20 @@ def test_depth_and_masks_survive_their_files(tmp_path):
     np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), mask)
     write_mask(tmp_path / "known.png", depth > 0)
     np.testing.assert_array_equal(read_mask(tmp_path / "known.png"), depth > 0)
-    assert (tmp_path / "known.png").read_bytes()[24] == 1  # bit depth in the PNG's header: a mask of booleans
+    assert (tmp_path / "known.png").read_bytes()[
+        24
+    ] == 1  # bit depth in the PNG's header: a mask of booleans
 
 
-@pytest.mark.parametrize(("extension", "options"), [
-    (".png", ()),
-    (".jpg", ()),
-    (".jpg", (cv2.IMWRITE_JPEG_PROGRESSIVE, 1)),
-    (".jpg", (cv2.IMWRITE_JPEG_RST_INTERVAL, 2)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("extension", "options"),
+    [
+        (".png", ()),
+        (".jpg", ()),
+        (".jpg", (cv2.IMWRITE_JPEG_PROGRESSIVE, 1)),
+        (".jpg", (cv2.IMWRITE_JPEG_RST_INTERVAL, 2)),
+    ],
+)
 def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension, options):
     pixels = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
     data, path = cv2.imencode(extension, pixels, options)[1].tobytes(), tmp_path / "image"
@@ -174,7 +236,14 @@ def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension, opti
         thumbnail = cv2.imencode(".jpg", pixels[::4, ::4])[1].tobytes()
         data = data[:2] + b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2) + thumbnail + data[2:]
     decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    for behind in (b"", b"mp4 \xff\xda \xff\xd9 \xff\xda", b"\xff\xd9", data[:-9], bytes(99), b"IDAT IEND IDAT"):
+    for behind in (
+        b"",
+        b"mp4 \xff\xda \xff\xd9 \xff\xda",
+        b"\xff\xd9",
+        data[:-9],
+        bytes(99),
+        b"IDAT IEND IDAT",
+    ):
         path.write_bytes(data + behind)
         np.testing.assert_array_equal(read_image(path), decoded)
     for end in (*range(0, len(data), 37), len(data) - 2, len(data) - 1):
@@ -185,7 +254,11 @@ def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension, opti
 def test_a_mask_file_of_zeros_and_ones_is_an_empty_mask_for_all(tmp_path):
     assert cv2.imwrite(str(tmp_path / "mask.png"), np.eye(*SIZE, dtype=np.uint8))
     frame = replace(sequence_data("one").frames[0], mask=read_mask(tmp_path / "mask.png"))
-    assert frame.mask.any() and frame_defect(frame) == "empty object mask" and not len(world_cloud([frame])[0])
+    assert (
+        frame.mask.any()
+        and frame_defect(frame) == "empty object mask"
+        and not len(world_cloud([frame])[0])
+    )
     np.testing.assert_array_equal(object_crop(frame, 8).rgb, resize_frame(frame, (8, 8)).rgb)
 
 
@@ -281,7 +354,9 @@ def test_a_patchs_point_has_the_lower_quartile_of_its_known_depths(seed):
     rows, cols = np.floor(pixels[..., 1]).astype(int), np.floor(pixels[..., 0]).astype(int)
     for row, col, expected in patch_depths_one_by_one(depth, (6, 8)):
         assert known[row, col] == (expected is not None)
-        assert rows[row, col] // 4 == row and cols[row, col] // 4 == col  # the pixel is one of the patch
+        assert (
+            rows[row, col] // 4 == row and cols[row, col] // 4 == col
+        )  # the pixel is one of the patch
         if expected is not None:
             assert points[row, col, 2] == expected == depth[rows[row, col], cols[row, col]]
 
@@ -295,7 +370,11 @@ def test_a_patch_without_depth_takes_the_filled_depth_at_its_centre():
     centre = camera.unproject_camera(np.array([10.5, 6.5]), inpaint_depth(depth)[6, 10])
     np.testing.assert_allclose(points[1, 2], centre)
     measured, same = patch_points(depth, camera, (4, 4), inpaint=False)
-    assert (same == known).all() and (measured[known] == points[known]).all() and (measured[1, 2] == 0).all()
+    assert (
+        (same == known).all()
+        and (measured[known] == points[known]).all()
+        and (measured[1, 2] == 0).all()
+    )
 
 
 def test_patches_need_not_divide_the_image():

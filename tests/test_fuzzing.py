@@ -1,6 +1,8 @@
-"""Fuzzing of everything that reads files: damaged and invented files must be read or refused by InputError.
+"""Fuzzing of everything that reads files: damaged and invented files must be read or refused by
+InputError.
 
-The readers are those of the hostile inputs with the valid files of their folder; the inputs are the same in each run.
+The readers are those of the hostile inputs with the valid files of their folder; the inputs are the
+same in each run.
 """
 
 import gzip
@@ -18,7 +20,15 @@ from zsp_lite.errors import InputError
 
 pytestmark = pytest.mark.slow
 
-_NAMES = ("frame annotations", "sequence annotations", "label", "point cloud", "safetensors", "nerfstudio", "poses")
+_NAMES = (
+    "frame annotations",
+    "sequence annotations",
+    "label",
+    "point cloud",
+    "safetensors",
+    "nerfstudio",
+    "poses",
+)
 _JPEG = "data/cup/a/images/frame000001.jpg"
 # Every reader, with the file that it reads.
 READERS = {name: READERS_OF[name] for name in _NAMES} | {
@@ -28,22 +38,54 @@ READERS = {name: READERS_OF[name] for name in _NAMES} | {
     "settings of a run": ("made/run.json", lambda folder: read_run(folder / "made").summary),
 }
 _STRANGE = st.sampled_from(
-    [b"", b"\0", b"\xff", b"-1", b"1e308", b"NaN", b"9" * 30, b"[", b"{", b'"', b"\n", b"#", b"/../", b"\xed\xa0\x80"]
-)  # fmt: skip
-_NUMBERS = st.integers() | st.floats() | st.sampled_from([10**30, 1e308, -1e308, 1e155, 1e-300, 0, -1, 2**63, 1 << 53])
+    [
+        b"",
+        b"\0",
+        b"\xff",
+        b"-1",
+        b"1e308",
+        b"NaN",
+        b"9" * 30,
+        b"[",
+        b"{",
+        b'"',
+        b"\n",
+        b"#",
+        b"/../",
+        b"\xed\xa0\x80",
+    ]
+)
+_NUMBERS = (
+    st.integers()
+    | st.floats()
+    | st.sampled_from([10**30, 1e308, -1e308, 1e155, 1e-300, 0, -1, 2**63, 1 << 53])
+)
 _VALUES = st.recursive(
     st.none() | st.booleans() | _NUMBERS | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3)
+    ),
     max_leaves=8,
 )
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The folder of the hostile inputs, and a benchmark run without the times and versions of this machine."""
+    """The folder of the hostile inputs, and a benchmark run without the times and versions of this
+    machine."""
     folder = prepare(tmp_path_factory.mktemp("fuzzing"))
-    result = {"error": 10.0, "symmetric_error": 5.0, "translation": 0.5, "scale": 1.1, "view": 1, "inliers": 9,
-              "seconds": 2.0, "note": "flat", "confidence": 0.7, "position": [0.5, 1.0, 2.0]}  # fmt: skip
+    result = {
+        "error": 10.0,
+        "symmetric_error": 5.0,
+        "translation": 0.5,
+        "scale": 1.1,
+        "view": 1,
+        "inliers": 9,
+        "seconds": 2.0,
+        "note": "flat",
+        "confidence": 0.7,
+        "position": [0.5, 1.0, 2.0],
+    }
     write_run(folder / "made", {"icp": {"cup/a:0/b:1,3": result, "cup/b:2/a:0,2": result}}, ["cup"])
     return folder
 
@@ -65,7 +107,8 @@ def pack(file: str, text: bytes) -> bytes:
 
 @st.composite
 def mutated(draw, data: bytes) -> bytes:
-    """A content with parts that were replaced, removed or repeated; most are near the start, where headers are."""
+    """A content with parts that were replaced, removed or repeated; most are near the start, where
+    headers are."""
     for _ in range(draw(st.integers(1, 4))):
         start = draw(st.integers(0, min(len(data), 1500)) | st.integers(0, len(data)))
         end = min(len(data), start + draw(st.integers(0, 12)))
@@ -100,7 +143,8 @@ def _places(content):
 
 @pytest.mark.parametrize("name", READERS)
 def test_a_reader_accepts_its_format_and_refuses_damage_by_an_input_error(folder, name):
-    """The first content that raises another error than InputError is printed in its smallest form."""
+    """The first content that raises another error than InputError is printed in its
+    smallest form."""
     file, read = READERS[name]
     valid = (folder / file).read_bytes()
     text = unpack(file, valid)
@@ -109,7 +153,9 @@ def test_a_reader_accepts_its_format_and_refuses_damage_by_an_input_error(folder
         contents |= changed_json(text).map(lambda one: pack(file, one))
     read(folder)
 
-    @settings(max_examples=100, database=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @settings(
+        max_examples=100, database=None, derandomize=True, suppress_health_check=list(HealthCheck)
+    )
     @given(contents)
     def test_one(data: bytes) -> None:
         (folder / file).write_bytes(data)

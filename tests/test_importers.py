@@ -1,4 +1,5 @@
-"""Captures written in every format from rendered views are read with the true cameras and depth, and imported."""
+"""Captures written in every format from rendered views are read with the true cameras and depth,
+and imported."""
 
 import json
 import weakref
@@ -32,7 +33,9 @@ def hairdryer_views():
     for view in exact:
         camera = replace(view.camera, t=view.camera.t * METRES)
         depth = (view.depth * METRES).astype(np.float32)
-        frames.append(Frame(view.rgb, depth, view.mask.astype(np.float32), camera, f"{len(frames):04d}"))
+        frames.append(
+            Frame(view.rgb, depth, view.mask.astype(np.float32), camera, f"{len(frames):04d}")
+        )
     return frames
 
 
@@ -52,16 +55,35 @@ def write_depth16(path, depth):
 
 
 def write_nerfstudio(folder, frames):
-    (fx, fy), (cx, cy), (h, w) = frames[0].camera.focal_length, frames[0].camera.principal_point, frames[0].camera.size
+    (fx, fy), (cx, cy), (h, w) = (
+        frames[0].camera.focal_length,
+        frames[0].camera.principal_point,
+        frames[0].camera.size,
+    )
     listed = []
     for frame in frames:
         write_image(folder / f"images/{frame.name}.jpg", frame.rgb, 95)
         write_depth16(folder / f"depths/{frame.name}.png", frame.depth)
         write_mask(folder / f"masks/{frame.name}.png", frame.mask)
         pose = to_world(frame) @ np.diag([1.0, -1, -1, 1])  # OpenGL: +y up, looking along -z
-        listed.append({"file_path": f"images/{frame.name}.jpg", "depth_file_path": f"depths/{frame.name}.png",
-                       "mask_path": f"masks/{frame.name}.png", "transform_matrix": pose.tolist()})  # fmt: skip
-    content = {"camera_model": "OPENCV", "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": w, "h": h, "frames": listed}
+        listed.append(
+            {
+                "file_path": f"images/{frame.name}.jpg",
+                "depth_file_path": f"depths/{frame.name}.png",
+                "mask_path": f"masks/{frame.name}.png",
+                "transform_matrix": pose.tolist(),
+            }
+        )
+    content = {
+        "camera_model": "OPENCV",
+        "fl_x": fx,
+        "fl_y": fy,
+        "cx": cx,
+        "cy": cy,
+        "w": w,
+        "h": h,
+        "frames": listed,
+    }
     (folder / "transforms.json").write_text(json.dumps(content))
 
 
@@ -120,7 +142,9 @@ def test_an_import_holds_a_few_frames_at_once(tmp_path, scan, monkeypatch, box):
 
     load, images, held = CaptureFrame.load, [], []
     monkeypatch.setattr(CaptureFrame, "load", load_counted)
-    assert import_source(open_source(scan, box=box), tmp_path / "data", "teapot", "mine").frames == 8
+    assert (
+        import_source(open_source(scan, box=box), tmp_path / "data", "teapot", "mine").frames == 8
+    )
     assert max(held) <= 3
 
 
@@ -128,7 +152,10 @@ def test_an_import_holds_a_few_frames_at_once(tmp_path, scan, monkeypatch, box):
 def test_distortion_is_corrected(tmp_path, views, model):
     folder = tmp_path / "scan"
     write_nerfstudio(folder, views[:1])
-    names, coefficients = ("k1", "k2", "p1", "p2", "k3"), np.array([0.12, -0.03, 0.002, -0.001, 2.0])
+    names, coefficients = (
+        ("k1", "k2", "p1", "p2", "k3"),
+        np.array([0.12, -0.03, 0.002, -0.001, 2.0]),
+    )
     if model == "OPENCV_FISHEYE":
         names, coefficients = ("k1", "k2", "k3", "k4"), np.array([0.12, -0.03, 0.02, -0.01])
     edited(lambda content: content.update(zip(names, coefficients), camera_model=model))(folder)
@@ -150,14 +177,24 @@ def test_distortion_is_corrected(tmp_path, views, model):
         top, left = int(y) - 4, int(x) - 4
         patch = loaded[top : top + 9, left : left + 9]
         rows, columns = np.mgrid[top : top + 9, left : left + 9] + 0.5
-        assert np.hypot((patch * columns).sum() / patch.sum() - x, (patch * rows).sum() / patch.sum() - y) < 0.35
+        assert (
+            np.hypot(
+                (patch * columns).sum() / patch.sum() - x, (patch * rows).sum() / patch.sum() - y
+            )
+            < 0.35
+        )
 
 
 def test_the_fused_cloud_lies_on_the_surface(views):
     points, colours, normals = fuse(views)
-    seen = np.concatenate([
-        view.camera.unproject(np.argwhere(view.mask > 0)[:, ::-1] + 0.5, view.depth[view.mask > 0]) for view in views
-    ])  # fmt: skip
+    seen = np.concatenate(
+        [
+            view.camera.unproject(
+                np.argwhere(view.mask > 0)[:, ::-1] + 0.5, view.depth[view.mask > 0]
+            )
+            for view in views
+        ]
+    )
     spread = seen.std(axis=0).mean()
     assert np.percentile(cKDTree(seen).query(points)[0], 90) < 0.1 * spread
     assert np.percentile(cKDTree(points).query(seen)[0], 90) < 0.2 * spread
@@ -183,18 +220,55 @@ def edited(*changes, encoding="utf-8", name="transforms.json"):
     return apply
 
 
-@pytest.mark.parametrize(("kind", "damage", "message"), [
-    ("nerfstudio", edited(lambda c: c.update(camera_model="PANORAMA")), "none of 8 frames .* 'PANORAMA'"),
-    ("nerfstudio", edited(lambda c: c.pop("fl_x")), "frame 0: no focal length, expected fl_x or"),
-    ("nerfstudio", edited(lambda c: [f.pop("depth_file_path") for f in c["frames"]]), "none of 8 frames has depth"),
-    ("nerfstudio", edited(lambda c: c.update(w=31.5)), "multiple of 1"),
-    ("nerfstudio", edited(lambda c: c.update(k4=0.01)), "frame 0: .* with k4 = 0.01, expected .* with k4 = 0"),
-    ("lists", replaced("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"), "rgb.txt 8, depth.txt 8, poses.txt 1"),
-    ("lists", replaced("poses.txt", 8 * ("1 0 0 0 " * 3 + "1 0 0 1\n")), "off the expected 0 0 0 1"),
-    ("lists", replaced("intrinsics.txt", "60 0 0\n0 60 0\n32 24 1\n"), "expected fx 0 cx, 0 fy cy, 0 0 1"),
-    ("lists", replaced("intrinsics.txt", 3 * "60 60 32 24\n"), "poses.txt 8, intrinsics 3; expected equal"),
-])  # fmt: skip
-def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(tmp_path, views, kind, damage, message):
+@pytest.mark.parametrize(
+    ("kind", "damage", "message"),
+    [
+        (
+            "nerfstudio",
+            edited(lambda c: c.update(camera_model="PANORAMA")),
+            "none of 8 frames .* 'PANORAMA'",
+        ),
+        (
+            "nerfstudio",
+            edited(lambda c: c.pop("fl_x")),
+            "frame 0: no focal length, expected fl_x or",
+        ),
+        (
+            "nerfstudio",
+            edited(lambda c: [f.pop("depth_file_path") for f in c["frames"]]),
+            "none of 8 frames has depth",
+        ),
+        ("nerfstudio", edited(lambda c: c.update(w=31.5)), "multiple of 1"),
+        (
+            "nerfstudio",
+            edited(lambda c: c.update(k4=0.01)),
+            "frame 0: .* with k4 = 0.01, expected .* with k4 = 0",
+        ),
+        (
+            "lists",
+            replaced("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"),
+            "rgb.txt 8, depth.txt 8, poses.txt 1",
+        ),
+        (
+            "lists",
+            replaced("poses.txt", 8 * ("1 0 0 0 " * 3 + "1 0 0 1\n")),
+            "off the expected 0 0 0 1",
+        ),
+        (
+            "lists",
+            replaced("intrinsics.txt", "60 0 0\n0 60 0\n32 24 1\n"),
+            "expected fx 0 cx, 0 fy cy, 0 0 1",
+        ),
+        (
+            "lists",
+            replaced("intrinsics.txt", 3 * "60 60 32 24\n"),
+            "poses.txt 8, intrinsics 3; expected equal",
+        ),
+    ],
+)
+def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(
+    tmp_path, views, kind, damage, message
+):
     WRITERS[kind](tmp_path, views)
     damage(tmp_path)
     refused(message, open_capture, tmp_path, kind)
@@ -203,7 +277,9 @@ def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(tmp_path,
 def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
     write_nerfstudio(tmp_path, views[:1])
     height, width = views[0].camera.size
-    plane = np.repeat(np.arange(500, 500 + height // 2), width // 2).reshape(height // 2, width // 2)
+    plane = np.repeat(np.arange(500, 500 + height // 2), width // 2).reshape(
+        height // 2, width // 2
+    )
     write_depth16(tmp_path / f"depths/{views[0].name}.png", plane / 1000)
     frame = open_capture(tmp_path, "nerfstudio").frames[0].load()
     np.testing.assert_allclose(frame.depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
@@ -211,16 +287,27 @@ def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
 
 def test_a_single_frame_is_fused_and_a_surface_that_one_of_many_frames_saw_is_left_out(views):
     assert len(fuse(views[:1])[0]) > 200
-    ghost = replace(views[0], depth=np.where(views[0].mask > 0.5, 0.5 * views[0].depth, 0).astype(np.float32))
+    ghost = replace(
+        views[0], depth=np.where(views[0].mask > 0.5, 0.5 * views[0].depth, 0).astype(np.float32)
+    )
     _, depth = views[0].camera.project(fuse([*views, ghost])[0])
     assert depth.min() > 0.7 * views[0].depth[views[0].mask > 0.5].min()
 
 
 def test_bad_boxes_empty_depth_and_frames_without_overlap_are_refused(views):
     refused("expected one inside", masks_from_box, views, (0, 0, 5, 9999))
-    refused("no known depth on the object", fuse, [replace(view, depth=np.zeros_like(view.depth)) for view in views])
+    refused(
+        "no known depth on the object",
+        fuse,
+        [replace(view, depth=np.zeros_like(view.depth)) for view in views],
+    )
     with pytest.raises(InputError, match="expected overlapping depth maps"):
-        fuse([replace(v, camera=replace(v.camera, t=v.camera.t + 100 * i)) for i, v in enumerate(views[:3])])
+        fuse(
+            [
+                replace(v, camera=replace(v.camera, t=v.camera.t + 100 * i))
+                for i, v in enumerate(views[:3])
+            ]
+        )
 
 
 def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(tmp_path, views):
@@ -230,12 +317,22 @@ def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(t
     done = import_source(source, tmp_path / "data", "teapot", "mine")
     assert (done.frames, done.empty) == (5, 1)
     assert len(Co3D(tmp_path / "data").frames("teapot", "mine")) == 5
-    refused("mine exists already, expected another", import_source, source, tmp_path / "data", "teapot", "mine")
+    refused(
+        "mine exists already, expected another",
+        import_source,
+        source,
+        tmp_path / "data",
+        "teapot",
+        "mine",
+    )
 
 
 def test_every_capture_in_a_folder_is_imported_once(tmp_path, views):
     for name in ("one", "two"):
         write_lists(tmp_path / "scans" / name, views, masks=True)
     done = dict(import_captures(tmp_path / "scans", tmp_path / "data", "teapot"))
-    assert [(name, one.frames) for name, one in done.items()] == [("one", len(views)), ("two", len(views))]
+    assert [(name, one.frames) for name, one in done.items()] == [
+        ("one", len(views)),
+        ("two", len(views)),
+    ]
     assert not list(import_captures(tmp_path / "scans", tmp_path / "data", "teapot"))

@@ -1,4 +1,5 @@
-"""Labelling by keypoints: labels agree with known ones, sessions survive a restart, bad picks are refused."""
+"""Labelling by keypoints: labels agree with known ones, sessions survive a restart, bad picks are
+refused."""
 
 import json
 import shutil
@@ -19,7 +20,11 @@ from zsp_lite.io.files import write_atomic
 
 @pytest.fixture
 def root(tmp_path):
-    write_co3d(tmp_path, "chair", [sequence_data("best", quality=3.0), sequence_data("a"), sequence_data("b")])
+    write_co3d(
+        tmp_path,
+        "chair",
+        [sequence_data("best", quality=3.0), sequence_data("a"), sequence_data("b")],
+    )
     return tmp_path
 
 
@@ -43,12 +48,19 @@ def test_residuals_are_relative_to_the_spread_of_the_keypoints():
     assert small.argmax() == 4
 
 
-@pytest.mark.parametrize(("reference", "picks", "message"), [
-    (corners()[:3], corners()[:3], "3 keypoints picked and 3 on the reference, expected equally many, at least 4"),
-    (corners(), corners()[:4], "4 keypoints picked and 5"),
-    (np.outer(np.arange(4), (1, 2, 3)), corners()[:4], "equal or collinear"),
-    (corners()[:4] * np.nan, corners()[:4], "finite"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("reference", "picks", "message"),
+    [
+        (
+            corners()[:3],
+            corners()[:3],
+            "3 keypoints picked and 3 on the reference, expected equally many, at least 4",
+        ),
+        (corners(), corners()[:4], "4 keypoints picked and 5"),
+        (np.outer(np.arange(4), (1, 2, 3)), corners()[:4], "equal or collinear"),
+        (corners()[:4] * np.nan, corners()[:4], "finite"),
+    ],
+)
 def test_bad_picks_are_refused(reference, picks, message):
     refused(message, align_picks, reference, picks)
 
@@ -63,8 +75,10 @@ def test_the_reference_is_the_best_cloud_and_a_restart_loses_nothing(root):
     assert again.names == ("left arm", "keypoint 2", "keypoint 3", "keypoint 4", "keypoint 5")
     np.testing.assert_array_equal(again.picks("a"), corners()[:2])
     assert [(row.sequence, row.state, row.picks) for row in again.progress()] == [
-        ("best", "reference", 5), ("a", "open", 2), ("b", "open", 0),
-    ]  # fmt: skip
+        ("best", "reference", 5),
+        ("a", "open", 2),
+        ("b", "open", 0),
+    ]
 
 
 def test_accepting_writes_the_published_format_and_the_references_identity(root):
@@ -77,7 +91,9 @@ def test_accepting_writes_the_published_format_and_the_references_identity(root)
     assert json.loads(path.read_text()).keys() == {"trans", "seq", "reference_seq"}
     labels = read_labels(root, "chair")
     np.testing.assert_allclose(labels["a"].trans[:3, :3], turn, atol=1e-9)
-    centre = labelling.cloud("best")[0].mean(axis=0)  # of the object, which the label maps to its centre
+    centre = labelling.cloud("best")[0].mean(
+        axis=0
+    )  # of the object, which the label maps to its centre
     np.testing.assert_allclose(labels["a"].trans @ [*centre, 1], [*(1.3 * turn @ centre + 2), 1])
     np.testing.assert_array_equal(labels["best"].trans, np.eye(4))
     states = {row.sequence: (row.state, row.rms) for row in Labelling(root, "chair").progress()}
@@ -91,7 +107,9 @@ def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
     refused("all 5 keypoints are picked", labelling.pick, "a", (0, 0, 0))
     labelling.undo("a")
     assert len(labelling.picks("a")) == 4
-    refused("keypoints of the reference best are in use on a; clear those first", labelling.undo, "best")
+    refused(
+        "keypoints of the reference best are in use on a; clear those first", labelling.undo, "best"
+    )
     labelling.put("a", [])
     labelling.undo("a")
     labelling.undo("best")
@@ -99,9 +117,15 @@ def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
     pick_all(labelling, "b", corners()[:4])
     labelling.accept("b")
     write_label(root, "chair", PoseLabel(np.eye(4), "a", "best"))
-    refused("a cannot be skipped: it has a label not made of picks; remove .*a.json", labelling.skip, "a")
+    refused(
+        "a cannot be skipped: it has a label not made of picks; remove .*a.json",
+        labelling.skip,
+        "a",
+    )
     labelling.skip("b")
-    assert Labelling(root, "chair").progress()[-1].state == "skipped" and "b" not in read_labels(root, "chair")
+    assert Labelling(root, "chair").progress()[-1].state == "skipped" and "b" not in read_labels(
+        root, "chair"
+    )
     labelling.put("b", [])
     labelling.pick("b", (0, 0, 0))
     assert labelling.progress()[-1].state == "open"
@@ -114,10 +138,16 @@ def test_invalid_categories_sequences_and_picks_are_refused(root):
     for call, message in (
         (lambda: labelling.accept("a"), "a has 3 of 5 keypoints, expected all, at least 4"),
         (lambda: labelling.accept("best"), "is the reference"),
-        (lambda: labelling.pick("none", (0, 0, 0)), "sequence is 'none', expected one of best, a, b"),
+        (
+            lambda: labelling.pick("none", (0, 0, 0)),
+            "sequence is 'none', expected one of best, a, b",
+        ),
         (lambda: labelling.skip("best"), "best cannot be skipped: it is the reference"),
         (lambda: labelling.pick("a", (0, np.nan, 0)), "picks on a holds nan, expected finite"),
-        (lambda: labelling.pick("a", (0, 1)), "picks on a is .*, expected real numbers of shape .n, 3."),
+        (
+            lambda: labelling.pick("a", (0, 1)),
+            "picks on a is .*, expected real numbers of shape .n, 3.",
+        ),
         (lambda: Labelling(root, "stool"), "category is 'stool', expected one of"),
     ):
         refused(message, call)
@@ -157,7 +187,11 @@ def test_a_large_residual_is_accepted_only_if_confirmed(root):
         f"residual of {100 * rms:.0f} % of the object's size, above 15 %; the worst keypoint is "
         f"{labelling.names[expected.argmax()]} with {100 * expected.max():.0f} %"
     )
-    refused("sequence a has a residual .* expected a smaller one, or confirmed=True", labelling.accept, "a")
+    refused(
+        "sequence a has a residual .* expected a smaller one, or confirmed=True",
+        labelling.accept,
+        "a",
+    )
     assert "a" not in read_labels(root, "chair")
     labelling.accept("a", confirmed=True)
     assert "a" in read_labels(root, "chair")
@@ -171,13 +205,21 @@ def test_the_reference_is_that_of_the_labels(root):
 def test_a_proposal_becomes_the_label_where_nothing_is_picked(root):
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_euler("z", 70, degrees=True).as_matrix()
-    for name, trans in (("a", np.eye(4)), ("best", turn)):  # the reference of proposals may be another one
-        write_atomic(root / "label_proposals" / "chair" / f"{name}.json", label_bytes(PoseLabel(trans, name, "a")))
+    for name, trans in (
+        ("a", np.eye(4)),
+        ("best", turn),
+    ):  # the reference of proposals may be another one
+        write_atomic(
+            root / "label_proposals" / "chair" / f"{name}.json",
+            label_bytes(PoseLabel(trans, name, "a")),
+        )
     labelling = Labelling(root, "chair")
     assert labelling.reference == "best" and labelling.proposal("b") is None
     np.testing.assert_allclose(labelling.proposal("a").R, turn[:3, :3].T)
     refused("sequence b has 0 of 0 keypoints", labelling.accept, "b")
     labelling.accept("a")
-    np.testing.assert_allclose(read_labels(root, "chair")["a"].trans[:3, :3], turn[:3, :3].T, atol=1e-12)
+    np.testing.assert_allclose(
+        read_labels(root, "chair")["a"].trans[:3, :3], turn[:3, :3].T, atol=1e-12
+    )
     write_atomic(root / "label_proposals" / "chair" / "b.json", b"{}")
     refused("proposal .*b.json|label .*b.json", Labelling, root, "chair")

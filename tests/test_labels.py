@@ -1,4 +1,5 @@
-"""Labels: relative poses, files, import of published labels and pairs, transfer between data sets."""
+"""Labels: relative poses, files, import of published labels and pairs, transfer between
+data sets."""
 
 import json
 from dataclasses import replace
@@ -49,18 +50,33 @@ def test_labels_and_pairs_are_imported_and_replace_others_only_on_request(clone,
     mine[:3, 3] = 0.1
     write_label(root, "chair", PoseLabel(mine, "b", "a"))
     before = contents(root)
-    refused(r"b\.json would be replaced by other content, expected --replace", import_labels, clone, root)
+    refused(
+        r"b\.json would be replaced by other content, expected --replace",
+        import_labels,
+        clone,
+        root,
+    )
     assert contents(root) == before
     import_labels(clone, root, replace=True)
     assert np.array_equal(read_labels(root, "chair")["b"].trans, np.eye(4))
 
 
-@pytest.mark.parametrize(("file", "content", "message"), [
-    ("clone/data/class_labels/chair/b.json", b"{", "Input data was truncated"),
-    ("clone/data/determ_eval/200samples_2tgt/chair.pt", b"pickle", "contains more than tensors"),
-    ("data/class_labels/chair/z.json", json.dumps({"trans": np.eye(4).tolist(), "seq": "z", "reference_seq": "z"}
-                                                  ).encode(), "have reference sequences a, z, expected one"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("clone/data/class_labels/chair/b.json", b"{", "Input data was truncated"),
+        (
+            "clone/data/determ_eval/200samples_2tgt/chair.pt",
+            b"pickle",
+            "contains more than tensors",
+        ),
+        (
+            "data/class_labels/chair/z.json",
+            json.dumps({"trans": np.eye(4).tolist(), "seq": "z", "reference_seq": "z"}).encode(),
+            "have reference sequences a, z, expected one",
+        ),
+    ],
+)
 def test_nothing_is_written_if_one_file_is_bad(clone, root, tmp_path, file, content, message):
     (root / "class_labels/chair").mkdir(parents=True)
     (tmp_path / file).write_bytes(content)
@@ -72,7 +88,12 @@ def test_nothing_is_written_if_one_file_is_bad(clone, root, tmp_path, file, cont
 def test_sources_without_labels_are_refused(root, tmp_path):
     (tmp_path / "labels.zip").write_bytes(b"text")
     for source in ("none", "labels.zip"):
-        refused(f"{source} holds no class_labels.*, expected a clone", import_labels, tmp_path / source, root)
+        refused(
+            f"{source} holds no class_labels.*, expected a clone",
+            import_labels,
+            tmp_path / source,
+            root,
+        )
     refused("does not exist", import_labels, tmp_path, tmp_path / "nowhere")
     refused("has no labels of category chair", transfer_labels, root, root, "chair")
 
@@ -83,24 +104,33 @@ def moved(sequence, world: Sim3, noise: float = 0.0):
     for frame in sequence.frames:
         rotation = frame.camera.R @ world.R.T
         centre = world.apply(frame.camera.centre) + noise * rng.normal(size=3)
-        frames.append(replace(frame, camera=replace(frame.camera, R=rotation, t=-rotation @ centre)))
+        frames.append(
+            replace(frame, camera=replace(frame.camera, R=rotation, t=-rotation @ centre))
+        )
     return replace(sequence, frames=frames, points=world.apply(sequence.points))
 
 
 def two_layouts(tmp_path, noise=0.0):
-    """Write a v1 folder with labels, and a v2 folder with other worlds; returns these worlds and a label."""
+    """Write a v1 folder with labels, and a v2 folder with other worlds; returns these worlds and a
+    label."""
     sequences = {name: sequence_data(name, frames=6) for name in "ab"}
     worlds = {
-        name: Sim3(0.5 + seed, Rotation.random(random_state=seed).as_matrix(), np.full(3, float(seed)))
+        name: Sim3(
+            0.5 + seed, Rotation.random(random_state=seed).as_matrix(), np.full(3, float(seed))
+        )
         for seed, name in enumerate("ab", 1)
     }
     write_co3d(tmp_path / "v1", "chair", sequences.values())
-    write_co3d(tmp_path / "v2", "chair", [moved(sequences[name], worlds[name], noise) for name in "ab"])
+    write_co3d(
+        tmp_path / "v2", "chair", [moved(sequences[name], worlds[name], noise) for name in "ab"]
+    )
     convert_to_v2(tmp_path / "v2/chair")
     trans = np.eye(4)
     trans[:3, :3] = Rotation.random(random_state=9).as_matrix()
     write_label(tmp_path / "v1", "chair", PoseLabel(np.eye(4), "a", "a"))
-    write_label(tmp_path / "v1", "chair", PoseLabel(trans.round(4), "b", "a"))  # as a text of few decimals
+    write_label(
+        tmp_path / "v1", "chair", PoseLabel(trans.round(4), "b", "a")
+    )  # as a text of few decimals
     return worlds, trans
 
 
@@ -124,7 +154,13 @@ def test_the_residual_is_reported_and_a_large_one_refused(tmp_path):
     two_layouts(tmp_path, noise=0.5)
     old, new = Co3D(tmp_path / "v1"), Co3D(tmp_path / "v2")
     assert 0.05 < align_worlds(old, new, "chair", "a")[1] < 0.5
-    refused("centres differ by .*, expected at most 0.05", transfer_labels, tmp_path / "v1", tmp_path / "v2", "chair")
+    refused(
+        "centres differ by .*, expected at most 0.05",
+        transfer_labels,
+        tmp_path / "v1",
+        tmp_path / "v2",
+        "chair",
+    )
     assert read_labels(tmp_path / "v2", "chair") == {}
 
 
@@ -139,12 +175,16 @@ def random_label(seed, name="a"):
 def test_the_relative_pose_takes_what_one_camera_sees_to_what_the_other_sees(seed):
     label_a, label_b = random_label(seed), random_label(seed + 1, "b")
     camera_a, camera_b = random_camera(seed), random_camera(seed + 1)
-    canonical = np.random.default_rng(seed).normal(size=(6, 3))  # points of the reference sequence's cloud
+    canonical = np.random.default_rng(seed).normal(
+        size=(6, 3)
+    )  # points of the reference sequence's cloud
     seen_a = camera_a.to_camera(Sim3.from_matrix(label_a.trans).apply(canonical))
     seen_b = camera_b.to_camera(Sim3.from_matrix(label_b.trans).apply(canonical))
     pose = relative_pose(label_a, camera_a, label_b, camera_b)
     np.testing.assert_allclose(Sim3.from_matrix(pose).apply(seen_a), seen_b, atol=1e-9)
-    np.testing.assert_allclose(pose @ relative_pose(label_b, camera_b, label_a, camera_a), np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(
+        pose @ relative_pose(label_b, camera_b, label_a, camera_a), np.eye(4), atol=1e-9
+    )
 
 
 def test_labels_are_read_back_from_files_in_the_published_format(tmp_path):
@@ -152,7 +192,11 @@ def test_labels_are_read_back_from_files_in_the_published_format(tmp_path):
     for name, label in written.items():
         path = write_label(tmp_path, "chair", label)
         assert path == tmp_path / "class_labels/chair" / f"{name}.json"
-        assert json.loads(path.read_text()) == {"trans": label.trans.tolist(), "seq": name, "reference_seq": "zero"}
+        assert json.loads(path.read_text()) == {
+            "trans": label.trans.tolist(),
+            "seq": name,
+            "reference_seq": "zero",
+        }
     read = read_labels(tmp_path, "chair")
     assert list(read) == ["a", "b"]
     for name, label in read.items():
@@ -160,13 +204,19 @@ def test_labels_are_read_back_from_files_in_the_published_format(tmp_path):
         assert (label.seq, label.reference_seq) == (name, "zero")
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"trans": np.diag([2.0, 2, 2, 1]).tolist()}, "a.json: trans is .*, 1 off the nearest rotation"),
-    ({"trans": np.diag([1.0, 1, -1, 1]).tolist()}, "expected a rotation"),
-    ({"trans": [[1.0, 0], [0, 1]]}, r"of length 4 - at `\$.trans"),
-    ({"seq": "b"}, "has seq 'b', expected seq as in its name"),
-    ({"seq": None}, r"got `null` - at `\$.seq`"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"trans": np.diag([2.0, 2, 2, 1]).tolist()},
+            "a.json: trans is .*, 1 off the nearest rotation",
+        ),
+        ({"trans": np.diag([1.0, 1, -1, 1]).tolist()}, "expected a rotation"),
+        ({"trans": [[1.0, 0], [0, 1]]}, r"of length 4 - at `\$.trans"),
+        ({"seq": "b"}, "has seq 'b', expected seq as in its name"),
+        ({"seq": None}, r"got `null` - at `\$.seq`"),
+    ],
+)
 def test_an_invalid_label_is_refused_with_its_file(tmp_path, change, message):
     path = write_label(tmp_path, "chair", PoseLabel(np.eye(4), "a", "a"))
     path.write_text(json.dumps(json.loads(path.read_text()) | change))

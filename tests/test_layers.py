@@ -1,10 +1,12 @@
-"""The structure of the code: no module imports from a layer above its own, and no room is above its limit of lines."""
+"""The structure of the code: no module imports from a layer above its own, and no room is above its
+limit of lines."""
 
 from tools import size
 from tools.rooms import ROOMS, flows, imports, modules
 
-# From the bottom to the top. A module imports from lower layers and from its own subpackage only, and so does a part of
-# the course. Imports inside functions, which delay the loading of large libraries, follow the same rule.
+# From the bottom to the top. A module imports from lower layers and from its own subpackage only,
+# and so does a part of the course. Imports inside functions, which delay the loading of large
+# libraries, follow the same rule.
 LAYERS = [
     "choices errors threads",
     "io",
@@ -33,7 +35,11 @@ LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names.
 
 def layer_name(module: str) -> str:
     """The name that a module or something in it has in `LAYERS`."""
-    return next(name for name in (".".join(module.split(".")[:2]), module.partition(".")[0]) if name in LAYER_OF)
+    return next(
+        name
+        for name in (".".join(module.split(".")[:2]), module.partition(".")[0])
+        if name in LAYER_OF
+    )
 
 
 def test_every_module_has_a_layer():
@@ -46,12 +52,17 @@ def test_no_module_imports_from_a_higher_layer_or_from_another_name_of_its_own()
         if package == "zsp_lite" and name != "__version__":
             own, other = layer_name(module), layer_name(name)
             allowed = other == own or LAYER_OF[other] < LAYER_OF[own]
-            assert allowed, f"zsp_lite.{module}, line {line}, imports {imported}: {other} is not below {own}"
+            assert allowed, (
+                f"zsp_lite.{module}, line {line}, imports {imported}: {other} is not below {own}"
+            )
 
 
-def test_the_course_alone_imports_its_packages_and_but_for_the_commands_nothing_imports_the_course():
+def test_only_the_commands_import_the_course_and_only_the_course_imports_its_packages():
     for module, imported, line in imports():
-        room, where = module.partition(".")[0], f"zsp_lite.{module}, line {line}, imports {imported}"
+        room, where = (
+            module.partition(".")[0],
+            f"zsp_lite.{module}, line {line}, imports {imported}",
+        )
         assert room == "course" or imported.partition(".")[0] not in OF_THE_COURSE, where
         assert room in ("course", "cli") or not imported.startswith("zsp_lite.course"), where
 
@@ -62,7 +73,9 @@ def test_nothing_flows_back_between_the_rooms_of_the_drawing():
 
 def test_every_room_is_within_its_limit():
     for room in size.rooms():
-        assert 0 < room.size <= room.limit, f"{room.name}: {room.size} {room.unit}, at most {room.limit}"
+        assert 0 < room.size <= room.limit, (
+            f"{room.name}: {room.size} {room.unit}, at most {room.limit}"
+        )
 
 
 def test_every_file_of_the_library_is_in_one_room():

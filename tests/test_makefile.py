@@ -1,4 +1,7 @@
-"""The Makefile: pip's settings reach pip, and `make lab` works on a copy, also as root. Python is a script here."""
+"""The Makefile: pip's settings reach pip, and `make lab` works on a copy, also as root.
+
+Python is a script here.
+"""
 
 import os
 import re
@@ -19,7 +22,9 @@ echo "$* [$PIP_INDEX_URL] [$PIP_EXTRA_INDEX_URL]" >> "$LOG"
 [ "$2" != venv ] || { mkdir -p "$3/bin" && cp "$0" "$3/bin/python"; }
 """
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32" or not shutil.which("make"), reason="needs make and a shell")
+pytestmark = pytest.mark.skipif(
+    sys.platform == "win32" or not shutil.which("make"), reason="needs make and a shell"
+)
 
 
 @pytest.fixture
@@ -40,14 +45,26 @@ def make(folder: Path, target: str, **environment) -> tuple[str, list[str]]:
     """What `make` printed, and the calls of Python."""
     log = folder / "calls"
     path = f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}"
-    inherited = {key: value for key, value in os.environ.items() if not key.startswith(("PIP_", "MAKE", "MFLAGS"))}
-    variables = inherited | {"LOG": str(log), "PATH": path, "PYTHON": str(folder / "bin/python")} | environment
-    run = subprocess.run(["make", target], cwd=folder, env=variables, capture_output=True, text=True, check=True)
+    inherited = {
+        key: value
+        for key, value in os.environ.items()
+        if not key.startswith(("PIP_", "MAKE", "MFLAGS"))
+    }
+    variables = (
+        inherited
+        | {"LOG": str(log), "PATH": path, "PYTHON": str(folder / "bin/python")}
+        | environment
+    )
+    run = subprocess.run(
+        ["make", target], cwd=folder, env=variables, capture_output=True, text=True, check=True
+    )
     return run.stdout, log.read_text().splitlines()
 
 
 def test_the_users_package_index_reaches_pip(folder):
-    _, calls = make(folder, "doctor", PIP_INDEX_URL="https://mine/simple", PIP_EXTRA_INDEX_URL="https://cpu/whl")
+    _, calls = make(
+        folder, "doctor", PIP_INDEX_URL="https://mine/simple", PIP_EXTRA_INDEX_URL="https://cpu/whl"
+    )
     (install,) = [call for call in calls if "pip install" in call and "environment.txt" in call]
     assert install.endswith("[https://mine/simple] [https://cpu/whl]")
 
@@ -57,12 +74,18 @@ def test_lab_opens_a_copy_of_the_notebooks_and_says_why_it_allows_root(folder, u
     text, calls = make(folder, "lab", USER_ID=user)
     assert ("--allow-root" in calls[-1]) == ("You are root" in text) == is_root
     # The root is the repository, so that links of the notebooks to docs/ lead somewhere.
-    options = {"--LabApp.news_url=None", "--ServerApp.root_dir=.", "--LabApp.default_url=/lab/tree/my_notebooks"}
+    options = {
+        "--LabApp.news_url=None",
+        "--ServerApp.root_dir=.",
+        "--LabApp.default_url=/lab/tree/my_notebooks",
+    }
     assert options <= set(calls[-1].split())
     (folder / "my_notebooks/00.ipynb").write_text("changed")
     text, _ = make(folder, "lab", USER_ID=user)
     assert (folder / "notebooks/00.ipynb").read_text() == "original"
-    assert (folder / "my_notebooks/00.ipynb").read_text() == "changed" and "move that folder away" in text
+    assert (
+        folder / "my_notebooks/00.ipynb"
+    ).read_text() == "changed" and "move that folder away" in text
 
 
 def test_the_version_is_the_same_everywhere():

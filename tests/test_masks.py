@@ -1,4 +1,5 @@
-"""Masks from depth and from a box, and what is said against a mask, on a red ball on a grey floor and a photograph."""
+"""Masks from depth and from a box, and what is said against a mask, on a red ball on a grey floor
+and a photograph."""
 
 from dataclasses import replace
 
@@ -19,11 +20,14 @@ DIRECTIONS = [(1, 0.2, 0.6), (0.4, 1, 0.5), (0.7, -0.8, 0.4), (1, 0.5, 1.5)]
 
 
 def ball_on_floor(direction) -> tuple[Frame, np.ndarray]:
-    """A frame of a ball on a floor in front of a wall, in metres, and the true mask; the depth has holes."""
+    """A frame of a ball on a floor in front of a wall, in metres, and the true mask; the depth has
+    holes."""
     camera = look_at(direction, 2.0)
     height, width = camera.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width))) @ camera.R  # world directions
+    rays = (
+        camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width))) @ camera.R
+    )  # world directions
     start = camera.centre
     along, across = rays @ start, np.square(rays).sum(axis=-1)
     root = along**2 - across * (start @ start - RADIUS**2)
@@ -35,7 +39,9 @@ def ball_on_floor(direction) -> tuple[Frame, np.ndarray]:
     depth = np.where(np.isfinite(depth) & (depth < 8), depth, 0)
     rng = np.random.default_rng(0)
     holes = rng.uniform(size=(height // 7, width // 9)) < 0.3
-    depth[cv2.resize(holes.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0] = 0
+    depth[
+        cv2.resize(holes.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    ] = 0
     rgb = np.where(on_ball[..., None], (200, 40, 40), 90) + rng.integers(-9, 9, (height, width, 3))
     return Frame(rgb.astype(np.uint8), depth.astype(np.float32), None, camera), on_ball
 
@@ -57,7 +63,9 @@ def test_depth_without_an_object_is_refused_and_a_frame_without_depth_gets_an_em
     frame, truth = ball_on_floor(DIRECTIONS[0])
     blind = replace(frame, depth=np.zeros_like(frame.depth))
     refused("no depth is known", masks_from_depth, [blind])
-    with pytest.raises(InputError, match="nothing stands out .* expected --box TOP,LEFT,HEIGHT,WIDTH"):
+    with pytest.raises(
+        InputError, match="nothing stands out .* expected --box TOP,LEFT,HEIGHT,WIDTH"
+    ):
         masks_from_depth([replace(frame, depth=np.full_like(frame.depth, 2))])
     empty, found = masks_from_depth([blind, frame])
     assert not empty.mask.any() and overlap(found.mask, truth) > 0.95
@@ -66,7 +74,9 @@ def test_depth_without_an_object_is_refused_and_a_frame_without_depth_gets_an_em
 
 def bounding(mask, margin):
     rows, columns = np.nonzero(mask.any(axis=1))[0], np.nonzero(mask.any(axis=0))[0]
-    return np.s_[rows[0] - margin : rows[-1] + 1 + margin, columns[0] - margin : columns[-1] + 1 + margin]
+    return np.s_[
+        rows[0] - margin : rows[-1] + 1 + margin, columns[0] - margin : columns[-1] + 1 + margin
+    ]
 
 
 def in_the_corner(mask):
@@ -90,12 +100,15 @@ def on_the_floor_too(mask):
     mask[box[0].stop - 15 : box[0].stop + 25, box[1].start - 20 : box[1].stop + 20] = True
 
 
-@pytest.mark.parametrize(("spoil", "sign"), [
-    (in_the_corner, "several borders of the image are touched"),
-    (in_two_parts, "several separate parts"),
-    (around_the_object, "colours disagree"),
-    (on_the_floor_too, "much of it lies in the plane around it"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("spoil", "sign"),
+    [
+        (in_the_corner, "several borders of the image are touched"),
+        (in_two_parts, "several separate parts"),
+        (around_the_object, "colours disagree"),
+        (on_the_floor_too, "much of it lies in the plane around it"),
+    ],
+)
 def test_a_mask_that_may_be_wrong_is_flagged_with_the_reason_and_the_number_of_frames(spoil, sign):
     (first, truth), (second, _) = (ball_on_floor(direction) for direction in DIRECTIONS[:2])
     good = masks_from_depth([first, second])
@@ -117,7 +130,9 @@ def test_a_box_finds_the_object_and_stays_empty_where_it_is_not_seen():
     (first, truth), (second, other) = (ball_on_floor(direction) for direction in DIRECTIONS[:2])
     away = ball_on_floor((-1, 0.2, 0.6))[0].camera
     rows, columns = bounding(truth, 5)
-    box = tuple(map(int, (rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)))
+    box = tuple(
+        map(int, (rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start))
+    )
     away = replace(second, camera=replace(away, t=away.t - (0, 0, 9)))  # behind the camera
     black = replace(second, rgb=np.zeros_like(second.rgb))
     masked = list(masks_from_box([first, away, black, second], box))

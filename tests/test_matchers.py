@@ -1,4 +1,7 @@
-"""Matchers against their definitions, worked out another way: POT for the transport, loops for mutual neighbours."""
+"""Matchers against their definitions, worked out another way:
+
+POT for the transport, loops for mutual neighbours.
+"""
 
 import numpy as np
 import ot
@@ -21,7 +24,9 @@ def masks() -> tuple[torch.Tensor, torch.Tensor]:
 def test_the_transport_plan_is_pots():
     sim = similarities()
     uniform = [np.full(n, 1 / n) for n in sim.shape]
-    expected = ot.sinkhorn(*uniform, 1 - sim.double().numpy(), reg=0.05, numItermax=5000, stopThr=1e-14)
+    expected = ot.sinkhorn(
+        *uniform, 1 - sim.double().numpy(), reg=0.05, numItermax=5000, stopThr=1e-14
+    )
     assert np.abs(sinkhorn(1 - sim, 0.05, 5000).numpy() - expected).max() < 1e-9
 
 
@@ -68,4 +73,6 @@ def test_plain_similarity_is_the_cosine_of_the_keys():
     first, second = feature_map(5), feature_map(6)
     (found,) = key_similarities(first, [second])
     u, v = first.keys[2, 3], second.keys[4, 5]
-    assert found[2 * 9 + 3, 4 * 9 + 5] == pytest.approx(float(u @ v / u.norm() / v.norm()), abs=1e-6)
+    assert found[2 * 9 + 3, 4 * 9 + 5] == pytest.approx(
+        float(u @ v / u.norm() / v.norm()), abs=1e-6
+    )

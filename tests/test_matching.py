@@ -1,4 +1,5 @@
-"""Similarity against materialised descriptors, cyclical distances against loops, and `match`'s promises."""
+"""Similarity against materialised descriptors, cyclical distances against loops, and `match`'s
+promises."""
 
 import cv2
 import numpy as np
@@ -29,7 +30,8 @@ def feature_map(seed: int, grid=(9, 9), channels: int = 16, saliency=None) -> Fe
 
 
 def cycles_by_loops(sim: np.ndarray, grid1, grid2, fg1, fg2, published=False) -> np.ndarray:
-    """Published cycles return to any patch but those of the first row and column, also off the foreground."""
+    """Published cycles return to any patch but those of the first row and column, also off the
+    foreground."""
     result = np.full(grid1, -np.inf)
     for u in range(sim.shape[0]):
         v = int(np.argmax(sim[u]))
@@ -118,7 +120,9 @@ def test_without_kmeans_the_k_best_cycles_are_taken_ties_by_similarity():
     everything = match(ref, target, k=81, kmeans=False)
     keys = list(zip(everything.distance, -everything.similarity))
     assert keys == sorted(keys)
-    np.testing.assert_array_equal(match(ref, target, k=7, kmeans=False).reference, everything.reference[:7])
+    np.testing.assert_array_equal(
+        match(ref, target, k=7, kmeans=False).reference, everything.reference[:7]
+    )
 
 
 def test_kmeans_keeps_the_most_salient_patch_of_each_group_of_like_patches():
@@ -168,7 +172,9 @@ def test_cycles_from_the_target_are_the_published_cycles_of_the_swapped_pair():
 def test_clusters_are_computed_by_one_thread(monkeypatch):
     class Observed(matching.KMeans):
         def fit(self, points):
-            threads.update([cv2.getNumThreads(), *(one["num_threads"] for one in threadpool_info())])
+            threads.update(
+                [cv2.getNumThreads(), *(one["num_threads"] for one in threadpool_info())]
+            )
             return super().fit(points)
 
     threads = set()

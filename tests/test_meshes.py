@@ -1,4 +1,5 @@
-"""Model files give one record in the canonical frame, or the reason why not; their renderings have exact geometry."""
+"""Model files give one record in the canonical frame, or the reason why not; their renderings have
+exact geometry."""
 
 import numpy as np
 import pytest
@@ -22,7 +23,10 @@ def test_an_obj_file_gives_texture_coordinates_texture_colour_and_opacity(tmp_pa
     mesh = read_mesh(write_quad(tmp_path / "quad.obj", CHECKS, colour=(0.5, 1, 1), opacity=0.25))
     assert len(mesh.faces) == 2 and np.ptp(mesh.vertices, axis=0).tolist() == [2, 2, 0]
     (material,) = mesh.materials
-    assert material.texture[..., :3].tolist() == CHECKS.tolist() and (material.texture[..., 3] == 255).all()
+    assert (
+        material.texture[..., :3].tolist() == CHECKS.tolist()
+        and (material.texture[..., 3] == 255).all()
+    )
     assert material.colour == pytest.approx([0.5, 1, 1, 0.25], abs=0.01)
     corner = mesh.vertices[mesh.faces].reshape(-1, 3)
     assert mesh.uv.reshape(-1, 2) == pytest.approx(corner[:, :2] / 2 + 0.5)  # u to the right, v up
@@ -66,25 +70,38 @@ def test_parts_of_a_scene_are_placed_by_its_graph(tmp_path):
         scene.add_geometry(trimesh.Trimesh(cube.vertices, cube.faces), transform=transform)
     scene.export(tmp_path / "two.glb")
     mesh = read_mesh(tmp_path / "two.glb")
-    assert mesh.vertices[:, 0].min() == pytest.approx(-0.5) and mesh.vertices[:, 0].max() == pytest.approx(6)
+    assert mesh.vertices[:, 0].min() == pytest.approx(-0.5) and mesh.vertices[
+        :, 0
+    ].max() == pytest.approx(6)
     assert np.linalg.norm(mesh.normals, axis=-1) == pytest.approx(np.ones((24, 3)), abs=1e-5)
 
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
 
-@pytest.mark.parametrize(("name", "content", "reason"), [
-    ("nan.obj", f"v nan 0 0\n{TRIANGLE}f 1 2 3\n", "nan.obj: vertices holds nan, expected finite numbers"),
-    ("far.obj", f"v 1e300 0 0\n{TRIANGLE}f 1 2 3\n", "far.obj: vertices holds 1e.300, expected finite numbers"),
-    ("flat.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no visible face with an area"),
-    ("lost.obj", f"mtllib gone.mtl\n{TRIANGLE}f 1 2 3\n", "lacks its material file 'gone.mtl'"),
-    ("damaged.glb", "glTF" + 50 * " ", "damaged.glb cannot be read"),
-    ("cube.dae", "<COLLADA/>", "lacks the package pycollada"),
-    ("clear.obj", "quad", "no visible face with an area"),
-    ("bare.obj", "quad", "lacks its texture 'bare.png'"),
-    ("many.obj", 3 * f"{TRIANGLE}f 1 2 3\n", "has 3 faces, expected 1 to 2"),
-    ("large.obj", 1000 * TRIANGLE, "bytes, expected at most"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        (
+            "nan.obj",
+            f"v nan 0 0\n{TRIANGLE}f 1 2 3\n",
+            "nan.obj: vertices holds nan, expected finite numbers",
+        ),
+        (
+            "far.obj",
+            f"v 1e300 0 0\n{TRIANGLE}f 1 2 3\n",
+            "far.obj: vertices holds 1e.300, expected finite numbers",
+        ),
+        ("flat.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no visible face with an area"),
+        ("lost.obj", f"mtllib gone.mtl\n{TRIANGLE}f 1 2 3\n", "lacks its material file 'gone.mtl'"),
+        ("damaged.glb", "glTF" + 50 * " ", "damaged.glb cannot be read"),
+        ("cube.dae", "<COLLADA/>", "lacks the package pycollada"),
+        ("clear.obj", "quad", "no visible face with an area"),
+        ("bare.obj", "quad", "lacks its texture 'bare.png'"),
+        ("many.obj", 3 * f"{TRIANGLE}f 1 2 3\n", "has 3 faces, expected 1 to 2"),
+        ("large.obj", 1000 * TRIANGLE, "bytes, expected at most"),
+    ],
+)
 def test_an_unusable_file_is_refused_with_its_reason(tmp_path, monkeypatch, name, content, reason):
     monkeypatch.setattr(meshes, "find_spec", lambda name: None)
     monkeypatch.setattr(meshes, "MAX_FACES", 2)
@@ -99,20 +116,29 @@ def test_an_unusable_file_is_refused_with_its_reason(tmp_path, monkeypatch, name
 
 def test_orientations_are_rotations_to_front_x_and_up_z():
     rotation = ModelInfo(front="-x", up="+y").axes(".obj")
-    assert rotation @ [-1, 0, 0] == pytest.approx([1, 0, 0]) and rotation @ [0, 1, 0] == pytest.approx([0, 0, 1])
+    assert rotation @ [-1, 0, 0] == pytest.approx([1, 0, 0]) and rotation @ [
+        0,
+        1,
+        0,
+    ] == pytest.approx([0, 0, 1])
     oblique = ModelInfo(front=(1, 1, 0), up=(0, 0, 2)).axes(".ply")
-    assert oblique @ oblique.T == pytest.approx(np.eye(3)) and np.linalg.det(oblique) == pytest.approx(1)
+    assert oblique @ oblique.T == pytest.approx(np.eye(3)) and np.linalg.det(
+        oblique
+    ) == pytest.approx(1)
     for info in (ModelInfo(front="+y", up="+y"), ModelInfo(up=(0, 0, 0))):
         refused("expected", info.axes, ".obj")
 
 
-@pytest.mark.parametrize(("folder", "entries", "message"), [
-    ("", '{"chair/gone": {}}', "names 'chair/gone', which has no file"),
-    ("", '{"chair/a": {"front": 3}}', "front"),
-    ("", '{"chair/a": {"front": "ahead"}}', "Invalid enum value 'ahead'"),
-    ("nowhere", "{}", "does not exist"),
-    ("chair", "{}", "holds no model"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("folder", "entries", "message"),
+    [
+        ("", '{"chair/gone": {}}', "names 'chair/gone', which has no file"),
+        ("", '{"chair/a": {"front": 3}}', "front"),
+        ("", '{"chair/a": {"front": "ahead"}}', "Invalid enum value 'ahead'"),
+        ("nowhere", "{}", "does not exist"),
+        ("chair", "{}", "holds no model"),
+    ],
+)
 def test_a_folder_without_models_and_a_wrong_list_are_refused(tmp_path, folder, entries, message):
     write_wedge(tmp_path / "chair" / "a.obj")
     (tmp_path / "models.json").write_text(entries)
@@ -134,7 +160,8 @@ def from_the_front(mesh):
 
 
 def intersect(camera, vertices, faces):
-    """Depth (h, w) of the nearest triangle at the centre of each pixel, from a linear system each; inf elsewhere."""
+    """Depth (h, w) of the nearest triangle at the centre of each pixel, from a linear system each;
+    inf elsewhere."""
     x, y = np.meshgrid(np.arange(camera.size[1]) + 0.5, np.arange(camera.size[0]) + 0.5)
     rays = camera.unproject_camera(np.stack([x, y], -1), np.ones(camera.size))
     nearest = np.full(camera.size, np.inf)
@@ -147,7 +174,9 @@ def intersect(camera, vertices, faces):
 
 
 @pytest.mark.parametrize("samples", [1, 2])
-def test_depth_and_mask_are_those_of_the_triangles_and_of_the_floor_for_any_number_of_samples(samples):
+def test_depth_and_mask_are_those_of_the_triangles_and_of_the_floor_for_any_number_of_samples(
+    samples,
+):
     mesh = painted(wedge())
     camera = view(mesh.vertices, azimuth=200)
     drawn = render(mesh, camera, samples)
@@ -161,7 +190,10 @@ def test_depth_and_mask_are_those_of_the_triangles_and_of_the_floor_for_any_numb
     row, col = np.nonzero(drawn.mask)
     ray = camera.unproject_camera(np.stack([col + 0.5, row + 0.5], 1), np.ones(len(row)))
     facing = (drawn.normals[row, col] * ray).sum(1)
-    assert np.linalg.norm(drawn.normals[row, col], axis=1) == pytest.approx(1, abs=1e-4) and (facing < 1e-6).all()
+    assert (
+        np.linalg.norm(drawn.normals[row, col], axis=1) == pytest.approx(1, abs=1e-4)
+        and (facing < 1e-6).all()
+    )
 
 
 def test_a_texture_is_upright_and_not_mirrored(tmp_path):
@@ -170,10 +202,16 @@ def test_a_texture_is_upright_and_not_mirrored(tmp_path):
     mesh = standing_quad(tmp_path, texture)
     drawn = render(mesh, from_the_front(mesh))
     row, col = np.nonzero(drawn.mask)
-    (top, bottom), (left, right) = (np.quantile(axis, (0.25, 0.75)).astype(int) for axis in (row, col))
+    (top, bottom), (left, right) = (
+        np.quantile(axis, (0.25, 0.75)).astype(int) for axis in (row, col)
+    )
     seen = drawn.rgb[np.ix_([top, bottom], [left, right])].astype(int)
     # Red, green / blue, yellow: the brighter channels tell them apart.
-    assert (seen.argmax(-1)[0] == [0, 1]).all() and seen[1, 0].argmax() == 2 and seen[1, 1].argmin() == 2
+    assert (
+        (seen.argmax(-1)[0] == [0, 1]).all()
+        and seen[1, 0].argmax() == 2
+        and seen[1, 1].argmin() == 2
+    )
 
 
 def test_a_hole_in_a_texture_is_a_hole_in_mask_depth_and_shadow(tmp_path):
@@ -188,4 +226,7 @@ def test_a_hole_in_a_texture_is_a_hole_in_mask_depth_and_shadow(tmp_path):
     full = (np.ptp(row) + 1) * (np.ptp(col) + 1)
     assert drawn.mask.sum() / full == pytest.approx(0.75, abs=0.05)
     behind = np.array([[-3.0, 0, 0], [-3.0, 0.9 * mesh.vertices[:, 1].max(), 0]], np.float32)
-    assert scene._visible_share(behind, np.tile(np.float32([1, 0, 0]), (2, 1, 1))).tolist() == [1, 0]
+    assert scene._visible_share(behind, np.tile(np.float32([1, 0, 0]), (2, 1, 1))).tolist() == [
+        1,
+        0,
+    ]

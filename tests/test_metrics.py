@@ -13,7 +13,9 @@ from zsp_lite.metrics import accuracy, median, rotation_error
 
 
 def about(axis, degrees: float) -> np.ndarray:
-    return Rotation.from_rotvec(np.radians(degrees) * np.array(axis) / np.linalg.norm(axis)).as_matrix()
+    return Rotation.from_rotvec(
+        np.radians(degrees) * np.array(axis) / np.linalg.norm(axis)
+    ).as_matrix()
 
 
 axes = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda axis: np.linalg.norm(axis) > 0.1)
@@ -33,7 +35,9 @@ def test_tiny_angles_and_angles_next_to_180_keep_their_digits():
     # cos(pi - e) rounds to -1 for e = 1e-9, and an arccos of the trace would say 180 exactly.
     nearly = np.array([[-1, -1e-9, 0], [1e-9, -1, 0], [0, 0, 1]])
     assert 180 - rotation_error(np.eye(3), nearly) == pytest.approx(np.degrees(1e-9), rel=1e-5)
-    assert 180 - rotation_error(np.eye(3), about((1, 2, 3), 180 - 1e-7)) == pytest.approx(1e-7, rel=1e-5)
+    assert 180 - rotation_error(np.eye(3), about((1, 2, 3), 180 - 1e-7)) == pytest.approx(
+        1e-7, rel=1e-5
+    )
     assert rotation_error(np.eye(3), np.eye(3)) == 0
     assert rotation_error(np.eye(3), np.diag([1.0, -1, -1])) == 180
 
@@ -41,7 +45,9 @@ def test_tiny_angles_and_angles_next_to_180_keep_their_digits():
 def test_batches_broadcast_and_tensors_are_taken():
     batch = np.stack([about((1, 0, 0), d) for d in (0, 10, 90)])
     np.testing.assert_allclose(rotation_error(np.eye(3), batch), [0, 10, 90], atol=1e-12)
-    np.testing.assert_allclose(rotation_error(torch.as_tensor(batch), torch.eye(3)), [0, 10, 90], atol=1e-6)
+    np.testing.assert_allclose(
+        rotation_error(torch.as_tensor(batch), torch.eye(3)), [0, 10, 90], atol=1e-6
+    )
     assert rotation_error(batch[:, None], batch[None]).shape == (3, 3)
 
 
@@ -76,17 +82,28 @@ def test_the_interval_of_an_accuracy_matches_the_binomial():
     low, high = bootstrap_ci(errors, acc30)
     assert low == pytest.approx(30.4, abs=1.5) and high == pytest.approx(49.6, abs=1.5)
     drawn = np.random.default_rng(0).integers(100, size=(2000, 100))
-    assert (low, high) == pytest.approx(tuple(np.percentile(accuracy(errors[drawn], 30), [2.5, 97.5])))
+    assert (low, high) == pytest.approx(
+        tuple(np.percentile(accuracy(errors[drawn], 30), [2.5, 97.5]))
+    )
 
 
 def test_equal_errors_have_no_spread():
     summary = figures_of([20.0] * 5)
     assert summary == {
-        "n": 5, "median": 20, "acc30": 100, "acc15": 0,
-        "median_ci": [20, 20], "acc30_ci": [100, 100], "acc15_ci": [0, 0], "above150": 0, "auc30": 100 * (1 - 20 / 30),
-        "above150_ci": [0, 0], "auc30_ci": [100 * (1 - 20 / 30)] * 2,
-    }  # fmt: skip
-    # At thresholds below 15 one of four is right, up to 30 two: (25 + 50) / 2. An error of 30 counts nowhere.
+        "n": 5,
+        "median": 20,
+        "acc30": 100,
+        "acc15": 0,
+        "median_ci": [20, 20],
+        "acc30_ci": [100, 100],
+        "acc15_ci": [0, 0],
+        "above150": 0,
+        "auc30": 100 * (1 - 20 / 30),
+        "above150_ci": [0, 0],
+        "auc30_ci": [100 * (1 - 20 / 30)] * 2,
+    }
+    # At thresholds below 15 one of four is right, up to 30 two: (25 + 50) / 2. An error of 30
+    # counts nowhere.
     assert figures_of([0.0, 15.0, 30.0, 60.0])["auc30"] == pytest.approx(37.5)
     assert figures_of([10.0, 149.0, 150.0, 151.0, 180.0])["above150"] == pytest.approx(40)
 
@@ -98,13 +115,17 @@ def test_a_pairs_weight_is_the_product_of_how_often_its_two_objects_are_drawn():
     weights = object_draws(PAIRS, resamples=500)
     np.testing.assert_allclose(weights.sum(axis=1), len(PAIRS))
     for row in weights:
-        # Some multiplicities of a, b, c and d, which sum to 4, explain all six weights up to their common factor.
+        # Some multiplicities of a, b, c and d, which sum to 4, explain all six weights up to their
+        # common factor.
         fits = [
             np.allclose(row * products.sum(), products * row.sum())
-            for a in range(5) for b in range(5 - a) for c in range(5 - a - b)
+            for a in range(5)
+            for b in range(5 - a)
+            for c in range(5 - a - b)
             for count in [dict(zip("abcd", (a, b, c, 4 - a - b - c)))]
-            for products in [np.array([count[one] * count[other] for one, other in PAIRS])] if products.any()
-        ]  # fmt: skip
+            for products in [np.array([count[one] * count[other] for one, other in PAIRS])]
+            if products.any()
+        ]
         assert any(fits)
 
 
@@ -134,7 +155,8 @@ def test_the_sign_test_counts_the_pairs_that_only_one_method_solves():
     result = paired_test(first, second)
     assert result["accuracy_gain"] == pytest.approx(50)
     assert result["sign_test_p"] == pytest.approx(0.125)
-    # Sums of +-80 over 7 signs at least as far as 5 * 80: |plus - minus| >= 5, that is 2 * (1 + 7) of 128.
+    # Sums of +-80 over 7 signs at least as far as 5 * 80: |plus - minus| >= 5, that is 2 * (1 + 7)
+    # of 128.
     assert result["permutation_test_p"] == pytest.approx(16 / 128)
 
 
@@ -146,13 +168,20 @@ def test_a_paired_differences_interval_and_p_value_are_those_of_its_replicates()
     gains = [100 * np.average((second < 30) * 1.0 - (first < 30), weights=row) for row in weights]
     assert result["accuracy_gain_ci"] == pytest.approx(list(np.percentile(gains, [2.5, 97.5])))
     below = np.sum(np.array(gains) < 1e-9)
-    assert result["accuracy_gain"] > 0 and result["accuracy_gain_p"] == pytest.approx(2 * (below + 1) / 2001)
+    assert result["accuracy_gain"] > 0 and result["accuracy_gain_p"] == pytest.approx(
+        2 * (below + 1) / 2001
+    )
 
 
 def test_a_method_does_not_differ_from_itself_and_one_pair_proves_nothing():
     result = paired_test([90.0], [10.0])
-    assert result["accuracy_gain"] == 100 and result["sign_test_p"] == result["permutation_test_p"] == 1
+    assert (
+        result["accuracy_gain"] == 100
+        and result["sign_test_p"] == result["permutation_test_p"] == 1
+    )
     errors = np.linspace(0, 180, 30)
     result = paired_test(errors, errors)
-    assert {result[f"{name}_p"] for name in ("accuracy_gain", "sign_test", "permutation_test")} == {1}
+    assert {result[f"{name}_p"] for name in ("accuracy_gain", "sign_test", "permutation_test")} == {
+        1
+    }
     assert result["accuracy_gain"] == 0 and result["accuracy_gain_ci"] == [0, 0]

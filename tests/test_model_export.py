@@ -27,12 +27,16 @@ SETTINGS = {"frames": FRAMES, "seed": 3, "image_size": SIZE}
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two chairs, one of which lies on its back in its file, and a sign whose texture is missing."""
+    """Two chairs, one of which lies on its back in its file, and a sign whose texture is
+    missing."""
     root = tmp_path_factory.mktemp("models")
     write_wedge(root / "chair" / "high.obj", seat=0.9)
     path = write_wedge(root / "chair" / "low.obj", seat=0.4)
     lines = path.read_text().splitlines()
-    lying = [f"v {x} {-z} {y}" for x, y, z in (map(float, line.split()[1:]) for line in lines if line[0] == "v")]
+    lying = [
+        f"v {x} {-z} {y}"
+        for x, y, z in (map(float, line.split()[1:]) for line in lines if line[0] == "v")
+    ]
     path.write_text("\n".join(lying + [line for line in lines if line[0] == "f"]) + "\n")
     info = {"front": "-y", "up": "+z", "author": "Ann", "licence": "CC0-1.0"}
     (root / "models.json").write_text(json.dumps({"chair/low": info}))
@@ -52,13 +56,22 @@ def test_the_data_folder_has_a_sequence_per_usable_model_and_names_the_others(da
     dataset, left_out = data
     assert dataset.categories() == ["chair"]
     assert [sequence.sequence_name for sequence in dataset.sequences("chair")] == ["high", "low"]
-    assert list(left_out) == ["sign/stop"] and "lacks its texture 'stop.png'" in left_out["sign/stop"]
+    assert (
+        list(left_out) == ["sign/stop"] and "lacks its texture 'stop.png'" in left_out["sign/stop"]
+    )
     frames = dataset.frames("chair", "low")
     frame = dataset.load(frames[0])
     assert len(frames) == FRAMES and min(frame.camera.size) == SIZE
-    assert 0.05 < (frame.mask > 0.5).mean() < 0.5 and 0.4 < (frame.depth[frame.mask > 0.9] > 0).mean() < 0.9
+    assert (
+        0.05 < (frame.mask > 0.5).mean() < 0.5
+        and 0.4 < (frame.depth[frame.mask > 0.9] > 0).mean() < 0.9
+    )
     record = json.loads((dataset.root / RENDERED_FILE).read_text())["sequences"]["chair"]["low"]
-    assert (record["author"], record["licence"], record["file"]) == ("Ann", "CC0-1.0", "chair/low.obj")
+    assert (record["author"], record["licence"], record["file"]) == (
+        "Ann",
+        "CC0-1.0",
+        "chair/low.obj",
+    )
 
 
 def test_labels_map_the_front_of_the_reference_to_the_front_of_every_object(data):
@@ -68,7 +81,9 @@ def test_labels_map_the_front_of_the_reference_to_the_front_of_every_object(data
     for name, label in labels.items():
         axes = label.trans[:3, :3] @ poses["high"].R  # of the reference, placed by the label
         assert axes == pytest.approx(poses[name].R, abs=1e-6)
-        assert label.trans[:3, :3] @ poses["high"].t + label.trans[:3, 3] == pytest.approx(poses[name].t, abs=1e-6)
+        assert label.trans[:3, :3] @ poses["high"].t + label.trans[:3, 3] == pytest.approx(
+            poses[name].t, abs=1e-6
+        )
         inside = poses[name].to_box(dataset.point_cloud("chair", name)[0])
         assert np.quantile(inside, 0.01) > -0.1 and np.quantile(inside, 0.99) < 1.1
     pairs = shipped_pairs(dataset, "chair", 3)
@@ -76,7 +91,9 @@ def test_labels_map_the_front_of_the_reference_to_the_front_of_every_object(data
     assert ground_truth_pair(dataset, pairs[0]).valid.sum() > 20
 
 
-def test_complete_sequences_stay_and_turned_models_are_rendered_again(data, folder, tmp_path, monkeypatch):
+def test_complete_sequences_stay_and_turned_models_are_rendered_again(
+    data, folder, tmp_path, monkeypatch
+):
     record = Mock(wraps=export.record_sequence)
     monkeypatch.setattr(export, "record_sequence", record)
     out = tmp_path / "data"
@@ -84,7 +101,9 @@ def test_complete_sequences_stay_and_turned_models_are_rendered_again(data, fold
     before = read_labels(out, "chair")["low"].trans
     export_models(folder, out, **SETTINGS)
     assert not record.called
-    export_models(folder, out, **SETTINGS, front="+x")  # of `high` alone: models.json orients the other one
+    export_models(
+        folder, out, **SETTINGS, front="+x"
+    )  # of `high` alone: models.json orients the other one
     assert [call.args[1] for call in record.call_args_list] == ["high"]
     assert not np.allclose(read_labels(out, "chair")["low"].trans, before)
     refused("was written with", export_models, folder, out, **{**SETTINGS, "seed": 4})
@@ -92,7 +111,12 @@ def test_complete_sequences_stay_and_turned_models_are_rendered_again(data, fold
 
 def test_a_folder_of_other_data_or_without_a_usable_model_is_refused(data, folder, tmp_path):
     write_quad(tmp_path / "models" / "sign" / "stop.obj", opacity=0)
-    refused("no usable model; sign/stop: .* no visible face", export_models, tmp_path / "models", tmp_path / "out")
+    refused(
+        "no usable model; sign/stop: .* no visible face",
+        export_models,
+        tmp_path / "models",
+        tmp_path / "out",
+    )
     shutil.copytree(data[0].root, tmp_path / "other")
     (tmp_path / "other" / RENDERED_FILE).unlink()
     refused("holds other data", export_models, folder, tmp_path / "other")
@@ -102,22 +126,50 @@ def test_the_command_line_renders_models_and_names_those_left_out(folder, tmp_pa
     out, mine = tmp_path / "data", tmp_path / "mine"
     write_wedge(mine / "chair" / "a.obj")
     shutil.copytree(folder / "sign", mine / "sign")
-    arguments = ["--frames", "1", "--image-size", "48", "--front", "-x", "--up", "+z", "--out", str(out)]
+    arguments = [
+        "--frames",
+        "1",
+        "--image-size",
+        "48",
+        "--front",
+        "-x",
+        "--up",
+        "+z",
+        "--out",
+        str(out),
+    ]
     assert "Left out sign/stop" in run(["synth", "--models", str(mine), *arguments])
     rotation = json.loads((out / RENDERED_FILE).read_text())["sequences"]["chair"]["a"]["rotation"]
     assert rotation == [-1, 0, 0, 0, -1, 0, 0, 0, 1]
 
 
 def test_the_code_of_the_page_on_own_models_writes_labels_that_align_the_objects(tmp_path):
-    (code,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs" / "own_models.md").read_text(), re.DOTALL)
+    (code,) = re.findall(
+        r"```python\n(.*?)```", (REPOSITORY / "docs" / "own_models.md").read_text(), re.DOTALL
+    )
     exec(code, names := {})
     rng = np.random.default_rng(0)
     points, poses = rng.normal(size=(50, 3)), [np.eye(4), np.eye(4)]
     poses[1][:3] = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
     camera = Camera(np.eye(3), np.zeros(3), np.full(2, 8.0), np.full(2, 4.0), (8, 8))
-    frame = Frame(np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), np.float32), np.ones((8, 8), np.float32), camera, "")
+    frame = Frame(
+        np.zeros((8, 8, 3), np.uint8),
+        np.ones((8, 8), np.float32),
+        np.ones((8, 8), np.float32),
+        camera,
+        "",
+    )
     recordings = [
-        (SequenceData(name, [frame], [0.0], points @ pose[:3, :3].T + pose[:3, 3], np.zeros((50, 3), np.uint8)), pose)
+        (
+            SequenceData(
+                name,
+                [frame],
+                [0.0],
+                points @ pose[:3, :3].T + pose[:3, 3],
+                np.zeros((50, 3), np.uint8),
+            ),
+            pose,
+        )
         for name, pose in zip(("first", "second"), poses)
     ]
     names["write_category"](tmp_path, "box", recordings)

@@ -1,4 +1,5 @@
-"""The package: public names, files, the wheel and its use without the repository, where samples are made."""
+"""The package: public names, files, the wheel and its use without the repository, where samples are
+made."""
 
 import os
 import re
@@ -17,16 +18,20 @@ from zsp_lite.course import samples
 
 REPOSITORY = Path(__file__).parents[1]
 FILES = ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", "CHANGELOG.md", "CITATION.cff")
-# Attributes of modules and classes that users and outside checks rely on, besides the package's own names.
+# Attributes of modules and classes that users and outside checks rely on, besides the package's own
+# names.
 PROMISED = """
-    vit.VisionTransformer features.log_bin matching.similarity matching.cyclical_distances alignment.umeyama
-    alignment.ransac metrics.rotation_error co3d.Co3D ZeroShotPose.estimate
+    vit.VisionTransformer features.log_bin matching.similarity matching.cyclical_distances
+    alignment.umeyama alignment.ransac metrics.rotation_error co3d.Co3D ZeroShotPose.estimate
 """.split()
 
 
 def test_every_promised_name_is_an_attribute_after_a_bare_import_which_does_not_import_torch():
     names = [*PROMISED, *zsp_lite.__all__]
-    code = "import operator, sys, zsp_lite; assert 'torch' not in sys.modules and 'cv2' not in sys.modules"
+    code = (
+        "import operator, sys, zsp_lite; assert 'torch' not in sys.modules and 'cv2' not in "
+        "sys.modules"
+    )
     code += f"\nfor name in {names}: operator.attrgetter(name)(zsp_lite)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -36,7 +41,9 @@ def wheel(tmp_path_factory):
     """The wheel, built from a copy of the repository."""
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
     for folder in ("zsp_lite", "data_samples/class_labels", "notebooks/results"):
-        shutil.copytree(REPOSITORY / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            REPOSITORY / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__")
+        )
     for name in FILES:
         shutil.copy(REPOSITORY / name, source)
     code = f"from setuptools import build_meta as b; b.build_wheel({str(out)!r})"
@@ -51,7 +58,11 @@ def test_the_wheel_has_the_package_and_nothing_else(wheel):
         metadata = next(name for name in names if name.endswith(".dist-info/METADATA"))
         fields = Parser().parsestr(archive.read(metadata).decode())
     assert {name.split("/")[0] for name in names} == {"zsp_lite", metadata.split("/")[0]}
-    files = [path for path in (REPOSITORY / "zsp_lite").rglob("*") if path.is_file() and path.suffix != ".pyc"]
+    files = [
+        path
+        for path in (REPOSITORY / "zsp_lite").rglob("*")
+        if path.is_file() and path.suffix != ".pyc"
+    ]
     assert {path.relative_to(REPOSITORY).as_posix() for path in files} <= set(names)
     assert fields["Name"] == "zsp-lite" and fields["License-Expression"] == "MIT"
     assert wheel.stat().st_size < 14e6
@@ -59,27 +70,50 @@ def test_the_wheel_has_the_package_and_nothing_else(wheel):
 
 @pytest.mark.slow
 def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
-    """README's first example and the demo, with nothing of the repository on the path; a second call makes nothing."""
+    """README's first example and the demo, with nothing of the repository on the path; a second
+    call makes nothing."""
     site, empty, cache = (tmp_path / name for name in ("site", "empty", "cache"))
     empty.mkdir()
-    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--no-compile"]
+    install = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        "--no-compile",
+    ]
     subprocess.run([*install, "--target", str(site), str(wheel)], check=True)
     readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
     (example, *_) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
     code = (
         f"import zsp_lite; assert zsp_lite.__file__.startswith({str(site)!r})\n"
         "from dataclasses import replace; from zsp_lite.course.synthetic.export import PRESETS\n"
-        "PRESETS['demo'] = replace(PRESETS['demo'], categories=('motorcycle',), frames=6, image_size=96)\n"
+        "PRESETS['demo'] = replace(PRESETS['demo'], categories=('motorcycle',), frames=6, "
+        "image_size=96)\n"
         f"{example}\nassert len(targets) == 5\n"
         "from zsp_lite.cli.main import main\n"
         "raise SystemExit(main(['demo', '--backbone', 'zsp-tiny', '--solver', 'paper']))"
     )
-    environment = os.environ | {"PYTHONPATH": str(site), "ZSP_LITE_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {
+        "PYTHONPATH": str(site),
+        "ZSP_LITE_CACHE": str(cache),
+        "OMP_NUM_THREADS": "1",
+    }
     environment.pop("ZSP_LITE_DATA", None)
-    run = subprocess.run([sys.executable, "-P", "-c", code], cwd=empty, env=environment, capture_output=True, text=True)
+    run = subprocess.run(
+        [sys.executable, "-P", "-c", code],
+        cwd=empty,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
     assert run.returncode == 0, run.stderr
     assert run.stderr.count("making synthetic samples") == 1
-    assert "Photographed motorcycle" in run.stdout and (empty / "outputs/demo/report.html").is_file()
+    assert (
+        "Photographed motorcycle" in run.stdout and (empty / "outputs/demo/report.html").is_file()
+    )
     assert [path.name for path in cache.iterdir()] == ["samples"]
 
 

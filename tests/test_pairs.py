@@ -24,7 +24,9 @@ NAMES = ["s3", "s1", "s2"]
 def dataset(tmp_path_factory):
     root = tmp_path_factory.mktemp("data")
     for category in ("chair", "lamp"):
-        write_co3d(root, category, [sequence_data(name, frames=12) for name in [*NAMES, "unlabelled"]])
+        write_co3d(
+            root, category, [sequence_data(name, frames=12) for name in [*NAMES, "unlabelled"]]
+        )
         for name in NAMES:
             write_label(root, category, PoseLabel(np.eye(4), name, "s1"))
     # Frame numbers are not positions: the list is shuffled, and numbers start at 100.
@@ -41,15 +43,23 @@ def dataset(tmp_path_factory):
 
 def item(dataset, **changes):
     frames = dataset.frame_list("chair")
-    where = {name: [i for i, key in enumerate(frames) if key.sequence_name == name] for name in NAMES}
-    ends = {"reference_seq_name": "s1", "reference_frame_id": where["s1"][0], "target_seq_name": "s2"}
+    where = {
+        name: [i for i, key in enumerate(frames) if key.sequence_name == name] for name in NAMES
+    }
+    ends = {
+        "reference_seq_name": "s1",
+        "reference_frame_id": where["s1"][0],
+        "target_seq_name": "s2",
+    }
     return {"class": "chair", **ends, "all_target_id": where["s2"][:3]} | changes
 
 
 def test_references_go_round_and_every_other_sequence_and_frame_gets_its_turn(dataset):
     pairs = sample_pairs(dataset, "chair", 300, 1, seed=0)
     assert [pair.reference_sequence for pair in pairs] == ["s1", "s2", "s3"] * 100
-    assert {(pair.reference_sequence, pair.target_sequence) for pair in pairs} == {*permutations(NAMES, 2)}
+    assert {(pair.reference_sequence, pair.target_sequence) for pair in pairs} == {
+        *permutations(NAMES, 2)
+    }
     assert {pair.reference_frame for pair in pairs} == set(range(100, 112))
     assert {pair.target_frames for pair in pairs} == {(number,) for number in range(100, 112)}
 
@@ -72,18 +82,32 @@ def test_sampling_depends_on_seed_and_category_alone(dataset):
 
 def test_all_pairs_are_different_and_too_large_a_number_gives_all_there_are(tmp_path, caplog):
     lengths = {"a": 2, "b": 3, "c": 5}
-    write_co3d(tmp_path, "chair", [sequence_data(name, frames=length) for name, length in lengths.items()])
+    write_co3d(
+        tmp_path, "chair", [sequence_data(name, frames=length) for name, length in lengths.items()]
+    )
     for name in lengths:
         write_label(tmp_path, "chair", PoseLabel(np.eye(4), name, "a"))
     every = sample_pairs(Co3D(tmp_path), "chair", total := 62, 2)  # 2 * (2 * 3 + 2 * 5 + 3 * 5)
-    assert len({pair.key for pair in every}) == total and {pair.reference_sequence for pair in every[-4:]} == {"c"}
-    assert all(sample_pairs(Co3D(tmp_path), "chair", n, 2) == every[:n] for n in range(total)) and not caplog.text
+    assert len({pair.key for pair in every}) == total and {
+        pair.reference_sequence for pair in every[-4:]
+    } == {"c"}
+    assert (
+        all(sample_pairs(Co3D(tmp_path), "chair", n, 2) == every[:n] for n in range(total))
+        and not caplog.text
+    )
     assert sample_pairs(Co3D(tmp_path), "chair", 10**9, 2) == every
     assert "category chair has 62 different pairs of 2 targets, not 1000000000" in caplog.text
 
 
 def test_missing_labels_and_frames_are_refused(dataset, tmp_path):
-    refused("labelled sequence chair/.* has 12 frames, expected at least 13", sample_pairs, dataset, "chair", 1, 13)
+    refused(
+        "labelled sequence chair/.* has 12 frames, expected at least 13",
+        sample_pairs,
+        dataset,
+        "chair",
+        1,
+        13,
+    )
     write_co3d(tmp_path, "chair", [sequence_data("s1")])
     refused("has 0 labelled sequences", lambda: sample_pairs(Co3D(tmp_path), "chair", 1, 1))
 
@@ -111,31 +135,47 @@ def test_published_ids_are_positions_in_the_frame_list(dataset, tmp_path, form):
     torch.save([given | {"all_target_id": form(given["all_target_id"])}], tmp_path / "chair.pt")
     (pair,) = read_published_pairs(tmp_path / "chair.pt", dataset)
     assert pair.reference_frame == frames[given["reference_frame_id"]].frame_number
-    assert pair.target_frames == tuple(frames[position].frame_number for position in given["all_target_id"])
+    assert pair.target_frames == tuple(
+        frames[position].frame_number for position in given["all_target_id"]
+    )
 
 
 def test_a_folders_own_pairs_are_found(tmp_path, caplog):
     write_co3d(tmp_path, "chair", [sequence_data(name) for name in "ab"])
     dataset = Co3D(tmp_path)
     assert shipped_pairs(dataset, "chair", 2) == []
-    pairs = [Pair("chair", "a", number % 4, "b", (0, 2)) for number in range(5)]  # the last is the first
+    pairs = [
+        Pair("chair", "a", number % 4, "b", (0, 2)) for number in range(5)
+    ]  # the last is the first
     for n in (3, 5):
         write_published_pairs(pairs_path(tmp_path, "chair", n, 2), pairs[:n], dataset)
     assert shipped_pairs(dataset, "chair", 2) == pairs[:3]
     assert shipped_pairs(dataset, "chair", 2, at_least=4) == pairs[:4]
-    assert shipped_pairs(dataset, "chair", 2, at_least=5) == pairs[:4] == category_pairs(dataset, "chair", 5, 2)
+    assert (
+        shipped_pairs(dataset, "chair", 2, at_least=5)
+        == pairs[:4]
+        == category_pairs(dataset, "chair", 5, 2)
+    )
     assert "category chair: 4 of 5 stored pairs are different" in caplog.text
-    assert shipped_pairs(dataset, "chair", 2, at_least=6) == shipped_pairs(dataset, "chair", 1) == []
+    assert (
+        shipped_pairs(dataset, "chair", 2, at_least=6) == shipped_pairs(dataset, "chair", 1) == []
+    )
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"reference_frame_id": 48}, "frame id 48 is not of s1, expected a position in the list of 48 frames"),
-    ({"all_target_id": []}, "all_target_id"),
-    ({"all_target_id": torch.tensor([[1, 2]])}, r"Expected `int`, got `array`"),
-    ({"target_seq_name": "s3"}, "is not of s3"),
-    ({"class": "sofa"}, "category is 'sofa'"),
-    ({"reference_frame_id": True}, "Expected `int`, got `bool`"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"reference_frame_id": 48},
+            "frame id 48 is not of s1, expected a position in the list of 48 frames",
+        ),
+        ({"all_target_id": []}, "all_target_id"),
+        ({"all_target_id": torch.tensor([[1, 2]])}, r"Expected `int`, got `array`"),
+        ({"target_seq_name": "s3"}, "is not of s3"),
+        ({"class": "sofa"}, "category is 'sofa'"),
+        ({"reference_frame_id": True}, "Expected `int`, got `bool`"),
+    ],
+)
 def test_ids_of_other_data_are_refused(dataset, tmp_path, changes, message):
     torch.save([item(dataset, **changes)], tmp_path / "chair.pt")
     refused(message, read_published_pairs, tmp_path / "chair.pt", dataset)

@@ -1,7 +1,9 @@
-"""The whole method on an object with perfect features: the pose, every setting, and frames that cannot be used.
+"""The whole method on an object with perfect features: the pose, every setting, and frames that
+cannot be used.
 
-The values are the truth, or symmetries of the problem (`test_sample_pairs.py` has those of the one-page version). A
-setting that is ignored fails: each case changes one, and names the first result that must differ.
+The values are the truth, or symmetries of the problem (`test_sample_pairs.py` has those of the
+one-page version). A setting that is ignored fails: each case changes one, and names the first
+result that must differ.
 """
 
 from copy import deepcopy
@@ -67,7 +69,9 @@ def test_propagation_gives_the_pose_against_every_target_view(estimate, referenc
         np.testing.assert_allclose(pose.apply(point), camera.to_camera(world), atol=1e-9)
     truths = [true_pose(reference.camera, AT_HOME, camera, ELSEWHERE) for camera in cameras]
     errors = [rotation_error(pose.R, truth.R) for pose, truth in zip(poses, truths)]
-    np.testing.assert_allclose(errors, errors[estimate.view], atol=1e-6)  # one rigid target: equal in every view
+    np.testing.assert_allclose(
+        errors, errors[estimate.view], atol=1e-6
+    )  # one rigid target: equal in every view
 
 
 def test_the_best_view_alone_maps_spread_and_centroid_onto_the_targets(method, reference):
@@ -81,13 +85,18 @@ def test_the_best_view_alone_maps_spread_and_centroid_onto_the_targets(method, r
 
 
 class NoisyBackbone(CoordinateBackbone):
-    """Coordinates of the object with noise: matches have outliers, so that every setting changes the result."""
+    """Coordinates of the object with noise: matches have outliers, so that every setting changes
+    the result."""
 
     def features(self, image):
         found = super().features(image)
         rng = np.random.default_rng(7)
         keys = found.keys + 0.5 * torch.from_numpy(rng.normal(size=found.keys.shape)).float()
-        return FeatureMap(keys, found.saliency * torch.from_numpy(rng.uniform(0.5, 1, found.grid)).float(), keys[7, 7])
+        return FeatureMap(
+            keys,
+            found.saliency * torch.from_numpy(rng.uniform(0.5, 1, found.grid)).float(),
+            keys[7, 7],
+        )
 
 
 BASE = ZeroShotPose(NoisyBackbone(grid=14), k=30, trials=8, threshold=0.1)
@@ -113,17 +122,31 @@ def by_stage(estimate: PoseEstimate) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("setting, value, first_changed", [
-    ("foreground", "mask", "foreground"), ("k", 20, "scores"),
-    ("kmeans", False, "scores"), ("seed", 1, "scores"), ("cycle_from", "target", "scores"),
-    ("matcher", "dual softmax", "scores"), ("binning", False, "scores"), ("view_selector", "global", "scores"),
-    ("view_selector", "saliency", "scores"), ("view_selector", "cyclical", "scores"),
-    ("threshold", 0.02, "inliers"), ("trials", 100, "inliers"),
-    ("sample_size", 8, "inliers"),
-])  # fmt: skip
-def test_a_setting_reaches_its_stage_and_no_earlier_one(reference, targets, setting, value, first_changed):
+@pytest.mark.parametrize(
+    "setting, value, first_changed",
+    [
+        ("foreground", "mask", "foreground"),
+        ("k", 20, "scores"),
+        ("kmeans", False, "scores"),
+        ("seed", 1, "scores"),
+        ("cycle_from", "target", "scores"),
+        ("matcher", "dual softmax", "scores"),
+        ("binning", False, "scores"),
+        ("view_selector", "global", "scores"),
+        ("view_selector", "saliency", "scores"),
+        ("view_selector", "cyclical", "scores"),
+        ("threshold", 0.02, "inliers"),
+        ("trials", 100, "inliers"),
+        ("sample_size", 8, "inliers"),
+    ],
+)
+def test_a_setting_reaches_its_stage_and_no_earlier_one(
+    reference, targets, setting, value, first_changed
+):
     frames = reference, targets[::2]
-    base, found = (by_stage(one.estimate(*frames)) for one in (BASE, replace(BASE, **{setting: value})))
+    base, found = (
+        by_stage(one.estimate(*frames)) for one in (BASE, replace(BASE, **{setting: value}))
+    )
     changed = [name for name in base if not np.array_equal(base[name], found[name])]
     assert changed[0] == first_changed
 
@@ -145,7 +168,9 @@ def test_a_given_matcher_selector_and_solver_are_called(views):
     assert estimate.view == 1 and estimate.view_scores.tolist() == [1, 3, 2]
 
     def first_view(reference, targets, matched, *, seed, threshold):
-        sim3, inliers = ransac(*match_points(reference, targets[0], matched[0].matches), threshold, seed=seed)
+        sim3, inliers = ransac(
+            *match_points(reference, targets[0], matched[0].matches), threshold, seed=seed
+        )
         views = np.zeros(len(targets)), reference, tuple(targets)
         return PoseEstimate(sim3, 0, matched[0].matches, inliers, *views, {"solver": 1.0})
 
@@ -181,28 +206,50 @@ def nearest(similarity, *_):
     return similarity.argmax(dim=1), similarity.amax(dim=1).double()
 
 
-@pytest.mark.parametrize("settings", [
-    {"matcher": nearest}, {"matcher": nearest, "solver": "verified"}, {"solver": align_best_view},
-    {"view_selector": lambda one: correspondence_score(one.matches, one.k)}, {"backbone": CoordinateBackbone()},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"matcher": nearest},
+        {"matcher": nearest, "solver": "verified"},
+        {"solver": align_best_view},
+        {"view_selector": lambda one: correspondence_score(one.matches, one.k)},
+        {"backbone": CoordinateBackbone()},
+    ],
+)
 def test_nothing_that_a_plug_in_overwrites_reaches_the_rest(reference, targets, settings):
-    before, backbone = deepcopy((reference.rgb, targets[0].depth)), {"backbone": CoordinateBackbone()}
-    spoiled = {name: one if isinstance(one, str) else spoiling(one) for name, one in settings.items()}
-    found, expected = (ZeroShotPose(**backbone | some).estimate(reference, targets) for some in (spoiled, settings))
+    before, backbone = (
+        deepcopy((reference.rgb, targets[0].depth)),
+        {"backbone": CoordinateBackbone()},
+    )
+    spoiled = {
+        name: one if isinstance(one, str) else spoiling(one) for name, one in settings.items()
+    }
+    found, expected = (
+        ZeroShotPose(**backbone | some).estimate(reference, targets) for some in (spoiled, settings)
+    )
     np.testing.assert_array_equal(found.sim3.matrix, expected.sim3.matrix)
     views, others = ((one.reference_view, *one.target_views) for one in (found, expected))
     for one, other in zip(views, others, strict=True):
-        assert torch.equal(one.features.keys, other.features.keys) and torch.equal(one.foreground, other.foreground)
-        assert np.array_equal(one.frame.rgb, other.frame.rgb) and np.array_equal(one.frame.depth, other.frame.depth)
+        assert torch.equal(one.features.keys, other.features.keys) and torch.equal(
+            one.foreground, other.foreground
+        )
+        assert np.array_equal(one.frame.rgb, other.frame.rgb) and np.array_equal(
+            one.frame.depth, other.frame.depth
+        )
     assert np.array_equal(reference.rgb, before[0]) and np.array_equal(targets[0].depth, before[1])
 
 
 @pytest.mark.parametrize(
     "answer", [lambda maps: maps[:-1], lambda maps: [*maps, maps[0]], lambda maps: [1] * len(maps)]
 )
-def test_a_backbone_that_does_not_return_a_map_for_each_image_is_refused(reference, targets, answer):
+def test_a_backbone_that_does_not_return_a_map_for_each_image_is_refused(
+    reference, targets, answer
+):
     method = ZeroShotPose(lambda images: answer(CoordinateBackbone()(images)))
-    with pytest.raises(FatalError, match=r"backbone function returned \d of .* for 6 images, expected 6 of FeatureMap"):
+    with pytest.raises(
+        FatalError,
+        match=r"backbone function returned \d of .* for 6 images, expected 6 of FeatureMap",
+    ):
         method.estimate(reference, targets)
 
 
@@ -230,7 +277,10 @@ def test_seed_and_threshold_reach_the_verified_solver(views):
     verified = estimate_noisy(views, VERIFIED)
     assert scores(estimate_noisy(views, VERIFIED, seed=1)) != scores(verified)
     wide = estimate_noisy(views, VERIFIED, threshold=2.0)
-    assert wide.inliers.sum() > verified.inliers.sum() and (wide.sim3.matrix == verified.sim3.matrix).all()
+    assert (
+        wide.inliers.sum() > verified.inliers.sum()
+        and (wide.sim3.matrix == verified.sim3.matrix).all()
+    )
 
 
 def test_a_patch_is_foreground_from_a_quarter_of_its_area(reference):
@@ -262,17 +312,28 @@ def test_too_few_matches_fall_back_to_the_best_view_with_a_flag(reference, targe
 
 
 @pytest.mark.parametrize("solver", ["paper", "verified"])
-def test_targets_without_depth_or_foreground_are_left_out_with_a_flag(method, reference, targets, solver):
+def test_targets_without_depth_or_foreground_are_left_out_with_a_flag(
+    method, reference, targets, solver
+):
     method = replace(method, solver=solver)
-    reference, *views = extract_views(method.backbone, [object_crop(frame) for frame in (reference, *targets)])
+    reference, *views = extract_views(
+        method.backbone, [object_crop(frame) for frame in (reference, *targets)]
+    )
     no_depth = replace(views[0], frame=replace(views[0].frame, depth=None))
-    unknown = replace(views[1], frame=replace(views[1].frame, depth=np.zeros_like(views[1].frame.depth)))
+    unknown = replace(
+        views[1], frame=replace(views[1].frame, depth=np.zeros_like(views[1].frame.depth))
+    )
     blank = replace(views[2], foreground=torch.zeros_like(views[2].foreground))
     estimate = method.estimate_from_views(reference, [no_depth, unknown, blank, views[4]])
     defects = ("no depth map", "no known depth", "no foreground")
     assert estimate.view == 3 and len(estimate.view_scores) == 4
-    assert estimate.flags[:3] == tuple(f"target {view} left out: {defect}" for view, defect in enumerate(defects))
-    with pytest.raises(InputError, match="all 2 target views were left out: target 0 left out: no depth map; target 1"):
+    assert estimate.flags[:3] == tuple(
+        f"target {view} left out: {defect}" for view, defect in enumerate(defects)
+    )
+    with pytest.raises(
+        InputError,
+        match="all 2 target views were left out: target 0 left out: no depth map; target 1",
+    ):
         method.estimate_from_views(reference, [no_depth, unknown])
 
 
@@ -283,17 +344,28 @@ def test_unusable_frames_are_refused_in_one_line(method, reference, targets):
     for frame, word in ((empty, "mask"), (no_depth, "depth"), (no_known, "depth")):
         assert "reference" in refused(word, method.estimate, frame, targets)
     refused("no target", method.estimate, reference, [])
-    refused("mask", lambda: replace(method, foreground="mask").estimate(replace(reference, mask=None), targets))
+    refused(
+        "mask",
+        lambda: replace(method, foreground="mask").estimate(replace(reference, mask=None), targets),
+    )
 
 
 OUT_OF_RANGE = {
-    "view_selector": ["best"], "foreground": ["all"], "cycle_from": ["both"], "solver": ["best"], "seed": [-1, 0.5],
-    "k": [0, 2.5, True], "trials": [0, 10.5], "sample_size": [2, 4.0],
+    "view_selector": ["best"],
+    "foreground": ["all"],
+    "cycle_from": ["both"],
+    "solver": ["best"],
+    "seed": [-1, 0.5],
+    "k": [0, 2.5, True],
+    "trials": [0, 10.5],
+    "sample_size": [2, 4.0],
     "threshold": [-1, 0, np.inf, np.nan, "0.2", True],
-}  # fmt: skip
+}
 
 
-@pytest.mark.parametrize("name, value", [(name, value) for name, values in OUT_OF_RANGE.items() for value in values])
+@pytest.mark.parametrize(
+    "name, value", [(name, value) for name, values in OUT_OF_RANGE.items() for value in values]
+)
 def test_settings_out_of_range_are_refused_and_the_others_kept_as_given(name, value):
     refused(f"^{name} is ", lambda: ZeroShotPose(CoordinateBackbone(), **{name: value}))
     assert ZeroShotPose(CoordinateBackbone(), k=30).k == 30

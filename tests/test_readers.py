@@ -1,4 +1,5 @@
-"""Scans in the layouts of apps and depth cameras, made of rendered frames: what is read, refused and left out."""
+"""Scans in the layouts of apps and depth cameras, made of rendered frames: what is read, refused
+and left out."""
 
 import json
 import re
@@ -16,7 +17,14 @@ import pytest
 from refusals import refused
 from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone
-from test_importers import edited, hairdryer_views, to_world, write_depth16, write_lists, write_nerfstudio
+from test_importers import (
+    edited,
+    hairdryer_views,
+    to_world,
+    write_depth16,
+    write_lists,
+    write_nerfstudio,
+)
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import write_image, write_mask
@@ -33,12 +41,17 @@ def views():
     return hairdryer_views()[:4]
 
 
-def write_files(folder, frames, images="images/{}.jpg", depths="depth/{}.png", unit=0.001, masks="masks/{}.png"):
-    """Write the images, the depth in 16 bits (0 where it is too far) and the masks of frames by their numbers."""
+def write_files(
+    folder, frames, images="images/{}.jpg", depths="depth/{}.png", unit=0.001, masks="masks/{}.png"
+):
+    """Write the images, the depth in 16 bits (0 where it is too far) and the masks of frames by
+    their numbers."""
     for k, frame in enumerate(frames):
         write_image(folder / images.format(f"{k:06d}"), frame.rgb, 95)
         values = np.rint(frame.depth / unit)
-        write_depth16(folder / depths.format(f"{k:06d}"), np.where(values < 65536, values, 0) / 1000)
+        write_depth16(
+            folder / depths.format(f"{k:06d}"), np.where(values < 65536, values, 0) / 1000
+        )
         write_mask(folder / masks.format(f"{k:06d}"), frame.mask)
 
 
@@ -65,7 +78,10 @@ def write_stray(folder, frames):
     write_confidence(folder / "confidence", frames)
     write_video(folder / "rgb.mp4", [frame.rgb for frame in frames])
     np.savetxt(folder / "camera_matrix.csv", frames[0].camera.K, delimiter=", ")
-    rows = [[k / 60, k, *to_world(frame)[:3, 3], *quaternion(to_world(frame))] for k, frame in enumerate(frames)]
+    rows = [
+        [k / 60, k, *to_world(frame)[:3, 3], *quaternion(to_world(frame))]
+        for k, frame in enumerate(frames)
+    ]
     header = "timestamp, frame, x, y, z, qx, qy, qz, qw"
     np.savetxt(folder / "odometry.csv", rows, delimiter=", ", header=header, comments="")
     return folder
@@ -76,11 +92,17 @@ def write_polycam(folder, frames):
     write_files(inside, frames, images="corrected_images/{}.jpg", masks="../masks/{}.png")
     write_confidence(inside / "confidence", frames)
     for k, frame in enumerate(frames):
-        pose, (fx, fy), (cx, cy) = to_world(frame) @ OPENGL, frame.camera.focal_length, frame.camera.principal_point
+        pose, (fx, fy), (cx, cy) = (
+            to_world(frame) @ OPENGL,
+            frame.camera.focal_length,
+            frame.camera.principal_point,
+        )
         camera = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
         path = inside / f"corrected_cameras/{k:06d}.json"
         path.parent.mkdir(exist_ok=True)
-        path.write_text(json.dumps(camera | {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "blur_score": 1.5}))
+        path.write_text(
+            json.dumps(camera | {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "blur_score": 1.5})
+        )
     (inside / "cameras").mkdir()
     return folder
 
@@ -88,34 +110,63 @@ def write_polycam(folder, frames):
 def write_record3d(folder, frames):
     height, width = frames[0].camera.size
     poses = [to_world(frame) @ OPENGL for frame in frames]
-    metadata = {"w": width, "h": height, "dw": width, "dh": height, "K": frames[0].camera.K.T.ravel().tolist(),
-                "poses": [[*quaternion(pose), *pose[:3, 3]] for pose in poses]}  # fmt: skip
+    metadata = {
+        "w": width,
+        "h": height,
+        "dw": width,
+        "dh": height,
+        "K": frames[0].camera.K.T.ravel().tolist(),
+        "poses": [[*quaternion(pose), *pose[:3, 3]] for pose in poses],
+    }
     path = folder.with_suffix(".r3d")
     with zipfile.ZipFile(path, "w") as zipped:
         zipped.writestr("metadata", json.dumps(metadata))
         for k, frame in enumerate(frames):
-            zipped.writestr(f"rgbd/{k}.jpg", cv2.imencode(".jpg", frame.rgb[..., ::-1])[1].tobytes())
-            zipped.writestr(f"rgbd/{k}.depth", lzfse.compress(np.where(frame.depth > 0, frame.depth, np.nan).tobytes()))
-            zipped.writestr(f"rgbd/{k}.conf", lzfse.compress(np.full(frame.depth.shape, 2, np.uint8).tobytes()))
-            zipped.writestr(f"masks/{k}.png", cv2.imencode(".png", np.uint8(255 * frame.mask))[1].tobytes())
+            zipped.writestr(
+                f"rgbd/{k}.jpg", cv2.imencode(".jpg", frame.rgb[..., ::-1])[1].tobytes()
+            )
+            zipped.writestr(
+                f"rgbd/{k}.depth",
+                lzfse.compress(np.where(frame.depth > 0, frame.depth, np.nan).tobytes()),
+            )
+            zipped.writestr(
+                f"rgbd/{k}.conf", lzfse.compress(np.full(frame.depth.shape, 2, np.uint8).tobytes())
+            )
+            zipped.writestr(
+                f"masks/{k}.png", cv2.imencode(".png", np.uint8(255 * frame.mask))[1].tobytes()
+            )
     return path
 
 
 def write_tum(folder, frames):
     write_files(folder, frames, unit=1 / 5000)
     for kind, ending in (("rgb", "images/{:06d}.jpg"), ("depth", "depth/{:06d}.png")):
-        lines = [f"{10 + k + 0.01 * (kind == 'depth')} {ending.format(k)}" for k in range(len(frames))]
+        lines = [
+            f"{10 + k + 0.01 * (kind == 'depth')} {ending.format(k)}" for k in range(len(frames))
+        ]
         (folder / f"{kind}.txt").write_text("# time file\n" + "\n".join(lines))
-    rows = [[10.005 + k, *to_world(one)[:3, 3], *quaternion(to_world(one))] for k, one in enumerate(frames)]
+    rows = [
+        [10.005 + k, *to_world(one)[:3, 3], *quaternion(to_world(one))]
+        for k, one in enumerate(frames)
+    ]
     np.savetxt(folder / "groundtruth.txt", rows, header="time tx ty tz qx qy qz qw")
     return folder
 
 
 def write_bop(folder, frames, objects=(5,)):
-    write_files(folder, frames, "rgb/{}.jpg", unit=0.0005, masks="mask_visib/{}_" + f"{len(objects) - 1:06d}.png")
+    write_files(
+        folder,
+        frames,
+        "rgb/{}.jpg",
+        unit=0.0005,
+        masks="mask_visib/{}_" + f"{len(objects) - 1:06d}.png",
+    )
     scene, cameras = {}, {}
     for k, frame in enumerate(frames):
-        pose = {"cam_R_m2c": frame.camera.R.ravel().tolist(), "cam_t_m2c": (1000 * frame.camera.t).tolist()}
+        pose = {
+            "cam_R_m2c": frame.camera.R.ravel().tolist(),
+            "cam_t_m2c": (1000 * frame.camera.t).tolist(),
+        }
         scene[k] = [pose | {"obj_id": number} for number in objects]
         K = frame.camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
         cameras[k] = {"cam_K": K.ravel().tolist(), "depth_scale": 0.5}
@@ -153,21 +204,31 @@ def write_zip_of_nerfstudio(folder, frames):
 
 
 WRITERS = {
-    "nerfstudio": write_zip_of_nerfstudio, "lists": partial(write_lists, masks=True), "stray": write_stray,
-    "polycam": write_polycam, "record3d": write_record3d, "tum": write_tum, "bop": write_bop, "scannet": write_scannet,
+    "nerfstudio": write_zip_of_nerfstudio,
+    "lists": partial(write_lists, masks=True),
+    "stray": write_stray,
+    "polycam": write_polycam,
+    "record3d": write_record3d,
+    "tum": write_tum,
+    "bop": write_bop,
+    "scannet": write_scannet,
     "open3d": write_open3d,
-}  # fmt: skip
+}
 
 
 def write(layout, folder, frames):
     """Write a scan; returns its path, and the options by which it is read."""
     folder.mkdir()
     (fx, fy), (cx, cy) = frames[0].camera.focal_length, frames[0].camera.principal_point
-    return WRITERS[layout](folder, frames), {"intrinsics": (fx, fy, cx, cy)} if layout == "tum" else {}
+    return WRITERS[layout](folder, frames), {
+        "intrinsics": (fx, fy, cx, cy)
+    } if layout == "tum" else {}
 
 
 @pytest.mark.parametrize("layout", WRITERS)
-def test_each_layout_is_recognised_and_gives_the_cameras_the_depth_and_the_masks(tmp_path, views, layout):
+def test_each_layout_is_recognised_and_gives_the_cameras_the_depth_and_the_masks(
+    tmp_path, views, layout
+):
     path, options = write(layout, tmp_path / "scan", views)
     capture = open_capture(path, **options)
     assert recognise(path)[0] == layout and not capture.left_out
@@ -192,19 +253,28 @@ def linked(folder):
 
 
 RELATIVES = {
-    "camera_angle_x": edited(lambda c: c.update(camera_angle_x=2 * np.arctan(c.pop("w") / 2 / c.pop("fl_x"))),
-                             lambda c: [c.pop(name) for name in ("fl_y", "h", "cx", "cy")]),
-    "depth_path": edited(each(lambda f: f.update(depth_path=f.pop("depth_file_path"))),
-                         lambda c: c.update(integer_depth_scale=0.001, depth_unit_scale_factor=5)),
-    "names without extension": edited(each(lambda f: f.update(file_path="./" + f["file_path"][:-4]))),
+    "camera_angle_x": edited(
+        lambda c: c.update(camera_angle_x=2 * np.arctan(c.pop("w") / 2 / c.pop("fl_x"))),
+        lambda c: [c.pop(name) for name in ("fl_y", "h", "cx", "cy")],
+    ),
+    "depth_path": edited(
+        each(lambda f: f.update(depth_path=f.pop("depth_file_path"))),
+        lambda c: c.update(integer_depth_scale=0.001, depth_unit_scale_factor=5),
+    ),
+    "names without extension": edited(
+        each(lambda f: f.update(file_path="./" + f["file_path"][:-4]))
+    ),
     "3 x 4": edited(each(lambda f: f["transform_matrix"].pop())),
     "byte-order mark": edited(encoding="utf-8-sig"),
     "the file itself": lambda folder: folder / "transforms.json",
     "transforms_train.json": edited(name="transforms_train.json"),
     "back slashes": edited(each(lambda f: f.update(file_path=f["file_path"].replace("/", "\\")))),
-    "absolute paths": lambda folder: edited(each(lambda f: f.update(file_path=f"{folder}/{f['file_path']}")))(folder),
-    "a linked folder": linked, "shuffled": edited(lambda c: c["frames"].reverse()),
-}  # fmt: skip
+    "absolute paths": lambda folder: edited(
+        each(lambda f: f.update(file_path=f"{folder}/{f['file_path']}"))
+    )(folder),
+    "a linked folder": linked,
+    "shuffled": edited(lambda c: c["frames"].reverse()),
+}
 
 
 @pytest.mark.parametrize("kind", RELATIVES)
@@ -215,7 +285,9 @@ def test_relatives_of_nerfstudio_are_read(tmp_path, views, kind, links):
     for one, view in zip(capture.frames, views, strict=True):
         frame = one.load()
         np.testing.assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
-        np.testing.assert_allclose(frame.camera.K, view.camera.K, rtol=0.02)  # 0.6 pixels off the middle
+        np.testing.assert_allclose(
+            frame.camera.K, view.camera.K, rtol=0.02
+        )  # 0.6 pixels off the middle
         np.testing.assert_allclose(frame.depth[view.mask > 0], view.depth[view.mask > 0], atol=6e-4)
 
 
@@ -223,13 +295,28 @@ def first(change):
     return edited(lambda c: change(c["frames"][0]))
 
 
-@pytest.mark.parametrize(("damage", "message"), [
-    (first(lambda f: f["transform_matrix"][0].__setitem__(0, float("nan"))), "frame 0: pose is .*None"),
-    (first(lambda f: f["transform_matrix"][0].__setitem__(0, 5.0)), "frame 0: .*expected a rotation"),
-    (first(lambda f: f.update(file_path="images/lost.jpg")), "frame 0: images/lost.jpg is missing in"),
-    (first(lambda f: f.update(depth_file_path="lost")), "frame 0: lost is missing in"),
-    (lambda folder: (folder / "masks/0000.png").write_bytes(b""), "mask .*0000.png cannot be decoded"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (
+            first(lambda f: f["transform_matrix"][0].__setitem__(0, float("nan"))),
+            "frame 0: pose is .*None",
+        ),
+        (
+            first(lambda f: f["transform_matrix"][0].__setitem__(0, 5.0)),
+            "frame 0: .*expected a rotation",
+        ),
+        (
+            first(lambda f: f.update(file_path="images/lost.jpg")),
+            "frame 0: images/lost.jpg is missing in",
+        ),
+        (first(lambda f: f.update(depth_file_path="lost")), "frame 0: lost is missing in"),
+        (
+            lambda folder: (folder / "masks/0000.png").write_bytes(b""),
+            "mask .*0000.png cannot be decoded",
+        ),
+    ],
+)
 def test_a_frame_that_cannot_be_used_is_left_out_and_named(tmp_path, views, damage, message):
     write_nerfstudio(tmp_path, views)
     damage(tmp_path)
@@ -237,7 +324,10 @@ def test_a_frame_that_cannot_be_used_is_left_out_and_named(tmp_path, views, dama
     assert [one.image.name for one in capture.frames] == ["0001.jpg", "0002.jpg", "0003.jpg"]
     source = open_source(tmp_path)
     (flag,) = source.flags(source.load([0]))
-    assert all(re.search(message, line) for line in (*capture.left_out, flag)) and "frames left out: 1: " in flag
+    assert (
+        all(re.search(message, line) for line in (*capture.left_out, flag))
+        and "frames left out: 1: " in flag
+    )
 
 
 def test_a_damaged_picture_is_left_out_and_named_unless_too_few_remain(tmp_path, views, run):
@@ -248,18 +338,32 @@ def test_a_damaged_picture_is_left_out_and_named_unless_too_few_remain(tmp_path,
     found = estimate_pose(*2 * [tmp_path / "scan"], "paper", backbone=CoordinateBackbone())
     assert len(found.targets) == 3
     assert sum("frames left out: 1: image" in flag for flag in found.estimates["paper"].flags) == 2
-    arguments = ["data", "import", str(tmp_path / "scan"), "--root", str(tmp_path / "mine"), "--category", "teapot"]
+    arguments = [
+        "data",
+        "import",
+        str(tmp_path / "scan"),
+        "--root",
+        str(tmp_path / "mine"),
+        "--category",
+        "teapot",
+    ]
     text = run([*arguments, "--sequence", "one"])
     assert "3 frames" in text and "flag: frames left out: 1: image" in text
     images[1].write_bytes(b"")
     assert "2 frames remain, expected 3: image" in run([*arguments, "--sequence", "two"], 2)
 
 
-@pytest.mark.parametrize("path", ["../../etc/passwd", "/etc/passwd", "images/../../x.jpg", "C:\\x.jpg", "..\\x.jpg"])
+@pytest.mark.parametrize(
+    "path", ["../../etc/passwd", "/etc/passwd", "images/../../x.jpg", "C:\\x.jpg", "..\\x.jpg"]
+)
 def test_a_path_that_leads_out_of_the_capture_is_refused(tmp_path, views, path):
     write_nerfstudio(tmp_path, views)
     first(lambda f: f.update(file_path=path))(tmp_path)
-    refused("leads out of the folder .*, expected a path inside, relative or absolute", open_capture, tmp_path)
+    refused(
+        "leads out of the folder .*, expected a path inside, relative or absolute",
+        open_capture,
+        tmp_path,
+    )
 
 
 def test_masks_belong_to_images_by_relative_path_then_name_then_stem(tmp_path):
@@ -267,12 +371,26 @@ def test_masks_belong_to_images_by_relative_path_then_name_then_stem(tmp_path):
         write_mask(tmp_path / name, np.ones((4, 4), np.float32))
     names = ("a/1.jpg", "b/1.jpg", "a/2.jpg", "a/3.jpg", "a/4.jpg", "b/4.jpg")
     found = find_masks(tmp_path, [Path("scan/images", name) for name in names])
-    assert found == [tmp_path / "a/1.png", None, tmp_path / "2.jpg.png", tmp_path / "3.png", None, None]
+    assert found == [
+        tmp_path / "a/1.png",
+        None,
+        tmp_path / "2.jpg.png",
+        tmp_path / "3.png",
+        None,
+        None,
+    ]
 
 
-def test_lists_have_names_with_signs_a_camera_for_each_image_and_images_of_several_sizes(tmp_path, views):
-    upright = replace(views[1], rgb=views[1].rgb[:, :64], depth=views[1].depth[:, :64], mask=views[1].mask[:, :64],
-                      camera=views[1].camera.crop((0, 0, 96, 64)))  # fmt: skip
+def test_lists_have_names_with_signs_a_camera_for_each_image_and_images_of_several_sizes(
+    tmp_path, views
+):
+    upright = replace(
+        views[1],
+        rgb=views[1].rgb[:, :64],
+        depth=views[1].depth[:, :64],
+        mask=views[1].mask[:, :64],
+        camera=views[1].camera.crop((0, 0, 96, 64)),
+    )
     frames = [replace(views[0], name="cup #10"), replace(upright, name="cup #9")]
     write_lists(tmp_path, frames)
     np.savetxt(tmp_path / "intrinsics.txt", [[300, 301, 60, 48], [200, 201, 40, 48]])
@@ -287,18 +405,30 @@ def test_options_of_formats(tmp_path, views):
     write("tum", tmp_path / "tum", views)
     assert open_capture(tmp_path / "tum").frames[0].camera.principal_point.tolist() == [320, 240]
     write_bop(tmp_path / "bop", views, objects=(3, 5))
-    refused("has the objects 3, 5, expected one of them as --object N", open_source, tmp_path / "bop")
+    refused(
+        "has the objects 3, 5, expected one of them as --object N", open_source, tmp_path / "bop"
+    )
     source = open_source(tmp_path / "bop", object=5, depth_unit=0.01)
     assert source.mask == "given" and source.load([0])[0].depth.max() > 15 * views[0].depth.max()
 
 
-@pytest.mark.parametrize(("files", "message"), [
-    (["sparse/0/images.bin"], "has COLMAP's poses, but no measured depth, expected raw data .* Stray Scanner"),
-    (["scan.mp4"], "is a video without depth and poses"),
-    (["model.obj", "model.mtl"], "is a model as Luma or KIRI export it"),
-    (["notes.doc"], "expected a folder or zip with the files of nerfstudio.*; Stray.*; TUM.*; BOP.*; Open3D"),
-    (["intrinsic.json", "color/0.png"], "has no trajectory.log, expected poses: run Open3D's"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        (
+            ["sparse/0/images.bin"],
+            "has COLMAP's poses, but no measured depth, expected raw data .* Stray Scanner",
+        ),
+        (["scan.mp4"], "is a video without depth and poses"),
+        (["model.obj", "model.mtl"], "is a model as Luma or KIRI export it"),
+        (
+            ["notes.doc"],
+            "expected a folder or zip with the files of nerfstudio.*; Stray.*; TUM.*; BOP.*; "
+            "Open3D",
+        ),
+        (["intrinsic.json", "color/0.png"], "has no trajectory.log, expected poses: run Open3D's"),
+    ],
+)
 def test_what_is_no_capture_is_answered_with_what_it_lacks(tmp_path, files, message):
     for name in files:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -315,13 +445,16 @@ def zipped(path, name="rgb.txt", data=b"", flag=0):
     return path
 
 
-@pytest.mark.parametrize(("make", "message"), [
-    (lambda path: path.write_bytes(b"PK\3\4" + bytes(99)), "File is not a zip file"),
-    (lambda path: zipped(path, "../../climbs"), "path ../../climbs leads out of"),
-    (lambda path: zipped(path, "/etc/x"), "path /etc/x leads out of"),
-    (lambda path: zipped(path, flag=1), "File .*'rgb.txt' .* is encrypted"),
-    (lambda path: zipped(path, data=bytes(60_000)), "1.. bytes unpack to 60,000"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda path: path.write_bytes(b"PK\3\4" + bytes(99)), "File is not a zip file"),
+        (lambda path: zipped(path, "../../climbs"), "path ../../climbs leads out of"),
+        (lambda path: zipped(path, "/etc/x"), "path /etc/x leads out of"),
+        (lambda path: zipped(path, flag=1), "File .*'rgb.txt' .* is encrypted"),
+        (lambda path: zipped(path, data=bytes(60_000)), "1.. bytes unpack to 60,000"),
+    ],
+)
 def test_a_zip_that_is_damaged_malicious_or_large_is_refused(tmp_path, monkeypatch, make, message):
     monkeypatch.setattr("zsp_lite.importers.unpacked._LARGE", 20_000)
     make(tmp_path / "scan.zip")
@@ -333,7 +466,10 @@ def test_the_sharpest_frames_of_a_video_and_of_images_are_chosen(tmp_path, views
     blank = np.zeros((8, 8), np.uint8)
     chosen = list(sharpest(range(2000), 100, lambda k: read.append(k) or blank, []))
     assert len(chosen) == 100 and len(read) <= 1000
-    blurred = [replace(views[0], rgb=cv2.GaussianBlur(views[0].rgb, (15, 15), 3), name=f"{k:04d}") for k in range(9)]
+    blurred = [
+        replace(views[0], rgb=cv2.GaussianBlur(views[0].rgb, (15, 15), 3), name=f"{k:04d}")
+        for k in range(9)
+    ]
     for sharp in (3, 8):
         blurred[sharp] = replace(blurred[sharp], rgb=views[0].rgb)
     for layout in ("stray", "lists", "record3d"):
@@ -341,8 +477,12 @@ def test_the_sharpest_frames_of_a_video_and_of_images_are_chosen(tmp_path, views
         assert [int(one.image.stem) for one in open_capture(path, count=3).frames] == [0, 3, 8]
 
 
-def test_the_scans_of_record3d_without_tracking_or_without_the_package_are_refused(tmp_path, views, monkeypatch):
-    path, _ = write("record3d", tmp_path / "scan", [replace(view, camera=views[0].camera) for view in views])
+def test_the_scans_of_record3d_without_tracking_or_without_the_package_are_refused(
+    tmp_path, views, monkeypatch
+):
+    path, _ = write(
+        "record3d", tmp_path / "scan", [replace(view, camera=views[0].camera) for view in views]
+    )
     monkeypatch.setitem(sys.modules, "lzfse", None)
     refused("compressed by LZFSE, expected its package: pip install lzfse", open_capture, path)
     metadata = {"K": [1.0] * 9, "dw": 4, "dh": 4, "poses": [[0.0] * 7] * 3}
@@ -352,7 +492,8 @@ def test_the_scans_of_record3d_without_tracking_or_without_the_package_are_refus
 
 
 def test_depth_of_middle_confidence_is_dropped_in_thin_bands_only():
-    """Smeared silhouettes: the depth map is low-pass filtered, and its confidence is 1 where it is wrong."""
+    """Smeared silhouettes: the depth map is low-pass filtered, and its confidence is 1 where it is
+    wrong."""
     y, x = np.mgrid[:192, :256]
     disc = (y - 96) ** 2 + (x - 128) ** 2 < 50**2
     true = np.where(disc, 0.5, 1.2)
@@ -361,7 +502,8 @@ def test_depth_of_middle_confidence_is_dropped_in_thin_bands_only():
     levels = np.where(wrong, 1, 2).astype(np.uint8)
     kept = trusted(levels)
     assert wrong.mean() > 0.01 and not (kept & wrong).any() and kept[~wrong].all()
-    # A dark surface is all of the middle level, and is kept; level 0 never is. The levels of Polycam reach 255.
+    # A dark surface is all of the middle level, and is kept; level 0 never is. The levels of
+    # Polycam reach 255.
     dark = np.where(disc & ~wrong, 1, levels).astype(np.uint8)
     assert trusted(dark)[disc & ~wrong].mean() > 0.95
     np.testing.assert_array_equal(trusted(dark * np.uint8(127) + (dark == 2)), trusted(dark))
@@ -383,7 +525,10 @@ def test_a_confidence_map_has_the_size_of_the_depth(tmp_path, views):
 def circle(degrees):
     """Cameras around the origin."""
     turns = Rotation.from_euler("y", degrees[:, None], degrees=True).as_matrix()
-    return [Camera(turn, np.array([0, 0, 2.0]), np.array([90.0, 90]), np.array([32.0, 32]), (64, 64)) for turn in turns]
+    return [
+        Camera(turn, np.array([0, 0, 2.0]), np.array([90.0, 90]), np.array([32.0, 32]), (64, 64))
+        for turn in turns
+    ]
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8])
@@ -415,5 +560,8 @@ def test_a_folder_of_masks_with_other_names_is_refused(tmp_path, views):
     write_lists(tmp_path, views)
     write_mask(tmp_path / "others/mask.png", views[0].mask)
     refused(
-        "has no mask that is named like an image, such as 0000.png", open_source, tmp_path, masks=tmp_path / "others"
+        "has no mask that is named like an image, such as 0000.png",
+        open_source,
+        tmp_path,
+        masks=tmp_path / "others",
     )

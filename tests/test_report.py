@@ -14,7 +14,13 @@ from zsp_lite.course.demo import N_TARGETS, demo_pairs, run_demo
 from zsp_lite.io.files import REPOSITORY
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.plots import object_cloud
-from zsp_lite.viz.report import _two_poses_figure, overview, table_rows, write_overview, write_report
+from zsp_lite.viz.report import (
+    _two_poses_figure,
+    overview,
+    table_rows,
+    write_overview,
+    write_report,
+)
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("closed_figures")]
 
@@ -61,7 +67,11 @@ def test_alternatives_are_the_different_poses_below_the_best_with_angles_in_the_
     estimate = results[0].estimates["verified"]
     found = estimate.alternatives
     assert results[0].estimates["paper"].alternatives == ()
-    assert found == tuple(one for index, one in enumerate(estimate.hypotheses) if one.mode == index > 0) != ()
+    assert (
+        found
+        == tuple(one for index, one in enumerate(estimate.hypotheses) if one.mode == index > 0)
+        != ()
+    )
     # The angle does not depend on the view in which the poses are expressed.
     for one in found:
         own = estimate.target_views[one.view].frame.camera
@@ -73,12 +83,16 @@ def test_alternatives_are_the_different_poses_below_the_best_with_angles_in_the_
 def test_the_page_loads_nothing_and_its_links_lead_to_notebooks(page, text):
     links = re.findall(r'\b(?:src|href)="([^"]*)"', text.replace(get_plotlyjs(), ""))
     local = [link for link in links if not link.startswith(("data:image/", "#pair-"))]
-    assert local and {(page.parent / link).resolve().parent for link in local} == {REPOSITORY / "notebooks"}
+    assert local and {(page.parent / link).resolve().parent for link in local} == {
+        REPOSITORY / "notebooks"
+    }
     assert all((page.parent / link).is_file() for link in local)
     assert len(text) < 12_000_000
 
 
-def test_the_table_has_the_numbers_of_both_solvers_and_the_page_those_of_the_hypotheses(results, text):
+def test_the_table_has_the_numbers_of_both_solvers_and_the_page_those_of_the_hypotheses(
+    results, text
+):
     (result,) = results
     for solver, row in zip(("paper", "verified"), table_rows(result), strict=True):
         estimate = result.estimates[solver]
@@ -92,7 +106,9 @@ def test_the_table_has_the_numbers_of_both_solvers_and_the_page_those_of_the_hyp
         assert "".join(f"<td>{cell}</td>" for cell in cells) in text
 
 
-def test_two_poses_are_shown_in_the_same_view_where_the_answer_is_one_of_two(results, text, exact_poses, tmp_path):
+def test_two_poses_are_shown_in_the_same_view_where_the_answer_is_one_of_two(
+    results, text, exact_poses, tmp_path
+):
     assert "One of two" not in text  # the features are perfect
     estimate = results[0].estimates["verified"]
     other = estimate.alternatives[0]
@@ -108,7 +124,9 @@ def test_two_poses_are_shown_in_the_same_view_where_the_answer_is_one_of_two(res
         (second, own.to_world(other.sim3.apply(cloud))),
     ):
         pixels, depth = camera.project(points)
-        np.testing.assert_allclose(axis.collections[0].get_offsets(), pixels[np.argsort(-depth)], atol=1e-6)
+        np.testing.assert_allclose(
+            axis.collections[0].get_offsets(), pixels[np.argsort(-depth)], atol=1e-6
+        )
 
 
 def test_the_scene_has_every_pose_in_one_frame(results, text):
@@ -119,7 +137,9 @@ def test_the_scene_has_every_pose_in_one_frame(results, text):
     assert names[:3] == ["paper solver", "verified solver", "verified solver, hypothesis 2"]
     assert len(names) == len(content["poses"])
     estimate = result.estimates["verified"]
-    for rotation, one in zip(np.array(content["poses"])[2:, :, :3], estimate.alternatives, strict=True):
+    for rotation, one in zip(
+        np.array(content["poses"])[2:, :, :3], estimate.alternatives, strict=True
+    ):
         own = estimate.target_views[one.view].frame.camera
         expected = result.estimate.target_camera.R @ own.R.T @ one.sim3.R
         np.testing.assert_allclose(rotation / np.cbrt(np.linalg.det(rotation)), expected, atol=1e-4)
@@ -132,9 +152,16 @@ def test_all_text_is_escaped(results, text, tmp_path):
     assert "synthetic ellipsoids &lt;script&gt;" in text and "a &amp; b" in text
     hostile = "<img src=x onerror=alert(1)>"
     estimate = replace(results[0].estimates["verified"], flags=(hostile,), timings={hostile: 1.0})
-    own = {"title": hostile, "sources": (hostile, hostile), "estimates": {hostile: estimate}, "errors": {hostile: 1.0}}
+    own = {
+        "title": hostile,
+        "sources": (hostile, hostile),
+        "estimates": {hostile: estimate},
+        "errors": {hostile: 1.0},
+    }
     result = replace(results[0], **own)
-    page = write_report(tmp_path / "report.html", [result], hostile, hostile, hostile).read_text(encoding="utf-8")
+    page = write_report(tmp_path / "report.html", [result], hostile, hostile, hostile).read_text(
+        encoding="utf-8"
+    )
     assert hostile not in page
     assert page.count("&lt;img src=x onerror=alert(1)&gt;") >= 15
 
@@ -145,11 +172,20 @@ def test_the_overview_marks_the_pose_of_each_solver_in_its_view(results, tmp_pat
     names = [[text.get_text() for text in axis.texts] for axis in figure.axes]
     rightly = [[f"right: {error:.0f}° off"] for error in results[0].errors.values()]
     assert names == [["ellipsoid"], *rightly, ["$x$"], ["wrong: 30° off"], ["right: 30° off"]]
-    assert [axis.get_title() for axis in figure.axes] == ["reference", "paper solver", "verified solver", "", "", ""]
+    assert [axis.get_title() for axis in figure.axes] == [
+        "reference",
+        "paper solver",
+        "verified solver",
+        "",
+        "",
+        "",
+    ]
     assert figure.axes[4].patches[0].get_edgecolor() != figure.axes[5].patches[0].get_edgecolor()
     for axis, one in zip(figure.axes[1:3], results[0].estimates.values()):
         cloud = one.sim3.apply(object_cloud(one.reference_view, most=20000))
-        pixels, _ = one.target_camera.project(one.target_camera.to_world(cloud[np.argsort(-cloud[:, 2])]))
+        pixels, _ = one.target_camera.project(
+            one.target_camera.to_world(cloud[np.argsort(-cloud[:, 2])])
+        )
         np.testing.assert_allclose(axis.collections[0].get_offsets(), pixels)
     write_overview(tmp_path / "deep" / "overview.jpg", results)
     assert (tmp_path / "deep" / "overview.jpg").read_bytes()[:2] == b"\xff\xd8"

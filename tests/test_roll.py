@@ -1,4 +1,7 @@
-"""A reference turned in the image: `upright=False` finds the turn, and the pose is that of the turned image."""
+"""A reference turned in the image:
+
+`upright=False` finds the turn, and the pose is that of the turned image.
+"""
 
 import numpy as np
 import pytest
@@ -13,7 +16,10 @@ from zsp_lite.own_objects import estimate_pose
 
 
 class UprightBackbone(CoordinateBackbone):
-    """Coordinates of the object in upright images, noise in turned ones. The object's z is blue and points up."""
+    """Coordinates of the object in upright images, noise in turned ones.
+
+    The object's z is blue and points up.
+    """
 
     images = 0  # that features were computed of
     salient = True  # whether turned images have a foreground
@@ -23,7 +29,10 @@ class UprightBackbone(CoordinateBackbone):
         found = super().features(image)
         rows, columns = np.nonzero(image.any(axis=-1))
         height = image[rows, columns, 2].astype(float) - image[rows, columns, 2].mean()
-        down, right = (height * (rows - rows.mean())).sum(), (height * (columns - columns.mean())).sum()
+        down, right = (
+            (height * (rows - rows.mean())).sum(),
+            (height * (columns - columns.mean())).sum(),
+        )
         if down < 0 and -down > abs(right):
             return found
         noise = torch.from_numpy(np.random.default_rng(5).normal(size=found.keys.shape)).float()
@@ -48,23 +57,34 @@ def test_a_turned_frame_shows_every_world_point_with_the_same_colour_and_depth(f
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("solver", "quarters"), [("paper", 1), ("paper", 2), ("verified", 3)])
-def test_a_turned_reference_stands_up_and_the_pose_is_that_of_the_turned_image(frames, solver, quarters):
+def test_a_turned_reference_stands_up_and_the_pose_is_that_of_the_turned_image(
+    frames, solver, quarters
+):
     rolled, backbone = turn_frame(frames[0], quarters), UprightBackbone()
-    found = estimate_pose(rolled, frames[1:4], solver, backbone=backbone, upright=False, references=1)
+    found = estimate_pose(
+        rolled, frames[1:4], solver, backbone=backbone, upright=False, references=1
+    )
     one = found.estimate
     truth = true_pose(frames[0].camera, AT_HOME, one.target_camera, ELSEWHERE)
-    flag = f"the reference is turned by {360 - 90 * quarters}° counterclockwise: the pose is that of the turned image"
+    flag = (
+        f"the reference is turned by {360 - 90 * quarters}° counterclockwise: the pose is that of "
+        "the turned image"
+    )
     assert rotation_error(one.sim3.R, truth.R) < 10 and flag in one.flags
     np.testing.assert_array_equal(found.reference.rgb, frames[0].rgb)
     np.testing.assert_allclose(found.reference.camera.matrix, frames[0].camera.matrix, atol=1e-9)
     lying = estimate_pose(rolled, frames[1:4], solver, backbone=backbone, references=1)
-    assert solver == "verified" or rotation_error(lying.estimate.sim3.R, truth.R) > 20  # the features are noise
+    assert (
+        solver == "verified" or rotation_error(lying.estimate.sim3.R, truth.R) > 20
+    )  # the features are noise
 
 
 @pytest.mark.slow
 def test_a_turn_that_gives_no_pose_is_passed_over(frames, monkeypatch):
     monkeypatch.setattr(UprightBackbone, "salient", False)
-    found = estimate_pose(turn_frame(frames[0], 1), frames[1:4], backbone=UprightBackbone(), upright=False)
+    found = estimate_pose(
+        turn_frame(frames[0], 1), frames[1:4], backbone=UprightBackbone(), upright=False
+    )
     assert any("turned by 270°" in flag for flag in found.estimate.flags)
 
 
@@ -72,7 +92,12 @@ def test_a_turn_that_gives_no_pose_is_passed_over(frames, monkeypatch):
 def test_the_command_tries_the_turns_on_demand(monkeypatch, ellipsoids, tmp_path):
     monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda choice: UprightBackbone())
     monkeypatch.setattr("zsp_lite.own_objects.write_pair", lambda *_: [])
-    words = ["estimate", *(str(ellipsoids.root / "ellipsoid" / name) for name in "ab"), "--targets", "2"]
+    words = [
+        "estimate",
+        *(str(ellipsoids.root / "ellipsoid" / name) for name in "ab"),
+        "--targets",
+        "2",
+    ]
     words += ["--solver", "paper", "--out", str(tmp_path)]
     for options, images in (([], 3), (["--not-upright"], 8)):
         UprightBackbone.images = 0

@@ -1,7 +1,8 @@
-"""The sample pairs: the one-page version of the method against the library, and both solvers against stored poses.
+"""The sample pairs: the one-page version of the method against the library, and both solvers
+against stored poses.
 
-Last digits of features depend on the processor, and a tie may fall the other way: of `sample_poses.json`, the first
-pairs of five target views, one pair of a solver may differ.
+Last digits of features depend on the processor, and a tie may fall the other way: of
+`sample_poses.json`, the first pairs of five target views, one pair of a solver may differ.
 """
 
 import functools
@@ -34,34 +35,49 @@ def dataset():
 
 @pytest.fixture(scope="module")
 def solved(dataset):
-    """The estimates of both solvers for each pair of `sample_poses.json`, by category, with shared features."""
+    """The estimates of both solvers for each pair of `sample_poses.json`, by category, with shared
+    features."""
     method = zsp_lite.ZeroShotPose(load_backbone())
-    pairs = {category: shipped_pairs(dataset, category, 5)[: len(stored)] for category, stored in STORED.items()}
+    pairs = {
+        category: shipped_pairs(dataset, category, 5)[: len(stored)]
+        for category, stored in STORED.items()
+    }
     both = SOLVERS["both"]
-    return {name: [solve_pair(method, *dataset.load_pair(pair), both) for pair in some] for name, some in pairs.items()}
+    return {
+        name: [solve_pair(method, *dataset.load_pair(pair), both) for pair in some]
+        for name, some in pairs.items()
+    }
 
 
 def as_crop(view) -> minimal.Crop:
     features, frame = view.features, view.frame
-    return minimal.Crop(features.keys.numpy(), features.saliency.numpy(), frame.depth, frame.camera.K)
+    return minimal.Crop(
+        features.keys.numpy(), features.saliency.numpy(), frame.depth, frame.camera.K
+    )
 
 
 def check_pair(method, reference, targets, name, **settings) -> None:
     """Check that both versions find the same matches, view, inliers and pose."""
     expected = method.estimate_from_views(reference, targets)
-    found = minimal.estimate_pose(as_crop(reference), [as_crop(target) for target in targets], **settings)
+    found = minimal.estimate_pose(
+        as_crop(reference), [as_crop(target) for target in targets], **settings
+    )
     assert found.view == expected.view, name
     np.testing.assert_array_equal(found.matches[0], expected.matches.reference, name)
     np.testing.assert_array_equal(found.matches[1], expected.matches.target, name)
     np.testing.assert_array_equal(found.inliers, expected.inliers, name)
     pose = Sim3(found.scale, found.R, found.t)
-    np.testing.assert_allclose(pose.matrix, expected.sim3.matrix, rtol=1e-6, atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(
+        pose.matrix, expected.sim3.matrix, rtol=1e-6, atol=1e-9, err_msg=name
+    )
 
 
 def test_it_is_one_page():
     source = Path(minimal.__file__).read_text(encoding="utf-8")
     assert len(source.splitlines()) <= 150
-    assert [line for line in source.splitlines() if "zsp_lite" in line] == ["from zsp_lite.errors import InputError"]
+    assert [line for line in source.splitlines() if "zsp_lite" in line] == [
+        "from zsp_lite.errors import InputError"
+    ]
 
 
 def test_it_gives_the_librarys_pose_for_two_pairs_at_full_size(dataset):
@@ -73,7 +89,9 @@ def test_it_gives_the_librarys_pose_for_two_pairs_at_full_size(dataset):
 
 
 @pytest.mark.slow
-def test_it_gives_the_librarys_pose_for_pairs_of_all_categories_with_one_to_five_target_views(dataset):
+def test_it_gives_the_librarys_pose_for_pairs_of_all_categories_with_one_to_five_target_views(
+    dataset,
+):
     # A coarse grid, fewer matches and fewer trials: 60 pairs.
     settings = {"k": 12, "trials": 30}
     method = zsp_lite.ZeroShotPose(load_backbone(image_size=64), **settings)
@@ -83,7 +101,9 @@ def test_it_gives_the_librarys_pose_for_pairs_of_all_categories_with_one_to_five
         assert len(pairs) == 20
         for pair in pairs[::4]:
             reference = view(category, pair.reference_sequence, pair.reference_frame)
-            targets = [view(category, pair.target_sequence, number) for number in pair.target_frames]
+            targets = [
+                view(category, pair.target_sequence, number) for number in pair.target_frames
+            ]
             check_pair(method, reference, targets, pair.key, **settings)
 
 
@@ -95,7 +115,9 @@ def test_its_descriptors_are_the_librarys(grid):
 
 
 def test_too_few_matches_are_refused():
-    crop = minimal.Crop(np.ones((4, 4, 2)), np.zeros((4, 4)), np.ones((32, 32), np.float32), np.eye(3))
+    crop = minimal.Crop(
+        np.ones((4, 4, 2)), np.zeros((4, 4)), np.ones((32, 32), np.float32), np.eye(3)
+    )
     refused("0 matches", minimal.estimate_pose, crop, [crop])
 
 
@@ -107,5 +129,8 @@ def test_views_and_poses_are_the_stored_ones(solved, solver):
         for estimates, values in zip(solved[category], stored, strict=True):
             estimate, expected = estimates[solver], values[solver]
             matrix = estimate.sim3.matrix[:3]
-            same.append(estimate.view == expected["view"] and np.allclose(matrix, expected["matrix"], atol=1e-4))
+            same.append(
+                estimate.view == expected["view"]
+                and np.allclose(matrix, expected["matrix"], atol=1e-4)
+            )
     assert len(same) == 8 and sum(same) >= 7

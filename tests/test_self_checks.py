@@ -1,4 +1,5 @@
-"""The questions of the self-checks, and how a notebook shows them: in the file itself, without a network."""
+"""The questions of the self-checks, and how a notebook shows them: in the file itself, without a
+network."""
 
 import json
 import re
@@ -18,13 +19,19 @@ FILES = sorted(QUESTIONS.glob("*.json"))
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_every_question_has_right_and_wrong_answers_with_feedback_to_each(path):
     checks = json.loads(path.read_text(encoding="utf-8"))
-    assert re.fullmatch(r"\d\d", path.stem) and [2 <= len(questions) <= 4 for questions in checks] == [True, True]
+    assert re.fullmatch(r"\d\d", path.stem) and [
+        2 <= len(questions) <= 4 for questions in checks
+    ] == [True, True]
     for question in sum(checks, []):
         kind, answers = question["type"], question["answers"]
         right = sum(answer.get("correct", False) for answer in answers)
         assert 0 < right < len(answers) and (kind != "multiple_choice" or right == 1)
-        assert (kind == "numeric") == (answers[-1].get("type") == "default")  # for what no value and no range covers
-        assert all(low < high for low, high in (answer["range"] for answer in answers if "range" in answer))
+        assert (kind == "numeric") == (
+            answers[-1].get("type") == "default"
+        )  # for what no value and no range covers
+        assert all(
+            low < high for low, high in (answer["range"] for answer in answers if "range" in answer)
+        )
         assert len({answer["feedback"] for answer in answers}) == len(answers)
 
 
@@ -47,4 +54,6 @@ def test_an_unknown_self_check_is_named():
 
 def test_without_jupyterquiz_the_error_has_the_command_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "jupyterquiz", None)
-    refused(r"needs jupyterquiz, which is not installed; pip install jupyterquiz", self_check, "00", 1)
+    refused(
+        r"needs jupyterquiz, which is not installed; pip install jupyterquiz", self_check, "00", 1
+    )

@@ -1,4 +1,5 @@
-"""The course site (`make site`): every link leads somewhere, notebooks are complete, solutions stay out."""
+"""The course site (`make site`): every link leads somewhere, notebooks are complete, solutions stay
+out."""
 
 import importlib
 import re
@@ -26,8 +27,12 @@ class Page:
         self.pictures, self.text = html.find_all("img"), html.get_text()
         self.loaded = [one["src"] for one in html.select("img[src], script[src], iframe[src]")]
         leading_on = {"next", "prev", "canonical", "search", "index"}
-        self.loaded += [one["href"] for one in html.find_all("link") if not leading_on & {*one["rel"]}]
-        self.anchors = {one[key] for key in ("id", "name") for one in html.find_all(attrs={key: True})}
+        self.loaded += [
+            one["href"] for one in html.find_all("link") if not leading_on & {*one["rel"]}
+        ]
+        self.anchors = {
+            one[key] for key in ("id", "name") for one in html.find_all(attrs={key: True})
+        }
 
 
 @pytest.fixture(scope="module")
@@ -44,18 +49,26 @@ def page_of(source: Path) -> str:
 pytestmark = pytest.mark.slow  # the site is built once, for all tests of this file
 
 
-def test_every_link_leads_to_a_file_and_every_anchor_to_an_element_and_no_page_is_beyond_reach(site, pages):
+def test_every_link_leads_to_a_file_and_every_anchor_to_an_element_and_no_page_is_beyond_reach(
+    site, pages
+):
     broken, reached = [], {"index.html", "search.html", "docs/index.html"}
     for name, page in pages.items():
         for link in page.links:
             parts = urlsplit(link)
             if parts.scheme or parts.netloc:
                 continue
-            path = ((site / name).parent / unquote(parts.path)).resolve() if parts.path else site / name
+            path = (
+                ((site / name).parent / unquote(parts.path)).resolve()
+                if parts.path
+                else site / name
+            )
             target = str(path.relative_to(site.resolve()))
             reached.add(target)
             anchor = unquote(parts.fragment)
-            if not path.is_file() or (anchor and target in pages and anchor not in pages[target].anchors):
+            if not path.is_file() or (
+                anchor and target in pages and anchor not in pages[target].anchors
+            ):
                 broken.append(f"{name}: {link}")
     assert not broken, "\n".join(broken)
     assert set(pages) <= reached
@@ -66,7 +79,9 @@ def test_no_page_loads_anything_from_elsewhere(site, pages):
         for source in page.loaded:
             path = urlsplit(source)
             if path.scheme != "data":
-                assert not path.netloc and ((site / name).parent / unquote(path.path)).is_file(), f"{name}: {source}"
+                assert not path.netloc and ((site / name).parent / unquote(path.path)).is_file(), (
+                    f"{name}: {source}"
+                )
 
 
 @pytest.mark.parametrize("path", DECKS, ids=lambda path: path.stem)
@@ -81,7 +96,12 @@ def test_a_deck_of_slides_is_a_single_file_with_its_pictures(pages, path):
 def test_a_notebook_shows_its_stored_pictures_its_drawings_and_what_it_printed(pages, path):
     page, cells = pages[page_of(path)], nbformat.read(path, 4).cells
     outputs = [output for cell in cells for output in cell.get("outputs", [])]
-    texts = [output.metadata[form]["alt"] for output in outputs for form in output.get("data", {}) if "image/" in form]
+    texts = [
+        output.metadata[form]["alt"]
+        for output in outputs
+        for form in output.get("data", {})
+        if "image/" in form
+    ]
     shown = [picture["alt"] for picture in page.pictures]
     assert [text for text in shown if text in texts] == texts
     drawings = re.findall(r"!\[([^]]+)\]\(", "\n".join(cell.source for cell in cells))
@@ -92,19 +112,27 @@ def test_a_notebook_shows_its_stored_pictures_its_drawings_and_what_it_printed(p
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_shows_every_line_of_its_text_also_one_that_begins_with_a_percent_sign(pages, path):
+def test_a_notebook_shows_every_line_of_its_text_also_one_that_begins_with_a_percent_sign(
+    pages, path
+):
     shown = "".join(pages[page_of(path)].text.split())
     cells = [cell.source for cell in nbformat.read(path, 4).cells if cell.cell_type == "markdown"]
     formulas, code, tags = r"\$\$.*?\$\$|\$.*?\$", r"```.*?```", r"<.*?>"
     pictures, links = r"!\[.*?\)", r"\]\(.*?\)"
     beginnings = r"(?m:^\s*([\d#>]+\.?|[-*]) )"  # of headings, quotations and lines of lists
     signs = r"[`\"'_*.\[\]|\\&-]"
-    others = re.compile("|".join([formulas, code, pictures, links, tags, beginnings, signs]), re.DOTALL)
-    for line in others.sub(lambda other: "|" + other[0].count("\n") * "\n", "\n".join(cells)).splitlines():
+    others = re.compile(
+        "|".join([formulas, code, pictures, links, tags, beginnings, signs]), re.DOTALL
+    )
+    for line in others.sub(
+        lambda other: "|" + other[0].count("\n") * "\n", "\n".join(cells)
+    ).splitlines():
         assert "".join(max(line.split("|"), key=len).split()) in shown, line
 
 
-def test_exercises_are_shown_and_offered_without_solutions_hidden_tests_and_guides_for_marking(site, pages):
+def test_exercises_are_shown_and_offered_without_solutions_hidden_tests_and_guides_for_marking(
+    site, pages
+):
     for path in EXERCISES:
         source = "\n".join(cell.source for cell in nbformat.read(path, 4).cells)
         hidden = re.compile(r"### BEGIN (?:SOLUTION|HIDDEN TESTS)\n(.*?)### END", re.DOTALL)
@@ -122,9 +150,15 @@ def test_exercises_are_shown_and_offered_without_solutions_hidden_tests_and_guid
 
 
 def test_the_reference_describes_every_public_class_and_function(pages):
-    anchors = set().union(*(page.anchors for name, page in pages.items() if name.startswith("docs/api/")))
+    anchors = set().union(
+        *(page.anchors for name, page in pages.items() if name.startswith("docs/api/"))
+    )
     homes = zsp_lite._HOME_OF  # without importing them, which takes seconds
-    public = [name for name in homes if name[0].isupper() or name in ("load_backbone", "estimate_pose", "open_source")]
+    public = [
+        name
+        for name in homes
+        if name[0].isupper() or name in ("load_backbone", "estimate_pose", "open_source")
+    ]
     assert len(public) > 10
     for name in public:
         assert f"{homes[name]}.{name}" in anchors, name
@@ -134,7 +168,9 @@ def test_every_notebook_can_be_downloaded_with_its_drawings(site, pages):
     for path in (*NOTEBOOKS, *EXERCISES):
         copy = Path("run", path.relative_to(REPOSITORY))
         assert any(link.endswith(str(copy)) for link in pages[page_of(path)].links), path.name
-        for drawing in re.findall(r"\]\((figures/[^)]+)\)", (site / copy).read_text(encoding="utf-8")):
+        for drawing in re.findall(
+            r"\]\((figures/[^)]+)\)", (site / copy).read_text(encoding="utf-8")
+        ):
             assert (site / copy.parent / drawing).is_file(), f"{path.name}: {drawing}"
 
 
@@ -150,5 +186,8 @@ def test_with_an_address_a_notebook_has_links_to_run_it_and_an_install_cell(monk
     assert others == stored.cells
     assert f"git clone --quiet --depth 1 {address} /content/zsp\n" in first.source
     assert "%cd /content/zsp/notebooks\n" in first.source
-    # Outside Colab the cell does nothing: its commands are lines of IPython, indented below the condition.
-    assert re.match(r'# .*\nimport sys\n\nif "google.colab" in sys.modules:\n(( {4}.*)?\n)+$', first.source)
+    # Outside Colab the cell does nothing: its commands are lines of IPython, indented below the
+    # condition.
+    assert re.match(
+        r'# .*\nimport sys\n\nif "google.colab" in sys.modules:\n(( {4}.*)?\n)+$', first.source
+    )

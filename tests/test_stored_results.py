@@ -31,13 +31,17 @@ def numbers(text: str) -> list[float]:
 
 def rows(text: str, start: str) -> list[str]:
     """The lines of the table whose head begins with `start`."""
-    return re.search(rf"^{re.escape(start)}.*\n\|[-:|]+\|\n((?:\|.*\n)+)", text, re.MULTILINE)[1].splitlines()
+    return re.search(rf"^{re.escape(start)}.*\n\|[-:|]+\|\n((?:\|.*\n)+)", text, re.MULTILINE)[
+        1
+    ].splitlines()
 
 
 def test_the_readme_has_the_figures_of_both_runs(runs):
     for line, row in zip(rows(page("README.md"), "| | procedural"), README_ROWS, strict=True):
         found = [run.summary["methods"][row] for run in runs.values()]
-        expected = [value for one in found for value in (one["acc30"], *one["acc30_ci"], one["above150"])]
+        expected = [
+            value for one in found for value in (one["acc30"], *one["acc30_ci"], one["above150"])
+        ]
         assert numbers(line.split("|", 2)[2]) == pytest.approx(expected, abs=0.051), row
 
 
@@ -63,7 +67,9 @@ def test_the_table_of_artist_made_models_has_the_figures(runs):
         one = methods[name]
         figures = ("median", "acc30", "acc15")
         expected = [value for figure in figures for value in (one[figure], *one[f"{figure}_ci"])]
-        assert numbers(line.split("|", 2)[2]) == pytest.approx([*expected, one["above150"]], abs=0.051), name
+        assert numbers(line.split("|", 2)[2]) == pytest.approx(
+            [*expected, one["above150"]], abs=0.051
+        ), name
 
 
 def test_the_marked_tables_are_those_of_the_runs(runs, monkeypatch):
@@ -75,7 +81,9 @@ def test_the_marked_tables_are_those_of_the_runs(runs, monkeypatch):
 
 
 def test_the_page_on_solvers_has_the_confidences(runs):
-    for line, run in zip(rows(page("docs/solvers.md"), "| objects | mean confidence"), runs.values(), strict=True):
+    for line, run in zip(
+        rows(page("docs/solvers.md"), "| objects | mean confidence"), runs.values(), strict=True
+    ):
         row = run.row("verified")
         confidence, right = row["confidence"].to_numpy(), row["error"].to_numpy() < 30
         measured = reliability(confidence, right)
@@ -89,5 +97,9 @@ def test_the_page_on_solvers_has_the_weights_of_the_code():
     stated = {}
     for line in rows(text, "| term |"):
         term, forward, reverse = re.match(r"\| `(\w+)` \|[^|]*\| (\S+) \| (\S*) ?\|", line).groups()
-        stated |= {term: forward} if not reverse else {f"forward_{term}": forward, f"reverse_{term}": reverse}
+        stated |= (
+            {term: forward}
+            if not reverse
+            else {f"forward_{term}": forward, f"reverse_{term}": reverse}
+        )
     assert {name: float(value) for name, value in stated.items()} == weights

@@ -14,14 +14,26 @@ from tools.synthetic import SPLITS
 from zsp_lite.course.synthetic import export
 from zsp_lite.course.synthetic.assembly import make_shape
 from zsp_lite.course.synthetic.categories import CATEGORIES
-from zsp_lite.course.synthetic.export import export_categories, make_object, sequence_name, shape_turns
+from zsp_lite.course.synthetic.export import (
+    export_categories,
+    make_object,
+    sequence_name,
+    shape_turns,
+)
 from zsp_lite.course.synthetic.primitives import surface_spread
-from zsp_lite.course.synthetic.sequences import record_sequence, render_sequence, soft_mask, stereo_depth
+from zsp_lite.course.synthetic.sequences import (
+    record_sequence,
+    render_sequence,
+    soft_mask,
+    stereo_depth,
+)
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.io.files import stable_hash
 
-ALL = {name: build for builders in (*SPLITS.values(), CATEGORIES) for name, build in builders.items()}
+ALL = {
+    name: build for builders in (*SPLITS.values(), CATEGORIES) for name, build in builders.items()
+}
 SEED, FRAMES, SIZE = 5, 6, 72
 
 
@@ -34,7 +46,8 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def chairs():
-    """Two chairs with simulated sensor errors, each with its exact pose and scale, and its exact views before that."""
+    """Two chairs with simulated sensor errors, each with its exact pose and scale, and its exact
+    views before that."""
 
     def recorded(index):
         name, key = sequence_name(SEED, "chair", index), stable_hash(f"{SEED}/chair/{index}")
@@ -46,7 +59,9 @@ def chairs():
 
 
 @pytest.mark.parametrize("category", sorted(ALL))
-def test_objects_of_a_category_are_unit_sized_vary_and_do_not_coincide_with_themselves_after_half_a_turn(category):
+def test_objects_of_a_category_have_unit_size_vary_and_differ_from_their_half_turn(
+    category,
+):
     shapes = [make_shape(ALL[category], seed) for seed in range(4)]
     for shape in shapes:
         assert shape.faces.max() < len(shape.vertices) and np.isfinite(shape.vertices).all()
@@ -55,7 +70,9 @@ def test_objects_of_a_category_are_unit_sized_vary_and_do_not_coincide_with_them
     extents = np.array([np.ptp(shape.vertices, axis=0) for shape in shapes])
     assert (extents.std(0) / extents.mean(0)).max() > 0.02
     turned = shapes[3].vertices * [-1, -1, 1]
-    assert np.linalg.norm(shapes[3].vertices[:, None] - turned[None, ::3], axis=-1).min(0).max() > 0.2
+    assert (
+        np.linalg.norm(shapes[3].vertices[:, None] - turned[None, ::3], axis=-1).min(0).max() > 0.2
+    )
 
 
 def test_depth_has_holes_and_noise_and_masks_are_soft_and_accurate_to_two_pixels(chairs):
@@ -68,9 +85,14 @@ def test_depth_has_holes_and_noise_and_masks_are_soft_and_accurate_to_two_pixels
         for frame, view in zip(data.frames, views, strict=True):
             known = frame.depth[view.mask] > 0
             assert 0.45 < known.mean() < 0.8  # and the others are holes
-            assert np.abs(frame.depth[view.mask] / (scale * view.depth[view.mask]) - 1)[known].mean() < 0.02
+            assert (
+                np.abs(frame.depth[view.mask] / (scale * view.depth[view.mask]) - 1)[known].mean()
+                < 0.02
+            )
             inside = view.mask.astype(np.uint8)
-            to_edge = cv2.distanceTransform(inside, cv2.DIST_L2, 5) + cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
+            to_edge = cv2.distanceTransform(inside, cv2.DIST_L2, 5) + cv2.distanceTransform(
+                1 - inside, cv2.DIST_L2, 5
+            )
             wrong = (frame.mask > 0.5) != view.mask
             assert 0 < wrong.sum() and to_edge[wrong].max() <= 2.5
     edge_on = replace(view, mask=np.zeros_like(view.mask))  # of a flat object
@@ -85,9 +107,13 @@ def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):
         canonical = (data.points - t) @ R / scale
         seen = np.concatenate([view.canonical[view.mask] for view in views])
         assert (canonical > seen.min(0) - 0.3).all() and (canonical < seen.max(0) + 0.3).all()
-        for frame, view in zip(data.frames, views, strict=True):  # coordinates project onto their own pixels and depth
+        for frame, view in zip(
+            data.frames, views, strict=True
+        ):  # coordinates project onto their own pixels and depth
             row, col = np.nonzero(view.mask)
-            pixels, depth = frame.camera.project(scale * view.canonical[row, col].astype(float) @ R.T + t)
+            pixels, depth = frame.camera.project(
+                scale * view.canonical[row, col].astype(float) @ R.T + t
+            )
             assert np.abs(pixels - np.stack([col + 0.5, row + 0.5], 1)).max() < 0.02
             np.testing.assert_allclose(depth, scale * view.depth[row, col], rtol=1e-4)
 
@@ -98,7 +124,9 @@ def test_an_export_reads_back(folder, chairs):
     assert len(dataset.select("toytruck")) == 2
     assert list(read_labels(folder, "chair")) == [data.name for data, *_ in chairs]
     for data, *_ in chairs:
-        np.testing.assert_allclose(dataset.point_cloud("chair", data.name)[0], data.points, atol=1e-4)
+        np.testing.assert_allclose(
+            dataset.point_cloud("chair", data.name)[0], data.points, atol=1e-4
+        )
         for annotation, wanted in zip(dataset.frames("chair", data.name), data.frames, strict=True):
             np.testing.assert_allclose(dataset.load(annotation).depth, wanted.depth, rtol=1e-3)
 
@@ -110,7 +138,9 @@ def test_an_interrupted_export_is_completed_and_complete_sequences_stay(tmp_path
         with pytest.raises(KeyboardInterrupt):
             export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
         export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
-    assert [call.args[1] for call in record.call_args_list] == [sequence_name(1, "mouse", k) for k in (0, 1, 1)]
+    assert [call.args[1] for call in record.call_args_list] == [
+        sequence_name(1, "mouse", k) for k in (0, 1, 1)
+    ]
     export_categories(["mouse"], tmp_path / "b", 2, 2, 1, 48)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 

@@ -1,4 +1,5 @@
-"""Training: renders of one object at a time, batches with their geometry, three losses; self-distillation."""
+"""Training: renders of one object at a time, batches with their geometry, three losses;
+self-distillation."""
 
 import copy
 from dataclasses import replace
@@ -15,7 +16,11 @@ from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.course.synthetic.sequences import orbit_pose
 from zsp_lite.course.training import renders as rendering
 from zsp_lite.course.training.batches import crop_grids, sample_batch
-from zsp_lite.course.training.distillation import Distillation, DistillationConfig, distillation_loss
+from zsp_lite.course.training.distillation import (
+    Distillation,
+    DistillationConfig,
+    distillation_loss,
+)
 from zsp_lite.course.training.objectives import attention_loss, correspondence_loss, losses
 from zsp_lite.course.training.renders import GRID, SIZE, VIEWS, render_object, render_set
 from zsp_lite.course.training.trainee import Trainee, initial_backbone
@@ -32,7 +37,8 @@ def two_rooms():
 
 @pytest.fixture(scope="module")
 def rendered():
-    """The renders of three training objects, and the azimuth of every view, one object after the other."""
+    """The renders of three training objects, and the azimuth of every view, one object after the
+    other."""
     with patch.object(rendering, "orbit_pose", wraps=orbit_pose) as poses:
         return render_set(range(3)), [call.kwargs["azimuth"] for call in poses.call_args_list]
 
@@ -54,13 +60,20 @@ def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(rendered)
 
 
 def test_renders_hold_unit_normals_and_centred_depth_on_the_object(renders):
-    for array, rows in zip(render_object(1), (renders.rgb, renders.surface, renders.geometry), strict=True):
+    for array, rows in zip(
+        render_object(1), (renders.rgb, renders.surface, renders.geometry), strict=True
+    ):
         np.testing.assert_array_equal(array, rows[1])  # a number stands for one object
     inside = ~np.isnan(renders.surface[..., 0])
     assert renders.rgb.shape == (3, VIEWS, SIZE, SIZE, 3) and inside.shape == (3, VIEWS, GRID, GRID)
     assert 0.05 < inside.mean() < 0.9
-    for number, points in enumerate(renders.surface):  # coordinates of the object, not of its instances
-        shape, seen = make_shape(rendering.build_random_object, [number, 1]).vertices, points[inside[number]]
+    for number, points in enumerate(
+        renders.surface
+    ):  # coordinates of the object, not of its instances
+        shape, seen = (
+            make_shape(rendering.build_random_object, [number, 1]).vertices,
+            points[inside[number]],
+        )
         assert (seen > shape.min(0) - 0.01).all() and (seen < shape.max(0) + 0.01).all()
     normals = np.linalg.norm(renders.geometry[..., :3].astype(np.float64), axis=-1)
     np.testing.assert_allclose(normals[inside], 1, atol=5e-3)
@@ -68,13 +81,17 @@ def test_renders_hold_unit_normals_and_centred_depth_on_the_object(renders):
     # Visible surfaces face the camera, which looks along +z, up to the slant of the rays.
     assert np.mean(renders.geometry[..., 2][inside] < 0.2) > 0.99
     depth = renders.geometry[..., 3].astype(np.float64)
-    for values, on in zip(depth.reshape(-1, GRID, GRID), inside.reshape(-1, GRID, GRID), strict=True):
+    for values, on in zip(
+        depth.reshape(-1, GRID, GRID), inside.reshape(-1, GRID, GRID), strict=True
+    ):
         assert abs(values[on].mean()) < 0.01 and abs(values[on].std() - 1) < 0.01
 
 
 def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
     """A patch's surface point must be one that the uncropped view shows."""
-    batch = sample_batch(renders, np.random.default_rng(0), 3, VIEWS, 96, (0.4, 1.0), members=np.array([0, 1, 2]))
+    batch = sample_batch(
+        renders, np.random.default_rng(0), 3, VIEWS, 96, (0.4, 1.0), members=np.array([0, 1, 2])
+    )
     crops = 3 * VIEWS
     assert batch.images.shape == (crops, 3, 96, 96) and batch.surface.shape == (crops, 144, 3)
     for crop in range(crops):
@@ -89,30 +106,45 @@ def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
 
 def test_normals_turn_and_flip_with_the_crop(renders):
     grid, turn = crop_grids(np.random.default_rng(3), 3 * VIEWS, VIEWS, 96, (0.5, 1.0))
-    batch = sample_batch(renders, np.random.default_rng(3), 3, VIEWS, 96, (0.5, 1.0), members=np.arange(3))
+    batch = sample_batch(
+        renders, np.random.default_rng(3), 3, VIEWS, 96, (0.5, 1.0), members=np.arange(3)
+    )
     assert set(torch.linalg.det(turn).round().tolist()) == {-1.0, 1.0}
     for crop in range(3 * VIEWS):
         right, down = grid[crop, 4, 5] - grid[crop, 4, 4], grid[crop, 5, 4] - grid[crop, 4, 4]
-        axes = torch.stack([right / right.norm(), down / down.norm()])  # of the crop, in the uncropped view
-        torch.testing.assert_close(turn[crop], axes, atol=0.15, rtol=0)  # a crop that is not square leans a little
+        axes = torch.stack(
+            [right / right.norm(), down / down.norm()]
+        )  # of the crop, in the uncropped view
+        torch.testing.assert_close(
+            turn[crop], axes, atol=0.15, rtol=0
+        )  # a crop that is not square leans a little
         on_object = ~batch.surface[crop, :, 0].isnan()
         before = batch.geometry[crop, on_object, :3].clone()
         before[:, :2] = before[:, :2] @ turn[crop]
-        view = renders.geometry[crop // VIEWS, crop % VIEWS].reshape(-1, 4)[:, :3].astype(np.float32)
+        view = (
+            renders.geometry[crop // VIEWS, crop % VIEWS].reshape(-1, 4)[:, :3].astype(np.float32)
+        )
         nearest = torch.cdist(before, torch.from_numpy(view)).amin(1)
         assert nearest.max() < 1e-3
 
 
 def test_the_correspondence_loss_of_right_and_of_wrong_keys_is_that_of_its_formula():
-    """Two views of the same 24 places, in pairs one radius apart, with 2.5 between pairs; each has its own key."""
+    """Two views of the same 24 places, in pairs one radius apart, with 2.5 between pairs; each has
+    its own key."""
     line = 0.15 * (3.5 * torch.arange(12)[:, None] + torch.tensor([0, 1])).flatten()
     places, keys = F.pad(line[:, None], (0, 2)).repeat(2, 1, 1), torch.eye(24).repeat(2, 1, 1)
 
     def loss(descriptors):
-        return correspondence_loss(descriptors, places, 1, 0.15, 0.1, 48, torch.Generator().manual_seed(0))
+        return correspondence_loss(
+            descriptors, places, 1, 0.15, 0.1, 48, torch.Generator().manual_seed(0)
+        )
 
-    target = np.array([1, np.exp(-0.5)]) / (1 + np.exp(-0.5))  # of the place itself and of its neighbour
-    constant = (target * np.log(target)).sum() + np.log(np.exp(10) + 23)  # similarities divided by 0.1, and zeros
+    target = np.array([1, np.exp(-0.5)]) / (
+        1 + np.exp(-0.5)
+    )  # of the place itself and of its neighbour
+    constant = (target * np.log(target)).sum() + np.log(
+        np.exp(10) + 23
+    )  # similarities divided by 0.1, and zeros
     right, accuracy = loss(keys)
     assert (float(right), accuracy) == (pytest.approx(constant - 10 * target[0], abs=1e-4), 1)
     keys[1] = keys[1].roll(2, 0)
@@ -160,7 +192,8 @@ def test_attention_on_the_mask_is_worth_more_than_attention_off_it():
 
 
 def test_a_few_steps_teach_a_network_where_the_object_is(renders):
-    """The summed loss falls on the batch that is trained on, and its terms are those of the single functions."""
+    """The summed loss falls on the batch that is trained on, and its terms are those of the single
+    functions."""
     torch.manual_seed(0)
     model = Trainee(initial_backbone(renders, 24, 2, 2), 1)
     batch = sample_batch(renders, np.random.default_rng(5), 2, VIEWS, 48, (0.8, 1.0))
@@ -182,12 +215,15 @@ def test_a_few_steps_teach_a_network_where_the_object_is(renders):
 
 # Self-distillation
 
-TINY = DistillationConfig(steps=45, images=8, local_crops=2, global_side=32, local_side=16, outputs=64)
+TINY = DistillationConfig(
+    steps=45, images=8, local_crops=2, global_side=32, local_side=16, outputs=64
+)
 
 
 @pytest.fixture(scope="module")
 def pictures() -> np.ndarray:
-    """Eight objects, two views each, (8, 2, 48, 48, 3): stripes of each object's own colour and direction."""
+    """Eight objects, two views each, (8, 2, 48, 48, 3): stripes of each object's own colour and
+    direction."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:48, :48]
     rgb = np.empty((8, 2, 48, 48, 3), np.uint8)
@@ -201,7 +237,11 @@ def pictures() -> np.ndarray:
 
 def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_crop():
     rng = np.random.default_rng(0)
-    student, teacher, centre = rng.normal(size=(4, 3, 5)), rng.normal(size=(2, 3, 5)), rng.normal(size=5)
+    student, teacher, centre = (
+        rng.normal(size=(4, 3, 5)),
+        rng.normal(size=(2, 3, 5)),
+        rng.normal(size=5),
+    )
     terms, entropies = [], []
     for picture in range(3):
         for g in range(2):
@@ -225,6 +265,9 @@ def test_a_run_depends_on_its_seed_alone_and_leaves_the_given_backbone_as_it_was
     runs = [Distillation(replace(TINY, seed=seed), backbone, pictures) for seed in (0, 0, 1)]
     figures = [[run.step() for _ in range(3)] for run in runs]
     assert figures[0] == figures[1] != figures[2]
-    weights = [[run.centre, *run.student.state_dict().values(), *run.teacher.state_dict().values()] for run in runs]
+    weights = [
+        [run.centre, *run.student.state_dict().values(), *run.teacher.state_dict().values()]
+        for run in runs
+    ]
     assert all(torch.equal(a, b) for a, b in zip(weights[0], weights[1], strict=True))
     assert all(torch.equal(before[name], value) for name, value in backbone.state_dict().items())

@@ -1,4 +1,5 @@
-"""tools/tuning.py: the fits recover known parameters, are evaluated on held-out categories, and refuse other splits."""
+"""tools/tuning.py: the fits recover known parameters, are evaluated on held-out categories, and
+refuse other splits."""
 
 from dataclasses import astuple, replace
 
@@ -11,14 +12,15 @@ from tools.tuning import Outcome, check_sides, fit_calibration, fit_weights, lea
 from zsp_lite.verified.confidence import Calibration
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 
-# Setting, span, number of views, angles to the nearest view and deviation of the view similarities, of no importance
-# to the weights of the score.
+# Setting, span, number of views, angles to the nearest view and deviation of the view similarities,
+# of no importance to the weights of the score.
 ALL_AROUND_TARGET = ("5 views all around", 288.0, 5, np.zeros(6), 0.1)
 TRUE_WEIGHTS = ScoreCoefficients(6, 0, -4, -2, 0, 3, 0, -1, 2)
 
 
 def sample_outcomes(n: int, rng: np.random.Generator) -> list[Outcome]:
-    """Pairs with one correct hypothesis each, drawn with probability proportional to exp(score) under TRUE_WEIGHTS."""
+    """Pairs with one correct hypothesis each, drawn with probability proportional to exp(score)
+    under TRUE_WEIGHTS."""
     outcomes = []
     for index in range(n):
         terms = rng.normal(size=(6, len(TERM_NAMES)))
@@ -26,7 +28,11 @@ def sample_outcomes(n: int, rng: np.random.Generator) -> list[Outcome]:
         probability = np.exp(score - score.max())
         errors = np.full(6, 120.0)
         errors[rng.choice(6, p=probability / probability.sum())] = 0
-        outcomes.append(Outcome(f"category {index % 4}", terms, errors, 90 * (1 - np.eye(6)), *ALL_AROUND_TARGET))
+        outcomes.append(
+            Outcome(
+                f"category {index % 4}", terms, errors, 90 * (1 - np.eye(6)), *ALL_AROUND_TARGET
+            )
+        )
     return outcomes
 
 
@@ -36,7 +42,8 @@ def test_the_weights_of_the_sampling_distribution_are_recovered():
 
 
 def sample_ranked(n: int, true: Calibration, rng: np.random.Generator) -> list[Outcome]:
-    """Pairs of three different poses, scored by the first two terms, of which one or none is right as `true` says."""
+    """Pairs of three different poses, scored by the first two terms, of which one or none is right
+    as `true` says."""
     outcomes = []
     for index in range(n):
         terms = np.zeros((3, len(TERM_NAMES)))
@@ -44,7 +51,14 @@ def sample_ranked(n: int, true: Calibration, rng: np.random.Generator) -> list[O
         terms[:, 1] = rng.uniform(-2, 2)  # the shape term, equal for all poses
         views = int(rng.integers(1, 11))
         seen = rng.uniform(0, 360), views, rng.uniform(0, 90, 3), rng.uniform(0, 0.2)
-        one = Outcome(f"category {index % 4}", terms, np.zeros(3), 90 * (1 - np.eye(3)), f"{views} views", *seen)
+        one = Outcome(
+            f"category {index % 4}",
+            terms,
+            np.zeros(3),
+            90 * (1 - np.eye(3)),
+            f"{views} views",
+            *seen,
+        )
         p = true.probabilities(terms[0, 0] - terms[:, 0], one.evidence(FIRST_TERMS))
         errors = np.full(4, 120.0)
         errors[rng.choice(4, p=[*p, 1 - p.sum()])] = 5
@@ -53,7 +67,9 @@ def sample_ranked(n: int, true: Calibration, rng: np.random.Generator) -> list[O
 
 
 FIRST_TERMS = ScoreCoefficients(*[1.0, 1.0, *[0.0] * (len(TERM_NAMES) - 2)])
-TRUE_CALIBRATION = Calibration((-0.4, 0.4, 0.2, 0.3, -1.0, 0.1), (0.5, -1.0, -0.4, -0.8, -6.0, -0.6), 0.2)
+TRUE_CALIBRATION = Calibration(
+    (-0.4, 0.4, 0.2, 0.3, -1.0, 0.1), (0.5, -1.0, -0.4, -0.8, -6.0, -0.6), 0.2
+)
 
 
 def test_the_coefficients_of_the_calibration_are_recovered():
@@ -62,7 +78,9 @@ def test_the_coefficients_of_the_calibration_are_recovered():
     for name in ("scale", "none"):
         true, measured = (np.delete(getattr(one, name), 4) for one in (TRUE_CALIBRATION, found))
         np.testing.assert_allclose(measured, true, atol=0.6)
-        assert getattr(found, name)[4] == pytest.approx(getattr(TRUE_CALIBRATION, name)[4], abs=2)  # of view_std
+        assert getattr(found, name)[4] == pytest.approx(
+            getattr(TRUE_CALIBRATION, name)[4], abs=2
+        )  # of view_std
     assert found.unseen == pytest.approx(0.2, abs=0.1)
     right = [one for one in outcomes if one.errors.min() < 30]
     refused("all have a right pose or none has", fit_calibration, right, FIRST_TERMS)
@@ -71,14 +89,23 @@ def test_the_coefficients_of_the_calibration_are_recovered():
 def test_no_fit_sees_the_category_it_is_evaluated_on():
     outcomes = sample_outcomes(12, np.random.default_rng(4))
     seen = leave_out(outcomes, lambda some: {one.category for one in some})
-    assert all(one.category not in others and len(others) == 3 for one, others in zip(outcomes, seen))
+    assert all(
+        one.category not in others and len(others) == 3 for one, others in zip(outcomes, seen)
+    )
 
 
 def test_categories_of_another_side_are_refused(tmp_path, capsys):
     for name in ("camera", "drill"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "frame_annotations.jgz").write_bytes(b"")
-    refused("category drill is for validation, expected training", check_sides, [tmp_path], "training")
-    refused("category camera is for training, expected validation", check_sides, [tmp_path], "validation")
+    refused(
+        "category drill is for validation, expected training", check_sides, [tmp_path], "training"
+    )
+    refused(
+        "category camera is for training, expected validation",
+        check_sides,
+        [tmp_path],
+        "validation",
+    )
     assert tuning.main(["weights", f"{tmp_path}:2"]) == 2
     assert "category drill is for validation" in capsys.readouterr().err

@@ -45,7 +45,9 @@ def test_perfect_features_give_the_true_pose(estimate, frames):
     assert rotation_error(estimate.sim3.R, truth(estimate, frames).R) < 4
     assert estimate.sim3.scale == pytest.approx(1.15, rel=0.08)
     centre = frames[0].camera.to_camera(np.zeros(3))
-    np.testing.assert_allclose(estimate.sim3.apply(centre), truth(estimate, frames).apply(centre), atol=0.12)
+    np.testing.assert_allclose(
+        estimate.sim3.apply(centre), truth(estimate, frames).apply(centre), atol=0.12
+    )
     assert estimate.confidence > 0.5 and not estimate.flags
 
 
@@ -80,7 +82,9 @@ def test_inliers_agree_with_the_pose_within_a_fraction_of_the_objects_size(estim
     seen = []
     for frame in frames[1:]:
         row, column = np.nonzero(frame.mask > 0.5)
-        points = frame.camera.unproject_camera(np.stack([column, row], axis=-1) + 0.5, frame.depth[row, column])
+        points = frame.camera.unproject_camera(
+            np.stack([column, row], axis=-1) + 0.5, frame.depth[row, column]
+        )
         seen.append((points - frame.camera.t) @ frame.camera.R)
     spread = np.sqrt(np.concatenate(seen).var(axis=0).mean())
     sure = np.abs(residual / (0.2 * spread) - 1) > 0.2  # the spread is that of what the views show
@@ -123,7 +127,10 @@ def test_one_target_view_is_enough(method, views, frames):
 
 
 def test_views_that_share_no_side_of_the_object_are_flagged(method):
-    cameras = [turned(look_at(side, distance=4.5), ELSEWHERE.R) for side in [(-1, -0.2, -0.1), (-1, 0.3, -0.2)]]
+    cameras = [
+        turned(look_at(side, distance=4.5), ELSEWHERE.R)
+        for side in [(-1, -0.2, -0.1), (-1, 0.3, -0.2)]
+    ]
     frames = [render(look_at((1, 0.2, 0.1)), Sim3.identity(), "reference")]
     frames += [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras)]
     reference, *targets = extract_views(method.backbone, [object_crop(frame) for frame in frames])
@@ -138,7 +145,9 @@ def test_uninformative_features_give_a_low_confidence(method, views, estimate):
         keys = torch.randn(28, 28, 16, generator=rng)
         return replace(view, features=FeatureMap(keys, view.features.saliency, keys[0, 0]))
 
-    found = method.estimate_from_views(meaningless(views[0]), [meaningless(view) for view in views[1:]])
+    found = method.estimate_from_views(
+        meaningless(views[0]), [meaningless(view) for view in views[1:]]
+    )
     assert found.confidence < estimate.confidence and found.flags
 
 
@@ -152,19 +161,40 @@ class SymmetricBackbone(CoordinateBackbone):
 
 
 # Two by two opposite, so that a half turn about z leaves alone what was seen, too.
-ALL_AROUND = [(1, 0.5, 0.5), (-1, -0.5, 0.5), (-0.4, 1, 0.2), (0.4, -1, 0.2), (0.6, -0.8, -0.4), (-0.6, 0.8, -0.4)]
+ALL_AROUND = [
+    (1, 0.5, 0.5),
+    (-1, -0.5, 0.5),
+    (-0.4, 1, 0.2),
+    (0.4, -1, 0.2),
+    (0.6, -0.8, -0.4),
+    (-0.6, 0.8, -0.4),
+]
 
 
 def test_a_symmetric_object_is_flagged_as_one_of_two(monkeypatch):
-    monkeypatch.setattr("synthetic_views.inside", lambda points: np.linalg.norm(points / (1.3, 0.9, 0.6), axis=-1) - 1)
-    frames = [render(look_at(direction), Sim3.identity()) for direction in [(0.9, -0.5, 0.3), *ALL_AROUND]]
+    monkeypatch.setattr(
+        "synthetic_views.inside",
+        lambda points: np.linalg.norm(points / (1.3, 0.9, 0.6), axis=-1) - 1,
+    )
+    frames = [
+        render(look_at(direction), Sim3.identity()) for direction in [(0.9, -0.5, 0.3), *ALL_AROUND]
+    ]
     found = ZeroShotPose(SymmetricBackbone(), solver="verified").estimate(frames[0], frames[1:])
     assert found.one_of_two and found.angle_to(found.alternatives[0]) > 150
     assert "one of two: poses" in found.note and "the object may be symmetric" in found.note
     assert found.confidence >= found.alternatives[0].confidence > found.confidence / np.e
-    assert found.confidence < 0.75 and sum(one.confidence for one in found.alternatives) + found.confidence <= 1
+    assert (
+        found.confidence < 0.75
+        and sum(one.confidence for one in found.alternatives) + found.confidence <= 1
+    )
     # Both answers are among the hypotheses, the one as true as the other.
-    in_world = np.stack([found.world_rotation(one) @ frames[0].camera.R for one in found.hypotheses])
-    errors = [rotation_error(in_world, np.diag(turn)) for turn in [(1.0, 1.0, 1.0), (-1.0, -1.0, 1.0)]]
-    assert min(error[0] for error in errors) < 30  # where the painting says little, poses some 25 degrees off are close
+    in_world = np.stack(
+        [found.world_rotation(one) @ frames[0].camera.R for one in found.hypotheses]
+    )
+    errors = [
+        rotation_error(in_world, np.diag(turn)) for turn in [(1.0, 1.0, 1.0), (-1.0, -1.0, 1.0)]
+    ]
+    assert (
+        min(error[0] for error in errors) < 30
+    )  # where the painting says little, poses some 25 degrees off are close
     assert (np.min(errors, axis=1) < 15).all() and np.min(errors) < 10

@@ -20,7 +20,13 @@ from zsp_lite.estimates import Hypothesis
 from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.verified.confidence import Calibration, evidence, modes, reliability_flags
-from zsp_lite.verified.poses import Poses, concatenate, non_maximum_suppression, rotation_angles, rotation_matrices
+from zsp_lite.verified.poses import (
+    Poses,
+    concatenate,
+    non_maximum_suppression,
+    rotation_angles,
+    rotation_matrices,
+)
 from zsp_lite.verified.proposals import poses_from_matches, poses_from_views
 from zsp_lite.verified.refinement import SearchSchedule, refine
 from zsp_lite.verified.scene import build_maps, build_scene, project_points, surface_weights
@@ -85,19 +91,30 @@ def test_an_object_cut_off_by_the_border_is_not_known_to_end_there():
     one = torch.eye(3)[None], torch.zeros(1, 3)
     assert float(project_points(maps, *one, left).silhouette_distance) == 0
     # 32 pixels to the border and 19.2 beyond are 51.2, at 32 pixels per unit of length.
-    assert float(project_points(maps, *one, right).silhouette_distance) == pytest.approx(51.2 / 32, rel=0.05)
+    assert float(project_points(maps, *one, right).silhouette_distance) == pytest.approx(
+        51.2 / 32, rel=0.05
+    )
 
 
-@pytest.mark.parametrize("size, grid", [((224, 224), (28, 28)), ((96, 160), (12, 20)), ((210, 140), (15, 7))])
+@pytest.mark.parametrize(
+    "size, grid", [((224, 224), (28, 28)), ((96, 160), (12, 20)), ((210, 140), (15, 7))]
+)
 def test_a_map_pixel_reads_the_patch_that_its_centre_lies_in(size, grid):
     camera = Camera(np.eye(3), np.zeros(3), np.full(2, 200.0), np.full(2, 100.0), size)
     image, ones = np.zeros((*size, 3), np.uint8), np.ones(size, np.float32)
     features = FeatureMap(torch.zeros(*grid, 4), torch.ones(grid), torch.ones(4))
-    view = View(Frame(image, ones, ones, camera), features, torch.ones(grid, dtype=torch.bool), ones)
-    maps = build_maps([view], [(np.eye(3), np.zeros(3))], Sim3.identity(), [np.arange(grid[0] * grid[1])])
+    view = View(
+        Frame(image, ones, ones, camera), features, torch.ones(grid, dtype=torch.bool), ones
+    )
+    maps = build_maps(
+        [view], [(np.eye(3), np.zeros(3))], Sim3.identity(), [np.arange(grid[0] * grid[1])]
+    )
     width, height = maps.size[0].int().tolist()
     # floor((i + 1/2) / n * cells), in exact fractions
-    row, column = ([int(Fraction(2 * i + 1, 2 * n) * k) for i in range(n)] for n, k in zip((height, width), grid))
+    row, column = (
+        [int(Fraction(2 * i + 1, 2 * n) * k) for i in range(n)]
+        for n, k in zip((height, width), grid)
+    )
     expected = np.array(row)[:, None] * grid[1] + np.array(column)
     np.testing.assert_array_equal(maps.table[:, 3].reshape(height, width), expected)
 
@@ -118,14 +135,19 @@ def test_outliers_far_behind_the_object_are_left_out(views):
 @given(seeds)
 def test_matches_with_outliers_propose_the_true_pose(seed):
     rng = np.random.default_rng(seed)
-    pose = Sim3(rng.uniform(0.7, 1.4), Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 0.1, 3))
+    pose = Sim3(
+        rng.uniform(0.7, 1.4), Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 0.1, 3)
+    )
     source = rng.normal(size=(30, 3))
     target = pose.apply(source)
     target[:12] = rng.normal(size=(12, 3))
     points = (torch.tensor(part, dtype=torch.float32) for part in (source, target))
     found = poses_from_matches(*points, np.random.default_rng(seed))
     assert rotation_error(found.rotation[0].double().numpy(), pose.R) < 1
-    assert len(found) <= 6 and (rotation_angles(found.rotation, found.rotation).fill_diagonal_(180) >= 20).all()
+    assert (
+        len(found) <= 6
+        and (rotation_angles(found.rotation, found.rotation).fill_diagonal_(180) >= 20).all()
+    )
 
 
 def test_without_enough_matches_no_pose_is_proposed():
@@ -169,7 +191,9 @@ def by_hand(scene, views, pose: Sim3) -> dict[str, float]:
     unit = 1 / scene.target_to_working.scale  # of the targets' working frame
     first = scene.target_cameras[0]
     sums: dict[str, float] = defaultdict(float)
-    in_reference = scene.reference_to_working.inverse().apply(scene.reference_points[:: EVERY[0]].numpy())
+    in_reference = scene.reference_to_working.inverse().apply(
+        scene.reference_points[:: EVERY[0]].numpy()
+    )
     for i, point in enumerate(in_reference):
         touched, alike = 0.0, 0.0
         for view, target in enumerate(targets):
@@ -221,9 +245,14 @@ def patch_column(scene, targets, view, patch):
 
 @pytest.mark.parametrize("turn", [(0, 0, 0), (25.0, 10, -15), (0, 180, 0)])
 def test_terms_equal_a_computation_point_by_point(scene, views, truth, turn):
-    turned = rotation_matrices(torch.deg2rad(torch.tensor([turn], dtype=torch.float32))) @ truth.rotation
+    turned = (
+        rotation_matrices(torch.deg2rad(torch.tensor([turn], dtype=torch.float32))) @ truth.rotation
+    )
     poses = Poses(truth.scale, turned, truth.translation + 0.1)
-    found, expected = first_terms(scene, poses, EVERY), by_hand(scene, views, scene.to_sim3(poses, 0, 0))
+    found, expected = (
+        first_terms(scene, poses, EVERY),
+        by_hand(scene, views, scene.to_sim3(poses, 0, 0)),
+    )
     for name, value in expected.items():
         assert found[name] == pytest.approx(value, abs=0.02), name
 
@@ -235,7 +264,9 @@ def test_the_truth_scores_above_other_poses(scene, truth):
     score = ScoreCoefficients().score(score_terms(scene, concatenate([truth, others])))
     assert int(score.argmax()) == 0
     terms = first_terms(scene, truth)
-    assert all(terms[name] < 0.02 for name in TERM_NAMES if name.endswith(("silhouette", "free_space")))
+    assert all(
+        terms[name] < 0.02 for name in TERM_NAMES if name.endswith(("silhouette", "free_space"))
+    )
 
 
 def test_unknown_depth_is_neither_on_the_object_nor_off_it(views, truth):
@@ -246,12 +277,18 @@ def test_unknown_depth_is_neither_on_the_object_nor_off_it(views, truth):
     for shift in (-1.0, 0.0, 1.0):
         pose = Poses(truth.scale, truth.rotation, truth.translation + shift)
         before, after = first_terms(scene, pose), first_terms(blind, pose)
-        assert after["forward_free_space"] == after["forward_overlap"] == after["forward_similarity"] == 0
+        assert (
+            after["forward_free_space"]
+            == after["forward_overlap"]
+            == after["forward_similarity"]
+            == 0
+        )
         assert after["forward_silhouette"] == before["forward_silhouette"]
 
 
 def test_the_viewpoint_term_is_highest_from_the_viewpoint_of_the_most_similar_view(views):
-    """Of two target views far apart, one is similar: the term is its similarity weighted by the angle."""
+    """Of two target views far apart, one is similar: the term is its similarity weighted by the
+    angle."""
     alike, other = torch.full((784, 784), 0.2), torch.full((784, 784), -0.4)
     scene = build_scene(views[0], views[1:3], [alike, other])
     np.testing.assert_allclose(scene.view_similarity, [0.3, -0.3], atol=1e-6)
@@ -266,12 +303,19 @@ def test_refinement_never_lowers_the_score():
     goal = Poses(torch.tensor([1.1]), rotation[None], torch.tensor([[0.1, -0.2, 0.05]]))
 
     def score(poses: Poses) -> torch.Tensor:
-        off = rotation_angles(poses.rotation, goal.rotation)[:, 0] / 20 + (poses.scale / goal.scale).log().square()
+        off = (
+            rotation_angles(poses.rotation, goal.rotation)[:, 0] / 20
+            + (poses.scale / goal.scale).log().square()
+        )
         return -off - (poses.translation - goal.translation).square().sum(dim=1)
 
     turn = rotation_matrices(torch.deg2rad(torch.tensor([[12.0, 5, -8], [-6, 10, 9]])))
-    start = Poses(torch.tensor([0.9, 1.2]), turn @ goal.rotation, goal.translation.expand(2, 3) + 0.1)
-    search = SearchSchedule(rounds=8, samples=40, rotation=6.0, translation=0.08, scale=0.06, decay=0.8)
+    start = Poses(
+        torch.tensor([0.9, 1.2]), turn @ goal.rotation, goal.translation.expand(2, 3) + 0.1
+    )
+    search = SearchSchedule(
+        rounds=8, samples=40, rotation=6.0, translation=0.08, scale=0.06, decay=0.8
+    )
     found, reached = refine(start, score, search, np.random.default_rng(0))
     assert (reached >= score(start)).all()
     np.testing.assert_allclose(reached, score(found), atol=1e-3)
@@ -281,14 +325,20 @@ def test_refinement_never_lowers_the_score():
 def test_bad_scenes_are_refused_in_one_line(views):
     reference, *targets = views
     empty = replace(reference, foreground=torch.zeros(28, 28, dtype=torch.bool))
-    refused("reference: 0 foreground patches of known depth, expected at least 8", featureless_scene, [empty, *targets])
+    refused(
+        "reference: 0 foreground patches of known depth, expected at least 8",
+        featureless_scene,
+        [empty, *targets],
+    )
     refused("target views: 0 foreground patches", featureless_scene, [reference, empty])
 
 
 def test_surface_weights_do_not_depend_on_the_sampling_density():
     rng = np.random.default_rng(6)
     angle = np.concatenate([rng.uniform(0, np.pi, 400), rng.uniform(np.pi, 2 * np.pi, 100)])
-    ring = torch.tensor(np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) * 2, dtype=torch.float32)
+    ring = torch.tensor(
+        np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) * 2, dtype=torch.float32
+    )
     share = surface_weights(ring)
     assert float(share.sum()) == pytest.approx(1, abs=1e-5)
     assert float(share[:400].sum()) == pytest.approx(0.5, abs=0.05)
@@ -328,8 +378,13 @@ def test_hypotheses_within_30_degrees_of_a_better_one_are_the_same_pose():
 def test_probabilities_by_hand():
     # Of four views that span half the circle, the nearest with exp(-(angle / 45)^2) = 1/2.
     known = evidence(180, 4, 45 * np.sqrt(np.log(2)), 0.03, 2.0)
-    calibration = Calibration((0.2, 0.4, -0.5, 0.6, 1.0, 0.1), (0.3, 0.8, -0.1, 0.2, -2.0, -0.25), 0.4)
-    a, none = np.exp(0.2 + 0.2 + 0.3 + 0.03 + 0.2) / 2, np.exp(0.3 + 0.4 + 0.1 - 0.06 - 0.5) * 4**-0.1
+    calibration = Calibration(
+        (0.2, 0.4, -0.5, 0.6, 1.0, 0.1), (0.3, 0.8, -0.1, 0.2, -2.0, -0.25), 0.4
+    )
+    a, none = (
+        np.exp(0.2 + 0.2 + 0.3 + 0.03 + 0.2) / 2,
+        np.exp(0.3 + 0.4 + 0.1 - 0.06 - 0.5) * 4**-0.1,
+    )
     odds = np.exp(-a * np.array([0.0, 0.5, 2.0, np.inf]))
     found = calibration.probabilities(np.array([0.0, 0.5, 2.0, np.inf]), known)
     np.testing.assert_allclose(found, (1 - 0.4 / 4) * odds / (none + odds.sum()))
@@ -338,14 +393,21 @@ def test_probabilities_by_hand():
 
 @pytest.mark.parametrize(
     ("probabilities", "angles", "one_of_two", "start"),
-    [((0.45, 0.35, 0.1), APART, True, "one of two: poses 180 degrees apart"),
-     ((0.5, 0.3, 0.18), APART, True, "one of two"),  # the third is below 1/e of the first
-     ((0.6, 0.2, 0.1), APART, False, ""),
-     ((0.4, 0.3, 0.2), APART, False, "3 poses more than 30 degrees apart"),
-     ((0.25, 0.2, 0.05), APART, False, "2 poses more than 30 degrees apart"),  # probably none is right
-     # 59.8 degrees apart: a third rotation may be near both.
-     ((0.45, 0.35, 0.1), APART / 3.01, False, "2 poses more than 30 degrees apart")],
-)  # fmt: skip
+    [
+        ((0.45, 0.35, 0.1), APART, True, "one of two: poses 180 degrees apart"),
+        ((0.5, 0.3, 0.18), APART, True, "one of two"),  # the third is below 1/e of the first
+        ((0.6, 0.2, 0.1), APART, False, ""),
+        ((0.4, 0.3, 0.2), APART, False, "3 poses more than 30 degrees apart"),
+        (
+            (0.25, 0.2, 0.05),
+            APART,
+            False,
+            "2 poses more than 30 degrees apart",
+        ),  # probably none is right
+        # 59.8 degrees apart: a third rotation may be near both.
+        ((0.45, 0.35, 0.1), APART / 3.01, False, "2 poses more than 30 degrees apart"),
+    ],
+)
 def test_an_answer_is_one_of_two_if_just_two_poses_far_apart_are_nearly_as_probable(
     probabilities, angles, one_of_two, start
 ):

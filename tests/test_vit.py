@@ -1,4 +1,5 @@
-"""The transformer against an independent one built from torch.nn.MultiheadAttention with the same weights."""
+"""The transformer against an independent one built from torch.nn.MultiheadAttention with the same
+weights."""
 
 import pytest
 import torch
@@ -26,18 +27,23 @@ def images() -> torch.Tensor:
 
 
 def oracle(vit: VisionTransformer, images: torch.Tensor):
-    """Output tokens, the facets of every block, attention of every block, by Conv2d and MultiheadAttention."""
+    """Output tokens, the facets of every block, attention of every block, by Conv2d and
+    MultiheadAttention."""
     weights = vit.state_dict()
     kernel, bias = weights["patch_embed.proj.weight"], weights["patch_embed.proj.bias"]
     patches = F.conv2d(images, kernel, bias, stride=PATCH)
-    x = torch.cat([weights["cls_token"].expand(len(images), 1, DIM), patches.flatten(2).transpose(1, 2)], 1)
+    x = torch.cat(
+        [weights["cls_token"].expand(len(images), 1, DIM), patches.flatten(2).transpose(1, 2)], 1
+    )
     x = x + weights["pos_embed"]
     facets, attentions = [], []
     for index in range(DEPTH):
         w = {key.removeprefix(f"blocks.{index}."): value for key, value in weights.items()}
         attention = nn.MultiheadAttention(DIM, HEADS, batch_first=True)
         names = {"in_proj_": "attn.qkv.", "out_proj.": "attn.proj."}
-        attention.load_state_dict({f"{a}{kind}": w[b + kind] for a, b in names.items() for kind in ("weight", "bias")})
+        attention.load_state_dict(
+            {f"{a}{kind}": w[b + kind] for a, b in names.items() for kind in ("weight", "bias")}
+        )
         normed = F.layer_norm(x, (DIM,), w["norm1.weight"], w["norm1.bias"], 1e-6)
         projections = F.linear(normed, w["attn.qkv.weight"], w["attn.qkv.bias"]).chunk(3, dim=-1)
         attended, probabilities = attention(normed, normed, normed, average_attn_weights=False)
@@ -47,7 +53,11 @@ def oracle(vit: VisionTransformer, images: torch.Tensor):
         hidden = F.gelu(F.linear(hidden, w["mlp.fc1.weight"], w["mlp.fc1.bias"]))
         x = x + F.linear(hidden, w["mlp.fc2.weight"], w["mlp.fc2.bias"])
         facets.append(dict(zip(("query", "key", "value", "token"), (*projections, x))))
-    return F.layer_norm(x, (DIM,), weights["norm.weight"], weights["norm.bias"], 1e-6), facets, attentions
+    return (
+        F.layer_norm(x, (DIM,), weights["norm.weight"], weights["norm.bias"], 1e-6),
+        facets,
+        attentions,
+    )
 
 
 @pytest.mark.parametrize("gradients", [False, True])
@@ -90,13 +100,17 @@ def test_state_dict_has_the_keys_and_shapes_of_dino_vits8():
     shapes |= {"patch_embed.proj.weight": (384, 3, 8, 8), "patch_embed.proj.bias": (384,)}
     layers = {"norm1": (384,), "attn.qkv": (1152, 384), "attn.proj": (384, 384), "norm2": (384,)}
     layers |= {"mlp.fc1": (1536, 384), "mlp.fc2": (384, 1536)}
-    for name, shape in [(f"blocks.{i}.{name}", shape) for i in range(12) for name, shape in layers.items()]:
+    for name, shape in [
+        (f"blocks.{i}.{name}", shape) for i in range(12) for name, shape in layers.items()
+    ]:
         shapes |= {f"{name}.weight": shape, f"{name}.bias": shape[:1]}
     shapes |= {"norm.weight": (384,), "norm.bias": (384,)}
     with torch.device("meta"):
         vit = VisionTransformer()
     assert {key: tuple(x.shape) for key, x in vit.state_dict().items()} == shapes
-    vit.load_state_dict({key: torch.empty(shape) for key, shape in shapes.items()}, strict=True, assign=True)
+    vit.load_state_dict(
+        {key: torch.empty(shape) for key, shape in shapes.items()}, strict=True, assign=True
+    )
     assert all(m.eps == 1e-6 for m in vit.modules() if isinstance(m, nn.LayerNorm))
 
 
@@ -107,7 +121,9 @@ def test_position_embedding_is_itself_on_its_own_grid_and_interpolated_on_others
     torch.testing.assert_close(resized[:, 0], model.pos_embed[:, 0])
     # DINO's own expression for an image of 24 x 48 pixels.
     stored = model.pos_embed[:, 1:].reshape(1, 4, 4, DIM).permute(0, 3, 1, 2)
-    expected = F.interpolate(stored, scale_factor=((24 // 8 + 0.1) / 4, (48 // 8 + 0.1) / 4), mode="bicubic")
+    expected = F.interpolate(
+        stored, scale_factor=((24 // 8 + 0.1) / 4, (48 // 8 + 0.1) / 4), mode="bicubic"
+    )
     torch.testing.assert_close(resized[:, 1:], expected.permute(0, 2, 3, 1).reshape(1, -1, DIM))
     with torch.no_grad():
         assert model.extract(torch.zeros(1, 3, 24, 48), 0).grid == (3, 6)

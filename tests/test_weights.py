@@ -21,7 +21,9 @@ def test_the_file_is_small_and_in_half_precision():
 
 
 def test_it_was_trained_on_none_of_the_categories_that_it_is_judged_by():
-    words = set(re.findall(r"\w+", (TINY.parent / "MODEL_CARD.md").read_text().partition("## Figures")[0]))
+    words = set(
+        re.findall(r"\w+", (TINY.parent / "MODEL_CARD.md").read_text().partition("## Figures")[0])
+    )
     assert TRAINING.keys() <= words
 
 
@@ -30,8 +32,13 @@ def crops():
     """Two target views of each of the demo's pairs, by category."""
     dataset, found = Co3D(sample_data()), {}
     for pair in demo_pairs(dataset):
-        frames = [dataset.frame(pair.category, pair.target_sequence, number) for number in pair.target_frames[1::2]]
-        found.setdefault(pair.category, []).extend(object_crop(dataset.load(frame)) for frame in frames)
+        frames = [
+            dataset.frame(pair.category, pair.target_sequence, number)
+            for number in pair.target_frames[1::2]
+        ]
+        found.setdefault(pair.category, []).extend(
+            object_crop(dataset.load(frame)) for frame in frames
+        )
     return found
 
 

@@ -1,4 +1,5 @@
-"""The widgets: every control has an effect, and the captions agree with the library at the values of the controls."""
+"""The widgets: every control has an effect, and the captions agree with the library at the values
+of the controls."""
 
 import re
 import sys
@@ -30,7 +31,11 @@ def values_of(control) -> list:
     """Return some values of a control."""
     if hasattr(control, "options"):
         return [value[1] if isinstance(value, tuple) else value for value in control.options]
-    return [True, False] if isinstance(control.value, bool) else [control.min, (control.min + control.max) // 2]
+    return (
+        [True, False]
+        if isinstance(control.value, bool)
+        else [control.min, (control.min + control.max) // 2]
+    )
 
 
 @pytest.mark.parametrize("name", [name for name in examples.WIDGETS if name != "label_poses"])
@@ -51,7 +56,9 @@ def test_every_control_changes_the_picture_and_going_back_restores_it(name):
 
 def test_no_module_imports_ipywidgets_before_a_widget_is_made():
     for path in Path(common.__file__).parent.glob("*.py"):
-        assert not re.search("^(from|import) ipywidgets", path.read_text(encoding="utf-8"), re.MULTILINE), path.name
+        assert not re.search(
+            "^(from|import) ipywidgets", path.read_text(encoding="utf-8"), re.MULTILINE
+        ), path.name
 
 
 def test_without_ipywidgets_the_error_has_the_command_that_installs_it(monkeypatch):
@@ -67,7 +74,11 @@ def sim():
 def test_attention_names_the_patch_with_the_largest_weight():
     backbone, widget = load_backbone("zsp-tiny", "cpu"), examples.attention()
     facets = features.all_facets(backbone, [examples.sample_pair().reference.rgb])
-    widget.controls["layer"].value, widget.controls["head"].value, widget.controls["row"].value = 4, 2, 20
+    widget.controls["layer"].value, widget.controls["head"].value, widget.controls["row"].value = (
+        4,
+        2,
+        20,
+    )
     heads, col = backbone.model.num_heads, widget.controls["col"].value
     q, k = (facets[4, name][0].unflatten(1, (heads, -1))[:, 2] for name in ("query", "key"))
     top = divmod(int((k @ q[1 + 20 * 28 + col])[1:].argmax()), 28)
@@ -77,10 +88,19 @@ def test_attention_names_the_patch_with_the_largest_weight():
 def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim):
     pair = examples.sample_pair()
     kinds, cells = {"one": sim, "other": -sim}, np.stack(np.divmod(sim.argmax(1).numpy(), 28), -1)
-    widget = features.patch_similarities(pair.reference.rgb, pair.target.rgb, kinds, pair.cells, pair.valid, "other")
-    widget.controls["kind"].value, widget.controls["row"].value, widget.controls["col"].value = "one", 15, 9
+    widget = features.patch_similarities(
+        pair.reference.rgb, pair.target.rgb, kinds, pair.cells, pair.valid, "other"
+    )
+    widget.controls["kind"].value, widget.controls["row"].value, widget.controls["col"].value = (
+        "one",
+        15,
+        9,
+    )
     row, col = cells[15 * 28 + 9]
-    assert f"nearest neighbour ({row}, {col}), cosine {sim[15 * 28 + 9].max():.2f}" in widget.caption.value
+    assert (
+        f"nearest neighbour ({row}, {col}), cosine {sim[15 * 28 + 9].max():.2f}"
+        in widget.caption.value
+    )
     right = correct_matches(cells.reshape(28, 28, 2), pair.cells)[pair.valid].mean()
     assert f"{right:.0%} have" in widget.caption.value
 
@@ -99,7 +119,9 @@ def test_the_cycle_has_the_cyclical_distance_and_names_the_background(sim):
     pair = examples.sample_views()
     widget = matching.cycle(*pair, sim)
     distances = -cyclical_distances(sim, (28, 28), (28, 28)).numpy()
-    valid = np.isfinite(cyclical_distances(sim, (28, 28), (28, 28), *(view.foreground for view in pair)).numpy())
+    valid = np.isfinite(
+        cyclical_distances(sim, (28, 28), (28, 28), *(view.foreground for view in pair)).numpy()
+    )
     for row, col in ((14, 14), (20, 8), (3, 25), (0, 0)):
         widget.controls["row"].value, widget.controls["col"].value = row, col
         assert f"u ({row}, {col}) →" in widget.caption.value
@@ -118,7 +140,10 @@ def test_the_caption_agrees_with_ransac():
         for name, value in (("trials", trials), ("threshold", threshold), ("seed", seed)):
             widget.controls[name].value = value
         sim3, inliers = ransac(source, target, threshold, trials, seed=seed, scale_range=(0.2, 5))
-        assert f"{inliers.sum()} of 40 matches are inliers; scale {sim3.scale:.2f}" in widget.caption.value
+        assert (
+            f"{inliers.sum()} of 40 matches are inliers; scale {sim3.scale:.2f}"
+            in widget.caption.value
+        )
         assert f"rotation error {rotation_error(sim3.R, TURN):.0f}°" in widget.caption.value
     line = np.outer(np.arange(40.0), [1, 2, 3])
     widget = alignment.ransac_settings(tuple(images), tuple(pixels), (line, line))

@@ -1,4 +1,5 @@
-"""The labelling widget without a browser: clicks are sent as messages, and every change is on disk at once."""
+"""The labelling widget without a browser: clicks are sent as messages, and every change is on disk
+at once."""
 
 import re
 
@@ -24,12 +25,16 @@ TURN = Rotation.random(random_state=4).as_matrix()
 
 @pytest.fixture
 def root(tmp_path):
-    """Three sequences: the cloud of a is that of best after a similarity transform, the cloud of b is shifted."""
+    """Three sequences: the cloud of a is that of best after a similarity transform, the cloud of b
+    is shifted."""
     sequences = [sequence_data("best", quality=3.0), sequence_data("a"), sequence_data("b")]
     points = np.random.default_rng(0).normal(size=(9000, 3)) * (1, 0.6, 0.4)
     colours = np.full(points.shape, 90, np.uint8)
     clouds = {"best": points, "a": 1.3 * points @ TURN.T + 2, "b": points + 1}
-    changed = [one.__class__(**{**vars(one), "points": clouds[one.name], "colours": colours}) for one in sequences]
+    changed = [
+        one.__class__(**{**vars(one), "points": clouds[one.name], "colours": colours})
+        for one in sequences
+    ]
     write_co3d(tmp_path, "chair", changed)
     return tmp_path
 
@@ -72,7 +77,9 @@ def message(box):
 def table(box, name):
     """Rows of a table as lists of texts."""
     rows = re.findall("<tr>.*?</tr>", box.tables[name].value, re.DOTALL)
-    return [[re.sub("<[^>]*>", "", cell) for cell in re.findall("<td.*?</td>", row)] for row in rows]
+    return [
+        [re.sub("<[^>]*>", "", cell) for cell in re.findall("<td.*?</td>", row)] for row in rows
+    ]
 
 
 def test_clicks_give_keypoints_and_an_accepted_label(labelling):
@@ -102,8 +109,14 @@ def test_a_new_widget_continues_an_earlier_session_and_shows_an_imported_label(r
     click_all(box, labelling, "sequence", "a", 2)
     again = Labelling(root, "chair")
     box = label_poses(again)
-    assert message(box) == "The earlier keypoints are loaded." and box.controls["sequence"].value == "a"
-    assert len(box.views["sequence"].widget.marks) == 2 and len(box.views["reference"].widget.marks) == 5
+    assert (
+        message(box) == "The earlier keypoints are loaded."
+        and box.controls["sequence"].value == "a"
+    )
+    assert (
+        len(box.views["sequence"].widget.marks) == 2
+        and len(box.views["reference"].widget.marks) == 5
+    )
     for button, left in (("undo", 1), ("redo", 0)):
         box.buttons[button].click()
         assert len(Labelling(root, "chair").picks("a")) == left
@@ -123,7 +136,9 @@ def test_proposals_are_looked_at_one_by_one_and_accepted_without_a_click(labelli
     assert "proposal is laid over" in message(box) and box.controls["overlay"].value
     first = box.controls["sequence"].value
     box.buttons["accept"].click()
-    np.testing.assert_allclose(read_labels(labelling.root, labelling.category)[first].trans[:3, :3], TURN, atol=1e-9)
+    np.testing.assert_allclose(
+        read_labels(labelling.root, labelling.category)[first].trans[:3, :3], TURN, atol=1e-9
+    )
     assert box.controls["sequence"].value != first and not box.buttons["accept"].disabled
 
 
@@ -132,7 +147,9 @@ def test_skip_and_next_go_through_the_open_sequences_and_the_slider_chooses_a_po
     box.controls["point"].value = 1234
     cursor = np.array(box.views["reference"].widget.cursor)
     box.buttons["pick"].click()
-    np.testing.assert_allclose(box.views["reference"]._to_view.apply(labelling.picks("best")[0]), cursor)
+    np.testing.assert_allclose(
+        box.views["reference"]._to_view.apply(labelling.picks("best")[0]), cursor
+    )
     box.buttons["undo"].click()
     box.buttons["next"].click()
     assert box.controls["sequence"].value == "best" and "on the reference first" in message(box)
@@ -152,7 +169,9 @@ def test_errors_are_one_line_in_the_widget(labelling):
     box = label_poses(labelling)
     beside = {"at": [5.0, 5.0], "view": np.eye(3).ravel().tolist(), "reach": 0.05}
     box.views["reference"].widget._handle_custom_msg(beside, [])
-    assert message(box) == "There is no point of the cloud at the click." and len(labelling.names) == 0
+    assert (
+        message(box) == "There is no point of the cloud at the click." and len(labelling.names) == 0
+    )
     click_all(box, labelling, "reference", "best", 3)
     box.controls["sequence"].value = "a"
     click(box, "sequence", corners(labelling, "a")[0])

@@ -1,4 +1,7 @@
-"""The checker of annotations. It is looked up by the name of its module, and `conftest` is the name of two."""
+"""The checker of annotations.
+
+It is looked up by the name of its module, and `conftest` is the name of two.
+"""
 
 from beartype import BeartypeConf, beartype
 

@@ -1,6 +1,7 @@
 """Conversion of AC3D models, FlightGear's format, to OBJ files with materials and textures.
 
-Textures are looked for beside the model and in the given folders, and written as PNG beside the OBJ file.
+Textures are looked for beside the model and in the given folders, and written as PNG beside the OBJ
+file.
 """
 
 import shlex
@@ -26,7 +27,9 @@ class Ac3dObject:
 
 def read_ac3d(path: Path) -> tuple[list[dict[str, list[float]]], list[Ac3dObject]]:
     """Return the materials (each a dict of numbers by keyword) and the objects of an AC3D file."""
-    lines = iter([line for line in path.read_bytes().decode("latin-1").splitlines() if line.strip()])
+    lines = iter(
+        [line for line in path.read_bytes().decode("latin-1").splitlines() if line.strip()]
+    )
     if not next(lines, "").startswith("AC3D"):
         raise InputError(f"{path} does not begin with AC3D")
     materials: list[dict[str, list[float]]] = []
@@ -44,7 +47,8 @@ def read_ac3d(path: Path) -> tuple[list[dict[str, list[float]]], list[Ac3dObject
 
 
 def convert(path: Path, out: Path, texture_folders: Sequence[Path] = ()) -> None:
-    """Write an AC3D model as OBJ with MTL and PNG files; textures may be beside it or in `texture_folders`."""
+    """Write an AC3D model as OBJ with MTL and PNG files; textures may be beside it or in
+    `texture_folders`."""
     materials, objects = read_ac3d(path)
     out.parent.mkdir(parents=True, exist_ok=True)
     obj, used, start, corner = [f"mtllib {out.stem}.mtl"], {}, 1, 1
@@ -53,7 +57,9 @@ def convert(path: Path, out: Path, texture_folders: Sequence[Path] = ()) -> None
         for material, corners in part.faces:
             name = used.setdefault((material, part.texture), f"m{len(used)}")
             obj += [f"vt {u:.6f} {v:.6f}" for _, u, v in corners]
-            face = " ".join(f"{start + vertex}/{corner + k}" for k, (vertex, _, _) in enumerate(corners))
+            face = " ".join(
+                f"{start + vertex}/{corner + k}" for k, (vertex, _, _) in enumerate(corners)
+            )
             obj += [f"usemtl {name}", f"f {face}"]
             corner += len(corners)
         start += len(part.vertices)
@@ -61,7 +67,12 @@ def convert(path: Path, out: Path, texture_folders: Sequence[Path] = ()) -> None
     for (index, texture), name in used.items():
         given = materials[index]
         numbers = {key: " ".join(map(str, given.get(key, [1, 1, 1]))) for key in ("rgb", "spec")}
-        mtl += [f"newmtl {name}", f"Kd {numbers['rgb']}", f"Ks {numbers['spec']}", f"Ns {given.get('shi', [10])[0]}"]
+        mtl += [
+            f"newmtl {name}",
+            f"Kd {numbers['rgb']}",
+            f"Ks {numbers['spec']}",
+            f"Ns {given.get('shi', [10])[0]}",
+        ]
         mtl.append(f"d {1 - given.get('trans', [0])[0]}")
         if texture:
             mtl.append(f"map_Kd {_write_texture(texture, path, out.parent, texture_folders)}")
@@ -80,7 +91,9 @@ def _material(words: list[str]) -> dict[str, list[float]]:
     return found
 
 
-def _read_object(lines: Iterator[str], rotation: np.ndarray, shift: np.ndarray, objects: list[Ac3dObject]) -> None:
+def _read_object(
+    lines: Iterator[str], rotation: np.ndarray, shift: np.ndarray, objects: list[Ac3dObject]
+) -> None:
     """Read one object and its children, which move with it."""
     turn, offset, vertices = np.eye(3), np.zeros(3), np.zeros((0, 3))
     texture, repeat, displacement = None, (1, 1), (0, 0)
@@ -91,7 +104,9 @@ def _read_object(lines: Iterator[str], rotation: np.ndarray, shift: np.ndarray, 
         if keyword == "loc":
             offset = np.array(rest, float)
         elif keyword == "rot":
-            turn = np.array(rest, float).reshape(3, 3).T  # rows of the file are the images of the axes
+            turn = (
+                np.array(rest, float).reshape(3, 3).T
+            )  # rows of the file are the images of the axes
         elif keyword == "data":
             left = int(rest[0])
             while left > 0:
@@ -103,7 +118,9 @@ def _read_object(lines: Iterator[str], rotation: np.ndarray, shift: np.ndarray, 
         elif keyword == "texoff":
             displacement = float(rest[0]), float(rest[1])
         elif keyword == "numvert":
-            vertices = np.array([next(lines).split()[:3] for _ in range(int(rest[0]))], float).reshape(-1, 3)
+            vertices = np.array(
+                [next(lines).split()[:3] for _ in range(int(rest[0]))], float
+            ).reshape(-1, 3)
         elif keyword == "SURF":
             is_polygon, material, corners = int(rest[0], 16) & 0xF == 0, 0, []
             for line_ in lines:
@@ -113,7 +130,10 @@ def _read_object(lines: Iterator[str], rotation: np.ndarray, shift: np.ndarray, 
                 elif key == "refs":
                     for _ in range(int(values[0])):
                         vertex, u, v = next(lines).split()[:3]
-                        u, v = float(u) * repeat[0] + displacement[0], float(v) * repeat[1] + displacement[1]
+                        u, v = (
+                            float(u) * repeat[0] + displacement[0],
+                            float(v) * repeat[1] + displacement[1],
+                        )
                         corners.append((int(vertex), u, v))
                     break
             if is_polygon and len(corners) >= 3:

@@ -1,8 +1,10 @@
-"""The drawings of the course: `python -m tools.drawings` writes them as SVG to notebooks/figures/ and docs/rooms.svg.
+"""The drawings of the course: `python -m tools.drawings` writes them as SVG to notebooks/figures/
+and docs/rooms.svg.
 
-One picture of the whole method (`method.svg`), a strip of its stages for the top of each notebook (`here_NN.svg`), and
-small drawings of single ideas. Two chairs made of boxes play the reference (blue) and the target (orange). The colours
-are those of the figures (Okabe and Ito), and a white ground makes the drawings legible on dark pages.
+One picture of the whole method (`method.svg`), a strip of its stages for the top of each notebook
+(`here_NN.svg`), and small drawings of single ideas. Two chairs made of boxes play the reference
+(blue) and the target (orange). The colours are those of the figures (Okabe and Ito), and a white
+ground makes the drawings legible on dark pages.
 """
 
 import re
@@ -69,19 +71,25 @@ class Photo:
     size: float  # side of the picture
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the places (N, 2) of points (N, 3) in the drawing, and their distances (N,) from the camera."""
+        """Return the places (N, 2) of points (N, 3) in the drawing, and their distances (N,) from
+        the camera."""
         angle, tilt = np.radians(self.azimuth), np.radians(20)
         right = np.array([-np.cos(angle), np.sin(angle), 0])
-        to_camera = np.array([np.sin(angle) * np.cos(tilt), np.cos(angle) * np.cos(tilt), np.sin(tilt)])
+        to_camera = np.array(
+            [np.sin(angle) * np.cos(tilt), np.cos(angle) * np.cos(tilt), np.sin(tilt)]
+        )
         up = np.cross(to_camera, right)
         centred = np.asarray(points, float) - [0, 0, 0.92]
         scale = self.size / 2.45
-        places = np.stack([centred @ right, -(centred @ up)], -1) * scale + np.add([self.x, self.y], self.size / 2)
+        places = np.stack([centred @ right, -(centred @ up)], -1) * scale + np.add(
+            [self.x, self.y], self.size / 2
+        )
         return places, -(centred @ to_camera)
 
     @cached_property
     def faces(self) -> list[tuple[str, np.ndarray, np.ndarray, float]]:
-        """Return the visible faces, far ones first: part, corners (4, 2), normal (3,), distance of the centre."""
+        """Return the visible faces, far ones first: part, corners (4, 2), normal (3,), distance of
+        the centre."""
         found = []
         for part, (centre, size) in self.chair.items():
             for axis in range(3):
@@ -93,7 +101,9 @@ class Photo:
                     others = [other for other in range(3) if other != axis]
                     corners = np.tile(normal, (4, 1))
                     corners[:, others] = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
-                    places, distances = self.project(np.array(centre) + corners * np.array(size) / 2)
+                    places, distances = self.project(
+                        np.array(centre) + corners * np.array(size) / 2
+                    )
                     found.append((part, places, normal, distances.mean()))
         return sorted(found, key=lambda face: -face[3])
 
@@ -101,17 +111,21 @@ class Photo:
         """Return where a place of `PLACES` is in the drawing, (2,)."""
         part, signs = PLACES[name]
         centre, size = self.chair[part]
-        return self.project(np.array([np.array(centre) + np.array(signs) * np.array(size) / 2]))[0][0]
+        return self.project(np.array([np.array(centre) + np.array(signs) * np.array(size) / 2]))[0][
+            0
+        ]
 
     def parts_at(self, points: np.ndarray) -> np.ndarray:
-        """Return the parts (N,) that the picture shows at points (N, 2) of the drawing; "" on the background."""
+        """Return the parts (N,) that the picture shows at points (N, 2) of the drawing; "" on the
+        background."""
         found = np.full(len(points), "", dtype=object)
         for part, corners, _, _ in self.faces:
             found[Polygon(corners).contains_points(points)] = part
         return found
 
     def dots(self, step: float) -> np.ndarray:
-        """Return places (N, 2) about `step` pixels apart on what the picture shows of the chair, far ones first."""
+        """Return places (N, 2) about `step` pixels apart on what the picture shows of the chair,
+        far ones first."""
         found = []
         for part, (a, b, c, d), _, _ in self.faces:
             along, across = (max(2, round(np.linalg.norm(end - a) / step)) for end in (b, d))
@@ -135,7 +149,9 @@ class Photo:
         faces = self.faces
         near, far = min(face[3] for face in faces), max(face[3] for face in faces)
         grey = [mix("#3A3A3A", "#C9C9C9", 1 - (face[3] - near) / (far - near)) for face in faces]
-        return self.ground() + "".join(polygon(face[1], fill, fill) for face, fill in zip(faces, grey, strict=True))
+        return self.ground() + "".join(
+            polygon(face[1], fill, fill) for face, fill in zip(faces, grey, strict=True)
+        )
 
     def ground(self, frame: str = LINE, thick: float = 1) -> str:
         return rect(self.x, self.y, self.size, self.size, PALE, frame, thick, corner=3)
@@ -155,43 +171,83 @@ def number(value: float) -> str:
 
 
 def attributes(**values: object) -> str:
-    pairs = ((key.rstrip("_").replace("_", "-"), value) for key, value in values.items() if value is not None)
-    return "".join(f' {key}="{number(value) if isinstance(value, int | float) else value}"' for key, value in pairs)
+    pairs = (
+        (key.rstrip("_").replace("_", "-"), value)
+        for key, value in values.items()
+        if value is not None
+    )
+    return "".join(
+        f' {key}="{number(value) if isinstance(value, int | float) else value}"'
+        for key, value in pairs
+    )
 
 
 def element(tag: str, content: str | None = None, **values: object) -> str:
-    return f"<{tag}{attributes(**values)}" + ("/>" if content is None else f">{content}</{tag}>") + "\n"
+    return (
+        f"<{tag}{attributes(**values)}"
+        + ("/>" if content is None else f">{content}</{tag}>")
+        + "\n"
+    )
 
 
 def rect(
-    x: float, y: float, width: float, height: float, fill: str, stroke: str | None = None, thick: float = 1,
+    x: float,
+    y: float,
+    width: float,
+    height: float,
+    fill: str,
+    stroke: str | None = None,
+    thick: float = 1,
     corner: float = 0,
-) -> str:  # fmt: skip
+) -> str:
     line = {} if stroke is None else {"stroke": stroke, "stroke_width": thick}
-    return element("rect", x=x, y=y, width=width, height=height, rx=corner or None, fill=fill, **line)
+    return element(
+        "rect", x=x, y=y, width=width, height=height, rx=corner or None, fill=fill, **line
+    )
 
 
 def polygon(corners: np.ndarray, fill: str, stroke: str | None = None) -> str:
     points = " ".join(f"{number(x)},{number(y)}" for x, y in corners)
     stroke = stroke or mix(fill, INK, 0.7)
-    return element("polygon", points=points, fill=fill, stroke=stroke, stroke_width=0.6, stroke_linejoin="round")
+    return element(
+        "polygon",
+        points=points,
+        fill=fill,
+        stroke=stroke,
+        stroke_width=0.6,
+        stroke_linejoin="round",
+    )
 
 
-def dot(place: np.ndarray, fill: str, radius: float = 4, stroke: str = "white", thick: float = 1.2) -> str:
-    return element("circle", cx=place[0], cy=place[1], r=radius, fill=fill, stroke=stroke, stroke_width=thick)
+def dot(
+    place: np.ndarray, fill: str, radius: float = 4, stroke: str = "white", thick: float = 1.2
+) -> str:
+    return element(
+        "circle", cx=place[0], cy=place[1], r=radius, fill=fill, stroke=stroke, stroke_width=thick
+    )
 
 
 def ring(place: np.ndarray, stroke: str, radius: float, thick: float) -> str:
-    return element("circle", cx=place[0], cy=place[1], r=radius, fill="none", stroke=stroke, stroke_width=thick)
+    return element(
+        "circle", cx=place[0], cy=place[1], r=radius, fill="none", stroke=stroke, stroke_width=thick
+    )
 
 
-def curve(path: str, stroke: str = INK, thick: float = 1.6, dash: str | None = None, head: bool = False) -> str:
+def curve(
+    path: str, stroke: str = INK, thick: float = 1.6, dash: str | None = None, head: bool = False
+) -> str:
     """Draw a path; with a head it is an arrow."""
     marker = f"url(#{_HEADS[stroke]})" if head else None
     return element(
-        "path", d=path, fill="none", stroke=stroke, stroke_width=thick, stroke_dasharray=dash, marker_end=marker,
+        "path",
+        d=path,
+        fill="none",
+        stroke=stroke,
+        stroke_width=thick,
+        stroke_dasharray=dash,
+        marker_end=marker,
         stroke_linecap="round",
-    )  # fmt: skip
+    )
 
 
 def straight(start: np.ndarray, end: np.ndarray, gap: float = 0) -> str:
@@ -212,40 +268,67 @@ def arc(start: np.ndarray, end: np.ndarray, bend: float, gap: float = 6) -> str:
         return a + (b - a) / np.linalg.norm(b - a) * gap
 
     (a, b), (c, d) = shorter(start, middle), shorter(end, middle)
-    return f"M{number(a)} {number(b)}Q{number(middle[0])} {number(middle[1])} {number(c)} {number(d)}"
+    return (
+        f"M{number(a)} {number(b)}Q{number(middle[0])} {number(middle[1])} {number(c)} {number(d)}"
+    )
 
 
-_HEADS = {INK: "ink", GREY: "grey", BLUE: "blue", ORANGE: "orange", GREEN: "green", VERMILLION: "red"}
+_HEADS = {
+    INK: "ink",
+    GREY: "grey",
+    BLUE: "blue",
+    ORANGE: "orange",
+    GREEN: "green",
+    VERMILLION: "red",
+}
 _TOKEN = re.compile(r"\*(.+?)\*|_\{(.+?)\}|\^\{(.+?)\}")
 
 
 def text(
-    content: str, x: float, y: float, size: float = 13, fill: str = INK, anchor: str = "start", bold: bool = False
+    content: str,
+    x: float,
+    y: float,
+    size: float = 13,
+    fill: str = INK,
+    anchor: str = "start",
+    bold: bool = False,
 ) -> str:
     """Draw a line of text; `*x*` is italic, `_{a}` a subscript, `^{b}` a superscript."""
     parts, end, back = [], 0, 0.0
     for found in [*_TOKEN.finditer(content), None]:
         plain = content[end : found.start() if found else None]
         if plain:
-            parts.append(f"<tspan{attributes(dy=back or None)}>{escape(plain)}</tspan>" if back else escape(plain))
+            parts.append(
+                f"<tspan{attributes(dy=back or None)}>{escape(plain)}</tspan>"
+                if back
+                else escape(plain)
+            )
             back = 0.0
         if found:
             italic, low, high = found.groups()
             if italic:
-                parts.append(f'<tspan font-style="italic"{attributes(dy=back or None)}>{escape(italic)}</tspan>')
+                parts.append(
+                    "<tspan "
+                    f'font-style="italic"{attributes(dy=back or None)}>{escape(italic)}</tspan>'
+                )
                 back = 0.0
             else:
                 shift = size * (0.28 if low else -0.38)
-                parts.append(
-                    f"<tspan{attributes(dy=shift + back, font_size=0.72 * size)}>{escape(low or high)}</tspan>"
-                )
+                style = attributes(dy=shift + back, font_size=0.72 * size)
+                parts.append(f"<tspan{style}>{escape(low or high)}</tspan>")
                 back = -shift
             end = found.end()
     weight = "bold" if bold else None
     return element(
-        "text", "".join(parts), x=x, y=y, font_size=size, fill=fill, text_anchor=None if anchor == "start" else anchor,
+        "text",
+        "".join(parts),
+        x=x,
+        y=y,
+        font_size=size,
+        fill=fill,
+        text_anchor=None if anchor == "start" else anchor,
         font_weight=weight,
-    )  # fmt: skip
+    )
 
 
 def group(content: str, x: float = 0, y: float = 0, scale: float = 1) -> str:
@@ -257,19 +340,31 @@ def svg(content: str, width: float, height: float, title: str, description: str)
     """Put a drawing on white ground, with a title and a description for those who cannot see it."""
     heads = "".join(
         element(
-            "marker", element("path", d="M0 0L9 4.5L0 9Z", fill=colour).strip(), id=name, markerUnits="userSpaceOnUse",
-            markerWidth=9, markerHeight=9, refX=7, refY=4.5, orient="auto",
+            "marker",
+            element("path", d="M0 0L9 4.5L0 9Z", fill=colour).strip(),
+            id=name,
+            markerUnits="userSpaceOnUse",
+            markerWidth=9,
+            markerHeight=9,
+            refX=7,
+            refY=4.5,
+            orient="auto",
         )
         for colour, name in _HEADS.items()
         if f"url(#{name})" in content
-    )  # fmt: skip
+    )
     defs = f"<defs>\n{heads}</defs>\n" if heads else ""
-    size = f'width="{number(width)}" height="{number(height)}" viewBox="0 0 {number(width)} {number(height)}"'
+    size = (
+        f'width="{number(width)}" height="{number(height)}" viewBox="0 0 {number(width)} '
+        f'{number(height)}"'
+    )
+    frame = rect(0.5, 0.5, width - 1, height - 1, "white", "#D9D9D4", 1, corner=10)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" role="img" '
         'aria-labelledby="title desc">\n'
-        f'<title id="title">{escape(title)}</title>\n<desc id="desc">{escape(description)}</desc>\n{defs}'
-        f"{rect(0.5, 0.5, width - 1, height - 1, 'white', '#D9D9D4', 1, corner=10)}{content}</svg>\n"
+        f'<title id="title">{escape(title)}</title>\n<desc '
+        f'id="desc">{escape(description)}</desc>\n{defs}'
+        f"{frame}{content}</svg>\n"
     )
 
 
@@ -281,7 +376,8 @@ def draw_images(words: bool = True) -> str:
     width, _ = PICTOGRAM
     reference = Photo(REFERENCE, 35, 2, 18, 76)
     targets = [
-        Photo(TARGET, azimuth, width - 76 - 12 * i, 30 - 12 * i, 76) for i, azimuth in ((2, 100), (1, 60), (0, 25))
+        Photo(TARGET, azimuth, width - 76 - 12 * i, 30 - 12 * i, 76)
+        for i, azimuth in ((2, 100), (1, 60), (0, 25))
     ]
     return reference.draw(BLUE) + "".join(target.draw(ORANGE) for target in targets)
 
@@ -289,7 +385,8 @@ def draw_images(words: bool = True) -> str:
 def draw_grid(x: float, y: float, size: float, cells: int, thick: float = 0.8) -> str:
     steps = [size * i / cells for i in range(1, cells)]
     path = "".join(
-        f"M{number(x + s)} {number(y)}v{number(size)}M{number(x)} {number(y + s)}h{number(size)}" for s in steps
+        f"M{number(x + s)} {number(y)}v{number(size)}M{number(x)} {number(y + s)}h{number(size)}"
+        for s in steps
     )
     return curve(path, "white", thick)
 
@@ -305,9 +402,17 @@ def draw_features(words: bool = True) -> str:
         shown = [part for part in grid.parts_at(inside) if part]
         if len(shown) > 2:
             colour = {"back": PINK, "seat": SKY}.get(max(set(shown), key=shown.count), GREEN)
-            found += rect(*corner, side, side, mix(colour, "white", 0.7 + 0.1 * ((3 * row + 5 * column) % 4)))
+            found += rect(
+                *corner, side, side, mix(colour, "white", 0.7 + 0.1 * ((3 * row + 5 * column) % 4))
+            )
     arrow = curve("M92 55H111", INK, 1.8, head=True)
-    return photo.draw(BLUE) + draw_grid(4, 13, 84, cells) + arrow + found + draw_grid(116, 13, 84, cells)
+    return (
+        photo.draw(BLUE)
+        + draw_grid(4, 13, 84, cells)
+        + arrow
+        + found
+        + draw_grid(116, 13, 84, cells)
+    )
 
 
 @cache
@@ -321,11 +426,19 @@ def draw_cycle(words: bool = True) -> str:
     return drawn
 
 
-def draw_walk(u: np.ndarray, v: np.ndarray, end: np.ndarray, size: float = 5, bend: float = 0.42) -> str:
+def draw_walk(
+    u: np.ndarray, v: np.ndarray, end: np.ndarray, size: float = 5, bend: float = 0.42
+) -> str:
     """Draw a cycle: from u to v (solid), from v to its end (dashed)."""
     there = curve(arc(u, v, bend, size + 3), INK, 2, head=True)
     back = curve(arc(v, end, 0.7 * bend, size + 4), INK, 2, "5 4", head=True)
-    return there + back + dot(u, BLUE, size) + dot(v, ORANGE, size) + dot(end, "white", size, BLUE, 2.2)
+    return (
+        there
+        + back
+        + dot(u, BLUE, size)
+        + dot(v, ORANGE, size)
+        + dot(end, "white", size, BLUE, 2.2)
+    )
 
 
 @cache
@@ -333,7 +446,9 @@ def draw_best_view(words: bool = True) -> str:
     drawn = ""
     for i, (azimuth, score) in enumerate(((110, 0.35), (30, 0.95), (-50, 0.6))):
         x, chosen = 4 + 68 * i, i == 1
-        drawn += Photo(TARGET, azimuth, x, 6, 60).draw(ORANGE, INK if chosen else LINE, 3 if chosen else 1)
+        drawn += Photo(TARGET, azimuth, x, 6, 60).draw(
+            ORANGE, INK if chosen else LINE, 3 if chosen else 1
+        )
         drawn += rect(x, 106 - 32 * score, 60, 32 * score, GREY if chosen else LINE, corner=2)
     return drawn
 
@@ -362,7 +477,9 @@ def draw_fit(words: bool = True) -> str:
     drawn = ""
     for i, (a, b) in enumerate(zip(first, second, strict=True)):
         wrong = i == 4
-        drawn += curve(straight(a, b, 6), VERMILLION if wrong else GREEN, 1.8, "4 4" if wrong else None)
+        drawn += curve(
+            straight(a, b, 6), VERMILLION if wrong else GREEN, 1.8, "4 4" if wrong else None
+        )
         if wrong:
             x, y = a + (b - a) * 0.72
             drawn += curve(f"M{x - 5:.1f} {y - 5:.1f}l10 10m0 -10l-10 10", VERMILLION, 2.4)
@@ -373,7 +490,9 @@ def draw_fit(words: bool = True) -> str:
 @cache
 def draw_pose(words: bool = True) -> str:
     photo = Photo(TARGET, 25, 52, 4, 102)
-    moved = Photo(_chair(0.87, 0.87, 0.73, 0.91, 0.12), 25, 52, 4, 102)  # the reference, scaled as a whole
+    moved = Photo(
+        _chair(0.87, 0.87, 0.73, 0.91, 0.12), 25, 52, 4, 102
+    )  # the reference, scaled as a whole
     drawn = photo.draw(mix(ORANGE, "white", 0.7)) + "".join(
         dot(place, BLUE, 1.8, "white", 0.4) for place in moved.dots(5.5)
     )
@@ -403,23 +522,49 @@ def draw_method() -> str:
     column = [MARGIN + left + gap + i * (panel + gap) for i in range(3)]
     below = MARGIN + row + 30
 
-    def draw_panel(x: float, y: float, title: str, notebook: str, lines: tuple[str, str], picture: str) -> str:
-        drawn = rect(x, y, panel, row, "#FBFBF9", LINE, 1.2, corner=8) + text(title, x + 12, y + 24, 15, bold=True)
+    def draw_panel(
+        x: float, y: float, title: str, notebook: str, lines: tuple[str, str], picture: str
+    ) -> str:
+        drawn = rect(x, y, panel, row, "#FBFBF9", LINE, 1.2, corner=8) + text(
+            title, x + 12, y + 24, 15, bold=True
+        )
         drawn += text(notebook, x + panel - 12, y + 24, 13, GREY, "end")
         drawn += group(picture, x + (panel - PICTOGRAM[0]) / 2, y + 40)
         return drawn + "".join(text(line, x + 12, y + 174 + 19 * i) for i, line in enumerate(lines))
 
     stages = [
         ("Features", "01", ("A network describes each", "patch by a vector Φ."), draw_features()),
-        ("Cycle", "02", ("Matches come first whose way", "*u* → *v* → *u*′ ends near *u*."), draw_cycle()),
-        ("Best view", "03", ("The view is chosen whose", "matches score highest."), draw_best_view()),
-        ("Depth", "04", ("Depth turns the patches *u*, *v*", "into the 3D points *x*, *y*."), draw_depth()),
-        ("Umeyama, RANSAC", "04", ("Of many fits, the one with", "which most matches agree."), draw_fit()),
+        (
+            "Cycle",
+            "02",
+            ("Matches come first whose way", "*u* → *v* → *u*′ ends near *u*."),
+            draw_cycle(),
+        ),
+        (
+            "Best view",
+            "03",
+            ("The view is chosen whose", "matches score highest."),
+            draw_best_view(),
+        ),
+        (
+            "Depth",
+            "04",
+            ("Depth turns the patches *u*, *v*", "into the 3D points *x*, *y*."),
+            draw_depth(),
+        ),
+        (
+            "Umeyama, RANSAC",
+            "04",
+            ("Of many fits, the one with", "which most matches agree."),
+            draw_fit(),
+        ),
         ("Pose", "05", ("*y* = *λRx* + *t* lays the", "reference on the target."), draw_pose()),
     ]
     drawn = ""
     for i, (title, notebook, lines, picture) in enumerate(stages):
-        drawn += draw_panel(column[i % 3], MARGIN if i < 3 else below, title, notebook, lines, picture)
+        drawn += draw_panel(
+            column[i % 3], MARGIN if i < 3 else below, title, notebook, lines, picture
+        )
     for y in (MARGIN + 95, below + 95):
         for x in column[1:]:
             drawn += curve(f"M{x - gap + 3} {y}h{gap - 8}", INK, 2.2, head=True)
@@ -427,10 +572,13 @@ def draw_method() -> str:
     middle, corner = below - 15, 8
     start, end = column[2] + panel / 2, column[0] + panel / 2
     drawn += curve(
-        f"M{start} {MARGIN + row + 3}V{middle - corner}q0 {corner} -{corner} {corner}H{end + corner}"
+        f"M{start} {MARGIN + row + 3}V{middle - corner}q0 {corner} -{corner} "
+        f"{corner}H{end + corner}"
         f"q-{corner} 0 -{corner} {corner}V{below - 5}",
-        INK, 2.2, head=True,
-    )  # fmt: skip
+        INK,
+        2.2,
+        head=True,
+    )
 
     height = below + row - MARGIN
     x = MARGIN
@@ -439,21 +587,33 @@ def draw_method() -> str:
     drawn += Photo(REFERENCE, 35, x + 12, MARGIN + 38, 104).draw(BLUE)
     drawn += Photo(REFERENCE, 35, x + 122, MARGIN + 86, 56).draw_depth()
     drawn += text("depth", x + 150, MARGIN + 78, 13, GREY, "middle")
-    drawn += text("one image of an object,", x + 12, MARGIN + 164) + text("with depth", x + 12, MARGIN + 183)
+    drawn += text("one image of an object,", x + 12, MARGIN + 164) + text(
+        "with depth", x + 12, MARGIN + 183
+    )
     y = MARGIN + 214
     drawn += curve(f"M{x + 12} {y - 12}h{left - 24}", LINE, 1.2)
     drawn += text("Target", x + 12, y + 14, 15, mix(ORANGE, INK, 0.68), bold=True)
     for i, azimuth in enumerate((110, 30, -50, 170)):
-        drawn += Photo(TARGET, azimuth, x + 12 + 86 * (i % 2), y + 24 + 75 * (i // 2), 68).draw(ORANGE)
-    for i, line in enumerate(("several images of another", "object, with depth and", "known cameras")):
+        drawn += Photo(TARGET, azimuth, x + 12 + 86 * (i % 2), y + 24 + 75 * (i // 2), 68).draw(
+            ORANGE
+        )
+    for i, line in enumerate(
+        ("several images of another", "object, with depth and", "known cameras")
+    ):
         drawn += text(line, x + 12, y + 187 + 18 * i)
     return svg(
-        drawn, WIDTH, below + row + MARGIN, "The method",
-        "From one image of a reference object and several images of a target object, both with depth, to the pose: "
-        "features of patches, cycles of nearest neighbours, choice of the best view, depth of the matched patches, a "
-        "fit by Umeyama's method in RANSAC, and the pose that lays the reference on the target. The numbers are those "
+        drawn,
+        WIDTH,
+        below + row + MARGIN,
+        "The method",
+        "From one image of a reference object and several images of a target object, both "
+        "with depth, to the pose: "
+        "features of patches, cycles of nearest neighbours, choice of the best view, depth "
+        "of the matched patches, a "
+        "fit by Umeyama's method in RANSAC, and the pose that lays the reference on the "
+        "target. The numbers are those "
         "of the notebooks.",
-    )  # fmt: skip
+    )
 
 
 # Where a notebook stands
@@ -489,26 +649,52 @@ def draw_here(notebook: str) -> str:
     for name, (title, draw) in STAGES.items():
         x, on = spans[name][0], name in here
         drawn += rect(
-            x, top, width, height, mix(SKY, "white", 0.22) if on else "white", BLUE if on else LINE, 3 if on else 1.2, 8
+            x,
+            top,
+            width,
+            height,
+            mix(SKY, "white", 0.22) if on else "white",
+            BLUE if on else LINE,
+            3 if on else 1.2,
+            8,
         )
         picture = group(draw(words=False), x + (width - 0.58 * PICTOGRAM[0]) / 2, top + 8, 0.58)
         drawn += picture if on else f'<g opacity="0.55">\n{picture}</g>\n'
-        drawn += text(title, x + width / 2, top + height - 10, 13, INK if on else GREY, "middle", bold=on)
+        drawn += text(
+            title, x + width / 2, top + height - 10, 13, INK if on else GREY, "middle", bold=on
+        )
         if name != "images":
-            drawn += curve(f"M{number(x - gap + 2)} {top + height / 2:g}h{gap - 6:g}", GREY, 2, head=True)
+            drawn += curve(
+                f"M{number(x - gap + 2)} {top + height / 2:g}h{gap - 6:g}", GREY, 2, head=True
+            )
     line, centre = top + height + 10, {name: x + w / 2 for name, (x, w) in spans.items()}
-    below_stage = {"images": ["10"], "features": ["09"], "best view": ["11"], "pose": ["08", "05", "07"]}
+    below_stage = {
+        "images": ["10"],
+        "features": ["09"],
+        "best view": ["11"],
+        "pose": ["08", "05", "07"],
+    }
     for stage, names in below_stage.items():
         stops = [AROUND[name][1] + AROUND[name][2] / 2 for name in names]
         path = f"M{number(centre[stage])} {top + height + 2}V{line}"
-        path += f"M{number(min([centre[stage], *stops]))} {line}H{number(max([centre[stage], *stops]))}"
+        path += (
+            f"M{number(min([centre[stage], *stops]))} {line}H{number(max([centre[stage], *stops]))}"
+        )
         path += "".join(f"M{number(stop)} {line}V{below}" for stop in stops)
         drawn += curve(path, LINE, 1.4)
     for name, (title, x, pill) in AROUND.items():
         on = name in here
         spans[name] = x, pill
         drawn += rect(x, below, pill, 28, BLUE if on else "white", BLUE if on else LINE, 1.2, 14)
-        drawn += text(f"{name} {title}", x + pill / 2, below + 18.5, 13, "white" if on else GREY, "middle", bold=on)
+        drawn += text(
+            f"{name} {title}",
+            x + pill / 2,
+            below + 18.5,
+            13,
+            "white" if on else GREY,
+            "middle",
+            bold=on,
+        )
     start, end = min(spans[name][0] for name in here), max(sum(spans[name]) for name in here)
     middle = (start + end) / 2
     if here[0] in STAGES:
@@ -516,38 +702,66 @@ def draw_here(notebook: str) -> str:
             drawn += curve(f"M{start} 27v-5H{end}v5", BLUE, 2)
         label = "you are here: the whole method" if here == WHOLE else "you are here"
         drawn += text(label, middle, 16, 13, BLUE, "middle", bold=True)
-        drawn += "" if here == WHOLE else polygon(np.array([[middle - 6, 21], [middle + 6, 21], [middle, 30]]), BLUE)
+        drawn += (
+            ""
+            if here == WHOLE
+            else polygon(np.array([[middle - 6, 21], [middle + 6, 21], [middle, 30]]), BLUE)
+        )
     else:
         foot = below + 28
-        drawn += polygon(np.array([[middle - 6, foot + 12], [middle + 6, foot + 12], [middle, foot + 3]]), BLUE)
+        drawn += polygon(
+            np.array([[middle - 6, foot + 12], [middle + 6, foot + 12], [middle, foot + 3]]), BLUE
+        )
         drawn += text("you are here", middle, foot + 27, 13, BLUE, "middle", bold=True)
-    names = ", ".join((STAGES | AROUND)[name][0] for name in here) if here != WHOLE else "the whole method"
+    names = (
+        ", ".join((STAGES | AROUND)[name][0] for name in here)
+        if here != WHOLE
+        else "the whole method"
+    )
     return svg(
-        drawn, WIDTH, below + 28 + (MARGIN if here[0] in STAGES else 36), f"Where notebook {notebook} stands",
-        f"The stages of the method in a row: images, features, cycle, best view, depth and RANSAC, pose. "
+        drawn,
+        WIDTH,
+        below + 28 + (MARGIN if here[0] in STAGES else 36),
+        f"Where notebook {notebook} stands",
+        "The stages of the method in a row: images, features, cycle, best view, depth and "
+        "RANSAC, pose. "
         f"Highlighted: {names}.",
-    )  # fmt: skip
+    )
 
 
 # Single ideas
 
 
-def draw_vector(x: float, y: float, colour: str, shades: tuple[float, ...], side: float = 15) -> str:
+def draw_vector(
+    x: float, y: float, colour: str, shades: tuple[float, ...], side: float = 15
+) -> str:
     """Draw a vector as a row of cells."""
-    cells = (rect(x + i * side, y, side, side, mix(colour, "white", share), "white") for i, share in enumerate(shades))
+    cells = (
+        rect(x + i * side, y, side, side, mix(colour, "white", share), "white")
+        for i, share in enumerate(shades)
+    )
     return "".join(cells)
 
 
-_SHADES = ((0.9, 0.35, 0.7, 0.2), (0.3, 0.8, 0.45, 0.95), (0.6, 0.25, 0.9, 0.5), (0.2, 0.6, 0.3, 0.8))
+_SHADES = (
+    (0.9, 0.35, 0.7, 0.2),
+    (0.3, 0.8, 0.45, 0.95),
+    (0.6, 0.25, 0.9, 0.5),
+    (0.2, 0.6, 0.3, 0.8),
+)
 
 
 def draw_query_key_value() -> str:
     width, height = 860, 330
     drawn = text("One patch, three vectors", 20, 32, 15, bold=True)
     drawn += Photo(REFERENCE, 35, 20, 96, 112).draw(BLUE) + draw_grid(20, 96, 112, 4)
-    drawn += rect(76, 124, 28, 28, "none", INK, 2.6) + text("patch *i*", 76, 230, 13, anchor="middle")
+    drawn += rect(76, 124, 28, 28, "none", INK, 2.6) + text(
+        "patch *i*", 76, 230, 13, anchor="middle"
+    )
     drawn += curve("M106 138H152", INK, 2, head=True)
-    drawn += draw_vector(158, 130, GREY, (0.7, 0.3, 0.85, 0.5)) + text("token_{i}", 188, 118, 13, anchor="middle")
+    drawn += draw_vector(158, 130, GREY, (0.7, 0.3, 0.85, 0.5)) + text(
+        "token_{i}", 188, 118, 13, anchor="middle"
+    )
     rows = (
         (56, BLUE, "query_{i}", "what the patch looks for"),
         (138, VERMILLION, "key_{i}", "what the patch offers"),
@@ -560,39 +774,64 @@ def draw_query_key_value() -> str:
     x = 570
     drawn += curve(f"M{x - 24} 20V{height - 20}", LINE, 1.2)
     drawn += text("What patch *i* receives", x, 32, 15, bold=True)
-    drawn += text("keys", x + 30, 62, 13, VERMILLION, "middle") + text("weights", x + 128, 62, 13, GREY, "middle")
+    drawn += text("keys", x + 30, 62, 13, VERMILLION, "middle") + text(
+        "weights", x + 128, 62, 13, GREY, "middle"
+    )
     drawn += text("values", x + 232, 62, 13, mix(GREEN, INK, 0.8), "middle")
-    for i, (weight, keys) in enumerate(zip((0.55, 0.25, 0.15, 0.05), np.roll(_SHADES, 1, 0), strict=True)):
+    for i, (weight, keys) in enumerate(
+        zip((0.55, 0.25, 0.15, 0.05), np.roll(_SHADES, 1, 0), strict=True)
+    ):
         y = 76 + 30 * i
-        drawn += draw_vector(x, y, VERMILLION, tuple(keys)) + rect(x + 84, y, 88 * weight / 0.55, 15, GREY)
+        drawn += draw_vector(x, y, VERMILLION, tuple(keys)) + rect(
+            x + 84, y, 88 * weight / 0.55, 15, GREY
+        )
         drawn += draw_vector(x + 202, y, mix(GREEN, "white", 0.35 + weight), _SHADES[i])
-    drawn += curve(f"M{x + 232} 196V222", INK, 2, head=True) + draw_vector(x + 202, 230, GREEN, (0.55, 0.4, 0.65, 0.4))
+    drawn += curve(f"M{x + 232} 196V222", INK, 2, head=True) + draw_vector(
+        x + 202, 230, GREEN, (0.55, 0.4, 0.65, 0.4)
+    )
     drawn += text("weighted sum", x + 190, 242, 13, anchor="end")
     drawn += text("weight_{ij} = softmax_{j} ( query_{i} · key_{j} / √*D* )", x, 282, 14)
     drawn += text("output_{i} = Σ_{j} weight_{ij} value_{j}", x, 310, 14)
     return svg(
-        drawn, width, height, "Query, key and value",
-        "Three matrices turn the token of a patch i into its query, its key and its value. The query is compared with "
-        "the keys of all patches. The softmax of these products gives weights, and patch i receives the weighted sum "
+        drawn,
+        width,
+        height,
+        "Query, key and value",
+        "Three matrices turn the token of a patch i into its query, its key and its value. "
+        "The query is compared with "
+        "the keys of all patches. The softmax of these products gives weights, and patch i "
+        "receives the weighted sum "
         "of the values.",
-    )  # fmt: skip
+    )
 
 
 def draw_cycles() -> str:
     width, height, size = 860, 280, 160
 
     def case(
-        x: float, title: str, places: tuple[str, str, str], off: tuple[float, float], lines: tuple[str, str]
+        x: float,
+        title: str,
+        places: tuple[str, str, str],
+        off: tuple[float, float],
+        lines: tuple[str, str],
     ) -> str:
         first, second = Photo(REFERENCE, 35, x, 50, size), Photo(TARGET, 30, x + 230, 50, size)
         u, v, end = first.place(places[0]), second.place(places[1]), first.place(places[2]) + off
-        drawn = text(title, x, 32, 15, bold=True) + first.draw(BLUE) + draw_grid(x, 50, size, 12, thick=0.6)
+        drawn = (
+            text(title, x, 32, 15, bold=True)
+            + first.draw(BLUE)
+            + draw_grid(x, 50, size, 12, thick=0.6)
+        )
         drawn += second.draw(ORANGE) + draw_grid(x + 230, 50, size, 12, thick=0.6)
         closed = max(np.abs(off)) > 0
-        drawn += curve(straight(u, end), GREEN if closed else VERMILLION, 3.5) + draw_walk(u, v, end, 6, 0.26)
+        drawn += curve(straight(u, end), GREEN if closed else VERMILLION, 3.5) + draw_walk(
+            u, v, end, 6, 0.26
+        )
         drawn += text("*v*", v[0] + 11, v[1] + 6, 16)
         if closed:
-            drawn += text("*u*", u[0] + 2, u[1] - 11, 16) + text("*u*′", end[0] - 4, end[1] + 24, 16)
+            drawn += text("*u*", u[0] + 2, u[1] - 11, 16) + text(
+                "*u*′", end[0] - 4, end[1] + 24, 16
+            )
         else:
             drawn += text("*u*", u[0] - 12, u[1] + 18, 16, anchor="end") + text(
                 "*u*′", end[0] - 11, end[1] + 19, 16, anchor="end"
@@ -600,21 +839,37 @@ def draw_cycles() -> str:
         return drawn + "".join(text(line, x, 236 + 21 * i, 14) for i, line in enumerate(lines))
 
     drawn = case(
-        20, "A short cycle", ("front left", "front left", "front left"), (12, 16),
-        ("*v* is the nearest neighbour of *u*, *u*′ that of *v*.",
-         "*u*′ is next to *u*: the match (*u*, *v*) ranks high."),
-    )  # fmt: skip
+        20,
+        "A short cycle",
+        ("front left", "front left", "front left"),
+        (12, 16),
+        (
+            "*v* is the nearest neighbour of *u*, *u*′ that of *v*.",
+            "*u*′ is next to *u*: the match (*u*, *v*) ranks high.",
+        ),
+    )
     drawn += curve(f"M430 20V{height - 20}", LINE, 1.2)
     drawn += case(
-        450, "A long cycle", ("foot left", "foot right", "top right"), (0, 0),
-        ("The way back leads to another part.", "*d*(*u*, *u*′) is large: the match (*u*, *v*) ranks low."),
-    )  # fmt: skip
+        450,
+        "A long cycle",
+        ("foot left", "foot right", "top right"),
+        (0, 0),
+        (
+            "The way back leads to another part.",
+            "*d*(*u*, *u*′) is large: the match (*u*, *v*) ranks low.",
+        ),
+    )
     return svg(
-        drawn, width, height, "The cycle",
-        "Left: from a patch u of the reference an arrow leads to its nearest neighbour v in the target, a dashed "
-        "arrow leads back to u', close to u, and the match ranks high. Right: the dashed arrow ends far from u, and "
+        drawn,
+        width,
+        height,
+        "The cycle",
+        "Left: from a patch u of the reference an arrow leads to its nearest neighbour v in "
+        "the target, a dashed "
+        "arrow leads back to u', close to u, and the match ranks high. Right: the dashed "
+        "arrow ends far from u, and "
         "the match ranks low.",
-    )  # fmt: skip
+    )
 
 
 def draw_axes(place: np.ndarray, turn: float, size: float = 30) -> str:
@@ -637,13 +892,19 @@ def draw_camera(place: np.ndarray, colour: str, flip: int) -> str:
 def draw_frames() -> str:
     width, height, y = 860, 290, 118
     x = [80, 255, 430, 605, 780]
-    names = (("camera of the", "reference image *i*"), ("world of the", "reference, *a*"),
-             ("frame of the", "category, 0"),
-             ("world of the", "target, *b*"), ("camera of the", "target view *j*"))  # fmt: skip
+    names = (
+        ("camera of the", "reference image *i*"),
+        ("world of the", "reference, *a*"),
+        ("frame of the", "category, 0"),
+        ("world of the", "target, *b*"),
+        ("camera of the", "target view *j*"),
+    )
     steps = ("(*T*^{cam}_{ai})^{−1}", "*T*_{0a}^{−1}", "*T*_{0b}", "*T*^{cam}_{bj}")
     kinds = "camera", "label", "label", "camera"
     drawn = text("From camera to camera, step by step", 20, 34, 15, bold=True)
-    drawn += draw_camera(np.array([x[0], y]), BLUE, 1) + draw_camera(np.array([x[4], y]), ORANGE, -1)
+    drawn += draw_camera(np.array([x[0], y]), BLUE, 1) + draw_camera(
+        np.array([x[4], y]), ORANGE, -1
+    )
     for place, turn in ((x[1], 12), (x[2], 0), (x[3], -20)):
         drawn += draw_axes(np.array([place - 4, y + 10]), turn)
     for i, (step, kind) in enumerate(zip(steps, kinds, strict=True)):
@@ -652,29 +913,42 @@ def draw_frames() -> str:
         drawn += text(step, (start + end) / 2, y - 14, 15, anchor="middle")
         drawn += text(kind, (start + end) / 2, y + 22, 13, GREY, "middle")
     for place, lines in zip(x, names, strict=True):
-        drawn += "".join(text(line, place, y + 62 + 18 * i, 13, anchor="middle") for i, line in enumerate(lines))
+        drawn += "".join(
+            text(line, place, y + 62 + 18 * i, 13, anchor="middle") for i, line in enumerate(lines)
+        )
     foot = y + 98
-    drawn += curve(f"M{x[0]} {foot}v12q0 10 10 10H{x[4] - 10}q10 0 10 -10V{foot + 4}", INK, 2.2, head=True)
+    drawn += curve(
+        f"M{x[0]} {foot}v12q0 10 10 10H{x[4] - 10}q10 0 10 -10V{foot + 4}", INK, 2.2, head=True
+    )
     formula = "the pose: *T* = *T*^{cam}_{bj} *T*_{0b} *T*_{0a}^{−1} (*T*^{cam}_{ai})^{−1}"
     drawn += text(formula, width / 2, foot + 48, 15, anchor="middle")
     return svg(
-        drawn, width, height, "The chain of frames",
-        "Five frames in a row: the camera of the reference image, the world of the reference sequence, the frame of "
-        "the category, the world of the target sequence, and the camera of the target view. Arrows between them are "
+        drawn,
+        width,
+        height,
+        "The chain of frames",
+        "Five frames in a row: the camera of the reference image, the world of the reference "
+        "sequence, the frame of "
+        "the category, the world of the target sequence, and the camera of the target view. "
+        "Arrows between them are "
         "the known cameras and the labels; one arrow from the first to the last is the pose.",
-    )  # fmt: skip
+    )
 
 
 def _frame_of(chair: Chair) -> np.ndarray:
-    """Return the corners (10, 3) of a chair: feet, seat and top, back before front; left and right alternate."""
-    feet = np.array([chair[f"leg {side}{end}"][0] for end in ("", " front") for side in ("left", "right")]) * [1, 1, 0]
+    """Return the corners (10, 3) of a chair: feet, seat and top, back before front; left and right
+    alternate."""
+    feet = np.array(
+        [chair[f"leg {side}{end}"][0] for end in ("", " front") for side in ("left", "right")]
+    ) * [1, 1, 0]
     seat, back = chair["seat"], chair["back"]
     tops = feet[:2] * [1, 0, 0] + [0, back[0][1], back[0][2] + back[1][2] / 2]
     return np.vstack([feet, feet + [0, 0, seat[0][2]], tops])
 
 
 def draw_mirror() -> str:
-    """Draw the best orthogonal matrix and the best rotation for matches that confuse the left and the right."""
+    """Draw the best orthogonal matrix and the best rotation for matches that confuse the left and
+    the right."""
     width, height, panel, size = 860, 300, 280, 176
     edges = [(0, 4), (1, 5), (2, 6), (3, 7), (4, 5), (5, 7), (7, 6), (6, 4), (4, 8), (5, 9), (8, 9)]
     x = _frame_of(REFERENCE)
@@ -685,15 +959,24 @@ def draw_mirror() -> str:
     fits = [(x - centre) @ (u * [1, 1, last] @ vt).T + centre for last in (1, sign)]
     panels = (
         ("The matches", ("They join the left of a chair", "with its right.")),
-        ("The best matrix: det = −1", ("Every point is on its match, but left", "is right now. No motion does this.")),
-        ("The best rotation: det = +1", ("The fit is worse. It is a motion,", "and so it is the answer.")),
+        (
+            "The best matrix: det = −1",
+            ("Every point is on its match, but left", "is right now. No motion does this."),
+        ),
+        (
+            "The best rotation: det = +1",
+            ("The fit is worse. It is a motion,", "and so it is the answer."),
+        ),
     )
     drawn = ""
     for i, (title, words) in enumerate(panels):
         left = 10 + panel * i
         drawn += text(title, left + panel / 2, 34, 15, anchor="middle", bold=True)
         if i == 0:
-            first, second = Photo(REFERENCE, 30, left + 4, 66, 126), Photo(REFERENCE, 30, left + 144, 66, 126)
+            first, second = (
+                Photo(REFERENCE, 30, left + 4, 66, 126),
+                Photo(REFERENCE, 30, left + 144, 66, 126),
+            )
             drawn += first.draw(BLUE) + second.draw(ORANGE)
             moved, colour, ends = first.project(x)[0], GREY, [8, 9, 6, 7]
         else:
@@ -711,11 +994,16 @@ def draw_mirror() -> str:
         if i:
             drawn += curve(f"M{left} 20V{height - 20}", LINE, 1.2)
     return svg(
-        drawn, width, height, "Mirror and rotation",
-        "A chair whose matches confuse left and right. The best orthogonal matrix puts every point on its match, but "
-        "it is a mirror, which no motion of the chair does. The best rotation leaves distances between the points, and "
+        drawn,
+        width,
+        height,
+        "Mirror and rotation",
+        "A chair whose matches confuse left and right. The best orthogonal matrix puts every "
+        "point on its match, but "
+        "it is a mirror, which no motion of the chair does. The best rotation leaves "
+        "distances between the points, and "
         "is the answer.",
-    )  # fmt: skip
+    )
 
 
 def draw_three() -> str:
@@ -723,9 +1011,17 @@ def draw_three() -> str:
     third = _chair(1.1, 1, 0.7, 0.7, 0.1)
     chairs = (REFERENCE, BLUE, (22, 66)), (TARGET, ORANGE, (182, 66)), (third, GREEN, (102, 190))
     panels = (
-        ("All right: it closes", (0, 0), ("0° + 0° = 0°: by way of *b* or", "directly, *c* stands the same.")),
+        (
+            "All right: it closes",
+            (0, 0),
+            ("0° + 0° = 0°: by way of *b* or", "directly, *c* stands the same."),
+        ),
         ("One error: it does not", (0, 180), ("0° + 180° ≠ 0°: one of the three", "is wrong.")),
-        ("Errors agree: it closes", (180, 180), ("180° + 180° = 0°: *b* is turned,", "only more objects can tell.")),
+        (
+            "Errors agree: it closes",
+            (180, 180),
+            ("180° + 180° = 0°: *b* is turned,", "only more objects can tell."),
+        ),
     )
     drawn = ""
     for i, (title, angles, words) in enumerate(panels):
@@ -733,26 +1029,53 @@ def draw_three() -> str:
         drawn += text(title, x + panel / 2, 34, 15, anchor="middle", bold=True)
         drawn += curve(f"M{x} 20V{height - 20}", LINE, 1.2) if i else ""
         for j, (chair, colour, (left, top)) in enumerate(chairs):
-            drawn += Photo(chair, 205 if i == 2 and j == 1 else 25, x + left, top, size).draw(colour)
+            drawn += Photo(chair, 205 if i == 2 and j == 1 else 25, x + left, top, size).draw(
+                colour
+            )
         a, b, c = (np.add(corner, size / 2) + [x, 0] for *_, corner in chairs)
         lines = (a, b, angles[0], (140, 90)), (b, c, angles[1], (220, 182)), (a, c, 0, (54, 182))
         for start, end, angle, at in lines:
-            drawn += curve(straight(start, end, 50), colour := VERMILLION if angle else INK, 2.2, head=True)
+            drawn += curve(
+                straight(start, end, 50), colour := VERMILLION if angle else INK, 2.2, head=True
+            )
             drawn += text(f"{angle}°", x + at[0], at[1], 14, colour, "middle", bold=True)
-        drawn += text("*a*", x + 10, 106, 15) + text("*b*", x + 262, 106, 15) + text("*c*", x + 186, 232, 15)
-        drawn += "".join(text(line, x + panel / 2, 306 + 20 * j, 14, anchor="middle") for j, line in enumerate(words))
+        drawn += (
+            text("*a*", x + 10, 106, 15)
+            + text("*b*", x + 262, 106, 15)
+            + text("*c*", x + 186, 232, 15)
+        )
+        drawn += "".join(
+            text(line, x + panel / 2, 306 + 20 * j, 14, anchor="middle")
+            for j, line in enumerate(words)
+        )
     return svg(
-        drawn, width, height, "Cycles of three objects",
-        "Three chairs a, b and c with arrows from a to b, b to c and a to c. If all turns are right, the way by b "
-        "agrees with the direct one. If one is half a turn off, it does not. If both of b are off, it does again.",
-    )  # fmt: skip
+        drawn,
+        width,
+        height,
+        "Cycles of three objects",
+        "Three chairs a, b and c with arrows from a to b, b to c and a to c. If all turns "
+        "are right, the way by b "
+        "agrees with the direct one. If one is half a turn off, it does not. If both of b "
+        "are off, it does again.",
+    )
 
 
 def draw_ransac() -> str:
     width, height, panel, radius = 860, 330, 280, 15
     random = np.random.default_rng(3)
     x = np.array(
-        [[-70, -60], [-22, -66], [34, -58], [72, -30], [60, 22], [24, 62], [-28, 58], [-72, 20], [-20, 0], [18, -8]],
+        [
+            [-70, -60],
+            [-22, -66],
+            [34, -58],
+            [72, -30],
+            [60, 22],
+            [24, 62],
+            [-28, 58],
+            [-72, 20],
+            [-20, 0],
+            [18, -8],
+        ],
         float,
     )
     y = x @ np.array([[0.96, -0.2], [0.2, 0.96]]).T + random.normal(0, 3.5, x.shape)
@@ -760,7 +1083,9 @@ def draw_ransac() -> str:
     samples = (2, 6, 8, 9), (0, 3, 5, 8)
     drawn = ""
     good = np.array([], int)
-    for i, title in enumerate(("A sample with wrong matches", "A sample of right matches", "Fitted to all inliers")):
+    for i, title in enumerate(
+        ("A sample with wrong matches", "A sample of right matches", "Fitted to all inliers")
+    ):
         left = 10 + panel * i
         sample = np.array(samples[i]) if i < 2 else good
         a, b = x[sample].mean(0), y[sample].mean(0)
@@ -777,8 +1102,11 @@ def draw_ransac() -> str:
                 picture += ring(a, INK, 8, 2)
         drawn += text(title, left + panel / 2, 34, 15, anchor="middle", bold=True)
         drawn += group(picture, left + panel / 2, 148)
-        words = (f"{inside.sum()} inliers of {len(x)}: forgotten", f"{inside.sum()} inliers of {len(x)}: kept",
-                 f"{inside.sum()} inliers: the result")[i]  # fmt: skip
+        words = (
+            f"{inside.sum()} inliers of {len(x)}: forgotten",
+            f"{inside.sum()} inliers of {len(x)}: kept",
+            f"{inside.sum()} inliers: the result",
+        )[i]
         drawn += text(words, left + panel / 2, 262, 14, anchor="middle")
         if i:
             drawn += curve(f"M{left} 20V270", LINE, 1.2)
@@ -792,10 +1120,15 @@ def draw_ransac() -> str:
     )
     drawn += "".join(mark + text(word, at, 305, 13, GREY) for mark, word, at in key)
     return svg(
-        drawn, width, height, "RANSAC",
-        "Three fits to the same matches, some of which are wrong. A sample with wrong matches has few inliers and is "
-        "forgotten, a sample of right matches has many and is kept, and the last fit uses all of its inliers.",
-    )  # fmt: skip
+        drawn,
+        width,
+        height,
+        "RANSAC",
+        "Three fits to the same matches, some of which are wrong. A sample with wrong "
+        "matches has few inliers and is "
+        "forgotten, a sample of right matches has many and is kept, and the last fit uses "
+        "all of its inliers.",
+    )
 
 
 def draw_scan() -> str:
@@ -810,18 +1143,28 @@ def draw_scan() -> str:
         for turn in np.radians(turns):
             away = np.array([np.cos(turn), -np.sin(turn)])
             drawn += _phone(middle + radius * away, -away)
-        drawn += text(title, x, 40, 15, anchor="middle", bold=True) + text("from above", x, 60, 13, GREY, "middle")
+        drawn += text(title, x, 40, 15, anchor="middle", bold=True) + text(
+            "from above", x, 60, 13, GREY, "middle"
+        )
     x, table, turn = 430, 226, np.radians(30)
     object_at = np.array([x + 60, table - 20])
     camera_at = object_at + 150 * np.array([-np.cos(turn), -np.sin(turn)])
-    drawn += curve(f"M{x - 120} {table}H{x + 120}", INK, 2) + rect(x + 40, table - 40, 40, 40, BLUE, corner=6)
-    drawn += curve(straight(camera_at, object_at, 24), GREY, 1.4, "5 4") + _phone(camera_at, object_at - camera_at)
+    drawn += curve(f"M{x - 120} {table}H{x + 120}", INK, 2) + rect(
+        x + 40, table - 40, 40, 40, BLUE, corner=6
+    )
+    drawn += curve(straight(camera_at, object_at, 24), GREY, 1.4, "5 4") + _phone(
+        camera_at, object_at - camera_at
+    )
     drawn += text("looking down by 30°", x, 40, 15, anchor="middle", bold=True)
     drawn += text("from the side; ½ to 1 m away", x, 60, 13, GREY, "middle")
     return svg(
-        drawn, width, height, "How to scan an object",
-        "A phone goes once around an object and looks down at it by 30 degrees; an arc shows one side only.",
-    )  # fmt: skip
+        drawn,
+        width,
+        height,
+        "How to scan an object",
+        "A phone goes once around an object and looks down at it by 30 degrees; an arc shows "
+        "one side only.",
+    )
 
 
 def _phone(place: np.ndarray, towards: np.ndarray) -> str:
@@ -837,7 +1180,8 @@ def _phone(place: np.ndarray, towards: np.ndarray) -> str:
 
 
 def _types(names: Iterable[str]) -> list[str]:
-    """Return the first of the types among imported names, at most two, in at most three lines of 11 letters."""
+    """Return the first of the types among imported names, at most two, in at most three lines of 11
+    letters."""
     lines = []
     for name in [name for name in names if name[0].isupper() and not name.isupper()][:2]:
         own = [""]
@@ -851,7 +1195,8 @@ def _types(names: Iterable[str]) -> list[str]:
 
 
 def draw_rooms() -> str:
-    """Draw the rooms on a diagonal; what one gives to another is at the right of the one and above the other."""
+    """Draw the rooms on a diagonal; what one gives to another is at the right of the one and above
+    the other."""
     across, down, wide, high = 74, 50, 68, 40
     centre = {room: np.array([51 + across * i, 34 + down * i]) for i, room in enumerate(ROOMS)}
     wires = parcels = boxes = ""
@@ -872,15 +1217,25 @@ def draw_rooms() -> str:
         "Shown are the types that are imported most; a dot: functions or constants only.",
         "Nothing flows back: the half below the rooms is empty.",
         "",
-        *(f"{room}: {modules.replace(' ', ', ')}" for room, modules in ROOMS.items() if room != modules),
+        *(
+            f"{room}: {modules.replace(' ', ', ')}"
+            for room, modules in ROOMS.items()
+            if room != modules
+        ),
     )
     foot = down * len(ROOMS)
     legend = text("The rooms of zsp_lite", 20, foot - 18 * len(words) - 8, 15, bold=True)
-    legend += "".join(text(line, 20, foot - 18 * (len(words) - 1 - i), 13) for i, line in enumerate(words))
+    legend += "".join(
+        text(line, 20, foot - 18 * (len(words) - 1 - i), 13) for i, line in enumerate(words)
+    )
     return svg(
-        wires + parcels + boxes + legend, 102 + across * (len(ROOMS) - 1), foot + 18, "The rooms of the library",
-        "The rooms on a diagonal, and the types that flow from each room to those after it, as the imports say.",
-    )  # fmt: skip
+        wires + parcels + boxes + legend,
+        102 + across * (len(ROOMS) - 1),
+        foot + 18,
+        "The rooms of the library",
+        "The rooms on a diagonal, and the types that flow from each room to those after it, "
+        "as the imports say.",
+    )
 
 
 DRAWINGS: dict[str, Callable[[], str]] = {
@@ -892,7 +1247,10 @@ DRAWINGS: dict[str, Callable[[], str]] = {
     "three": draw_three,
     "ransac": draw_ransac,
     "scan": draw_scan,
-    **{f"here_{notebook}": (lambda notebook=notebook: draw_here(notebook)) for notebook in sorted(HERE)},
+    **{
+        f"here_{notebook}": (lambda notebook=notebook: draw_here(notebook))
+        for notebook in sorted(HERE)
+    },
 }
 
 

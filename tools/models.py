@@ -5,10 +5,11 @@
     for file in *.deb; do dpkg-deb -x $file packages/${file%%_*}; done
     python -m tools.models tools/artists.json packages outputs/artists_models
 
-A catalogue names every model: package, file, licence, author and orientation. `artists.json` is that of the evaluation
-preset `artists`, `samples.json` that of `data_samples/`, `training.json` that of training, and `validation.json` that
-of the choice between weights. The models themselves are not part of this repository. Those under GPL may be rendered
-for evaluation only; neither they nor pictures of them are to be published.
+A catalogue names every model: package, file, licence, author and orientation. `artists.json` is
+that of the evaluation preset `artists`, `samples.json` that of `data_samples/`, `training.json`
+that of training, and `validation.json` that of the choice between weights. The models themselves
+are not part of this repository. Those under GPL may be rendered for evaluation only; neither they
+nor pictures of them are to be published.
 """
 
 import hashlib
@@ -42,7 +43,9 @@ class Source(msgspec.Struct, frozen=True, omit_defaults=True):
     sha256: str  # of the work's own file (of the archive member where `member` is given)
     licence: str
     author: str
-    licence_file: str  # where the licence was read: in the package, or in the archive beside the work
+    licence_file: (
+        str  # where the licence was read: in the package, or in the archive beside the work
+    )
     member: str = ""  # path of the work in the archive `file`
     title: str = ""  # that the author gave to the work
 
@@ -61,7 +64,10 @@ class Source(msgspec.Struct, frozen=True, omit_defaults=True):
             raise InputError(f"{path} has no {self.member}")
         data = place.read_bytes()
         if (found := hashlib.sha256(data).hexdigest()) != self.sha256:
-            raise InputError(f"{path} {self.member}: checksum {found}, expected {self.sha256} as in the catalogue")
+            raise InputError(
+                f"{path} {self.member}: checksum {found}, expected {self.sha256} as in the "
+                "catalogue"
+            )
         return data
 
 
@@ -85,7 +91,8 @@ def read_catalogue(path: Path) -> Catalogue:
 
 
 def build(packages: Path, out: Path, catalogue: Catalogue) -> None:
-    """Copy or convert every model of the catalogue to `out/CATEGORY/NAME/`; write its `models.json` and attribution.
+    """Copy or convert every model of the catalogue to `out/CATEGORY/NAME/`; write its `models.json`
+    and attribution.
 
     `packages` has one folder per unpacked package.
     """
@@ -101,7 +108,9 @@ def build(packages: Path, out: Path, catalogue: Catalogue) -> None:
             else:
                 folders = [packages / entry.package / entry.textures] if entry.textures else []
                 convert(source, target / f"{name}.obj", folders)
-            origin = f"{entry.package} {catalogue.packages[entry.package]}: {entry.member or entry.file}"
+            origin = (
+                f"{entry.package} {catalogue.packages[entry.package]}: {entry.member or entry.file}"
+            )
             infos[f"{category}/{name}"] = ModelInfo(
                 entry.front, "+y", entry.author, entry.licence, origin, _changes(entry)
             )
@@ -116,8 +125,10 @@ def attribution(catalogue: Catalogue) -> str:
         "# Attribution",
         "",
         f"The pictures show 3D models from these Debian packages: {packages}.",
-        "Each model was rotated, centred, scaled, and rendered in a room with a simulated camera and depth sensor; the",
-        "table lists further changes. The licence was read in the file of the last column, in the archive of the model",
+        "Each model was rotated, centred, scaled, and rendered in a room with a simulated "
+        "camera and depth sensor; the",
+        "table lists further changes. The licence was read in the file of the last column, "
+        "in the archive of the model",
         "or in the package.",
         "",
         "| model | title | author | licence | file | changes | licence read in |",
@@ -125,8 +136,14 @@ def attribution(catalogue: Catalogue) -> str:
     ]
     for category, models in catalogue.models.items():
         for name, entry in models.items():
-            licence = f"[{entry.licence}]({LICENCES[entry.licence]})" if entry.licence in LICENCES else entry.licence
-            file = f"{entry.file.rpartition('/')[2]}: {entry.member}" if entry.member else entry.file
+            licence = (
+                f"[{entry.licence}]({LICENCES[entry.licence]})"
+                if entry.licence in LICENCES
+                else entry.licence
+            )
+            file = (
+                f"{entry.file.rpartition('/')[2]}: {entry.member}" if entry.member else entry.file
+            )
             model, changes = f"{category}/{name}", _changes(entry)
             columns = (model, entry.title, entry.author, licence, file, changes, entry.licence_file)
             lines.append(f"| {' | '.join(columns)} |".replace("|  |", "| |"))
@@ -134,7 +151,9 @@ def attribution(catalogue: Catalogue) -> str:
 
 
 def _changes(entry: Entry) -> str:
-    changes = ["converted from AC3D"] * (not entry.member) + [f"{entry.front} taken as front"] * (entry.front != "+z")
+    changes = ["converted from AC3D"] * (not entry.member) + [f"{entry.front} taken as front"] * (
+        entry.front != "+z"
+    )
     return ", ".join(changes)
 
 

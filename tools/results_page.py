@@ -1,7 +1,7 @@
 """Put the tables of the stored runs into the pages: python -m tools.results_page.
 
-A table of a page stands between the lines <!-- table RUN NAME --> and <!-- end of table -->, without its notes: the
-figures of the paper, over all categories.
+A table of a page stands between the lines <!-- table RUN NAME --> and <!-- end of table -->,
+without its notes: the figures of the paper, over all categories.
 """
 
 import re
@@ -24,7 +24,9 @@ def updated(text: str) -> str:
         start, run, name, _, end = found.groups()
         summary = read_run(RUNS / run).summary
         (table,) = (one for one in every_table(summary) if one.name == name)
-        cells = table.cells[[title for title in table.cells if title.rpartition(": ")[2] in _FIGURES]]
+        cells = table.cells[
+            [title for title in table.cells if title.rpartition(": ")[2] in _FIGURES]
+        ]
         title = f"{table.title} ({max(row['n'] for row in summary['methods'].values()):,} pairs)"
         shown = Table(name, title, cells)
         return f"{start}{as_markdown(shown)}\n{end}"

@@ -1,4 +1,5 @@
-"""The rooms of the library, and what flows between them: the names that one room imports from another."""
+"""The rooms of the library, and what flows between them: the names that one room imports from
+another."""
 
 import ast
 from collections import Counter, defaultdict
@@ -28,19 +29,30 @@ ROOM_OF = {module: room for room, modules in ROOMS.items() for module in modules
 
 
 def modules() -> dict[str, Path]:
-    """Return the file of every module of the package but its `__init__`, by dotted name without "zsp_lite."."""
-    paths = {path: path.relative_to(PACKAGE).with_suffix("").parts for path in sorted(PACKAGE.rglob("*.py"))}
-    return {".".join(parts).removesuffix(".__init__"): path for path, parts in paths.items() if parts != ("__init__",)}
+    """Return the file of every module of the package but its `__init__`, by dotted name without
+    "zsp_lite."."""
+    paths = {
+        path: path.relative_to(PACKAGE).with_suffix("").parts
+        for path in sorted(PACKAGE.rglob("*.py"))
+    }
+    return {
+        ".".join(parts).removesuffix(".__init__"): path
+        for path, parts in paths.items()
+        if parts != ("__init__",)
+    }
 
 
 def imports() -> Iterator[tuple[str, str, int]]:
-    """Find every import, also inside functions: a module, "package.module.name" that it imports, and the line."""
+    """Find every import, also inside functions: a module, "package.module.name" that it imports,
+    and the line."""
     for module, path in modules().items():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 yield from ((module, alias.name, node.lineno) for alias in node.names)
             elif isinstance(node, ast.ImportFrom):
-                assert not node.level, f"{path}, line {node.lineno}: relative import, expected the full name"
+                assert not node.level, (
+                    f"{path}, line {node.lineno}: relative import, expected the full name"
+                )
                 # Where the public names of the package are defined.
                 homes = zsp_lite._HOME_OF if node.module == "zsp_lite" else {}
                 for alias in node.names:

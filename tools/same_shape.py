@@ -1,11 +1,12 @@
-"""Copy the models whose poses can be compared: those of one shape, with the same side in front (`same_shape.json`).
+"""Copy the models whose poses can be compared: those of one shape, with the same side in front
+(`same_shape.json`).
 
     python -m tools.same_shape training outputs/training_models outputs/training_shapes
     python -m tools.same_shape validation outputs/validation_models outputs/validation_shapes
 
-The catalogues `training.json` and `validation.json` group models by what they are. A ceiling fan and a table fan, or a
-desk and a lectern, have no pose in common that a picture could show. The models of this list were chosen from pictures
-of all models.
+The catalogues `training.json` and `validation.json` group models by what they are. A ceiling fan
+and a table fan, or a desk and a lectern, have no pose in common that a picture could show. The
+models of this list were chosen from pictures of all models.
 """
 
 import json

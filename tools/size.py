@@ -2,8 +2,9 @@
 
     python -m tools.size
 
-`tests/size_limits.csv` names the rooms, the pattern of their files and the limits; a test holds them. Lines are all
-lines of files of code; words are those of Markdown files and of the text cells of notebooks.
+`tests/size_limits.csv` names the rooms, the pattern of their files and the limits; a test holds
+them. Lines are all lines of files of code; words are those of Markdown files and of the text cells
+of notebooks.
 """
 
 import csv
@@ -41,7 +42,11 @@ def _lines(file: Path) -> int:
 def _words(file: Path) -> int:
     text = file.read_text(encoding="utf-8")
     if file.suffix == ".ipynb":
-        text = "\n".join("".join(one["source"]) for one in json.loads(text)["cells"] if one["cell_type"] == "markdown")
+        text = "\n".join(
+            "".join(one["source"])
+            for one in json.loads(text)["cells"]
+            if one["cell_type"] == "markdown"
+        )
     return len(text.split())
 
 

@@ -1,6 +1,8 @@
-"""Print the times that docs/scale.md quotes, and the memory: `python -m tools.speed`, from the root of the repository.
+"""Print the times that docs/scale.md quotes, and the memory: `python -m tools.speed`, from the root
+of the repository.
 
-All estimates are of one pair of the sample data with five target views. Times are medians; run it on an idle machine.
+All estimates are of one pair of the sample data with five target views. Times are medians; run it
+on an idle machine.
 """
 
 import resource
@@ -35,10 +37,14 @@ def seconds(function: Callable[[], object], repeats: int = REPEATS) -> float:
 
 
 def one_estimate() -> None:
-    """Make one estimate and print the peak memory of this process in bytes; `main` runs it in a new one."""
+    """Make one estimate and print the peak memory of this process in bytes; `main` runs it in a new
+    one."""
     dataset = Co3D(sample_data())
     ZeroShotPose(load_backbone(device="cpu")).estimate(*dataset.load_pair(example_pair(dataset)))
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024))
+    print(
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        * (1 if sys.platform == "darwin" else 1024)
+    )
 
 
 def main() -> None:
@@ -49,8 +55,14 @@ def main() -> None:
     tiny, dataset = load_backbone(device="cpu"), Co3D(sample_data())
     pair = example_pair(dataset)
     reference, targets = dataset.load_pair(pair)
-    images, large = [one.rgb for one in (reference, *targets)], Backbone(VisionTransformer(), "DINO", device="cpu")
-    report("forward pass of DINO ViT-S/8 with random weights, six images", 1000 * seconds(lambda: large(images)))
+    images, large = (
+        [one.rgb for one in (reference, *targets)],
+        Backbone(VisionTransformer(), "DINO", device="cpu"),
+    )
+    report(
+        "forward pass of DINO ViT-S/8 with random weights, six images",
+        1000 * seconds(lambda: large(images)),
+    )
     report(f"the same with {tiny.name}", 1000 * seconds(lambda: tiny(images)))
     for solver in ("paper", "verified"):
         method = ZeroShotPose(tiny, solver=solver)
@@ -60,7 +72,10 @@ def main() -> None:
             report(f"{solver} solver: {stage}", stages[stage])
         report(f"{solver} solver: all but features", sum(stages.values()) - stages["features"])
     frame = dataset.frame(pair.category, pair.target_sequence, pair.target_frames[0])
-    report("reading and features, per frame", 1000 * seconds(lambda: method.views([dataset.load(frame)])))
+    report(
+        "reading and features, per frame",
+        1000 * seconds(lambda: method.views([dataset.load(frame)])),
+    )
 
     keys = [torch.randn(28, 28, 384, generator=torch.Generator().manual_seed(i)) for i in range(6)]
     fast = seconds(lambda: similarities(keys[0], keys[1:]))

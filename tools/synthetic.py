@@ -21,15 +21,26 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("split", choices=SPLITS)
     for name, default in {"sequences": 4, "frames": 24, "seed": 0}.items():
         parser.add_argument(f"--{name}", type=int, default=default)
-    parser.add_argument("--heights", type=float, nargs=2, default=HEIGHTS, help="range of the cameras' mean elevation")
+    parser.add_argument(
+        "--heights",
+        type=float,
+        nargs=2,
+        default=HEIGHTS,
+        help="range of the cameras' mean elevation",
+    )
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args(arguments)
     builders = SPLITS[given.split]
     with writing(given.out):
         export_categories(
-            list(builders), given.out, given.sequences, given.frames, given.seed,
-            builders=builders, heights=tuple(given.heights),
-        )  # fmt: skip
+            list(builders),
+            given.out,
+            given.sequences,
+            given.frames,
+            given.seed,
+            builders=builders,
+            heights=tuple(given.heights),
+        )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,20 @@
-"""The categories that weights and constants are fitted to; none of them is evaluated (front +x, left +y, up +z)."""
+"""The categories that weights and constants are fitted to; none of them is evaluated (front +x,
+left +y, up +z)."""
 
 import numpy as np
 
 from zsp_lite.course.synthetic.assembly import Assembly, disc
-from zsp_lite.course.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
+from zsp_lite.course.synthetic.primitives import (
+    TAU,
+    box,
+    capsule,
+    cylinder,
+    ellipsoid,
+    extrusion,
+    lathe,
+    rod,
+    torus,
+)
 
 
 def quadruped(a: Assembly) -> None:
@@ -12,12 +23,18 @@ def quadruped(a: Assembly) -> None:
     a.add(capsule((-length / 2, 0, z), (length / 2, 0, z + a.u(-0.05, 0.1)), r * a.u(0.8, 1), r), 0)
     for x in (-length / 2, length / 2 - 0.05):
         foot = (x + a.u(-0.1, 0.1), r * 0.65, 0.06)
-        a.add(capsule((x, r * 0.6, z - 0.05), foot, a.u(0.08, 0.13), a.u(0.06, 0.1)), 0, mirror=True)
+        a.add(
+            capsule((x, r * 0.6, z - 0.05), foot, a.u(0.08, 0.13), a.u(0.06, 0.1)), 0, mirror=True
+        )
     head = np.array([length / 2 + a.u(0.1, 0.4), 0, z + a.u(0.25, 0.9)])
     a.add(capsule((length / 2, 0, z + 0.1), head, a.u(0.12, 0.2), a.u(0.1, 0.18)), 0)
     a.add(capsule(head, head + [a.u(0.2, 0.4), 0, -0.08], a.u(0.15, 0.24), a.u(0.09, 0.15)), 1)
     if a.chance(0.8):
-        a.add(ellipsoid((0.05, a.u(0.06, 0.12), a.u(0.1, 0.22)), head + [-0.05, 0.15, 0.2]), 2, mirror=True)
+        a.add(
+            ellipsoid((0.05, a.u(0.06, 0.12), a.u(0.1, 0.22)), head + [-0.05, 0.15, 0.2]),
+            2,
+            mirror=True,
+        )
     a.add(ellipsoid((0.04, 0.03, 0.04), head + [0.1, 0.15, 0.08]), 3, mirror=True)
     tail = (-length / 2 - r - a.u(0.1, 0.5), 0, z + a.u(-0.4, 0.4))
     a.add(capsule((-length / 2 - r * 0.6, 0, z + 0.1), tail, 0.06, 0.04), 2)
@@ -26,12 +43,25 @@ def quadruped(a: Assembly) -> None:
 def fish(a: Assembly) -> None:
     length, h = a.u(0.8, 1.2), a.u(0.3, 0.6)
     a.add(ellipsoid((length, a.u(0.15, 0.35), h)), 0)
-    tail = [[-length * 0.85, 0], [-length * 1.5, a.u(0.3, 0.55)], [-length * 1.3, 0], [-length * 1.5, -a.u(0.3, 0.55)]]
+    tail = [
+        [-length * 0.85, 0],
+        [-length * 1.5, a.u(0.3, 0.55)],
+        [-length * 1.3, 0],
+        [-length * 1.5, -a.u(0.3, 0.55)],
+    ]
     a.add(extrusion(tail, 0.06), 1)
-    fin = [[0.3 * length, h * 0.8], [-0.1 * length, h * 0.9 + a.u(0.15, 0.5)], [-0.5 * length, h * 0.7]]
+    fin = [
+        [0.3 * length, h * 0.8],
+        [-0.1 * length, h * 0.9 + a.u(0.15, 0.5)],
+        [-0.5 * length, h * 0.7],
+    ]
     a.add(extrusion(fin, 0.05), 1)
     a.add(ellipsoid((0.06, 0.05, 0.06), (length * 0.72, 0.14, h * 0.2)), 3, mirror=True)
-    a.add(ellipsoid((0.25, 0.04, 0.12)).rotated("z", -0.5).translated((0.15, 0.28, -0.1)), 2, mirror=True)
+    a.add(
+        ellipsoid((0.25, 0.04, 0.12)).rotated("z", -0.5).translated((0.15, 0.28, -0.1)),
+        2,
+        mirror=True,
+    )
 
 
 def teapot(a: Assembly) -> None:
@@ -41,14 +71,24 @@ def teapot(a: Assembly) -> None:
     a.add(ellipsoid((r * 0.5, r * 0.5, 0.12), (0, 0, h)), 1)
     a.add(ellipsoid((0.09, 0.09, 0.1), (0, 0, h + 0.15)), 2)
     a.add(rod((r * 0.75, 0, h * 0.35), (r * 1.25, 0, h * a.u(0.7, 1.1)), 0.14, 0.06), 0)
-    handle = torus(h * a.u(0.25, 0.35), a.u(0.04, 0.07), (0, 1, 0), (-r * 0.9, 0, h * 0.5), 1.05 * np.pi, 1.95 * np.pi)
+    handle = torus(
+        h * a.u(0.25, 0.35),
+        a.u(0.04, 0.07),
+        (0, 1, 0),
+        (-r * 0.9, 0, h * 0.5),
+        1.05 * np.pi,
+        1.95 * np.pi,
+    )
     a.add(handle, 2)
 
 
 def guitar(a: Assembly) -> None:
     r, neck = a.u(0.4, 0.55), a.u(1.0, 1.5)
     a.add(cylinder(r, r, 0.22, 24).rotated("y", np.pi / 2), 0)
-    a.add(cylinder(r * 0.75, r * 0.75, 0.22, 24).rotated("y", np.pi / 2).translated((0, 0, r * 1.1)), 0)
+    a.add(
+        cylinder(r * 0.75, r * 0.75, 0.22, 24).rotated("y", np.pi / 2).translated((0, 0, r * 1.1)),
+        0,
+    )
     a.add(cylinder(0.14, 0.14, 0.24, 16).rotated("y", np.pi / 2).translated((0.01, 0, r * 0.75)), 3)
     top = r * 1.6 + neck
     a.add(box((0.08, 0.12, neck), (0.1, 0, r * 1.6 + neck / 2)), 1)
@@ -85,7 +125,12 @@ def cart(a: Assembly) -> None:
     length, w, h, wheel = a.u(0.9, 1.4), a.u(0.6, 0.9), a.u(0.3, 0.7), a.u(0.12, 0.3)
     z, flare = wheel + 0.1, a.u(0, 0.2)
     a.add(box((length, w, 0.06), (0, 0, z)), 0)
-    panel = [[-length / 2, z], [length / 2, z], [length / 2 + flare, z + h], [-length / 2 - flare * 0.3, z + h]]
+    panel = [
+        [-length / 2, z],
+        [length / 2, z],
+        [length / 2 + flare, z + h],
+        [-length / 2 - flare * 0.3, z + h],
+    ]
     a.add(extrusion(panel, 0.05, "xz", w / 2), 0, mirror=True)
     for x in (-length / 2, length / 2 + flare * 0.5):
         a.add(box((0.05, w, h), (x, 0, z + h / 2)), 1)
@@ -99,7 +144,19 @@ def cart(a: Assembly) -> None:
 
 def rocket(a: Assembly) -> None:
     h, r = a.u(1.4, 2.2), a.u(0.25, 0.4)
-    a.add(lathe([[0.001, 0], [r * 0.7, 0], [r, h * 0.3], [r * 0.9, h * 0.65], [r * 0.4, h * 0.9], [0.001, h]]), 0)
+    a.add(
+        lathe(
+            [
+                [0.001, 0],
+                [r * 0.7, 0],
+                [r, h * 0.3],
+                [r * 0.9, h * 0.65],
+                [r * 0.4, h * 0.9],
+                [0.001, h],
+            ]
+        ),
+        0,
+    )
     a.add(torus(r * 0.45, 0.05, (1, 0, 0), (r * 0.85, 0, h * 0.6)), 1)
     a.add(ellipsoid((0.06, r * 0.4, r * 0.4), (r * 0.85, 0, h * 0.6)), 4)
     fin = extrusion([[r * 0.7, h * 0.3], [r + 0.4, 0], [r + 0.4, -0.25], [r * 0.6, 0.05]], 0.06)
@@ -117,7 +174,9 @@ def windmill(a: Assembly) -> None:
     vanes, turn = 3 + a.choice(3), a.u(0, TAU)
     outline = [[0.05, 0.02], [blade, 0.1 + a.u(0, 0.1)], [blade, -0.02], [0.05, -0.02]]
     for k in range(vanes):
-        a.add(extrusion(outline, 0.04, "yz").rotated("x", turn + k * TAU / vanes).translated(hub), 3)
+        a.add(
+            extrusion(outline, 0.04, "yz").rotated("x", turn + k * TAU / vanes).translated(hub), 3
+        )
     a.add(box((0.05, 0.2, 0.4), (r, 0, 0.2)), 4)
     a.add(box((0.04, 0.14, 0.14), (r * 0.95, 0.02, h * 0.5)), 4)
 

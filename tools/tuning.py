@@ -1,19 +1,22 @@
 """Fit the constants of the verified solver: the weights of the score, and the calibration.
 
-Run from the root of the repository. The weights are fitted on training categories, the calibration on validation
-categories, that neither the backbone nor the weights were fitted on. docs/rebuild.md makes the data:
+Run from the root of the repository. The weights are fitted on training categories, the calibration
+on validation categories, that neither the backbone nor the weights were fitted on. docs/rebuild.md
+makes the data:
 
     python -m tools.tuning weights outputs/training_poses:30 outputs/training:30
     python -m tools.tuning calibration outputs/{validation:60,validation_poses:60}
     python -m tools.tuning scans outputs/{validation:6,validation_poses:6}
 
-The last fits `category.OF_TWO`. FOLDER:PAIRS is a data folder and the number of pairs of each of its categories, in
-each setting of the target views: all around the object, and but for the weights also within arcs. Folders with
-categories of another side (`concepts.csv`) are refused. The tool prints the fitted values and how well they do on
-categories left out of the fit; the constants of the library are these, rounded.
+The last fits `category.OF_TWO`. FOLDER:PAIRS is a data folder and the number of pairs of each of
+its categories, in each setting of the target views: all around the object, and but for the weights
+also within arcs. Folders with categories of another side (`concepts.csv`) are refused. The tool
+prints the fitted values and how well they do on categories left out of the fit; the constants of
+the library are these, rounded.
 
-The weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the probability that one
-is correct is the softmax of their scores. They are fitted to hypotheses that the solver finds with its present weights.
+The weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the
+probability that one is correct is the softmax of their scores. They are fitted to hypotheses that
+the solver finds with its present weights.
 """
 
 import argparse
@@ -54,22 +57,31 @@ from zsp_lite.viz.reliability import reliability
 
 CONCEPTS = Path(__file__).with_name("concepts.csv")  # the side of every name of a category
 CORRECT_ANGLE = 30.0  # degrees
-# A hypothesis counts as correct to the degree exp(-(error / 12 degrees)^2); pairs without one above 0.3 are not used.
+# A hypothesis counts as correct to the degree exp(-(error / 12 degrees)^2); pairs without one above
+# 0.3 are not used.
 _SOFT_ANGLE, _MIN_CORRECTNESS = 12.0, 0.3
 _WEIGHT_RIDGE = 1e-2
 _CALIBRATION_RIDGE = 1e-3
 _SURE = 0.8  # confidences above this are reported by themselves
-# The settings of the target views, by what is fitted: their number, and the arc in degrees that they lie in.
+# The settings of the target views, by what is fitted: their number, and the arc in degrees that
+# they lie in.
 ALL_AROUND = 360.0
 _SETTINGS = {
     "weights": ((5, ALL_AROUND),),
-    "calibration": (*((n, ALL_AROUND) for n in (1, 2, 3, 5, 10)), *((5, arc) for arc in (30.0, 60.0, 90.0, 120.0))),
+    "calibration": (
+        *((n, ALL_AROUND) for n in (1, 2, 3, 5, 10)),
+        *((5, arc) for arc in (30.0, 60.0, 90.0, 120.0)),
+    ),
     # Degrees that each of two objects was seen around, and number of its target views.
     "scans": (
-        ((360.0, 5), (360.0, 5)), ((360.0, 3), (360.0, 3)), ((150.0, 5), (150.0, 5)), ((70.0, 5), (70.0, 5)),
-        ((360.0, 5), (1.0, 1)), ((100.0, 5), (360.0, 5)),
+        ((360.0, 5), (360.0, 5)),
+        ((360.0, 3), (360.0, 3)),
+        ((150.0, 5), (150.0, 5)),
+        ((70.0, 5), (70.0, 5)),
+        ((360.0, 5), (1.0, 1)),
+        ((100.0, 5), (360.0, 5)),
     ),
-}  # fmt: skip
+}
 _FRAMES = 1, 2, 4, 8  # reference frames of each object
 _Fit = TypeVar("_Fit")
 
@@ -85,7 +97,9 @@ class Outcome:
     setting: str  # of the target views, in words
     span: float  # angle in degrees that the usable target views span around the target
     n_views: int  # usable target views
-    nearest: Float[np.ndarray, " m"]  # degrees between the reference's camera and the nearest target view's
+    nearest: Float[
+        np.ndarray, " m"
+    ]  # degrees between the reference's camera and the nearest target view's
     view_std: float  # standard deviation of the target views' similarity to the reference
 
     @property
@@ -93,8 +107,11 @@ class Outcome:
         """How correct each hypothesis is, in [0, 1]."""
         return np.exp(-np.square(self.errors / _SOFT_ANGLE))
 
-    def ranked(self, weights: ScoreCoefficients) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """Return by how many nats each different pose is below the best under the weights, and its error."""
+    def ranked(
+        self, weights: ScoreCoefficients
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        """Return by how many nats each different pose is below the best under the weights, and its
+        error."""
         scores = self.terms @ np.array(astuple(weights))
         order = np.argsort(-scores, kind="stable")
         different = order[modes(self.angles[np.ix_(order, order)]) == np.arange(len(order))]
@@ -110,10 +127,14 @@ class Outcome:
 def collect_outcomes(
     root: Path, category: str, pairs: int, settings: Sequence[tuple[int, float]], seed: int = 0
 ) -> list[Outcome]:
-    """Run the verified solver on `pairs` pairs of a category in each setting; features are extracted once per image."""
+    """Run the verified solver on `pairs` pairs of a category in each setting; features are
+    extracted once per image."""
     torch.set_num_threads(1)
     dataset, backbone, outcomes = Co3D(root), load_backbone(device="cpu"), []
-    labels, name = read_labels(root, category), f"{root.name}/{category}"  # folders may share names of categories
+    labels, name = (
+        read_labels(root, category),
+        f"{root.name}/{category}",
+    )  # folders may share names of categories
     method = ZeroShotPose(backbone, solver="verified")
     numbers: dict[str, list[int]] = {}
     for frame in dataset.frame_list(category):
@@ -124,21 +145,33 @@ def collect_outcomes(
         return method.views([dataset.load(dataset.frame(category, sequence, number))])[0]
 
     for n_targets, arc in settings:
-        setting = f"{n_targets} views all around" if arc == ALL_AROUND else f"views within {arc:.0f} degrees"
+        setting = (
+            f"{n_targets} views all around"
+            if arc == ALL_AROUND
+            else f"views within {arc:.0f} degrees"
+        )
         for pair in sample_pairs(dataset, category, pairs, n_targets, seed):
             targets = [view(pair.target_sequence, number) for number in pair.target_frames]
             if arc < ALL_AROUND:
-                around = [view(pair.target_sequence, number) for number in sorted(numbers[pair.target_sequence])]
+                around = [
+                    view(pair.target_sequence, number)
+                    for number in sorted(numbers[pair.target_sequence])
+                ]
                 targets = views_within(around, arc, np.random.default_rng(pair.seed))
             reference = view(pair.reference_sequence, pair.reference_frame)
             ends = labels[pair.reference_sequence], labels[pair.target_sequence]
-            outcomes.append(solve_views(replace(method, seed=pair.seed), (name, setting), reference, targets, ends))
+            outcomes.append(
+                solve_views(
+                    replace(method, seed=pair.seed), (name, setting), reference, targets, ends
+                )
+            )
     return outcomes
 
 
 @dataclass(frozen=True, eq=False)
 class ScanOutcome:
-    """What an `Outcome` tells the calibration, of two objects that are solved from several frames of both."""
+    """What an `Outcome` tells the calibration, of two objects that are solved from several frames
+    of both."""
 
     category: str
     setting: str
@@ -146,15 +179,20 @@ class ScanOutcome:
     poses: tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]  # see `Outcome.ranked`
     known: Float[np.ndarray, "5"]
 
-    def ranked(self, weights: ScoreCoefficients | None) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    def ranked(
+        self, weights: ScoreCoefficients | None
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         return self.poses
 
     def evidence(self, weights: ScoreCoefficients | None) -> Float[np.ndarray, "5"]:
         return self.known
 
 
-def collect_scans(root: Path, category: str, pairs: int, settings: Sequence[tuple]) -> list[ScanOutcome]:
-    """Find the poses between `pairs` pairs of objects of a category from several frames of both, in each setting."""
+def collect_scans(
+    root: Path, category: str, pairs: int, settings: Sequence[tuple]
+) -> list[ScanOutcome]:
+    """Find the poses between `pairs` pairs of objects of a category from several frames of both, in
+    each setting."""
     torch.set_num_threads(1)
     dataset, labels, outcomes = Co3D(root), read_labels(root, category), []
     method = ZeroShotPose(load_backbone(device="cpu"), solver="verified")
@@ -165,7 +203,9 @@ def collect_scans(root: Path, category: str, pairs: int, settings: Sequence[tupl
         rng, frames, targets = np.random.default_rng(stable_hash(f"{ends}{setting}") >> 1), {}, {}
         for name, (arc, views) in zip(ends, setting):
             count = len(dataset.frames(category, name))
-            some = (rng.integers(count) + np.arange(max(1, round(count * arc / ALL_AROUND)))) % count
+            some = (
+                rng.integers(count) + np.arange(max(1, round(count * arc / ALL_AROUND)))
+            ) % count
             frames[name] = [int(some[k]) for k in spread(_FRAMES[-1], len(some))]
             targets[name] = [view(name, int(some[k])) for k in spread(views, len(some))]
         found = []
@@ -180,25 +220,35 @@ def collect_scans(root: Path, category: str, pairs: int, settings: Sequence[tupl
             some = [one for rank, one in found if rank % (_FRAMES[-1] // count) == 0]
             objects = synchronise(some).objects
             rotations = np.stack([objects[name].sim3.R for name in names])
-            sides = np.array([[names.index(one.reference), names.index(one.target)] for one in some])
+            sides = np.array(
+                [[names.index(one.reference), names.index(one.target)] for one in some]
+            )
             spans = np.array([one.span for one in some])
             margin, other, known = compare_two(_build_nodes(some, sides)[1], rotations, 1, spans)
             poses = [rotations[1]] if other is None else [rotations[1], other]
             errors = rotation_error(np.stack([one.T @ rotations[0] for one in poses]), true)
             seen = " and ".join(f"{views} views within {arc:.0f}°" for arc, views in setting)
             deficit = np.array([0.0, margin])[: len(poses)]
-            outcomes.append(ScanOutcome(f"{root.name}/{category}", seen, count, (deficit, errors), known))
+            outcomes.append(
+                ScanOutcome(f"{root.name}/{category}", seen, count, (deficit, errors), known)
+            )
     return outcomes
 
 
 def views_within(around: Sequence[View], arc: float, rng: np.random.Generator) -> list[View]:
-    """Draw two to ten views from a random arc of the views that go once around an object, in their order."""
-    points = [one.frame.camera.to_world(one.measured_points[0][one.known_foreground]) for one in around]
+    """Draw two to ten views from a random arc of the views that go once around an object, in their
+    order."""
+    points = [
+        one.frame.camera.to_world(one.measured_points[0][one.known_foreground]) for one in around
+    ]
     centre = np.median(np.concatenate(points), axis=0)
     first = int(rng.integers(len(around)))
     turned = [*around[first:], *around[:first]]
     count = 1
-    while count < len(turned) and view_span([one.frame.camera for one in turned[: count + 1]], centre) <= arc:
+    while (
+        count < len(turned)
+        and view_span([one.frame.camera for one in turned[: count + 1]], centre) <= arc
+    ):
         count += 1
     wanted = min(int(rng.choice([2, 3, 5, 10])), count)
     return [turned[k] for k in np.linspace(0, count - 1, wanted).round().astype(int)]
@@ -211,12 +261,18 @@ def solve_views(
     targets: Sequence[View],
     labels: tuple[PoseLabel, PoseLabel],
 ) -> Outcome:
-    """Run the verified solver on the views of a pair, of a category and setting, and measure its hypotheses."""
+    """Run the verified solver on the views of a pair, of a category and setting, and measure its
+    hypotheses."""
     targets = [targets[index] for index in usable_targets(targets)[0]]
-    solution = VerifiedSolver().solve(reference, targets, method.match_views(reference, targets), method.seed)
+    solution = VerifiedSolver().solve(
+        reference, targets, method.match_views(reference, targets), method.seed
+    )
 
     cameras = [target.frame.camera for target in targets]
-    true = [relative_pose(labels[0], reference.frame.camera, labels[1], camera)[:3, :3] for camera in cameras]
+    true = [
+        relative_pose(labels[0], reference.frame.camera, labels[1], camera)[:3, :3]
+        for camera in cameras
+    ]
     hypotheses = solution.hypotheses
     # Rotations to the targets' world, which hypotheses in different target views have in common.
     in_world = np.stack([cameras[one.view].R.T @ one.sim3.R for one in hypotheses])
@@ -236,15 +292,19 @@ def solve_views(
 def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> ScoreCoefficients:
     r"""Fit the weights of a conditional logit with soft labels.
 
-    Minimises -mean_pairs \log \sum_i softmax(S)_i c_i + ridge |w|^2 with c_i = \exp(-(error_i / 12 degrees)^2) and w
-    the weights per standard deviation of their terms.
+    Minimises -mean_pairs \log \sum_i softmax(S)_i c_i + ridge |w|^2 with c_i = \exp(-(error_i / 12
+    degrees)^2) and w the weights per standard deviation of their terms.
 
     Raises:
         InputError: No pair has a correct hypothesis among several.
     """
-    used = [one for one in outcomes if len(one.errors) > 1 and one.correctness.max() > _MIN_CORRECTNESS]
+    used = [
+        one for one in outcomes if len(one.errors) > 1 and one.correctness.max() > _MIN_CORRECTNESS
+    ]
     if not used:
-        raise InputError(f"{len(outcomes)} pairs, none with a correct hypothesis among several, expected some")
+        raise InputError(
+            f"{len(outcomes)} pairs, none with a correct hypothesis among several, expected some"
+        )
     std = np.concatenate([one.terms - one.terms.mean(axis=0) for one in used]).std(axis=0) + 1e-9
     # One row per pair, padded to the longest list with hypotheses of probability 0.
     shape = len(used), max(len(one.errors) for one in used)
@@ -277,20 +337,25 @@ def fit_calibration(
 ) -> Calibration:
     """Fit the calibration by maximum likelihood: which of the different poses, if any, is right?
 
-    Every category counts the same, so that the numbers of pairs chosen per category do not decide. The `ridge` is on
-    coefficients per standard deviation of the evidence. InputError if all estimates are right, or none is.
+    Every category counts the same, so that the numbers of pairs chosen per category do not decide.
+    The `ridge` is on coefficients per standard deviation of the evidence. InputError if all
+    estimates are right, or none is.
     """
     ranked = [one.ranked(weights) for one in outcomes]
     right = [np.flatnonzero(error < CORRECT_ANGLE) for _, error in ranked]
     if min(map(len, right)) > 0 or max(map(len, right)) == 0:
-        raise InputError(f"{len(outcomes)} pairs: all have a right pose or none has, expected both kinds")
+        raise InputError(
+            f"{len(outcomes)} pairs: all have a right pose or none has, expected both kinds"
+        )
     most = max(len(deficit) for deficit, _ in ranked)
     deficits = torch.full((len(outcomes), most), 1e3, dtype=torch.float64)
     for row, (deficit, _) in zip(deficits, ranked):
         row[: len(deficit)] = torch.from_numpy(deficit)
     target = torch.tensor([int(found[0]) if len(found) else most for found in right])
     count = Counter(one.category for one in outcomes)
-    importance = torch.tensor([1 / (count[one.category] * len(count)) for one in outcomes], dtype=torch.float64)
+    importance = torch.tensor(
+        [1 / (count[one.category] * len(count)) for one in outcomes], dtype=torch.float64
+    )
     known = np.array([one.evidence(weights) for one in outcomes])[:, 1:]
     mean, std = known.mean(axis=0), known.std(axis=0) + 1e-9
     x = torch.from_numpy(np.column_stack([np.ones(len(known)), (known - mean) / std]))
@@ -331,30 +396,38 @@ def report_weights(outcomes: Sequence[Outcome], present: ScoreCoefficients) -> l
     held_out = leave_out(outcomes, fit_weights)
     rows = (
         ("present weights", [one.ranked(present)[1][0] for one in outcomes]),
-        ("fitted weights, held-out category", [one.ranked(w)[1][0] for one, w in zip(outcomes, held_out)]),
+        (
+            "fitted weights, held-out category",
+            [one.ranked(w)[1][0] for one, w in zip(outcomes, held_out)],
+        ),
         ("most accurate hypothesis", [one.errors.min() for one in outcomes]),
     )
     return [
         f"{len(outcomes)} pairs of {len({one.category for one in outcomes})} categories",
         *(f"{name:35s}{_accuracy(np.array(errors))}" for name, errors in rows),
-        "fitted weights: " + ", ".join(f"{name} {value:.1f}" for name, value in asdict(fitted).items()),
+        "fitted weights: "
+        + ", ".join(f"{name} {value:.1f}" for name, value in asdict(fitted).items()),
     ]
 
 
 def report_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) -> list[str]:
-    """Format the fit of the calibration, and how well it holds on categories that the fit has not seen."""
+    """Format the fit of the calibration, and how well it holds on categories that the fit has not
+    seen."""
     fitted = fit_calibration(outcomes, weights)
     held_out = leave_out(outcomes, lambda some: fit_calibration(some, weights))
     first, others = [], []
     for one, calibration in zip(outcomes, held_out):
         deficit, error = one.ranked(weights)
-        pairs = list(zip(calibration.probabilities(deficit, one.evidence(weights)), error < CORRECT_ANGLE))
+        pairs = list(
+            zip(calibration.probabilities(deficit, one.evidence(weights)), error < CORRECT_ANGLE)
+        )
         first.append(pairs[0])
         others += pairs[1:]
     confidence, right = map(np.array, zip(*first))
     lines = [
         f"{len(outcomes)} outcomes of {len({one.category for one in outcomes})} categories",
-        f"scale: {_numbers(fitted.scale)}; none: {_numbers(fitted.none)}; unseen: {fitted.unseen:.3f}",
+        f"scale: {_numbers(fitted.scale)}; none: {_numbers(fitted.none)}; unseen: "
+        f"{fitted.unseen:.3f}",
         "confidence, held-out category:",
         str(reliability(confidence, right, min(10, len(right)))),
     ]
@@ -362,10 +435,14 @@ def report_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) 
     for setting in dict.fromkeys(settings.tolist()):
         chosen = settings == setting
         sure = chosen & (confidence > _SURE)
-        error = reliability(confidence[chosen], right[chosen], min(5, int(chosen.sum()))).calibration_error
+        error = reliability(
+            confidence[chosen], right[chosen], min(5, int(chosen.sum()))
+        ).calibration_error
         lines.append(
-            f"  {setting}: {chosen.sum()} outcomes, mean confidence {100 * confidence[chosen].mean():.0f} %, right "
-            f"{100 * right[chosen].mean():.0f} %, expected calibration error {100 * error:.1f} points; "
+            f"  {setting}: {chosen.sum()} outcomes, mean confidence "
+            f"{100 * confidence[chosen].mean():.0f} %, right "
+            f"{100 * right[chosen].mean():.0f} %, expected calibration error "
+            f"{100 * error:.1f} points; "
             f"{right[sure].sum()} of {sure.sum()} with a confidence above {_SURE} are right"
         )
     if others:
@@ -384,7 +461,8 @@ def _accuracy(errors: Float[np.ndarray, " n"]) -> str:
 
 
 def folder_and_pairs(text: str) -> tuple[Path, int]:
-    """Parse a tool's argument FOLDER:PAIRS, a data folder and the number of pairs of each of its categories."""
+    """Parse a tool's argument FOLDER:PAIRS, a data folder and the number of pairs of each of its
+    categories."""
     folder, _, pairs = text.rpartition(":")
     if not folder or not pairs.isdecimal() or int(pairs) < 1:
         raise argparse.ArgumentTypeError(f"{text}: expected FOLDER:PAIRS, PAIRS at least 1")
@@ -392,7 +470,8 @@ def folder_and_pairs(text: str) -> tuple[Path, int]:
 
 
 def check_sides(folders: Iterable[str | Path], side: str) -> None:
-    """Raise InputError if a data folder has a category that `concepts.csv` does not list for a side."""
+    """Raise InputError if a data folder has a category that `concepts.csv` does not list for a
+    side."""
     with CONCEPTS.open(newline="") as file:
         sides = {row["name"]: row["side"] for row in csv.DictReader(file)}
     for folder in folders:
@@ -403,14 +482,22 @@ def check_sides(folders: Iterable[str | Path], side: str) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(prog="python -m tools.tuning", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.tuning", description=__doc__.split("\n")[0]
+    )
     parser.add_argument("constants", choices=_SETTINGS, help="what to fit")
     parser.add_argument("data", nargs="+", type=folder_and_pairs, metavar="FOLDER:PAIRS")
     given = parser.parse_args(arguments)
     fit = given.constants
     try:
-        check_sides([folder for folder, _ in given.data], "training" if fit == "weights" else "validation")
-        jobs = [(root, category, pairs) for root, pairs in given.data for category in Co3D(root).categories()]
+        check_sides(
+            [folder for folder, _ in given.data], "training" if fit == "weights" else "validation"
+        )
+        jobs = [
+            (root, category, pairs)
+            for root, pairs in given.data
+            for category in Co3D(root).categories()
+        ]
         with ProcessPoolExecutor(os.cpu_count()) as pool:
             collect = collect_scans if fit == "scans" else collect_outcomes
             parts = pool.map(collect, *zip(*jobs), [_SETTINGS[fit]] * len(jobs))
@@ -418,7 +505,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         report = report_weights if fit == "weights" else report_calibration
         print("\n".join(report(outcomes, ScoreCoefficients())))
         if fit == "scans":
-            by_frames = [replace(one, setting=f"{one.frames} frames of each object") for one in outcomes]
+            by_frames = [
+                replace(one, setting=f"{one.frames} frames of each object") for one in outcomes
+            ]
             print("\n".join(report(by_frames, ScoreCoefficients())))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -1,12 +1,24 @@
-"""The categories for choices and calibration; none is trained on, none is evaluated (front +x, left +y, up +z)."""
+"""The categories for choices and calibration; none is trained on, none is evaluated (front +x, left
++y, up +z)."""
 
 import numpy as np
 
 from zsp_lite.course.synthetic.assembly import Assembly, disc
-from zsp_lite.course.synthetic.primitives import box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
+from zsp_lite.course.synthetic.primitives import (
+    box,
+    capsule,
+    cylinder,
+    ellipsoid,
+    extrusion,
+    lathe,
+    rod,
+    torus,
+)
 
 
-def _wheel(a: Assembly, x: float, y: float, radius: float, width: float, mirror: bool = True) -> None:
+def _wheel(
+    a: Assembly, x: float, y: float, radius: float, width: float, mirror: bool = True
+) -> None:
     """Add a wheel that stands on the ground, with its axis along y."""
     a.add(disc(radius, width, (x, y, radius)), 3, mirror)
     a.add(disc(radius * 0.5, width * 1.2, (x, y, radius)), 4, mirror)
@@ -23,13 +35,23 @@ def helicopter(a: Assembly) -> None:
     top = z + r * 1.2 + 0.2
     a.add(rod((0, 0, z), (0, 0, top), 0.05), 2)
     for k in range(blades):
-        blade = box((reach, 0.11, 0.03), (reach / 2, 0, top)).rotated("z", phase + 2 * np.pi * k / blades)
+        blade = box((reach, 0.11, 0.03), (reach / 2, 0, top)).rotated(
+            "z", phase + 2 * np.pi * k / blades
+        )
         a.add(blade, 2)
     a.add(torus(0.2, 0.025, (0, 1, 0), tail + [0, 0.08, 0.05]), 3)
     if a.chance(0.7):
-        a.add(rod((-length * 0.6, r * 0.8, 0.05), (length * 0.9, r * 0.8, 0.05), 0.035), 3, mirror=True)
+        a.add(
+            rod((-length * 0.6, r * 0.8, 0.05), (length * 0.9, r * 0.8, 0.05), 0.035),
+            3,
+            mirror=True,
+        )
         for x in (-0.3, 0.35):
-            a.add(rod((x * length, r * 0.4, z - r * 0.7), (x * length, r * 0.8, 0.05), 0.03), 3, mirror=True)
+            a.add(
+                rod((x * length, r * 0.4, z - r * 0.7), (x * length, r * 0.8, 0.05), 0.03),
+                3,
+                mirror=True,
+            )
     else:
         _wheel(a, length * 0.4, r * 0.7, 0.14, 0.1)
         _wheel(a, -length * 0.6, 0, 0.1, 0.1, mirror=False)
@@ -38,10 +60,17 @@ def helicopter(a: Assembly) -> None:
 def wheelbarrow(a: Assembly) -> None:
     length, w, wheel = a.u(0.9, 1.2), a.u(0.55, 0.8), a.u(0.2, 0.32)
     z, depth = wheel + a.u(0.15, 0.3), a.u(0.25, 0.45)
-    side = [[-length / 2, z + depth], [-length * 0.3, z], [length * 0.25, z], [length * a.u(0.55, 0.75), z + depth]]
+    side = [
+        [-length / 2, z + depth],
+        [-length * 0.3, z],
+        [length * 0.25, z],
+        [length * a.u(0.55, 0.75), z + depth],
+    ]
     a.add(extrusion(side, 0.05).translated((0, w / 2, 0)), 0, mirror=True)
     a.add(box((length * 0.6, w, 0.05), (0, 0, z)), 0)
-    a.add(rod((length * 0.3, 0, z + 0.02), (length * 0.6, 0, z + depth * 0.9), w * 0.45, w * 0.5), 0)
+    a.add(
+        rod((length * 0.3, 0, z + 0.02), (length * 0.6, 0, z + depth * 0.9), w * 0.45, w * 0.5), 0
+    )
     grip = np.array([-length / 2 - a.u(0.4, 0.7), w * 0.4, z + a.u(0.1, 0.4)])
     a.add(rod((length * 0.6, w * 0.15, wheel), grip, 0.04), 1, mirror=True)
     a.add(capsule(grip, grip + [-0.15, 0, 0.02], 0.06), 2, mirror=True)
@@ -57,7 +86,12 @@ def watering_can(a: Assembly) -> None:
     rose = tip - [r * 0.8, 0, h * 0.2]
     a.add(rod(tip, tip + 0.2 * rose / np.linalg.norm(rose), 0.05, a.u(0.12, 0.2)), 1)
     a.add(rod((r * 0.7, 0, h), tip * [0.8, 1, 1] - [0, 0, 0.15], 0.025), 2)
-    a.add(torus(h * a.u(0.3, 0.4), 0.05, (0, 1, 0), (-r * 0.85, 0, h * 0.55), np.pi * 0.95, np.pi * 2.05), 2)
+    a.add(
+        torus(
+            h * a.u(0.3, 0.4), 0.05, (0, 1, 0), (-r * 0.85, 0, h * 0.55), np.pi * 0.95, np.pi * 2.05
+        ),
+        2,
+    )
     if a.chance(0.5):
         a.add(cylinder(r * 1.05, r * 1.05, 0.08, 20).translated((0, 0, h * a.u(0.3, 0.7))), 3)
 
@@ -74,7 +108,9 @@ def vacuum_cleaner(a: Assembly) -> None:
     a.add(rod(hose, wand, 0.06), 3)
     a.add(box((0.22, a.u(0.5, 0.8), 0.1), wand), 2)
     if a.chance(0.5):
-        a.add(torus(0.16, 0.035, (0, 1, 0), (-length * 0.2, 0, 2 * r + 0.1), -np.pi / 2, np.pi / 2), 4)
+        a.add(
+            torus(0.16, 0.035, (0, 1, 0), (-length * 0.2, 0, 2 * r + 0.1), -np.pi / 2, np.pi / 2), 4
+        )
 
 
 def drill(a: Assembly) -> None:
@@ -110,7 +146,17 @@ def dinosaur(a: Assembly) -> None:
     a.add(capsule(chest + [0, r * 0.5, -0.05], foot, 0.1, 0.06), 1, mirror=True)
     for k in range(5):
         x = hip[0] - 0.3 + 0.25 * k
-        a.add(extrusion([[x - 0.1, z + r * 0.6], [x + 0.1, z + r * 0.6], [x - 0.05, z + r + a.u(0.15, 0.35)]], 0.05), 2)
+        a.add(
+            extrusion(
+                [
+                    [x - 0.1, z + r * 0.6],
+                    [x + 0.1, z + r * 0.6],
+                    [x - 0.05, z + r + a.u(0.15, 0.35)],
+                ],
+                0.05,
+            ),
+            2,
+        )
 
 
 def mailbox(a: Assembly) -> None:
@@ -148,10 +194,18 @@ def bed(a: Assembly) -> None:
     a.add(box((length, width, a.u(0.15, 0.3)), (0, 0, z)), 0)
     for end, height in ((1, a.u(0.65, 1.1)), (-1, a.u(0.35, 0.65))):
         a.add(box((0.08, width, height), (end * length / 2, 0, height / 2 + 0.08)), 1)
-        a.add(rod((end * length / 2, width / 2, 0), (end * length / 2, width / 2, height + 0.12), 0.05), 1, mirror=True)
+        a.add(
+            rod(
+                (end * length / 2, width / 2, 0), (end * length / 2, width / 2, height + 0.12), 0.05
+            ),
+            1,
+            mirror=True,
+        )
     top = z + 0.17
     if double:
-        a.add(ellipsoid((0.2, width * 0.2, 0.1), (length * 0.37, width * 0.24, top)), 2, mirror=True)
+        a.add(
+            ellipsoid((0.2, width * 0.2, 0.1), (length * 0.37, width * 0.24, top)), 2, mirror=True
+        )
     else:
         a.add(ellipsoid((0.2, width * 0.36, 0.1), (length * 0.37, 0, top)), 2)
     a.add(box((length * a.u(0.4, 0.65), width * 1.03, 0.12), (-length * 0.15, 0, top - 0.05)), 3)
@@ -174,8 +228,13 @@ def bathtub(a: Assembly) -> None:
 def skateboard(a: Assembly) -> None:
     length, w, z = a.u(1.6, 2.2), a.u(0.4, 0.55), 0.25
     a.add(box((length * 0.66, w, 0.05), (0, 0, z)), 0)
-    for end, reach, rise in ((1, a.u(0.2, 0.3), a.u(0.35, 0.6)), (-1, a.u(0.14, 0.22), a.u(0.15, 0.35))):
-        deck = box((length * reach, w * 0.92, 0.05), (length * reach / 2 - 0.01, 0, 0)).rotated("y", -rise)
+    for end, reach, rise in (
+        (1, a.u(0.2, 0.3), a.u(0.35, 0.6)),
+        (-1, a.u(0.14, 0.22), a.u(0.15, 0.35)),
+    ):
+        deck = box((length * reach, w * 0.92, 0.05), (length * reach / 2 - 0.01, 0, 0)).rotated(
+            "y", -rise
+        )
         deck = deck if end == 1 else deck.rotated("z", np.pi)
         a.add(deck.translated((end * length * 0.33, 0, z)), 0)
     for x in (-0.24 * length, 0.26 * length):
@@ -188,13 +247,22 @@ def skateboard(a: Assembly) -> None:
 def tram(a: Assembly) -> None:
     length, w, h, floor = a.u(2.4, 3.2), a.u(0.7, 0.9), a.u(0.7, 0.9), 0.15
     rake, belt, roof = a.u(0.1, 0.3), floor + h * 0.45, floor + h
-    front, rear = [[length / 2, floor], [length / 2, belt]], [[-length / 2, roof], [-length / 2, floor]]
+    front, rear = (
+        [[length / 2, floor], [length / 2, belt]],
+        [[-length / 2, roof], [-length / 2, floor]],
+    )
     a.add(extrusion([*front, [length / 2 - rake, roof], *rear], w), 0)
     screen = box((0.03, w * 0.8, h * 0.36)).rotated("y", -np.arctan(rake / (roof - belt)))
     a.add(screen.translated((length / 2 - rake / 2 + 0.01, 0, (belt + roof) / 2)), 4)
     a.add(box((0.03, w * 0.5, h * 0.3), (-length / 2, 0, (belt + roof) / 2)), 4)
     for k in range(4):
-        a.add(box((length * 0.15, 0.03, h * 0.3), ((k - 1.6) * length * 0.2, w / 2, (belt + roof) / 2)), 4, mirror=True)
+        a.add(
+            box(
+                (length * 0.15, 0.03, h * 0.3), ((k - 1.6) * length * 0.2, w / 2, (belt + roof) / 2)
+            ),
+            4,
+            mirror=True,
+        )
     a.add(ellipsoid((0.04, 0.07, 0.06), (length / 2, w * 0.32, floor + 0.17)), 5, mirror=True)
     a.add(box((0.04, 0.1, 0.08), (-length / 2, w * 0.35, floor + 0.2)), 6, mirror=True)
     for x in (-0.32, 0.32):
@@ -206,5 +274,14 @@ def tram(a: Assembly) -> None:
 
 # Long bodies whose ends differ only in details measure errors of half a turn.
 LONG_BODIES = (bed, bathtub, skateboard, tram)
-OTHERS = (helicopter, wheelbarrow, watering_can, vacuum_cleaner, drill, dinosaur, mailbox, excavator)
+OTHERS = (
+    helicopter,
+    wheelbarrow,
+    watering_can,
+    vacuum_cleaner,
+    drill,
+    dinosaur,
+    mailbox,
+    excavator,
+)
 VALIDATION = {build.__name__: build for build in (*OTHERS, *LONG_BODIES)}

@@ -47,18 +47,24 @@ def attention() -> Widget:
     image, backbone = sample_pair().reference.rgb, _backbone()
     facets = features.all_facets(backbone, [image])
     queries, keys = (
-        torch.cat([facets[layer, facet] for layer in range(backbone.model.depth)]) for facet in ("query", "key")
+        torch.cat([facets[layer, facet] for layer in range(backbone.model.depth)])
+        for facet in ("query", "key")
     )
     return features.attention(image, queries, keys, GRID, backbone.model.num_heads)
 
 
 def patch_similarities() -> Widget:
-    """`features.patch_similarities` on a sample pair: the keys of two layers, and those of the last with context."""
+    """`features.patch_similarities` on a sample pair: the keys of two layers, and those of the last
+    with context."""
     pair, (first, second) = sample_pair(), sample_views()
     tokens = features.all_facets(_backbone(), [pair.reference.rgb, pair.target.rgb])
-    sims = {f"layer {n}, key": similarity(*tokens[n, "key"][:, 1:].unflatten(1, GRID)) for n in (3, 11)}
+    sims = {
+        f"layer {n}, key": similarity(*tokens[n, "key"][:, 1:].unflatten(1, GRID)) for n in (3, 11)
+    }
     sims["bare key"] = key_similarities(first.features.keys, [second.features.keys])[0]
-    return features.patch_similarities(pair.reference.rgb, pair.target.rgb, sims, pair.cells, pair.valid)
+    return features.patch_similarities(
+        pair.reference.rgb, pair.target.rgb, sims, pair.cells, pair.valid
+    )
 
 
 def saliency() -> Widget:
@@ -76,7 +82,9 @@ def ransac_settings() -> Widget:
     pair = sample_views()
     found = match(pair[0].features, pair[1].features)
     images = tuple(view.frame.rgb for view in pair)
-    return alignment_widgets.ransac_settings(images, tuple(match_pixels(pair, found)), match_points(*pair, found))
+    return alignment_widgets.ransac_settings(
+        images, tuple(match_pixels(pair, found)), match_points(*pair, found)
+    )
 
 
 def one_outlier() -> Widget:
@@ -94,7 +102,8 @@ def box_to_mask() -> Widget:
 
 
 def label_poses() -> Widget:
-    """`labelling.label_poses` on a temporary copy of a sample category, with four keypoints on two objects."""
+    """`labelling.label_poses` on a temporary copy of a sample category, with four keypoints on two
+    objects."""
     folder = TemporaryDirectory(prefix="zsp-lite-")
     category = Co3D(sample_data()).categories()[0]
     shutil.copytree(sample_data() / category, Path(folder.name) / category)
@@ -112,9 +121,16 @@ def label_poses() -> Widget:
 WIDGETS: dict[str, Callable[[], Widget]] = {
     build.__name__: build
     for build in (
-        attention, patch_similarities, saliency, cycle, ransac_settings, one_outlier, box_to_mask, label_poses,
+        attention,
+        patch_similarities,
+        saliency,
+        cycle,
+        ransac_settings,
+        one_outlier,
+        box_to_mask,
+        label_poses,
     )
-}  # fmt: skip
+}
 
 
 @cache

@@ -10,7 +10,8 @@ Read the files in this order:
     pipeline     the method, composed of stages, each in a file of its own:
     views        object crop, features, foreground
     features     feature maps and log-binned descriptors
-    matching     cyclical distances and correspondences; matchers: the alternatives of the supplement
+    matching     cyclical distances and correspondences
+    matchers     the alternatives of the supplement
     best_view    selection of the target view to align with
     alignment    Umeyama's method in RANSAC
     points       points of the object
@@ -21,7 +22,7 @@ Read the files in this order:
 
     data, backbones, viz, io, benchmark, baselines, importers, cli
     verified     a solver beyond the paper that tests many poses in all target views
-    course       what the notebooks need besides: demo, samples, synthetic, labelling, training, widgets
+    course       what the notebooks need besides
 """
 
 import ast
@@ -30,10 +31,15 @@ from pathlib import Path
 
 __version__ = "0.3.0"
 
-# Public names, and the modules that hold them, stand in `__init__.pyi`, for editors too. They are imported on first
-# use: torch takes seconds to import, which `zsp-lite --help` does not need.
+# Public names, and the modules that hold them, stand in `__init__.pyi`, for editors too. They are
+# imported on first use: torch takes seconds to import, which `zsp-lite --help` does not need.
 _STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
-_HOME_OF = {one.name: node.module for node in _STUB.body if isinstance(node, ast.ImportFrom) for one in node.names}
+_HOME_OF = {
+    one.name: node.module
+    for node in _STUB.body
+    if isinstance(node, ast.ImportFrom)
+    for one in node.names
+}
 
 __all__ = ["__version__", *_HOME_OF]
 
@@ -42,7 +48,11 @@ def __getattr__(name: str):
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     home = importlib.import_module(_HOME_OF[name])
-    return vars(home)[name] if name in vars(home) else importlib.import_module(f"{home.__name__}.{name}")
+    return (
+        vars(home)[name]
+        if name in vars(home)
+        else importlib.import_module(f"{home.__name__}.{name}")
+    )
 
 
 def __dir__() -> list[str]:

@@ -53,7 +53,10 @@ def pair_solver(root: str, backbone: BackboneLike, threads: int) -> Evaluate:
         line: dict[str, Any] = {"pair": pair.key}
         with suppress(NoPoseError):
             found = hypotheses(PairProblem(pair, store))
-            line |= {"centre": found.centre.tolist(), "matrices": [one.matrix.tolist() for one in found.sim3s]}
+            line |= {
+                "centre": found.centre.tolist(),
+                "matrices": [one.matrix.tolist() for one in found.sim3s],
+            }
             line |= {"probabilities": found.probabilities.tolist(), "span": found.span}
         return line
 
@@ -72,21 +75,24 @@ def align_category(
 ) -> CategoryAlignment:
     """Align all objects of a category in one frame, without labels (see `category`).
 
-    Pairs whose views determine no pose are left out. A run in OUT is continued: pairs that it has are not solved again.
+    Pairs whose views determine no pose are left out. A run in OUT is continued: pairs that it has
+    are not solved again.
 
     Args:
         dataset: Data set.
         category: Name of the category.
         backbone: Backbone, or what `load_backbone` takes.
         sequences: Names of the sequences, one per object; None for all of the category.
-        pairs: Objects that each object is the reference of; None for all others, or from twelve objects on, for six.
+        pairs: Objects that each object is the reference of; None for all others, or from twelve
+            objects on, for six.
         targets: Target frames per pair of frames; each pair of objects becomes several of these
             (see `category.references_per_pair`).
         out: Folder of the run, which keeps the hypotheses of the pairs; None keeps nothing.
         executor: Number of processes, or any `Executor`.
 
     Raises:
-        InputError: Sequences are fewer than two, too short, or not connected by pairs with poses; OUT has another run.
+        InputError: Sequences are fewer than two, too short, or not connected by pairs with poses;
+            OUT has another run.
         FatalError: The backbone is broken, or a frame cannot be read.
     """
     chosen = {pair.key: pair for pair in object_pairs(dataset, category, sequences, pairs, targets)}
@@ -96,13 +102,26 @@ def align_category(
         open_workers(executor) as (pool, workers),
     ):
         settings = Settings(
-            data=str(dataset.root).encode(errors="replace").decode(), backbone=fingerprint(loaded), targets=targets,
-            library=[library_version()], methods={"alignment": "hypotheses of the verified solver"}, labels={},
-            calls=[Call(**environment(), workers=workers, rows=["alignment"], pairs={category: len(chosen)})],
-        )  # fmt: skip
+            data=str(dataset.root).encode(errors="replace").decode(),
+            backbone=fingerprint(loaded),
+            targets=targets,
+            library=[library_version()],
+            methods={"alignment": "hypotheses of the verified solver"},
+            labels={},
+            calls=[
+                Call(
+                    **environment(),
+                    workers=workers,
+                    rows=["alignment"],
+                    pairs={category: len(chosen)},
+                )
+            ],
+        )
         with open_run(folder, settings):
             make = partial(pair_solver, str(dataset.root.resolve()), backbone if pool else loaded)
-            evaluate_pairs(folder, make, dict.fromkeys(chosen.values(), ["alignment"]), pool, workers, _Line)
+            evaluate_pairs(
+                folder, make, dict.fromkeys(chosen.values(), ["alignment"]), pool, workers, _Line
+            )
         known = read_hypotheses(folder)
     found = [known[key] for key in chosen if key in known]
     if not found:
@@ -113,27 +132,36 @@ def align_category(
     return synchronise(found)
 
 
-def alignment_errors(found: CategoryAlignment, labels: Mapping[str, PoseLabel]) -> tuple[list[float], list[float]]:
-    """Compute the rotation errors in degrees of all ordered pairs of labelled objects, and of every pair alone."""
+def alignment_errors(
+    found: CategoryAlignment, labels: Mapping[str, PoseLabel]
+) -> tuple[list[float], list[float]]:
+    """Compute the rotation errors in degrees of all ordered pairs of labelled objects, and of every
+    pair alone."""
     turns = {name: labels[name].trans[:3, :3] for name in found.objects if name in labels}
     true = {(a, b): turns[b] @ turns[a].T for a, b in permutations(turns, 2)}
     together = [float(rotation_error(found.between(*pair).R, true[pair])) for pair in true]
     alone = [((one.reference, one.target), one.sim3s[0].R) for one in found.pairs]
-    return together, [float(rotation_error(rotation, true[pair])) for pair, rotation in alone if pair in true]
+    return together, [
+        float(rotation_error(rotation, true[pair])) for pair, rotation in alone if pair in true
+    ]
 
 
 def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
-    """Read the hypotheses that a run of `align_category` keeps, by the key of the pair of frames, for `synchronise`."""
+    """Read the hypotheses that a run of `align_category` keeps, by the key of the pair of frames,
+    for `synchronise`."""
     found = {}
     for line in (line for line in read_lines(out, _Line) if line.matrices):
         names = [part.rpartition(":")[0] for part in line.pair.split("/")[1:]]
         sim3s = tuple(map(Sim3.from_matrix, np.array(line.matrices)))
-        found[line.pair] = PairHypotheses(*names, sim3s, np.array(line.probabilities), np.array(line.centre), line.span)
+        found[line.pair] = PairHypotheses(
+            *names, sim3s, np.array(line.probabilities), np.array(line.centre), line.span
+        )
     return found
 
 
 def write_alignment(found: CategoryAlignment, out: str | Path) -> Path:
-    """Write the poses of all objects in the common frame, and the disagreements, to OUT/alignment.json."""
+    """Write the poses of all objects in the common frame, and the disagreements, to
+    OUT/alignment.json."""
     objects = {
         name: {
             "world_to_frame": one.sim3.matrix.tolist(),
@@ -144,20 +172,33 @@ def write_alignment(found: CategoryAlignment, out: str | Path) -> Path:
         for name, one in found.objects.items()
     }
     path = Path(out) / "alignment.json"
-    pairs = [{"pair": pair, "degrees": round(angle, 2)} for pair, angle in found.disagreements.items()]
+    pairs = [
+        {"pair": pair, "degrees": round(angle, 2)} for pair, angle in found.disagreements.items()
+    ]
     write_atomic(path, json.dumps({"objects": objects, "disagreements": pairs}, indent=1).encode())
     return path
 
 
 def write_labels(
-    found: CategoryAlignment, root: str | Path, category: str, kind: str = "class_labels", replace: bool = False
+    found: CategoryAlignment,
+    root: str | Path,
+    category: str,
+    kind: str = "class_labels",
+    replace: bool = False,
 ) -> Path:
-    """Write the alignment as pose labels to ROOT/KIND/CATEGORY/, in the format of the published code.
+    """Write the alignment as pose labels to ROOT/KIND/CATEGORY/, in the format of the published
+    code.
 
-    The first object is the reference. Without `replace`, InputError if one exists with other content.
+    The first object is the reference. Without `replace`, InputError if one exists with other
+    content.
     """
     reference, folder = next(iter(found.objects)), Path(root) / kind / category
     centre = found.objects[reference].centre
-    labels = {name: rigid_label(found.between(reference, name), centre, name, reference) for name in found.objects}
-    write_all({folder / f"{name}.json": label_bytes(label) for name, label in labels.items()}, replace)
+    labels = {
+        name: rigid_label(found.between(reference, name), centre, name, reference)
+        for name in found.objects
+    }
+    write_all(
+        {folder / f"{name}.json": label_bytes(label) for name, label in labels.items()}, replace
+    )
     return folder

@@ -9,14 +9,23 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from zsp_lite.errors import InputError, check_integer, check_magnitude, check_number, real_array, rotation_matrix
+from zsp_lite.errors import (
+    InputError,
+    check_integer,
+    check_magnitude,
+    check_number,
+    real_array,
+    rotation_matrix,
+)
 
-# Range of the scale between two objects of a category whose scenes are both scaled to unit standard deviation. The
-# paper gives none; without a range, RANSAC can shrink the source onto a dense part of the target.
+# Range of the scale between two objects of a category whose scenes are both scaled to unit standard
+# deviation. The paper gives none; without a range, RANSAC can shrink the source onto a dense part
+# of the target.
 SCALE_RANGE = (0.2, 5.0)
-# Points are treated as collinear, which leaves the rotation about their line undetermined, below these ratios of the
-# second to the first singular value: of a sample's covariance, a ratio of squared widths; and of a cloud, a ratio of
-# widths, above the rounding of float32 coordinates on a line.
+# Points are treated as collinear, which leaves the rotation about their line undetermined, below
+# these ratios of the second to the first singular value: of a sample's covariance, a ratio of
+# squared widths; and of a cloud, a ratio of widths, above the rounding of float32 coordinates on a
+# line.
 _COLLINEAR_SAMPLE, _COLLINEAR_CLOUD = 1e-6, 1e-5
 MOST_TRIALS = 10_000_000
 _BLOCK = 1_000_000  # residuals at a time: 24 MB of offsets
@@ -24,24 +33,35 @@ _BLOCK = 1_000_000  # residuals at a time: 24 MB of offsets
 
 @dataclass(frozen=True, eq=False)
 class Sim3:
-    """Similarity transform `y = scale * R @ x + t`, from reference-camera points to target-camera points."""
+    """Similarity transform `y = scale * R @ x + t`, from reference-camera points to target-camera
+    points."""
 
     scale: float  # positive, unitless
-    R: Float[np.ndarray, "3 3"]  # rotation; the nearest one of what is given (see `errors.rotation_matrix`)
+    R: Float[
+        np.ndarray, "3 3"
+    ]  # rotation; the nearest one of what is given (see `errors.rotation_matrix`)
     t: Float[np.ndarray, "3"]  # translation, in units of the target's scene
 
     def __post_init__(self):
         translation = real_array("Sim3: t", self.t, (3,)).copy()
         if not np.isfinite(translation).all() or not 0 < self.scale < np.inf:
-            raise InputError(f"Sim3: scale is {self.scale} and t {translation}, expected finite numbers, scale above 0")
+            raise InputError(
+                f"Sim3: scale is {self.scale} and t {translation}, expected finite numbers, "
+                "scale above 0"
+            )
         object.__setattr__(self, "scale", float(self.scale))
-        object.__setattr__(self, "R", rotation_matrix("Sim3: R", real_array("Sim3: R", self.R, (3, 3))))
+        object.__setattr__(
+            self, "R", rotation_matrix("Sim3: R", real_array("Sim3: R", self.R, (3, 3)))
+        )
         object.__setattr__(self, "t", translation)
 
     def __repr__(self) -> str:
         rows = (np.array2string(row, precision=4, suppress_small=True) for row in (*self.R, self.t))
         first, second, third, translation = rows
-        return f"Sim3(scale={self.scale:.4f}, t={translation},\n     R=[{first},\n        {second},\n        {third}])"
+        return (
+            f"Sim3(scale={self.scale:.4f}, t={translation},\n     R=[{first},\n        "
+            f"{second},\n        {third}])"
+        )
 
     @classmethod
     def identity(cls) -> "Sim3":
@@ -76,7 +96,8 @@ class Sim3:
 
 
 def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = True) -> Sim3:
-    """Fit the similarity that minimises sum |target - (scale * R @ source + t)|^2 (paper eq. 4; Umeyama 1991).
+    """Fit the similarity that minimises sum |target - (scale * R @ source + t)|^2 (paper eq. 4;
+    Umeyama 1991).
 
     Args:
         source: (N, 3) points, N >= 3, NumPy or torch.
@@ -87,8 +108,9 @@ def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = True) -> Si
         The best similarity. Its R is a rotation even where a reflection would fit better.
 
     Raises:
-        InputError: Shapes are wrong or unequal, there are fewer than 3 points, values are not finite, or the points
-            are all equal or collinear (which leaves the rotation about their line undetermined).
+        InputError: Shapes are wrong or unequal, there are fewer than 3 points, values are not
+            finite, or the points are all equal or collinear (which leaves the rotation about their
+            line undetermined).
     """
     source, target = _point_pairs(source, target, minimum=3)
     scale_range = (0.0, np.inf) if with_scale else (1.0, 1.0)
@@ -99,13 +121,16 @@ def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = True) -> Si
 def nearest_rotation(
     covariance: Float[np.ndarray, "b 3 3"],
 ) -> tuple[Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, " b"]]:
-    """Solve the orthogonal Procrustes problem for rotations: argmax_R trace(R^T @ covariance) (Umeyama 1991).
+    """Solve the orthogonal Procrustes problem for rotations: argmax_R trace(R^T @ covariance)
+    (Umeyama 1991).
 
-    Returns the rotations, the covariances' singular values, and signs: -1 where a reflection would fit better.
+    Returns the rotations, the covariances' singular values, and signs: -1 where a reflection would
+    fit better.
     """
     left, singular, right = np.linalg.svd(covariance)
     rotation = left @ right
-    # The best orthogonal matrix may be a reflection; flipping the last axis gives the best rotation, det(R) = +1.
+    # The best orthogonal matrix may be a reflection; flipping the last axis gives the best
+    # rotation, det(R) = +1.
     sign = np.sign(np.linalg.det(rotation))
     mirrored = np.flatnonzero(sign < 0)
     rotation[mirrored] -= 2 * left[mirrored, :, 2:] * right[mirrored, 2:, :]
@@ -116,17 +141,25 @@ def umeyama_batch(
     source: Float[np.ndarray, "b n 3"],
     target: Float[np.ndarray, "b n 3"],
     scale_range: tuple[float, float] = (0.0, np.inf),
-) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b 3"], Float[np.ndarray, " b"]]:
+) -> tuple[
+    Float[np.ndarray, " b"],
+    Float[np.ndarray, "b 3 3"],
+    Float[np.ndarray, "b 3"],
+    Float[np.ndarray, " b"],
+]:
     """Fit similarities to a batch of point sets, without checks (see `umeyama`).
 
-    The best rotation does not depend on the scale, in which the error is quadratic. Returns scales, rotations,
-    translations, and the ratio of the second to the first singular value of the covariance, 0 for collinear points.
+    The best rotation does not depend on the scale, in which the error is quadratic. Returns scales,
+    rotations, translations, and the ratio of the second to the first singular value of the
+    covariance, 0 for collinear points.
     """
     source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
     centred_source, centred_target = source - source_mean[:, None], target - target_mean[:, None]
     rotation, singular, sign = nearest_rotation(centred_target.swapaxes(1, 2) @ centred_source)
     variance = np.square(centred_source).sum(axis=(1, 2))
-    scale = (singular[:, 0] + singular[:, 1] + sign * singular[:, 2]) / np.where(variance > 0, variance, 1)
+    scale = (singular[:, 0] + singular[:, 1] + sign * singular[:, 2]) / np.where(
+        variance > 0, variance, 1
+    )
     scale = scale.clip(*scale_range)
     translation = target_mean - scale[:, None] * (rotation @ source_mean[:, :, None])[:, :, 0]
     conditioning = singular[:, 1] / np.where(singular[:, 0] > 0, singular[:, 0], 1)
@@ -144,26 +177,28 @@ def ransac(
 ) -> tuple[Sim3, Bool[np.ndarray, " n"]]:
     """Fit a similarity to points with outliers: Umeyama's method in RANSAC (paper, sec. 4.3).
 
-    Each trial fits the similarity to a random sample. The trial with the most inliers wins (ties: the smaller sum of
-    their residuals), and the similarity is fitted again to its inliers.
+    Each trial fits the similarity to a random sample. The trial with the most inliers wins (ties:
+    the smaller sum of their residuals), and the similarity is fitted again to its inliers.
 
     Args:
         source: (N, 3) points, N >= sample_size, NumPy or torch.
         target: (N, 3) corresponding points.
-        threshold: Largest residual |target - (scale * R @ source + t)| of an inlier, in target units. The paper's 0.2
-            is for scenes of unit standard deviation.
+        threshold: Largest residual |target - (scale * R @ source + t)| of an inlier, in target
+            units. The paper's 0.2 is for scenes of unit standard deviation.
         trials: Number of samples.
-        sample_size: Points per sample, drawn without replacement. The paper takes 4, since 3 can be degenerate.
+        sample_size: Points per sample, drawn without replacement. The paper takes 4, since 3 can be
+            degenerate.
         seed: Seed or generator of the samples; the same seed gives the same result.
-        scale_range: Smallest and largest scale. Trials outside are discarded; the final fit is the best within.
+        scale_range: Smallest and largest scale. Trials outside are discarded; the final fit is the
+            best within.
 
     Returns:
-        The similarity fitted to the inliers, or that of the best trial if they are fewer than 3 or collinear; and
-        the (N,) inliers of the best trial.
+        The similarity fitted to the inliers, or that of the best trial if they are fewer than 3 or
+        collinear; and the (N,) inliers of the best trial.
 
     Raises:
-        InputError: Shapes are wrong, there are too few points, values are not finite, a setting is out of range, or
-            every sample is collinear or has a scale out of range.
+        InputError: Shapes are wrong, there are too few points, values are not finite, a setting is
+            out of range, or every sample is collinear or has a scale out of range.
     """
     check_integer("ransac: trials", trials, 1, MOST_TRIALS)
     check_integer("ransac: sample_size", sample_size, 3)
@@ -171,14 +206,18 @@ def ransac(
     if not isinstance(seed, np.random.Generator):
         check_integer("ransac: seed", seed, 0)
     if np.shape(scale_range) != (2,) or not 0 <= scale_range[0] <= scale_range[1]:
-        raise InputError(f"ransac: scale_range is {scale_range}, expected (smallest, largest), both not negative")
+        raise InputError(
+            f"ransac: scale_range is {scale_range}, expected (smallest, largest), both not negative"
+        )
     source, target = _point_pairs(source, target, minimum=sample_size)
     rng, block = np.random.default_rng(seed), max(_BLOCK // len(source), 1)
     winner = None
     for first in range(0, trials, block):
         samples = _draw_samples(len(source), sample_size, min(block, trials - first), rng)
         found = _best_trial(source, target, samples, threshold, scale_range)
-        if found and (winner is None or (-found[1].sum(), found[2]) < (-winner[1].sum(), winner[2])):
+        if found and (
+            winner is None or (-found[1].sum(), found[2]) < (-winner[1].sum(), winner[2])
+        ):
             winner = found
     if winner is None:
         found = f"no usable sample in {trials} trials over {len(source)} points"
@@ -193,12 +232,18 @@ def ransac(
 
 
 def _best_trial(
-    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], samples: Int[np.ndarray, "trials size"],
-    threshold: float, scale_range: tuple[float, float],
-) -> tuple[Sim3, Bool[np.ndarray, " n"], float] | None:  # fmt: skip
-    """Return the fit to the best sample, its inliers and the sum of their residuals; None if no sample is usable."""
+    source: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "n 3"],
+    samples: Int[np.ndarray, "trials size"],
+    threshold: float,
+    scale_range: tuple[float, float],
+) -> tuple[Sim3, Bool[np.ndarray, " n"], float] | None:
+    """Return the fit to the best sample, its inliers and the sum of their residuals; None if no
+    sample is usable."""
     scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
-    usable = (conditioning > _COLLINEAR_SAMPLE) & (scale >= scale_range[0]) & (scale <= scale_range[1])
+    usable = (
+        (conditioning > _COLLINEAR_SAMPLE) & (scale >= scale_range[0]) & (scale <= scale_range[1])
+    )
     if not usable.any():
         return None
     scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
@@ -213,10 +258,15 @@ def _best_trial(
     return Sim3(scale[best], rotation[best], translation[best]), inlier[best], float(sums.min())
 
 
-def _draw_samples(n: int, size: int, trials: int, rng: np.random.Generator) -> Int[np.ndarray, "trials size"]:
-    """Draw `trials` samples of `size` different indices below n, uniformly, without a loop over the trials."""
+def _draw_samples(
+    n: int, size: int, trials: int, rng: np.random.Generator
+) -> Int[np.ndarray, "trials size"]:
+    """Draw `trials` samples of `size` different indices below n, uniformly, without a loop over the
+    trials."""
     samples = np.empty((trials, size), dtype=np.int64)
-    for k in range(size):  # a rank among the n - k indices left, moved up past each earlier index that is not larger
+    for k in range(
+        size
+    ):  # a rank among the n - k indices left, moved up past each earlier index that is not larger
         draw = rng.integers(n - k, size=trials)
         for earlier in np.sort(samples[:, :k], axis=1).T:
             draw += draw >= earlier
@@ -224,11 +274,16 @@ def _draw_samples(n: int, size: int, trials: int, rng: np.random.Generator) -> I
     return samples
 
 
-def _point_pairs(source: ArrayLike, target: ArrayLike, minimum: int) -> tuple[np.ndarray, np.ndarray]:
+def _point_pairs(
+    source: ArrayLike, target: ArrayLike, minimum: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Convert corresponding points to float64 arrays and check them."""
     source, target = real_array("source", source), real_array("target", target)
     if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
-        raise InputError(f"source and target have shapes {source.shape} and {target.shape}, expected equal (N, 3)")
+        raise InputError(
+            f"source and target have shapes {source.shape} and {target.shape}, expected equal "
+            "(N, 3)"
+        )
     if len(source) < minimum:
         raise InputError(f"got {len(source)} corresponding points, expected at least {minimum}")
     for name, points in (("source", source), ("target", target)):

@@ -1,4 +1,5 @@
-"""Best view selection: the paper's correspondence score and its three alternatives (sec. 4.2, table 3)."""
+"""Best view selection: the paper's correspondence score and its three alternatives (sec. 4.2, table
+3)."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -21,14 +22,17 @@ class ViewMatch:
 
     reference: View
     target: View
-    similarity: Float[torch.Tensor, "reference target"]  # cosines between the descriptors of their patches
+    similarity: Float[
+        torch.Tensor, "reference target"
+    ]  # cosines between the descriptors of their patches
     matches: Matches  # at most k matches
     k: int  # requested number of matches
 
 
 @runtime_checkable
 class ViewSelector(Protocol):
-    """A score of how well a target view suits the reference. Any callable with this signature is accepted.
+    """A score of how well a target view suits the reference. Any callable with this signature is
+    accepted.
 
     A selector that counts the matches whose descriptors are close:
 
@@ -46,8 +50,8 @@ class ViewSelector(Protocol):
 def correspondence_score(matches: Matches, k: int) -> float:
     """Score the matches of a view (eq. 3, "CorrespondSim"): the sum of -d over the k matches.
 
-    d is the L2 distance of normalised descriptors. A missing match counts as orthogonal, d = sqrt(2). Otherwise a view
-    with few matches would win by having few terms to sum.
+    d is the L2 distance of normalised descriptors. A missing match counts as orthogonal, d =
+    sqrt(2). Otherwise a view with few matches would win by having few terms to sum.
     """
     return score_from_cosines(torch.as_tensor(matches.similarity), k)
 
@@ -64,8 +68,12 @@ def global_score(reference: FeatureMap, target: FeatureMap) -> float:
 
 
 def mask_iou(first: Mask, second: Mask) -> float:
-    """Compute the intersection over union of two masks, 0 if both are empty ("SaliencyIoU" of two foregrounds)."""
-    first, second = torch.as_tensor(first, dtype=torch.bool), torch.as_tensor(second, dtype=torch.bool)
+    """Compute the intersection over union of two masks, 0 if both are empty ("SaliencyIoU" of two
+    foregrounds)."""
+    first, second = (
+        torch.as_tensor(first, dtype=torch.bool),
+        torch.as_tensor(second, dtype=torch.bool),
+    )
     return float((first & second).sum() / (first | second).sum().clamp_min(1))
 
 
@@ -75,10 +83,12 @@ def cyclical_iou(
     target_foreground: Bool[torch.Tensor, "target_rows target_cols"],
     threshold: float = 1.5,
 ) -> float:
-    """Compute "CyclicalDistIoU": the IoU of the target's foreground and its patches of small cyclical distance.
+    """Compute "CyclicalDistIoU": the IoU of the target's foreground and its patches of small
+    cyclical distance.
 
-    The distance is that of a cycle from a target patch through the reference back to the target. The paper gives no
-    threshold; 1.5 patches take a return to the patch itself or to one of its eight neighbours.
+    The distance is that of a cycle from a target patch through the reference back to the target.
+    The paper gives no threshold; 1.5 patches take a return to the patch itself or to one of its
+    eight neighbours.
     """
     grids = tuple(target_foreground.shape), tuple(reference_foreground.shape)
     distances = cyclical_distances(similarity.T, *grids, target_foreground, reference_foreground)
@@ -89,5 +99,7 @@ VIEW_SELECTORS: dict[str, ViewSelector] = {
     "correspond": lambda one: correspondence_score(one.matches, one.k),
     "global": lambda one: global_score(one.reference.features, one.target.features),
     "saliency": lambda one: mask_iou(one.reference.foreground, one.target.foreground),
-    "cyclical": lambda one: cyclical_iou(one.similarity, one.reference.foreground, one.target.foreground),
+    "cyclical": lambda one: cyclical_iou(
+        one.similarity, one.reference.foreground, one.target.foreground
+    ),
 }

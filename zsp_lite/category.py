@@ -1,20 +1,26 @@
-r"""All objects of a category in one common frame, without labels: synchronisation of the hypotheses of many pairs.
+r"""All objects of a category in one common frame, without labels: synchronisation of the hypotheses
+of many pairs.
 
-The verified solver gives a few hypotheses for each ordered pair (a, b) of objects: similarities from the world of a to
-that of b, with probabilities. One pair often cannot tell the front from the back; all pairs, each seen from several
-sides, mostly can (Birdal et al., Synchronizing probability measures on rotations, CVPR 2020). Sought is a similarity
-x -> s_i Q_i x + t_i from the world of each object i to a common frame. Hypothesis h of a pair, of rotation H_h, agrees
-with the rotations if Q_a = Q_b H_h. With \theta_h the angle between the two, they maximise
+The verified solver gives a few hypotheses for each ordered pair (a, b) of objects: similarities
+from the world of a to that of b, with probabilities. One pair often cannot tell the front from the
+back; all pairs, each seen from several sides, mostly can (Birdal et al., Synchronizing probability
+measures on rotations, CVPR 2020). Sought is a similarity x -> s_i Q_i x + t_i from the world of
+each object i to a common frame. Hypothesis h of a pair, of rotation H_h, agrees with the rotations
+if Q_a = Q_b H_h. With \theta_h the angle between the two, they maximise
 
     \sum_{pairs} \log(\epsilon + \sum_h p_h \exp(\kappa (\cos\theta_h - 1))),
 
-the logarithm of a mixture of von Mises-Fisher densities and a uniform one, which limits the cost of a wrong pair.
+the logarithm of a mixture of von Mises-Fisher densities and a uniform one, which limits the cost of
+a wrong pair.
 
-1. Search: many chains set one object after the other to a rotation that a hypothesis proposes, sampled by its
-   probability given all others (Gibbs sampling; Geman and Geman 1984), at a temperature that falls to zero.
-2. Averaging on the rotation group (Hartley et al., Rotation averaging, IJCV 2013): each rotation in turn becomes the
-   mean of the proposals, weighted by how well they agree (expectation maximisation).
-3. Scales, linear in their logarithms, then translations: least absolute deviations over the hypotheses that agree.
+1. Search: many chains set one object after the other to a rotation that a hypothesis proposes,
+   sampled by its probability given all others (Gibbs sampling; Geman and Geman 1984), at a
+   temperature that falls to zero.
+2. Averaging on the rotation group (Hartley et al., Rotation averaging, IJCV 2013): each rotation in
+   turn becomes the mean of the proposals, weighted by how well they agree (expectation
+   maximisation).
+3. Scales, linear in their logarithms, then translations: least absolute deviations over the
+   hypotheses that agree.
 """
 
 from collections.abc import Sequence
@@ -38,10 +44,16 @@ KAPPA, FLOOR = 16.0, 0.1  # \kappa, with which a hypothesis 20 degrees off count
 SAME_ANGLE = 30.0  # degrees; rotations further apart disagree
 ALL_PAIRS_BELOW, PAIRS_PER_OBJECT = 12, 6  # see `object_pairs`
 _REFERENCES, _REFERENCES_OF_ONE = 3, 16  # see `references_per_pair`
-_CHAINS, _TEMPERATURES = 48, (*np.geomspace(1, 0.3, 12), *[0.0] * 4)  # of each sweep: at 0, coordinate ascent
+_CHAINS, _TEMPERATURES = (
+    48,
+    (*np.geomspace(1, 0.3, 12), *[0.0] * 4),
+)  # of each sweep: at 0, coordinate ascent
 _PROPOSERS, _AVERAGING_SWEEPS, _REWEIGHTINGS = 8, 6, 10
-_WEAK = 1e-3  # weight of hypotheses that disagree, so that every object gets a scale and a translation
-# Coefficients of `_judge`, fitted by tools/category_fit.py on validation categories to sets of three to five objects.
+_WEAK = (
+    1e-3  # weight of hypotheses that disagree, so that every object gets a scale and a translation
+)
+# Coefficients of `_judge`, fitted by tools/category_fit.py on validation categories to sets of
+# three to five objects.
 MARGIN, NONE, NONE_AGREEING = 1.57, -3.07, -2.37
 # Probabilities of two objects, whose evidence `compare_two` returns (fit: `tools/tuning.py`).
 OF_TWO = Calibration((-1.08, -0.02, -0.65, 1.57, 0.35), (2.62, 0.27, 0.54, -6.18, -2.27), 0.112)
@@ -54,7 +66,8 @@ _Proposals = Float[np.ndarray, "t d m 3 3"]  # of m hypotheses of each of d pair
 
 @dataclass(frozen=True, eq=False)
 class PairHypotheses:
-    """Candidate similarities from the world of one object to that of another, with their probabilities."""
+    """Candidate similarities from the world of one object to that of another, with their
+    probabilities."""
 
     reference: str  # name of the object that the similarities start from
     target: str  # name of the object that they lead to
@@ -70,18 +83,24 @@ class ObjectPose:
 
     sim3: Sim3  # from the object's world to the common frame
     centre: Float[np.ndarray, "3"]  # of the object, in its world
-    probability: float  # that its rotation is within 30 degrees of the one that most objects agree with
-    alternative: Sim3 | None  # next best pose, more than 30 degrees off, all other objects fixed; None without one
+    probability: (
+        float  # that its rotation is within 30 degrees of the one that most objects agree with
+    )
+    alternative: (
+        Sim3 | None
+    )  # next best pose, more than 30 degrees off, all other objects fixed; None without one
     alternative_probability: float  # that this is the right one
 
 
 @dataclass(frozen=True, eq=False)
 class CategoryAlignment:
-    """All objects of a category in one frame: that of the first object, with a mean log scale of zero."""
+    """All objects of a category in one frame: that of the first object, with a mean log scale of
+    zero."""
 
     objects: dict[str, ObjectPose]  # by name, sorted
     pairs: tuple[PairHypotheses, ...]  # what it was found from
-    # median angle from the best hypothesis of the pairs (reference, target), where above 30 degrees; largest first
+    # median angle from the best hypothesis of the pairs (reference, target), where above 30
+    # degrees; largest first
     disagreements: dict[tuple[str, str], float]
 
     def between(self, reference: str, target: str) -> Sim3:
@@ -90,12 +109,17 @@ class CategoryAlignment:
 
 
 def references_per_pair(objects: int) -> int:
-    """Return from how many frames of the first object a pair of objects is solved: the more, the fewer objects."""
+    """Return from how many frames of the first object a pair of objects is solved: the more, the
+    fewer objects."""
     return max(_REFERENCES, _REFERENCES_OF_ONE // objects)
 
 
 def object_pairs(
-    dataset: Co3D, category: str, sequences: Sequence[str] | None, per_object: int | None, targets: int
+    dataset: Co3D,
+    category: str,
+    sequences: Sequence[str] | None,
+    per_object: int | None,
+    targets: int,
 ) -> list[Pair]:
     """Choose the pairs of frames that a category is aligned by (see `align_category`)."""
     numbers = dataset.frame_numbers(category)
@@ -104,17 +128,22 @@ def object_pairs(
         raise InputError(f"category {category}: {n} sequences to align, expected at least 2")
     for name in names:
         if (length := len(numbers.get(name, ()))) < (least := max(targets, _REFERENCES)):
-            raise InputError(f"sequence {category}/{name} has {length} frames, expected at least {least}")
+            raise InputError(
+                f"sequence {category}/{name} has {length} frames, expected at least {least}"
+            )
     if per_object is None:
         per_object = n - 1 if n < ALL_PAIRS_BELOW else PAIRS_PER_OBJECT
     rng = np.random.default_rng(0)
     circle = rng.permutation(n).tolist()
-    steps = [1, *(2 + rng.permutation(n - 2)).tolist()][:per_object]  # the first connects all objects
+    steps = [1, *(2 + rng.permutation(n - 2)).tolist()][
+        :per_object
+    ]  # the first connects all objects
     pairs = []
     for a, b in sorted((circle[k], circle[(k + step) % n]) for k in range(n) for step in steps):
         reference, target = names[a], names[b]
         rng = np.random.default_rng([0, stable_hash(f"{category}/{reference}/{target}") >> 1])
-        # Frames that are evenly spaced over a sequence show several sides; the random starts depend on the names only.
+        # Frames that are evenly spaced over a sequence show several sides; the random starts depend
+        # on the names only.
         first, around = numbers[reference], numbers[target]
         start, target_start = rng.integers(len(first)), rng.integers(len(around))
         count = min(references_per_pair(n), len(first))
@@ -122,15 +151,19 @@ def object_pairs(
             frame = first[(start + r * len(first) // count) % len(first)]
             turn = (np.arange(targets) + r / count) / targets  # of the sequence, from its start
             positions = (target_start + (turn * len(around)).astype(int)) % len(around)
-            pairs.append(Pair(category, reference, frame, target, tuple(around[k] for k in positions)))
+            pairs.append(
+                Pair(category, reference, frame, target, tuple(around[k] for k in positions))
+            )
     return pairs
 
 
 def scan_pairs(dataset: Co3D, pair: Pair, references: int) -> list[Pair]:
-    """Return the pairs of frames that the pose of a pair is found from by several frames of both objects.
+    """Return the pairs of frames that the pose of a pair is found from by several frames of both
+    objects.
 
-    These are `references` frames of each object, evenly spaced over its sequence from the pair's own frame on, each
-    with as many views of the other as the pair has. The pair itself is the first.
+    These are `references` frames of each object, evenly spaced over its sequence from the pair's
+    own frame on, each with as many views of the other as the pair has. The pair itself is the
+    first.
     """
     numbers = dataset.frame_numbers(pair.category)
     ends, count = (pair.reference_sequence, pair.target_sequence), len(pair.target_frames)
@@ -150,20 +183,25 @@ def scan_pairs(dataset: Co3D, pair: Pair, references: int) -> list[Pair]:
 
 
 def world_hypotheses(reference: str, target: str, estimate: PoseEstimate) -> PairHypotheses:
-    """Convert the hypotheses of the verified solver to similarities between the worlds of two objects, by name."""
+    """Convert the hypotheses of the verified solver to similarities between the worlds of two
+    objects, by name."""
     sim3s = tuple(estimate.between_worlds(one.sim3, one.view) for one in estimate.hypotheses)
     probabilities = np.array([one.confidence for one in estimate.hypotheses])
     view, used = estimate.reference_view, np.flatnonzero(np.isfinite(estimate.view_scores))
-    centre = view.frame.camera.to_world(np.median(view.measured_points[0][view.known_foreground], axis=0))
+    centre = view.frame.camera.to_world(
+        np.median(view.measured_points[0][view.known_foreground], axis=0)
+    )
     cameras = [estimate.target_views[k].frame.camera for k in used]
     span = view_span(cameras, sim3s[0].apply(centre))
     return PairHypotheses(reference, target, sim3s, probabilities, centre, span)
 
 
 def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
-    """Find the similarities from the objects' worlds to one frame that agree best with the hypotheses of all pairs.
+    """Find the similarities from the objects' worlds to one frame that agree best with the
+    hypotheses of all pairs.
 
-    Two objects may have several pairs. The order does not matter. InputError if the pairs do not connect all objects.
+    Two objects may have several pairs. The order does not matter. InputError if the pairs do not
+    connect all objects.
     """
     pairs = sorted(pairs, key=lambda pair: (pair.reference, pair.target, pair.centre.tolist()))
     names = sorted({name for pair in pairs for name in (pair.reference, pair.target)})
@@ -171,25 +209,45 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
     links = coo_array((np.ones(len(ends)), ends.T), (len(names), len(names)))
     order = breadth_first_order(links.tocsr(), 0, directed=False, return_predecessors=False)
     if len(order) < len(names):
-        raise InputError(f"pairs connect {len(order)} of {len(names)} objects with {names[0]}, expected all")
+        raise InputError(
+            f"pairs connect {len(order)} of {len(names)} objects with {names[0]}, expected all"
+        )
     nodes = _build_nodes(pairs, ends)
     rotations = _search(nodes, order, np.random.default_rng(0))
     scales, translations, centres = _scales_and_translations(pairs, ends, rotations)
-    off = np.array([rotation_angle(rotations[a], rotations[b] @ one.sim3s[0].R) for (a, b), one in zip(ends, pairs)])
+    off = np.array(
+        [
+            rotation_angle(rotations[a], rotations[b] @ one.sim3s[0].R)
+            for (a, b), one in zip(ends, pairs)
+        ]
+    )
     objects = {}
     for i, name in enumerate(names):
-        sim3, agreeing = Sim3(scales[i], rotations[i], translations[i]), off[(ends == i).any(axis=1)] < SAME_ANGLE
+        sim3, agreeing = (
+            Sim3(scales[i], rotations[i], translations[i]),
+            off[(ends == i).any(axis=1)] < SAME_ANGLE,
+        )
         if len(names) > 2:
             probability, turned, other = _judge(nodes[i], rotations, i, float(agreeing.mean()))
         else:
-            margin, turned, known = compare_two(nodes[i], rotations, i, np.array([pair.span for pair in pairs]))
+            margin, turned, known = compare_two(
+                nodes[i], rotations, i, np.array([pair.span for pair in pairs])
+            )
             probability, other = OF_TWO.probabilities(np.array([0.0, margin]), known).tolist()
         alternative = None
         if turned is not None:  # about the object's centre
-            alternative = Sim3(scales[i], turned, sim3.apply(centres[i]) - scales[i] * turned @ centres[i])
+            alternative = Sim3(
+                scales[i], turned, sim3.apply(centres[i]) - scales[i] * turned @ centres[i]
+            )
         objects[name] = ObjectPose(sim3, centres[i], probability, alternative, other)
-    angles = {(names[a], names[b]): float(np.median(off[(ends == (a, b)).all(axis=1)])) for a, b in ends}
-    worst = {key: angles[key] for key in sorted(angles, key=angles.get, reverse=True) if angles[key] > SAME_ANGLE}
+    angles = {
+        (names[a], names[b]): float(np.median(off[(ends == (a, b)).all(axis=1)])) for a, b in ends
+    }
+    worst = {
+        key: angles[key]
+        for key in sorted(angles, key=angles.get, reverse=True)
+        if angles[key] > SAME_ANGLE
+    }
     return CategoryAlignment(objects, tuple(pairs), worst)
 
 
@@ -205,19 +263,26 @@ class _Node:
         """Return the rotations that the hypotheses propose."""
         return rotations[:, self.neighbour][:, :, None] @ self.turn
 
-    def agreement(self, candidates: _Candidates, proposals: _Proposals) -> Float[np.ndarray, "t c d m"]:
-        r"""Return \exp(\kappa (\cos\theta - 1)) of candidates and proposals; \cos\theta = (trace - 1) / 2."""
+    def agreement(
+        self, candidates: _Candidates, proposals: _Proposals
+    ) -> Float[np.ndarray, "t c d m"]:
+        r"""Return \exp(\kappa (\cos\theta - 1)) of candidates and proposals; \cos\theta = (trace -
+        1) / 2."""
         t, c = candidates.shape[:2]
         trace = candidates.reshape(t, c, 9) @ proposals.reshape(t, -1, 9).swapaxes(1, 2)
         return np.exp(KAPPA / 2 * (trace - 3)).reshape(t, c, *self.weight.shape)
 
     def score(self, candidates: _Candidates, proposals: _Proposals) -> Float[np.ndarray, "t c"]:
-        """Return the part of the objective that depends on this object, for candidates of its rotation."""
+        """Return the part of the objective that depends on this object, for candidates of its
+        rotation."""
         agreement = self.agreement(candidates, proposals)
         return np.log(np.einsum("tcdm,dm->tcd", agreement, self.weight) + FLOOR).sum(axis=2)
 
-    def mean(self, present: Float[np.ndarray, "t 3 3"], proposals: _Proposals) -> Float[np.ndarray, "t 3 3"]:
-        """Return the mean of the proposals, weighted by the probability that each is the pair's right one."""
+    def mean(
+        self, present: Float[np.ndarray, "t 3 3"], proposals: _Proposals
+    ) -> Float[np.ndarray, "t 3 3"]:
+        """Return the mean of the proposals, weighted by the probability that each is the pair's
+        right one."""
         weight = self.weight * self.agreement(present[:, None], proposals)[:, 0]
         weight /= weight.sum(axis=2, keepdims=True) + FLOOR
         return nearest_rotation(np.einsum("tdm,tdmij->tij", weight, proposals))[0]
@@ -228,17 +293,23 @@ def _build_nodes(pairs: Sequence[PairHypotheses], ends: Int[np.ndarray, "e 2"]) 
     most = max(len(pair.sim3s) for pair in pairs)
     rows: list[list[tuple]] = [[] for _ in range(ends.max() + 1)]
     for (a, b), pair in zip(ends, pairs):
-        turn = np.resize(np.array([one.R for one in pair.sim3s], np.float32), (most, 3, 3))  # padded by repetition
+        turn = np.resize(
+            np.array([one.R for one in pair.sim3s], np.float32), (most, 3, 3)
+        )  # padded by repetition
         weight = np.pad(pair.probabilities, (0, most - len(pair.sim3s))).astype(np.float32)
         rows[a].append((b, turn, weight))
         rows[b].append((a, turn.swapaxes(1, 2), weight))
     return [_Node(*(np.array(column) for column in zip(*row))) for row in rows]
 
 
-def _search(nodes: list[_Node], order: Int[np.ndarray, " n"], rng: np.random.Generator) -> Float[np.ndarray, "n 3 3"]:
+def _search(
+    nodes: list[_Node], order: Int[np.ndarray, " n"], rng: np.random.Generator
+) -> Float[np.ndarray, "n 3 3"]:
     """Return the rotations that maximise the objective, relative to the first object's."""
     rotations = np.tile(np.eye(3, dtype=np.float32), (_CHAINS, len(nodes), 1, 1))
-    for k, i in enumerate(order[1:], 1):  # in this order, each object has a pair with an earlier one
+    for k, i in enumerate(
+        order[1:], 1
+    ):  # in this order, each object has a pair with an earlier one
         earlier = np.isin(nodes[i].neighbour, order[:k])
         known = _Node(nodes[i].neighbour[earlier], nodes[i].turn[earlier], nodes[i].weight[earlier])
         _sample(known, rotations, int(i), 1.0, rng)
@@ -248,39 +319,54 @@ def _search(nodes: list[_Node], order: Int[np.ndarray, " n"], rng: np.random.Gen
     for _ in range(_AVERAGING_SWEEPS):
         for i, node in enumerate(nodes):
             rotations[:, i] = node.mean(rotations[:, i], node.proposals(rotations))
-    scores = [node.score(rotations[:, i, None], node.proposals(rotations)) for i, node in enumerate(nodes)]
+    scores = [
+        node.score(rotations[:, i, None], node.proposals(rotations)) for i, node in enumerate(nodes)
+    ]
     best = rotations[np.sum(scores, axis=0)[:, 0].argmax()].astype(np.float64)
     return nearest_rotation(best[0].T @ best)[0]
 
 
-def _sample(node: _Node, rotations: _Rotations, i: int, temperature: float, rng: np.random.Generator) -> None:
-    """Set the rotation of object i, in place, to its present one or one that a hypothesis of a few pairs proposes."""
+def _sample(
+    node: _Node, rotations: _Rotations, i: int, temperature: float, rng: np.random.Generator
+) -> None:
+    """Set the rotation of object i, in place, to its present one or one that a hypothesis of a few
+    pairs proposes."""
     t, some = len(rotations), rng.permutation(len(node.neighbour))[:_PROPOSERS]
     proposals = node.proposals(rotations)
-    candidates = np.concatenate([rotations[:, i, None], proposals[:, some].reshape(t, -1, 3, 3)], axis=1)
+    candidates = np.concatenate(
+        [rotations[:, i, None], proposals[:, some].reshape(t, -1, 3, 3)], axis=1
+    )
     score = node.score(candidates, proposals)
-    score += temperature * rng.gumbel(size=score.shape)  # the largest is then a sample of the softmax
+    score += temperature * rng.gumbel(
+        size=score.shape
+    )  # the largest is then a sample of the softmax
     rotations[:, i] = candidates[np.arange(t), score.argmax(axis=1)]
 
 
 def _judge(
     node: _Node, rotations: Float[np.ndarray, "n 3 3"], i: int, agreeing: float
 ) -> tuple[float, Float[np.ndarray, "3 3"] | None, float]:
-    """Return the probability of an object's rotation, the best other one, all others fixed, and its probability."""
+    """Return the probability of an object's rotation, the best other one, all others fixed, and its
+    probability."""
     margin, best = _margin(node, rotations, i)
-    # The pairs of an object err together, so the margin counts by the root of their number. A conditional logit; that
-    # none is right is less probable if more of the object's pairs agree.
-    other, none = np.exp(-MARGIN * margin / np.sqrt(len(node.neighbour))), np.exp(NONE + NONE_AGREEING * agreeing)
+    # The pairs of an object err together, so the margin counts by the root of their number. A
+    # conditional logit; that none is right is less probable if more of the object's pairs agree.
+    other, none = (
+        np.exp(-MARGIN * margin / np.sqrt(len(node.neighbour))),
+        np.exp(NONE + NONE_AGREEING * agreeing),
+    )
     return float(1 / (1 + other + none)), best, float(other / (1 + other + none))
 
 
 def compare_two(
     node: _Node, rotations: Float[np.ndarray, "2 3 3"], i: int, spans: Float[np.ndarray, " d"]
 ) -> tuple[float, Float[np.ndarray, "3 3"] | None, Float[np.ndarray, "5"]]:
-    """Return the `_margin` of one of two objects, the best other rotation, and the evidence for `OF_TWO`.
+    """Return the `_margin` of one of two objects, the best other rotation, and the evidence for
+    `OF_TWO`.
 
-    This is how far around the better seen object the target views go, the number of pairs, and the probability that the
-    surest pair, and all in the mean, give to the rotation. Pairs count by the share of the circle that they show.
+    This is how far around the better seen object the target views go, the number of pairs, and the
+    probability that the surest pair, and all in the mean, give to the rotation. Pairs count by the
+    share of the circle that they show.
     """
     margin, best = _margin(node, rotations, i)
     near = rotation_angle(node.proposals(rotations[None])[0], rotations[i]) < SAME_ANGLE
@@ -292,43 +378,61 @@ def compare_two(
 def _margin(
     node: _Node, rotations: Float[np.ndarray, "n 3 3"], i: int
 ) -> tuple[float, Float[np.ndarray, "3 3"] | None]:
-    """Return by how much an object's rotation is better than the best other one, all others fixed, and that one."""
+    """Return by how much an object's rotation is better than the best other one, all others fixed,
+    and that one."""
     proposals = node.proposals(rotations[None])
     others = proposals.reshape(-1, 3, 3)
     others = others[rotation_angle(others, rotations[i]) > SAME_ANGLE]
-    present, *scores = node.score(np.concatenate([rotations[None, i], others])[None], proposals)[0].tolist()
+    present, *scores = node.score(np.concatenate([rotations[None, i], others])[None], proposals)[
+        0
+    ].tolist()
     return (present - max(scores), others[np.argmax(scores)]) if scores else (np.inf, None)
 
 
 def _scales_and_translations(
-    pairs: Sequence[PairHypotheses], ends: Int[np.ndarray, "e 2"], rotations: Float[np.ndarray, "n 3 3"]
+    pairs: Sequence[PairHypotheses],
+    ends: Int[np.ndarray, "e 2"],
+    rotations: Float[np.ndarray, "n 3 3"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Fit scales and translations to the hypotheses that agree with the rotations; return the objects' centres too."""
+    """Fit scales and translations to the hypotheses that agree with the rotations; return the
+    objects' centres too."""
     a, b = np.repeat(ends, [len(pair.sim3s) for pair in pairs], axis=0).T
     sim3s = [one for pair in pairs for one in pair.sim3s]
     c = np.stack([pair.centre for pair in pairs for _ in pair.sim3s])
     y = np.stack([one.apply(centre) for one, centre in zip(sim3s, c)])
-    angle = np.radians(rotation_angle(rotations[a], rotations[b] @ np.stack([one.R for one in sim3s])))
+    angle = np.radians(
+        rotation_angle(rotations[a], rotations[b] @ np.stack([one.R for one in sim3s]))
+    )
     probability = np.concatenate([pair.probabilities for pair in pairs])
     weight = probability * (np.exp(KAPPA * (np.cos(angle) - 1)) + _WEAK)
-    # Hypothesis (lambda, H, tau) demands log s_a - log s_b = log(lambda), and t_a - t_b = s_b Q_b y - s_a Q_a c with
-    # y = lambda H c + tau, the place in the world of b of the centre c of a.
+    # Hypothesis (lambda, H, tau) demands log s_a - log s_b = log(lambda), and t_a - t_b = s_b Q_b y
+    # - s_a Q_a c with y = lambda H c + tau, the place in the world of b of the centre c of a.
     incidence = np.eye(len(rotations))[a] - np.eye(len(rotations))[b]
-    scales = np.exp(_least_absolute(incidence, np.log([[one.scale] for one in sim3s]), weight))[:, 0]
+    scales = np.exp(_least_absolute(incidence, np.log([[one.scale] for one in sim3s]), weight))[
+        :, 0
+    ]
     linear = scales[:, None, None] * rotations
     shift = np.einsum("kij,kj->ki", linear[b], y) - np.einsum("kij,kj->ki", linear[a], c)
     t = _least_absolute(incidence, shift, weight)
-    seen = np.concatenate([np.eye(len(rotations))[a], np.eye(len(rotations))[b]]) * np.r_[weight, weight][:, None]
+    seen = (
+        np.concatenate([np.eye(len(rotations))[a], np.eye(len(rotations))[b]])
+        * np.r_[weight, weight][:, None]
+    )
     return scales, t - t[0], (seen / seen.sum(axis=0)).T @ np.r_[c, y]
 
 
 def _least_absolute(
-    incidence: Float[np.ndarray, "k n"], difference: Float[np.ndarray, "k e"], weight: Float[np.ndarray, " k"]
+    incidence: Float[np.ndarray, "k n"],
+    difference: Float[np.ndarray, "k e"],
+    weight: Float[np.ndarray, " k"],
 ) -> Float[np.ndarray, "n e"]:
-    """Minimise sum_k w_k |incidence_k x - difference_k| over x of mean zero, by iteratively reweighted squares."""
+    """Minimise sum_k w_k |incidence_k x - difference_k| over x of mean zero, by iteratively
+    reweighted squares."""
     scaled = weight
     for _ in range(_REWEIGHTINGS):
         weighted = incidence.T * scaled
-        x = np.linalg.lstsq(weighted @ incidence, weighted @ difference, rcond=None)[0]  # of least norm: mean zero
+        x = np.linalg.lstsq(weighted @ incidence, weighted @ difference, rcond=None)[
+            0
+        ]  # of least norm: mean zero
         scaled = weight / (np.linalg.norm(incidence @ x - difference, axis=1) + 1e-9)
     return x

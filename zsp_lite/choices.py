@@ -1,11 +1,14 @@
-"""Names that a user chooses from. The command line offers them without importing what they stand for."""
+"""Names that a user chooses from.
+
+The command line offers them without importing what they stand for.
+"""
 
 from typing import Literal, get_args
 
 # Solvers of a pair, each with those that it runs.
 SOLVERS = {"paper": ("paper",), "verified": ("verified",), "both": ("paper", "verified")}
-# Activation of a transformer block that describes a patch (compared by Amir et al. 2021): an input of its attention, or
-# its output, not normalised ("token").
+# Activation of a transformer block that describes a patch (compared by Amir et al. 2021): an input
+# of its attention, or its output, not normalised ("token").
 Facet = Literal["key", "query", "value", "token"]
 FACETS: tuple[str, ...] = get_args(Facet)
 # Where object masks come from: with the frames, GrabCut from a box, or depth.
@@ -23,4 +26,9 @@ METRICS = {
     "scale": "scale ratio",
     "milliseconds": "ms per pair",
 }
-METRICS_SHOWN = ("mean_category_median", "acc30", "acc15", "auc30")  # by default: the paper's, and one more
+METRICS_SHOWN = (
+    "mean_category_median",
+    "acc30",
+    "acc15",
+    "auc30",
+)  # by default: the paper's, and one more

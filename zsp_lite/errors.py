@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import numpy as np
 
-# Largest coordinate, in any unit of length or in pixels. Beyond 1e150 squares overflow, and LAPACK may never return.
+# Largest coordinate, in any unit of length or in pixels. Beyond 1e150 squares overflow, and LAPACK
+# may never return.
 MAX_LENGTH = 1e9
-# Largest entry of the difference between a rotation matrix from outside, a few decimals or half precision, and the
-# nearest rotation; and of |R @ R.T - I| for a rotation in float32, which is kept as it is.
+# Largest entry of the difference between a rotation matrix from outside, a few decimals or half
+# precision, and the nearest rotation; and of |R @ R.T - I| for a rotation in float32, which is kept
+# as it is.
 ROTATION_TOLERANCE, _FLOAT32_TOLERANCE = 1e-2, 1e-6
 _LONGEST = 1000  # characters of a message
 
@@ -22,27 +24,33 @@ _LONGEST = 1000  # characters of a message
 class InputError(ValueError):
     """Bad input: one line that names the argument or file, what was given and what was expected.
 
-    The command line prints that line on stderr and exits with code 2. Every other exception is a bug and shows its
-    traceback. Of a very long message, such as one with a long path, the beginning and the end are kept.
+    The command line prints that line on stderr and exits with code 2. Every other exception is a
+    bug and shows its traceback. Of a very long message, such as one with a long path, the beginning
+    and the end are kept.
     """
 
     def __init__(self, message: str):
-        super().__init__(message if len(message) <= _LONGEST else f"{message[:600]} ... {message[-300:]}")
+        super().__init__(
+            message if len(message) <= _LONGEST else f"{message[:600]} ... {message[-300:]}"
+        )
 
 
 class NoPoseError(InputError):
-    """Two objects whose views do not determine a pose, for instance for want of depth; all else is in order."""
+    """Two objects whose views do not determine a pose, for instance for want of depth; all else is
+    in order."""
 
 
 class FatalError(ValueError):
     """An error that ends a benchmark run: a broken backbone or an unreadable frame.
 
-    It is no InputError, by which a row says that a pair has no pose, and nothing is stored for the pair that it hits.
+    It is no InputError, by which a row says that a pair has no pose, and nothing is stored for the
+    pair that it hits.
     """
 
 
 def describe_failure(error: BaseException) -> str:
-    """Describe an exception of somebody else's code in one line: where it was raised, its type and its message."""
+    """Describe an exception of somebody else's code in one line: where it was raised, its type and
+    its message."""
     *_, last = traceback.extract_tb(error.__traceback__)
     told = "".join(traceback.format_exception_only(error))  # also where its own str() fails
     return " ".join(f"{last.filename}, line {last.lineno}: {told}".split())
@@ -50,7 +58,8 @@ def describe_failure(error: BaseException) -> str:
 
 @contextmanager
 def ends_the_run(what: str) -> Iterator[None]:
-    """Turn an error of the block, which reads data or calls a backbone, into a FatalError: it is not the pair's."""
+    """Turn an error of the block, which reads data or calls a backbone, into a FatalError: it is
+    not the pair's."""
     try:
         yield
     except FatalError:
@@ -63,44 +72,67 @@ def ends_the_run(what: str) -> Iterator[None]:
 
 def check_integer(name: str, value: object, minimum: int, maximum: int | float = math.inf) -> None:
     """Raise InputError if a value is not an integer from `minimum` to `maximum`."""
-    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or not minimum <= value <= maximum:
+    if (
+        not isinstance(value, numbers.Integral)
+        or isinstance(value, bool)
+        or not minimum <= value <= maximum
+    ):
         limits = f"of at least {minimum}" if maximum == math.inf else f"from {minimum} to {maximum}"
         raise InputError(f"{name} is {value!r}, expected an integer {limits}")
 
 
 def check_number(name: str, value: object, above: float) -> None:
     """Raise InputError if a value is not a finite real number greater than `above`."""
-    if not isinstance(value, numbers.Real) or isinstance(value, bool) or not above < value < math.inf:
+    if (
+        not isinstance(value, numbers.Real)
+        or isinstance(value, bool)
+        or not above < value < math.inf
+    ):
         raise InputError(f"{name} is {value!r}, expected a finite number greater than {above:g}")
 
 
 def check_magnitude(name: str, values: object) -> None:
-    """Raise InputError if a number of an array is not finite, or above `MAX_LENGTH` in magnitude."""
-    import numpy as np  # here, because `zsp-lite --help` imports this module and does not need NumPy
+    """Raise InputError if a number of an array is not finite, or above `MAX_LENGTH` in
+    magnitude."""
+    # here, because `zsp-lite --help` imports this module and does not need NumPy
+    import numpy as np
 
     sizes = np.abs(values)
     if not (sizes <= MAX_LENGTH).all():  # False for NaN too
-        raise InputError(f"{name} holds {np.max(sizes)}, expected finite numbers of at most {MAX_LENGTH:g}")
+        raise InputError(
+            f"{name} holds {np.max(sizes)}, expected finite numbers of at most {MAX_LENGTH:g}"
+        )
 
 
 def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
     """Raise InputError if a value is none of those allowed."""
     if value not in (allowed := list(allowed)):
-        raise InputError(f"{name} is {value!r}, expected one of {', '.join(map(str, allowed)) or '(none)'}")
+        raise InputError(
+            f"{name} is {value!r}, expected one of {', '.join(map(str, allowed)) or '(none)'}"
+        )
 
 
-def real_array(name: str, values: object, shape: tuple[int | None, ...] | None = None) -> "np.ndarray":
-    """Convert real numbers to a float64 array; InputError for texts and complex numbers, which NumPy would convert.
+def real_array(
+    name: str, values: object, shape: tuple[int | None, ...] | None = None
+) -> "np.ndarray":
+    """Convert real numbers to a float64 array; InputError for texts and complex numbers, which
+    NumPy would convert.
 
     If a `shape` is given, in which None is any length, another one is an InputError, too.
     """
     import numpy as np
 
     found, expected = None, "real numbers"
-    with suppress(TypeError, ValueError, RuntimeError):  # of NumPy, for instance for rows of different lengths
+    with suppress(
+        TypeError, ValueError, RuntimeError
+    ):  # of NumPy, for instance for rows of different lengths
         array = np.asarray(values)
         if array.dtype.kind in "biuf":
-            if shape is None or len(shape) == array.ndim and all(n in (None, m) for n, m in zip(shape, array.shape)):
+            if (
+                shape is None
+                or len(shape) == array.ndim
+                and all(n in (None, m) for n, m in zip(shape, array.shape))
+            ):
                 return array.astype(np.float64, copy=False)
             found = f"has shape {array.shape}"
     if shape is not None:
@@ -109,9 +141,11 @@ def real_array(name: str, values: object, shape: tuple[int | None, ...] | None =
 
 
 def rotation_matrix(name: str, values: object) -> "np.ndarray":
-    """Convert rotations (..., 3, 3) from outside to float64: rounded ones become the nearest rotations.
+    """Convert rotations (..., 3, 3) from outside to float64: rounded ones become the nearest
+    rotations.
 
-    InputError, which says how far off they are, for matrices that are no rotations within `ROTATION_TOLERANCE`.
+    InputError, which says how far off they are, for matrices that are no rotations within
+    `ROTATION_TOLERANCE`.
     """
     import numpy as np
 
@@ -134,13 +168,18 @@ def rotation_matrix(name: str, values: object) -> "np.ndarray":
 
 
 def rigid_matrix(name: str, values: object) -> "np.ndarray":
-    """Convert a rigid transform (4, 4) from outside to float64, with the rotation that `rotation_matrix` returns."""
+    """Convert a rigid transform (4, 4) from outside to float64, with the rotation that
+    `rotation_matrix` returns."""
     import numpy as np
 
     matrix = real_array(name, values, (4, 4)).copy()
     check_magnitude(name, matrix)
-    if (off := np.abs(matrix[3] - (0, 0, 0, 1)).max()) > ROTATION_TOLERANCE:  # for instance a transposed matrix
-        raise InputError(f"{name} has the last row {matrix[3].tolist()}, {off:.2g} off the expected 0 0 0 1")
+    if (
+        off := np.abs(matrix[3] - (0, 0, 0, 1)).max()
+    ) > ROTATION_TOLERANCE:  # for instance a transposed matrix
+        raise InputError(
+            f"{name} has the last row {matrix[3].tolist()}, {off:.2g} off the expected 0 0 0 1"
+        )
     matrix[:3, :3] = rotation_matrix(name, matrix[:3, :3])
     matrix[3] = 0, 0, 0, 1
     return matrix

@@ -1,4 +1,5 @@
-"""Pose estimates, of one solver and of a pair, and the protocol of the solvers that compute them from matched views."""
+"""Pose estimates, of one solver and of a pair, and the protocol of the solvers that compute them
+from matched views."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -30,22 +31,24 @@ class Hypothesis:
     view: int  # index of the target view that is closest to the reference viewpoint under this pose
     score: float  # in nats, comparable between the hypotheses of one estimate
     terms: dict[str, float]  # the terms that the score is a weighted sum of, by name
-    # probability that the rotation error is below 30 degrees. Over different poses, those whose `mode` is their own
-    # index, the probabilities sum to at most 1 (see `verified.confidence`)
+    # probability that the rotation error is below 30 degrees. Over different poses, those whose
+    # `mode` is their own index, the probabilities sum to at most 1 (see `verified.confidence`)
     confidence: float
-    # index of the hypothesis that stands for this pose: its own, or that of a better one that is the same pose within
-    # 30 degrees
+    # index of the hypothesis that stands for this pose: its own, or that of a better one that is
+    # the same pose within 30 degrees
     mode: int
 
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """Pose of the reference object in one of the target views, with the intermediate results behind it."""
+    """Pose of the reference object in one of the target views, with the intermediate results behind
+    it."""
 
     sim3: Sim3  # reference-camera points to camera points of the chosen target view
     view: int  # index of the chosen target view
     matches: Matches  # matches between the reference and the chosen view
-    # (K,) the matches that agree with the pose; with the verified solver, of those with measured depth on both sides
+    # (K,) the matches that agree with the pose; with the verified solver, of those with measured
+    # depth on both sides
     inliers: Bool[np.ndarray, " k"]
     # (N,) score of every target view, higher is better; -inf for views that were left out
     view_scores: Float[np.ndarray, " n"]
@@ -53,9 +56,12 @@ class PoseEstimate:
     target_views: tuple[View, ...]  # the same of all N target views
     timings: dict[str, float] = field(default_factory=dict)  # seconds per stage
     flags: tuple[str, ...] = ()  # one line per reason not to trust the estimate
-    hypotheses: tuple[Hypothesis, ...] = ()  # candidate poses of the solver, best first; empty for the paper's solver
-    # whether the solver cannot decide between the estimate and its first alternative: both are nearly equally probable
-    # and far apart, such as by a half turn (see `verified.confidence.reliability_flags`)
+    hypotheses: tuple[
+        Hypothesis, ...
+    ] = ()  # candidate poses of the solver, best first; empty for the paper's solver
+    # whether the solver cannot decide between the estimate and its first alternative: both are
+    # nearly equally probable and far apart, such as by a half turn (see
+    # `verified.confidence.reliability_flags`)
     one_of_two: bool = False
 
     @property
@@ -70,12 +76,14 @@ class PoseEstimate:
 
     @property
     def confidence(self) -> float | None:
-        """Probability that the rotation error is below 30 degrees; None if the solver does not estimate it."""
+        """Probability that the rotation error is below 30 degrees; None if the solver does not
+        estimate it."""
         return self.hypotheses[0].confidence if self.hypotheses else None
 
     @cached_property
     def alternatives(self) -> tuple[Hypothesis, ...]:
-        """Other poses, most probable first, without those within 30 degrees of a better one; () without hypotheses."""
+        """Other poses, most probable first, without those within 30 degrees of a better one; ()
+        without hypotheses."""
         return tuple(one for index, one in enumerate(self.hypotheses) if one.mode == index)[1:]
 
     @property
@@ -85,16 +93,20 @@ class PoseEstimate:
 
     def between_worlds(self, sim3: Sim3, view: int) -> Sim3:
         """Return the similarity between the worlds that a pose in a target view stands for."""
-        reference, target = (one.frame.camera for one in (self.reference_view, self.target_views[view]))
+        reference, target = (
+            one.frame.camera for one in (self.reference_view, self.target_views[view])
+        )
         return Sim3(1.0, target.R, target.t).inverse() @ sim3 @ Sim3(1.0, reference.R, reference.t)
 
     def world_rotation(self, pose: Hypothesis | None = None) -> Float[np.ndarray, "3 3"]:
-        """Return the rotation from the reference camera's frame to the world of the target views."""
+        """Return the rotation from the reference camera's frame to the world of the target
+        views."""
         sim3, view = (self.sim3, self.view) if pose is None else (pose.sim3, pose.view)
         return self.target_views[view].frame.camera.R.T @ sim3.R
 
     def angle_to(self, pose: Hypothesis) -> float:
-        """Return the angle in degrees between the rotation of the estimate and that of another pose."""
+        """Return the angle in degrees between the rotation of the estimate and that of another
+        pose."""
         return float(rotation_error(self.world_rotation(), self.world_rotation(pose)))
 
     @property
@@ -108,15 +120,20 @@ class PoseEstimate:
         angle = rotation_error(np.eye(3), self.sim3.R)
         return (
             f"PoseEstimate(target view {self.view} of {len(self.target_views)}, {matches}{sure},\n"
-            f"  rotation by {angle:.1f} degrees, t {np.round(self.sim3.t, 3).tolist()}, scale {self.sim3.scale:.3f},\n"
-            f"  {sum(self.timings.values()):.2f} s, {f'flags: {self.note}' if self.flags else 'no flags'})"
+            f"  rotation by {angle:.1f} degrees, t {np.round(self.sim3.t, 3).tolist()}, scale "
+            f"{self.sim3.scale:.3f},\n"
+            f"  {sum(self.timings.values()):.2f} s, "
+            f"{f'flags: {self.note}' if self.flags else 'no flags'})"
         )
 
     def propagate(self, cameras: Sequence[Camera]) -> list[Sim3]:
         """Express the pose in other cameras of the target sequence (sec. 5.6)."""
         best = self.target_camera
         turns = [camera.R @ best.R.T for camera in cameras]
-        return [Sim3(1.0, turn, camera.t - turn @ best.t) @ self.sim3 for turn, camera in zip(turns, cameras)]
+        return [
+            Sim3(1.0, turn, camera.t - turn @ best.t) @ self.sim3
+            for turn, camera in zip(turns, cameras)
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,12 +155,16 @@ class PairResult:
     reference: Frame  # reference frame, whole
     targets: tuple[Frame, ...]  # target frames, whole
     estimates: dict[str, PoseEstimate]  # estimate of each solver by its name, at least one
-    errors: dict[str, float]  # rotation error of each estimate in degrees; empty without pose labels
+    errors: dict[
+        str, float
+    ]  # rotation error of each estimate in degrees; empty without pose labels
     pair: Pair | None = None  # the evaluation pair, or None
     # where the masks of the reference and of the targets come from: "given", "box" or "auto"
     masks: tuple[str, str] = ("given", "given")
     backbone: str = ""  # name of the backbone
-    votes: tuple[Vote, ...] = ()  # of the frames of both objects, the reference frame's first; () for one frame
+    votes: tuple[
+        Vote, ...
+    ] = ()  # of the frames of both objects, the reference frame's first; () for one frame
 
     @property
     def world_sim3(self) -> Sim3:
@@ -172,7 +193,10 @@ class PairResult:
         return "\n".join(f"{solver}: {estimate!r}" for solver, estimate in self.estimates.items())
 
     def as_json(self) -> dict[str, Any]:
-        """Return all numbers in the types of JSON. Matrices are for column vectors; `null` marks what is unknown."""
+        """Return all numbers in the types of JSON.
+
+        Matrices are for column vectors; `null` marks what is unknown.
+        """
         solved = {}
         for solver, estimate in self.estimates.items():
             solved[solver] = {
@@ -191,14 +215,16 @@ class PairResult:
                 "one_of_two": estimate.one_of_two,
                 "alternatives": [
                     {
-                        "view": one.view, "matrix": one.sim3.matrix.tolist(), "probability": one.confidence,
+                        "view": one.view,
+                        "matrix": one.sim3.matrix.tolist(),
+                        "probability": one.confidence,
                         "degrees_from_best": estimate.angle_to(one),
                         "score_below_best": estimate.hypotheses[0].score - one.score,
                     }
                     for one in estimate.alternatives
                 ],
                 "seconds": dict(estimate.timings),
-            }  # fmt: skip
+            }
         views = [frame.name for frame in self.targets]
         return {
             "reference": {"source": self.sources[0], "masks": self.masks[0]},
@@ -207,50 +233,65 @@ class PairResult:
             "estimates": solved,
             "degrees_between_solvers": self.disagreement,
             "votes": [
-                {"frame": one.name, "confidence": one.estimate.confidence, "degrees_from_answer": one.degrees}
+                {
+                    "frame": one.name,
+                    "confidence": one.estimate.confidence,
+                    "degrees_from_answer": one.degrees,
+                }
                 for one in self.votes
             ],
         }
 
 
 def label_errors(found: PairResult, category: Path, sequences: Sequence[str]) -> dict[str, float]:
-    """Compute rotation errors in degrees; {} unless both sequences of the folder of a category have labels."""
+    """Compute rotation errors in degrees; {} unless both sequences of the folder of a category have
+    labels."""
     labels, errors = read_labels(category.parent, category.name), {}
     if not set(sequences) <= set(labels):
         return errors
     first, second = (labels[name] for name in sequences)
     for name, estimate in found.estimates.items():
-        truth = relative_pose(first, found.reference.camera, second, found.targets[estimate.view].camera)
+        truth = relative_pose(
+            first, found.reference.camera, second, found.targets[estimate.view].camera
+        )
         errors[name] = float(rotation_error(estimate.sim3.R, truth[:3, :3]))
     return errors
 
 
 @runtime_checkable
 class Solver(Protocol):
-    """The last stage of `ZeroShotPose`: from matched views to a pose. Any callable with this signature is accepted.
+    """The last stage of `ZeroShotPose`: from matched views to a pose. Any callable with this
+    signature is accepted.
 
     A solver that fits the pose in the first target view:
 
-        def first_view(reference, targets, matched, *, seed, threshold):
-            points = match_points(reference, targets[0], matched[0].matches)
-            sim3, inliers = ransac(*points, threshold=threshold, seed=seed)
-            scores = np.zeros(len(targets))
-            return PoseEstimate(sim3, 0, matched[0].matches, inliers, scores, reference, tuple(targets))
+        def first_view(reference, targets, matched, *, seed, threshold): points =
+            match_points(reference, targets[0], matched[0].matches) sim3, inliers = ransac(*points,
+            threshold=threshold, seed=seed) scores = np.zeros(len(targets)) return
+            PoseEstimate(sim3, 0, matched[0].matches, inliers, scores, reference, tuple(targets))
 
         ZeroShotPose(backbone, solver=first_view)
 
-    A solver with an attribute `kmeans = False` gets the k best matches. Without this attribute, k-means selects the
-    matches (see `ZeroShotPose.kmeans`).
+    A solver with an attribute `kmeans = False` gets the k best matches. Without this attribute,
+    k-means selects the matches (see `ZeroShotPose.kmeans`).
     """
 
     def __call__(
-        self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], *, seed: int, threshold: float
+        self,
+        reference: View,
+        targets: Sequence[View],
+        matched: Sequence[ViewMatch],
+        *,
+        seed: int,
+        threshold: float,
     ) -> PoseEstimate:
-        """Estimate the pose of the reference object from N >= 1 target views, each with its matches to the reference.
+        """Estimate the pose of the reference object from N >= 1 target views, each with its matches
+        to the reference.
 
-        All views have known depth in at least one pixel, and the targets a foreground patch. The same `seed` gives the
-        same pose. `threshold` is the largest residual of an inlier for an object of unit standard deviation, as the
-        scenes of CO3D are scaled. InputError if the views do not determine a pose.
+        All views have known depth in at least one pixel, and the targets a foreground patch. The
+        same `seed` gives the same pose. `threshold` is the largest residual of an inlier for an
+        object of unit standard deviation, as the scenes of CO3D are scaled. InputError if the views
+        do not determine a pose.
         """
         ...
 

@@ -1,8 +1,9 @@
 """Feature maps of a vision transformer, and log-binned descriptors (Amir et al. 2021).
 
-The descriptor of a patch has 17 bins: the keys of the patch and its eight neighbours at stride 1, and the eight
-neighbours at stride 3 of the keys averaged over 3x3 patches. `log_bin` follows this definition literally and needs 17
-times the memory of the keys; `matching.similarity` compares such descriptors without building them.
+The descriptor of a patch has 17 bins: the keys of the patch and its eight neighbours at stride 1,
+and the eight neighbours at stride 3 of the keys averaged over 3x3 patches. `log_bin` follows this
+definition literally and needs 17 times the memory of the keys; `matching.similarity` compares such
+descriptors without building them.
 """
 
 from collections.abc import Sequence
@@ -18,13 +19,15 @@ from torch import Tensor
 from zsp_lite.errors import InputError
 
 Grid = tuple[int, int]  # (rows, columns) of patches
-# A patch is foreground if its saliency is above this. The paper gives no value; this is the published code's.
+# A patch is foreground if its saliency is above this. The paper gives no value; this is the
+# published code's.
 SALIENCY_THRESHOLD = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureMap:
-    """Features of one image: copies of what is given, as float32 tensors on the CPU without gradients.
+    """Features of one image: copies of what is given, as float32 tensors on the CPU without
+    gradients.
 
     InputError if shapes do not fit together or values are not finite.
     """
@@ -42,14 +45,22 @@ class FeatureMap:
         keys, saliency = tuple(self.keys.shape), tuple(self.saliency.shape)
         if len(keys) != 3 or 0 in keys or saliency != keys[:2]:
             raise InputError(
-                f"FeatureMap: keys and saliency have shapes {keys}, {saliency}, expected (H, W, D), (H, W)"
+                f"FeatureMap: keys and saliency have shapes {keys}, {saliency}, expected (H, "
+                "W, D), (H, W)"
             )
-        if not all(bool(x.isfinite().all()) for x in (self.keys, self.saliency, self.global_feature)):
-            raise InputError("FeatureMap: keys, saliency or global feature hold values that are not finite")
+        if not all(
+            bool(x.isfinite().all()) for x in (self.keys, self.saliency, self.global_feature)
+        ):
+            raise InputError(
+                "FeatureMap: keys, saliency or global feature hold values that are not finite"
+            )
 
     def __repr__(self) -> str:
         rows, columns, channels = self.keys.shape
-        return f"FeatureMap({rows} x {columns} patches, {int(self.foreground().sum())} foreground, {channels} channels)"
+        return (
+            f"FeatureMap({rows} x {columns} patches, {int(self.foreground().sum())} foreground, "
+            f"{channels} channels)"
+        )
 
     @property
     def grid(self) -> Grid:
@@ -65,8 +76,9 @@ class FeatureMap:
 class FeatureExtractor(Protocol):
     """A backbone: maps images to feature maps. Any callable with this signature is accepted.
 
-    An attribute `image_size` (pixels), if there is one, sets the size of the object crops; the default is 224. An
-    attribute `has_saliency` that is False says that the saliency is 1 everywhere, so that object masks are needed.
+    An attribute `image_size` (pixels), if there is one, sets the size of the object crops; the
+    default is 224. An attribute `has_saliency` that is False says that the saliency is 1
+    everywhere, so that object masks are needed.
 
     A backbone whose keys are the mean colours of 8 x 8 pixels:
 
@@ -85,7 +97,8 @@ class FeatureExtractor(Protocol):
     """
 
     def __call__(self, images: Sequence[np.ndarray]) -> list[FeatureMap]:
-        """Extract the feature maps, all on one grid, of images (H, W, 3), uint8 or float in [0, 1]."""
+        """Extract the feature maps, all on one grid, of images (H, W, 3), uint8 or float in
+        [0, 1]."""
         ...
 
 
@@ -93,8 +106,9 @@ class FeatureExtractor(Protocol):
 def bin_indices(grid: Grid) -> Int[Tensor, "17 n"]:
     """Compute, for each bin and patch, the index of the patch that fills it.
 
-    Bins 0 to 8 read the keys (offsets -1, 0, 1 in rows and columns, row-major), bins 9 to 16 the pooled keys (offsets
-    -3, 0, 3, row-major, without the centre). Offsets beyond the border are clamped to it.
+    Bins 0 to 8 read the keys (offsets -1, 0, 1 in rows and columns, row-major), bins 9 to 16 the
+    pooled keys (offsets -3, 0, 3, row-major, without the centre). Offsets beyond the border are
+    clamped to it.
     """
     near = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     far = [(3 * dy, 3 * dx) for dy, dx in near if (dy, dx) != (0, 0)]
@@ -102,13 +116,15 @@ def bin_indices(grid: Grid) -> Int[Tensor, "17 n"]:
     with torch.inference_mode(False):  # the result is cached, and later callers may need gradients
         rows, columns = torch.arange(height)[:, None], torch.arange(width)
         filled = [
-            (rows + dy).clamp(0, height - 1) * width + (columns + dx).clamp(0, width - 1) for dy, dx in near + far
+            (rows + dy).clamp(0, height - 1) * width + (columns + dx).clamp(0, width - 1)
+            for dy, dx in near + far
         ]
         return torch.stack(filled).flatten(1)
 
 
 def average_pool(x: Tensor, axes: tuple[int, int]) -> Tensor:
-    """Average over 3x3 windows of two axes at stride 1, smaller ones at the border (count_include_pad=False)."""
+    """Average over 3x3 windows of two axes at stride 1, smaller ones at the border
+    (count_include_pad=False)."""
     for axis in axes:
         n = x.shape[axis]
         total = x.clone()
@@ -121,11 +137,17 @@ def average_pool(x: Tensor, axes: tuple[int, int]) -> Tensor:
     return x
 
 
-def log_bin(x: Float[Tensor, "b h w d"] | Float[np.ndarray, "b h w d"]) -> Float[Tensor, "b h w 17*d"]:
-    """Compute the descriptors of all patches from keys x: 17 bins, concatenated in the order of `bin_indices`."""
+def log_bin(
+    x: Float[Tensor, "b h w d"] | Float[np.ndarray, "b h w d"],
+) -> Float[Tensor, "b h w 17*d"]:
+    """Compute the descriptors of all patches from keys x: 17 bins, concatenated in the order of
+    `bin_indices`."""
     x = torch.as_tensor(x)
     b, h, w, d = x.shape
     pooled = average_pool(x, (1, 2))
     index = bin_indices((h, w)).to(x.device)
-    near, far = x.flatten(1, 2)[:, index[:9]], pooled.flatten(1, 2)[:, index[9:]]  # (B, 9 or 8, H*W, D)
+    near, far = (
+        x.flatten(1, 2)[:, index[:9]],
+        pooled.flatten(1, 2)[:, index[9:]],
+    )  # (B, 9 or 8, H*W, D)
     return torch.cat([near, far], dim=1).transpose(1, 2).reshape(b, h, w, 17 * d)

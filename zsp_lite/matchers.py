@@ -1,7 +1,8 @@
 """Alternatives to cyclical distances (supplement, "Design of correspondence method").
 
-A `Matcher` selects, for each patch of one image, a partner in the other, and scores the match. `matching.match` keeps
-the matches of highest score and selects among them by k-means; the paper's matcher, "cyclical", is in `matching`.
+A `Matcher` selects, for each patch of one image, a partner in the other, and scores the match.
+`matching.match` keeps the matches of highest score and selects among them by k-means; the paper's
+matcher, "cyclical", is in `matching`.
 """
 
 from collections.abc import Callable
@@ -16,7 +17,8 @@ from torch import Tensor
 class Matcher(Protocol):
     """A way to match patches. Any callable with this signature is accepted.
 
-    A matcher that takes the nearest neighbour if it is clearly better than the second nearest (Lowe's ratio test):
+    A matcher that takes the nearest neighbour if it is clearly better than the second nearest
+    (Lowe's ratio test):
 
         def ratio_test(similarity, foreground1, foreground2):
             distance = (2 - 2 * similarity).clamp_min(0).sqrt()
@@ -29,32 +31,43 @@ class Matcher(Protocol):
     """
 
     def __call__(
-        self, similarity: Float[Tensor, "n1 n2"], foreground1: Bool[Tensor, " n1"], foreground2: Bool[Tensor, " n2"], /
+        self,
+        similarity: Float[Tensor, "n1 n2"],
+        foreground1: Bool[Tensor, " n1"],
+        foreground2: Bool[Tensor, " n2"],
+        /,
     ) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
-        """Match the patches of image 1 with those of image 2, given the cosines between their descriptors.
+        """Match the patches of image 1 with those of image 2, given the cosines between their
+        descriptors.
 
-        Returns for each patch of image 1 the index of its partner in image 2, and the score of the match, higher is
-        better; -inf for no match.
+        Returns for each patch of image 1 the index of its partner in image 2, and the score of the
+        match, higher is better; -inf for no match.
         """
         ...
 
 
-# The paper gives neither. LoFTR (Sun et al. 2021) divides its similarities by 0.1 before a dual softmax; 0.05 is the
-# weight of the entropy in SCOT (Liu et al. 2020), the optimal transport that the paper cites.
+# The paper gives neither. LoFTR (Sun et al. 2021) divides its similarities by 0.1 before a dual
+# softmax; 0.05 is the weight of the entropy in SCOT (Liu et al. 2020), the optimal transport that
+# the paper cites.
 SOFTMAX_TEMPERATURE = 0.1
 TRANSPORT_REGULARISATION = 0.05
 TRANSPORT_STEPS = 100
 
 
-def mutual_nearest_neighbours(similarity: Float[Tensor, "m n"]) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
+def mutual_nearest_neighbours(
+    similarity: Float[Tensor, "m n"],
+) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
     """Match mutual nearest neighbours, scored by their similarity."""
     best, partner = similarity.max(dim=1)
     returned = similarity.argmax(dim=0)[partner]
-    return partner, best.masked_fill(returned != torch.arange(len(best), device=best.device), -torch.inf)
+    return partner, best.masked_fill(
+        returned != torch.arange(len(best), device=best.device), -torch.inf
+    )
 
 
 def dual_softmax(similarity: Float[Tensor, "m n"]) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
-    """Match each patch with the partner of highest probability under a dual softmax (Cheng et al. 2021).
+    """Match each patch with the partner of highest probability under a dual softmax (Cheng et al.
+    2021).
 
     The score is the logarithm of the product of the softmax over rows and the softmax over columns.
     """
@@ -64,17 +77,24 @@ def dual_softmax(similarity: Float[Tensor, "m n"]) -> tuple[Int[Tensor, " m"], F
     return partner, score
 
 
-def optimal_transport(similarity: Float[Tensor, "m n"]) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
-    """Match each patch with the partner that receives most of its mass under optimal transport (Liu et al. 2020).
+def optimal_transport(
+    similarity: Float[Tensor, "m n"],
+) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
+    """Match each patch with the partner that receives most of its mass under optimal transport (Liu
+    et al. 2020).
 
-    The plan moves uniform mass between the patches at cost 1 - similarity. The score is the mass moved.
+    The plan moves uniform mass between the patches at cost 1 - similarity. The score is the mass
+    moved.
     """
     score, partner = sinkhorn(1 - similarity, TRANSPORT_REGULARISATION, TRANSPORT_STEPS).max(dim=1)
     return partner, score
 
 
-def sinkhorn(cost: Float[Tensor, "n1 n2"], regularisation: float, steps: int) -> Float[Tensor, "n1 n2"]:
-    """Compute the entropy-regularised transport plan between uniform masses (Cuturi 2013), in float64 on the CPU.
+def sinkhorn(
+    cost: Float[Tensor, "n1 n2"], regularisation: float, steps: int
+) -> Float[Tensor, "n1 n2"]:
+    """Compute the entropy-regularised transport plan between uniform masses (Cuturi 2013), in
+    float64 on the CPU.
 
     Its columns sum to 1 / n2, its rows to 1 / n1 in the limit of many steps.
     """
@@ -89,11 +109,16 @@ def sinkhorn(cost: Float[Tensor, "n1 n2"], regularisation: float, steps: int) ->
     return rows[:, None] * kernel * columns
 
 
-def on_foreground(choose: Callable[[Float[Tensor, "m n"]], tuple[Int[Tensor, " m"], Float[Tensor, " m"]]]) -> Matcher:
-    """Make a matcher of a function that matches the foreground patches alone, given their similarities; on the CPU."""
+def on_foreground(
+    choose: Callable[[Float[Tensor, "m n"]], tuple[Int[Tensor, " m"], Float[Tensor, " m"]]],
+) -> Matcher:
+    """Make a matcher of a function that matches the foreground patches alone, given their
+    similarities; on the CPU."""
 
     def matcher(similarity, foreground1, foreground2):
-        similarity, foreground1, foreground2 = (one.cpu() for one in (similarity, foreground1, foreground2))
+        similarity, foreground1, foreground2 = (
+            one.cpu() for one in (similarity, foreground1, foreground2)
+        )
         partner = torch.zeros(len(foreground1), dtype=torch.long)
         score = torch.full((len(foreground1),), -torch.inf, dtype=torch.float64)
         if foreground1.any() and foreground2.any():

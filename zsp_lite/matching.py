@@ -1,13 +1,16 @@
-"""Semantic correspondences between two images from cyclical distances (sec. 4.1, eq. 2, and supplement).
+"""Semantic correspondences between two images from cyclical distances (sec. 4.1, eq. 2, and
+supplement).
 
-`similarity` is the cosine of log-binned descriptors. `cyclical_distances` follows each patch to its nearest neighbour
-in the other image and back. `match` takes the 2K patches of smallest cyclical distance and selects K by k-means.
+`similarity` is the cosine of log-binned descriptors. `cyclical_distances` follows each patch to its
+nearest neighbour in the other image and back. `match` takes the 2K patches of smallest cyclical
+distance and selects K by k-means.
 
-Why `similarity` needs no descriptors: a descriptor is a concatenation, so the product of two descriptors is a sum over
-bins of products of keys. Each of these products is an entry of one matrix S of all keys against all keys, shifted by
-the bin's offset in both images. With J_s[S](r1, c1, r2, c2) = sum over i in (-1, 0, 1) of S(r1 + s i, c1, r2 + s i,
-c2), J_s' the same for columns, and P the 3x3 average pooling in both images, the sum is J_1 J_1' S + (J_3 J_3' - 1)
-P S: a dozen additions of S to itself.
+Why `similarity` needs no descriptors: a descriptor is a concatenation, so the product of two
+descriptors is a sum over bins of products of keys. Each of these products is an entry of one matrix
+S of all keys against all keys, shifted by the bin's offset in both images. With J_s[S](r1, c1, r2,
+c2) = sum over i in (-1, 0, 1) of S(r1 + s i, c1, r2 + s i, c2), J_s' the same for columns, and P
+the 3x3 average pooling in both images, the sum is J_1 J_1' S + (J_3 J_3' - 1) P S: a dozen
+additions of S to itself.
 """
 
 import threading
@@ -55,7 +58,8 @@ def similarity(ref: Keys, target: Keys) -> Float[Tensor, "n1 n2"]:
         target: Feature map, or keys (H2, W2, D), of the target.
 
     Returns:
-        (H1 * W1, H2 * W2) cosines, patches in row-major order. Descriptors of length 0 have similarity 0.
+        (H1 * W1, H2 * W2) cosines, patches in row-major order. Descriptors of length 0 have
+        similarity 0.
     """
     return similarities(ref, [target])[0]
 
@@ -68,12 +72,15 @@ def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]
     for keys2 in map(_keys, targets):
         products = keys1.flatten(0, 1) @ keys2.flatten(0, 1).T
         summed = _bin_products(products.view(*keys1.shape[:2], *keys2.shape[:2]))
-        results.append(summed.view(products.shape).mul_(inverse_norm1[:, None]).mul_(_inverse_norm(keys2)))
+        results.append(
+            summed.view(products.shape).mul_(inverse_norm1[:, None]).mul_(_inverse_norm(keys2))
+        )
     return results
 
 
 def key_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
-    """Compute the cosine similarities of the keys themselves, without log-binning (see `similarities`)."""
+    """Compute the cosine similarities of the keys themselves, without log-binning (see
+    `similarities`)."""
     first, *others = (F.normalize(_keys(one).flatten(0, 1), dim=1) for one in (ref, *targets))
     return [first @ other.T for other in others]
 
@@ -81,7 +88,8 @@ def key_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n
 def nearest_neighbours(
     sim: Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"],
 ) -> tuple[Int[Tensor, " n1"], Int[Tensor, " n2"]]:
-    """Find each row's most similar column and each column's most similar row (the argmins of eq. 2)."""
+    """Find each row's most similar column and each column's most similar row (the argmins of eq.
+    2)."""
     sim = torch.as_tensor(sim)
     return sim.argmax(dim=1), sim.argmax(dim=0)
 
@@ -93,7 +101,8 @@ def cyclical_distances(
     fg1: Bool[Tensor, "h1 w1"] | Bool[np.ndarray, "h1 w1"] | None = None,
     fg2: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
 ) -> Float[Tensor, "h1 w1"]:
-    """Compute the cyclical distance map C_u = -d(u, u') (eq. 2): u's nearest neighbour is v, and v's is u'.
+    """Compute the cyclical distance map C_u = -d(u, u') (eq. 2): u's nearest neighbour is v, and
+    v's is u'.
 
     Args:
         sim: (H1 * W1, H2 * W2) similarities.
@@ -124,11 +133,13 @@ def match(
     matcher: str | Matcher = "cyclical",
     binning: bool = True,
 ) -> Matches:
-    """Find at most k correspondences (sec. 4.1; supplement, "Number and diversity of correspondences").
+    """Find at most k correspondences (sec. 4.1; supplement, "Number and diversity of
+    correspondences").
 
-    The 2k patches of smallest cyclical distance (ties: more similar first, then row-major) are clustered by k-means on
-    their descriptors into k clusters. The most salient patch of each cluster is returned. With fewer than 2k valid
-    cycles all of them are clustered; with at most k, all are returned, which may be none.
+    The 2k patches of smallest cyclical distance (ties: more similar first, then row-major) are
+    clustered by k-means on their descriptors into k clusters. The most salient patch of each
+    cluster is returned. With fewer than 2k valid cycles all of them are clustered; with at most k,
+    all are returned, which may be none.
 
     Args:
         ref: Feature map of the reference.
@@ -136,8 +147,9 @@ def match(
         k: Number of matches.
         kmeans: False returns the k best patches without clustering.
         seed: Seed or generator of k-means.
-        cycle_from: Image in which cycles start and whose patches are clustered and compared in saliency. "reference"
-            is the paper's; "target" follows the cycle step of the published code, with its masking.
+        cycle_from: Image in which cycles start and whose patches are clustered and compared in
+            saliency. "reference" is the paper's; "target" follows the cycle step of the published
+            code, with its masking.
         ref_foreground: (H1, W1) foreground of the reference; by default `ref.foreground()`.
         target_foreground: (H2, W2) foreground of the target.
         sim: (H1 * W1, H2 * W2) similarities, if they are computed already.
@@ -157,12 +169,15 @@ def match(
         score, neighbour = _cycles(sim, on_start, on_end, published=cycle_from == "target")
     else:
         rank = MATCHERS[matcher] if isinstance(matcher, str) else matcher
-        # Copies, since a matcher may overwrite what it gets, such as the similarities of the background.
+        # Copies, since a matcher may overwrite what it gets, such as the similarities of the
+        # background.
         answer = rank(sim.clone(), on_start.flatten().clone(), on_end.flatten().clone())
         neighbour, score = (torch.as_tensor(one).cpu() for one in answer)
         if not len(neighbour) == len(score) == len(sim):
             found = f"{len(neighbour)} partners and {len(score)} scores"
-            raise InputError(f"the matcher returned {found}, expected one for each of {len(sim)} patches")
+            raise InputError(
+                f"the matcher returned {found}, expected one for each of {len(sim)} patches"
+            )
     best = sim.gather(1, neighbour[:, None])[:, 0]
 
     # The rest works on a few hundred numbers, in NumPy.
@@ -171,7 +186,9 @@ def match(
     order = order[np.isfinite(score[order])][: 2 * k if kmeans else k]
     if kmeans and len(order) > k:
         clusters = _cluster(_gram(start, order, binning), k, np.random.default_rng(seed))
-        by_cluster = np.lexsort((-start.saliency.flatten().numpy()[order], clusters))  # the most salient first
+        by_cluster = np.lexsort(
+            (-start.saliency.flatten().numpy()[order], clusters)
+        )  # the most salient first
         first = np.unique(clusters[by_cluster], return_index=True)[1]
         order = order[np.sort(by_cluster[first])]
     u = np.stack(np.unravel_index(order, start.grid), axis=-1)
@@ -181,9 +198,13 @@ def match(
 
 
 def _cycles(
-    sim: Float[Tensor, "n1 n2"], on1: Bool[Tensor, "h1 w1"], on2: Bool[Tensor, "h2 w2"], published: bool = False
+    sim: Float[Tensor, "n1 n2"],
+    on1: Bool[Tensor, "h1 w1"],
+    on2: Bool[Tensor, "h2 w2"],
+    published: bool = False,
 ) -> tuple[Float[Tensor, " n1"], Int[Tensor, " n1"]]:
-    """Compute the scores of `cyclical_distances`, and each foreground patch's nearest neighbour; 0 for the others.
+    """Compute the scores of `cyclical_distances`, and each foreground patch's nearest neighbour; 0
+    for the others.
 
     Only the foreground's neighbours, and of the patches of image 2 only theirs, are searched for.
     """
@@ -193,9 +214,15 @@ def _cycles(
     reached, position = forth.unique(return_inverse=True)
     back = sim[:, reached].argmax(dim=0)[position]
     row, column = back // columns, back % columns
-    distance = torch.stack([u // columns - row, u % columns - column]).to(torch.float32).square().sum(0).sqrt()
-    # The published code does not check that u' is foreground, and discards every u' in row 0 or column 0: it marks "no
-    # cycle" by index 0, and looks for the mark in each coordinate.
+    distance = (
+        torch.stack([u // columns - row, u % columns - column])
+        .to(torch.float32)
+        .square()
+        .sum(0)
+        .sqrt()
+    )
+    # The published code does not check that u' is foreground, and discards every u' in row 0 or
+    # column 0: it marks "no cycle" by index 0, and looks for the mark in each coordinate.
     valid = on2[forth] & ((row > 0) & (column > 0) if published else on1[back])
     score = torch.full((len(sim),), -torch.inf, device=sim.device)
     score[u] = torch.where(valid, -distance, -torch.inf)
@@ -206,7 +233,9 @@ def _cycles(
 
 def _keys(features: Keys) -> Float[Tensor, "h w d"]:
     """Get the keys as a float32 tensor."""
-    return torch.as_tensor(features.keys if isinstance(features, FeatureMap) else features).to(torch.float32)
+    return torch.as_tensor(features.keys if isinstance(features, FeatureMap) else features).to(
+        torch.float32
+    )
 
 
 def _bin_products(products: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w1 h2 w2"]:
@@ -215,18 +244,24 @@ def _bin_products(products: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w
     def columns(x: Tensor) -> Tensor:
         return x.permute(1, 0, 3, 2)
 
-    # Every sum and average is separable: along the rows of both images (axes 0 and 2), then along their columns.
+    # Every sum and average is separable: along the rows of both images (axes 0 and 2), then along
+    # their columns.
     pooled = average_pool(products, (0, 2))
-    near, far, centre = (columns(x) for x in (_joint_shifts(products, 1), _joint_shifts(pooled, 3), pooled))
+    near, far, centre = (
+        columns(x) for x in (_joint_shifts(products, 1), _joint_shifts(pooled, 3), pooled)
+    )
     far, centre = average_pool(far, (0, 2)), average_pool(centre, (0, 2))
     return columns(_joint_shifts(near, 1).add_(_joint_shifts(far, 3)).sub_(centre))
 
 
 def _joint_shifts(x: Float[Tensor, "a b c d"], step: int) -> Float[Tensor, "a b c d"]:
-    """Sum x shifted by -step, 0 and step along axes 0 and 2 together, each clamped at its border."""
+    """Sum x shifted by -step, 0 and step along axes 0 and 2 together, each clamped at its
+    border."""
     total = x.clone()
     for shift in (-step, step):
-        index1, index2 = ((torch.arange(n, device=x.device) + shift).clamp(0, n - 1) for n in x.shape[::2])
+        index1, index2 = (
+            (torch.arange(n, device=x.device) + shift).clamp(0, n - 1) for n in x.shape[::2]
+        )
         total.add_(x.index_select(0, index1).index_select(2, index2))
     return total
 
@@ -239,28 +274,38 @@ def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
     return squared.clamp_min(torch.finfo(squared.dtype).tiny).rsqrt()
 
 
-def _gram(features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = True) -> Float[np.ndarray, "m m"]:
-    """Compute the cosines between the descriptors of a few patches, which are few enough to build."""
+def _gram(
+    features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = True
+) -> Float[np.ndarray, "m m"]:
+    """Compute the cosines between the descriptors of a few patches, which are few enough to
+    build."""
     keys = features.keys.double()
     index = torch.from_numpy(index)
     descriptors = keys.flatten(0, 1)[index]
     if binning:
         bins, pooled = bin_indices(features.grid)[:, index], average_pool(keys, (0, 1))
-        descriptors = torch.cat([keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]])  # (17, m, D)
+        descriptors = torch.cat(
+            [keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]]
+        )  # (17, m, D)
         descriptors = descriptors.transpose(0, 1).flatten(1)
     descriptors = F.normalize(descriptors, dim=1)
-    # Rounded, because greedy k-means++ has exact ties (of two points that are each other's nearest, either lowers the
-    # sum of squares by the same amount), which rounding errors would break differently each time.
+    # Rounded, because greedy k-means++ has exact ties (of two points that are each other's nearest,
+    # either lowers the sum of squares by the same amount), which rounding errors would break
+    # differently each time.
     return (descriptors @ descriptors.T).round(decimals=6).numpy()
 
 
-def _cluster(gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator) -> Int[np.ndarray, " m"]:
+def _cluster(
+    gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator
+) -> Int[np.ndarray, " m"]:
     """Cluster m points, given by their inner products, by k-means; returns their labels."""
     with one_thread(), _filters, warnings.catch_warnings():
-        # Eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions of the same inner products,
-        # hence the same distances: k-means on them is k-means on the descriptors of 17 D dimensions, but faster.
+        # Eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions of the
+        # same inner products, hence the same distances: k-means on them is k-means on the
+        # descriptors of 17 D dimensions, but faster.
         values, vectors = np.linalg.eigh(gram)
         points = vectors * np.sqrt(np.maximum(values, 0.0))
-        # Equal descriptors (a uniform surface) leave clusters empty: that gives fewer matches and needs no warning.
+        # Equal descriptors (a uniform surface) leave clusters empty: that gives fewer matches and
+        # needs no warning.
         warnings.simplefilter("ignore", ConvergenceWarning)
         return KMeans(k, n_init=1, random_state=int(rng.integers(2**31))).fit(points).labels_

@@ -1,4 +1,5 @@
-"""Pose errors, and the paper's figures of them (sec. 5.1; supplement, "Choice of evaluation metrics")."""
+"""Pose errors, and the paper's figures of them (sec. 5.1; supplement, "Choice of evaluation
+metrics")."""
 
 import numpy as np
 from jaxtyping import Float
@@ -10,8 +11,8 @@ from zsp_lite.errors import rotation_matrix
 def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
     """Compute the geodesic angle between rotations, exact near 0 and 180 degrees.
 
-    The angle is the atan2 of the relative rotation's sine (its antisymmetric part) and cosine (its trace). An arccos of
-    the trace loses all digits near 0 and 180.
+    The angle is the atan2 of the relative rotation's sine (its antisymmetric part) and cosine (its
+    trace). An arccos of the trace loses all digits near 0 and 180.
 
     Args:
         first: Rotations (..., 3, 3), numpy or torch.
@@ -27,7 +28,9 @@ def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
     return rotation_angle(first, rotation_matrix("rotation_error: second", second))
 
 
-def rotation_angle(first: Float[np.ndarray, "*a 3 3"], second: Float[np.ndarray, "*b 3 3"]) -> np.ndarray | float:
+def rotation_angle(
+    first: Float[np.ndarray, "*a 3 3"], second: Float[np.ndarray, "*b 3 3"]
+) -> np.ndarray | float:
     """Compute the angles of `rotation_error` without checks."""
     relative = np.swapaxes(first, -1, -2) @ second
     twice_sine = np.sqrt(
@@ -39,8 +42,11 @@ def rotation_angle(first: Float[np.ndarray, "*a 3 3"], second: Float[np.ndarray,
     return np.degrees(np.arctan2(twice_sine, twice_cosine))[()]
 
 
-def accuracy(errors: ArrayLike, threshold: float, weights: ArrayLike | None = None) -> np.ndarray | float:
-    """Compute the percentages (...) of errors (..., n) in degrees strictly below a threshold; Acc30 is threshold=30.
+def accuracy(
+    errors: ArrayLike, threshold: float, weights: ArrayLike | None = None
+) -> np.ndarray | float:
+    """Compute the percentages (...) of errors (..., n) in degrees strictly below a threshold; Acc30
+    is threshold=30.
 
     Non-negative weights (..., n) are broadcast against the errors.
     """
@@ -48,10 +54,11 @@ def accuracy(errors: ArrayLike, threshold: float, weights: ArrayLike | None = No
 
 
 def median(errors: ArrayLike, weights: ArrayLike | None = None) -> np.ndarray | float:
-    """Compute the medians (...) of errors (..., n), or of errors (n,) with non-negative weights (..., n).
+    """Compute the medians (...) of errors (..., n), or of errors (n,) with non-negative weights
+    (..., n).
 
-    The weighted median halves the total weight. Where the half falls between two errors it is their mean, so that
-    equal weights give the ordinary median.
+    The weighted median halves the total weight. Where the half falls between two errors it is their
+    mean, so that equal weights give the ordinary median.
     """
     errors = np.asarray(errors, np.float64)
     if weights is None:

@@ -1,4 +1,5 @@
-"""Zero-shot pose estimation from frames to a pose, composed of the stages' functions (paper, fig. 2 and sec. 4)."""
+"""Zero-shot pose estimation from frames to a pose, composed of the stages' functions (paper, fig. 2
+and sec. 4)."""
 
 import pkgutil
 from collections.abc import Iterable, Sequence
@@ -32,25 +33,22 @@ _FEW = 10  # fewer points do not give a standard deviation
 class ZeroShotPose:
     """Zero-shot category-level pose estimation; the defaults are the paper's.
 
-    Attributes:
-        backbone: Computes the features of images; any `FeatureExtractor`.
-        k: Number of matches.
-        kmeans: Select the matches by clustering the 2k best candidates (sec. 4.1); False takes the k best. None uses
-            the solver's setting (see `estimates.Solver`): True for the paper's, False for the verified one.
-        view_selector: "correspond", as in the paper, another name in `best_view.VIEW_SELECTORS`, or a `ViewSelector`.
-        trials: Number of RANSAC trials.
-        threshold: Largest residual of a RANSAC inlier in scene units. (The scenes of CO3D are scaled to unit standard
-            deviation.)
-        sample_size: Points per RANSAC trial.
-        foreground: "saliency", as in the paper, or "mask" for the frame's own object mask. Backbones without saliency
-            need "mask".
-        cycle_from: View in which cycles start: "reference", as in the paper, or "target", as in the cycle step of the
-            published code (see `matching.match`; docs/published_code.md lists all its differences).
-        matcher: "cyclical", as in the paper, another name in `matchers.MATCHERS`, or a `Matcher`.
-        binning: Compare log-binned descriptors, as in the paper; False compares the keys themselves.
-        solver: "paper" selects the best view and aligns with it by RANSAC; or a name in `SOLVER_CLASSES`, such as
-            "verified", or a `Solver`. The settings view_selector, trials and sample_size are for "paper" only.
-        seed: Seed of k-means and of the solver.
+    Attributes: backbone: Computes the features of images; any `FeatureExtractor`. k: Number of
+        matches. kmeans: Select the matches by clustering the 2k best candidates (sec. 4.1); False
+        takes the k best. None uses the solver's setting (see `estimates.Solver`): True for the
+        paper's, False for the verified one. view_selector: "correspond", as in the paper, another
+        name in `best_view.VIEW_SELECTORS`, or a `ViewSelector`. trials: Number of RANSAC trials.
+        threshold: Largest residual of a RANSAC inlier in scene units. (The scenes of CO3D are
+        scaled to unit standard deviation.) sample_size: Points per RANSAC trial. foreground:
+        "saliency", as in the paper, or "mask" for the frame's own object mask. Backbones without
+        saliency need "mask". cycle_from: View in which cycles start: "reference", as in the paper,
+        or "target", as in the cycle step of the published code (see `matching.match`;
+        docs/published_code.md lists all its differences). matcher: "cyclical", as in the paper,
+        another name in `matchers.MATCHERS`, or a `Matcher`. binning: Compare log-binned
+        descriptors, as in the paper; False compares the keys themselves. solver: "paper" selects
+        the best view and aligns with it by RANSAC; or a name in `SOLVER_CLASSES`, such as
+        "verified", or a `Solver`. The settings view_selector, trials and sample_size are for
+        "paper" only. seed: Seed of k-means and of the solver.
 
     Raises:
         InputError: A setting is out of range.
@@ -78,29 +76,39 @@ class ZeroShotPose:
             value = getattr(self, name)
             if name not in stages or not callable(value):  # else a plug-in
                 check_choice(name, value, allowed)
-        for name, *limits in (("k", 1), ("trials", 1, MOST_TRIALS), ("sample_size", 3), ("seed", 0)):
+        for name, *limits in (
+            ("k", 1),
+            ("trials", 1, MOST_TRIALS),
+            ("sample_size", 3),
+            ("seed", 0),
+        ):
             check_integer(name, getattr(self, name), *limits)
         if not callable(self.backbone):
-            raise InputError(f"backbone is {self.backbone!r}, expected what `load_backbone` returns")
+            raise InputError(
+                f"backbone is {self.backbone!r}, expected what `load_backbone` returns"
+            )
         if self.foreground == "saliency" and not getattr(self.backbone, "has_saliency", True):
             name = getattr(self.backbone, "name", type(self.backbone).__name__)
-            raise InputError(f"foreground is 'saliency', which {name} does not have; expected 'mask'")
+            raise InputError(
+                f"foreground is 'saliency', which {name} does not have; expected 'mask'"
+            )
         check_number("threshold", self.threshold, above=0)
 
     def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:
         """Estimate the pose of the reference object in the best of N target views.
 
-        A frame without a mask is not cropped. Target views with a `frame_defect`, such as an empty mask, or without
-        foreground are left out, with a flag each. If the matches of the best view do not determine a pose (fewer than
-        `sample_size`, or collinear), the pose is that of the best view itself, with a flag (see `view_alignment`).
+        A frame without a mask is not cropped. Target views with a `frame_defect`, such as an empty
+        mask, or without foreground are left out, with a flag each. If the matches of the best view
+        do not determine a pose (fewer than `sample_size`, or collinear), the pose is that of the
+        best view itself, with a flag (see `view_alignment`).
 
         Args:
             reference: Frame of the reference object.
             targets: Frames of another object of its category, in one world.
 
         Raises:
-            InputError: There are no targets, no target is usable, or the reference has an empty mask or no known
-                depth.
+            InputError: There are no targets, no target is usable, or the reference has an empty
+                mask or no known depth.
         """
         timings: dict[str, float] = {}
         with timed(timings, "features"):
@@ -111,14 +119,20 @@ class ZeroShotPose:
     def views(self, frames: Iterable[Frame]) -> list[View]:
         """Crop frames to their objects and extract features and foregrounds, all in one batch."""
         size = getattr(self.backbone, "image_size", IMAGE_SIZE)
-        return extract_views(self.backbone, [object_crop(frame, size) for frame in frames], self.foreground)
+        return extract_views(
+            self.backbone, [object_crop(frame, size) for frame in frames], self.foreground
+        )
 
     def match_views(
-        self, reference: View, targets: Sequence[View], similarities: Sequence[Float[torch.Tensor, "_ _"]] | None = None
+        self,
+        reference: View,
+        targets: Sequence[View],
+        similarities: Sequence[Float[torch.Tensor, "_ _"]] | None = None,
     ) -> list[ViewMatch]:
         """Match the reference with each target view (sec. 4.1).
 
-        `similarities` are the cosines of the reference's patches with those of each view, if they are known already.
+        `similarities` are the cosines of the reference's patches with those of each view, if they
+        are known already.
         """
         if similarities is None:
             compare = cosine_similarities if self.binning else key_similarities
@@ -127,10 +141,18 @@ class ZeroShotPose:
         matched = []
         for target, similarity in zip(targets, similarities, strict=True):
             matches = match(
-                reference.features, target.features, self.k, kmeans, self.seed, self.cycle_from,
-                ref_foreground=reference.foreground, target_foreground=target.foreground, sim=similarity,
-                matcher=self.matcher, binning=self.binning,
-            )  # fmt: skip
+                reference.features,
+                target.features,
+                self.k,
+                kmeans,
+                self.seed,
+                self.cycle_from,
+                ref_foreground=reference.foreground,
+                target_foreground=target.foreground,
+                sim=similarity,
+                matcher=self.matcher,
+                binning=self.binning,
+            )
             matched.append(ViewMatch(reference, target, similarity, matches, self.k))
         return matched
 
@@ -157,14 +179,23 @@ class ZeroShotPose:
         scores = np.full(len(targets), -np.inf)
         scores[usable] = np.reshape(found.view_scores, len(usable))
         return replace(
-            found, view=usable[found.view], view_scores=scores, reference_view=reference, target_views=tuple(targets),
-            timings=timings | found.timings, flags=(*flags, *found.flags),
+            found,
+            view=usable[found.view],
+            view_scores=scores,
+            reference_view=reference,
+            target_views=tuple(targets),
+            timings=timings | found.timings,
+            flags=(*flags, *found.flags),
             hypotheses=tuple(replace(one, view=usable[one.view]) for one in found.hypotheses),
-        )  # fmt: skip
+        )
 
     def _solver(self) -> Solver:
         if self.solver == "paper":
-            settings = {"view_selector": self.view_selector, "trials": self.trials, "sample_size": self.sample_size}
+            settings = {
+                "view_selector": self.view_selector,
+                "trials": self.trials,
+                "sample_size": self.sample_size,
+            }
             return partial(align_best_view, **settings)
         if isinstance(self.solver, str):
             return pkgutil.resolve_name(SOLVER_CLASSES[self.solver])()
@@ -172,14 +203,24 @@ class ZeroShotPose:
 
 
 def solve_pair(
-    method: ZeroShotPose, reference: Frame, targets: Sequence[Frame], solvers: Sequence[str] | None = None
+    method: ZeroShotPose,
+    reference: Frame,
+    targets: Sequence[Frame],
+    solvers: Sequence[str] | None = None,
 ) -> dict[str, PoseEstimate]:
-    """Estimate the pose of a pair by each of several solvers, by name, or by the method's own, with shared features."""
+    """Estimate the pose of a pair by each of several solvers, by name, or by the method's own, with
+    shared features."""
     first, *others = method.views([reference, *targets])
     if solvers is None:
-        name = method.solver if isinstance(method.solver, str) else getattr(method.solver, "__name__", "solver")
+        name = (
+            method.solver
+            if isinstance(method.solver, str)
+            else getattr(method.solver, "__name__", "solver")
+        )
         return {name: method.estimate_from_views(first, others)}
-    return {name: replace(method, solver=name).estimate_from_views(first, others) for name in solvers}
+    return {
+        name: replace(method, solver=name).estimate_from_views(first, others) for name in solvers
+    }
 
 
 def align_best_view(
@@ -193,7 +234,8 @@ def align_best_view(
     trials: int = 1000,
     sample_size: int = 4,
 ) -> PoseEstimate:
-    """Solve as the paper does: select the best view (sec. 4.2) and fit the pose to its matches by RANSAC (sec. 4.3).
+    """Solve as the paper does: select the best view (sec. 4.2) and fit the pose to its matches by
+    RANSAC (sec. 4.3).
 
     This is the `Solver` named "paper"; `ZeroShotPose` explains the settings.
     """
@@ -211,22 +253,32 @@ def align_best_view(
         flags: tuple[str, ...] = ()
         try:
             sim3, inliers = ransac(
-                *points, threshold=threshold, trials=trials, sample_size=sample_size, seed=seed,
+                *points,
+                threshold=threshold,
+                trials=trials,
+                sample_size=sample_size,
+                seed=seed,
                 scale_range=SCALE_RANGE,
-            )  # fmt: skip
+            )
             if (agreeing := int(inliers.sum())) < sample_size:
                 flags = (f"only {agreeing} of {len(inliers)} matches agree with the pose",)
         except InputError as error:
-            sim3, inliers = view_alignment(reference, targets[best]), np.zeros(len(points[0]), dtype=bool)
+            sim3, inliers = (
+                view_alignment(reference, targets[best]),
+                np.zeros(len(points[0]), dtype=bool),
+            )
             flags = (f"pose is the best view's, not a fit: {error}",)
-    return PoseEstimate(sim3, best, matches, inliers, scores, reference, tuple(targets), timings, flags)
+    return PoseEstimate(
+        sim3, best, matches, inliers, scores, reference, tuple(targets), timings, flags
+    )
 
 
 def view_alignment(reference: View, target: View) -> Sim3:
-    """Align a view with the reference without matches: the pose of the row "Ours-BV" in the paper's tables.
+    """Align a view with the reference without matches: the pose of the row "Ours-BV" in the paper's
+    tables.
 
-    The rotation is the identity. Scale and translation map the standard deviation and the centroid of the reference's
-    foreground points onto those of the target's.
+    The rotation is the identity. Scale and translation map the standard deviation and the centroid
+    of the reference's foreground points onto those of the target's.
     """
     first, second = _foreground_points(reference), _foreground_points(target)
     spreads = standard_deviation(first), standard_deviation(second)
@@ -235,7 +287,8 @@ def view_alignment(reference: View, target: View) -> Sim3:
 
 
 def _foreground_points(view: View) -> Float[np.ndarray, "n 3"]:
-    """Get the points of the foreground patches with measured depth; if they are too few, those of the whole crop."""
+    """Get the points of the foreground patches with measured depth; if they are too few, those of
+    the whole crop."""
     points, known = view.patch_points
     for chosen in (view.known_foreground, known):
         if chosen.sum() >= _FEW:

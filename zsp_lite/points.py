@@ -8,12 +8,14 @@ from jaxtyping import Bool, Float, UInt8
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
 
-_FAR = 4.0  # points of a frame farther from their median than this multiple of the median distance are outliers
+# points of a frame farther from their median than this multiple of the median distance are outliers
+_FAR = 4.0
 _SAMPLE = 1 << 21  # points of many frames that are held at once; 50 MB
 
 
 def object_pixels(frame: Frame) -> Bool[np.ndarray, "height width"]:
-    """Select the pixels on the object that have known depth; a frame without a mask is all object."""
+    """Select the pixels on the object that have known depth; a frame without a mask is all
+    object."""
     known = frame.depth > 0
     return known if frame.mask is None else known & (frame.mask > ON_OBJECT)
 
@@ -23,14 +25,19 @@ def object_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
     return unproject_depth(frame.depth, frame.camera)[object_pixels(frame)]
 
 
-def world_points(frame: Frame, pixels: Bool[np.ndarray, "height width"], step: int = 1) -> Float[np.ndarray, "n 3"]:
+def world_points(
+    frame: Frame, pixels: Bool[np.ndarray, "height width"], step: int = 1
+) -> Float[np.ndarray, "n 3"]:
     """Unproject every `step`-th of some pixels of known depth, row by row, to world points."""
     rows, columns = np.divmod(np.flatnonzero(pixels)[::step], pixels.shape[1])
-    return frame.camera.unproject(np.stack([columns, rows], axis=-1) + 0.5, frame.depth[rows, columns])
+    return frame.camera.unproject(
+        np.stack([columns, rows], axis=-1) + 0.5, frame.depth[rows, columns]
+    )
 
 
 def sampling_step(frame: Frame, count: int) -> int:
-    """Return the step by which the `world_points` of `count` frames of this size fit into memory together."""
+    """Return the step by which the `world_points` of `count` frames of this size fit into memory
+    together."""
     return max(1, count * frame.depth.size // _SAMPLE)
 
 
@@ -49,12 +56,16 @@ def standard_deviation(points: Float[np.ndarray, "n 3"]) -> float:
 
 
 def axis_deviation(points: Float[np.ndarray, "n 3"]) -> float:
-    """Compute the mean of the standard deviations of the three axes; it is 1 in scenes of CO3D (supplement)."""
+    """Compute the mean of the standard deviations of the three axes; it is 1 in scenes of CO3D
+    (supplement)."""
     return float(points.std(axis=0).mean())
 
 
-def world_cloud(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Gather the world points and colours of the object in the usable frames, without each frame's outliers."""
+def world_cloud(
+    frames: Sequence[Frame],
+) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """Gather the world points and colours of the object in the usable frames, without each frame's
+    outliers."""
     clouds, colours = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
     for frame in frames:
         if not frame_defect(frame) and (inside := object_pixels(frame)).any():

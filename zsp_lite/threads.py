@@ -10,24 +10,28 @@ import cv2
 from threadpoolctl import OpenBLASController, ThreadpoolController
 
 _lock, _blocks, _of_process = threading.Lock(), 0, ExitStack()
-# From threadpoolctl 3.8 on, only the thread that set the number for OpenBLAS first may set it, unless this is called.
+# From threadpoolctl 3.8 on, only the thread that set the number for OpenBLAS first may set it,
+# unless this is called.
 _let_this_thread_set = getattr(OpenBLASController, "clear_controlling_thread", lambda force: None)
 
 
 @lru_cache(1)
 def _libraries(modules: int) -> ThreadpoolController:
-    """Find the loaded libraries, which takes ten milliseconds; anew only after imports, by the number of modules."""
+    """Find the loaded libraries, which takes ten milliseconds; anew only after imports, by the
+    number of modules."""
     return ThreadpoolController()
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Restrict all libraries to one thread within a block: more are slower on small matrices, and disturb workers."""
+    """Restrict all libraries to one thread within a block: more are slower on small matrices, and
+    disturb workers."""
     global _blocks
     libraries = _libraries(len(sys.modules))
     with _lock:
         _blocks += 1
-        # OpenCV and BLAS have one number for all threads of the process: the last of several blocks restores it.
+        # OpenCV and BLAS have one number for all threads of the process: the last of several blocks
+        # restores it.
         if _blocks == 1:
             _of_process.callback(cv2.setNumThreads, cv2.getNumThreads())
             cv2.setNumThreads(1)

@@ -1,4 +1,5 @@
-"""Views: the object crop of a frame with its features, foreground patches and 3D points (fig. 2, left)."""
+"""Views: the object crop of a frame with its features, foreground patches and 3D points (fig. 2,
+left)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,8 @@ from zsp_lite.errors import FatalError, InputError, NoPoseError, ends_the_run
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor, FeatureMap
 
 IMAGE_SIZE = 224  # pixels of an object crop for a backbone without the attribute image_size
-# Share of a foreground patch that the mask covers. Thin parts, such as a chair's legs, do not cover half a patch.
+# Share of a foreground patch that the mask covers. Thin parts, such as a chair's legs, do not cover
+# half a patch.
 _MASK_SHARE = 0.25
 
 
@@ -30,13 +32,19 @@ class View:
     soft_mask: Float[np.ndarray, "height width"] = field(repr=False)
 
     @cached_property  # of N target views the paper's solver needs only those of the chosen one
-    def patch_points(self) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-        """Camera-frame point of each patch, and whether its depth was measured (see `depth.patch_points`)."""
+    def patch_points(
+        self,
+    ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
+        """Camera-frame point of each patch, and whether its depth was measured (see
+        `depth.patch_points`)."""
         return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint=True)
 
     @cached_property
-    def measured_points(self) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-        """`patch_points` without in-painting: the point of a patch without measured depth is the origin."""
+    def measured_points(
+        self,
+    ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
+        """`patch_points` without in-painting: the point of a patch without measured depth is the
+        origin."""
         return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint=False)
 
     @property
@@ -46,7 +54,8 @@ class View:
 
 
 def object_crop(frame: Frame, size: int | None = IMAGE_SIZE) -> Frame:
-    """Crop a frame to its object and resize it to size x size pixels, if given (supplement, "Object crops").
+    """Crop a frame to its object and resize it to size x size pixels, if given (supplement, "Object
+    crops").
 
     The aspect is not kept. A frame without a mask, or with an empty one, is not cropped.
     """
@@ -54,42 +63,54 @@ def object_crop(frame: Frame, size: int | None = IMAGE_SIZE) -> Frame:
     return resize_frame(cropped, (size, size)) if size else cropped
 
 
-def extract_views(backbone: FeatureExtractor, crops: Sequence[Frame], foreground: str = "saliency") -> list[View]:
-    """Extract the views of object crops, their features in one batch; see `frame_view` for the foreground."""
+def extract_views(
+    backbone: FeatureExtractor, crops: Sequence[Frame], foreground: str = "saliency"
+) -> list[View]:
+    """Extract the views of object crops, their features in one batch; see `frame_view` for the
+    foreground."""
     maps = feature_maps(backbone, crops)
-    return [frame_view(crop, features, foreground) for crop, features in zip(crops, maps, strict=True)]
+    return [
+        frame_view(crop, features, foreground) for crop, features in zip(crops, maps, strict=True)
+    ]
 
 
 def feature_maps(backbone: FeatureExtractor, crops: Sequence[Frame]) -> list[FeatureMap]:
-    """Call a backbone on copies of the crops' images; FatalError unless it returns a feature map for each."""
+    """Call a backbone on copies of the crops' images; FatalError unless it returns a feature map
+    for each."""
     name = getattr(backbone, "name", type(backbone).__name__)
     with ends_the_run(f"backbone {name}"):
         maps = list(backbone([crop.rgb.copy() for crop in crops]))
     if len(maps) != len(crops) or not all(isinstance(one, FeatureMap) for one in maps):
         kinds = ", ".join(sorted({type(one).__name__ for one in maps})) or "nothing"
         expected = f"expected {len(crops)} of FeatureMap"
-        raise FatalError(f"backbone {name} returned {len(maps)} of {kinds} for {len(crops)} images, {expected}")
+        raise FatalError(
+            f"backbone {name} returned {len(maps)} of {kinds} for {len(crops)} images, {expected}"
+        )
     return maps
 
 
 def frame_view(crop: Frame, features: FeatureMap, foreground: str = "saliency") -> View:
     """Combine an object crop with its features and its foreground patches.
 
-    The foreground are the salient patches (see `FeatureMap.foreground`), or for "mask" the patches of which the frame's
-    mask covers at least a quarter. A frame with an empty mask has no foreground.
+    The foreground are the salient patches (see `FeatureMap.foreground`), or for "mask" the patches
+    of which the frame's mask covers at least a quarter. A frame with an empty mask has no
+    foreground.
     """
     if foreground == "mask" or not crop.shows_object:
         return View(crop, features, patch_mask(crop, features.grid), crop.mask)
-    # As a soft mask: 0 for no saliency, 0.5 at the threshold of the foreground, 1 from twice that on.
+    # As a soft mask: 0 for no saliency, 0.5 at the threshold of the foreground, 1 from twice that
+    # on.
     ramp = (features.saliency.numpy() / (2 * SALIENCY_THRESHOLD)).clip(0, 1)
     soft_mask = cv2.resize(ramp, crop.camera.size[::-1], interpolation=cv2.INTER_LINEAR)
     return View(crop, features, features.foreground(), soft_mask)
 
 
 def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]:
-    """Select the target views that a pose can be estimated in: those without a `frame_defect`, with a foreground patch.
+    """Select the target views that a pose can be estimated in: those without a `frame_defect`, with
+    a foreground patch.
 
-    Returns their indices, and for each other view a flag that names it and the reason. NoPoseError if none is usable.
+    Returns their indices, and for each other view a flag that names it and the reason. NoPoseError
+    if none is usable.
     """
     usable, flags = [], []
     for index, target in enumerate(targets):
@@ -106,6 +127,8 @@ def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]
 def patch_mask(frame: Frame, grid: tuple[int, int]) -> Bool[torch.Tensor, "rows cols"]:
     """Select the patches of which the frame's mask covers at least a quarter."""
     if frame.mask is None:
-        raise InputError(f"{frame.name or 'frame'}: no mask, expected one for the patches' foreground")
+        raise InputError(
+            f"{frame.name or 'frame'}: no mask, expected one for the patches' foreground"
+        )
     covered = cv2.resize(frame.mask, grid[::-1], interpolation=cv2.INTER_AREA)
     return torch.from_numpy(covered >= _MASK_SHARE)

@@ -1,4 +1,5 @@
-"""Write what docs/playground.md loads: `python -m docs.playground.build outputs/site/docs/playground`.
+"""Write what docs/playground.md loads: `python -m docs.playground.build
+outputs/site/docs/playground`.
 
 onnxruntime-web is fetched from the npm registry, or that in npm_config_registry, into the cache.
 """
@@ -27,9 +28,11 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.points import near_median
 from zsp_lite.views import View
 
-# Of each category the first evaluation pair, whatever its result, and the next with an error below 15 degrees.
+# Of each category the first evaluation pair, whatever its result, and the next with an error below
+# 15 degrees.
 PAIRS = {"bicycle": (0, 1), "car": (0, 6), "chair": (0, 4), "motorcycle": (0, 1)}
-# Steps of the stored numbers, 16-bit integers. Cosines of descriptors are off by at most 5e-4, of bare keys by 2e-3.
+# Steps of the stored numbers, 16-bit integers. Cosines of descriptors are off by at most 5e-4, of
+# bare keys by 2e-3.
 KEY_STEP, POINT_STEP = 1 / 64, 1 / 1024
 GRID, NUMBER = (28, 28), (28, 1)  # patches, and factors of row and column in the number of a patch
 RUNTIME = "onnxruntime-web-1.30.0.tgz"
@@ -41,18 +44,26 @@ _FROM_SECOND = np.array([0, 1]), np.array([1, 1 << 30])  # starts and ends of a 
 
 def stored_pairs(dataset: Co3D) -> list[Pair]:
     """List the pairs of the page."""
-    return [shipped_pairs(dataset, name, 5)[index] for name, both in PAIRS.items() for index in both]
+    return [
+        shipped_pairs(dataset, name, 5)[index] for name, both in PAIRS.items() for index in both
+    ]
 
 
 def pair_data(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> tuple[list[dict], float]:
-    """Compute the data of each view, the reference first; of targets also truth and matches; and the error."""
+    """Compute the data of each view, the reference first; of targets also truth and matches; and
+    the error."""
     reference, targets = dataset.load_pair(pair)
     first, *others = views = method.views([reference, *targets])
     keys = np.stack([view.features.keys.flatten(0, 1).numpy() for view in views])
-    axes = np.linalg.svd(keys.reshape(-1, keys.shape[-1]), full_matrices=False)[2]  # principal: few of them matter
+    axes = np.linalg.svd(keys.reshape(-1, keys.shape[-1]), full_matrices=False)[
+        2
+    ]  # principal: few of them matter
     rounded = np.round(keys @ axes.T / KEY_STEP).astype("<i2").swapaxes(1, 2)
     data = [_view_data(view, one) for view, one in zip(views, rounded[:, rounded.any(axis=(0, 2))])]
-    matched, names = method.match_views(first, others), (pair.reference_sequence, pair.target_sequence)
+    matched, names = (
+        method.match_views(first, others),
+        (pair.reference_sequence, pair.target_sequence),
+    )
     labels = [read_labels(dataset.root, pair.category)[name] for name in names]
     poses = [object_poses(dataset, pair.category)[name] for name in names]
     seen = patch_coordinates(first.frame, poses[0], GRID)
@@ -60,8 +71,12 @@ def pair_data(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> tuple[list[dic
         frame, found = one.target.frame, one.matches
         cells, valid = ground_truth_matches(seen, patch_coordinates(frame, poses[1], GRID))
         target["truth"] = _packed(np.where(valid, cells @ NUMBER, -1).astype("<i2"))
-        target["rotation"] = relative_pose(labels[0], first.frame.camera, labels[1], frame.camera)[:3, :3].tolist()
-        target["chosen"] = np.stack([found.reference @ NUMBER, found.target @ NUMBER], axis=1).tolist()
+        target["rotation"] = relative_pose(labels[0], first.frame.camera, labels[1], frame.camera)[
+            :3, :3
+        ].tolist()
+        target["chosen"] = np.stack(
+            [found.reference @ NUMBER, found.target @ NUMBER], axis=1
+        ).tolist()
     estimate = method.estimate_from_views(first, others, matched)
     return data, rotation_error(estimate.sim3.R, data[1 + estimate.view]["rotation"])
 
@@ -72,16 +87,32 @@ def _packed(array: np.ndarray) -> str:
 
 def write_page_data(folder: Path) -> None:
     """Write the pairs, one script each, the network, and a script that lists them."""
-    dataset, method, titles = Co3D(sample_data()), ZeroShotPose(load_backbone("zsp-tiny", "cpu")), []
+    dataset, method, titles = (
+        Co3D(sample_data()),
+        ZeroShotPose(load_backbone("zsp-tiny", "cpu")),
+        [],
+    )
     folder.mkdir(parents=True, exist_ok=True)
     for index, pair in enumerate(stored_pairs(dataset)):
         views, error = pair_data(dataset, pair, method)
         mark = "✓ right" if error < 30 else "✕ wrong"
-        titles.append(f"{pair.category}: {pair.reference_sequence} → {pair.target_sequence} ({mark}, {error:.0f}°)")
-        (folder / f"pair{index}.js").write_text(f"STORED[{index}] = {json.dumps(views, separators=(',', ':'))};\n")
+        titles.append(
+            f"{pair.category}: {pair.reference_sequence} → {pair.target_sequence} ({mark}, "
+            f"{error:.0f}°)"
+        )
+        (folder / f"pair{index}.js").write_text(
+            f"STORED[{index}] = {json.dumps(views, separators=(',', ':'))};\n"
+        )
     (folder / "zsp-tiny.onnx").write_bytes(onnx_model(method.backbone))
-    draws = _packed(np.random.default_rng(method.seed).bit_generator.random_raw(5000).astype("<u8"))  # of RANSAC
-    content = {"titles": titles, "steps": (KEY_STEP, POINT_STEP), "draws": draws, "runtime": fetch_runtime(folder)}
+    draws = _packed(
+        np.random.default_rng(method.seed).bit_generator.random_raw(5000).astype("<u8")
+    )  # of RANSAC
+    content = {
+        "titles": titles,
+        "steps": (KEY_STEP, POINT_STEP),
+        "draws": draws,
+        "runtime": fetch_runtime(folder),
+    }
     (folder / "data.js").write_text(f"const STORED = [], DATA = {json.dumps(content)};\n")
 
 
@@ -89,12 +120,20 @@ def fetch_runtime(folder: Path) -> bool:
     """Unpack onnxruntime-web into the folder; returns False where it cannot be fetched."""
     registry = os.environ.get("npm_config_registry", "https://registry.npmjs.org").rstrip("/")
     try:
-        archive = fetch(f"{registry}/onnxruntime-web/-/{RUNTIME}", cache_folder() / RUNTIME, digest=RUNTIME_SHA256)
+        archive = fetch(
+            f"{registry}/onnxruntime-web/-/{RUNTIME}",
+            cache_folder() / RUNTIME,
+            digest=RUNTIME_SHA256,
+        )
     except InputError as error:
         print(f"the page will have no part for one's own photographs: {error}", file=sys.stderr)
         return False
     with tarfile.open(archive) as package:
-        for name in ("ort.wasm.min.js", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm"):
+        for name in (
+            "ort.wasm.min.js",
+            "ort-wasm-simd-threaded.mjs",
+            "ort-wasm-simd-threaded.wasm",
+        ):
             (folder / name).write_bytes(package.extractfile(f"package/dist/{name}").read())
     return True
 
@@ -104,26 +143,43 @@ def _view_data(view: View, keys: np.ndarray) -> dict:
     solid[solid] = near_median(points[solid], 2.5)  # to draw in 3D
     jpeg = cv2.imencode(".jpg", view.frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
     return {
-        "jpeg": b64encode(jpeg).decode(), "keys": _packed(keys), "saliency": _packed(view.features.saliency.numpy()),
-        "points": _packed(np.round(points / POINT_STEP).astype("<i2")), "solid": np.flatnonzero(solid).tolist(),
-        **{name: getattr(camera, name).tolist() for name in ("R", "t", "focal_length", "principal_point")},
-    }  # fmt: skip
+        "jpeg": b64encode(jpeg).decode(),
+        "keys": _packed(keys),
+        "saliency": _packed(view.features.saliency.numpy()),
+        "points": _packed(np.round(points / POINT_STEP).astype("<i2")),
+        "solid": np.flatnonzero(solid).tolist(),
+        **{
+            name: getattr(camera, name).tolist()
+            for name in ("R", "t", "focal_length", "principal_point")
+        },
+    }
 
 
-# ONNX files are protocol buffers. Weights are float16, as in the embedded checkpoint, and cast where they are used.
+# ONNX files are protocol buffers. Weights are float16, as in the embedded checkpoint, and cast
+# where they are used.
 def onnx_model(backbone: Backbone) -> bytes:
-    """Encode the graph from "image" (1, 3, side, side), RGB in [0, 1], to "keys" (1, n, d), "saliency" (1, 1, 1, n)."""
+    """Encode the graph from "image" (1, 3, side, side), RGB in [0, 1], to "keys" (1, n, d),
+    "saliency" (1, 1, 1, n)."""
     graph, model, side = _Graph(), backbone.model, backbone.image_size
     add, linear = graph.add, graph.linear
     mean, std = (np.float32(values).reshape(1, 3, 1, 1) for values in (backbone.mean, backbone.std))
     image = add("Div", add("Sub", "image", mean), std)
-    patches = add("Conv", image, *model.patch_embed.proj.parameters(), strides=[model.patch_size] * 2)
-    patches = add("Transpose", add("Reshape", patches, np.array([1, model.embed_dim, -1])), perm=[0, 2, 1])
+    patches = add(
+        "Conv", image, *model.patch_embed.proj.parameters(), strides=[model.patch_size] * 2
+    )
+    patches = add(
+        "Transpose", add("Reshape", patches, np.array([1, model.embed_dim, -1])), perm=[0, 2, 1]
+    )
     tokens = add("Add", add("Concat", model.cls_token, patches, axis=1), model.pos_embed)
     joined, split = np.array([1, -1, model.embed_dim]), np.array([1, 0, model.num_heads, -1])
     for index, block in enumerate(model.blocks):
-        normed = add("LayerNormalization", tokens, *block.norm1.parameters(), epsilon=block.norm1.eps)
-        query, key, value = (linear(normed, *part) for part in zip(*(p.chunk(3) for p in block.attn.qkv.parameters())))
+        normed = add(
+            "LayerNormalization", tokens, *block.norm1.parameters(), epsilon=block.norm1.eps
+        )
+        query, key, value = (
+            linear(normed, *part)
+            for part in zip(*(p.chunk(3) for p in block.attn.qkv.parameters()))
+        )
         if index == backbone.layer:
             add("Slice", key, *_FROM_SECOND, np.array([0, 1]), name="keys")
         query, key, value = (add("Reshape", part, split) for part in (query, key, value))
@@ -133,11 +189,15 @@ def onnx_model(backbone: Backbone) -> bytes:
             break  # its attention is all that is needed
         heads = add("Reshape", add("Einsum", attention, value, equation="bhij,bjhd->bihd"), joined)
         tokens = add("Add", tokens, linear(heads, *block.attn.proj.parameters()))
-        normed = add("LayerNormalization", tokens, *block.norm2.parameters(), epsilon=block.norm2.eps)
+        normed = add(
+            "LayerNormalization", tokens, *block.norm2.parameters(), epsilon=block.norm2.eps
+        )
         hidden = add("Gelu", linear(normed, *block.mlp.fc1.parameters()))
         tokens = add("Add", tokens, linear(hidden, *block.mlp.fc2.parameters()))
     chosen = add("Gather", attention, np.array(backbone.saliency_heads), axis=1)
-    saliency = add("ReduceMean", add("Slice", chosen, *_FROM_SECOND, np.array([2, 3])), np.array([1]))
+    saliency = add(
+        "ReduceMean", add("Slice", chosen, *_FROM_SECOND, np.array([2, 3])), np.array([1])
+    )
     low, high = add("ReduceMin", saliency), add("ReduceMax", saliency)
     add("Div", add("Sub", saliency, low), add("Sub", high, low), name="saliency")
     return graph.encode((11, "image", (1, 3, side, side)), (12, "keys", ()), (12, "saliency", ()))
@@ -149,13 +209,20 @@ class _Graph:
     def __init__(self):
         self.fields = [(2, "vit")]
 
-    def add(self, operator: str, *inputs: str | np.ndarray | torch.Tensor, name: str = "", **attributes) -> str:
-        """Add a node and return the name of its output. Arrays are stored as they are, tensors as float16."""
+    def add(
+        self, operator: str, *inputs: str | np.ndarray | torch.Tensor, name: str = "", **attributes
+    ) -> str:
+        """Add a node and return the name of its output.
+
+        Arrays are stored as they are, tensors as float16.
+        """
         fields = [(1, one if isinstance(one, str) else self._store(one)) for one in inputs]
         name = name or f"{operator}{len(self.fields)}"
         for attribute, value in attributes.items():
             (field, kind), values = _ATTRIBUTES[type(value)], np.atleast_1d(value).tolist()
-            fields.append((5, _message((1, attribute), *((field, one) for one in values), (20, kind))))
+            fields.append(
+                (5, _message((1, attribute), *((field, one) for one in values), (20, kind)))
+            )
         self.fields.append((1, _message(*fields, (2, name), (4, operator))))
         return name
 
@@ -164,13 +231,16 @@ class _Graph:
 
     def _store(self, values: np.ndarray | torch.Tensor) -> str:
         is_weight, name = torch.is_tensor(values), f"tensor{len(self.fields)}"
-        array = values.detach().cpu().numpy().astype(np.float16) if is_weight else np.asarray(values)
+        array = (
+            values.detach().cpu().numpy().astype(np.float16) if is_weight else np.asarray(values)
+        )
         content = (2, _TYPES[array.dtype.name]), (8, name), (9, array.tobytes())
         self.fields.append((5, _message(*((1, n) for n in array.shape), *content)))
         return self.add("Cast", name, to=_TYPES["float32"]) if is_weight else name
 
     def encode(self, *ends: tuple[int, str, tuple[int, ...]]) -> bytes:
-        """Encode the model with float32 inputs (field 11) and outputs (12); an output needs no shape."""
+        """Encode the model with float32 inputs (field 11) and outputs (12); an output needs no
+        shape."""
         for field, name, shape in ends:
             sizes = [(2, _message(*((1, _message((1, n))) for n in shape)))] if shape else []
             kind = _message((1, _message((1, _TYPES["float32"]), *sizes)))

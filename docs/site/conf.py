@@ -1,12 +1,17 @@
-"""Sphinx configuration of the course site (`make site`): the notebooks as stored, docs/ and the API reference."""
+"""Sphinx configuration of the course site (`make site`): the notebooks as stored, docs/ and the API
+reference."""
 
 import sys
 import tomllib
 from pathlib import Path
 
-sys.modules["rfc3987_syntax"] = None  # jsonschema would build parsers of addresses with it, which takes seconds
+sys.modules["rfc3987_syntax"] = (
+    None  # jsonschema would build parsers of addresses with it, which takes seconds
+)
 
-ROOT = Path(__file__).parents[2]  # also Sphinx's source folder, so that all relative links stay as they are
+ROOT = Path(__file__).parents[
+    2
+]  # also Sphinx's source folder, so that all relative links stay as they are
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
 _project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -38,7 +43,9 @@ include_patterns = [
 ]
 # Sphinx walks through every folder that is not excluded.
 _sources = {"docs", "notebooks", "data_samples", "zsp_lite"}
-exclude_patterns = [path.name for path in ROOT.iterdir() if path.is_dir() and path.name not in _sources]
+exclude_patterns = [
+    path.name for path in ROOT.iterdir() if path.is_dir() and path.name not in _sources
+]
 exclude_patterns += ["**/.ipynb_checkpoints", "notebooks/exercises/release", "data_samples/*/*"]
 
 nb_execution_mode = "off"  # outputs are those stored in the notebooks
@@ -77,7 +84,8 @@ html_context = {"default_mode": "auto"}  # light or dark as in the system
 html_theme_options = {
     "repository_url": course_repository,
     "use_repository_button": bool(course_repository),
-    "use_download_button": False,  # would offer the source; `course` links to the notebook for students
+    # would offer the source; `course` links to the notebook for students
+    "use_download_button": False,
     "navbar_persistent": [],  # the search field is in the sidebar
     "show_navbar_depth": 1,
     "max_navbar_depth": 1,

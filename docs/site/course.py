@@ -1,10 +1,14 @@
 """Sphinx extension of the course site: what MyST-NB and the theme do not do with stored notebooks.
 
-- Widgets become the picture that they showed when the notebook was stored; plotly figures become HTML.
-- Exercises lose their solutions, hidden tests and guides for marking, by nbgrader's own preprocessors.
-- Each notebook can be downloaded and, if the repository's address is known, opened in Colab with an install cell.
+- Widgets become the picture that they showed when the notebook was stored; plotly figures become
+  HTML.
+- Exercises lose their solutions, hidden tests and guides for marking, by nbgrader's own
+  preprocessors.
+- Each notebook can be downloaded and, if the repository's address is known, opened in Colab with an
+  install cell.
 - Docstrings keep their indented examples.
-- Intervals such as [47.6, 66.2] never break over two lines. Wide tables use the margin at the right.
+- Intervals such as [47.6, 66.2] never break over two lines. Wide tables use the margin at the
+  right.
 - The members of the modules in the reference are folded.
 """
 
@@ -47,7 +51,8 @@ HIDDEN_LINKS = """
 ```
 """
 
-# A line "- `zsp_lite.NAME`" of a page of the reference becomes a section with the docstrings of this module.
+# A line "- `zsp_lite.NAME`" of a page of the reference becomes a section with the docstrings of
+# this module.
 MODULE = r"""
 ## \1
 
@@ -80,7 +85,9 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
         widgets = notebook.metadata.pop("widgets", {})
         for cell in notebook.cells:
             if cell.cell_type == "code":
-                cell.outputs = [shown for output in cell.outputs for shown in static_outputs(output, widgets)]
+                cell.outputs = [
+                    shown for output in cell.outputs for shown in static_outputs(output, widgets)
+                ]
         app.env.temp_data["alternative texts"] = [
             output.metadata[form]["alt"]
             for cell in notebook.cells
@@ -88,7 +95,9 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
             for form in output.get("data", {})
             if form.startswith("image/")
         ]
-        notebook.cells.insert(1, nbformat.v4.new_markdown_cell(run_links(docname, app.config.course_repository)))
+        notebook.cells.insert(
+            1, nbformat.v4.new_markdown_cell(run_links(docname, app.config.course_repository))
+        )
         source[0] = nbformat.writes(notebook)
     else:  # a link to a folder has no page to lead to
         source[0] = re.sub(
@@ -105,20 +114,27 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
 def remove_solutions(notebook: NotebookNode, root: Path) -> None:
     """Make the student version of an exercise. Other notebooks have no cells of nbgrader."""
     if any("nbgrader" in cell.metadata for cell in notebook.cells):
-        config = PyFileConfigLoader("nbgrader_config.py", path=str(root / "notebooks" / "exercises")).load_config()
+        config = PyFileConfigLoader(
+            "nbgrader_config.py", path=str(root / "notebooks" / "exercises")
+        ).load_config()
         for clear in (ClearSolutions, ClearHiddenTests, ClearMarkScheme):
             clear(config=config).preprocess(notebook, {})
 
 
 def static_outputs(output: NotebookNode, widgets: dict) -> list[NotebookNode]:
-    """The forms of a stored output that need no kernel: HTML of a plotly figure, picture and caption of a widget."""
+    """The forms of a stored output that need no kernel:
+
+    HTML of a plotly figure, picture and caption of a widget.
+    """
     data = output.get("data", {})
     if PLOTLY in data:
         figure = plotly.io.from_json(json.dumps(data[PLOTLY]), skip_invalid=True)
         figure.update_layout(width=None, autosize=True)
         return [html_output(plotly.io.to_html(figure, include_plotlyjs=False, full_html=False))]
     if WIDGET in data:
-        return widget_outputs(widgets["application/vnd.jupyter.widget-state+json"]["state"], data[WIDGET]["model_id"])
+        return widget_outputs(
+            widgets["application/vnd.jupyter.widget-state+json"]["state"], data[WIDGET]["model_id"]
+        )
     return [output]
 
 
@@ -137,15 +153,25 @@ def widget_outputs(models: dict, identifier: str) -> list[NotebookNode]:
             (buffer,) = model["buffers"]
             pictures.append({f"image/{state['format']}": buffer["data"]})
         elif model["model_name"] == "HTMLModel":
-            captions.append(re.sub("<style>.*?</style>|<[^>]*>", "", state["value"], flags=re.DOTALL).strip())
+            captions.append(
+                re.sub("<style>.*?</style>|<[^>]*>", "", state["value"], flags=re.DOTALL).strip()
+            )
         elif state.get("description"):
-            value = state["_options_labels"][state["index"]] if "index" in state else state.get("value", "")
-            controls.append(f"{state['description']} = {value}" if value != "" else state["description"])
+            value = (
+                state["_options_labels"][state["index"]]
+                if "index" in state
+                else state.get("value", "")
+            )
+            controls.append(
+                f"{state['description']} = {value}" if value != "" else state["description"]
+            )
         for child in state.get("children", []):
             visit(child.removeprefix("IPY_MODEL_"))
 
     visit(identifier)
-    note = html_output(f'<p class="widget">Interactive in a running notebook: {escape(", ".join(controls))}.</p>')
+    note = html_output(
+        f'<p class="widget">Interactive in a running notebook: {escape(", ".join(controls))}.</p>'
+    )
     if not pictures:
         return [note]
     alt, caption = " ".join(captions).removeprefix("Picture: "), captions[-1]
@@ -159,21 +185,25 @@ def widget_outputs(models: dict, identifier: str) -> list[NotebookNode]:
 
 
 def describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
-    """Give the pictures of stored outputs their alternative texts, which MyST-NB leaves out (`doctree-read`)."""
+    """Give the pictures of stored outputs their alternative texts, which MyST-NB leaves out
+    (`doctree-read`)."""
     pictures = [node for node in doctree.findall(nodes.image) if "jupyter_execute" in node["uri"]]
     for node, alt in zip(pictures, app.env.temp_data.get("alternative texts", []), strict=True):
         node["alt"] = alt
 
 
 def keep_intervals(app: Sphinx, doctree: nodes.document) -> None:
-    """Join the ends of intervals in text, and in the HTML tables of outputs, by a no-break space (`doctree-read`)."""
+    """Join the ends of intervals in text, and in the HTML tables of outputs, by a no-break space
+    (`doctree-read`)."""
     for text in list(doctree.findall(nodes.Text)):
         part = text.parent
         table = isinstance(part, nodes.raw) and "<table" in text
         if table or not isinstance(
             part, nodes.raw | nodes.literal | nodes.literal_block | nodes.math | nodes.math_block
         ):
-            joined = INTERVAL.sub(lambda interval: interval[0].replace(" ", "\N{NO-BREAK SPACE}"), text)
+            joined = INTERVAL.sub(
+                lambda interval: interval[0].replace(" ", "\N{NO-BREAK SPACE}"), text
+            )
             part.replace(text, nodes.Text(joined))
 
 
@@ -185,7 +215,10 @@ def widen_tables(app: Sphinx, doctree: nodes.document) -> None:
             table.replace_self(box := nodes.container(classes=["full-width"]))
             box += table
     for part in doctree.findall(nodes.raw):
-        rows = [re.findall(r"<t[hd].*?>(.*?)</t[hd]>", row, re.DOTALL) for row in part.astext().split("</tr>")]
+        rows = [
+            re.findall(r"<t[hd].*?>(.*?)</t[hd]>", row, re.DOTALL)
+            for row in part.astext().split("</tr>")
+        ]
         if is_wide([[re.sub("<.*?>", "", cell) for cell in row] for row in rows]):
             output = part.parent
             while "cell_output" not in output.get("classes", ["cell_output"]):
@@ -198,12 +231,15 @@ def is_wide(rows: list[list[str]]) -> bool:
 
 
 def mark_place(app: Sphinx, doctree: nodes.document) -> None:
-    """Class the strip at the top of a notebook by the middle of its first marked box, in percent (`doctree-read`)."""
+    """Class the strip at the top of a notebook by the middle of its first marked box, in percent
+    (`doctree-read`)."""
     for image in doctree.findall(nodes.image):
         if "/here_" in image["uri"]:
             strip = (app.srcdir / image["uri"]).read_text(encoding="utf-8")
             box = re.search('<rect x="([^"]*)"[^>]*? width="([^"]*)"[^>]*stroke="#0072B2"', strip)
-            middle = (float(box[1]) + float(box[2]) / 2) / float(re.search('width="(.*?)"', strip)[1])
+            middle = (float(box[1]) + float(box[2]) / 2) / float(
+                re.search('width="(.*?)"', strip)[1]
+            )
             image["classes"].append(f"here-{100 * middle:.0f}")
 
 
@@ -212,17 +248,23 @@ def fold_members(app: Sphinx, doctree: nodes.document) -> None:
     for section in list(doctree.findall(nodes.section)):
         members = [node for node in section.children if isinstance(node, addnodes.desc)]
         if members and app.env.docname.startswith("docs/api/"):
-            marks = [(member[0]["ids"][0], member[0]["fullname"]) for member in members if member[0]["ids"]]
+            marks = [
+                (member[0]["ids"][0], member[0]["fullname"])
+                for member in members
+                if member[0]["ids"]
+            ]
             links = ", ".join(f'<a href="#{mark}"><code>{name}</code></a>' for mark, name in marks)
             start = (
-                f'<p class="members">{links}</p><details class="members"><summary>Signatures and arguments</summary>'
+                f'<p class="members">{links}</p><details class="members"><summary>Signatures and '
+                "arguments</summary>"
             )
             section.insert(section.index(members[0]), nodes.raw("", start, format="html"))
             section += nodes.raw("", "</details>", format="html")
 
 
 def shorten_titles(app: Sphinx, env: BuildEnvironment) -> None:
-    """Leave the part before the colon of the notebooks' titles in the sidebar (Sphinx's event `env-updated`)."""
+    """Leave the part before the colon of the notebooks' titles in the sidebar (Sphinx's event
+    `env-updated`)."""
     for name, contents in env.tocs.items():
         if name.startswith("notebooks/"):
             title = next(contents.findall(nodes.Text))
@@ -232,28 +274,42 @@ def shorten_titles(app: Sphinx, env: BuildEnvironment) -> None:
 def run_links(docname: str, repository: str) -> str:
     """HTML with the links to download a notebook and to open it in Colab or in a dev container."""
     up = "../" * docname.count("/")
-    links = [(f"{up}docs/install.html#run-the-notebooks", "Run it"), (f"{up}run/{docname}.ipynb", "Download")]
+    links = [
+        (f"{up}docs/install.html#run-the-notebooks", "Run it"),
+        (f"{up}run/{docname}.ipynb", "Download"),
+    ]
     if repository:
         name = urlsplit(repository).path.strip("/")
         links += [
-            (f"https://colab.research.google.com/github/{name}/blob/{BRANCH}/run/{docname}.ipynb", "Open in Colab"),
+            (
+                f"https://colab.research.google.com/github/{name}/blob/{BRANCH}/run/{docname}.ipynb",
+                "Open in Colab",
+            ),
             (f"https://codespaces.new/{name}", "Open in a dev container"),
         ]
-    return '<p class="run">' + " ".join(f'<a href="{escape(link)}">{text}</a>' for link, text in links) + "</p>"
+    return (
+        '<p class="run">'
+        + " ".join(f'<a href="{escape(link)}">{text}</a>' for link, text in links)
+        + "</p>"
+    )
 
 
 def runnable(notebook: NotebookNode, repository: str) -> NotebookNode:
-    """Copy a notebook with a first cell that installs zsp-lite in Colab, if the repository's address is known."""
+    """Copy a notebook with a first cell that installs zsp-lite in Colab, if the repository's
+    address is known."""
     notebook = deepcopy(notebook)
     if repository:
         folder = repository.rstrip("/").removesuffix(".git").rpartition("/")[2]
-        cell = nbformat.v4.new_code_cell(INSTALL_IN_COLAB.format(repository=repository, folder=folder), id="install")
+        cell = nbformat.v4.new_code_cell(
+            INSTALL_IN_COLAB.format(repository=repository, folder=folder), id="install"
+        )
         notebook.cells.insert(0, cell)
     return notebook
 
 
 def write_files(app: Sphinx, error: Exception | None) -> None:
-    """Write the notebooks to run with their drawings, and plotly's script (Sphinx's event `build-finished`)."""
+    """Write the notebooks to run with their drawings, and plotly's script (Sphinx's event
+    `build-finished`)."""
     if error or app.builder.format != "html":
         return
     for docname in app.env.found_docs:
@@ -265,26 +321,42 @@ def write_files(app: Sphinx, error: Exception | None) -> None:
             copy.parent.mkdir(parents=True, exist_ok=True)
             nbformat.write(runnable(notebook, app.config.course_repository), copy)
     shutil.copytree(
-        app.srcdir / "notebooks" / "figures", app.outdir / "run" / "notebooks" / "figures", dirs_exist_ok=True
+        app.srcdir / "notebooks" / "figures",
+        app.outdir / "run" / "notebooks" / "figures",
+        dirs_exist_ok=True,
     )
     script = Path(plotly.__file__).parent / "package_data" / "plotly.min.js"
     shutil.copy(script, app.outdir / "_static" / script.name)
 
 
-def add_plotly(app: Sphinx, pagename: str, templatename: str, context: dict, doctree: nodes.document | None) -> None:
+def add_plotly(
+    app: Sphinx, pagename: str, templatename: str, context: dict, doctree: nodes.document | None
+) -> None:
     """Load plotly's script on the pages that have a figure of it (`html-page-context`)."""
     if doctree and any("plotly-graph-div" in node.astext() for node in doctree.findall(nodes.raw)):
         app.add_js_file("plotly.min.js", priority=100)
 
 
-def skip_imported(app: Sphinx, what: str, name: str, member: object, skip: bool, options: object) -> bool | None:
-    """Leave out what a module imports from other packages, before autodoc analyses them (`autodoc-skip-member`)."""
-    foreign = isinstance(member, ModuleType) or not getattr(member, "__module__", "").startswith("zsp_lite")
-    return True if what == "module" and foreign and isinstance(member, ModuleType | type | FunctionType) else None
+def skip_imported(
+    app: Sphinx, what: str, name: str, member: object, skip: bool, options: object
+) -> bool | None:
+    """Leave out what a module imports from other packages, before autodoc analyses them
+    (`autodoc-skip-member`)."""
+    foreign = isinstance(member, ModuleType) or not getattr(member, "__module__", "").startswith(
+        "zsp_lite"
+    )
+    return (
+        True
+        if what == "module" and foreign and isinstance(member, ModuleType | type | FunctionType)
+        else None
+    )
 
 
-def mark_examples(app: Sphinx, kind: str, name: str, thing: object, options: object, lines: list[str]) -> None:
-    """Mark indented blocks of a docstring as literal, and link pages (`autodoc-process-docstring`, before napoleon)."""
+def mark_examples(
+    app: Sphinx, kind: str, name: str, thing: object, options: object, lines: list[str]
+) -> None:
+    """Mark indented blocks of a docstring as literal, and link pages (`autodoc-process-docstring`,
+    before napoleon)."""
     text, literal = [], False
     for line in lines:
         indented = line.startswith("    ")

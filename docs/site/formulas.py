@@ -1,8 +1,9 @@
-"""Sphinx extension of the course site: formulas as MathML, with a font for them that comes with the site.
+"""Sphinx extension of the course site: formulas as MathML, with a font for them that comes with the
+site.
 
-MathML needs no script from the network, but a font with mathematical metrics: without one, brackets do not grow and
-bars touch letters. The font is STIX Two Math of the package `ziamath`, cut down to the characters of formulas. Where
-the package is not installed, the reader's own fonts are used.
+MathML needs no script from the network, but a font with mathematical metrics: without one, brackets
+do not grow and bars touch letters. The font is STIX Two Math of the package `ziamath`, cut down to
+the characters of formulas. Where the package is not installed, the reader's own fonts are used.
 """
 
 import base64
@@ -21,8 +22,16 @@ from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
 
-# Latin, accents, Greek, punctuation, letters and operators, brackets; bold, italic and script alphabets.
-CHARACTERS = [(0x20, 0xFF), (0x300, 0x36F), (0x391, 0x3F6), (0x2010, 0x2063), (0x2100, 0x22FF), (0x2308, 0x230B)]
+# Latin, accents, Greek, punctuation, letters and operators, brackets; bold, italic and script
+# alphabets.
+CHARACTERS = [
+    (0x20, 0xFF),
+    (0x300, 0x36F),
+    (0x391, 0x3F6),
+    (0x2010, 0x2063),
+    (0x2100, 0x22FF),
+    (0x2308, 0x230B),
+]
 CHARACTERS += [(0x27E6, 0x27EB), (0x1D400, 0x1D503), (0x1D6A4, 0x1D7FF)]
 
 
@@ -33,8 +42,12 @@ def math_font() -> bytes:
         return b""
     font = TTFont(Path(package.origin).parent / "fonts" / "STIXTwoMath-Regular.ttf")
     features = ["ssty", "dtls", "flac", "kern", "mark"]
-    subsetter = Subsetter(Options(hinting=False, layout_features=features, name_IDs=["*"]))  # with its licence
-    subsetter.populate(unicodes=[code for first, last in CHARACTERS for code in range(first, last + 1)])
+    subsetter = Subsetter(
+        Options(hinting=False, layout_features=features, name_IDs=["*"])
+    )  # with its licence
+    subsetter.populate(
+        unicodes=[code for first, last in CHARACTERS for code in range(first, last + 1)]
+    )
     subsetter.subset(font)
     font.flavor = "woff"
     font.save(file := io.BytesIO())
@@ -44,11 +57,15 @@ def math_font() -> bytes:
 def mathml(latex: str, display: str = "inline") -> str:
     r"""Convert a formula, with four repairs of what latex2mathml makes.
 
-    The names of `\operatorname` become text. Bold and script letters become characters of their own, as browsers know
-    no `mathvariant`. The bars of a norm do not grow: each would grow by itself, as only one of them has the exponent.
-    A minus after an equals sign is close to its term.
+    The names of `\operatorname` become text. Bold and script letters become characters of their
+    own, as browsers know no `mathvariant`. The bars of a norm do not grow: each would grow by
+    itself, as only one of them has the exponent. A minus after an equals sign is close to its term.
     """
-    latex = re.sub(r"\\operatorname\*?\{(.*?)\}", lambda name: rf"\text{{{name[1]}}}".replace(r"\,", " "), latex)
+    latex = re.sub(
+        r"\\operatorname\*?\{(.*?)\}",
+        lambda name: rf"\text{{{name[1]}}}".replace(r"\,", " "),
+        latex,
+    )
     text = convert(latex, display=display)
     text = re.sub('<mi mathvariant="(bold|script|bold-italic)">(.*?)</mi>', _letter, text)
     text = re.sub("(<mo>&#x0003D;</mo>)<mo>(&#x02212;)", r'\1<mo form="prefix">\2', text)
@@ -79,7 +96,9 @@ def write_font(app: Sphinx, error: Exception | None) -> None:
         (app.outdir / "_static" / "math.woff").write_bytes(math_font())
 
 
-def pass_font(app: Sphinx, pagename: str, templatename: str, context: dict, doctree: nodes.document | None) -> None:
+def pass_font(
+    app: Sphinx, pagename: str, templatename: str, context: dict, doctree: nodes.document | None
+) -> None:
     """Let templates embed the font."""
     context["math_font"] = base64.b64encode(math_font()).decode()
 

@@ -1,15 +1,17 @@
 """Sphinx extension of the course site: slides for the labs, from the pages of `docs/slides/`.
 
-A page becomes a deck in one HTML file that needs no network: its title is the first slide, each of its sections another
-one. The directive `picture` embeds a picture that a notebook shows, so that the slides show the stored results:
+A page becomes a deck in one HTML file that needs no network: its title is the first slide, each of
+its sections another one. The directive `picture` embeds a picture that a notebook shows, so that
+the slides show the stored results:
 
     ```{picture} ../../notebooks/02_cyclical_maps.ipynb
     :heading: The map of a real pair
     ```
 
-is the first picture below the heading that contains these words. The path may also be that of a drawing, which has its
-description inside. `:tiles: 3 3 8 4` cuts a picture of 3 columns and 3 rows, and shows the first 8 parts in 4 columns.
-What stands in the directive `notes` is shown in the presenter's view only.
+is the first picture below the heading that contains these words. The path may also be that of a
+drawing, which has its description inside. `:tiles: 3 3 8 4` cuts a picture of 3 columns and 3 rows,
+and shows the first 8 parts in 4 columns. What stands in the directive `notes` is shown in the
+presenter's view only.
 """
 
 import base64
@@ -30,7 +32,8 @@ DECKS = "docs/slides/"
 
 
 class Picture(SphinxDirective):
-    """Embed a picture file or a picture of a notebook's stored outputs, with its alternative text."""
+    """Embed a picture file or a picture of a notebook's stored outputs, with its
+    alternative text."""
 
     required_arguments = 1
     option_spec = {"heading": directives.unchanged, "tiles": directives.positive_int_list}
@@ -72,15 +75,18 @@ def pictures_below(notebook: NotebookNode, heading: str) -> list[tuple[str, str,
         heading: Words of the section's heading.
 
     Returns:
-        Media type, data in base64 and alternative text of each PNG or JPEG picture in the outputs from the cell with
-        the heading to the next cell with a heading of the same or a higher level. Empty without such a heading.
+        Media type, data in base64 and alternative text of each PNG or JPEG picture in the outputs
+        from the cell with the heading to the next cell with a heading of the same or a higher
+        level. Empty without such a heading.
     """
     found, level = [], 0
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
             if level and re.search(rf"^#{{1,{level}}} ", cell.source, re.MULTILINE):
                 break
-            if not level and (mark := re.search(rf"^(#+) .*{re.escape(heading)}", cell.source, re.MULTILINE)):
+            if not level and (
+                mark := re.search(rf"^(#+) .*{re.escape(heading)}", cell.source, re.MULTILINE)
+            ):
                 level = len(mark[1])
         elif level:
             for output in cell.get("outputs", []):
@@ -91,7 +97,8 @@ def pictures_below(notebook: NotebookNode, heading: str) -> list[tuple[str, str,
 
 
 def arranged(data: str, columns: int, rows: int, count: int, new_columns: int) -> str:
-    """Cut a picture in base64 into equal tiles, and lay the first of them out in another number of columns."""
+    """Cut a picture in base64 into equal tiles, and lay the first of them out in another number of
+    columns."""
     picture = Image.open(io.BytesIO(base64.b64decode(data)))
     width, height = picture.width // columns, picture.height // rows
     result = Image.new("RGB", (new_columns * width, -(-count // new_columns) * height), "white")
@@ -103,8 +110,11 @@ def arranged(data: str, columns: int, rows: int, count: int, new_columns: int) -
     return base64.b64encode(file.getvalue()).decode()
 
 
-def choose_template(app: Sphinx, pagename: str, templatename: str, context: dict, doctree: object) -> str | None:
-    """Use the template of the slides for the pages of `docs/slides/` (Sphinx's event `html-page-context`)."""
+def choose_template(
+    app: Sphinx, pagename: str, templatename: str, context: dict, doctree: object
+) -> str | None:
+    """Use the template of the slides for the pages of `docs/slides/` (Sphinx's event
+    `html-page-context`)."""
     return "slides.html" if pagename.startswith(DECKS) else None
 
 

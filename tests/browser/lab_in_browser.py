@@ -1,4 +1,5 @@
-"""A JupyterLab of one's own on loopback, and what a reader does there: open, run, look, move a slider."""
+"""A JupyterLab of one's own on loopback, and what a reader does there: open, run, look, move a
+slider."""
 
 import json
 import os
@@ -36,16 +37,31 @@ def chromium(playwright) -> str | None:
 
 @contextmanager
 def running_chromium():
-    """Chromium, as a browser of Playwright. Without one the tests are skipped, but fail in continuous integration."""
+    """Chromium, as a browser of Playwright.
+
+    Without one the tests are skipped, but fail in continuous integration.
+    """
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         program = chromium(playwright)
         if program is None:
             refuse = pytest.fail if os.environ.get("CI") else pytest.skip
-            refuse("no Chromium here: `apt install chromium` or `python -m playwright install chromium` brings one")
-        options = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--use-gl=swiftshader"]
-        options += ["--no-first-run", "--disable-background-networking", "--disable-component-update"]
+            refuse(
+                "no Chromium here: `apt install chromium` or `python -m playwright install "
+                "chromium` brings one"
+            )
+        options = [
+            "--no-sandbox",
+            "--disable-gpu",
+            "--enable-unsafe-swiftshader",
+            "--use-gl=swiftshader",
+        ]
+        options += [
+            "--no-first-run",
+            "--disable-background-networking",
+            "--disable-component-update",
+        ]
         running = playwright.chromium.launch(executable_path=program, args=options)
         yield running
         running.close()
@@ -61,7 +77,9 @@ class Lab:
     def ask(self, path: str, method: str = "GET"):
         """The server's answer below /api/, decoded; None where it is empty."""
         request = urllib.request.Request(
-            f"{self.url}/api/{path}", method=method, headers={"Authorization": f"token {self.token}"}
+            f"{self.url}/api/{path}",
+            method=method,
+            headers={"Authorization": f"token {self.token}"},
         )
         with urllib.request.urlopen(request, timeout=20) as answer:
             body = answer.read()
@@ -74,7 +92,8 @@ class Lab:
 
 @contextmanager
 def serve(folder: Path, state: Path, data: Path):
-    """A `Lab` on `folder`, with settings, workspaces and log in `state`, so that the user's own stay as they are."""
+    """A `Lab` on `folder`, with settings, workspaces and log in `state`, so that the user's own
+    stay as they are."""
     for plugin, settings in _SETTINGS.items():
         path = state / "settings" / f"{plugin}.jupyterlab-settings"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -85,7 +104,9 @@ def serve(folder: Path, state: Path, data: Path):
         "JUPYTER_CONFIG_DIR": str(state / "config"),
         "JUPYTER_RUNTIME_DIR": str(state / "runtime"),
         "IPYTHONDIR": str(state / "ipython"),
-        "PYTHONPATH": os.pathsep.join(filter(None, [str(REPOSITORY), os.environ.get("PYTHONPATH")])),
+        "PYTHONPATH": os.pathsep.join(
+            filter(None, [str(REPOSITORY), os.environ.get("PYTHONPATH")])
+        ),
         "ZSP_LITE_DATA": str(data),
     }
     environment.pop("MPLBACKEND", None)  # the tests' own: kernels draw into the notebook
@@ -94,18 +115,30 @@ def serve(folder: Path, state: Path, data: Path):
         port = free.getsockname()[1]
     lab = Lab(f"http://127.0.0.1:{port}", secrets.token_hex(16))
     command = [
-        sys.executable, "-m", "jupyter", "lab", "--no-browser", "--allow-root", "--ServerApp.ip=127.0.0.1",
-        f"--ServerApp.port={port}", "--ServerApp.port_retries=0", f"--IdentityProvider.token={lab.token}",
+        sys.executable,
+        "-m",
+        "jupyter",
+        "lab",
+        "--no-browser",
+        "--allow-root",
+        "--ServerApp.ip=127.0.0.1",
+        f"--ServerApp.port={port}",
+        "--ServerApp.port_retries=0",
+        f"--IdentityProvider.token={lab.token}",
         f"--ServerApp.root_dir={folder}",
         "--ServerApp.tornado_settings={'page_config_data': {'buildCheck': False}}",
-    ]  # fmt: skip
+    ]
     with open(state / "jupyterlab.log", "w") as log:
-        server = subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=subprocess.STDOUT)
+        server = subprocess.Popen(
+            command, cwd=folder, env=environment, stdout=log, stderr=subprocess.STDOUT
+        )
     try:
         deadline = time.monotonic() + 180
         while not _answers(lab):
             if server.poll() is not None or time.monotonic() > deadline:
-                raise RuntimeError(f"JupyterLab did not start:\n{(state / 'jupyterlab.log').read_text()[-3000:]}")
+                raise RuntimeError(
+                    f"JupyterLab did not start:\n{(state / 'jupyterlab.log').read_text()[-3000:]}"
+                )
             time.sleep(0.5)
         yield lab
         lab.stop_kernels()
@@ -132,18 +165,27 @@ def open_notebook(page, lab: Lab, name: str) -> None:
     page.wait_for_selector('.jp-Notebook-ExecutionIndicator[data-status="idle"]', timeout=180_000)
 
 
-# Whether some cell has begun to run, and whether one still runs or waits: "[ ]:" has not begun, "[*]:" runs.
-_BEGUN = "[...document.querySelectorAll('.jp-CodeCell .jp-InputPrompt')].some(e => /[*0-9]/.test(e.innerText))"
+# Whether some cell has begun to run, and whether one still runs or waits: "[ ]:" has not begun,
+# "[*]:" runs.
+_BEGUN = (
+    "[...document.querySelectorAll('.jp-CodeCell .jp-InputPrompt')].some(e => "
+    "/[*0-9]/.test(e.innerText))"
+)
 _RUNNING = _BEGUN.replace("*0-9", "*")
 
 
 def run_all(page, patience: float) -> None:
-    """Run > Run All Cells, and wait until nothing runs or waits any more.  TimeoutError after `patience` seconds."""
+    """Run > Run All Cells, and wait until nothing runs or waits any more.
+
+    TimeoutError after `patience` seconds.
+    """
     deadline, asked = time.monotonic() + patience, 0.0
     while not page.evaluate(_BEGUN):
         if time.monotonic() > deadline:
             raise TimeoutError(f"no code cell had begun to run after {patience:.0f} s")
-        if time.monotonic() > asked + 20:  # a notebook that has only just opened may not hear the menu
+        if (
+            time.monotonic() > asked + 20
+        ):  # a notebook that has only just opened may not hear the menu
             page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
             page.locator('.lm-Menu-item[data-command="runmenu:run-all"]').click()
             asked = time.monotonic()
@@ -165,7 +207,8 @@ def saved(page, lab: Lab, name: str) -> dict:
 
 
 def errors(page, notebook: dict) -> list[str]:
-    """What went wrong: error outputs of a saved notebook, cells that never ran, and what the page cannot show."""
+    """What went wrong: error outputs of a saved notebook, cells that never ran, and what the page
+    cannot show."""
     found = []
     for number, cell in enumerate(notebook["cells"]):
         if cell["cell_type"] == "code":
@@ -173,21 +216,32 @@ def errors(page, notebook: dict) -> list[str]:
             found += [f"cell {number}: {output['ename']}: {output['evalue']}" for output in outputs]
             if cell["execution_count"] is None:
                 found.append(f"cell {number} did not run")
-    for failure in ("Error displaying widget", "Error creating widget", "Loading widget...", "JavaScript Error"):
+    for failure in (
+        "Error displaying widget",
+        "Error creating widget",
+        "Loading widget...",
+        "JavaScript Error",
+    ):
         found += page.locator(".jp-OutputArea-output", has_text=failure).all_inner_texts()
-    # What has no source shows nothing on purpose, as the picture that plotly keeps beside its drawings.
+    # What has no source shows nothing on purpose, as the picture that plotly keeps beside its
+    # drawings.
     broken = """() => [...document.querySelectorAll('.jp-Notebook img[src]')]
-      .filter(e => e.complete && !e.naturalWidth).map(e => `picture not shown: ${e.src.slice(0, 80)}`)"""
+      .filter(e => e.complete && !e.naturalWidth)
+      .map(e => `picture not shown: ${e.src.slice(0, 80)}`)"""
     return found + page.evaluate(broken)
 
 
 def slider_outputs(page) -> list:
     """One locator for each output that has a slider in it."""
-    return page.locator(".jp-Notebook .jp-OutputArea-output", has=page.locator(".noUi-handle")).all()
+    return page.locator(
+        ".jp-Notebook .jp-OutputArea-output", has=page.locator(".noUi-handle")
+    ).all()
 
 
-# Everything that is drawn, as text: pixels of images and canvases, plotly's SVG. Null while an image is being replaced.
-_PICTURES = """output => Promise.all([...output.querySelectorAll('img, canvas, .js-plotly-plot')].map(async e => {
+# Everything that is drawn, as text: pixels of images and canvases, plotly's SVG. Null while an
+# image is being replaced.
+_PICTURES = """output => Promise.all(
+  [...output.querySelectorAll('img, canvas, .js-plotly-plot')].map(async e => {
   if (e.tagName == 'DIV') return e.innerHTML;
   if (e.tagName == 'CANVAS') return e.toDataURL();
   await e.decode();
@@ -215,9 +269,11 @@ def slider_moves_picture(output) -> bool:
 
 
 def label_by_clicks(page) -> None:
-    """Label a sequence as a person does: four keypoints on the reference, one taken back, four on the next, accept.
+    """Label a sequence as a person does: four keypoints on the reference, one taken back, four on
+    the next, accept.
 
-    The outermost points of two objects seldom correspond, so the widget may ask to press accept again.
+    The outermost points of two objects seldom correspond, so the widget may ask to press accept
+    again.
     """
     box = page.locator(".zsp-label")
     _pick_outermost(page, "reference")
@@ -227,7 +283,10 @@ def label_by_clicks(page) -> None:
     box.locator("button.zsp-next").click()
     _pick_outermost(page, "sequence")
     accept = box.locator("button.zsp-accept:enabled")
-    accepted, asked = box.locator(".zsp-progress td", has_text="accepted"), box.get_by_text("press accept again")
+    accepted, asked = (
+        box.locator(".zsp-progress td", has_text="accepted"),
+        box.get_by_text("press accept again"),
+    )
     accept.click()
     accepted.or_(asked).first.wait_for()
     if asked.first.is_visible():
@@ -236,13 +295,23 @@ def label_by_clicks(page) -> None:
 
 
 def _pick_outermost(page, cloud: str, first: int = 0) -> None:
-    """Click on the points of a cloud that are furthest left, right, up and down on the screen, from the `first` on."""
+    """Click on the points of a cloud that are furthest left, right, up and down on the screen, from
+    the `first` on."""
     canvas = page.locator(f".zsp-cloud-{cloud} canvas")
     canvas.scroll_into_view_if_needed()
-    page.wait_for_function("name => +document.querySelector(`.zsp-cloud-${name} canvas`).dataset.points > 0", arg=cloud)
-    places = canvas.evaluate("c => [...Array(+c.dataset.points).keys()].map(i => c.pointOnCanvas(i))")
+    page.wait_for_function(
+        "name => +document.querySelector(`.zsp-cloud-${name} canvas`).dataset.points > 0", arg=cloud
+    )
+    places = canvas.evaluate(
+        "c => [...Array(+c.dataset.points).keys()].map(i => c.pointOnCanvas(i))"
+    )
     across, down = (lambda place: place[0]), (lambda place: place[1])
-    ends = [min(places, key=across), max(places, key=across), min(places, key=down), max(places, key=down)]
+    ends = [
+        min(places, key=across),
+        max(places, key=across),
+        min(places, key=down),
+        max(places, key=down),
+    ]
     for number, (x, y) in list(enumerate(ends, 1))[first:]:
         canvas.click(position={"x": x, "y": y})
         _await_marks(page, cloud, number)
@@ -258,7 +327,9 @@ def _await_marks(page, cloud: str, number: int) -> None:
 def photograph(page, path: Path) -> None:
     """The notebook as a picture, up to the height in pixels that Chromium can draw at once."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    cells = page.evaluate("() => document.querySelector('.jp-WindowedPanel-inner').getBoundingClientRect().height")
+    cells = page.evaluate(
+        "() => document.querySelector('.jp-WindowedPanel-inner').getBoundingClientRect().height"
+    )
     page.set_viewport_size({"width": 1300, "height": int(min(cells + 150, 15_000))})
     time.sleep(2)  # until everything is laid out anew
     page.screenshot(path=path, timeout=120_000)

@@ -1,4 +1,5 @@
-"""The page docs/playground.md in Chromium: it computes what the library computes, and a person can use it."""
+"""The page docs/playground.md in Chromium: it computes what the library computes, and a person can
+use it."""
 
 import base64
 import subprocess
@@ -22,17 +23,29 @@ from zsp_lite.course.samples import sample_data
 from zsp_lite.matching import cyclical_distances, key_similarities, match, similarity
 from zsp_lite.metrics import rotation_error
 
-DEFAULTS = {"saliency": 0.05, "binned": True, "cycle": True, "k": 50, "kmeans": True, "trials": 1000, "threshold": 0.2}
+DEFAULTS = {
+    "saliency": 0.05,
+    "binned": True,
+    "cycle": True,
+    "k": 50,
+    "kmeans": True,
+    "trials": 1000,
+    "threshold": 0.2,
+}
 SOLVE = """(chosen) => {
   const { targets, best, pose, error } = solveViews(state.views, chosen);
   const kept = ({ matches, score, distances }) => ({ matches, score, distances: [...distances] });
   return { targets: targets.map(kept), best, pose, error };
 }"""
-FIRST_TARGET = "document.querySelectorAll('.views canvas')[0].getContext('2d').getImageData(0, 0, 448, 448).data"
+FIRST_TARGET = (
+    "document.querySelectorAll('.views canvas')[0].getContext('2d').getImageData(0, 0, 448, "
+    "448).data"
+)
 PACK = """(array) => {
   const bytes = new Uint8Array(array.buffer, array.byteOffset, array.byteLength);
   let text = "";
-  for (let i = 0; i < bytes.length; i += 4096) text += String.fromCharCode(...bytes.subarray(i, i + 4096));
+  for (let i = 0; i < bytes.length; i += 4096)
+    text += String.fromCharCode(...bytes.subarray(i, i + 4096));
   return btoa(text);
 }"""
 
@@ -42,8 +55,22 @@ def site(tmp_path_factory):
     """Folder of a site with this one page."""
     folder = tmp_path_factory.mktemp("site")
     only = ["-D", "include_patterns=docs/playground.md", "-D", "root_doc=docs/playground"]
-    command = [sys.executable, "-m", "sphinx", "-q", "-c", "docs/site", "-d", folder / "doctrees", *only, ".", folder]
-    subprocess.run(command, cwd=REPOSITORY, check=True, stderr=subprocess.DEVNULL)  # links to other pages are missing
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-c",
+        "docs/site",
+        "-d",
+        folder / "doctrees",
+        *only,
+        ".",
+        folder,
+    ]
+    subprocess.run(
+        command, cwd=REPOSITORY, check=True, stderr=subprocess.DEVNULL
+    )  # links to other pages are missing
     write_page_data(folder / "docs" / "playground")
     return folder
 
@@ -65,7 +92,9 @@ def open_page(browser, address, **options):
     page.broken = []
     page.on("pageerror", lambda error: page.broken.append(str(error)))
     page.goto(f"{address}/docs/playground.html")
-    page.wait_for_function("document.getElementById('pictures').getAttribute('aria-busy') === 'false'")
+    page.wait_for_function(
+        "document.getElementById('pictures').getAttribute('aria-busy') === 'false'"
+    )
     return page
 
 
@@ -84,15 +113,23 @@ def nearest(sim, on1, on2):
 def test_the_page_computes_what_the_library_computes(stored, method, index):
     dataset = Co3D(sample_data())
     result = run_pair(dataset, stored_pairs(dataset)[index], method)
-    expected, views = result.estimate, [result.estimate.reference_view, *result.estimate.target_views]
+    expected, views = (
+        result.estimate,
+        [result.estimate.reference_view, *result.estimate.target_views],
+    )
     stored.evaluate("index => openStored(index)", index)
     default = stored.evaluate(SOLVE, DEFAULTS)
     assert default["best"] == expected.view
-    np.testing.assert_allclose([one["score"] for one in default["targets"]], expected.view_scores, atol=0.05)
+    np.testing.assert_allclose(
+        [one["score"] for one in default["targets"]], expected.view_scores, atol=0.05
+    )
     assert rotation_error(np.array(default["pose"]["R"]), expected.sim3.R) < 1
     assert default["error"] == pytest.approx(result.error, abs=1)
 
-    solved = {cycle: stored.evaluate(SOLVE, DEFAULTS | {"kmeans": False, "cycle": cycle}) for cycle in (True, False)}
+    solved = {
+        cycle: stored.evaluate(SOLVE, DEFAULTS | {"kmeans": False, "cycle": cycle})
+        for cycle in (True, False)
+    }
     kept = []  # features with the rounded keys that the page stores
     for i, view in enumerate(views):
         on = stored.evaluate(f"Array.from(state.views[{i}].saliency, (value) => value > 0.05)")
@@ -102,12 +139,16 @@ def test_the_page_computes_what_the_library_computes(stored, method, index):
     for i, view in enumerate(views[1:]):
         compared = (array(stored, f"state.views[{i + 1}].compared[{one}].sim") for one in (0, 1))
         bare, sim = (torch.from_numpy(one.reshape(784, 784)) for one in compared)
-        torch.testing.assert_close(sim, similarity(views[0].features, view.features), atol=1e-3, rtol=0)
+        torch.testing.assert_close(
+            sim, similarity(views[0].features, view.features), atol=1e-3, rtol=0
+        )
         torch.testing.assert_close(sim, similarity(kept[0], kept[i + 1]), atol=1e-5, rtol=0)
         (plain,) = key_similarities(views[0].features, [view.features])
         torch.testing.assert_close(bare, plain, atol=3e-3, rtol=0)
         closed = -cyclical_distances(sim, (28, 28), (28, 28), views[0].foreground, view.foreground)
-        np.testing.assert_allclose(solved[True]["targets"][i]["distances"], closed.flatten(), atol=1e-6)
+        np.testing.assert_allclose(
+            solved[True]["targets"][i]["distances"], closed.flatten(), atol=1e-6
+        )
         for cycle, matcher in ((True, "cyclical"), (False, nearest)):
             matches = match(kept[0], kept[i + 1], kmeans=False, sim=sim, matcher=matcher)
             found = solved[cycle]["targets"][i]
@@ -118,7 +159,9 @@ def test_the_page_computes_what_the_library_computes(stored, method, index):
     u, v = np.transpose(solved[True]["targets"][best]["matches"])
     x, y = (np.array(stored.evaluate(f"state.views[{i}].points")) for i in (0, best + 1))
     fitted, inliers = ransac(x[u], y[v], scale_range=(0.2, 5))
-    assert rotation_error(np.array(pose["R"]), fitted.R) < 1e-3 and pose["inliers"] == inliers.tolist()
+    assert (
+        rotation_error(np.array(pose["R"]), fitted.R) < 1e-3 and pose["inliers"] == inliers.tolist()
+    )
     assert not stored.broken
 
 
@@ -129,7 +172,9 @@ def test_photographs_get_the_features_of_the_library_and_no_pose(browser, site, 
     files = [tmp_path / "a.png", tmp_path / "b.png"]
     for file, view in zip(files, views):
         cv2.imwrite(str(file), view.frame.rgb[..., ::-1])
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=site))
+    server = ThreadingHTTPServer(
+        ("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=site)
+    )
     threading.Thread(target=server.serve_forever, daemon=True).start()
     address, asked = f"http://127.0.0.1:{server.server_port}", []
     page = open_page(browser, address)
@@ -138,7 +183,9 @@ def test_photographs_get_the_features_of_the_library_and_no_pose(browser, site, 
     page.on("request", lambda request: asked.append((request.method, request.url)))
     page.set_input_files("#files", files)
     page.wait_for_function("/not left|cannot/.test(document.getElementById('notice').textContent)")
-    assert "not left this computer" in page.inner_text("#notice") and "No pose" in page.inner_text("#stages")
+    assert "not left this computer" in page.inner_text("#notice") and "No pose" in page.inner_text(
+        "#stages"
+    )
     for i, view in enumerate(views):
         keys, saliency = (array(page, f"state.views[{i}].{name}") for name in ("keys", "saliency"))
         np.testing.assert_allclose(keys, view.features.keys.flatten(), atol=1e-3)
@@ -146,14 +193,20 @@ def test_photographs_get_the_features_of_the_library_and_no_pose(browser, site, 
     page.select_option("#pair", "3")  # the pair shown before
     page.wait_for_function("/3D models/.test(document.getElementById('notice').textContent)")
     assert page.evaluate("state.views.length") == 6 and "No pose" not in page.inner_text("#stages")
-    assert asked and all(how == "GET" and url.startswith((address, "data:", "blob:")) for how, url in asked)
+    assert asked and all(
+        how == "GET" and url.startswith((address, "data:", "blob:")) for how, url in asked
+    )
     server.shutdown()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1280, 390])
 def test_a_person_uses_the_page_with_keyboard_and_touch(browser, site, width, scheme):
-    options = {"viewport": {"width": width, "height": 900}, "color_scheme": scheme, "has_touch": True}
+    options = {
+        "viewport": {"width": width, "height": 900},
+        "color_scheme": scheme,
+        "has_touch": True,
+    }
     page = open_page(browser, site.as_uri(), **options)
 
     def tab_to(name):
@@ -171,9 +224,18 @@ def test_a_person_uses_the_page_with_keyboard_and_touch(browser, site, width, sc
     assert (picture != array(page, FIRST_TARGET, np.uint8)).any() and picture.std() > 20
     box = page.locator("#reference").bounding_box()
     page.touchscreen.tap(box["x"] + 60, box["y"] + 60)
-    assert page.inner_text("#patch").endswith("click to hold") and "row 14" not in page.inner_text("#patch")
+    assert page.inner_text("#patch").endswith("click to hold") and "row 14" not in page.inner_text(
+        "#patch"
+    )
     right, left = "ArrowRight", "ArrowLeft"
-    keys = {"cloud": "ArrowUp", "saliency": right, "cycle": " ", "k": left, "kmeans": " ", "trials": "Home"}
+    keys = {
+        "cloud": "ArrowUp",
+        "saliency": right,
+        "cycle": " ",
+        "k": left,
+        "kmeans": " ",
+        "trials": "Home",
+    }
     for name, key in keys.items():
         before = page.inner_text("#stages"), page.evaluate("element('cloud').toDataURL()")
         tab_to(name)

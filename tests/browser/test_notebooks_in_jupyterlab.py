@@ -1,4 +1,5 @@
-"""Every notebook runs without errors in JupyterLab in Chromium, and its widgets react to their sliders.
+"""Every notebook runs without errors in JupyterLab in Chromium, and its widgets react to their
+sliders.
 
 A self-check gives feedback, and asks nothing of the network.
 """
@@ -33,7 +34,9 @@ def lab(browser, tmp_path_factory):
         nbformat.write(notebook, path)
     python = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
     check = new_code_cell('from zsp_lite.course.widgets import self_check\nself_check("00", 1)')
-    asking = new_notebook(cells=[new_markdown_cell("A formula, for MathJax: $x^2$"), check], metadata=python)
+    asking = new_notebook(
+        cells=[new_markdown_cell("A formula, for MathJax: $x^2$"), check], metadata=python
+    )
     nbformat.write(asking, folder / "notebooks" / "asking.ipynb")
     with reader.serve(folder / "notebooks", folder, folder / "data_samples") as running:
         yield running
@@ -54,12 +57,17 @@ def test_a_self_check_gives_feedback_without_a_network(page, lab):
     reader.open_notebook(page, lab, "asking.ipynb")
     reader.run_all(page, patience=300)
     feedback = page.locator(".Feedback").first
-    for answer, words in (("CAD model", "No CAD model is used."), ("one image of the first object", "Yes.")):
+    for answer, words in (
+        ("CAD model", "No CAD model is used."),
+        ("one image of the first object", "Yes."),
+    ):
         page.locator(".MCButton", has_text=answer).click()
         assert feedback.inner_text().startswith(words)
     page.wait_for_timeout(2000)  # jupyterquiz looks for MathJax after half a second
     assert page.evaluate("typeof MathJax") == "object"
-    assert asked and not [url for url in asked if not url.startswith((lab.url, "ws://127.0.0.1", "data:", "blob:"))]
+    assert asked and not [
+        url for url in asked if not url.startswith((lab.url, "ws://127.0.0.1", "data:", "blob:"))
+    ]
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
@@ -72,10 +80,14 @@ def test_a_notebook_runs_and_its_widgets_react(page, lab, name):
         assert not wrong
         outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
         widgets = sum(WIDGET in output.get("data", {}) for output in outputs)
-        shown = page.locator(".jp-Notebook .jp-OutputArea-output", has=page.locator(".jupyter-widgets"))
+        shown = page.locator(
+            ".jp-Notebook .jp-OutputArea-output", has=page.locator(".jupyter-widgets")
+        )
         assert shown.count() >= widgets, f"{shown.count()} widgets in the page, expected {widgets}"
         moved = [reader.slider_moves_picture(output) for output in reader.slider_outputs(page)]
-        assert all(moved), f"which pictures of widgets of {name} changed when their sliders were moved: {moved}"
+        assert all(moved), (
+            f"which pictures of widgets of {name} changed when their sliders were moved: {moved}"
+        )
         if name in LABELLING:
             reader.label_by_clicks(page)
     finally:

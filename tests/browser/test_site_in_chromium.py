@@ -1,4 +1,5 @@
-"""The course site in Chromium: pages fit a phone, fields can be read, the class does not see the presenter's notes."""
+"""The course site in Chromium: pages fit a phone, fields can be read, the class does not see the
+presenter's notes."""
 
 
 def test_no_page_is_wider_than_the_screen_of_a_phone(browser, site):
@@ -21,9 +22,17 @@ def test_notes_are_shown_in_the_presenters_view_alone(browser, site):
     assert "questions on exercise 02, 10 min" in presenter.inner_text("article")
     for key, window in (("ArrowRight", page), ("ArrowRight", presenter)):
         window.keyboard.press(key)
-    assert page.inner_text("#place") == presenter.inner_text("header b") and page.inner_text("#place").startswith("3 /")
+    assert page.inner_text("#place") == presenter.inner_text("header b") and page.inner_text(
+        "#place"
+    ).startswith("3 /")
     assert presenter.locator("article img").count() == 1
-    assert "comes close" in presenter.inner_text("article") and "comes close" not in page.inner_text("main")
+    assert "comes close" in presenter.inner_text(
+        "article"
+    ) and "comes close" not in page.inner_text("main")
     page.keyboard.press("ArrowRight")
-    assert "equation 3" in presenter.inner_text("article") and "Taken literally" in presenter.inner_text("article")
-    assert "equation 3" not in page.inner_text("main") and "Taken literally" not in page.inner_text("main")
+    assert "equation 3" in presenter.inner_text(
+        "article"
+    ) and "Taken literally" in presenter.inner_text("article")
+    assert "equation 3" not in page.inner_text("main") and "Taken literally" not in page.inner_text(
+        "main"
+    )

@@ -1,4 +1,5 @@
-"""Run the checks; `checks` is a module of its own, because the processes that it starts import it."""
+"""Run the checks; `checks` is a module of its own, because the processes that it starts
+import it."""
 
 import sys
 

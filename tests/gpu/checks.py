@@ -1,4 +1,5 @@
-"""Checks on a CUDA GPU against the CPU of the same machine: poses, notebooks, speed; skipped without a GPU.
+"""Checks on a CUDA GPU against the CPU of the same machine: poses, notebooks, speed; skipped
+without a GPU.
 
     python -m tests.gpu [--parts poses notebooks speed] [--device cuda] [--out outputs/gpu]
 
@@ -34,25 +35,36 @@ from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import extract_views, object_crop
 
 CORES, LARGEST_ANGLE = os.cpu_count(), 1.0  # degrees between the poses of two devices
-# Share of pairs of a solver that may differ: of features that differ in the last digits, a tie may fall the other way.
+# Share of pairs of a solver that may differ: of features that differ in the last digits, a tie may
+# fall the other way.
 TIES = 0.05
 Result = tuple[list[str], list[str]]  # lines of a table, and what failed
 
 
 def solve(pickled: bytes) -> dict[str, np.ndarray]:
-    """Estimate the rotations of a reference in the world of its targets by both solvers, on one thread."""
+    """Estimate the rotations of a reference in the world of its targets by both solvers, on one
+    thread."""
     torch.set_num_threads(1)
     reference, *targets = pickle.loads(pickled)
     backbone, found = load_backbone(device="cpu"), {}
     for solver in SOLVERS["both"]:
-        found[solver] = ZeroShotPose(backbone, solver=solver).estimate_from_views(reference, targets).world_rotation()
+        found[solver] = (
+            ZeroShotPose(backbone, solver=solver)
+            .estimate_from_views(reference, targets)
+            .world_rotation()
+        )
     return found
 
 
 def poses(device: str) -> Result:
-    """Compare the poses of all evaluation pairs with five target views that features of both devices give."""
+    """Compare the poses of all evaluation pairs with five target views that features of both
+    devices give."""
     dataset, work = Co3D(sample_data()), []
-    pairs = [pair for category in labelled_categories(dataset) for pair in shipped_pairs(dataset, category, 5)]
+    pairs = [
+        pair
+        for category in labelled_categories(dataset)
+        for pair in shipped_pairs(dataset, category, 5)
+    ]
     for backbone in (load_backbone(device=device), load_backbone(device="cpu")):
         for pair in pairs:
             reference, targets = dataset.load_pair(pair)
@@ -63,10 +75,18 @@ def poses(device: str) -> Result:
         found = list(executor.map(solve, work))
     lines, failures = [], []
     for solver in SOLVERS["both"]:
-        first, second = (np.stack([one[solver] for one in some]) for some in (found[: len(pairs)], found[len(pairs) :]))
+        first, second = (
+            np.stack([one[solver] for one in some])
+            for some in (found[: len(pairs)], found[len(pairs) :])
+        )
         angles = rotation_error(first, second)
-        differ = [f"{pairs[k].key} by {angles[k]:.1f}°" for k in np.flatnonzero(angles > LARGEST_ANGLE)]
-        told = f"{solver} solver: {len(differ)} of {len(pairs)} poses differ between {device} and cpu: {differ}"
+        differ = [
+            f"{pairs[k].key} by {angles[k]:.1f}°" for k in np.flatnonzero(angles > LARGEST_ANGLE)
+        ]
+        told = (
+            f"{solver} solver: {len(differ)} of {len(pairs)} poses differ between {device} and "
+            f"cpu: {differ}"
+        )
         lines.append(f"| {told} | | |")
         if len(differ) > TIES * len(pairs):
             failures.append(told)
@@ -74,7 +94,8 @@ def poses(device: str) -> Result:
 
 
 def notebooks(device: str) -> Result:
-    """Execute notebooks 00 to 04, with their assertions, on the device; outputs are of a CPU and are not compared.
+    """Execute notebooks 00 to 04, with their assertions, on the device; outputs are of a CPU and
+    are not compared.
 
     Notebook 01 computes inside the network and names the CPU.
     """
@@ -83,9 +104,29 @@ def notebooks(device: str) -> Result:
             text = path.read_text(encoding="utf-8")
             if "backbone.model" not in text:
                 text = text.replace(r"device=\"cpu\"", rf"device=\"{device}\"")
-            Path(folder, path.name).write_text(text.replace("nbval-check-output", "not-compared"), encoding="utf-8")
-        command = [sys.executable, "-m", "pytest", "-c", "pyproject.toml", "--rootdir", folder, "-q", "--nbval-lax"]
-        command += ["--nbval-current-env", "--nbval-cell-timeout=300", "-n", "4", "--dist", "loadfile", folder]
+            Path(folder, path.name).write_text(
+                text.replace("nbval-check-output", "not-compared"), encoding="utf-8"
+            )
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-c",
+            "pyproject.toml",
+            "--rootdir",
+            folder,
+            "-q",
+            "--nbval-lax",
+        ]
+        command += [
+            "--nbval-current-env",
+            "--nbval-cell-timeout=300",
+            "-n",
+            "4",
+            "--dist",
+            "loadfile",
+            folder,
+        ]
         threads = {"OMP_NUM_THREADS": str(max(1, CORES // 4))}
         status = subprocess.run(command, cwd=REPOSITORY, env=os.environ | threads).returncode
     return [], [f"pytest of the notebooks ended with {status}"] if status else []
@@ -105,18 +146,25 @@ def speed(device: str) -> Result:
         return seconds(to_its_end, 3)
 
     for one in dict.fromkeys((device, "cpu")):
-        dino = Backbone(VisionTransformer(224, 8, 384, 12, 6), "DINO ViT-S/8, random weights", device=one)
+        dino = Backbone(
+            VisionTransformer(224, 8, 384, 12, 6), "DINO ViT-S/8, random weights", device=one
+        )
         for backbone in (load_backbone(device=one), dino):
             for size in (8, 64):
                 backbone.batch_size = size
                 rate = size / measured(lambda: backbone(images[:size]))
-                lines.append(f"| {backbone.name}, batches of {size} | {one} | {rate:.0f} images/s |")
+                lines.append(
+                    f"| {backbone.name}, batches of {size} | {one} | {rate:.0f} images/s |"
+                )
             for solver in SOLVERS["both"]:
                 method = ZeroShotPose(backbone, solver=solver)
                 rate = 1 / measured(lambda: method.estimate(reference, targets))
                 lines.append(f"| {backbone.name}, {solver} solver | {one} | {rate:.1f} pairs/s |")
             if one == "cuda":
-                lines.append(f"| {backbone.name}, memory | {one} | {torch.cuda.max_memory_allocated() / 1e9:.2f} GB |")
+                lines.append(
+                    f"| {backbone.name}, memory | {one} | "
+                    f"{torch.cuda.max_memory_allocated() / 1e9:.2f} GB |"
+                )
                 torch.cuda.reset_peak_memory_stats()
     return lines, []
 
@@ -132,7 +180,10 @@ def main() -> int:
         print("skipped: no CUDA device")
         return 0
     name = torch.cuda.get_device_name() if options.device == "cuda" else "no GPU"
-    report, failures = [f"| {name}, {CORES} cores, PyTorch {torch.__version__} | device | |", "|---|---|---:|"], []
+    report, failures = (
+        [f"| {name}, {CORES} cores, PyTorch {torch.__version__} | device | |", "|---|---|---:|"],
+        [],
+    )
     options.out.mkdir(parents=True, exist_ok=True)
     for part in options.parts:
         start = time.perf_counter()

@@ -1,9 +1,11 @@
-"""Run every hostile input in a forked process with limits on memory and time, and count the outcomes.
+"""Run every hostile input in a forked process with limits on memory and time, and count the
+outcomes.
 
     python -m tests.hostile [GROUP ...]
 
-The libraries are imported once, before the processes fork. A case fails by a traceback, by a wrong answer without an
-error, after 20 s of processor time or two minutes, or with 1 GB more memory than the idle process. Linux only.
+The libraries are imported once, before the processes fork. A case fails by a traceback, by a wrong
+answer without an error, after 20 s of processor time or two minutes, or with 1 GB more memory than
+the idle process. Linux only.
 """
 
 import gc
@@ -34,18 +36,24 @@ SECONDS, WAIT, MEMORY = 20, 120, 1 << 30  # limits of a case: processor time, ti
 
 
 def attempt(case, folder: Path, answers) -> None:
-    """Run a case with limits, and send the outcome, the message and the memory that was used, in bytes."""
+    """Run a case with limits, and send the outcome, the message and the memory that was used, in
+    bytes."""
     os.setsid()
     for stream in (1, 2):
         os.dup2(os.open(folder / f"stream{stream}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
     os.chdir(folder)
     resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (size + 3 * MEMORY,) * 2)  # the machine's memory is not to fill up
+    resource.setrlimit(
+        resource.RLIMIT_AS, (size + 3 * MEMORY,) * 2
+    )  # the machine's memory is not to fill up
     try:
         kind, message = case.call(folder)
     except InputError as error:
-        kind, message = "wrong" if "\n" in str(error) or len(str(error)) > 1500 else "refused", str(error)
+        kind, message = (
+            "wrong" if "\n" in str(error) or len(str(error)) > 1500 else "refused",
+            str(error),
+        )
     except BaseException as error:
         lines = traceback.format_exc().strip().splitlines()
         kind, message = "traceback", f"{type(error).__name__}: {error} | {' '.join(lines[-3:-1])}"
@@ -54,7 +62,10 @@ def attempt(case, folder: Path, answers) -> None:
 
 
 def run_case(case, folder: Path, idle: int) -> tuple[str, str]:
-    """Run a case in a forked process. Returns the outcome and the message; `idle`: bytes of an idle process."""
+    """Run a case in a forked process.
+
+    Returns the outcome and the message; `idle`: bytes of an idle process.
+    """
     context = multiprocessing.get_context("fork")
     answers, sending = context.Pipe(duplex=False)
     process = context.Process(target=attempt, args=(case, folder, sending))
@@ -92,7 +103,9 @@ def main(groups: list[str]) -> int:
     for (group, kind), count in counts.items():
         print(f"{group:10} {kind:10} {count:4}")
     bad = sum(count for (_, kind), count in counts.items() if kind not in ("refused", "right"))
-    print(f"{counts.total() - bad} of {counts.total()} as expected, {time.monotonic() - start:.0f} s")
+    print(
+        f"{counts.total() - bad} of {counts.total()} as expected, {time.monotonic() - start:.0f} s"
+    )
     return int(bad > 0)
 
 

@@ -1,4 +1,5 @@
-"""What a process must withstand: endless, oversized and malicious files and options, for every reader and command."""
+"""What a process must withstand: endless, oversized and malicious files and options, for every
+reader and command."""
 
 import gzip
 import io
@@ -34,7 +35,10 @@ from zsp_lite.importers import open_capture
 from zsp_lite.importers.files import read_depth_file, read_mask_file, read_picture
 
 COMMANDS_OF = {
-    "picture": ("a.png", ("estimate", "ROOT/a.png", "ROOT/b.png", "--intrinsics", "60,60,32,32", "--out", "ROOT/e")),
+    "picture": (
+        "a.png",
+        ("estimate", "ROOT/a.png", "ROOT/b.png", "--intrinsics", "60,60,32,32", "--out", "ROOT/e"),
+    ),
     "results": (RESULTS, ("tables", "ROOT/out")),
     "packed results": (f"{RESULTS}.gz", ("tables", "ROOT/out")),
     "run to continue": ("out/run.jsonl", (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/out")),
@@ -52,9 +56,14 @@ for kind in STRANGE:
 
 # oversized
 def png(width: int, height: int) -> bytes:
-    chunks = ((b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)),
-              (b"IDAT", zlib.compress(bytes(1 << 20), 9)), (b"IEND", b""))  # fmt: skip
-    packed = (struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks)
+    chunks = (
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)),
+        (b"IDAT", zlib.compress(bytes(1 << 20), 9)),
+        (b"IEND", b""),
+    )
+    packed = (
+        struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks
+    )
     return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
 
 
@@ -64,45 +73,90 @@ def safetensors(header: dict | bytes, data: bytes = b"") -> bytes:
 
 
 def _npy(shape, descr="<f8", data=b"") -> bytes:
-    header = str({"descr": descr, "fortran_order": False, "shape": shape}).encode().ljust(117) + b"\n"
+    header = (
+        str({"descr": descr, "fortran_order": False, "shape": shape}).encode().ljust(117) + b"\n"
+    )
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + data
 
 
 DEEP = b"[" * 100_000
 OVERSIZED = [
-    ("image", png(30_000, 30_000)), ("depth", png(2**31 - 1, 2**31 - 1)), ("frame annotations", gzip_bomb),
-    ("sequence annotations", gzip.compress(DEEP)), ("label", DEEP), ("nerfstudio", DEEP), ("labels to import", DEEP),
-    ("frame annotations", gzip.compress(b'[{"sequence_name": "a", "frame_number": ' + b"9" * 100_000 + b"}]")),
+    ("image", png(30_000, 30_000)),
+    ("depth", png(2**31 - 1, 2**31 - 1)),
+    ("frame annotations", gzip_bomb),
+    ("sequence annotations", gzip.compress(DEEP)),
+    ("label", DEEP),
+    ("nerfstudio", DEEP),
+    ("labels to import", DEEP),
+    (
+        "frame annotations",
+        gzip.compress(b'[{"sequence_name": "a", "frame_number": ' + b"9" * 100_000 + b"}]"),
+    ),
     ("pairs", b"\x80\x02" + b"]" * 100_000 + b"."),
-    ("safetensors", safetensors({"a": {"dtype": "F32", "shape": [10**12], "data_offsets": [0, 4]}}, bytes(4))),
+    (
+        "safetensors",
+        safetensors({"a": {"dtype": "F32", "shape": [10**12], "data_offsets": [0, 4]}}, bytes(4)),
+    ),
     ("safetensors", safetensors(b'{"a":' * 100_000)),
-    ("lists", "x" * 20_000_000), ("lists", "\n" * 2_000_000),
-]  # fmt: skip
+    ("lists", "x" * 20_000_000),
+    ("lists", "\n" * 2_000_000),
+]
 for number, (what, data) in enumerate(OVERSIZED):
     name, read = READERS_OF[what]
     case("oversized", f"{what} {number}", read, written(name, data))
-command("oversized", "results that are a gzip bomb", "tables", "ROOT/out", change=written(f"{RESULTS}.gz", gzip_bomb))
-case("oversized", "depth map of 10^15 numbers", read_capture("lists"), lambda folder: (
-    written("capture/z/0.npy", _npy((10**15,)))(folder), written("capture/depth.txt", "z/0.npy\n")(folder)))  # fmt: skip
+command(
+    "oversized",
+    "results that are a gzip bomb",
+    "tables",
+    "ROOT/out",
+    change=written(f"{RESULTS}.gz", gzip_bomb),
+)
+case(
+    "oversized",
+    "depth map of 10^15 numbers",
+    read_capture("lists"),
+    lambda folder: (
+        written("capture/z/0.npy", _npy((10**15,)))(folder),
+        written("capture/depth.txt", "z/0.npy\n")(folder),
+    ),
+)
 
 
 # malicious: links that lead out of a folder, code in files and as values of options
 def _link(name, target):
-    return lambda folder: ((folder / name).unlink(missing_ok=True), (folder / name).symlink_to(target))
+    return lambda folder: (
+        (folder / name).unlink(missing_ok=True),
+        (folder / name).symlink_to(target),
+    )
 
 
-case("malicious", "depth map of objects", read_capture("lists"), lambda folder: (
-    written("capture/z/0.npy", _npy((1,), "|O", b"cos\nsystem\n(S'touch executed'\ntR."))(folder),
-    written("capture/depth.txt", "z/0.npy\n")(folder)))  # fmt: skip
+case(
+    "malicious",
+    "depth map of objects",
+    read_capture("lists"),
+    lambda folder: (
+        written("capture/z/0.npy", _npy((1,), "|O", b"cos\nsystem\n(S'touch executed'\ntR."))(
+            folder
+        ),
+        written("capture/depth.txt", "z/0.npy\n")(folder),
+    ),
+)
 for target in ("capture/pictures/0.jpg", "capture/rgb.txt"):
-    case("malicious", f"{target} is a link out of the folder", read_capture("lists"), _link(target, "/etc/passwd"))
+    case(
+        "malicious",
+        f"{target} is a link out of the folder",
+        read_capture("lists"),
+        _link(target, "/etc/passwd"),
+    )
 
 
 def scan(layout: str, change):
     """Write one frame in a layout of `test_readers`, and change the folder."""
 
     def write(folder):
-        path, _ = write_scan(layout, folder / "scan", [replace(sequence_data("c", 1).frames[0], name="0")])
+        path, _ = write_scan(
+            layout, folder / "scan", [replace(sequence_data("c", 1).frames[0], name="0")]
+        )
         change(path)
         (folder / "path").write_text(str(path))
 
@@ -146,24 +200,76 @@ def ten_hours(data: bytes) -> bytes:
 for name, layout, change in (
     ("zip that unpacks to 3 GB", "nerfstudio", zip_of("transforms.json", 3 << 30)),
     ("zip with a path that climbs", "nerfstudio", zip_of("../../executed", 1 << 20)),
-    ("transforms.json with a path that climbs", "polycam", lambda path: written("transforms.json", json.dumps(
-        {"fl_x": 1, "frames": [{"file_path": "../../../../../etc/passwd", "depth_path": "/dev/zero", "transform_matrix": [[1, 0, 0, 0]] * 3}]}))(path)),
-    ("quaternion of zeros", "stray", written("odometry.csv", "timestamp, frame\n0, 0, 0, 0, 0, 0, 0, 0, 0\n")),
-    ("frames without end", "stray", lambda path: (
-        written("odometry.csv", "timestamp, frame\n" + "".join(f"0, {k}, 0, 0, 0, 0, 0, 0, 1\n" for k in (1e9, 1e18, -5, "nan")))(path),
-        written("depth/1000000000.png", "")(path))),
-    ("video of 10 hours", "stray", lambda path: (
-        rewritten("rgb.mp4", ten_hours)(path), rewritten("odometry.csv", lambda data: data.replace(b", 0.0", b", 9e5"))(path),
-        written("depth/900000.png", "")(path))),
-    ("video that is a list of addresses", "stray", written("rgb.mp4", "#EXTM3U\n#EXTINF:9,\n/etc/passwd\n")),
-    ("camera of objects", "polycam", written("keyframes/corrected_cameras/000000.json", '{"fx": {}, "t_00": "x"}')),
+    (
+        "transforms.json with a path that climbs",
+        "polycam",
+        lambda path: written(
+            "transforms.json",
+            json.dumps(
+                {
+                    "fl_x": 1,
+                    "frames": [
+                        {
+                            "file_path": "../../../../../etc/passwd",
+                            "depth_path": "/dev/zero",
+                            "transform_matrix": [[1, 0, 0, 0]] * 3,
+                        }
+                    ],
+                }
+            ),
+        )(path),
+    ),
+    (
+        "quaternion of zeros",
+        "stray",
+        written("odometry.csv", "timestamp, frame\n0, 0, 0, 0, 0, 0, 0, 0, 0\n"),
+    ),
+    (
+        "frames without end",
+        "stray",
+        lambda path: (
+            written(
+                "odometry.csv",
+                "timestamp, frame\n"
+                + "".join(f"0, {k}, 0, 0, 0, 0, 0, 0, 1\n" for k in (1e9, 1e18, -5, "nan")),
+            )(path),
+            written("depth/1000000000.png", "")(path),
+        ),
+    ),
+    (
+        "video of 10 hours",
+        "stray",
+        lambda path: (
+            rewritten("rgb.mp4", ten_hours)(path),
+            rewritten("odometry.csv", lambda data: data.replace(b", 0.0", b", 9e5"))(path),
+            written("depth/900000.png", "")(path),
+        ),
+    ),
+    (
+        "video that is a list of addresses",
+        "stray",
+        written("rgb.mp4", "#EXTM3U\n#EXTINF:9,\n/etc/passwd\n"),
+    ),
+    (
+        "camera of objects",
+        "polycam",
+        written("keyframes/corrected_cameras/000000.json", '{"fx": {}, "t_00": "x"}'),
+    ),
     ("depth that is no LZFSE", "record3d", without_lzfse),
     ("quaternion of zeros", "tum", written("groundtruth.txt", "10 0 0 0 0 0 0 0\n")),
-    ("times that are no numbers", "tum", written("rgb.txt", "nan a.jpg\ninf b.jpg\n-1e308 c.jpg\n")),
-    ("objects that are lists", "bop", written("scene_gt.json", '{"0": [{"obj_id": [], "cam_R_m2c": {}, "cam_t_m2c": "x"}]}')),
+    (
+        "times that are no numbers",
+        "tum",
+        written("rgb.txt", "nan a.jpg\ninf b.jpg\n-1e308 c.jpg\n"),
+    ),
+    (
+        "objects that are lists",
+        "bop",
+        written("scene_gt.json", '{"0": [{"obj_id": [], "cam_R_m2c": {}, "cam_t_m2c": "x"}]}'),
+    ),
     ("pose of many numbers", "scannet", written("pose/000000.txt", "1 2 3 4\n" * 100_000)),
     ("matrix of nothing", "open3d", written("intrinsic.json", '{"intrinsic_matrix": [[], [[]]]}')),
-):  # fmt: skip
+):
     case("scan", f"{layout}: {name}", read_scan, scan(layout, change))
 
 
@@ -182,41 +288,109 @@ def npz(*members: np.ndarray) -> bytes:
 
 
 def exif(kind: int, count: int, value: bytes) -> bytes:
-    """A JPEG whose EXIF orientation has a type, a number of values and a value or an offset; its directory repeats."""
-    directory = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + struct.pack("<HHI4sI", 0x0112, kind, count, value, 8)
+    """A JPEG whose EXIF orientation has a type, a number of values and a value or an offset; its
+    directory repeats."""
+    directory = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + struct.pack(
+        "<HHI4sI", 0x0112, kind, count, value, 8
+    )
     jpeg = encoded(np.zeros((8, 8, 3), np.uint8), "JPEG")
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(directory) + 2) + directory + jpeg[2:]
 
 
-TIFF, LABELS = encoded(np.ones((32, 32), np.float32), "TIFF"), np.arange(4096, dtype=np.uint16).reshape(64, 64) % 300
+TIFF, LABELS = (
+    encoded(np.ones((32, 32), np.float32), "TIFF"),
+    np.arange(4096, dtype=np.uint16).reshape(64, 64) % 300,
+)
 for name, read, data in (
     ("cut.webp", read_picture, encoded(np.zeros((32, 32, 3), np.uint8), "WEBP")[:-9]),
-    ("cut.tiff", read_depth_file, TIFF[:2000]), ("wild.tiff", read_depth_file, TIFF[:4] + b"\xff" * 4 + TIFF[8:]),
-    ("bomb.tiff", read_depth_file, lambda: encoded(np.zeros((20_000, 20_000), np.uint16), "TIFF", compression="tiff_lzw")),
-    ("cut.pfm", read_depth_file, b"Pf\n32 32\n-1.0\n" + bytes(99)), ("bomb.pfm", read_depth_file, b"Pf\n99999 99999\n-1.0\n"),
-    ("two.npz", read_depth_file, npz(LABELS, LABELS)), ("objects.npz", read_depth_file, npz(np.array([{}]))),
+    ("cut.tiff", read_depth_file, TIFF[:2000]),
+    ("wild.tiff", read_depth_file, TIFF[:4] + b"\xff" * 4 + TIFF[8:]),
+    (
+        "bomb.tiff",
+        read_depth_file,
+        lambda: encoded(np.zeros((20_000, 20_000), np.uint16), "TIFF", compression="tiff_lzw"),
+    ),
+    ("cut.pfm", read_depth_file, b"Pf\n32 32\n-1.0\n" + bytes(99)),
+    ("bomb.pfm", read_depth_file, b"Pf\n99999 99999\n-1.0\n"),
+    ("two.npz", read_depth_file, npz(LABELS, LABELS)),
+    ("objects.npz", read_depth_file, npz(np.array([{}]))),
     ("palette.png", read_mask_file, encoded(LABELS.astype(np.uint8), "PNG", palette=True)),
     ("cut.tif", read_mask_file, TIFF[:2000]),
-):  # fmt: skip
-    case("picture", name, lambda folder, name=name, read=read: read(folder / name), written(name, data))
-case("picture", "npz of 3 GB", READERS_OF["depth file"][1], lambda folder: zip_of("a.npy", 3 << 30)(folder / "z.npz"))
+):
+    case(
+        "picture",
+        name,
+        lambda folder, name=name, read=read: read(folder / name),
+        written(name, data),
+    )
+case(
+    "picture",
+    "npz of 3 GB",
+    READERS_OF["depth file"][1],
+    lambda folder: zip_of("a.npy", 3 << 30)(folder / "z.npz"),
+)
 MASK_OF_300_LABELS = written("a_mask.png", encoded(LABELS, "PNG"))
 command("picture", "mask of 300 labels", *COMMANDS_OF["picture"][1], change=MASK_OF_300_LABELS)
-for tag in ((3, 1, b"\x60\xea\0\0"), (2, 4, b"abc\0"), (5, 1, b"\xff" * 4), (3, 1 << 31, bytes(4)), (99, 1, bytes(4))):
-    CASES.append(Case("picture", f"EXIF orientation {tag}", lambda folder, tag=tag: (
-        written("e.jpg", exif(*tag))(folder), ("right" if read_picture(folder / "e.jpg")[1] == 1 else "wrong", ""))[1]))  # fmt: skip
+for tag in (
+    (3, 1, b"\x60\xea\0\0"),
+    (2, 4, b"abc\0"),
+    (5, 1, b"\xff" * 4),
+    (3, 1 << 31, bytes(4)),
+    (99, 1, bytes(4)),
+):
+    CASES.append(
+        Case(
+            "picture",
+            f"EXIF orientation {tag}",
+            lambda folder, tag=tag: (
+                written("e.jpg", exif(*tag))(folder),
+                ("right" if read_picture(folder / "e.jpg")[1] == 1 else "wrong", ""),
+            )[1],
+        )
+    )
 
 ON_DATA = (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/new")
-for option, value in (("--methods", "raises:now"),
-                      ("--methods", "a=/dev/zero/x.csv"), ("--categories", "../.."), ("--list-pairs", "/dev/null/x")):  # fmt: skip
-    command("malicious", f"benchmark {option} {value!r}", *ON_DATA, option, value, change=lambda folder: (
-        sys.path.insert(0, str(folder)), written("raises.py", "raise SystemExit(3)")(folder)))  # fmt: skip
+for option, value in (
+    ("--methods", "raises:now"),
+    ("--methods", "a=/dev/zero/x.csv"),
+    ("--categories", "../.."),
+    ("--list-pairs", "/dev/null/x"),
+):
+    command(
+        "malicious",
+        f"benchmark {option} {value!r}",
+        *ON_DATA,
+        option,
+        value,
+        change=lambda folder: (
+            sys.path.insert(0, str(folder)),
+            written("raises.py", "raise SystemExit(3)")(folder),
+        ),
+    )
 
 # options that reach beyond their folder, or ask for more than there is
 for argv in (
-    (*ON_DATA, "--pairs", "100000000"), (*ON_DATA, "--workers", "100000000000"), (*ON_DATA, "--image-size", "1000000"),
-    (*BENCHMARK, "--data", "ROOT/data", "--out", "/dev/null/x"), ("compare", "ROOT", "\udcff"), ("demo", "--data", "\udcff"),
-    ("data", "labels", "file:///etc", "--root", "ROOT/data"), ("data", "transfer", "ROOT/data", "ROOT/data", "../cup"),
-    ("data", "import", "lists", "ROOT/capture", "--root", "ROOT/data", "--category", "c", "--sequence", "..", "--box", "2,2,20,20"),
-):  # fmt: skip
+    (*ON_DATA, "--pairs", "100000000"),
+    (*ON_DATA, "--workers", "100000000000"),
+    (*ON_DATA, "--image-size", "1000000"),
+    (*BENCHMARK, "--data", "ROOT/data", "--out", "/dev/null/x"),
+    ("compare", "ROOT", "\udcff"),
+    ("demo", "--data", "\udcff"),
+    ("data", "labels", "file:///etc", "--root", "ROOT/data"),
+    ("data", "transfer", "ROOT/data", "ROOT/data", "../cup"),
+    (
+        "data",
+        "import",
+        "lists",
+        "ROOT/capture",
+        "--root",
+        "ROOT/data",
+        "--category",
+        "c",
+        "--sequence",
+        "..",
+        "--box",
+        "2,2,20,20",
+    ),
+):
     command("options", " ".join(argv).replace(" ".join(ON_DATA), "benchmark")[:60], *argv)

@@ -31,20 +31,28 @@ CASES: list["Case"] = []
 
 @dataclass(frozen=True)
 class Case:
-    """A call with the case's own copy of the folder that raises InputError, or returns an outcome and a message."""
+    """A call with the case's own copy of the folder that raises InputError, or returns an outcome
+    and a message."""
 
     group: str
     name: str
     call: Callable[[Path], tuple[str, str]]
 
 
-def case(group: str, name: str, read: Callable[[Path], object], change: Callable[[Path], object]) -> None:
+def case(
+    group: str, name: str, read: Callable[[Path], object], change: Callable[[Path], object]
+) -> None:
     """Register a reader that must raise InputError after a change of the folder."""
-    CASES.append(Case(group, name, lambda folder: (change(folder), ("wrong", repr(read(folder))))[1]))
+    CASES.append(
+        Case(group, name, lambda folder: (change(folder), ("wrong", repr(read(folder))))[1])
+    )
 
 
-def command(group: str, name: str, *argv: str, change: Callable[[Path], object] | None = None, codes=(2,)) -> None:
-    """Register a command line that must end with one of the exit codes: with 2, one line on stderr."""
+def command(
+    group: str, name: str, *argv: str, change: Callable[[Path], object] | None = None, codes=(2,)
+) -> None:
+    """Register a command line that must end with one of the exit codes: with 2, one line on
+    stderr."""
 
     def call(folder: Path):
         if change is not None:
@@ -54,7 +62,12 @@ def command(group: str, name: str, *argv: str, change: Callable[[Path], object] 
             code = main([text.replace("ROOT", str(folder)) for text in argv])
         stderr.flush()
         text = stderr.buffer.getvalue().decode()
-        if code not in codes or "Traceback" in text or code == 2 and len(text.strip().splitlines()) != 1:
+        if (
+            code not in codes
+            or "Traceback" in text
+            or code == 2
+            and len(text.strip().splitlines()) != 1
+        ):
             return "wrong", f"exit code {code}, expected {codes}, and one line on stderr: {text}"
         return "refused" if code == 2 else "right", text
 
@@ -64,8 +77,9 @@ def command(group: str, name: str, *argv: str, change: Callable[[Path], object] 
 def prepare(folder: Path) -> Path:
     """Write what the cases change, each in its own copy.
 
-    data: two labelled sequences of one category; out: a benchmark run on them; capture: one frame as lists and as
-    nerfstudio's; a.png and b.png: pictures with depth and mask; x.safetensors: a small network; poses.csv: one pose.
+    data: two labelled sequences of one category; out: a benchmark run on them; capture: one frame
+    as lists and as nerfstudio's; a.png and b.png: pictures with depth and mask; x.safetensors: a
+    small network; poses.csv: one pose.
     """
     data = folder / "data"
     write_co3d(data, "cup", [sequence_data("a", 6), sequence_data("b", 6, seed=1)])
@@ -79,10 +93,18 @@ def prepare(folder: Path) -> Path:
     depth = np.where(disc, 1000 + 4 * x + 2 * y, 0).astype(np.uint16)
     for name in ("a", "b"):
         picture = np.stack([4 * x, 4 * y, 2 * (x + y)], axis=-1).astype(np.uint8)
-        for end, image in (("", picture), ("_depth", depth), ("_mask", 255 * disc.astype(np.uint8))):
+        for end, image in (
+            ("", picture),
+            ("_depth", depth),
+            ("_mask", 255 * disc.astype(np.uint8)),
+        ):
             cv2.imwrite(str(folder / f"{name}{end}.png"), image)
     (folder / "poses.csv").write_text(POSES)
-    save_file(VisionTransformer(32, 8, 64, 2, 1).state_dict(), folder / "x.safetensors", {"num_heads": "1"})
+    save_file(
+        VisionTransformer(32, 8, 64, 2, 1).state_dict(),
+        folder / "x.safetensors",
+        {"num_heads": "1"},
+    )
     return folder
 
 
@@ -92,11 +114,17 @@ def read_frames(folder: Path):
 
 
 def read_capture(layout: str) -> Callable[[Path], object]:
-    return lambda folder: [frame.load() for frame in open_capture(folder / "capture", layout).frames]
+    return lambda folder: [
+        frame.load() for frame in open_capture(folder / "capture", layout).frames
+    ]
 
 
 FRAMES, SEQUENCES = "data/cup/frame_annotations.jgz", "data/cup/sequence_annotations.jgz"
-PAIRS, LABEL, RESULTS = "data/determ_eval/1samples_2tgt/cup.pt", "data/class_labels/cup/b.json", "out/run.jsonl"
+PAIRS, LABEL, RESULTS = (
+    "data/determ_eval/1samples_2tgt/cup.pt",
+    "data/class_labels/cup/b.json",
+    "out/run.jsonl",
+)
 # Every reader, with the file that it reads.
 READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
     "image": ("a.png", lambda folder: read_image(folder / "a.png")),
@@ -105,16 +133,22 @@ READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
     "depth file": ("z.npz", lambda folder: read_depth_file(folder / "z.npz")),
     "frame annotations": (FRAMES, read_frames),
     "sequence annotations": (SEQUENCES, lambda folder: Co3D(folder / "data").sequences("cup")),
-    "point cloud": ("data/cup/a/pointcloud.ply", lambda folder: Co3D(folder / "data").point_cloud("cup", "a")),
+    "point cloud": (
+        "data/cup/a/pointcloud.ply",
+        lambda folder: Co3D(folder / "data").point_cloud("cup", "a"),
+    ),
     "label": (LABEL, lambda folder: read_labels(folder / "data", "cup")),
     "pairs": (PAIRS, lambda folder: shipped_pairs(Co3D(folder / "data"), "cup", 2)),
-    "labels to import": ("new/class_labels/cup/c.json", lambda folder: import_labels(folder / "new", folder / "data")),
+    "labels to import": (
+        "new/class_labels/cup/c.json",
+        lambda folder: import_labels(folder / "new", folder / "data"),
+    ),
     "checkpoint": ("x.pth", lambda folder: load_backbone(folder / "x.pth", "cpu")),
     "safetensors": ("x.safetensors", lambda folder: load_backbone(folder / "x.safetensors", "cpu")),
     "lists": ("capture/rgb.txt", read_capture("lists")),
     "nerfstudio": ("capture/transforms.json", read_capture("nerfstudio")),
     "poses": ("poses.csv", lambda folder: read_poses(folder / "poses.csv")),
-}  # fmt: skip
+}
 BENCHMARK = ("benchmark", "--pairs", "2", "--targets", "2", "--methods", "icp")
 POSES = """pair,target_frame,rotation,translation,scale
 "cup/a:0/b:1,4",1,1 0 0 0 1 0 0 0 1,0 0 1,1.5
@@ -142,7 +176,8 @@ def _sparse(path: Path) -> None:
         file.truncate(20 << 30)
 
 
-# What does not end, or does not fit into memory. What is damaged is for tests/test_files.py and tests/test_fuzzing.py.
+# What does not end, or does not fit into memory. What is damaged is for tests/test_files.py and
+# tests/test_fuzzing.py.
 STRANGE: dict[str, Callable[[Path], object]] = {
     "pipe": lambda path: os.mkfifo(path),  # looked up late: Windows has none
     "link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),

@@ -16,22 +16,29 @@ from zsp_lite.choices import FACETS, Facet
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.features import FeatureMap
 
-Image = Float[np.ndarray, "_ _ 3"] | UInt8[np.ndarray, "_ _ 3"] | Float[Tensor, "_ _ 3"] | UInt8[Tensor, "_ _ 3"]
+Image = (
+    Float[np.ndarray, "_ _ 3"]
+    | UInt8[np.ndarray, "_ _ 3"]
+    | Float[Tensor, "_ _ 3"]
+    | UInt8[Tensor, "_ _ 3"]
+)
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class Backbone:
-    """Vision transformer as feature extractor of the method (section 4.1). The arguments are attributes, too.
+    """Vision transformer as feature extractor of the method (section 4.1). The arguments are
+    attributes, too.
 
     Args:
         model: Network.
         name: Name used in tables and reports.
-        layer: Block that describes the patches (see `load_backbone`). Default: block 9 counted from 0, or the last of
-            a shallower network.
-        saliency_heads: Heads of the last block whose CLS attention is averaged into the saliency. Default: heads 0, 2,
-            4 and 5 for the size of DINO's ViT-S (Amir et al. 2021), all heads for other sizes.
+        layer: Block that describes the patches (see `load_backbone`). Default: block 9 counted from
+            0, or the last of a shallower network.
+        saliency_heads: Heads of the last block whose CLS attention is averaged into the saliency.
+            Default: heads 0, 2, 4 and 5 for the size of DINO's ViT-S (Amir et al. 2021), all heads
+            for other sizes.
         batch_size: Number of images in one forward pass.
         device, facet, image_size: As of `load_backbone`; the default size is the model's.
         mean, std: Normalisation of RGB values in [0, 1].
@@ -58,13 +65,20 @@ class Backbone:
             dino_small = (model.embed_dim, model.num_heads, model.depth) == (384, 6, 12)
             saliency_heads = (0, 2, 4, 5) if dino_small else heads
         if not saliency_heads or not set(saliency_heads) <= set(heads):
-            raise InputError(f"{name}: saliency_heads are {tuple(saliency_heads)}, expected some of 0 to {heads[-1]}")
+            raise InputError(
+                f"{name}: saliency_heads are {tuple(saliency_heads)}, expected some of 0 to "
+                f"{heads[-1]}"
+            )
         check_choice(f"{name}: facet", facet, FACETS)
         self.name, self.facet, self.saliency_heads = name, facet, tuple(saliency_heads)
-        self.layer = block_index(min(9, model.depth - 1) if layer is None else layer, model.depth, name)
+        self.layer = block_index(
+            min(9, model.depth - 1) if layer is None else layer, model.depth, name
+        )
         self.mean, self.std, self.batch_size = tuple(mean), tuple(std), batch_size
         self.patch_size, self.embed_dim = model.patch_size, model.embed_dim
-        self.image_size = nearest_multiple(model.image_size if image_size is None else image_size, model.patch_size)
+        self.image_size = nearest_multiple(
+            model.image_size if image_size is None else image_size, model.patch_size
+        )
         self.device = choose_device(device)
         self.model = model.to(self.device).eval().requires_grad_(False)
 
@@ -77,8 +91,8 @@ class Backbone:
             images: RGB images (H, W, 3) of any sizes, uint8 or float in [0, 1].
 
         Returns:
-            One FeatureMap per image, float32, on the CPU. The saliency is the CLS attention averaged over the saliency
-            heads, min-max normalised to [0, 1].
+            One FeatureMap per image, float32, on the CPU. The saliency is the CLS attention
+            averaged over the saliency heads, min-max normalised to [0, 1].
 
         Raises:
             InputError: For other image types, shapes or values.
@@ -92,29 +106,44 @@ class Backbone:
     def _extract(self, batch: Float[Tensor, "b 3 s s"]) -> list[FeatureMap]:
         # The patches' convolution in float32, too: by default, a GPU computes it in TensorFloat-32.
         cudnn = torch.backends.cudnn
-        flags = cudnn.flags(cudnn.enabled, cudnn.benchmark, deterministic=cudnn.deterministic, allow_tf32=False)
+        flags = cudnn.flags(
+            cudnn.enabled, cudnn.benchmark, deterministic=cudnn.deterministic, allow_tf32=False
+        )
         with torch.inference_mode(), flags if self.device.type == "cuda" else nullcontext():
-            tokens = self.model.extract(normalize(batch, self.mean, self.std), self.layer, self.facet)
+            tokens = self.model.extract(
+                normalize(batch, self.mean, self.std), self.layer, self.facet
+            )
             saliency = tokens.attention[:, list(self.saliency_heads)].float().mean(1)
             low, high = saliency.amin(1, keepdim=True), saliency.amax(1, keepdim=True)
             saliency = (saliency - low) / (high - low).clamp_min(1e-12)
-            parts = tokens.keys.unflatten(1, tokens.grid), saliency.unflatten(1, tokens.grid), tokens.cls
+            parts = (
+                tokens.keys.unflatten(1, tokens.grid),
+                saliency.unflatten(1, tokens.grid),
+                tokens.cls,
+            )
         return [FeatureMap(*one) for one in zip(*(values.cpu() for values in parts), strict=True)]
 
 
 def block_index(layer: int | str, depth: int, name: str = "backbone") -> int:
-    """Return the index from 0 of a block given as "last", "block9" or an integer; negative ones count from the end."""
-    found = re.fullmatch(r"(?:block(?=\d))?(-?\d+)", "-1" if layer == "last" else str(layer).strip())
+    """Return the index from 0 of a block given as "last", "block9" or an integer; negative ones
+    count from the end."""
+    found = re.fullmatch(
+        r"(?:block(?=\d))?(-?\d+)", "-1" if layer == "last" else str(layer).strip()
+    )
     if not found or not -depth <= int(found[1]) < depth:
         raise InputError(
-            f"{name}: layer is {layer!r}, expected 'last', 'block0' to 'block{depth - 1}', or a number from {-depth} "
+            f"{name}: layer is {layer!r}, expected 'last', 'block0' to 'block{depth - 1}', or "
+            f"a number from {-depth} "
             f"to {depth - 1}"
         )
     return int(found[1]) % depth
 
 
-def prepare_images(images: Sequence[Image], size: int = 224, first: int = 0) -> Float[Tensor, "b 3 s s"]:
-    """Stack RGB images (H, W, 3), uint8 or float in [0, 1], into a batch of squares with values in [0, 1].
+def prepare_images(
+    images: Sequence[Image], size: int = 224, first: int = 0
+) -> Float[Tensor, "b 3 s s"]:
+    """Stack RGB images (H, W, 3), uint8 or float in [0, 1], into a batch of squares with values in
+    [0, 1].
 
     Images are resized bilinearly with anti-aliasing. Errors count the images from `first`.
     """
@@ -123,20 +152,28 @@ def prepare_images(images: Sequence[Image], size: int = 224, first: int = 0) -> 
         # Copied, because torch does not accept read-only arrays and negative strides.
         image = image if torch.is_tensor(image) else torch.from_numpy(np.array(image))
         is_bytes = image.dtype == torch.uint8
-        is_unit = image.is_floating_point() and bool(((image >= 0) & (image <= 1)).all())  # false for NaN too
+        is_unit = image.is_floating_point() and bool(
+            ((image >= 0) & (image <= 1)).all()
+        )  # false for NaN too
         if image.shape[2:] != (3,) or not image.numel() or not (is_bytes or is_unit):
             found = f"{image.dtype} of shape {tuple(image.shape)}"
-            raise InputError(f"image {index} is {found}, expected uint8 or floats in [0, 1] of shape (H, W, 3)")
+            raise InputError(
+                f"image {index} is {found}, expected uint8 or floats in [0, 1] of shape (H, W, 3)"
+            )
         image = image.to(torch.float32) / (255 if is_bytes else 1)
         image = image.permute(2, 0, 1)[None]
         if image.shape[2:] != (size, size):
-            image = F.interpolate(image, (size, size), mode="bilinear", align_corners=False, antialias=True)
+            image = F.interpolate(
+                image, (size, size), mode="bilinear", align_corners=False, antialias=True
+            )
         prepared.append(image)
     return torch.cat(prepared)
 
 
 def normalize(
-    images: Float[Tensor, "b 3 h w"], mean: Sequence[float] = IMAGENET_MEAN, std: Sequence[float] = IMAGENET_STD
+    images: Float[Tensor, "b 3 h w"],
+    mean: Sequence[float] = IMAGENET_MEAN,
+    std: Sequence[float] = IMAGENET_STD,
 ) -> Float[Tensor, "b 3 h w"]:
     """Subtract the mean and divide by the standard deviation, per channel."""
     mean, std = (images.new_tensor(x).view(3, 1, 1) for x in (mean, std))

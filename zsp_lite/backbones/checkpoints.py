@@ -13,27 +13,45 @@ from zsp_lite.io.files import MAX_WEIGHTS, file_size, load_torch
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read weights with DINO's state-dict keys, and metadata, from a .safetensors file or a torch file of tensors only.
+    """Read weights with DINO's state-dict keys, and metadata, from a .safetensors file or a torch
+    file of tensors only.
 
-    No code from the file is executed. A torch file has no metadata. InputError if there is anything but tensors.
+    No code from the file is executed. A torch file has no metadata. InputError if there is anything
+    but tensors.
     """
     path = Path(path)
     if path.suffix == ".safetensors":
         file_size(path, "checkpoint", MAX_WEIGHTS)
         try:
             with safe_open(path, framework="pt") as file:
-                return {key: file.get_tensor(key) for key in file.keys()}, dict(file.metadata() or {})
+                return {key: file.get_tensor(key) for key in file.keys()}, dict(
+                    file.metadata() or {}
+                )
         except Exception as error:  # a damaged file can raise almost any exception
             reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise InputError(f"checkpoint {path}: damaged, or contains more than tensors ({reason[:120]})") from error
+            raise InputError(
+                f"checkpoint {path}: damaged, or contains more than tensors ({reason[:120]})"
+            ) from error
     content = load_torch(path, "checkpoint")
-    for nested in ("teacher", "state_dict", "model"):  # DINO's training checkpoints contain teacher and student
+    for nested in (
+        "teacher",
+        "state_dict",
+        "model",
+    ):  # DINO's training checkpoints contain teacher and student
         if isinstance(content, dict) and isinstance(content.get(nested), dict):
             content = content[nested]
             break
-    if not isinstance(content, dict) or not content or not all(torch.is_tensor(x) for x in content.values()):
-        raise InputError(f"checkpoint {path}: expected a state dict of tensors, got {type(content).__name__}")
-    plain = {str(key).removeprefix("module.").removeprefix("backbone."): x for key, x in content.items()}
+    if (
+        not isinstance(content, dict)
+        or not content
+        or not all(torch.is_tensor(x) for x in content.values())
+    ):
+        raise InputError(
+            f"checkpoint {path}: expected a state dict of tensors, got {type(content).__name__}"
+        )
+    plain = {
+        str(key).removeprefix("module.").removeprefix("backbone."): x for key, x in content.items()
+    }
     return {key: x for key, x in plain.items() if not key.startswith("head.")}, {}
 
 
@@ -42,7 +60,9 @@ def metadata_integers(metadata: dict[str, str], key: str, path: Path) -> list[in
     try:
         return [int(word) for word in metadata[key].split(",")] if key in metadata else None
     except ValueError as error:
-        raise InputError(f"checkpoint {path}: metadata {key} is {metadata[key]!r}, expected integers") from error
+        raise InputError(
+            f"checkpoint {path}: metadata {key} is {metadata[key]!r}, expected integers"
+        ) from error
 
 
 def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> VisionTransformer:
@@ -53,11 +73,14 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> 
         depth = len({key.split(".")[1] for key in weights if key.startswith("blocks.")})
         if num_heads is None:
             num_heads = dim // 64 if dim % 64 == 0 else 0  # the transformer refuses 0 heads
-        with torch.device("meta"):  # the checkpoint replaces the initial values: do not compute them
+        with torch.device(
+            "meta"
+        ):  # the checkpoint replaces the initial values: do not compute them
             model = VisionTransformer(side * patch_size, patch_size, dim, depth, num_heads)
     except (KeyError, ValueError, IndexError) as error:
         raise InputError(
-            f"{path.name}: not a vision transformer in the DINO layout ({error}); num_heads is read from the metadata, "
+            f"{path.name}: not a vision transformer in the DINO layout ({error}); num_heads "
+            "is read from the metadata, "
             "by default one per 64 channels"
         ) from error
     for key, values in weights.items():
@@ -66,5 +89,7 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> 
     try:
         model.load_state_dict({key: values.float() for key, values in weights.items()}, assign=True)
     except RuntimeError as error:  # several lines that name every key
-        raise InputError(f"{path.name}: the weights do not fit: {' '.join(str(error).split())[:300]}") from error
+        raise InputError(
+            f"{path.name}: the weights do not fit: {' '.join(str(error).split())[:300]}"
+        ) from error
     return model

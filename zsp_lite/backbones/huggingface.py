@@ -1,8 +1,10 @@
-"""Vision transformers in Hugging Face's format: DINOv2, DINOv3, ViT, DeiT, CLIP's image encoder and similar models.
+"""Vision transformers in Hugging Face's format: DINOv2, DINOv3, ViT, DeiT, CLIP's image encoder and
+similar models.
 
-Attention, block outputs and the CLS token are outputs of the transformers library; queries, keys and values, which it
-does not return, are recorded by a forward hook on their projection. The code does not depend on the architecture. It
-needs the package transformers, which is imported on first use.
+Attention, block outputs and the CLS token are outputs of the transformers library; queries, keys
+and values, which it does not return, are recorded by a forward hook on their projection. The code
+does not depend on the architecture. It needs the package transformers, which is imported on first
+use.
 """
 
 import inspect
@@ -22,69 +24,100 @@ PREFIX = "hf:"
 IMAGE_SIZE = 224  # pixels, the paper's
 CONFIG, PROCESSORS = "config.json", ("preprocessor_config.json", "processor_config.json")
 WEIGHTS = "model.safetensors", "model.safetensors.index.json"
-# The only files that are downloaded or read: weights in safetensors format, no pickle files, no code.
+# The only files that are downloaded or read: weights in safetensors format, no pickle files, no
+# code.
 FILES = (CONFIG, *PROCESSORS, *WEIGHTS, "model*.safetensors")
 _PROJECTIONS = {  # of a facet, by the names that architectures give them
-    "query": ("q_proj", "query"), "key": ("k_proj", "key"), "value": ("v_proj", "value"),
-}  # fmt: skip
+    "query": ("q_proj", "query"),
+    "key": ("k_proj", "key"),
+    "value": ("v_proj", "value"),
+}
 _CLS = {"cls_token", "class_token", "class_embedding"}  # parameters
 _BEFORE_PATCHES = (*_CLS, "register_tokens", "distillation_token")
 
 
 class HuggingFaceViT(nn.Module):
-    """Adapter of a Hugging Face model with the attributes and the `extract` of `vit.VisionTransformer`.
+    """Adapter of a Hugging Face model with the attributes and the `extract` of
+    `vit.VisionTransformer`.
 
-    The model must compute attention eagerly, so that it returns it. InputError if it has no CLS token or no query, key
-    and value projections in every block, or does not run on images of `image_size`.
+    The model must compute attention eagerly, so that it returns it. InputError if it has no CLS
+    token or no query, key and value projections in every block, or does not run on images of
+    `image_size`.
     """
 
     def __init__(self, model: nn.Module, config, image_size: int, name: str):
         super().__init__()
         self.vit = model
         patch, self.num_heads, self.depth = (
-            getattr(config, key, None) for key in ("patch_size", "num_attention_heads", "num_hidden_layers")
+            getattr(config, key, None)
+            for key in ("patch_size", "num_attention_heads", "num_hidden_layers")
         )
-        self.patch_size = patch[0] if isinstance(patch, (list, tuple)) and len(set(patch)) == 1 else patch
-        sizes_known = all(isinstance(size, int) for size in (self.patch_size, self.num_heads, self.depth))
+        self.patch_size = (
+            patch[0] if isinstance(patch, (list, tuple)) and len(set(patch)) == 1 else patch
+        )
+        sizes_known = all(
+            isinstance(size, int) for size in (self.patch_size, self.num_heads, self.depth)
+        )
         # In a plain list, so that the modules are not registered a second time.
         self._projections = [found for module in model.modules() if (found := _projections(module))]
         special = {key.rpartition(".")[2]: x for key, x in model.named_parameters()}
         if not sizes_known or len(self._projections) != self.depth or not _CLS & special.keys():
             raise InputError(
-                f"{name}: a {config.model_type} model, expected a vision transformer with one square patch_size, "
-                f"num_attention_heads, a CLS token, and in each of num_hidden_layers blocks the projections "
+                f"{name}: a {config.model_type} model, expected a vision transformer with one "
+                "square patch_size, "
+                "num_attention_heads, a CLS token, and in each of num_hidden_layers blocks "
+                "the projections "
                 f"{', '.join(map(' or '.join, _PROJECTIONS.values()))}"
             )
         self.image_size = nearest_multiple(image_size, self.patch_size)
         self.embed_dim = self._projections[0]["query"].in_features
         # Number of tokens before the patches.
-        self._prefix = sum(special[key].numel() // self.embed_dim for key in _BEFORE_PATCHES if key in special)
+        self._prefix = sum(
+            special[key].numel() // self.embed_dim for key in _BEFORE_PATCHES if key in special
+        )
         self._arguments = inspect.signature(model.forward).parameters.keys()
         self._try(name)
 
-    def extract(self, images: Float[Tensor, "batch 3 height width"], layer: int, facet: Facet = "key") -> Tokens:
-        """Compute the descriptors of one block (counted from 0), the CLS attention and the CLS output token.
+    def extract(
+        self, images: Float[Tensor, "batch 3 height width"], layer: int, facet: Facet = "key"
+    ) -> Tokens:
+        """Compute the descriptors of one block (counted from 0), the CLS attention and the CLS
+        output token.
 
-        Register and distillation tokens are removed. Keys and queries are taken before any rotary position embedding,
-        so that they do not depend on the position.
+        Register and distillation tokens are removed. Keys and queries are taken before any rotary
+        position embedding, so that they do not depend on the position.
         """
         grid = images.shape[2] // self.patch_size, images.shape[3] // self.patch_size
         # Models without this option always interpolate.
-        options = {"interpolate_pos_encoding": True} if "interpolate_pos_encoding" in self._arguments else {}
-        if "noise" in self._arguments:  # a masked autoencoder orders the patches by it: keep their order
-            options["noise"] = torch.arange(grid[0] * grid[1], device=images.device).float().expand(len(images), -1)
-        projected: list[Tensor] = []
-        hook = self._projections[layer]["query" if facet == "token" else facet].register_forward_hook(
-            lambda module, inputs, output: projected.append(output)
+        options = (
+            {"interpolate_pos_encoding": True}
+            if "interpolate_pos_encoding" in self._arguments
+            else {}
         )
+        if (
+            "noise" in self._arguments
+        ):  # a masked autoencoder orders the patches by it: keep their order
+            options["noise"] = (
+                torch.arange(grid[0] * grid[1], device=images.device)
+                .float()
+                .expand(len(images), -1)
+            )
+        projected: list[Tensor] = []
+        hook = self._projections[layer][
+            "query" if facet == "token" else facet
+        ].register_forward_hook(lambda module, inputs, output: projected.append(output))
         try:
-            output = self.vit(pixel_values=images, output_attentions=True, output_hidden_states=True, **options)
+            output = self.vit(
+                pixel_values=images, output_attentions=True, output_hidden_states=True, **options
+            )
         finally:
             hook.remove()
         descriptors = output.hidden_states[layer + 1] if facet == "token" else projected[0]
         attention = output.attentions[-1][:, :, 0]
         patches = slice(self._prefix, None)
-        return Tokens(descriptors[:, patches], attention[..., patches], output.last_hidden_state[:, 0], grid)
+        return Tokens(
+            descriptors[:, patches], attention[..., patches], output.last_hidden_state[:, 0], grid
+        )
 
     def _try(self, name: str) -> None:
         """Run one forward pass, so that an unsuitable model is refused when it is loaded."""
@@ -93,10 +126,13 @@ class HuggingFaceViT(nn.Module):
                 tokens = self.extract(torch.zeros(1, 3, self.image_size, self.image_size), 0)
             rows, columns = tokens.grid
             if tokens.keys.shape[1] != rows * columns:
-                raise ValueError(f"{tokens.keys.shape[1]} tokens without {', '.join(_BEFORE_PATCHES)}")
+                raise ValueError(
+                    f"{tokens.keys.shape[1]} tokens without {', '.join(_BEFORE_PATCHES)}"
+                )
         except Exception as error:  # any model may be given, which may raise any exception
             raise InputError(
-                f"{name}: {type(self.vit).__name__} does not run on {self.image_size} x {self.image_size} pixels with "
+                f"{name}: {type(self.vit).__name__} does not run on {self.image_size} x "
+                f"{self.image_size} pixels with "
                 f"one token per patch of {self.patch_size} x {self.patch_size} ({_one_line(error)})"
             ) from error
 
@@ -104,9 +140,11 @@ class HuggingFaceViT(nn.Module):
 def load_huggingface(
     name: str, image_size: int | None
 ) -> tuple[HuggingFaceViT, tuple[list[float], list[float]] | None]:
-    """Load the model of "hf:NAME": a folder in Hugging Face's format or the name of a model on the hub.
+    """Load the model of "hf:NAME": a folder in Hugging Face's format or the name of a model on the
+    hub.
 
-    The second result is the mean and standard deviation that normalise RGB values in [0, 1], None if unknown.
+    The second result is the mean and standard deviation that normalise RGB values in [0, 1], None
+    if unknown.
     """
     folder = model_folder(name)
     from transformers import AutoConfig, AutoModel
@@ -114,32 +152,51 @@ def load_huggingface(
     local = {"local_files_only": True, "trust_remote_code": False}
     try:
         config = AutoConfig.from_pretrained(folder, **local)
-        vision = getattr(config, "vision_config", config)  # CLIP and similar models: the image encoder
+        vision = getattr(
+            config, "vision_config", config
+        )  # CLIP and similar models: the image encoder
         if hasattr(vision, "mask_ratio"):
             vision.mask_ratio = 0.0  # a masked autoencoder must see the whole image
         with _quiet():
             model, report = AutoModel.from_pretrained(
-                folder, config=config, use_safetensors=True, attn_implementation="eager", output_loading_info=True,
-                dtype=torch.float32, **local,
-            )  # fmt: skip
+                folder,
+                config=config,
+                use_safetensors=True,
+                attn_implementation="eager",
+                output_loading_info=True,
+                dtype=torch.float32,
+                **local,
+            )
         normalisation = _normalisation(folder)
-        # transformers initialises missing weights randomly. Only weights that the method does not use may be missing.
-        missing = sorted(key for key in report["missing_keys"] if "pooler" not in key and "mask_token" not in key)
+        # transformers initialises missing weights randomly. Only weights that the method does not
+        # use may be missing.
+        missing = sorted(
+            key for key in report["missing_keys"] if "pooler" not in key and "mask_token" not in key
+        )
         if missing:
             raise ValueError(f"{len(missing)} weights are not in the file, first {missing[0]}")
-    except Exception as error:  # damaged JSON, unknown types, wrong fields or shapes: no common base class
-        raise InputError(f"{name}: cannot be loaded by the package transformers ({_one_line(error)})") from error
+    except (
+        Exception
+    ) as error:  # damaged JSON, unknown types, wrong fields or shapes: no common base class
+        raise InputError(
+            f"{name}: cannot be loaded by the package transformers ({_one_line(error)})"
+        ) from error
     for key, weight in model.named_parameters():
         if key in report["missing_keys"]:
-            weight.data.zero_()  # random values would give the backbone another identity at every start
+            # random values would give the backbone another identity at every start
+            weight.data.zero_()
     model = getattr(model, "vision_model", model).eval()
-    return HuggingFaceViT(model, vision, IMAGE_SIZE if image_size is None else image_size, name), normalisation
+    return HuggingFaceViT(
+        model, vision, IMAGE_SIZE if image_size is None else image_size, name
+    ), normalisation
 
 
 def model_folder(name: str) -> Path:
-    """Return the folder of "hf:NAME": NAME if it is a folder, else the hub's cache folder of the model NAME.
+    """Return the folder of "hf:NAME": NAME if it is a folder, else the hub's cache folder of the
+    model NAME.
 
-    Only files that are not in the cache are downloaded, so that a model used before works without a network.
+    Only files that are not in the cache are downloaded, so that a model used before works without a
+    network.
     """
     wanted = name.removeprefix(PREFIX).strip()
     folder = Path(wanted).expanduser()
@@ -150,19 +207,28 @@ def model_folder(name: str) -> Path:
 
         if not wanted or not os.path.isdir(folder):  # isdir is False for a name that is too long
             with suppress(LocalEntryNotFoundError):
-                folder = Path(snapshot_download(wanted, allow_patterns=FILES, local_files_only=True))
+                folder = Path(
+                    snapshot_download(wanted, allow_patterns=FILES, local_files_only=True)
+                )
             if not _has_weights(folder):
                 folder = Path(snapshot_download(wanted, allow_patterns=FILES))
     except ImportError as error:
         raise InputError(
-            f"{name}: needs the package transformers: pip install transformers huggingface-hub ({_one_line(error)})"
+            f"{name}: needs the package transformers: pip install transformers "
+            f"huggingface-hub ({_one_line(error)})"
         ) from error
-    except Exception as error:  # no such model, no permission, no network: the hub's client says which
+    except (
+        Exception
+    ) as error:  # no such model, no permission, no network: the hub's client says which
         raise InputError(
-            f"{name}: neither a folder nor a model OWNER/MODEL that the Hugging Face hub gives ({_one_line(error)})"
+            f"{name}: neither a folder nor a model OWNER/MODEL that the Hugging Face hub "
+            f"gives ({_one_line(error)})"
         ) from error
     if not (folder / CONFIG).is_file() or not _has_weights(folder):
-        raise InputError(f"{name}: {folder} has no {CONFIG} or no {WEIGHTS[0]} (weights in other formats are not read)")
+        raise InputError(
+            f"{name}: {folder} has no {CONFIG} or no {WEIGHTS[0]} (weights in other formats "
+            "are not read)"
+        )
     return folder
 
 
@@ -171,7 +237,8 @@ def _has_weights(folder: Path) -> bool:
 
 
 def _projections(attention: nn.Module) -> dict[str, nn.Linear]:
-    """Return the linear layer of each facet if the module itself has all three, else an empty dict."""
+    """Return the linear layer of each facet if the module itself has all three, else an
+    empty dict."""
     found = {
         facet: layer
         for facet, names in _PROJECTIONS.items()
@@ -182,7 +249,8 @@ def _projections(attention: nn.Module) -> dict[str, nn.Linear]:
 
 
 def _normalisation(folder: Path) -> tuple[list[float], list[float]] | None:
-    """Return mean and standard deviation from the settings of the image processor, None if they are not there."""
+    """Return mean and standard deviation from the settings of the image processor, None if they are
+    not there."""
     from transformers import ImageProcessingMixin
 
     if not any((folder / file).is_file() for file in PROCESSORS):
@@ -194,7 +262,10 @@ def _normalisation(folder: Path) -> tuple[list[float], list[float]] | None:
     if mean is None or std is None:
         return None
     if not len(mean) == len(std) == 3 or not min(std) > 0:
-        raise ValueError(f"image_mean {mean} and image_std {std}, expected three numbers each, image_std positive")
+        raise ValueError(
+            f"image_mean {mean} and image_std {std}, expected three numbers each, image_std "
+            "positive"
+        )
     return mean, std
 
 

@@ -19,8 +19,11 @@ from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash
 from zsp_lite.io.modules import import_object
 
-DINO_URL = "https://dl.fbaipublicfiles.com/dino/"  # the environment variable ZSP_LITE_DINO_URL overrides it
-MOST_BYTES = 400_000_000  # of a released file: a ViT-B, the largest, has 86 million weights of 4 bytes
+# the environment variable ZSP_LITE_DINO_URL overrides it
+DINO_URL = "https://dl.fbaipublicfiles.com/dino/"
+MOST_BYTES = (
+    400_000_000  # of a released file: a ViT-B, the largest, has 86 million weights of 4 bytes
+)
 WEIGHTS = Path(__file__).parents[1] / "weights"
 DEFAULT = "zsp-tiny"
 TINY = WEIGHTS / "zsp-tiny.safetensors"
@@ -44,10 +47,16 @@ class PretrainedWeights:
 
 
 PRETRAINED = {
-    "dino_vits8": PretrainedWeights("dino_deitsmall8_pretrain/dino_deitsmall8_pretrain.pth", "230cd5", 86_728_949),
-    "dino_vits16": PretrainedWeights("dino_deitsmall16_pretrain/dino_deitsmall16_pretrain.pth", "cf0f22"),
+    "dino_vits8": PretrainedWeights(
+        "dino_deitsmall8_pretrain/dino_deitsmall8_pretrain.pth", "230cd5", 86_728_949
+    ),
+    "dino_vits16": PretrainedWeights(
+        "dino_deitsmall16_pretrain/dino_deitsmall16_pretrain.pth", "cf0f22"
+    ),
     "dino_vitb8": PretrainedWeights("dino_vitbase8_pretrain/dino_vitbase8_pretrain.pth", "556550"),
-    "dino_vitb16": PretrainedWeights("dino_vitbase16_pretrain/dino_vitbase16_pretrain.pth", "552daf"),
+    "dino_vitb16": PretrainedWeights(
+        "dino_vitbase16_pretrain/dino_vitbase16_pretrain.pth", "552daf"
+    ),
 }
 
 
@@ -64,7 +73,9 @@ class BackboneConfig:
     image_size: int | None = None
 
 
-BackboneLike = FeatureExtractor | str | Path | BackboneConfig  # a backbone, or what `load_backbone` takes
+BackboneLike = (
+    FeatureExtractor | str | Path | BackboneConfig
+)  # a backbone, or what `load_backbone` takes
 
 
 def load_backbone(
@@ -80,25 +91,28 @@ def load_backbone(
     Args:
         name_or_path: One of:
 
-            - a name of `available_backbones`: "zsp-tiny" (part of the package), or a DINO model such as "dino_vits8",
-              which is downloaded to `cache_folder()` on first use;
-            - a checkpoint in the DINO layout: a .safetensors file, or a torch file of tensors only, also nested under
-              "teacher", "state_dict" or "model". Metadata of a .safetensors file may give the number of heads
-              ("num_heads", default: one per 64 channels), the block ("key_block") and "saliency_heads";
-            - "hf:NAME": a model of the Hugging Face hub or a folder in its format (needs the package transformers);
+            - a name of `available_backbones`: "zsp-tiny" (part of the package), or a DINO model
+              such as "dino_vits8", which is downloaded to `cache_folder()` on first use;
+            - a checkpoint in the DINO layout: a .safetensors file, or a torch file of tensors only,
+              also nested under "teacher", "state_dict" or "model". Metadata of a .safetensors file
+              may give the number of heads ("num_heads", default: one per 64 channels), the block
+              ("key_block") and "saliency_heads";
+            - "hf:NAME": a model of the Hugging Face hub or a folder in its format (needs the
+              package transformers);
             - a `BackboneConfig`, without further options.
         device: Default: the GPU if there is one, else the CPU.
-        layer: Block that describes the patches: "block9", "last", or an integer from 0; negative integers count from
-            the end. Default: the checkpoint's metadata, else block 9 counted from 0, as in the published code (the
-            paper writes "the 9th ViT layer"); three quarters of the depth for "hf:NAME".
-        facet: Activation of that block used as descriptor: "key" (as in the paper), "query", "value", or "token" (the
-            block's output).
-        image_size: Side in pixels to which images are resized, rounded to a multiple of the patch size. Default:
-            the checkpoint's; 224 for "hf:NAME".
+        layer: Block that describes the patches: "block9", "last", or an integer from 0; negative
+            integers count from the end. Default: the checkpoint's metadata, else block 9 counted
+            from 0, as in the published code (the paper writes "the 9th ViT layer"); three quarters
+            of the depth for "hf:NAME".
+        facet: Activation of that block used as descriptor: "key" (as in the paper), "query",
+            "value", or "token" (the block's output).
+        image_size: Side in pixels to which images are resized, rounded to a multiple of the patch
+            size. Default: the checkpoint's; 224 for "hf:NAME".
 
     Raises:
-        InputError: If the name or an option is unknown, a download fails, the file is not such a checkpoint, or options
-            are given beside a `BackboneConfig`.
+        InputError: If the name or an option is unknown, a download fails, the file is not such a
+            checkpoint, or options are given beside a `BackboneConfig`.
     """
     options = {"layer": layer, "facet": facet, "image_size": image_size}
     config = name_or_path
@@ -118,21 +132,31 @@ def load_backbone(
 
 
 def as_backbone(backbone: BackboneLike) -> FeatureExtractor:
-    """Return a backbone as it is, and load one that is given by name, by the path of its file or by its config."""
-    return load_backbone(backbone) if isinstance(backbone, str | Path | BackboneConfig) else backbone
+    """Return a backbone as it is, and load one that is given by name, by the path of its file or by
+    its config."""
+    return (
+        load_backbone(backbone) if isinstance(backbone, str | Path | BackboneConfig) else backbone
+    )
 
 
-def named_backbone(name: str, layer: str | None, facet: Facet, image_size: int | None) -> BackboneLike:
-    """Return what `as_backbone` takes for a name with options; it may be "module:thing", of a backbone of one's own."""
+def named_backbone(
+    name: str, layer: str | None, facet: Facet, image_size: int | None
+) -> BackboneLike:
+    """Return what `as_backbone` takes for a name with options; it may be "module:thing", of a
+    backbone of one's own."""
     config = BackboneConfig(name, layer, facet, image_size)
     plain = config == BackboneConfig(name)
     if name.startswith(PREFIX) or os.path.isfile(name) or not re.fullmatch(r"[\w.]+:[\w.]+", name):
         return name if plain else config
     found = import_object(name)
     if isinstance(found, type) or not callable(found):
-        raise InputError(f"backbone {name!r} is of type {type(found).__name__}, expected a function of images")
+        raise InputError(
+            f"backbone {name!r} is of type {type(found).__name__}, expected a function of images"
+        )
     if not plain:
-        raise InputError(f"backbone {name!r} is your own, expected no layer, facet or image size beside it")
+        raise InputError(
+            f"backbone {name!r} is your own, expected no layer, facet or image size beside it"
+        )
     return found
 
 
@@ -144,11 +168,16 @@ def available_backbones() -> dict[str, Path | None]:
 
 def obtained_by(name: str) -> str:
     """Return what is to be done for a backbone whose file `available_backbones` does not have."""
-    return "missing: reinstall zsp-lite" if name == DEFAULT else f"not downloaded: zsp-lite weights fetch {name}"
+    return (
+        "missing: reinstall zsp-lite"
+        if name == DEFAULT
+        else f"not downloaded: zsp-lite weights fetch {name}"
+    )
 
 
 def download(name: str) -> Path:
-    """Return the file of a backbone of this name, or the folder of "hf:NAME", downloaded if it is not there yet.
+    """Return the file of a backbone of this name, or the folder of "hf:NAME", downloaded if it is
+    not there yet.
 
     InputError if the file is not the released one.
     """
@@ -162,11 +191,13 @@ def download(name: str) -> Path:
         path = fetch(weights.url, weights.path, weights.size, weights.md5_prefix, most=MOST_BYTES)
     except InputError as error:
         raise InputError(
-            f"{name}: {error}; download that file on another machine and copy it to {weights.path}, or use {DEFAULT}"
+            f"{name}: {error}; download that file on another machine and copy it to "
+            f"{weights.path}, or use {DEFAULT}"
         ) from error
     if not has_size_and_hash(path, weights.size, weights.md5_prefix):
         raise InputError(
-            f"{name}: {path} is not the released file, expected {weights.size or 'any number of'} bytes with MD5 "
+            f"{name}: {path} is not the released file, expected "
+            f"{weights.size or 'any number of'} bytes with MD5 "
             f"{weights.md5_prefix}...; remove it, then run zsp-lite weights fetch {name}"
         )
     return path
@@ -180,7 +211,15 @@ def _load_huggingface(config: BackboneConfig, device: str | torch.device | None)
     layer = 3 * model.depth // 4 if config.layer is None else config.layer
     # One image at a time, because transformers returns the attention of all blocks.
     return Backbone(
-        model, label, layer, range(model.num_heads), device, batch_size=1, facet=config.facet, mean=mean, std=std
+        model,
+        label,
+        layer,
+        range(model.num_heads),
+        device,
+        batch_size=1,
+        facet=config.facet,
+        mean=mean,
+        std=std,
     )
 
 
@@ -192,12 +231,22 @@ def _load_checkpoint(config: BackboneConfig, device: str | torch.device | None) 
         label = path.stem
     else:
         raise InputError(
-            f"backbone {name!r}: neither a file nor one of {', '.join(available_backbones())}, nor {PREFIX}NAME"
+            f"backbone {name!r}: neither a file nor one of "
+            f"{', '.join(available_backbones())}, nor {PREFIX}NAME"
         )
     weights, metadata = read_checkpoint(path)
     num_heads, key_block, saliency_heads = (
-        metadata_integers(metadata, key, path) for key in ("num_heads", "key_block", "saliency_heads")
+        metadata_integers(metadata, key, path)
+        for key in ("num_heads", "key_block", "saliency_heads")
     )
     model = build_vit(weights, num_heads[0] if num_heads else None, path)
     layer = key_block[0] if config.layer is None and key_block else config.layer
-    return Backbone(model, label, layer, saliency_heads, device, facet=config.facet, image_size=config.image_size)
+    return Backbone(
+        model,
+        label,
+        layer,
+        saliency_heads,
+        device,
+        facet=config.facet,
+        image_size=config.image_size,
+    )

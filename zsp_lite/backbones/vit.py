@@ -1,7 +1,8 @@
 """A vision transformer in the layout of the public DINO checkpoints (Caron et al. 2021).
 
-The method uses three outputs (sections 4.1 and 5.3): the *keys* of one block as patch descriptors, the *attention* of
-the last block's CLS token as saliency, and the CLS output token as global feature.
+The method uses three outputs (sections 4.1 and 5.3): the *keys* of one block as patch descriptors,
+the *attention* of the last block's CLS token as saliency, and the CLS output token as global
+feature.
 """
 
 import math
@@ -16,11 +17,14 @@ from torch import Tensor, nn
 from zsp_lite.choices import Facet
 from zsp_lite.errors import InputError, check_integer
 
-MOST_INPUT = 2048  # pixels of an image's side; the time of attention grows with the fourth power of the side
+MOST_INPUT = (
+    2048  # pixels of an image's side; the time of attention grows with the fourth power of the side
+)
 
 
 def nearest_multiple(size: int, patch_size: int) -> int:
-    """Round an image size to a positive multiple of `patch_size`; InputError for one below 1 or above `MOST_INPUT`."""
+    """Round an image size to a positive multiple of `patch_size`; InputError for one below 1 or
+    above `MOST_INPUT`."""
     check_integer("image_size", size, 1, MOST_INPUT)
     return max(1, round(size / patch_size)) * patch_size
 
@@ -29,8 +33,12 @@ def nearest_multiple(size: int, patch_size: int) -> int:
 class Tokens:
     """Outputs of a forward pass that the method uses; the n patches are in row-major order."""
 
-    keys: Float[Tensor, "batch n dim"]  # descriptors: the keys (or another facet) of one block, heads concatenated
-    attention: Float[Tensor, "batch heads n"]  # of the last block, from CLS to the patches; softmax over 1 + n tokens
+    keys: Float[
+        Tensor, "batch n dim"
+    ]  # descriptors: the keys (or another facet) of one block, heads concatenated
+    attention: Float[
+        Tensor, "batch heads n"
+    ]  # of the last block, from CLS to the patches; softmax over 1 + n tokens
     cls: Float[Tensor, "batch dim"]  # CLS output token after the final normalisation
     grid: tuple[int, int]  # rows and columns of patches; their product is n
 
@@ -39,10 +47,16 @@ class Tokens:
 class TrainingTokens:
     """Outputs of a forward pass that training losses use, with gradients."""
 
-    tokens: Float[Tensor, "batch tokens dim"]  # all output tokens after the final normalisation, CLS first
+    tokens: Float[
+        Tensor, "batch tokens dim"
+    ]  # all output tokens after the final normalisation, CLS first
     keys: Float[Tensor, "batch n dim"]  # keys of the patches in one block, heads concatenated
-    key_input: Float[Tensor, "batch n dim"]  # normalised patch tokens of that block: the keys are linear in them
-    cls_logits: Float[Tensor, "batch heads tokens"]  # scaled attention logits of the last block from CLS to all tokens
+    key_input: Float[
+        Tensor, "batch n dim"
+    ]  # normalised patch tokens of that block: the keys are linear in them
+    cls_logits: Float[
+        Tensor, "batch heads tokens"
+    ]  # scaled attention logits of the last block from CLS to all tokens
 
 
 @dataclass(frozen=True)
@@ -50,7 +64,9 @@ class BlockActivations:
     """Intermediate results of one transformer block, CLS first."""
 
     normed: Float[Tensor, "batch tokens dim"]  # input after the first normalisation
-    query: Float[Tensor, "batch outputs dim"]  # like key and value a linear function of `normed`, heads concatenated
+    query: Float[
+        Tensor, "batch outputs dim"
+    ]  # like key and value a linear function of `normed`, heads concatenated
     key: Float[Tensor, "batch tokens dim"]
     value: Float[Tensor, "batch tokens dim"]
     token: Float[Tensor, "batch outputs dim"]  # output of the block, not normalised
@@ -66,13 +82,19 @@ class Attention(nn.Module):
         self.qkv = nn.Linear(dim, 3 * dim)
         self.proj = nn.Linear(dim, dim)
 
-    def split_heads(self, x: Float[Tensor, "batch n dim"]) -> Float[Tensor, "batch heads n head_dim"]:
+    def split_heads(
+        self, x: Float[Tensor, "batch n dim"]
+    ) -> Float[Tensor, "batch heads n head_dim"]:
         return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)
 
     def forward(
-        self, q: Float[Tensor, "batch m dim"], k: Float[Tensor, "batch n dim"], v: Float[Tensor, "batch n dim"]
+        self,
+        q: Float[Tensor, "batch m dim"],
+        k: Float[Tensor, "batch n dim"],
+        v: Float[Tensor, "batch n dim"],
     ) -> Float[Tensor, "batch m dim"]:
-        """Attend from each query to all keys and apply the output projection; heads are slices of the last axis."""
+        """Attend from each query to all keys and apply the output projection; heads are slices of
+        the last axis."""
         q, k, v = self.split_heads(q), self.split_heads(k), self.split_heads(v)
         return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
 
@@ -95,8 +117,11 @@ class Block(nn.Module):
         layers = {"fc1": nn.Linear(dim, 4 * dim), "gelu": nn.GELU(), "fc2": nn.Linear(4 * dim, dim)}
         self.mlp = nn.Sequential(OrderedDict(layers))
 
-    def forward(self, x: Float[Tensor, "batch n dim"], outputs: int | None = None) -> BlockActivations:
-        """Compute the activations; queries and output, which take most of the time, of the first `outputs` tokens."""
+    def forward(
+        self, x: Float[Tensor, "batch n dim"], outputs: int | None = None
+    ) -> BlockActivations:
+        """Compute the activations; queries and output, which take most of the time, of the first
+        `outputs` tokens."""
         normed = self.norm1(x)
         if outputs is None:
             q, k, v = self.attn.qkv(normed).chunk(3, dim=-1)
@@ -116,31 +141,47 @@ class PatchEmbed(nn.Module):
         self.patch_size = patch_size
         self.proj = nn.Conv2d(3, dim, kernel_size=patch_size, stride=patch_size)
 
-    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch n dim"]:
-        # The windows of the convolution do not overlap: it is one matrix product, which is faster on a CPU.
+    def forward(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> Float[Tensor, "batch n dim"]:
+        # The windows of the convolution do not overlap: it is one matrix product, which is faster
+        # on a CPU.
         p = self.patch_size
         patches = images.unflatten(3, (-1, p)).unflatten(2, (-1, p)).permute(0, 2, 4, 1, 3, 5)
-        return F.linear(patches.flatten(3).flatten(1, 2), self.proj.weight.flatten(1), self.proj.bias)
+        return F.linear(
+            patches.flatten(3).flatten(1, 2), self.proj.weight.flatten(1), self.proj.bias
+        )
 
 
 class VisionTransformer(nn.Module):
     """ViT with the state-dict keys and shapes of a DINO checkpoint (loads one with strict=True).
 
-    The position embedding is stored for square images of `image_size` pixels and interpolated for other sizes.
+    The position embedding is stored for square images of `image_size` pixels and interpolated for
+    other sizes.
     """
 
     def __init__(
-        self, image_size: int = 224, patch_size: int = 8, embed_dim: int = 384, depth: int = 12, num_heads: int = 6
+        self,
+        image_size: int = 224,
+        patch_size: int = 8,
+        embed_dim: int = 384,
+        depth: int = 12,
+        num_heads: int = 6,
     ):
         super().__init__()
         sizes = image_size, patch_size, embed_dim, depth, num_heads
         if min(sizes) < 1 or image_size % patch_size or embed_dim % num_heads:
             found = f"image_size, patch_size, embed_dim, depth and num_heads are {sizes}"
-            raise InputError(f"VisionTransformer: {found}, expected positive multiples of patch_size and num_heads")
+            raise InputError(
+                f"VisionTransformer: {found}, expected positive multiples of patch_size and "
+                "num_heads"
+            )
         self.image_size, self.patch_size, self.embed_dim = image_size, patch_size, embed_dim
         self.depth, self.num_heads = depth, num_heads
         self.cls_token = nn.Parameter(torch.zeros(1, 1, embed_dim))
-        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + (image_size // patch_size) ** 2, embed_dim))
+        self.pos_embed = nn.Parameter(
+            torch.zeros(1, 1 + (image_size // patch_size) ** 2, embed_dim)
+        )
         self.patch_embed = PatchEmbed(patch_size, embed_dim)
         self.blocks = nn.ModuleList(Block(embed_dim, num_heads) for _ in range(depth))
         self.norm = nn.LayerNorm(embed_dim, eps=1e-6)
@@ -157,40 +198,56 @@ class VisionTransformer(nn.Module):
         if grid == (side, side):
             return self.pos_embed
         stored = self.pos_embed[:, 1:].unflatten(1, (side, side)).permute(0, 3, 1, 2)
-        # As in DINO's code, 0.1 is added against rounding, and interpolate() samples with that scale instead of the
-        # exact ratio.
+        # As in DINO's code, 0.1 is added against rounding, and interpolate() samples with that
+        # scale instead of the exact ratio.
         scale = tuple((cells + 0.1) / side for cells in grid)
         resized = F.interpolate(stored, scale_factor=scale, mode="bicubic", align_corners=False)
         return torch.cat([self.pos_embed[:, :1], resized.flatten(2).transpose(1, 2)], dim=1)
 
-    def embed(self, images: Float[Tensor, "batch 3 height width"]) -> tuple[Tensor, tuple[int, int]]:
-        """Return the input of the first block (batch, 1 + n, dim) and the patch grid (rows, columns)."""
+    def embed(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> tuple[Tensor, tuple[int, int]]:
+        """Return the input of the first block (batch, 1 + n, dim) and the patch grid (rows,
+        columns)."""
         grid = (images.shape[2] // self.patch_size, images.shape[3] // self.patch_size)
         patches = self.patch_embed(images)
-        x = torch.cat([self.cls_token.expand(len(images), -1, -1).to(patches.dtype), patches], dim=1)
+        x = torch.cat(
+            [self.cls_token.expand(len(images), -1, -1).to(patches.dtype), patches], dim=1
+        )
         return x + self.position_embedding(grid), grid
 
-    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch tokens dim"]:
+    def forward(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> Float[Tensor, "batch tokens dim"]:
         """Return the normalised output tokens, CLS first."""
         x, _ = self.embed(images)
         for block in self.blocks:
             x = block(x).token
         return self.norm(x)
 
-    def extract(self, images: Float[Tensor, "batch 3 height width"], layer: int = 9, facet: Facet = "key") -> Tokens:
-        """Compute the descriptors of one block (counted from 0), CLS attention and CLS output of normalised images."""
+    def extract(
+        self, images: Float[Tensor, "batch 3 height width"], layer: int = 9, facet: Facet = "key"
+    ) -> Tokens:
+        """Compute the descriptors of one block (counted from 0), CLS attention and CLS output of
+        normalised images."""
         x, grid = self.embed(images)
         for index, block in enumerate(self.blocks):
-            # In the last block the method needs the keys of all tokens, but the query and the output of CLS only.
+            # In the last block the method needs the keys of all tokens, but the query and the
+            # output of CLS only.
             activations = block(x, 1 if index == self.depth - 1 and facet == "key" else None)
             x = activations.token
             if index == layer:
                 descriptors = getattr(activations, facet)
         logits = block.attn.cls_logits(activations.query, activations.key)
-        return Tokens(descriptors[:, 1:], logits.softmax(-1)[:, :, 1:], self.norm(x[:, :1])[:, 0], grid)
+        return Tokens(
+            descriptors[:, 1:], logits.softmax(-1)[:, :, 1:], self.norm(x[:, :1])[:, 0], grid
+        )
 
-    def forward_training(self, images: Float[Tensor, "batch 3 height width"], layer: int) -> TrainingTokens:
-        """Compute all output tokens, the keys of block `layer` and the CLS attention logits, with gradients."""
+    def forward_training(
+        self, images: Float[Tensor, "batch 3 height width"], layer: int
+    ) -> TrainingTokens:
+        """Compute all output tokens, the keys of block `layer` and the CLS attention logits, with
+        gradients."""
         x, _ = self.embed(images)
         activations = []
         for block in self.blocks:
@@ -198,4 +255,6 @@ class VisionTransformer(nn.Module):
             x = activations[-1].token
         chosen, last = activations[layer], activations[-1]
         logits = self.blocks[-1].attn.cls_logits(last.query, last.key)
-        return TrainingTokens(self.norm(last.token), chosen.key[:, 1:], chosen.normed[:, 1:], logits)
+        return TrainingTokens(
+            self.norm(last.token), chosen.key[:, 1:], chosen.normed[:, 1:], logits
+        )

@@ -1,4 +1,5 @@
-"""SIFT (Lowe 2004): keypoints with depth, a baseline of the paper (sec. 5.2), and dense RootSIFT as patch features."""
+"""SIFT (Lowe 2004): keypoints with depth, a baseline of the paper (sec. 5.2), and dense RootSIFT as
+patch features."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +18,8 @@ from zsp_lite.matchers import mutual_nearest_neighbours
 KEYPOINT_SIZE = 24.0  # of RootSIFT, pixels
 _CELLS, _BINS = 4, 8  # cells along each side of a descriptor, orientations per cell
 _CELL = 1.5  # side of a cell, in keypoint sizes
-# OpenCV's constants: blur of the first octave (the image is assumed to have a blur of 0.5), clipping, scale.
+# OpenCV's constants: blur of the first octave (the image is assumed to have a blur of 0.5),
+# clipping, scale.
 _BLUR = (1.6**2 - 0.5**2) ** 0.5
 _CLIP, _SCALE = 0.2, 512.0
 
@@ -31,7 +33,10 @@ class Keypoints:
 
 
 class Sift:
-    """Detector and descriptor of keypoints in the mask or, without a mask, in the whole image: OpenCV's defaults."""
+    """Detector and descriptor of keypoints in the mask or, without a mask, in the whole image:
+
+    OpenCV's defaults.
+    """
 
     name = "sift"
 
@@ -43,7 +48,8 @@ class Sift:
             mask = None if frame.mask is None else (frame.mask > ON_OBJECT).astype(np.uint8)
             points, descriptors = cv2.SIFT_create().detectAndCompute(grey, mask)
             descriptors = np.empty((0, 128), np.float32) if descriptors is None else descriptors
-            # OpenCV measures from the centre of pixel 0 (half a pixel) in an upsampled image, shifted by -1/4 pixel.
+            # OpenCV measures from the centre of pixel 0 (half a pixel) in an upsampled image,
+            # shifted by -1/4 pixel.
             pixels = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.25
             length = np.linalg.norm(descriptors, axis=1, keepdims=True)
             found.append(Keypoints(pixels, descriptors / np.maximum(length, 1e-12)))
@@ -53,8 +59,11 @@ class Sift:
 def mutual_matches(
     first: Keypoints, second: Keypoints, k: int = 50
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return indices in both images, and cosines, of the k most similar mutual nearest neighbours, best first."""
-    similarity = torch.from_numpy(first.descriptors.astype(np.float64) @ second.descriptors.T.astype(np.float64))
+    """Return indices in both images, and cosines, of the k most similar mutual nearest neighbours,
+    best first."""
+    similarity = torch.from_numpy(
+        first.descriptors.astype(np.float64) @ second.descriptors.T.astype(np.float64)
+    )
     if not similarity.numel():  # an image without keypoints
         return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
     partner, score = mutual_nearest_neighbours(similarity)
@@ -63,17 +72,20 @@ def mutual_matches(
 
 
 def unproject_pixels(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Compute the points of pixels in camera coordinates, with in-painted depth where it is unknown."""
+    """Compute the points of pixels in camera coordinates, with in-painted depth where it is
+    unknown."""
     height, width = frame.camera.size
     columns, rows = np.floor(pixels).astype(np.int64).clip(0, (width - 1, height - 1)).T
     return frame.camera.unproject_camera(pixels, inpaint_depth(frame.depth)[rows, columns])
 
 
 class RootSift:
-    """Feature extractor without saliency: the keys (28, 28, 128) are upright SIFT descriptors at the patch centres.
+    """Feature extractor without saliency: the keys (28, 28, 128) are upright SIFT descriptors at
+    the patch centres.
 
-    As RootSIFT (Arandjelovic and Zisserman 2012), they are square roots of L1-normalised histograms, whose dot products
-    are Hellinger kernels. The global feature is their normalised mean.
+    As RootSIFT (Arandjelovic and Zisserman 2012), they are square roots of L1-normalised
+    histograms, whose dot products are Hellinger kernels. The global feature is their normalised
+    mean.
     """
 
     name = "rootsift"
@@ -84,12 +96,18 @@ class RootSift:
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
         """Extract the features of (H, W, 3) images, uint8 or float in [0, 1]."""
         maps, side = [], self.image_size // self.patch_size
-        centres = (np.arange(side) + 0.5) * self.patch_size - 0.5  # OpenCV's origin is the centre of pixel 0
+        centres = (
+            np.arange(side) + 0.5
+        ) * self.patch_size - 0.5  # OpenCV's origin is the centre of pixel 0
         for rgb in prepare_images(images, self.image_size).mul(255).round().to(torch.uint8):
-            grey = cv2.cvtColor(np.ascontiguousarray(rgb.permute(1, 2, 0).numpy()), cv2.COLOR_RGB2GRAY)
+            grey = cv2.cvtColor(
+                np.ascontiguousarray(rgb.permute(1, 2, 0).numpy()), cv2.COLOR_RGB2GRAY
+            )
             histograms = dense_sift(grey, centres, KEYPOINT_SIZE)
             total = histograms.sum(axis=-1, keepdims=True)
-            keys = torch.from_numpy(np.sqrt(histograms / np.maximum(total, 1e-12)).astype(np.float32))
+            keys = torch.from_numpy(
+                np.sqrt(histograms / np.maximum(total, 1e-12)).astype(np.float32)
+            )
             mean = torch.nn.functional.normalize(keys.mean((0, 1)), dim=0)
             maps.append(FeatureMap(keys, torch.ones(side, side), mean))
         return maps
@@ -98,7 +116,8 @@ class RootSift:
 def dense_sift(
     grey: UInt8[np.ndarray, "n n"], centres: Float[np.ndarray, " side"], size: float
 ) -> Float[np.ndarray, "side side 128"]:
-    """Compute the descriptors of upright keypoints on a grid: integers from 0 to 255, OpenCV's up to rounding."""
+    """Compute the descriptors of upright keypoints on a grid: integers from 0 to 255, OpenCV's up
+    to rounding."""
     n, side = len(grey), len(centres)
     blurred = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _BLUR)
     right, up = np.zeros_like(blurred), np.zeros_like(blurred)  # gradients are 0 at the border
@@ -108,7 +127,8 @@ def dense_sift(
     # Each gradient contributes to the two nearest orientations, with linear weights.
     distance = np.abs(angle * (_BINS / 360) - np.arange(_BINS, dtype=np.float32)[:, None, None])
     oriented = length * np.maximum(1 - np.minimum(distance, _BINS - distance), 0)
-    # The weights are separable in rows and columns: two small products do it in a hundredth of OpenCV's time.
+    # The weights are separable in rows and columns: two small products do it in a hundredth of
+    # OpenCV's time.
     weights = _weights(n, centres, _CELL * size)
     cells = (weights @ oriented @ weights.T).reshape(_BINS, side, _CELLS, side, _CELLS)
     histograms = cells.transpose(1, 3, 2, 4, 0).reshape(side, side, -1)
@@ -117,10 +137,15 @@ def dense_sift(
     return np.round(histograms * (_SCALE / np.maximum(norm, np.finfo(np.float32).eps))).clip(0, 255)
 
 
-def _weights(n: int, centres: Float[np.ndarray, " side"], cell: float) -> Float[np.ndarray, "rows n"]:
-    """Compute the weight of each of n pixels along one axis in each cell of each keypoint (keypoints x cells, n)."""
+def _weights(
+    n: int, centres: Float[np.ndarray, " side"], cell: float
+) -> Float[np.ndarray, "rows n"]:
+    """Compute the weight of each of n pixels along one axis in each cell of each keypoint
+    (keypoints x cells, n)."""
     offset = np.arange(n) - np.round(centres)[:, None]
     in_cells = offset / cell
-    window = np.exp(-(in_cells**2) / (_CELLS**2 / 2)) * (np.abs(offset) <= round(cell * 2**0.5 * (_CELLS + 1) / 2))
+    window = np.exp(-(in_cells**2) / (_CELLS**2 / 2)) * (
+        np.abs(offset) <= round(cell * 2**0.5 * (_CELLS + 1) / 2)
+    )
     distance = np.abs(in_cells[:, None] + _CELLS / 2 - 0.5 - np.arange(_CELLS)[:, None])
     return (window[:, None] * np.maximum(1 - distance, 0)).reshape(-1, n).astype(np.float32)

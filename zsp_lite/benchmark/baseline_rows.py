@@ -1,4 +1,5 @@
-"""The paper's baselines (sec. 5.2 and supplement), and poses that many frames or objects agree on, as rows."""
+"""The paper's baselines (sec. 5.2 and supplement), and poses that many frames or objects agree on,
+as rows."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -13,7 +14,13 @@ from zsp_lite.baselines.sift import Keypoints, mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints
 from zsp_lite.benchmark.problem import Answer, PairProblem
 from zsp_lite.best_view import score_from_cosines
-from zsp_lite.category import PairHypotheses, object_pairs, scan_pairs, synchronise, world_hypotheses
+from zsp_lite.category import (
+    PairHypotheses,
+    object_pairs,
+    scan_pairs,
+    synchronise,
+    world_hypotheses,
+)
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError, NoPoseError
 
@@ -21,7 +28,8 @@ _K = 50  # number of matches, as in "Ours"
 
 
 def icp(problem: PairProblem, view: int = 0) -> Answer:
-    """Run "ICP", in the first target view; the worlds start where the first cameras of both sequences coincide."""
+    """Run "ICP", in the first target view; the worlds start where the first cameras of both
+    sequences coincide."""
     reference, *targets = problem.frames(depth=True)
     sequences = problem.pair.reference_sequence, problem.pair.target_sequence
     dataset, category = problem.store.dataset, problem.pair.category
@@ -39,24 +47,33 @@ def icp_best_view(problem: PairProblem) -> Answer:
 
 
 def sift(problem: PairProblem) -> Answer:
-    """Run "SIFT": select the view by the similarity of its mutual nearest neighbours, and fit the pose by RANSAC."""
+    """Run "SIFT": select the view by the similarity of its mutual nearest neighbours, and fit the
+    pose by RANSAC."""
     first: Keypoints
     first, *others = (crop.described["sift"] for crop in problem.crops)
     found = [mutual_matches(first, other, _K) for other in others]
-    view = int(np.argmax([score_from_cosines(torch.from_numpy(similarity), _K) for *_, similarity in found]))
+    view = int(
+        np.argmax(
+            [score_from_cosines(torch.from_numpy(similarity), _K) for *_, similarity in found]
+        )
+    )
     one, two, _ = found[view]
     return fit_keypoints(problem, view, first.pixels[one], others[view].pixels[two])
 
 
 def category(problem: PairProblem) -> Answer:
-    """Run "category": the pose by the alignment of all objects of the category, which needs no label of any."""
-    pairs = object_pairs(problem.store.dataset, problem.pair.category, None, None, len(problem.pair.target_frames))
+    """Run "category": the pose by the alignment of all objects of the category, which needs no
+    label of any."""
+    pairs = object_pairs(
+        problem.store.dataset, problem.pair.category, None, None, len(problem.pair.target_frames)
+    )
     return _agreed(problem, [problem.pair, *pairs])
 
 
 @dataclass(frozen=True)
 class Scans:
-    """Run "scans-R": the pose that `references` frames of each object agree on, solved against views of the other."""
+    """Run "scans-R": the pose that `references` frames of each object agree on, solved against
+    views of the other."""
 
     references: int
 
@@ -65,9 +82,14 @@ class Scans:
 
 
 def _agreed(problem: PairProblem, pairs: Sequence[Pair]) -> Answer:
-    """Return the pose that the hypotheses of pairs of frames agree on, those of the problem's own pair among them."""
+    """Return the pose that the hypotheses of pairs of frames agree on, those of the problem's own
+    pair among them."""
     own, kept = hypotheses(problem), problem.store.kept
-    others = [pair for pair in (replace(one, repeat=problem.pair.repeat) for one in pairs) if pair != problem.pair]
+    others = [
+        pair
+        for pair in (replace(one, repeat=problem.pair.repeat) for one in pairs)
+        if pair != problem.pair
+    ]
     for key in ((hypotheses, pair) for pair in others):
         if key not in kept:  # for other rows, and for other pairs of the same objects
             kept[key] = None
@@ -76,7 +98,9 @@ def _agreed(problem: PairProblem, pairs: Sequence[Pair]) -> Answer:
     alignment = synchronise([own, *filter(None, (kept[hypotheses, pair] for pair in others))])
     reference, target = (Sim3(1.0, one.camera.R, one.camera.t) for one in problem.frames()[:2])
     sim3 = target @ alignment.between(own.reference, own.target) @ reference.inverse()
-    return Answer(sim3.R, 0, sim3.t, sim3.scale, confidence=alignment.objects[own.target].probability)
+    return Answer(
+        sim3.R, 0, sim3.t, sim3.scale, confidence=alignment.objects[own.target].probability
+    )
 
 
 def hypotheses(problem: PairProblem) -> PairHypotheses:

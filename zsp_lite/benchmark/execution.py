@@ -1,6 +1,8 @@
-"""Evaluate chunks of pairs in this process, a pool of processes, or any `concurrent.futures.Executor`.
+"""Evaluate chunks of pairs in this process, a pool of processes, or any
+`concurrent.futures.Executor`.
 
-A chunk is a few pairs of one category that share frames. A killed run loses the chunks that were being evaluated.
+A chunk is a few pairs of one category that share frames. A killed run loses the chunks that were
+being evaluated.
 """
 
 import os
@@ -30,7 +32,8 @@ _UNKNOWN_WORKERS = 256  # of an executor that does not tell
 
 
 class _Processes(ProcessPoolExecutor):
-    """Processes that `open_workers` ends; the pool's thread would print a traceback if their futures were cancelled."""
+    """Processes that `open_workers` ends; the pool's thread would print a traceback if their
+    futures were cancelled."""
 
 
 def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[Chunk]:
@@ -46,24 +49,34 @@ def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[
 def evaluate_chunks(
     make: Callable[[], Evaluate], chunks: Sequence[Chunk], executor: Executor | None, shared: Path
 ) -> Iterator[list[dict[str, Any]]]:
-    """Yield the lines that what `make` makes finds; `shared` is a new file in a folder that all workers see."""
+    """Yield the lines that what `make` makes finds; `shared` is a new file in a folder that all
+    workers see."""
     if executor is None:
         evaluate = make()
         with one_thread():
             for pair, rows in chain.from_iterable(chunks):
                 yield [evaluate(pair, rows)]
         return
-    pickled = _pickle(make, executor)  # in a file, because a backbone has megabytes, and each worker reads it once
+    pickled = _pickle(
+        make, executor
+    )  # in a file, because a backbone has megabytes, and each worker reads it once
     futures = []
     try:
         write_atomic(shared, pickled)
-        futures += [executor.submit(_evaluate_chunk, str(shared), digest(pickled), chunk) for chunk in chunks]
+        futures += [
+            executor.submit(_evaluate_chunk, str(shared), digest(pickled), chunk)
+            for chunk in chunks
+        ]
         for future in as_completed(futures):
             yield future.result()
     except ImportError as error:
-        raise InputError(f"a worker cannot import the rows: {error}, expected the module there, too") from error
+        raise InputError(
+            f"a worker cannot import the rows: {error}, expected the module there, too"
+        ) from error
     except Exception as error:
-        if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":  # the latter is Dask's
+        if (
+            not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker"
+        ):  # the latter is Dask's
             raise
         advice = "finished pairs are stored: run again to continue, with fewer workers"
         raise InputError(f"a worker ended abruptly, perhaps out of memory; {advice}") from error
@@ -75,8 +88,11 @@ def evaluate_chunks(
 
 
 def _pickle(make: Callable[[], Any], executor: Executor) -> bytes:
-    """Pickle by value what a notebook, or a module in the current folder, defines: workers need not see it."""
-    if not isinstance(executor, ProcessPoolExecutor):  # whose processes import what this one can import
+    """Pickle by value what a notebook, or a module in the current folder, defines: workers need not
+    see it."""
+    if not isinstance(
+        executor, ProcessPoolExecutor
+    ):  # whose processes import what this one can import
         found = {name for _, name, _ in pkgutil.iter_modules([os.getcwd()])} - {"zsp_lite"}
         for name in found & sys.modules.keys():
             cloudpickle.register_pickle_by_value(sys.modules[name])
@@ -88,11 +104,14 @@ _worker = threading.local()  # an executor's workers may be threads
 
 
 def _evaluate_chunk(shared: str, digest_of_it: str, chunk: Chunk) -> list[dict[str, Any]]:
-    """Evaluate a chunk in a worker, which keeps what evaluates it for the next one of the same call."""
+    """Evaluate a chunk in a worker, which keeps what evaluates it for the next one of the same
+    call."""
     if getattr(_worker, "shared", None) != shared:
         pickled = read_bytes(shared, "rows of the run")
         if digest(pickled) != digest_of_it:  # never unpickle what somebody else has written
-            raise InputError(f"rows of the run {shared} have changed, expected the file that this run wrote")
+            raise InputError(
+                f"rows of the run {shared} have changed, expected the file that this run wrote"
+            )
         _worker.evaluate, _worker.shared = cloudpickle.loads(pickled)(), shared
     with one_thread():
         return [_worker.evaluate(pair, rows) for pair, rows in chunk]
@@ -100,12 +119,17 @@ def _evaluate_chunk(shared: str, digest_of_it: str, chunk: Chunk) -> list[dict[s
 
 @contextmanager
 def open_workers(executor: Executor | int = 1) -> Iterator[tuple[Executor | None, int]]:
-    """Open an executor (None: this process) with its number of workers, and close it after the block.
+    """Open an executor (None: this process) with its number of workers, and close it after the
+    block.
 
     It is a number of processes, 1 for this one, or an Executor, which stays open.
     """
     if isinstance(executor, Executor):
-        yield executor, getattr(executor, "_max_workers", None) or getattr(executor, "num_workers", _UNKNOWN_WORKERS)
+        yield (
+            executor,
+            getattr(executor, "_max_workers", None)
+            or getattr(executor, "num_workers", _UNKNOWN_WORKERS),
+        )
         return
     check_integer("workers", executor, 1, 4096)
     if executor == 1:
@@ -122,7 +146,8 @@ def open_workers(executor: Executor | int = 1) -> Iterator[tuple[Executor | None
 
 
 def _start_worker() -> None:
-    """Ignore interrupts, which the parent process handles, and end when the parent ends, even if it was killed."""
+    """Ignore interrupts, which the parent process handles, and end when the parent ends, even if it
+    was killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:

@@ -21,37 +21,57 @@ from zsp_lite.io.files import REPOSITORY, digest
 
 
 def described(value: Any) -> str:
-    """Describe a setting as text: an object by "module:name", whatever its code; a dataclass with its public fields."""
+    """Describe a setting as text: an object by "module:name", whatever its code; a dataclass with
+    its public fields."""
     if value is None or isinstance(value, bool | int | float | str | list | tuple):
         return str(value)
     named = value if hasattr(value, "__qualname__") else type(value)
     name = f"{named.__module__}:{named.__qualname__}"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = [field.name for field in dataclasses.fields(value) if not field.name.startswith("_")]
-        return f"{name}({', '.join(f'{field}={described(getattr(value, field))}' for field in fields)})"
+        names = [one.name for one in dataclasses.fields(value) if not one.name.startswith("_")]
+        fields = ", ".join(f"{one}={described(getattr(value, one))}" for one in names)
+        return f"{name}({fields})"
     return name
 
 
 def fingerprint(extractor: Any) -> str:
-    """Return the name of an extractor (by default "module:name"), and a hash of its `state_dict` and settings."""
+    """Return the name of an extractor (by default "module:name"), and a hash of its `state_dict`
+    and settings."""
     name, settings = getattr(extractor, "name", None) or described(extractor), ""
     state_dict = getattr(extractor, "state_dict", None)
     if isinstance(extractor, Backbone):
-        state_dict, image = extractor.model.state_dict, (extractor.image_size, extractor.mean, extractor.std)
+        state_dict, image = (
+            extractor.model.state_dict,
+            (extractor.image_size, extractor.mean, extractor.std),
+        )
         settings = repr((extractor.layer, extractor.facet, extractor.saliency_heads, *image))
     parts: list[str | bytes] = []
     for key, weight in sorted(state_dict().items()) if callable(state_dict) else ():
-        parts += [key, weight.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()]
+        parts += [
+            key,
+            weight.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes(),
+        ]
     return f"{name} {digest(settings, *parts)}" if parts else name
 
 
 @functools.cache
 def library_version() -> dict[str, str | None]:
-    """Return the version of zsp_lite, and the commit of its checkout, "-dirty" if files differ; None if installed."""
+    """Return the version of zsp_lite, and the commit of its checkout, "-dirty" if files differ;
+    None if installed."""
     commit = None
     # An installed copy may lie inside the repository of another project, whose commit says nothing.
     if (REPOSITORY / ".git").exists():
-        describe = ["git", "-C", str(REPOSITORY), "describe", "--always", "--abbrev=40", "--dirty", "--exclude", "*"]
+        describe = [
+            "git",
+            "-C",
+            str(REPOSITORY),
+            "describe",
+            "--always",
+            "--abbrev=40",
+            "--dirty",
+            "--exclude",
+            "*",
+        ]
         with suppress(OSError):  # git is not installed
             commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip() or None
     return {"version": __version__, "commit": commit}

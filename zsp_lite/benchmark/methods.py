@@ -1,4 +1,5 @@
-"""Methods of the benchmark: the rows of its tables as plain data, groups of rows, and methods of one's own."""
+"""Methods of the benchmark: the rows of its tables as plain data, groups of rows, and methods of
+one's own."""
 
 import json
 import re
@@ -21,15 +22,20 @@ from zsp_lite.io.modules import import_object
 
 @dataclass(frozen=True)
 class Method:
-    """A row of the tables: the paper's method with some settings changed, or a function of one's own."""
+    """A row of the tables: the paper's method with some settings changed, or a function of one's
+    own."""
 
     features: str = "backbone"  # name of the feature extractor in `make_extractors`
-    # The fitted pose; the best view without a fit ("Ours-BV"); the pose fitted in the target view that is nearest in
-    # rotation to the ground truth; or the rotation between the reference and the best view without depth.
+    # The fitted pose; the best view without a fit ("Ours-BV"); the pose fitted in the target view
+    # that is nearest in rotation to the ground truth; or the rotation between the reference and the
+    # best view without depth.
     answer: Literal["pose", "best view", "true view", "essential matrix"] = "pose"
-    settings: Mapping[str, Any] = field(default_factory=dict)  # settings of `ZeroShotPose` that differ from the paper's
+    settings: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # settings of `ZeroShotPose` that differ from the paper's
     targets: int | None = None  # number of target views per pair; None for that of the run
-    # Function of a `Problem` that replaces the paper's method; `features` is then the extractor that it uses.
+    # Function of a `Problem` that replaces the paper's method; `features` is then the extractor
+    # that it uses.
     solve: Callable[[Any], Any] | None = None
     seconds: int = field(default=60, compare=False)  # limit of a row of one's own for a pair
 
@@ -39,7 +45,8 @@ _MASK = {"foreground": "mask"}
 METHODS: dict[str, Method] = {
     "ours": Method(),
     "ours-bv": Method(answer="best view"),
-    # SIFT has no saliency and uses the true mask. Other rows use the mask only if their name says so.
+    # SIFT has no saliency and uses the true mask. Other rows use the mask only if their name says
+    # so.
     "rootsift": Method("rootsift", settings=_MASK),
     "ours-mask": Method(settings=_MASK),
     "oracle-view": Method(answer="true view"),
@@ -68,7 +75,8 @@ METHODS: dict[str, Method] = {
     # Beyond the paper.
     "verified": Method(settings={"solver": "verified"}),
     "verified-mask": Method(settings={"solver": "verified"} | _MASK),
-    # See other frames of both objects, and other objects of the category, too, without labels: tables of their own.
+    # See other frames of both objects, and other objects of the category, too, without labels:
+    # tables of their own.
     "scans-2": Method(solve=baseline_rows.Scans(2)),
     "scans-4": Method(solve=baseline_rows.Scans(4)),
     "scans-8": Method(solve=baseline_rows.Scans(8)),
@@ -82,49 +90,70 @@ def read_paper_tables() -> list[dict[str, Any]]:
     return json.loads(Path(__file__).with_name("paper_tables.json").read_text(encoding="utf-8"))
 
 
-# Rows or other groups: the tables of the paper, one by one and together, and what goes beyond them. In no group is
-# "category".
+# Rows or other groups: the tables of the paper, one by one and together, and what goes beyond them.
+# In no group is "category".
 GROUPS: dict[str, list[str]] = {
     "default": ["ours", "ours-bv", "rootsift"],
     **{
         table["group"]: [line["row"] for line in table["rows"] if line["row"]]
-        for table in read_paper_tables() if "group" in table
+        for table in read_paper_tables()
+        if "group" in table
     },
     "scans": ["scans-2", "scans-4", "scans-8"],
     "verified-views": ["verified", "verified-n1", "verified-n3", "verified-n10", "verified-mask"],
-    "ablations": ["ours", "table3", "matchers", "correspondences", "trials", "depth", "published"],  # at one N
+    "ablations": [
+        "ours",
+        "table3",
+        "matchers",
+        "correspondences",
+        "trials",
+        "depth",
+        "published",
+    ],  # at one N
     "paper": ["ours", "ours-bv", "table1", "ablations", "views", "rootsift", "ours-mask"],
     "all": ["paper", "verified-views", "oracle-view"],
-}  # fmt: skip
+}
 
 
 def _members(name: str) -> list[str]:
     """The rows of a group, or the name of a row itself."""
-    return [row for member in GROUPS[name] for row in _members(member)] if name in GROUPS else [name]
+    return (
+        [row for member in GROUPS[name] for row in _members(member)] if name in GROUPS else [name]
+    )
 
 
-def resolve(methods: str | Sequence[str] | Mapping[str, Any], sweep: Sequence[float] = ()) -> dict[str, Method]:
+def resolve(
+    methods: str | Sequence[str] | Mapping[str, Any], sweep: Sequence[float] = ()
+) -> dict[str, Method]:
     """Resolve names to rows, in order and without duplicates.
 
-    Names are those of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, or NAME=module:thing or
-    NAME=poses.csv, also without NAME=. A mapping leads from names to these, to a `Method`, or to objects of one's own.
-    Each RANSAC threshold V of a sweep makes a row NAME@threshold=V of each.
-    InputError if a name is unknown or another row's, or a thing cannot be imported or read, or is of no kind.
+    Names are those of rows or groups (`METHODS`, `GROUPS`), ROW-nN for a row at N target views, or
+    NAME=module:thing or NAME=poses.csv, also without NAME=. A mapping leads from names to these, to
+    a `Method`, or to objects of one's own. Each RANSAC threshold V of a sweep makes a row
+    NAME@threshold=V of each. InputError if a name is unknown or another row's, or a thing cannot be
+    imported or read, or is of no kind.
     """
     if not isinstance(methods, Mapping):
         names = [methods] if isinstance(methods, str) else methods
         parts = (row.partition("=") for name in names for row in _members(name))
         meanings = {(name.strip(), meant or name): None for name, _, meant in parts}
         if len(methods := dict(meanings.keys())) < len(meanings):
-            raise InputError(f"methods {', '.join(names)} are two of one name, expected one of each")
+            raise InputError(
+                f"methods {', '.join(names)} are two of one name, expected one of each"
+            )
     if not methods:
         raise InputError("no methods, expected some; `zsp-lite benchmark --list` lists them")
     labels = [line["label"] for table in read_paper_tables() for line in table["rows"]]
-    taken = {*map(str.casefold, [*METHODS, *GROUPS, *labels, "alignment"])}  # the last is the row of `align`
+    taken = {
+        *map(str.casefold, [*METHODS, *GROUPS, *labels, "alignment"])
+    }  # the last is the row of `align`
     for name, meant in methods.items():
         plain, text = str(name).strip().casefold(), meant if isinstance(meant, str) else ""
         if text != name and taken & {plain, base_name(plain), base_name(text)}:
-            raise InputError(f"method {name!r} gives a library row another name, or a name of its or the paper's away")
+            raise InputError(
+                f"method {name!r} gives a library row another name, or a name of its or the "
+                "paper's away"
+            )
     rows = {str(name): _method(str(name), meant) for name, meant in methods.items()}
     return _swept(rows, sweep) if sweep else rows
 
@@ -139,7 +168,8 @@ def _method(name: str, meant: Any) -> Method:
             return Method("none", solve=StoredPoses(meant, *read_poses(meant)))
         if ":" not in meant:
             raise InputError(
-                f"method {meant!r} is unknown; `zsp-lite benchmark --list` lists all, NAME=module:thing and "
+                f"method {meant!r} is unknown; `zsp-lite benchmark --list` lists all, "
+                "NAME=module:thing and "
                 "NAME=poses.csv are your own"
             )
         meant = import_object(meant)
@@ -178,14 +208,20 @@ def _swept(rows: Mapping[str, Method], thresholds: Sequence[float]) -> dict[str,
 
 
 def make_extractors(backbone: FeatureExtractor, methods: Mapping[str, Method]) -> dict[str, Any]:
-    """Make the feature extractors of rows, by name. They are called on images, or `describe` frames."""
+    """Make the feature extractors of rows, by name.
+
+    They are called on images, or `describe` frames.
+    """
     every = {"none": None, "backbone": backbone, "rootsift": RootSift(), "sift": Sift()}
     return {method.features: every[method.features] for method in methods.values()}
 
 
 def description(method: Method) -> str:
-    """Describe a row as text; rows with the same name and other descriptions are not stored in one run."""
-    settings = ", ".join(f"{name}={described(value)}" for name, value in sorted(method.settings.items()))
+    """Describe a row as text; rows with the same name and other descriptions are not stored in one
+    run."""
+    settings = ", ".join(
+        f"{name}={described(value)}" for name, value in sorted(method.settings.items())
+    )
     views = f"{method.targets} views" if method.targets else ""
     solve = described(method.solve) if method.solve else ""
     return "; ".join(filter(None, [method.features, method.answer, settings, views, solve]))

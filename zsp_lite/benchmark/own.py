@@ -1,4 +1,5 @@
-"""Methods of one's own: which kind of method an object is, what it gets, and poses that another program computed."""
+"""Methods of one's own: which kind of method an object is, what it gets, and poses that another
+program computed."""
 
 import ctypes
 import threading
@@ -19,14 +20,21 @@ from zsp_lite.errors import InputError, describe_failure, ends_the_run, real_arr
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import object_crop
 
-KINDS = ("problem", "keypoints", "matcher", "solver")  # functions of one, two and three arguments, and a solver
+KINDS = (
+    "problem",
+    "keypoints",
+    "matcher",
+    "solver",
+)  # functions of one, two and three arguments, and a solver
 
 
 def kind_of(name: str, thing: Any) -> str:
-    """Tell what the thing of a row is: "estimator" (has `estimate`), or the function of one of `KINDS`.
+    """Tell what the thing of a row is: "estimator" (has `estimate`), or the function of one of
+    `KINDS`.
 
-    The number of arguments without a default, but for `seed` and `threshold`, tells the kinds apart, and a solver has
-    both of these; an attribute `kind` of the thing comes before it. InputError if it is none of these.
+    The number of arguments without a default, but for `seed` and `threshold`, tells the kinds
+    apart, and a solver has both of these; an attribute `kind` of the thing comes before it.
+    InputError if it is none of these.
     """
     if not isinstance(thing, type):
         if callable(getattr(thing, "estimate", None)):
@@ -35,14 +43,20 @@ def kind_of(name: str, thing: Any) -> str:
             return kind
         known = parameters(thing)
         others = [one for name, one in known.items() if name not in ("seed", "threshold")]
-        needed = [one for one in others if one.default is one.empty and one.kind is not one.VAR_KEYWORD]
-        positional = all(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed)
+        needed = [
+            one for one in others if one.default is one.empty and one.kind is not one.VAR_KEYWORD
+        ]
+        positional = all(
+            one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed
+        )
         if positional and len(needed) in (1, 2, 3):
             solves = len(needed) == 3 and known.keys() >= {"seed", "threshold"}
             return "solver" if solves else KINDS[len(needed) - 1]
     raise InputError(
-        f"method {name!r} is of type {type(thing).__name__}, expected a function of one argument (problem), two (two "
-        "images) or three (similarities, two foregrounds), a solver, or an object with estimate(reference, targets)"
+        f"method {name!r} is of type {type(thing).__name__}, expected a function of one "
+        "argument (problem), two (two "
+        "images) or three (similarities, two foregrounds), a solver, or an object with "
+        "estimate(reference, targets)"
     )
 
 
@@ -52,7 +66,8 @@ class OutOfTime(BaseException):
 
 @contextmanager
 def fails_alone(seconds: int) -> Iterator[None]:
-    """Turn an error of the block, or that it takes too long between two calls of compiled code, into an InputError."""
+    """Turn an error of the block, or that it takes too long between two calls of compiled code,
+    into an InputError."""
     thread, ended = ctypes.c_ulong(threading.get_ident()), threading.Lock()
 
     def watch() -> None:
@@ -75,11 +90,14 @@ def fails_alone(seconds: int) -> Iterator[None]:
         raise
     except BaseException as error:
         late = f"takes more than {seconds} s"
-        raise InputError(late if isinstance(error, OutOfTime) else describe_failure(error)) from error
+        raise InputError(
+            late if isinstance(error, OutOfTime) else describe_failure(error)
+        ) from error
 
 
 def given(method: Any, problem: PairProblem) -> Any:
-    """Return what the row of a method of one's own gets: copies; nothing in them leads to the data set and labels."""
+    """Return what the row of a method of one's own gets: copies; nothing in them leads to the data
+    set and labels."""
     if not isinstance(method, Estimator | KeypointMatcher):
         return Problem(problem.seed, deepcopy(problem.crops), problem.store.extractors, {})
     with ends_the_run("reading frames"):
@@ -98,13 +116,16 @@ class Estimator:
 
     def __call__(self, problem: Problem) -> Any:
         reference, *targets = problem.frames()
-        own = replace(self.own, seed=problem.seed) if isinstance(self.own, ZeroShotPose) else self.own
+        own = (
+            replace(self.own, seed=problem.seed) if isinstance(self.own, ZeroShotPose) else self.own
+        )
         return seeded(own.estimate, problem.seed)(reference, targets)
 
 
 @dataclass(frozen=True)
 class KeypointMatcher:
-    """Row of a matcher of keypoints in two images, followed by RANSAC; docs/benchmark_your_own.md has its protocol."""
+    """Row of a matcher of keypoints in two images, followed by RANSAC; docs/benchmark_your_own.md
+    has its protocol."""
 
     own: Callable[[np.ndarray, np.ndarray], tuple[Any, Any, Any]]
     threshold: float = 0.2  # of RANSAC
@@ -120,18 +141,30 @@ class KeypointMatcher:
         return fit_keypoints(problem, view, *found[view][:2], self.threshold)
 
 
-def fit_keypoints(problem: Problem, view: int, first: Any, second: Any, threshold: float = 0.2) -> Answer:
-    """Fit the pose to matched pixels of the reference's crop and of a target's: depth, then RANSAC (sec. 4.3)."""
+def fit_keypoints(
+    problem: Problem, view: int, first: Any, second: Any, threshold: float = 0.2
+) -> Answer:
+    """Fit the pose to matched pixels of the reference's crop and of a target's: depth, then RANSAC
+    (sec. 4.3)."""
     reference, *targets = problem.frames(depth=True)
     empty = np.zeros((0, 2))
-    first, second = (real_array("matched points", one if len(one) else empty, (None, 2)) for one in (first, second))
+    first, second = (
+        real_array("matched points", one if len(one) else empty, (None, 2))
+        for one in (first, second)
+    )
     if len(first) != len(second):
-        raise InputError(f"matched points are {len(first)} and {len(second)}, expected as many in both images")
+        raise InputError(
+            f"matched points are {len(first)} and {len(second)}, expected as many in both images"
+        )
     try:
         points = unproject_pixels(reference, first), unproject_pixels(targets[view], second)
-        sim3, inliers = ransac(*points, threshold=threshold, seed=problem.seed, scale_range=SCALE_RANGE)
+        sim3, inliers = ransac(
+            *points, threshold=threshold, seed=problem.seed, scale_range=SCALE_RANGE
+        )
     except InputError as error:
-        return Answer(np.eye(3), view, note=f"pose is the best view's, not a fit: {error}", inliers=0)
+        return Answer(
+            np.eye(3), view, note=f"pose is the best view's, not a fit: {error}", inliers=0
+        )
     return Answer(sim3.R, view, sim3.t, sim3.scale, inliers=int(inliers.sum()))
 
 

@@ -1,4 +1,7 @@
-"""Argument and results of a benchmark row: `Problem`, whose frames a `FrameStore` keeps, and `Answer`."""
+"""Argument and results of a benchmark row:
+
+`Problem`, whose frames a `FrameStore` keeps, and `Answer`.
+"""
 
 import inspect
 import time
@@ -30,9 +33,13 @@ CAPACITY = 128  # frames in memory
 class Answer:
     """Pose of the reference object in one of the target views."""
 
-    rotation: Float[np.ndarray, "3 3"]  # from the reference's camera to the camera of the target view
+    rotation: Float[
+        np.ndarray, "3 3"
+    ]  # from the reference's camera to the camera of the target view
     view: int = 0  # index of the target view
-    translation: Float[np.ndarray, "3"] | None = None  # in the target's unit, if the method estimates it
+    translation: Float[np.ndarray, "3"] | None = (
+        None  # in the target's unit, if the method estimates it
+    )
     scale: float | None = None  # if the method estimates it
     note: str = ""  # warning about the pose; "" for none
     inliers: int | None = None  # number of matches that agree with the pose
@@ -42,18 +49,22 @@ class Answer:
 class Row(Protocol):
     """A row of the benchmark's tables: any callable from a `Problem` to a pose.
 
-    A row that takes the pose of the target view whose global feature is most similar to the reference's:
+    A row that takes the pose of the target view whose global feature is most similar to the
+    reference's:
 
-        def most_similar(problem):
-            first, *others = (view.features.global_feature for view in problem.views())
-            return np.eye(3), int(np.argmax([torch.cosine_similarity(first, other, dim=0) for other in others]))
+        def most_similar(problem): first, *others = (view.features.global_feature for view in
+            problem.views()) return np.eye(3), int(np.argmax([torch.cosine_similarity(first, other,
+            dim=0) for other in others]))
     """
 
-    def __call__(self, problem: "Problem") -> Answer | PoseEstimate | Sim3 | np.ndarray | tuple[Sim3 | np.ndarray, int]:
+    def __call__(
+        self, problem: "Problem"
+    ) -> Answer | PoseEstimate | Sim3 | np.ndarray | tuple[Sim3 | np.ndarray, int]:
         """Estimate the pose of the reference object in one of the target views.
 
-        A Sim3 or a rotation (3, 3) stands alone (target view 0) or with the view's index. InputError says that there is
-        no pose: the pair counts as failed, with an error of 180 degrees.
+        A Sim3 or a rotation (3, 3) stands alone (target view 0) or with the view's index.
+        InputError says that there is no pose: the pair counts as failed, with an error of 180
+        degrees.
         """
         ...
 
@@ -65,16 +76,21 @@ def as_answer(found: Any) -> Answer:
         return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, inliers, found.confidence)
     if isinstance(found, Answer):
         move, scale = found.translation, 1.0 if found.scale is None else found.scale
-        exact = Sim3(scale, found.rotation, np.zeros(3) if move is None else move)  # refuses what is no pose
+        exact = Sim3(
+            scale, found.rotation, np.zeros(3) if move is None else move
+        )  # refuses what is no pose
         return replace(found, rotation=exact.R, translation=None if move is None else exact.t)
     pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
     if isinstance(pose, Sim3):
         return Answer(pose.R, int(view), pose.t, pose.scale)
-    return Answer(rotation_matrix("pose of the row", real_array("pose of the row", pose, (3, 3))), int(view))
+    return Answer(
+        rotation_matrix("pose of the row", real_array("pose of the row", pose, (3, 3))), int(view)
+    )
 
 
 def parameters(plugin: Any) -> Mapping[str, inspect.Parameter]:
-    """Return the parameters of a plug-in by name; none if it has no signature, as some of compiled modules."""
+    """Return the parameters of a plug-in by name; none if it has no signature, as some of compiled
+    modules."""
     with suppress(TypeError, ValueError):
         return inspect.signature(getattr(plugin, "forward", plugin)).parameters
     return {}
@@ -85,7 +101,9 @@ def seeded(plugin: Any, seed: int) -> Any:
     return partial(plugin, seed=seed) if "seed" in parameters(plugin) else plugin
 
 
-def _timed(timings: dict[str, list[float]], stage: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def _timed(
+    timings: dict[str, list[float]], stage: str, function: Callable[..., Any], *arguments: Any
+) -> Any:
     """Call a function, and add the time that it takes to the timings of a stage."""
     start = time.perf_counter()
     found = function(*arguments)
@@ -104,14 +122,17 @@ class Crop:
     def view(self, features: str, foreground: str) -> View:
         """Return the crop with its features and foreground (see `views.frame_view`)."""
         if (features, foreground) not in self._views:
-            self._views[features, foreground] = frame_view(self.frame, self.described[features], foreground)
+            self._views[features, foreground] = frame_view(
+                self.frame, self.described[features], foreground
+            )
         return self._views[features, foreground]
 
 
 class FrameStore:
     """Crops, of which the last used are kept; `timings` are the seconds of their pair by stage.
 
-    `kept` is what a row keeps for all pairs. `threads` are those of feature extraction, None leaves them as they are.
+    `kept` is what a row keeps for all pairs. `threads` are those of feature extraction, None leaves
+    them as they are.
     """
 
     def __init__(self, dataset: Co3D, extractors: Mapping[str, Any], threads: int | None = None):
@@ -126,27 +147,43 @@ class FrameStore:
         size = getattr(self.extractors.get("backbone"), "image_size", IMAGE_SIZE)
         with ends_the_run(f"reading frame {sequence}/{number}"):
             annotation = self.dataset.frame(category, sequence, number)
-            return Crop(_timed(self.timings, "reading", lambda: object_crop(self.dataset.load(annotation), size)))
+            return Crop(
+                _timed(
+                    self.timings,
+                    "reading",
+                    lambda: object_crop(self.dataset.load(annotation), size),
+                )
+            )
 
     def crop(self, category: str, sequence: str, number: int, features: Iterable[str] = ()) -> Crop:
         """Return a frame's crop with what some extractors compute from it, each once."""
         crop = self._read(category, sequence, number)
         for name in features:
             if name not in crop.described:
-                extract = getattr(self.extractors[name], "describe", partial(feature_maps, self.extractors[name]))
-                # One frame at a time: the last bits of a frame's features must not depend on the rest of a batch.
+                extract = getattr(
+                    self.extractors[name], "describe", partial(feature_maps, self.extractors[name])
+                )
+                # One frame at a time: the last bits of a frame's features must not depend on the
+                # rest of a batch.
                 with threadpool_limits(self.threads), ends_the_run(f"features {name!r}"):
                     crop.described[name] = _timed(self.timings, name, extract, [crop.frame])[0]
         return crop
 
 
 class Problem:
-    """One pair as a row sees it: images, depth, masks, cameras and features of both objects, and a seed.
+    """One pair as a row sees it: images, depth, masks, cameras and features of both objects, and a
+    seed.
 
     Nothing in it leads to the data set.
     """
 
-    def __init__(self, seed: int, crops: Sequence[Crop], extractors: Mapping[str, Any], timings: dict[str, list]):
+    def __init__(
+        self,
+        seed: int,
+        crops: Sequence[Crop],
+        extractors: Mapping[str, Any],
+        timings: dict[str, list],
+    ):
         self.seed, self.crops = seed, crops  # the reference's crop first
         self._extractors, self._timings = extractors, timings
         self._found: dict[tuple, Any] = {}  # estimates and similarities
@@ -162,18 +199,27 @@ class Problem:
         return frames
 
     def views(self) -> list[View]:
-        """Return the crops with the features of the run's backbone, and the foreground that its saliency finds."""
+        """Return the crops with the features of the run's backbone, and the foreground that its
+        saliency finds."""
         return [crop.view("backbone", "saliency") for crop in self.crops]
 
     def estimate(
-        self, features: str = "backbone", settings: Mapping[str, Any] | None = None, target: int | None = None
+        self,
+        features: str = "backbone",
+        settings: Mapping[str, Any] | None = None,
+        target: int | None = None,
     ) -> PoseEstimate:
-        """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the one with an index."""
+        """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the
+        one with an index."""
         settings = settings or {}
         name = (features, target, *sorted(settings.items()))
         if name not in self._found:
-            plugins = {key: seeded(value, self.seed) for key, value in settings.items() if key != "solver"}
-            method = ZeroShotPose(self._extractors[features], **{**settings, **plugins}, seed=self.seed)
+            plugins = {
+                key: seeded(value, self.seed) for key, value in settings.items() if key != "solver"
+            }
+            method = ZeroShotPose(
+                self._extractors[features], **{**settings, **plugins}, seed=self.seed
+            )
             crops = self.crops if target is None else (self.crops[0], self.crops[1 + target])
             reference, *targets = (crop.view(features, method.foreground) for crop in crops)
             matched = [self._match(method, reference, view) for view in targets]
@@ -187,11 +233,14 @@ class Problem:
         if key not in self._found:
             compare = similarities if method.binning else key_similarities
             self._found[key] = _timed(self._timings, "similarity", compare, first, [second])
-        return _timed(self._timings, "matching", method.match_views, reference, [target], self._found[key])[0]
+        return _timed(
+            self._timings, "matching", method.match_views, reference, [target], self._found[key]
+        )[0]
 
 
 class PairProblem(Problem):
-    """A problem with its pair and data set, for rows of the library; `features` are the extractors that they use."""
+    """A problem with its pair and data set, for rows of the library; `features` are the extractors
+    that they use."""
 
     def __init__(self, pair: Pair, store: FrameStore, features: Iterable[str] = ("backbone",)):
         self.pair, self.store = pair, store

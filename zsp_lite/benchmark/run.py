@@ -1,4 +1,5 @@
-"""Run the benchmark: rotation errors of methods over many pairs of a CO3D-format folder (paper sec. 5)."""
+"""Run the benchmark: rotation errors of methods over many pairs of a CO3D-format folder (paper sec.
+5)."""
 
 import json
 import logging
@@ -22,10 +23,27 @@ from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.baselines.geometry import essential_rotation
 from zsp_lite.benchmark import execution
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
-from zsp_lite.benchmark.methods import GROUPS, Method, description, is_own, make_extractors, read_paper_tables, resolve
+from zsp_lite.benchmark.methods import (
+    GROUPS,
+    Method,
+    description,
+    is_own,
+    make_extractors,
+    read_paper_tables,
+    resolve,
+)
 from zsp_lite.benchmark.own import StoredPoses, fails_alone, given
 from zsp_lite.benchmark.problem import Answer, FrameStore, PairProblem, as_answer, seeded
-from zsp_lite.benchmark.runs import Call, ResultLine, Run, Settings, add_lines, open_run, read_lines, read_run
+from zsp_lite.benchmark.runs import (
+    Call,
+    ResultLine,
+    Run,
+    Settings,
+    add_lines,
+    open_run,
+    read_lines,
+    read_run,
+)
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.ground_truth import common_turns
@@ -51,10 +69,11 @@ def evaluate(
     seeds: int = 1,
     sweep: Sequence[float] = (),
 ) -> dict[str, Any]:
-    """Evaluate rows on pairs of every category, and store every finished pair in the folder of the run at once.
+    """Evaluate rows on pairs of every category, and store every finished pair in the folder of the
+    run at once.
 
-    A run in the folder is continued: pairs and rows that it has are not evaluated again. Results do not depend on the
-    order of pairs, on the executor or on the number of workers.
+    A run in the folder is continued: pairs and rows that it has are not evaluated again. Results do
+    not depend on the order of pairs, on the executor or on the number of workers.
 
     Args:
         data: Folder in CO3D's layout, with pose labels.
@@ -69,18 +88,24 @@ def evaluate(
         sweep: RANSAC thresholds V; each row is evaluated with each, as NAME@threshold=V.
 
     Returns:
-        The content of OUT/summary.json (see `statistics.summarise`); `write_reports` writes tables and figures.
+        The content of OUT/summary.json (see `statistics.summarise`); `write_reports` writes tables
+        and figures.
 
     Raises:
-        InputError: For unknown rows or categories, missing labels or files, and an OUT that holds another run.
+        InputError: For unknown rows or categories, missing labels or files, and an OUT that holds
+            another run.
         FatalError: The backbone is broken, or a frame cannot be read.
     """
     check_integer("targets", targets, 1)
     check_integer("row_seconds", row_seconds, 1, 1_000_000)
     check_integer("seeds", seeds, 1, 1000)
-    rows = {name: replace(row, seconds=row_seconds) for name, row in resolve(methods, sweep).items()}
+    rows = {
+        name: replace(row, seconds=row_seconds) for name, row in resolve(methods, sweep).items()
+    }
     dataset, remarks = Co3D(data), {}
-    numbers = pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
+    numbers = (
+        pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
+    )
     work = pairs_of_rows(dataset, rows, numbers, targets)
     loaded = as_backbone(backbone)
     extractors = make_extractors(loaded, rows)
@@ -88,19 +113,36 @@ def evaluate(
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
         elif isinstance(row.solve, StoredPoses):
-            remark = row.solve.remark(dataset, [pair for pair, names in work.items() if name in names])
+            remark = row.solve.remark(
+                dataset, [pair for pair, names in work.items() if name in names]
+            )
             remarks[name] = f"{name}: {remark}." if remark else ""
     with execution.open_workers(executor) as (pool, workers):
         settings = Settings(
-            data=str(data).encode(errors="replace").decode(), backbone=fingerprint(loaded), targets=targets,
-            library=[library_version()], labels={category: _labels(dataset, category) for category in numbers},
+            data=str(data).encode(errors="replace").decode(),
+            backbone=fingerprint(loaded),
+            targets=targets,
+            library=[library_version()],
+            labels={category: _labels(dataset, category) for category in numbers},
             methods={name: description(row) for name, row in rows.items()},
-            calls=[Call(**environment(), workers=workers, rows=list(rows), pairs=dict(numbers), seeds=seeds,
-                        remarks=remarks)],
-        )  # fmt: skip
+            calls=[
+                Call(
+                    **environment(),
+                    workers=workers,
+                    rows=list(rows),
+                    pairs=dict(numbers),
+                    seeds=seeds,
+                    remarks=remarks,
+                )
+            ],
+        )
         with open_run(out, settings):
-            make = partial(pair_evaluator, str(Path(data).resolve()), rows, backbone if pool else loaded)
-            repeated = {replace(pair, repeat=k): names for k in range(seeds) for pair, names in work.items()}
+            make = partial(
+                pair_evaluator, str(Path(data).resolve()), rows, backbone if pool else loaded
+            )
+            repeated = {
+                replace(pair, repeat=k): names for k in range(seeds) for pair, names in work.items()
+            }
             evaluate_pairs(out, make, repeated, pool, workers)
     found = read_run(out)
     for remark in filter(None, [*remarks.values(), *found.failures]):
@@ -109,14 +151,19 @@ def evaluate(
 
 
 def write_reports(
-    run: str | Path, out: str | Path | None = None, metrics: Sequence[str] = METRICS_SHOWN,
-    rows: Sequence[str] | None = None, intervals: bool = False, size: tuple[float, float] | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    """Write summary.json, tables/ and figures/ of a run, by default into its folder, and return what tables show.
+    run: str | Path,
+    out: str | Path | None = None,
+    metrics: Sequence[str] = METRICS_SHOWN,
+    rows: Sequence[str] | None = None,
+    intervals: bool = False,
+    size: tuple[float, float] | None = None,
+) -> dict[str, Any]:
+    """Write summary.json, tables/ and figures/ of a run, by default into its folder, and return
+    what tables show.
 
-    `metrics` are the figures of the table of all rows, `rows` those of tables and figures, in order, by default all;
-    `intervals` puts intervals into LaTeX, `size` is that of figures (W, H) in inches. Tables of an earlier call which
-    have no rows now are removed.
+    `metrics` are the figures of the table of all rows, `rows` those of tables and figures, in
+    order, by default all; `intervals` puts intervals into LaTeX, `size` is that of figures (W, H)
+    in inches. Tables of an earlier call which have no rows now are removed.
     """
     from zsp_lite.benchmark import tables  # workers need no matplotlib
 
@@ -137,19 +184,33 @@ def _write_summary(run: Run, out: str | Path) -> dict[str, Any]:
 
 
 def evaluate_pairs(
-    out: str | Path, make: Callable[[int], execution.Evaluate], work: Mapping[Pair, list[str]], pool: Any, workers: int,
+    out: str | Path,
+    make: Callable[[int], execution.Evaluate],
+    work: Mapping[Pair, list[str]],
+    pool: Any,
+    workers: int,
     kind: type = ResultLine,
-) -> None:  # fmt: skip
-    """Evaluate the rows and pairs that a run lacks, and add what is found, lines of a `kind`, to it at once.
+) -> None:
+    """Evaluate the rows and pairs that a run lacks, and add what is found, lines of a `kind`, to it
+    at once.
 
     `make`, such as `pair_evaluator`, makes what evaluates a pair, from a number of threads.
     """
-    known = {(row, line.pair, line.repeat) for line in read_lines(out, kind) for row in line.results}
-    new = {pair: [name for name in names if (name, pair.key, pair.repeat) not in known] for pair, names in work.items()}
+    known = {
+        (row, line.pair, line.repeat) for line in read_lines(out, kind) for row in line.results
+    }
+    new = {
+        pair: [name for name in names if (name, pair.key, pair.repeat) not in known]
+        for pair, names in work.items()
+    }
     todo = {pair: names for pair, names in new.items() if names}
-    chunks = execution.make_chunks(todo, max(1, min(execution.CHUNK_SIZE, len(todo) // (4 * workers))))
+    chunks = execution.make_chunks(
+        todo, max(1, min(execution.CHUNK_SIZE, len(todo) // (4 * workers)))
+    )
     make = partial(make, max(1, get_num_threads() // workers))
-    shared = Path(out).resolve() / f".rows-{uuid4()}"  # for workers, which may have another current folder
+    shared = (
+        Path(out).resolve() / f".rows-{uuid4()}"
+    )  # for workers, which may have another current folder
     quiet = not logger.isEnabledFor(logging.INFO)
     look = {"unit": "pair", "delay": 1, "disable": quiet or None}  # None: hidden outside a terminal
     with (
@@ -164,7 +225,8 @@ def evaluate_pairs(
 def pairs_of_rows(
     dataset: Co3D, rows: Mapping[str, Method], numbers: Mapping[str, int], targets: int
 ) -> dict[Pair, list[str]]:
-    """Return the pairs, each with the rows that are evaluated on it: the same for all rows of as many target views."""
+    """Return the pairs, each with the rows that are evaluated on it: the same for all rows of as
+    many target views."""
     work: dict[Pair, list[str]] = {}
     for n_targets in {row.targets or targets for row in rows.values()}:
         names = [name for name, row in rows.items() if (row.targets or targets) == n_targets]
@@ -177,30 +239,46 @@ def pairs_of_rows(
 def _labels(dataset: Co3D, category: str) -> str:
     """Hash of the pose labels of a category."""
     labels = read_labels(dataset.root, category).items()
-    return digest(*(part for name, label in labels for part in (name, label.trans.tobytes(), label.reference_seq)))
+    return digest(
+        *(
+            part
+            for name, label in labels
+            for part in (name, label.trans.tobytes(), label.reference_seq)
+        )
+    )
 
 
-def pair_evaluator(root: str, methods: Mapping[str, Method], backbone: Any, threads: int) -> execution.Evaluate:
-    """Make what evaluates pairs in one process; frames, and features by some `threads`, are kept from pair to pair."""
+def pair_evaluator(
+    root: str, methods: Mapping[str, Method], backbone: Any, threads: int
+) -> execution.Evaluate:
+    """Make what evaluates pairs in one process; frames, and features by some `threads`, are kept
+    from pair to pair."""
     store = FrameStore(Co3D(root), make_extractors(as_backbone(backbone), methods), threads)
     return lambda pair, names: evaluate_pair(pair, {name: methods[name] for name in names}, store)
 
 
 def evaluate_pair(pair: Pair, methods: Mapping[str, Method], store: FrameStore) -> dict[str, Any]:
-    """Evaluate rows on a pair: a line of the run's results (see `runs.ResultLine`), with median seconds by stage."""
+    """Evaluate rows on a pair: a line of the run's results (see `runs.ResultLine`), with median
+    seconds by stage."""
     store.timings.clear()
     problem = PairProblem(pair, store, {method.features for method in methods.values()} - {"none"})
     for sequence in (pair.reference_sequence, pair.target_sequence):
         store.extent(pair.category, sequence)  # an unreadable point cloud is no failure of a row
     labels = store.labels(pair.category)
     # Ground truth from the reference's camera to each target's.
-    truths = np.stack([true_pose(store.dataset, labels, pair, view) for view in range(len(pair.target_frames))])
+    truths = np.stack(
+        [true_pose(store.dataset, labels, pair, view) for view in range(len(pair.target_frames))]
+    )
     results = {name: _evaluate(name, method, problem, truths) for name, method in methods.items()}
-    timings = {stage: round(float(np.median(seconds)), 5) for stage, seconds in store.timings.items()}
+    timings = {
+        stage: round(float(np.median(seconds)), 5) for stage, seconds in store.timings.items()
+    }
     return {"pair": pair.key, "results": results, "repeat": pair.repeat, "timings": timings}
 
 
-def _evaluate(name: str, method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]) -> dict[str, Any]:
+def _evaluate(
+    name: str, method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]
+) -> dict[str, Any]:
     own = is_own(name) and type(method.solve) is not StoredPoses
     seen = given(method.solve, problem) if own and method.solve else problem
     start = time.perf_counter()
@@ -209,24 +287,41 @@ def _evaluate(name: str, method: Method, problem: PairProblem, truths: Float[np.
             solve = seeded(method.solve, problem.seed)
             answer = as_answer(solve(seen)) if solve else _answer(method, problem, truths)
             if not 0 <= answer.view < len(truths):
-                raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
-            result = {"seconds": time.perf_counter() - start} | _measure(answer, problem, truths[answer.view])
+                raise InputError(
+                    f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}"
+                )
+            result = {"seconds": time.perf_counter() - start} | _measure(
+                answer, problem, truths[answer.view]
+            )
             line = {"pair": problem.pair.key, "results": {name: result}}
-            msgspec.json.encode(msgspec.convert(line, ResultLine))  # refuses what could not be stored
-    except InputError as error:  # there is no pose: without these pairs, methods that fail often would look better
+            msgspec.json.encode(
+                msgspec.convert(line, ResultLine)
+            )  # refuses what could not be stored
+    except (
+        InputError
+    ) as error:  # there is no pose: without these pairs, methods that fail often would look better
         return {"error": 180.0, "failed": str(error).encode(errors="replace").decode()}
-    return {name: round(value, 4) if isinstance(value, float) else value for name, value in result.items()}
+    return {
+        name: round(value, 4) if isinstance(value, float) else value
+        for name, value in result.items()
+    }
 
 
-def _measure(answer: Answer, problem: PairProblem, truth: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
+def _measure(
+    answer: Answer, problem: PairProblem, truth: Float[np.ndarray, "4 4"]
+) -> dict[str, Any]:
     """Measure an answer: "error", and what is known of the other members of a stored result."""
-    known = {name: getattr(answer, name) for name in ("view", "note", "scale", "inliers", "confidence")}
+    known = {
+        name: getattr(answer, name) for name in ("view", "note", "scale", "inliers", "confidence")
+    }
     known["note"] = answer.note[:1000]
     known["error"] = rotation_error(answer.rotation, truth[:3, :3])
     known["rotation"] = answer.rotation.ravel().round(6).tolist()
     reference, *targets = (frame.camera for frame in problem.frames())
     names = problem.pair.reference_sequence, problem.pair.target_sequence
-    if (turns := common_turns(problem.store.dataset.root, problem.pair.category, *names)) is not None:
+    if (
+        turns := common_turns(problem.store.dataset.root, problem.pair.category, *names)
+    ) is not None:
         to_camera = targets[answer.view].R
         turned = to_camera @ turns @ to_camera.T @ truth[:3, :3]
         known["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
@@ -237,8 +332,13 @@ def _measure(answer: Answer, problem: PairProblem, truth: Float[np.ndarray, "4 4
         (first, _), (_, diameter) = ends
         centre, scale = reference.to_camera(first), 1.0 if answer.scale is None else answer.scale
         found = scale * answer.rotation @ centre + answer.translation
-        known["translation"] = np.linalg.norm(found - truth[:3, :3] @ centre - truth[:3, 3]) / diameter
-    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in known.items()}
+        known["translation"] = (
+            np.linalg.norm(found - truth[:3, :3] @ centre - truth[:3, 3]) / diameter
+        )
+    plain = {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in known.items()
+    }
     return {name: value for name, value in plain.items() if value is not None}
 
 
@@ -246,7 +346,9 @@ def _answer(method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4
     """Answer of a row that is the paper's method with other settings."""
     if method.answer == "true view":
         nearest = int(rotation_error(np.eye(3), truths[:, :3, :3]).argmin())
-        return replace(as_answer(problem.estimate(method.features, method.settings, nearest)), view=nearest)
+        return replace(
+            as_answer(problem.estimate(method.features, method.settings, nearest)), view=nearest
+        )
     estimate = problem.estimate(method.features, method.settings)
     answer = as_answer(estimate)
     reference, target = estimate.reference_view, estimate.target_views[estimate.view]

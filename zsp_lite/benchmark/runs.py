@@ -1,7 +1,8 @@
 """A run: its folder, to which results are only ever added, and what it found as one table.
 
-run.json holds what decides the results, and every call of `evaluate`. A line of run.jsonl, or of run.jsonl.gz, is what
-`evaluate_pair` returned for a pair. One process writes to a folder; others can read it meanwhile.
+run.json holds what decides the results, and every call of `evaluate`. A line of run.jsonl, or of
+run.jsonl.gz, is what `evaluate_pair` returned for a pair. One process writes to a folder; others
+can read it meanwhile.
 """
 
 import os
@@ -48,7 +49,9 @@ class Settings(msgspec.Struct):
     data: str
     backbone: str  # fingerprint
     targets: int
-    library: Annotated[list[dict[str, str | None]], msgspec.Meta(min_length=1)]  # version and commit
+    library: Annotated[
+        list[dict[str, str | None]], msgspec.Meta(min_length=1)
+    ]  # version and commit
     methods: dict[str, str]  # description by row
     labels: dict[str, str]  # hash of the pose labels by category
     calls: Annotated[list[Call], msgspec.Meta(min_length=1)]
@@ -56,7 +59,8 @@ class Settings(msgspec.Struct):
 
 
 class _Result(msgspec.Struct):
-    """What a row found for a pair (see `evaluate_pair`); other members are not part of the table."""
+    """What a row found for a pair (see `evaluate_pair`); other members are not part of the
+    table."""
 
     error: _Degrees
     confidence: Annotated[float, msgspec.Meta(ge=0, le=1)] | None = None
@@ -64,8 +68,12 @@ class _Result(msgspec.Struct):
     translation: float | None = None  # error of the object's centre in diameters of the target
     scale: float | None = None  # estimated over labelled, which is 1
     view: int | None = None
-    rotation: Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)] | None = None  # row by row
-    position: Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)] | None = None  # the pose's translation
+    rotation: Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)] | None = (
+        None  # row by row
+    )
+    position: Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)] | None = (
+        None  # the pose's translation
+    )
     inliers: int | None = None
     seconds: float | None = None
     note: str = ""
@@ -81,12 +89,13 @@ class ResultLine(msgspec.Struct):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Results of a run on the pairs that the rows of the last call have finished (see `read_run`)."""
+    """Results of a run on the pairs that the rows of the last call have finished (see
+    `read_run`)."""
 
     settings: Settings
-    # A line for each row, pair and seed, in this order: "row", "category", "pair" (its key), "repeat" (of the seed),
-    # "problem" (the key without target frames), "reference" and "target" (the objects, CATEGORY/SEQUENCE), the
-    # members of `_Result`, and "milliseconds".
+    # A line for each row, pair and seed, in this order: "row", "category", "pair" (its key),
+    # "repeat" (of the seed), "problem" (the key without target frames), "reference" and "target"
+    # (the objects, CATEGORY/SEQUENCE), the members of `_Result`, and "milliseconds".
     table: pd.DataFrame
     timings: Mapping[str, float]  # median seconds by stage
     note: str = ""  # what is missing
@@ -97,10 +106,18 @@ class Run:
         # A backbone's fingerprint is its name and a hash.
         backbone = self.settings.backbone.rpartition(" ")[0] or self.settings.backbone
         data = {"root": self.settings.data, "categories": list(self.table["category"].unique())}
-        data |= {"pairs": int(self.table.groupby("row")["pair"].nunique().max()), "targets": self.settings.targets}
+        data |= {
+            "pairs": int(self.table.groupby("row")["pair"].nunique().max()),
+            "targets": self.settings.targets,
+        }
         notes = " ".join(filter(None, [self.note, *self.failures]))
         note = {"note": notes} if notes else {}
-        return {"data": data, "backbone": backbone} | note | summarise(self.table) | {"timings": dict(self.timings)}
+        return (
+            {"data": data, "backbone": backbone}
+            | note
+            | summarise(self.table)
+            | {"timings": dict(self.timings)}
+        )
 
     @cached_property
     def failures(self) -> list[str]:
@@ -108,7 +125,10 @@ class Run:
         failed = self.table[self.table["failed"] != ""].groupby("row", sort=False)
         counts, pairs = failed["pair"].nunique(), self.table.groupby("row")["pair"].nunique()
         return [
-            f"{name} failed on {counts[name]} of {pairs[name]} pairs, counted as 180°; the first: {reason}."
+            (
+                f"{name} failed on {counts[name]} of {pairs[name]} pairs, counted as 180°; the "
+                f"first: {reason}."
+            )
             for name, reason in failed["failed"].first().items()
         ]
 
@@ -116,24 +136,36 @@ class Run:
         """Return the table's lines of a row by pair key; InputError for an unknown row."""
         found = self.table[self.table["row"] == name]
         if found.empty:
-            raise InputError(f"row {name!r} is not in the run, expected one of {', '.join(self.table['row'].unique())}")
+            raise InputError(
+                f"row {name!r} is not in the run, expected one of "
+                f"{', '.join(self.table['row'].unique())}"
+            )
         return found.set_index("pair")
 
     def poses(
         self, name: str
-    ) -> tuple[list[Pair], Int[np.ndarray, " n"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
-        """Return the pairs for which a row has a pose, the target views, the rotations and the translations, or NaN."""
+    ) -> tuple[
+        list[Pair], Int[np.ndarray, " n"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]
+    ]:
+        """Return the pairs for which a row has a pose, the target views, the rotations and the
+        translations, or NaN."""
         found = self.row(name).dropna(subset=["rotation", "view"])
         if found.empty:
             raise InputError(f"row {name!r} has no poses in the run")
         rotations = np.array(found["rotation"].tolist()).reshape(-1, 3, 3)
         positions = np.array([position or [np.nan] * 3 for position in found["position"]])
-        return [Pair.from_key(key) for key in found.index], found["view"].to_numpy(int), rotations, positions
+        return (
+            [Pair.from_key(key) for key in found.index],
+            found["view"].to_numpy(int),
+            rotations,
+            positions,
+        )
 
 
 @contextmanager
 def open_run(out: str | Path, settings: Settings) -> Iterator[None]:
-    """Be the only writer of a run's folder, which is new or holds a run with these settings; then `add_lines` adds."""
+    """Be the only writer of a run's folder, which is new or holds a run with these settings; then
+    `add_lines` adds."""
     with writing(out):
         out, packed = Path(out), Path(out) / f"{LINES}.gz"
         settings.folder = os.path.realpath(settings.data).encode(errors="replace").decode()
@@ -153,13 +185,15 @@ def _write_settings(out: Path, settings: Settings) -> None:
 
 
 def _continued(out: Path, now: Settings) -> Settings:
-    """Merge settings with those of the run that a folder holds; InputError if they do not go together."""
+    """Merge settings with those of the run that a folder holds; InputError if they do not go
+    together."""
     before = read_json(out / SETTINGS, Settings, "settings of a run")
     held, asked = _compared(before), _compared(now)
     for name in asked:
         if held.get(name, asked[name]) != asked[name]:
             raise InputError(
-                f"{out} holds a run with {name} {held[name]}, this is {asked[name]}; choose another folder"
+                f"{out} holds a run with {name} {held[name]}, this is {asked[name]}; choose "
+                "another folder"
             )
     merged = {name: getattr(before, name) | getattr(now, name) for name in ("methods", "labels")}
     library = [*(one for one in before.library if one != now.library[0]), *now.library]
@@ -169,7 +203,9 @@ def _continued(out: Path, now: Settings) -> Settings:
 def _compared(settings: Settings) -> dict[str, Any]:
     """What has to be equal in two calls that add to one run, where both have it, by its name."""
     groups = {name: getattr(settings, name) for name in ("methods", "labels")}
-    parts = {f"{name} of {key}": value for name, group in groups.items() for key, value in group.items()}
+    parts = {
+        f"{name} of {key}": value for name, group in groups.items() for key, value in group.items()
+    }
     whole = {name: getattr(settings, name) for name in ("backbone", "targets")}
     whole["data"] = settings.folder or os.path.realpath(settings.data)
     command = "align" if "alignment" in settings.methods else "benchmark"
@@ -183,18 +219,26 @@ def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]], kind: type = 
         msgspec.convert(lines, list[kind])
         with open(Path(out) / LINES, "ab") as file:
             file.write(msgspec.json.Encoder().encode_lines(lines))
-    except (OSError, ValueError, msgspec.ValidationError) as error:  # ValueError: a text that is not Unicode
+    except (
+        OSError,
+        ValueError,
+        msgspec.ValidationError,
+    ) as error:  # ValueError: a text that is not Unicode
         raise InputError(f"{Path(out) / LINES} cannot be written: {error}") from error
 
 
 def read_lines(out: str | Path, kind: type = ResultLine) -> list[Any]:
     """Read the results of the finished pairs of a run's folder, lines of a `kind`."""
     lines = enumerate(_finished_lines(Path(out)).splitlines(), 1)
-    return [decode_json(text, kind, f"results of a run in {out}, line {number}") for number, text in lines]
+    return [
+        decode_json(text, kind, f"results of a run in {out}, line {number}")
+        for number, text in lines
+    ]
 
 
 def _finished_lines(out: Path) -> bytes:
-    """Read run.jsonl, or run.jsonl.gz, up to its last line that was written to the end; b"" without these."""
+    """Read run.jsonl, or run.jsonl.gz, up to its last line that was written to the end; b"" without
+    these."""
     path, packed, what = out / LINES, out / f"{LINES}.gz", "results of a run"
     data = read_bytes(path, what) if path.exists() else b""
     if packed.exists():
@@ -205,10 +249,14 @@ def _finished_lines(out: Path) -> bytes:
 def read_run(out: str | Path) -> Run:
     """Read a run from its folder, also where it was interrupted.
 
-    Shown are the pairs that all rows of the last call have finished, and all rows of the folder that have these pairs.
-    Pairs of different numbers of target views are the same if they are the same "problem".
+    Shown are the pairs that all rows of the last call have finished, and all rows of the folder
+    that have these pairs. Pairs of different numbers of target views are the same if they are the
+    same "problem".
     """
-    settings, lines = read_json(Path(out) / SETTINGS, Settings, "settings of a run"), read_lines(out)
+    settings, lines = (
+        read_json(Path(out) / SETTINGS, Settings, "settings of a run"),
+        read_lines(out),
+    )
     table, last = _finished(_table(lines, settings), settings), settings.calls[-1]
     if table.empty:
         raise InputError(f"{out}: the run has no pair that all its rows have finished")
@@ -221,7 +269,12 @@ def read_run(out: str | Path) -> Run:
         notes.append("Evaluated by several versions of zsp-lite (run.json lists them).")
     if hidden := [name for name in settings.methods if name not in rows]:
         notes.append(f"Without {', '.join(hidden)}, which lack pairs of the last call.")
-    remarks = {name: remark for call in settings.calls for name, remark in call.remarks.items() if name in rows}
+    remarks = {
+        name: remark
+        for call in settings.calls
+        for name, remark in call.remarks.items()
+        if name in rows
+    }
     return Run(settings, table, timings, " ".join(filter(None, [*notes, *remarks.values()])))
 
 
@@ -229,8 +282,9 @@ def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
     """Tabulate the results in the categories of the last call, by row, category and pair."""
     results = [
         {"row": row, "pair": line.pair, "repeat": line.repeat} | msgspec.structs.asdict(one)
-        for line in lines for row, one in line.results.items()
-    ]  # fmt: skip
+        for line in lines
+        for row, one in line.results.items()
+    ]
     table = pd.DataFrame(results, columns=["row", "pair", "repeat", *_Result.__struct_fields__])
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
     table["milliseconds"] = 1000 * table["seconds"].astype(float)
@@ -244,7 +298,8 @@ def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
 
 
 def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
-    """Keep the pairs that all rows of the last call have finished, and the rows, by seed, that have all of these."""
+    """Keep the pairs that all rows of the last call have finished, and the rows, by seed, that have
+    all of these."""
     views = table["pair"].str.count(",")  # one less than the target views
     finished = {}  # by number of views
     for number, found in table[table["row"].isin(settings.calls[-1].rows)].groupby(views):

@@ -1,8 +1,9 @@
-"""The paper's tables from the summary of a run, with intervals, and the published results in columns of their own;
-the comparison of two runs; and the figures of a run.
+"""The paper's tables from the summary of a run, with intervals, and the published results in
+columns of their own; the comparison of two runs; and the figures of a run.
 
-Medians are means of the categories' medians, as in the paper; accuracies are over all pairs. `paper_tables.json` has
-the rows of each table, and what the paper published for CO3D (20 categories with 100 pairs each) with DINO ViT-S/8.
+Medians are means of the categories' medians, as in the paper; accuracies are over all pairs.
+`paper_tables.json` has the rows of each table, and what the paper published for CO3D (20 categories
+with 100 pairs each) with DINO ViT-S/8.
 """
 
 import re
@@ -28,12 +29,21 @@ from zsp_lite.errors import InputError
 from zsp_lite.io.files import write_atomic
 from zsp_lite.metrics import accuracy, median
 from zsp_lite.views import object_crop
-from zsp_lite.viz.plots import COLOURS, draw_moved_cloud, frame_cloud, pale, show_dots, show_images, show_panels
+from zsp_lite.viz.plots import (
+    COLOURS,
+    draw_moved_cloud,
+    frame_cloud,
+    pale,
+    show_dots,
+    show_images,
+    show_panels,
+)
 
 PAPER = METRICS_SHOWN[:3]
 PUBLISHED = "paper, CO3D"
 _PUBLISHED_NOTE = "Figures of the paper: other data (CO3D) and another backbone (DINO ViT-S/8)."
-# Rows that see more than the pair, in tables of their own: by the name of the table its title and rows.
+# Rows that see more than the pair, in tables of their own: by the name of the table its title and
+# rows.
 SEE_MORE = {
     "with_scans": ("With several frames of the reference object", GROUPS["scans"]),
     "with_others": ("With other unlabelled objects of the category", ["category"]),
@@ -81,16 +91,23 @@ class Table:
 
 
 def choose(run: Run, rows: Sequence[str]) -> dict[str, Any]:
-    """Return the summary of a run with some rows, in this order, for the tables; InputError for an unknown row."""
+    """Return the summary of a run with some rows, in this order, for the tables; InputError for an
+    unknown row."""
     for name in rows:
         run.row(name)
-    return run.summary | {"methods": {name: run.summary["methods"][name] for name in rows}, "chosen": list(rows)}
+    return run.summary | {
+        "methods": {name: run.summary["methods"][name] for name in rows},
+        "chosen": list(rows),
+    }
 
 
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
-    """Return all tables of a run; `metrics` are the figures of the table of all rows (see `METRICS`)."""
+    """Return all tables of a run; `metrics` are the figures of the table of all rows (see
+    `METRICS`)."""
     times = summary["milliseconds"]
-    methods = {name: row | {"milliseconds": times.get(name)} for name, row in summary["methods"].items()}
+    methods = {
+        name: row | {"milliseconds": times.get(name)} for name, row in summary["methods"].items()
+    }
     summary = {**summary, "methods": methods}
     first = (all_rows(summary, metrics, name) for name in ("all_rows", *SEE_MORE))
     shown = *PAPER, *(metric for metric in metrics if metric == "milliseconds")
@@ -98,10 +115,17 @@ def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHO
     return [table for table in tables if table.cells.size]
 
 
-def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN, table: str = "all_rows") -> Table:
-    """Return every row that sees the pair only, or those of a table of `SEE_MORE` below "verified", which does, too."""
+def all_rows(
+    summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN, table: str = "all_rows"
+) -> Table:
+    """Return every row that sees the pair only, or those of a table of `SEE_MORE` below "verified",
+    which does, too."""
     title, members = SEE_MORE.get(table, ("All rows", []))
-    names = [name for name in summary["methods"] if base_name(name) in members or not members and not _sees_more(name)]
+    names = [
+        name
+        for name in summary["methods"]
+        if base_name(name) in members or not members and not _sees_more(name)
+    ]
     if members and names:  # what they add to
         names = [*(name for name in summary["methods"] if name == "verified"), *names]
     rows = {}
@@ -111,42 +135,72 @@ def all_rows(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN,
         difference = _difference(summary.get("against", {}).get(name))
         rows[name] = [pairs, *(_cell(row, metric) for metric in metrics), failed, *difference]
     titles = ["pairs", *(METRICS[name] for name in metrics), "failed", "Acc30 − ours", "p"]
-    gain = 'Acc30 − ours: difference to "ours" on the same pairs, in points, and its p value by the same bootstrap.'
+    gain = (
+        'Acc30 − ours: difference to "ours" on the same pairs, in points, and its p value by the '
+        "same bootstrap."
+    )
     return _table(summary, table, title, rows, titles, metrics, gain)
 
 
 def paper_tables(summary: Mapping[str, Any], metrics: Sequence[str] = PAPER) -> list[Table]:
-    """Return tables 1 to 3, those of the supplement and more, where the run has two of their rows."""
+    """Return tables 1 to 3, those of the supplement and more, where the run has two of
+    their rows."""
     tables = [_paper_table(spec, summary, metrics) for spec in read_paper_tables()]
     return [table for table in tables if table.cells[METRICS["acc30"]].count() > 1]
 
 
-def _paper_table(spec: Mapping[str, Any], summary: Mapping[str, Any], metrics: Sequence[str]) -> Table:
-    """A table with the run's rows, the published figures, and in Table 1, rows of one's own below the paper's."""
-    categories, methods, views = summary["data"]["categories"], summary["methods"], f"-n{summary['data']['targets']}"
-    lines = [(one["row"] if one["row"] in methods else one["row"].removesuffix(views), one) for one in spec["rows"]]
+def _paper_table(
+    spec: Mapping[str, Any], summary: Mapping[str, Any], metrics: Sequence[str]
+) -> Table:
+    """A table with the run's rows, the published figures, and in Table 1, rows of one's own below
+    the paper's."""
+    categories, methods, views = (
+        summary["data"]["categories"],
+        summary["methods"],
+        f"-n{summary['data']['targets']}",
+    )
+    lines = [
+        (one["row"] if one["row"] in methods else one["row"].removesuffix(views), one)
+        for one in spec["rows"]
+    ]
     if spec["name"] == "table_1":
         lines += [(name, {"label": name, "published": []}) for name in own_rows(summary)]
     if chosen := summary.get("chosen"):
-        lines = sorted((line for line in lines if line[0] in chosen), key=lambda line: chosen.index(line[0]))
+        lines = sorted(
+            (line for line in lines if line[0] in chosen), key=lambda line: chosen.index(line[0])
+        )
     # Of the single categories with a published Acc30, those of the run are shown.
     names = [title.removesuffix(" Acc30") for title in spec["published"]]
-    kept = [k for k, (name, title) in enumerate(zip(names, spec["published"])) if name in (title, *categories)]
+    kept = [
+        k
+        for k, (name, title) in enumerate(zip(names, spec["published"]))
+        if name in (title, *categories)
+    ]
     featured = [names[k] for k in kept if names[k] in categories]
-    titles = [*(METRICS[metric] for metric in metrics), *(f"{category} Acc30" for category in featured)]
+    titles = [
+        *(METRICS[metric] for metric in metrics),
+        *(f"{category} Acc30" for category in featured),
+    ]
     rows = {}
     for name, line in lines:
         row = methods.get(name)
         cells = [_cell(row, metric) for metric in metrics]
-        cells += [_cell(row and row["per_category"].get(category), "acc30") for category in featured]
-        rows[line["label"]] = cells + [Cell(line["published"][k]) if line["published"] else None for k in kept]
+        cells += [
+            _cell(row and row["per_category"].get(category), "acc30") for category in featured
+        ]
+        rows[line["label"]] = cells + [
+            Cell(line["published"][k]) if line["published"] else None for k in kept
+        ]
     titles += [f"{PUBLISHED}: {spec['published'][k]}" for k in kept]
     notes = _PUBLISHED_NOTE if kept else "", spec.get("note", "")
     return _table(summary, spec["name"], spec["title"], rows, titles, metrics, *notes)
 
 
-def by_category(summary: Mapping[str, Any], metric: str = "acc30", most: int | None = None) -> Table:
-    """Return a figure of the first `most` rows, or of all, with a line for each category and one for all pairs."""
+def by_category(
+    summary: Mapping[str, Any], metric: str = "acc30", most: int | None = None
+) -> Table:
+    """Return a figure of the first `most` rows, or of all, with a line for each category and one
+    for all pairs."""
     methods = {name: summary["methods"][name] for name in important_rows(summary)[:most]}
     rows = {
         category: [_cell(row["per_category"].get(category), metric) for row in methods.values()]
@@ -157,24 +211,32 @@ def by_category(summary: Mapping[str, Any], metric: str = "acc30", most: int | N
     return _table(summary, name, title, rows, list(methods), [metric], across=True)
 
 
-def compare(first: Run, second: Run, rows: Sequence[str] | None = None, names: Sequence[str] = "AB") -> Table:
-    """Compare rows of two runs, by default every row that both have, on the pairs that both have evaluated.
+def compare(
+    first: Run, second: Run, rows: Sequence[str] | None = None, names: Sequence[str] = "AB"
+) -> Table:
+    """Compare rows of two runs, by default every row that both have, on the pairs that both have
+    evaluated.
 
-    Rows are texts "A:B", for row A of the first and B of the second run, or "A"; `names` are those of the runs.
-    InputError if a row or a common pair is missing.
+    Rows are texts "A:B", for row A of the first and B of the second run, or "A"; `names` are those
+    of the runs. InputError if a row or a common pair is missing.
     """
     of_first, of_second = (run.table["row"].unique() for run in (first, second))
     rows, cells = [name for name in of_first if name in of_second] if rows is None else rows, {}
     if not len(rows):
-        raise InputError(f"runs have no row in common: {', '.join(of_first)} and {', '.join(of_second)}")
+        raise InputError(
+            f"runs have no row in common: {', '.join(of_first)} and {', '.join(of_second)}"
+        )
     for text in rows:
         one, _, other = (text, "", text) if text in of_first else text.partition(":")
         lines = (
-            run.row(name).set_index("repeat", append=True, drop=False) for run, name in ((first, one), (second, other))
+            run.row(name).set_index("repeat", append=True, drop=False)
+            for run, name in ((first, one), (second, other))
         )
         both = next(lines).join(next(lines)["error"].rename("other"), how="inner").sort_index()
         if both.empty:
-            raise InputError(f"rows {one} and {other} have no pair in common: other data or number of views")
+            raise InputError(
+                f"rows {one} and {other} have no pair in common: other data or number of views"
+            )
         errors = both[["error", "other"]].to_numpy().T
         figures = [Cell(len(both), decimals=0), *map(Cell, accuracy(errors, 30))]
         difference = _difference(paired_difference(*errors, weights=draws_of(both)))
@@ -191,7 +253,9 @@ def _difference(test: Mapping[str, Any] | None) -> tuple[Cell | None, Cell | Non
     """The gain and the p value of a `paired_difference`."""
     if test is None:
         return None, None
-    return Cell(test["accuracy_gain"], *test["accuracy_gain_ci"]), Cell(test["accuracy_gain_p"], decimals=3)
+    return Cell(test["accuracy_gain"], *test["accuracy_gain_ci"]), Cell(
+        test["accuracy_gain_p"], decimals=3
+    )
 
 
 def own_rows(summary: Mapping[str, Any]) -> list[str]:
@@ -200,12 +264,16 @@ def own_rows(summary: Mapping[str, Any]) -> list[str]:
 
 
 def important_rows(summary: Mapping[str, Any]) -> list[str]:
-    """List the rows of a run that see the pair only, or all if none does, "ours" and one's own first; or the chosen."""
+    """List the rows of a run that see the pair only, or all if none does, "ours" and one's own
+    first; or the chosen."""
     if "chosen" in summary:
         return summary["chosen"]
     first = ["ours", *own_rows(summary), "ours-bv", "verified"]
     names = [name for name in summary["methods"] if not _sees_more(name)]
-    return sorted(names or summary["methods"], key=lambda name: first.index(name) if name in first else len(first))
+    return sorted(
+        names or summary["methods"],
+        key=lambda name: first.index(name) if name in first else len(first),
+    )
 
 
 def _sees_more(name: str) -> bool:
@@ -223,9 +291,15 @@ def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:
 
 
 def _table(
-    summary: Mapping[str, Any], name: str, title: str, rows: Mapping[str, Sequence[Cell | None]],
-    titles: Sequence[str], metrics: Sequence[str], *more: str, across: bool = False,
-) -> Table:  # fmt: skip
+    summary: Mapping[str, Any],
+    name: str,
+    title: str,
+    rows: Mapping[str, Sequence[Cell | None]],
+    titles: Sequence[str],
+    metrics: Sequence[str],
+    *more: str,
+    across: bool = False,
+) -> Table:
     """Make a table of a run, with notes on how to read it, and with what the run has evaluated."""
     data, notes = summary["data"], [summary.get("note", "")]
     if "mean_category_median" in metrics:
@@ -233,24 +307,41 @@ def _table(
     if {"translation", "scale"} & set(metrics):
         notes.append("Translation and scale: medians of the pairs for which a row has them.")
     if any("@threshold=" in name for name in summary["methods"]):
-        notes.append("A threshold is to be chosen on validation categories, never on those that are evaluated.")
+        notes.append(
+            "A threshold is to be chosen on validation categories, never on those that are "
+            "evaluated."
+        )
     if "milliseconds" in metrics:
-        notes.append("ms per pair: median; what rows share, such as features, counts for the first that needs it.")
+        notes.append(
+            "ms per pair: median; what rows share, such as features, counts for the first "
+            "that needs it."
+        )
     notes += ["Intervals: 95 %, bootstrap over objects.", *_note_on_seeds(summary), *more]
-    pairs = f"{data['pairs']} pairs" + (" of an unfinished run" if "Not finished" in notes[0] else "")
-    what = f"{Path(data['root']).name}, {pairs}, {data['targets']} target views, backbone {summary['backbone']}"
+    pairs = f"{data['pairs']} pairs" + (
+        " of an unfinished run" if "Not finished" in notes[0] else ""
+    )
+    what = (
+        f"{Path(data['root']).name}, {pairs}, {data['targets']} target views, backbone "
+        f"{summary['backbone']}"
+    )
     cells = pd.DataFrame.from_dict(rows, "index", object, titles)
     return Table(name, title, cells, " ".join(filter(None, notes)), what, across)
 
 
 def _note_on_seeds(summary: Mapping[str, Any]) -> list[str]:
-    """Say how much the draws of k-means and RANSAC alone change Acc30, if there are several of each pair."""
-    spread = {name: row["acc30_sd_of_seeds"] for name, row in summary["methods"].items() if "acc30_sd_of_seeds" in row}
+    """Say how much the draws of k-means and RANSAC alone change Acc30, if there are several of each
+    pair."""
+    spread = {
+        name: row["acc30_sd_of_seeds"]
+        for name, row in summary["methods"].items()
+        if "acc30_sd_of_seeds" in row
+    }
     if not spread:
         return []
     name = "ours" if "ours" in spread else next(iter(spread))
     return [
-        f"Means over seeds, which the intervals hold; by seed, Acc30 of {name} has a standard deviation of "
+        f"Means over seeds, which the intervals hold; by seed, Acc30 of {name} has a standard "
+        "deviation of "
         f"{spread[name]:.1f} points."
     ]
 
@@ -259,16 +350,21 @@ def as_csv(table: Table) -> str:
     """Format as plain numbers, an interval in two columns of its own."""
     columns = {
         f"{title} {part}".removesuffix(" value"): [getattr(cell, part, None) for cell in cells]
-        for title, cells in table.cells.items() for part in ("value", "low", "high")
-    }  # fmt: skip
+        for title, cells in table.cells.items()
+        for part in ("value", "low", "high")
+    }
     numbers = pd.DataFrame(columns, table.cells.index).dropna(axis="columns", how="all")
     return numbers.to_csv(index_label="row", float_format="%.6g")
 
 
 def as_markdown(table: Table) -> str:
     """Format as a pipe table under its title."""
-    text = table.text.rename(**dict.fromkeys(("index", "columns"), lambda name: name.replace("|", "\\|")))
-    lines = text.to_markdown(disable_numparse=True, colalign=("left", *["right"] * len(text.columns)))
+    text = table.text.rename(
+        **dict.fromkeys(("index", "columns"), lambda name: name.replace("|", "\\|"))
+    )
+    lines = text.to_markdown(
+        disable_numparse=True, colalign=("left", *["right"] * len(text.columns))
+    )
     return "\n\n".join(filter(None, [f"**{table.title}**", lines, table.note])) + "\n"
 
 
@@ -278,23 +374,47 @@ def as_latex(table: Table, intervals: bool = False) -> str:
     The paper's figures of these columns follow in lines of their own.
     """
     time = METRICS["milliseconds"]
-    titles = [title for title in table.cells if title not in ("pairs", time)][:3] + [time] * (time in table.cells)
+    titles = [title for title in table.cells if title not in ("pairs", time)][:3] + [time] * (
+        time in table.cells
+    )
     shown = table.cells[titles].dropna(how="all")
-    texts, best = shown.map(_number, interval=intervals), shown.apply(_are_best, axis=int(table.across))
-    published = table.cells.reindex(columns=[f"{PUBLISHED}: {title}" for title in titles]).dropna(how="all")
-    published = published.set_axis(titles, axis="columns").rename(lambda label: f"{PUBLISHED}: {label}")
+    texts, best = (
+        shown.map(_number, interval=intervals),
+        shown.apply(_are_best, axis=int(table.across)),
+    )
+    published = table.cells.reindex(columns=[f"{PUBLISHED}: {title}" for title in titles]).dropna(
+        how="all"
+    )
+    published = published.set_axis(titles, axis="columns").rename(
+        lambda label: f"{PUBLISHED}: {label}"
+    )
     lines = pd.concat([texts.mask(best, r"\textbf{" + texts + "}"), published.map(_number)])
     lines = lines.rename(index=_escape, columns=_escape)
-    title = re.sub(r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title)  # LaTeX counts tables itself
-    caption = _escape(". ".join(filter(None, (title, table.data, _PUBLISHED_NOTE if len(published) else ""))))
+    title = re.sub(
+        r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title
+    )  # LaTeX counts tables itself
+    caption = _escape(
+        ". ".join(filter(None, (title, table.data, _PUBLISHED_NOTE if len(published) else "")))
+    )
     alignment = "l" + "r" * len(titles)
-    return lines.to_latex(position="tb", label=f"tab:{table.name}", caption=caption, column_format=alignment)
+    return lines.to_latex(
+        position="tb", label=f"tab:{table.name}", caption=caption, column_format=alignment
+    )
 
 
 def _are_best(cells: pd.Series) -> pd.Series:
-    """Tell which cells of one metric are the best, if there are rivals; a row that is told the true view is none."""
-    rivals = {name: cell for name, cell in cells.items() if cell and cell.metric and "oracle-view" not in name}
-    values = pd.Series({name: round(cell.value, cell.decimals) for name, cell in rivals.items()}, cells.index, float)
+    """Tell which cells of one metric are the best, if there are rivals; a row that is told the true
+    view is none."""
+    rivals = {
+        name: cell
+        for name, cell in cells.items()
+        if cell and cell.metric and "oracle-view" not in name
+    }
+    values = pd.Series(
+        {name: round(cell.value, cell.decimals) for name, cell in rivals.items()},
+        cells.index,
+        float,
+    )
     lowest = any(cell.metric in _LOWEST_IS_BEST for cell in rivals.values())
     return (values == (values.min() if lowest else values.max())) & (len(rivals) > 1)
 
@@ -309,47 +429,81 @@ def _number(cell: Any, interval: bool = False) -> str:
 def write_tables(tables: Iterable[Table], folder: str | Path, intervals: bool = False) -> None:
     """Write each table as NAME.csv, NAME.md and NAME.tex, this with `intervals` or without."""
     for table in tables:
-        texts = {".csv": as_csv(table), ".md": as_markdown(table), ".tex": as_latex(table, intervals)}
+        texts = {
+            ".csv": as_csv(table),
+            ".md": as_markdown(table),
+            ".tex": as_latex(table, intervals),
+        }
         for suffix, text in texts.items():
             write_atomic(Path(folder) / f"{table.name}{suffix}", text.encode())
 
 
 def error_distribution(run: Run, row: str = "ours") -> Figure:
-    """Draw the rotation error of every pair, one line per category (figure "err_distrib" of the supplement).
+    """Draw the rotation error of every pair, one line per category (figure "err_distrib" of the
+    supplement).
 
     A second cluster near 180 degrees consists of confusions of front and back.
     """
     groups = {str(name): errors for name, errors in run.row(row).groupby("category")["error"]}
-    labels = {"xlabel": f"rotation error of {row} (degrees)", "xlim": (-3, 183), "xticks": range(0, 181, 30)}
+    labels = {
+        "xlabel": f"rotation error of {row} (degrees)",
+        "xlim": (-3, 183),
+        "xticks": range(0, 181, 30),
+    }
     return show_dots({row: groups}, **labels)
 
 
 def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
-    """Draw the cumulative distribution of the errors, one line per row; by default of the most important rows."""
+    """Draw the cumulative distribution of the errors, one line per row; by default of the most
+    important rows."""
     curves = {}
     for name in rows or important_rows(run.summary)[: len(COLOURS)]:
         errors = np.sort(run.row(name)["error"])
         shares = 100 * np.arange(len(errors) + 1) / len(errors)
-        curves[name] = np.repeat([0, *errors], 2)[1:], np.repeat(shares, 2)[:-1]  # a step at every error
+        curves[name] = (
+            np.repeat([0, *errors], 2)[1:],
+            np.repeat(shares, 2)[:-1],
+        )  # a step at every error
     labels = {"xlabel": "rotation error (degrees)", "ylabel": "pairs with at most this error (%)"}
     labels |= {"xlim": (0, 180), "ylim": (0, 100), "xticks": (0, 15, 30, 60, 90, 120, 150, 180)}
     return show_panels({"": curves}, size=(6.5, 4), **labels)
 
 
 def pair_figure(run: Run, key: str, dataset: Co3D, rows: Sequence[str] | None = None) -> Figure:
-    """Draw the reference of a pair, and for each row with a pose its target view, below it under the moved points.
+    """Draw the reference of a pair, and for each row with a pose its target view, below it under
+    the moved points.
 
-    Without a translation, they are moved to the middle of the target's points. InputError if no row has a pose.
+    Without a translation, they are moved to the middle of the target's points. InputError if no row
+    has a pose.
     """
-    stored = {name: run.row(name).dropna(subset=["rotation", "view"]) for name in rows or run.table["row"].unique()}
-    found = {name: row.loc[[key]].iloc[0] for name, row in stored.items() if key in row.index}  # of the first seed
+    stored = {
+        name: run.row(name).dropna(subset=["rotation", "view"])
+        for name in rows or run.table["row"].unique()
+    }
+    found = {
+        name: row.loc[[key]].iloc[0] for name, row in stored.items() if key in row.index
+    }  # of the first seed
     if not found:
-        raise InputError(f"pair {key!r} has no pose in the run, expected a key such as {run.table['pair'].iloc[0]}")
+        raise InputError(
+            f"pair {key!r} has no pose in the run, expected a key such as "
+            f"{run.table['pair'].iloc[0]}"
+        )
     reference, targets = dataset.load_pair(Pair.from_key(key))
-    crops = [object_crop(reference), *(object_crop(targets[int(result["view"])]) for result in found.values())]
+    crops = [
+        object_crop(reference),
+        *(object_crop(targets[int(result["view"])]) for result in found.values()),
+    ]
     cloud, images = frame_cloud(crops[0]), [crop.rgb for crop in crops]
-    poses = [Sim3.identity(), *(_pose(result, cloud, crop) for result, crop in zip(found.values(), crops[1:]))]
-    titles = ["reference", *found, "its points", *(f"{result['error']:.0f}° off" for result in found.values())]
+    poses = [
+        Sim3.identity(),
+        *(_pose(result, cloud, crop) for result, crop in zip(found.values(), crops[1:])),
+    ]
+    titles = [
+        "reference",
+        *found,
+        "its points",
+        *(f"{result['error']:.0f}° off" for result in found.values()),
+    ]
     figure, axes = show_images([*images, *map(pale, images)], titles, len(crops))
     draw_moved_cloud(axes[len(crops) :], [crop.camera for crop in crops], cloud, poses)
     return figure
@@ -364,7 +518,10 @@ def _pose(result: pd.Series, cloud: np.ndarray, target: Frame) -> Sim3:
 
 
 def write_figures(
-    run: Run, folder: str | Path, rows: Sequence[str] | None = None, size: tuple[float, float] | None = None
+    run: Run,
+    folder: str | Path,
+    rows: Sequence[str] | None = None,
+    size: tuple[float, float] | None = None,
 ) -> None:
     """Write the errors of the first row by category, and the error curves (see `save_figure`)."""
     first = [*(rows or own_rows(run.summary)), *important_rows(run.summary)][0]
@@ -373,13 +530,18 @@ def write_figures(
         save_figure(error_curves(run, rows), folder, "error_curves", size)
 
 
-def save_figure(figure: Figure, folder: str | Path, name: str, size: tuple[float, float] | None = None) -> Path:
-    """Write and close a figure of a size in inches as NAME.pdf and NAME.png, whose path is returned."""
+def save_figure(
+    figure: Figure, folder: str | Path, name: str, size: tuple[float, float] | None = None
+) -> Path:
+    """Write and close a figure of a size in inches as NAME.pdf and NAME.png, whose path is
+    returned."""
     path = Path(folder) / f"{re.sub('[^A-Za-z0-9.,-]', '_', name)[:200]}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     if size is not None:
         figure.set_size_inches(size)
-    with plt.rc_context({"pdf.fonttype": 42, "ps.fonttype": 42}):  # publishers refuse fonts of type 3
+    with plt.rc_context(
+        {"pdf.fonttype": 42, "ps.fonttype": 42}
+    ):  # publishers refuse fonts of type 3
         figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})
     figure.savefig(path, dpi=150)
     plt.close(figure)

@@ -4,34 +4,62 @@ from pathlib import Path
 
 import click
 
-from zsp_lite.cli.common import COUNT, NAMES, PATH, backbone_options, examples, replace_option, workers_option
+from zsp_lite.cli.common import (
+    COUNT,
+    NAMES,
+    PATH,
+    backbone_options,
+    examples,
+    replace_option,
+    workers_option,
+)
 
 
 @click.command(
     epilog=examples(
-        "align path/to/scans --category cup", "align data_samples --category car --out outputs/cars --propose"
+        "align path/to/scans --category cup",
+        "align data_samples --category car --out outputs/cars --propose",
     )
 )
 @click.argument("data", type=PATH)
 @click.option("--category", metavar="NAME", required=True, help="Category of the objects.")
-@click.option("--sequences", type=NAMES, show_default="all of the category", help="Sequences, one per object.")
-@click.option("--pairs", type=COUNT, show_default="all; 6 from twelve objects on", help="Partners of each object.")
+@click.option(
+    "--sequences", type=NAMES, show_default="all of the category", help="Sequences, one per object."
+)
+@click.option(
+    "--pairs",
+    type=COUNT,
+    show_default="all; 6 from twelve objects on",
+    help="Partners of each object.",
+)
 @click.option("--targets", type=COUNT, default=5, help="Target views per pair.")
-@click.option("--out", type=PATH, show_default="outputs/align/NAME", help="Folder; an existing run is continued.")
-@click.option("--propose", is_flag=True, help="Write the labels into DATA as proposals, which notebook 08 shows.")
+@click.option(
+    "--out",
+    type=PATH,
+    show_default="outputs/align/NAME",
+    help="Folder; an existing run is continued.",
+)
+@click.option(
+    "--propose",
+    is_flag=True,
+    help="Write the labels into DATA as proposals, which notebook 08 shows.",
+)
 @replace_option
 @workers_option
 @backbone_options
-def align(data, category, sequences, pairs, targets, out, propose, replace, backbone, workers) -> None:
+def align(
+    data, category, sequences, pairs, targets, out, propose, replace, backbone, workers
+) -> None:
     """Align all objects of a category in one frame; no label is needed.
 
-    DATA is a data folder, or a folder with a capture of each object (see `zsp-lite data import --help`).
+    DATA is a data folder, or a folder with a capture of each object (see `zsp-lite data import
+    --help`).
 
-    Every object gets a similarity from its world to the common frame, and the probability that its rotation is within
-    30 degrees of the one that most objects agree with. OUT gets them as alignment.json, as pose labels in
-    class_labels/CATEGORY/, which `zsp-lite data labels OUT --root DATA` takes, and as pictures in report.html. With
-    fewer than five objects, or where objects look alike from two sides, some may be turned round against the rest: look
-    at the report.
+    Every object gets a similarity from its world to the common frame, and the probability that its
+    rotation is within 30 degrees of the one that most objects agree with. OUT gets them as
+    alignment.json, as pose labels in class_labels/CATEGORY/, which `zsp-lite data labels OUT --root
+    DATA` takes, and as pictures in report.html. With fewer than five objects, or where objects look
+    alike from two sides, some may be turned round against the rest: look at the report.
     """
     from zsp_lite.align import align_category, alignment_errors, write_alignment, write_labels
     from zsp_lite.category import SAME_ANGLE
@@ -54,13 +82,21 @@ def align(data, category, sequences, pairs, targets, out, propose, replace, back
     written.append(write_category_report(out / "report.html", found, dataset, category))
     if propose:
         written.append(write_labels(found, dataset.root, category, "label_proposals", replace))
-    print_rows(f"{category}: {len(found.objects)} objects in one frame", COLUMNS, object_rows(found))
+    print_rows(
+        f"{category}: {len(found.objects)} objects in one frame", COLUMNS, object_rows(found)
+    )
     for (first, second), angle in found.disagreements.items():
         print(f"{first} to {second}: the best pose of the pair alone is {angle:.0f}° away")
     errors, alone = alignment_errors(found, read_labels(dataset.root, category))
     if errors:
-        right, before = (sum(error < SAME_ANGLE for error in some) / len(some) for some in (errors, alone))
-        print(f"By the pose labels, {right:.1%} of {len(errors)} ordered pairs are within {SAME_ANGLE:.0f}°;", end=" ")
+        right, before = (
+            sum(error < SAME_ANGLE for error in some) / len(some) for some in (errors, alone)
+        )
+        print(
+            f"By the pose labels, {right:.1%} of {len(errors)} ordered pairs are within "
+            f"{SAME_ANGLE:.0f}°;",
+            end=" ",
+        )
         print(f"of the best poses of {len(alone)} pairs of views and objects alone, {before:.1%}.")
     for path in written:
         print(f"Written: {path}")

@@ -6,20 +6,43 @@ import textwrap
 import click
 
 from zsp_lite.choices import METRICS, METRICS_SHOWN
-from zsp_lite.cli.common import COUNT, NAMES, PATH, Parsed, backbone_options, examples, workers_option
+from zsp_lite.cli.common import (
+    COUNT,
+    NAMES,
+    PATH,
+    Parsed,
+    backbone_options,
+    examples,
+    workers_option,
+)
 
 SIZE = Parsed(
-    "W,H", lambda text: tuple(map(float, text.split(","))),
-    lambda size: len(size) == 2 and all(1 <= side <= 100 for side in size), "two numbers from 1 to 100",
-)  # fmt: skip
-THRESHOLDS = Parsed(
-    "threshold=V,V", lambda text: [*map(float, text.removeprefix("threshold=").split(","))], bool, "threshold=V,V"
+    "W,H",
+    lambda text: tuple(map(float, text.split(","))),
+    lambda size: len(size) == 2 and all(1 <= side <= 100 for side in size),
+    "two numbers from 1 to 100",
 )
-LATEX = Parsed("intervals,time", lambda text: text.split(","), {"", "intervals", "time"}.issuperset, "intervals, time")
+THRESHOLDS = Parsed(
+    "threshold=V,V",
+    lambda text: [*map(float, text.removeprefix("threshold=").split(","))],
+    bool,
+    "threshold=V,V",
+)
+LATEX = Parsed(
+    "intervals,time",
+    lambda text: text.split(","),
+    {"", "intervals", "time"}.issuperset,
+    "intervals, time",
+)
 _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 metrics_option = click.option(
     "--metrics",
-    type=Parsed("a,b", lambda text: [*dict.fromkeys(text.split(","))], set(METRICS).issuperset, ", ".join(METRICS)),
+    type=Parsed(
+        "a,b",
+        lambda text: [*dict.fromkeys(text.split(","))],
+        set(METRICS).issuperset,
+        ", ".join(METRICS),
+    ),
     default=",".join(METRICS_SHOWN),
     help=f"Figures in the table of all rows: {', '.join(METRICS)}.",
 )
@@ -27,35 +50,70 @@ metrics_option = click.option(
 
 @click.command(
     epilog=examples(
-        "benchmark", "benchmark --data outputs/paper17 --pairs 15 --methods ours,rootsift --out outputs/compared",
+        "benchmark",
+        "benchmark --data outputs/paper17 --pairs 15 --methods ours,rootsift --out "
+        "outputs/compared",
         "benchmark --list",
     )
-)  # fmt: skip
+)
 @click.option(
-    "--data", type=PATH, envvar="ZSP_LITE_DATA", show_default="$ZSP_LITE_DATA, else data_samples",
+    "--data",
+    type=PATH,
+    envvar="ZSP_LITE_DATA",
+    show_default="$ZSP_LITE_DATA, else data_samples",
     help="Folder in CO3D's layout.",
-)  # fmt: skip
+)
 @backbone_options
 @click.option("--categories", type=NAMES, show_default="all with pose labels", help="Categories.")
 @click.option("--pairs", type=COUNT, default=30, help="Pairs per category.")
-@click.option("--targets", type=COUNT, default=5, help="Target views per pair, for methods that do not fix them.")
 @click.option(
-    "--methods", type=NAMES, default="default",
+    "--targets",
+    type=COUNT,
+    default=5,
+    help="Target views per pair, for methods that do not fix them.",
+)
+@click.option(
+    "--methods",
+    type=NAMES,
+    default="default",
     help="Rows or groups of rows, see --list; NAME=module:thing or NAME=poses.csv for your own.",
-)  # fmt: skip
-@click.option("--seeds", type=COUNT, default=1, help="Evaluations of each pair, with other random draws.")
-@click.option("--sweep", type=THRESHOLDS, help="Evaluate each row with each of these thresholds of RANSAC.")
+)
+@click.option(
+    "--seeds", type=COUNT, default=1, help="Evaluations of each pair, with other random draws."
+)
+@click.option(
+    "--sweep", type=THRESHOLDS, help="Evaluate each row with each of these thresholds of RANSAC."
+)
 @click.option("--list", "list_only", is_flag=True, help="Print every method and group, and exit.")
-@click.option("--list-pairs", type=PATH, help="Only write the pairs to this CSV file, for another program.")
-@click.option("--out", type=PATH, default="outputs/benchmark", help="Folder; an existing run is continued.")
+@click.option(
+    "--list-pairs", type=PATH, help="Only write the pairs to this CSV file, for another program."
+)
+@click.option(
+    "--out", type=PATH, default="outputs/benchmark", help="Folder; an existing run is continued."
+)
 @workers_option
-@click.option("--row-seconds", type=COUNT, default=60, help="Time limit of a method of your own for a pair.")
+@click.option(
+    "--row-seconds", type=COUNT, default=60, help="Time limit of a method of your own for a pair."
+)
 @metrics_option
 @click.option("--quiet", is_flag=True, help="Print no progress bar and no tables.")
 def benchmark(
-    data, backbone, categories, pairs, targets, methods, list_only, list_pairs, out, workers, metrics, quiet,
-    row_seconds, seeds, sweep,
-) -> None:  # fmt: skip
+    data,
+    backbone,
+    categories,
+    pairs,
+    targets,
+    methods,
+    list_only,
+    list_pairs,
+    out,
+    workers,
+    metrics,
+    quiet,
+    row_seconds,
+    seeds,
+    sweep,
+) -> None:
     """Measure rotation errors over many pairs, and write tables, figures and results."""
     if list_only:
         return _list_methods()
@@ -74,7 +132,18 @@ def benchmark(
         asked = pairs_of_rows(dataset, resolve(methods), numbers, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
-    evaluate(dataset.root, backbone, methods, numbers, targets, out, workers, row_seconds, seeds, sweep or ())
+    evaluate(
+        dataset.root,
+        backbone,
+        methods,
+        numbers,
+        targets,
+        out,
+        workers,
+        row_seconds,
+        seeds,
+        sweep or (),
+    )
     summary = write_reports(out, metrics=metrics)
     if not quiet:
         print(f"{dataset.root}, backbone {summary['backbone']}, {targets} target views")
@@ -91,7 +160,14 @@ def _list_methods() -> None:
     for name, method in METHODS.items():
         print(f"{name:18} {description(method)}")
     for name, members in GROUPS.items():
-        print(textwrap.fill(f"{name}: {', '.join(members)}", 100, subsequent_indent="    ", break_on_hyphens=False))
+        print(
+            textwrap.fill(
+                f"{name}: {', '.join(members)}",
+                100,
+                subsequent_indent="    ",
+                break_on_hyphens=False,
+            )
+        )
 
 
 def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
@@ -99,20 +175,32 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
     from zsp_lite.benchmark import tables
     from zsp_lite.cli.terminal import print_table
 
-    found = [one for one in tables.every_table(summary, metrics) if not one.name.startswith("categories")]
+    found = [
+        one for one in tables.every_table(summary, metrics) if not one.name.startswith("categories")
+    ]
     for table in (*found, tables.by_category(summary, most=_ROWS_SHOWN)):
         if with_paper or table.name in ("all_rows", *tables.SEE_MORE, "categories_acc30"):
             print_table(table)
 
 
-@click.command(epilog=examples("tables outputs/benchmark", "tables outputs/benchmark --metrics median,above150"))
+@click.command(
+    epilog=examples(
+        "tables outputs/benchmark", "tables outputs/benchmark --metrics median,above150"
+    )
+)
 @click.argument("run", type=PATH)
 @click.option("--out", type=PATH, show_default="the run's folder", help="Folder to write.")
 @metrics_option
-@click.option("--rows", type=NAMES, show_default="all", help="Rows of the tables and figures, in order.")
-@click.option("--latex", type=LATEX, default="", show_default="none", help="Add these to LaTeX tables.")
+@click.option(
+    "--rows", type=NAMES, show_default="all", help="Rows of the tables and figures, in order."
+)
+@click.option(
+    "--latex", type=LATEX, default="", show_default="none", help="Add these to LaTeX tables."
+)
 @click.option("--size", type=SIZE, help="Width and height of the figures in inches.")
-@click.option("--pair", metavar="KEY", help="Only draw this pair of run.jsonl, with the pose of each row.")
+@click.option(
+    "--pair", metavar="KEY", help="Only draw this pair of run.jsonl, with the pose of each row."
+)
 @click.option("--data", type=PATH, show_default="the run's", help="Data folder, for --pair.")
 def tables(run, out, metrics, rows, latex, size, pair, data) -> None:
     """Write tables and figures of a benchmark run, also of one that goes on."""
@@ -122,20 +210,34 @@ def tables(run, out, metrics, rows, latex, size, pair, data) -> None:
 
     if pair:
         found = read_run(run)
-        figure = pair_figure(found, pair, Co3D(data or found.settings.folder or found.settings.data), rows)
+        figure = pair_figure(
+            found, pair, Co3D(data or found.settings.folder or found.settings.data), rows
+        )
         print(f"Written: {save_figure(figure, (out or run) / 'figures', f'pair_{pair}', size)}")
         return
     if "time" in latex and "milliseconds" not in metrics:
         metrics = [*metrics, "milliseconds"]
-    _print_summary(write_reports(run, out, metrics, rows, "intervals" in latex, size), metrics, with_paper=True)
+    _print_summary(
+        write_reports(run, out, metrics, rows, "intervals" in latex, size), metrics, with_paper=True
+    )
 
 
-@click.command(epilog=examples("compare outputs/a outputs/b", "compare outputs/a outputs/a --rows ours:rootsift"))
+@click.command(
+    epilog=examples(
+        "compare outputs/a outputs/b", "compare outputs/a outputs/a --rows ours:rootsift"
+    )
+)
 @click.argument("run_a", type=PATH)
 @click.argument("run_b", type=PATH)
-@click.option("--rows", type=NAMES, show_default="all common rows", help="A:B for row A of RUN_A and B of RUN_B, or A.")
+@click.option(
+    "--rows",
+    type=NAMES,
+    show_default="all common rows",
+    help="A:B for row A of RUN_A and B of RUN_B, or A.",
+)
 def compare(run_a, run_b, rows) -> None:
-    """Compare two benchmark runs on their common pairs, with intervals over objects and tests of significance.
+    """Compare two benchmark runs on their common pairs, with intervals over objects and tests of
+    significance.
 
     RUN_A and RUN_B are folders of runs.
     """

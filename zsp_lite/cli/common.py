@@ -13,9 +13,14 @@ from zsp_lite.choices import FACETS, MASKS
 
 
 class Parsed(click.ParamType):
-    """Type of an option: `parse` converts its text, and `valid` tells whether the value can be used."""
+    """Type of an option:
 
-    def __init__(self, metavar: str, parse: Callable[[str], Any], valid: Callable[[Any], bool], expected: str):
+    `parse` converts its text, and `valid` tells whether the value can be used.
+    """
+
+    def __init__(
+        self, metavar: str, parse: Callable[[str], Any], valid: Callable[[Any], bool], expected: str
+    ):
         self.name, self.parse, self.valid, self.expected = metavar, parse, valid, expected
 
     def convert(self, value, parameter, context):
@@ -31,10 +36,25 @@ def _finite(*counts: int) -> Callable[[tuple[float, ...]], bool]:
 
 COUNT, INDEX = click.IntRange(1, 1_000_000), click.IntRange(min=0)
 PATH = Parsed("path", Path, lambda path: "\0" not in str(path), "a path")
-NAMES = Parsed("a,b", lambda text: [name for name in text.split(",") if name], bool, "names separated by commas")
+NAMES = Parsed(
+    "a,b",
+    lambda text: [name for name in text.split(",") if name],
+    bool,
+    "names separated by commas",
+)
 LENGTH = Parsed("metres", float, lambda length: 0 < length < 1e9, "a positive number below 1e9")
-BOX = Parsed("top,left,height,width", lambda text: tuple(map(int, text.split(","))), _finite(4), "four integers")
-INTRINSICS = Parsed("fx,fy,cx,cy", lambda text: tuple(map(float, text.split(","))), _finite(4, 9), "four numbers, or K")
+BOX = Parsed(
+    "top,left,height,width",
+    lambda text: tuple(map(int, text.split(","))),
+    _finite(4),
+    "four integers",
+)
+INTRINSICS = Parsed(
+    "fx,fy,cx,cy",
+    lambda text: tuple(map(float, text.split(","))),
+    _finite(4, 9),
+    "four numbers, or K",
+)
 ORIENTATION = click.Choice(("stored", "displayed"))
 
 
@@ -44,22 +64,42 @@ def examples(*lines: str) -> str:
 
 
 def refuse_options(given: Mapping[str, Any], taken: Collection[str], by: str) -> None:
-    """Raise click.UsageError if an option was given, and `by`, which takes only some options, does not take it."""
+    """Raise click.UsageError if an option was given, and `by`, which takes only some options, does
+    not take it."""
     for name, value in given.items():
         if value and name not in taken:
             raise click.UsageError(f"--{name.replace('_', '-')} does not go with {by}")
 
 
-replace_option = click.option("--replace", is_flag=True, help="Replace existing files that have other content.")
+replace_option = click.option(
+    "--replace", is_flag=True, help="Replace existing files that have other content."
+)
 
 
 def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add --backbone, --layer, --facet and --image-size; the command gets `backbone`, which `as_backbone` takes."""
+    """Add --backbone, --layer, --facet and --image-size; the command gets `backbone`, which
+    `as_backbone` takes."""
 
-    @click.option("--backbone", "name", default="zsp-tiny", help="Name of `weights list`, file, hf:NAME, module:thing.")
-    @click.option("--layer", show_default="the backbone's own", help="Block of the descriptors: block0, ..., last.")
-    @click.option("--facet", type=click.Choice(FACETS), default="key", help="Activation of that block to use.")
-    @click.option("--image-size", type=COUNT, show_default="usually 224", help="Side of the network's input in pixels.")
+    @click.option(
+        "--backbone",
+        "name",
+        default="zsp-tiny",
+        help="Name of `weights list`, file, hf:NAME, module:thing.",
+    )
+    @click.option(
+        "--layer",
+        show_default="the backbone's own",
+        help="Block of the descriptors: block0, ..., last.",
+    )
+    @click.option(
+        "--facet", type=click.Choice(FACETS), default="key", help="Activation of that block to use."
+    )
+    @click.option(
+        "--image-size",
+        type=COUNT,
+        show_default="usually 224",
+        help="Side of the network's input in pixels.",
+    )
     @wraps(command)
     def with_backbone(name, layer, facet, image_size, **others):
         from zsp_lite.backbones.load import named_backbone
@@ -78,14 +118,35 @@ workers_option = click.option("--workers", type=COUNT, default=1, help="Worker p
 
 
 def source_options(multiple: bool) -> Callable[..., Any]:
-    """Add the options of `open_source` that images and captures have, once or for each of several objects."""
+    """Add the options of `open_source` that images and captures have, once or for each of several
+    objects."""
     option = partial(click.option, multiple=multiple)
     return _options(
-        option("--mask", type=click.Choice(MASKS), help="given: mask files; box: by GrabCut; auto: by depth, colours."),
-        option("--box", type=BOX, help="Bounding box of the object in the first image in pixels, for GrabCut."),
-        option("--intrinsics", type=INTRINSICS, help="Of an image or TUM; pixel centres at half-integers."),
+        option(
+            "--mask",
+            type=click.Choice(MASKS),
+            help="given: mask files; box: by GrabCut; auto: by depth, colours.",
+        ),
+        option(
+            "--box",
+            type=BOX,
+            help="Bounding box of the object in the first image in pixels, for GrabCut.",
+        ),
+        option(
+            "--intrinsics",
+            type=INTRINSICS,
+            help="Of an image or TUM; pixel centres at half-integers.",
+        ),
         option("--label", type=INDEX, help="Number of the object in masks that label several."),
-        option("--orientation", type=ORIENTATION, help="How depth, mask and camera refer to a photograph with EXIF."),
-        option("--depth-unit", type=LENGTH, help="Metres per stored depth value: 0.001 for millimetres."),
+        option(
+            "--orientation",
+            type=ORIENTATION,
+            help="How depth, mask and camera refer to a photograph with EXIF.",
+        ),
+        option(
+            "--depth-unit",
+            type=LENGTH,
+            help="Metres per stored depth value: 0.001 for millimetres.",
+        ),
         option("--object", type=INDEX, help="Number of the object in a scene of BOP."),
     )

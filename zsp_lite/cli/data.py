@@ -1,4 +1,7 @@
-"""The commands for data: `data check`, `data download`, `data labels`, `data transfer`, `data import`."""
+"""The commands for data:
+
+`data check`, `data download`, `data labels`, `data transfer`, `data import`.
+"""
 
 import dataclasses
 import sys
@@ -8,16 +11,35 @@ from typing import Any
 
 import click
 
-from zsp_lite.cli.common import COUNT, PATH, examples, refuse_options, replace_option, source_options
+from zsp_lite.cli.common import (
+    COUNT,
+    PATH,
+    examples,
+    refuse_options,
+    replace_option,
+    source_options,
+)
 from zsp_lite.errors import InputError
 
 _LICENCE = "CO3D is under CC BY-NC 4.0: no commercial use."
 _PROBLEMS_SHOWN = 5  # of a category
-_CHECK_COLUMNS = ("category", "layout", "sequences", "complete", "labelled", "usable", "pairs", "frames", "disk")
+_CHECK_COLUMNS = (
+    "category",
+    "layout",
+    "sequences",
+    "complete",
+    "labelled",
+    "usable",
+    "pairs",
+    "frames",
+    "disk",
+)
 root_option = click.option("--root", type=PATH, required=True, help="Data folder.")
 
 
-@click.group(no_args_is_help=False, epilog=examples("data check path/to/co3d", "data import --help"))
+@click.group(
+    no_args_is_help=False, epilog=examples("data check path/to/co3d", "data import --help")
+)
 def data() -> None:
     """Download or check CO3D, import labels or captures, transfer labels from CO3D v1 to v2."""
 
@@ -25,9 +47,14 @@ def data() -> None:
 @data.command(epilog=examples("data check path/to/co3d", "data check path/to/co3d --deep"))
 @click.argument("root", type=PATH)
 @click.option("--deep", is_flag=True, help="Also decode every file; slow on large folders.")
-@click.option("--partial", is_flag=True, help="A sequence without any file is not a problem: it was not downloaded.")
+@click.option(
+    "--partial",
+    is_flag=True,
+    help="A sequence without any file is not a problem: it was not downloaded.",
+)
 def check(root, deep, partial) -> int:
-    """Report missing or broken files, the number of files of evaluation pairs, and the size on disk.
+    """Report missing or broken files, the number of files of evaluation pairs, and the size on
+    disk.
 
     The exit code is 1 if there is any problem.
     """
@@ -37,7 +64,8 @@ def check(root, deep, partial) -> int:
 
 
 def _print_checks(root: Path, checks: Sequence[Any]) -> int:
-    """Print the results of `check_folder`, and return the exit code: 1 if there is any problem, else 0."""
+    """Print the results of `check_folder`, and return the exit code: 1 if there is any problem,
+    else 0."""
     from rich.filesize import decimal
 
     from zsp_lite.cli.terminal import print_rows
@@ -49,7 +77,11 @@ def _print_checks(root: Path, checks: Sequence[Any]) -> int:
         kinds = ", ".join(f"{kind} {count:,}" for kind, count in sorted(check.defects.items()))
         counted = [
             (check.absent, check.sequences, "annotated sequences are not downloaded"),
-            (check.labelled - check.usable, check.labelled, "labelled sequences cannot be evaluated"),
+            (
+                check.labelled - check.usable,
+                check.labelled,
+                "labelled sequences cannot be evaluated",
+            ),
             (check.cloudless, check.sequences, "sequences have no point cloud"),
             (check.defects.total(), check.frames, f"frames cannot be used ({kinds})"),
         ]
@@ -68,24 +100,46 @@ def _print_checks(root: Path, checks: Sequence[Any]) -> int:
 @data.command(
     epilog=examples(
         "data download co3d --category toaster --single-sequence",
-        "data download co3d-v1 --category toaster --labels path/to/clone --labelled-only --root path/to/co3d",
+        "data download co3d-v1 --category toaster --labels path/to/clone --labelled-only "
+        "--root path/to/co3d",
     )
 )
 @click.argument("dataset", type=click.Choice(("co3d", "co3d-v1")))
-@click.option("--category", "categories", metavar="NAME", multiple=True, required=True, help="May be repeated.")
-@click.option("--single-sequence", is_flag=True, help="co3d: a few sequences of each category, about 0.2 GB.")
-@click.option("--chunks", type=COUNT, show_default="all", help="co3d: only the first N archives of each category.")
+@click.option(
+    "--category",
+    "categories",
+    metavar="NAME",
+    multiple=True,
+    required=True,
+    help="May be repeated.",
+)
+@click.option(
+    "--single-sequence", is_flag=True, help="co3d: a few sequences of each category, about 0.2 GB."
+)
+@click.option(
+    "--chunks",
+    type=COUNT,
+    show_default="all",
+    help="co3d: only the first N archives of each category.",
+)
 @click.option("--root", type=PATH, show_default="the name of the data set", help="Data folder.")
-@click.option("--labels", type=PATH, help="co3d-v1: also import labels and pairs, as `data labels` does.")
-@click.option("--labelled-only", is_flag=True, help="With --labels: only labelled sequences, about 0.75 GB a category.")
+@click.option(
+    "--labels", type=PATH, help="co3d-v1: also import labels and pairs, as `data labels` does."
+)
+@click.option(
+    "--labelled-only",
+    is_flag=True,
+    help="With --labels: only labelled sequences, about 0.75 GB a category.",
+)
 @click.option("--yes", is_flag=True, help="Download without asking.")
 def download(dataset, categories, single_sequence, chunks, root, labels, labelled_only, yes) -> int:
     """Download categories of CO3D from its official server, check them, and import labels.
 
-    DATASET is co3d (version 2, in chunks of up to 20 GB) or co3d-v1 (the version of the paper and of its labels, one
-    archive for each category). The sizes are shown and confirmed first. An interrupted download is resumed by the same
-    command. With --labelled-only, sequences are read out of the archive on the server. The environment variables
-    ZSP_LITE_CO3D_URL and ZSP_LITE_CO3D_V1_URL give the address of a mirror.
+    DATASET is co3d (version 2, in chunks of up to 20 GB) or co3d-v1 (the version of the paper and
+    of its labels, one archive for each category). The sizes are shown and confirmed first. An
+    interrupted download is resumed by the same command. With --labelled-only, sequences are read
+    out of the archive on the server. The environment variables ZSP_LITE_CO3D_URL and
+    ZSP_LITE_CO3D_V1_URL give the address of a mirror.
     """
     from zsp_lite.data import archives as co3d
     from zsp_lite.data.check import check_folder
@@ -94,13 +148,19 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
     if dataset == "co3d-v1":
         refuse_options({"single_sequence": single_sequence, "chunks": chunks}, (), dataset)
     else:
-        refuse_options({"labels": labels}, (), f"{dataset}: labels are of v1 (see `zsp-lite data transfer`)")
+        refuse_options(
+            {"labels": labels}, (), f"{dataset}: labels are of v1 (see `zsp-lite data transfer`)"
+        )
     if labelled_only and not labels:
         raise click.UsageError("--labelled-only goes with --labels")
 
     root = root or Path(dataset)
     categories = tuple(dict.fromkeys(categories))
-    archives = [one for name in categories for one in co3d.list_archives(dataset, name, single_sequence, chunks)]
+    archives = [
+        one
+        for name in categories
+        for one in co3d.list_archives(dataset, name, single_sequence, chunks)
+    ]
     if labelled_only:
         labelled = published_sequences(labels, categories)
         archives = [dataclasses.replace(one, sequences=labelled[one.category]) for one in archives]
@@ -120,16 +180,31 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
     return _print_checks(root, check_folder(root, categories=categories, partial=some))
 
 
-def _confirmed(archives: Sequence[Any], sizes: Sequence[int | None], needed: int, root: Path, yes: bool) -> bool:
-    """Print the sizes of the archives and of what they need on the disk, bytes, and ask whether to download them."""
+def _confirmed(
+    archives: Sequence[Any], sizes: Sequence[int | None], needed: int, root: Path, yes: bool
+) -> bool:
+    """Print the sizes of the archives and of what they need on the disk, bytes, and ask whether to
+    download them."""
     from zsp_lite.cli.terminal import print_rows
 
-    names = [f"{len(one.sequences)} sequences of {one.name}" if one.sequences else one.name for one in archives]
-    rows = [(name, "unknown" if size is None else f"{size / 1e9:,.2f} GB") for name, size in zip(names, sizes)]
-    print_rows("To download", ("archive", "size"), [*rows, ("together", f"{sum(filter(None, sizes)) / 1e9:,.2f} GB")])
+    names = [
+        f"{len(one.sequences)} sequences of {one.name}" if one.sequences else one.name
+        for one in archives
+    ]
+    rows = [
+        (name, "unknown" if size is None else f"{size / 1e9:,.2f} GB")
+        for name, size in zip(names, sizes)
+    ]
+    print_rows(
+        "To download",
+        ("archive", "size"),
+        [*rows, ("together", f"{sum(filter(None, sizes)) / 1e9:,.2f} GB")],
+    )
     print(f"Needed on the disk of {root}: {needed / 1e9:.2f} GB. {_LICENCE}")
     if not yes and not sys.stdin.isatty():
-        raise InputError("nobody can confirm the download: standard input is not a terminal, expected --yes")
+        raise InputError(
+            "nobody can confirm the download: standard input is not a terminal, expected --yes"
+        )
     return yes or click.confirm("Download?")
 
 
@@ -140,13 +215,17 @@ def _confirmed(archives: Sequence[Any], sizes: Sequence[int | None], needed: int
 def labels(source, root, replace) -> None:
     """Import the published pose labels and evaluation pairs into a data folder.
 
-    SOURCE is a local clone of the published repository, or what `zsp-lite align` has written. The published labels are
-    those of CO3D v1 and do not fit v2: import them into a v1 folder, then use `zsp-lite data transfer`.
+    SOURCE is a local clone of the published repository, or what `zsp-lite align` has written. The
+    published labels are those of CO3D v1 and do not fit v2: import them into a v1 folder, then use
+    `zsp-lite data transfer`.
     """
     from zsp_lite.data.published import import_labels
 
     counts = import_labels(source, root, replace=replace)
-    print(f"Written to {root}: {counts['class_labels']} labels, {counts['determ_eval']} files of pairs")
+    print(
+        f"Written to {root}: {counts['class_labels']} labels, {counts['determ_eval']} files "
+        "of pairs"
+    )
 
 
 @data.command(epilog=examples("data transfer path/to/v1 path/to/v2 chair"))
@@ -155,7 +234,8 @@ def labels(source, root, replace) -> None:
 @click.argument("category")
 @replace_option
 def transfer(v1, v2, category, replace) -> None:
-    """Transfer labels from a CO3D v1 folder to a v2 folder by aligning the camera centres of the same frames."""
+    """Transfer labels from a CO3D v1 folder to a v2 folder by aligning the camera centres of the
+    same frames."""
     from zsp_lite.data.published import transfer_labels
 
     residuals = transfer_labels(v1, v2, category, replace=replace)
@@ -164,21 +244,32 @@ def transfer(v1, v2, category, replace) -> None:
     print(f"Written: {len(residuals)} labels of {category} in {v2}")
 
 
-@data.command("import", epilog=examples("data import scan.zip --root mine --category cup --sequence one"))
+@data.command(
+    "import", epilog=examples("data import scan.zip --root mine --category cup --sequence one")
+)
 @click.argument("source", metavar="[FORMAT] SCAN", type=PATH, nargs=-1, required=True)
 @root_option
 @click.option("--category", metavar="NAME", required=True, help="Category of the object.")
 @click.option("--sequence", metavar="NAME", required=True, help="Name of the new sequence.")
 @source_options(multiple=False)
-@click.option("--masks", type=PATH, help="Folder of mask files named like the images, instead of --box.")
-@click.option("--frames", "count", type=COUNT, default=100, help="Maximum number of frames, evenly spaced and sharp.")
+@click.option(
+    "--masks", type=PATH, help="Folder of mask files named like the images, instead of --box."
+)
+@click.option(
+    "--frames",
+    "count",
+    type=COUNT,
+    default=100,
+    help="Maximum number of frames, evenly spaced and sharp.",
+)
 def import_(source, root, category, sequence, mask, box, **options) -> None:
-    """Import an RGB-D capture, images with depth and camera poses in one world, as a sequence of a data folder.
+    """Import an RGB-D capture, images with depth and camera poses in one world, as a sequence of a
+    data folder.
 
-    SCAN is a folder, or the zip file that an app has exported. Its FORMAT is recognised, if it is not given:
-    nerfstudio (also of Blender, NeRFCapture and instant-ngp), stray (Stray Scanner), polycam (its raw data), record3d
-    (needs `pip install lzfse`), tum (RGB-D benchmark), bop, scannet, open3d (recorder, with the trajectory of its
-    reconstruction), or lists of your own:
+    SCAN is a folder, or the zip file that an app has exported. Its FORMAT is recognised, if it is
+    not given: nerfstudio (also of Blender, NeRFCapture and instant-ngp), stray (Stray Scanner),
+    polycam (its raw data), record3d (needs `pip install lzfse`), tum (RGB-D benchmark), bop,
+    scannet, open3d (recorder, with the trajectory of its reconstruction), or lists of your own:
 
     \b
       rgb.txt, depth.txt  one file per line; depth as 16-bit PNG, TIFF, .npy, ...
@@ -186,10 +277,10 @@ def import_(source, root, category, sequence, mask, box, **options) -> None:
       intrinsics.txt      3 x 3 matrix in pixels, or fx fy cx cy, once or in each line;
                           pixel centres at half-integers
 
-    Depth maps must be registered to the images: a pixel of both shows the same point. The object is given by --box, by
-    which GrabCut segments it in all images, by --masks, or by masks of the capture, in masks/ with the names of the
-    images; frames without it are left out. --mask auto finds it by depth and colours, as is done for single frames
-    without a mask, too.
+    Depth maps must be registered to the images: a pixel of both shows the same point. The object is
+    given by --box, by which GrabCut segments it in all images, by --masks, or by masks of the
+    capture, in masks/ with the names of the images; frames without it are left out. --mask auto
+    finds it by depth and colours, as is done for single frames without a mask, too.
     """
     from zsp_lite.importers import FORMATS
     from zsp_lite.importers.convert import import_source
@@ -197,14 +288,19 @@ def import_(source, root, category, sequence, mask, box, **options) -> None:
 
     layout = str(source[0]) if len(source) > 1 else None
     if layout not in (None, *FORMATS) or len(source) > 2:
-        raise click.UsageError(f"{' '.join(map(str, source))}: expected SCAN, or one of {', '.join(FORMATS)} before it")
-    refuse_options({"masks": options["masks"] and (box or mask == "auto")}, (), "--box or --mask auto")
+        raise click.UsageError(
+            f"{' '.join(map(str, source))}: expected SCAN, or one of {', '.join(FORMATS)} before it"
+        )
+    refuse_options(
+        {"masks": options["masks"] and (box or mask == "auto")}, (), "--box or --mask auto"
+    )
     mask = mask or ("box" if box else "given")
     opened = open_source(source[-1], mask=mask, box=box, layout=layout, **options)
     done = import_source(opened, root, category, sequence)
     print(
         f"Written: {root / category / sequence}: {done.frames} frames, {done.points:,} points, "
-        f"scaled by {done.scale:.4g}" + (f"; {done.empty} frames without the object left out" if done.empty else "")
+        f"scaled by {done.scale:.4g}"
+        + (f"; {done.empty} frames without the object left out" if done.empty else "")
     )
     for flag in done.flags:
         print(f"flag: {flag}")

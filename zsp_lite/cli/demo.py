@@ -5,20 +5,31 @@ import click
 from zsp_lite.choices import SOLVERS
 from zsp_lite.cli.common import PATH, backbone_options, examples
 
-SYNTHETIC_NOTE = "synthetic objects, composed of primitives, with depth holes and soft masks as in CO3D."
+SYNTHETIC_NOTE = (
+    "synthetic objects, composed of primitives, with depth holes and soft masks as in CO3D."
+)
 MODELS_NOTE = "renderings of 3D models, with depth holes and soft masks as in CO3D."
 USER_NOTE = "the given folder in CO3D's layout."
 
 
-@click.command(epilog=examples("demo", "demo --data path/to/co3d --backbone dino_vits8 --out outputs/co3d"))
+@click.command(
+    epilog=examples("demo", "demo --data path/to/co3d --backbone dino_vits8 --out outputs/co3d")
+)
 @click.option("--data", type=PATH, show_default="data_samples", help="Folder in CO3D's layout.")
-@click.option("--solver", type=click.Choice(SOLVERS), default="both", help="Solver for the pairs of the categories.")
+@click.option(
+    "--solver",
+    type=click.Choice(SOLVERS),
+    default="both",
+    help="Solver for the pairs of the categories.",
+)
 @backbone_options
 @click.option("--out", type=PATH, default="outputs/demo", help="Folder for the report.")
 def demo(data, solver, backbone, out) -> None:
-    """Estimate the pose of a real motorcycle and of one pair per category: tables, and a report with pictures.
+    """Estimate the pose of a real motorcycle and of one pair per category: tables, and a report
+    with pictures.
 
-    The real motorcycle is a photograph; its targets are a category `motorcycle` of synthetic objects in the data.
+    The real motorcycle is a photograph; its targets are a category `motorcycle` of synthetic
+    objects in the data.
     """
     from rich.console import Console
 
@@ -40,10 +51,15 @@ def demo(data, solver, backbone, out) -> None:
         found = list(run_photograph(dataset, model))
         photograph = photograph_section(found) if found else None
         results = list(run_demo(dataset, model, SOLVERS[solver]))
-        path = write_report(out / "report.html", results, getattr(model, "name", ""), str(folder), note, photograph)
+        path = write_report(
+            out / "report.html", results, getattr(model, "name", ""), str(folder), note, photograph
+        )
         write_overview(out / "overview.jpg", results)
     if photograph:
-        title = f"Photographed motorcycle: directions from the rendered {photograph.sequence}, compared by eye"
+        title = (
+            f"Photographed motorcycle: directions from the rendered {photograph.sequence}, "
+            "compared by eye"
+        )
         print_rows(title, photograph.columns, photograph.rows, texts=2)
     rows = [row for result in results for row in table_rows(result)]
     print_rows(f"One pair per category in {folder}, backbone {model.name}", COLUMNS, rows, texts=2)

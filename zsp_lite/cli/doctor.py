@@ -20,22 +20,41 @@ def doctor() -> int:
             print(f"{'':24}-> {fix}")
         if state == "bad":
             failed.append(name)
-    print(f"Missing or broken: {', '.join(failed)}." if failed else "Everything required is installed.")
+    print(
+        f"Missing or broken: {', '.join(failed)}."
+        if failed
+        else "Everything required is installed."
+    )
     return 1 if failed else 0
 
 
 def run_checks() -> Iterator[tuple[str, str, str, str]]:
-    """Yield name, state ("ok", "note" if it is optional, "bad"), what was found, and the fix, first problems first."""
-    yield "Python", "ok", f"{platform.python_version()} on {platform.system()} ({sys.executable})", ""
+    """Yield name, state ("ok", "note" if it is optional, "bad"), what was found, and the fix, first
+    problems first."""
+    yield (
+        "Python",
+        "ok",
+        f"{platform.python_version()} on {platform.system()} ({sys.executable})",
+        "",
+    )
     try:
         import torch
 
         from zsp_lite.backbones.load import DEFAULT, available_backbones, obtained_by
         from zsp_lite.io.download import cache_folder
     except (ImportError, OSError) as error:
-        yield "packages", "bad", f"cannot be imported: {error}", f"{sys.executable} -m pip install path/to/zsp-lite"
+        yield (
+            "packages",
+            "bad",
+            f"cannot be imported: {error}",
+            f"{sys.executable} -m pip install path/to/zsp-lite",
+        )
         return
-    cuda = f"CUDA on {torch.cuda.get_device_name(0)}" if torch.cuda.is_available() else "no CUDA (not required)"
+    cuda = (
+        f"CUDA on {torch.cuda.get_device_name(0)}"
+        if torch.cuda.is_available()
+        else "no CUDA (not required)"
+    )
     yield "torch", "ok", f"{torch.__version__}, {torch.get_num_threads()} threads, {cuda}", ""
     path = available_backbones()[DEFAULT]
     state, fix = ("ok", "") if path else ("bad", obtained_by(DEFAULT))
@@ -45,4 +64,9 @@ def run_checks() -> Iterator[tuple[str, str, str, str]]:
     if existing.is_dir() and os.access(existing, os.W_OK):
         yield "cache", "ok", str(folder), ""
     else:
-        yield "cache", "note", f"{folder} cannot be written", "set ZSP_LITE_CACHE to a folder, for downloads"
+        yield (
+            "cache",
+            "note",
+            f"{folder} cannot be written",
+            "set ZSP_LITE_CACHE to a folder, for downloads",
+        )

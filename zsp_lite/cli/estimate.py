@@ -7,7 +7,16 @@ import click
 from zsp_lite.choices import SOLVERS
 from zsp_lite.cli.common import COUNT, INDEX, PATH, backbone_options, examples, source_options
 
-_ONCE_PER_OBJECT = ("mask", "box", "intrinsics", "label", "orientation", "depth", "depth_unit", "object")
+_ONCE_PER_OBJECT = (
+    "mask",
+    "box",
+    "intrinsics",
+    "label",
+    "orientation",
+    "depth",
+    "depth_unit",
+    "object",
+)
 
 
 @click.command(
@@ -21,38 +30,67 @@ _ONCE_PER_OBJECT = ("mask", "box", "intrinsics", "label", "orientation", "depth"
 @click.argument("reference", type=PATH)
 @click.argument("target", type=PATH)
 @click.argument("others", type=PATH, nargs=-1, metavar="")
-@click.option("--helpers", type=PATH, multiple=True, metavar="C [D ...]", help="Other objects, last of all.")
-@click.option("--solver", type=click.Choice(SOLVERS), default="verified", help="Solver of the pose.")
-@click.option("--reference-frame", type=INDEX, show_default="first usable", help="Its number in REFERENCE.")
-@click.option("--references", type=COUNT, show_default="4; 1 with --reference-frame", help="Frames of each object.")
-@click.option("--targets", type=COUNT, show_default="5", help="Number of target views, evenly spaced.")
+@click.option(
+    "--helpers", type=PATH, multiple=True, metavar="C [D ...]", help="Other objects, last of all."
+)
+@click.option(
+    "--solver", type=click.Choice(SOLVERS), default="verified", help="Solver of the pose."
+)
+@click.option(
+    "--reference-frame", type=INDEX, show_default="first usable", help="Its number in REFERENCE."
+)
+@click.option(
+    "--references",
+    type=COUNT,
+    show_default="4; 1 with --reference-frame",
+    help="Frames of each object.",
+)
+@click.option(
+    "--targets", type=COUNT, show_default="5", help="Number of target views, evenly spaced."
+)
 @source_options(multiple=True)
-@click.option("--depth", type=PATH, multiple=True, help="Depth of an image, if it is not beside it. Once per image.")
+@click.option(
+    "--depth",
+    type=PATH,
+    multiple=True,
+    help="Depth of an image, if it is not beside it. Once per image.",
+)
 @click.option("--workers", type=COUNT, default=1, help="Frames that are solved at once.")
-@click.option("--not-upright", is_flag=True, help="Try four turns by 90 degrees of the reference images.")
+@click.option(
+    "--not-upright", is_flag=True, help="Try four turns by 90 degrees of the reference images."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 @backbone_options
-@click.option("--out", type=PATH, default="outputs/estimate", help="Folder for the report and the point clouds.")
-def estimate(reference, target, others, helpers, not_upright, as_json, backbone, out, **settings) -> None:
+@click.option(
+    "--out",
+    type=PATH,
+    default="outputs/estimate",
+    help="Folder for the report and the point clouds.",
+)
+def estimate(
+    reference, target, others, helpers, not_upright, as_json, backbone, out, **settings
+) -> None:
     """Estimate the pose between two objects of one category; no label is needed.
 
-    REFERENCE and TARGET are each a sequence of a data folder (ROOT/CATEGORY/SEQUENCE), the folder or zip of a capture
-    (see `zsp-lite data import --help`), or an image NAME.jpg, .png or .webp with its depth NAME_depth.png and,
-    if there is one, its mask NAME_mask.png or .jpg.
+    REFERENCE and TARGET are each a sequence of a data folder (ROOT/CATEGORY/SEQUENCE), the folder
+    or zip of a capture (see `zsp-lite data import --help`), or an image NAME.jpg, .png or .webp
+    with its depth NAME_depth.png and, if there is one, its mask NAME_mask.png or .jpg.
 
-    The options from --mask to --object may be given once for each object: REFERENCE, TARGET, then helpers. A single
-    value is for all, a single --box for REFERENCE, or for the one whose --mask is box. By default, masks are given, or
-    made by depth where there are none. Intrinsics may also be the 9 numbers of K in rows; cx and cy are 0.5 more than
-    OpenCV's. Depth is a 16-bit PNG or TIFF, .npy, .npz, float .tiff or .pfm, registered to the colours.
+    The options from --mask to --object may be given once for each object: REFERENCE, TARGET, then
+    helpers. A single value is for all, a single --box for REFERENCE, or for the one whose --mask is
+    box. By default, masks are given, or made by depth where there are none. Intrinsics may also be
+    the 9 numbers of K in rows; cx and cy are 0.5 more than OpenCV's. Depth is a 16-bit PNG or TIFF,
+    .npy, .npz, float .tiff or .pfm, registered to the colours.
 
-    --helpers are scans of other objects of the category, without labels: what the pair alone cannot tell, such as
-    front from back, all objects together mostly can.
+    --helpers are scans of other objects of the category, without labels: what the pair alone cannot
+    tell, such as front from back, all objects together mostly can.
 
-    The pose maps points of the reference camera to points of the camera of the chosen target view; both cameras are
-    those of the images as viewers display them, by their EXIF orientation, which makes a portrait upright. OUT gets
-    report.html and point clouds: target.ply, and aligned_SOLVER.ply, the reference after the pose. Where the verified
-    solver cannot decide between two poses, the report shows both, and aligned_SOLVER_2.ply is the other. Where both
-    are labelled sequences of one category, the rotation error is shown too.
+    The pose maps points of the reference camera to points of the camera of the chosen target view;
+    both cameras are those of the images as viewers display them, by their EXIF orientation, which
+    makes a portrait upright. OUT gets report.html and point clouds: target.ply, and
+    aligned_SOLVER.ply, the reference after the pose. Where the verified solver cannot decide
+    between two poses, the report shows both, and aligned_SOLVER_2.ply is the other. Where both are
+    labelled sequences of one category, the rotation error is shown too.
     """
     import json
 
@@ -63,7 +101,9 @@ def estimate(reference, target, others, helpers, not_upright, as_json, backbone,
     if helpers and settings["solver"] != "verified":
         raise click.UsageError("--helpers goes with --solver verified only")
     if others and not helpers:
-        raise click.UsageError(f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers")
+        raise click.UsageError(
+            f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers"
+        )
     with writing(out):
         given = {name: settings.pop(name) for name in _ONCE_PER_OBJECT}
         sources = open_pair(reference, target, given, (*helpers, *others))
@@ -71,7 +111,13 @@ def estimate(reference, target, others, helpers, not_upright, as_json, backbone,
         found = estimate_pose(*sources[:2], **settings)
         files = write_pair(found, out)
     if as_json:
-        print(json.dumps(found.as_json() | {"files": [str(path) for path in files]}, indent=1, allow_nan=False))
+        print(
+            json.dumps(
+                found.as_json() | {"files": [str(path) for path in files]},
+                indent=1,
+                allow_nan=False,
+            )
+        )
     else:
         _print_tables(found)
         for path in files:
@@ -99,7 +145,8 @@ def _print_tables(found: Any) -> None:
         for rank, other in enumerate(one.alternatives, 2):
             print(
                 f"  hypothesis {rank}: turned by {one.angle_to(other):.0f}° from the best, "
-                f"score {other.score - one.hypotheses[0].score:+.1f} nats, probability {other.confidence:.2f}"
+                f"score {other.score - one.hypotheses[0].score:+.1f} nats, probability "
+                f"{other.confidence:.2f}"
             )
         for flag in one.flags:
             print(f"  flag: {flag}")

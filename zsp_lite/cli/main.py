@@ -1,7 +1,7 @@
 """The command `zsp-lite`: it parses options, calls the library and prints the results.
 
-Each command imports what it needs inside its function, so that `--help` stays quick. Arguments are of the types of the
-options.
+Each command imports what it needs inside its function, so that `--help` stays quick. Arguments are
+of the types of the options.
 """
 
 import io
@@ -26,8 +26,13 @@ from zsp_lite.errors import FatalError, InputError
 
 @click.group(
     no_args_is_help=False,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120, "show_default": True},
-    epilog="`zsp-lite COMMAND --help` explains a command. Bad input: one line on stderr and exit code 2.",
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "max_content_width": 120,
+        "show_default": True,
+    },
+    epilog="`zsp-lite COMMAND --help` explains a command. Bad input: one line on stderr and exit "
+    "code 2.",
 )
 @click.version_option(__version__)
 def cli() -> None:
@@ -39,7 +44,8 @@ for command in (demo, estimate, align, benchmark, tables, compare, synth, data, 
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command, and return the exit code: 0, 1 (a check failed), 2 (bad input), or 130 (interrupted)."""
+    """Run one command, and return the exit code: 0, 1 (a check failed), 2 (bad input), or 130
+    (interrupted)."""
     os.environ["MPLBACKEND"] = "Agg"  # figures are written to files, without a display
     logging.basicConfig(format="%(message)s")
     logging.getLogger("zsp_lite").setLevel(logging.INFO)
@@ -84,7 +90,9 @@ def list_weights() -> None:
         print(f"{name:19} {path or obtained_by(name)}")
 
 
-@weights.command(epilog=examples("weights fetch dino_vits8", "weights fetch hf:facebook/dinov2-small"))
+@weights.command(
+    epilog=examples("weights fetch dino_vits8", "weights fetch hf:facebook/dinov2-small")
+)
 @click.argument("name")
 def fetch(name) -> None:
     """Download a backbone: NAME as `weights list` prints it, or hf:NAME."""

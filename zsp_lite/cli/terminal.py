@@ -1,4 +1,5 @@
-"""Tables in the terminal: a table that is wider continues in the next line, and no figure is cut."""
+"""Tables in the terminal: a table that is wider continues in the next line, and no figure
+is cut."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -8,8 +9,11 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 
-def print_rows(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> None:
-    """Print rows below their title; the first `texts` columns are aligned left, the others, with numbers, right."""
+def print_rows(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1
+) -> None:
+    """Print rows below their title; the first `texts` columns are aligned left, the others, with
+    numbers, right."""
     table = RichTable(title=title)
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number < texts else "right", no_wrap=True)
@@ -25,7 +29,9 @@ def print_table(table: Any) -> None:
     look = {"box": SIMPLE_HEAD, "pad_edge": False, "caption_justify": "left"}
     made = RichTable(title=table.title, caption=table.note or None, **look)
     longest = max(map(len, table.text.index), default=0)
-    made.add_column("", justify="left", min_width=min(longest, 14), overflow="fold")  # a row's name is never cut off
+    made.add_column(
+        "", justify="left", min_width=min(longest, 14), overflow="fold"
+    )  # a row's name is never cut off
     for title in table.text.columns:
         style = "dim" if title.startswith(PUBLISHED) else None
         title = title.replace(": ", "\n").replace(" (", "\n(").replace(" Acc30", "\nAcc30")

@@ -1,1 +1,2 @@
-"""The course on the method: demo, sample data, renderer of synthetic objects, labelling, training and widgets."""
+"""The course on the method: demo, sample data, renderer of synthetic objects, labelling, training
+and widgets."""

@@ -13,35 +13,55 @@ N_TARGETS = 5
 
 
 def demo_pairs(dataset: Co3D) -> list[Pair]:
-    """Select, independently of results, the first stored or sampled evaluation pair of every labelled category."""
-    return [category_pairs(dataset, category, 1, N_TARGETS)[0] for category in labelled_categories(dataset)]
+    """Select, independently of results, the first stored or sampled evaluation pair of every
+    labelled category."""
+    return [
+        category_pairs(dataset, category, 1, N_TARGETS)[0]
+        for category in labelled_categories(dataset)
+    ]
 
 
 def example_pair(dataset: Co3D) -> Pair:
-    """Return a pair for a first try: a stored pair of scooters in `data_samples/`, else the first of all.
+    """Return a pair for a first try: a stored pair of scooters in `data_samples/`, else the first
+    of all.
 
-    The pair of scooters is chosen by its result: a turn of 41 degrees, and both solvers are less than 10 off.
+    The pair of scooters is chosen by its result: a turn of 41 degrees, and both solvers are less
+    than 10 off.
     """
     chosen = Pair("motorcycle", "scooter", 10, "scooter2", (2, 6, 11, 16, 21))
-    folders = (dataset.root / chosen.category / name for name in (chosen.reference_sequence, chosen.target_sequence))
+    folders = (
+        dataset.root / chosen.category / name
+        for name in (chosen.reference_sequence, chosen.target_sequence)
+    )
     return chosen if all(folder.is_dir() for folder in folders) else demo_pairs(dataset)[0]
 
 
-def run_demo(dataset: Co3D, backbone: FeatureExtractor, solvers: Sequence[str] = ("paper",)) -> Iterator[PairResult]:
-    """Estimate the poses of `demo_pairs` with the paper's settings, one at a time, by each solver."""
+def run_demo(
+    dataset: Co3D, backbone: FeatureExtractor, solvers: Sequence[str] = ("paper",)
+) -> Iterator[PairResult]:
+    """Estimate the poses of `demo_pairs` with the paper's settings, one at a time, by each
+    solver."""
     method = ZeroShotPose(backbone)
     for pair in demo_pairs(dataset):
         yield run_pair(dataset, pair, method, solvers)
 
 
-def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[str] | None = None) -> PairResult:
-    """Estimate the pose of a pair by each solver, by default the method's own, and its error if it has labels."""
+def run_pair(
+    dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[str] | None = None
+) -> PairResult:
+    """Estimate the pose of a pair by each solver, by default the method's own, and its error if it
+    has labels."""
     reference, targets = dataset.load_pair(pair)
     estimates = solve_pair(method, reference, targets, solvers)
     sources = (
         f"sequence {pair.reference_sequence}, frame {pair.reference_frame}",
         f"sequence {pair.target_sequence}, frames {', '.join(map(str, pair.target_frames))}",
     )
-    name, sequences = getattr(method.backbone, "name", ""), (pair.reference_sequence, pair.target_sequence)
-    found = PairResult(pair.category, sources, reference, tuple(targets), estimates, {}, pair, backbone=name)
+    name, sequences = (
+        getattr(method.backbone, "name", ""),
+        (pair.reference_sequence, pair.target_sequence),
+    )
+    found = PairResult(
+        pair.category, sources, reference, tuple(targets), estimates, {}, pair, backbone=name
+    )
     return replace(found, errors=label_errors(found, dataset.root / pair.category, sequences))

@@ -10,16 +10,23 @@ from zsp_lite.data.depth import fit_plane, unproject_depth
 from zsp_lite.data.frames import Frame, largest_region
 
 CATEGORY, TARGET = "motorcycle", "scooter"  # the synthetic object that tells the directions
-# Directions of the photographed motorcycle in camera coordinates. There is no measured ground truth. The front was
-# judged by eye from the rear wheel, since the front wheel is turned, and may be wrong by 10 degrees. Up is the normal
-# of the floor; the motorcycle leans on its side stand by a few degrees.
+# Directions of the photographed motorcycle in camera coordinates. There is no measured ground
+# truth. The front was judged by eye from the rear wheel, since the front wheel is turned, and may
+# be wrong by 10 degrees. Up is the normal of the floor; the motorcycle leans on its side stand by a
+# few degrees.
 FRONT = (0.97, 0.06, -0.24)
 UP = (0.01, -0.97, -0.26)
 
-# Calibration at the size in scikit-image, from its documentation: focal length, principal point and difference of the
-# two principal points in pixels, baseline in metres. The values are those of the original photograph divided by 4.
-# They therefore count from the corner of the image, as `Camera` does, to within 1/8 pixel.
-_FOCAL_LENGTH, _PRINCIPAL_POINT, _PRINCIPAL_DIFFERENCE, _BASELINE = 994.978, (311.193, 254.877), 31.086, 0.193001
+# Calibration at the size in scikit-image, from its documentation: focal length, principal point and
+# difference of the two principal points in pixels, baseline in metres. The values are those of the
+# original photograph divided by 4. They therefore count from the corner of the image, as `Camera`
+# does, to within 1/8 pixel.
+_FOCAL_LENGTH, _PRINCIPAL_POINT, _PRINCIPAL_DIFFERENCE, _BASELINE = (
+    994.978,
+    (311.193, 254.877),
+    31.086,
+    0.193001,
+)
 _FLOOR_ROWS = slice(300, None)  # lower part of the photograph, mostly floor
 _FLOOR_DISTANCE = 0.01  # metres; largest distance of a floor point from the plane
 _CLEARANCE = 0.02  # metres; smallest height of an object point above the floor
@@ -29,9 +36,10 @@ _FARTHEST = 2.75  # metres; the motorcycle is nearer, the bench and the shelf be
 def load_photograph() -> Frame:
     """Load a photograph of a motorcycle with dense depth and an object mask.
 
-    Photograph and disparities, measured with structured light, are scikit-image's `stereo_motorcycle`, of Middlebury's
-    2014 stereo data (Scharstein et al., GCPR 2014). The world is the camera's frame. Lengths are scaled as in CO3D, so
-    that the points of the object have unit standard deviation; one unit is about 0.22 m.
+    Photograph and disparities, measured with structured light, are scikit-image's
+    `stereo_motorcycle`, of Middlebury's 2014 stereo data (Scharstein et al., GCPR 2014). The world
+    is the camera's frame. Lengths are scaled as in CO3D, so that the points of the object have unit
+    standard deviation; one unit is about 0.22 m.
     """
     import skimage.data
 
@@ -41,15 +49,21 @@ def load_photograph() -> Frame:
     return replace(frame, depth=frame.depth / np.float32(points.std(axis=0).mean()))
 
 
-def motorcycle_frame(rgb: UInt8[np.ndarray, "h w 3"], disparity: Float32[np.ndarray, "h w"]) -> Frame:
-    """Convert the left image and its disparities in pixels to a frame with depth in metres and an object mask."""
+def motorcycle_frame(
+    rgb: UInt8[np.ndarray, "h w 3"], disparity: Float32[np.ndarray, "h w"]
+) -> Frame:
+    """Convert the left image and its disparities in pixels to a frame with depth in metres and an
+    object mask."""
     known = np.isfinite(disparity)
     depth = np.zeros_like(disparity)
     depth[known] = _BASELINE * _FOCAL_LENGTH / (disparity[known] + _PRINCIPAL_DIFFERENCE)
-    camera = Camera(np.eye(3), np.zeros(3), np.full(2, _FOCAL_LENGTH), np.array(_PRINCIPAL_POINT), depth.shape)
+    camera = Camera(
+        np.eye(3), np.zeros(3), np.full(2, _FOCAL_LENGTH), np.array(_PRINCIPAL_POINT), depth.shape
+    )
     points = unproject_depth(depth, camera)
     normal, offset = fit_plane(points[_FLOOR_ROWS][known[_FLOOR_ROWS]], _FLOOR_DISTANCE)
     height = (points @ normal - offset) * -np.sign(normal[1])  # +y is down
-    # Thin parts, such as the brake cables and a mirror, are missing, and so are the lowest 2 cm of the tyres.
+    # Thin parts, such as the brake cables and a mirror, are missing, and so are the lowest 2 cm of
+    # the tyres.
     mask = largest_region(known & (depth < _FARTHEST) & (height > _CLEARANCE))
     return Frame(rgb, depth, mask.astype(np.float32), camera, "motorcycle photograph")

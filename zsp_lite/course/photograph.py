@@ -1,4 +1,5 @@
-"""The photographed motorcycle: its pose, estimated from views of a synthetic one, and figures of it."""
+"""The photographed motorcycle: its pose, estimated from views of a synthetic one, and figures of
+it."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +24,10 @@ from zsp_lite.viz import plots
 from zsp_lite.viz.report import PhotographSection
 
 _COLUMNS = ("foreground", "solver", "front off by", "up off by", "confidence")
-_FOREGROUNDS = {"mask": "mask", "saliency": "own saliency"}  # settings of `ZeroShotPose`, and their names here
+_FOREGROUNDS = {
+    "mask": "mask",
+    "saliency": "own saliency",
+}  # settings of `ZeroShotPose`, and their names here
 _SOLVERS = ("paper", "verified")
 _POINTS = 1500  # drawn of the aligned cloud
 _LENGTH = 2.2  # of the arrows; the points of the motorcycle have unit standard deviation
@@ -31,25 +35,35 @@ _LENGTH = 2.2  # of the arrows; the points of the motorcycle have unit standard 
 
 @dataclass(frozen=True, eq=False)
 class PhotographResult:
-    """Pose of the motorcycle of `load_photograph` in its camera, estimated from views of a synthetic one."""
+    """Pose of the motorcycle of `load_photograph` in its camera, estimated from views of a
+    synthetic one."""
 
     photograph: Frame
     sequence: str  # sequence of the synthetic motorcycle
     foreground: str  # setting of `ZeroShotPose`
     solver: str  # setting of `ZeroShotPose`
     estimate: PoseEstimate  # the photograph is the reference
-    axes: Float[np.ndarray, "3 3"]  # columns: front, left and up of the photographed motorcycle, as estimated
-    cloud: Float[np.ndarray, "n 3"]  # point cloud of the synthetic motorcycle, aligned with the photographed one
-    along: Float[np.ndarray, " n"]  # position of each point of the cloud, from the rear (0) to the front (1)
-    front_error: float  # degrees between the estimated front and the front judged by eye, which may be wrong by 10
+    axes: Float[
+        np.ndarray, "3 3"
+    ]  # columns: front, left and up of the photographed motorcycle, as estimated
+    cloud: Float[
+        np.ndarray, "n 3"
+    ]  # point cloud of the synthetic motorcycle, aligned with the photographed one
+    along: Float[
+        np.ndarray, " n"
+    ]  # position of each point of the cloud, from the rear (0) to the front (1)
+    # degrees between the estimated front and the front judged by eye, which may be wrong by 10
+    front_error: float
     up_error: float  # degrees between the estimated top and the normal of the floor
 
 
 def run_photograph(dataset: Co3D, backbone: FeatureExtractor) -> Iterator[PhotographResult]:
-    """Estimate how the motorcycle in a real photograph stands, from a synthetic motorcycle whose front is known.
+    """Estimate how the motorcycle in a real photograph stands, from a synthetic motorcycle whose
+    front is known.
 
-    There is one result for each foreground and solver, and none without a category of synthetic motorcycles. The
-    sequence is `TARGET` of `motorcycle`, or the first of other data; both are independent of the results.
+    There is one result for each foreground and solver, and none without a category of synthetic
+    motorcycles. The sequence is `TARGET` of `motorcycle`, or the first of other data; both are
+    independent of the results.
     """
     if not (dataset.root / motorcycle.CATEGORY / POSES_FILE).is_file():
         return
@@ -68,27 +82,36 @@ def run_photograph(dataset: Co3D, backbone: FeatureExtractor) -> Iterator[Photog
             axes = to_photograph.R @ camera.R @ pose.R
             cloud, along = to_photograph.apply(camera.to_camera(points)), pose.to_box(points)[:, 0]
             errors = _angle(axes[:, 0], motorcycle.FRONT), _angle(axes[:, 2], motorcycle.UP)
-            yield PhotographResult(photograph, sequence, foreground, solver, estimate, axes, cloud, along, *errors)
+            yield PhotographResult(
+                photograph, sequence, foreground, solver, estimate, axes, cloud, along, *errors
+            )
 
 
 def photograph_section(results: Sequence[PhotographResult]) -> PhotographSection:
     """Return what the report of the demo shows of the results."""
     rows = []
     for result in results:
-        confidence = "–" if result.estimate.confidence is None else f"{result.estimate.confidence:.2f}"
+        confidence = (
+            "–" if result.estimate.confidence is None else f"{result.estimate.confidence:.2f}"
+        )
         errors = f"{result.front_error:.0f}°", f"{result.up_error:.0f}°"
         rows.append((_FOREGROUNDS[result.foreground], result.solver, *errors, confidence))
-    return PhotographSection(results[0].sequence, _COLUMNS, rows, partial(photograph_figure, results))
+    return PhotographSection(
+        results[0].sequence, _COLUMNS, rows, partial(photograph_figure, results)
+    )
 
 
 def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
-    """Draw the aligned cloud and the estimated front, left and up on the photograph, one panel per result.
+    """Draw the aligned cloud and the estimated front, left and up on the photograph, one panel per
+    result.
 
     The left column shows a view of the synthetic motorcycle, and the directions judged by eye.
     """
     photograph, estimate = results[0].photograph, results[0].estimate
     view, (height, width) = estimate.target_views[estimate.view].frame.rgb, photograph.camera.size
-    margin = round((view.shape[0] * width / height - view.shape[1]) / 2)  # to the aspect of the photograph
+    margin = round(
+        (view.shape[0] * width / height - view.shape[1]) / 2
+    )  # to the aspect of the photograph
     view = np.pad(view, ((0, 0), (margin, margin), (0, 0)), constant_values=255)
     titles = [
         f"{_FOREGROUNDS[result.foreground]}, {result.solver} solver\n"
@@ -100,7 +123,10 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
     images = [view, *[photograph.rgb] * (len(titles) - 1)]
     figure, (_, *axes) = plots.show_images(images, titles, columns=1 + len(_SOLVERS), size=3.6)
     up, front = np.array(motorcycle.UP), np.array(motorcycle.FRONT)
-    centre, directions = np.median(object_points(photograph), axis=0), np.stack([front, np.cross(up, front), up])
+    centre, directions = (
+        np.median(object_points(photograph), axis=0),
+        np.stack([front, np.cross(up, front), up]),
+    )
     _draw_directions(axes.pop(len(_SOLVERS)), photograph, centre, directions)
     for axis, result in zip(axes, results):
         chosen = np.linspace(0, len(result.cloud) - 1, min(_POINTS, len(result.cloud))).astype(int)
@@ -111,7 +137,9 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
 
 
 def _draw_directions(axis: Axes, frame: Frame, origin: np.ndarray, directions: np.ndarray) -> None:
-    plots.draw_axes(axis, frame.camera, origin, origin + _LENGTH * directions, ("front", "left", "up"))
+    plots.draw_axes(
+        axis, frame.camera, origin, origin + _LENGTH * directions, ("front", "left", "up")
+    )
 
 
 def _angle(first: np.ndarray, second: tuple[float, ...]) -> float:

@@ -1,4 +1,5 @@
-"""The sample data: those of the repository, or, outside a clone, synthetic objects that are made once in the cache."""
+"""The sample data: those of the repository, or, outside a clone, synthetic objects that are made
+once in the cache."""
 
 import logging
 from pathlib import Path
@@ -12,10 +13,12 @@ logger = logging.getLogger(__name__)
 
 
 def sample_data() -> Path:
-    """Return the folder of the sample data: `data_samples/` here or in the repository, or `samples/` in the cache.
+    """Return the folder of the sample data: `data_samples/` here or in the repository, or
+    `samples/` in the cache.
 
-    Outside a clone of the repository, synthetic objects are made once in the cache, which takes about 15 s (the preset
-    "demo" of `zsp-lite synth`). An interrupted call is completed by the next one.
+    Outside a clone of the repository, synthetic objects are made once in the cache, which takes
+    about 15 s (the preset "demo" of `zsp-lite synth`). An interrupted call is completed by the next
+    one.
     """
     folders = Path("data_samples"), REPOSITORY / "data_samples", cache_folder() / "samples"
     for folder in folders:

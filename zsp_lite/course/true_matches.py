@@ -1,7 +1,8 @@
 """Ground-truth matches between views of synthetic objects, for evaluation only.
 
-Instances of a category have different proportions. Their points are therefore compared in box coordinates, from 0
-(rear, right, bottom) to 1 (front, left, top) along each axis of the object's bounding box.
+Instances of a category have different proportions. Their points are therefore compared in box
+coordinates, from 0 (rear, right, bottom) to 1 (front, left, top) along each axis of the object's
+bounding box.
 """
 
 from dataclasses import dataclass
@@ -27,20 +28,25 @@ class GroundTruthPair:
     category: str
     reference: Frame  # object crops
     target: Frame
-    cells: Int[np.ndarray, "rows cols 2"]  # matching target patch (row, col) of each reference patch
+    cells: Int[
+        np.ndarray, "rows cols 2"
+    ]  # matching target patch (row, col) of each reference patch
     valid: Bool[np.ndarray, "rows cols"]  # reference patches that have a match
 
 
 def patch_coordinates(
     frame: Frame, pose: ObjectPose, grid: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-    """Return the box coordinates of the object point that each patch shows, and the patches where they are known.
+    """Return the box coordinates of the object point that each patch shows, and the patches where
+    they are known.
 
-    They are known where the mask covers a quarter of the patch, one of its object pixels has depth, and the point is
-    inside the box.
+    They are known where the mask covers a quarter of the patch, one of its object pixels has depth,
+    and the point is inside the box.
     """
     # Object pixels only: the floor between the spokes of a bicycle is inside the box as well.
-    points, measured = patch_points(np.where(frame.mask > _MASK_THRESHOLD, frame.depth, 0), frame.camera, grid)
+    points, measured = patch_points(
+        np.where(frame.mask > _MASK_THRESHOLD, frame.depth, 0), frame.camera, grid
+    )
     coordinates = pose.to_box(frame.camera.to_world(points))
     inside = (np.abs(coordinates - 0.5) <= 0.5 + _MARGIN).all(axis=-1)
     return coordinates, measured & inside & patch_mask(frame, grid).numpy()
@@ -51,10 +57,11 @@ def ground_truth_matches(
     target: tuple[Float[np.ndarray, "r2 c2 3"], Bool[np.ndarray, "r2 c2"]],
     tolerance: float = 0.1,
 ) -> tuple[Int[np.ndarray, "r1 c1 2"], Bool[np.ndarray, "r1 c1"]]:
-    """Match each reference patch to the target patch with the nearest box coordinates, at most `tolerance` away.
+    """Match each reference patch to the target patch with the nearest box coordinates, at most
+    `tolerance` away.
 
-    `reference` and `target` are results of `patch_coordinates`. Returns the target patch (row, col) of each reference
-    patch, (0, 0) without a match, and the reference patches that have one.
+    `reference` and `target` are results of `patch_coordinates`. Returns the target patch (row, col)
+    of each reference patch, (0, 0) without a match, and the reference patches that have one.
     """
     (points, known), (target_points, target_known) = reference, target
     cells, valid = np.zeros((*known.shape, 2), int), np.zeros_like(known)
@@ -68,20 +75,27 @@ def ground_truth_matches(
 
 
 def correct_matches(
-    cells: Int[np.ndarray, "*batch 2"], true_cells: Int[np.ndarray, "*batch 2"], tolerance: float = 1
+    cells: Int[np.ndarray, "*batch 2"],
+    true_cells: Int[np.ndarray, "*batch 2"],
+    tolerance: float = 1,
 ) -> Bool[np.ndarray, "*batch"]:
-    """Return which cells (row, col) are within `tolerance` patches of the true cells, in rows and in columns."""
+    """Return which cells (row, col) are within `tolerance` patches of the true cells, in rows and
+    in columns."""
     return np.abs(np.asarray(cells) - true_cells).max(axis=-1) <= tolerance
 
 
 def ground_truth_pair(dataset: Co3D, pair: Pair) -> GroundTruthPair:
-    """Load a pair with its ground-truth matches of 28 x 28 patches, for the target view that has the most of them."""
+    """Load a pair with its ground-truth matches of 28 x 28 patches, for the target view that has
+    the most of them."""
     grid = (28, 28)
     poses = object_poses(dataset, pair.category)
     reference, targets = dataset.load_pair(pair)
     reference, targets = object_crop(reference), [object_crop(target) for target in targets]
     coordinates = patch_coordinates(reference, poses[pair.reference_sequence], grid)
     target_pose = poses[pair.target_sequence]
-    matches = [ground_truth_matches(coordinates, patch_coordinates(target, target_pose, grid)) for target in targets]
+    matches = [
+        ground_truth_matches(coordinates, patch_coordinates(target, target_pose, grid))
+        for target in targets
+    ]
     best = int(np.argmax([valid.sum() for _, valid in matches]))
     return GroundTruthPair(pair.category, reference, targets[best], *matches[best])

@@ -1,1 +1,2 @@
-"""Data sets in CO3D's layout: frames and cameras, pose labels, evaluation pairs, download and check."""
+"""Data sets in CO3D's layout: frames and cameras, pose labels, evaluation pairs, download and
+check."""

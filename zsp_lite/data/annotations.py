@@ -1,7 +1,8 @@
 """Records of CO3D's annotation files (v1 and v2), read with msgspec.
 
-The frame annotations of a category can hold 86,000 frames in 100 MB of JSON. `read_frame_index` decodes the sequence
-name and number of each frame only; `FrameIndex.frame` decodes and validates a whole entry.
+The frame annotations of a category can hold 86,000 frames in 100 MB of JSON. `read_frame_index`
+decodes the sequence name and number of each frame only; `FrameIndex.frame` decodes and validates a
+whole entry.
 """
 
 import gzip
@@ -27,7 +28,9 @@ class ImageAnnotation(msgspec.Struct, frozen=True, gc=False):
 
 class DepthAnnotation(msgspec.Struct, frozen=True, gc=False):
     path: str
-    scale_adjustment: Annotated[float, msgspec.Meta(gt=0, le=MAX_LENGTH)]  # factor from stored depth to depth
+    scale_adjustment: Annotated[
+        float, msgspec.Meta(gt=0, le=MAX_LENGTH)
+    ]  # factor from stored depth to depth
     mask_path: str | None = None
 
 
@@ -86,23 +89,31 @@ class FrameIndex:
     path: Path
     entries: list[msgspec.Raw]  # JSON of each frame
     keys: list[FrameKey]
-    by_sequence: dict[str, dict[int, int]]  # of each sequence, the positions in `entries` by frame number, sorted
+    by_sequence: dict[
+        str, dict[int, int]
+    ]  # of each sequence, the positions in `entries` by frame number, sorted
 
     def positions(self, sequence: str) -> dict[int, int]:
-        """Return the positions of a sequence's frames by frame number; InputError if the sequence is unknown."""
+        """Return the positions of a sequence's frames by frame number; InputError if the sequence
+        is unknown."""
         if sequence not in self.by_sequence:
             raise InputError(f"frame annotations {self.path} have no frames of {sequence!r}")
         return self.by_sequence[sequence]
 
     def frame(self, position: int) -> FrameAnnotation:
-        """Decode the entry at a position; InputError, which names file, frame and field, if a field is invalid."""
+        """Decode the entry at a position; InputError, which names file, frame and field, if a field
+        is invalid."""
         key = self.keys[position]
-        what = f"frame annotations {self.path} (entry {position}: frame {key.frame_number} of {key.sequence_name})"
+        what = (
+            f"frame annotations {self.path} (entry {position}: frame {key.frame_number} of "
+            f"{key.sequence_name})"
+        )
         return decode_json(self.entries[position], FrameAnnotation, what)
 
 
 def read_frame_index(path: Path) -> FrameIndex:
-    """Read the frame annotations of a category; InputError if they are damaged, or have a frame twice."""
+    """Read the frame annotations of a category; InputError if they are damaged, or have a frame
+    twice."""
     data = read_annotations(path)
     # Two passes that each skip most of the bytes are faster than one that builds every frame.
     keys = decode_json(data, list[FrameKey], f"frame annotations {path}")
@@ -112,7 +123,8 @@ def read_frame_index(path: Path) -> FrameIndex:
         first = by_sequence.setdefault(key.sequence_name, {}).setdefault(key.frame_number, position)
         if first != position:
             raise InputError(
-                f"frame annotations {path}: entries {first} and {position} are both frame {key.frame_number} of "
+                f"frame annotations {path}: entries {first} and {position} are both frame "
+                f"{key.frame_number} of "
                 f"{key.sequence_name}, expected each frame once"
             )
     return FrameIndex(path, entries, keys, by_sequence)
@@ -120,7 +132,9 @@ def read_frame_index(path: Path) -> FrameIndex:
 
 def read_sequences(path: Path) -> list[SequenceAnnotation]:
     """Read the sequence annotations of a category, in file order."""
-    return decode_json(read_annotations(path), list[SequenceAnnotation], f"sequence annotations {path}")
+    return decode_json(
+        read_annotations(path), list[SequenceAnnotation], f"sequence annotations {path}"
+    )
 
 
 def read_annotations(path: Path) -> bytes:
@@ -129,7 +143,8 @@ def read_annotations(path: Path) -> bytes:
 
 
 def compress(data: bytes) -> bytes:
-    """Compress with gzip, without name and time in the header, so that equal data give equal bytes."""
+    """Compress with gzip, without name and time in the header, so that equal data give
+    equal bytes."""
     buffer = io.BytesIO()  # gzip.compress would write the platform into the header
     with gzip.GzipFile(filename="", mode="wb", fileobj=buffer, mtime=0) as file:
         file.write(data)

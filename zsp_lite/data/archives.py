@@ -1,7 +1,8 @@
 """Download of the published archives of CO3D: the list of archives, disk space, unpacking.
 
-A category of CO3D v2 is published in chunks of up to 20 GB, of which the first holds the annotations; a category of v1
-is one archive. Single sequences can be read out of an archive without downloading the rest of it.
+A category of CO3D v2 is published in chunks of up to 20 GB, of which the first holds the
+annotations; a category of v1 is one archive. Single sequences can be read out of an archive without
+downloading the rest of it.
 """
 
 import io
@@ -39,7 +40,8 @@ class Archive:
     name: str
     url: str
     sha256: str
-    # What is read out of the archive on the server, with the annotations; if empty, the whole archive is downloaded.
+    # What is read out of the archive on the server, with the annotations; if empty, the whole
+    # archive is downloaded.
     sequences: tuple[str, ...] = ()
 
 
@@ -53,9 +55,13 @@ class _Unpacked(msgspec.Struct):
 def list_archives(
     dataset: str, category: str, single_sequence: bool = False, chunks: int | None = None
 ) -> list[Archive]:
-    """List the first archives of a category of "co3d" (v2) or "co3d-v1"; the very first holds the annotations."""
+    """List the first archives of a category of "co3d" (v2) or "co3d-v1"; the very first holds the
+    annotations."""
     subset, suffix = ("single-sequence", "_singlesequence") if single_sequence else ("full", "")
-    catalogue, origin = msgspec.json.decode(CATALOGUE.read_bytes())[dataset], f"{dataset} ({subset})"
+    catalogue, origin = (
+        msgspec.json.decode(CATALOGUE.read_bytes())[dataset],
+        f"{dataset} ({subset})",
+    )
     digests = catalogue.get(subset, {})
     check_choice(f"category of {origin}", category, digests)
     base = (os.environ.get(URL_VARIABLES[dataset]) or catalogue["url"]).rstrip("/")
@@ -67,13 +73,22 @@ def list_archives(
 
 
 def missing_archives(root: Path, archives: Sequence[Archive]) -> list[Archive]:
-    """Return what is not unpacked yet of archives; InputError if the folder has a category from elsewhere."""
+    """Return what is not unpacked yet of archives; InputError if the folder has a category from
+    elsewhere."""
     record, missing = _read_record(root), []
     for archive in archives:
         place, found = root / archive.category, record.get(archive.category)
-        origin = found.origin if found else "elsewhere" if place.is_dir() and any(place.iterdir()) else archive.origin
+        origin = (
+            found.origin
+            if found
+            else "elsewhere"
+            if place.is_dir() and any(place.iterdir())
+            else archive.origin
+        )
         if origin != archive.origin:
-            raise InputError(f"{place} is from {origin}, expected another folder (--root) for {archive.origin}")
+            raise InputError(
+                f"{place} is from {origin}, expected another folder (--root) for {archive.origin}"
+            )
         done = found.done if found else []
         sequences = tuple(name for name in archive.sequences if name not in done)
         if archive.name not in done and (sequences or not archive.sequences):
@@ -90,31 +105,43 @@ def download_size(archive: Archive) -> int | None:
 
 
 def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | None]) -> int:
-    """Return the number of bytes that missing archives of these sizes need on the disk; InputError if it has less."""
-    # Unpacked archives are about as large as the archives. Of whole archives, one at a time is there, too.
+    """Return the number of bytes that missing archives of these sizes need on the disk; InputError
+    if it has less."""
+    # Unpacked archives are about as large as the archives. Of whole archives, one at a time is
+    # there, too.
     whole = [size or 0 for archive, size in zip(missing, sizes) if not archive.sequences]
-    present = [path.stat().st_size for archive in missing for path in (root / _WORK).glob(f"{archive.name}*")]
+    present = [
+        path.stat().st_size
+        for archive in missing
+        for path in (root / _WORK).glob(f"{archive.name}*")
+    ]
     needed = sum(size or 0 for size in sizes) + max(whole, default=0) - sum(present)
     existing = next(path for path in (root.absolute(), *root.absolute().parents) if path.exists())
     if needed > (free := shutil.disk_usage(existing).free):
         raise InputError(
-            f"disk of {root} has {free / 1e9:.1f} GB free, expected at least {needed / 1e9:.1f} GB; choose another "
+            f"disk of {root} has {free / 1e9:.1f} GB free, expected at least "
+            f"{needed / 1e9:.1f} GB; choose another "
             "folder, or fewer chunks"
         )
     return max(0, needed)
 
 
 def download_archives(root: Path, archives: Sequence[Archive]) -> None:
-    """Download archives, verify them, and unpack them, or sequences of them; continues an interrupted download."""
+    """Download archives, verify them, and unpack them, or sequences of them; continues an
+    interrupted download."""
     with writing(root / _WORK):
-        for archive in reversed(missing_archives(root, archives)):  # the first, with the annotations, comes last
+        for archive in reversed(
+            missing_archives(root, archives)
+        ):  # the first, with the annotations, comes last
             path = root / _WORK / archive.name
             if not archive.sequences and not path.exists():
                 fetch(archive.url, path, remote_size(archive.url), digest=archive.sha256)
             record = _read_record(root)
             category = record.setdefault(archive.category, _Unpacked(archive.origin))
             write_atomic(root / _RECORD, msgspec.json.encode(record))
-            with _zip(RemoteFile(archive.url) if archive.sequences else io.FileIO(path), archive.url) as zipped:
+            with _zip(
+                RemoteFile(archive.url) if archive.sequences else io.FileIO(path), archive.url
+            ) as zipped:
                 _unpack(zipped, root, _members(zipped, archive))
             category.done += archive.sequences or [archive.name]
             write_atomic(root / _RECORD, msgspec.json.encode(record))
@@ -122,8 +149,11 @@ def download_archives(root: Path, archives: Sequence[Archive]) -> None:
 
 
 def _unpack(zipped: zipfile.ZipFile, root: Path, members: Sequence[zipfile.ZipInfo]) -> None:
-    """Unpack members of a zip archive, annotations last, so that a category is read only if it is complete."""
-    targets = {one: path_inside(root, one.filename) for one in members}  # checks all before the first is written
+    """Unpack members of a zip archive, annotations last, so that a category is read only if it is
+    complete."""
+    targets = {
+        one: path_inside(root, one.filename) for one in members
+    }  # checks all before the first is written
     members = sorted(members, key=lambda one: (_is_annotation(one), one.header_offset))
     for one in tqdm(members, "unpacking", disable=None):
         path = targets[one]
@@ -132,13 +162,20 @@ def _unpack(zipped: zipfile.ZipFile, root: Path, members: Sequence[zipfile.ZipIn
 
 
 def _members(zipped: zipfile.ZipFile, archive: Archive) -> list[zipfile.ZipInfo]:
-    """List the files of the category in an archive, or its annotations and the files of the archive's `sequences`."""
-    members = [one for one in zipped.infolist() if one.filename.startswith(f"{archive.category}/") and not one.is_dir()]
+    """List the files of the category in an archive, or its annotations and the files of the
+    archive's `sequences`."""
+    members = [
+        one
+        for one in zipped.infolist()
+        if one.filename.startswith(f"{archive.category}/") and not one.is_dir()
+    ]
     if not archive.sequences:
         return members
     folder_of = {one: one.filename.split("/")[1] for one in members}
     if absent := sorted(set(archive.sequences) - set(folder_of.values())):
-        raise InputError(f"archive {archive.name} has no sequence {absent[0]!r}, expected all that are labelled")
+        raise InputError(
+            f"archive {archive.name} has no sequence {absent[0]!r}, expected all that are labelled"
+        )
     return [one for one in members if _is_annotation(one) or folder_of[one] in archive.sequences]
 
 

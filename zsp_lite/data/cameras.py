@@ -1,7 +1,9 @@
-"""Pinhole cameras in OpenCV conventions, and their exact conversion from and to PyTorch3D (CO3D v1 and v2).
+"""Pinhole cameras in OpenCV conventions, and their exact conversion from and to PyTorch3D (CO3D v1
+and v2).
 
-A camera maps world points to camera coordinates by `x_cam = R @ x_world + t` (column vectors; +x right, +y down,
-+z forward). Pixel coordinates are (x, y) with pixel centres at half-integers: the image covers [0, W] x [0, H].
+A camera maps world points to camera coordinates by `x_cam = R @ x_world + t` (column vectors; +x
+right, +y down, +z forward). Pixel coordinates are (x, y) with pixel centres at half-integers: the
+image covers [0, W] x [0, H].
 """
 
 from collections.abc import Sequence
@@ -23,29 +25,41 @@ from zsp_lite.errors import (
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
 Values = Real[np.ndarray, "..."] | Sequence
 
-NDC_NORM_IMAGE_BOUNDS = "ndc_norm_image_bounds"  # CO3D v1, and the default if the format is not given
+NDC_NORM_IMAGE_BOUNDS = (
+    "ndc_norm_image_bounds"  # CO3D v1, and the default if the format is not given
+)
 NDC_ISOTROPIC = "ndc_isotropic"  # CO3D v2
 
-# Rotation of camera coordinates if the image is turned by 90 degrees counterclockwise: right becomes up.
+# Rotation of camera coordinates if the image is turned by 90 degrees counterclockwise: right
+# becomes up.
 _QUARTER_TURN = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 # PyTorch3D's camera axes (+x left, +y up, +z forward) are OpenCV's rotated by 180 degrees about z.
 _AXES = np.array([-1.0, -1.0, 1.0])
 MOST_PIXELS = 1_000_000  # of a side
-_STEEP = 0.4  # a camera looks along the vertical if the sine of its angle to the vertical is at most this
+# a camera looks along the vertical if the sine of its angle to the vertical is at most this
+_STEEP = 0.4
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Pinhole camera without distortion; InputError for a value out of range, or an `R` that is no rotation."""
+    """Pinhole camera without distortion; InputError for a value out of range, or an `R` that is no
+    rotation."""
 
-    R: Float[np.ndarray, "3 3"]  # (3, 3) rotation, world to camera; the nearest rotation of what is given
+    R: Float[
+        np.ndarray, "3 3"
+    ]  # (3, 3) rotation, world to camera; the nearest rotation of what is given
     t: Float[np.ndarray, "3"]  # (3,) translation, world to camera, in units of the world
     focal_length: Float[np.ndarray, "2"]  # (2,) along x and y, pixels
     principal_point: Float[np.ndarray, "2"]  # (2,) as (x, y), pixels
     size: tuple[int, int]  # image (height, width), pixels
 
     def __post_init__(self):
-        for name, shape in (("R", (3, 3)), ("t", (3,)), ("focal_length", (2,)), ("principal_point", (2,))):
+        for name, shape in (
+            ("R", (3, 3)),
+            ("t", (3,)),
+            ("focal_length", (2,)),
+            ("principal_point", (2,)),
+        ):
             array = np.array(real_array(f"camera {name}", getattr(self, name), shape))
             check_magnitude(f"camera {name}", array)
             object.__setattr__(self, name, array)
@@ -58,21 +72,34 @@ class Camera:
 
     @classmethod
     def from_pytorch3d(
-        cls, R: Values, T: Values, focal_length: Values, principal_point: Values, intrinsics_format: str,
+        cls,
+        R: Values,
+        T: Values,
+        focal_length: Values,
+        principal_point: Values,
+        intrinsics_format: str,
         size: Sequence[int],
-    ) -> "Camera":  # fmt: skip
-        """Convert a PyTorch3D camera, such as a CO3D viewpoint, of an image of `size` (height, width) in pixels.
+    ) -> "Camera":
+        """Convert a PyTorch3D camera, such as a CO3D viewpoint, of an image of `size` (height,
+        width) in pixels.
 
-        `X_cam = X_world @ R + T` with row vectors, +x left, +y up. Each side of the image covers [-1, 1] in the format
-        "ndc_norm_image_bounds", the shorter side in "ndc_isotropic".
+        `X_cam = X_world @ R + T` with row vectors, +x left, +y up. Each side of the image covers
+        [-1, 1] in the format "ndc_norm_image_bounds", the shorter side in "ndc_isotropic".
         """
         R, T, focal_length, principal_point = map(np.asarray, (R, T, focal_length, principal_point))
         scale, centre = _ndc(size, intrinsics_format)
         # NDC axes point left and up, pixel axes right and down: hence the minus.
-        return cls(_AXES[:, None] * R.T, _AXES * T, focal_length * scale, centre - principal_point * scale, size)
+        return cls(
+            _AXES[:, None] * R.T,
+            _AXES * T,
+            focal_length * scale,
+            centre - principal_point * scale,
+            size,
+        )
 
     def to_pytorch3d(self, intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS) -> dict:
-        """Convert to the arguments of `from_pytorch3d` by name, without `size`; arrays are float64."""
+        """Convert to the arguments of `from_pytorch3d` by name, without `size`; arrays are
+        float64."""
         scale, centre = _ndc(self.size, intrinsics_format)
         return {
             "R": (_AXES[:, None] * self.R).T,
@@ -111,42 +138,61 @@ class Camera:
     ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch"]]:
         """Project world points (..., 3) to pixels (..., 2) as (x, y), and depths (...) along +z.
 
-        Points at depth 0 have pixels that are not finite, and points at negative depth are behind the camera.
+        Points at depth 0 have pixels that are not finite, and points at negative depth are behind
+        the camera.
         """
         in_camera = self.to_camera(points)
         depth = in_camera[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            pixels = in_camera[..., :2] / depth[..., None] * self.focal_length + self.principal_point
+            pixels = (
+                in_camera[..., :2] / depth[..., None] * self.focal_length + self.principal_point
+            )
         return pixels, depth
 
     def unproject_camera(
-        self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float | np.floating
+        self,
+        pixels: Real[np.ndarray, "*batch 2"],
+        depth: Real[np.ndarray, "*batch"] | float | np.floating,
     ) -> Float[np.ndarray, "*batch 3"]:
-        """Compute the points (..., 3) in camera coordinates at given pixels (x, y) and depths along +z."""
+        """Compute the points (..., 3) in camera coordinates at given pixels (x, y) and depths along
+        +z."""
         depth = np.asarray(depth, dtype=np.float64)[..., None]
         rays = (np.asarray(pixels, dtype=np.float64) - self.principal_point) / self.focal_length
-        return np.concatenate([rays * depth, np.broadcast_to(depth, (*rays.shape[:-1], 1))], axis=-1)
+        return np.concatenate(
+            [rays * depth, np.broadcast_to(depth, (*rays.shape[:-1], 1))], axis=-1
+        )
 
     def unproject(
-        self, pixels: Real[np.ndarray, "*batch 2"], depth: Real[np.ndarray, "*batch"] | float | np.floating
+        self,
+        pixels: Real[np.ndarray, "*batch 2"],
+        depth: Real[np.ndarray, "*batch"] | float | np.floating,
     ) -> Float[np.ndarray, "*batch 3"]:
-        """Compute the points (..., 3) in world coordinates at given pixels and depths; the inverse of `project`."""
+        """Compute the points (..., 3) in world coordinates at given pixels and depths; the inverse
+        of `project`."""
         return self.to_world(self.unproject_camera(pixels, depth))
 
     def crop(self, box: Box) -> "Camera":
-        """Return the camera of the image cropped to `box` (top, left, height, width): the principal point moves."""
+        """Return the camera of the image cropped to `box` (top, left, height, width): the principal
+        point moves."""
         top, left, height, width = box
-        return replace(self, principal_point=self.principal_point - (left, top), size=(height, width))
+        return replace(
+            self, principal_point=self.principal_point - (left, top), size=(height, width)
+        )
 
     def resize(self, size: Sequence[int]) -> "Camera":
-        """Return the camera of the image resized to (height, width): the intrinsics are scaled per axis."""
+        """Return the camera of the image resized to (height, width): the intrinsics are scaled per
+        axis."""
         scale = np.array([size[1] / self.size[1], size[0] / self.size[0]])
         return replace(
-            self, focal_length=self.focal_length * scale, principal_point=self.principal_point * scale, size=size
+            self,
+            focal_length=self.focal_length * scale,
+            principal_point=self.principal_point * scale,
+            size=size,
         )
 
     def turn(self, quarters: int) -> "Camera":
-        """Return the camera of the image turned as in `numpy.rot90`: the camera turns about its optical axis."""
+        """Return the camera of the image turned as in `numpy.rot90`: the camera turns about its
+        optical axis."""
         camera = self
         for _ in range(quarters % 4):
             x, y = camera.principal_point
@@ -157,19 +203,23 @@ class Camera:
 
 
 def split_intrinsics(name: str, values: Values) -> Float[np.ndarray, "4"]:
-    """Return fx, fy, cx, cy, which may be given as a matrix (3, 3) or its 9 numbers; InputError for anything else."""
+    """Return fx, fy, cx, cy, which may be given as a matrix (3, 3) or its 9 numbers; InputError for
+    anything else."""
     matrix = real_array(name, values)
     if matrix.shape in ((3, 3), (9,)):
         fx, skew, cx, *zeros, one = matrix.ravel().tolist()
         zero, fy, cy, *zeros = zeros
         if any((skew, zero, *zeros)) or one != 1:
-            raise InputError(f"{name} is {matrix.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels")
+            raise InputError(
+                f"{name} is {matrix.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels"
+            )
         matrix = np.array([fx, fy, cx, cy])
     return real_array(name, matrix, (4,))
 
 
 def camera_from_pose(pose: Values, intrinsics: Values, size: tuple[int, int], where: str) -> Camera:
-    """Create a camera from its intrinsics and its camera-to-world pose in OpenCV's axes; errors begin with `where`."""
+    """Create a camera from its intrinsics and its camera-to-world pose in OpenCV's axes; errors
+    begin with `where`."""
     pose = rigid_matrix(f"{where}: camera-to-world pose", pose)
     rotation = pose[:3, :3]
     values = split_intrinsics(f"{where}: intrinsics", intrinsics)
@@ -188,8 +238,10 @@ def _ndc(size: Sequence[int], intrinsics_format: str) -> tuple[np.ndarray, np.nd
 
 
 def ground_axes(cameras: Sequence[Camera]) -> Float[np.ndarray, "2 3"]:
-    """Return the axes of the world to the right and up in a drawing of the scene from above, normal to the vertical."""
-    # The vertical is the image axis that the cameras agree on better, since images may be turned by 90 degrees.
+    """Return the axes of the world to the right and up in a drawing of the scene from above, normal
+    to the vertical."""
+    # The vertical is the image axis that the cameras agree on better, since images may be turned by
+    # 90 degrees.
     axes = np.mean([camera.R[[1, 0]] for camera in cameras], axis=0)
     down = axes[np.linalg.norm(axes, axis=1).round(6).argmax()]
     right, up = np.linalg.svd(down[None])[2][1:]
@@ -197,7 +249,8 @@ def ground_axes(cameras: Sequence[Camera]) -> Float[np.ndarray, "2 3"]:
 
 
 def azimuths(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
-    """Return the directions of cameras around a point in degrees, seen from above; NaN for those along the vertical."""
+    """Return the directions of cameras around a point in degrees, seen from above; NaN for those
+    along the vertical."""
     directions = np.stack([camera.centre for camera in cameras]) - centre
     x, y = ground_axes(cameras) @ directions.T
     steep = np.hypot(x, y) <= _STEEP * np.linalg.norm(directions, axis=1)
@@ -205,7 +258,8 @@ def azimuths(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float
 
 
 def view_span(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> float:
-    """Return the angle in degrees that cameras span around a point: 360 minus the largest gap; 0 for one camera."""
+    """Return the angle in degrees that cameras span around a point: 360 minus the largest gap; 0
+    for one camera."""
     angles = azimuths(cameras, centre)
     angles = np.sort(angles[~np.isnan(angles)])
     if len(angles) > 1:

@@ -1,4 +1,5 @@
-"""Check of a data folder: missing and broken files, sequences that can be evaluated, size on disk."""
+"""Check of a data folder: missing and broken files, sequences that can be evaluated, size
+on disk."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -29,7 +30,8 @@ class CategoryCheck:
     complete: int = 0  # sequences without problems
     absent: int = 0  # annotated sequences without any file, in a folder that was downloaded in part
     labelled: int = 0  # sequences with a label
-    # Labelled sequences that can be evaluated: at least two frames have image, mask, depth and camera, and no defect.
+    # Labelled sequences that can be evaluated: at least two frames have image, mask, depth and
+    # camera, and no defect.
     usable: int = 0
     cloudless: int = 0  # sequences without a point cloud, in the annotations or on the disk
     # Frames with each `frames.frame_defect`, such as "black image"; counted by a deep check alone.
@@ -39,7 +41,8 @@ class CategoryCheck:
     problems: list[str] = field(default_factory=list)  # messages, one line each
 
     def attempt(self, function: Callable, *values: object) -> Any:
-        """Call a function; if it raises InputError, its message becomes a problem, and the result is None."""
+        """Call a function; if it raises InputError, its message becomes a problem, and the result
+        is None."""
         try:
             return function(*values)
         except InputError as error:
@@ -48,29 +51,44 @@ class CategoryCheck:
 
 
 def check_folder(
-    root: str | Path, deep: bool = False, categories: Sequence[str] | None = None, partial: bool = False
+    root: str | Path,
+    deep: bool = False,
+    categories: Sequence[str] | None = None,
+    partial: bool = False,
 ) -> list[CategoryCheck]:
     """Check some or all categories of a data folder, sorted by name.
 
-    A `deep` check also decodes every image, mask, depth map and point cloud, which is slow on large folders; otherwise
-    the files must exist and not be empty. If `partial`, a sequence without any file is counted, and is not a problem.
+    A `deep` check also decodes every image, mask, depth map and point cloud, which is slow on large
+    folders; otherwise the files must exist and not be empty. If `partial`, a sequence without any
+    file is counted, and is not a problem.
     """
     dataset = Co3D(root)
     chosen = sorted(set(dataset.categories() if categories is None else categories))
     if not chosen:
-        raise InputError(f"data folder {root} holds no category, expected CATEGORY/frame_annotations.jgz")
-    return [_check_category(dataset, name, deep, partial) for name in tqdm(chosen, "checking", disable=None)]
+        raise InputError(
+            f"data folder {root} holds no category, expected CATEGORY/frame_annotations.jgz"
+        )
+    return [
+        _check_category(dataset, name, deep, partial)
+        for name in tqdm(chosen, "checking", disable=None)
+    ]
 
 
 def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> CategoryCheck:
     check = CategoryCheck(category)
-    keys, sequences = check.attempt(dataset.frame_list, category), check.attempt(dataset.sequences, category)
+    keys, sequences = (
+        check.attempt(dataset.frame_list, category),
+        check.attempt(dataset.sequences, category),
+    )
     if keys is None or sequences is None:
         return check
     clouds = {one.sequence_name: one.point_cloud for one in sequences}
     names = list(dict.fromkeys(key.sequence_name for key in keys))
     check.sequences, check.frames = len(names), len(keys)
-    check.problems += [f"sequence {name} has no frames in the annotations" for name in sorted(set(clouds) - set(names))]
+    check.problems += [
+        f"sequence {name} has no frames in the annotations"
+        for name in sorted(set(clouds) - set(names))
+    ]
     usable = set()
     for name in names:
         if partial and not (dataset.root / category / name).exists():
@@ -80,7 +98,10 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
         frames = check.attempt(dataset.frames, category, name) or []
         if sum(_check_frame(dataset, frame, deep, check) for frame in frames) >= 2:
             usable.add(name)
-        if any(frame.viewpoint and frame.viewpoint.intrinsics_format == NDC_ISOTROPIC for frame in frames):
+        if any(
+            frame.viewpoint and frame.viewpoint.intrinsics_format == NDC_ISOTROPIC
+            for frame in frames
+        ):
             check.layout = "v2"
         if name not in clouds:
             check.problems.append(f"sequence {name} is not in {SEQUENCES_FILE}")
@@ -98,10 +119,18 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
     return check
 
 
-def _check_frame(dataset: Co3D, annotation: FrameAnnotation, deep: bool, check: CategoryCheck) -> bool:
-    """Check the files and the camera of a frame, and count its defect; True if a pose can be estimated in it."""
+def _check_frame(
+    dataset: Co3D, annotation: FrameAnnotation, deep: bool, check: CategoryCheck
+) -> bool:
+    """Check the files and the camera of a frame, and count its defect; True if a pose can be
+    estimated in it."""
     depth, mask = annotation.depth, annotation.mask
-    paths = [annotation.image.path, mask and mask.path, depth and depth.path, depth and depth.mask_path]
+    paths = [
+        annotation.image.path,
+        mask and mask.path,
+        depth and depth.path,
+        depth and depth.mask_path,
+    ]
     are_there = [_check_file(dataset, path, check) for path in paths if path]
     if annotation.viewpoint is None or not all(are_there):
         return False

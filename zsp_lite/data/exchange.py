@@ -1,4 +1,5 @@
-"""CSV files exchanged with another program, pairs and poses; docs/benchmark_your_own.md has the columns of both."""
+"""CSV files exchanged with another program, pairs and poses; docs/benchmark_your_own.md has the
+columns of both."""
 
 import csv
 import io
@@ -13,7 +14,14 @@ from scipy.stats import binom
 
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.pairs import true_poses
-from zsp_lite.errors import InputError, check_choice, check_magnitude, check_number, real_array, rotation_matrix
+from zsp_lite.errors import (
+    InputError,
+    check_choice,
+    check_magnitude,
+    check_number,
+    real_array,
+    rotation_matrix,
+)
 from zsp_lite.io.files import digest, read_bytes, write_atomic
 from zsp_lite.metrics import rotation_error
 
@@ -36,17 +44,33 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
     lines = []
     for pair in pairs:
         targets = [("target", pair.target_sequence, frame) for frame in pair.target_frames]
-        for role, sequence, frame in [("reference", pair.reference_sequence, pair.reference_frame), *targets]:
+        for role, sequence, frame in [
+            ("reference", pair.reference_sequence, pair.reference_frame),
+            *targets,
+        ]:
             found = dataset.frame(pair.category, sequence, frame)
             camera, depth, mask = dataset.camera(found), found.depth, found.mask
             (fx, fy), (cx, cy) = camera.focal_length.tolist(), camera.principal_point.tolist()
             R, t = (" ".join(map(repr, part.ravel().tolist())) for part in (camera.R, camera.t))
-            lines.append({
-                "pair": pair.key, "role": role, "category": pair.category, "sequence": sequence, "frame": frame,
-                "image": found.image.path, "depth": depth and depth.path,
-                "depth_scale": depth and depth.scale_adjustment, "mask": mask and mask.path,
-                "fx": fx, "fy": fy, "cx": cx, "cy": cy, "R": R, "t": t,
-            })  # fmt: skip
+            lines.append(
+                {
+                    "pair": pair.key,
+                    "role": role,
+                    "category": pair.category,
+                    "sequence": sequence,
+                    "frame": frame,
+                    "image": found.image.path,
+                    "depth": depth and depth.path,
+                    "depth_scale": depth and depth.scale_adjustment,
+                    "mask": mask and mask.path,
+                    "fx": fx,
+                    "fy": fy,
+                    "cx": cx,
+                    "cy": cy,
+                    "R": R,
+                    "t": t,
+                }
+            )
     write_atomic(path, pd.DataFrame(lines).to_csv(index=False, lineterminator="\n").encode())
     return Path(path)
 
@@ -73,12 +97,16 @@ def _read_lines(path: str | Path, data: bytes) -> list[tuple[int, dict]]:
         mark = next((mark for mark in ";\t" if mark in text.partition("\n")[0]), ",")
         reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=mark, restval="")
         reader.fieldnames = ["_".join(name.lower().split()) for name in reader.fieldnames or ()]
-        # The reader's own number of a line is wrong after a blank one; a spreadsheet's blank lines have separators.
+        # The reader's own number of a line is wrong after a blank one; a spreadsheet's blank lines
+        # have separators.
         lines = [(reader.reader.line_num, line) for line in reader if any(line.values())]
     except (ValueError, csv.Error) as error:
         raise InputError(f"poses {path}: {error}, expected a CSV file") from error
     if wrong := [name for name in _REQUIRED if reader.fieldnames.count(name) != 1]:
-        raise InputError(f"poses {path}: no or two columns {', '.join(wrong)}, expected a CSV file with one of each")
+        raise InputError(
+            f"poses {path}: no or two columns {', '.join(wrong)}, expected a CSV file with "
+            "one of each"
+        )
     return lines
 
 
@@ -102,7 +130,9 @@ def _numbers(name: str, text: str, size: int) -> np.ndarray:
     return values
 
 
-def check_poses(path: str | Path, poses: Mapping[str, StoredPose], dataset: Co3D, pairs: Sequence[Pair]) -> str:
+def check_poses(
+    path: str | Path, poses: Mapping[str, StoredPose], dataset: Co3D, pairs: Sequence[Pair]
+) -> str:
     """Say how many of the poses have no pair, and which convention fits better.
 
     InputError if no pose is of any of the pairs, or if one is in none of its pair's target frames.
@@ -111,16 +141,22 @@ def check_poses(path: str | Path, poses: Mapping[str, StoredPose], dataset: Co3D
     if not found:
         raise InputError(f"{path} has no pose for any of the pairs of --list-pairs")
     for pair, pose in found.items():
-        check_choice(f"poses {path}, line {pose.line}: target_frame", pose.target_frame, pair.target_frames)
+        check_choice(
+            f"poses {path}, line {pose.line}: target_frame", pose.target_frame, pair.target_frames
+        )
     surplus = len(poses) - len(found)
-    remarks = f"{surplus} of {len(poses)} poses fit no pair" if surplus else "", other_convention(dataset, found)
+    remarks = (
+        f"{surplus} of {len(poses)} poses fit no pair" if surplus else "",
+        other_convention(dataset, found),
+    )
     return "; ".join(filter(None, remarks))
 
 
 def other_convention(dataset: Co3D, poses: Mapping[Pair, StoredPose]) -> str:
     """Name another convention by which rotations clearly agree with the labels, or return "".
 
-    Those of other programs may be inverted, or conjugated, for cameras in OpenGL's or PyTorch3D's axes.
+    Those of other programs may be inverted, or conjugated, for cameras in OpenGL's or PyTorch3D's
+    axes.
     """
     views = [pair.target_frames.index(pose.target_frame) for pair, pose in poses.items()]
     truths = true_poses(dataset.root, list(poses), np.array(views))[:, :3, :3]
@@ -128,12 +164,19 @@ def other_convention(dataset: Co3D, poses: Mapping[Pair, StoredPose]) -> str:
     readings = {"": given}
     for signs in ((1, -1, -1), (-1, -1, 1)):
         readings[f"conjugated by diag{signs}"] = given * np.outer(signs, signs)
-    readings |= {f"inverted and {name}".removesuffix(" and "): one.swapaxes(1, 2) for name, one in readings.items()}
+    readings |= {
+        f"inverted and {name}".removesuffix(" and "): one.swapaxes(1, 2)
+        for name, one in readings.items()
+    }
     errors = {name: rotation_error(rotations, truths) for name, rotations in readings.items()}
     medians = {name: float(np.median(error)) for name, error in errors.items()}
     best = min(medians, key=medians.get)
-    # Rows that confuse left and right, or turn little, have small errors in either reading: that of most pairs counts.
+    # Rows that confuse left and right, or turn little, have small errors in either reading: that of
+    # most pairs counts.
     by_chance = binom.sf((errors[best] < errors[""]).sum() - 1, len(truths), 1 / 2)
     if medians[best] > min(30, medians[""] / 2) or by_chance > _CHANCE:
         return ""
-    return f"rotations agree with the labels if {best}: median {medians[best]:.0f}° in place of {medians['']:.0f}°"
+    return (
+        f"rotations agree with the labels if {best}: median {medians[best]:.0f}° in place of "
+        f"{medians['']:.0f}°"
+    )

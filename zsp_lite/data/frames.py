@@ -1,4 +1,5 @@
-"""RGB-D frames with object masks: cropping, resizing, and reading and writing of image files of data folders."""
+"""RGB-D frames with object masks: cropping, resizing, and reading and writing of image files of
+data folders."""
 
 import io
 from collections.abc import Callable
@@ -19,7 +20,9 @@ from zsp_lite.io.files import read_bytes, write_atomic
 
 MAX_PIXELS = 1 << 26  # of an image file
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
-_SAME_ASPECT = 0.01  # largest relative difference of the aspect ratios of an image and its smaller depth map
+_SAME_ASPECT = (
+    0.01  # largest relative difference of the aspect ratios of an image and its smaller depth map
+)
 _BLACK = 10  # an image without a colour of this value is black, as CO3D's hidden frames are
 
 
@@ -31,15 +34,21 @@ class Frame:
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]  # (H, W, 3) colours, uint8
-    depth: Float32[np.ndarray, "h w"] | None  # (H, W) along +z in units of the camera's world, 0 where unknown
-    mask: Float32[np.ndarray, "h w"] | None  # (H, W) probability that a pixel is on the object, in [0, 1]
+    depth: (
+        Float32[np.ndarray, "h w"] | None
+    )  # (H, W) along +z in units of the camera's world, 0 where unknown
+    mask: (
+        Float32[np.ndarray, "h w"] | None
+    )  # (H, W) probability that a pixel is on the object, in [0, 1]
     camera: Camera
     name: str = ""  # for error messages
 
     def __post_init__(self):
         label, size, rgb = f"frame {self.name}".rstrip(), self.camera.size, np.array(self.rgb)
         if rgb.dtype != np.uint8 or rgb.shape != (*size, 3):
-            raise InputError(f"{label} rgb is {rgb.dtype} {rgb.shape}, expected uint8 {(*size, 3)} as the camera")
+            raise InputError(
+                f"{label} rgb is {rgb.dtype} {rgb.shape}, expected uint8 {(*size, 3)} as the camera"
+            )
         object.__setattr__(self, "rgb", rgb)
         for name, top in (("depth", MAX_LENGTH), ("mask", 1.0)):
             if (values := getattr(self, name)) is None:
@@ -48,26 +57,45 @@ class Frame:
                 values = np.array(values)
             else:
                 values = real_array(f"{label} {name}", values).astype(np.float32)
-            if values.shape != size or not (values.min() >= 0 and values.max() <= top):  # not, because of NaN
-                found = f"shape {values.shape}" if values.shape != size else f"{values.min()} to {values.max()}"
-                raise InputError(f"{label} {name} has {found}, expected shape {size} and values from 0 to {top:g}")
+            if values.shape != size or not (
+                values.min() >= 0 and values.max() <= top
+            ):  # not, because of NaN
+                found = (
+                    f"shape {values.shape}"
+                    if values.shape != size
+                    else f"{values.min()} to {values.max()}"
+                )
+                raise InputError(
+                    f"{label} {name} has {found}, expected shape {size} and values from 0 to "
+                    f"{top:g}"
+                )
             object.__setattr__(self, name, values)
 
     @classmethod
     def from_arrays(
-        cls, rgb: np.ndarray, depth: np.ndarray, K: Values, mask: np.ndarray | None = None, pose: Values | None = None,
-        depth_unit: float = 1.0, name: str = "",
-    ) -> "Frame":  # fmt: skip
+        cls,
+        rgb: np.ndarray,
+        depth: np.ndarray,
+        K: Values,
+        mask: np.ndarray | None = None,
+        pose: Values | None = None,
+        depth_unit: float = 1.0,
+        name: str = "",
+    ) -> "Frame":
         """Make a frame of arrays as a camera gives them, in any unit of length.
 
         Args:
-            rgb: Colours (H, W, 3), with or without alpha, or grey (H, W): uint8, or floats from 0 to 1.
-            depth: Numbers (h, w) or (h, w, 1) along +z, registered to the colours, of their size, or smaller and of the
-                same aspect ratio; unknown where NaN, infinite, zero or negative.
-            K: Intrinsics of the colours, (3, 3) or (fx, fy, cx, cy), pixels; the first pixel's centre is (0, 0).
-            mask: The object's pixels (H, W): booleans, 0 and 1, or 0 to 255. None leaves it to `estimate_pose`.
-            pose: Rigid transform (4, 4) from camera to world in OpenCV's axes (x right, y down, z forward), in units of
-                the world. By default, the world is the camera's frame.
+            rgb: Colours (H, W, 3), with or without alpha, or grey (H, W): uint8, or floats from 0
+                to 1.
+            depth: Numbers (h, w) or (h, w, 1) along +z, registered to the colours, of their size,
+                or smaller and of the same aspect ratio; unknown where NaN, infinite, zero or
+                negative.
+            K: Intrinsics of the colours, (3, 3) or (fx, fy, cx, cy), pixels; the first pixel's
+                centre is (0, 0).
+            mask: The object's pixels (H, W): booleans, 0 and 1, or 0 to 255. None leaves it to
+                `estimate_pose`.
+            pose: Rigid transform (4, 4) from camera to world in OpenCV's axes (x right, y down, z
+                forward), in units of the world. By default, the world is the camera's frame.
             depth_unit: World units per unit of `depth`.
             name: Name for messages and reports.
 
@@ -78,7 +106,9 @@ class Frame:
         if image.ndim == 2:
             image = np.repeat(image[..., None], 3, axis=2)
         if image.ndim != 3 or image.shape[2] not in (3, 4):
-            raise InputError(f"{label} rgb has shape {image.shape}, expected (H, W), (H, W, 3) or (H, W, 4)")
+            raise InputError(
+                f"{label} rgb has shape {image.shape}, expected (H, W), (H, W, 3) or (H, W, 4)"
+            )
         image, size = image[..., :3], image.shape[:2]
         intrinsics = split_intrinsics(f"{label} K", K) + (0, 0, 0.5, 0.5)
         camera = camera_from_pose(np.eye(4) if pose is None else pose, intrinsics, size, label)
@@ -92,7 +122,9 @@ class Frame:
         if mask is not None:
             mask = real_array(f"{label} mask", mask).astype(np.float32)
             if 1 < (most := mask.max()) <= ON_OBJECT * 255:
-                raise InputError(f"{label} mask has {most:g} at most, expected booleans, 0 and 1, or 0 to 255")
+                raise InputError(
+                    f"{label} mask has {most:g} at most, expected booleans, 0 and 1, or 0 to 255"
+                )
             mask = mask / np.float32(255) if most > 1 else mask
         return cls(image, enlarge_depth(values, size), mask, camera, name)
 
@@ -103,13 +135,24 @@ class Frame:
 
     def __repr__(self) -> str:
         height, width = self.camera.size
-        depth = "no depth" if self.depth is None else f"depth known at {(self.depth > 0).mean():.0%} of the pixels"
-        mask = "no mask" if self.mask is None else f"mask above {ON_OBJECT} at {(self.mask > ON_OBJECT).mean():.0%}"
+        depth = (
+            "no depth"
+            if self.depth is None
+            else f"depth known at {(self.depth > 0).mean():.0%} of the pixels"
+        )
+        mask = (
+            "no mask"
+            if self.mask is None
+            else f"mask above {ON_OBJECT} at {(self.mask > ON_OBJECT).mean():.0%}"
+        )
         return f"Frame({self.name!r}, {height} x {width} pixels, {depth}, {mask})"
 
 
-def enlarge_depth(depth: Float32[np.ndarray, "h w"], size: tuple[int, int]) -> Float32[np.ndarray, "..."]:
-    """Enlarge a smaller depth map of the same aspect ratio to an image's size (H, W); others stay as they are."""
+def enlarge_depth(
+    depth: Float32[np.ndarray, "h w"], size: tuple[int, int]
+) -> Float32[np.ndarray, "..."]:
+    """Enlarge a smaller depth map of the same aspect ratio to an image's size (H, W); others stay
+    as they are."""
     (rows, columns), (height, width) = depth.shape, size
     if rows >= height or abs(rows * width / (columns * height) - 1) > _SAME_ASPECT:
         return depth
@@ -118,7 +161,8 @@ def enlarge_depth(depth: Float32[np.ndarray, "h w"], size: tuple[int, int]) -> F
 
 
 def frame_defect(frame: Frame) -> str:
-    """Say why a frame cannot be used for pose estimation, such as "black image"; "" for a usable frame."""
+    """Say why a frame cannot be used for pose estimation, such as "black image"; "" for a usable
+    frame."""
     if frame.rgb.max() < _BLACK:
         return "black image"
     if not frame.shows_object:
@@ -128,11 +172,15 @@ def frame_defect(frame: Frame) -> str:
     return "" if (frame.depth > 0).any() else "no known depth"
 
 
-def mask_to_bbox(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1) -> Box:
-    """Compute the bounding box (top, left, height, width) of the mask above a threshold, padded and clipped.
+def mask_to_bbox(
+    mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1
+) -> Box:
+    """Compute the bounding box (top, left, height, width) of the mask above a threshold, padded and
+    clipped.
 
-    If no pixel is above the threshold, it is lowered in steps of 0.05, down to 0. Height and width grow by the fraction
-    `padding`, half of it on each side, as in CO3D's loader. InputError if the mask is empty.
+    If no pixel is above the threshold, it is lowered in steps of 0.05, down to 0. Height and width
+    grow by the fraction `padding`, half of it on each side, as in CO3D's loader. InputError if the
+    mask is empty.
     """
     if not (mask > 0).any():
         raise InputError(f"object mask of shape {mask.shape} is empty, expected a pixel above 0")
@@ -144,7 +192,8 @@ def mask_to_bbox(mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding:
 
 
 def largest_region(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Remove parts thinner than 3 pixels and return the largest connected region, empty if there is none."""
+    """Remove parts thinner than 3 pixels and return the largest connected region, empty if there is
+    none."""
     opened = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, regions, statistics, _ = cv2.connectedComponentsWithStats(opened)
     areas = statistics[1:, cv2.CC_STAT_AREA]  # the first region is the outside
@@ -159,7 +208,8 @@ def crop_to_object(frame: Frame) -> Frame:
 
 
 def turn_frame(frame: Frame, quarters: int) -> Frame:
-    """Turn a frame and its camera by quarter turns as in `numpy.rot90`; depths and world points stay the same."""
+    """Turn a frame and its camera by quarter turns as in `numpy.rot90`; depths and world points
+    stay the same."""
     if quarters % 4 == 0:
         return frame
     turned = frame.camera.turn(quarters)
@@ -167,19 +217,27 @@ def turn_frame(frame: Frame, quarters: int) -> Frame:
 
 
 def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
-    """Resize a frame without keeping its aspect ratio; colours are averaged along a side that shrinks."""
+    """Resize a frame without keeping its aspect ratio; colours are averaged along a side that
+    shrinks."""
     camera = frame.camera.resize(size)
     (height, width), (old_height, old_width) = camera.size, frame.camera.size
-    # INTER_AREA averages only if neither side grows: first shrink, then enlarge the sides that grow.
-    rgb = cv2.resize(frame.rgb, (min(width, old_width), min(height, old_height)), interpolation=cv2.INTER_AREA)
+    # INTER_AREA averages only if neither side grows: first shrink, then enlarge the sides that
+    # grow.
+    rgb = cv2.resize(
+        frame.rgb, (min(width, old_width), min(height, old_height)), interpolation=cv2.INTER_AREA
+    )
     rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR)
     depth, mask = frame.depth, frame.mask
-    if depth is not None:  # of the nearest pixel, since values interpolated at an edge or hole lie on no surface
+    if (
+        depth is not None
+    ):  # of the nearest pixel, since values interpolated at an edge or hole lie on no surface
         rows = (2 * np.arange(height) + 1) * old_height // (2 * height)
         cols = (2 * np.arange(width) + 1) * old_width // (2 * width)
         depth = depth[np.ix_(rows, cols)]
     if mask is not None:
-        mask = cv2.resize(np.ascontiguousarray(mask), (width, height), interpolation=cv2.INTER_LINEAR).clip(0, 1)
+        mask = cv2.resize(
+            np.ascontiguousarray(mask), (width, height), interpolation=cv2.INTER_LINEAR
+        ).clip(0, 1)
     return replace(frame, rgb=rgb, depth=depth, mask=mask, camera=camera)
 
 
@@ -191,15 +249,20 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """Read an 8-bit or 1-bit mask file as probabilities (H, W) in [0, 1]; InputError if it is damaged."""
+    """Read an 8-bit or 1-bit mask file as probabilities (H, W) in [0, 1]; InputError if it is
+    damaged."""
     return decode_image(path, "mask", cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
 
 
 def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.ndarray, "h w"]:
-    """Read a CO3D depth file (see `decode_depth`) as (H, W), 0 where unknown; InputError if it is no such file."""
+    """Read a CO3D depth file (see `decode_depth`) as (H, W), 0 where unknown; InputError if it is
+    no such file."""
     bits = decode_image(path, "depth", cv2.IMREAD_UNCHANGED)
     if bits.dtype != np.uint16 or bits.ndim != 2:
-        raise InputError(f"depth {path} holds {bits.dtype} of shape {bits.shape}, expected a 16-bit greyscale PNG")
+        raise InputError(
+            f"depth {path} holds {bits.dtype} of shape {bits.shape}, expected a 16-bit "
+            "greyscale PNG"
+        )
     return decode_depth(bits, scale_adjustment)
 
 
@@ -215,44 +278,62 @@ def write_image(path: str | Path, rgb: UInt8[np.ndarray, "h w 3"], quality: int 
 
 
 def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"] | Bool[np.ndarray, "h w"]) -> None:
-    """Write probabilities (H, W) in [0, 1] as an 8-bit PNG, or a boolean mask as a 1-bit one, with values 255 and 0."""
+    """Write probabilities (H, W) in [0, 1] as an 8-bit PNG, or a boolean mask as a 1-bit one, with
+    values 255 and 0."""
     options = [cv2.IMWRITE_PNG_BILEVEL, 1] if mask.dtype == bool else []
     _encode(path, ".png", np.rint(mask.astype(np.float64) * 255).astype(np.uint8), options)
 
 
-def write_depth(path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0) -> None:
-    """Write depth (H, W) as a 16-bit PNG that holds the float16 bits of `depth / scale_adjustment`."""
+def write_depth(
+    path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0
+) -> None:
+    """Write depth (H, W) as a 16-bit PNG that holds the float16 bits of `depth /
+    scale_adjustment`."""
     _encode(path, ".png", encode_depth(depth, scale_adjustment), [])
 
 
 def _changed(frame: Frame, camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Frame:
     """Return a frame with another camera and `change` applied to its colours, depth and mask."""
     images = {"rgb": frame.rgb, "depth": frame.depth, "mask": frame.mask}
-    return replace(frame, camera=camera, **{name: one if one is None else change(one) for name, one in images.items()})
+    return replace(
+        frame,
+        camera=camera,
+        **{name: one if one is None else change(one) for name, one in images.items()},
+    )
 
 
 def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
-    """Return the padded, clipped range [first, end) of the true values of a one-dimensional array."""
+    """Return the padded, clipped range [first, end) of the true values of a one-dimensional
+    array."""
     first, last = np.flatnonzero(inside)[[0, -1]]
     margin = (last + 1 - first) * padding / 2
     return max(0, int(np.floor(first - margin))), min(len(inside), int(np.ceil(last + 1 + margin)))
 
 
 def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
-    """Decode a JPEG or PNG file by OpenCV with its flags; InputError if it is damaged or too large."""
+    """Decode a JPEG or PNG file by OpenCV with its flags; InputError if it is damaged or
+    too large."""
     data = read_bytes(path, what)
     is_jpeg = data[:2] == b"\xff\xd8"
     image, expected = None, "a complete JPEG or PNG"
-    with suppress(OSError, SyntaxError, ValueError, cv2.error):  # of Pillow, for another format or a damaged header
-        opened = (JpegImageFile if is_jpeg else PngImageFile)(io.BytesIO(data))  # reads the header only
+    with suppress(
+        OSError, SyntaxError, ValueError, cv2.error
+    ):  # of Pillow, for another format or a damaged header
+        opened = (JpegImageFile if is_jpeg else PngImageFile)(
+            io.BytesIO(data)
+        )  # reads the header only
         width, height = opened.size
         if width * height > MAX_PIXELS:
             expected = f"at most {MAX_PIXELS} pixels, not {height} x {width}"
         else:
-            (opened.load if is_jpeg else opened.verify)()  # OpenCV fills missing parts of an image with grey
+            (
+                opened.load if is_jpeg else opened.verify
+            )()  # OpenCV fills missing parts of an image with grey
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
-        raise InputError(f"{what} {path} cannot be decoded ({len(data)} bytes), expected {expected}")
+        raise InputError(
+            f"{what} {path} cannot be decoded ({len(data)} bytes), expected {expected}"
+        )
     return image
 
 

@@ -14,19 +14,24 @@ from zsp_lite.errors import InputError, rigid_matrix
 from zsp_lite.io.files import read_json
 
 _warn_once = functools.cache(logging.getLogger(__name__).warning)
-POSES_FILE = "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
+POSES_FILE = (
+    "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
+)
 _Vector = tuple[float, float, float]
 _Row = tuple[float, float, float, float]
 
 
 class ObjectPose(msgspec.Struct):
-    """Pose of an object in its world, `world = scale * R @ object + t`, and its bounding box in object coordinates."""
+    """Pose of an object in its world, `world = scale * R @ object + t`, and its bounding box in
+    object coordinates."""
 
     trans: tuple[_Row, _Row, _Row, _Row]  # the matrix [R t]
     scale: float
     low: _Vector  # corners of the box
     high: _Vector
-    turns: tuple[int, ...] = ()  # about the up axis, in degrees, after which the shape is the same; 0 is not among them
+    turns: tuple[
+        int, ...
+    ] = ()  # about the up axis, in degrees, after which the shape is the same; 0 is not among them
 
     @property
     def R(self) -> Float[np.ndarray, "3 3"]:
@@ -37,7 +42,8 @@ class ObjectPose(msgspec.Struct):
         return np.array(self.trans)[:3, 3]
 
     def to_object(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Map world points to object coordinates (front +x, left +y, up +z, surface of unit standard deviation)."""
+        """Map world points to object coordinates (front +x, left +y, up +z, surface of unit
+        standard deviation)."""
         return (np.asarray(world, np.float64) - self.t) @ self.R / self.scale
 
     def to_box(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
@@ -50,12 +56,18 @@ def read_poses(out: Path, category: str) -> dict[str, ObjectPose]:
     if not (path := out / category / POSES_FILE).is_file():
         return {}
     poses = read_json(path, dict[str, ObjectPose], "object poses")
-    exact = {name: rigid_matrix(f"object poses {path}: {name}", one.trans).tolist() for name, one in poses.items()}
+    exact = {
+        name: rigid_matrix(f"object poses {path}: {name}", one.trans).tolist()
+        for name, one in poses.items()
+    }
     return {name: msgspec.structs.replace(one, trans=exact[name]) for name, one in poses.items()}
 
 
-def common_turns(out: Path, category: str, first: str, second: str) -> Float[np.ndarray, "s 3 3"] | None:
-    """Return the turns in the world of the second object after which both look the same; None where nothing is known.
+def common_turns(
+    out: Path, category: str, first: str, second: str
+) -> Float[np.ndarray, "s 3 3"] | None:
+    """Return the turns in the world of the second object after which both look the same; None where
+    nothing is known.
 
     The first is the identity.
     """
@@ -72,8 +84,11 @@ def common_turns(out: Path, category: str, first: str, second: str) -> Float[np.
 
 
 def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:
-    """Read the object pose of every sequence of a category; InputError if the folder is not a synthetic export."""
+    """Read the object pose of every sequence of a category; InputError if the folder is not a
+    synthetic export."""
     if not (poses := read_poses(dataset.root, category)):
         path = dataset.root / category / POSES_FILE
-        raise InputError(f"{path} is missing, expected a synthetic export: other data has no exact object poses")
+        raise InputError(
+            f"{path} is missing, expected a synthetic export: other data has no exact object poses"
+        )
     return poses

@@ -1,7 +1,8 @@
 """Pose labels in the format of the published code, and ground-truth relative poses.
 
-The label of a sequence is a rigid transform (column vectors) from the world of the category's reference sequence to the
-world of the sequence; the label of the reference sequence is the identity. Files: ROOT/class_labels/CATEGORY/SEQ.json.
+The label of a sequence is a rigid transform (column vectors) from the world of the category's
+reference sequence to the world of the sequence; the label of the reference sequence is the
+identity. Files: ROOT/class_labels/CATEGORY/SEQ.json.
 """
 
 import json
@@ -30,7 +31,8 @@ class _LabelFile(msgspec.Struct):
 
 @dataclass(frozen=True, eq=False)
 class PoseLabel:
-    """Pose label of the sequence `seq`: the rigid transform from the world of `reference_seq` to its world."""
+    """Pose label of the sequence `seq`: the rigid transform from the world of `reference_seq` to
+    its world."""
 
     trans: Float[np.ndarray, "4 4"]
     seq: str
@@ -46,15 +48,19 @@ def label_folder(root: str | Path, category: str) -> Path:
 
 
 def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
-    """Read the labels of a category by sequence, sorted by name; InputError if they have several references."""
+    """Read the labels of a category by sequence, sorted by name; InputError if they have several
+    references."""
     return read_label_folder(label_folder(root, category))
 
 
 def read_label_folder(folder: Path, added: Mapping[str, PoseLabel] = {}) -> dict[str, PoseLabel]:
-    """Read the labels of one category in a folder by sequence, together with labels that will be added to it."""
+    """Read the labels of one category in a folder by sequence, together with labels that will be
+    added to it."""
     labels = {path.stem: read_label(path) for path in sorted(folder.glob("*.json"))} | added
     if len(references := sorted({label.reference_seq for label in labels.values()})) > 1:
-        raise InputError(f"labels in {folder} have reference sequences {', '.join(references)}, expected one")
+        raise InputError(
+            f"labels in {folder} have reference sequences {', '.join(references)}, expected one"
+        )
     return labels
 
 
@@ -63,11 +69,14 @@ def read_label(path: Path) -> PoseLabel:
     label = read_json(path, _LabelFile, "label")
     if label.seq != path.stem:
         raise InputError(f"label {path} has seq {label.seq!r}, expected seq as in its name")
-    return PoseLabel(rigid_matrix(f"label {path}: trans", label.trans), label.seq, label.reference_seq)
+    return PoseLabel(
+        rigid_matrix(f"label {path}: trans", label.trans), label.seq, label.reference_seq
+    )
 
 
 def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:
-    """Write a label atomically, replacing an earlier one of the same sequence, and return the path."""
+    """Write a label atomically, replacing an earlier one of the same sequence, and return
+    the path."""
     path = label_folder(root, category) / f"{plain_name(label.seq, 'sequence')}.json"
     write_atomic(path, label_bytes(label))
     return path
@@ -79,8 +88,10 @@ def label_bytes(label: PoseLabel) -> bytes:
 
 
 def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> PoseLabel:
-    """Convert a similarity from the reference's world to a label with the same rotation and image of `centre`."""
-    # A label has no scale: with the similarity's translation, an object off the origin would be displaced.
+    """Convert a similarity from the reference's world to a label with the same rotation and image
+    of `centre`."""
+    # A label has no scale: with the similarity's translation, an object off the origin would be
+    # displaced.
     centre = np.asarray(centre, dtype=np.float64)
     trans = np.eye(4)
     trans[:3, :3] = sim3.R
@@ -91,10 +102,16 @@ def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> 
 def relative_pose(
     label_a: PoseLabel, camera_a: Camera, label_b: PoseLabel, camera_b: Camera
 ) -> Float[np.ndarray, "4 4"]:
-    """Compute the ground-truth pose between two frames: `T_ab = Tcam_b @ T0b @ inv(T0a) @ inv(Tcam_a)`.
+    """Compute the ground-truth pose between two frames: `T_ab = Tcam_b @ T0b @ inv(T0a) @
+    inv(Tcam_a)`.
 
-    This is the composition in "Labelling pose for evaluation" of the supplement, which writes it from left to right. It
-    leads from the coordinates of the reference frame's camera a to those of the target's camera b, for column vectors.
-    Both labels have the same reference sequence.
+    This is the composition in "Labelling pose for evaluation" of the supplement, which writes it
+    from left to right. It leads from the coordinates of the reference frame's camera a to those of
+    the target's camera b, for column vectors. Both labels have the same reference sequence.
     """
-    return camera_b.matrix @ label_b.trans @ np.linalg.inv(label_a.trans) @ np.linalg.inv(camera_a.matrix)
+    return (
+        camera_b.matrix
+        @ label_b.trans
+        @ np.linalg.inv(label_a.trans)
+        @ np.linalg.inv(camera_a.matrix)
+    )

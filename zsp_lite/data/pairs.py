@@ -1,4 +1,5 @@
-"""Evaluation pairs (section 5.1 of the paper): sampled, or read from the evaluation sets of the published code.
+"""Evaluation pairs (section 5.1 of the paper): sampled, or read from the evaluation sets of the
+published code.
 
 These sets are torch files that refer to frames by their positions in the category's frame list.
 """
@@ -33,25 +34,42 @@ class _PublishedPair(msgspec.Struct):
 
 
 def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int = 0) -> list[Pair]:
-    """Sample `n` different evaluation pairs of a category, or all if there are fewer, each with `n_targets` frames.
+    """Sample `n` different evaluation pairs of a category, or all if there are fewer, each with
+    `n_targets` frames.
 
-    Reference sequences take turns; the target sequence is a random other one. The reference frame is random; the target
-    frames are evenly spaced from a random start. The pairs of a smaller `n` are the first ones of a larger.
+    Reference sequences take turns; the target sequence is a random other one. The reference frame
+    is random; the target frames are evenly spaced from a random start. The pairs of a smaller `n`
+    are the first ones of a larger.
     """
     rng = np.random.default_rng([seed, stable_hash(category) >> 1])
     sequences = sorted(read_labels(dataset.root, category))
     frames = dataset.frame_numbers(category)
     numbers = {name: frames.get(name, []) for name in sequences}
     if len(sequences) < 2:
-        raise InputError(f"category {category} has {len(sequences)} labelled sequences, expected at least 2")
+        raise InputError(
+            f"category {category} has {len(sequences)} labelled sequences, expected at least 2"
+        )
     shortest = min(sequences, key=lambda name: len(numbers[name]))
     if (found := len(numbers[shortest])) < n_targets:
-        raise InputError(f"labelled sequence {category}/{shortest} has {found} frames, expected at least {n_targets}")
+        raise InputError(
+            f"labelled sequence {category}/{shortest} has {found} frames, expected at least "
+            f"{n_targets}"
+        )
 
-    every = sum(map(len, numbers.values()))  # frames; each is the start of one choice of target frames
-    left = {name: len(own) * (every - len(own)) for name, own in numbers.items()}  # pairs that are not sampled yet
+    every = sum(
+        map(len, numbers.values())
+    )  # frames; each is the start of one choice of target frames
+    left = {
+        name: len(own) * (every - len(own)) for name, own in numbers.items()
+    }  # pairs that are not sampled yet
     if (total := sum(left.values())) < n:
-        logger.warning("category %s has %d different pairs of %d targets, not %d", category, total, n_targets, n)
+        logger.warning(
+            "category %s has %d different pairs of %d targets, not %d",
+            category,
+            total,
+            n_targets,
+            n,
+        )
     pairs: dict[Pair, None] = {}
     for reference in itertools.cycle(sequences):
         if len(pairs) == min(n, total):
@@ -63,52 +81,88 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
             frame = numbers[reference][rng.integers(len(numbers[reference]))]
             length = len(numbers[target])
             positions = (rng.integers(length) + np.arange(n_targets) * length // n_targets) % length
-            pairs[Pair(category, reference, frame, target, tuple(numbers[target][p] for p in positions))] = None
+            pairs[
+                Pair(
+                    category, reference, frame, target, tuple(numbers[target][p] for p in positions)
+                )
+            ] = None
         left[reference] -= len(pairs) - found
 
 
 def labelled_categories(dataset: Co3D) -> list[str]:
     """List the categories with at least two labelled sequences; InputError if there is none."""
     categories = dataset.categories()
-    if found := [category for category in categories if len(read_labels(dataset.root, category)) >= 2]:
+    if found := [
+        category for category in categories if len(read_labels(dataset.root, category)) >= 2
+    ]:
         return found
     raise InputError(
-        f"{dataset.root}: none of {len(categories)} categories has pose labels of two sequences, expected them in "
+        f"{dataset.root}: none of {len(categories)} categories has pose labels of two "
+        "sequences, expected them in "
         "class_labels/CATEGORY/SEQUENCE.json; `zsp-lite data labels` imports published labels"
     )
 
 
-def true_poses(root: str | Path, pairs: Sequence[Pair], views: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
-    """Compute the labelled pose of each pair, from its reference's camera to that of the target view with an index."""
+def true_poses(
+    root: str | Path, pairs: Sequence[Pair], views: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Compute the labelled pose of each pair, from its reference's camera to that of the target
+    view with an index."""
     dataset, labels = Co3D(root), cache(partial(read_labels, root))
-    return np.stack([
-        true_pose(dataset, labels(pair.category), pair, int(view)) for pair, view in zip(pairs, views, strict=True)
-    ])  # fmt: skip
+    return np.stack(
+        [
+            true_pose(dataset, labels(pair.category), pair, int(view))
+            for pair, view in zip(pairs, views, strict=True)
+        ]
+    )
 
 
-def true_pose(dataset: Co3D, labels: Mapping[str, PoseLabel], pair: Pair, view: int) -> Float[np.ndarray, "4 4"]:
-    """Compute the labelled pose of a pair from its reference's camera to that of a target view, by its index."""
-    frames = (pair.reference_sequence, pair.reference_frame), (pair.target_sequence, pair.target_frames[view])
+def true_pose(
+    dataset: Co3D, labels: Mapping[str, PoseLabel], pair: Pair, view: int
+) -> Float[np.ndarray, "4 4"]:
+    """Compute the labelled pose of a pair from its reference's camera to that of a target view, by
+    its index."""
+    frames = (
+        (pair.reference_sequence, pair.reference_frame),
+        (pair.target_sequence, pair.target_frames[view]),
+    )
     reference, target = (dataset.camera(dataset.frame(pair.category, *frame)) for frame in frames)
-    return relative_pose(labels[pair.reference_sequence], reference, labels[pair.target_sequence], target)
+    return relative_pose(
+        labels[pair.reference_sequence], reference, labels[pair.target_sequence], target
+    )
 
 
 def pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:
-    """Return the path of an evaluation set of `n` pairs: ROOT/determ_eval/{n}samples_{n_targets}tgt/CATEGORY.pt."""
-    return Path(root) / "determ_eval" / f"{n}samples_{n_targets}tgt" / f"{plain_name(category, 'category')}.pt"
+    """Return the path of an evaluation set of `n` pairs:
+
+    ROOT/determ_eval/{n}samples_{n_targets}tgt/CATEGORY.pt.
+    """
+    return (
+        Path(root)
+        / "determ_eval"
+        / f"{n}samples_{n_targets}tgt"
+        / f"{plain_name(category, 'category')}.pt"
+    )
 
 
 def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 1) -> list[Pair]:
-    """Read the first evaluation set of the folder with at least so many pairs, without repetitions; [] without one."""
-    sets = (read_published_pairs(path, dataset) for path in pair_files(dataset, category, f"*samples_{n_targets}tgt"))
+    """Read the first evaluation set of the folder with at least so many pairs, without repetitions;
+    [] without one."""
+    sets = (
+        read_published_pairs(path, dataset)
+        for path in pair_files(dataset, category, f"*samples_{n_targets}tgt")
+    )
     pairs = next((pairs for pairs in sets if len(pairs) >= at_least), [])
     if len(different := [*dict.fromkeys(pairs)]) < len(pairs):
-        logger.warning("category %s: %d of %d stored pairs are different", category, len(different), len(pairs))
+        logger.warning(
+            "category %s: %d of %d stored pairs are different", category, len(different), len(pairs)
+        )
     return different
 
 
 def category_pairs(dataset: Co3D, category: str, n: int, n_targets: int) -> list[Pair]:
-    """Return n pairs: the first of the folder's own evaluation set if it has so many, else sampled ones."""
+    """Return n pairs: the first of the folder's own evaluation set if it has so many, else sampled
+    ones."""
     shipped = shipped_pairs(dataset, category, n_targets, at_least=n)
     return shipped[:n] or sample_pairs(dataset, category, n, n_targets)
 
@@ -119,7 +173,8 @@ def pair_files(dataset: Co3D, category: str, folders: str = "*") -> list[Path]:
 
 
 def read_published_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
-    """Read an evaluation set of the published code; InputError if it is damaged or does not fit the data set."""
+    """Read an evaluation set of the published code; InputError if it is damaged or does not fit the
+    data set."""
     pairs = []
     for number, item in enumerate(read_pair_file(Path(path))):
         frames = dataset.frame_list(item.category)
@@ -128,19 +183,31 @@ def read_published_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
         for sequence, position in chosen:
             if not 0 <= position < len(frames) or frames[position].sequence_name != sequence:
                 raise InputError(
-                    f"evaluation pairs {path}, pair {number}: frame id {position} is not of {sequence}, expected a "
+                    f"evaluation pairs {path}, pair {number}: frame id {position} is not of "
+                    f"{sequence}, expected a "
                     f"position in the list of {len(frames)} frames"
                 )
         reference, *targets = (frames[position].frame_number for _, position in chosen)
-        pairs.append(Pair(item.category, item.reference_seq_name, reference, item.target_seq_name, tuple(targets)))
+        pairs.append(
+            Pair(
+                item.category,
+                item.reference_seq_name,
+                reference,
+                item.target_seq_name,
+                tuple(targets),
+            )
+        )
     return pairs
 
 
 def read_pair_file(path: Path) -> list[_PublishedPair]:
-    """Read an evaluation set without its data set; InputError if it is damaged or has another structure."""
+    """Read an evaluation set without its data set; InputError if it is damaged or has another
+    structure."""
     content = load_torch(path, "evaluation pairs")
     try:
-        plain = msgspec.to_builtins(content, enc_hook=lambda one: one.tolist() if torch.is_tensor(one) else str(one))
+        plain = msgspec.to_builtins(
+            content, enc_hook=lambda one: one.tolist() if torch.is_tensor(one) else str(one)
+        )
         return msgspec.convert(plain, list[_PublishedPair])
     except (msgspec.ValidationError, RecursionError) as error:
         raise InputError(f"evaluation pairs {path}: {error}") from error
@@ -154,7 +221,9 @@ def write_published_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D
     for pair in pairs:
         reference = position[pair.reference_sequence, pair.reference_frame]
         targets = [position[pair.target_sequence, number] for number in pair.target_frames]
-        item = _PublishedPair(pair.category, pair.reference_sequence, reference, pair.target_sequence, targets)
+        item = _PublishedPair(
+            pair.category, pair.reference_sequence, reference, pair.target_sequence, targets
+        )
         items.append(msgspec.to_builtins(item))
     buffer = io.BytesIO()  # torch.save to a file would store the file's name
     torch.save(items, buffer)

@@ -1,4 +1,5 @@
-"""Import of RGB-D captures: the formats that are read, object masks, and sequences in CO3D's layout."""
+"""Import of RGB-D captures: the formats that are read, object masks, and sequences in CO3D's
+layout."""
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -7,7 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import MOST_FRAMES, Capture, CaptureFrame, Makers, collect, find_masks, sharpest
+from zsp_lite.importers.capture import (
+    MOST_FRAMES,
+    Capture,
+    CaptureFrame,
+    Makers,
+    collect,
+    find_masks,
+    sharpest,
+)
 from zsp_lite.importers.lists import read_lists, read_tum
 from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.importers.phones import read_polycam, read_record3d, read_stray
@@ -29,7 +38,9 @@ class Format:
 
 # A folder has the first format whose signs it has.
 FORMATS = {
-    "nerfstudio": Format(("transforms*.json",), "nerfstudio, Blender, NeRFCapture or instant-ngp", read_nerfstudio),
+    "nerfstudio": Format(
+        ("transforms*.json",), "nerfstudio, Blender, NeRFCapture or instant-ngp", read_nerfstudio
+    ),
     "stray": Format(("rgb.mp4", "odometry.csv"), "Stray Scanner", read_stray),
     "polycam": Format(("keyframes/*cameras",), "Polycam's raw data", read_polycam),
     "record3d": Format(("metadata", "rgbd"), "Record3D", read_record3d),
@@ -39,23 +50,45 @@ FORMATS = {
     "scannet": Format(("pose", "intrinsic/intrinsic_color.txt"), "ScanNet", read_scannet),
     "open3d": Format(("intrinsic.json", "color"), "Open3D's recorder", read_open3d),
 }
-_HOW = "expected raw data with depth and poses, as Stray Scanner, Record3D or Polycam export them from LiDAR"
+_HOW = (
+    "expected raw data with depth and poses, as Stray Scanner, Record3D or Polycam export them "
+    "from LiDAR"
+)
 # What is near to a capture, by names and extensions of its files.
 _INCOMPLETE = {
-    ("sparse", "images.bin", "images.txt", "database.db"): "has COLMAP's poses, but no measured depth",
-    ("rgb.txt", "depth.txt", "depth"): "has images and depth, but no poses (groundtruth.txt, poses.txt, pose/, ...)",
-    ("scene_camera.json", "scene_gt.json"): "lacks scene_gt.json or scene_camera.json of a BOP scene",
+    (
+        "sparse",
+        "images.bin",
+        "images.txt",
+        "database.db",
+    ): "has COLMAP's poses, but no measured depth",
+    (
+        "rgb.txt",
+        "depth.txt",
+        "depth",
+    ): "has images and depth, but no poses (groundtruth.txt, poses.txt, pose/, ...)",
+    (
+        "scene_camera.json",
+        "scene_gt.json",
+    ): "lacks scene_gt.json or scene_camera.json of a BOP scene",
     (".sens",): "is ScanNet's packed scan: unpack it by ScanNet's SensReader",
     (".mp4", ".mov", ".m4v"): "is a video without depth and poses",
-    (".ply", ".splat", ".obj", ".glb", ".usdz"): "is a model as Luma or KIRI export it, without depth and poses",
+    (
+        ".ply",
+        ".splat",
+        ".obj",
+        ".glb",
+        ".usdz",
+    ): "is a model as Luma or KIRI export it, without depth and poses",
 }
 
 
 def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
-    """Return the format of a capture, a name in `FORMATS`, and the folder or file that its reader takes.
+    """Return the format of a capture, a name in `FORMATS`, and the folder or file that its reader
+    takes.
 
-    A capture is a folder, the zip or .r3d file of an app, or a transforms.json. InputError for anything else; it says
-    what is missing, or what is expected, and `also`.
+    A capture is a folder, the zip or .r3d file of an app, or a transforms.json. InputError for
+    anything else; it says what is missing, or what is expected, and `also`.
     """
     path, folder = Path(path), Path(path)
     if path.is_file() and path.suffix.lower() in (".zip", ".r3d"):
@@ -76,12 +109,18 @@ def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
 
 
 def open_capture(
-    path: str | Path, layout: str | None = None, count: int = MOST_FRAMES, masks: Path | None = None,
-    files: Mapping[str, Any] = {}, **options: Any,
-) -> Capture:  # fmt: skip
-    """Read the frames of a capture, with the masks of its folder masks/, if it has one (see `open_source`).
+    path: str | Path,
+    layout: str | None = None,
+    count: int = MOST_FRAMES,
+    masks: Path | None = None,
+    files: Mapping[str, Any] = {},
+    **options: Any,
+) -> Capture:
+    """Read the frames of a capture, with the masks of its folder masks/, if it has one (see
+    `open_source`).
 
-    `files` replaces members of each `CaptureFrame`. InputError if the capture cannot be read, or no frame can be used.
+    `files` replaces members of each `CaptureFrame`. InputError if the capture cannot be read, or no
+    frame can be used.
     """
     source = path = Path(path)
     with suppress(InputError if layout else ()):
@@ -93,11 +132,21 @@ def open_capture(
     images = [frame.image for frame in frames]
     found = find_masks(masks or (path if path.is_dir() else path.parent) / "masks", images)
     if masks is not None and not any(found):
-        raise InputError(f"--masks {masks} has no mask that is named like an image, such as {images[0].stem}.png")
+        raise InputError(
+            f"--masks {masks} has no mask that is named like an image, such as {images[0].stem}.png"
+        )
     own = [None if masks else frame.mask for frame in frames]
-    frames = [replace(frame, mask=one or mask, **files) for frame, one, mask in zip(frames, own, found)]
-    frames = [frame for frame, _ in sharpest(frames, count, lambda frame: frame.load().rgb, left_out)]
+    frames = [
+        replace(frame, mask=one or mask, **files) for frame, one, mask in zip(frames, own, found)
+    ]
+    frames = [
+        frame for frame, _ in sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
+    ]
     if not frames:
-        found = f"none of {len(left_out)} frames can be used: {left_out[0]}" if left_out else "no frame, expected some"
+        found = (
+            f"none of {len(left_out)} frames can be used: {left_out[0]}"
+            if left_out
+            else "no frame, expected some"
+        )
         raise InputError(f"capture {source}: {found}")
     return Capture(frames, left_out)

@@ -1,7 +1,9 @@
-"""Check that the depth of a few frames agrees by their poses, and name the usual mistake that explains if it does not.
+"""Check that the depth of a few frames agrees by their poses, and name the usual mistake that
+explains if it does not.
 
-Points of the object in one frame are moved into another. The share of them that lies on its surface is high if units
-and poses are right, also with noise and holes: about 0.9 for cameras 15 degrees apart, and 0.8 for 45 degrees.
+Points of the object in one frame are moved into another. The share of them that lies on its surface
+is high if units and poses are right, also with noise and holes: about 0.9 for cameras 15 degrees
+apart, and 0.8 for 45 degrees.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,17 +23,25 @@ from zsp_lite.metrics import rotation_angle
 from zsp_lite.points import object_pixels, world_points
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-_POINTS, _LEAST_POINTS, _PAIRS = 500, 50, 8  # points of a frame, at most and at least, and pairs of frames
+_POINTS, _LEAST_POINTS, _PAIRS = (
+    500,
+    50,
+    8,
+)  # points of a frame, at most and at least, and pairs of frames
 _NEAREST, _BEST, _FARTHEST = 4.0, 20.0, 50.0  # angle between two cameras that are compared, degrees
 _TOLERANCE = 0.05  # of depth, relative to that of the object
 _AGREEING = 0.6  # share of points above which frames agree without doubt
 _FITTING, _GAIN = 0.5, 0.25  # least share of points by the right correction, and its least gain
 _ALIKE = 0.03  # difference of shares below which the likelier correction is named
-_RAY_GAIN = 1.2  # least ratio of the share if depth is along the ray, which changes little near the axis
+_RAY_GAIN = (
+    1.2  # least ratio of the share if depth is along the ray, which changes little near the axis
+)
 _CONTRADICTING = 0.4  # share of points below which frames contradict each other
 _UNITS = {1.0: "metres", 0.001: "millimetres", 0.0002: "1/5000 m"}
 _FACTORS = (1000.0, 0.001, 5.0, 0.2, 10.0, 0.1)  # from one common unit to another
-_SCALES = [scale for scale in np.geomspace(1e-3, 1e3, 280).tolist() if not 0.96 < scale < 1.04]  # steps of 5 %
+_SCALES = [
+    scale for scale in np.geomspace(1e-3, 1e3, 280).tolist() if not 0.96 < scale < 1.04
+]  # steps of 5 %
 
 _Pose = Float[np.ndarray, "4 4"]  # world to camera
 _Correction = Callable[[_Pose], _Pose]
@@ -51,9 +61,13 @@ class _Surface:
         """Gather some points of the object in a frame; without a mask, all is object."""
         mask = np.ones(frame.depth.shape, np.float32) if frame.mask is None else frame.mask
         pixels = object_pixels(frame)
-        points = frame.camera.to_camera(world_points(frame, pixels, int(pixels.sum()) // _POINTS + 1))
+        points = frame.camera.to_camera(
+            world_points(frame, pixels, int(pixels.sum()) // _POINTS + 1)
+        )
         depth = np.where(cv2.dilate(mask, np.ones((5, 5))) > ON_OBJECT, frame.depth, np.inf)
-        return cls(points, depth, frame.camera, float(np.median(points[:, 2])) if len(points) else 0.0)
+        return cls(
+            points, depth, frame.camera, float(np.median(points[:, 2])) if len(points) else 0.0
+        )
 
     def share(self, other: "_Surface", motion: _Pose, along_ray: bool) -> float:
         """Return the share of points that a motion between cameras takes onto another surface."""
@@ -61,7 +75,9 @@ class _Surface:
         if along_ray:
             points = points * points[:, 2:] / np.linalg.norm(points, axis=1, keepdims=True)
         pixels, depth = camera.project(points)
-        inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < other.depth.shape[::-1]).all(axis=1)
+        inside = (
+            (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < other.depth.shape[::-1]).all(axis=1)
+        )
         stored = np.linalg.norm(camera.to_camera(points), axis=1) if along_ray else depth
         columns, rows = pixels[inside].astype(int).T
         surface = other.depth[rows, columns]
@@ -73,9 +89,11 @@ _Pair = tuple[_Surface, _Surface]
 
 
 def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
-    """Say that frames of one object do not agree, and which usual mistake explains it; "" if they do, or none overlap.
+    """Say that frames of one object do not agree, and which usual mistake explains it; "" if they
+    do, or none overlap.
 
-    Masks are found where there are none. `unit` is the world units per stored depth value, if it can be changed.
+    Masks are found where there are none. `unit` is the world units per stored depth value, if it
+    can be changed.
     """
     objects, scenes = [], []
     for frame in frames:
@@ -92,9 +110,16 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     given, everywhere = _share(pairs), _share(whole)
     found = f"depth and poses of the frames do not agree ({given:.0%} of the object's points do)"
     along_ray = [_share(some, along_ray=True) for some in (whole, pairs)]
-    if along_ray[0] > _RAY_GAIN * everywhere and min(along_ray) > _FITTING and along_ray[1] > _AGREEING:
+    if (
+        along_ray[0] > _RAY_GAIN * everywhere
+        and min(along_ray) > _FITTING
+        and along_ray[1] > _AGREEING
+    ):
         mistake = "depth is the distance along the ray of a pixel, not along the optical axis"
-        return f"{found}; all that is seen agrees better ({along_ray[0]:.0%}, not {everywhere:.0%}) if {mistake}"
+        return (
+            f"{found}; all that is seen agrees better ({along_ray[0]:.0%}, not {everywhere:.0%}) "
+            f"if {mistake}"
+        )
     if given > _AGREEING:
         return ""
     for share, text in _explanations(pairs, unit):
@@ -105,12 +130,16 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
 
 
 def neighbours(count: int) -> list[int]:
-    """Choose up to six positions among `count` frames that go once around an object: three and those beside them."""
-    return sorted({(k * count // 3 + beside) % count for k in range(3) for beside in (0, max(1, count // 18))})
+    """Choose up to six positions among `count` frames that go once around an object: three and
+    those beside them."""
+    return sorted(
+        {(k * count // 3 + beside) % count for k in range(3) for beside in (0, max(1, count // 18))}
+    )
 
 
 def _pairs(surfaces: Sequence[_Surface]) -> list[_Pair]:
-    """Pair each surface with that of a camera turned by about `_BEST` degrees, an angle that no mistake changes."""
+    """Pair each surface with that of a camera turned by about `_BEST` degrees, an angle that no
+    mistake changes."""
     pairs, surfaces = [], [one for one in surfaces if len(one.points) >= _LEAST_POINTS]
     for one in surfaces:
         angles = np.array([rotation_angle(one.camera.R, other.camera.R) for other in surfaces])
@@ -121,7 +150,10 @@ def _pairs(surfaces: Sequence[_Surface]) -> list[_Pair]:
 
 
 def _share(
-    pairs: Sequence[_Pair], corrected: _Correction = np.asarray, scale: float = 1.0, along_ray: bool = False
+    pairs: Sequence[_Pair],
+    corrected: _Correction = np.asarray,
+    scale: float = 1.0,
+    along_ray: bool = False,
 ) -> float:
     """Return the median share of agreeing points, by corrected poses and with scaled depth."""
     shares = []
@@ -133,7 +165,8 @@ def _share(
 
 
 def _explanations(pairs: Sequence[_Pair], unit: float | None) -> Iterator[tuple[float, str]]:
-    """Give the best correction of poses, by a common factor and by any factor, and the share of points that agree."""
+    """Give the best correction of poses, by a common factor and by any factor, and the share of
+    points that agree."""
     shares = np.array([_share(pairs, correct) for _, correct in _CORRECTIONS])
     likeliest = int(np.argmax(shares > shares.max() - _ALIKE))
     yield shares[likeliest], f"the poses {_CORRECTIONS[likeliest][0]}"
@@ -145,7 +178,8 @@ def _explanations(pairs: Sequence[_Pair], unit: float | None) -> Iterator[tuple[
 
 
 def _scaled(factor: float, distance: float, unit: float | None) -> str:
-    """Say that the depth, or the positions of the cameras, are to be scaled: what leaves the distance plausible."""
+    """Say that the depth, or the positions of the cameras, are to be scaled: what leaves the
+    distance plausible."""
     nearest, farthest = PLAUSIBLE
     if unit and nearest <= distance <= farthest and not nearest <= factor * distance <= farthest:
         return f"the positions of the cameras are multiplied by {1 / factor:.3g}"
@@ -162,9 +196,12 @@ def _reorder(pose: _Pose) -> _Pose:
     return np.linalg.inv(to_world)
 
 
-_OTHER_AXES = "have the other axes, OpenGL's for OpenCV's or the reverse: negate the columns y and z"
+_OTHER_AXES = (
+    "have the other axes, OpenGL's for OpenCV's or the reverse: negate the columns y and z"
+)
 _INVERSE = "are world to camera"
-# From wrong to right matrices. Those of a file may be in OpenGL's axes; the choice of the world's axes does not matter.
+# From wrong to right matrices. Those of a file may be in OpenGL's axes; the choice of the world's
+# axes does not matter.
 _CORRECTIONS: list[tuple[str, _Correction]] = [
     (_INVERSE, np.linalg.inv),
     (_INVERSE, lambda pose: _FLIP @ np.linalg.inv(pose)),

@@ -1,4 +1,5 @@
-"""RGB-D captures: the files and camera of a frame, how they become a `Frame`, and what the readers of formats share."""
+"""RGB-D captures: the files and camera of a frame, how they become a `Frame`, and what the readers
+of formats share."""
 
 import re
 from collections import Counter
@@ -19,7 +20,8 @@ from zsp_lite.errors import InputError, real_array
 from zsp_lite.importers import files
 from zsp_lite.io.files import OutsideError, find_inside, read_bytes
 
-# OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with half-integer centres.
+# OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with
+# half-integer centres.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # +y up, looking along -z
 _FARTHEST = 1e4  # greatest known depth, in units of the world
@@ -36,16 +38,23 @@ class CaptureFrame:
     depth: Path  # of the image's aspect ratio; phones store it smaller than the image
     camera: Camera
     depth_unit: float = 0.001  # world units per stored depth value
-    distortion: tuple[float, ...] = ()  # OpenCV's k1, k2, p1, p2, k3; image, depth and mask are undistorted
+    distortion: tuple[
+        float, ...
+    ] = ()  # OpenCV's k1, k2, p1, p2, k3; image, depth and mask are undistorted
     mask: Path | None = None
-    fisheye: bool = False  # whether the distortion is that of OpenCV's fisheye cameras, k1, k2, k3, k4
+    fisheye: bool = (
+        False  # whether the distortion is that of OpenCV's fisheye cameras, k1, k2, k3, k4
+    )
     confidence: Path | None = None  # of each pixel of the depth map, see `trusted`
     label: int | None = None  # of the object, where masks have the labels of several
-    orientation: str | None = None  # "stored" or "displayed": how camera, depth and mask refer to a turned photograph
+    orientation: str | None = (
+        None  # "stored" or "displayed": how camera, depth and mask refer to a turned photograph
+    )
     posed: bool = True  # False for a single image, whose world is its camera's frame
 
     def load(self) -> Frame:
-        """Load the frame as viewers display it; InputError if a file is missing, damaged or of another size."""
+        """Load the frame as viewers display it; InputError if a file is missing, damaged or of
+        another size."""
         rgb, turn = files.read_picture(self.image)
         lies_stored = partial(files.lies_as_stored, rgb.shape, turn, self.orientation, self.image)
 
@@ -82,36 +91,55 @@ class CaptureFrame:
         return np.where(known, depth, np.float32(0))
 
     def _undistortion(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return OpenCV's maps that undistort the image, of which `camera` is the camera after turning."""
+        """Return OpenCV's maps that undistort the image, of which `camera` is the camera after
+        turning."""
         matrix, coefficients = camera.K - HALF_PIXEL, np.array(self.distortion)
         if self.fisheye:
             undistortion = cv2.fisheye.initUndistortRectifyMap
         else:
             undistortion = cv2.initUndistortRectifyMap
             p1, p2 = coefficients[2:4]
-            coefficients[[3, 2]] = (camera.R @ self.camera.R.T)[:2, :2] @ (p2, p1)  # a vector: it turns with the image
-        return undistortion(matrix, coefficients, np.eye(3), matrix, camera.size[::-1], cv2.CV_32FC1)
+            coefficients[[3, 2]] = (camera.R @ self.camera.R.T)[:2, :2] @ (
+                p2,
+                p1,
+            )  # a vector: it turns with the image
+        return undistortion(
+            matrix, coefficients, np.eye(3), matrix, camera.size[::-1], cv2.CV_32FC1
+        )
 
 
 class Capture(NamedTuple):
-    """Frames of a capture in the natural order of their image names, whatever the order in its files."""
+    """Frames of a capture in the natural order of their image names, whatever the order in its
+    files."""
 
     frames: list[CaptureFrame]
     left_out: list[str]  # what is wrong with each frame that is left out
 
 
-Makers = Iterator[Callable[[], CaptureFrame]]  # what a reader returns; a frame that cannot be used raises InputError
+Makers = Iterator[
+    Callable[[], CaptureFrame]
+]  # what a reader returns; a frame that cannot be used raises InputError
 
 
 def make_frame(
-    folder: Path, image: str | Path, depth: str | Path, pose: Values, intrinsics: Values, where: str,
-    axes: Values = np.eye(4), size: tuple[int, int] | None = None, mask: str | None = None,
-    confidence: str | Path | None = None, **others: Any,
-) -> CaptureFrame:  # fmt: skip
-    """Make a frame of what the files in the folder of a capture say; InputError if its files or numbers are no frame.
+    folder: Path,
+    image: str | Path,
+    depth: str | Path,
+    pose: Values,
+    intrinsics: Values,
+    where: str,
+    axes: Values = np.eye(4),
+    size: tuple[int, int] | None = None,
+    mask: str | None = None,
+    confidence: str | Path | None = None,
+    **others: Any,
+) -> CaptureFrame:
+    """Make a frame of what the files in the folder of a capture say; InputError if its files or
+    numbers are no frame.
 
-    The pose, camera to world, is a matrix of 12 or 16 numbers, or a position and a quaternion x, y, z, w, in OpenCV's
-    axes after multiplication by `axes`. Intrinsics are fx, fy, cx, cy or a matrix. Mask and confidence may be missing.
+    The pose, camera to world, is a matrix of 12 or 16 numbers, or a position and a quaternion x, y,
+    z, w, in OpenCV's axes after multiplication by `axes`. Intrinsics are fx, fy, cx, cy or a
+    matrix. Mask and confidence may be missing.
     """
     names = image, depth, mask, confidence
     paths = [find_inside(folder, name) if isinstance(name, str) else name for name in names]
@@ -123,7 +151,9 @@ def make_frame(
     if pose.size == 7:
         length = np.linalg.norm(pose[3:])
         if not 0.9 < length < 1.1:
-            raise InputError(f"{where}: quaternion {pose[3:].tolist()} has the length {length:.3g}, expected 1")
+            raise InputError(
+                f"{where}: quaternion {pose[3:].tolist()} has the length {length:.3g}, expected 1"
+            )
         pose = np.column_stack([Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]])
     if pose.size == 12:
         pose = np.vstack([pose.reshape(3, 4), (0, 0, 0, 1)])
@@ -139,7 +169,8 @@ def refuse(problem: str) -> CaptureFrame:
 
 
 def collect(makers: Iterable[Callable[[], CaptureFrame]]) -> tuple[list[CaptureFrame], list[str]]:
-    """Return the frames that can be made, in the natural order of their images, and what is wrong with the others."""
+    """Return the frames that can be made, in the natural order of their images, and what is wrong
+    with the others."""
     frames, left_out = [], []
     for make in makers:
         try:
@@ -160,9 +191,11 @@ def _natural_order(path: Path) -> tuple[list[str | int], str]:
 def sharpest(
     items: Sequence[Any], count: int, read: Callable[[Any], np.ndarray], left_out: list[str]
 ) -> Iterator[tuple[Any, np.ndarray]]:
-    """Split the items into `count` stretches, and yield the sharpest candidate of each with its image.
+    """Split the items into `count` stretches, and yield the sharpest candidate of each with its
+    image.
 
-    What is wrong with unreadable ones is added to `left_out`. The first item is chosen, because a box may be for it.
+    What is wrong with unreadable ones is added to `left_out`. The first item is chosen, because a
+    box may be for it.
     """
     parts = [[position] for position in range(len(items))]
     if len(items) > count:
@@ -192,8 +225,8 @@ def _sharpness(image: UInt8[np.ndarray, "..."]) -> float:
 def trusted(levels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Tell measured depth from smeared depth by levels of confidence: 0, 1, 2, or 0 to 255.
 
-    The lowest level is unknown, and the middle one is kept where it is wide, as on dark surfaces, but not in thin
-    bands, as along silhouettes, where the depth is a mean of object and background.
+    The lowest level is unknown, and the middle one is kept where it is wide, as on dark surfaces,
+    but not in thin bands, as along silhouettes, where the depth is a mean of object and background.
     """
     best = levels >= (2 if levels.max() <= 2 else 255)
     middle = ((levels > 0) & ~best).astype(np.uint8)
@@ -201,20 +234,32 @@ def trusted(levels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
-    """Find the mask of each image in a folder: by its relative path or its name, with its extension or without.
+    """Find the mask of each image in a folder: by its relative path or its name, with its extension
+    or without.
 
-    The longest path that both share decides. Images of one name in several folders do not share a mask.
+    The longest path that both share decides. Images of one name in several folders do not share a
+    mask.
     """
-    every = [path for path in sorted(Path(folder).rglob("*.*")) if path.suffix.lower() in files.MASKS]
+    every = [
+        path for path in sorted(Path(folder).rglob("*.*")) if path.suffix.lower() in files.MASKS
+    ]
     named = {path.relative_to(folder).with_suffix("").as_posix(): path for path in every}
 
     def tails(image: Path) -> list[str]:
-        return ["/".join(image.with_suffix("").parts[-count:]) for count in range(len(image.parts), 0, -1)]
+        return [
+            "/".join(image.with_suffix("").parts[-count:])
+            for count in range(len(image.parts), 0, -1)
+        ]
 
     shared = Counter(tail for image in images for tail in tails(image))
     found = []
     for image in images:
-        own = [name for tail in tails(image) if shared[tail] == 1 for name in (tail + image.suffix, tail)]
+        own = [
+            name
+            for tail in tails(image)
+            if shared[tail] == 1
+            for name in (tail + image.suffix, tail)
+        ]
         found.append(next((named[name] for name in own if name in named), None))
     return found
 
@@ -222,18 +267,25 @@ def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
 def read_lines(path: Path) -> list[str]:
     """Read the lines of a text file but for empty ones and those that begin with #."""
     text = read_bytes(path, "list").decode("utf-8-sig", "replace")
-    if not (lines := [line for part in text.splitlines() if (line := part.strip()) and line[0] != "#"]):
+    if not (
+        lines := [line for part in text.splitlines() if (line := part.strip()) and line[0] != "#"]
+    ):
         raise InputError(f"{path} is empty, expected at least 1 line")
     return lines
 
 
-def read_numbers(path: Path, columns: tuple[int, ...], **options: Any) -> Float[np.ndarray, "rows columns"]:
-    """Read a text file of numbers by `numpy.loadtxt` with its options, as many in each line as one of `columns`."""
+def read_numbers(
+    path: Path, columns: tuple[int, ...], **options: Any
+) -> Float[np.ndarray, "rows columns"]:
+    """Read a text file of numbers by `numpy.loadtxt` with its options, as many in each line as one
+    of `columns`."""
     lines = read_lines(path)
     try:
         values = np.loadtxt(lines, ndmin=2, **options)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
     if values.shape[1] not in columns:
-        raise InputError(f"{path}: {values.shape[1]} numbers per line, expected {' or '.join(map(str, columns))}")
+        raise InputError(
+            f"{path}: {values.shape[1]} numbers per line, expected {' or '.join(map(str, columns))}"
+        )
     return values

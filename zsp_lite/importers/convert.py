@@ -1,4 +1,5 @@
-"""Conversion of a source to a sequence of a data folder in CO3D's layout, with a fused point cloud (Open3D)."""
+"""Conversion of a source to a sequence of a data folder in CO3D's layout, with a fused point cloud
+(Open3D)."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,10 +18,14 @@ from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import load_open3d
 from zsp_lite.points import axis_deviation, object_pixels, sampling_step, world_points
 
-_VOXELS = 96  # voxels per three standard deviations of the object; finer than the noise of depth cameras
+_VOXELS = (
+    96  # voxels per three standard deviations of the object; finer than the noise of depth cameras
+)
 _MAX_POINTS = 50_000
 _LEAST_STEP = 7  # between the pixels by which the size of the object is estimated
-_UNFINISHED = ".unfinished"  # file in the folder of a sequence whose import goes on, or was interrupted
+_UNFINISHED = (
+    ".unfinished"  # file in the folder of a sequence whose import goes on, or was interrupted
+)
 _MIN_VIEWS = 3  # number of frames that must see a surface, if there are that many frames
 
 
@@ -36,18 +41,22 @@ class ImportResult:
 
 
 def import_source(source: Source, root: str | Path, category: str, sequence: str) -> ImportResult:
-    """Write the frames of a source as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused point cloud.
+    """Write the frames of a source as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused
+    point cloud.
 
-    Lengths are scaled so that the point cloud has unit standard deviation, averaged over the axes, as in CO3D. Frames
-    whose mask is empty are left out. An interrupted import can be repeated. InputError, and nothing is written, if the
-    source cannot be read, segmented or fused, or the sequence exists.
+    Lengths are scaled so that the point cloud has unit standard deviation, averaged over the axes,
+    as in CO3D. Frames whose mask is empty are left out. An interrupted import can be repeated.
+    InputError, and nothing is written, if the source cannot be read, segmented or fused, or the
+    sequence exists.
     """
     folder = Path(root) / plain_name(category, "category") / plain_name(sequence, "sequence")
     unfinished, count = folder / _UNFINISHED, len(source.numbers)
     if folder.exists() and not unfinished.is_file():
         raise InputError(f"{folder} exists already, expected another sequence name")
     if source.left_out and count < _MIN_VIEWS:
-        raise InputError(f"{source.path}: {count} frames remain, expected {_MIN_VIEWS}: {source.left_out[0]}")
+        raise InputError(
+            f"{source.path}: {count} frames remain, expected {_MIN_VIEWS}: {source.left_out[0]}"
+        )
     if line := source.contradiction():
         raise InputError(f"{source.path}: {line}")
     source = source.segmented()
@@ -58,26 +67,36 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
     points, colours, normals = fuse(frames)
     scale = 1 / axis_deviation(points)
     scaled = LazyFrames(lambda position: scale_frame(source.read(position), scale), seen)
-    data = SequenceData(sequence, scaled, [float(position) for position in seen], points * scale, colours, normals)
+    data = SequenceData(
+        sequence, scaled, [float(position) for position in seen], points * scale, colours, normals
+    )
     with writing(root):
         folder.mkdir(parents=True, exist_ok=True)
         unfinished.touch()
         write_co3d(root, category, [data])
         unfinished.unlink()
-    return ImportResult(len(seen), count - len(seen), len(points), scale, tuple(source.flags(frames)))
+    return ImportResult(
+        len(seen), count - len(seen), len(points), scale, tuple(source.flags(frames))
+    )
 
 
-def import_captures(folder: str | Path, root: str | Path, category: str) -> Iterator[tuple[str, ImportResult]]:
-    """Import each capture in a folder as a sequence of its name, but for those that are there; give what was done."""
+def import_captures(
+    folder: str | Path, root: str | Path, category: str
+) -> Iterator[tuple[str, ImportResult]]:
+    """Import each capture in a folder as a sequence of its name, but for those that are there; give
+    what was done."""
     for path in sorted(Path(folder).iterdir()):
         name = path.stem if path.is_file() else path.name
         place = Path(root) / category / name
-        if not path.name.startswith(".") and (not place.exists() or (place / _UNFINISHED).is_file()):
+        if not path.name.startswith(".") and (
+            not place.exists() or (place / _UNFINISHED).is_file()
+        ):
             yield name, import_source(open_source(path), root, category, name)
 
 
 class LazyFrames(Sequence[Frame]):
-    """Frames that are loaded at each access, because those of a capture do not fit into memory together."""
+    """Frames that are loaded at each access, because those of a capture do not fit into memory
+    together."""
 
     def __init__(self, load: Callable[[int], Frame], indices: Sequence[int]):
         self._load, self._indices = load, indices
@@ -92,18 +111,25 @@ class LazyFrames(Sequence[Frame]):
 def fuse(
     frames: Collection[Frame],
 ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Fuse the depth inside the masks by TSDF (Curless and Levoy 1996) to world points, RGB colours and normals."""
+    """Fuse the depth inside the masks by TSDF (Curless and Levoy 1996) to world points, RGB colours
+    and normals."""
     o3d = load_open3d()
     voxel = 3 * _spread(frames) / _VOXELS
     types, shapes = (o3d.core.float32,) * 3, ((1,), (1,), (3,))
-    volume = o3d.t.geometry.VoxelBlockGrid(("tsdf", "weight", "color"), types, shapes, voxel, 16, 2000)
+    volume = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight", "color"), types, shapes, voxel, 16, 2000
+    )
     for frame in frames:
         depth = np.where(object_pixels(frame), frame.depth, 0).astype(np.float32)
         if not depth.any():
             continue
         intrinsic = o3d.core.Tensor(frame.camera.K - HALF_PIXEL)
         extrinsic = o3d.core.Tensor(frame.camera.matrix)
-        options = {"depth_scale": 1.0, "depth_max": 1.01 * float(depth.max()), "trunc_voxel_multiplier": 4.0}
+        options = {
+            "depth_scale": 1.0,
+            "depth_max": 1.01 * float(depth.max()),
+            "trunc_voxel_multiplier": 4.0,
+        }
         depth = o3d.t.geometry.Image(depth)
         colour = o3d.t.geometry.Image(frame.rgb.astype(np.float32) / 255)
         blocks = volume.compute_unique_block_coordinates(depth, intrinsic, extrinsic, **options)
@@ -114,7 +140,10 @@ def fuse(
     if len(cloud.points) > _MAX_POINTS:
         cloud = cloud.uniform_down_sample(int(np.ceil(len(cloud.points) / _MAX_POINTS)))
     if len(cloud.points) < 4:
-        raise InputError(f"{len(frames)} frames fuse to {len(cloud.points)} points, expected overlapping depth maps")
+        raise InputError(
+            f"{len(frames)} frames fuse to {len(cloud.points)} points, expected overlapping "
+            "depth maps"
+        )
     colours = np.rint(np.asarray(cloud.colors) * 255).clip(0, 255).astype(np.uint8)
     return np.asarray(cloud.points).copy(), colours, np.asarray(cloud.normals).copy()
 
@@ -126,13 +155,19 @@ def scale_frame(frame: Frame, scale: float) -> Frame:
 
 
 def _spread(frames: Collection[Frame]) -> float:
-    """Estimate the object's standard deviation, averaged over the axes, by the median absolute deviation."""
+    """Estimate the object's standard deviation, averaged over the axes, by the median absolute
+    deviation."""
     clouds = []
     for frame in frames:
         step = max(_LEAST_STEP, sampling_step(frame, len(frames)))
         clouds.append(world_points(frame, object_pixels(frame), step))
     points = np.concatenate(clouds)
     if not len(points):
-        raise InputError(f"{len(frames)} frames have no known depth on the object, expected some inside the masks")
+        raise InputError(
+            f"{len(frames)} frames have no known depth on the object, expected some inside "
+            "the masks"
+        )
     deviation = np.abs(points - np.median(points, axis=0))
-    return float(1.48 * np.median(deviation, axis=0).mean())  # 1.48: ratio to the standard deviation for normal noise
+    return float(
+        1.48 * np.median(deviation, axis=0).mean()
+    )  # 1.48: ratio to the standard deviation for normal noise

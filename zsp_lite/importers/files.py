@@ -1,7 +1,8 @@
-"""Pictures, depth maps and masks as cameras, apps and labelling tools write them, and what speaks against intrinsics.
+"""Pictures, depth maps and masks as cameras, apps and labelling tools write them, and what speaks
+against intrinsics.
 
-A photograph's EXIF orientation says how viewers turn and mirror the stored pixels. Its depth, its mask and its camera
-may refer to the pixels as stored or as displayed.
+A photograph's EXIF orientation says how viewers turn and mirror the stored pixels. Its depth, its
+mask and its camera may refer to the pixels as stored or as displayed.
 """
 
 import io
@@ -29,9 +30,21 @@ _FORMATS = ("JPEG", "PNG", "WEBP")
 DEPTHS = (".png", ".npy", ".npz", ".tiff", ".tif", ".pfm", ".exr")
 MASKS = (".png", ".jpg", ".jpeg", ".webp", ".tiff", ".tif", ".npy")
 CO3D_DEPTH = ".geometric.png"  # float16 bits
-_DAMAGED = (OSError, SyntaxError, ValueError, EOFError, MemoryError, RuntimeError, zlib.error, zipfile.BadZipFile,
-            tokenize.TokenError, cv2.error, Image.DecompressionBombError)  # fmt: skip
-# By EXIF orientation: the number of quarter turns, as in `numpy.rot90`, before an image is mirrored left to right.
+_DAMAGED = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    MemoryError,
+    RuntimeError,
+    zlib.error,
+    zipfile.BadZipFile,
+    tokenize.TokenError,
+    cv2.error,
+    Image.DecompressionBombError,
+)
+# By EXIF orientation: the number of quarter turns, as in `numpy.rot90`, before an image is mirrored
+# left to right.
 _QUARTERS = dict(enumerate((0, 0, 2, 2, 3, 3, 1, 1), 1))
 _MIRRORED = (2, 4, 5, 7)
 _LOSSY = (".jpg", ".jpeg", ".webp")
@@ -61,16 +74,29 @@ def picture_size(path: str | Path) -> tuple[int, int]:
 
 
 def read_depth_file(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """Read the stored values of a depth map, 0 where unknown: not finite, not positive, or 65535 in 16 bits."""
+    """Read the stored values of a depth map, 0 where unknown: not finite, not positive, or 65535 in
+    16 bits."""
     path = Path(path)
     if path.name.endswith(CO3D_DEPTH):
         return read_depth(path)
     values = _read_values(path, "depth")
-    if values.ndim == 3 and (values.shape[2] == 1 or path.suffix.lower() == ".exr"):  # Blender repeats it as colours
+    if values.ndim == 3 and (
+        values.shape[2] == 1 or path.suffix.lower() == ".exr"
+    ):  # Blender repeats it as colours
         values = values[..., 0]
-    if values.ndim != 2 or values.dtype.kind not in "fiu" or values.dtype.itemsize < 2 or not values.size:
-        expected = "numbers (H, W): a 16-bit greyscale PNG or TIFF, .npy, .npz with one array, or float .tiff or .pfm"
-        raise InputError(f"depth {path} holds {values.dtype} of shape {values.shape}, expected {expected}")
+    if (
+        values.ndim != 2
+        or values.dtype.kind not in "fiu"
+        or values.dtype.itemsize < 2
+        or not values.size
+    ):
+        expected = (
+            "numbers (H, W): a 16-bit greyscale PNG or TIFF, .npy, .npz with one array, or float "
+            ".tiff or .pfm"
+        )
+        raise InputError(
+            f"depth {path} holds {values.dtype} of shape {values.shape}, expected {expected}"
+        )
     with np.errstate(over="ignore", invalid="ignore"):
         depth = values.astype(np.float32)
     known = np.isfinite(depth) & (depth > 0) & ((depth != 65535) | (values.dtype.itemsize != 2))
@@ -80,15 +106,21 @@ def read_depth_file(path: str | Path) -> Float32[np.ndarray, "h w"]:
 def read_mask_file(path: str | Path, label: int | None = None) -> Float32[np.ndarray, "h w"]:
     """Read a mask file as probabilities (H, W) in [0, 1].
 
-    Of two values, the larger is the object. A picture with a palette, or of at most 32 values, none above 50, has
-    labels: the object is the one that is not 0, or the given `label` of several. Other values are probabilities, above
-    half of the largest for JPEG and WebP, which blur two values to many.
+    Of two values, the larger is the object. A picture with a palette, or of at most 32 values, none
+    above 50, has labels: the object is the one that is not 0, or the given `label` of several.
+    Other values are probabilities, above half of the largest for JPEG and WebP, which blur two
+    values to many.
     """
     values, indexed = _mask_values(Path(path))
     found, integers = np.unique(values), values.dtype.kind in "iu"
     lossy = Path(path).suffix.lower() in _LOSSY
     labels = found[(found > 0) & (found != _VOID)]
-    few = integers and not lossy and len(found) <= _MOST_LABELS and max(labels, default=0) <= _LARGEST_LABEL
+    few = (
+        integers
+        and not lossy
+        and len(found) <= _MOST_LABELS
+        and max(labels, default=0) <= _LARGEST_LABEL
+    )
     if label is not None:
         mask = values == label
     elif len(found) <= 2:
@@ -96,16 +128,22 @@ def read_mask_file(path: str | Path, label: int | None = None) -> Float32[np.nda
     elif lossy:
         mask = values > found[-1] / 2
     elif not (indexed or few):
-        mask = values / (max(1.0, found[-1]) if not integers else 65535 if values.dtype == np.uint16 else 255)
+        mask = values / (
+            max(1.0, found[-1]) if not integers else 65535 if values.dtype == np.uint16 else 255
+        )
     elif len(labels) == 1:
         mask = values == labels[0]
     else:
-        raise InputError(f"mask {path} has the labels {', '.join(map(str, labels))}, expected --label with one of them")
+        raise InputError(
+            f"mask {path} has the labels {', '.join(map(str, labels))}, expected --label with "
+            "one of them"
+        )
     return mask.astype(np.float32)
 
 
 def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
-    """Read the values of a mask file, and whether they are numbers of colours: of a palette, or of a few colours."""
+    """Read the values of a mask file, and whether they are numbers of colours: of a palette, or of
+    a few colours."""
     values = _read_values(path, "mask")
     if path.suffix.lower() == ".png":
         with _decoding("mask", path):
@@ -117,12 +155,17 @@ def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
         if alpha.size and np.ptp(alpha):
             return alpha[..., 0], False
         if path.suffix.lower() not in _LOSSY and (colours != colours[..., :1]).any():
-            kinds, numbers = np.unique(colours @ np.array([1 << 32, 1 << 16, 1]), return_inverse=True)
+            kinds, numbers = np.unique(
+                colours @ np.array([1 << 32, 1 << 16, 1]), return_inverse=True
+            )
             if len(kinds) <= _MOST_LABELS:
                 return numbers.reshape(colours.shape[:2]), True
         values = colours.max(axis=2)
     if values.ndim != 2 or values.dtype.kind not in "fiub" or not values.size:
-        raise InputError(f"mask {path} holds {values.dtype} of shape {values.shape}, expected one value per pixel")
+        raise InputError(
+            f"mask {path} holds {values.dtype} of shape {values.shape}, expected one value "
+            "per pixel"
+        )
     return values, False
 
 
@@ -134,10 +177,14 @@ def _read_values(path: Path, what: str) -> Shaped[np.ndarray, "..."]:
             values = np.load(io.BytesIO(data), allow_pickle=False)
             if isinstance(values, np.lib.npyio.NpzFile):
                 if len(values.files) != 1:
-                    raise InputError(f"{what} {path} holds {len(values.files)} arrays, expected one")
+                    raise InputError(
+                        f"{what} {path} holds {len(values.files)} arrays, expected one"
+                    )
                 (member,) = values.zip.infolist()
                 values = values[values.files[0]] if member.file_size <= MAX_FILE else None
-        elif suffix == ".exr":  # None, or an error where the variable OPENCV_IO_ENABLE_OPENEXR is not set
+        elif (
+            suffix == ".exr"
+        ):  # None, or an error where the variable OPENCV_IO_ENABLE_OPENEXR is not set
             values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         elif suffix in (".tif", ".tiff", ".pfm", ".webp"):
             values = np.array(_open(path, what, ("TIFF", "PPM", "WEBP")))
@@ -170,17 +217,24 @@ def _decoding(what: str, path: str | Path) -> Iterator[None]:
         expected = f"a complete {Path(path).suffix or 'image'} file of at most {MAX_PIXELS} pixels"
         if str(path).endswith(".exr"):
             expected = "an OpenCV that reads .exr, or the depth as .npy or a float .tiff"
-        raise InputError(f"{what} {path} cannot be decoded ({type(error).__name__}), expected {expected}") from error
+        raise InputError(
+            f"{what} {path} cannot be decoded ({type(error).__name__}), expected {expected}"
+        ) from error
 
 
-def lies_as_stored(stored: Sequence[int], orientation: int, form: str | None, path: Path, size: Sequence[int]) -> bool:
-    """Tell by its size whether an image of a photograph lies as the stored pixels, or as displayed; else by `form`."""
+def lies_as_stored(
+    stored: Sequence[int], orientation: int, form: str | None, path: Path, size: Sequence[int]
+) -> bool:
+    """Tell by its size whether an image of a photograph lies as the stored pixels, or as displayed;
+    else by `form`."""
     if orientation == 1:
         return True
     if orientation > 4 and stored[0] != stored[1]:
         return (size[0] < size[1]) == (stored[0] < stored[1])
     if form is None:
-        unclear = "turns it, and sizes do not show whether depth, mask and intrinsics are turned, too"
+        unclear = (
+            "turns it, and sizes do not show whether depth, mask and intrinsics are turned, too"
+        )
         expected = "--orientation stored or --orientation displayed"
         raise InputError(f"{path}: EXIF orientation {orientation} {unclear}, expected {expected}")
     return form == "stored"
@@ -193,10 +247,14 @@ def display_image(image: Shaped[np.ndarray, "..."], orientation: int) -> Shaped[
 
 
 def display_camera(camera: Camera, orientation: int, where: str, posed: bool) -> Camera:
-    """Turn the camera of a stored image with it; one without a pose stays upright, and may be mirrored."""
+    """Turn the camera of a stored image with it; one without a pose stays upright, and may be
+    mirrored."""
     turned = camera.turn(_QUARTERS[orientation])
     if posed and orientation in _MIRRORED:
-        raise InputError(f"image {where} is mirrored by its EXIF orientation {orientation}, expected 1, 3, 6 or 8")
+        raise InputError(
+            f"image {where} is mirrored by its EXIF orientation {orientation}, expected 1, 3, "
+            "6 or 8"
+        )
     if orientation in _MIRRORED:
         x, y = turned.principal_point
         turned = replace(turned, principal_point=np.array([turned.size[1] - x, y]))
@@ -204,29 +262,46 @@ def display_camera(camera: Camera, orientation: int, where: str, posed: bool) ->
 
 
 def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
-    """Say what speaks against the intrinsics of an image; InputError for a field of view that no camera has.
+    """Say what speaks against the intrinsics of an image; InputError for a field of view that no
+    camera has.
 
     The principal point of an image is near its middle, unless it is a crop of a larger one.
     """
-    side, values = np.array(camera.size[::-1], float), np.concatenate([camera.focal_length, camera.principal_point])
+    side, values = (
+        np.array(camera.size[::-1], float),
+        np.concatenate([camera.focal_length, camera.principal_point]),
+    )
     focal, centre = values[:2], values[2:]
     ratios = 2 * centre / side  # of the image that the intrinsics fit to this one
     doubts = [f"the intrinsics {_listed(values)}"]
     if max(*centre, *focal / 5) <= 1:
-        doubts.append(f"look normalised: for this image they would be {_listed(values * np.tile(side, 2))}")
-    elif min(ratios) > 0 and np.ptp(ratios) < 0.05 * ratios.mean() and abs(ratios.mean() - 1) > _OFF_MIDDLE:
+        doubts.append(
+            f"look normalised: for this image they would be {_listed(values * np.tile(side, 2))}"
+        )
+    elif (
+        min(ratios) > 0
+        and np.ptp(ratios) < 0.05 * ratios.mean()
+        and abs(ratios.mean() - 1) > _OFF_MIDDLE
+    ):
         fitted_to = "an image" if max(2 * centre) > _LARGEST_SENSOR else "a sensor in millimetres"
         wide, high = 2 * centre
-        fitted = f"fit {fitted_to} of {wide:.4g} x {high:.4g}, not {side[0]:.0f} x {side[1]:.0f} pixels"
+        fitted = (
+            f"fit {fitted_to} of {wide:.4g} x {high:.4g}, not {side[0]:.0f} x {side[1]:.0f} pixels"
+        )
         doubts.append(f"{fitted}: for this image they would be {_listed(values / ratios.mean())}")
     elif np.abs(ratios - 1).max() > _OFF_MIDDLE:
         doubts.append("have their principal point far from the middle, as those of a crop")
     elif focal.max() > _UNEQUAL * focal.min():
         doubts.append("have unequal focal lengths")
-    whole = 2 * np.maximum(centre, side - centre)  # of the smallest image around this one with its centre there
+    whole = 2 * np.maximum(
+        centre, side - centre
+    )  # of the smallest image around this one with its centre there
     view = np.degrees(2 * np.arctan(whole / focal / 2)).max()
     if not _LEAST_VIEW <= view <= _LARGEST_VIEW:
-        found = f"have a field of view of {view:.3g} degrees, expected {_LEAST_VIEW:g} to {_LARGEST_VIEW:g}"
+        found = (
+            f"have a field of view of {view:.3g} degrees, expected {_LEAST_VIEW:g} to "
+            f"{_LARGEST_VIEW:g}"
+        )
         raise InputError(f"{where}: {' '.join(doubts)}{'; they' if doubts[1:] else ''} {found}")
     return (" ".join(doubts),) if len(doubts) > 1 else ()
 

@@ -9,18 +9,32 @@ from scipy.spatial import cKDTree
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import Makers, make_frame, read_lines, read_numbers
 
-_TUM_INTRINSICS = 525.0, 525.0, 320.0, 240.0  # the benchmark's default, with pixel centres at half-integers
-_TUM_UNIT, _TUM_TOLERANCE = 1 / 5000, 0.02  # metres per stored depth value; seconds between an image and its depth
+_TUM_INTRINSICS = (
+    525.0,
+    525.0,
+    320.0,
+    240.0,
+)  # the benchmark's default, with pixel centres at half-integers
+_TUM_UNIT, _TUM_TOLERANCE = (
+    1 / 5000,
+    0.02,
+)  # metres per stored depth value; seconds between an image and its depth
 
 
 def read_lists(folder: Path) -> Makers:
-    """Read a capture given as plain text lists, of which line n describes frame n (see `zsp-lite data import -h`)."""
+    """Read a capture given as plain text lists, of which line n describes frame n (see `zsp-lite
+    data import -h`)."""
     images, depths = (read_lines(folder / name) for name in ("rgb.txt", "depth.txt"))
     poses = read_numbers(folder / "poses.txt", (12, 16))
     intrinsics = read_numbers(folder / "intrinsics.txt", (3, 4))
     if intrinsics.shape[1] == 3 or len(intrinsics) == 1:
         intrinsics = [intrinsics.squeeze()] * len(poses)
-    counts = {"rgb.txt": len(images), "depth.txt": len(depths), "poses.txt": len(poses), "intrinsics": len(intrinsics)}
+    counts = {
+        "rgb.txt": len(images),
+        "depth.txt": len(depths),
+        "poses.txt": len(poses),
+        "intrinsics": len(intrinsics),
+    }
     if len(set(counts.values())) > 1:
         found = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise InputError(f"capture {folder}: the lists have lines: {found}; expected equal numbers")
@@ -29,20 +43,30 @@ def read_lists(folder: Path) -> Makers:
         yield partial(make_frame, folder, *names, poses[line], intrinsics[line], where)
 
 
-def read_tum(folder: Path, intrinsics: tuple[float, float, float, float] = _TUM_INTRINSICS) -> Makers:
-    """Read a sequence of TUM's RGB-D benchmark: image, depth and pose of the nearest times are a frame."""
+def read_tum(
+    folder: Path, intrinsics: tuple[float, float, float, float] = _TUM_INTRINSICS
+) -> Makers:
+    """Read a sequence of TUM's RGB-D benchmark: image, depth and pose of the nearest times are a
+    frame."""
     poses = read_numbers(folder / "groundtruth.txt", (8,))
     names = [folder / name for name in ("rgb.txt", "depth.txt")]
     times, depth_times = (read_numbers(name, (1,), usecols=0)[:, 0] for name in names)
     images, depths = ([line.split(maxsplit=1)[-1] for line in read_lines(name)] for name in names)
-    for time, image, depth, pose in zip(times, images, _nearest(depth_times, times), _nearest(poses[:, 0], times)):
+    for time, image, depth, pose in zip(
+        times, images, _nearest(depth_times, times), _nearest(poses[:, 0], times)
+    ):
         if min(depth, pose) >= 0:
             files, where = (image, depths[depth]), f"{folder}, time {time:.6f}"
-            yield partial(make_frame, folder, *files, poses[pose, 1:], intrinsics, where, depth_unit=_TUM_UNIT)
+            yield partial(
+                make_frame, folder, *files, poses[pose, 1:], intrinsics, where, depth_unit=_TUM_UNIT
+            )
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> list[int]:
-    """Return the position of the time that is nearest to each wanted one, -1 if none is within the tolerance."""
+    """Return the position of the time that is nearest to each wanted one, -1 if none is within the
+    tolerance."""
     tree = cKDTree(np.nan_to_num(times, nan=-1)[:, None])
-    gaps, found = tree.query(np.nan_to_num(wanted, nan=-9)[:, None], distance_upper_bound=_TUM_TOLERANCE)
+    gaps, found = tree.query(
+        np.nan_to_num(wanted, nan=-9)[:, None], distance_upper_bound=_TUM_TOLERANCE
+    )
     return np.where(np.isfinite(gaps), found, -1).tolist()

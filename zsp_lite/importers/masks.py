@@ -1,7 +1,9 @@
-"""Object masks of a capture: by colours from one bounding box (GrabCut), or by depth; and flags of doubtful masks.
+"""Object masks of a capture: by colours from one bounding box (GrabCut), or by depth; and flags of
+doubtful masks.
 
-By depth, the plane of the table or floor is fitted to the points of all frames. What is above it falls into connected
-parts; the object is the part at the point that the optical axes approach. Where depth is unknown, colours decide.
+By depth, the plane of the table or floor is fitted to the points of all frames. What is above it
+falls into connected parts; the object is the part at the point that the optical axes approach.
+Where depth is unknown, colours decide.
 """
 
 from collections import Counter
@@ -26,9 +28,12 @@ _ITERATIONS = 4  # of GrabCut
 _LONGEST_SIDE = 320  # pixels of an image in GrabCut, whose time is proportional to the area
 _PADDING = 0.1  # of the projected bounding box, relative to its longer side
 _SMALLEST_BOX = 4  # pixels
-_BALL_OFFSET = 0.6  # distance of the ball's centre behind the visible surface, relative to its radius
+_BALL_OFFSET = (
+    0.6  # distance of the ball's centre behind the visible surface, relative to its radius
+)
 _POINTS = 4000
-# By depth: all lengths are relative to the distance of the cameras from the point that they look at.
+# By depth: all lengths are relative to the distance of the cameras from the point that they look
+# at.
 _REACH = 0.7  # points farther from that point are not part of the object
 _PLANE_DISTANCE = 0.01  # largest distance of a point of the plane
 _CLEARANCE = 0.02  # smallest height of a point of the object above the plane
@@ -36,15 +41,17 @@ _VOXEL = 0.07  # parts that are farther apart than this are separate
 _PLANES = 3  # planes to try: the largest may be a wall or a side of the object
 _MAX_BELOW = 0.05  # share of the points that may lie below the supporting plane
 _MIN_ON_PLANE = 0.05  # share of the points that must lie on it
-_MIN_SPREAD = 0.7  # least deviation of the points on it, relative to that of the others: sides of objects are smaller
-# Two objects are alike if the ratios of their points, which count less far from the focus, and of their extents exceed
-# these values. Gaps between them may be smaller than `_VOXEL` by this factor, if there are so many views: an object
-# that hides parts of itself has gaps in a few views.
+# least deviation of the points on it, relative to that of the others: sides of objects are smaller
+_MIN_SPREAD = 0.7
+# Two objects are alike if the ratios of their points, which count less far from the focus, and of
+# their extents exceed these values. Gaps between them may be smaller than `_VOXEL` by this factor,
+# if there are so many views: an object that hides parts of itself has gaps in a few views.
 _COMPARABLE, _ALIKE, _FINER, _MANY = 0.5, 0.7, 4, 8
 _CLOUD_POINTS = 20_000
 _MIN_PIXELS = 100
-# The bounding box of the object in known depth grows by these shares of its sides, half of it on each side: pixels of
-# unknown depth inside the first box may be on the object, and the colours of the background are those in the second.
+# The bounding box of the object in known depth grows by these shares of its sides, half of it on
+# each side: pixels of unknown depth inside the first box may be on the object, and the colours of
+# the background are those in the second.
 _UNKNOWN_PADDING, _CONTEXT_PADDING = 0.1, 0.8
 # A mask is flagged beyond these values, which were chosen on renderings.
 _BORDERS = 2  # number of the image's borders that a mask may not touch at once
@@ -53,22 +60,29 @@ _PARTS = 0.25  # share of the mask outside its largest region
 _COLOUR_IOU = 0.5  # least overlap with the mask that GrabCut finds in the padded bounding box
 _LEAST_SIGNS = 0.5  # per frame, below which masks are not flagged
 _LYING = 0.5  # share of the object's points that may lie in the plane around it
-_CARRYING, _CARRIED = 0.4, 0.05  # shares of the object's points in and above one plane, such as a table's
+_CARRYING, _CARRIED = (
+    0.4,
+    0.05,
+)  # shares of the object's points in and above one plane, such as a table's
 
 PLAUSIBLE = 0.05, 20.0  # distance of an object, metres
 _LEAST_KNOWN = 0.4  # share of the pixels on the object
 DOUBTFUL = "the masks may be wrong"
 
-Plane = tuple[Float[np.ndarray, "3"], float]  # unit normal, to the side of the cameras, and offset: normal @ x = offset
+Plane = tuple[
+    Float[np.ndarray, "3"], float
+]  # unit normal, to the side of the cameras, and offset: normal @ x = offset
 
 
 def masks_from_box(frames: Iterable[Frame], box: Box) -> Iterator[Frame]:
-    """Segment the object in the frames of a capture, given its box (top, left, height, width) in the first one.
+    """Segment the object in the frames of a capture, given its box (top, left, height, width) in
+    the first one.
 
-    OpenCV's GrabCut (Rother, Kolmogorov and Blake 2004) separates the colours inside and outside of a box. The box of
-    a further frame is the projection of the object points of the frames before it and of a ball as wide as the first
-    box, which stands for what is not visible there. A mask is empty where a further frame does not show the object.
-    The frames are read one by one, as their masks are asked for. InputError if the box finds nothing.
+    OpenCV's GrabCut (Rother, Kolmogorov and Blake 2004) separates the colours inside and outside of
+    a box. The box of a further frame is the projection of the object points of the frames before it
+    and of a ball as wide as the first box, which stands for what is not visible there. A mask is
+    empty where a further frame does not show the object. The frames are read one by one, as their
+    masks are asked for. InputError if the box finds nothing.
     """
     frames = iter(frames)
     first = next(frames)
@@ -76,11 +90,16 @@ def masks_from_box(frames: Iterable[Frame], box: Box) -> Iterator[Frame]:
     top, left, box_height, box_width = box
     inside = min(top, left) >= 0 and top + box_height <= height and left + box_width <= width
     if not inside or min(box_height, box_width) < _SMALLEST_BOX:
-        raise InputError(f"box (top, left, height, width) is {tuple(box)}, expected one inside {(height, width)}")
+        raise InputError(
+            f"box (top, left, height, width) is {tuple(box)}, expected one inside {(height, width)}"
+        )
     first = replace(first, mask=grab_cut(first.rgb, box))
     points = _inner_points(first)
     if not len(points):
-        raise InputError(f"frame {first.name}: no object with known depth in the box {tuple(box)}, expected another")
+        raise InputError(
+            f"frame {first.name}: no object with known depth in the box {tuple(box)}, "
+            "expected another"
+        )
     depth = float(np.median(first.depth[object_pixels(first)]))
     radius = depth * (np.array([box_width, box_height]) / first.camera.focal_length).max() / 2
     middle = np.array([left + box_width / 2, top + box_height / 2])
@@ -93,7 +112,8 @@ def masks_from_box(frames: Iterable[Frame], box: Box) -> Iterator[Frame]:
 def _masks_from_points(
     frames: Iterator[Frame], points: Float[np.ndarray, "n 3"], ball: Float[np.ndarray, "m 3"]
 ) -> Iterator[Frame]:
-    """Segment the object in frames, given world points on it and those of a ball that stands for the rest."""
+    """Segment the object in frames, given world points on it and those of a ball that stands for
+    the rest."""
     for frame in frames:
         found = _project_box(frame, np.concatenate([points, ball]))
         seen = min(found[2:]) >= _SMALLEST_BOX and not frame_defect(replace(frame, mask=None))
@@ -105,7 +125,8 @@ def _masks_from_points(
 
 
 def grab_cut(rgb: UInt8[np.ndarray, "h w 3"], box: Box) -> Float[np.ndarray, "h w"]:
-    """Return the mask of the largest region in a box (top, left, height, width) with other colours than around it."""
+    """Return the mask of the largest region in a box (top, left, height, width) with other colours
+    than around it."""
     top, left, height, width = box
     inside = np.zeros(rgb.shape[:2], bool)
     inside[top : top + height, left : left + width] = True
@@ -113,11 +134,18 @@ def grab_cut(rgb: UInt8[np.ndarray, "h w 3"], box: Box) -> Float[np.ndarray, "h 
 
 
 def separate_colours(
-    rgb: UInt8[np.ndarray, "h w 3"], possible: Bool[np.ndarray, "h w"], certain: Bool[np.ndarray, "h w"] | bool = False
+    rgb: UInt8[np.ndarray, "h w 3"],
+    possible: Bool[np.ndarray, "h w"],
+    certain: Bool[np.ndarray, "h w"] | bool = False,
 ) -> Bool[np.ndarray, "h w"]:
-    """Select the foreground by GrabCut on the image or a smaller copy: `certain` pixels, and some `possible` ones."""
+    """Select the foreground by GrabCut on the image or a smaller copy:
+
+    `certain` pixels, and some `possible` ones.
+    """
     height, width = possible.shape
-    labels = np.where(certain, cv2.GC_FGD, np.where(possible, cv2.GC_PR_FGD, cv2.GC_BGD)).astype(np.uint8)
+    labels = np.where(certain, cv2.GC_FGD, np.where(possible, cv2.GC_PR_FGD, cv2.GC_BGD)).astype(
+        np.uint8
+    )
     shrink = max(1, max(height, width) / _LONGEST_SIDE)
     size = max(1, round(width / shrink)), max(1, round(height / shrink))
     bgr = cv2.resize(rgb[..., ::-1], size, interpolation=cv2.INTER_AREA)
@@ -132,13 +160,15 @@ def separate_colours(
 
 
 def _inner_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
-    """World points inside the mask, without its border, where depth may be that of the background."""
+    """World points inside the mask, without its border, where depth may be that of the
+    background."""
     inner = replace(frame, mask=cv2.erode(frame.mask, np.ones((5, 5), np.uint8)))
     return world_points(inner, object_pixels(inner))
 
 
 def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box:
-    """Compute the padded bounding box of projected world points, of size 0 if they are not in the image."""
+    """Compute the padded bounding box of projected world points, of size 0 if they are not in the
+    image."""
     height, width = frame.camera.size
     pixels, depth = frame.camera.project(points)
     pixels = pixels[depth > 0]
@@ -152,9 +182,12 @@ def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box:
 
 
 def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
-    """Segment the object in frames of one world; InputError if nothing, or two alike, stand where the cameras look."""
+    """Segment the object in frames of one world; InputError if nothing, or two alike, stand where
+    the cameras look."""
     if not any((frame.depth > 0).any() for frame in frames):
-        raise InputError(f"no depth is known in any of {len(frames)} frames, expected some to find the object")
+        raise InputError(
+            f"no depth is known in any of {len(frames)} frames, expected some to find the object"
+        )
     focus, distance = _focus(frames)
     pixels, sample = [], []
     for frame in frames:
@@ -162,24 +195,33 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
         near[near] = _within(world_points(frame, near), focus, distance)
         pixels.append(near)
         sample.append(world_points(frame, near, sampling_step(frame, len(frames))))
-    plane = _supporting_plane([frame.camera.centre for frame in frames], np.concatenate(sample), distance)
+    plane = _supporting_plane(
+        [frame.camera.centre for frame in frames], np.concatenate(sample), distance
+    )
     if plane is not None:
         for frame, near in zip(frames, pixels, strict=True):
             near[near] = world_points(frame, near) @ plane[0] - plane[1] > _CLEARANCE * distance
     parts = _part_at(focus, frames, pixels, _VOXEL * distance)
     if len(frames) >= _MANY:
-        _part_at(focus, frames, parts, _VOXEL / _FINER * distance)  # refuses a part that is two objects close together
-    masked = [replace(frame, mask=_with_unknown(frame, part)) for frame, part in zip(frames, parts, strict=True)]
+        _part_at(
+            focus, frames, parts, _VOXEL / _FINER * distance
+        )  # refuses a part that is two objects close together
+    masked = [
+        replace(frame, mask=_with_unknown(frame, part))
+        for frame, part in zip(frames, parts, strict=True)
+    ]
     if not any(frame.mask.sum() >= _MIN_PIXELS for frame in masked):
         raise InputError(
-            f"{frames[0].name or 'frame'}: nothing stands out from a plane where the camera looks, expected "
+            f"{frames[0].name or 'frame'}: nothing stands out from a plane where the camera "
+            "looks, expected "
             "--box TOP,LEFT,HEIGHT,WIDTH around the object"
         )
     return masked
 
 
 def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
-    """Say in one line what speaks against the masks of frames of one world; frames with a defect do not count."""
+    """Say in one line what speaks against the masks of frames of one world; frames with a defect do
+    not count."""
     plane, distance = _plane_around(frames)
     usable, found = 0, Counter()
     for frame in frames:
@@ -189,13 +231,16 @@ def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
     if found.total() < _LEAST_SIGNS * usable:
         return ()
     signs = [f"{sign} ({count} of {usable} frames)" for sign, count in found.items()]
-    if signs and plane is None:  # alone it is no reason: many objects fill the image, or stand on a dark turntable
+    if (
+        signs and plane is None
+    ):  # alone it is no reason: many objects fill the image, or stand on a dark turntable
         signs.append("no plane is found that the object stands on")
     return (f"{DOUBTFUL}: {', '.join(signs)}",) if signs else ()
 
 
 def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
-    """Question the object's distance, if lengths are metres, and whether most of it has known depth."""
+    """Question the object's distance, if lengths are metres, and whether most of it has known
+    depth."""
     distances, seen, known = [], 0, 0
     for frame in frames:
         depth = frame.depth[object_pixels(frame)]
@@ -204,23 +249,33 @@ def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
     distance = float(np.nanmedian(distances)) if known else PLAUSIBLE[0]
     if metric and not PLAUSIBLE[0] <= distance <= PLAUSIBLE[1]:
         cure = "the unit of its depth is given by --depth-unit (0.001: millimetres, 1: metres)"
-        yield f"the object is {distance:.3g} m from the camera, expected {PLAUSIBLE[0]:g} to {PLAUSIBLE[1]:g} m; {cure}"
+        yield (
+            f"the object is {distance:.3g} m from the camera, expected {PLAUSIBLE[0]:g} to "
+            f"{PLAUSIBLE[1]:g} m; {cure}"
+        )
     if known < _LEAST_KNOWN * seen:
         yield f"depth is known on {known / seen:.0%} of the object only"
 
 
 def given_mask_flags(frames: Collection[Frame], missing: Collection[str]) -> tuple[str, ...]:
-    """Name the frames whose masks were made, and question masks that cover most of the image's border."""
+    """Name the frames whose masks were made, and question masks that cover most of the image's
+    border."""
     flags = [f"no mask is given for {', '.join(missing)}: found by depth"] if missing else []
     masks = (frame.mask > ON_OBJECT for frame in frames)
-    borders = [np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean() for mask in masks]
+    borders = [
+        np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean() for mask in masks
+    ]
     if count := sum(share > _MOST for share in borders):
-        flags.append(f"{DOUBTFUL}: those of {count} of {len(borders)} frames cover most of the border: inverted?")
+        flags.append(
+            f"{DOUBTFUL}: those of {count} of {len(borders)} frames cover most of the border: "
+            "inverted?"
+        )
     return tuple(flags)
 
 
 def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:
-    """Fit the plane that an object stands on to points outside of its masks; return also the cameras' distance."""
+    """Fit the plane that an object stands on to points outside of its masks; return also the
+    cameras' distance."""
     on_object, around, centres = [], [], []
     for frame in frames:
         if frame_defect(frame):
@@ -238,7 +293,9 @@ def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:
     return _supporting_plane(centres, cloud[_within(cloud, centre, distance)], distance), distance
 
 
-def _within(points: Float[np.ndarray, "n 3"], focus: Float[np.ndarray, "3"], distance: float) -> Bool[np.ndarray, " n"]:
+def _within(
+    points: Float[np.ndarray, "n 3"], focus: Float[np.ndarray, "3"], distance: float
+) -> Bool[np.ndarray, " n"]:
     """Select the points that may be part of an object at the focus of cameras at a distance."""
     return np.linalg.norm(points - focus, axis=1) < _REACH * distance
 
@@ -246,7 +303,8 @@ def _within(points: Float[np.ndarray, "n 3"], focus: Float[np.ndarray, "3"], dis
 def _supporting_plane(
     centres: Sequence[Float[np.ndarray, "3"]], cloud: Float[np.ndarray, "n 3"], distance: float
 ) -> Plane | None:
-    """Fit the plane that an object stands on to the points around it, below the cameras; None if there is none."""
+    """Fit the plane that an object stands on to the points around it, below the cameras; None if
+    there is none."""
     cloud = cloud[:: max(1, -(-len(cloud) // _CLOUD_POINTS))]
     rest = cloud
     for _ in range(_PLANES):
@@ -258,15 +316,22 @@ def _supporting_plane(
         height = cloud @ normal - offset
         on = np.abs(height) < _PLANE_DISTANCE * distance
         below = (height < -3 * _PLANE_DISTANCE * distance).mean()
-        spread, other_spread = (standard_deviation(cloud[some]) if some.any() else 0.0 for some in (on, ~on))
-        if spread >= _MIN_SPREAD * other_spread and on.mean() >= _MIN_ON_PLANE and below <= _MAX_BELOW:
+        spread, other_spread = (
+            standard_deviation(cloud[some]) if some.any() else 0.0 for some in (on, ~on)
+        )
+        if (
+            spread >= _MIN_SPREAD * other_spread
+            and on.mean() >= _MIN_ON_PLANE
+            and below <= _MAX_BELOW
+        ):
             return normal, offset
         rest = rest[np.abs(rest @ normal - offset) >= _PLANE_DISTANCE * distance]
     return None
 
 
 def _focus(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"], float]:
-    """Return the point nearest to the optical axes of the cameras, and their mean distance from it."""
+    """Return the point nearest to the optical axes of the cameras, and their mean distance
+    from it."""
     centres = np.stack([frame.camera.centre for frame in frames])
     axes = np.stack([frame.camera.R[2] for frame in frames])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -275,7 +340,8 @@ def _focus(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"], float]:
         focus = np.linalg.solve(system, np.einsum("nij,nj->i", across, centres) / len(frames))
         if (np.einsum("nj,nj->n", focus - centres, axes) > 0).all():
             return focus, float(np.linalg.norm(focus - centres, axis=1).mean())
-    # One camera, or parallel axes: the median of the nearest quarter of the points in the central part of an image.
+    # One camera, or parallel axes: the median of the nearest quarter of the points in the central
+    # part of an image.
     first = next(k for k, frame in enumerate(frames) if (frame.depth > 0).any())
     known, (height, width) = frames[first].depth > 0, frames[first].camera.size
     middle = np.zeros_like(known)
@@ -287,32 +353,49 @@ def _focus(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"], float]:
 
 
 def _part_at(
-    focus: Float[np.ndarray, "3"], frames: Sequence[Frame], pixels: Sequence[np.ndarray], voxel: float
+    focus: Float[np.ndarray, "3"],
+    frames: Sequence[Frame],
+    pixels: Sequence[np.ndarray],
+    voxel: float,
 ) -> list[Bool[np.ndarray, "_ _"]]:
-    """Select the pixels in the connected part with the most points, which count less far from the focus.
+    """Select the pixels in the connected part with the most points, which count less far from the
+    focus.
 
     InputError if a second part is alike.
     """
-    clouds = [partial(world_points, *one) for one in zip(frames, pixels, strict=True)]  # to be computed twice, not kept
-    corners = [(cloud.min(axis=0), cloud.max(axis=0)) for cloud in (make() for make in clouds) if len(cloud)]
+    clouds = [
+        partial(world_points, *one) for one in zip(frames, pixels, strict=True)
+    ]  # to be computed twice, not kept
+    corners = [
+        (cloud.min(axis=0), cloud.max(axis=0))
+        for cloud in (make() for make in clouds)
+        if len(cloud)
+    ]
     if not corners:
         return list(pixels)
     low, high = np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))
     shape = np.floor((high - low) / voxel).astype(int) + 1
     weight, cells = np.zeros(shape.prod()), []
     for points in (make() for make in clouds):
-        cells.append(np.ravel_multi_index(np.floor((points - low) / voxel).astype(int).T, shape).astype(np.int32))
+        cells.append(
+            np.ravel_multi_index(np.floor((points - low) / voxel).astype(int).T, shape).astype(
+                np.int32
+            )
+        )
         near = np.exp(-np.square(np.linalg.norm(points - focus, axis=1) / (8 * voxel)))
         weight += np.bincount(cells[-1], near, len(weight))
     part = ndimage.label(weight.reshape(shape) > 0, np.ones((3, 3, 3)))[0].ravel()
     sizes = np.bincount(part, weight)
     first = sizes.argmax()
     large = np.flatnonzero(sizes > _COMPARABLE * sizes[first])
-    extents = np.array([np.argwhere((part == one).reshape(shape)).std(axis=0).mean() for one in large])
+    extents = np.array(
+        [np.argwhere((part == one).reshape(shape)).std(axis=0).mean() for one in large]
+    )
     likeness = extents / extents[large == first]
     if ((likeness > _ALIKE) & (likeness < 1 / _ALIKE)).sum() > 1:
         raise InputError(
-            f"{frames[0].name or 'frame'}: two objects of like size stand where the camera looks, expected "
+            f"{frames[0].name or 'frame'}: two objects of like size stand where the camera "
+            "looks, expected "
             "--box TOP,LEFT,HEIGHT,WIDTH around one of them"
         )
     chosen = part == first
@@ -323,20 +406,31 @@ def _part_at(
 
 
 def _with_unknown(frame: Frame, mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Remove single pixels of a mask, and add the pixels of unknown depth around it that have the object's colours."""
+    """Remove single pixels of a mask, and add the pixels of unknown depth around it that have the
+    object's colours."""
     mask = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     if mask.any():
         mask |= _colours_around(frame, mask > 0, certain=True) & (frame.depth == 0)
     return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).astype(np.float32)
 
 
-def _colours_around(frame: Frame, mask: Bool[np.ndarray, "h w"], certain: bool) -> Bool[np.ndarray, "h w"]:
-    """Separate the colours in the box of a mask by GrabCut; around a `certain` mask only pixels of unknown depth."""
-    boxes = [mask_to_bbox(mask.astype(np.uint8), padding=padding) for padding in (_UNKNOWN_PADDING, _CONTEXT_PADDING)]
-    inner, context = (np.s_[top : top + height, left : left + width] for top, left, height, width in boxes)
+def _colours_around(
+    frame: Frame, mask: Bool[np.ndarray, "h w"], certain: bool
+) -> Bool[np.ndarray, "h w"]:
+    """Separate the colours in the box of a mask by GrabCut; around a `certain` mask only pixels of
+    unknown depth."""
+    boxes = [
+        mask_to_bbox(mask.astype(np.uint8), padding=padding)
+        for padding in (_UNKNOWN_PADDING, _CONTEXT_PADDING)
+    ]
+    inner, context = (
+        np.s_[top : top + height, left : left + width] for top, left, height, width in boxes
+    )
     possible, found = np.zeros_like(mask), np.zeros_like(mask)
     possible[inner] = (frame.depth[inner] == 0) | (not certain)
-    found[context] = separate_colours(frame.rgb[context], possible[context], mask[context] & certain)
+    found[context] = separate_colours(
+        frame.rgb[context], possible[context], mask[context] & certain
+    )
     return found
 
 
@@ -344,7 +438,10 @@ def _signs(frame: Frame, plane: Plane | None, distance: float) -> Iterator[str]:
     """Name what speaks against the mask of a frame."""
     mask = frame.mask > ON_OBJECT
     width = max(mask.shape) // 100 + 1  # of the border, pixels
-    if sum(edge.any() for edge in (mask[:width], mask[-width:], mask[:, :width], mask[:, -width:])) >= _BORDERS:
+    if (
+        sum(edge.any() for edge in (mask[:width], mask[-width:], mask[:, :width], mask[:, -width:]))
+        >= _BORDERS
+    ):
         yield "several borders of the image are touched"
     if mask.mean() > _MOST:
         yield "most of the image is covered"

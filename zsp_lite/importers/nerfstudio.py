@@ -1,4 +1,7 @@
-"""nerfstudio's transforms.json and its relatives: Blender's synthetic scenes, NeRFCapture, instant-ngp."""
+"""nerfstudio's transforms.json and its relatives:
+
+Blender's synthetic scenes, NeRFCapture, instant-ngp.
+"""
 
 import math
 from functools import partial
@@ -52,16 +55,24 @@ class _Frame(msgspec.Struct):
 def read_nerfstudio(path: str | Path) -> Makers:
     """Read the frames with depth of a folder with transforms.json, or of such a file.
 
-    The depth is in millimetres unless the file has `integer_depth_scale` or `depth_unit_scale_factor`.
+    The depth is in millimetres unless the file has `integer_depth_scale` or
+    `depth_unit_scale_factor`.
     """
     path = Path(path)
     if path.suffix != ".json":
         path = next((path / name for name in _NAMES if (path / name).is_file()), path / _NAMES[0])
     common = read_json(path, dict[str, Any], "capture")
-    listed = decode_json(msgspec.json.encode(common.pop("frames", None)), list[dict[str, Any]], f"{path}, frames")
-    with_depth = [k for k, own in enumerate(listed) if own.get("depth_file_path") or own.get("depth_path")]
+    listed = decode_json(
+        msgspec.json.encode(common.pop("frames", None)), list[dict[str, Any]], f"{path}, frames"
+    )
+    with_depth = [
+        k for k, own in enumerate(listed) if own.get("depth_file_path") or own.get("depth_path")
+    ]
     if not with_depth:
-        raise InputError(f"{path}: none of {len(listed)} frames has depth_file_path or depth_path, expected depth")
+        raise InputError(
+            f"{path}: none of {len(listed)} frames has depth_file_path or depth_path, "
+            "expected depth"
+        )
     for number in with_depth:
         yield partial(_make, path.parent, common | listed[number], f"{path}, frame {number}")
 
@@ -80,16 +91,32 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     if not (frame.fl_x or frame.camera_angle_x):
         raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
     fx = frame.fl_x or width / 2 / math.tan(frame.camera_angle_x / 2)
-    fy = frame.fl_y or (height / 2 / math.tan(frame.camera_angle_y / 2) if frame.camera_angle_y else fx)
-    cx, cy = (width / 2 if frame.cx is None else frame.cx), (height / 2 if frame.cy is None else frame.cy)
-    if found not in (None, (height, width)) and math.isclose(height * found[1], width * found[0], rel_tol=0.01):
+    fy = frame.fl_y or (
+        height / 2 / math.tan(frame.camera_angle_y / 2) if frame.camera_angle_y else fx
+    )
+    cx, cy = (
+        (width / 2 if frame.cx is None else frame.cx),
+        (height / 2 if frame.cy is None else frame.cy),
+    )
+    if found not in (None, (height, width)) and math.isclose(
+        height * found[1], width * found[0], rel_tol=0.01
+    ):
         fitted = ", ".join(f"{value * found[1] / width:.4g}" for value in (fx, fy, cx, cy))
         expected = f"its own size {found[1]} x {found[0]} with the intrinsics {fitted}"
         raise InputError(f"{where}: w and h of {image} are {width} x {height}, expected {expected}")
     # OpenCV's order of the coefficients; its model has no r^8 term, k4.
     last = (frame.k3, frame.k4) if fisheye else (frame.p1, frame.p2, frame.k3)
     return make_frame(
-        folder, frame.file_path, frame.depth_file_path or frame.depth_path, frame.transform_matrix,
-        (fx, fy, cx, cy), where, FROM_OPENGL, (height, width), frame.mask_path, fisheye=fisheye,
-        depth_unit=frame.integer_depth_scale or frame.depth_unit_scale_factor, distortion=(frame.k1, frame.k2, *last),
-    )  # fmt: skip
+        folder,
+        frame.file_path,
+        frame.depth_file_path or frame.depth_path,
+        frame.transform_matrix,
+        (fx, fy, cx, cy),
+        where,
+        FROM_OPENGL,
+        (height, width),
+        frame.mask_path,
+        fisheye=fisheye,
+        depth_unit=frame.integer_depth_scale or frame.depth_unit_scale_factor,
+        distortion=(frame.k1, frame.k2, *last),
+    )

@@ -1,4 +1,7 @@
-"""Scans of phones as their apps export them, after the apps' documents: Stray Scanner, Polycam, Record3D."""
+"""Scans of phones as their apps export them, after the apps' documents:
+
+Stray Scanner, Polycam, Record3D.
+"""
 
 from functools import partial
 from pathlib import Path
@@ -10,7 +13,15 @@ import numpy as np
 
 from zsp_lite.data.frames import write_image
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import FROM_OPENGL, CaptureFrame, Makers, make_frame, read_numbers, refuse, sharpest
+from zsp_lite.importers.capture import (
+    FROM_OPENGL,
+    CaptureFrame,
+    Makers,
+    make_frame,
+    read_numbers,
+    refuse,
+    sharpest,
+)
 from zsp_lite.importers.unpacked import new_folder, open_video
 from zsp_lite.io.files import read_bytes, read_json
 
@@ -26,7 +37,9 @@ def read_stray(folder: Path, count: int) -> Makers:
         picture = (pictures / name).with_suffix(".jpg")
         write_image(picture, image, 95)
         files = picture, f"depth/{name}"
-        yield partial(make_frame, folder, *files, row[2:], K, where, confidence=f"confidence/{name}")
+        yield partial(
+            make_frame, folder, *files, row[2:], K, where, confidence=f"confidence/{name}"
+        )
     for problem in left_out:
         yield partial(refuse, problem)
 
@@ -34,7 +47,11 @@ def read_stray(folder: Path, count: int) -> Makers:
 def read_polycam(folder: Path) -> Makers:
     """Read Polycam's raw data: its corrected images and cameras, if they are there."""
     folder = folder / "keyframes"
-    prefix = "corrected_" if all((folder / f"corrected_{one}").is_dir() for one in ("cameras", "images")) else ""
+    prefix = (
+        "corrected_"
+        if all((folder / f"corrected_{one}").is_dir() for one in ("cameras", "images"))
+        else ""
+    )
     for path in sorted((folder / f"{prefix}cameras").glob("*.json")):
         yield partial(_make_polycam, folder, path, f"{prefix}images/{path.stem}")
 
@@ -45,7 +62,9 @@ def _make_polycam(folder: Path, path: Path, image: str) -> CaptureFrame:
     intrinsics = [camera.get(name) for name in ("fx", "fy", "cx", "cy")]
     files = image, f"depth/{path.stem}"
     confidence = f"confidence/{path.stem}"
-    return make_frame(folder, *files, pose, intrinsics, f"{path}", FROM_OPENGL, confidence=confidence)
+    return make_frame(
+        folder, *files, pose, intrinsics, f"{path}", FROM_OPENGL, confidence=confidence
+    )
 
 
 _Side = Annotated[int, msgspec.Meta(ge=1, le=10_000)]  # pixels
@@ -73,7 +92,9 @@ def read_record3d(folder: Path) -> Makers:
         yield partial(_make_record3d, folder, unpacked / f"{number}", scan, intrinsics)
 
 
-def _make_record3d(folder: Path, unpacked: Path, scan: _Record3D, intrinsics: list[float | None]) -> CaptureFrame:
+def _make_record3d(
+    folder: Path, unpacked: Path, scan: _Record3D, intrinsics: list[float | None]
+) -> CaptureFrame:
     """Decompress depth and confidence of a frame to files `unpacked`.npy and .png."""
     name, pose = f"rgbd/{unpacked.name}", scan.poses[int(unpacked.name)]
     depth, confidence = unpacked.with_suffix(".npy"), unpacked.with_suffix(".png")
@@ -81,9 +102,16 @@ def _make_record3d(folder: Path, unpacked: Path, scan: _Record3D, intrinsics: li
     if (folder / f"{name}.conf").is_file():
         cv2.imwrite(str(confidence), _decompressed(folder / f"{name}.conf", np.uint8, scan))
     return make_frame(
-        folder, f"{name}.jpg", depth, pose[4:] + pose[:4], intrinsics, f"{folder}, frame {unpacked.name}", FROM_OPENGL,
-        confidence=confidence if confidence.is_file() else None, depth_unit=1.0,
-    )  # fmt: skip
+        folder,
+        f"{name}.jpg",
+        depth,
+        pose[4:] + pose[:4],
+        intrinsics,
+        f"{folder}, frame {unpacked.name}",
+        FROM_OPENGL,
+        confidence=confidence if confidence.is_file() else None,
+        depth_unit=1.0,
+    )
 
 
 def _decompressed(path: Path, kind: type, scan: _Record3D) -> np.ndarray:
@@ -91,11 +119,15 @@ def _decompressed(path: Path, kind: type, scan: _Record3D) -> np.ndarray:
     try:
         import lzfse
     except ImportError as error:
-        raise InputError(f"{path.name} is compressed by LZFSE, expected its package: pip install lzfse") from error
+        raise InputError(
+            f"{path.name} is compressed by LZFSE, expected its package: pip install lzfse"
+        ) from error
     data = read_bytes(path, "depth")
     try:
         if len(data) > 2 * scan.dh * scan.dw * np.dtype(kind).itemsize:
             raise ValueError(f"{len(data)} compressed bytes")
         return np.frombuffer(lzfse.decompress(data), kind).reshape(scan.dh, scan.dw)
     except (lzfse.error, MemoryError, ValueError) as error:
-        raise InputError(f"{path.name} is no map of {scan.dh} x {scan.dw} numbers ({error or 'damaged'})") from error
+        raise InputError(
+            f"{path.name} is no map of {scan.dh} x {scan.dw} numbers ({error or 'damaged'})"
+        ) from error

@@ -32,14 +32,20 @@ def read_bop(folder: Path, object: int | None = None) -> Makers:
     if object is None and len(known) == 1:
         object = known[0]
     if object not in known:
-        raise InputError(f"{folder} has the objects {', '.join(map(str, known))}, expected one of them as --object N")
+        raise InputError(
+            f"{folder} has the objects {', '.join(map(str, known))}, expected one of them as "
+            "--object N"
+        )
     for image, some in numbers.items():
         if object in some and image in cameras:
             yield partial(_make_bop, folder, image, object, scene[image], cameras[image])
 
 
-def _make_bop(folder: Path, image: str, object: int, scene: list[_Annotation], camera: dict[str, Any]) -> CaptureFrame:
-    """Make a frame of an object and a camera; pixel centres are at integers, lengths in millimetres."""
+def _make_bop(
+    folder: Path, image: str, object: int, scene: list[_Annotation], camera: dict[str, Any]
+) -> CaptureFrame:
+    """Make a frame of an object and a camera; pixel centres are at integers, lengths in
+    millimetres."""
     where, name = f"{folder}, image {image}", f"{image:0>6}"
     indices = [index for index, one in enumerate(scene) if one.obj_id == object]
     if len(indices) > 1:
@@ -49,11 +55,15 @@ def _make_bop(folder: Path, image: str, object: int, scene: list[_Annotation], c
     t = real_array(f"{where}: cam_t_m2c", placed.cam_t_m2c, (3,))
     K = real_array(f"{where}: cam_K", camera.get("cam_K"), (9,))
     pose = np.column_stack([R.reshape(3, 3).T, -_MILLIMETRES * R.reshape(3, 3).T @ t])
-    unit = _MILLIMETRES * float(real_array(f"{where}: depth_scale", camera.get("depth_scale", 1), ()))
+    unit = _MILLIMETRES * float(
+        real_array(f"{where}: depth_scale", camera.get("depth_scale", 1), ())
+    )
     check_number(f"{where}: depth_scale", unit, above=0)
     mask = f"mask_visib/{name}_{index:06d}"
     files = f"rgb/{name}", f"depth/{name}"
-    return make_frame(folder, *files, pose, K.reshape(3, 3) + HALF_PIXEL, where, mask=mask, depth_unit=unit)
+    return make_frame(
+        folder, *files, pose, K.reshape(3, 3) + HALF_PIXEL, where, mask=mask, depth_unit=unit
+    )
 
 
 def read_scannet(folder: Path) -> Makers:
@@ -64,20 +74,49 @@ def read_scannet(folder: Path) -> Makers:
 
 
 def _make_scannet(folder: Path, path: Path, K: Float[np.ndarray, "3 3"]) -> CaptureFrame:
-    return make_frame(folder, f"color/{path.stem}", f"depth/{path.stem}", read_numbers(path, (4,)), K, str(path))
+    return make_frame(
+        folder, f"color/{path.stem}", f"depth/{path.stem}", read_numbers(path, (4,)), K, str(path)
+    )
 
 
 def read_open3d(folder: Path) -> Makers:
     """Read frames of Open3D's recorder, with the trajectory that its reconstruction writes."""
-    log = next((one for one in (folder / "trajectory.log", folder / "scene/trajectory.log") if one.is_file()), None)
+    log = next(
+        (
+            one
+            for one in (folder / "trajectory.log", folder / "scene/trajectory.log")
+            if one.is_file()
+        ),
+        None,
+    )
     if log is None:
-        raise InputError(f"{folder} has no trajectory.log, expected poses: run Open3D's reconstruction system on it")
+        raise InputError(
+            f"{folder} has no trajectory.log, expected poses: run Open3D's reconstruction "
+            "system on it"
+        )
     camera = read_json(folder / "intrinsic.json", dict[str, Any], "capture")
-    K = real_array(f"{folder}/intrinsic.json: intrinsic_matrix", camera.get("intrinsic_matrix"), (9,))
-    images = sorted(path.stem for path in (folder / "color").glob("*") if path.suffix.lower() in (".jpg", ".png"))
-    lines = read_numbers(log, (4,), usecols=(0, 1, 2, -1))  # three frame numbers, and four lines of a matrix
+    K = real_array(
+        f"{folder}/intrinsic.json: intrinsic_matrix", camera.get("intrinsic_matrix"), (9,)
+    )
+    images = sorted(
+        path.stem
+        for path in (folder / "color").glob("*")
+        if path.suffix.lower() in (".jpg", ".png")
+    )
+    lines = read_numbers(
+        log, (4,), usecols=(0, 1, 2, -1)
+    )  # three frame numbers, and four lines of a matrix
     if len(lines) != 5 * len(images):
-        raise InputError(f"{log} has {len(lines)} lines, expected 5 for each of {len(images)} images")
+        raise InputError(
+            f"{log} has {len(lines)} lines, expected 5 for each of {len(images)} images"
+        )
     for image, pose in zip(images, lines.reshape(-1, 5, 4)[:, 1:]):
         files = f"color/{image}", f"depth/{image}"
-        yield partial(make_frame, folder, *files, pose, K.reshape(3, 3).T + HALF_PIXEL, f"{log}, frame {image}")
+        yield partial(
+            make_frame,
+            folder,
+            *files,
+            pose,
+            K.reshape(3, 3).T + HALF_PIXEL,
+            f"{log}, frame {image}",
+        )

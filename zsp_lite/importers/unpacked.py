@@ -20,8 +20,21 @@ from zsp_lite.data.frames import MAX_PIXELS
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import file_size, path_inside
 
-_MOST, _LARGE, _RATIO = 20e9, 1e9, 200  # bytes of an unpacked zip; above the second at most 200 times those of the zip
-_DAMAGE = (zipfile.BadZipFile, zlib.error, LZMAError, struct.error, OSError, EOFError, RuntimeError, ValueError)
+_MOST, _LARGE, _RATIO = (
+    20e9,
+    1e9,
+    200,
+)  # bytes of an unpacked zip; above the second at most 200 times those of the zip
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    LZMAError,
+    struct.error,
+    OSError,
+    EOFError,
+    RuntimeError,
+    ValueError,
+)
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # silent
 
 
@@ -34,7 +47,8 @@ def new_folder() -> Path:
 
 @cache
 def unpack(path: Path) -> Path:
-    """Unpack a zip to a temporary folder; InputError if it is damaged, encrypted, too large, or has paths out of it."""
+    """Unpack a zip to a temporary folder; InputError if it is damaged, encrypted, too large, or has
+    paths out of it."""
     size, folder = file_size(path, "zip"), new_folder()
     try:
         with zipfile.ZipFile(path) as zipped:
@@ -45,22 +59,32 @@ def unpack(path: Path) -> Path:
                 path_inside(folder, one.filename)
             zipped.extractall(folder)  # makes no links
     except _DAMAGE as error:
-        raise InputError(f"zip {path} cannot be unpacked: {error}, expected a capture as an app exports it") from error
+        raise InputError(
+            f"zip {path} cannot be unpacked: {error}, expected a capture as an app exports it"
+        ) from error
     return folder
 
 
 def open_video(path: Path) -> Callable[[int], UInt8[np.ndarray, "h w 3"]]:
-    """Return a function that decodes the frame with a number, as it is stored; the numbers may not decrease.
+    """Return a function that decodes the frame with a number, as it is stored; the numbers may not
+    decrease.
 
     InputError if the file is no video, and by the function if it has no such frame.
     """
     file_size(path, "video")
     with open(path, "rb") as file:
-        is_video = file.read(8)[4:] == b"ftyp"  # other files may name addresses, which are not to be opened
-    video, position = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG) if is_video else cv2.VideoCapture(), -1
+        is_video = (
+            file.read(8)[4:] == b"ftyp"
+        )  # other files may name addresses, which are not to be opened
+    video, position = (
+        cv2.VideoCapture(str(path), cv2.CAP_FFMPEG) if is_video else cv2.VideoCapture(),
+        -1,
+    )
     pixels = video.get(cv2.CAP_PROP_FRAME_WIDTH) * video.get(cv2.CAP_PROP_FRAME_HEIGHT)
     if not video.isOpened() or pixels > MAX_PIXELS:
-        raise InputError(f"video {path} cannot be decoded, expected an MP4 file of at most {MAX_PIXELS} pixels")
+        raise InputError(
+            f"video {path} cannot be decoded, expected an MP4 file of at most {MAX_PIXELS} pixels"
+        )
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
 
     def read(number: int) -> UInt8[np.ndarray, "h w 3"]:

@@ -1,4 +1,5 @@
-"""Files on a server: download with resume, checksum and a limit on the size (pooch cannot resume), parts of a file."""
+"""Files on a server: download with resume, checksum and a limit on the size (pooch cannot resume),
+parts of a file."""
 
 import hashlib
 import http.client
@@ -17,7 +18,8 @@ from zsp_lite.io.files import sha256
 CHUNK = 1 << 18  # bytes
 TIMEOUT = 30  # of a connection, s
 ATTEMPTS = 3
-# What urllib raises if a server cannot be reached, sends no file, or is given by an invalid address.
+# What urllib raises if a server cannot be reached, sends no file, or is given by an invalid
+# address.
 NETWORK_ERRORS = (OSError, http.client.HTTPException, ValueError)
 
 
@@ -27,12 +29,19 @@ def cache_folder() -> Path:
 
 
 def fetch(
-    url: str, path: Path, size: int | None = None, md5_prefix: str = "", digest: str = "", most: float = math.inf
+    url: str,
+    path: Path,
+    size: int | None = None,
+    md5_prefix: str = "",
+    digest: str = "",
+    most: float = math.inf,
 ) -> Path:
-    """Download a file unless it exists; it has `size` bytes, or at most `most`, and the given checksums.
+    """Download a file unless it exists; it has `size` bytes, or at most `most`, and the given
+    checksums.
 
-    Data is written to `path`.part, which is renamed after its size, the first digits of its MD5 digest and its SHA-256
-    `digest` were verified. An interrupted download is resumed, in up to three attempts and by later calls.
+    Data is written to `path`.part, which is renamed after its size, the first digits of its MD5
+    digest and its SHA-256 `digest` were verified. An interrupted download is resumed, in up to
+    three attempts and by later calls.
     """
     if path.exists():
         return path
@@ -44,12 +53,19 @@ def fetch(
     except NETWORK_ERRORS as error:
         raise InputError(f"download of {url} failed: {error}") from error
     if not complete:
-        raise InputError(f"download of {url} was interrupted at {received} bytes; call again to resume")
+        raise InputError(
+            f"download of {url} was interrupted at {received} bytes; call again to resume"
+        )
     matches = has_size_and_hash(part, size, md5_prefix) and digest in ("", sha256(part, "download"))
     if received > most or not matches:
         part.unlink()  # resuming from wrong data would never succeed
-        expected = f"{'at most ' * (size is None)}{most} bytes with the checksum {digest or md5_prefix or '(any)'}"
-        raise InputError(f"download of {url} is another file of {received} bytes, expected {expected}; removed")
+        expected = (
+            f"{'at most ' * (size is None)}{most} bytes with the checksum "
+            f"{digest or md5_prefix or '(any)'}"
+        )
+        raise InputError(
+            f"download of {url} is another file of {received} bytes, expected {expected}; removed"
+        )
     os.replace(part, path)
     return path
 
@@ -57,21 +73,31 @@ def fetch(
 def has_size_and_hash(path: Path, size: int | None = None, md5_prefix: str = "") -> bool:
     """Check the size of a file (bytes, if given) and the first digits of its MD5 digest."""
     with open(path, "rb") as file:
-        digest = hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest() if md5_prefix else ""
+        digest = (
+            hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
+            if md5_prefix
+            else ""
+        )
     return size in (None, path.stat().st_size) and digest.startswith(md5_prefix)
 
 
 def remote_size(url: str) -> int | None:
-    """Ask a server for the size of a file in bytes, None if it does not tell; InputError if it has no such file."""
+    """Ask a server for the size of a file in bytes, None if it does not tell; InputError if it has
+    no such file."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=TIMEOUT) as response:
-            return None if (length := response.headers.get("Content-Length")) is None else int(length)
+        with urllib.request.urlopen(
+            urllib.request.Request(url, method="HEAD"), timeout=TIMEOUT
+        ) as response:
+            return (
+                None if (length := response.headers.get("Content-Length")) is None else int(length)
+            )
     except NETWORK_ERRORS as error:
         raise InputError(f"{url} cannot be reached: {error}") from error
 
 
 class RemoteFile(io.RawIOBase):
-    """A file on a server, of which only the parts that are read are transferred (HTTP range requests)."""
+    """A file on a server, of which only the parts that are read are transferred (HTTP range
+    requests)."""
 
     def __init__(self, url: str):
         super().__init__()
@@ -83,11 +109,15 @@ class RemoteFile(io.RawIOBase):
     seekable = readable
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        self._position = max(0, offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence])
+        self._position = max(
+            0,
+            offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence],
+        )
         return self._position
 
     def readinto(self, buffer: bytearray | memoryview) -> int:
-        """Read up to `len(buffer)` bytes; InputError if the server cannot be reached or does not send parts."""
+        """Read up to `len(buffer)` bytes; InputError if the server cannot be reached or does not
+        send parts."""
         count, problem = min(len(buffer), self.size - self._position), "the connection was closed"
         if count <= 0:
             return 0

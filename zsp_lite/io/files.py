@@ -1,4 +1,5 @@
-"""Atomic writes, reads with limits and errors that name the file, JSON, and checks of paths and names."""
+"""Atomic writes, reads with limits and errors that name the file, JSON, and checks of paths and
+names."""
 
 import codecs
 import gzip
@@ -20,7 +21,8 @@ from zsp_lite.errors import InputError
 REPOSITORY = Path(__file__).resolve().parents[2]  # of an installed copy: the folder of the packages
 MAX_FILE = 1 << 30  # bytes of a file that is read at once, and of what is decompressed from it
 MAX_WEIGHTS = 4 << 30  # bytes of a file of weights
-# Compressed data may grow to this many bytes, or by this factor if that is more. Annotations grow by 10.
+# Compressed data may grow to this many bytes, or by this factor if that is more. Annotations grow
+# by 10.
 GROWTH_ALLOWED, _GROWTH_FACTOR = 1 << 26, 32
 _LONGEST_NAME = 255  # bytes, on most file systems
 
@@ -30,7 +32,8 @@ class OutsideError(InputError):
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:
-    """Write a file, and missing folders above it, so that a reader sees the old or the new content, never a part."""
+    """Write a file, and missing folders above it, so that a reader sees the old or the new content,
+    never a part."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
@@ -42,26 +45,33 @@ def write_atomic(path: str | Path, data: bytes) -> None:
 
 
 def read_bytes(path: str | Path, what: str) -> bytes:
-    """Read a file of at most `MAX_FILE` bytes; InputError, which names its kind `what`, if it cannot be read."""
+    """Read a file of at most `MAX_FILE` bytes; InputError, which names its kind `what`, if it
+    cannot be read."""
     file_size(path, what, MAX_FILE)
     return Path(path).read_bytes()
 
 
 def read_json(path: str | Path, kind: Any, what: str) -> Any:
-    """Read a JSON file as a type of msgspec; InputError, which names its kind `what`, its path and the field."""
-    return decode_json(without_nan(read_bytes(path, what)).removeprefix(codecs.BOM_UTF8), kind, f"{what} {path}")
+    """Read a JSON file as a type of msgspec; InputError, which names its kind `what`, its path and
+    the field."""
+    return decode_json(
+        without_nan(read_bytes(path, what)).removeprefix(codecs.BOM_UTF8), kind, f"{what} {path}"
+    )
 
 
 def without_nan(data: bytes) -> bytes:
-    """Replace NaN and Infinity, which Python's json writes but which are not valid JSON, by null."""
-    # Null is then accepted by optional fields, and refused by the others with the name of the field.
+    """Replace NaN and Infinity, which Python's json writes but which are not valid JSON, by
+    null."""
+    # Null is then accepted by optional fields, and refused by the others with the name of the
+    # field.
     if b"NaN" in data or b"Infinity" in data:
         data = re.sub(rb"(?<=[:,\[\s])-?(?:NaN|Infinity)(?=[,\]}\s])", b"null", data)
     return data
 
 
 def decode_json(data: bytes | msgspec.Raw, kind: Any, what: str) -> Any:
-    """Decode JSON as a type of msgspec; InputError, which begins with `what`, if it is damaged or lacks a field."""
+    """Decode JSON as a type of msgspec; InputError, which begins with `what`, if it is damaged or
+    lacks a field."""
     try:
         return msgspec.json.decode(data, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -69,11 +79,16 @@ def decode_json(data: bytes | msgspec.Raw, kind: Any, what: str) -> Any:
 
 
 def file_size(path: str | Path, what: str, most: float = math.inf) -> int:
-    """Return the size of a file in bytes; InputError if it is longer than `most`, no file, or cannot be read."""
+    """Return the size of a file in bytes; InputError if it is longer than `most`, no file, or
+    cannot be read."""
     try:
         status = os.stat(path)
         if not stat.S_ISREG(status.st_mode):  # a pipe or a device may never end
-            problem = "is a directory" if stat.S_ISDIR(status.st_mode) else "a pipe or a device, expected a file"
+            problem = (
+                "is a directory"
+                if stat.S_ISDIR(status.st_mode)
+                else "a pipe or a device, expected a file"
+            )
         elif status.st_size > most:
             problem = f"{status.st_size} bytes, expected at most {most}"
         elif os.access(path, os.R_OK):
@@ -86,18 +101,24 @@ def file_size(path: str | Path, what: str, most: float = math.inf) -> int:
 
 
 def load_torch(path: str | Path, what: str) -> Any:
-    """Read a torch file without executing code in it; InputError if it is damaged, or has more than plain data."""
+    """Read a torch file without executing code in it; InputError if it is damaged, or has more than
+    plain data."""
     import torch  # takes seconds, and most callers of this module do not need it
 
     file_size(path, what, MAX_WEIGHTS)
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged file can raise almost any; torch's message recommends unsafe loading
-        raise InputError(f"{what} {path}: damaged, or contains more than tensors ({type(error).__name__})") from error
+    except (
+        Exception
+    ) as error:  # a damaged file can raise almost any; torch's message recommends unsafe loading
+        raise InputError(
+            f"{what} {path}: damaged, or contains more than tensors ({type(error).__name__})"
+        ) from error
 
 
 def sha256(path: str | Path, what: str) -> str:
-    """Return the SHA-256 digest of a file in hexadecimal digits; InputError if it cannot be read."""
+    """Return the SHA-256 digest of a file in hexadecimal digits; InputError if it cannot be
+    read."""
     file_size(path, what)
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -130,7 +151,8 @@ def decompress(data: bytes, what: str) -> bytes:
 
 
 def path_inside(root: str | Path, relative: str) -> Path:
-    """Resolve a path relative to a folder; InputError if it leads out of it (by "..", absolute, or by a link)."""
+    """Resolve a path relative to a folder; InputError if it leads out of it (by "..", absolute, or
+    by a link)."""
     root = Path(root).resolve()
     try:
         resolved = (root / relative).resolve()
@@ -140,28 +162,41 @@ def path_inside(root: str | Path, relative: str) -> Path:
         problem = "leads out of"
     except (ValueError, OSError, RuntimeError):  # null byte, name too long, cyclic links
         problem = "is invalid in"
-    raise InputError(f"path {_shown(relative)} {problem} the data folder {root}, expected a path inside")
+    raise InputError(
+        f"path {_shown(relative)} {problem} the data folder {root}, expected a path inside"
+    )
 
 
 def find_inside(root: str | Path, text: str) -> Path | None:
-    """Find a file, or an image without its extension, by a path that a file of the folder gives, relative or absolute.
+    """Find a file, or an image without its extension, by a path that a file of the folder gives,
+    relative or absolute.
 
-    Links inside the folder, which its owner made, may lead anywhere. OutsideError if the text itself leads out of it.
+    Links inside the folder, which its owner made, may lead anywhere. OutsideError if the text
+    itself leads out of it.
     """
     root, text = os.path.abspath(root), text.replace("\\", "/")
     path = os.path.normpath(text if PureWindowsPath(text).drive else os.path.join(root, text))
-    if text and not path.startswith((os.path.join(root, ""), os.path.join(os.path.realpath(root), ""))):
+    if text and not path.startswith(
+        (os.path.join(root, ""), os.path.join(os.path.realpath(root), ""))
+    ):
         expected = "a path inside, relative or absolute; a link inside may lead elsewhere"
-        raise OutsideError(f"path {_shown(text)} leads out of the folder {root}, expected {expected}")
-    return next((Path(path + end) for end in ("", ".png", ".jpg", ".jpeg") if os.path.isfile(path + end)), None)
+        raise OutsideError(
+            f"path {_shown(text)} leads out of the folder {root}, expected {expected}"
+        )
+    return next(
+        (Path(path + end) for end in ("", ".png", ".jpg", ".jpeg") if os.path.isfile(path + end)),
+        None,
+    )
 
 
 def plain_name(name: str, what: str) -> str:
-    """Return `name` if it is a valid name of a single file or folder; InputError, which begins with `what`, if not."""
+    """Return `name` if it is a valid name of a single file or folder; InputError, which begins with
+    `what`, if not."""
     separated = not name or name.startswith(".") or any(character in "/\\:\0" for character in name)
     if separated or len(os.fsencode(name)) > _LONGEST_NAME:
         raise InputError(
-            f"{what} name is {_shown(name)!r}, expected a plain folder name of at most {_LONGEST_NAME} bytes"
+            f"{what} name is {_shown(name)!r}, expected a plain folder name of at most "
+            f"{_LONGEST_NAME} bytes"
         )
     return name
 

@@ -12,9 +12,11 @@ from zsp_lite.errors import InputError
 
 @contextmanager
 def writing(folder: str | Path) -> Iterator[None]:
-    """Be the only writer of a folder until this process ends; InputError if another process writes to it.
+    """Be the only writer of a folder until this process ends; InputError if another process writes
+    to it.
 
-    The folder is made if it does not exist, and is removed if it was made and nothing was written into it.
+    The folder is made if it does not exist, and is removed if it was made and nothing was written
+    into it.
     """
     folder = Path(folder)
     made = [one for one in (folder, *folder.parents) if not os.path.exists(one)]
@@ -26,8 +28,14 @@ def writing(folder: str | Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except OSError as error:  # a Timeout of the lock is one, too
-        problem = "another process is writing to it" if isinstance(error, Timeout) else f"cannot be written ({error})"
-        raise InputError(f"{folder}: {problem}, expected a folder for this process alone") from error
+        problem = (
+            "another process is writing to it"
+            if isinstance(error, Timeout)
+            else f"cannot be written ({error})"
+        )
+        raise InputError(
+            f"{folder}: {problem}, expected a folder for this process alone"
+        ) from error
     try:
         yield
     finally:

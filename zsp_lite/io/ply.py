@@ -1,4 +1,7 @@
-"""Point clouds: PLY files, and the import of Open3D, for which all other modules call `load_open3d`."""
+"""Point clouds:
+
+PLY files, and the import of Open3D, for which all other modules call `load_open3d`.
+"""
 
 import ctypes
 import functools
@@ -13,12 +16,23 @@ from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import read_bytes, write_atomic
 
 _VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])
-_PROPERTIES = [*(f"float {one}" for one in "x y z nx ny nz".split()), "uchar red", "uchar green", "uchar blue"]
+_PROPERTIES = [
+    *(f"float {one}" for one in "x y z nx ny nz".split()),
+    "uchar red",
+    "uchar green",
+    "uchar blue",
+]
 # The names of PLY for numpy's types; some programs write numpy's own, such as float32.
 _TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
     "double": "f8",
-}  # fmt: skip
+}
 
 
 def write_ply(
@@ -27,32 +41,44 @@ def write_ply(
     colours: UInt8[np.ndarray, "n 3"],
     normals: Real[np.ndarray, "n 3"] | None = None,
 ) -> None:
-    """Write a point cloud in CO3D's form: binary, float32 positions and normals (or zeros), 8-bit colours."""
+    """Write a point cloud in CO3D's form: binary, float32 positions and normals (or zeros), 8-bit
+    colours."""
     check_magnitude(f"point cloud {path}", points)
     vertices = np.zeros(len(points), dtype=_VERTEX)
     vertices["position"], vertices["colour"] = points, colours
     if normals is not None:
         vertices["normal"] = normals
     properties = "".join(f"property {one}\n" for one in _PROPERTIES)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}end_header\n"
+    header = (
+        "ply\nformat binary_little_endian 1.0\nelement vertex "
+        f"{len(vertices)}\n{properties}end_header\n"
+    )
     write_atomic(path, header.encode("ascii") + vertices.tobytes())
 
 
-def read_ply(path: str | Path) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
-    """Read the positions and 8-bit colours (None if there are none) of a PLY file; InputError if it is damaged."""
+def read_ply(
+    path: str | Path,
+) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
+    """Read the positions and 8-bit colours (None if there are none) of a PLY file; InputError if it
+    is damaged."""
     data = read_bytes(path, "point cloud")
     try:
         columns = _vertex_columns(data)
         points = np.stack([columns[axis] for axis in "xyz"], axis=-1).astype(np.float64)
         colours = _colours(columns)
     except Exception as error:  # ValueError, KeyError, TypeError and others, whatever is malformed
-        raise InputError(f"point cloud {path} ({len(data)} bytes) is not a complete PLY file: {error!r}") from error
+        raise InputError(
+            f"point cloud {path} ({len(data)} bytes) is not a complete PLY file: {error!r}"
+        ) from error
     check_magnitude(f"point cloud {path}", points)
     return points, colours
 
 
 def _vertex_columns(data: bytes) -> dict[str, np.ndarray]:
-    """Return the properties of the vertices, which must be the first element of a PLY file. ValueError and others."""
+    """Return the properties of the vertices, which must be the first element of a PLY file.
+
+    ValueError and others.
+    """
     header, _, rest = data.partition(b"end_header")
     body = rest[rest.index(b"\n") + 1 :]
     encoding, elements, types = "", [], {}
@@ -81,7 +107,8 @@ def _vertex_columns(data: bytes) -> dict[str, np.ndarray]:
 
 
 def _colours(columns: dict[str, np.ndarray]) -> UInt8[np.ndarray, "n 3"] | None:
-    """Return the colours of vertices, integers of 8 bits or numbers from 0 to 1; None if they have none."""
+    """Return the colours of vertices, integers of 8 bits or numbers from 0 to 1; None if they have
+    none."""
     if not {"red", "green", "blue"} <= columns.keys():
         return None
     colours = np.stack([columns[name] for name in ("red", "green", "blue")], axis=-1)
@@ -93,8 +120,11 @@ def _colours(columns: dict[str, np.ndarray]) -> UInt8[np.ndarray, "n 3"] | None:
 @functools.cache
 def load_open3d():
     """Import and return the `open3d` module."""
-    os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # it would start a server in a notebook
-    # Open3D's Linux wheels link against libusb-1.0, which is often not installed: it is loaded from a package.
+    os.environ.setdefault(
+        "OPEN3D_DISABLE_WEB_VISUALIZER", "true"
+    )  # it would start a server in a notebook
+    # Open3D's Linux wheels link against libusb-1.0, which is often not installed: it is loaded from
+    # a package.
     if sys.platform.startswith("linux"):
         import libusb_package
 

@@ -1,16 +1,18 @@
-r"""Calibrated probabilities: how likely is the rotation of each hypothesis within 30 degrees of the truth?
+r"""Calibrated probabilities: how likely is the rotation of each hypothesis within 30 degrees of the
+truth?
 
-The score S is a conditional logit (McFadden 1974), with one more alternative: that none of the poses is right. Of the
-different poses (see `modes`) of an estimate, pose k has the probability
+The score S is a conditional logit (McFadden 1974), with one more alternative: that none of the
+poses is right. Of the different poses (see `modes`) of an estimate, pose k has the probability
 
     p_k = (1 - \lambda h) \exp(-a (S_1 - S_k)) / (\exp(b) + \sum_j \exp(-a (S_1 - S_j))),
     \log a = \alpha . x,   b = \beta . x.
 
-x is what is known about the estimate beside the scores (see `evidence`), above all the span: how far around the target
-its views go. Where they show one side only, the best pose turns that side to the reference, and whether the reference
-shows a hidden side that looks alike cannot be known. h is the share of the circle around the target from where no view
-is within 60 degrees, relative to that of a single view, and \lambda the chance of such a side. What the p_k leave of 1
-is the probability of none of these. The confidence of an estimate is p_1. `viz.reliability` measures how well such
+x is what is known about the estimate beside the scores (see `evidence`), above all the span: how
+far around the target its views go. Where they show one side only, the best pose turns that side to
+the reference, and whether the reference shows a hidden side that looks alike cannot be known. h is
+the share of the circle around the target from where no view is within 60 degrees, relative to that
+of a single view, and \lambda the chance of such a side. What the p_k leave of 1 is the probability
+of none of these. The confidence of an estimate is p_1. `viz.reliability` measures how well such
 probabilities are calibrated.
 """
 
@@ -23,36 +25,52 @@ from jaxtyping import Float, Int
 from zsp_lite.estimates import Hypothesis
 from zsp_lite.verified.verification import VIEWPOINT_SIGMA
 
-# Hypotheses whose rotations differ by more than this many degrees are distinct: the paper's wider error threshold.
+# Hypotheses whose rotations differ by more than this many degrees are distinct: the paper's wider
+# error threshold.
 MODE_ANGLE = 30.0
-TIE_RATIO = float(np.exp(-1))  # of the best pose's probability: above it, another pose is nearly as probable
-_MIN_OVERLAP = 0.05  # fraction of points on an observed surface; with less in both directions, a pose is flagged
-# The same of the similarity term. Correct and wrong poses have 0.06 and more, views that share no side 0.01.
+TIE_RATIO = float(
+    np.exp(-1)
+)  # of the best pose's probability: above it, another pose is nearly as probable
+# fraction of points on an observed surface; with less in both directions, a pose is flagged
+_MIN_OVERLAP = 0.05
+# The same of the similarity term. Correct and wrong poses have 0.06 and more, views that share no
+# side 0.01.
 _MIN_SIMILARITY = 0.02
 
 
 def evidence(
-    span: float,  # angle in degrees that the target views span around the target (see `cameras.view_span`)
+    # angle in degrees that the target views span around the target (see `cameras.view_span`)
+    span: float,
     n_views: int,
-    nearest: float,  # angle in degrees from the reference's camera to the nearest target view's under the best pose
-    view_std: float,  # of the target views' similarity to the reference; small if the features distinguish no sides
-    shape_fit: float,  # part of the best score from overlap, silhouettes and free space; small if shapes do not fit
+    # angle in degrees from the reference's camera to the nearest target view's under the best pose
+    nearest: float,
+    # of the target views' similarity to the reference; small if the features distinguish no sides
+    view_std: float,
+    # part of the best score from overlap, silhouettes and free space; small if shapes do not fit
+    shape_fit: float,
 ) -> Float[np.ndarray, "6"]:
-    """Return a constant and what the probabilities of an estimate depend on, beside the scores of its poses."""
+    """Return a constant and what the probabilities of an estimate depend on, beside the scores of
+    its poses."""
     nearness = np.exp(-((nearest / VIEWPOINT_SIGMA) ** 2))
     return np.array([1.0, span / 360, np.log(n_views), nearness, view_std, shape_fit])
 
 
 @dataclass(frozen=True)
 class Calibration:
-    r"""The coefficients \alpha and \beta of the `evidence`, in its order, and \lambda (fit: `tools/tuning.py`)."""
+    r"""The coefficients \alpha and \beta of the `evidence`, in its order, and \lambda (fit:
+
+    `tools/tuning.py`).
+    """
 
     scale: tuple[float, ...] = (-0.40, 1.46, 0.025, -0.93, 2.90, -0.063)  # \alpha
     none: tuple[float, ...] = (0.55, -2.87, 0.72, 0.61, -28.5, -0.501)  # \beta
     unseen: float = 0.313  # \lambda
 
-    def probabilities(self, deficit: Float[np.ndarray, " m"], x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " m"]:
-        """Return the probabilities of poses by their `deficit` S_1 - S_k, which is infinite for a pose that is none."""
+    def probabilities(
+        self, deficit: Float[np.ndarray, " m"], x: Float[np.ndarray, " k"]
+    ) -> Float[np.ndarray, " m"]:
+        """Return the probabilities of poses by their `deficit` S_1 - S_k, which is infinite for a
+        pose that is none."""
         odds = np.exp(-np.exp(x @ self.scale) * deficit)
         return (1 - self.unseen * hidden_share(x[1])) * odds / (np.exp(x @ self.none) + odds.sum())
 
@@ -63,7 +81,8 @@ def hidden_share(span: float | Float[np.ndarray, " n"]) -> float | Float[np.ndar
 
 
 def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
-    """Return whose pose each hypothesis has: the nearest better one's that is within 30 degrees, else its own."""
+    """Return whose pose each hypothesis has: the nearest better one's that is within 30 degrees,
+    else its own."""
     found: list[int] = []
     for i, row in enumerate(angle):
         near = [j for j in range(i) if found[j] == j and row[j] < MODE_ANGLE]
@@ -74,17 +93,32 @@ def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
 def reliability_flags(
     hypotheses: Sequence[Hypothesis], angle: Float[np.ndarray, "m m"]
 ) -> tuple[tuple[str, ...], bool]:
-    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one of two poses."""
+    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one
+    of two poses."""
     terms, flags = hypotheses[0].terms, []
     probability = np.array([one.confidence for one in hypotheses])
-    tied = [k for k, one in enumerate(hypotheses) if one.mode == k and probability[k] > TIE_RATIO * probability[0]]
-    # Together more probable than not; more than 60 degrees apart, no rotation is within 30 degrees of both.
-    one_of_two = bool(len(tied) == 2 and probability[tied].sum() > 0.5 and angle[tied[0], tied[1]] > 2 * MODE_ANGLE)
+    tied = [
+        k
+        for k, one in enumerate(hypotheses)
+        if one.mode == k and probability[k] > TIE_RATIO * probability[0]
+    ]
+    # Together more probable than not; more than 60 degrees apart, no rotation is within 30 degrees
+    # of both.
+    one_of_two = bool(
+        len(tied) == 2
+        and probability[tied].sum() > 0.5
+        and angle[tied[0], tied[1]] > 2 * MODE_ANGLE
+    )
     if len(tied) > 1:
         shown = " and ".join(f"{probability[i]:.2f}" for i in tied)
-        start = f"one of two: poses {angle[tied[0], tied[1]]:.0f}" if one_of_two else f"{len(tied)} poses more than 30"
+        start = (
+            f"one of two: poses {angle[tied[0], tied[1]]:.0f}"
+            if one_of_two
+            else f"{len(tied)} poses more than 30"
+        )
         flags.append(
-            f"{start} degrees apart explain the views about equally well (probabilities {shown}): the object may be "
+            f"{start} degrees apart explain the views about equally well (probabilities "
+            f"{shown}): the object may be "
             "symmetric"
         )
     if terms and max(terms["forward_overlap"], terms["reverse_overlap"]) < _MIN_OVERLAP:

@@ -10,14 +10,16 @@ from torch import Tensor
 
 from zsp_lite.metrics import rotation_angle
 
-# Scales that the solver allows, in every stage. In working units (see `scene`) both point clouds have unit spread, so
-# a scale differs from 1 only where the views show different parts of the two objects, or their proportions differ.
+# Scales that the solver allows, in every stage. In working units (see `scene`) both point clouds
+# have unit spread, so a scale differs from 1 only where the views show different parts of the two
+# objects, or their proportions differ.
 SCALE_RANGE = (0.5, 2.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """m similarity transforms `y = scale * rotation @ x + translation` in working units, float32."""
+    """m similarity transforms `y = scale * rotation @ x + translation` in working units,
+    float32."""
 
     scale: Float[Tensor, " m"]  # positive
     rotation: Float[Tensor, "m 3 3"]
@@ -48,7 +50,12 @@ class Poses:
 
 def concatenate(batches: Sequence[Poses]) -> Poses:
     """Concatenate batches of poses."""
-    return Poses(*(torch.cat([getattr(p, name) for p in batches]) for name in ("scale", "rotation", "translation")))
+    return Poses(
+        *(
+            torch.cat([getattr(p, name) for p in batches])
+            for name in ("scale", "rotation", "translation")
+        )
+    )
 
 
 def float_tensor(values) -> Tensor:
@@ -61,13 +68,17 @@ def exp_(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     return x.clamp_min_(-80).exp_()
 
 
-def rotation_angles(first: Float[Tensor, "m 3 3"], second: Float[Tensor, "n 3 3"]) -> Float[Tensor, "m n"]:
-    """Compute the geodesic angle in degrees between each rotation of one batch and each of the other."""
+def rotation_angles(
+    first: Float[Tensor, "m 3 3"], second: Float[Tensor, "n 3 3"]
+) -> Float[Tensor, "m n"]:
+    """Compute the geodesic angle in degrees between each rotation of one batch and each of the
+    other."""
     return torch.from_numpy(rotation_angle(first[:, None].numpy(), second[None].numpy()))
 
 
 def rotation_matrices(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
-    """Convert rotation vectors (axis times angle in radians) to matrices by Rodrigues' formula, in float32."""
+    """Convert rotation vectors (axis times angle in radians) to matrices by Rodrigues' formula, in
+    float32."""
     angle = vectors.norm(dim=-1, keepdim=True)
     x, y, z = (vectors / angle.clamp_min(1e-12)).unbind(-1)
     zero = torch.zeros_like(x)

@@ -1,8 +1,8 @@
 """Pose proposals: fits to three matches of one target view, and viewpoints around the object.
 
-Unlike in RANSAC, the sample with the largest consensus is not taken as the result, because errors of matches are
-correlated (the front of an object can match its back everywhere). Each view contributes several proposals, and the
-score over all views selects among them (see `verification`).
+Unlike in RANSAC, the sample with the largest consensus is not taken as the result, because errors
+of matches are correlated (the front of an object can match its back everywhere). Each view
+contributes several proposals, and the score over all views selects among them (see `verification`).
 """
 
 import numpy as np
@@ -12,7 +12,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from zsp_lite.alignment import umeyama_batch
-from zsp_lite.verified.poses import SCALE_RANGE, Poses, float_tensor, non_maximum_suppression, rotation_matrices
+from zsp_lite.verified.poses import (
+    SCALE_RANGE,
+    Poses,
+    float_tensor,
+    non_maximum_suppression,
+    rotation_matrices,
+)
 from zsp_lite.verified.scene import Scene
 
 _TRIALS = 300  # samples of three matches, per view
@@ -21,12 +27,16 @@ _INLIER_DISTANCE = 0.3  # working units
 _MIN_ANGLE = 20.0  # degrees between the proposals of a view
 _POOL = 200  # best samples of a view that go into non-maximum suppression
 _TURNS = torch.deg2rad(torch.arange(30.0, 360.0, 30.0))  # of a viewpoint about the vertical
-# Scale of the poses from views: the spread of what one view shows is about this fraction of the whole object's.
+# Scale of the poses from views: the spread of what one view shows is about this fraction of the
+# whole object's.
 _VIEW_SCALE = 0.9
 
 
-def poses_from_matches(source: Float[Tensor, "k 3"], target: Float[Tensor, "k 3"], rng: np.random.Generator) -> Poses:
-    """Fit poses to random samples of three matches and keep the best that differ by at least 20 degrees."""
+def poses_from_matches(
+    source: Float[Tensor, "k 3"], target: Float[Tensor, "k 3"], rng: np.random.Generator
+) -> Poses:
+    """Fit poses to random samples of three matches and keep the best that differ by at least 20
+    degrees."""
     if len(source) < 3:
         return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
     sample = np.argpartition(rng.random((_TRIALS, len(source))), (0, 1, 2), axis=1)[:, :3]
@@ -37,11 +47,14 @@ def poses_from_matches(source: Float[Tensor, "k 3"], target: Float[Tensor, "k 3"
     # As in MSAC (Torr and Zisserman 2000), sum_i max(0, 1 - (|T x_i - y_i| / 0.3)^2).
     score = (1 - squared_residual / _INLIER_DISTANCE**2).clamp_min_(0).sum(dim=1)
     best = torch.argsort(score, descending=True, stable=True)[:_POOL]
-    return poses[best[non_maximum_suppression(poses.rotation[best], score[best], _MIN_ANGLE, _PER_VIEW)]]
+    return poses[
+        best[non_maximum_suppression(poses.rotation[best], score[best], _MIN_ANGLE, _PER_VIEW)]
+    ]
 
 
 def poses_from_views(scene: Scene) -> Poses:
-    """Return poses with the viewpoints of the target views, and that of the first one turned about the vertical."""
+    """Return poses with the viewpoints of the target views, and that of the first one turned about
+    the vertical."""
     views = scene.target_maps.rotation.transpose(1, 2)
     # The mean of the directions that are up in the target images.
     vertical = F.normalize(-scene.target_maps.rotation[:, 1].mean(dim=0), dim=0)

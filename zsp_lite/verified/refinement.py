@@ -1,7 +1,8 @@
 """Refinement: each pose climbs the score by random search.
 
-The score is piecewise constant in places (silhouettes, pixels), so gradients do not help. The search is a simple
-evolution strategy: per round it perturbs every pose with Gaussian steps of shrinking width and keeps the best one.
+The score is piecewise constant in places (silhouettes, pixels), so gradients do not help. The
+search is a simple evolution strategy: per round it perturbs every pose with Gaussian steps of
+shrinking width and keeps the best one.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from zsp_lite.verified.poses import SCALE_RANGE, Poses, concatenate, non_maximum_suppression, rotation_matrices
+from zsp_lite.verified.poses import (
+    SCALE_RANGE,
+    Poses,
+    concatenate,
+    non_maximum_suppression,
+    rotation_matrices,
+)
 from zsp_lite.verified.scene import Scene
 from zsp_lite.verified.verification import WEIGHTS, score_terms
 
@@ -22,11 +29,14 @@ MAX_HYPOTHESES, MIN_ANGLE = 6, 15.0
 _MAX_POLISHED = 3  # of these, the best that are polished
 # About this many points of the reference and of the targets are scored during the search.
 _SEARCH_POINTS, _POLISH_POINTS = (150, 375), (450, 2000)
-_PARENTS = 6  # steps of a round that are recombined into one candidate of the next round (mu in CMA-ES)
+_PARENTS = (
+    6  # steps of a round that are recombined into one candidate of the next round (mu in CMA-ES)
+)
 
 
 class SearchSchedule(NamedTuple):
-    """Number of rounds and of steps per round and pose, and standard deviations of the steps in the first round."""
+    """Number of rounds and of steps per round and pose, and standard deviations of the steps in the
+    first round."""
 
     rounds: int
     samples: int
@@ -36,13 +46,18 @@ class SearchSchedule(NamedTuple):
     decay: float  # factor on all three after each round
 
 
-COARSE = SearchSchedule(rounds=3, samples=16, rotation=7.0, translation=0.12, scale=0.08, decay=0.65)
+COARSE = SearchSchedule(
+    rounds=3, samples=16, rotation=7.0, translation=0.12, scale=0.08, decay=0.65
+)
 FINE = SearchSchedule(rounds=5, samples=24, rotation=4.7, translation=0.08, scale=0.06, decay=0.75)
-POLISH = SearchSchedule(rounds=4, samples=24, rotation=2.0, translation=0.035, scale=0.025, decay=0.8)
+POLISH = SearchSchedule(
+    rounds=4, samples=24, rotation=2.0, translation=0.035, scale=0.025, decay=0.8
+)
 
 
 def refine_coarse_to_fine(scene: Scene, poses: Poses, rng: np.random.Generator) -> Poses:
-    """Refine poses in three searches of decreasing width, scored on some of the points; keep those that differ."""
+    """Refine poses in three searches of decreasing width, scored on some of the points; keep those
+    that differ."""
 
     def score(poses: Poses, points: tuple[int, int] = _SEARCH_POINTS) -> Float[Tensor, " m"]:
         totals = len(scene.reference_points), len(scene.target_points)
@@ -57,17 +72,23 @@ def refine_coarse_to_fine(scene: Scene, poses: Poses, rng: np.random.Generator) 
 
 
 def refine(
-    poses: Poses, score: Callable[[Poses], Float[Tensor, " _"]], schedule: SearchSchedule, rng: np.random.Generator
+    poses: Poses,
+    score: Callable[[Poses], Float[Tensor, " _"]],
+    schedule: SearchSchedule,
+    rng: np.random.Generator,
 ) -> tuple[Poses, Float[Tensor, " m"]]:
-    """Improve every pose by random search within `SCALE_RANGE`; return the poses and their scores."""
+    """Improve every pose by random search within `SCALE_RANGE`; return the poses and their
+    scores."""
     best_score, m = score(poses), len(poses)
     rows = torch.arange(m)
-    # A candidate of the next round is the mean of the best steps, with the weights of CMA-ES (Hansen 2016).
+    # A candidate of the next round is the mean of the best steps, with the weights of CMA-ES
+    # (Hansen 2016).
     weights = np.log(_PARENTS + 0.5) - np.log(np.arange(1, _PARENTS + 1))
     weights = torch.tensor(weights / weights.sum(), dtype=torch.float32)[:, None]
     recombined = None
     for turn in range(schedule.rounds):
-        # All poses get the same steps: the result for one pose does not depend on the number of others.
+        # All poses get the same steps: the result for one pose does not depend on the number of
+        # others.
         draws = rng.standard_normal((schedule.samples, 7)).astype(np.float32) * schedule.decay**turn
         steps = torch.from_numpy(draws).repeat(m, 1, 1)
         if recombined is not None:
@@ -85,7 +106,8 @@ def refine(
 
 
 def _perturb(poses: Poses, steps: Float[Tensor, "m samples 7"], schedule: SearchSchedule) -> Poses:
-    """Apply each step to its pose: three components of rotation, three of translation, one of log-scale."""
+    """Apply each step to its pose: three components of rotation, three of translation, one of
+    log-scale."""
     vectors = torch.deg2rad(schedule.rotation * steps[..., :3]).flatten(0, 1)
     rotation = rotation_matrices(vectors).view(*steps.shape[:2], 3, 3) @ poses.rotation[:, None]
     scale = (poses.scale[:, None] * torch.exp(schedule.scale * steps[..., 6])).clamp(*SCALE_RANGE)

@@ -1,12 +1,13 @@
 """The scene: the points, feature similarities and maps of all views, in two normalised frames.
 
-Working units: the reference's points are centred at their mean and divided by their spread (standard deviation,
-averaged over the axes); the points of all target views together likewise, with the axes of the first target camera. A
-pose between the two then has a scale near 1 and a translation near 0, and all lengths in the solver are relative to
-the size of the object.
+Working units: the reference's points are centred at their mean and divided by their spread
+(standard deviation, averaged over the axes); the points of all target views together likewise, with
+the axes of the first target camera. A pose between the two then has a scale near 1 and a
+translation near 0, and all lengths in the solver are relative to the size of the object.
 
-Maps have depth, mask, silhouette distance and patch of each pixel. A pixel of unknown depth gives no information about
-surfaces: its weight is 0. It may still lie inside or outside the silhouette, which comes from the mask.
+Maps have depth, mask, silhouette distance and patch of each pixel. A pixel of unknown depth gives
+no information about surfaces: its weight is 0. It may still lie inside or outside the silhouette,
+which comes from the mask.
 """
 
 from collections.abc import Sequence
@@ -26,13 +27,14 @@ from zsp_lite.points import near_median, standard_deviation
 from zsp_lite.verified.poses import Poses, exp_, float_tensor
 from zsp_lite.views import View
 
-# Points farther from the median point than this many median distances are outliers: patches at a silhouette may have
-# the depth of the background.
+# Points farther from the median point than this many median distances are outliers: patches at a
+# silhouette may have the depth of the background.
 _OUTLIER_DISTANCE = 3.0
 _DENSITY_SIGMA = 0.25  # working units
 _DENSITY_ROWS = 200  # points at a time
 MIN_POINTS = 8  # fewer do not determine a shape to align
-# Resolution of the maps. Finer maps do not change results with patches of 8 pixels, and exceed the processor's cache.
+# Resolution of the maps. Finer maps do not change results with patches of 8 pixels, and exceed the
+# processor's cache.
 _MAP_PIXELS = 128 * 128
 # The silhouette of a soft mask is uncertain: distances to it are averaged over these.
 _MASK_THRESHOLDS = (0.3, 0.5, 0.7)
@@ -46,14 +48,19 @@ _Rigid = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]  # rotation and
 class ViewMaps:
     """Cameras of v views in working units, and one table row for each of their pixels."""
 
-    rotation: Float[Tensor, "v 3 3"]  # world-to-camera: `x_cam = rotation @ x + translation`, x in the working frame
+    rotation: Float[
+        Tensor, "v 3 3"
+    ]  # world-to-camera: `x_cam = rotation @ x + translation`, x in the working frame
     translation: Float[Tensor, "v 3"]  # working units
-    focal_length: Float[Tensor, " v"]  # in map pixels; the maps are resampled so that it is equal along both axes
+    focal_length: Float[
+        Tensor, " v"
+    ]  # in map pixels; the maps are resampled so that it is equal along both axes
     principal_point: Float[Tensor, "v 2"]  # (x, y) in map pixels
     size: Float[Tensor, "v 2"]  # (width, height) in map pixels, whole numbers
     first_row: Int[Tensor, " v"]  # table row of each view's first pixel
-    # row-major, view after view, each column contiguous: depth in working units; its weight (the soft mask, 0 where the
-    # depth is unknown); distance to the silhouette in map pixels (0 inside); similarity column of the patch (-1: none)
+    # row-major, view after view, each column contiguous: depth in working units; its weight (the
+    # soft mask, 0 where the depth is unknown); distance to the silhouette in map pixels (0 inside);
+    # similarity column of the patch (-1: none)
     table: Float[Tensor, "pixels 4"]
     pixel_scale: Float[Tensor, "v 2"]  # (x, y) pixels of the view's frame per map pixel
 
@@ -64,7 +71,9 @@ class Projection:
 
     depth: Float[Tensor, "m v n"]  # depth of the point, working units
     surface_depth: Float[Tensor, "m v n"]  # measured depth at its pixel, working units
-    weight: Float[Tensor, "m v n"]  # of the measured depth, in [0, 1]; 0 where it is unknown or background
+    weight: Float[
+        Tensor, "m v n"
+    ]  # of the measured depth, in [0, 1]; 0 where it is unknown or background
     silhouette_distance: Float[Tensor, "m v n"]  # at the point's depth, working units; 0 inside
     patch: Int[Tensor, "m v n"]  # similarity column of the patch at its pixel, -1 for none
     pixels: Float[Tensor, "m v n 2"]  # (x, y) in map pixels
@@ -74,44 +83,74 @@ class Projection:
 class Scene:
     """A reference view and v target views of another object, prepared for scoring poses."""
 
-    reference_points: Float[Tensor, "n 3"]  # foreground patches of known depth in the reference, working units
+    reference_points: Float[
+        Tensor, "n 3"
+    ]  # foreground patches of known depth in the reference, working units
     target_points: Float[Tensor, "m 3"]  # the same of all target views
     target_column: Int[Tensor, " m"]  # column of each target point in `similarity`
-    target_weight: Float[Tensor, " m"]  # share of the surface that each target point represents; they sum to 1
-    similarity: Float[Tensor, "n columns"]  # of each point to each foreground patch of all targets, double-centred
+    target_weight: Float[
+        Tensor, " m"
+    ]  # share of the surface that each target point represents; they sum to 1
+    similarity: Float[
+        Tensor, "n columns"
+    ]  # of each point to each foreground patch of all targets, double-centred
     reference_maps: ViewMaps  # per-pixel maps of the reference
     target_maps: ViewMaps  # per-pixel maps of the targets
     reference_to_working: Sim3  # Reference camera to working units
     target_to_working: Sim3  # first target camera to working units
     target_cameras: tuple[Camera, ...]  # cameras of the targets
-    matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]  # points of reference and target, per target
+    matches: tuple[
+        tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...
+    ]  # points of reference and target, per target
     view_similarity: Float[Tensor, " v"]  # of each target view to the reference, less their mean
     view_similarity_std: float  # standard deviation of that similarity over the target views
     view_span: float  # angle in degrees that the target views span around the target
 
     def to_sim3(self, poses: Poses, index: int, view: int) -> Sim3:
-        """Convert a pose from working units to a similarity from the reference camera to a target view's camera."""
-        left, _, right = np.linalg.svd(poses.rotation[index].double().numpy())  # orthogonal again in float64
-        pose = Sim3(float(poses.scale[index]), left @ right, poses.translation[index].double().numpy())
+        """Convert a pose from working units to a similarity from the reference camera to a target
+        view's camera."""
+        left, _, right = np.linalg.svd(
+            poses.rotation[index].double().numpy()
+        )  # orthogonal again in float64
+        pose = Sim3(
+            float(poses.scale[index]), left @ right, poses.translation[index].double().numpy()
+        )
         rotation, translation = _relative_pose(self.target_cameras[0], self.target_cameras[view])
-        return Sim3(1.0, rotation, translation) @ self.target_to_working.inverse() @ pose @ self.reference_to_working
+        return (
+            Sim3(1.0, rotation, translation)
+            @ self.target_to_working.inverse()
+            @ pose
+            @ self.reference_to_working
+        )
 
 
 def build_scene(
-    reference: View, targets: Sequence[View], similarities: Sequence[Tensor], matches: Sequence[Matches] = ()
+    reference: View,
+    targets: Sequence[View],
+    similarities: Sequence[Tensor],
+    matches: Sequence[Matches] = (),
 ) -> Scene:
     """Prepare the scene of a reference view and its target views."""
     cameras = tuple(target.frame.camera for target in targets)
     to_camera = [_relative_pose(cameras[0], camera) for camera in cameras]
     source = reference.measured_points[0].reshape(-1, 3)
-    clouds = [(view.measured_points[0].reshape(-1, 3) - t) @ R for view, (R, t) in zip(targets, to_camera)]
-    cloud, known = np.concatenate(clouds), np.concatenate([target.known_foreground.ravel() for target in targets])
+    clouds = [
+        (view.measured_points[0].reshape(-1, 3) - t) @ R for view, (R, t) in zip(targets, to_camera)
+    ]
+    cloud, known = (
+        np.concatenate(clouds),
+        np.concatenate([target.known_foreground.ravel() for target in targets]),
+    )
     name = reference.frame.name or "reference"
-    reference_to_working, source_valid = _normalisation(source, reference.known_foreground.ravel(), name)
+    reference_to_working, source_valid = _normalisation(
+        source, reference.known_foreground.ravel(), name
+    )
     target_to_working, valid = _normalisation(cloud, known, "target views")
     source, cloud = reference_to_working.apply(source), target_to_working.apply(cloud)
 
-    starts = np.cumsum([len(one) for one in clouds])[:-1]  # of the patches of each target but the first
+    starts = np.cumsum([len(one) for one in clouds])[
+        :-1
+    ]  # of the patches of each target but the first
     foregrounds = [target.foreground.ravel() for target in targets]
     column = _number(np.concatenate(foregrounds))
     reference_foreground = reference.foreground.ravel()
@@ -119,7 +158,8 @@ def build_scene(
         similarity.float()[reference_foreground][:, foreground]
         for similarity, foreground in zip(similarities, foregrounds, strict=True)
     ]
-    # Of each view: each foreground patch's highest similarity in the other view, averaged in both directions.
+    # Of each view: each foreground patch's highest similarity in the other view, averaged in both
+    # directions.
     best = [(one.amax(dim=1).mean() + one.amax(dim=0).mean()) / 2 for one in between_foregrounds]
     view_similarity = torch.stack(best) - torch.stack(best).mean()
     valid_rows = torch.from_numpy(source_valid)[reference_foreground]
@@ -136,8 +176,12 @@ def build_scene(
         target_points=float_tensor(cloud[valid]),
         target_column=torch.from_numpy(column[valid]),
         target_weight=surface_weights(float_tensor(cloud[valid])),
-        similarity=torch.cat([double_centre(one[valid_rows]) for one in between_foregrounds], dim=1).contiguous(),
-        reference_maps=build_maps([reference], still, reference_to_working, [_number(source_valid)]),
+        similarity=torch.cat(
+            [double_centre(one[valid_rows]) for one in between_foregrounds], dim=1
+        ).contiguous(),
+        reference_maps=build_maps(
+            [reference], still, reference_to_working, [_number(source_valid)]
+        ),
         target_maps=build_maps(targets, to_camera, target_to_working, np.split(column, starts)),
         reference_to_working=reference_to_working,
         target_to_working=target_to_working,
@@ -150,10 +194,15 @@ def build_scene(
 
 
 def build_maps(
-    views: Sequence[View], world_to_camera: Sequence[_Rigid], to_working: Sim3, columns: Sequence[Int[np.ndarray, " _"]]
+    views: Sequence[View],
+    world_to_camera: Sequence[_Rigid],
+    to_working: Sim3,
+    columns: Sequence[Int[np.ndarray, " _"]],
 ) -> ViewMaps:
     """Build the maps of views that share a world frame."""
-    cameras, tables = zip(*(_table(*one, to_working.scale) for one in zip(views, columns, strict=True)))
+    cameras, tables = zip(
+        *(_table(*one, to_working.scale) for one in zip(views, columns, strict=True))
+    )
     sizes = np.array([camera.size[::-1] for camera in cameras])
     return ViewMaps(
         float_tensor([R for R, _ in world_to_camera]),
@@ -168,19 +217,26 @@ def build_maps(
 
 
 def project_points(
-    maps: ViewMaps, linear: Float[Tensor, "m 3 3"], translation: Float[Tensor, "m 3"], points: Float[Tensor, "n 3"]
+    maps: ViewMaps,
+    linear: Float[Tensor, "m 3 3"],
+    translation: Float[Tensor, "m 3"],
+    points: Float[Tensor, "n 3"],
 ) -> Projection:
-    """Transform points by `linear @ x + translation`, project them into every view and read the maps."""
+    """Transform points by `linear @ x + translation`, project them into every view and read the
+    maps."""
     m, v = len(linear), len(maps.size)
     camera_linear = (maps.rotation @ linear[:, None]).reshape(-1, 3)
     camera_translation = (maps.rotation @ translation[:, None, :, None])[..., 0] + maps.translation
     in_camera = (camera_linear @ points.T).view(m, v, 3, -1).add_(camera_translation[..., None])
     depth = in_camera[:, :, 2]
     pixels_per_unit = maps.focal_length[:, None] / depth.clamp_min(_MIN_DEPTH)
-    pixels = in_camera[:, :, :2].mul_(pixels_per_unit[:, :, None]).add_(maps.principal_point[..., None])
+    pixels = (
+        in_camera[:, :, :2].mul_(pixels_per_unit[:, :, None]).add_(maps.principal_point[..., None])
+    )
     last = torch.nextafter(maps.size, torch.zeros(()))[..., None]
-    # A point beyond the border reads the nearest border pixel, and its silhouette distance is larger by the distance to
-    # it; but where the silhouette reaches the border, the object is cut off, its extent unknown, and the distance 0.
+    # A point beyond the border reads the nearest border pixel, and its silhouette distance is
+    # larger by the distance to it; but where the silhouette reaches the border, the object is cut
+    # off, its extent unknown, and the distance 0.
     nearest = torch.minimum(pixels.clamp_min(0), last)
     column, row = nearest.int().unbind(2)
     index = (row * maps.size[:, :1].int()).add_(column).add_(maps.first_row[:, None].int())
@@ -195,7 +251,8 @@ def project_points(
 def _table(
     view: View, columns: Int[np.ndarray, " patches"], scale: float
 ) -> tuple[Camera, Float[np.ndarray, "4 pixels"]]:
-    """Resize the camera to about _MAP_PIXELS pixels, with equal focal lengths along both axes, and fill its table."""
+    """Resize the camera to about _MAP_PIXELS pixels, with equal focal lengths along both axes, and
+    fill its table."""
     camera, grid = view.frame.camera, view.features.grid
     aspect = (camera.size[0] / camera.focal_length[1]) / (camera.size[1] / camera.focal_length[0])
     height = max(round(float(np.sqrt(_MAP_PIXELS * aspect))), 1)
@@ -203,29 +260,40 @@ def _table(
     mask = cv2.resize(view.soft_mask, (width, height), interpolation=cv2.INTER_LINEAR)
     depth = view.frame.depth[_at_centres((height, width), camera.size)]
     outside = [(mask < threshold).astype(np.uint8) for threshold in _MASK_THRESHOLDS]
-    distance = [cv2.distanceTransform(one, cv2.DIST_L2, 5).clip(max=_NO_SILHOUETTE) for one in outside]
+    distance = [
+        cv2.distanceTransform(one, cv2.DIST_L2, 5).clip(max=_NO_SILHOUETTE) for one in outside
+    ]
     column = columns.reshape(grid)[_at_centres((height, width), grid)]
     table = depth * scale, np.where(depth > 0, mask, 0), np.mean(distance, axis=0), column
-    return camera.resize((height, width)), np.stack([values.astype(np.float32) for values in table]).reshape(4, -1)
+    return camera.resize((height, width)), np.stack(
+        [values.astype(np.float32) for values in table]
+    ).reshape(4, -1)
 
 
 def _at_centres(size: tuple[int, int], grid: tuple[int, int]) -> tuple[Int[np.ndarray, "_ _"], ...]:
-    """Index a grid over an image of (height, width) pixels, such as its patches, by the cell at each pixel's centre."""
+    """Index a grid over an image of (height, width) pixels, such as its patches, by the cell at
+    each pixel's centre."""
     return np.ix_(*((2 * np.arange(n) + 1) * cells // (2 * n) for n, cells in zip(size, grid)))
 
 
 def double_centre(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
-    """Subtract the means of rows and columns, because patches amid an object are similar to most, at its rim to few."""
+    """Subtract the means of rows and columns, because patches amid an object are similar to most,
+    at its rim to few."""
     rows, columns = similarity.mean(dim=1, keepdim=True), similarity.mean(dim=0, keepdim=True)
     return similarity - rows - columns + similarity.mean()
 
 
 def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
-    """Weight points by the inverse of a Gaussian kernel density: what three views show has three times the points."""
+    """Weight points by the inverse of a Gaussian kernel density: what three views show has three
+    times the points."""
     points = points / _DENSITY_SIGMA
     square = points.square().sum(dim=1, keepdim=True)
-    left, right = torch.cat([points, square], dim=1), torch.cat([points, torch.full_like(square, -0.5)], dim=1)
-    # |x - y|^2 / 2 is a product of few rows at a time with all, so that it stays in the processor's cache.
+    left, right = (
+        torch.cat([points, square], dim=1),
+        torch.cat([points, torch.full_like(square, -0.5)], dim=1),
+    )
+    # |x - y|^2 / 2 is a product of few rows at a time with all, so that it stays in the processor's
+    # cache.
     products = (torch.addmm(-square.T / 2, part, right.T) for part in left.split(_DENSITY_ROWS))
     density = torch.cat([exp_(product).sum(dim=1) for product in products])
     return (1 / density) / (1 / density).sum()
@@ -245,9 +313,12 @@ def _number(selected: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
 def _normalisation(
     points: Float[np.ndarray, "n 3"], valid: Bool[np.ndarray, " n"], name: str
 ) -> tuple[Sim3, Bool[np.ndarray, " n"]]:
-    """Compute the similarity that gives the valid points mean 0 and unit spread, and mark the outliers as invalid."""
+    """Compute the similarity that gives the valid points mean 0 and unit spread, and mark the
+    outliers as invalid."""
     if (n := int(valid.sum())) < MIN_POINTS:
-        raise NoPoseError(f"{name}: {n} foreground patches of known depth, expected at least {MIN_POINTS}")
+        raise NoPoseError(
+            f"{name}: {n} foreground patches of known depth, expected at least {MIN_POINTS}"
+        )
     kept = valid.copy()
     kept[valid] = near_median(points[valid], _OUTLIER_DISTANCE)
     mean, spread = points[kept].mean(axis=0), standard_deviation(points[kept])

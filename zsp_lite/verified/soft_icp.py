@@ -1,13 +1,15 @@
-r"""Soft ICP: iterated alignment with soft correspondences that are near in space and similar in features.
+r"""Soft ICP: iterated alignment with soft correspondences that are near in space and similar in
+features.
 
-A variant of EM-ICP (Granger and Pennec 2002) with features. Reference point x_i under the current pose T and target
-point y_j have the affinity
+A variant of EM-ICP (Granger and Pennec 2002) with features. Reference point x_i under the current
+pose T and target point y_j have the affinity
 
     A_ij = \exp(-|T x_i - y_j|^2 / (2 \sigma^2) + \lambda C_ij),
 
-with C the double-centred feature similarity and \lambda = 8. Each x_i is paired with the mean \sum_j A_ij y_j / a_i,
-where a_i = \sum_j A_ij, and gets the weight a_i / (a_i + a_0) in a weighted fit of the pose: a point without a target
-point that is near and similar has nearly no influence. \sigma decreases geometrically from 0.5 to 0.15 working units.
+with C the double-centred feature similarity and \lambda = 8. Each x_i is paired with the mean
+\sum_j A_ij y_j / a_i, where a_i = \sum_j A_ij, and gets the weight a_i / (a_i + a_0) in a weighted
+fit of the pose: a point without a target point that is near and similar has nearly no influence.
+\sigma decreases geometrically from 0.5 to 0.15 working units.
 """
 
 import numpy as np
@@ -27,14 +29,18 @@ _OUTLIER_AFFINITY = 0.01  # a_0 divided by the number of target points
 def soft_icp(scene: Scene, poses: Poses) -> Poses:
     """Align every pose to the local optimum, independently of the others."""
     totals = len(scene.reference_points), len(scene.target_points)
-    rows, columns = (torch.arange(min(n, most)) * n // min(n, most) for n, most in zip(totals, _MAX_POINTS))
+    rows, columns = (
+        torch.arange(min(n, most)) * n // min(n, most) for n, most in zip(totals, _MAX_POINTS)
+    )
     source, target = scene.reference_points[rows], scene.target_points[columns]
     feature_term = _FEATURE_WEIGHT * scene.similarity[rows][:, scene.target_column[columns]]
     target_square = target.square().sum(dim=1)
     for sigma in np.geomspace(*_SIGMAS, _ITERATIONS):
         moved = poses.apply(source)
         square = moved.square().sum(dim=2, keepdim=True) + target_square
-        square = torch.baddbmm(square, moved, target.T.expand(len(moved), 3, -1), alpha=-2).clamp_min_(0)
+        square = torch.baddbmm(
+            square, moved, target.T.expand(len(moved), 3, -1), alpha=-2
+        ).clamp_min_(0)
         affinity = exp_(square.mul_(-0.5 / sigma**2).add_(feature_term))
         total = affinity.sum(dim=2, keepdim=True)
         partner = (affinity @ target) / total.clamp_min(1e-12)
@@ -42,10 +48,15 @@ def soft_icp(scene: Scene, poses: Poses) -> Poses:
         weight = weight / weight.sum(dim=1, keepdim=True).clamp_min(1e-6)
         source_mean, partner_mean = (weight * source).sum(dim=1), (weight * partner).sum(dim=1)
         x, y = source - source_mean[:, None], partner - partner_mean[:, None]
-        rotation = float_tensor(nearest_rotation(((weight * y).transpose(1, 2) @ x).double().numpy())[0])
-        # Soft partners are averages and have a smaller spread than the targets, so the least-squares scale would
-        # shrink in each iteration. The ratio of spreads does not; half steps make it converge.
-        variance_ratio = (weight * y.square()).sum(dim=(1, 2)) / (weight * x.square()).sum(dim=(1, 2)).clamp_min(1e-9)
+        rotation = float_tensor(
+            nearest_rotation(((weight * y).transpose(1, 2) @ x).double().numpy())[0]
+        )
+        # Soft partners are averages and have a smaller spread than the targets, so the
+        # least-squares scale would shrink in each iteration. The ratio of spreads does not; half
+        # steps make it converge.
+        variance_ratio = (weight * y.square()).sum(dim=(1, 2)) / (weight * x.square()).sum(
+            dim=(1, 2)
+        ).clamp_min(1e-9)
         scale = (variance_ratio.sqrt().clamp(*SCALE_RANGE) + poses.scale) / 2
         rotated_mean = (rotation @ source_mean[..., None])[..., 0]
         poses = Poses(scale, rotation, partner_mean - scale[:, None] * rotated_mean)

@@ -21,7 +21,8 @@ from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import TERM_NAMES, WEIGHTS, score_terms
 from zsp_lite.views import View
 
-# Poses that go from the proposals to the refinement, and the smallest angle between them in degrees.
+# Poses that go from the proposals to the refinement, and the smallest angle between them in
+# degrees.
 _MAX_REFINED, _MIN_ANGLE_REFINED = 12, 20.0
 
 
@@ -30,7 +31,9 @@ class Solution:
     """Hypotheses of the verified solver, and what they were scored on."""
 
     hypotheses: tuple[Hypothesis, ...]  # best score first, at least one, at least 15 degrees apart
-    view_angles: Float[np.ndarray, " n"]  # degrees from the reference's camera to each target view's under the best one
+    view_angles: Float[
+        np.ndarray, " n"
+    ]  # degrees from the reference's camera to each target view's under the best one
     timings: dict[str, float]  # seconds per stage
     scene: Scene  # the scene that poses were scored on
     view_order: tuple[int, ...]  # index of the target view behind each view of the scene
@@ -43,31 +46,63 @@ class VerifiedSolver:
     kmeans = False  # the best matches, without clusters (see `ZeroShotPose.kmeans`)
 
     def __call__(
-        self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], *, seed: int, threshold: float
+        self,
+        reference: View,
+        targets: Sequence[View],
+        matched: Sequence[ViewMatch],
+        *,
+        seed: int,
+        threshold: float,
     ) -> PoseEstimate:
-        """Return the best hypothesis of `solve` (see `estimates.Solver`). Inliers have measured depth on both sides."""
+        """Return the best hypothesis of `solve` (see `estimates.Solver`).
+
+        Inliers have measured depth on both sides.
+        """
         solution = self.solve(reference, targets, matched, seed)
         rotation, best = solution.poses.rotation, solution.hypotheses[0]
-        flags, one_of_two = reliability_flags(solution.hypotheses, rotation_angles(rotation, rotation).numpy())
+        flags, one_of_two = reliability_flags(
+            solution.hypotheses, rotation_angles(rotation, rotation).numpy()
+        )
         matches = matched[best.view].matches
         spread = 1 / solution.scene.target_to_working.scale  # of the target's points from all views
-        inliers = measured_inliers(reference, targets[best.view], matches, best.sim3, threshold * spread)
+        inliers = measured_inliers(
+            reference, targets[best.view], matches, best.sim3, threshold * spread
+        )
         return PoseEstimate(
-            best.sim3, best.view, matches, inliers, -solution.view_angles,
-            reference, tuple(targets), solution.timings, flags, solution.hypotheses, one_of_two,
-        )  # fmt: skip
+            best.sim3,
+            best.view,
+            matches,
+            inliers,
+            -solution.view_angles,
+            reference,
+            tuple(targets),
+            solution.timings,
+            flags,
+            solution.hypotheses,
+            one_of_two,
+        )
 
-    def solve(self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], seed: int = 0) -> Solution:
-        """Run all stages on usable target views, in any order and any world, and their matches with the reference."""
+    def solve(
+        self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], seed: int = 0
+    ) -> Solution:
+        """Run all stages on usable target views, in any order and any world, and their matches with
+        the reference."""
         rng, timings = np.random.default_rng(seed), {}
         with torch.no_grad():
             with timed(timings, "scene"):
-                # By a hash of their content, which neither the order of the targets nor the world's axes change.
-                content = [target.frame.rgb.tobytes() + target.foreground.numpy().tobytes() for target in targets]
+                # By a hash of their content, which neither the order of the targets nor the world's
+                # axes change.
+                content = [
+                    target.frame.rgb.tobytes() + target.foreground.numpy().tobytes()
+                    for target in targets
+                ]
                 digests = [hashlib.blake2b(one, digest_size=16).digest() for one in content]
                 order = tuple(sorted(range(len(targets)), key=digests.__getitem__))
                 targets, matched = ([some[k] for k in order] for some in (targets, matched))
-                similarities, matches = [one.similarity for one in matched], [one.matches for one in matched]
+                similarities, matches = (
+                    [one.similarity for one in matched],
+                    [one.matches for one in matched],
+                )
                 scene = build_scene(reference, targets, similarities, matches)
             with timed(timings, "proposals"):
                 by_view = [poses_from_matches(*points, rng) for points in scene.matches]
@@ -76,21 +111,39 @@ class VerifiedSolver:
                 poses = soft_icp(scene, poses)
             with timed(timings, "verification"):
                 score = WEIGHTS.score(score_terms(scene, poses))
-                poses = poses[non_maximum_suppression(poses.rotation, score, _MIN_ANGLE_REFINED, _MAX_REFINED)]
+                poses = poses[
+                    non_maximum_suppression(poses.rotation, score, _MIN_ANGLE_REFINED, _MAX_REFINED)
+                ]
             with timed(timings, "refinement"):
                 poses = refine_coarse_to_fine(scene, poses, rng)
             with timed(timings, "ranking"):
                 terms = score_terms(scene, poses)
-                best = non_maximum_suppression(poses.rotation, WEIGHTS.score(terms), MIN_ANGLE, MAX_HYPOTHESES)
+                best = non_maximum_suppression(
+                    poses.rotation, WEIGHTS.score(terms), MIN_ANGLE, MAX_HYPOTHESES
+                )
                 poses, terms = poses[best], terms[best]
-                angles = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2)).numpy()
-                score, shape_fit = (one.score(terms).double().numpy() for one in (WEIGHTS, WEIGHTS.of_shape()))
+                angles = rotation_angles(
+                    poses.rotation, scene.target_maps.rotation.transpose(1, 2)
+                ).numpy()
+                score, shape_fit = (
+                    one.score(terms).double().numpy() for one in (WEIGHTS, WEIGHTS.of_shape())
+                )
                 mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
                 apart = float(angles[0].min())
-                facts = scene.view_span, len(order), apart, scene.view_similarity_std, float(shape_fit[0])
-                deficit = np.where(mode == np.arange(len(mode)), score[0] - score, np.inf)  # of different poses
+                facts = (
+                    scene.view_span,
+                    len(order),
+                    apart,
+                    scene.view_similarity_std,
+                    float(shape_fit[0]),
+                )
+                deficit = np.where(
+                    mode == np.arange(len(mode)), score[0] - score, np.inf
+                )  # of different poses
                 confidence = Calibration().probabilities(deficit, evidence(*facts))[mode]
-                nearest = angles.argmin(axis=1).tolist()  # the scene's view that is closest under each pose
+                nearest = angles.argmin(
+                    axis=1
+                ).tolist()  # the scene's view that is closest under each pose
                 sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(nearest)]
                 named = [dict(zip(TERM_NAMES, row)) for row in terms.tolist()]
                 views = [order[view] for view in nearest]
@@ -103,7 +156,8 @@ class VerifiedSolver:
 def measured_inliers(
     reference: View, target: View, matches: Matches, sim3: Sim3, threshold: float
 ) -> Bool[np.ndarray, " k"]:
-    """Return which matches have measured depth on both sides and a residual below the threshold under a pose."""
+    """Return which matches have measured depth on both sides and a residual below the threshold
+    under a pose."""
     (source, known), (destination, seen) = reference.measured_points, target.measured_points
     u, v = tuple(matches.reference.T), tuple(matches.target.T)
     residual = np.linalg.norm(sim3.apply(source[u]) - destination[v], axis=1)

@@ -1,38 +1,41 @@
-r"""The score of a pose: a weighted sum of nine terms that compare it with everything that the views show.
+r"""The score of a pose: a weighted sum of nine terms that compare it with everything that the views
+show.
 
     S(T) = \sum_k w_k \phi_k(T)
 
-Four terms project the n reference points into the V target views (`forward_*`), four project the target points into
-the reference view (`reverse_*`, then V = 1), and one compares views as a whole.
+Four terms project the n reference points into the V target views (`forward_*`), four project the
+target points into the reference view (`reverse_*`, then V = 1), and one compares views as a whole.
 
-Point i, moved by T and projected into view v, has depth z and falls on a pixel with measured depth d of weight m (the
-soft mask, 0 where the depth is unknown), at distance r from the silhouette. With \delta = z - d (positive behind the
-surface), \sigma = 0.25 and \rho = 0.5, all lengths in working units:
+Point i, moved by T and projected into view v, has depth z and falls on a pixel with measured depth
+d of weight m (the soft mask, 0 where the depth is unknown), at distance r from the silhouette. With
+\delta = z - d (positive behind the surface), \sigma = 0.25 and \rho = 0.5, all lengths in working
+units:
 
-    a_iv = m \exp(-\delta^2 / (2 \sigma^2))             the point lies on the measured surface
-    b_iv = m clip(-(\delta + \sigma) / \rho, 0, 1)      it lies in front of it, in observed free space
-    c_iv = min(r / \rho, 1)                             it lies outside the silhouette
-    s_iv                                                double-centred feature similarity of the point's patch to the
-                                                        foreground patch at the pixel; without one, s_iv = a_iv = 0
+    a_iv = m \exp(-\delta^2 / (2 \sigma^2))           it lies on the measured surface
+    b_iv = m clip(-(\delta + \sigma) / \rho, 0, 1)    it lies in front of it, in observed free space
+    c_iv = min(r / \rho, 1)                           it lies outside the silhouette
+    s_iv    double-centred feature similarity of the point's patch to the foreground patch at the
+            pixel; without one, s_iv = a_iv = 0
 
-A point behind the surface is occluded, and one on a pixel of unknown depth can be anywhere: neither counts against
-the pose. With point weights q_i that sum to 1 (equal for the reference, `surface_weights` for the targets) and
-\kappa = 0.5, the terms of one direction are
+A point behind the surface is occluded, and one on a pixel of unknown depth can be anywhere: neither
+counts against the pose. With point weights q_i that sum to 1 (equal for the reference,
+`surface_weights` for the targets) and \kappa = 0.5, the terms of one direction are
 
     similarity  = \sum_i q_i (\sum_v a_iv s_iv) / (\sum_v a_iv + \kappa)
     overlap     = \sum_i q_i min(\sum_v a_iv, 1)
     silhouette  = \sum_i q_i (1/V) \sum_v c_iv
     free_space  = \sum_i q_i (1/V) \sum_v b_iv
 
-and the ninth, with l_v the feature similarity of target view v to the reference (`scene.view_similarity`) and
-\theta_v the angle by which T rotates the reference's camera against that of view v, is
+and the ninth, with l_v the feature similarity of target view v to the reference
+(`scene.view_similarity`) and \theta_v the angle by which T rotates the reference's camera against
+that of view v, is
 
     viewpoint   = \sum_v (l_v - mean(l)) \exp(-(\theta_v / 45 degrees)^2).
 
 It is the paper's criterion for the best view (sec. 4.2), used as evidence for a pose.
 
-The weights w are those of a conditional logit (McFadden 1974), fitted by `tools/tuning.py`: among the hypotheses of a
-pair, the probability that one is correct is proportional to \exp(S).
+The weights w are those of a conditional logit (McFadden 1974), fitted by `tools/tuning.py`: among
+the hypotheses of a pair, the probability that one is correct is proportional to \exp(S).
 """
 
 from collections.abc import Iterator
@@ -49,7 +52,8 @@ SURFACE_SIGMA = 0.25  # sigma, working units
 MAX_VIOLATION = 0.5  # rho, working units: distance at which b and c reach 1
 VIEWPOINT_SIGMA = 45.0  # degrees
 _SIMILARITY_PRIOR = 0.5  # kappa
-_CHUNK = 250_000  # projected points at a time, so that intermediate results stay in the processor's cache
+# projected points at a time, so that intermediate results stay in the processor's cache
+_CHUNK = 250_000
 
 
 @dataclass(frozen=True)
@@ -76,22 +80,32 @@ class ScoreCoefficients:
 
 
 TERM_NAMES = tuple(field.name for field in fields(ScoreCoefficients))
-FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint")  # the other terms compare shapes
+FEATURE_TERMS = (
+    "forward_similarity",
+    "reverse_similarity",
+    "viewpoint",
+)  # the other terms compare shapes
 WEIGHTS = ScoreCoefficients()
 
 
 @dataclass(frozen=True, eq=False)
 class PointTerms:
-    """The parts of the terms for each point in each view, before averaging (see the module's docstring)."""
+    """The parts of the terms for each point in each view, before averaging (see the module's
+    docstring)."""
 
     projection: Projection  # where the n points fall in the v views under m poses
-    surface: Float[Tensor, "m v n"]  # a: weight in [0, 1] with which the point lies on the measured surface
+    surface: Float[
+        Tensor, "m v n"
+    ]  # a: weight in [0, 1] with which the point lies on the measured surface
     silhouette: Float[Tensor, "m v n"]  # c: in [0, 1]
     free_space: Float[Tensor, "m v n"]  # b: in [0, 1]
-    similarity: Float[Tensor, "m v n"]  # s: feature similarity to the patch at the pixel, 0 without one
+    similarity: Float[
+        Tensor, "m v n"
+    ]  # s: feature similarity to the patch at the pixel, 0 without one
 
     def averages(self, point_weights: Float[Tensor, " n"]) -> Iterator[Float[Tensor, " m"]]:
-        """Yield similarity, overlap, silhouette and free space of each pose, averaged over views and points."""
+        """Yield similarity, overlap, silhouette and free space of each pose, averaged over views
+        and points."""
         q = point_weights / point_weights.sum()
         surface = self.surface * (self.projection.patch >= 0)
         total = surface.sum(dim=1)
@@ -116,15 +130,23 @@ def reverse_terms(scene: Scene, poses: Poses, stride: int = 1) -> PointTerms:
     return _point_terms(scene, projection, scene.target_column[::stride], scene.similarity.shape[1])
 
 
-def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) -> Float[Tensor, "m 9"]:
-    """Compute the terms of every pose, a column per term in the order of `TERM_NAMES`, on a part of the points."""
+def score_terms(
+    scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)
+) -> Float[Tensor, "m 9"]:
+    """Compute the terms of every pose, a column per term in the order of `TERM_NAMES`, on a part of
+    the points."""
     target_weights = scene.target_weight[:: stride[1]]
     reference_weights = torch.ones(len(scene.reference_points[:: stride[0]]))
-    size = max(_CHUNK // (len(reference_weights) * len(scene.target_cameras) + len(target_weights)), 1)
+    size = max(
+        _CHUNK // (len(reference_weights) * len(scene.target_cameras) + len(target_weights)), 1
+    )
     chunks = []
     for first in range(0, len(poses), size):
         some = poses[first : first + size]
-        forward, reverse = forward_terms(scene, some, stride[0]), reverse_terms(scene, some, stride[1])
+        forward, reverse = (
+            forward_terms(scene, some, stride[0]),
+            reverse_terms(scene, some, stride[1]),
+        )
         chunks.append((*forward.averages(reference_weights), *reverse.averages(target_weights)))
     # The angle includes rotation about the line of sight, with which features change.
     angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2))
@@ -132,7 +154,9 @@ def score_terms(scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)) ->
     return torch.stack([*(torch.cat(term) for term in zip(*chunks)), viewpoint], dim=1)
 
 
-def _point_terms(scene: Scene, projection: Projection, offset: Int[Tensor, " n"], patch_stride: int) -> PointTerms:
+def _point_terms(
+    scene: Scene, projection: Projection, offset: Int[Tensor, " n"], patch_stride: int
+) -> PointTerms:
     """Read the similarity of point i to patch j at index `offset[i] + patch_stride * j`."""
     delta = projection.depth - projection.surface_depth
     surface = exp_(delta.square().mul_(-0.5 / SURFACE_SIGMA**2)).mul_(projection.weight)

@@ -21,10 +21,11 @@ MOST = 10  # objects of a figure
 def objects_figure(
     dataset: Co3D, category: str, alignment: CategoryAlignment, names: Sequence[str] | None = None
 ) -> Figure:
-    """Show objects by the frame that is nearest to one camera: in their own worlds above, in the common frame below.
+    """Show objects by the frame that is nearest to one camera: in their own worlds above, in the
+    common frame below.
 
-    The camera is that of the first frame of the most probable object of the category. Doubtful objects are shown in
-    their next best turn, too. At most ten objects are shown.
+    The camera is that of the first frame of the most probable object of the category. Doubtful
+    objects are shown in their next best turn, too. At most ten objects are shown.
     """
     names = list(names or alignment.objects)[:MOST]
     objects, look = alignment.objects, doubtful(alignment)
@@ -37,17 +38,24 @@ def objects_figure(
     if turned := {name: common @ other.R for name, other in others.items() if other}:
         rows["or turned"] = turned
     size = 1.25 * len(names) + 0.3, 1.35 * len(rows) + 0.3
-    figure, axes = plt.subplots(len(rows), len(names), figsize=size, layout="constrained", squeeze=False)
+    figure, axes = plt.subplots(
+        len(rows), len(names), figsize=size, layout="constrained", squeeze=False
+    )
     for line, (title, cameras) in zip(axes, rows.items(), strict=True):
         line[names.index(next(iter(cameras)))].set_ylabel(title)
         for axis, name in zip(line, names, strict=True):
             axis.set(xticks=[], yticks=[], frame_on=False)
             if name in cameras:
                 frames = _frames(dataset, category, name)
-                angles = rotation_angle(np.stack([dataset.camera(one).R for one in frames]), cameras[name])
+                angles = rotation_angle(
+                    np.stack([dataset.camera(one).R for one in frames]), cameras[name]
+                )
                 axis.imshow(object_crop(dataset.load(frames[int(np.argmin(angles))])).rgb)
     for axis, name in zip(axes[1], names, strict=True):
-        text, colour = f"{name[:16]}\n{100 * objects[name].probability:.0f} %", VERMILLION if name in look else "black"
+        text, colour = (
+            f"{name[:16]}\n{100 * objects[name].probability:.0f} %",
+            VERMILLION if name in look else "black",
+        )
         axis.set_xlabel(text, fontsize=8, color=colour, parse_math=False)
     return figure
 
@@ -58,7 +66,8 @@ def doubtful(alignment: CategoryAlignment) -> list[str]:
 
 
 def object_rows(alignment: CategoryAlignment) -> list[tuple[str, ...]]:
-    """Return the lines of the table of objects: name, probability, and the next best turn with its probability."""
+    """Return the lines of the table of objects: name, probability, and the next best turn with its
+    probability."""
     rows = []
     for name, one in alignment.objects.items():
         other = "", ""

@@ -1,8 +1,9 @@
 """Plots of every stage of the method, as pieces to combine.
 
-`show_...` makes a figure: images in a grid, maps over images, matches between two, curves, points, intervals, dots by
-category, histograms. `draw_...`, `overlay_map` and the marks add to axes, so that a figure is a few calls. A patch is a
-cell (row, col) of a grid (rows, columns). Titles and names are no TeX.
+`show_...` makes a figure: images in a grid, maps over images, matches between two, curves, points,
+intervals, dots by category, histograms. `draw_...`, `overlay_map` and the marks add to axes, so
+that a figure is a few calls. A patch is a cell (row, col) of a grid (rows, columns). Titles and
+names are no TeX.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -59,12 +60,15 @@ def show_images(
     size: float = 2.4,
     cmap: str = "gray",
 ) -> tuple[Figure, list[Axes]]:
-    """Show images (H, W, 3) or (H, W) in a grid, each `size` inches wide; returns the figure and one axis per image.
+    """Show images (H, W, 3) or (H, W) in a grid, each `size` inches wide; returns the figure and
+    one axis per image.
 
     Pixel (x, y) of an image is at (x, y) of its axes, [0, W] x [0, H].
     """
     aspect = max(np.shape(image)[0] / np.shape(image)[1] for image in images)
-    figure, axes = _panels(len(images), columns, size, size * aspect + 0.1 + 0.2 * _lines_of(titles))
+    figure, axes = _panels(
+        len(images), columns, size, size * aspect + 0.1 + 0.2 * _lines_of(titles)
+    )
     for axis, image in zip(axes, images):
         axis.set_axis_off()
         draw_image(axis, image, cmap)
@@ -74,7 +78,8 @@ def show_images(
 
 
 def draw_image(axis: Axes, image: np.ndarray, cmap: str = "gray") -> None:
-    """Draw an image, with pixel (x, y) at (x, y) of the axes; what is drawn over it does not move their limits."""
+    """Draw an image, with pixel (x, y) at (x, y) of the axes; what is drawn over it does not move
+    their limits."""
     height, width = np.shape(image)[:2]
     axis.imshow(image, cmap=cmap, extent=(0, width, height, 0), interpolation="nearest")
     axis.autoscale(False)
@@ -95,11 +100,14 @@ def overlay_map(
 ) -> AxesImage:
     """Draw a map on the patch grid over the image of an axis, transparent where it is not finite.
 
-    `limits` are the values at the ends of the colour map, `label` is that of a colour bar. `set_data` fills it anew.
+    `limits` are the values at the ends of the colour map, `label` is that of a colour bar.
+    `set_data` fills it anew.
     """
     low, high = limits or (None, None)
     style = {"cmap": cmap, "alpha": alpha, "interpolation": "nearest", "vmin": low, "vmax": high}
-    drawn = axis.imshow(np.asarray(values, np.float64), extent=(*axis.get_xlim(), *axis.get_ylim()), **style)
+    drawn = axis.imshow(
+        np.asarray(values, np.float64), extent=(*axis.get_xlim(), *axis.get_ylim()), **style
+    )
     if label is not None:
         bar = axis.figure.colorbar(drawn, ax=axis, location="bottom", shrink=0.85, pad=0.02)
         bar.set_label(label, fontsize=_FONT - 1)
@@ -108,7 +116,8 @@ def overlay_map(
 
 
 def mark(axis: Axes, text: str, colour: str = CHOSEN, size: float = _FONT) -> None:
-    """Draw a coloured frame around the image of an axis and write `text` in its corner, `size` points high."""
+    """Draw a coloured frame around the image of an axis and write `text` in its corner, `size`
+    points high."""
     frame = {"transform": axis.transAxes, "fill": False, "edgecolor": colour, "linewidth": 5}
     axis.add_patch(Rectangle((0, 0), 1, 1, zorder=10, **frame))
     font = {"fontsize": size, "weight": "bold", "va": "top", "parse_math": False}
@@ -118,28 +127,45 @@ def mark(axis: Axes, text: str, colour: str = CHOSEN, size: float = _FONT) -> No
 def patch_centres(
     cells: Integer[np.ndarray, "n 2"], grid: tuple[int, int], size: tuple[int, int]
 ) -> Float[np.ndarray, "n 2"]:
-    """Return the pixels (x, y) of the centres of patches (row, col) of a grid over an image of `size` (H, W)."""
+    """Return the pixels (x, y) of the centres of patches (row, col) of a grid over an image of
+    `size` (H, W)."""
     scale = np.array([size[1] / grid[1], size[0] / grid[0]])
     return (np.asarray(cells)[:, ::-1] + 0.5) * scale
 
 
 def match_pixels(views: Sequence[View], matches: Matches) -> list[Float[np.ndarray, "n 2"]]:
-    """Return the pixels (x, y) of matched patches in the images of the reference and of the target."""
+    """Return the pixels (x, y) of matched patches in the images of the reference and of the
+    target."""
     cells = matches.reference, matches.target
-    return [patch_centres(own, view.features.grid, view.frame.rgb.shape[:2]) for own, view in zip(cells, views)]
+    return [
+        patch_centres(own, view.features.grid, view.frame.rgb.shape[:2])
+        for own, view in zip(cells, views)
+    ]
 
 
 def circle_patch(axis: Axes, cell: Cell, grid: tuple[int, int], marker: str = "o") -> list[Artist]:
-    """Mark a patch of the image of an axis by a white circle, or by an orange star (`marker` "*")."""
-    style = {"color": ORANGE, "markersize": 18} if marker == "*" else {"color": "white", "markersize": 7}
+    """Mark a patch of the image of an axis by a white circle, or by an orange star
+    (`marker` "*")."""
+    style = (
+        {"color": ORANGE, "markersize": 18}
+        if marker == "*"
+        else {"color": "white", "markersize": 7}
+    )
     centre = patch_centres(np.array([cell]), grid, _size(axis)).T
     return axis.plot(*centre, marker, markeredgecolor="black", zorder=8, **style)
 
 
 def outline_patch(
-    axis: Axes, cell: Cell, grid: tuple[int, int], reach: int = 0, colour: str = "white", label: str = "", **style: Any
+    axis: Axes,
+    cell: Cell,
+    grid: tuple[int, int],
+    reach: int = 0,
+    colour: str = "white",
+    label: str = "",
+    **style: Any,
 ) -> list[Artist]:
-    """Outline a patch of the image of an axis, or the block of patches up to `reach` around it, with a label beside it.
+    """Outline a patch of the image of an axis, or the block of patches up to `reach` around it,
+    with a label beside it.
 
     The block is cut at the border of the image.
     """
@@ -147,7 +173,15 @@ def outline_patch(
     (left, top), (right, bottom) = corners[:, ::-1] * np.divide(_size(axis), grid)[::-1]
     box = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=colour, **style)
     at, side = (right, "left") if cell[1] < 0.8 * grid[1] else (left, "right")
-    name = axis.text(at, (top + bottom) / 2, f" {label} ", ha=side, va="center", weight="bold", path_effects=_OUTLINE)
+    name = axis.text(
+        at,
+        (top + bottom) / 2,
+        f" {label} ",
+        ha=side,
+        va="center",
+        weight="bold",
+        path_effects=_OUTLINE,
+    )
     return [axis.add_patch(box), name]
 
 
@@ -158,21 +192,44 @@ def draw_cycle(
     colour: str = "white",
     names: Sequence[str] = ("u", "v", "u'"),
 ) -> list[Artist]:
-    """Draw a cycle between the images of two axes: a solid arrow from u to v, a dashed one from v back to u'."""
+    """Draw a cycle between the images of two axes: a solid arrow from u to v, a dashed one from v
+    back to u'."""
     if names and tuple(cells[0]) == tuple(cells[2]):
         names = f"{names[0]} = {names[2]}", names[1], ""
     ends = axes[0], axes[1], axes[0]
-    places = [patch_centres(np.array([cell]), grid, _size(axis))[0] for cell, axis in zip(cells, ends)]
+    places = [
+        patch_centres(np.array([cell]), grid, _size(axis))[0] for cell, axis in zip(cells, ends)
+    ]
     drawn = axes[0].plot(*places[0], "o", color=colour, markeredgecolor="black", markersize=8)
     for start, line in ((0, "-"), (1, "--")):
         arrow = ConnectionPatch(
-            places[start], places[start + 1], "data", "data", axesA=ends[start], axesB=ends[start + 1],
-            arrowstyle="-|>", mutation_scale=14, connectionstyle="arc3,rad=-0.1", linestyle=line, linewidth=2,
-            color=colour, path_effects=BORDER,
-        )  # fmt: skip
+            places[start],
+            places[start + 1],
+            "data",
+            "data",
+            axesA=ends[start],
+            axesB=ends[start + 1],
+            arrowstyle="-|>",
+            mutation_scale=14,
+            connectionstyle="arc3,rad=-0.1",
+            linestyle=line,
+            linewidth=2,
+            color=colour,
+            path_effects=BORDER,
+        )
         drawn.append(axes[0].figure.add_artist(arrow))
     for axis, place, name, side in zip(ends, places, names, ("left", "left", "right")):
-        drawn.append(axis.text(*place, name, fontsize=11, weight="bold", va="bottom", ha=side, path_effects=_OUTLINE))
+        drawn.append(
+            axis.text(
+                *place,
+                name,
+                fontsize=11,
+                weight="bold",
+                va="bottom",
+                ha=side,
+                path_effects=_OUTLINE,
+            )
+        )
     return drawn
 
 
@@ -186,14 +243,21 @@ def show_matches(
 ) -> Figure:
     """Show two images and matches of their patches (row, col), as `draw_matches` draws them."""
     figure, axes = show_images(images, titles, size=size)
-    draw_matches(axes, [patch_centres(own, grid, image.shape[:2]) for own, image in zip(cells, images)], inliers)
+    draw_matches(
+        axes,
+        [patch_centres(own, grid, image.shape[:2]) for own, image in zip(cells, images)],
+        inliers,
+    )
     return figure
 
 
 def draw_matches(
-    axes: Sequence[Axes], pixels: Sequence[Real[np.ndarray, "n 2"]], inliers: Bool[np.ndarray, " n"] | None = None
+    axes: Sequence[Axes],
+    pixels: Sequence[Real[np.ndarray, "n 2"]],
+    inliers: Bool[np.ndarray, " n"] | None = None,
 ) -> list[Artist]:
-    """Mark matches, at pixels (x, y) of two images, and join some: inliers solid, blue; others dashed, orange.
+    """Mark matches, at pixels (x, y) of two images, and join some: inliers solid, blue; others
+    dashed, orange.
 
     Of more than 15 matches, 15 have a line, with the same share of inliers.
     """
@@ -205,11 +269,17 @@ def draw_matches(
         style = {"color": VERMILLION, "linewidth": 1.2, "linestyle": (0, (4, 2))}
         if good:  # with a white outline, to be visible on dark images
             style = {"color": BLUE, "linewidth": 1.8, "path_effects": _OUTLINE}
-        line = ConnectionPatch(a, b, "data", "data", axesA=axes[0], axesB=axes[1], zorder=5, **style)
+        line = ConnectionPatch(
+            a, b, "data", "data", axesA=axes[0], axesB=axes[1], zorder=5, **style
+        )
         drawn.append(axes[0].figure.add_artist(line))
     for axis, at in zip(axes, pixels):
-        drawn.append(axis.scatter(*at[~inliers].T, 25, VERMILLION, marker="x", linewidths=1.2, zorder=6))
-        drawn.append(axis.scatter(*at[inliers].T, 25, BLUE, edgecolors="white", linewidths=0.7, zorder=6))
+        drawn.append(
+            axis.scatter(*at[~inliers].T, 25, VERMILLION, marker="x", linewidths=1.2, zorder=6)
+        )
+        drawn.append(
+            axis.scatter(*at[inliers].T, 25, BLUE, edgecolors="white", linewidths=0.7, zorder=6)
+        )
     return drawn
 
 
@@ -225,10 +295,11 @@ def show_panels(
     size: tuple[float, float] = (10, 3.4),
     **labels: Any,
 ) -> Figure:
-    """Show curves (x, y), or points that are not `joined`, in each panel, by its title, with one legend.
+    """Show curves (x, y), or points that are not `joined`, in each panel, by its title, with one
+    legend.
 
-    Curves differ in colour, line and marker. `size` is the width of the figure and the height of a row; `labels` is
-    what `Axes.set` takes.
+    Curves differ in colour, line and marker. `size` is the width of the figure and the height of a
+    row; `labels` is what `Axes.set` takes.
     """
     width = size[0] / min(columns or len(panels), len(panels))
     figure, axes = _panels(len(panels), columns, width, size[1])
@@ -239,7 +310,9 @@ def show_panels(
             if joined:
                 axis.plot(x, y, line, color=colour, label=name, **style)
             else:
-                axis.scatter(x, y, 50, colour, marker, edgecolors="black", linewidths=0.4, label=name)
+                axis.scatter(
+                    x, y, 50, colour, marker, edgecolors="black", linewidths=0.4, label=name
+                )
         axis.set(title=title, **labels)
     _legend(figure, axes[0])
     return figure
@@ -253,10 +326,11 @@ def show_points(
     down: bool = False,
     **labels: Any,
 ) -> Figure:
-    """Show sets of points (x, y, ...) in each panel, by its title, with equal scales and one legend.
+    """Show sets of points (x, y, ...) in each panel, by its title, with equal scales and one
+    legend.
 
-    All panels have the same extent, around the first set of each; points far off it are cut. The y axis points `down`
-    as in images. `labels` is what `Axes.set` takes.
+    All panels have the same extent, around the first set of each; points far off it are cut. The y
+    axis points `down` as in images. `labels` is what `Axes.set` takes.
     """
     firsts = [next(iter(sets.values()))[:, :2] for sets in panels.values()]
     ranges = np.array([np.percentile(points, [1, 99], axis=0) for points in firsts])
@@ -271,28 +345,47 @@ def show_points(
             axis.scatter(*points.T[:2], area, colour, **style)
         axis.set_title(title, fontsize=_FONT, parse_math=False)
         y_limits = (y + half[1], y - half[1]) if down else (y - half[1], y + half[1])
-        axis.set(**{"xlim": (x - half[0], x + half[0]), "ylim": y_limits, "aspect": "equal"} | labels)
+        axis.set(
+            **{"xlim": (x - half[0], x + half[0]), "ylim": y_limits, "aspect": "equal"} | labels
+        )
     for handle in _legend(figure, axes[0], "outside lower center").legend_handles:
         handle.set(sizes=[40], linewidths=[1.5])  # small marks would be pale
     return figure
 
 
-def show_dots(groups: Mapping[str, Mapping[str, ArrayLike]], median: bool = True, **labels: Any) -> Figure:
-    """Show values as a row of dots for each name, with a bar at the `median`; several groups differ in colour.
+def show_dots(
+    groups: Mapping[str, Mapping[str, ArrayLike]], median: bool = True, **labels: Any
+) -> Figure:
+    """Show values as a row of dots for each name, with a bar at the `median`; several groups differ
+    in colour.
 
-    `groups` has the values by the name of the row, by the name of the group; `labels` is what `Axes.set` takes.
+    `groups` has the values by the name of the row, by the name of the group; `labels` is what
+    `Axes.set` takes.
     """
     rows = list(next(iter(groups.values())))
     figure, axis = plt.subplots(figsize=(8, 1.1 + 0.42 * len(rows)), layout="constrained")
     rng, width = np.random.default_rng(0), 0.5 / len(groups)
-    for index, ((group, values), colour, marker) in enumerate(zip(groups.items(), cycle(COLOURS), cycle(_MARKERS))):
+    for index, ((group, values), colour, marker) in enumerate(
+        zip(groups.items(), cycle(COLOURS), cycle(_MARKERS))
+    ):
         for row, name in enumerate(rows):
             middle = row + width * (index - (len(groups) - 1) / 2)
             height = middle + width * rng.uniform(-0.4, 0.4, len(values[name]))
-            style = {"marker": marker, "edgecolors": "white", "linewidths": 0.4, "label": "" if row else group}
+            style = {
+                "marker": marker,
+                "edgecolors": "white",
+                "linewidths": 0.4,
+                "label": "" if row else group,
+            }
             axis.scatter(values[name], height, 40, colour, **style)
             if median and len(values[name]):
-                axis.vlines(np.median(values[name]), middle - 0.4, middle + 0.4, color=VERMILLION, linewidth=2.5)
+                axis.vlines(
+                    np.median(values[name]),
+                    middle - 0.4,
+                    middle + 0.4,
+                    color=VERMILLION,
+                    linewidth=2.5,
+                )
     axis.set_yticks(range(len(rows)), rows)
     axis.set(ylim=(len(rows) - 0.4, -0.6), **labels)
     if len(groups) > 1:
@@ -301,17 +394,22 @@ def show_dots(groups: Mapping[str, Mapping[str, ArrayLike]], median: bool = True
 
 
 def show_intervals(
-    x: ArrayLike, intervals: Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike]], joined: bool = True, **labels: Any
+    x: ArrayLike,
+    intervals: Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike]],
+    joined: bool = True,
+    **labels: Any,
 ) -> Figure:
     """Show up to four rows of values over x, each value with a bar from its lower to its upper end.
 
-    A row is (values, lower ends, upper ends) by its name; bars at one x stand beside each other. A line joins the
-    values of a row if they are `joined`; `labels` is what `Axes.set` takes.
+    A row is (values, lower ends, upper ends) by its name; bars at one x stand beside each other. A
+    line joins the values of a row if they are `joined`; `labels` is what `Axes.set` takes.
     """
     figure, axis = plt.subplots(figsize=(7, 3.8), layout="constrained")
     styles = zip(intervals.items(), COLOURS, _LINES, _MARKERS)
     for place, ((name, (values, low, high)), colour, line, marker) in enumerate(styles):
-        beside = offset_copy(axis.transData, figure, x=5 * (place - (len(intervals) - 1) / 2), units="points")
+        beside = offset_copy(
+            axis.transData, figure, x=5 * (place - (len(intervals) - 1) / 2), units="points"
+        )
         line = line if joined else "none"
         (row,) = axis.plot(x, values, linestyle=line, marker=marker, color=colour, label=name)
         for artist in (row, axis.vlines(x, low, high, color=colour, alpha=0.5, linewidth=3)):
@@ -348,15 +446,19 @@ def show_maps(
 
 
 def pca_colours(
-    maps: Sequence[Real[np.ndarray, "rows cols d"]], foreground: Sequence[Bool[np.ndarray, "rows cols"]] | None = None
+    maps: Sequence[Real[np.ndarray, "rows cols d"]],
+    foreground: Sequence[Bool[np.ndarray, "rows cols"]] | None = None,
 ) -> list[Float[np.ndarray, "rows cols 3"]]:
     """Map features to colours by their first three principal components, which all maps share.
 
-    Each component is scaled to its range from the 2nd to the 98th percentile. The components are fitted to the
-    `foreground` patches; others are white. Each map gives an RGB image in [0, 1], with one pixel per patch.
+    Each component is scaled to its range from the 2nd to the 98th percentile. The components are
+    fitted to the `foreground` patches; others are white. Each map gives an RGB image in [0, 1],
+    with one pixel per patch.
     """
     features = [np.asarray(one, dtype=np.float64) for one in maps]
-    on = [np.asarray(one, bool) for one in foreground or (np.ones(one.shape[:2]) for one in features)]
+    on = [
+        np.asarray(one, bool) for one in foreground or (np.ones(one.shape[:2]) for one in features)
+    ]
     inside = np.concatenate([one[where] for one, where in zip(features, on)])
     centred = inside - inside.mean(axis=0)
     axes = np.linalg.eigh(centred.T @ centred)[1][:, :-4:-1]
@@ -366,9 +468,14 @@ def pca_colours(
 
 
 def draw_points(
-    axis: Axes, camera: Camera, points: Real[np.ndarray, "n 3"], colours: np.ndarray | str = BLUE, size: float = 5.0
+    axis: Axes,
+    camera: Camera,
+    points: Real[np.ndarray, "n 3"],
+    colours: np.ndarray | str = BLUE,
+    size: float = 5.0,
 ) -> None:
-    """Draw points of a camera's frame in its image, far ones first; those behind the camera are left out."""
+    """Draw points of a camera's frame in its image, far ones first; those behind the camera are
+    left out."""
     points = np.asarray(points, dtype=np.float64)
     order = np.argsort(-points[:, 2])
     order = order[points[order, 2] > 0]
@@ -378,9 +485,14 @@ def draw_points(
 
 
 def draw_axes(
-    axis: Axes, camera: Camera, origin: Real[np.ndarray, "3"], ends: Real[np.ndarray, "3 3"], names: Sequence[str]
+    axis: Axes,
+    camera: Camera,
+    origin: Real[np.ndarray, "3"],
+    ends: Real[np.ndarray, "3 3"],
+    names: Sequence[str],
 ) -> None:
-    """Draw arrows from an origin to three ends (rows), points of a camera's frame, in its image, with their names.
+    """Draw arrows from an origin to three ends (rows), points of a camera's frame, in its image,
+    with their names.
 
     Arrows with an end behind the camera are left out; names stay inside the image.
     """
@@ -388,12 +500,28 @@ def draw_axes(
     inside = np.array(camera.size[::-1])
     for name, colour, end, near in zip(names, _AXIS_COLOURS, pixels[1:], depth[1:]):
         if min(near, depth[0]) > 0:
-            arrow = {"arrowstyle": "-|>", "color": colour, "linewidth": 2, "shrinkA": 0, "shrinkB": 0}
-            drawn = axis.annotate("", end, pixels[0], zorder=6, annotation_clip=False, arrowprops=arrow)
+            arrow = {
+                "arrowstyle": "-|>",
+                "color": colour,
+                "linewidth": 2,
+                "shrinkA": 0,
+                "shrinkB": 0,
+            }
+            drawn = axis.annotate(
+                "", end, pixels[0], zorder=6, annotation_clip=False, arrowprops=arrow
+            )
             drawn.set_in_layout(False)
             drawn.arrow_patch.set_clip_path(axis.patch)
-            style = {"fontsize": _FONT, "weight": "bold", "ha": "center", "va": "center", "path_effects": _OUTLINE}
-            axis.text(*np.clip(end, 0.08 * inside, 0.92 * inside), name, color=colour, zorder=7, **style)
+            style = {
+                "fontsize": _FONT,
+                "weight": "bold",
+                "ha": "center",
+                "va": "center",
+                "path_effects": _OUTLINE,
+            }
+            axis.text(
+                *np.clip(end, 0.08 * inside, 0.92 * inside), name, color=colour, zorder=7, **style
+            )
 
 
 def draw_moved_cloud(
@@ -404,9 +532,11 @@ def draw_moved_cloud(
     names: Sequence[str] | None = ("", "", ""),
     size: float = 3,
 ) -> None:
-    """Draw points of the reference camera's frame, and its axes, over the images of cameras, each with its own pose.
+    """Draw points of the reference camera's frame, and its axes, over the images of cameras, each
+    with its own pose.
 
-    The colour of a point is its position along the object. `names` are the labels of the axes; None draws no axes.
+    The colour of a point is its position along the object. `names` are the labels of the axes; None
+    draws no axes.
     """
     colours, middle = coordinate_colours(cloud), cloud.mean(axis=0)
     ends = middle + 2 * axis_deviation(cloud) * np.eye(3)
@@ -416,8 +546,11 @@ def draw_moved_cloud(
             draw_axes(axis, camera, pose.apply(middle), pose.apply(ends), names)
 
 
-def moved_points(estimates: Mapping[str, PoseEstimate], size: float = 3.4, columns: int | None = None) -> Figure:
-    """Show the reference under its own points, and for each estimate its target view under the moved points."""
+def moved_points(
+    estimates: Mapping[str, PoseEstimate], size: float = 3.4, columns: int | None = None
+) -> Figure:
+    """Show the reference under its own points, and for each estimate its target view under the
+    moved points."""
     views = chosen_views(estimates.values())
     titles = ["reference, its own points", *estimates]
     figure, axes = show_images([pale(view.frame.rgb) for view in views], titles, columns, size)
@@ -434,19 +567,27 @@ def chosen_views(estimates: Collection[PoseEstimate]) -> list[View]:
 def draw_estimates(
     axes: Iterable[Axes], estimates: Collection[PoseEstimate], most: int = 20000, size: float = 3
 ) -> None:
-    """Draw at most `most` points of the reference over the images of `chosen_views`, moved by each estimate."""
-    views, poses = chosen_views(estimates), [Sim3.identity(), *(_rounded(one.sim3) for one in estimates)]
-    draw_moved_cloud(axes, [view.frame.camera for view in views], object_cloud(views[0], most), poses, None, size)
+    """Draw at most `most` points of the reference over the images of `chosen_views`, moved by each
+    estimate."""
+    views, poses = (
+        chosen_views(estimates),
+        [Sim3.identity(), *(_rounded(one.sim3) for one in estimates)],
+    )
+    draw_moved_cloud(
+        axes, [view.frame.camera for view in views], object_cloud(views[0], most), poses, None, size
+    )
 
 
 def _rounded(pose: Sim3) -> Sim3:
-    """Round a pose: the number of threads changes its last digits, and should not change a picture."""
+    """Round a pose: the number of threads changes its last digits, and should not change a
+    picture."""
     turn = Rotation.from_rotvec(Rotation.from_matrix(pose.R).as_rotvec().round(3))
     return Sim3(round(pose.scale, 3), turn.as_matrix(), pose.t.round(3))
 
 
 def coordinate_colours(points: Real[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Colour points by their position along the first principal axis of the cloud, which shows its orientation."""
+    """Colour points by their position along the first principal axis of the cloud, which shows its
+    orientation."""
     points = np.asarray(points, dtype=np.float64)
     centred = points - points.mean(axis=0)
     along = centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1]
@@ -456,7 +597,8 @@ def coordinate_colours(points: Real[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 
 def object_cloud(view: View, most: int = 2000) -> Float[np.ndarray, "n 3"]:
     """Gather a view's object points for display, without outliers.
 
-    The object is where the mask is above 0.9, which leaves out its border; without a mask, the foreground patches.
+    The object is where the mask is above 0.9, which leaves out its border; without a mask, the
+    foreground patches.
     """
     return frame_cloud(view.frame, view.soft_mask > 0.5, most)
 
@@ -464,7 +606,8 @@ def object_cloud(view: View, most: int = 2000) -> Float[np.ndarray, "n 3"]:
 def frame_cloud(
     frame: Frame, inside: Bool[np.ndarray, "height width"] | bool = True, most: int = 2000
 ) -> Float[np.ndarray, "n 3"]:
-    """Gather a frame's object points as `object_cloud` does; without a mask, the points of the pixels `inside`."""
+    """Gather a frame's object points as `object_cloud` does; without a mask, the points of the
+    pixels `inside`."""
     if frame.depth is None:
         raise InputError(f"{frame.name or 'frame'}: no depth map")
     inside = inside if frame.mask is None else frame.mask > 0.9
@@ -477,7 +620,9 @@ def frame_cloud(
     return points[kept]
 
 
-def _panels(number: int, columns: int | None, width: float, height: float) -> tuple[Figure, list[Axes]]:
+def _panels(
+    number: int, columns: int | None, width: float, height: float
+) -> tuple[Figure, list[Axes]]:
     """Return panels of a size in inches in a grid, by default in one row."""
     columns = min(columns or number, number)
     rows = -(-number // columns)

@@ -1,4 +1,5 @@
-"""One picture of an estimated pose: the reference in the target views, and where the cameras are, seen from above."""
+"""One picture of an estimated pose: the reference in the target views, and where the cameras are,
+seen from above."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,16 +20,22 @@ from zsp_lite.viz import plots
 
 _OTHERS = 4  # target views that are shown beside the chosen one
 _POINTS = 3000  # of the target, drawn from above
-_OBJECT = 0.45  # reach of the object in the drawing from above; the cameras are on or inside a circle of radius 1
+# reach of the object in the drawing from above; the cameras are on or inside a circle of radius 1
+_OBJECT = 0.45
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Directions from the target object to the cameras, seen from above with the reference camera below."""
+    """Directions from the target object to the cameras, seen from above with the reference camera
+    below."""
 
-    targets: dict[int, Float[np.ndarray, "2"]]  # unit vectors towards target cameras without their vertical part
+    targets: dict[
+        int, Float[np.ndarray, "2"]
+    ]  # unit vectors towards target cameras without their vertical part
     reference: Float[np.ndarray, "2"]  # the same of the reference camera under the estimated pose
-    gap: tuple[float, float]  # no target camera is between these angles (degrees, counter-clockwise from the right)
+    gap: tuple[
+        float, float
+    ]  # no target camera is between these angles (degrees, counter-clockwise from the right)
     nearest: int  # number of the target view closest to the reference viewpoint
     angle: float  # angle in degrees between the directions of that view and of the reference
     centre: Float[np.ndarray, "3"]  # middle of the target object in the world
@@ -38,7 +45,8 @@ class Coverage:
 def coverage(
     cameras: Mapping[int, Camera], reference: Float[np.ndarray, "3"], centre: Float[np.ndarray, "3"]
 ) -> Coverage:
-    """Compute where the target cameras, by number, and the centre of the reference camera are around an object."""
+    """Compute where the target cameras, by number, and the centre of the reference camera are
+    around an object."""
     numbers, cameras = list(cameras), list(cameras.values())
     places = np.stack([*(camera.centre for camera in cameras), reference])
     directions = (places - centre) / np.linalg.norm(places - centre, axis=1, keepdims=True)
@@ -56,65 +64,123 @@ def coverage(
     angles = np.degrees(np.arccos((directions[:-1] @ directions[-1]).clip(-1, 1)))
     *targets, seen_reference = directions @ axes.T
     nearest = numbers[int(angles.argmin())]
-    return Coverage(dict(zip(numbers, targets)), seen_reference, gap, nearest, float(angles.min()), centre, axes)
+    return Coverage(
+        dict(zip(numbers, targets)), seen_reference, gap, nearest, float(angles.min()), centre, axes
+    )
 
 
 def pose_picture(result: PairResult, solver: str) -> Figure:
-    """Show the reference, the target and the reference's points in the target views, and the cameras from above.
+    """Show the reference, the target and the reference's points in the target views, and the
+    cameras from above.
 
     The colour of a point is its position along the reference object.
     """
     estimate = result.estimates[solver]
-    chosen, frames, reference = estimate.view, [view.frame for view in estimate.target_views], estimate.reference_view
+    chosen, frames, reference = (
+        estimate.view,
+        [view.frame for view in estimate.target_views],
+        estimate.reference_view,
+    )
     used = np.flatnonzero(np.isfinite(estimate.view_scores))  # others were left out
     others = used[used != chosen]
-    shown = [chosen, *others[np.linspace(0, len(others), min(_OTHERS, len(others)), endpoint=False).astype(int)]]
+    shown = [
+        chosen,
+        *others[np.linspace(0, len(others), min(_OTHERS, len(others)), endpoint=False).astype(int)],
+    ]
     names = [f"view {number + 1}" for number in range(len(frames))]
     if solver == "paper":
         names = [f"{name}, score {score:.1f}" for name, score in zip(names, estimate.view_scores)]
     titles = ["reference", f"target {names[chosen]}", f"reference in view {chosen + 1}"]
     titles += [f"in {names[view]}" for view in shown[1:]] + ["seen from above"]
-    images = [reference.frame.rgb, frames[chosen].rgb, *(plots.pale(frames[view].rgb) for view in shown)]
-    figure, axes = plots.show_images([*images, np.full_like(images[0], 255)], titles, columns=4, size=2.5)
+    images = [
+        reference.frame.rgb,
+        frames[chosen].rgb,
+        *(plots.pale(frames[view].rgb) for view in shown),
+    ]
+    figure, axes = plots.show_images(
+        [*images, np.full_like(images[0], 255)], titles, columns=4, size=2.5
+    )
     figure.set_figheight(figure.get_figheight() + 0.4)  # space for the legend
     if (mask := frames[chosen].mask) is not None:
         columns, rows = (np.arange(size) + 0.5 for size in mask.shape[::-1])
         axes[1].contour(columns, rows, mask, [ON_OBJECT], colors=["white"], linewidths=1.5)
-    cloud, cameras = plots.object_cloud(reference, most=20000), [frames[view].camera for view in shown]
+    cloud, cameras = (
+        plots.object_cloud(reference, most=20000),
+        [frames[view].camera for view in shown],
+    )
     plots.draw_moved_cloud(axes[:1], [reference.frame.camera], cloud, [Sim3.identity()], None)
     plots.draw_moved_cloud(axes[2:], cameras, cloud, estimate.propagate(cameras), None)
     target_cloud = world_cloud(result.targets)[0]
     if not len(target_cloud):
-        raise InputError("no depth is known on the target object, expected some for a picture of the pose")
+        raise InputError(
+            "no depth is known on the target object, expected some for a picture of the pose"
+        )
     # The reference camera is the origin of its own frame.
     place = estimate.target_camera.to_world(estimate.sim3.t)
-    seen = coverage({int(view) + 1: frames[view].camera for view in used}, place, np.median(target_cloud, axis=0))
-    _draw_from_above(axes[-1], seen, target_cloud, estimate.target_camera.to_world(estimate.sim3.apply(cloud)))
-    draw_cameras(axes[-1], seen, chosen + 1, f"reference under this pose, {seen.angle:.0f}° from view {seen.nearest}")
-    figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    seen = coverage(
+        {int(view) + 1: frames[view].camera for view in used},
+        place,
+        np.median(target_cloud, axis=0),
+    )
+    _draw_from_above(
+        axes[-1], seen, target_cloud, estimate.target_camera.to_world(estimate.sim3.apply(cloud))
+    )
+    draw_cameras(
+        axes[-1],
+        seen,
+        chosen + 1,
+        f"reference under this pose, {seen.angle:.0f}° from view {seen.nearest}",
+    )
+    figure.legend(
+        *axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
+    )
     return figure
 
 
 def draw_cameras(axis: Axes, seen: Coverage, chosen: int, reference: str = "reference") -> None:
-    """Draw the target cameras with their numbers, and a star for the reference camera, around the object."""
+    """Draw the target cameras with their numbers, and a star for the reference camera, around the
+    object."""
     axis.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal")
     for number, place in seen.targets.items():
         style = {"color": plots.CHOSEN if number == chosen else plots.BLUE}
         axis.plot(*place, "o", markersize=11, markeredgecolor="white", **style)
-        axis.text(*(1.23 * place), str(number), ha="center", va="center", fontsize=11, weight="bold", zorder=4, **style)
-    axis.plot(*seen.reference, "*", color=plots.VERMILLION, markersize=20, markeredgecolor="white", label=reference)
+        axis.text(
+            *(1.23 * place),
+            str(number),
+            ha="center",
+            va="center",
+            fontsize=11,
+            weight="bold",
+            zorder=4,
+            **style,
+        )
+    axis.plot(
+        *seen.reference,
+        "*",
+        color=plots.VERMILLION,
+        markersize=20,
+        markeredgecolor="white",
+        label=reference,
+    )
 
 
 def _draw_from_above(axis: Axes, seen: Coverage, target: np.ndarray, reference: np.ndarray) -> None:
-    """Draw world points of the target (grey) and of the reference, the arc of the target cameras, and its gap."""
+    """Draw world points of the target (grey) and of the reference, the arc of the target cameras,
+    and its gap."""
     begin, end = seen.gap
     axis.images[0].remove()
     axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0))
     axis.add_patch(Arc((0, 0), 2, 2, theta1=end, theta2=begin + 360, color=plots.BLUE, linewidth=4))
-    empty, spanned = f"no target view in these {end - begin:.0f}°", f"the target views span {360 - end + begin:.0f}°"
+    empty, spanned = (
+        f"no target view in these {end - begin:.0f}°",
+        f"the target views span {360 - end + begin:.0f}°",
+    )
     axis.plot([], [], "s", color="0.5", alpha=0.25, markersize=14, label=empty)
     axis.plot([], [], color=plots.BLUE, linewidth=4, label=spanned)
-    flat = [(points - seen.centre) @ seen.axes.T for points in (target[:: -(-len(target) // _POINTS)], reference)]
+    flat = [
+        (points - seen.centre) @ seen.axes.T
+        for points in (target[:: -(-len(target) // _POINTS)], reference)
+    ]
     scale = _OBJECT / np.quantile(np.linalg.norm(flat[0], axis=1), 0.9)
     for points, colours in zip(flat, ("0.6", plots.coordinate_colours(reference))):
         inside = np.linalg.norm(scale * points, axis=1, keepdims=True) < 0.9

@@ -1,7 +1,8 @@
 """Results as one self-contained HTML page, and as one picture.
 
-The page is the Jinja2 template `templates/report.html`. Images are inlined as data URIs and plotly's script once. It
-follows the colour scheme of the browser: figures are transparent, with text in a grey that is legible on both grounds.
+The page is the Jinja2 template `templates/report.html`. Images are inlined as data URIs and
+plotly's script once. It follows the colour scheme of the browser: figures are transparent, with
+text in a grey that is legible on both grounds.
 """
 
 import base64
@@ -32,18 +33,22 @@ from zsp_lite.viz.votes import ring_figure, votes_figure
 COLUMNS = ("category", "solver", "view", "inliers", "error", "confidence", "time")
 _MEANINGS = {
     "view": "the target view that the pose leads to",
-    "inliers": "matches of that view that agree with the pose, which the verified solver does not need",
+    "inliers": "matches of that view that agree with the pose, which the "
+    "verified solver does not need",
     "error": "angle to the labelled rotation",
     "confidence": "probability of an error below 30°, calibrated on renderings",
 }
 _RIGHT = 30.0  # degrees; a pose with a smaller error is marked as right
 _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark ground
-_TEMPLATES = Environment(loader=PackageLoader("zsp_lite.viz"), autoescape=True, undefined=StrictUndefined)
+_TEMPLATES = Environment(
+    loader=PackageLoader("zsp_lite.viz"), autoescape=True, undefined=StrictUndefined
+)
 _COLOURED = "text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"
 
 
 class PhotographSection(NamedTuple):
-    """What the page of the demo shows of a photographed motorcycle, whose directions a synthetic one tells."""
+    """What the page of the demo shows of a photographed motorcycle, whose directions a synthetic
+    one tells."""
 
     sequence: str  # of the synthetic motorcycle
     columns: Sequence[str]
@@ -53,22 +58,36 @@ class PhotographSection(NamedTuple):
 
 def write_pair_report(path: Path, result: PairResult) -> Path:
     """Write the page of one pair of the user's own."""
-    names = {"given": "given with the images", "box": "GrabCut from a box", "auto": "found by depth and colours"}
+    names = {
+        "given": "given with the images",
+        "box": "GrabCut from a box",
+        "auto": "found by depth and colours",
+    }
     note = f"reference {names[result.masks[0]]}, target {names[result.masks[1]]}"
     return write_report(path, [result], result.backbone, data_note=note, own=True)
 
 
-def write_category_report(path: Path, alignment: CategoryAlignment, dataset: Co3D, category: str) -> Path:
-    """Write a page with contact sheets and the table of all objects, and the first sheet as objects.jpg beside it."""
+def write_category_report(
+    path: Path, alignment: CategoryAlignment, dataset: Co3D, category: str
+) -> Path:
+    """Write a page with contact sheets and the table of all objects, and the first sheet as
+    objects.jpg beside it."""
     names = list(alignment.objects)
-    parts = [names[start : start + category_sheet.MOST] for start in range(0, len(names), category_sheet.MOST)]
+    parts = [
+        names[start : start + category_sheet.MOST]
+        for start in range(0, len(names), category_sheet.MOST)
+    ]
     figures = [category_sheet.objects_figure(dataset, category, alignment, part) for part in parts]
-    sheets = [_encode(figure, dpi=150, format="jpg", pil_kwargs={"quality": 90}) for figure in figures]
+    sheets = [
+        _encode(figure, dpi=150, format="jpg", pil_kwargs={"quality": 90}) for figure in figures
+    ]
     text = _TEMPLATES.get_template("category.html").render(
-        category=category, columns=category_sheet.COLUMNS, rows=category_sheet.object_rows(alignment),
+        category=category,
+        columns=category_sheet.COLUMNS,
+        rows=category_sheet.object_rows(alignment),
         images=[f"data:image/jpeg;base64,{base64.b64encode(sheet).decode()}" for sheet in sheets],
         doubtful=category_sheet.doubtful(alignment),
-    )  # fmt: skip
+    )
     write_atomic(path.with_name("objects.jpg"), sheets[0])
     write_atomic(path, text.encode())
     return path
@@ -88,29 +107,48 @@ def write_report(
         pairs = [_pair_parts(result, f"scene-{index}") for index, result in enumerate(results, 1)]
         picture = _data_uri(photograph.draw()) if photograph else ""
     page = _TEMPLATES.get_template("report.html").render(
-        plotly=Markup(get_plotlyjs()), backbone=backbone, columns=COLUMNS, pairs=pairs, data=data, data_note=data_note,
-        own=own, photograph=photograph, photograph_picture=picture, link=lambda name: _notebook_link(name, path.parent),
-    )  # fmt: skip
+        plotly=Markup(get_plotlyjs()),
+        backbone=backbone,
+        columns=COLUMNS,
+        pairs=pairs,
+        data=data,
+        data_note=data_note,
+        own=own,
+        photograph=photograph,
+        photograph_picture=picture,
+        link=lambda name: _notebook_link(name, path.parent),
+    )
     write_atomic(path, page.encode(errors="replace"))
     return path
 
 
 def _pair_parts(result: PairResult, scene_id: str) -> dict[str, Any]:
     """Make the rows and the pictures of a pair for the template."""
-    estimates, votes = result.estimates, [votes_figure(result.votes), ring_figure(result)] if result.votes else []
+    estimates, votes = (
+        result.estimates,
+        [votes_figure(result.votes), ring_figure(result)] if result.votes else [],
+    )
     return {
         "result": result,
         "rows": table_rows(result),
         "pictures": {solver: _data_uri(pose_picture(result, solver)) for solver in estimates},
-        "both": {solver: _data_uri(_two_poses_figure(one)) for solver, one in estimates.items() if one.one_of_two},
+        "both": {
+            solver: _data_uri(_two_poses_figure(one))
+            for solver, one in estimates.items()
+            if one.one_of_two
+        },
         "votes": [_data_uri(figure) for figure in votes],
         "stages": _stages(result, scene_id),
     }
 
 
 def _notebook_link(name: str, folder: Path) -> Markup:
-    """Link to a notebook of the clone; its number alone if there is none, or if it is on another drive."""
-    label, local = Markup("notebook {}").format(name[:2]), REPOSITORY / "notebooks" / f"{name}.ipynb"
+    """Link to a notebook of the clone; its number alone if there is none, or if it is on another
+    drive."""
+    label, local = (
+        Markup("notebook {}").format(name[:2]),
+        REPOSITORY / "notebooks" / f"{name}.ipynb",
+    )
     try:
         address = Path(os.path.relpath(local, folder)).as_posix()
     except ValueError:
@@ -138,18 +176,25 @@ def legend(columns: Sequence[str] = COLUMNS) -> str:
 
 def write_overview(path: Path, results: Sequence[PairResult]) -> None:
     """Write the picture of `overview` as a JPEG."""
-    write_atomic(path, _encode(overview(results), format="jpeg", bbox_inches="tight", pil_kwargs={"quality": 88}))
+    write_atomic(
+        path,
+        _encode(overview(results), format="jpeg", bbox_inches="tight", pil_kwargs={"quality": 88}),
+    )
 
 
 def overview(results: Sequence[PairResult]) -> Figure:
-    """Show a row per result: the reference, and for each solver the target view of its pose under the moved points.
+    """Show a row per result: the reference, and for each solver the target view of its pose under
+    the moved points.
 
-    The colour of a point is its position along the reference object. The poses are marked as right or wrong.
+    The colour of a point is its position along the reference object. The poses are marked as right
+    or wrong.
     """
     titles = ["reference", *(f"{solver} solver" for solver in results[0].estimates)]
     images = []
     for result in results:
-        reference, *targets = (view.frame.rgb for view in plots.chosen_views(result.estimates.values()))
+        reference, *targets = (
+            view.frame.rgb for view in plots.chosen_views(result.estimates.values())
+        )
         images += [reference, *map(plots.pale, targets)]
     figure, axes = plots.show_images(images, columns=len(titles), size=2.4)
     figure.set_layout_engine("compressed")
@@ -165,19 +210,26 @@ def overview(results: Sequence[PairResult]) -> Figure:
 
 
 def _stages(result: PairResult, scene_id: str) -> dict[str, str]:
-    """Draw the method's stages for the chosen view of the first solver; `scene_id` is unique on the page."""
+    """Draw the method's stages for the chosen view of the first solver; `scene_id` is unique on the
+    page."""
     views, names = plots.chosen_views([result.estimate]), ("reference", "chosen target")
     images = [view.frame.rgb for view in views]
     saliency = dict(zip(names, (view.features.saliency.numpy() for view in views)))
     cycles, sim = {}, similarity(views[0].features, views[1].features)
     for name, start, end, table in ((names[0], *views, sim), (names[1], *views[::-1], sim.T)):
-        distances = cyclical_distances(table, start.features.grid, end.features.grid, start.foreground, end.foreground)
+        distances = cyclical_distances(
+            table, start.features.grid, end.features.grid, start.foreground, end.foreground
+        )
         cycles[name] = distances.numpy()
     style = {"limits": (-10, 0), "cmap": "cividis", "label": "− distance (patches)"}
     figure, axes = plots.show_images(images, names, size=2.7)
-    plots.draw_matches(axes, plots.match_pixels(views, result.estimate.matches), result.estimate.inliers)
+    plots.draw_matches(
+        axes, plots.match_pixels(views, result.estimate.matches), result.estimate.inliers
+    )
     return {
-        "saliency": _data_uri(plots.show_maps(images, saliency, size=2.7, limits=(0, 1), label="saliency")),
+        "saliency": _data_uri(
+            plots.show_maps(images, saliency, size=2.7, limits=(0, 1), label="saliency")
+        ),
         "cycles": _data_uri(plots.show_maps(images, cycles, size=2.7, **style)),
         "matches": _data_uri(figure),
         "scene": _scene_html(result, scene_id),
@@ -192,26 +244,49 @@ def _scene_html(result: PairResult, scene_id: str) -> Markup:
     for solver, estimate in result.estimates.items():
         poses[f"{solver} solver"] = estimate
         for rank, one in enumerate(estimate.alternatives, 2):
-            poses[f"{solver} solver, hypothesis {rank}"] = replace(estimate, sim3=one.sim3, view=one.view)
+            poses[f"{solver} solver, hypothesis {rank}"] = replace(
+                estimate, sim3=one.sim3, view=one.view
+            )
     moves = [one.propagate([second.frame.camera])[0] for one in poses.values()]
     scene = aligned_clouds(moves[0].apply(cloud), plots.object_cloud(second))
     # The clouds fill the scene. The eye is above the target camera, to its right.
     camera = {"eye": {"x": 0.75, "y": -0.5, "z": -1.2}, "center": {"x": 0, "y": 0, "z": 0}}
-    ground = {"paper_bgcolor": "rgba(0,0,0,0)", "font_color": _GREY, "legend_bgcolor": "rgba(0,0,0,0)"}
+    ground = {
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "font_color": _GREY,
+        "legend_bgcolor": "rgba(0,0,0,0)",
+    }
     hidden = {f"scene_{axis}axis_visible": False for axis in "xyz"}
     scene.update_layout(height=400, scene_camera=camera, **ground, **hidden)
-    config = {"displaylogo": False, "responsive": True, "scrollZoom": False, "displayModeBar": False}
-    content = {"points": cloud.round(4).tolist(), "poses": [move.matrix[:3].round(6).tolist() for move in moves]}
+    config = {
+        "displaylogo": False,
+        "responsive": True,
+        "scrollZoom": False,
+        "displayModeBar": False,
+    }
+    content = {
+        "points": cloud.round(4).tolist(),
+        "poses": [move.matrix[:3].round(6).tolist() for move in moves],
+    }
     plot = scene.to_html(full_html=False, include_plotlyjs=False, div_id=scene_id, config=config)
-    return Markup(_TEMPLATES.get_template("scene.html").render(names=list(poses), plot=Markup(plot), content=content))
+    return Markup(
+        _TEMPLATES.get_template("scene.html").render(
+            names=list(poses), plot=Markup(plot), content=content
+        )
+    )
 
 
 def _two_poses_figure(estimate: PoseEstimate) -> Figure:
     """Draw the estimate and its first alternative in the same target view."""
     second = estimate.alternatives[0]
-    (moved,) = replace(estimate, sim3=second.sim3, view=second.view).propagate([estimate.target_camera])
+    (moved,) = replace(estimate, sim3=second.sim3, view=second.view).propagate(
+        [estimate.target_camera]
+    )
     title = f"turned by {estimate.angle_to(second):.0f}°, probability {second.confidence:.2f}"
-    poses = {f"probability {estimate.confidence:.2f}": estimate, title: replace(estimate, sim3=moved)}
+    poses = {
+        f"probability {estimate.confidence:.2f}": estimate,
+        title: replace(estimate, sim3=moved),
+    }
     return plots.moved_points(poses)
 
 

@@ -1,4 +1,5 @@
-"""Points of the verified solver in a view: on a surface, occluded, or a contradiction to the pose."""
+"""Points of the verified solver in a view: on a surface, occluded, or a contradiction to
+the pose."""
 
 from collections.abc import Sequence
 
@@ -23,13 +24,15 @@ _DRAWN = 1, 4, 0, 2, 3  # contradictions last, so that no other point covers the
 def classify_points(terms: PointTerms, pose: int = 0) -> Int[np.ndarray, "v n"]:
     """Classify each point in each view under one of the poses, as indices into `POINT_CLASSES`.
 
-    A point is on the surface if its surface weight is at least half of what it would be exactly on the surface. The
-    points that are left are behind it: occluded.
+    A point is on the surface if its surface weight is at least half of what it would be exactly on
+    the surface. The points that are left are behind it: occluded.
     """
     projection = terms.projection
     distance, weight = projection.silhouette_distance[pose].numpy(), projection.weight[pose].numpy()
     surface, free_space = terms.surface[pose].numpy(), terms.free_space[pose].numpy()
-    return np.select([distance > 0, weight <= 0, surface >= weight / 2, free_space > 0], [3, 4, 0, 2], 1)
+    return np.select(
+        [distance > 0, weight <= 0, surface >= weight / 2, free_space > 0], [3, 4, 0, 2], 1
+    )
 
 
 def show_point_classes(
@@ -40,14 +43,24 @@ def show_point_classes(
     columns: int | None = None,
     size: float = 3.0,
 ) -> Figure:
-    """Show points at pixels (x, y) of each image by their class; those outside are drawn at the border."""
+    """Show points at pixels (x, y) of each image by their class; those outside are drawn at the
+    border."""
     figure, axes = show_images(images, titles, columns, size)
     for axis, image, places, found in zip(axes, images, pixels, classes):
         places = np.clip(places, 0, image.shape[1::-1])
         for index in _DRAWN:
             name, (colour, marker) = list(POINT_CLASSES.items())[index]
             style = {"marker": marker, "edgecolors": "black", "linewidths": 0.4, "label": name}
-            axis.scatter(*places[found == index].T, 6 if name == "depth unknown" else 14, colour, **style)
+            axis.scatter(
+                *places[found == index].T, 6 if name == "depth unknown" else 14, colour, **style
+            )
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9, handletextpad=0.1)
+    figure.legend(
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=len(labels),
+        fontsize=9,
+        handletextpad=0.1,
+    )
     return figure

@@ -1,4 +1,5 @@
-"""What several frames say of one pose: each frame with the pose that it votes for, and all hypotheses on a ring."""
+"""What several frames say of one pose: each frame with the pose that it votes for, and all
+hypotheses on a ring."""
 
 from collections.abc import Sequence
 
@@ -26,18 +27,25 @@ def votes_figure(votes: Sequence[Vote]) -> Figure:
     for vote in shown:
         confidence = f"prob. {vote.estimate.confidence:.2f}"
         titles += [vote.name.replace(" of ", "\nof "), f"{vote.degrees:.0f}° off,\n{confidence}"]
-    figure, axes = plots.show_images([plots.pale(view.frame.rgb) for view in views], titles, columns=8, size=1.45)
+    figure, axes = plots.show_images(
+        [plots.pale(view.frame.rgb) for view in views], titles, columns=8, size=1.45
+    )
     for k, vote in enumerate(shown):
         plots.draw_estimates(axes[2 * k : 2 * k + 2], [vote.estimate], most=1500, size=2)
-        axes[2 * k + 1].title.set_color(plots.VERMILLION if vote.degrees > SAME_ANGLE else plots.BLUE)
+        axes[2 * k + 1].title.set_color(
+            plots.VERMILLION if vote.degrees > SAME_ANGLE else plots.BLUE
+        )
     return figure
 
 
 def ring_figure(result: PairResult) -> Figure:
-    """Show the turns about the vertical of all hypotheses from the answer (dots), and the answer's poses (stars)."""
+    """Show the turns about the vertical of all hypotheses from the answer (dots), and the answer's
+    poses (stars)."""
     answer = result.estimates["verified"]
     up = np.cross(*ground_axes([view.frame.camera for view in answer.target_views]))
-    figure, axis = plt.subplots(figsize=(3.6, 3.6), layout="constrained", subplot_kw={"polar": True})
+    figure, axis = plt.subplots(
+        figsize=(3.6, 3.6), layout="constrained", subplot_kw={"polar": True}
+    )
 
     def turn(rotation: np.ndarray) -> float:
         x, y, z, w = Rotation.from_matrix(rotation @ answer.world_sim3.R.T).as_quat()
@@ -48,10 +56,22 @@ def ring_figure(result: PairResult) -> Figure:
             world = vote.estimate.between_worlds(one.sim3, one.view)
             angle = turn(world.inverse().R if vote.backward else world.R)
             near = np.cos(angle) > np.cos(np.radians(SAME_ANGLE))
-            axis.scatter(angle, 1, 260 * one.confidence, plots.BLUE if near else plots.VERMILLION, alpha=0.45)
+            axis.scatter(
+                angle, 1, 260 * one.confidence, plots.BLUE if near else plots.VERMILLION, alpha=0.45
+            )
     for one in (answer.hypotheses[0], *answer.alternatives):
         angle = turn(answer.between_worlds(one.sim3, one.view).R)
-        axis.scatter(angle, 0.5, 400 * one.confidence, plots.ORANGE, marker="*", edgecolors="black", linewidths=0.5)
+        axis.scatter(
+            angle,
+            0.5,
+            400 * one.confidence,
+            plots.ORANGE,
+            marker="*",
+            edgecolors="black",
+            linewidths=0.5,
+        )
         axis.text(angle, 0.24, f"{one.confidence:.2f}", ha="center", va="center", fontsize=9)
-    axis.set(theta_zero_location="N", ylim=(0, 1.15), yticks=[], xticks=np.radians([0, 90, 180, 270]))
+    axis.set(
+        theta_zero_location="N", ylim=(0, 1.15), yticks=[], xticks=np.radians([0, 90, 180, 270])
+    )
     return figure

@@ -1,7 +1,8 @@
-"""Pose labelling as in the paper's supplement: the same keypoints are picked on the point cloud of every sequence.
+"""Pose labelling as in the paper's supplement: the same keypoints are picked on the point cloud of
+every sequence.
 
-`session` keeps the picks and labels of a category on disk; `zsp_lite.course.widgets.labelling` is the widget for
-notebooks.
+`session` keeps the picks and labels of a category on disk; `zsp_lite.course.widgets.labelling` is
+the widget for notebooks.
 """
 
 from zsp_lite.course.labelling.session import Labelling, align_picks

@@ -1,11 +1,14 @@
-"""Labelling session of a category, stored on disk after every change, and the alignment of two clouds by keypoints.
+"""Labelling session of a category, stored on disk after every change, and the alignment of two
+clouds by keypoints.
 
-See "Labelling pose for evaluation" in the paper's supplement: at least four keypoints are picked in the same order on
-the clouds of the reference sequence and of another sequence, and aligned by Umeyama's method with scale.
+See "Labelling pose for evaluation" in the paper's supplement: at least four keypoints are picked in
+the same order on the clouds of the reference sequence and of another sequence, and aligned by
+Umeyama's method with scale.
 
-ROOT/label_picks/CATEGORY.json holds the names of the keypoints and all picks; ROOT/class_labels/CATEGORY/SEQ.json holds
-the accepted labels in the format of the published code; ROOT/label_proposals/CATEGORY/SEQ.json, in the same format,
-what `zsp-lite align --propose` proposes.
+ROOT/label_picks/CATEGORY.json holds the names of the keypoints and all picks;
+ROOT/class_labels/CATEGORY/SEQ.json holds the accepted labels in the format of the published code;
+ROOT/label_proposals/CATEGORY/SEQ.json, in the same format, what `zsp-lite align --propose`
+proposes.
 """
 
 from collections.abc import Sequence
@@ -20,14 +23,22 @@ from numpy.typing import ArrayLike
 from zsp_lite.alignment import Sim3, umeyama
 from zsp_lite.data.annotations import Row
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import PoseLabel, label_folder, read_label_folder, read_labels, rigid_label, write_label
+from zsp_lite.data.labels import (
+    PoseLabel,
+    label_folder,
+    read_label_folder,
+    read_labels,
+    rigid_label,
+    write_label,
+)
 from zsp_lite.errors import InputError, check_choice, check_magnitude, real_array
 from zsp_lite.io.files import plain_name, read_json, write_atomic
 
 Point = Real[np.ndarray, "3"] | Sequence[float]
 MIN_KEYPOINTS = 4
-# A label whose RMS residual is above this fraction of the object's size is accepted on request only: usually two
-# keypoints are confused. The size is the longest side of the point cloud without outliers.
+# A label whose RMS residual is above this fraction of the object's size is accepted on request
+# only: usually two keypoints are confused. The size is the longest side of the point cloud without
+# outliers.
 MAX_RESIDUAL = 0.15
 OPEN, ACCEPTED, SKIPPED, REFERENCE = "open", "accepted", "skipped", "reference"
 
@@ -37,8 +48,9 @@ class Alignment:
     """Alignment of the reference sequence with another sequence."""
 
     sim3: Sim3  # from the world of the reference sequence to that of the sequence
-    # Distance of each transformed keypoint from its pick, relative to the spread of the picks (their standard
-    # deviation, averaged over the axes), so that objects of any size can be compared.
+    # Distance of each transformed keypoint from its pick, relative to the spread of the picks
+    # (their standard deviation, averaged over the axes), so that objects of any size can be
+    # compared.
     residuals: Float[np.ndarray, " n"]
 
     @property
@@ -48,9 +60,11 @@ class Alignment:
 
 
 def align_picks(reference: ArrayLike, picks: ArrayLike) -> Alignment:
-    """Align keypoints (n, 3) of the reference sequence, n >= 4, and of another one by Umeyama's method with scale.
+    """Align keypoints (n, 3) of the reference sequence, n >= 4, and of another one by Umeyama's
+    method with scale.
 
-    InputError if the numbers differ or are below 4, a keypoint is not finite, or all are equal or collinear.
+    InputError if the numbers differ or are below 4, a keypoint is not finite, or all are equal or
+    collinear.
     """
     reference, picks = (np.asarray(points, dtype=np.float64) for points in (reference, picks))
     if len(reference) != len(picks) or len(picks) < MIN_KEYPOINTS:
@@ -75,31 +89,42 @@ class Progress:
     sequence: str
     state: str  # "reference", "open", "accepted" or "skipped"
     picks: int
-    rms: float | None  # of the residuals relative to the spread of the picks; None before all keypoints are picked
+    rms: (
+        float | None
+    )  # of the residuals relative to the spread of the picks; None before all keypoints are picked
     problem: str = ""  # why the picks give no alignment, such as all on one line
 
 
 class Labelling:
     """Labelling of one category: pick keypoints, align, accept.
 
-    Keypoints are defined on the reference sequence and picked on the others in the same order, as points in world
-    coordinates of the sequence. Only one process may use a session at a time.
+    Keypoints are defined on the reference sequence and picked on the others in the same order, as
+    points in world coordinates of the sequence. Only one process may use a session at a time.
     """
 
     def __init__(self, root: str | Path, category: str):
         """Open a category with its stored picks.
 
-        The sequences are the ten with the best point clouds (`Co3D.select`), or all with a point cloud if there are no
-        quality scores; the reference is that of the stored picks and labels, or else the best point cloud. InputError
-        if the category is unknown, fewer than two sequences have point clouds, or the references differ.
+        The sequences are the ten with the best point clouds (`Co3D.select`), or all with a point
+        cloud if there are no quality scores; the reference is that of the stored picks and labels,
+        or else the best point cloud. InputError if the category is unknown, fewer than two
+        sequences have point clouds, or the references differ.
         """
-        self.root, self.category, self.dataset = Path(root), plain_name(category, "category"), Co3D(root)
+        self.root, self.category, self.dataset = (
+            Path(root),
+            plain_name(category, "category"),
+            Co3D(root),
+        )
         known = {one.sequence_name: one for one in self.dataset.sequences(category)}
         with_cloud = [name for name, one in known.items() if one.point_cloud is not None]
         self.path = self.root / "label_picks" / f"{self.category}.json"
         stored = read_json(self.path, _Picks, "picks") if self.path.is_file() else None
-        if stored and len(stored.names) != (found := len(stored.picks.get(stored.reference_seq, []))):
-            raise InputError(f"picks {self.path}: {len(stored.names)} names, but {found} picks on the reference")
+        if stored and len(stored.names) != (
+            found := len(stored.picks.get(stored.reference_seq, []))
+        ):
+            raise InputError(
+                f"picks {self.path}: {len(stored.names)} names, but {found} picks on the reference"
+            )
         references = {label.reference_seq for label in read_labels(root, category).values()}
         references |= {stored.reference_seq} if stored else set()
         if len(references) > 1:
@@ -109,9 +134,13 @@ class Labelling:
         chosen = list(dict.fromkeys([*references, *chosen]))
         if missing := [name for name in chosen if name not in with_cloud]:
             allowed = ", ".join(with_cloud) or "none"
-            raise InputError(f"sequence {category}/{missing[0]} has no point cloud, expected some of {allowed}")
+            raise InputError(
+                f"sequence {category}/{missing[0]} has no point cloud, expected some of {allowed}"
+            )
         if len(chosen) < 2:
-            raise InputError(f"category {category} has {len(chosen)} sequence with a point cloud, expected two")
+            raise InputError(
+                f"category {category} has {len(chosen)} sequence with a point cloud, expected two"
+            )
         best = max(chosen, key=lambda name: known[name].point_cloud.quality_score or -np.inf)
         self.reference = next(iter(references), best)
         self.sequences = sorted(chosen, key=lambda name: name != self.reference)
@@ -127,10 +156,13 @@ class Labelling:
 
     def picks(self, sequence: str) -> Float[np.ndarray, "n 3"]:
         """Return the picks (n, 3) on a sequence, in its world coordinates."""
-        return np.array(self._stored.picks.get(self._known(sequence), []), dtype=np.float64).reshape(-1, 3)
+        return np.array(
+            self._stored.picks.get(self._known(sequence), []), dtype=np.float64
+        ).reshape(-1, 3)
 
     def cloud(self, sequence: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return points (n, 3) and colours (n, 3), uint8, of a sequence's point cloud; grey if it has no colours."""
+        """Return points (n, 3) and colours (n, 3), uint8, of a sequence's point cloud; grey if it
+        has no colours."""
         if self._known(sequence) not in self._clouds:
             points, colours = self.dataset.point_cloud(self.category, sequence)
             if colours is None:
@@ -139,18 +171,26 @@ class Labelling:
         return self._clouds[sequence]
 
     def first_view(self, sequence: str) -> Float[np.ndarray, "3 3"]:
-        """Return the rotation (3, 3) from world to first camera of a sequence; the identity without cameras."""
+        """Return the rotation (3, 3) from world to first camera of a sequence; the identity without
+        cameras."""
         frames = self.dataset.frames(self.category, self._known(sequence))
-        return next((self.dataset.camera(frame).R for frame in frames if frame.viewpoint is not None), np.eye(3))
+        return next(
+            (self.dataset.camera(frame).R for frame in frames if frame.viewpoint is not None),
+            np.eye(3),
+        )
 
     def pick(self, sequence: str, point: Point, name: str = "") -> None:
-        """Add the next keypoint (3,) of a sequence, in its world coordinates; on the reference, a new one of that name.
+        """Add the next keypoint (3,) of a sequence, in its world coordinates; on the reference, a
+        new one of that name.
 
         InputError if all are picked, or the reference's keypoints are in use on other sequences.
         """
         picks = self.picks(sequence)
         if sequence != self.reference and len(picks) >= len(self.names):
-            raise InputError(f"sequence {sequence}: all {len(self.names)} keypoints are picked; undo one to pick again")
+            raise InputError(
+                f"sequence {sequence}: all {len(self.names)} keypoints are picked; undo one "
+                "to pick again"
+            )
         self.put(sequence, [*picks, point], (*self.names, name or f"keypoint {len(picks) + 1}"))
 
     def undo(self, sequence: str) -> None:
@@ -159,36 +199,51 @@ class Labelling:
             self.put(sequence, picks[:-1], self.names[:-1])
 
     def proposal(self, sequence: str) -> Sim3 | None:
-        """Return the proposed similarity from the world of the reference to that of a sequence; None without one."""
+        """Return the proposed similarity from the world of the reference to that of a sequence;
+        None without one."""
         if not {self.reference, self._known(sequence)} <= self._proposals.keys():
             return None
         trans = self._proposals[sequence] @ np.linalg.inv(self._proposals[self.reference])
         return Sim3(1.0, trans[:3, :3], trans[:3, 3])
 
-    def put(self, sequence: str, points: Sequence[Point] | Real[np.ndarray, "n 3"], names: Sequence[str] = ()) -> None:
+    def put(
+        self,
+        sequence: str,
+        points: Sequence[Point] | Real[np.ndarray, "n 3"],
+        names: Sequence[str] = (),
+    ) -> None:
         """Replace all picks (n, 3) of a sequence, and on the reference the names of the keypoints.
 
-        A sequence that was skipped is open again. An accepted label is kept until another one is accepted.
+        A sequence that was skipped is open again. An accepted label is kept until another one is
+        accepted.
         """
-        points = real_array(f"picks on {sequence}", points if len(points) else np.zeros((0, 3)), (None, 3))
+        points = real_array(
+            f"picks on {sequence}", points if len(points) else np.zeros((0, 3)), (None, 3)
+        )
         check_magnitude(f"picks on {sequence}", points)
         if self._known(sequence) == self.reference:
-            if others := [name for name, picks in self._stored.picks.items() if name != sequence and picks]:
+            if others := [
+                name for name, picks in self._stored.picks.items() if name != sequence and picks
+            ]:
                 in_use = f"in use on {', '.join(others)}"
-                raise InputError(f"keypoints of the reference {sequence} are {in_use}; clear those first")
+                raise InputError(
+                    f"keypoints of the reference {sequence} are {in_use}; clear those first"
+                )
             self._stored.names[:] = names
         self._stored.picks[sequence] = points.tolist()
         self._save(sequence)
 
     def alignment(self, sequence: str) -> Alignment | None:
-        """Align the reference with a sequence by the picks; None before all keypoints are picked."""
+        """Align the reference with a sequence by the picks; None before all keypoints are
+        picked."""
         picks = self.picks(sequence)
         if len(picks) < MIN_KEYPOINTS or len(picks) != len(self.names):
             return None
         return align_picks(self.picks(self.reference), picks)
 
     def doubt(self, sequence: str) -> str:
-        """Say in a line why a label should be checked: its RMS residual is above `MAX_RESIDUAL`; "" otherwise."""
+        """Say in a line why a label should be checked: its RMS residual is above `MAX_RESIDUAL`; ""
+        otherwise."""
         if (alignment := self.alignment(sequence)) is None:
             return ""
         # From fractions of the spread of the picks to fractions of the object's size.
@@ -199,22 +254,28 @@ class Labelling:
             return ""
         worst = int(residuals.argmax())
         return (
-            f"residual of {100 * rms:.0f} % of the object's size, above {100 * MAX_RESIDUAL:.0f} %; the worst keypoint "
+            f"residual of {100 * rms:.0f} % of the object's size, above "
+            f"{100 * MAX_RESIDUAL:.0f} %; the worst keypoint "
             f"is {self.names[worst]} with {100 * residuals[worst]:.0f} %"
         )
 
     def accept(self, sequence: str, confirmed: bool = False) -> Path:
-        """Write the label of a sequence, also in `doubt` if `confirmed`, and that of the reference, the identity.
+        """Write the label of a sequence, also in `doubt` if `confirmed`, and that of the reference,
+        the identity.
 
-        Without picks on the sequence, the label is the proposal. Returns the label file of the sequence. InputError if
-        keypoints are missing, the sequence is the reference, or the label is in doubt and not confirmed.
+        Without picks on the sequence, the label is the proposal. Returns the label file of the
+        sequence. InputError if keypoints are missing, the sequence is the reference, or the label
+        is in doubt and not confirmed.
         """
         alignment, picked = self.alignment(sequence), len(self.picks(sequence))
         sim3 = alignment.sim3 if alignment else None if picked else self.proposal(sequence)
         if sequence == self.reference:
             problem = "is the reference: its label is the identity and comes by itself"
         elif sim3 is None:
-            problem = f"has {picked} of {len(self.names)} keypoints, expected all, at least {MIN_KEYPOINTS}"
+            problem = (
+                f"has {picked} of {len(self.names)} keypoints, expected all, at least "
+                f"{MIN_KEYPOINTS}"
+            )
         else:
             problem = "" if confirmed else self.doubt(sequence)
             problem = problem and f"has a {problem}; expected a smaller one, or confirmed=True"
@@ -229,12 +290,15 @@ class Labelling:
         return path
 
     def skip(self, sequence: str) -> None:
-        """Exclude a sequence, for instance one with a bad point cloud, and delete the label made of its picks."""
+        """Exclude a sequence, for instance one with a bad point cloud, and delete the label made of
+        its picks."""
         path = label_folder(self.root, self.category) / f"{self._known(sequence)}.json"
         # Labels do not say where they come from: one with all its picks was made of them.
         imported = path.is_file() and not 0 < len(self.names) == len(self.picks(sequence))
         if imported or sequence == self.reference:
-            reason = f"has a label not made of picks; remove {path}" if imported else "is the reference"
+            reason = (
+                f"has a label not made of picks; remove {path}" if imported else "is the reference"
+            )
             raise InputError(f"sequence {sequence} cannot be skipped: it {reason}")
         path.unlink(missing_ok=True)
         if sequence not in self._stored.skipped:
@@ -253,7 +317,9 @@ class Labelling:
                 alignment = None if name == self.reference else self.alignment(name)
             except InputError as error:
                 problem = str(error)
-            rows.append(Progress(name, state, len(self.picks(name)), alignment and alignment.rms, problem))
+            rows.append(
+                Progress(name, state, len(self.picks(name)), alignment and alignment.rms, problem)
+            )
         return rows
 
     def _known(self, sequence: str) -> str:

@@ -1,4 +1,5 @@
-"""Procedural objects: primitives composed to a mesh of unit size, parts of several, and their random materials."""
+"""Procedural objects: primitives composed to a mesh of unit size, parts of several, and their
+random materials."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,7 +17,8 @@ Y = (0.0, 1.0, 0.0)
 class Assembly:
     """Collects the parts of one object, and draws the random numbers that its builder asks for.
 
-    With `variation`, the proportions (`u`) are perturbed by noise from that source; the choices between parts stay.
+    With `variation`, the proportions (`u`) are perturbed by noise from that source; the choices
+    between parts stay.
     """
 
     def __init__(self, rng: np.random.Generator, variation: np.random.Generator | None = None):
@@ -40,7 +42,8 @@ class Assembly:
         return int(self.rng.integers(n))
 
     def add(self, mesh: Mesh, material: int, mirror: bool = False) -> None:
-        """Add a part of material 0 .. 7; with `mirror`, also its mirror image in the plane y = 0."""
+        """Add a part of material 0 .. 7; with `mirror`, also its mirror image in the plane
+        y = 0."""
         self.meshes.append(mesh)
         self.materials.append(material)
         if mirror:
@@ -50,13 +53,18 @@ class Assembly:
 Builder = Callable[[Assembly], None]  # adds the parts of one random object of a category
 
 
-def make_shape(build: Builder, seed: int | list[int], variation: np.random.Generator | None = None) -> TexturedMesh:
-    """Return the object that `build` composes, centred, of unit `surface_spread`, without materials."""
+def make_shape(
+    build: Builder, seed: int | list[int], variation: np.random.Generator | None = None
+) -> TexturedMesh:
+    """Return the object that `build` composes, centred, of unit `surface_spread`, without
+    materials."""
     assembly = Assembly(np.random.default_rng(seed), variation)
     build(assembly)
     vertices, faces = joined(assembly.meshes)
     material = np.repeat(assembly.materials, [len(mesh.faces) for mesh in assembly.meshes])
-    vertices = vertices * np.exp(assembly.rng.normal(0, 0.08, 3))  # a small random scale along each axis
+    vertices = vertices * np.exp(
+        assembly.rng.normal(0, 0.08, 3)
+    )  # a small random scale along each axis
     vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
     vertices, n = vertices / surface_spread(vertices, faces), len(faces)
     uv, white = np.zeros((n, 3, 2), np.float32), np.ones((n, 3, 3), np.float32)
@@ -64,11 +72,14 @@ def make_shape(build: Builder, seed: int | list[int], variation: np.random.Gener
 
 
 def rounded_box(size, centre=(0, 0, 0), squareness: float = 5.0) -> Mesh:
-    """Return a superellipsoid of the given size (3,): an ellipsoid at squareness 2, nearly a box at 10."""
+    """Return a superellipsoid of the given size (3,): an ellipsoid at squareness 2, nearly a box at
+    10."""
     n = 11  # points along a side of a cube, denser at the edges, where the curvature is largest
     line = np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
     u, v = (grid.ravel() for grid in np.meshgrid(line, line, indexing="ij"))
-    corner = np.arange(n * n).reshape(n, n)[:-1, :-1].ravel()  # of each cell, the one with the lowest index
+    corner = (
+        np.arange(n * n).reshape(n, n)[:-1, :-1].ravel()
+    )  # of each cell, the one with the lowest index
     cells = np.concatenate([corner[:, None] + [0, n, n + 1], corner[:, None] + [0, n + 1, 1]])
     sides = [np.stack([np.full(n * n, sign), sign * u, v], 1) for sign in (-1.0, 1.0)]
     vertices = np.concatenate([np.roll(side, axis, axis=1) for axis in range(3) for side in sides])
@@ -86,7 +97,8 @@ def tapered(mesh: Mesh, low: float, high: float, factor: float) -> Mesh:
 
 
 def pane(start, end, width: float, thickness: float = 0.04) -> Mesh:
-    """Return a slab between two points (x, z) of width `width` along y, for example a windscreen."""
+    """Return a slab between two points (x, z) of width `width` along y, for example a
+    windscreen."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     along = (end - start) / np.linalg.norm(end - start)
     across = thickness / 2 * np.array([-along[1], along[0]])
@@ -111,7 +123,9 @@ class _Kind(NamedTuple):
     value: tuple[float, float]
     roughness: tuple[float, float]
     specular: float = 0.04
-    waves: tuple[int, ...] = (5,)  # numbers of waves of the pattern: 1 for stripes, 2 for checks, more for patches
+    waves: tuple[int, ...] = (
+        5,
+    )  # numbers of waves of the pattern: 1 for stripes, 2 for checks, more for patches
     frequency: tuple[float, float] = (2, 8)  # of the pattern, in radians per unit
     contrast: tuple[float, float] = (0.05, 0.2)  # of the pattern
 
@@ -119,10 +133,16 @@ class _Kind(NamedTuple):
 _ANY = (0, 360)
 _KINDS = (
     _Kind(0.22, _ANY, (0, 0.8), (0.25, 0.95), (0.35, 0.75)),  # paint
-    _Kind(0.13, _ANY, (0, 0.8), (0.25, 0.95), (0.35, 0.75), 0.04, (1, 2, 5), (3, 14), (0.3, 1)),  # printed paint
+    _Kind(
+        0.13, _ANY, (0, 0.8), (0.25, 0.95), (0.35, 0.75), 0.04, (1, 2, 5), (3, 14), (0.3, 1)
+    ),  # printed paint
     _Kind(0.23, _ANY, (0, 0.9), (0.25, 0.95), (0.15, 0.4), 0.05),  # plastic
-    _Kind(0.12, (18, 38), (0.3, 0.65), (0.4, 0.85), (0.4, 0.8), 0.04, (1,), (10, 24), (0.2, 0.4)),  # wood
-    _Kind(0.14, _ANY, (0, 0.8), (0.25, 0.95), (0.95, 0.95), 0.02, (3,), (28, 40), (0.15, 0.4)),  # cloth
+    _Kind(
+        0.12, (18, 38), (0.3, 0.65), (0.4, 0.85), (0.4, 0.8), 0.04, (1,), (10, 24), (0.2, 0.4)
+    ),  # wood
+    _Kind(
+        0.14, _ANY, (0, 0.8), (0.25, 0.95), (0.95, 0.95), 0.02, (3,), (28, 40), (0.15, 0.4)
+    ),  # cloth
     _Kind(0.08, (20, 60), (0, 0.3), (0.65, 0.95), (0.2, 0.55), 0.4),  # metal
     _Kind(0.08, _ANY, (0, 0), (0.08, 0.3), (0.7, 0.95)),  # rubber
 )
@@ -136,7 +156,8 @@ def random_materials(seed: int | list[int] | np.random.Generator) -> tuple[Mater
 
 
 def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
-    """Draw two sRGB colours and sine waves through the object that mix them: stripes, grain, checks or patches."""
+    """Draw two sRGB colours and sine waves through the object that mix them: stripes, grain, checks
+    or patches."""
     ranges = (kind.hue, kind.saturation, kind.value)
     colour, other = (hsv(*(rng.uniform(*limits) for limits in ranges)) for _ in range(2))
     darker = len(kind.waves) == 1  # a printed pattern has a second colour
@@ -152,4 +173,6 @@ def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
         share = np.clip(0.5 + 0.5 * sharpness * value, 0, 1)
         return (colour + share * (other - colour)).astype(np.float32)
 
-    return Material(np.ones(4), pattern=pattern, specular=kind.specular, roughness=rng.uniform(*kind.roughness))
+    return Material(
+        np.ones(4), pattern=pattern, specular=kind.specular, roughness=rng.uniform(*kind.roughness)
+    )

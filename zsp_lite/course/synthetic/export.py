@@ -1,4 +1,5 @@
-"""Export of procedural categories or of a folder of models: a data folder in CO3D's layout, with labels and pairs."""
+"""Export of procedural categories or of a folder of models: a data folder in CO3D's layout, with
+labels and pairs."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,9 +23,16 @@ from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
 
-SETTINGS_FILE = "synthetic.json"  # in the data folder of procedural objects: the settings of the export
-RENDERED_FILE = "rendered_models.json"  # in that of models: the settings, and the model of each sequence
-_MODEL_PAIRS, _MODEL_TARGETS = 20, (1, 3, 5)  # pairs per category of models, for each of these numbers of target views
+SETTINGS_FILE = (
+    "synthetic.json"  # in the data folder of procedural objects: the settings of the export
+)
+RENDERED_FILE = (
+    "rendered_models.json"  # in that of models: the settings, and the model of each sequence
+)
+_MODEL_PAIRS, _MODEL_TARGETS = (
+    20,
+    (1, 3, 5),
+)  # pairs per category of models, for each of these numbers of target views
 
 
 @dataclass(frozen=True)
@@ -40,9 +48,11 @@ class Preset:
 
 
 PRESETS = {
-    # The sample data outside the repository, made in some 15 s: the photograph of the demo needs a motorcycle.
+    # The sample data outside the repository, made in some 15 s: the photograph of the demo needs a
+    # motorcycle.
     "demo": Preset(("bicycle", "chair", "motorcycle"), 2, 12, 176, pairs=10, targets=(1, 3, 5)),
-    # The size of the paper's evaluation: twenty categories, ten sequences of about a hundred frames each.
+    # The size of the paper's evaluation: twenty categories, ten sequences of about a hundred frames
+    # each.
     "paper": Preset(tuple(CATEGORIES), 10, 100, 256, pairs=100, targets=(1, 3, 5, 10, 20)),
     "paper-small": Preset(tuple(CATEGORIES), 5, 24, 256, pairs=25, targets=(1, 3, 5, 10, 20)),
 }
@@ -69,42 +79,54 @@ def export_categories(
 ) -> None:
     """Write sequences of procedural categories to a folder, with pose labels.
 
-    A sequence depends only on the seed, its category and its index. An incomplete export is completed; complete
-    sequences are not rendered again. The first sequence of a category is the reference of its labels. `image_size` is
-    the shorter image side in pixels, `heights` the range of the mean elevation of a sequence's cameras in degrees.
-    InputError if a category is unknown, or if the folder was written with other settings.
+    A sequence depends only on the seed, its category and its index. An incomplete export is
+    completed; complete sequences are not rendered again. The first sequence of a category is the
+    reference of its labels. `image_size` is the shorter image side in pixels, `heights` the range
+    of the mean elevation of a sequence's cameras in degrees. InputError if a category is unknown,
+    or if the folder was written with other settings.
     """
     for category in categories:
         check_choice("category", category, builders)
     out, settings = Path(out), {"seed": seed, "frames": frames, "image_size": image_size}
     if (out / SETTINGS_FILE).is_file():
-        _check_same_settings(out, read_json(out / SETTINGS_FILE, dict[str, int], "settings"), settings)
+        _check_same_settings(
+            out, read_json(out / SETTINGS_FILE, dict[str, int], "settings"), settings
+        )
     write_atomic(out / SETTINGS_FILE, json.dumps(settings).encode())
     jobs = [(category, index) for category in categories for index in range(sequences)]
     for category, index in tqdm(jobs, "rendering", disable=None):
         name, key = sequence_name(seed, category, index), _key(seed, category, index)
         if name not in read_poses(out, category):
             mesh = make_object(category, index, seed, builders)
-            write_sequence(out, category, mesh, record_sequence(mesh, name, key, frames, image_size, heights))
+            write_sequence(
+                out, category, mesh, record_sequence(mesh, name, key, frames, image_size, heights)
+            )
     for category in categories:
-        write_labels(out, category, [sequence_name(seed, category, index) for index in range(sequences)])
+        write_labels(
+            out, category, [sequence_name(seed, category, index) for index in range(sequences)]
+        )
 
 
-def make_object(category: str, index: int, seed: int, builders: Mapping[str, Builder] = CATEGORIES) -> TexturedMesh:
+def make_object(
+    category: str, index: int, seed: int, builders: Mapping[str, Builder] = CATEGORIES
+) -> TexturedMesh:
     """Return the object of sequence number `index` in canonical coordinates, with its materials."""
     key = _key(seed, category, index)
     return replace(make_shape(builders[category], [key, 0]), materials=random_materials([key, 3]))
 
 
 def sequence_name(seed: int, category: str, index: int) -> str:
-    """Return a name like CO3D's, three groups of digits; names sort in the order of their indices, up to 900."""
+    """Return a name like CO3D's, three groups of digits; names sort in the order of their indices,
+    up to 900."""
     digits = _key(seed, category, index)
     return f"{100 + index}_{1000 + digits % 9000}_{1000 + digits // 9000 % 9000}"
 
 
 class _Rendered(msgspec.Struct):
     settings: dict[str, int | str]
-    sequences: dict[str, dict[str, dict]]  # the origin of each rendered sequence, by category and name
+    sequences: dict[
+        str, dict[str, dict]
+    ]  # the origin of each rendered sequence, by category and name
 
 
 def export_models(
@@ -116,11 +138,13 @@ def export_models(
     front: str | None = None,
     up: str | None = None,
 ) -> dict[str, str]:
-    """Render every model of a folder into a sequence of a data folder, with pose labels and evaluation pairs.
+    """Render every model of a folder into a sequence of a data folder, with pose labels and
+    evaluation pairs.
 
-    An incomplete export is completed; complete sequences are not rendered again, unless the model or its orientation
-    changed. The other arguments are as of `export_categories` and `list_models`. Returns the models that were left out
-    ("CATEGORY/NAME"), with the reason. InputError if no model is usable, or if `out` holds other data.
+    An incomplete export is completed; complete sequences are not rendered again, unless the model
+    or its orientation changed. The other arguments are as of `export_categories` and `list_models`.
+    Returns the models that were left out ("CATEGORY/NAME"), with the reason. InputError if no model
+    is usable, or if `out` holds other data.
     """
     models, out = list_models(folder, front, up), Path(out)
     settings = {"seed": seed, "frames": frames, "image_size": image_size}
@@ -129,14 +153,19 @@ def export_models(
         rendered = read_json(out / RENDERED_FILE, _Rendered, "records")
         _check_same_settings(out, rendered.settings, settings)
     elif out.is_dir() and Co3D(out).categories():
-        raise InputError(f"folder {out} holds other data, expected an empty one or an export of models")
+        raise InputError(
+            f"folder {out} holds other data, expected an empty one or an export of models"
+        )
     for model in tqdm(models, "rendering", disable=None):
         rotation = model.info.axes(model.path.suffix)  # to the canonical frame
         record = {
             "file": model.path.relative_to(folder).as_posix(),
             "sha256": sha256(model.path, "model"),
             "rotation": np.round(rotation, 9).ravel().tolist(),
-            **{name: getattr(model.info, name) for name in ("author", "licence", "source", "changes")},
+            **{
+                name: getattr(model.info, name)
+                for name in ("author", "licence", "source", "changes")
+            },
         }
         known = rendered.sequences.get(model.category, {}).get(model.name) == record
         if known and model.name in read_poses(out, model.category):
@@ -147,17 +176,23 @@ def export_models(
             left_out[f"{model.category}/{model.name}"] = str(error)
             continue
         key = _key(seed, model.category, model.name)
-        write_sequence(out, model.category, mesh, record_sequence(mesh, model.name, key, frames, image_size))
+        write_sequence(
+            out, model.category, mesh, record_sequence(mesh, model.name, key, frames, image_size)
+        )
         # The record is written last; a sequence with a record is complete.
         rendered.sequences.setdefault(model.category, {})[model.name] = record
-        write_atomic(out / RENDERED_FILE, msgspec.json.format(msgspec.json.encode(rendered), indent=1))
+        write_atomic(
+            out / RENDERED_FILE, msgspec.json.format(msgspec.json.encode(rendered), indent=1)
+        )
     if not rendered.sequences:
         key, reason = next(iter(left_out.items()))
         raise InputError(f"{folder} holds no usable model; {key}: {reason}")
     for category, sequences in rendered.sequences.items():
         write_labels(out, category, sorted(sequences))
         if len(sequences) > 1:
-            write_pairs(out, category, _MODEL_PAIRS, [n for n in _MODEL_TARGETS if n <= frames], seed)
+            write_pairs(
+                out, category, _MODEL_PAIRS, [n for n in _MODEL_TARGETS if n <= frames], seed
+            )
     return left_out
 
 
@@ -169,41 +204,55 @@ def _key(seed: int, category: str, sequence: int | str) -> int:
 def _check_same_settings(out: Path, found: Mapping, settings: Mapping) -> None:
     """Raise InputError if a folder was written with other settings."""
     if found != settings:
-        raise InputError(f"folder {out} was written with {found}, expected {settings} or another folder")
+        raise InputError(
+            f"folder {out} was written with {found}, expected {settings} or another folder"
+        )
 
 
 def write_sequence(
-    out: Path, category: str, mesh: TexturedMesh, recorded: tuple[SequenceData, Float[np.ndarray, "4 4"], float]
+    out: Path,
+    category: str,
+    mesh: TexturedMesh,
+    recorded: tuple[SequenceData, Float[np.ndarray, "4 4"], float],
 ) -> None:
-    """Add a recorded sequence to a data folder; its pose is written last, so that a sequence with one is complete."""
+    """Add a recorded sequence to a data folder; its pose is written last, so that a sequence with
+    one is complete."""
     data, pose, scale = recorded
     write_co3d(out, category, [data], quality=88)
     low, high = mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()
     poses = read_poses(out, category)
     poses[data.name] = ObjectPose(pose.tolist(), scale, low, high, shape_turns(mesh.vertices))
-    write_atomic(out / category / POSES_FILE, json.dumps(msgspec.to_builtins(poses), indent=1).encode())
+    write_atomic(
+        out / category / POSES_FILE, json.dumps(msgspec.to_builtins(poses), indent=1).encode()
+    )
 
 
 def shape_turns(vertices: Float[np.ndarray, "v 3"]) -> tuple[int, ...]:
-    """Return the quarter turns about the up axis, in degrees, after which the vertices are the same within 3 %."""
+    """Return the quarter turns about the up axis, in degrees, after which the vertices are the same
+    within 3 %."""
     points = vertices - (vertices.min(0) + vertices.max(0)) / 2
     x, y, z = points.T
     turned = {90: (-y, x, z), 180: (-x, -y, z), 270: (y, -x, z)}
-    distance = {turn: KDTree(points).query(np.stack(one, 1))[0].max() for turn, one in turned.items()}
+    distance = {
+        turn: KDTree(points).query(np.stack(one, 1))[0].max() for turn, one in turned.items()
+    }
     return tuple(turn for turn, farthest in distance.items() if farthest < 0.03 * np.ptp(points))
 
 
 def write_labels(out: Path, category: str, names: Sequence[str]) -> None:
-    """Write the pose labels of sequences from their object poses; the first name is the reference."""
+    """Write the pose labels of sequences from their object poses; the first name is the
+    reference."""
     poses = {name: np.array(pose.trans) for name, pose in read_poses(out, category).items()}
     for name in names:
-        # Rounded, to be equal on all processors, and without negative zeros; of the reference, exactly the identity.
+        # Rounded, to be equal on all processors, and without negative zeros; of the reference,
+        # exactly the identity.
         trans = np.round(poses[name] @ np.linalg.inv(poses[names[0]]), 12) + 0.0
         write_label(out, category, PoseLabel(trans, name, names[0]))
 
 
 def write_pairs(out: Path, category: str, pairs: int, targets: Iterable[int], seed: int) -> None:
-    """Sample evaluation pairs, a file per number of target views, in the format of the published evaluation."""
+    """Sample evaluation pairs, a file per number of target views, in the format of the published
+    evaluation."""
     dataset = Co3D(out)
     for n_targets in targets:
         sampled = sample_pairs(dataset, category, pairs, n_targets, seed)

@@ -1,4 +1,5 @@
-"""Folders of models, `FOLDER/CATEGORY/NAME.obj` or `FOLDER/CATEGORY/NAME/FILE.obj`, as textured meshes.
+"""Folders of models, `FOLDER/CATEGORY/NAME.obj` or `FOLDER/CATEGORY/NAME/FILE.obj`, as textured
+meshes.
 
 The optional file `models.json` gives the orientation and the origin of each model, see `ModelInfo`.
 """
@@ -32,11 +33,18 @@ _Direction = Literal["+x", "-x", "+y", "-y", "+z", "-z"] | tuple[float, float, f
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Surface of a part of a mesh; its colour is the product of `colour`, `texture` and `pattern`, all sRGB."""
+    """Surface of a part of a mesh; its colour is the product of `colour`, `texture` and `pattern`,
+    all sRGB."""
 
-    colour: Float[np.ndarray, "4"]  # with opacity, in [0, 1]; an opacity below 1 lets the room shine through
-    texture: UInt8[np.ndarray, "h w 4"] | None = None  # rows from top to bottom; opacity below 128 means a hole
-    pattern: Callable[[np.ndarray], np.ndarray] | None = None  # colours (n, 3) of points (n, 3) in object coordinates
+    colour: Float[
+        np.ndarray, "4"
+    ]  # with opacity, in [0, 1]; an opacity below 1 lets the room shine through
+    texture: UInt8[np.ndarray, "h w 4"] | None = (
+        None  # rows from top to bottom; opacity below 128 means a hole
+    )
+    pattern: Callable[[np.ndarray], np.ndarray] | None = (
+        None  # colours (n, 3) of points (n, 3) in object coordinates
+    )
     specular: float = 0.04  # reflectance at normal incidence
     roughness: float = 0.7  # as in glTF: 0 for a mirror, 1 for a matte surface
 
@@ -48,8 +56,12 @@ class TexturedMesh:
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]  # indices of vertices
     normals: Float[np.ndarray, "f 3 3"]  # unit shading normal of each corner of each face
-    uv: Float[np.ndarray, "f 3 2"]  # of each corner; (0, 0) is the lower left corner of the texture, which repeats
-    colours: Float[np.ndarray, "f 3 3"]  # sRGB in [0, 1] of each corner, a factor of the material's colour
+    uv: Float[
+        np.ndarray, "f 3 2"
+    ]  # of each corner; (0, 0) is the lower left corner of the texture, which repeats
+    colours: Float[
+        np.ndarray, "f 3 3"
+    ]  # sRGB in [0, 1] of each corner, a factor of the material's colour
     material: Int[np.ndarray, " f"]  # index of each face
     materials: tuple[Material, ...] = ()
 
@@ -65,12 +77,17 @@ class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
     changes: str = ""  # with respect to the source
 
     def axes(self, extension: str) -> Float[np.ndarray, "3 3"]:
-        """Return the rotation from the axes of the file to the canonical frame (front +x, left +y, up +z)."""
-        front, up = ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")  # the latter as in glTF
+        """Return the rotation from the axes of the file to the canonical frame (front +x, left +y,
+        up +z)."""
+        front, up = (
+            ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")
+        )  # the latter as in glTF
         front, up = self.front or front, self.up or up
         given = [_AXES[one] if isinstance(one, str) else np.array(one) for one in (front, up)]
         x, z = (vector / max(np.linalg.norm(vector), 1e-6) for vector in given)
-        return rotation_matrix(f"front {front} and up {up}: the axes", np.stack([x, np.cross(z, x), z]))
+        return rotation_matrix(
+            f"front {front} and up {up}: the axes", np.stack([x, np.cross(z, x), z])
+        )
 
 
 @dataclass(frozen=True)
@@ -84,7 +101,8 @@ class Model:
 
 
 def list_models(folder: str | Path, front: str | None = None, up: str | None = None) -> list[Model]:
-    """Return the models of a folder by category and name; `front` and `up` where `models.json` does not give them."""
+    """Return the models of a folder by category and name; `front` and `up` where `models.json` does
+    not give them."""
     folder = Path(folder)
     infos, models = read_infos(folder), {}
     files = [(path.parent.name, path.stem, path) for path in folder.glob("*/*")]
@@ -94,15 +112,24 @@ def list_models(folder: str | Path, front: str | None = None, up: str | None = N
             continue
         key = f"{category}/{name}"
         if key in models:
-            raise InputError(f"model {key} has two files, {models[key].path.name} and {path.name}, expected one")
+            raise InputError(
+                f"model {key} has two files, {models[key].path.name} and {path.name}, expected one"
+            )
         info = infos.pop(key, ModelInfo())
         info = msgspec.structs.replace(info, front=info.front or front, up=info.up or up)
         models[key] = Model(plain_name(category, "category"), plain_name(name, "model"), path, info)
     if not models:
-        kinds = f"CATEGORY/NAME.EXT or CATEGORY/NAME/FILE.EXT with EXT one of {', '.join(EXTENSIONS)}"
-        raise InputError(f"{folder} {'holds no model' if folder.is_dir() else 'does not exist'}, expected {kinds}")
+        kinds = (
+            f"CATEGORY/NAME.EXT or CATEGORY/NAME/FILE.EXT with EXT one of {', '.join(EXTENSIONS)}"
+        )
+        raise InputError(
+            f"{folder} {'holds no model' if folder.is_dir() else 'does not exist'}, expected "
+            f"{kinds}"
+        )
     if infos:
-        raise InputError(f"{folder / MODELS_FILE} names {min(infos)!r}, which has no file in {folder}")
+        raise InputError(
+            f"{folder / MODELS_FILE} names {min(infos)!r}, which has no file in {folder}"
+        )
     return [models[key] for key in sorted(models)]
 
 
@@ -113,7 +140,8 @@ def read_infos(folder: str | Path) -> dict[str, ModelInfo]:
 
 
 def read_mesh(path: str | Path) -> TexturedMesh:
-    """Read a mesh file with its textures, in the axes and the unit of the file; InputError if it is unusable."""
+    """Read a mesh file with its textures, in the axes and the unit of the file; InputError if it is
+    unusable."""
     import trimesh  # slow to import
 
     path = Path(path)
@@ -122,7 +150,9 @@ def read_mesh(path: str | Path) -> TexturedMesh:
         raise InputError(f"model {path} lacks {missing}")
     try:
         scene = trimesh.load_scene(path, process=False)
-        placed = [scene.graph[node] for node in scene.graph.nodes_geometry]  # transforms and names of geometries
+        placed = [
+            scene.graph[node] for node in scene.graph.nodes_geometry
+        ]  # transforms and names of geometries
         parts = [
             _part(scene.geometry[name], transform)
             for transform, name in placed
@@ -138,25 +168,33 @@ def read_mesh(path: str | Path) -> TexturedMesh:
     check_magnitude(f"model {path}: vertices", vertices)
     a, b, c = np.moveaxis(vertices[faces] / _size(vertices), 1, 0)
     opacity = np.array([one.colour[3] for one in materials])
-    visible = (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12) & (opacity[material] >= _INVISIBLE)
+    visible = (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12) & (
+        opacity[material] >= _INVISIBLE
+    )
     if not visible.any():
         raise InputError(f"model {path} has no visible face with an area")
     used, faces = np.unique(faces[visible], return_inverse=True)
     vertices, faces = vertices[used], faces.reshape(-1, 3)
     uv, colours = (np.concatenate(corners)[visible] for corners in (uv, colours))
-    return TexturedMesh(vertices, faces, smooth_normals(vertices, faces), uv, colours, material[visible], materials)
+    return TexturedMesh(
+        vertices, faces, smooth_normals(vertices, faces), uv, colours, material[visible], materials
+    )
 
 
 def canonical_mesh(mesh: TexturedMesh, rotation: Float[np.ndarray, "3 3"]) -> TexturedMesh:
-    """Rotate a mesh to front +x, left +y, up +z, centre its bounding box, and scale its surface to unit spread."""
+    """Rotate a mesh to front +x, left +y, up +z, centre its bounding box, and scale its surface to
+    unit spread."""
     vertices = mesh.vertices @ rotation.T
     vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
     spread = surface_spread(vertices, mesh.faces)
-    return replace(mesh, vertices=vertices / spread, normals=(mesh.normals @ rotation.T).astype(np.float32))
+    return replace(
+        mesh, vertices=vertices / spread, normals=(mesh.normals @ rotation.T).astype(np.float32)
+    )
 
 
 def _missing(path: Path) -> str:
-    """Name what a file of this type needs and trimesh would not report: a package, or a file that it refers to."""
+    """Name what a file of this type needs and trimesh would not report: a package, or a file that
+    it refers to."""
     if path.suffix.lower() == ".dae" and not find_spec("collada"):
         return "the package pycollada: pip install pycollada"
     for name in _values(path, b"mtllib") if path.suffix.lower() == ".obj" else ():
@@ -171,12 +209,21 @@ def _missing(path: Path) -> str:
 
 def _values(path: Path, key: bytes) -> list[str]:
     """Return the values of the lines that begin with a keyword."""
-    found = (line.strip().split(maxsplit=1) for line in read_bytes(path, "model").splitlines() if key in line.lower())
-    return [words[1].decode(errors="replace").strip() for words in found if len(words) == 2 and words[0].lower() == key]
+    found = (
+        line.strip().split(maxsplit=1)
+        for line in read_bytes(path, "model").splitlines()
+        if key in line.lower()
+    )
+    return [
+        words[1].decode(errors="replace").strip()
+        for words in found
+        if len(words) == 2 and words[0].lower() == key
+    ]
 
 
 def _part(mesh, transform: np.ndarray) -> tuple[Mesh, np.ndarray, np.ndarray, Material]:
-    """Return one geometry of a trimesh scene, its texture coordinates and colours (f, 3, ...), and its material."""
+    """Return one geometry of a trimesh scene, its texture coordinates and colours (f, 3, ...), and
+    its material."""
     faces, visual = np.asarray(mesh.faces, np.int64), mesh.visual
     vertices = np.asarray(mesh.vertices, float) @ transform[:3, :3].T + transform[:3, 3]
     uv, colours = np.zeros((len(faces), 3, 2), np.float32), np.ones((len(faces), 3, 3), np.float32)
@@ -232,7 +279,8 @@ def _rgba(colour) -> Float[np.ndarray, "4"]:
 
 
 def _image(image) -> UInt8[np.ndarray, "h w 4"] | None:
-    """Return a PIL image as RGBA bytes, reduced to at most `_TEXTURE_SIZE` pixels along its longer side."""
+    """Return a PIL image as RGBA bytes, reduced to at most `_TEXTURE_SIZE` pixels along its longer
+    side."""
     if image is None:
         return None
     image = image.convert("RGBA")
@@ -246,20 +294,26 @@ def _size(vertices: np.ndarray) -> float:
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
-    """Return corner normals: the mean normal of the faces around the corner that meet at less than 40 degrees."""
+    """Return corner normals: the mean normal of the faces around the corner that meet at less than
+    40 degrees."""
     size = _size(vertices)
     a, b, c = np.moveaxis(vertices[faces] / size, 1, 0)
     weighted = np.cross(b - a, c - a)  # by area
     normal = unit(weighted)
-    # Corners in the order of their points, and in `first` the position of the first corner of the same point.
+    # Corners in the order of their points, and in `first` the position of the first corner of the
+    # same point.
     _, point = np.unique(np.round(vertices / size, 6), axis=0, return_inverse=True)
     point = point.ravel()[faces.ravel()]
     corner = np.argsort(point, kind="stable")
-    _, first, of, counts = np.unique(point[corner], return_index=True, return_inverse=True, return_counts=True)
+    _, first, of, counts = np.unique(
+        point[corner], return_index=True, return_inverse=True, return_counts=True
+    )
     face = corner // 3
     total = np.zeros((len(corner), 3))
     several = np.arange(len(corner))
-    for step in range(min(int(counts.max()), _FACES_PER_POINT)):  # every corner with the step-th corner of its point
+    for step in range(
+        min(int(counts.max()), _FACES_PER_POINT)
+    ):  # every corner with the step-th corner of its point
         several = several[counts[of[several]] > step]
         other = face[first[of[several]] + step]
         close = np.einsum("nd,nd->n", normal[face[several]], normal[other]) > _CREASE

@@ -7,7 +7,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 TAU = 2 * np.pi
-_PLANES = {"xz": (0, 2, 1), "xy": (0, 1, 2), "yz": (1, 2, 0)}  # axes of the outline, and that of the thickness
+_PLANES = {
+    "xz": (0, 2, 1),
+    "xy": (0, 1, 2),
+    "yz": (1, 2, 0),
+}  # axes of the outline, and that of the thickness
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,8 @@ class Mesh:
         return Mesh(self.vertices * np.asarray(factors, float), self.faces)
 
     def rotated(self, axis: str, angle: float) -> "Mesh":
-        """Return the mesh rotated about the axis "x", "y" or "z" through the origin, right-handed, in radians."""
+        """Return the mesh rotated about the axis "x", "y" or "z" through the origin, right-handed,
+        in radians."""
         i = "xyz".index(axis)
         j, k = (i + 1) % 3, (i + 2) % 3
         R = np.eye(3)
@@ -42,7 +47,8 @@ class Mesh:
         return Mesh(self.vertices @ np.stack([x, np.cross(z, x), z]), self.faces)
 
     def mirrored(self) -> "Mesh":
-        """Return the mirror image in the plane y = 0; faces are reversed so that normals still point outwards."""
+        """Return the mirror image in the plane y = 0; faces are reversed so that normals still
+        point outwards."""
         return Mesh(self.vertices * [1, -1, 1], self.faces[:, ::-1])
 
 
@@ -54,7 +60,8 @@ def joined(meshes: Sequence) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
 
 
 def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
-    """Return the standard deviation of the surface, averaged over the axes, in the unit of the vertices."""
+    """Return the standard deviation of the surface, averaged over the axes, in the unit of the
+    vertices."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)[:, None]
     middle = (a + b + c) / 3
@@ -64,19 +71,24 @@ def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
 
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Return vectors (..., 3) scaled to unit length; zeros stay."""
-    return vectors / np.maximum(np.sqrt(np.einsum("...d,...d->...", vectors, vectors))[..., None], 1e-30)
+    return vectors / np.maximum(
+        np.sqrt(np.einsum("...d,...d->...", vectors, vectors))[..., None], 1e-30
+    )
 
 
 def box(size, centre=(0, 0, 0)) -> Mesh:
     """Return an axis-aligned box of the given size (3,)."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    sides = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    sides = np.array(
+        [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    )
     faces = np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
     return Mesh(corners, faces).scaled(size).translated(centre)
 
 
 def lathe(profile, sides: int = 20, start: float = 0.0, stop: float = TAU) -> Mesh:
-    """Revolve a profile (n, 2) of radii and heights about z; normals point outwards if the profile goes up."""
+    """Revolve a profile (n, 2) of radii and heights about z; normals point outwards if the profile
+    goes up."""
     profile = np.asarray(profile, float)
     closed = np.isclose(stop - start, TAU)
     angle = np.linspace(start, stop, sides, endpoint=not closed)
@@ -90,8 +102,11 @@ def lathe(profile, sides: int = 20, start: float = 0.0, stop: float = TAU) -> Me
 
 
 def cylinder(bottom: float, top: float, height: float, sides: int = 18) -> Mesh:
-    """Return a closed cone frustum about z, centred at the origin, with radii `bottom` and `top`."""
-    return lathe([[1e-4, -height / 2], [bottom, -height / 2], [top, height / 2], [1e-4, height / 2]], sides)
+    """Return a closed cone frustum about z, centred at the origin, with radii `bottom` and
+    `top`."""
+    return lathe(
+        [[1e-4, -height / 2], [bottom, -height / 2], [top, height / 2], [1e-4, height / 2]], sides
+    )
 
 
 def ellipsoid(radii, centre=(0, 0, 0), sides: int = 18) -> Mesh:
@@ -119,7 +134,9 @@ def capsule(start, end, radius: float, end_radius: float | None = None) -> Mesh:
     return mesh.pointing(along).translated(np.add(start, end) / 2)
 
 
-def torus(major: float, minor: float, axis=(0, 0, 1), centre=(0, 0, 0), start=0.0, stop=TAU, sides=24) -> Mesh:
+def torus(
+    major: float, minor: float, axis=(0, 0, 1), centre=(0, 0, 0), start=0.0, stop=TAU, sides=24
+) -> Mesh:
     """Return a torus about `axis`, or its arc from angle `start` to `stop` in radians."""
     t = np.linspace(-np.pi, np.pi, 11)
     tube = np.stack([major + minor * np.cos(t), minor * np.sin(t)], 1)
@@ -127,14 +144,20 @@ def torus(major: float, minor: float, axis=(0, 0, 1), centre=(0, 0, 0), start=0.
 
 
 def extrusion(outline, thickness: float, plane: str = "xz", offset: float = 0.0) -> Mesh:
-    """Extrude an outline (n, 2), star-shaped about its mean, in the plane "xz", "xy" or "yz", to a slab at `offset`."""
+    """Extrude an outline (n, 2), star-shaped about its mean, in the plane "xz", "xy" or "yz", to a
+    slab at `offset`."""
     outline = np.asarray(outline, float)
     n = len(outline)
     flat = np.concatenate([outline, [outline.mean(0)]])
     across = np.repeat([-thickness / 2, thickness / 2], n + 1) + offset
     i, k = np.arange(n), (np.arange(n) + 1) % n
     back, front, hub = np.full(n, n), n + 1, np.full(n, 2 * n + 1)
-    faces = [[back, i, k], [hub, front + k, front + i], [i, k, front + k], [i, front + k, front + i]]
+    faces = [
+        [back, i, k],
+        [hub, front + k, front + i],
+        [i, k, front + k],
+        [i, front + k, front + i],
+    ]
     vertices = np.zeros((2 * n + 2, 3))
     vertices[:, _PLANES[plane]] = np.column_stack([np.tile(flat, (2, 1)), across])
     return Mesh(vertices, np.stack([np.stack(f, 1) for f in faces], 1).reshape(-1, 3))

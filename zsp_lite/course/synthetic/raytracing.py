@@ -1,7 +1,8 @@
 """Renderer of textured meshes on the CPU: Open3D intersects rays, NumPy and OpenCV shade the hits.
 
-A sample of the picture receives the key light with a soft shadow, the light of the room that the object does not block,
-and reflections. Depth, mask and object coordinates are exact: those of the ray through the centre of each pixel.
+A sample of the picture receives the key light with a soft shadow, the light of the room that the
+object does not block, and reflections. Depth, mask and object coordinates are exact: those of the
+ray through the centre of each pixel.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,9 @@ from zsp_lite.io.ply import load_open3d
 _LAYERS = 4  # surfaces with holes that a ray passes through
 _OFFSET = 2e-3  # of the start of a ray from the surface that it leaves, in units
 _RAYS = 4  # per sample towards the room, and per point of the floor towards the key light
-_BLOCKED = 0.25  # light from parts of the object that block the room, relative to the light of the room
+_BLOCKED = (
+    0.25  # light from parts of the object that block the room, relative to the light of the room
+)
 _SHADOW_CELLS = 96  # along each side of the grid on which the shadow on the floor is known
 
 
@@ -30,15 +33,20 @@ class Rendering:
     """One rendered view with its exact geometry."""
 
     rgb: UInt8[np.ndarray, "h w 3"]
-    depth: Float[np.ndarray, "h w"]  # z in the camera frame, 0 where the ray hits neither the object nor the floor
+    depth: Float[
+        np.ndarray, "h w"
+    ]  # z in the camera frame, 0 where the ray hits neither the object nor the floor
     mask: Bool[np.ndarray, "h w"]  # pixels of the object
     canonical: Float[np.ndarray, "h w 3"]  # object coordinates of each object pixel, NaN elsewhere
-    normals: Float[np.ndarray, "h w 3"]  # unit normals of the object pixels in the camera frame, 0 elsewhere
+    normals: Float[
+        np.ndarray, "h w 3"
+    ]  # unit normals of the object pixels in the camera frame, 0 elsewhere
     camera: Camera
 
 
 class _Hits(NamedTuple):
-    """Surface points of rays: indices of the rays that hit, distances in ray parameters, faces and corner weights."""
+    """Surface points of rays: indices of the rays that hit, distances in ray parameters, faces and
+    corner weights."""
 
     ray: np.ndarray
     distance: np.ndarray
@@ -54,7 +62,8 @@ class MeshScene:
         mesh: TexturedMesh,
         room: Room,
         seed: int | np.random.Generator,
-        coordinates: Float[np.ndarray, "v 3"] | None = None,  # of the object that the mesh is a deformed copy of
+        coordinates: Float[np.ndarray, "v 3"]
+        | None = None,  # of the object that the mesh is a deformed copy of
         samples: int = 2,  # per pixel, along each axis
     ):
         o3d = load_open3d()
@@ -67,12 +76,20 @@ class MeshScene:
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
         self.origin = np.array([*(low + high)[:2] / 2, low[2]], np.float32)  # of the room
         first, second, third = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float32), 1, 0)
-        cross = np.cross(second - first, third - first)  # normal, with twice the area of the face as its length
+        cross = np.cross(
+            second - first, third - first
+        )  # normal, with twice the area of the face as its length
         self._flat = unit(cross)
-        self._coordinates = (mesh.vertices if coordinates is None else coordinates)[mesh.faces].astype(np.float32)
+        self._coordinates = (mesh.vertices if coordinates is None else coordinates)[
+            mesh.faces
+        ].astype(np.float32)
         self._textures = [None if m.texture is None else pyramid(m.texture) for m in mesh.materials]
-        self._has_holes = [m.texture is not None and bool(m.texture[..., 3].min() < 128) for m in mesh.materials]
-        self._properties = np.array([[m.specular, m.roughness, m.colour[3]] for m in mesh.materials], np.float32)
+        self._has_holes = [
+            m.texture is not None and bool(m.texture[..., 3].min() < 128) for m in mesh.materials
+        ]
+        self._properties = np.array(
+            [[m.specular, m.roughness, m.colour[3]] for m in mesh.materials], np.float32
+        )
         uv_area = np.abs(np.linalg.det(mesh.uv[:, 1:] - mesh.uv[:, :1]))
         # Lengths of the texture per unit, by face.
         self._texture_scale = np.sqrt(uv_area / np.maximum(np.linalg.norm(cross, axis=1), 1e-12))
@@ -80,7 +97,8 @@ class MeshScene:
         self._gain: float | None = None
 
     def render(self, camera: Camera) -> Rendering:
-        """Render one view; the exposure is measured on the first view and varies little after it."""
+        """Render one view; the exposure is measured on the first view and varies little
+        after it."""
         rays = _pixel_rays(camera, 1)
         radiance, depth = self._background(camera, rays)
         hits = self._cast(camera.centre, rays)
@@ -89,19 +107,26 @@ class MeshScene:
         canonical = np.full_like(normals, np.nan)
         mask[pixel], depth[pixel] = True, hits.distance  # rays have unit z in the camera frame
         canonical[pixel] = _interpolated(hits.weights, self._coordinates[hits.face])
-        normals[pixel] = _towards(self._flat[hits.face], rays.reshape(-1, 3)[hits.ray]) @ camera.R.T.astype(np.float32)
+        normals[pixel] = _towards(
+            self._flat[hits.face], rays.reshape(-1, 3)[hits.ray]
+        ) @ camera.R.T.astype(np.float32)
         if self._samples > 1:
             rays = _pixel_rays(camera, self._samples)
             hits = self._cast(camera.centre, rays)
-        shaded = cv2.resize(self._shade(camera, rays, hits), camera.size[::-1], interpolation=cv2.INTER_AREA)
+        shaded = cv2.resize(
+            self._shade(camera, rays, hits), camera.size[::-1], interpolation=cv2.INTER_AREA
+        )
         radiance = shaded[..., :3] + (1 - shaded[..., 3:]) * radiance
         if self._gain is None:
             self._gain = self.room.camera.exposure_gain(radiance)
-        rgb = self.room.camera.develop(radiance, self._gain * np.exp(self._rng.normal(0, 0.025)), self._rng)
+        rgb = self.room.camera.develop(
+            radiance, self._gain * np.exp(self._rng.normal(0, 0.025)), self._rng
+        )
         return Rendering(rgb, depth, mask, canonical, normals, camera)
 
     def _cast(self, origin: Float[np.ndarray, "#*n 3"], rays: Float[np.ndarray, "*n 3"]) -> _Hits:
-        """Return the first point that each ray meets; a ray passes through the holes of textures."""
+        """Return the first point that each ray meets; a ray passes through the holes of
+        textures."""
         origin = np.broadcast_to(origin.astype(np.float32), rays.shape).reshape(-1, 3)
         rays = rays.reshape(-1, 3)
         start, active, found = np.zeros(len(rays), np.float32), np.arange(len(rays)), []
@@ -111,7 +136,10 @@ class MeshScene:
             reach = result["t_hit"].numpy()
             on = np.flatnonzero(np.isfinite(reach))
             uv = result["primitive_uvs"].numpy()[on]
-            face, weights = result["primitive_ids"].numpy()[on].astype(np.int64), np.column_stack([1 - uv.sum(1), uv])
+            face, weights = (
+                result["primitive_ids"].numpy()[on].astype(np.int64),
+                np.column_stack([1 - uv.sum(1), uv]),
+            )
             ray = active[on]
             distance = start[ray] + reach[on]
             hole = self._is_hole(face, weights)
@@ -131,17 +159,25 @@ class MeshScene:
             hole[on] = sample_image(self._textures[index][0], u, 1 - v, cv2.BORDER_WRAP)[:, 3] < 128
         return hole
 
-    def _visible_share(self, point: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n k 3"]) -> np.ndarray:
-        """Return the share (n,) of the directions from each point that the object does not block."""
+    def _visible_share(
+        self, point: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n k 3"]
+    ) -> np.ndarray:
+        """Return the share (n,) of the directions from each point that the object does not
+        block."""
         n, count = directions.shape[:2]
         blocked = np.bincount(self._cast(point[:, None], directions).ray // count, minlength=n)
         return 1 - blocked.astype(np.float32) / np.float32(count)
 
-    def _shade(self, camera: Camera, rays: Float[np.ndarray, "h w 3"], hits: _Hits) -> Float[np.ndarray, "h w 4"]:
-        """Return the radiance of the object along rays, multiplied by its opacity, and the opacity."""
+    def _shade(
+        self, camera: Camera, rays: Float[np.ndarray, "h w 3"], hits: _Hits
+    ) -> Float[np.ndarray, "h w 4"]:
+        """Return the radiance of the object along rays, multiplied by its opacity, and the
+        opacity."""
         size = rays.shape[:2]
         rays, material = rays.reshape(-1, 3)[hits.ray], self.mesh.material[hits.face]
-        footprint = hits.distance / (camera.focal_length.mean() * self._samples)  # width of a sample, in units
+        footprint = hits.distance / (
+            camera.focal_length.mean() * self._samples
+        )  # width of a sample, in units
         albedo = self._albedo(hits, footprint)
         view, flat = unit(rays), _towards(self._flat[hits.face], rays)
         normal = _interpolated(hits.weights, self.mesh.normals[hits.face])
@@ -152,12 +188,17 @@ class MeshScene:
         facing = np.maximum(-_dot(normal, view), 0.02)
         point = camera.centre.astype(np.float32) + hits.distance[:, None] * rays + _OFFSET * flat
 
-        light, light_colour = self.room.light.astype(np.float32), self.room.light_colour.astype(np.float32)
+        light, light_colour = (
+            self.room.light.astype(np.float32),
+            self.room.light_colour.astype(np.float32),
+        )
         key = np.maximum(normal @ light, 0) * (flat @ light > 0)
         lit, of_light = np.flatnonzero(key), np.ones(len(key), np.float32)
         of_light[lit] = self._lit_share(point[lit], 1)
         # Directions with a density of the cosine about the normal.
-        towards_room = unit(normal[:, None] + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
+        towards_room = unit(
+            normal[:, None] + 0.99 * _spread_directions(self._rng, len(point), _RAYS)
+        )
         of_room = self._visible_share(point, towards_room)
         # Few rays per sample are noisy: each sample takes the mean of its neighbours on the object.
         shares = np.zeros((*size, 3), np.float32)
@@ -168,20 +209,30 @@ class MeshScene:
         diffuse = (key[:, None] * light_colour + around) * albedo
 
         specular, roughness, opacity = self._properties[material].T
-        # Reflectance by Schlick's approximation, the highlight by Blinn and Phong with its normalisation.
-        reflectance = (specular + np.maximum(1 - roughness - specular, 0) * (1 - facing) ** 5)[:, None]
+        # Reflectance by Schlick's approximation, the highlight by Blinn and Phong with its
+        # normalisation.
+        reflectance = (specular + np.maximum(1 - roughness - specular, 0) * (1 - facing) ** 5)[
+            :, None
+        ]
         exponent = 2 / np.maximum(roughness, 0.25) ** 4 - 2
         cosine = np.maximum(_dot(normal, unit(light - view)), 0)
         highlight = key * (exponent + 8) / 8 * cosine**exponent
-        mirrored = self.room.reflection(view + 2 * facing[:, None] * normal, roughness) * visible[:, None]
-        colour = diffuse * (1 - reflectance) + reflectance * (mirrored + highlight[:, None] * light_colour)
+        mirrored = (
+            self.room.reflection(view + 2 * facing[:, None] * normal, roughness) * visible[:, None]
+        )
+        colour = diffuse * (1 - reflectance) + reflectance * (
+            mirrored + highlight[:, None] * light_colour
+        )
 
         shaded = np.zeros((*size, 4), np.float32)
-        shaded.reshape(-1, 4)[hits.ray] = opacity[:, None] * np.column_stack([colour, np.ones(len(colour))])
+        shaded.reshape(-1, 4)[hits.ray] = opacity[:, None] * np.column_stack(
+            [colour, np.ones(len(colour))]
+        )
         return shaded
 
     def _albedo(self, hits: _Hits, footprint: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-        """Return the linear colours of surface points; `footprint` is the width of a sample, in units."""
+        """Return the linear colours of surface points; `footprint` is the width of a sample, in
+        units."""
         face, weights, material = hits.face, hits.weights, self.mesh.material[hits.face]
         albedo = srgb_to_linear(_interpolated(weights, self.mesh.colours[face]))
         for index in np.unique(material):
@@ -193,19 +244,28 @@ class MeshScene:
                 albedo[on] *= srgb_to_linear(look.pattern(points))
             if texture:
                 u, v = _interpolated(weights[on], self.mesh.uv[face[on]]).T
-                texels = footprint[on] * self._texture_scale[face[on]] * np.sqrt(np.prod(texture[0].shape[:2]))
+                texels = (
+                    footprint[on]
+                    * self._texture_scale[face[on]]
+                    * np.sqrt(np.prod(texture[0].shape[:2]))
+                )
                 sample = sample_pyramid(texture, u, 1 - v, texels, cv2.BORDER_WRAP)
                 albedo[on] *= srgb_to_linear(sample[:, :3] / 255)
-        # Artists use pure black and fully saturated colours; real surfaces reflect a few percent of all colours.
+        # Artists use pure black and fully saturated colours; real surfaces reflect a few percent of
+        # all colours.
         return 0.015 + 0.8 * albedo
 
     def _lit_share(self, point: Float[np.ndarray, "n 3"], count: int) -> np.ndarray:
-        """Return the share (n,) of the key light that the object does not block, by `count` rays from each point."""
-        offset = np.float32(np.tan(self.room.light_radius)) * _spread_directions(self._rng, len(point), count)
+        """Return the share (n,) of the key light that the object does not block, by `count` rays
+        from each point."""
+        offset = np.float32(np.tan(self.room.light_radius)) * _spread_directions(
+            self._rng, len(point), count
+        )
         return self._visible_share(point, unit(self.room.light.astype(np.float32) + offset))
 
     def _shadow_on_the_floor(self) -> tuple[Float[np.ndarray, "n n 2"], float]:
-        """Return the visible shares of the key light and of the room on a grid below the object, and its width."""
+        """Return the visible shares of the key light and of the room on a grid below the object,
+        and its width."""
         extent, light = np.ptp(self.mesh.vertices, axis=0), self.room.light
         length = extent[2] * max(float(np.linalg.norm(light[:2]) / max(light[2], 0.3)), 0.8)
         n, width = _SHADOW_CELLS, float(extent[:2].max()) + 2 * min(length, 5.0)
@@ -213,14 +273,19 @@ class MeshScene:
         x, y = np.meshgrid(line, line)
         point = np.stack([x, y, np.full_like(x, _OFFSET)], -1).reshape(-1, 3) + self.origin
         key = self._lit_share(point, _RAYS).reshape(n, n)
-        towards_room = unit(np.float32([0, 0, 1]) + 0.99 * _spread_directions(self._rng, len(point), _RAYS))
+        towards_room = unit(
+            np.float32([0, 0, 1]) + 0.99 * _spread_directions(self._rng, len(point), _RAYS)
+        )
         around = self._visible_share(point, towards_room).reshape(n, n)
-        return np.dstack([cv2.GaussianBlur(key, (0, 0), 0.8), cv2.GaussianBlur(around, (0, 0), 2.0)]), width
+        return np.dstack(
+            [cv2.GaussianBlur(key, (0, 0), 0.8), cv2.GaussianBlur(around, (0, 0), 2.0)]
+        ), width
 
     def _background(
         self, camera: Camera, rays: Float[np.ndarray, "h w 3"]
     ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-        """Return the radiance of the room with the shadow of the object, and the depth of the floor."""
+        """Return the radiance of the room with the shadow of the object, and the depth of the
+        floor."""
         eye, flat_rays = camera.centre - self.origin, rays.reshape(-1, 3)
         radiance, reach = self.room.radiance(eye, flat_rays, 1 / camera.focal_length.mean())
         floor = np.flatnonzero(reach)
@@ -236,15 +301,21 @@ def _pixel_rays(camera: Camera, n: int) -> Float[np.ndarray, "h w 3"]:
     height, width = camera.size
     x = ((np.arange(width * n) + 0.5) / n - camera.principal_point[0]) / camera.focal_length[0]
     y = ((np.arange(height * n) + 0.5) / n - camera.principal_point[1]) / camera.focal_length[1]
-    return (x[None, :, None] * camera.R[0] + (y[:, None, None] * camera.R[1] + camera.R[2])).astype(np.float32)
+    return (x[None, :, None] * camera.R[0] + (y[:, None, None] * camera.R[1] + camera.R[2])).astype(
+        np.float32
+    )
 
 
-def _interpolated(weights: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "n 3 c"]) -> Float[np.ndarray, "n c"]:
+def _interpolated(
+    weights: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "n 3 c"]
+) -> Float[np.ndarray, "n c"]:
     """Return values at surface points from those at the corners of their faces."""
     return np.einsum("nk,nkc->nc", weights, corners)
 
 
-def _towards(normal: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def _towards(
+    normal: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
     """Return normals that point towards the eye of rays."""
     return normal * -np.sign(_dot(normal, rays))[:, None]
 
@@ -254,10 +325,15 @@ def _dot(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "n 3"]) -> Floa
     return np.einsum("nd,nd->n", one, other)
 
 
-def _spread_directions(rng: np.random.Generator, n: int, count: int) -> Float[np.ndarray, "n {count} 3"]:
-    """Return n sets of `count` unit vectors that are spread evenly over the sphere, each set turned at random."""
+def _spread_directions(
+    rng: np.random.Generator, n: int, count: int
+) -> Float[np.ndarray, "n {count} 3"]:
+    """Return n sets of `count` unit vectors that are spread evenly over the sphere, each set turned
+    at random."""
     index = np.arange(count, dtype=np.float32)
     z = 1 - 2 * (index + rng.random((n, 1), np.float32)) / count
-    angle = np.float32(2 * np.pi) * (index * np.float32(0.618034) + rng.random((n, 1), np.float32))  # golden ratio
+    angle = np.float32(2 * np.pi) * (
+        index * np.float32(0.618034) + rng.random((n, 1), np.float32)
+    )  # golden ratio
     radius = np.sqrt(np.maximum(1 - z**2, 0))
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], -1)

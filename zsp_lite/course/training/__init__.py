@@ -1,1 +1,2 @@
-"""Training of small transformers from random weights on rendered objects, as notebook 09 shows it."""
+"""Training of small transformers from random weights on rendered objects, as notebook 09
+shows it."""

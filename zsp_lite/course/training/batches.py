@@ -1,4 +1,5 @@
-"""Training batches: random crops, flips and colours of rendered views, with the geometry that goes with them."""
+"""Training batches: random crops, flips and colours of rendered views, with the geometry that goes
+with them."""
 
 from dataclasses import dataclass
 
@@ -16,11 +17,16 @@ MEAN, STD = 0.45, 0.25  # normalisation of RGB values in [0, 1] during training
 
 @dataclass(frozen=True)
 class Batch:
-    """Crops of several objects, the views of an object one after the other; n patches per crop, row by row."""
+    """Crops of several objects, the views of an object one after the other; n patches per crop, row
+    by row."""
 
     images: Float[Tensor, "crops 3 side side"]  # normalised RGB
-    surface: Float[Tensor, "crops n 3"]  # object coordinates at the centre of each patch, NaN on the background
-    geometry: Float[Tensor, "crops n 4"]  # there: normal in the camera frame, and depth standardised over the object
+    surface: Float[
+        Tensor, "crops n 3"
+    ]  # object coordinates at the centre of each patch, NaN on the background
+    geometry: Float[
+        Tensor, "crops n 4"
+    ]  # there: normal in the camera frame, and depth standardised over the object
     coverage: Float[Tensor, "crops n"]  # fraction of each patch that the object covers
     objects: int  # their number
 
@@ -28,7 +34,8 @@ class Batch:
 def crop_grids(
     rng: np.random.Generator, n: int, per_object: int, side: int, scale: tuple[float, float]
 ) -> tuple[Float[Tensor, "n side side 2"], Float[Tensor, "n 2 2"]]:
-    """Draw slightly rotated crops as grids for `grid_sample`, and the map of directions in the image to the crop's."""
+    """Draw slightly rotated crops as grids for `grid_sample`, and the map of directions in the
+    image to the crop's."""
     size = rng.uniform(*scale, n)
     ratio = np.exp(rng.uniform(-0.25, 0.25, n))
     width, height = np.minimum(size * ratio, 1), np.minimum(size / ratio, 1)
@@ -37,14 +44,19 @@ def crop_grids(
     # Each group is mirrored as a whole or not.
     flip = np.repeat(rng.choice([-1.0, 1.0], n // per_object), per_object)
     c, s = np.cos(angle), np.sin(angle)
-    affine = np.array([[width * c * flip, -width * s, x], [height * s * flip, height * c, y]], np.float32)
+    affine = np.array(
+        [[width * c * flip, -width * s, x], [height * s * flip, height * c, y]], np.float32
+    )
     turn = np.array([[flip * c, flip * s], [-s, c]], np.float32)
-    affine, turn = (torch.from_numpy(matrix).permute(2, 0, 1).contiguous() for matrix in (affine, turn))
+    affine, turn = (
+        torch.from_numpy(matrix).permute(2, 0, 1).contiguous() for matrix in (affine, turn)
+    )
     return F.affine_grid(affine, (n, 1, side, side), align_corners=False), turn
 
 
 def recolour(rng: np.random.Generator, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
-    """Change brightness, contrast and saturation at random, blur some images, and normalise by `MEAN` and `STD`."""
+    """Change brightness, contrast and saturation at random, blur some images, and normalise by
+    `MEAN` and `STD`."""
     n = len(x)
 
     def draw(low, high):
@@ -54,7 +66,9 @@ def recolour(rng: np.random.Generator, x: Float[Tensor, "n 3 h w"]) -> Float[Ten
     mean = x.mean((2, 3), keepdim=True)
     x = (x - mean) * draw(0.7, 1.3) + mean
     grey = x.mean(1, keepdim=True)
-    saturation = draw(0.3, 1.4) * torch.from_numpy((rng.random((n, 1, 1, 1)) > 0.2).astype(np.float32))
+    saturation = draw(0.3, 1.4) * torch.from_numpy(
+        (rng.random((n, 1, 1, 1)) > 0.2).astype(np.float32)
+    )
     x = grey + (x - grey) * saturation
     blurred = torch.from_numpy(rng.random(n) < 0.3)
     x[blurred] = F.avg_pool2d(F.pad(x[blurred], (1, 1, 1, 1), mode="replicate"), 3, 1)
@@ -70,10 +84,11 @@ def sample_batch(
     scale: tuple[float, float],
     members: np.ndarray | None = None,
 ) -> Batch:
-    """Draw random crops of `side` pixels, whose widths are between the two of `scale` as a fraction of the image's.
+    """Draw random crops of `side` pixels, whose widths are between the two of `scale` as a fraction
+    of the image's.
 
-    The objects are random or the `members`; of each there are 8 views (all), 4 (two pairs, a quarter turn apart) or 2
-    (one pair).
+    The objects are random or the `members`; of each there are 8 views (all), 4 (two pairs, a
+    quarter turn apart) or 2 (one pair).
     """
     index = rng.integers(0, len(renders.rgb), objects) if members is None else members
     chosen = np.arange(VIEWS)[None].repeat(objects, 0)
@@ -88,10 +103,14 @@ def sample_batch(
     images = F.grid_sample(rgb / 255, grid, padding_mode="reflection", align_corners=False)
 
     def at(resolution):
-        return F.interpolate(grid.permute(0, 3, 1, 2), (resolution,) * 2, mode="area").permute(0, 2, 3, 1)
+        return F.interpolate(grid.permute(0, 3, 1, 2), (resolution,) * 2, mode="area").permute(
+            0, 2, 3, 1
+        )
 
     def sample(values, where):
-        return F.grid_sample(values, where, mode="nearest", padding_mode="border", align_corners=False)
+        return F.grid_sample(
+            values, where, mode="nearest", padding_mode="border", align_corners=False
+        )
 
     patches = side // PATCH_SIZE
     on_object = (~surface[:, :1].isnan()).float()

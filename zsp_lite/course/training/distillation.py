@@ -1,11 +1,13 @@
 """Self-distillation of the backbone, DINO (Caron et al. 2021).
 
-Only images are used: no labels, masks, depth or other views. Each image is cut into two global and several local
-crops. Student and teacher map each crop to a distribution over K outputs, and the student is trained to predict, from
-every crop, the teacher's distribution for the other global crop. The teacher is an exponential average of the student.
+Only images are used: no labels, masks, depth or other views. Each image is cut into two global and
+several local crops. Student and teacher map each crop to a distribution over K outputs, and the
+student is trained to predict, from every crop, the teacher's distribution for the other global
+crop. The teacher is an exponential average of the student.
 
-Two trivial solutions have a small loss: the same output for every image, and a uniform distribution. Centring of the
-teacher's logits prevents the first and favours the second; sharpening, a low teacher temperature, does the opposite.
+Two trivial solutions have a small loss: the same output for every image, and a uniform
+distribution. Centring of the teacher's logits prevents the first and favours the second;
+sharpening, a low teacher temperature, does the opposite.
 """
 
 import copy
@@ -21,7 +23,10 @@ from torch import Tensor, nn
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.course.training.batches import crop_grids, recolour
 
-GLOBAL_SCALE, LOCAL_SCALE = (0.6, 1.0), (0.25, 0.6)  # widths of the crops as a fraction of the image's
+GLOBAL_SCALE, LOCAL_SCALE = (
+    (0.6, 1.0),
+    (0.25, 0.6),
+)  # widths of the crops as a fraction of the image's
 HIDDEN, BOTTLENECK = 256, 64  # widths of the head's layers
 STUDENT_TEMPERATURE = 0.1
 CENTRE_MOMENTUM = 0.9  # decay per step of the average of the teacher's logits
@@ -32,7 +37,8 @@ MAX_GRADIENT_NORM = 3.0  # gradients with a larger norm are scaled down to it
 
 @dataclass(frozen=True)
 class DistillationConfig:
-    """Everything that determines the result of a run, except the images and the initial backbone."""
+    """Everything that determines the result of a run, except the images and the initial
+    backbone."""
 
     seed: int = 0  # of crops and of the random head
     steps: int = 300
@@ -52,7 +58,11 @@ class Head(nn.Module):
 
     def __init__(self, dim: int, outputs: int):
         super().__init__()
-        first, middle, last = nn.Linear(dim, HIDDEN), nn.Linear(HIDDEN, HIDDEN), nn.Linear(HIDDEN, BOTTLENECK)
+        first, middle, last = (
+            nn.Linear(dim, HIDDEN),
+            nn.Linear(HIDDEN, HIDDEN),
+            nn.Linear(HIDDEN, BOTTLENECK),
+        )
         self.mlp = nn.Sequential(first, nn.GELU(), middle, nn.GELU(), last)
         self.directions = nn.Parameter(torch.randn(outputs, BOTTLENECK))
         for module in (first, middle, last):
@@ -72,19 +82,26 @@ class Network(nn.Module):
         self.backbone = backbone
         self.head = Head(backbone.embed_dim, outputs)
 
-    def forward(self, images: Float[Tensor, "crops batch 3 side side"]) -> Float[Tensor, "crops batch outputs"]:
+    def forward(
+        self, images: Float[Tensor, "crops batch 3 side side"]
+    ) -> Float[Tensor, "crops batch outputs"]:
         return self.head(self.backbone(images.flatten(0, 1))[:, 0]).unflatten(0, images.shape[:2])
 
 
 def multi_crop(
-    images: UInt8[np.ndarray, "batch size size 3"], rng: np.random.Generator, config: DistillationConfig
+    images: UInt8[np.ndarray, "batch size size 3"],
+    rng: np.random.Generator,
+    config: DistillationConfig,
 ) -> tuple[Float[Tensor, "2 batch 3 g g"], Float[Tensor, "k batch 3 l l"]]:
-    """Cut two global and k local crops out of each image, each rotated, mirrored and recoloured independently."""
+    """Cut two global and k local crops out of each image, each rotated, mirrored and recoloured
+    independently."""
     rgb = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255
 
     def crops(count: int, side: int, scale: tuple[float, float]) -> Tensor:
         grid, _ = crop_grids(rng, count * len(rgb), 1, side, scale)
-        cut = F.grid_sample(rgb.repeat(count, 1, 1, 1), grid, padding_mode="reflection", align_corners=False)
+        cut = F.grid_sample(
+            rgb.repeat(count, 1, 1, 1), grid, padding_mode="reflection", align_corners=False
+        )
         return recolour(rng, cut).unflatten(0, (count, len(rgb)))
 
     large = crops(2, config.global_side, GLOBAL_SCALE)
@@ -98,12 +115,14 @@ def distillation_loss(
     student_temperature: float,
     teacher_temperature: float,
 ) -> tuple[Tensor, dict[str, float]]:
-    """Compute the cross-entropy between the teacher's and the student's distributions of different crops (eq. 3).
+    """Compute the cross-entropy between the teacher's and the student's distributions of different
+    crops (eq. 3).
 
-    The arguments are logits; the first two crops of the student are the global ones. `centre`, the average of the
-    teacher's logits, is subtracted. The figures are in nats: "loss"; "teacher_entropy", mean entropy of the teacher's
-    distributions; "kl", divergence of the student's from them; and "information", the mutual information of output and
-    image: 0 for both trivial solutions, at most log(batch) if both crops of an image have the same distribution.
+    The arguments are logits; the first two crops of the student are the global ones. `centre`, the
+    average of the teacher's logits, is subtracted. The figures are in nats: "loss";
+    "teacher_entropy", mean entropy of the teacher's distributions; "kl", divergence of the
+    student's from them; and "information", the mutual information of output and image: 0 for both
+    trivial solutions, at most log(batch) if both crops of an image have the same distribution.
     """
     log_p = ((teacher.detach() - centre) / teacher_temperature).log_softmax(-1)
     p = log_p.exp()
@@ -114,14 +133,20 @@ def distillation_loss(
     entropy = -(p * log_p).sum(-1).mean().item()
     mean = p.mean((0, 1))
     information = -torch.xlogy(mean, mean).sum().item() - entropy
-    return loss, dict(loss=loss.item(), teacher_entropy=entropy, kl=loss.item() - entropy, information=information)
+    return loss, dict(
+        loss=loss.item(), teacher_entropy=entropy, kl=loss.item() - entropy, information=information
+    )
 
 
 class Distillation:
-    """A run of DINO on images of several views of each of n objects; the teacher's backbone is its result."""
+    """A run of DINO on images of several views of each of n objects; the teacher's backbone is its
+    result."""
 
     def __init__(
-        self, config: DistillationConfig, backbone: VisionTransformer, rgb: UInt8[np.ndarray, "n views size size 3"]
+        self,
+        config: DistillationConfig,
+        backbone: VisionTransformer,
+        rgb: UInt8[np.ndarray, "n views size size 3"],
     ):
         torch.manual_seed(config.seed)
         self.config, self.rgb, self.steps_done = config, rgb, 0
@@ -129,7 +154,9 @@ class Distillation:
         self.teacher = copy.deepcopy(self.student).requires_grad_(False)
         self.centre = torch.zeros(config.outputs)
         matrices = [p for p in self.student.parameters() if p.ndim > 1]
-        vectors = [p for p in self.student.parameters() if p.ndim <= 1]  # biases and norms: no weight decay
+        vectors = [
+            p for p in self.student.parameters() if p.ndim <= 1
+        ]  # biases and norms: no weight decay
         groups = [{"params": matrices}, {"params": vectors, "weight_decay": 0.0}]
         self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate)
 
@@ -140,7 +167,9 @@ class Distillation:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.param_groups[0]["weight_decay"] = cosine(WEIGHT_DECAY, progress)
-        self.student.head.directions.requires_grad_(progress >= 0.05)  # DINO fixes the last layer in the first epoch
+        self.student.head.directions.requires_grad_(
+            progress >= 0.05
+        )  # DINO fixes the last layer in the first epoch
 
         rng = np.random.default_rng([config.seed, 3, self.steps_done])
         objects, views = (rng.integers(count, size=config.images) for count in self.rgb.shape[:2])
@@ -156,7 +185,9 @@ class Distillation:
         self.optimizer.step()
 
         with torch.no_grad():
-            for slow, fast in zip(self.teacher.parameters(), self.student.parameters(), strict=True):
+            for slow, fast in zip(
+                self.teacher.parameters(), self.student.parameters(), strict=True
+            ):
                 slow.lerp_(fast, 1 - cosine(TEACHER_MOMENTUM, progress))
         if config.centring:
             self.centre.lerp_(teacher.mean((0, 1)), 1 - CENTRE_MOMENTUM)  # eq. 4

@@ -1,7 +1,7 @@
 """Training losses: correspondence, geometry per patch, and attention on the object.
 
-The losses use ground truth of the renderer for the views of one object. The object's proportions differ from view to
-view. No loss compares two objects or uses category names.
+The losses use ground truth of the renderer for the views of one object. The object's proportions
+differ from view to view. No loss compares two objects or uses category names.
 """
 
 import torch
@@ -18,16 +18,23 @@ QUERIES = 256  # largest number of query patches per object
 
 
 def correspondence_loss(
-    descriptors: Float[Tensor, "crops n dim"], surface: Float[Tensor, "crops n 3"], objects: int,
-    radius: float, temperature: float, queries: int, generator: torch.Generator,
-) -> tuple[Tensor, float]:  # fmt: skip
-    """Compute InfoNCE between the views of each object, with soft targets by distance on its surface.
+    descriptors: Float[Tensor, "crops n dim"],
+    surface: Float[Tensor, "crops n 3"],
+    objects: int,
+    radius: float,
+    temperature: float,
+    queries: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, float]:
+    """Compute InfoNCE between the views of each object, with soft targets by distance on its
+    surface.
 
-    The target of a query patch is a distribution over the patches of the object's other views: a Gaussian of the
-    distance between the surface points with standard deviation `radius` (object units), 0 beyond 2.4 of these. At most
-    `queries` random patches of an object are queries. The descriptors are unit vectors, ordered by object and view.
-    The loss is the divergence from the targets, so that 0 is its minimum; the second result is the fraction of queries
-    whose nearest descriptor has a non-zero target.
+    The target of a query patch is a distribution over the patches of the object's other views: a
+    Gaussian of the distance between the surface points with standard deviation `radius` (object
+    units), 0 beyond 2.4 of these. At most `queries` random patches of an object are queries. The
+    descriptors are unit vectors, ordered by object and view. The loss is the divergence from the
+    targets, so that 0 is its minimum; the second result is the fraction of queries whose nearest
+    descriptor has a non-zero target.
     """
     crops, n, dim = descriptors.shape
     views = crops // objects
@@ -58,9 +65,12 @@ def correspondence_loss(
 
 
 def geometry_loss(
-    prediction: Float[Tensor, "crops n 5"], geometry: Float[Tensor, "crops n 4"], on_object: Bool[Tensor, "crops n"]
+    prediction: Float[Tensor, "crops n 5"],
+    geometry: Float[Tensor, "crops n 4"],
+    on_object: Bool[Tensor, "crops n"],
 ) -> Tensor:
-    """Compute the loss of predicted normals and relative depth (channels 0 to 3) and foreground logit (channel 4)."""
+    """Compute the loss of predicted normals and relative depth (channels 0 to 3) and foreground
+    logit (channel 4)."""
     inside = on_object.float()
     foreground = F.binary_cross_entropy_with_logits(prediction[..., 4], inside)
     error = F.smooth_l1_loss(prediction[..., :4], geometry, beta=0.3, reduction="none").mean(-1)
@@ -70,11 +80,13 @@ def geometry_loss(
 def attention_loss(
     cls_logits: Float[Tensor, "crops heads tokens"], coverage: Float[Tensor, "crops n"]
 ) -> tuple[Tensor, float]:
-    """Compute the loss of the CLS attention, averaged over heads, against the rendered mask; and an IoU.
+    """Compute the loss of the CLS attention, averaged over heads, against the rendered mask; and an
+    IoU.
 
-    The target is uniform on the object and zero elsewhere. The loss is the divergence between the normalised mask and
-    the attention over patches, plus a cross-entropy that separates object and background at 0.12 times the mean
-    attention on the object. The mean IoU is that of the mask with min-max normalised attention above 0.05.
+    The target is uniform on the object and zero elsewhere. The loss is the divergence between the
+    normalised mask and the attention over patches, plus a cross-entropy that separates object and
+    background at 0.12 times the mean attention on the object. The mean IoU is that of the mask with
+    min-max normalised attention above 0.05.
     """
     attention = cls_logits.softmax(-1)[..., 1:].mean(1)
     attention = attention / attention.sum(1, keepdim=True)
@@ -85,7 +97,9 @@ def attention_loss(
     target = coverage / coverage.sum(1, keepdim=True)
     spread = F.kl_div(attention.log(), target, reduction="batchmean")
     level = (attention * coverage).sum(1, keepdim=True) / coverage.sum(1, keepdim=True)
-    side = F.binary_cross_entropy_with_logits(attention.log() - (0.12 * level.detach()).log(), coverage)
+    side = F.binary_cross_entropy_with_logits(
+        attention.log() - (0.12 * level.detach()).log(), coverage
+    )
     with torch.no_grad():
         low, high = attention.amin(1, keepdim=True), attention.amax(1, keepdim=True)
         found, truth = (attention - low) / (high - low + 1e-12) > 0.05, coverage > 0.25
@@ -96,16 +110,20 @@ def attention_loss(
 def losses(
     model: Trainee, batch: Batch, generator: torch.Generator, helpers: float = 0.4
 ) -> tuple[Tensor, dict[str, float]]:
-    """Compute the correspondence loss plus `helpers` times the geometry and attention losses of one batch.
+    """Compute the correspondence loss plus `helpers` times the geometry and attention losses of one
+    batch.
 
-    The figures are the value of each loss, the match accuracy and the IoU of the saliency. The model's running mean of
-    the keys is updated.
+    The figures are the value of each loss, the match accuracy and the IoU of the saliency. The
+    model's running mean of the keys is updated.
     """
     out = model(batch.images)
     on_object = ~batch.surface[..., 0].isnan()
     geometry = 0.5 * sum(
         geometry_loss(head(features), batch.geometry, on_object)
-        for head, features in ((model.geometry_of_tokens, out.tokens[:, 1:]), (model.geometry_of_keys, out.key_input))
+        for head, features in (
+            (model.geometry_of_tokens, out.tokens[:, 1:]),
+            (model.geometry_of_keys, out.key_input),
+        )
     )
     attention, iou = attention_loss(out.cls_logits, batch.coverage)
     descriptors = F.normalize(model.centred(out.keys, update_mean=True), dim=-1)
@@ -114,4 +132,7 @@ def losses(
     )
     total = match + helpers * (geometry + attention)
     figures = {"loss": total, "match": match, "geometry": geometry, "attention": attention}
-    return total, {name: value.item() for name, value in figures.items()} | {"accuracy": accuracy, "iou": iou}
+    return total, {name: value.item() for name, value in figures.items()} | {
+        "accuracy": accuracy,
+        "iou": iou,
+    }

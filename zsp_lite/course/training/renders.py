@@ -1,7 +1,9 @@
-"""The training set: objects of no category, with several views of one object at a time and their geometry.
+"""The training set: objects of no category, with several views of one object at a time and their
+geometry.
 
-Each view shows another instance of the object, with its own proportions, materials and room: the differences between
-the instances are what the features are to ignore. Objects have their front at +x, left at +y, top at +z.
+Each view shows another instance of the object, with its own proportions, materials and room: the
+differences between the instances are what the features are to ignore. Objects have their front at
++x, left at +y, top at +z.
 """
 
 from collections.abc import Iterable
@@ -14,7 +16,16 @@ from jaxtyping import Float, UInt8
 
 from zsp_lite.course.synthetic.assembly import Assembly, make_shape, random_materials
 from zsp_lite.course.synthetic.meshes import TexturedMesh
-from zsp_lite.course.synthetic.primitives import TAU, Mesh, box, capsule, cylinder, ellipsoid, extrusion, torus
+from zsp_lite.course.synthetic.primitives import (
+    TAU,
+    Mesh,
+    box,
+    capsule,
+    cylinder,
+    ellipsoid,
+    extrusion,
+    torus,
+)
 from zsp_lite.course.synthetic.raytracing import MeshScene, Rendering
 from zsp_lite.course.synthetic.room import Room, random_room
 from zsp_lite.course.synthetic.sequences import orbit_pose
@@ -23,10 +34,13 @@ from zsp_lite.data.cameras import Camera
 VIEWS = 8  # per object
 SIZE = 192  # of a view, pixels
 GRID = 48  # points along each side of a view at which geometry is known
-# Smallest and largest difference in azimuth of the two views of a pair, about that of a reference and the nearest of a
-# few target views, and never more than that of two views of different pairs.
+# Smallest and largest difference in azimuth of the two views of a pair, about that of a reference
+# and the nearest of a few target views, and never more than that of two views of different pairs.
 PAIR_ANGLES = np.radians((5, 45))
-ROOMS, SHARING = 8, 100  # so many rooms for so many consecutive objects: a room takes five times as long as a view
+ROOMS, SHARING = (
+    8,
+    100,
+)  # so many rooms for so many consecutive objects: a room takes five times as long as a view
 
 
 @dataclass(frozen=True)
@@ -34,10 +48,12 @@ class RenderSet:
     """Views of n objects, with the geometry at every fourth pixel."""
 
     rgb: UInt8[np.ndarray, "n views size size 3"]
-    # Object coordinates, NaN on the background. Two views of one object correspond where these agree; they have no
-    # meaning across objects.
+    # Object coordinates, NaN on the background. Two views of one object correspond where these
+    # agree; they have no meaning across objects.
     surface: Float[np.ndarray, "n views grid grid 3"]
-    geometry: Float[np.ndarray, "n views grid grid 4"]  # normal in the camera frame, depth standardised over the object
+    geometry: Float[
+        np.ndarray, "n views grid grid 4"
+    ]  # normal in the camera frame, depth standardised over the object
 
 
 def render_set(numbers: Iterable[int]) -> RenderSet:
@@ -46,7 +62,8 @@ def render_set(numbers: Iterable[int]) -> RenderSet:
 
 
 def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Render one object as four pairs of views, a quarter turn apart; returns its rows of a `RenderSet`."""
+    """Render one object as four pairs of views, a quarter turn apart; returns its rows of a
+    `RenderSet`."""
     rng = np.random.default_rng([number, 0])  # [number, 1] draws the object itself
     shape = make_shape(build_random_object, [number, 1])
     start, step, views = rng.uniform(0, TAU), SIZE // GRID, []
@@ -63,7 +80,9 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             distance=rng.uniform(5, 10),
             target=(mesh.vertices.max(0) + mesh.vertices.min(0)) / 2,
         )
-        camera = framed_camera(mesh.vertices, R, t, SIZE, 1.12 * np.exp(rng.normal(0, 0.06)), rng.normal(0, 0.02, 2))
+        camera = framed_camera(
+            mesh.vertices, R, t, SIZE, 1.12 * np.exp(rng.normal(0, 0.06)), rng.normal(0, 0.02, 2)
+        )
         image = render_instance(number, mesh, shape.vertices, camera, rng)
         every = (slice(step // 2, None, step),) * 2
         depth, on_object = image.depth[every], image.mask[every]
@@ -75,9 +94,15 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def framed_camera(
-    vertices: Float[np.ndarray, "v 3"], R: np.ndarray, t: np.ndarray, size: int, margin: float = 1.1, shift=(0, 0)
+    vertices: Float[np.ndarray, "v 3"],
+    R: np.ndarray,
+    t: np.ndarray,
+    size: int,
+    margin: float = 1.1,
+    shift=(0, 0),
 ) -> Camera:
-    """Return a camera at pose R, t with a square image of `size` pixels that contains all vertices."""
+    """Return a camera at pose R, t with a square image of `size` pixels that contains all
+    vertices."""
     in_camera = vertices @ R.T + t
     plane = in_camera[:, :2] / in_camera[:, 2:]
     low, high = plane.min(0), plane.max(0)
@@ -87,12 +112,21 @@ def framed_camera(
 
 
 def render_instance(
-    number: int, mesh: TexturedMesh, coordinates: Float[np.ndarray, "v 3"], camera: Camera, rng: np.random.Generator
+    number: int,
+    mesh: TexturedMesh,
+    coordinates: Float[np.ndarray, "v 3"],
+    camera: Camera,
+    rng: np.random.Generator,
 ) -> Rendering:
-    """Render an instance of object `number`, with the coordinates of that object, in a random room turned at random."""
+    """Render an instance of object `number`, with the coordinates of that object, in a random room
+    turned at random."""
     angle = rng.uniform(0, TAU)
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    turned = replace(mesh, vertices=mesh.vertices @ turn.T, normals=(mesh.normals @ turn.T).astype(np.float32))
+    turn = np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    )
+    turned = replace(
+        mesh, vertices=mesh.vertices @ turn.T, normals=(mesh.normals @ turn.T).astype(np.float32)
+    )
     room = _room(number // SHARING * ROOMS + int(rng.integers(ROOMS)))
     scene = MeshScene(turned, room, rng, coordinates, samples=1)
     view = scene.render(replace(camera, R=camera.R @ turn.T))
@@ -103,13 +137,19 @@ def render_instance(
 def _room(index: int) -> Room:
     """Return a room in half the resolution, to save memory."""
     room = random_room(index)
-    halves = (cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in room.images)
+    halves = (
+        cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        for image in room.images
+    )
     return replace(room, images=tuple(halves))
 
 
 def build_random_object(a: Assembly) -> None:
-    """Build a tree of 5 to 10 random parts, left and right alike, each attached to one of those before it."""
-    nodes = [(np.zeros(3), np.array([a.u(0.5, 1.3), a.u(0.4, 1.0), a.u(0.4, 1.2)]))]  # centre and size of each part
+    """Build a tree of 5 to 10 random parts, left and right alike, each attached to one of those
+    before it."""
+    nodes = [
+        (np.zeros(3), np.array([a.u(0.5, 1.3), a.u(0.4, 1.0), a.u(0.4, 1.2)]))
+    ]  # centre and size of each part
     a.add(_random_solid(a, nodes[0][1]), a.choice(5))
     for _ in range(4 + a.choice(6)):
         parent, parent_size = nodes[a.choice(len(nodes))]

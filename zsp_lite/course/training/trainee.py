@@ -14,9 +14,11 @@ from zsp_lite.course.training.renders import VIEWS, RenderSet
 
 
 class Trainee(nn.Module):
-    """A transformer whose keys of block `layer` (from 0) are trained, and the running mean of these keys.
+    """A transformer whose keys of block `layer` (from 0) are trained, and the running mean of these
+    keys.
 
-    Two linear heads, which only training uses, predict geometry from the output tokens and from the keys' input.
+    Two linear heads, which only training uses, predict geometry from the output tokens and from the
+    keys' input.
     """
 
     def __init__(self, backbone: VisionTransformer, layer: int):
@@ -30,11 +32,15 @@ class Trainee(nn.Module):
         """Run the transformer on images that are normalised by `batches.MEAN` and `batches.STD`."""
         return self.backbone.forward_training(images, self.layer)
 
-    def centred(self, keys: Float[Tensor, "batch n dim"], update_mean: bool = False) -> Float[Tensor, "batch n dim"]:
+    def centred(
+        self, keys: Float[Tensor, "batch n dim"], update_mean: bool = False
+    ) -> Float[Tensor, "batch n dim"]:
         """Subtract the running mean of the keys."""
         if update_mean:
             mean = keys.detach().mean((0, 1))
-            self.key_mean.copy_(mean if not self.key_mean.any() else 0.95 * self.key_mean + 0.05 * mean)
+            self.key_mean.copy_(
+                mean if not self.key_mean.any() else 0.95 * self.key_mean + 0.05 * mean
+            )
         return keys - self.key_mean
 
 
@@ -42,20 +48,29 @@ class Trainee(nn.Module):
 def as_trainee(backbone: VisionTransformer, layer: int, renders: RenderSet, side: int) -> Trainee:
     """Wrap a transformer with the mean key of crops of `side` pixels of at most six objects."""
     trainee = Trainee(backbone, layer)
-    batch = sample_batch(renders, np.random.default_rng(7), min(6, len(renders.rgb)), VIEWS, side, (0.85, 1.0))
+    batch = sample_batch(
+        renders, np.random.default_rng(7), min(6, len(renders.rgb)), VIEWS, side, (0.85, 1.0)
+    )
     trainee.centred(trainee(batch.images).keys, update_mean=True)
     return trainee
 
 
 @torch.no_grad()
-def initial_backbone(renders: RenderSet, embed_dim: int, depth: int, num_heads: int) -> VisionTransformer:
+def initial_backbone(
+    renders: RenderSet, embed_dim: int, depth: int, num_heads: int
+) -> VisionTransformer:
     """Make a transformer with the initial values of a training.
 
-    Linear layers are Xavier-initialised, with smaller residual branches; position embeddings are sines and cosines. The
-    patch embedding whitens the patches of the training crops, with damping so that noise is not amplified: a random
-    linear embedding would pass on little more than the mean brightness.
+    Linear layers are Xavier-initialised, with smaller residual branches; position embeddings are
+    sines and cosines. The patch embedding whitens the patches of the training crops, with damping
+    so that noise is not amplified: a random linear embedding would pass on little more than the
+    mean brightness.
     """
-    backbone, dim, p = VisionTransformer(224, PATCH_SIZE, embed_dim, depth, num_heads), embed_dim, PATCH_SIZE
+    backbone, dim, p = (
+        VisionTransformer(224, PATCH_SIZE, embed_dim, depth, num_heads),
+        embed_dim,
+        PATCH_SIZE,
+    )
     generator = torch.Generator().manual_seed(0)
     for name, module in backbone.named_modules():
         if isinstance(module, nn.Linear):
@@ -66,7 +81,9 @@ def initial_backbone(renders: RenderSet, embed_dim: int, depth: int, num_heads: 
     backbone.pos_embed.zero_()
     backbone.pos_embed[0, 1:] = 0.25 * _sine_cosine_embedding(dim, backbone.image_size // p)
     rng = np.random.default_rng([0, 1])
-    images = torch.cat([sample_batch(renders, rng, 15, VIEWS, 96, (0.4, 1.0)).images for _ in range(4)])
+    images = torch.cat(
+        [sample_batch(renders, rng, 15, VIEWS, 96, (0.4, 1.0)).images for _ in range(4)]
+    )
     patches = F.unfold(images, p, stride=p).transpose(1, 2).flatten(0, 1)
     patches = patches - patches.mean(0)
     variance, axes = torch.linalg.eigh(patches.T @ patches / len(patches))
@@ -83,4 +100,6 @@ def _sine_cosine_embedding(dim: int, side: int) -> Float[Tensor, "n dim"]:
     centre = (torch.arange(side) + 0.5) / side * 12
     wave = torch.exp(-math.log(60) * torch.arange(dim // 4) / (dim // 4))
     y, x = torch.meshgrid(centre, centre, indexing="ij")
-    return torch.cat([f(p[..., None] * wave) for p in (y, x) for f in (torch.sin, torch.cos)], -1).flatten(0, 1)
+    return torch.cat(
+        [f(p[..., None] * wave) for p in (y, x) for f in (torch.sin, torch.cos)], -1
+    ).flatten(0, 1)

@@ -6,7 +6,13 @@ from jaxtyping import Float, Real
 from matplotlib.collections import LineCollection
 
 from zsp_lite.alignment import SCALE_RANGE, ransac, umeyama
-from zsp_lite.course.widgets.common import Widget, interactive_figure, load_package, redrawing, slider
+from zsp_lite.course.widgets.common import (
+    Widget,
+    interactive_figure,
+    load_package,
+    redrawing,
+    slider,
+)
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION, draw_image, draw_matches, show_points
@@ -21,9 +27,12 @@ def ransac_settings(
     points: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
     truth: Float[np.ndarray, "3 3"] | None = None,
 ) -> Widget:
-    """Show the inliers of RANSAC on matches, given by pixels (x, y) in both images and by points in both cameras."""
+    """Show the inliers of RANSAC on matches, given by pixels (x, y) in both images and by points in
+    both cameras."""
     (source, target), n = points, len(points[0])
-    figure, (*axes, graph) = plt.subplots(1, 3, figsize=(9.6, 3.6), width_ratios=(1, 1, 1.3), layout="constrained")
+    figure, (*axes, graph) = plt.subplots(
+        1, 3, figsize=(9.6, 3.6), width_ratios=(1, 1, 1.3), layout="constrained"
+    )
     for axis, image, title in zip(axes, images, ("reference", "target")):
         draw_image(axis, image)
         axis.set_axis_off()
@@ -39,7 +48,9 @@ def ransac_settings(
     def update(trials: int, threshold: float, seed: int) -> str:
         line.set_ydata([threshold, threshold])
         try:
-            sim3, inliers = ransac(source, target, threshold, trials, seed=seed, scale_range=SCALE_RANGE)
+            sim3, inliers = ransac(
+                source, target, threshold, trials, seed=seed, scale_range=SCALE_RANGE
+            )
         except InputError as error:
             lines(axes, pixels, np.zeros(n, bool))
             for dots in (inside, outside):
@@ -52,7 +63,9 @@ def ransac_settings(
         outside.set_offsets(positions[~inliers[order]])
         lines(axes, pixels, inliers)
         text = f"{inliers.sum()} of {n} matches are inliers; scale {sim3.scale:.2f}"
-        return text + (f"; rotation error {rotation_error(sim3.R, truth):.0f}°." if truth is not None else ".")
+        return text + (
+            f"; rotation error {rotation_error(sim3.R, truth):.0f}°." if truth is not None else "."
+        )
 
     widgets = load_package()
     controls = {
@@ -60,12 +73,16 @@ def ransac_settings(
         "threshold": slider("threshold", 0.02, 1.0, 0.2, 0.02),
         "seed": slider("seed", 0, 20, 0),
     }
-    alt = "Two images with the inliers between them, and the residual of each match with the threshold"
+    alt = (
+        "Two images with the inliers between them, and the residual of each match with the "
+        "threshold"
+    )
     return interactive_figure(figure, controls, update, alt)
 
 
 def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> Widget:
-    """Show the least-squares fit of corresponding points while the last target point moves along x."""
+    """Show the least-squares fit of corresponding points while the last target point moves
+    along x."""
     exact = umeyama(source, target)
     farthest = np.vstack([target, target[-1] + [_FARTHEST, 0, 0]])  # the panel has room for it
     sets = {"target": farthest, "source after the fit": target}
@@ -84,9 +101,16 @@ def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3
         crosses.set_offsets(fitted)
         bars.set_segments(np.stack([fitted, changed[:, :2]], axis=1))
         return (
-            f"The last of {len(source)} points has moved by {distance:.1f}: the rotation changes by "
-            f"{rotation_error(fit.R, exact.R):.1f}°, the scale from {exact.scale:.2f} to {fit.scale:.2f}."
+            f"The last of {len(source)} points has moved by {distance:.1f}: the rotation "
+            "changes by "
+            f"{rotation_error(fit.R, exact.R):.1f}°, the scale from {exact.scale:.2f} to "
+            f"{fit.scale:.2f}."
         )
 
-    alt = "Target points and source points after the least-squares fit; lines connect corresponding points"
-    return interactive_figure(figure, {"distance": slider("moved by", 0.0, _FARTHEST, 0.0, 0.1)}, update, alt)
+    alt = (
+        "Target points and source points after the least-squares fit; lines connect "
+        "corresponding points"
+    )
+    return interactive_figure(
+        figure, {"distance": slider("moved by", 0.0, _FARTHEST, 0.0, 0.1)}, update, alt
+    )

@@ -1,6 +1,7 @@
 """A point cloud that the user can rotate and click, on a plain canvas without WebGL or network.
 
-The browser draws the points and sends clicks (`cloud_view.js`). Python finds the clicked point in the full cloud.
+The browser draws the points and sends clicks (`cloud_view.js`). Python finds the clicked point in
+the full cloud.
 """
 
 from collections.abc import Callable
@@ -18,7 +19,9 @@ from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, ORANGE
 
 MAX_POINTS = 6000  # points drawn; more are slow in the browser
-_DEPTH_TOLERANCE = 0.15  # points farther behind the front point under the pointer cannot be clicked; in view units
+_DEPTH_TOLERANCE = (
+    0.15  # points farther behind the front point under the pointer cannot be clicked; in view units
+)
 
 _STYLE = """
 .zsp-cloud { border: 1px solid #888; background: white; cursor: crosshair; touch-action: none; }
@@ -27,19 +30,24 @@ _STYLE = """
 
 
 def view_units(points: Real[np.ndarray, "n 3"]) -> Sim3:
-    """Return the similarity from the world to view units: the ball around a cloud becomes the unit ball.
+    """Return the similarity from the world to view units: the ball around a cloud becomes the unit
+    ball.
 
     The ball is from the 1st to the 99th percentile along each axis, robust to outliers.
     """
     low, high = np.percentile(points, [1, 99], axis=0) if len(points) else np.zeros((2, 3))
     radius = float(np.linalg.norm(high - low)) / 2
     if not radius >= 1e-12:  # not, because of NaN
-        raise InputError(f"point cloud of {len(points)} points has no extent, expected an object of finite points")
+        raise InputError(
+            f"point cloud of {len(points)} points has no extent, expected an object of finite "
+            "points"
+        )
     return Sim3(1 / radius, np.eye(3), -(low + high) / 2 / radius)
 
 
 def subsample(points: Real[np.ndarray, "n 3"], most: int = MAX_POINTS) -> Int[np.ndarray, " m"]:
-    """Return the indices of at most `most` points, neighbours after each other, as the slider goes through them."""
+    """Return the indices of at most `most` points, neighbours after each other, as the slider goes
+    through them."""
     kept = np.arange(len(points))
     if len(points) > most:
         kept = np.random.default_rng(0).choice(len(points), most, replace=False)
@@ -47,12 +55,16 @@ def subsample(points: Real[np.ndarray, "n 3"], most: int = MAX_POINTS) -> Int[np
 
 
 def point_under(
-    points: Float[np.ndarray, "n 3"], view: Real[np.ndarray, "3 3"], at: Real[np.ndarray, "2"], reach: float
+    points: Float[np.ndarray, "n 3"],
+    view: Real[np.ndarray, "3 3"],
+    at: Real[np.ndarray, "2"],
+    reach: float,
 ) -> int | None:
     """Return the index of the clicked point, or None.
 
-    It is the nearest of the points (in view units) within `reach` of the click that are not far behind the front one.
-    The rows of `view` point right, down and forward; `at` is the click (right, down) from the centre of the canvas.
+    It is the nearest of the points (in view units) within `reach` of the click that are not far
+    behind the front one. The rows of `view` point right, down and forward; `at` is the click
+    (right, down) from the centre of the canvas.
     """
     on_screen = points @ view.T
     distance = np.hypot(*(on_screen[:, :2] - at).T)
@@ -67,7 +79,8 @@ class CloudView:
     """A canvas with one point cloud; `widget` is its Jupyter widget."""
 
     def __init__(self, name: str, on_pick: Callable[[np.ndarray | None], Any]):
-        """Create an empty canvas, of class zsp-cloud-NAME; a click calls `on_pick` with the world point, or None."""
+        """Create an empty canvas, of class zsp-cloud-NAME; a click calls `on_pick` with the world
+        point, or None."""
         self.widget = _cloud_widget()()
         self.widget.add_class(f"zsp-cloud-{name}")
         self.widget.on_msg(self._clicked)
@@ -83,9 +96,11 @@ class CloudView:
         alt: str,
         overlay: Real[np.ndarray, "m 3"] | None = None,
     ) -> None:
-        """Show a cloud of coloured world points, seen along `view` (see `point_under`; None keeps the present one).
+        """Show a cloud of coloured world points, seen along `view` (see `point_under`; None keeps
+        the present one).
 
-        With an `overlay`, the points of a second cloud, the first is orange discs, the second blue crosses.
+        With an `overlay`, the points of a second cloud, the first is orange discs, the second blue
+        crosses.
         """
         self._cloud, self._to_view = np.asarray(points, dtype=np.float64), view_units(points)
         kept = subsample(points, MAX_POINTS if overlay is None else MAX_POINTS // 2)
@@ -116,7 +131,9 @@ class CloudView:
 
     def point_at(self, point: Real[np.ndarray, "3"] | None) -> None:
         """Draw a cross-hair at a world point; None removes it."""
-        self.widget.cursor = [] if point is None or self._to_view is None else self._to_view.apply(point).tolist()
+        self.widget.cursor = (
+            [] if point is None or self._to_view is None else self._to_view.apply(point).tolist()
+        )
 
     def _clicked(self, _, content: dict, buffers: list) -> None:
         if self._to_view is not None:

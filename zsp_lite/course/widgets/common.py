@@ -2,14 +2,16 @@
 
 How to write a widget:
 
-- Write one function that takes computed data (views, matrices, errors), draws a matplotlib figure once, and returns
-  `interactive_figure(...)`.
-- Its `update` callback is called when a control moves. It changes existing artists (`set_data`, `set_offsets`,
-  `set_text`), or draws a primitive of `viz.plots` anew (`redrawing`). Expensive results are computed before.
-- `update` returns a caption with the numbers that the figure shows, also for readers who cannot see it or its colours.
+- Write one function that takes computed data (views, matrices, errors), draws a matplotlib figure
+  once, and returns `interactive_figure(...)`.
+- Its `update` callback is called when a control moves. It changes existing artists (`set_data`,
+  `set_offsets`, `set_text`), or draws a primitive of `viz.plots` anew (`redrawing`). Expensive
+  results are computed before.
+- `update` returns a caption with the numbers that the figure shows, also for readers who cannot see
+  it or its colours.
 - The latency of a control should be at most 150 ms. Keep figures below about 9 by 4 inches.
-- The figure is a PNG in an image widget, which every frontend shows. Patches and points are chosen by sliders, which
-  work by keyboard.
+- The figure is a PNG in an image widget, which every frontend shows. Patches and points are chosen
+  by sliders, which work by keyboard.
 - The notebook shows a static figure as well (`show`), because widgets need a running kernel.
 - Add an example on sample data to `tools/widget_examples.py`.
 """
@@ -37,38 +39,66 @@ def load_package(name: str = "ipywidgets") -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise InputError(f"this widget needs {name}, which is not installed; pip install {name}") from error
+        raise InputError(
+            f"this widget needs {name}, which is not installed; pip install {name}"
+        ) from error
 
 
 def slider(label: str, low: float, high: float, value: float, step: float = 1) -> Widget:
-    """Return a slider from `low` to `high`, with integer values if all four numbers are integers."""
+    """Return a slider from `low` to `high`, with integer values if all four numbers are
+    integers."""
     widgets = load_package()
     integer = all(isinstance(x, int | np.integer) for x in (low, high, value, step))
     kind = widgets.IntSlider if integer else widgets.FloatSlider
     form = {} if integer else {"readout_format": f".{max(0, -int(np.floor(np.log10(step))))}f"}
-    return kind(value, min=low, max=high, step=step, description=label, style=_LABEL, layout={"width": "22em"}, **form)
+    return kind(
+        value,
+        min=low,
+        max=high,
+        step=step,
+        description=label,
+        style=_LABEL,
+        layout={"width": "22em"},
+        **form,
+    )
 
 
 def patch_sliders(grid: tuple[int, int], start: tuple[int, int], of: str = "") -> dict[str, Widget]:
-    """Return sliders over the rows and columns of a patch grid, counted from 0, that begin at a patch."""
+    """Return sliders over the rows and columns of a patch grid, counted from 0, that begin at a
+    patch."""
     names = (("row", f"row{of}"), ("col", f"column{of}"))
-    return {name: slider(label, 0, cells - 1, at) for (name, label), cells, at in zip(names, grid, start)}
+    return {
+        name: slider(label, 0, cells - 1, at)
+        for (name, label), cells, at in zip(names, grid, start)
+    }
 
 
-def interactive_figure(figure: Figure, controls: Mapping[str, Widget], update: Callable[..., str], alt: str) -> Widget:
-    """Return a widget of controls above a picture of a figure above a caption, which are its attributes.
+def interactive_figure(
+    figure: Figure, controls: Mapping[str, Widget], update: Callable[..., str], alt: str
+) -> Widget:
+    """Return a widget of controls above a picture of a figure above a caption, which are its
+    attributes.
 
-    `update` is called with the values of the `controls`, which have the names of its arguments; it changes the figure
-    and returns the caption. `alt` describes the figure for screen readers, whatever the controls are.
+    `update` is called with the values of the `controls`, which have the names of its arguments; it
+    changes the figure and returns the caption. `alt` describes the figure for screen readers,
+    whatever the controls are.
     """
     widgets = load_package()
     plt.close(figure)  # otherwise the notebook shows it a second time
     canvas = FigureCanvasAgg(figure)
-    # Not stretched in wide windows, and low enough for the controls to stay in sight on a screen of 800 pixels.
-    size = {"max_width": "100%", "max_height": "420px", "align_self": "flex-start", "object_fit": "contain"}
+    # Not stretched in wide windows, and low enough for the controls to stay in sight on a screen of
+    # 800 pixels.
+    size = {
+        "max_width": "100%",
+        "max_height": "420px",
+        "align_self": "flex-start",
+        "object_fit": "contain",
+    }
     picture = widgets.Image(format="png", layout=size)
     # Image widgets have no alternative text, and JupyterLab fails on images with a tooltip.
-    described = widgets.HTML(f'<span style="position: absolute; left: -9999px">Picture: {escape(alt)}</span>')
+    described = widgets.HTML(
+        f'<span style="position: absolute; left: -9999px">Picture: {escape(alt)}</span>'
+    )
     caption = widgets.HTML()
 
     def redraw(change=None) -> None:
@@ -79,8 +109,8 @@ def interactive_figure(figure: Figure, controls: Mapping[str, Widget], update: C
 
     for control in controls.values():
         control.observe(redraw, names="value")
-    # The layout is computed once and then fixed, so that the figure does not move between updates. That of images with
-    # colour bars is exact only after the second pass.
+    # The layout is computed once and then fixed, so that the figure does not move between updates.
+    # That of images with colour bars is exact only after the second pass.
     redraw()
     redraw()
     figure.set_layout_engine("none")
@@ -91,7 +121,8 @@ def interactive_figure(figure: Figure, controls: Mapping[str, Widget], update: C
 
 
 def redrawing(draw: Callable[..., list[Artist]]) -> Callable[..., None]:
-    """Return a function that calls `draw`, which returns artists, and removes those of the call before."""
+    """Return a function that calls `draw`, which returns artists, and removes those of the call
+    before."""
     drawn: list[Artist] = []
 
     def redraw(*values, **named) -> None:
@@ -103,7 +134,8 @@ def redrawing(draw: Callable[..., list[Artist]]) -> Callable[..., None]:
 
 
 def show(figure: Figure, alt: str) -> None:
-    """Show a static figure in a notebook, with an alternative text that is stored in the notebook."""
+    """Show a static figure in a notebook, with an alternative text that is stored in the
+    notebook."""
     from IPython.display import display
 
     plt.close(figure)

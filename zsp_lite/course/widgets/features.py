@@ -14,7 +14,14 @@ from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.best_view import mask_iou
 from zsp_lite.choices import FACETS
 from zsp_lite.course.true_matches import correct_matches
-from zsp_lite.course.widgets.common import Widget, interactive_figure, load_package, patch_sliders, redrawing, slider
+from zsp_lite.course.widgets.common import (
+    Widget,
+    interactive_figure,
+    load_package,
+    patch_sliders,
+    redrawing,
+    slider,
+)
 from zsp_lite.errors import InputError
 from zsp_lite.views import View, patch_mask
 from zsp_lite.viz import plots
@@ -22,11 +29,17 @@ from zsp_lite.viz import plots
 Image = UInt8[np.ndarray, "height width 3"]
 
 
-def all_facets(backbone: Backbone, images: Sequence[Image]) -> dict[tuple[int, str], Float[Tensor, "batch tokens dim"]]:
-    """Compute the query, key, value and output of every token (CLS first) in every layer, in one forward pass."""
+def all_facets(
+    backbone: Backbone, images: Sequence[Image]
+) -> dict[tuple[int, str], Float[Tensor, "batch tokens dim"]]:
+    """Compute the query, key, value and output of every token (CLS first) in every layer, in one
+    forward pass."""
     model = backbone.model
     if not isinstance(model, VisionTransformer):
-        raise InputError(f"{backbone.name}: not in DINO's layout, expected zsp-tiny, a DINO model or a checkpoint file")
+        raise InputError(
+            f"{backbone.name}: not in DINO's layout, expected zsp-tiny, a DINO model or a "
+            "checkpoint file"
+        )
     batch = normalize(prepare_images(images, backbone.image_size), backbone.mean, backbone.std)
     found = {}
     with torch.no_grad():
@@ -45,7 +58,8 @@ def attention(
     grid: tuple[int, int],
     heads: int,
 ) -> Widget:
-    """Show the attention weights of one patch; queries and keys are of all tokens, CLS first, heads concatenated."""
+    """Show the attention weights of one patch; queries and keys are of all tokens, CLS first, heads
+    concatenated."""
     layers, _, dim = queries.shape
     figure, axes = plots.show_images([image, image], ["query patch", "attention weights"], size=3.2)
     outline = redrawing(plots.outline_patch)
@@ -63,14 +77,17 @@ def attention(
         weights.set_data(patches / patches.max())
         outline(axes[0], (row, col), grid, label="query", linewidth=2, path_effects=plots.BORDER)
         return (
-            f"Patch ({row}, {col}), layer {layer}, head {head}: the largest weight is {patches.max():.1%} on patch "
-            f"({top[0]}, {top[1]}); uniform attention would give {1 / len(found):.1%}. CLS has {found[0]:.1%}."
+            f"Patch ({row}, {col}), layer {layer}, head {head}: the largest weight is "
+            f"{patches.max():.1%} on patch "
+            f"({top[0]}, {top[1]}); uniform attention would give {1 / len(found):.1%}. CLS "
+            f"has {found[0]:.1%}."
         )
 
     controls = {
         **patch_sliders(grid, (grid[0] // 2, grid[1] // 2)),
-        "layer": slider("layer", 0, layers - 1, layers * 3 // 4), "head": slider("head", 0, heads - 1, 0),
-    }  # fmt: skip
+        "layer": slider("layer", 0, layers - 1, layers * 3 // 4),
+        "head": slider("head", 0, heads - 1, 0),
+    }
     alt = "An image with one patch outlined, and the attention weights of that patch."
     return interactive_figure(figure, controls, update, alt)
 
@@ -83,20 +100,27 @@ def patch_similarities(
     valid: Bool[np.ndarray, "h w"],
     start: str | None = None,
 ) -> Widget:
-    """Show how similar one patch is to all patches of the target, its nearest neighbour and its true match.
+    """Show how similar one patch is to all patches of the target, its nearest neighbour and its
+    true match.
 
-    `sims` has the matrix of each kind of similarity, `start` is the kind shown first. `cells` and `valid` are the true
-    matches of the reference patches, from `ground_truth_matches`.
+    `sims` has the matrix of each kind of similarity, `start` is the kind shown first. `cells` and
+    `valid` are the true matches of the reference patches, from `ground_truth_matches`.
     """
     grid = valid.shape
-    figure, axes = plots.show_images([reference, target], ["reference", "similarity to the patch u"], size=3.2)
+    figure, axes = plots.show_images(
+        [reference, target], ["reference", "similarity to the patch u"], size=3.2
+    )
     figure.set_figheight(4)  # space for the colour bar
     axes[0].set_anchor("N")
-    shown = plots.overlay_map(axes[1], np.zeros(grid), limits=(0, 1), label="cosine; star: true match")
+    shown = plots.overlay_map(
+        axes[1], np.zeros(grid), limits=(0, 1), label="cosine; star: true match"
+    )
 
     @redrawing
     def mark(cell: tuple[int, int], nearest: tuple[int, int]) -> list[Artist]:
-        drawn = plots.outline_patch(axes[0], cell, grid, label="u", linewidth=2, path_effects=plots.BORDER)
+        drawn = plots.outline_patch(
+            axes[0], cell, grid, label="u", linewidth=2, path_effects=plots.BORDER
+        )
         drawn += plots.circle_patch(axes[1], nearest, grid)
         return drawn + (plots.circle_patch(axes[1], cells[cell], grid, "*") if valid[cell] else [])
 
@@ -116,20 +140,28 @@ def patch_similarities(
             distance = np.abs(np.subtract(nearest, cells[row, col])).max()
             true = f"true match ({true_row}, {true_col}), distance {distance} patches"
         return (
-            f"{kind}: nearest neighbour {nearest}, cosine {similar[nearest]:.2f}; {true}. Of the {valid.sum()} patches "
-            f"with a true match, {share_correct(kind):.0%} have their nearest neighbour within one patch of it."
+            f"{kind}: nearest neighbour {nearest}, cosine {similar[nearest]:.2f}; {true}. Of "
+            f"the {valid.sum()} patches "
+            f"with a true match, {share_correct(kind):.0%} have their nearest neighbour "
+            "within one patch of it."
         )
 
     known = np.argwhere(valid)
     middle = tuple(known[np.abs(known - np.median(known, axis=0)).sum(axis=1).argmin()].tolist())
-    kinds = load_package().Dropdown(options=list(sims), value=start or next(iter(sims)), description="similarity")
+    kinds = load_package().Dropdown(
+        options=list(sims), value=start or next(iter(sims)), description="similarity"
+    )
     controls = {**patch_sliders(grid, middle), "kind": kinds}
-    alt = "A patch of the reference; its similarities, nearest neighbour and true match in the target."
+    alt = (
+        "A patch of the reference; its similarities, nearest neighbour and true match in the "
+        "target."
+    )
     return interactive_figure(figure, controls, update, alt)
 
 
 def saliency(view: View) -> Widget:
-    """Show the foreground patches above a saliency threshold, and their overlap with the object mask."""
+    """Show the foreground patches above a saliency threshold, and their overlap with the object
+    mask."""
     grid, values = view.features.grid, view.features.saliency.numpy()
     truth = patch_mask(view.frame, grid)
     thresholds = np.linspace(0, 1, 101)
@@ -151,7 +183,8 @@ def saliency(view: View) -> Widget:
         line.set_xdata([threshold, threshold])
         wrong, missed = on & ~truth.numpy(), truth.numpy() & ~on
         return (
-            f"Above {threshold:.2f}: {on.sum()} of {on.size} patches are foreground. {wrong.sum()} of them are not on "
+            f"Above {threshold:.2f}: {on.sum()} of {on.size} patches are foreground. "
+            f"{wrong.sum()} of them are not on "
             f"the object; {missed.sum()} of the {int(truth.sum())} object patches are missing. "
             f"IoU {mask_iou(torch.from_numpy(on), truth):.2f}."
         )

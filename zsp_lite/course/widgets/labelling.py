@@ -1,7 +1,7 @@
 """Widget for labelling poses: keypoints by clicks on point clouds, residuals, overlay, accept.
 
-The widget only displays and forwards. `zsp_lite.course.labelling.Labelling` holds the keypoints and writes every change
-at once, so that the work continues after a restart.
+The widget only displays and forwards. `zsp_lite.course.labelling.Labelling` holds the keypoints and
+writes every change at once, so that the work continues after a restart.
 """
 
 import html
@@ -12,7 +12,15 @@ import numpy as np
 import pandas as pd
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.course.labelling.session import ACCEPTED, MIN_KEYPOINTS, OPEN, SKIPPED, Alignment, Labelling, Progress
+from zsp_lite.course.labelling.session import (
+    ACCEPTED,
+    MIN_KEYPOINTS,
+    OPEN,
+    SKIPPED,
+    Alignment,
+    Labelling,
+    Progress,
+)
 from zsp_lite.course.widgets.cloud_view import CloudView, subsample
 from zsp_lite.course.widgets.common import Widget, load_package
 from zsp_lite.data.labels import read_labels
@@ -20,7 +28,10 @@ from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, ORANGE
 
 _STATE_SYMBOLS = {ACCEPTED: "✓", OPEN: "○", SKIPPED: "–"}
-_PROPOSED = "A proposal is laid over the cloud: accept it if both clouds agree; otherwise click keypoints, or skip."
+_PROPOSED = (
+    "A proposal is laid over the cloud: accept it if both clouds agree; otherwise click "
+    "keypoints, or skip."
+)
 _TOOLTIPS = {
     "undo": "Remove the last keypoint of this sequence",
     "redo": "Remove all keypoints of this sequence",
@@ -30,7 +41,8 @@ _TOOLTIPS = {
     "pick": "Pick the point under the cross-hair",
 }
 _HELP = (
-    "Click: pick. Drag: rotate. Shift and drag: pan. Wheel: zoom, after a click on the cloud. Keyboard: arrows and + − "
+    "Click: pick. Drag: rotate. Shift and drag: pan. Wheel: zoom, after a click on the "
+    "cloud. Keyboard: arrows and + − "
     "on a cloud; the slider chooses a point, the button picks it."
 )
 _STYLE = """<style>
@@ -46,21 +58,27 @@ _STYLE = """<style>
 
 
 def label_poses(labelling: Labelling) -> Widget:
-    """Label a category: the point cloud of the reference on the left, that of the current sequence on the right."""
+    """Label a category: the point cloud of the reference on the left, that of the current sequence
+    on the right."""
     return _LabellingWidget(labelling).box
 
 
 class _LabellingWidget:
-    """The parts of the widget, the action of each button, which returns the message to show, and the display."""
+    """The parts of the widget, the action of each button, which returns the message to show, and
+    the display."""
 
     def __init__(self, labelling: Labelling):
         self.labelling = labelling
         self.shown: dict[str, object] = {}
-        self.asked: tuple[str, bytes] | None = None  # the label in doubt that accept was pressed for
+        self.asked: tuple[str, bytes] | None = (
+            None  # the label in doubt that accept was pressed for
+        )
         self.refreshing = False
         self.box = self._build()
         started = any(row.picks for row in labelling.progress())
-        self.controls["sequence"].value = self._next_open(labelling.reference) if started else labelling.reference
+        self.controls["sequence"].value = (
+            self._next_open(labelling.reference) if started else labelling.reference
+        )
         self._do(lambda: "The earlier keypoints are loaded." if started else "")
 
     def _build(self) -> Widget:
@@ -70,17 +88,28 @@ class _LabellingWidget:
         options = [(f"{reference} (reference)", reference), *((name, name) for name in others)]
         self.controls = controls = {
             "sequence": widgets.Dropdown(options=options, description="sequence", style=style),
-            "name": widgets.Text(description="name", placeholder="for example: left arm", continuous_update=False,
-                                 style=style, layout={"width": "16em"}),
-            "overlay": widgets.ToggleButton(description="overlay", tooltip="Show both clouds, aligned, in two colours",
-                                            layout=narrow),
+            "name": widgets.Text(
+                description="name",
+                placeholder="for example: left arm",
+                continuous_update=False,
+                style=style,
+                layout={"width": "16em"},
+            ),
+            "overlay": widgets.ToggleButton(
+                description="overlay",
+                tooltip="Show both clouds, aligned, in two colours",
+                layout=narrow,
+            ),
             "point": widgets.IntSlider(description="point", style=style, layout={"width": "32em"}),
-        }  # fmt: skip
+        }
         self.buttons = buttons = {
             name: widgets.Button(description=name, tooltip=tooltip, layout=narrow)
             for name, tooltip in _TOOLTIPS.items()
         }
-        self.views = {name: CloudView(name, partial(self._clicked, name)) for name in ("reference", "sequence")}
+        self.views = {
+            name: CloudView(name, partial(self._clicked, name))
+            for name in ("reference", "sequence")
+        }
         self.captions = {name: widgets.HTML() for name in self.views}
         self.tables = {name: widgets.HTML() for name in ("progress", "keypoints")}
         self.message = widgets.HTML()
@@ -95,7 +124,10 @@ class _LabellingWidget:
             widgets.VBox([self.captions[name], view.widget], layout={"margin": "0 8px 0 0"})
             for name, view in self.views.items()
         ]
-        edit, finish = ([buttons[name] for name in names] for names in (("undo", "redo"), ("accept", "skip", "next")))
+        edit, finish = (
+            [buttons[name] for name in names]
+            for names in (("undo", "redo"), ("accept", "skip", "next"))
+        )
         wrap = {"flex_flow": "row wrap"}
         centred = wrap | {"align_items": "center"}
         rows = [
@@ -139,7 +171,10 @@ class _LabellingWidget:
         asked = sequence, self.labelling.picks(sequence).tobytes()
         if doubt and self.asked != asked:
             self.asked = asked
-            raise InputError(f"{doubt}. Correct the keypoints, or press accept again to write the label nevertheless")
+            raise InputError(
+                f"{doubt}. Correct the keypoints, or press accept again to write the label "
+                "nevertheless"
+            )
         path = self.labelling.accept(sequence, confirmed=True)
         return f"Written: {'/'.join(path.parts[-3:])}. {self.next()}"
 
@@ -166,9 +201,14 @@ class _LabellingWidget:
         labelling, picks = self.labelling, self.labelling.picks(sequence)
         same = np.flatnonzero((picks == point).all(axis=1))
         if len(same):
-            raise InputError(f"keypoint {same[0] + 1}, {labelling.names[same[0]]}, is at this point already")
+            raise InputError(
+                f"keypoint {same[0] + 1}, {labelling.names[same[0]]}, is at this point already"
+            )
         if sequence != labelling.reference and len(labelling.names) < MIN_KEYPOINTS:
-            raise InputError(f"the reference has {len(labelling.names)} keypoints, expected {MIN_KEYPOINTS} first")
+            raise InputError(
+                f"the reference has {len(labelling.names)} keypoints, expected "
+                f"{MIN_KEYPOINTS} first"
+            )
         labelling.pick(sequence, point, self.controls["name"].value.strip())
         self.controls["name"].value = ""
         if sequence != labelling.reference and len(picks) + 1 == len(labelling.names):
@@ -177,7 +217,11 @@ class _LabellingWidget:
         return f"Keypoint {len(picks) + 1}, {labelling.names[len(picks)]}, picked on {sequence}."
 
     def _clicked(self, view: str, point: np.ndarray | None) -> None:
-        self._do(lambda: self._add(self.labelling.reference if view == "reference" else self.current, point))
+        self._do(
+            lambda: self._add(
+                self.labelling.reference if view == "reference" else self.current, point
+            )
+        )
 
     def _changed(self, change) -> None:
         if self.refreshing:
@@ -198,9 +242,15 @@ class _LabellingWidget:
                     problem = str(error)
         finally:
             self.refreshing = False
-        kind, shown = ("problem", f"Not done: {problem}") if problem else ("info", text or self._instruction())
+        kind, shown = (
+            ("problem", f"Not done: {problem}")
+            if problem
+            else ("info", text or self._instruction())
+        )
         # Announced by screen readers.
-        self.message.value = f'<p class="{kind}" role="status" aria-live="polite">{html.escape(shown)}</p>'
+        self.message.value = (
+            f'<p class="{kind}" role="status" aria-live="polite">{html.escape(shown)}</p>'
+        )
 
     def _next_open(self, sequence: str) -> str:
         """Return the next open sequence after this one, cyclically; itself if none is open."""
@@ -211,7 +261,10 @@ class _LabellingWidget:
 
     def _proposed(self, sequence: str) -> bool:
         """Whether a proposal for a sequence waits for confirmation."""
-        return not len(self.labelling.picks(sequence)) and self.labelling.proposal(sequence) is not None
+        return (
+            not len(self.labelling.picks(sequence))
+            and self.labelling.proposal(sequence) is not None
+        )
 
     def _instruction(self) -> str:
         """Return what the user can do next."""
@@ -219,8 +272,15 @@ class _LabellingWidget:
         picked = len(labelling.picks(self.current))
         if self.on_reference:
             missing = MIN_KEYPOINTS - len(names)
-            more = f"at least {missing} more" if missing > 0 else "enough; add more, or go on with next"
-            return f"Click a point of the reference that all objects of the category have: {len(names)} so far, {more}."
+            more = (
+                f"at least {missing} more"
+                if missing > 0
+                else "enough; add more, or go on with next"
+            )
+            return (
+                "Click a point of the reference that all objects of the category have: "
+                f"{len(names)} so far, {more}."
+            )
         if self._proposed(self.current):
             return _PROPOSED
         if picked < len(names):
@@ -228,7 +288,10 @@ class _LabellingWidget:
         if (alignment := labelling.alignment(self.current)) is None:
             return f"Pick at least {MIN_KEYPOINTS} keypoints on the reference first."
         rms = 100 * alignment.rms
-        return f"All {picked} keypoints are picked, residual {rms:.1f} %. Accept if both clouds agree, otherwise redo."
+        return (
+            f"All {picked} keypoints are picked, residual {rms:.1f} %. Accept if both clouds "
+            "agree, otherwise redo."
+        )
 
     def _refresh(self) -> None:
         labelling, controls = self.labelling, self.controls
@@ -244,7 +307,9 @@ class _LabellingWidget:
         self.buttons["skip"].disabled = self.on_reference
         self.tables["progress"].value = _progress_table(rows, self.current)
         self.tables["keypoints"].value = _keypoint_table(labelling.names, row.picks, alignment)
-        self.captions["reference"].value = f"{_dot(BLUE)} reference {html.escape(labelling.reference)}"
+        self.captions[
+            "reference"
+        ].value = f"{_dot(BLUE)} reference {html.escape(labelling.reference)}"
         self._show_cloud("reference", labelling.reference, None)
         if self.on_reference:
             self.shown.pop("sequence", None)
@@ -261,7 +326,8 @@ class _LabellingWidget:
             raise InputError(row.problem)
 
     def _aligned_reference(self, alignment: Alignment | None) -> np.ndarray | None:
-        """Return the reference cloud in the world of the sequence, by its keypoints, its label, or a proposal."""
+        """Return the reference cloud in the world of the sequence, by its keypoints, its label, or
+        a proposal."""
         if self.on_reference or alignment is None and len(self.labelling.picks(self.current)):
             return None
         label = read_labels(self.labelling.root, self.labelling.category).get(self.current)
@@ -271,7 +337,9 @@ class _LabellingWidget:
             sim3 = Sim3(1.0, label.trans[:3, :3], label.trans[:3, 3])
         else:
             sim3 = self.labelling.proposal(self.current)
-        return None if sim3 is None else sim3.apply(self.labelling.cloud(self.labelling.reference)[0])
+        return (
+            None if sim3 is None else sim3.apply(self.labelling.cloud(self.labelling.reference)[0])
+        )
 
     def _show_cloud(self, name: str, sequence: str, overlay: np.ndarray | None) -> None:
         """Show a cloud, unless it is on the canvas already, and the keypoints."""
@@ -280,7 +348,8 @@ class _LabellingWidget:
         if before != key:
             points, colours = self.labelling.cloud(sequence)
             alt = (
-                f"Point cloud of {sequence}. The slider named point chooses a point by keyboard, the arrow keys rotate."
+                f"Point cloud of {sequence}. The slider named point chooses a point by keyboard, "
+                "the arrow keys rotate."
             )
             view = self.labelling.first_view(sequence) if before[0] != sequence else None
             try:
@@ -300,7 +369,9 @@ class _LabellingWidget:
 
     def _move_cursor(self, only_if_shown: bool = False) -> None:
         """Move the cross-hair to the point of the slider."""
-        current, other = ("reference", "sequence") if self.on_reference else ("sequence", "reference")
+        current, other = (
+            ("reference", "sequence") if self.on_reference else ("sequence", "reference")
+        )
         self.views[other].point_at(None)
         if not only_if_shown or self.views[current].widget.cursor:
             self.views[current].point_at(self._slider_point())
@@ -309,18 +380,35 @@ class _LabellingWidget:
 def _progress_table(rows: Sequence[Progress], current: str) -> str:
     cells = []
     for row in rows:
-        residual = "see above" if row.problem else "" if row.rms is None else f"{100 * row.rms:.1f} %"
+        residual = (
+            "see above" if row.problem else "" if row.rms is None else f"{100 * row.rms:.1f} %"
+        )
         marker = "▸" if row.sequence == current else ""
-        cells.append((marker, row.sequence, f"{_STATE_SYMBOLS.get(row.state, '●')} {row.state}", row.picks, residual))
+        cells.append(
+            (
+                marker,
+                row.sequence,
+                f"{_STATE_SYMBOLS.get(row.state, '●')} {row.state}",
+                row.picks,
+                residual,
+            )
+        )
     return _table(("", "sequence", "state", "keypoints", "residual"), cells)
 
 
 def _keypoint_table(names: Sequence[str], picked: int, alignment: Alignment | None) -> str:
-    """Return the table of keypoints, of which the first `picked` are picked on the current sequence."""
-    residuals = [""] * len(names) if alignment is None else [f"{100 * x:.1f} %" for x in alignment.residuals]
+    """Return the table of keypoints, of which the first `picked` are picked on the current
+    sequence."""
+    residuals = (
+        [""] * len(names)
+        if alignment is None
+        else [f"{100 * x:.1f} %" for x in alignment.residuals]
+    )
     if alignment is not None:
         residuals[int(alignment.residuals.argmax())] += " ← largest"
-    states = ["✓" if index < picked else "next" if index == picked else "" for index in range(len(names))]
+    states = [
+        "✓" if index < picked else "next" if index == picked else "" for index in range(len(names))
+    ]
     cells = [*zip(range(1, len(names) + 1), names, states, residuals)]
     return _table(("", "keypoint", "picked", "residual"), cells or [("", "none yet", "", "")])
 

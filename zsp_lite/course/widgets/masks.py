@@ -11,12 +11,17 @@ from zsp_lite.viz.plots import ORANGE, show_images
 
 
 def box_to_mask(frame: Frame, box: Box) -> Widget:
-    """Show the mask that GrabCut segments in a box (top, left, height, width), and its overlap with the frame's."""
+    """Show the mask that GrabCut segments in a box (top, left, height, width), and its overlap with
+    the frame's."""
     height, width = frame.camera.size
     top, left, box_height, box_width = box
     figure, (axis,) = show_images([frame.rgb], ["box and mask"], size=4.2)
-    shade = axis.imshow(np.zeros((height, width, 4)), extent=(0, width, height, 0), interpolation="nearest")
-    outline = axis.add_patch(Rectangle((0, 0), 1, 1, fill=False, edgecolor=ORANGE, linewidth=2, linestyle="--"))
+    shade = axis.imshow(
+        np.zeros((height, width, 4)), extent=(0, width, height, 0), interpolation="nearest"
+    )
+    outline = axis.add_patch(
+        Rectangle((0, 0), 1, 1, fill=False, edgecolor=ORANGE, linewidth=2, linestyle="--")
+    )
 
     def update(top: int, left: int, bottom: int, right: int) -> str:
         outline.set(xy=(left, top), width=right - left, height=bottom - top)

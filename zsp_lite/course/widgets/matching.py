@@ -11,7 +11,8 @@ from zsp_lite.viz import plots
 
 
 def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
-    """Show the cycle of a reference patch u, from its nearest neighbour v in the target back to u' (eq. 2)."""
+    """Show the cycle of a reference patch u, from its nearest neighbour v in the target back to u'
+    (eq. 2)."""
     grid = reference.features.grid
     forth, back = (x.numpy() for x in nearest_neighbours(sim))
     values = sim.numpy()
@@ -33,11 +34,17 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
             if not view.foreground[cell]
         )
         return (
-            f"u {cells[0]} → v {cells[1]}, cosine {values[u, v]:.2f} → u' {cells[2]}, cosine {values[w, v]:.2f}: "
+            f"u {cells[0]} → v {cells[1]}, cosine {values[u, v]:.2f} → u' {cells[2]}, cosine "
+            f"{values[w, v]:.2f}: "
             f"d(u, u') = {np.hypot(*np.subtract(cells[0], cells[2])):.1f} patches"
             + (f"; {off} not on the foreground, so the distance is infinite." if off else ".")
         )
 
-    start = divmod(int(np.where(reference.foreground, values.max(1).reshape(grid), -2).argmax()), grid[1])
-    alt = "A solid arrow from the patch u to its nearest neighbour v, a dashed arrow from v to the patch u'."
+    start = divmod(
+        int(np.where(reference.foreground, values.max(1).reshape(grid), -2).argmax()), grid[1]
+    )
+    alt = (
+        "A solid arrow from the patch u to its nearest neighbour v, a dashed arrow from v to the "
+        "patch u'."
+    )
     return interactive_figure(figure, patch_sliders(grid, start, " of u"), update, alt)

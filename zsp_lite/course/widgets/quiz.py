@@ -1,7 +1,9 @@
-"""Self-checks: questions with instant feedback in a notebook, from the files `questions/NN.json`, by jupyterquiz.
+"""Self-checks: questions with instant feedback in a notebook, from the files `questions/NN.json`,
+by jupyterquiz.
 
-A file has the questions of one notebook: a list of self-checks, each a list of questions in jupyterquiz's format (the
-types "multiple_choice", "many_choice" and "numeric"). Texts are HTML: `<i>K</i>`, `<sub>`, `&lt;`; LaTeX is not shown.
+A file has the questions of one notebook: a list of self-checks, each a list of questions in
+jupyterquiz's format (the types "multiple_choice", "many_choice" and "numeric"). Texts are HTML:
+`<i>K</i>`, `<sub>`, `&lt;`; LaTeX is not shown.
 """
 
 import json
@@ -35,17 +37,26 @@ def read_questions(notebook: str) -> list[list[dict]]:
 
 
 def self_check(notebook: str, number: int) -> None:
-    """Show a self-check of a notebook ("00") below the cell, the first by 1; answers get feedback without a kernel."""
+    """Show a self-check of a notebook ("00") below the cell, the first by 1; answers get feedback
+    without a kernel."""
     checks = read_questions(notebook)
     check_integer("number", number, 1, len(checks))
     jupyterquiz = load_package("jupyterquiz")
     ipython = load_package("IPython")
     if ipython.get_ipython() is None:
-        raise InputError("self_check was called outside IPython, expected a notebook, which can show the questions")
+        raise InputError(
+            "self_check was called outside IPython, expected a notebook, which can show the "
+            "questions"
+        )
     with ipython.utils.capture.capture_output() as captured:
         jupyterquiz.display_quiz(checks[number - 1], colors=_COLOURS)
-    form, script = (output.data for output in captured.outputs)  # the form is a <div> that jupyterquiz leaves open
-    ipython.display.display(ipython.display.HTML(form["text/html"] + f"<style>{_STYLE}</style></div>"))
-    # Where a page has MathJax, jupyterquiz would replace it by one from the network: hide it from the script.
+    form, script = (
+        output.data for output in captured.outputs
+    )  # the form is a <div> that jupyterquiz leaves open
+    ipython.display.display(
+        ipython.display.HTML(form["text/html"] + f"<style>{_STYLE}</style></div>")
+    )
+    # Where a page has MathJax, jupyterquiz would replace it by one from the network: hide it from
+    # the script.
     hidden = f"{{ let MathJax;\n{script['application/javascript']}\n}}"
     ipython.display.display(ipython.display.Javascript(hidden))

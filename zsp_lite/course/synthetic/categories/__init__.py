@@ -1,16 +1,49 @@
-"""The categories that methods are evaluated on: the names of the paper's twenty, each built of primitives.
+"""The categories that methods are evaluated on: the names of the paper's twenty, each built of
+primitives.
 
 No backbone is trained on them, and no setting is chosen by them.
 """
 
 from zsp_lite.course.synthetic.assembly import Builder
-from zsp_lite.course.synthetic.categories.belongings import backpack, book, handbag, keyboard, laptop, mouse, remote
+from zsp_lite.course.synthetic.categories.belongings import (
+    backpack,
+    book,
+    handbag,
+    keyboard,
+    laptop,
+    mouse,
+    remote,
+)
 from zsp_lite.course.synthetic.categories.household import chair, hairdryer, toaster, toilet
 from zsp_lite.course.synthetic.categories.street import bicycle, car, hydrant, motorcycle
-from zsp_lite.course.synthetic.categories.toys import teddybear, toybus, toyplane, toytrain, toytruck
+from zsp_lite.course.synthetic.categories.toys import (
+    teddybear,
+    toybus,
+    toyplane,
+    toytrain,
+    toytruck,
+)
 
 _BUILDERS = (
-    backpack, bicycle, book, car, chair, hairdryer, handbag, hydrant, keyboard, laptop, motorcycle, mouse, remote,
-    teddybear, toaster, toilet, toybus, toyplane, toytrain, toytruck,
-)  # fmt: skip
+    backpack,
+    bicycle,
+    book,
+    car,
+    chair,
+    hairdryer,
+    handbag,
+    hydrant,
+    keyboard,
+    laptop,
+    motorcycle,
+    mouse,
+    remote,
+    teddybear,
+    toaster,
+    toilet,
+    toybus,
+    toyplane,
+    toytrain,
+    toytruck,
+)
 CATEGORIES: dict[str, Builder] = {build.__name__: build for build in _BUILDERS}

@@ -5,26 +5,59 @@ from collections.abc import Callable
 import numpy as np
 
 from zsp_lite.course.synthetic.assembly import Assembly, Y, rounded_box, tapered
-from zsp_lite.course.synthetic.primitives import TAU, Mesh, box, capsule, cylinder, ellipsoid, extrusion, lathe, torus
+from zsp_lite.course.synthetic.primitives import (
+    TAU,
+    Mesh,
+    box,
+    capsule,
+    cylinder,
+    ellipsoid,
+    extrusion,
+    lathe,
+    torus,
+)
 
 
 def backpack(a: Assembly) -> None:
-    """Build a backpack, with or without a flap: pockets at the front, shoulder straps behind, handle on top."""
+    """Build a backpack, with or without a flap: pockets at the front, shoulder straps behind,
+    handle on top."""
     depth, width, height = a.u(0.42, 0.62), a.u(0.7, 1.0), a.u(1.1, 1.5)
     front, back, narrowing = depth / 2, -depth / 2, a.u(0.7, 1.0)
     body = rounded_box((depth, width, height), (0, 0, height / 2), a.u(3.5, 6))
     a.add(tapered(body, height / 2, height, narrowing), 0)
     pocket_depth, pocket_height = depth * a.u(0.45, 0.7), height * a.u(0.35, 0.5)
     pocket_z = height * a.u(0.06, 0.12) + pocket_height / 2
-    a.add(rounded_box((pocket_depth, width * a.u(0.65, 0.85), pocket_height), (front, 0, pocket_z), 4), 1)
+    a.add(
+        rounded_box(
+            (pocket_depth, width * a.u(0.65, 0.85), pocket_height), (front, 0, pocket_z), 4
+        ),
+        1,
+    )
     if a.chance(0.4):
-        flap = rounded_box((depth * 1.15, width * 1.02, height * 0.3), (depth * 0.08, 0, height * 0.92), 4)
+        flap = rounded_box(
+            (depth * 1.15, width * 1.02, height * 0.3), (depth * 0.08, 0, height * 0.92), 4
+        )
         a.add(tapered(flap, height / 2, height, narrowing), 2)
-        a.add(box((0.04, 0.1, height * 0.38), (depth * 0.6, width * 0.2, height * 0.66)), 3, mirror=True)
+        a.add(
+            box((0.04, 0.1, height * 0.38), (depth * 0.6, width * 0.2, height * 0.66)),
+            3,
+            mirror=True,
+        )
     else:
         upper_pocket = (depth * 0.4, width * 0.6, height * a.u(0.18, 0.26))
         a.add(rounded_box(upper_pocket, (depth * 0.38, 0, height * 0.74), 4), 2)
-    a.add(torus(a.u(0.08, 0.13), 0.03, (1, 0, 0), (back * 0.6, 0, height), TAU / 4, TAU * 3 / 4, sides=12), 3)
+    a.add(
+        torus(
+            a.u(0.08, 0.13),
+            0.03,
+            (1, 0, 0),
+            (back * 0.6, 0, height),
+            TAU / 4,
+            TAU * 3 / 4,
+            sides=12,
+        ),
+        3,
+    )
     strap_y, bulge = width * a.u(0.22, 0.3), a.u(0.12, 0.22)
     bend = (back - bulge, strap_y, height * 0.7)
     a.add(capsule((back + 0.02, strap_y * 0.8, height * 0.93), bend, 0.05), 4, mirror=True)
@@ -35,17 +68,25 @@ def backpack(a: Assembly) -> None:
 
 
 def handbag(a: Assembly) -> None:
-    """Build a tote, flap bag or bowling bag: one or two handles, clasp and pocket at the front, tag on one side."""
+    """Build a tote, flap bag or bowling bag: one or two handles, clasp and pocket at the front, tag
+    on one side."""
     depth, width, height = a.u(0.3, 0.5), a.u(1.0, 1.5), a.u(0.7, 1.1)
     style = ("tote", "flap bag", "bowling bag")[a.choice(3)]
     narrowing = a.u(1.0, 1.2) if style == "tote" else a.u(0.65, 0.95)
-    body = rounded_box((depth, width, height), (0, 0, height / 2), 8 if style == "tote" else a.u(3, 5))
+    body = rounded_box(
+        (depth, width, height), (0, 0, height / 2), 8 if style == "tote" else a.u(3, 5)
+    )
     a.add(tapered(body, 0, height, narrowing), 0)
     front, top_width = depth / 2, width * narrowing
     if style == "flap bag":
         drop = height * a.u(0.45, 0.65)
         a.add(rounded_box((0.06, top_width, drop), (front + 0.02, 0, height - drop / 2), 6), 1)
-        a.add(cylinder(0.07, 0.07, 0.06).rotated("y", TAU / 4).translated((front + 0.07, 0, height - drop + 0.08)), 3)
+        a.add(
+            cylinder(0.07, 0.07, 0.06)
+            .rotated("y", TAU / 4)
+            .translated((front + 0.07, 0, height - drop + 0.08)),
+            3,
+        )
     else:
         pocket_width, pocket_height = width * a.u(0.45, 0.7), height * a.u(0.35, 0.5)
         a.add(rounded_box((0.1, pocket_width, pocket_height), (front, 0, height * 0.35), 4), 1)
@@ -58,7 +99,8 @@ def handbag(a: Assembly) -> None:
 
 
 def book(a: Assembly) -> None:
-    """Build a book: closed or slightly open, spine on the left; title and picture or band on the cover."""
+    """Build a book: closed or slightly open, spine on the left; title and picture or band on the
+    cover."""
     # The top of the page points backwards (-x); the reader is at the front.
     height, width, thick, board = a.u(1.3, 1.7), a.u(0.9, 1.25), a.u(0.12, 0.4), a.u(0.025, 0.05)
     spine = width / 2
@@ -66,7 +108,9 @@ def book(a: Assembly) -> None:
     a.add(box((height, width, board)), 0)
     if a.chance(0.5):
         angle = np.linspace(0, np.pi, 9)
-        arc = np.stack([spine + 0.1 * np.sin(angle), thick / 2 + (thick + board) / 2 * np.cos(angle)], 1)
+        arc = np.stack(
+            [spine + 0.1 * np.sin(angle), thick / 2 + (thick + board) / 2 * np.cos(angle)], 1
+        )
         a.add(extrusion(arc, height, "yz"), 2)
     else:
         a.add(box((height, board, thick + board), (0, spine, thick / 2)), 2)
@@ -74,12 +118,17 @@ def book(a: Assembly) -> None:
 
     def add_to_cover(mesh: Mesh, material: int) -> None:
         # The cover rotates about the upper edge of the spine.
-        a.add(mesh.translated((0, -spine, 0)).rotated("x", -lift).translated((0, spine, thick)), material)
+        a.add(
+            mesh.translated((0, -spine, 0)).rotated("x", -lift).translated((0, spine, thick)),
+            material,
+        )
 
     add_to_cover(box((height, width, board)), 0)
     title_x = -height * a.u(0.2, 0.32)
     for line in range(1 + a.choice(3)):
-        add_to_cover(box((0.08, width * a.u(0.35, 0.7), 0.02), (title_x + 0.13 * line, 0, board / 2)), 3)
+        add_to_cover(
+            box((0.08, width * a.u(0.35, 0.7), 0.02), (title_x + 0.13 * line, 0, board / 2)), 3
+        )
     if a.chance(0.6):
         picture = (height * a.u(0.25, 0.4), width * a.u(0.5, 0.8), 0.015)
         add_to_cover(box(picture, (height * 0.15, 0, board / 2)), 4)
@@ -88,16 +137,33 @@ def book(a: Assembly) -> None:
 
 
 def laptop(a: Assembly) -> None:
-    """Build a laptop: keys and touchpad on the base, towards the user at the front; opened by 80 to 130 degrees."""
+    """Build a laptop: keys and touchpad on the base, towards the user at the front; opened by 80 to
+    130 degrees."""
     depth, width, thick = a.u(0.8, 1.1), a.u(1.2, 1.6), a.u(0.05, 0.1)
     a.add(rounded_box((depth, width, thick), (0, 0, thick / 2), 12), 0)
     n_rows, n_keys = 4 + a.choice(2), 10 + a.choice(4)
     field, front = depth * a.u(0.4, 0.5), depth * a.u(0.08, 0.14)  # of the keys
     a.add(box((field * 1.06, width * 0.88, 0.01), (front - field / 2, 0, thick)), 5)
-    _add_keys(a.add, n_rows, n_keys, (front, width * 0.425), (field / n_rows, width * 0.85 / n_keys), thick)
-    a.add(box((depth * 0.24, width * a.u(0.22, 0.36), 0.015), (depth * 0.31, a.u(-0.08, 0.04), thick)), 2)
+    _add_keys(
+        a.add,
+        n_rows,
+        n_keys,
+        (front, width * 0.425),
+        (field / n_rows, width * 0.85 / n_keys),
+        thick,
+    )
+    a.add(
+        box(
+            (depth * 0.24, width * a.u(0.22, 0.36), 0.015), (depth * 0.31, a.u(-0.08, 0.04), thick)
+        ),
+        2,
+    )
     hinge = (-depth / 2 + 0.03, 0, thick + 0.02)
-    opening, lid, rim = a.u(np.radians(80), np.radians(130)), depth * a.u(0.9, 1.02), a.u(0.04, 0.09)
+    opening, lid, rim = (
+        a.u(np.radians(80), np.radians(130)),
+        depth * a.u(0.9, 1.02),
+        a.u(0.04, 0.09),
+    )
 
     def add_to_lid(mesh: Mesh, material: int) -> None:
         # The part is given for the closed lid: the screen faces down, the hinge is at x = 0.
@@ -108,24 +174,33 @@ def laptop(a: Assembly) -> None:
     add_to_lid(cylinder(a.u(0.06, 0.12), 0.06, 0.02, 16).translated((lid / 2, 0, thick * 0.6)), 6)
 
 
-def _add_keys(add: Callable[[Mesh, int], None], n_rows: int, n_keys: int, corner, cell, z: float) -> None:
-    """Add rows of keys at height z: a grid of cells (depth, width) with its front left corner at (x, y)."""
+def _add_keys(
+    add: Callable[[Mesh, int], None], n_rows: int, n_keys: int, corner, cell, z: float
+) -> None:
+    """Add rows of keys at height z: a grid of cells (depth, width) with its front left corner at
+    (x, y)."""
     for row in range(n_rows):
         for key in range(n_keys):
             if row > 0 or not 3 <= key < n_keys - 4:
                 place = (corner[0] - (row + 0.5) * cell[0], corner[1] - (key + 0.5) * cell[1], z)
-                add(box((cell[0] * 0.78, cell[1] * 0.8, 0.1), place), 2 if key in (0, n_keys - 1) else 1)
+                add(
+                    box((cell[0] * 0.78, cell[1] * 0.8, 0.1), place),
+                    2 if key in (0, n_keys - 1) else 1,
+                )
     bar = (n_keys - 7) * cell[1]  # the space bar replaces all but seven keys of the front row
     place = (corner[0] - cell[0] / 2, corner[1] - 3 * cell[1] - bar / 2, z)
     add(box((cell[0] * 0.78, bar * 0.97, 0.1), place), 3)
 
 
 def mouse(a: Assembly) -> None:
-    """Build a computer mouse: buttons and wheel at the front, optional cable, thumb rest on the left."""
+    """Build a computer mouse: buttons and wheel at the front, optional cable, thumb rest on the
+    left."""
     length, width, height = a.u(1.1, 1.5), a.u(0.65, 0.9), a.u(0.32, 0.55)
     shell = rounded_box((length, width, 2 * height), squareness=a.u(2.2, 3.5))
     vertices = shell.vertices.copy()
-    vertices[:, 2] = np.maximum(vertices[:, 2], 0) * (1 - a.u(0.1, 0.4) * (vertices[:, 0] / length + 0.1))
+    vertices[:, 2] = np.maximum(vertices[:, 2], 0) * (
+        1 - a.u(0.1, 0.4) * (vertices[:, 0] / length + 0.1)
+    )
     a.add(Mesh(vertices, shell.faces), 0)
     a.add(shell.scaled((1.03, 1.03, 0.06)), 3)
     # A button is the front quarter of the shell, slightly raised.
@@ -135,37 +210,66 @@ def mouse(a: Assembly) -> None:
     a.add(Mesh(button, shell.faces), 1, mirror=True)
     a.add(torus(0.09, 0.045, Y, (length * a.u(0.25, 0.33), 0, height * 0.78), sides=16), 2)
     if a.chance(0.5):
-        a.add(rounded_box((length * 0.5, 0.12, height * 0.3), (0.05, width * 0.46, height * 0.55), 4), 4)
+        a.add(
+            rounded_box((length * 0.5, 0.12, height * 0.3), (0.05, width * 0.46, height * 0.55), 4),
+            4,
+        )
     if a.chance(0.6):
         cable_end = (length / 2 + a.u(0.2, 0.5), a.u(-0.3, 0.3), 0.05)
         a.add(capsule((length * 0.46, 0, height * 0.25), cable_end, 0.04, 0.03), 5)
 
 
 def keyboard(a: Assembly) -> None:
-    """Build a keyboard: rows of keys, space bar towards the user, optional number pad on the right, optional cable."""
+    """Build a keyboard: rows of keys, space bar towards the user, optional number pad on the right,
+    optional cable."""
     depth, width, thick, tilt = a.u(0.55, 0.8), a.u(1.6, 2.2), a.u(0.08, 0.16), a.u(0.03, 0.16)
     has_pad = a.chance(0.6)
 
     def add_tilted(mesh: Mesh, material: int) -> None:
-        a.add(mesh.rotated("y", tilt).translated((0, 0, thick / 2 + depth / 2 * np.sin(tilt))), material)
+        a.add(
+            mesh.rotated("y", tilt).translated((0, 0, thick / 2 + depth / 2 * np.sin(tilt))),
+            material,
+        )
 
     add_tilted(rounded_box((depth, width, thick), squareness=a.u(8, 14)), 0)
     n_rows, n_keys = 5 + a.choice(2), 11 + a.choice(4)
     field, row_depth = width * (0.68 if has_pad else 0.92), depth * 0.86 / n_rows
-    _add_keys(add_tilted, n_rows, n_keys, (depth * 0.43, width * 0.46), (row_depth, field / n_keys), thick / 2)
+    _add_keys(
+        add_tilted,
+        n_rows,
+        n_keys,
+        (depth * 0.43, width * 0.46),
+        (row_depth, field / n_keys),
+        thick / 2,
+    )
     for row in range(n_rows - 1 if has_pad else 0):
         for key in range(4):
-            place = (depth * 0.43 - (row + 0.5) * row_depth, -width * (0.275 + 0.05 * key), thick / 2)
+            place = (
+                depth * 0.43 - (row + 0.5) * row_depth,
+                -width * (0.275 + 0.05 * key),
+                thick / 2,
+            )
             add_tilted(box((row_depth * 0.78, width * 0.04, 0.1), place), 2 if key == 3 else 1)
     if a.chance(0.4):
-        add_tilted(rounded_box((a.u(0.2, 0.35), width * 0.94, thick * 0.7), (depth / 2 + 0.12, 0, -0.01)), 4)
+        add_tilted(
+            rounded_box((a.u(0.2, 0.35), width * 0.94, thick * 0.7), (depth / 2 + 0.12, 0, -0.01)),
+            4,
+        )
     if a.chance(0.6):
         y = a.u(-0.3, 0.3) * width
-        a.add(capsule((-depth * 0.47, y, thick), (-depth / 2 - a.u(0.1, 0.25), y + a.u(-0.1, 0.1), 0.05), 0.03), 6)
+        a.add(
+            capsule(
+                (-depth * 0.47, y, thick),
+                (-depth / 2 - a.u(0.1, 0.25), y + a.u(-0.1, 0.1), 0.05),
+                0.03,
+            ),
+            6,
+        )
 
 
 def remote(a: Assembly) -> None:
-    """Build a remote control: power key and emitter at the front, ring in the middle, number keys behind."""
+    """Build a remote control: power key and emitter at the front, ring in the middle, number keys
+    behind."""
     length, width, thick = a.u(1.4, 2.0), a.u(0.38, 0.58), a.u(0.14, 0.26)
     body = rounded_box((thick, width, length), (0, 0, length / 2), a.u(4, 9))
     waist, top = a.u(0.8, 1.0), thick + 0.005

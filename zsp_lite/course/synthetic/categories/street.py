@@ -2,13 +2,36 @@
 
 import numpy as np
 
-from zsp_lite.course.synthetic.assembly import Assembly, Y, add_wheels, disc, pane, rounded_box, tapered
-from zsp_lite.course.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod, torus
+from zsp_lite.course.synthetic.assembly import (
+    Assembly,
+    Y,
+    add_wheels,
+    disc,
+    pane,
+    rounded_box,
+    tapered,
+)
+from zsp_lite.course.synthetic.primitives import (
+    TAU,
+    box,
+    capsule,
+    cylinder,
+    ellipsoid,
+    extrusion,
+    lathe,
+    rod,
+    torus,
+)
 
 
 def bicycle(a: Assembly) -> None:
     """Build a bicycle: diamond or step-through frame; flat, swept or drop bars; optional basket."""
-    wheel, tyre, tube, half_base = a.u(0.36, 0.52), a.u(0.022, 0.05), a.u(0.028, 0.048), a.u(0.5, 0.66)
+    wheel, tyre, tube, half_base = (
+        a.u(0.36, 0.52),
+        a.u(0.022, 0.05),
+        a.u(0.028, 0.048),
+        a.u(0.5, 0.66),
+    )
     front, rear = np.array([half_base, 0, wheel]), np.array([-half_base, 0, wheel])
     for hub in (front, rear):
         a.add(torus(wheel - tyre, tyre, Y, hub, sides=32), 3)
@@ -22,7 +45,11 @@ def bicycle(a: Assembly) -> None:
     crank = np.array([a.u(-0.12, 0.04), 0, wheel * a.u(0.6, 0.9)])
     top_tube_end = crank + (saddle - crank) * (0.35 if a.chance(0.35) else 0.85)
     a.add(rod(head, front + [0, 0.07, 0], tube * 0.8), 2, mirror=True)
-    for start, end in ((head - [0, 0, 0.14], crank), (saddle, crank), (head - [0, 0, 0.06], top_tube_end)):
+    for start, end in (
+        (head - [0, 0, 0.14], crank),
+        (saddle, crank),
+        (head - [0, 0, 0.06], top_tube_end),
+    ):
         a.add(rod(start, end, tube), 0)
     for end in (crank, saddle - [0, 0, 0.12]):
         a.add(rod(rear + [0, 0.05, 0], end, tube * 0.6), 0, mirror=True)
@@ -40,13 +67,16 @@ def bicycle(a: Assembly) -> None:
         pedal = crank + side * np.array([0.13, 0.13, -0.13])
         a.add(rod(crank + [0, side * 0.09, 0], pedal, 0.02), 2)
         a.add(box((0.1, 0.1, 0.025), pedal + [0, side * 0.05, 0]), 3)
-    a.add(disc(0.12, 0.02, crank - [0, 0.06, 0]), 2)  # the chain ring of a bicycle is on its right side
+    a.add(
+        disc(0.12, 0.02, crank - [0, 0.06, 0]), 2
+    )  # the chain ring of a bicycle is on its right side
     if a.chance(0.35):
         a.add(box((0.28, 0.34, 0.22), head + [0.2, 0, 0.05]), 5)  # the basket
 
 
 def motorcycle(a: Assembly) -> None:
-    """Build a cruiser, a sport motorcycle with a fairing, or a scooter with a leg shield; exhaust on the right."""
+    """Build a cruiser, a sport motorcycle with a fairing, or a scooter with a leg shield; exhaust
+    on the right."""
     style = ("cruiser", "sport", "scooter")[a.choice(3)]
     wheel, tyre = a.u(0.26, 0.32) if style == "scooter" else a.u(0.36, 0.46), a.u(0.07, 0.11)
     half_base = a.u(0.6, 0.72) + (0.1 if style == "cruiser" else 0)
@@ -58,7 +88,11 @@ def motorcycle(a: Assembly) -> None:
     head = front + [-a.u(0.2, 0.28) - (0.15 if style == "cruiser" else 0), 0, a.u(0.55, 0.72)]
     a.add(rod(head, front + [0, 0.11, 0], 0.04), 2, mirror=True)
     a.add(ellipsoid((0.1, 0.12, 0.12), head + [0.12, 0, a.u(-0.06, 0.04)]), 4)
-    grip = head + [-a.u(0.12, 0.25), a.u(0.3, 0.42), a.u(0.2, 0.4) if style == "cruiser" else a.u(0.02, 0.2)]
+    grip = head + [
+        -a.u(0.12, 0.25),
+        a.u(0.3, 0.42),
+        a.u(0.2, 0.4) if style == "cruiser" else a.u(0.02, 0.2),
+    ]
     a.add(rod(head, grip + [0.1, -0.06, 0], 0.026), 2, mirror=True)
     a.add(capsule(grip + [0.1, -0.06, 0], grip, 0.035), 3, mirror=True)
 
@@ -69,7 +103,9 @@ def motorcycle(a: Assembly) -> None:
         a.add(box((half_base * 1.1, 0.36, 0.08), (0, 0, floor)), 0)
         body = (half_base * 1.15, 0.42, seat_z - floor + 0.1)
         a.add(rounded_box(body, (-half_base * 0.75, 0, (seat_z + floor) / 2), 4), 0)
-        a.add(rounded_box((half_base * 1.05, 0.36, 0.14), (-half_base * 0.65, 0, seat_z + 0.08), 3), 6)
+        a.add(
+            rounded_box((half_base * 1.05, 0.36, 0.14), (-half_base * 0.65, 0, seat_z + 0.08), 3), 6
+        )
         a.add(box((0.06, 0.2, 0.09), (-half_base * 1.35, 0, seat_z * 0.85)), 5)
     else:
         engine = np.array([a.u(-0.08, 0.08), 0, wheel * a.u(0.85, 1.1)])
@@ -85,7 +121,9 @@ def motorcycle(a: Assembly) -> None:
         if style == "sport":
             upper = [[head[0] + 0.3, head[2] - 0.1], [head[0] - 0.05, head[2] + 0.12]]
             lower = [[0.05, wheel * 1.6], [0.0, wheel * 0.6], [0.35, wheel * 0.9]]
-            a.add(tapered(extrusion(upper + lower, a.u(0.34, 0.44)), wheel, head[2] + 0.12, 0.55), 0)
+            a.add(
+                tapered(extrusion(upper + lower, a.u(0.34, 0.44)), wheel, head[2] + 0.12, 0.55), 0
+            )
             a.add(pane(head[[0, 2]] + [0.12, 0.08], head[[0, 2]] + [-0.08, 0.3], 0.24), 5)
     exhaust_end = (-half_base * a.u(0.9, 1.3), -0.22, wheel * a.u(0.7, 1.3))
     a.add(rod((0.05, -0.2, wheel * 0.6), exhaust_end, 0.05, a.u(0.06, 0.09)), 7)
@@ -101,7 +139,12 @@ def car(a: Assembly) -> None:
     bonnet_end = nose - length * (a.u(0.11, 0.18) if style == "van" else a.u(0.24, 0.31))
     boot_start = tail + length * {"saloon": 0.18, "pickup": 0.43}.get(style, 0.02)
     nose_z = belt - (belt - sill) * a.u(0.15, 0.35)
-    front = [[nose, sill], [nose + 0.03, (sill + nose_z) / 2], [nose - 0.04, nose_z], [bonnet_end, belt]]
+    front = [
+        [nose, sill],
+        [nose + 0.03, (sill + nose_z) / 2],
+        [nose - 0.04, nose_z],
+        [bonnet_end, belt],
+    ]
     a.add(tapered(extrusion([[tail, sill], *front, [tail, belt]], width), sill, belt, 0.94), 0)
 
     rear_slope = a.u(0.02, 0.08) if style in ("pickup", "van") else a.u(0.1, 0.3)
@@ -114,14 +157,28 @@ def car(a: Assembly) -> None:
         a.add(tapered(pane(low, high, width * 0.8, 0.03), belt, roof, taper), 4)
     # The side windows have the outline of the cabin, reduced in size, and a pillar in the middle.
     middle = cabin.mean(0)
-    a.add(tapered(extrusion(middle + (cabin - middle) * [0.86, 0.7], width * 0.94), belt, roof, taper), 4)
-    a.add(tapered(pane((middle[0], belt), (middle[0], roof), width * 0.95, 0.06), belt, roof, taper), 0)
+    a.add(
+        tapered(
+            extrusion(middle + (cabin - middle) * [0.86, 0.7], width * 0.94), belt, roof, taper
+        ),
+        4,
+    )
+    a.add(
+        tapered(pane((middle[0], belt), (middle[0], roof), width * 0.95, 0.06), belt, roof, taper),
+        0,
+    )
     if style == "pickup":
         wall, bed = a.u(0.08, 0.18), boot_start - tail
-        a.add(box((bed, 0.06, wall), (tail + bed / 2, width * 0.44, belt + wall / 2)), 0, mirror=True)
+        a.add(
+            box((bed, 0.06, wall), (tail + bed / 2, width * 0.44, belt + wall / 2)), 0, mirror=True
+        )
         a.add(box((0.06, width * 0.9, wall), (tail + 0.03, 0, belt + wall / 2)), 0)
     light_z = sill + (nose_z - sill) * 0.72
-    a.add(ellipsoid((0.06, a.u(0.09, 0.15), a.u(0.05, 0.08)), (nose, width * 0.34, light_z)), 5, mirror=True)
+    a.add(
+        ellipsoid((0.06, a.u(0.09, 0.15), a.u(0.05, 0.08)), (nose, width * 0.34, light_z)),
+        5,
+        mirror=True,
+    )
     a.add(box((0.05, width * a.u(0.25, 0.4), a.u(0.07, 0.12)), (nose + 0.01, 0, light_z)), 6)
     a.add(box((0.04, 0.1, a.u(0.1, 0.2)), (tail - 0.01, width * 0.4, belt - 0.16)), 7, mirror=True)
     for x in (nose + 0.02, tail - 0.02):
@@ -131,13 +188,22 @@ def car(a: Assembly) -> None:
 
 
 def hydrant(a: Assembly) -> None:
-    """Build a hydrant: barrel, flange and bonnet; large outlet at the front, small outlets at the sides; chain."""
+    """Build a hydrant: barrel, flange and bonnet; large outlet at the front, small outlets at the
+    sides; chain."""
     radius, height = a.u(0.24, 0.36), a.u(0.9, 1.35)
     neck, rim, cap = radius * a.u(0.85, 1), radius * 1.22, height * 0.82
     foot = [[0.001, 0], [radius * 1.45, 0], [radius * 1.45, 0.09], [radius, 0.11]]
-    a.add(lathe([*foot, [neck, height * 0.75], [rim, height * 0.76], [rim, cap], [neck, cap + 0.01]], 24), 0)
+    a.add(
+        lathe(
+            [*foot, [neck, height * 0.75], [rim, height * 0.76], [rim, cap], [neck, cap + 0.01]], 24
+        ),
+        0,
+    )
     t = np.linspace(0, np.pi / 2, 7)
-    dome, cone = np.stack([np.cos(t), 0.25 * np.sin(t)], 1), [[1.05, 0], [0.9, 0.14], [0.35, 0.2], [0, 0.22]]
+    dome, cone = (
+        np.stack([np.cos(t), 0.25 * np.sin(t)], 1),
+        [[1.05, 0], [0.9, 0.14], [0.35, 0.2], [0, 0.22]],
+    )
     bonnet = np.array(dome if a.chance(0.5) else cone) * [radius, height]
     a.add(lathe(bonnet + [0, cap], 24), 1 if a.chance(0.6) else 0)
     top = cap + bonnet[-1, 1]
@@ -151,6 +217,11 @@ def hydrant(a: Assembly) -> None:
         a.add(rod((reach, 0, z), (reach + 0.1, 0, z), pipe * 1.2, sides=8).rotated("z", turn), 1)
         a.add(rod((reach, 0, z), (reach + 0.18, 0, z), 0.05, sides=5).rotated("z", turn), 2)
     for angle in np.arange(8) * TAU / 8 + 0.2:
-        a.add(cylinder(0.035, 0.035, 0.05, 6).translated((radius * 1.27, 0, 0.11)).rotated("z", angle), 2)
+        a.add(
+            cylinder(0.035, 0.035, 0.05, 6)
+            .translated((radius * 1.27, 0, 0.11))
+            .rotated("z", angle),
+            2,
+        )
     if a.chance(0.6):
         a.add(torus(a.u(0.1, 0.16), 0.018, Y, (radius + 0.12, 0.03, outlet - bore - 0.08)), 3)

@@ -3,11 +3,21 @@
 import numpy as np
 
 from zsp_lite.course.synthetic.assembly import Assembly, add_wheels, disc, pane, rounded_box
-from zsp_lite.course.synthetic.primitives import TAU, box, capsule, cylinder, ellipsoid, extrusion, lathe, rod
+from zsp_lite.course.synthetic.primitives import (
+    TAU,
+    box,
+    capsule,
+    cylinder,
+    ellipsoid,
+    extrusion,
+    lathe,
+    rod,
+)
 
 
 def teddybear(a: Assembly) -> None:
-    """Build a sitting or standing teddy bear: round or long muzzle, arms raised or hanging, optional shirt."""
+    """Build a sitting or standing teddy bear: round or long muzzle, arms raised or hanging,
+    optional shirt."""
     belly, tall, skull = a.u(0.36, 0.55), a.u(0.48, 0.68), a.u(0.32, 0.46)
     standing = a.chance(0.3)
     floor = a.u(0.35, 0.5) if standing else 0.0
@@ -33,24 +43,37 @@ def teddybear(a: Assembly) -> None:
     else:
         foot = np.array([a.u(0.45, 0.75), belly * a.u(0.7, 1.1), leg])
         a.add(capsule((0.1, belly * 0.55, 0.15), foot, leg), 0, mirror=True)
-        a.add(ellipsoid((0.07, leg * 0.85, leg * 1.15), foot + [leg * 0.85, 0, 0.05]), 1, mirror=True)
+        a.add(
+            ellipsoid((0.07, leg * 0.85, leg * 1.15), foot + [leg * 0.85, 0, 0.05]), 1, mirror=True
+        )
     a.add(ellipsoid((0.1, 0.1, 0.1), (-belly * 0.85, 0, floor + 0.25)), 0)  # the tail
     if a.chance(0.6):  # a light belly
-        a.add(ellipsoid((belly * 0.3, belly * 0.65, tall * 0.65), (belly * 0.62, 0, floor + tall * 0.95)), 1)
+        a.add(
+            ellipsoid(
+                (belly * 0.3, belly * 0.65, tall * 0.65), (belly * 0.62, 0, floor + tall * 0.95)
+            ),
+            1,
+        )
     elif a.chance(0.6):
         shirt = np.array([[0.97, 0.75], [1.04, 1.0], [0.96, 1.4], [0.66, 1.78]]) * [belly, tall]
         a.add(lathe(shirt, 24).scaled((0.87, 1, 1)).translated((0, 0, floor)), 4)
 
 
 def toyplane(a: Assembly) -> None:
-    """Build a propeller plane or jet: low, middle, high or double wing, straight or swept; optional wheels."""
+    """Build a propeller plane or jet: low, middle, high or double wing, straight or swept; optional
+    wheels."""
     length, radius = a.u(1.6, 2.6), a.u(0.16, 0.32)
     nose, tail, jet = length / 2, -length / 2, a.chance(0.4)
     a.add(capsule((tail, 0, 0), (nose - radius, 0, 0), radius * a.u(0.35, 0.7), radius), 0)
     span, chord, wing_x = a.u(0.8, 1.5), a.u(0.3, 0.6), a.u(-0.1, 0.3)
     sweep = a.u(0.25, 0.6) if jet else a.u(-0.05, 0.2)
     lead, trail = wing_x + chord / 2, wing_x - chord / 2
-    wing = [[lead, 0], [lead - sweep, span], [trail - sweep + chord * a.u(0.1, 0.4), span], [trail, 0]]
+    wing = [
+        [lead, 0],
+        [lead - sweep, span],
+        [trail - sweep + chord * a.u(0.1, 0.4), span],
+        [trail, 0],
+    ]
     biplane = not jet and a.chance(0.35)
     wing_z = -radius * 0.7 if biplane else a.u(-0.12, 0.1) if a.chance(0.7) else radius
     a.add(extrusion(wing, 0.06, "xy", wing_z), 1, mirror=True)
@@ -61,7 +84,12 @@ def toyplane(a: Assembly) -> None:
             place = np.array([x - sweep * 0.6, span * 0.65, 0])
             a.add(rod(place + [0, 0, wing_z], place + [0, 0, upper], 0.02), 3, mirror=True)
     fin, stabiliser = a.u(0.3, 0.6), a.u(0.3, 0.55)
-    a.add(extrusion([[tail + 0.35, 0], [tail + 0.05, fin], [tail - 0.12, fin], [tail - 0.02, 0]], 0.06), 2)
+    a.add(
+        extrusion(
+            [[tail + 0.35, 0], [tail + 0.05, fin], [tail - 0.12, fin], [tail - 0.02, 0]], 0.06
+        ),
+        2,
+    )
     outline = [[tail + 0.3, 0], [tail + 0.1, stabiliser], [tail - 0.1, stabiliser], [tail, 0]]
     a.add(extrusion(outline, 0.05, "xy", 0.05 if a.chance(0.75) else fin * 0.92), 1, mirror=True)
     if jet:
@@ -74,7 +102,13 @@ def toyplane(a: Assembly) -> None:
         for k in range(n_blades):
             upright = box((0.035, 0.1, blade), (nose + 0.08, 0, blade / 2))
             a.add(upright.rotated("x", turn + k * TAU / n_blades), 5)
-    a.add(ellipsoid((a.u(0.2, 0.35), radius * 0.7, radius * 0.7), (length * a.u(0.16, 0.28), 0, radius * 0.75)), 4)
+    a.add(
+        ellipsoid(
+            (a.u(0.2, 0.35), radius * 0.7, radius * 0.7),
+            (length * a.u(0.16, 0.28), 0, radius * 0.75),
+        ),
+        4,
+    )
     if a.chance(0.6):
         gear = np.array([wing_x + 0.1, 0.25, -radius - 0.22])
         a.add(rod(gear * [1, 0.6, 0], gear, 0.025), 3, mirror=True)
@@ -82,7 +116,8 @@ def toyplane(a: Assembly) -> None:
 
 
 def toytruck(a: Assembly) -> None:
-    """Build a truck: cab over engine or with a bonnet; box, flat bed, tank, tipper or crane behind."""
+    """Build a truck: cab over engine or with a bonnet; box, flat bed, tank, tipper or crane
+    behind."""
     length, width, wheel = a.u(1.7, 2.6), a.u(0.7, 1.0), a.u(0.16, 0.28)
     nose, tail, deck = length / 2, -length / 2, wheel * 1.3
     cab_length, cab_height, slope = a.u(0.4, 0.65), a.u(0.5, 0.85), a.u(0.04, 0.18)
@@ -93,12 +128,19 @@ def toytruck(a: Assembly) -> None:
         a.add(rounded_box(size, (nose - bonnet * 0.5, 0, deck + cab_height * 0.26), 6), 0)
     front, roof = nose - bonnet * 0.85, deck + cab_height
     rear = front - cab_length
-    bend, top = (front, deck + cab_height * 0.5), (front - slope, roof)  # lower and upper edge of the windscreen
+    bend, top = (
+        (front, deck + cab_height * 0.5),
+        (front - slope, roof),
+    )  # lower and upper edge of the windscreen
     a.add(extrusion([(rear, deck + 0.04), (front, deck + 0.04), bend, top, (rear, roof)], width), 0)
     side_window = (cab_length * 0.5, width * 1.02, cab_height * 0.3)
     a.add(box(side_window, (rear + cab_length * 0.48, 0, deck + cab_height * 0.72)), 4)
     a.add(pane(np.add(bend, [0.01, 0.04]), np.add(top, [0.01, -0.04]), width * 0.84), 4)
-    a.add(ellipsoid((0.05, 0.08, 0.08), (nose, width * 0.34, deck + cab_height * 0.28)), 5, mirror=True)
+    a.add(
+        ellipsoid((0.05, 0.08, 0.08), (nose, width * 0.34, deck + cab_height * 0.28)),
+        5,
+        mirror=True,
+    )
     a.add(box((0.06, width * 0.4, cab_height * 0.2), (nose + 0.01, 0, deck + cab_height * 0.27)), 6)
 
     load = rear - 0.05 - tail  # the length behind the cab
@@ -119,7 +161,10 @@ def toytruck(a: Assembly) -> None:
     else:
         # A tipper is a flat bed that is tilted about its rear edge.
         tilt, wall = a.u(0.15, 0.6) if style == "tipper" else 0.0, a.u(0.2, 0.45)
-        bottom, front_wall = box((load, width, 0.06), (load / 2, 0, 0)), box((0.06, width, wall), (load, 0, wall / 2))
+        bottom, front_wall = (
+            box((load, width, 0.06), (load / 2, 0, 0)),
+            box((0.06, width, wall), (load, 0, wall / 2)),
+        )
         side_wall = box((load, 0.06, wall), (load / 2, width / 2, wall / 2))
         for mesh in (bottom, front_wall, side_wall, side_wall.mirrored()):
             a.add(mesh.rotated("y", -tilt).translated((tail, 0, deck + 0.1)), 1)
@@ -140,11 +185,18 @@ def toybus(a: Assembly) -> None:
         size = (bonnet * 1.4, width * 0.8, height * 0.5)
         a.add(rounded_box(size, (nose - bonnet * 0.6, 0, floor + height * 0.25), 6), 0)
     else:
-        a.add(box((0.05, width * 0.7, height * 0.1), (nose, 0, floor + height * 0.93)), 6)  # the destination sign
+        a.add(
+            box((0.05, width * 0.7, height * 0.1), (nose, 0, floor + height * 0.93)), 6
+        )  # the destination sign
     front = nose - bonnet
     body, middle = front - tail, (front + tail) / 2
     a.add(rounded_box((body, width, height), (middle, 0, floor + height / 2), a.u(7, 14)), 0)
-    a.add(box((body * 0.96, width * 1.02, height * a.u(0.04, 0.1)), (middle, 0, floor + height * 0.3)), 1)
+    a.add(
+        box(
+            (body * 0.96, width * 1.02, height * a.u(0.04, 0.1)), (middle, 0, floor + height * 0.3)
+        ),
+        1,
+    )
     n_windows, window_height = 4 + a.choice(4), height * (0.2 if n_floors == 2 else 0.3)
     pitch = body * 0.9 / n_windows
     for share in (0.36, 0.78) if n_floors == 2 else (0.66,):
@@ -155,7 +207,10 @@ def toybus(a: Assembly) -> None:
         a.add(box((0.04, width * 0.84, window_height * 1.2), (front, 0, z)), 4)
         a.add(box((0.04, width * 0.6, window_height * 0.8), (tail, 0, z)), 4)
     door = height * (0.42 if n_floors == 2 else 0.72)
-    a.add(box((pitch * 0.9, 0.04, door), (front - body * 0.12, -width / 2, floor + 0.06 + door / 2)), 6)
+    a.add(
+        box((pitch * 0.9, 0.04, door), (front - body * 0.12, -width / 2, floor + 0.06 + door / 2)),
+        6,
+    )
     a.add(ellipsoid((0.05, 0.07, 0.07), (nose, width * 0.33, floor + 0.14)), 5, mirror=True)
     a.add(box((0.03, 0.09, 0.14), (tail, width * 0.4, floor + 0.2)), 7, mirror=True)
     for x in (nose - length * a.u(0.18, 0.24), tail + length * a.u(0.17, 0.24)):
@@ -170,8 +225,18 @@ def toytrain(a: Assembly) -> None:
     cab_length, cab_height = length * a.u(0.22, 0.34), a.u(0.65, 0.95)
     cab_x, floor = tail + cab_length / 2 + 0.04, deck + 0.06
     a.add(box((cab_length, width, cab_height), (cab_x, 0, floor + cab_height / 2)), 0)
-    a.add(box((cab_length * 0.5, width * 1.03, cab_height * 0.3), (cab_x, 0, deck + cab_height * 0.72)), 4)
-    a.add(ellipsoid((cab_length * 0.68, width * 0.6, a.u(0.08, 0.18)), (cab_x, 0, floor + cab_height)), 1)
+    a.add(
+        box(
+            (cab_length * 0.5, width * 1.03, cab_height * 0.3), (cab_x, 0, deck + cab_height * 0.72)
+        ),
+        4,
+    )
+    a.add(
+        ellipsoid(
+            (cab_length * 0.68, width * 0.6, a.u(0.08, 0.18)), (cab_x, 0, floor + cab_height)
+        ),
+        1,
+    )
     rear, front = tail + cab_length, nose - 0.06  # of the hood
     if a.chance(0.7):
         radius = width * a.u(0.34, 0.46)
@@ -187,12 +252,25 @@ def toytrain(a: Assembly) -> None:
     else:
         hood_width, hood_height = width * a.u(0.7, 0.95), cab_height * a.u(0.55, 0.8)
         middle = (rear + front) / 2
-        a.add(rounded_box((front - rear, hood_width, hood_height), (middle, 0, floor + hood_height / 2), 9), 0)
-        a.add(ellipsoid((0.05, 0.07, 0.07), (front, width * 0.22, deck + hood_height * 0.8)), 5, mirror=True)
+        a.add(
+            rounded_box(
+                (front - rear, hood_width, hood_height), (middle, 0, floor + hood_height / 2), 9
+            ),
+            0,
+        )
+        a.add(
+            ellipsoid((0.05, 0.07, 0.07), (front, width * 0.22, deck + hood_height * 0.8)),
+            5,
+            mirror=True,
+        )
         a.add(box((0.25, width * 0.3, 0.14), (middle, 0, deck + 0.1 + hood_height)), 3)  # exhaust
     cowcatcher = [[nose, deck + 0.05], [nose + a.u(0.12, 0.25), 0.05], [nose, 0.05]]
     a.add(extrusion(cowcatcher, width * 0.75), 7)
     axles = np.linspace(tail + wheel * 1.3, nose - wheel * 1.6, 2 + a.choice(3))
     for x in axles:
         add_wheels(a, x, width / 2 - 0.03, wheel, 0.08)
-    a.add(box((axles[-1] - axles[0], 0.03, 0.05), (axles.mean(), width / 2 + 0.06, wheel)), 7, mirror=True)
+    a.add(
+        box((axles[-1] - axles[0], 0.03, 0.05), (axles.mean(), width / 2 + 0.06, wheel)),
+        7,
+        mirror=True,
+    )
