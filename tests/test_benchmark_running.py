@@ -168,31 +168,41 @@ def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tabl
     assert seen[-1] == len(pairs_in(tmp_path)) == len(set(pairs_in(tmp_path))) == 12
 
 
+ONE_WORKER_WAITS = """
+import os, time
+from pathlib import Path
+
+def row(problem):
+    try:
+        Path("first").touch(exist_ok=False)
+        os.environ["IS_FIRST"] = "yes"
+    except FileExistsError:
+        while "IS_FIRST" not in os.environ and not Path("go").exists():
+            time.sleep(0.02)
+    return problem.reference.camera.R
+"""
+
+
 @needs_signals
-def test_an_interrupt_ends_a_run_and_its_workers_with_one_line_and_the_run_can_be_continued(
-    tmp_path,
-):
-    words = [
-        "benchmark",
-        "--data",
-        str(small_folder()),
-        "--pairs",
-        "12",
-        "--methods",
-        "ours",
-        "--out",
-        str(tmp_path),
-    ]
+def test_an_interrupt_ends_a_run_and_its_workers_with_one_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "waiting_rows.py").write_text(ONE_WORKER_WAITS)
+    words = ["benchmark", "--data", str(small_folder()), "--pairs", "12", "--out", "run"]
+    words += ["--methods", "waits=waiting_rows:row"]
     command = [sys.executable, "-m", "zsp_lite", *words, "--workers", "2"]
     with subprocess.Popen(
         command, env=PATHS, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
-        while not (tmp_path / LINES).exists() or not pairs_in(tmp_path):
+        while not (tmp_path / "run" / LINES).exists() or not pairs_in(tmp_path / "run"):
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGINT)
-        assert process.communicate()[1] == "zsp-lite: interrupted\n" and process.returncode == 130
-    stored = pairs_in(tmp_path)
-    assert 0 < len(stored) < 24 and main(words) == 0 and pairs_in(tmp_path)[: len(stored)] == stored
+        assert process.communicate()[1] == "zsp-lite: interrupted\n"
+    assert process.returncode == 130
+    stored = pairs_in(tmp_path / "run")
+    assert 0 < len(stored) < 24
+    (tmp_path / "go").touch()
+    assert main(words) == 0, "an interrupted run can be continued"
+    assert pairs_in(tmp_path / "run")[: len(stored)] == stored
 
 
 def test_modules_of_the_current_folder_travel_to_workers_and_what_they_lack_is_one_line(

@@ -2,19 +2,34 @@
 
     python -m tools.size
 
-`tests/size_limits.csv` names the rooms, the pattern of their files and the limits; a test holds
-them. Lines are all lines of files of code; words are those of Markdown files and of the text cells
-of notebooks.
+`tests/size_limits.csv` names the rooms, the patterns of their files and the limits; a test holds
+them. Code is counted in tokens without comments and docstrings, so that neither an explanation nor
+a line break costs anything; text in words of Markdown files and of the text cells of notebooks.
 """
 
+import ast
 import csv
+import io
+import itertools
 import json
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from pygments.lexers import get_lexer_for_filename
+from pygments.token import Comment, Text
+
 ROOT = Path(__file__).parents[1]
 LIMITS = ROOT / "tests" / "size_limits.csv"
+_LAYOUT = {
+    tokenize.COMMENT,
+    tokenize.NL,
+    tokenize.NEWLINE,
+    tokenize.INDENT,
+    tokenize.DEDENT,
+    tokenize.ENDMARKER,
+}
 
 
 class Room(NamedTuple):
@@ -31,22 +46,46 @@ def rooms() -> Iterator[Room]:
     with LIMITS.open(newline="") as table:
         for row in csv.DictReader(table):
             files = {file for pattern in row["files"].split() for file in ROOT.glob(pattern)}
-            count = _words if row["unit"] == "words" else _lines
+            count = _words if row["unit"] == "words" else _tokens
             yield Room(row["room"], row["unit"], sum(map(count, files)), int(row["limit"]))
 
 
-def _lines(file: Path) -> int:
-    return file.read_text(encoding="utf-8").count("\n")
+def _tokens(file: Path) -> int:
+    text = file.read_text(encoding="utf-8")
+    return python_tokens(text) if file.suffix == ".py" else other_tokens(text, file.name)
+
+
+def python_tokens(text: str) -> int:
+    """Count the tokens of a Python program that are neither comments, docstrings nor layout."""
+    documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+    nodes = [node for node in ast.walk(ast.parse(text)) if isinstance(node, documented)]
+    docstrings = {node.body[0].lineno for node in nodes if ast.get_docstring(node) is not None}
+    tokens = [
+        token
+        for token in tokenize.generate_tokens(io.StringIO(text).readline)
+        if token.type not in _LAYOUT
+        and not (token.type == tokenize.STRING and token.start[0] in docstrings)
+    ]
+    # The formatter alone decides on a comma before a closing bracket and where a string is broken.
+    by_formatter = sum(
+        (first.string == "," and second.string in {")", "]", "}"})
+        or first.type == second.type == tokenize.STRING
+        for first, second in itertools.pairwise(tokens)
+    )
+    return len(tokens) - by_formatter
+
+
+def other_tokens(text: str, name: str) -> int:
+    """Count the tokens of JavaScript, CSS or HTML that are neither comments nor white space."""
+    found = get_lexer_for_filename(name).get_tokens(text)
+    return sum(kind not in Comment and kind not in Text for kind, _ in found)
 
 
 def _words(file: Path) -> int:
     text = file.read_text(encoding="utf-8")
     if file.suffix == ".ipynb":
-        text = "\n".join(
-            "".join(one["source"])
-            for one in json.loads(text)["cells"]
-            if one["cell_type"] == "markdown"
-        )
+        cells = json.loads(text)["cells"]
+        text = "\n".join("".join(one["source"]) for one in cells if one["cell_type"] == "markdown")
     return len(text.split())
 
 

@@ -21,8 +21,7 @@ COLLINEAR = 1e-6  # of 3D points on a line, the ratio of the covariance's singul
 
 
 class Crop(NamedTuple):
-    """An object crop: the features of its h x w patches from a vision transformer, depth and
-    camera."""
+    """An object crop: features of h x w patches from a vision transformer, depth and camera."""
 
     keys: np.ndarray  # (h, w, d), of one block
     saliency: np.ndarray  # (h, w), attention of the class token, scaled to [0, 1]
@@ -31,8 +30,7 @@ class Crop(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """The similarity x -> scale * R @ x + t from reference-camera points to camera points of target
-    `view`."""
+    """The similarity x -> scale * R @ x + t from the reference camera to that of target `view`."""
 
     scale: float
     R: np.ndarray  # (3, 3)
@@ -42,9 +40,7 @@ class Pose(NamedTuple):
     inliers: np.ndarray  # (n,) bool, the matches that agree with the pose
 
 
-def estimate_pose(
-    reference: Crop, targets: list[Crop], k=50, trials=1000, threshold=0.2, seed=0
-) -> Pose:
+def estimate_pose(reference: Crop, targets, k=50, trials=1000, threshold=0.2, seed=0) -> Pose:
     """Estimate the pose of the reference object in the best of the target views."""
     matches = [find_matches(reference, target, k, seed) for target in targets]
     view = int(np.argmax([view_score(cosine, k) for _, _, cosine in matches]))
@@ -55,13 +51,13 @@ def estimate_pose(
 
 
 def log_bin(keys):
-    """Compute the normalised descriptors (h * w, 17 d) of keys (h, w, d) (Amir et al. 2021): the
-    keys of the 3 x 3 neighbourhood, and the keys averaged over 3 x 3 patches of the 8 neighbours at
-    distance 3, all within the border."""
+    """Compute the normalised descriptors (h * w, 17 d) of keys (h, w, d) (Amir et al. 2021).
+
+    Bins: the keys of 3 x 3 neighbours, and means over 3 x 3 patches at the 8 ones at distance 3.
+    """
     keys = torch.as_tensor(keys).double()
-    coarse = avg_pool2d(
-        keys.permute(2, 0, 1), 3, stride=1, padding=1, count_include_pad=False
-    ).permute(1, 2, 0)
+    channels = keys.permute(2, 0, 1)  # first, as pooling takes them
+    coarse = avg_pool2d(channels, 3, stride=1, padding=1, count_include_pad=False).permute(1, 2, 0)
     row, column = np.indices(keys.shape[:2])
 
     def neighbours(image, dy, dx):
@@ -73,32 +69,26 @@ def log_bin(keys):
 
 
 def find_matches(reference, target, k, seed):
-    """Find at most k matches (sec. 4.1): patches u and v, each (n, 2), and the cosines of their
-    descriptors (n,)."""
+    """Find at most k matches (sec. 4.1): patches u and v (n, 2), cosines of descriptors (n,)."""
     phi1, phi2 = log_bin(reference.keys), log_bin(target.keys)
     salience1, salience2 = reference.saliency.ravel(), target.saliency.ravel()
-    place1, place2 = (
-        np.argwhere(np.ones(crop.saliency.shape)) for crop in (reference, target)
-    )  # (row, column)
+    place1 = np.argwhere(np.ones(reference.saliency.shape))  # (row, column) of each patch
+    place2 = np.argwhere(np.ones(target.saliency.shape))
     cosine = (phi1 @ phi2.T).numpy()  # the largest cosine of unit vectors is the smallest distance
 
-    # Cycle (eq. 2): v is the nearest neighbour of u, and u' that of v. Infinite distance off the
-    # foreground.
+    # Cycle (eq. 2): v is the nearest neighbour of u, and u' that of v. Off the object: infinite.
     u = np.arange(len(phi1))
     v = cosine.argmax(axis=1)
     u_cycle = cosine.argmax(axis=0)[v]
     on_object = np.minimum(np.minimum(salience1[u], salience2[v]), salience1[u_cycle]) > SALIENT
-    distance = np.where(
-        on_object, np.linalg.norm(place1[u] - place1[u_cycle], axis=1), np.inf
-    )  # -C_u = d(u, u')
+    distance = np.linalg.norm(place1[u] - place1[u_cycle], axis=1)  # -C_u = d(u, u')
+    distance = np.where(on_object, distance, np.inf)
 
-    # The 2k smallest cyclical distances (of equal ones, the most similar), in k clusters: the most
-    # salient of each.
+    # Of the 2k smallest distances (of equal ones, the most similar), the most salient of k clusters
     best = np.lexsort([-cosine[u, v], distance])
     best = best[np.isfinite(distance[best])][: 2 * k]
     if len(best) > k:
-        # k-means needs only distances: points in 2k dimensions of the same inner products give the
-        # same clusters.
+        # k-means needs only distances: points in 2k dimensions with the same inner products do.
         values, vectors = np.linalg.eigh((phi1[best] @ phi1[best].T).round(decimals=6).numpy())
         points = vectors * np.sqrt(np.maximum(values, 0))
         draw = int(np.random.default_rng(seed).integers(2**31))
@@ -109,15 +99,16 @@ def find_matches(reference, target, k, seed):
 
 
 def view_score(cosine, k):
-    """Sum -d(Phi(I1)_u, Phi(I2)_v) over k matches (eq. 3); missing ones count as orthogonal. d^2 =
-    2 - 2 cosine."""
+    """Sum -d(Phi(I1)_u, Phi(I2)_v) over k matches (eq. 3); missing ones count as orthogonal."""
+    # of unit vectors, d^2 = 2 - 2 cosine
     return -np.sqrt(np.maximum(2 - 2 * cosine, 0)).sum() - (k - len(cosine)) * np.sqrt(2)
 
 
 def unproject(crop, patches):
-    """Compute depth * K^-1 (column, row, 1) at one pixel of each patch (supplement, "Depth
-    completion"): the pixel at the 25th percentile of its known depths. A patch without known depth
-    takes its centre, where depth is in-painted."""
+    """Compute depth * K^-1 (column, row, 1) at one pixel of each patch (supplement).
+
+    It is at the 25th percentile of the known depths, or the centre, in-painted, if none is known.
+    """
     known = crop.depth > 0
     filled = cv2.inpaint(crop.depth, np.uint8(~known), 3, cv2.INPAINT_NS)
     filled = np.clip(np.nan_to_num(filled), crop.depth[known].min(), crop.depth.max())
@@ -126,11 +117,9 @@ def unproject(crop, patches):
     for top, left in patches * (height, width):
         depth = np.where(known, crop.depth, np.inf)[top : top + height, left : left + width].ravel()
         count = np.isfinite(depth).sum()
-        pixel = (
-            np.argsort(depth, kind="stable")[(count - 1) // 4]
-            if count
-            else height // 2 * width + width // 2
-        )
+        pixel = height // 2 * width + width // 2
+        if count:
+            pixel = np.argsort(depth, kind="stable")[(count - 1) // 4]
         row, column = top + pixel // width, left + pixel % width
         points.append(filled[row, column] * np.linalg.solve(crop.K, [column + 0.5, row + 0.5, 1]))
     return np.array(points)
@@ -149,14 +138,11 @@ def umeyama(x, y, scales=(0, np.inf)):
 
 
 def ransac(x, y, trials, threshold, rng):
-    """Fit a similarity to samples of 4 matches; refit the one with the most inliers to these (sec.
-    4.3)."""
+    """Fit a similarity to samples of 4 matches, and refit the best to its inliers (sec. 4.3)."""
     if len(x) < 4:
         raise InputError(f"the best view has {len(x)} matches, expected at least 4")
     samples = np.empty((trials, 4), dtype=int)
-    for i in range(
-        4
-    ):  # without replacement: draw a rank among the indices that are not in the sample yet
+    for i in range(4):  # without replacement: a rank among the indices not in the sample yet
         samples[:, i] = rng.integers(len(x) - i, size=trials)
         for earlier in np.sort(samples[:, :i]).T:
             samples[:, i] += samples[:, i] >= earlier
@@ -167,11 +153,11 @@ def ransac(x, y, trials, threshold, rng):
             scale, R, t = fit
             residual = np.linalg.norm(y - (scale * x @ R.T + t), axis=1)
             inliers = residual < threshold
-            if (
-                found := (inliers.sum(), -residual[inliers].sum())
-            ) > agreement:  # of equal numbers, the closer
+            found = (inliers.sum(), -residual[inliers].sum())  # of equal numbers, the closer
+            if found > agreement:
                 best, agreement = (fit, inliers), found
     if best is None:
         raise InputError(f"no sample of 4 matches spans a plane and has a scale in {SCALES}")
     fit, inliers = best
-    return (umeyama(x[inliers], y[inliers], SCALES) if inliers.sum() >= 3 else None) or fit, inliers
+    refit = umeyama(x[inliers], y[inliers], SCALES) if inliers.sum() >= 3 else None
+    return refit or fit, inliers
