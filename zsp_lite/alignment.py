@@ -37,9 +37,8 @@ class Sim3:
     points."""
 
     scale: float  # positive, unitless
-    R: Float[
-        np.ndarray, "3 3"
-    ]  # rotation; the nearest one of what is given (see `errors.rotation_matrix`)
+    # rotation; the nearest one of what is given (see `errors.rotation_matrix`)
+    R: Float[np.ndarray, "3 3"]
     t: Float[np.ndarray, "3"]  # translation, in units of the target's scene
 
     def __post_init__(self):

@@ -22,9 +22,8 @@ class ViewMatch:
 
     reference: View
     target: View
-    similarity: Float[
-        torch.Tensor, "reference target"
-    ]  # cosines between the descriptors of their patches
+    # cosines between the descriptors of their patches
+    similarity: Float[torch.Tensor, "reference target"]
     matches: Matches  # at most k matches
     k: int  # requested number of matches
 

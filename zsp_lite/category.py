@@ -44,14 +44,14 @@ KAPPA, FLOOR = 16.0, 0.1  # \kappa, with which a hypothesis 20 degrees off count
 SAME_ANGLE = 30.0  # degrees; rotations further apart disagree
 ALL_PAIRS_BELOW, PAIRS_PER_OBJECT = 12, 6  # see `object_pairs`
 _REFERENCES, _REFERENCES_OF_ONE = 3, 16  # see `references_per_pair`
+# of each sweep: at 0, coordinate ascent
 _CHAINS, _TEMPERATURES = (
     48,
     (*np.geomspace(1, 0.3, 12), *[0.0] * 4),
-)  # of each sweep: at 0, coordinate ascent
-_PROPOSERS, _AVERAGING_SWEEPS, _REWEIGHTINGS = 8, 6, 10
-_WEAK = (
-    1e-3  # weight of hypotheses that disagree, so that every object gets a scale and a translation
 )
+_PROPOSERS, _AVERAGING_SWEEPS, _REWEIGHTINGS = 8, 6, 10
+# weight of hypotheses that disagree, so that every object gets a scale and a translation
+_WEAK = 1e-3
 # Coefficients of `_judge`, fitted by tools/category_fit.py on validation categories to sets of
 # three to five objects.
 MARGIN, NONE, NONE_AGREEING = 1.57, -3.07, -2.37
@@ -83,12 +83,10 @@ class ObjectPose:
 
     sim3: Sim3  # from the object's world to the common frame
     centre: Float[np.ndarray, "3"]  # of the object, in its world
-    probability: (
-        float  # that its rotation is within 30 degrees of the one that most objects agree with
-    )
-    alternative: (
-        Sim3 | None
-    )  # next best pose, more than 30 degrees off, all other objects fixed; None without one
+    # that its rotation is within 30 degrees of the one that most objects agree with
+    probability: float
+    # next best pose, more than 30 degrees off, all other objects fixed; None without one
+    alternative: Sim3 | None
     alternative_probability: float  # that this is the right one
 
 
@@ -135,9 +133,8 @@ def object_pairs(
         per_object = n - 1 if n < ALL_PAIRS_BELOW else PAIRS_PER_OBJECT
     rng = np.random.default_rng(0)
     circle = rng.permutation(n).tolist()
-    steps = [1, *(2 + rng.permutation(n - 2)).tolist()][
-        :per_object
-    ]  # the first connects all objects
+    # the first connects all objects
+    steps = [1, *(2 + rng.permutation(n - 2)).tolist()][:per_object]
     pairs = []
     for a, b in sorted((circle[k], circle[(k + step) % n]) for k in range(n) for step in steps):
         reference, target = names[a], names[b]
@@ -293,9 +290,8 @@ def _build_nodes(pairs: Sequence[PairHypotheses], ends: Int[np.ndarray, "e 2"]) 
     most = max(len(pair.sim3s) for pair in pairs)
     rows: list[list[tuple]] = [[] for _ in range(ends.max() + 1)]
     for (a, b), pair in zip(ends, pairs):
-        turn = np.resize(
-            np.array([one.R for one in pair.sim3s], np.float32), (most, 3, 3)
-        )  # padded by repetition
+        # padded by repetition
+        turn = np.resize(np.array([one.R for one in pair.sim3s], np.float32), (most, 3, 3))
         weight = np.pad(pair.probabilities, (0, most - len(pair.sim3s))).astype(np.float32)
         rows[a].append((b, turn, weight))
         rows[b].append((a, turn.swapaxes(1, 2), weight))
@@ -337,9 +333,8 @@ def _sample(
         [rotations[:, i, None], proposals[:, some].reshape(t, -1, 3, 3)], axis=1
     )
     score = node.score(candidates, proposals)
-    score += temperature * rng.gumbel(
-        size=score.shape
-    )  # the largest is then a sample of the softmax
+    # the largest is then a sample of the softmax
+    score += temperature * rng.gumbel(size=score.shape)
     rotations[:, i] = candidates[np.arange(t), score.argmax(axis=1)]
 
 
@@ -431,8 +426,7 @@ def _least_absolute(
     scaled = weight
     for _ in range(_REWEIGHTINGS):
         weighted = incidence.T * scaled
-        x = np.linalg.lstsq(weighted @ incidence, weighted @ difference, rcond=None)[
-            0
-        ]  # of least norm: mean zero
+        # of least norm: mean zero
+        x = np.linalg.lstsq(weighted @ incidence, weighted @ difference, rcond=None)[0]
         scaled = weight / (np.linalg.norm(incidence @ x - difference, axis=1) + 1e-9)
     return x

@@ -56,9 +56,8 @@ class PoseEstimate:
     target_views: tuple[View, ...]  # the same of all N target views
     timings: dict[str, float] = field(default_factory=dict)  # seconds per stage
     flags: tuple[str, ...] = ()  # one line per reason not to trust the estimate
-    hypotheses: tuple[
-        Hypothesis, ...
-    ] = ()  # candidate poses of the solver, best first; empty for the paper's solver
+    # candidate poses of the solver, best first; empty for the paper's solver
+    hypotheses: tuple[Hypothesis, ...] = ()
     # whether the solver cannot decide between the estimate and its first alternative: both are
     # nearly equally probable and far apart, such as by a half turn (see
     # `verified.confidence.reliability_flags`)
@@ -155,16 +154,14 @@ class PairResult:
     reference: Frame  # reference frame, whole
     targets: tuple[Frame, ...]  # target frames, whole
     estimates: dict[str, PoseEstimate]  # estimate of each solver by its name, at least one
-    errors: dict[
-        str, float
-    ]  # rotation error of each estimate in degrees; empty without pose labels
+    # rotation error of each estimate in degrees; empty without pose labels
+    errors: dict[str, float]
     pair: Pair | None = None  # the evaluation pair, or None
     # where the masks of the reference and of the targets come from: "given", "box" or "auto"
     masks: tuple[str, str] = ("given", "given")
     backbone: str = ""  # name of the backbone
-    votes: tuple[
-        Vote, ...
-    ] = ()  # of the frames of both objects, the reference frame's first; () for one frame
+    # of the frames of both objects, the reference frame's first; () for one frame
+    votes: tuple[Vote, ...] = ()
 
     @property
     def world_sim3(self) -> Sim3:
@@ -265,10 +262,12 @@ class Solver(Protocol):
 
     A solver that fits the pose in the first target view:
 
-        def first_view(reference, targets, matched, *, seed, threshold): points =
-            match_points(reference, targets[0], matched[0].matches) sim3, inliers = ransac(*points,
-            threshold=threshold, seed=seed) scores = np.zeros(len(targets)) return
-            PoseEstimate(sim3, 0, matched[0].matches, inliers, scores, reference, tuple(targets))
+        def first_view(reference, targets, matched, *, seed, threshold):
+            found = matched[0].matches
+            points = match_points(reference, targets[0], found)
+            sim3, inliers = ransac(*points, threshold=threshold, seed=seed)
+            scores = np.zeros(len(targets))
+            return PoseEstimate(sim3, 0, found, inliers, scores, reference, tuple(targets))
 
         ZeroShotPose(backbone, solver=first_view)
 

@@ -186,9 +186,8 @@ def match(
     order = order[np.isfinite(score[order])][: 2 * k if kmeans else k]
     if kmeans and len(order) > k:
         clusters = _cluster(_gram(start, order, binning), k, np.random.default_rng(seed))
-        by_cluster = np.lexsort(
-            (-start.saliency.flatten().numpy()[order], clusters)
-        )  # the most salient first
+        # the most salient first
+        by_cluster = np.lexsort((-start.saliency.flatten().numpy()[order], clusters))
         first = np.unique(clusters[by_cluster], return_index=True)[1]
         order = order[np.sort(by_cluster[first])]
     u = np.stack(np.unravel_index(order, start.grid), axis=-1)
@@ -284,9 +283,8 @@ def _gram(
     descriptors = keys.flatten(0, 1)[index]
     if binning:
         bins, pooled = bin_indices(features.grid)[:, index], average_pool(keys, (0, 1))
-        descriptors = torch.cat(
-            [keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]]
-        )  # (17, m, D)
+        # (17, m, D)
+        descriptors = torch.cat([keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]])
         descriptors = descriptors.transpose(0, 1).flatten(1)
     descriptors = F.normalize(descriptors, dim=1)
     # Rounded, because greedy k-means++ has exact ties (of two points that are each other's nearest,

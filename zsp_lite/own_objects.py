@@ -49,9 +49,8 @@ class _Scan:
     standard deviation."""
 
     source: Source
-    references: list[
-        int
-    ]  # positions of the frames that are solved against target views of other objects
+    # positions of the frames that are solved against target views of other objects
+    references: list[int]
     targets: list[int]  # positions of the target views
     frames: dict[int, Frame]
     views: dict[int, View]
@@ -159,9 +158,8 @@ def estimate_pose(
         for name, one in (("mask", mask), ("intrinsics", intrinsics))
         if one is not None
     }
-    with (
-        nullcontext() if out is None else writing(out)
-    ):  # a folder that cannot be written is an error at once
+    # a folder that cannot be written is an error at once
+    with nullcontext() if out is None else writing(out):
         sources = open_pair(reference, target, given, helpers)
         if helpers and len({one.path.resolve() for one in sources}) < len(sources):
             raise InputError(

@@ -56,12 +56,10 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
             f"{n_targets}"
         )
 
-    every = sum(
-        map(len, numbers.values())
-    )  # frames; each is the start of one choice of target frames
-    left = {
-        name: len(own) * (every - len(own)) for name, own in numbers.items()
-    }  # pairs that are not sampled yet
+    # frames; each is the start of one choice of target frames
+    every = sum(map(len, numbers.values()))
+    # pairs that are not sampled yet
+    left = {name: len(own) * (every - len(own)) for name, own in numbers.items()}
     if (total := sum(left.values())) < n:
         logger.warning(
             "category %s has %d different pairs of %d targets, not %d",
