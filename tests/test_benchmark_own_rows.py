@@ -237,7 +237,7 @@ def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
         {"exact": exact, "one score": lambda first, second: (*exact(first, second)[:2], 0.5)}
     )
     for pair in category_pairs(dataset, "lump", 4, 3):
-        found = evaluate_pair(pair, rows, store)["results"]
+        found = evaluate_pair(pair, rows, rows, store)["results"]
         reference, targets = dataset.load_pair(pair)
         reference, *targets = (object_crop(frame, None).rgb for frame in (reference, *targets))
         counts = [len(exact(reference, target)[0]) for target in targets]

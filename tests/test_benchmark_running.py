@@ -155,7 +155,7 @@ def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tabl
             os.kill(max(_children(os.getpid()) - before), signal.SIGKILL)
         seen.append(len(pairs_in(tmp_path)))
 
-    monkeypatch.setattr("zsp_lite.benchmark.run.add_lines", after_each_save(kill_a_worker))
+    monkeypatch.setattr("zsp_lite.benchmark.execution.add_lines", after_each_save(kill_a_worker))
     arguments = (small_folder(), SlowBackbone(grid=8), ROWS, 6, 3, tmp_path)
     refused(
         "finished pairs are stored: run again to continue, with fewer workers",
@@ -260,7 +260,7 @@ def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch
             refused("another process is writing", evaluate, *arguments)
 
     arguments = (small_folder(), QUICK, ["ours-bv"], 2, 3, tmp_path)
-    monkeypatch.setattr("zsp_lite.benchmark.run.add_lines", after_each_save(look))
+    monkeypatch.setattr("zsp_lite.benchmark.execution.add_lines", after_each_save(look))
     evaluate(*arguments)
     assert seen == [1, 2, 3, 4]
     assert evaluate(*arguments)["methods"]["ours-bv"]["n"] == 4
@@ -430,7 +430,7 @@ def test_the_tables_of_an_unfinished_run_say_so(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as context, pytest.raises(KeyboardInterrupt):
-        context.setattr("zsp_lite.benchmark.run.add_lines", after_each_save(stop))
+        context.setattr("zsp_lite.benchmark.execution.add_lines", after_each_save(stop))
         run_rows(["ours", "ours-bv"], tmp_path, 3)
     write_reports(tmp_path)
     for name in ("all_rows", "table_a_depth", "categories_acc30"):

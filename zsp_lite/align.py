@@ -17,10 +17,9 @@ import numpy as np
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.benchmark.baseline_rows import hypotheses
-from zsp_lite.benchmark.execution import Evaluate, open_workers
+from zsp_lite.benchmark.execution import Evaluate, evaluate_pairs, open_workers
 from zsp_lite.benchmark.identity import environment, fingerprint, library_version
 from zsp_lite.benchmark.problem import FrameStore, PairProblem
-from zsp_lite.benchmark.run import evaluate_pairs
 from zsp_lite.benchmark.runs import Call, Settings, open_run, read_lines
 from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
 from zsp_lite.data.co3d import Co3D, Pair

@@ -5,21 +5,27 @@ A chunk is a few pairs of one category that share frames. A killed run loses the
 being evaluated.
 """
 
+import logging
 import os
 import pkgutil
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+from functools import partial
 from itertools import chain
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import cloudpickle
+from torch import get_num_threads
+from tqdm import tqdm
 
+from zsp_lite.benchmark.runs import ResultLine, add_lines, read_lines
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError, check_integer, ends_the_run
 from zsp_lite.io.files import digest, read_bytes, write_atomic
@@ -28,6 +34,7 @@ from zsp_lite.threads import one_thread
 Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
 Evaluate = Callable[[Pair, list[str]], dict[str, Any]]  # finds the line of a run for a pair
 CHUNK_SIZE = 16  # pairs
+logger = logging.getLogger(__name__)
 _UNKNOWN_WORKERS = 256  # of an executor that does not tell
 
 
@@ -46,43 +53,89 @@ def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[
     return chunks
 
 
-def evaluate_chunks(
-    make: Callable[[], Evaluate], chunks: Sequence[Chunk], executor: Executor | None, shared: Path
-) -> Iterator[list[dict[str, Any]]]:
-    """Yield the lines that what `make` makes finds; `shared` is a new file in a folder that all
-    workers see."""
-    if executor is None:
-        evaluate = make()
-        with one_thread():
-            for pair, rows in chain.from_iterable(chunks):
-                yield [evaluate(pair, rows)]
+def evaluate_pairs(
+    out: str | Path,
+    make: Callable[[int], Evaluate],
+    work: Mapping[Pair, list[str]],
+    executor: Executor | None,
+    workers: int,
+    kind: type = ResultLine,
+) -> None:
+    """Evaluate the rows and pairs that a run lacks, and add the lines found to it at once.
+
+    Args:
+        out: Folder of the run.
+        make: Makes what finds the line of a pair, from the number of threads that it may use.
+        work: The rows of each pair.
+        executor: Where to evaluate, with its number of workers; None for this process.
+        kind: Type of the lines.
+    """
+    known = {
+        (row, line.pair, line.repeat) for line in read_lines(out, kind) for row in line.results
+    }
+    todo = {}
+    for pair, names in work.items():
+        new = [name for name in names if (name, pair.key, pair.repeat) not in known]
+        if new:
+            todo[pair] = new
+    if not todo:
         return
-    # in a file, because a backbone has megabytes, and each worker reads it once
+    make = partial(make, max(1, get_num_threads() // workers))
+    chunks = make_chunks(todo, max(1, min(CHUNK_SIZE, len(todo) // (4 * workers))))
+    hidden = None if logger.isEnabledFor(logging.INFO) else True  # None: outside a terminal
+    done = len(work) - len(todo)
+    with tqdm(total=len(work), initial=done, unit="pair", delay=1, disable=hidden) as bar:
+
+        def store(lines: list[dict[str, Any]]) -> None:
+            add_lines(out, lines, kind)
+            bar.update(len(lines))
+
+        if executor is None:
+            evaluate = make()
+            with one_thread():
+                for pair, rows in chain.from_iterable(chunks):
+                    store([evaluate(pair, rows)])
+            return
+        with _rows_for_workers(make, executor, out) as (path, checksum):
+            futures = [executor.submit(_evaluate_chunk, path, checksum, one) for one in chunks]
+            try:
+                for future in as_completed(futures):
+                    store(future.result())
+            finally:
+                if not isinstance(executor, _Processes):
+                    for future in futures:
+                        future.cancel()
+
+
+@contextmanager
+def _rows_for_workers(
+    make: Callable[[], Evaluate], executor: Executor, out: str | Path
+) -> Iterator[tuple[str, str]]:
+    """Write what evaluates pairs to a file in the run's folder, which all workers see.
+
+    A backbone has megabytes, and each worker reads it once. Yields the path, absolute because a
+    worker may have another current folder, and the digest of the file. Errors of workers that are
+    no row's become one line.
+    """
+    path = Path(out).resolve() / f".rows-{uuid4()}"
     pickled = _pickle(make, executor)
-    futures = []
     try:
-        write_atomic(shared, pickled)
-        futures += [
-            executor.submit(_evaluate_chunk, str(shared), digest(pickled), chunk)
-            for chunk in chunks
-        ]
-        for future in as_completed(futures):
-            yield future.result()
+        write_atomic(path, pickled)
+        yield str(path), digest(pickled)
     except ImportError as error:
         raise InputError(
             f"a worker cannot import the rows: {error}, expected the module there, too"
         ) from error
     except Exception as error:
-        # the latter is Dask's
+        # the second is Dask's
         if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
             raise
-        advice = "finished pairs are stored: run again to continue, with fewer workers"
-        raise InputError(f"a worker ended abruptly, perhaps out of memory; {advice}") from error
+        raise InputError(
+            "a worker ended abruptly, perhaps out of memory; finished pairs are stored: run again "
+            "to continue, with fewer workers"
+        ) from error
     finally:
-        if not isinstance(executor, _Processes):
-            for future in futures:
-                future.cancel()
-        shared.unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
 
 
 def _pickle(make: Callable[[], Any], executor: Executor) -> bytes:

@@ -1,23 +1,24 @@
-"""Run the benchmark: rotation errors of methods over many pairs of a CO3D-format folder (paper sec.
-5)."""
+"""Run the benchmark: rotation errors of rows over many pairs of a CO3D-format folder (sec. 5).
+
+The way of a pair: `evaluate` samples it, `execution.evaluate_pairs` hands it to this process or a
+worker, `evaluate_pair` reads frames and features, `_evaluate_row` asks each row and measures its
+answer; `write_reports` makes tables of what is stored.
+"""
 
 import json
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import closing, nullcontext
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import msgspec
 import numpy as np
 from jaxtyping import Float
-from torch import get_num_threads
-from tqdm import tqdm
 
 from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.baselines.geometry import essential_rotation
@@ -39,9 +40,7 @@ from zsp_lite.benchmark.runs import (
     ResultLine,
     Run,
     Settings,
-    add_lines,
     open_run,
-    read_lines,
     read_run,
 )
 from zsp_lite.choices import METRICS_SHOWN
@@ -99,25 +98,30 @@ def evaluate(
     check_integer("targets", targets, 1)
     check_integer("row_seconds", row_seconds, 1, 1_000_000)
     check_integer("seeds", seeds, 1, 1000)
+    # The rows, and the pairs that each is evaluated on.
     rows = {
         name: replace(row, seconds=row_seconds) for name, row in resolve(methods, sweep).items()
     }
-    dataset, remarks = Co3D(data), {}
-    numbers = (
-        pairs if isinstance(pairs, Mapping) else dict.fromkeys(labelled_categories(dataset), pairs)
-    )
+    dataset = Co3D(data)
+    numbers = pairs
+    if not isinstance(pairs, Mapping):
+        numbers = dict.fromkeys(labelled_categories(dataset), pairs)
     work = pairs_of_rows(dataset, rows, numbers, targets)
     loaded = as_backbone(backbone)
-    extractors = make_extractors(loaded, rows)
-    for name, row in rows.items():
-        if row.solve is None:
-            ZeroShotPose(extractors[row.features], **row.settings)  # refuses wrong settings
-        elif isinstance(row.solve, StoredPoses):
-            remark = row.solve.remark(
-                dataset, [pair for pair, names in work.items() if name in names]
-            )
-            remarks[name] = f"{name}: {remark}." if remark else ""
+    remarks = _check_rows(rows, make_extractors(loaded, rows), dataset, work)
+    repeated = {
+        replace(pair, repeat=k): names for k in range(seeds) for pair, names in work.items()
+    }
+
     with execution.open_workers(executor) as (pool, workers):
+        call = Call(
+            **environment(),
+            workers=workers,
+            rows=list(rows),
+            pairs=dict(numbers),
+            seeds=seeds,
+            remarks=remarks,
+        )
         settings = Settings(
             data=str(data).encode(errors="replace").decode(),
             backbone=fingerprint(loaded),
@@ -125,29 +129,36 @@ def evaluate(
             library=[library_version()],
             labels={category: _labels(dataset, category) for category in numbers},
             methods={name: description(row) for name, row in rows.items()},
-            calls=[
-                Call(
-                    **environment(),
-                    workers=workers,
-                    rows=list(rows),
-                    pairs=dict(numbers),
-                    seeds=seeds,
-                    remarks=remarks,
-                )
-            ],
+            calls=[call],
         )
+        # Workers load a named backbone themselves; an object travels to them.
+        travels = backbone if pool else loaded
+        make = partial(pair_evaluator, str(Path(data).resolve()), rows, travels)
         with open_run(out, settings):
-            make = partial(
-                pair_evaluator, str(Path(data).resolve()), rows, backbone if pool else loaded
-            )
-            repeated = {
-                replace(pair, repeat=k): names for k in range(seeds) for pair, names in work.items()
-            }
-            evaluate_pairs(out, make, repeated, pool, workers)
+            execution.evaluate_pairs(out, make, repeated, pool, workers)
+
     found = read_run(out)
     for remark in filter(None, [*remarks.values(), *found.failures]):
         logger.warning("%s", remark)
     return _write_summary(found, out)
+
+
+def _check_rows(
+    rows: Mapping[str, Method],
+    extractors: Mapping[str, Any],
+    dataset: Co3D,
+    work: Mapping[Pair, list[str]],
+) -> dict[str, str]:
+    """Refuse wrong settings before anything is computed; return remarks on stored poses by row."""
+    remarks = {}
+    for name, row in rows.items():
+        if row.solve is None:
+            ZeroShotPose(extractors[row.features], **row.settings)
+        elif isinstance(row.solve, StoredPoses):
+            asked = [pair for pair, names in work.items() if name in names]
+            remark = row.solve.remark(dataset, asked)
+            remarks[name] = f"{name}: {remark}." if remark else ""
+    return remarks
 
 
 def write_reports(
@@ -183,44 +194,6 @@ def _write_summary(run: Run, out: str | Path) -> dict[str, Any]:
     return run.summary
 
 
-def evaluate_pairs(
-    out: str | Path,
-    make: Callable[[int], execution.Evaluate],
-    work: Mapping[Pair, list[str]],
-    pool: Any,
-    workers: int,
-    kind: type = ResultLine,
-) -> None:
-    """Evaluate the rows and pairs that a run lacks, and add what is found, lines of a `kind`, to it
-    at once.
-
-    `make`, such as `pair_evaluator`, makes what evaluates a pair, from a number of threads.
-    """
-    known = {
-        (row, line.pair, line.repeat) for line in read_lines(out, kind) for row in line.results
-    }
-    new = {
-        pair: [name for name in names if (name, pair.key, pair.repeat) not in known]
-        for pair, names in work.items()
-    }
-    todo = {pair: names for pair, names in new.items() if names}
-    chunks = execution.make_chunks(
-        todo, max(1, min(execution.CHUNK_SIZE, len(todo) // (4 * workers)))
-    )
-    make = partial(make, max(1, get_num_threads() // workers))
-    # for workers, which may have another current folder
-    shared = Path(out).resolve() / f".rows-{uuid4()}"
-    quiet = not logger.isEnabledFor(logging.INFO)
-    look = {"unit": "pair", "delay": 1, "disable": quiet or None}  # None: hidden outside a terminal
-    with (
-        tqdm(total=len(work), initial=len(work) - len(todo), **look) as bar,
-        closing(execution.evaluate_chunks(make, chunks, pool, shared)) as found,
-    ):
-        for lines in found:
-            add_lines(out, lines, kind)
-            bar.update(len(lines))
-
-
 def pairs_of_rows(
     dataset: Co3D, rows: Mapping[str, Method], numbers: Mapping[str, int], targets: int
 ) -> dict[Pair, list[str]]:
@@ -253,14 +226,15 @@ def pair_evaluator(
     """Make what evaluates pairs in one process; frames, and features by some `threads`, are kept
     from pair to pair."""
     store = FrameStore(Co3D(root), make_extractors(as_backbone(backbone), methods), threads)
-    return lambda pair, names: evaluate_pair(pair, {name: methods[name] for name in names}, store)
+    return partial(evaluate_pair, methods=methods, store=store)
 
 
-def evaluate_pair(pair: Pair, methods: Mapping[str, Method], store: FrameStore) -> dict[str, Any]:
-    """Evaluate rows on a pair: a line of the run's results (see `runs.ResultLine`), with median
-    seconds by stage."""
+def evaluate_pair(
+    pair: Pair, names: Iterable[str], methods: Mapping[str, Method], store: FrameStore
+) -> dict[str, Any]:
+    """Evaluate the named rows on a pair: a line of the run's results (see `runs.ResultLine`)."""
     store.timings.clear()
-    problem = PairProblem(pair, store, {method.features for method in methods.values()} - {"none"})
+    problem = PairProblem(pair, store, {methods[name].features for name in names} - {"none"})
     for sequence in (pair.reference_sequence, pair.target_sequence):
         store.extent(pair.category, sequence)  # an unreadable point cloud is no failure of a row
     labels = store.labels(pair.category)
@@ -268,36 +242,34 @@ def evaluate_pair(pair: Pair, methods: Mapping[str, Method], store: FrameStore) 
     truths = np.stack(
         [true_pose(store.dataset, labels, pair, view) for view in range(len(pair.target_frames))]
     )
-    results = {name: _evaluate(name, method, problem, truths) for name, method in methods.items()}
+    results = {name: _evaluate_row(name, methods[name], problem, truths) for name in names}
     timings = {
         stage: round(float(np.median(seconds)), 5) for stage, seconds in store.timings.items()
     }
     return {"pair": pair.key, "results": results, "repeat": pair.repeat, "timings": timings}
 
 
-def _evaluate(
+def _evaluate_row(
     name: str, method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]
 ) -> dict[str, Any]:
+    """Ask a row for its pose of a pair, and measure it; a failure is a result, too."""
     own = is_own(name) and type(method.solve) is not StoredPoses
     seen = given(method.solve, problem) if own and method.solve else problem
     start = time.perf_counter()
     try:
         with fails_alone(method.seconds) if own else nullcontext():
             solve = seeded(method.solve, problem.seed)
-            answer = as_answer(solve(seen)) if solve else _answer(method, problem, truths)
+            answer = as_answer(solve(seen)) if solve else _paper_answer(method, problem, truths)
             if not 0 <= answer.view < len(truths):
-                raise InputError(
-                    f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}"
-                )
-            result = {"seconds": time.perf_counter() - start} | _measure(
-                answer, problem, truths[answer.view]
-            )
+                expected = f"expected 0 to {len(truths) - 1}"
+                raise InputError(f"answer is for view {answer.view}, {expected}")
+            seconds = time.perf_counter() - start
+            result = {"seconds": seconds} | _measure(answer, problem, truths[answer.view])
+            # Refuses what could not be stored.
             line = {"pair": problem.pair.key, "results": {name: result}}
-            # refuses what could not be stored
             msgspec.json.encode(msgspec.convert(line, ResultLine))
-    except (
-        InputError
-    ) as error:  # there is no pose: without these pairs, methods that fail often would look better
+    except InputError as error:
+        # 180 degrees: without these pairs, methods that fail often would look better.
         return {"error": 180.0, "failed": str(error).encode(errors="replace").decode()}
     return {
         name: round(value, 4) if isinstance(value, float) else value
@@ -310,29 +282,37 @@ def _measure(
 ) -> dict[str, Any]:
     """Measure an answer: "error", and what is known of the other members of a stored result."""
     known = {
-        name: getattr(answer, name) for name in ("view", "note", "scale", "inliers", "confidence")
+        "view": answer.view,
+        "note": answer.note[:1000],
+        "scale": answer.scale,
+        "inliers": answer.inliers,
+        "confidence": answer.confidence,
+        "error": rotation_error(answer.rotation, truth[:3, :3]),
+        "rotation": answer.rotation.ravel().round(6).tolist(),
     }
-    known["note"] = answer.note[:1000]
-    known["error"] = rotation_error(answer.rotation, truth[:3, :3])
-    known["rotation"] = answer.rotation.ravel().round(6).tolist()
     reference, *targets = (frame.camera for frame in problem.frames())
     names = problem.pair.reference_sequence, problem.pair.target_sequence
-    if (
-        turns := common_turns(problem.store.dataset.root, problem.pair.category, *names)
-    ) is not None:
+
+    # Turns of the target object that look the same are no errors of its symmetric error.
+    turns = common_turns(problem.store.dataset.root, problem.pair.category, *names)
+    if turns is not None:
         to_camera = targets[answer.view].R
         turned = to_camera @ turns @ to_camera.T @ truth[:3, :3]
         known["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
-    ends = [problem.store.extent(problem.pair.category, name) for name in names]
+
+    # Where the reference object's centre comes to lie, in diameters of the target object.
+    category = problem.pair.category
+    reference_extent = problem.store.extent(category, problem.pair.reference_sequence)
+    target_extent = problem.store.extent(category, problem.pair.target_sequence)
     if answer.translation is not None:
         known["position"] = answer.translation.round(6).tolist()
-    if answer.translation is not None and None not in ends:
-        (first, _), (_, diameter) = ends
-        centre, scale = reference.to_camera(first), 1.0 if answer.scale is None else answer.scale
-        found = scale * answer.rotation @ centre + answer.translation
-        known["translation"] = (
-            np.linalg.norm(found - truth[:3, :3] @ centre - truth[:3, 3]) / diameter
-        )
+        if reference_extent and target_extent:
+            centre = reference.to_camera(reference_extent[0])
+            scale = 1.0 if answer.scale is None else answer.scale
+            found = scale * answer.rotation @ centre + answer.translation
+            distance = np.linalg.norm(found - truth[:3, :3] @ centre - truth[:3, 3])
+            known["translation"] = distance / target_extent[1]
+
     plain = {
         name: value.item() if isinstance(value, np.generic) else value
         for name, value in known.items()
@@ -340,7 +320,9 @@ def _measure(
     return {name: value for name, value in plain.items() if value is not None}
 
 
-def _answer(method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:
+def _paper_answer(
+    method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]
+) -> Answer:
     """Answer of a row that is the paper's method with other settings."""
     if method.answer == "true view":
         nearest = int(rotation_error(np.eye(3), truths[:, :3, :3]).argmin())
