@@ -15,7 +15,7 @@ LAYERS = [
     "matching views",
     "best_view points",
     "estimates",
-    "pipeline backbones",
+    "pipeline backbones pair_result",
     "verified importers baselines",
     "category",
     "viz",

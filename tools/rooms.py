@@ -14,7 +14,7 @@ ROOMS = {
     "files": "choices errors io threads",
     "geometry": "alignment features matchers metrics minimal",
     "data": "data",
-    "stages": "best_view estimates matching pipeline points views",
+    "stages": "best_view estimates matching pair_result pipeline points views",
     "backbones": "backbones",
     "baselines": "baselines",
     "verified": "category verified",

@@ -23,6 +23,7 @@ from zsp_lite import (
     metrics as metrics,
     minimal as minimal,
     own_objects as own_objects,
+    pair_result as pair_result,
     pipeline as pipeline,
     points as points,
     verified as verified,

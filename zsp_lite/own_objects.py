@@ -22,13 +22,14 @@ from zsp_lite.choices import SOLVERS
 from zsp_lite.data.cameras import Values, view_span
 from zsp_lite.data.frames import Frame, frame_defect, turn_frame
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
-from zsp_lite.estimates import Hypothesis, PairResult, PoseEstimate, Vote, label_errors, timed
+from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.masks import DOUBTFUL
 from zsp_lite.importers.sources import Source, SourceLike, open_pair
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.metrics import rotation_angle, rotation_error
+from zsp_lite.pair_result import PairResult, Vote, label_errors
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import axis_deviation, world_cloud
 from zsp_lite.verified.confidence import reliability_flags
