@@ -17,7 +17,7 @@ LAYERS = [
     "estimates",
     "pipeline backbones pair_result",
     "verified importers baselines",
-    "category",
+    "category scans",
     "viz",
     "benchmark own_objects",
     "align",

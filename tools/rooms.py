@@ -21,7 +21,7 @@ ROOMS = {
     "importers": "importers",
     "viz": "viz",
     "benchmark": "benchmark",
-    "objects": "align own_objects",
+    "objects": "align own_objects scans",
     "course": "course",
     "cli": "__main__ cli",
 }

@@ -26,6 +26,7 @@ from zsp_lite import (
     pair_result as pair_result,
     pipeline as pipeline,
     points as points,
+    scans as scans,
     verified as verified,
     views as views,
     viz as viz,
