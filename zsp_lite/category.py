@@ -78,7 +78,7 @@ class PairHypotheses:
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectPose:
+class AlignedObject:
     """Pose of one object in the common frame of its category."""
 
     sim3: Sim3  # from the object's world to the common frame
@@ -97,7 +97,7 @@ class CategoryAlignment:
     """All objects of a category in one frame: that of the first object, with a mean log scale of
     zero."""
 
-    objects: dict[str, ObjectPose]  # by name, sorted
+    objects: dict[str, AlignedObject]  # by name, sorted
     pairs: tuple[PairHypotheses, ...]  # what it was found from
     # median angle from the best hypothesis of the pairs (reference, target), where above 30
     # degrees; largest first
@@ -239,7 +239,7 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
             alternative = Sim3(
                 scales[i], turned, sim3.apply(centres[i]) - scales[i] * turned @ centres[i]
             )
-        objects[name] = ObjectPose(sim3, centres[i], probability, alternative, other)
+        objects[name] = AlignedObject(sim3, centres[i], probability, alternative, other)
     angles = {
         (names[a], names[b]): float(np.median(off[(ends == (a, b)).all(axis=1)])) for a, b in ends
     }
