@@ -22,9 +22,8 @@ class ViewMatch:
 
     reference: View
     target: View
-    similarity: Float[
-        torch.Tensor, "reference target"
-    ]  # cosines between the descriptors of their patches
+    # cosines between the descriptors of their patches
+    similarity: Float[torch.Tensor, "reference target"]
     matches: Matches  # at most k matches
     k: int  # requested number of matches
 
@@ -70,10 +69,8 @@ def global_score(reference: FeatureMap, target: FeatureMap) -> float:
 def mask_iou(first: Mask, second: Mask) -> float:
     """Compute the intersection over union of two masks, 0 if both are empty ("SaliencyIoU" of two
     foregrounds)."""
-    first, second = (
-        torch.as_tensor(first, dtype=torch.bool),
-        torch.as_tensor(second, dtype=torch.bool),
-    )
+    first = torch.as_tensor(first, dtype=torch.bool)
+    second = torch.as_tensor(second, dtype=torch.bool)
     return float((first & second).sum() / (first | second).sum().clamp_min(1))
 
 

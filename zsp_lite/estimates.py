@@ -51,9 +51,8 @@ class PoseEstimate:
     target_views: tuple[View, ...]  # the same of all N target views
     timings: dict[str, float] = field(default_factory=dict)  # seconds per stage
     flags: tuple[str, ...] = ()  # one line per reason not to trust the estimate
-    hypotheses: tuple[
-        Hypothesis, ...
-    ] = ()  # candidate poses of the solver, best first; empty for the paper's solver
+    # candidate poses of the solver, best first; empty for the paper's solver
+    hypotheses: tuple[Hypothesis, ...] = ()
     # whether the solver cannot decide between the estimate and its first alternative: both are
     # nearly equally probable and far apart, such as by a half turn (see
     # `verified.confidence.reliability_flags`)
@@ -88,9 +87,8 @@ class PoseEstimate:
 
     def between_worlds(self, sim3: Sim3, view: int) -> Sim3:
         """Return the similarity between the worlds that a pose in a target view stands for."""
-        reference, target = (
-            one.frame.camera for one in (self.reference_view, self.target_views[view])
-        )
+        reference = self.reference_view.frame.camera
+        target = self.target_views[view].frame.camera
         return Sim3(1.0, target.R, target.t).inverse() @ sim3 @ Sim3(1.0, reference.R, reference.t)
 
     def world_rotation(self, pose: Hypothesis | None = None) -> Float[np.ndarray, "3 3"]:

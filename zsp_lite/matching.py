@@ -281,10 +281,9 @@ def _bin_products(products: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w
     # Every sum and average is separable: along the rows of both images (axes 0 and 2), then along
     # their columns.
     pooled = average_pool(products, (0, 2))
-    near, far, centre = (
-        columns(x) for x in (_joint_shifts(products, 1), _joint_shifts(pooled, 3), pooled)
-    )
-    far, centre = average_pool(far, (0, 2)), average_pool(centre, (0, 2))
+    near = columns(_joint_shifts(products, 1))
+    far = average_pool(columns(_joint_shifts(pooled, 3)), (0, 2))
+    centre = average_pool(columns(pooled), (0, 2))
     return columns(_joint_shifts(near, 1).add_(_joint_shifts(far, 3)).sub_(centre))
 
 
@@ -293,10 +292,12 @@ def _joint_shifts(x: Float[Tensor, "a b c d"], step: int) -> Float[Tensor, "a b 
     border."""
     total = x.clone()
     for shift in (-step, step):
-        index1, index2 = (
-            (torch.arange(n, device=x.device) + shift).clamp(0, n - 1) for n in x.shape[::2]
-        )
-        total.add_(x.index_select(0, index1).index_select(2, index2))
+        shifted = x
+        for axis in (0, 2):
+            last = x.shape[axis] - 1
+            index = (torch.arange(last + 1, device=x.device) + shift).clamp(0, last)
+            shifted = shifted.index_select(axis, index)
+        total.add_(shifted)
     return total
 
 
@@ -318,10 +319,8 @@ def _gram(
     descriptors = keys.flatten(0, 1)[index]
     if binning:
         bins, pooled = bin_indices(features.grid)[:, index], average_pool(keys, (0, 1))
-        descriptors = torch.cat(
-            [keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]]
-        )  # (17, m, D)
-        descriptors = descriptors.transpose(0, 1).flatten(1)
+        near, far = keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]
+        descriptors = torch.cat([near, far]).transpose(0, 1).flatten(1)  # (m, 17 D)
     descriptors = F.normalize(descriptors, dim=1)
     # Rounded, because greedy k-means++ has exact ties (of two points that are each other's nearest,
     # either lowers the sum of squares by the same amount), which rounding errors would break

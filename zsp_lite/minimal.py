@@ -77,9 +77,8 @@ def find_matches(reference, target, k, seed):
     descriptors (n,)."""
     phi1, phi2 = log_bin(reference.keys), log_bin(target.keys)
     salience1, salience2 = reference.saliency.ravel(), target.saliency.ravel()
-    place1, place2 = (
-        np.argwhere(np.ones(crop.saliency.shape)) for crop in (reference, target)
-    )  # (row, column)
+    place1 = np.argwhere(np.ones(reference.saliency.shape))  # (row, column) of each patch
+    place2 = np.argwhere(np.ones(target.saliency.shape))
     cosine = (phi1 @ phi2.T).numpy()  # the largest cosine of unit vectors is the smallest distance
 
     # Cycle (eq. 2): v is the nearest neighbour of u, and u' that of v. Infinite distance off the
@@ -88,9 +87,8 @@ def find_matches(reference, target, k, seed):
     v = cosine.argmax(axis=1)
     u_cycle = cosine.argmax(axis=0)[v]
     on_object = np.minimum(np.minimum(salience1[u], salience2[v]), salience1[u_cycle]) > SALIENT
-    distance = np.where(
-        on_object, np.linalg.norm(place1[u] - place1[u_cycle], axis=1), np.inf
-    )  # -C_u = d(u, u')
+    distance = np.linalg.norm(place1[u] - place1[u_cycle], axis=1)  # -C_u = d(u, u')
+    distance = np.where(on_object, distance, np.inf)
 
     # The 2k smallest cyclical distances (of equal ones, the most similar), in k clusters: the most
     # salient of each.
@@ -154,9 +152,8 @@ def ransac(x, y, trials, threshold, rng):
     if len(x) < 4:
         raise InputError(f"the best view has {len(x)} matches, expected at least 4")
     samples = np.empty((trials, 4), dtype=int)
-    for i in range(
-        4
-    ):  # without replacement: draw a rank among the indices that are not in the sample yet
+    # Without replacement: draw a rank among the indices that are not in the sample yet.
+    for i in range(4):
         samples[:, i] = rng.integers(len(x) - i, size=trials)
         for earlier in np.sort(samples[:, :i]).T:
             samples[:, i] += samples[:, i] >= earlier
@@ -167,9 +164,8 @@ def ransac(x, y, trials, threshold, rng):
             scale, R, t = fit
             residual = np.linalg.norm(y - (scale * x @ R.T + t), axis=1)
             inliers = residual < threshold
-            if (
-                found := (inliers.sum(), -residual[inliers].sum())
-            ) > agreement:  # of equal numbers, the closer
+            found = (inliers.sum(), -residual[inliers].sum())
+            if found > agreement:  # of equal numbers, the closer
                 best, agreement = (fit, inliers), found
     if best is None:
         raise InputError(f"no sample of 4 matches spans a plane and has a scale in {SCALES}")

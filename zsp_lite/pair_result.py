@@ -33,16 +33,14 @@ class PairResult:
     reference: Frame  # reference frame, whole
     targets: tuple[Frame, ...]  # target frames, whole
     estimates: dict[str, PoseEstimate]  # estimate of each solver by its name, at least one
-    errors: dict[
-        str, float
-    ]  # rotation error of each estimate in degrees; empty without pose labels
+    # rotation error of each estimate in degrees; empty without pose labels
+    errors: dict[str, float]
     pair: Pair | None = None  # the evaluation pair, or None
     # where the masks of the reference and of the targets come from: "given", "box" or "auto"
     masks: tuple[str, str] = ("given", "given")
     backbone: str = ""  # name of the backbone
-    votes: tuple[
-        Vote, ...
-    ] = ()  # of the frames of both objects, the reference frame's first; () for one frame
+    # of the frames of both objects, the reference frame's first; () for one frame
+    votes: tuple[Vote, ...] = ()
 
     @property
     def world_sim3(self) -> Sim3:
