@@ -136,10 +136,11 @@ class Solver(Protocol):
 
     A solver that fits the pose in the first target view:
 
-        def first_view(reference, targets, matched, *, seed, threshold): points =
-            match_points(reference, targets[0], matched[0].matches) sim3, inliers = ransac(*points,
-            threshold=threshold, seed=seed) scores = np.zeros(len(targets)) return
-            PoseEstimate(sim3, 0, matched[0].matches, inliers, scores, reference, tuple(targets))
+        def first_view(reference, targets, matched, *, seed, threshold):
+            matches, scores = matched[0].matches, np.zeros(len(targets))
+            points = match_points(reference, targets[0], matches)
+            sim3, inliers = ransac(*points, threshold=threshold, seed=seed)
+            return PoseEstimate(sim3, 0, matches, inliers, scores, reference, tuple(targets))
 
         ZeroShotPose(backbone, solver=first_view)
 

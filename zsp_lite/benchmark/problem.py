@@ -52,9 +52,10 @@ class Row(Protocol):
     A row that takes the pose of the target view whose global feature is most similar to the
     reference's:
 
-        def most_similar(problem): first, *others = (view.features.global_feature for view in
-            problem.views()) return np.eye(3), int(np.argmax([torch.cosine_similarity(first, other,
-            dim=0) for other in others]))
+        def most_similar(problem):
+            first, *others = (view.features.global_feature for view in problem.views())
+            cosines = [torch.cosine_similarity(first, other, dim=0) for other in others]
+            return np.eye(3), int(np.argmax(cosines))
     """
 
     def __call__(
