@@ -89,16 +89,7 @@ class PairResult:
                 "error_degrees": self.errors.get(solver),
                 "flags": list(estimate.flags),
                 "one_of_two": estimate.one_of_two,
-                "alternatives": [
-                    {
-                        "view": one.view,
-                        "matrix": one.sim3.matrix.tolist(),
-                        "probability": one.confidence,
-                        "degrees_from_best": estimate.angle_to(one),
-                        "score_below_best": estimate.hypotheses[0].score - one.score,
-                    }
-                    for one in estimate.alternatives
-                ],
+                "alternatives": _alternatives(estimate),
                 "seconds": dict(estimate.timings),
             }
         views = [frame.name for frame in self.targets]
@@ -117,6 +108,20 @@ class PairResult:
                 for one in self.votes
             ],
         }
+
+
+def _alternatives(estimate: PoseEstimate) -> list[dict[str, Any]]:
+    """List the alternatives of an estimate in the types of JSON."""
+    return [
+        {
+            "view": one.view,
+            "matrix": one.sim3.matrix.tolist(),
+            "probability": one.confidence,
+            "degrees_from_best": estimate.angle_to(one),
+            "score_below_best": estimate.hypotheses[0].score - one.score,
+        }
+        for one in estimate.alternatives
+    ]
 
 
 def label_errors(found: PairResult, category: Path, sequences: Sequence[str]) -> dict[str, float]:
