@@ -162,10 +162,11 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
         if set(ends) != {A, B}:
             return one
         best = one.hypotheses[0]
+        # the half turn is that of A's world
         turn, other = (
             reference.frame.camera.R,
             targets[best.view].frame.camera.R,
-        )  # the half turn is that of A's world
+        )
         turned = (
             best.sim3.R @ turn @ HALF_TURN @ turn.T
             if ends[0] == A

@@ -119,9 +119,8 @@ def test_umeyama_is_the_best_rotation_by_scipy_also_for_a_mirrored_target(seed, 
         sim3 = umeyama(source, target)
         x, y = source - source.mean(axis=0), target - target.mean(axis=0)
         np.testing.assert_allclose(sim3.R, Rotation.align_vectors(y, x)[0].as_matrix(), atol=1e-6)
-        assert sim3.scale == pytest.approx(
-            (x @ sim3.R.T * y).sum() / np.square(x).sum()
-        )  # the least-squares scale
+        # the least-squares scale
+        assert sim3.scale == pytest.approx((x @ sim3.R.T * y).sum() / np.square(x).sum())
         np.testing.assert_allclose(sim3.apply(source.mean(axis=0)), target.mean(axis=0), atol=1e-9)
 
 

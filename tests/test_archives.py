@@ -238,9 +238,8 @@ def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkey
 
     monkeypatch.setattr(zipfile.ZipFile, "read", stop_at_third)
     download(root, dataset="co3d-v1", code=130)
-    assert (
-        len(files_of(root / "toaster")) == 3 and Co3D(root).categories() == []
-    )  # annotations last
+    # annotations last
+    assert len(files_of(root / "toaster")) == 3 and Co3D(root).categories() == []
     monkeypatch.setattr(zipfile.ZipFile, "read", read)
     download(root, dataset="co3d-v1")
     assert contents(root / "toaster") == contents(source / "toaster")

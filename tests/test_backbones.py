@@ -342,9 +342,8 @@ def test_a_backbone_of_ones_own_is_named_by_its_module_and_takes_no_options(tmp_
     text = "class Maps:\n    def __call__(self, images): ...\n\nmaps, size = Maps(), 3"
     (tmp_path / "my_backbone_file.py").write_text(text)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        sys, "path", [path for path in sys.path if path]
-    )  # as a console script has it
+    # as a console script has it
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     named = load.named_backbone
     assert type(named("my_backbone_file:maps", None, "key", None)).__name__ == "Maps"
     for thing, told in (

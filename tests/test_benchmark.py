@@ -132,9 +132,8 @@ def test_the_picture_of_a_pair_shows_each_rows_pose_in_its_target_view(tmp_path,
     drawn, turned = (axis.collections[0].get_offsets() for axis in figure.axes[4:])
     x, y = np.floor(drawn.data).astype(int).clip(0, 223).T
     assert np.mean(crop.mask[y, x] > 0.5) > 0.9  # the pose is nearly exact
-    assert (
-        np.abs(turned.mean(axis=0) - 112).max() < 40
-    )  # a rotation alone is drawn in the middle of the object
+    # a rotation alone is drawn in the middle of the object
+    assert np.abs(turned.mean(axis=0) - 112).max() < 40
     refused(
         "pair 'lump' has no pose in the run, expected a key such as lump/",
         pair_figure,
@@ -288,9 +287,8 @@ def test_seeds_repeat_every_pair_with_other_draws_and_tables_average_over_them(t
         3,
         tmp_path / "three",
     )
-    first = read_lines(tmp_path / "three")[
-        0
-    ].pair  # and as a call with more seeds that was interrupted
+    # and as a call with more seeds that was interrupted
+    first = read_lines(tmp_path / "three")[0].pair
     add_lines(
         tmp_path / "three", [{"pair": first, "repeat": 1, "results": {"ours-mask": {"error": 0.0}}}]
     )

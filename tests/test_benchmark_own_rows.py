@@ -431,9 +431,8 @@ def test_a_spreadsheets_poses_are_read_and_the_note_names_their_convention(
     )
     for pair in category_pairs(dataset, "lump", 12, 3):
         pose = exact_pose(dataset, pair)
-        mixed = (
-            pose.R.T if len(lines) < 10 else pose.R
-        )  # as of a method that confuses left and right
+        # as of a method that confuses left and right
+        mixed = pose.R.T if len(lines) < 10 else pose.R
         other = (
             Rotation.random(random_state=len(lines)).as_matrix() if convention == "none" else mixed
         )
@@ -554,9 +553,8 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
         "import os\nos.chdir('/')\ndef still(problem):\n    return None\n"
     )
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        sys, "path", [path for path in sys.path if path]
-    )  # as a console script has it
+    # as a console script has it
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     (tmp_path / "row_that_exits.py").write_text("raise SystemExit(3)")
     refused(
         "'row_that_exits:a' cannot be imported: .*py, line 1: SystemExit: 3",

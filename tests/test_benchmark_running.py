@@ -288,9 +288,8 @@ def test_numbers_of_threads_are_restored_after_blocks_that_overlap():
     go.set()
     with threadpool_limits(2, "blas"):
         before = counts()
-        with ThreadPoolExecutor(
-            2
-        ) as executor:  # the first block to start may be the first or the last to end
+        # the first block to start may be the first or the last to end
+        with ThreadPoolExecutor(2) as executor:
             inside = [
                 one.result()
                 for one in (executor.submit(block, go, ended), executor.submit(block, ended, go))
@@ -372,9 +371,8 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
         frames |= {(pair.target_sequence, number) for number in pair.target_frames}
         frames.add((pair.reference_sequence, pair.reference_frame))
     assert sum(calls) == len(frames)
-    assert set(calls) == {
-        1
-    }  # a frame's features do not depend, in their last bits, on the rest of a batch
+    # a frame's features do not depend, in their last bits, on the rest of a batch
+    assert set(calls) == {1}
 
 
 def test_the_same_data_by_another_path_continue_a_run_and_other_data_do_not(

@@ -173,12 +173,13 @@ def test_a_latex_table_has_four_columns_and_the_best_of_each_in_bold():
         "low": [error(12.31), Cell(49.9, metric="acc30"), Cell(-4.0), Cell(2, decimals=0)],
         "none ~^\\{}": [error(99.9), None, None, Cell(0.0002, decimals=3)],
         "empty": [None, None, None, Cell(1)],
+        # is told the true view
         "oracle-view": [
             error(1.0),
             Cell(99.0, metric="acc30"),
             Cell(0.0),
             None,
-        ],  # is told the true view
+        ],
     }
     cells = frame(rows, ["Med. err. (°)", "Acc30 (%)", "B − A", "pairs"])
     table = tables.Table("mine", "Table 9. 50% & more", cells, data="my_data, 3 pairs")
@@ -191,12 +192,13 @@ def test_a_latex_table_has_four_columns_and_the_best_of_each_in_bold():
     )
     assert body_of(table) == [
         ["", r"Med. err. ($^\circ$)", r"Acc30 (\%)", "B $-$ A"],
+        # equal as far as they are shown
         [
             r"a\_b \& 50\%",
             r"\textbf{12.3}",
             r"\textbf{50.0}",
             "$-$3.2",
-        ],  # equal as far as they are shown
+        ],
         ["low", r"\textbf{12.3}", "49.9", "$-$4.0"],
         [r"none \textasciitilde{}\textasciicircum{}\textbackslash{}\{\}", "99.9", "--", "--"],
         ["oracle-view", "1.0", "99.0", "0.0"],
@@ -331,9 +333,8 @@ def test_the_papers_figures_were_copied_right():
     ]
     for table in read_paper_tables():
         assert all(len(line["published"]) == len(table["published"]) for line in table["rows"])
-        assert all(
-            resolve(line["row"]) for line in table["rows"] if line["row"]
-        )  # others have published figures only
+        # others have published figures only
+        assert all(resolve(line["row"]) for line in table["rows"] if line["row"])
 
 
 def test_a_runs_table_has_the_parts_of_each_result_and_of_each_pairs_key(tmp_path):
@@ -477,9 +478,8 @@ def test_runs_are_compared_on_the_pairs_that_both_have(run, tmp_path):
 
 def test_figures_show_every_pair_and_every_row(run):
     (axis,) = tables.error_distribution(run).axes
-    assert sum(len(points.get_offsets()) for points in axis.collections) == 48 + len(
-        CATEGORIES
-    )  # and the medians
+    # and the medians
+    assert sum(len(points.get_offsets()) for points in axis.collections) == 48 + len(CATEGORIES)
     assert [label.get_text() for label in axis.get_yticklabels()] == sorted(CATEGORIES)
     (axis,) = tables.error_curves(run, ["ours", "icp"]).axes
     curve = axis.get_lines()[0]

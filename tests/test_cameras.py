@@ -90,7 +90,6 @@ def test_the_span_of_views_is_that_around_the_object(roll):
     for height in (0, 30, 60):
         assert span(*((az, height) for az in range(0, 360, 72))) == pytest.approx(288)
     assert 15 < span((0, 60), (20, 60), (40, 60)) < 40  # a cluster above is one side, too
-    assert (
-        span((0, 20), (20, 25), (40, 15), (180, 85)) < 60
-    )  # a view from the top does not show the back
+    # a view from the top does not show the back
+    assert span((0, 20), (20, 25), (40, 15), (180, 85)) < 60
     assert span(*((az, 75) for az in range(0, 360, 72))) < 60

@@ -65,9 +65,8 @@ def problem(seed: int, flipped: float = 0.0) -> tuple[list[Sim3], list[PairHypot
 def test_poses_are_recovered_among_outliers_and_half_turns_whatever_the_order_of_the_pairs(seed):
     truth, pairs = problem(seed, flipped=0.1)
     alignment, again = synchronise(pairs), synchronise(pairs[::-1])
-    scale = np.exp(
-        np.mean(np.log([one.scale for one in truth]))
-    )  # the mean log scale of the found poses is zero
+    # the mean log scale of the found poses is zero
+    scale = np.exp(np.mean(np.log([one.scale for one in truth])))
     for (name, one), true in zip(alignment.objects.items(), truth, strict=True):
         expected = Sim3(truth[0].scale / scale, np.eye(3), np.zeros(3)) @ truth[0].inverse() @ true
         np.testing.assert_allclose(one.sim3.matrix, expected.matrix, atol=2e-2)

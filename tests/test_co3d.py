@@ -55,9 +55,8 @@ def test_written_data_is_read_back(root, version):
             )
         np.testing.assert_array_equal(frame.mask, expected.mask)
         np.testing.assert_allclose(frame.depth, expected.depth, rtol=2**-11)
-        assert (
-            np.abs(frame.rgb.astype(int) - expected.rgb).mean() < 8
-        )  # JPEG, colours at half resolution
+        # JPEG, colours at half resolution
+        assert np.abs(frame.rgb.astype(int) - expected.rgb).mean() < 8
     points, colours = dataset.point_cloud("chair", "b_2")
     np.testing.assert_allclose(points, written.points, rtol=1e-6)
     np.testing.assert_array_equal(colours, written.colours)
@@ -76,12 +75,13 @@ def test_written_files_have_the_layout_of_co3d(root):
         assert (root / "chair/a_1" / part.replace("?", "frame000001")).is_file()
     entry = json.loads(gzip.decompress((root / "chair/frame_annotations.jgz").read_bytes()))[0]
     assert entry["image"] == {"path": "chair/b_2/images/frame000001.jpg", "size": [24, 32]}
+    # v1 has no format
     assert set(entry["viewpoint"]) == {
         "R",
         "T",
         "focal_length",
         "principal_point",
-    }  # v1 has no format
+    }
 
 
 def test_a_sequence_written_again_replaces_itself_and_nothing_else(root):

@@ -129,9 +129,8 @@ def test_every_command_and_option_in_running_text_exists(page):
     before them."""
     commands = [*cli.commands.values()]
     commands += [one for command in commands for one in getattr(command, "commands", {}).values()]
-    options = {option for command in commands for option in options_of(command)} | {
-        "--force"
-    }  # nbgrader's
+    # nbgrader's
+    options = {option for command in commands for option in options_of(command)} | {"--force"}
     for code in _INLINE_CODE.findall(markdown(page)):
         words = code.split()
         if words[0] == "zsp-lite" and len(words) > 1 and words[1] != "COMMAND":

@@ -340,9 +340,8 @@ def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, 
             archive.writestr(
                 f"A_{number}_assignsubmission_file_{name}.ipynb", nbformat.writes(notebook)
             )
-        text, test, stripped, *_ = graded(
-            handed_in, grade=True, locked=True
-        ).values()  # nbgrader puts them back
+        # nbgrader puts them back
+        text, test, stripped, *_ = graded(handed_in, grade=True, locked=True).values()
         (
             turn_into_text(text),
             handed_in.cells.insert(1, deepcopy(test)),
@@ -406,9 +405,8 @@ def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, 
         and "HIDDEN TESTS" in page
     )
     assert len(scores) == 8 and "Test cell" not in page
-    assert re.findall(r'href="([^"]*)">Comment</a>', page) == [
-        "#mine"
-    ]  # the student's own link, and no other
+    # the student's own link, and no other
+    assert re.findall(r'href="([^"]*)">Comment</a>', page) == ["#mine"]
     assert "<math" in page and "<code>\\broken{</code>" in page
     assert "<script" not in page and not re.search(
         r"""(src|href)=["'](?!#|data:)|url\(["']?http""", page

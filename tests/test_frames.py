@@ -50,16 +50,18 @@ SIZE = (24, 32)
         ([(20, 40, 40, 60, 1.0)], 0.1, (18, 37, 44, 66)),  # a tenth, half of it on each side
         ([(0, 0, 100, 200, 1.0)], 0.1, (0, 0, 100, 200)),  # in the image
         ([(0, 180, 40, 20, 1.0)], 0.1, (0, 179, 42, 21)),
+        # pixels at the threshold do not count
         (
             [(20, 40, 40, 60, 1.0), (0, 0, 5, 5, 0.4)],
             0,
             (20, 40, 40, 60),
-        ),  # pixels at the threshold do not count
+        ),
+        # a lowered threshold
         (
             [(20, 40, 40, 60, 0.1), (30, 50, 10, 10, 0.3)],
             0,
             (30, 50, 10, 10),
-        ),  # a lowered threshold
+        ),
     ],
 )
 def test_the_box_bounds_the_pixels_above_the_threshold(parts, padding, box):
@@ -215,9 +217,8 @@ def test_depth_and_masks_survive_their_files(tmp_path):
     np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), mask)
     write_mask(tmp_path / "known.png", depth > 0)
     np.testing.assert_array_equal(read_mask(tmp_path / "known.png"), depth > 0)
-    assert (tmp_path / "known.png").read_bytes()[
-        24
-    ] == 1  # bit depth in the PNG's header: a mask of booleans
+    # bit depth in the PNG's header: a mask of booleans
+    assert (tmp_path / "known.png").read_bytes()[24] == 1
 
 
 @pytest.mark.parametrize(
@@ -354,9 +355,8 @@ def test_a_patchs_point_has_the_lower_quartile_of_its_known_depths(seed):
     rows, cols = np.floor(pixels[..., 1]).astype(int), np.floor(pixels[..., 0]).astype(int)
     for row, col, expected in patch_depths_one_by_one(depth, (6, 8)):
         assert known[row, col] == (expected is not None)
-        assert (
-            rows[row, col] // 4 == row and cols[row, col] // 4 == col
-        )  # the pixel is one of the patch
+        # the pixel is one of the patch
+        assert rows[row, col] // 4 == row and cols[row, col] // 4 == col
         if expected is not None:
             assert points[row, col, 2] == expected == depth[rows[row, col], cols[row, col]]
 

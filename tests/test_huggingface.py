@@ -179,14 +179,12 @@ def test_missing_weights_are_refused_and_not_made_up(tmp_path):
     weights = load((folder / "model.safetensors").read_bytes())
     kept = {key: x for key, x in weights.items() if "pooler" not in key}
     save_file(kept, folder / "model.safetensors", metadata={"format": "pt"})
-    first, second = (
-        load_backbone(f"hf:{folder}", "cpu", image_size=48) for _ in range(2)
-    )  # nobody reads the pooler
+    # nobody reads the pooler
+    first, second = (load_backbone(f"hf:{folder}", "cpu", image_size=48) for _ in range(2))
     assert fingerprint(first) == fingerprint(second)
     del kept["layernorm.weight"]
-    other = shutil.copytree(
-        folder, tmp_path / "other"
-    )  # Windows keeps a file whose tensors are in use
+    # Windows keeps a file whose tensors are in use
+    other = shutil.copytree(folder, tmp_path / "other")
     save_file(kept, other / "model.safetensors", metadata={"format": "pt"})
     refused(
         "1 weights are not in the file, first layernorm.weight", load_backbone, f"hf:{other}", "cpu"

@@ -91,9 +91,8 @@ def test_accepting_writes_the_published_format_and_the_references_identity(root)
     assert json.loads(path.read_text()).keys() == {"trans", "seq", "reference_seq"}
     labels = read_labels(root, "chair")
     np.testing.assert_allclose(labels["a"].trans[:3, :3], turn, atol=1e-9)
-    centre = labelling.cloud("best")[0].mean(
-        axis=0
-    )  # of the object, which the label maps to its centre
+    # of the object, which the label maps to its centre
+    centre = labelling.cloud("best")[0].mean(axis=0)
     np.testing.assert_allclose(labels["a"].trans @ [*centre, 1], [*(1.3 * turn @ centre + 2), 1])
     np.testing.assert_array_equal(labels["best"].trans, np.eye(4))
     states = {row.sequence: (row.state, row.rms) for row in Labelling(root, "chair").progress()}

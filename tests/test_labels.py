@@ -128,9 +128,8 @@ def two_layouts(tmp_path, noise=0.0):
     trans = np.eye(4)
     trans[:3, :3] = Rotation.random(random_state=9).as_matrix()
     write_label(tmp_path / "v1", "chair", PoseLabel(np.eye(4), "a", "a"))
-    write_label(
-        tmp_path / "v1", "chair", PoseLabel(trans.round(4), "b", "a")
-    )  # as a text of few decimals
+    # as a text of few decimals
+    write_label(tmp_path / "v1", "chair", PoseLabel(trans.round(4), "b", "a"))
     return worlds, trans
 
 
@@ -175,9 +174,8 @@ def random_label(seed, name="a"):
 def test_the_relative_pose_takes_what_one_camera_sees_to_what_the_other_sees(seed):
     label_a, label_b = random_label(seed), random_label(seed + 1, "b")
     camera_a, camera_b = random_camera(seed), random_camera(seed + 1)
-    canonical = np.random.default_rng(seed).normal(
-        size=(6, 3)
-    )  # points of the reference sequence's cloud
+    # points of the reference sequence's cloud
+    canonical = np.random.default_rng(seed).normal(size=(6, 3))
     seen_a = camera_a.to_camera(Sim3.from_matrix(label_a.trans).apply(canonical))
     seen_b = camera_b.to_camera(Sim3.from_matrix(label_b.trans).apply(canonical))
     pose = relative_pose(label_a, camera_a, label_b, camera_b)

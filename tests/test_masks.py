@@ -25,9 +25,8 @@ def ball_on_floor(direction) -> tuple[Frame, np.ndarray]:
     camera = look_at(direction, 2.0)
     height, width = camera.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = (
-        camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width))) @ camera.R
-    )  # world directions
+    # world directions
+    rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width))) @ camera.R
     start = camera.centre
     along, across = rays @ start, np.square(rays).sum(axis=-1)
     root = along**2 - across * (start @ start - RADIUS**2)

@@ -101,9 +101,8 @@ def test_complete_sequences_stay_and_turned_models_are_rendered_again(
     before = read_labels(out, "chair")["low"].trans
     export_models(folder, out, **SETTINGS)
     assert not record.called
-    export_models(
-        folder, out, **SETTINGS, front="+x"
-    )  # of `high` alone: models.json orients the other one
+    # of `high` alone: models.json orients the other one
+    export_models(folder, out, **SETTINGS, front="+x")
     assert [call.args[1] for call in record.call_args_list] == ["high"]
     assert not np.allclose(read_labels(out, "chair")["low"].trans, before)
     refused("was written with", export_models, folder, out, **{**SETTINGS, "seed": 4})

@@ -144,9 +144,8 @@ def test_a_folders_own_pairs_are_found(tmp_path, caplog):
     write_co3d(tmp_path, "chair", [sequence_data(name) for name in "ab"])
     dataset = Co3D(tmp_path)
     assert shipped_pairs(dataset, "chair", 2) == []
-    pairs = [
-        Pair("chair", "a", number % 4, "b", (0, 2)) for number in range(5)
-    ]  # the last is the first
+    # the last is the first
+    pairs = [Pair("chair", "a", number % 4, "b", (0, 2)) for number in range(5)]
     for n in (3, 5):
         write_published_pairs(pairs_path(tmp_path, "chair", n, 2), pairs[:n], dataset)
     assert shipped_pairs(dataset, "chair", 2) == pairs[:3]

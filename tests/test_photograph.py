@@ -17,9 +17,8 @@ from zsp_lite.points import axis_deviation, object_points
 
 pytestmark = pytest.mark.slow
 
-CANONICAL = look_at(
-    (1, 0.5, 0.2)
-).R  # front, left and up of the object, in the coordinates of `synthetic_views`
+# front, left and up of the object, in the coordinates of `synthetic_views`
+CANONICAL = look_at((1, 0.5, 0.2)).R
 CLEAR_OF_THE_FLOOR = np.s_[450:, :]  # the motorcycle does not reach the lowest rows
 
 

@@ -69,9 +69,8 @@ def test_propagation_gives_the_pose_against_every_target_view(estimate, referenc
         np.testing.assert_allclose(pose.apply(point), camera.to_camera(world), atol=1e-9)
     truths = [true_pose(reference.camera, AT_HOME, camera, ELSEWHERE) for camera in cameras]
     errors = [rotation_error(pose.R, truth.R) for pose, truth in zip(poses, truths)]
-    np.testing.assert_allclose(
-        errors, errors[estimate.view], atol=1e-6
-    )  # one rigid target: equal in every view
+    # one rigid target: equal in every view
+    np.testing.assert_allclose(errors, errors[estimate.view], atol=1e-6)
 
 
 def test_the_best_view_alone_maps_spread_and_centroid_onto_the_targets(method, reference):

@@ -39,11 +39,12 @@ def test_lines_join_the_centres_of_matched_patches_and_those_of_outliers_are_das
     )
     lines = {(tuple(line.xy1), tuple(line.xy2)): line.get_linestyle() for line in figure.artists}
     assert set(lines) == {((10, 10), (70, 50)), ((30, 30), (30, 30)), ((70, 50), (10, 10))}
+    # outliers first, below
     assert [line in ("-", "solid") for line in lines.values()] == [
         False,
         True,
         True,
-    ]  # outliers first, below
+    ]
 
 
 def test_points_and_axes_are_drawn_at_their_projections_and_nothing_behind_the_camera():

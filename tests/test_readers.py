@@ -285,9 +285,8 @@ def test_relatives_of_nerfstudio_are_read(tmp_path, views, kind, links):
     for one, view in zip(capture.frames, views, strict=True):
         frame = one.load()
         np.testing.assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
-        np.testing.assert_allclose(
-            frame.camera.K, view.camera.K, rtol=0.02
-        )  # 0.6 pixels off the middle
+        # 0.6 pixels off the middle
+        np.testing.assert_allclose(frame.camera.K, view.camera.K, rtol=0.02)
         np.testing.assert_allclose(frame.depth[view.mask > 0], view.depth[view.mask > 0], atol=6e-4)
 
 

@@ -74,9 +74,8 @@ def test_a_turned_reference_stands_up_and_the_pose_is_that_of_the_turned_image(
     np.testing.assert_array_equal(found.reference.rgb, frames[0].rgb)
     np.testing.assert_allclose(found.reference.camera.matrix, frames[0].camera.matrix, atol=1e-9)
     lying = estimate_pose(rolled, frames[1:4], solver, backbone=backbone, references=1)
-    assert (
-        solver == "verified" or rotation_error(lying.estimate.sim3.R, truth.R) > 20
-    )  # the features are noise
+    # the features are noise
+    assert solver == "verified" or rotation_error(lying.estimate.sim3.R, truth.R) > 20
 
 
 @pytest.mark.slow

@@ -26,9 +26,8 @@ def test_every_question_has_right_and_wrong_answers_with_feedback_to_each(path):
         kind, answers = question["type"], question["answers"]
         right = sum(answer.get("correct", False) for answer in answers)
         assert 0 < right < len(answers) and (kind != "multiple_choice" or right == 1)
-        assert (kind == "numeric") == (
-            answers[-1].get("type") == "default"
-        )  # for what no value and no range covers
+        # for what no value and no range covers
+        assert (kind == "numeric") == (answers[-1].get("type") == "default")
         assert all(
             low < high for low, high in (answer["range"] for answer in answers if "range" in answer)
         )

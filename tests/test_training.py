@@ -112,12 +112,10 @@ def test_normals_turn_and_flip_with_the_crop(renders):
     assert set(torch.linalg.det(turn).round().tolist()) == {-1.0, 1.0}
     for crop in range(3 * VIEWS):
         right, down = grid[crop, 4, 5] - grid[crop, 4, 4], grid[crop, 5, 4] - grid[crop, 4, 4]
-        axes = torch.stack(
-            [right / right.norm(), down / down.norm()]
-        )  # of the crop, in the uncropped view
-        torch.testing.assert_close(
-            turn[crop], axes, atol=0.15, rtol=0
-        )  # a crop that is not square leans a little
+        # of the crop, in the uncropped view
+        axes = torch.stack([right / right.norm(), down / down.norm()])
+        # a crop that is not square leans a little
+        torch.testing.assert_close(turn[crop], axes, atol=0.15, rtol=0)
         on_object = ~batch.surface[crop, :, 0].isnan()
         before = batch.geometry[crop, on_object, :3].clone()
         before[:, :2] = before[:, :2] @ turn[crop]
@@ -139,12 +137,10 @@ def test_the_correspondence_loss_of_right_and_of_wrong_keys_is_that_of_its_formu
             descriptors, places, 1, 0.15, 0.1, 48, torch.Generator().manual_seed(0)
         )
 
-    target = np.array([1, np.exp(-0.5)]) / (
-        1 + np.exp(-0.5)
-    )  # of the place itself and of its neighbour
-    constant = (target * np.log(target)).sum() + np.log(
-        np.exp(10) + 23
-    )  # similarities divided by 0.1, and zeros
+    # of the place itself and of its neighbour
+    target = np.array([1, np.exp(-0.5)]) / (1 + np.exp(-0.5))
+    # similarities divided by 0.1, and zeros
+    constant = (target * np.log(target)).sum() + np.log(np.exp(10) + 23)
     right, accuracy = loss(keys)
     assert (float(right), accuracy) == (pytest.approx(constant - 10 * target[0], abs=1e-4), 1)
     keys[1] = keys[1].roll(2, 0)

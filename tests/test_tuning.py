@@ -78,9 +78,8 @@ def test_the_coefficients_of_the_calibration_are_recovered():
     for name in ("scale", "none"):
         true, measured = (np.delete(getattr(one, name), 4) for one in (TRUE_CALIBRATION, found))
         np.testing.assert_allclose(measured, true, atol=0.6)
-        assert getattr(found, name)[4] == pytest.approx(
-            getattr(TRUE_CALIBRATION, name)[4], abs=2
-        )  # of view_std
+        # of view_std
+        assert getattr(found, name)[4] == pytest.approx(getattr(TRUE_CALIBRATION, name)[4], abs=2)
     assert found.unseen == pytest.approx(0.2, abs=0.1)
     right = [one for one in outcomes if one.errors.min() < 30]
     refused("all have a right pose or none has", fit_calibration, right, FIRST_TERMS)

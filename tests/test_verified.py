@@ -194,7 +194,6 @@ def test_a_symmetric_object_is_flagged_as_one_of_two(monkeypatch):
     errors = [
         rotation_error(in_world, np.diag(turn)) for turn in [(1.0, 1.0, 1.0), (-1.0, -1.0, 1.0)]
     ]
-    assert (
-        min(error[0] for error in errors) < 30
-    )  # where the painting says little, poses some 25 degrees off are close
+    # where the painting says little, poses some 25 degrees off are close
+    assert min(error[0] for error in errors) < 30
     assert (np.min(errors, axis=1) < 15).all() and np.min(errors) < 10

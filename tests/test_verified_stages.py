@@ -398,12 +398,13 @@ def test_probabilities_by_hand():
         ((0.5, 0.3, 0.18), APART, True, "one of two"),  # the third is below 1/e of the first
         ((0.6, 0.2, 0.1), APART, False, ""),
         ((0.4, 0.3, 0.2), APART, False, "3 poses more than 30 degrees apart"),
+        # probably none is right
         (
             (0.25, 0.2, 0.05),
             APART,
             False,
             "2 poses more than 30 degrees apart",
-        ),  # probably none is right
+        ),
         # 59.8 degrees apart: a third rotation may be near both.
         ((0.45, 0.35, 0.1), APART / 3.01, False, "2 poses more than 30 degrees apart"),
     ],

@@ -104,9 +104,8 @@ def _read_object(
         if keyword == "loc":
             offset = np.array(rest, float)
         elif keyword == "rot":
-            turn = (
-                np.array(rest, float).reshape(3, 3).T
-            )  # rows of the file are the images of the axes
+            # rows of the file are the images of the axes
+            turn = np.array(rest, float).reshape(3, 3).T
         elif keyword == "data":
             left = int(rest[0])
             while left > 0:

@@ -490,9 +490,8 @@ def draw_fit(words: bool = True) -> str:
 @cache
 def draw_pose(words: bool = True) -> str:
     photo = Photo(TARGET, 25, 52, 4, 102)
-    moved = Photo(
-        _chair(0.87, 0.87, 0.73, 0.91, 0.12), 25, 52, 4, 102
-    )  # the reference, scaled as a whole
+    # the reference, scaled as a whole
+    moved = Photo(_chair(0.87, 0.87, 0.73, 0.91, 0.12), 25, 52, 4, 102)
     drawn = photo.draw(mix(ORANGE, "white", 0.7)) + "".join(
         dot(place, BLUE, 1.8, "white", 0.4) for place in moved.dots(5.5)
     )

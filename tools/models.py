@@ -43,9 +43,8 @@ class Source(msgspec.Struct, frozen=True, omit_defaults=True):
     sha256: str  # of the work's own file (of the archive member where `member` is given)
     licence: str
     author: str
-    licence_file: (
-        str  # where the licence was read: in the package, or in the archive beside the work
-    )
+    # where the licence was read: in the package, or in the archive beside the work
+    licence_file: str
     member: str = ""  # path of the work in the archive `file`
     title: str = ""  # that the author gave to the work
 

@@ -97,9 +97,8 @@ class Outcome:
     setting: str  # of the target views, in words
     span: float  # angle in degrees that the usable target views span around the target
     n_views: int  # usable target views
-    nearest: Float[
-        np.ndarray, " m"
-    ]  # degrees between the reference's camera and the nearest target view's
+    # degrees between the reference's camera and the nearest target view's
+    nearest: Float[np.ndarray, " m"]
     view_std: float  # standard deviation of the target views' similarity to the reference
 
     @property
@@ -131,10 +130,11 @@ def collect_outcomes(
     extracted once per image."""
     torch.set_num_threads(1)
     dataset, backbone, outcomes = Co3D(root), load_backbone(device="cpu"), []
+    # folders may share names of categories
     labels, name = (
         read_labels(root, category),
         f"{root.name}/{category}",
-    )  # folders may share names of categories
+    )
     method = ZeroShotPose(backbone, solver="verified")
     numbers: dict[str, list[int]] = {}
     for frame in dataset.frame_list(category):

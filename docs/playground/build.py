@@ -55,9 +55,8 @@ def pair_data(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> tuple[list[dic
     reference, targets = dataset.load_pair(pair)
     first, *others = views = method.views([reference, *targets])
     keys = np.stack([view.features.keys.flatten(0, 1).numpy() for view in views])
-    axes = np.linalg.svd(keys.reshape(-1, keys.shape[-1]), full_matrices=False)[
-        2
-    ]  # principal: few of them matter
+    # principal: few of them matter
+    axes = np.linalg.svd(keys.reshape(-1, keys.shape[-1]), full_matrices=False)[2]
     rounded = np.round(keys @ axes.T / KEY_STEP).astype("<i2").swapaxes(1, 2)
     data = [_view_data(view, one) for view, one in zip(views, rounded[:, rounded.any(axis=(0, 2))])]
     matched, names = (
@@ -104,9 +103,8 @@ def write_page_data(folder: Path) -> None:
             f"STORED[{index}] = {json.dumps(views, separators=(',', ':'))};\n"
         )
     (folder / "zsp-tiny.onnx").write_bytes(onnx_model(method.backbone))
-    draws = _packed(
-        np.random.default_rng(method.seed).bit_generator.random_raw(5000).astype("<u8")
-    )  # of RANSAC
+    # of RANSAC
+    draws = _packed(np.random.default_rng(method.seed).bit_generator.random_raw(5000).astype("<u8"))
     content = {
         "titles": titles,
         "steps": (KEY_STEP, POINT_STEP),

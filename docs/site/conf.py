@@ -5,13 +5,11 @@ import sys
 import tomllib
 from pathlib import Path
 
-sys.modules["rfc3987_syntax"] = (
-    None  # jsonschema would build parsers of addresses with it, which takes seconds
-)
+# jsonschema would build parsers of addresses with it, which takes seconds
+sys.modules["rfc3987_syntax"] = None
 
-ROOT = Path(__file__).parents[
-    2
-]  # also Sphinx's source folder, so that all relative links stay as they are
+# also Sphinx's source folder, so that all relative links stay as they are
+ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
 _project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

@@ -42,9 +42,8 @@ def math_font() -> bytes:
         return b""
     font = TTFont(Path(package.origin).parent / "fonts" / "STIXTwoMath-Regular.ttf")
     features = ["ssty", "dtls", "flac", "kern", "mark"]
-    subsetter = Subsetter(
-        Options(hinting=False, layout_features=features, name_IDs=["*"])
-    )  # with its licence
+    # with its licence
+    subsetter = Subsetter(Options(hinting=False, layout_features=features, name_IDs=["*"]))
     subsetter.populate(
         unicodes=[code for first, last in CHARACTERS for code in range(first, last + 1)]
     )

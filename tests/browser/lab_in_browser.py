@@ -183,9 +183,8 @@ def run_all(page, patience: float) -> None:
     while not page.evaluate(_BEGUN):
         if time.monotonic() > deadline:
             raise TimeoutError(f"no code cell had begun to run after {patience:.0f} s")
-        if (
-            time.monotonic() > asked + 20
-        ):  # a notebook that has only just opened may not hear the menu
+        # a notebook that has only just opened may not hear the menu
+        if time.monotonic() > asked + 20:
             page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
             page.locator('.lm-Menu-item[data-command="runmenu:run-all"]').click()
             asked = time.monotonic()

@@ -68,9 +68,8 @@ def site(tmp_path_factory):
         ".",
         folder,
     ]
-    subprocess.run(
-        command, cwd=REPOSITORY, check=True, stderr=subprocess.DEVNULL
-    )  # links to other pages are missing
+    # links to other pages are missing
+    subprocess.run(command, cwd=REPOSITORY, check=True, stderr=subprocess.DEVNULL)
     write_page_data(folder / "docs" / "playground")
     return folder
 

@@ -44,9 +44,8 @@ def attempt(case, folder: Path, answers) -> None:
     os.chdir(folder)
     resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(
-        resource.RLIMIT_AS, (size + 3 * MEMORY,) * 2
-    )  # the machine's memory is not to fill up
+    # the machine's memory is not to fill up
+    resource.setrlimit(resource.RLIMIT_AS, (size + 3 * MEMORY,) * 2)
     try:
         kind, message = case.call(folder)
     except InputError as error:

@@ -73,9 +73,8 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> 
         depth = len({key.split(".")[1] for key in weights if key.startswith("blocks.")})
         if num_heads is None:
             num_heads = dim // 64 if dim % 64 == 0 else 0  # the transformer refuses 0 heads
-        with torch.device(
-            "meta"
-        ):  # the checkpoint replaces the initial values: do not compute them
+        # the checkpoint replaces the initial values: do not compute them
+        with torch.device("meta"):
             model = VisionTransformer(side * patch_size, patch_size, dim, depth, num_heads)
     except (KeyError, ValueError, IndexError) as error:
         raise InputError(

@@ -94,9 +94,8 @@ class HuggingFaceViT(nn.Module):
             if "interpolate_pos_encoding" in self._arguments
             else {}
         )
-        if (
-            "noise" in self._arguments
-        ):  # a masked autoencoder orders the patches by it: keep their order
+        # a masked autoencoder orders the patches by it: keep their order
+        if "noise" in self._arguments:
             options["noise"] = (
                 torch.arange(grid[0] * grid[1], device=images.device)
                 .float()
@@ -152,9 +151,8 @@ def load_huggingface(
     local = {"local_files_only": True, "trust_remote_code": False}
     try:
         config = AutoConfig.from_pretrained(folder, **local)
-        vision = getattr(
-            config, "vision_config", config
-        )  # CLIP and similar models: the image encoder
+        # CLIP and similar models: the image encoder
+        vision = getattr(config, "vision_config", config)
         if hasattr(vision, "mask_ratio"):
             vision.mask_ratio = 0.0  # a masked autoencoder must see the whole image
         with _quiet():

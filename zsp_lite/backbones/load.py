@@ -21,9 +21,8 @@ from zsp_lite.io.modules import import_object
 
 # the environment variable ZSP_LITE_DINO_URL overrides it
 DINO_URL = "https://dl.fbaipublicfiles.com/dino/"
-MOST_BYTES = (
-    400_000_000  # of a released file: a ViT-B, the largest, has 86 million weights of 4 bytes
-)
+# of a released file: a ViT-B, the largest, has 86 million weights of 4 bytes
+MOST_BYTES = 400_000_000
 WEIGHTS = Path(__file__).parents[1] / "weights"
 DEFAULT = "zsp-tiny"
 TINY = WEIGHTS / "zsp-tiny.safetensors"
@@ -73,9 +72,8 @@ class BackboneConfig:
     image_size: int | None = None
 
 
-BackboneLike = (
-    FeatureExtractor | str | Path | BackboneConfig
-)  # a backbone, or what `load_backbone` takes
+# a backbone, or what `load_backbone` takes
+BackboneLike = FeatureExtractor | str | Path | BackboneConfig
 
 
 def load_backbone(

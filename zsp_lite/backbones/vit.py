@@ -17,9 +17,8 @@ from torch import Tensor, nn
 from zsp_lite.choices import Facet
 from zsp_lite.errors import InputError, check_integer
 
-MOST_INPUT = (
-    2048  # pixels of an image's side; the time of attention grows with the fourth power of the side
-)
+# pixels of an image's side; the time of attention grows with the fourth power of the side
+MOST_INPUT = 2048
 
 
 def nearest_multiple(size: int, patch_size: int) -> int:
@@ -33,12 +32,10 @@ def nearest_multiple(size: int, patch_size: int) -> int:
 class Tokens:
     """Outputs of a forward pass that the method uses; the n patches are in row-major order."""
 
-    keys: Float[
-        Tensor, "batch n dim"
-    ]  # descriptors: the keys (or another facet) of one block, heads concatenated
-    attention: Float[
-        Tensor, "batch heads n"
-    ]  # of the last block, from CLS to the patches; softmax over 1 + n tokens
+    # descriptors: the keys (or another facet) of one block, heads concatenated
+    keys: Float[Tensor, "batch n dim"]
+    # of the last block, from CLS to the patches; softmax over 1 + n tokens
+    attention: Float[Tensor, "batch heads n"]
     cls: Float[Tensor, "batch dim"]  # CLS output token after the final normalisation
     grid: tuple[int, int]  # rows and columns of patches; their product is n
 
@@ -47,16 +44,13 @@ class Tokens:
 class TrainingTokens:
     """Outputs of a forward pass that training losses use, with gradients."""
 
-    tokens: Float[
-        Tensor, "batch tokens dim"
-    ]  # all output tokens after the final normalisation, CLS first
+    # all output tokens after the final normalisation, CLS first
+    tokens: Float[Tensor, "batch tokens dim"]
     keys: Float[Tensor, "batch n dim"]  # keys of the patches in one block, heads concatenated
-    key_input: Float[
-        Tensor, "batch n dim"
-    ]  # normalised patch tokens of that block: the keys are linear in them
-    cls_logits: Float[
-        Tensor, "batch heads tokens"
-    ]  # scaled attention logits of the last block from CLS to all tokens
+    # normalised patch tokens of that block: the keys are linear in them
+    key_input: Float[Tensor, "batch n dim"]
+    # scaled attention logits of the last block from CLS to all tokens
+    cls_logits: Float[Tensor, "batch heads tokens"]
 
 
 @dataclass(frozen=True)
@@ -64,9 +58,8 @@ class BlockActivations:
     """Intermediate results of one transformer block, CLS first."""
 
     normed: Float[Tensor, "batch tokens dim"]  # input after the first normalisation
-    query: Float[
-        Tensor, "batch outputs dim"
-    ]  # like key and value a linear function of `normed`, heads concatenated
+    # like key and value a linear function of `normed`, heads concatenated
+    query: Float[Tensor, "batch outputs dim"]
     key: Float[Tensor, "batch tokens dim"]
     value: Float[Tensor, "batch tokens dim"]
     token: Float[Tensor, "batch outputs dim"]  # output of the block, not normalised

@@ -85,9 +85,8 @@ def essential_rotation(
     first = _directions(reference.camera, matches.reference, grid)
     second = _directions(target.camera, matches.target, grid)
     focal = np.concatenate([reference.camera.focal_length, target.camera.focal_length]).mean()
-    threshold = (
-        reference.camera.size[0] / grid[0] / focal
-    )  # matches are patch centres: a patch is as far as one is off
+    # matches are patch centres: a patch is as far as one is off
+    threshold = reference.camera.size[0] / grid[0] / focal
     poses = []
     if len(matches) >= 5:  # five-point RANSAC; OpenCV's draws are always the same
         found, mask = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.999, threshold)

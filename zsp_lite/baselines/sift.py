@@ -96,9 +96,8 @@ class RootSift:
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
         """Extract the features of (H, W, 3) images, uint8 or float in [0, 1]."""
         maps, side = [], self.image_size // self.patch_size
-        centres = (
-            np.arange(side) + 0.5
-        ) * self.patch_size - 0.5  # OpenCV's origin is the centre of pixel 0
+        # OpenCV's origin is the centre of pixel 0
+        centres = (np.arange(side) + 0.5) * self.patch_size - 0.5
         for rgb in prepare_images(images, self.image_size).mul(255).round().to(torch.uint8):
             grey = cv2.cvtColor(
                 np.ascontiguousarray(rgb.permute(1, 2, 0).numpy()), cv2.COLOR_RGB2GRAY

@@ -57,9 +57,8 @@ def evaluate_chunks(
             for pair, rows in chain.from_iterable(chunks):
                 yield [evaluate(pair, rows)]
         return
-    pickled = _pickle(
-        make, executor
-    )  # in a file, because a backbone has megabytes, and each worker reads it once
+    # in a file, because a backbone has megabytes, and each worker reads it once
+    pickled = _pickle(make, executor)
     futures = []
     try:
         write_atomic(shared, pickled)
@@ -74,9 +73,8 @@ def evaluate_chunks(
             f"a worker cannot import the rows: {error}, expected the module there, too"
         ) from error
     except Exception as error:
-        if (
-            not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker"
-        ):  # the latter is Dask's
+        # the latter is Dask's
+        if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
             raise
         advice = "finished pairs are stored: run again to continue, with fewer workers"
         raise InputError(f"a worker ended abruptly, perhaps out of memory; {advice}") from error
@@ -90,9 +88,8 @@ def evaluate_chunks(
 def _pickle(make: Callable[[], Any], executor: Executor) -> bytes:
     """Pickle by value what a notebook, or a module in the current folder, defines: workers need not
     see it."""
-    if not isinstance(
-        executor, ProcessPoolExecutor
-    ):  # whose processes import what this one can import
+    # whose processes import what this one can import
+    if not isinstance(executor, ProcessPoolExecutor):
         found = {name for _, name, _ in pkgutil.iter_modules([os.getcwd()])} - {"zsp_lite"}
         for name in found & sys.modules.keys():
             cloudpickle.register_pickle_by_value(sys.modules[name])

@@ -30,9 +30,8 @@ class Method:
     # that is nearest in rotation to the ground truth; or the rotation between the reference and the
     # best view without depth.
     answer: Literal["pose", "best view", "true view", "essential matrix"] = "pose"
-    settings: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # settings of `ZeroShotPose` that differ from the paper's
+    # settings of `ZeroShotPose` that differ from the paper's
+    settings: Mapping[str, Any] = field(default_factory=dict)
     targets: int | None = None  # number of target views per pair; None for that of the run
     # Function of a `Problem` that replaces the paper's method; `features` is then the extractor
     # that it uses.
@@ -101,6 +100,7 @@ GROUPS: dict[str, list[str]] = {
     },
     "scans": ["scans-2", "scans-4", "scans-8"],
     "verified-views": ["verified", "verified-n1", "verified-n3", "verified-n10", "verified-mask"],
+    # at one N
     "ablations": [
         "ours",
         "table3",
@@ -109,7 +109,7 @@ GROUPS: dict[str, list[str]] = {
         "trials",
         "depth",
         "published",
-    ],  # at one N
+    ],
     "paper": ["ours", "ours-bv", "table1", "ablations", "views", "rootsift", "ours-mask"],
     "all": ["paper", "verified-views", "oracle-view"],
 }
@@ -144,9 +144,8 @@ def resolve(
     if not methods:
         raise InputError("no methods, expected some; `zsp-lite benchmark --list` lists them")
     labels = [line["label"] for table in read_paper_tables() for line in table["rows"]]
-    taken = {
-        *map(str.casefold, [*METHODS, *GROUPS, *labels, "alignment"])
-    }  # the last is the row of `align`
+    # the last is the row of `align`
+    taken = {*map(str.casefold, [*METHODS, *GROUPS, *labels, "alignment"])}
     for name, meant in methods.items():
         plain, text = str(name).strip().casefold(), meant if isinstance(meant, str) else ""
         if text != name and taken & {plain, base_name(plain), base_name(text)}:

@@ -20,12 +20,13 @@ from zsp_lite.errors import InputError, describe_failure, ends_the_run, real_arr
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import object_crop
 
+# functions of one, two and three arguments, and a solver
 KINDS = (
     "problem",
     "keypoints",
     "matcher",
     "solver",
-)  # functions of one, two and three arguments, and a solver
+)
 
 
 def kind_of(name: str, thing: Any) -> str:

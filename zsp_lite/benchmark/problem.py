@@ -33,13 +33,11 @@ CAPACITY = 128  # frames in memory
 class Answer:
     """Pose of the reference object in one of the target views."""
 
-    rotation: Float[
-        np.ndarray, "3 3"
-    ]  # from the reference's camera to the camera of the target view
+    # from the reference's camera to the camera of the target view
+    rotation: Float[np.ndarray, "3 3"]
     view: int = 0  # index of the target view
-    translation: Float[np.ndarray, "3"] | None = (
-        None  # in the target's unit, if the method estimates it
-    )
+    # in the target's unit, if the method estimates it
+    translation: Float[np.ndarray, "3"] | None = None
     scale: float | None = None  # if the method estimates it
     note: str = ""  # warning about the pose; "" for none
     inliers: int | None = None  # number of matches that agree with the pose
@@ -77,9 +75,8 @@ def as_answer(found: Any) -> Answer:
         return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, inliers, found.confidence)
     if isinstance(found, Answer):
         move, scale = found.translation, 1.0 if found.scale is None else found.scale
-        exact = Sim3(
-            scale, found.rotation, np.zeros(3) if move is None else move
-        )  # refuses what is no pose
+        # refuses what is no pose
+        exact = Sim3(scale, found.rotation, np.zeros(3) if move is None else move)
         return replace(found, rotation=exact.R, translation=None if move is None else exact.t)
     pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
     if isinstance(pose, Sim3):

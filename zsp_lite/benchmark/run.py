@@ -208,9 +208,8 @@ def evaluate_pairs(
         todo, max(1, min(execution.CHUNK_SIZE, len(todo) // (4 * workers)))
     )
     make = partial(make, max(1, get_num_threads() // workers))
-    shared = (
-        Path(out).resolve() / f".rows-{uuid4()}"
-    )  # for workers, which may have another current folder
+    # for workers, which may have another current folder
+    shared = Path(out).resolve() / f".rows-{uuid4()}"
     quiet = not logger.isEnabledFor(logging.INFO)
     look = {"unit": "pair", "delay": 1, "disable": quiet or None}  # None: hidden outside a terminal
     with (
@@ -294,9 +293,8 @@ def _evaluate(
                 answer, problem, truths[answer.view]
             )
             line = {"pair": problem.pair.key, "results": {name: result}}
-            msgspec.json.encode(
-                msgspec.convert(line, ResultLine)
-            )  # refuses what could not be stored
+            # refuses what could not be stored
+            msgspec.json.encode(msgspec.convert(line, ResultLine))
     except (
         InputError
     ) as error:  # there is no pose: without these pairs, methods that fail often would look better

@@ -49,9 +49,8 @@ class Settings(msgspec.Struct):
     data: str
     backbone: str  # fingerprint
     targets: int
-    library: Annotated[
-        list[dict[str, str | None]], msgspec.Meta(min_length=1)
-    ]  # version and commit
+    # version and commit
+    library: Annotated[list[dict[str, str | None]], msgspec.Meta(min_length=1)]
     methods: dict[str, str]  # description by row
     labels: dict[str, str]  # hash of the pose labels by category
     calls: Annotated[list[Call], msgspec.Meta(min_length=1)]
@@ -68,12 +67,10 @@ class _Result(msgspec.Struct):
     translation: float | None = None  # error of the object's centre in diameters of the target
     scale: float | None = None  # estimated over labelled, which is 1
     view: int | None = None
-    rotation: Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)] | None = (
-        None  # row by row
-    )
-    position: Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)] | None = (
-        None  # the pose's translation
-    )
+    # row by row
+    rotation: Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)] | None = None
+    # the pose's translation
+    position: Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)] | None = None
     inliers: int | None = None
     seconds: float | None = None
     note: str = ""

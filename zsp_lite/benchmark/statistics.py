@@ -206,9 +206,8 @@ def paired_test(
     from scipy.stats import binomtest, permutation_test
 
     first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
-    change = (second < threshold) * 1 - (
-        first < threshold
-    )  # 1 for a pair that the second alone solves
+    # 1 for a pair that the second alone solves
+    change = (second < threshold) * 1 - (first < threshold)
     sign = binomtest((change > 0).sum(), np.count_nonzero(change)).pvalue if change.any() else 1.0
     how = {"permutation_type": "samples", "n_resamples": 10_000, "batch": 500, "vectorized": True}
     # scipy refuses one pair, whose difference has the same size with both signs.

@@ -390,9 +390,8 @@ def as_latex(table: Table, intervals: bool = False) -> str:
     )
     lines = pd.concat([texts.mask(best, r"\textbf{" + texts + "}"), published.map(_number)])
     lines = lines.rename(index=_escape, columns=_escape)
-    title = re.sub(
-        r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title
-    )  # LaTeX counts tables itself
+    # LaTeX counts tables itself
+    title = re.sub(r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title)
     caption = _escape(
         ". ".join(filter(None, (title, table.data, _PUBLISHED_NOTE if len(published) else "")))
     )
@@ -460,10 +459,11 @@ def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
     for name in rows or important_rows(run.summary)[: len(COLOURS)]:
         errors = np.sort(run.row(name)["error"])
         shares = 100 * np.arange(len(errors) + 1) / len(errors)
+        # a step at every error
         curves[name] = (
             np.repeat([0, *errors], 2)[1:],
             np.repeat(shares, 2)[:-1],
-        )  # a step at every error
+        )
     labels = {"xlabel": "rotation error (degrees)", "ylabel": "pairs with at most this error (%)"}
     labels |= {"xlim": (0, 180), "ylim": (0, 100), "xticks": (0, 15, 30, 60, 90, 120, 150, 180)}
     return show_panels({"": curves}, size=(6.5, 4), **labels)
@@ -480,9 +480,8 @@ def pair_figure(run: Run, key: str, dataset: Co3D, rows: Sequence[str] | None = 
         name: run.row(name).dropna(subset=["rotation", "view"])
         for name in rows or run.table["row"].unique()
     }
-    found = {
-        name: row.loc[[key]].iloc[0] for name, row in stored.items() if key in row.index
-    }  # of the first seed
+    # of the first seed
+    found = {name: row.loc[[key]].iloc[0] for name, row in stored.items() if key in row.index}
     if not found:
         raise InputError(
             f"pair {key!r} has no pose in the run, expected a key such as "
@@ -539,9 +538,8 @@ def save_figure(
     path.parent.mkdir(parents=True, exist_ok=True)
     if size is not None:
         figure.set_size_inches(size)
-    with plt.rc_context(
-        {"pdf.fonttype": 42, "ps.fonttype": 42}
-    ):  # publishers refuse fonts of type 3
+    # publishers refuse fonts of type 3
+    with plt.rc_context({"pdf.fonttype": 42, "ps.fonttype": 42}):
         figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})
     figure.savefig(path, dpi=150)
     plt.close(figure)

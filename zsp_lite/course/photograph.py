@@ -24,10 +24,11 @@ from zsp_lite.viz import plots
 from zsp_lite.viz.report import PhotographSection
 
 _COLUMNS = ("foreground", "solver", "front off by", "up off by", "confidence")
+# settings of `ZeroShotPose`, and their names here
 _FOREGROUNDS = {
     "mask": "mask",
     "saliency": "own saliency",
-}  # settings of `ZeroShotPose`, and their names here
+}
 _SOLVERS = ("paper", "verified")
 _POINTS = 1500  # drawn of the aligned cloud
 _LENGTH = 2.2  # of the arrows; the points of the motorcycle have unit standard deviation
@@ -43,15 +44,12 @@ class PhotographResult:
     foreground: str  # setting of `ZeroShotPose`
     solver: str  # setting of `ZeroShotPose`
     estimate: PoseEstimate  # the photograph is the reference
-    axes: Float[
-        np.ndarray, "3 3"
-    ]  # columns: front, left and up of the photographed motorcycle, as estimated
-    cloud: Float[
-        np.ndarray, "n 3"
-    ]  # point cloud of the synthetic motorcycle, aligned with the photographed one
-    along: Float[
-        np.ndarray, " n"
-    ]  # position of each point of the cloud, from the rear (0) to the front (1)
+    # columns: front, left and up of the photographed motorcycle, as estimated
+    axes: Float[np.ndarray, "3 3"]
+    # point cloud of the synthetic motorcycle, aligned with the photographed one
+    cloud: Float[np.ndarray, "n 3"]
+    # position of each point of the cloud, from the rear (0) to the front (1)
+    along: Float[np.ndarray, " n"]
     # degrees between the estimated front and the front judged by eye, which may be wrong by 10
     front_error: float
     up_error: float  # degrees between the estimated top and the normal of the floor
@@ -109,9 +107,8 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
     """
     photograph, estimate = results[0].photograph, results[0].estimate
     view, (height, width) = estimate.target_views[estimate.view].frame.rgb, photograph.camera.size
-    margin = round(
-        (view.shape[0] * width / height - view.shape[1]) / 2
-    )  # to the aspect of the photograph
+    # to the aspect of the photograph
+    margin = round((view.shape[0] * width / height - view.shape[1]) / 2)
     view = np.pad(view, ((0, 0), (margin, margin), (0, 0)), constant_values=255)
     titles = [
         f"{_FOREGROUNDS[result.foreground]}, {result.solver} solver\n"

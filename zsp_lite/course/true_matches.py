@@ -28,9 +28,8 @@ class GroundTruthPair:
     category: str
     reference: Frame  # object crops
     target: Frame
-    cells: Int[
-        np.ndarray, "rows cols 2"
-    ]  # matching target patch (row, col) of each reference patch
+    # matching target patch (row, col) of each reference patch
+    cells: Int[np.ndarray, "rows cols 2"]
     valid: Bool[np.ndarray, "rows cols"]  # reference patches that have a match
 
 

@@ -28,9 +28,8 @@ class ImageAnnotation(msgspec.Struct, frozen=True, gc=False):
 
 class DepthAnnotation(msgspec.Struct, frozen=True, gc=False):
     path: str
-    scale_adjustment: Annotated[
-        float, msgspec.Meta(gt=0, le=MAX_LENGTH)
-    ]  # factor from stored depth to depth
+    # factor from stored depth to depth
+    scale_adjustment: Annotated[float, msgspec.Meta(gt=0, le=MAX_LENGTH)]
     mask_path: str | None = None
 
 
@@ -89,9 +88,8 @@ class FrameIndex:
     path: Path
     entries: list[msgspec.Raw]  # JSON of each frame
     keys: list[FrameKey]
-    by_sequence: dict[
-        str, dict[int, int]
-    ]  # of each sequence, the positions in `entries` by frame number, sorted
+    # of each sequence, the positions in `entries` by frame number, sorted
+    by_sequence: dict[str, dict[int, int]]
 
     def positions(self, sequence: str) -> dict[int, int]:
         """Return the positions of a sequence's frames by frame number; InputError if the sequence

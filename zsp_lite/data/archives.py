@@ -151,9 +151,8 @@ def download_archives(root: Path, archives: Sequence[Archive]) -> None:
 def _unpack(zipped: zipfile.ZipFile, root: Path, members: Sequence[zipfile.ZipInfo]) -> None:
     """Unpack members of a zip archive, annotations last, so that a category is read only if it is
     complete."""
-    targets = {
-        one: path_inside(root, one.filename) for one in members
-    }  # checks all before the first is written
+    # checks all before the first is written
+    targets = {one: path_inside(root, one.filename) for one in members}
     members = sorted(members, key=lambda one: (_is_annotation(one), one.header_offset))
     for one in tqdm(members, "unpacking", disable=None):
         path = targets[one]

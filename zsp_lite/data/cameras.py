@@ -25,9 +25,8 @@ from zsp_lite.errors import (
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
 Values = Real[np.ndarray, "..."] | Sequence
 
-NDC_NORM_IMAGE_BOUNDS = (
-    "ndc_norm_image_bounds"  # CO3D v1, and the default if the format is not given
-)
+# CO3D v1, and the default if the format is not given
+NDC_NORM_IMAGE_BOUNDS = "ndc_norm_image_bounds"
 NDC_ISOTROPIC = "ndc_isotropic"  # CO3D v2
 
 # Rotation of camera coordinates if the image is turned by 90 degrees counterclockwise: right
@@ -45,9 +44,8 @@ class Camera:
     """Pinhole camera without distortion; InputError for a value out of range, or an `R` that is no
     rotation."""
 
-    R: Float[
-        np.ndarray, "3 3"
-    ]  # (3, 3) rotation, world to camera; the nearest rotation of what is given
+    # (3, 3) rotation, world to camera; the nearest rotation of what is given
+    R: Float[np.ndarray, "3 3"]
     t: Float[np.ndarray, "3"]  # (3,) translation, world to camera, in units of the world
     focal_length: Float[np.ndarray, "2"]  # (2,) along x and y, pixels
     principal_point: Float[np.ndarray, "2"]  # (2,) as (x, y), pixels

@@ -117,9 +117,8 @@ def fit_plane(
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.where(lengths > 0, lengths, 1)
     distances = np.abs(normals @ points.T - (normals * corners[:, 0]).sum(axis=1, keepdims=True))
-    counts = (distances < threshold).sum(axis=1) * (
-        lengths[:, 0] > 0
-    )  # 0 for a sample of collinear points
+    # 0 for a sample of collinear points
+    counts = (distances < threshold).sum(axis=1) * (lengths[:, 0] > 0)
     inliers = points[distances[counts.argmax()] < threshold]
     centre = inliers.mean(axis=0)
     normal = np.linalg.svd(inliers - centre, full_matrices=False)[2][2]

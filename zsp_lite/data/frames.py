@@ -20,9 +20,8 @@ from zsp_lite.io.files import read_bytes, write_atomic
 
 MAX_PIXELS = 1 << 26  # of an image file
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
-_SAME_ASPECT = (
-    0.01  # largest relative difference of the aspect ratios of an image and its smaller depth map
-)
+# largest relative difference of the aspect ratios of an image and its smaller depth map
+_SAME_ASPECT = 0.01
 _BLACK = 10  # an image without a colour of this value is black, as CO3D's hidden frames are
 
 
@@ -34,12 +33,10 @@ class Frame:
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]  # (H, W, 3) colours, uint8
-    depth: (
-        Float32[np.ndarray, "h w"] | None
-    )  # (H, W) along +z in units of the camera's world, 0 where unknown
-    mask: (
-        Float32[np.ndarray, "h w"] | None
-    )  # (H, W) probability that a pixel is on the object, in [0, 1]
+    # (H, W) along +z in units of the camera's world, 0 where unknown
+    depth: Float32[np.ndarray, "h w"] | None
+    # (H, W) probability that a pixel is on the object, in [0, 1]
+    mask: Float32[np.ndarray, "h w"] | None
     camera: Camera
     name: str = ""  # for error messages
 
@@ -57,9 +54,8 @@ class Frame:
                 values = np.array(values)
             else:
                 values = real_array(f"{label} {name}", values).astype(np.float32)
-            if values.shape != size or not (
-                values.min() >= 0 and values.max() <= top
-            ):  # not, because of NaN
+            # not, because of NaN
+            if values.shape != size or not (values.min() >= 0 and values.max() <= top):
                 found = (
                     f"shape {values.shape}"
                     if values.shape != size
@@ -228,9 +224,8 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     )
     rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR)
     depth, mask = frame.depth, frame.mask
-    if (
-        depth is not None
-    ):  # of the nearest pixel, since values interpolated at an edge or hole lie on no surface
+    # of the nearest pixel, since values interpolated at an edge or hole lie on no surface
+    if depth is not None:
         rows = (2 * np.arange(height) + 1) * old_height // (2 * height)
         cols = (2 * np.arange(width) + 1) * old_width // (2 * width)
         depth = depth[np.ix_(rows, cols)]
@@ -316,19 +311,16 @@ def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
     data = read_bytes(path, what)
     is_jpeg = data[:2] == b"\xff\xd8"
     image, expected = None, "a complete JPEG or PNG"
-    with suppress(
-        OSError, SyntaxError, ValueError, cv2.error
-    ):  # of Pillow, for another format or a damaged header
-        opened = (JpegImageFile if is_jpeg else PngImageFile)(
-            io.BytesIO(data)
-        )  # reads the header only
+    # of Pillow, for another format or a damaged header
+    with suppress(OSError, SyntaxError, ValueError, cv2.error):
+        # reads the header only
+        opened = (JpegImageFile if is_jpeg else PngImageFile)(io.BytesIO(data))
         width, height = opened.size
         if width * height > MAX_PIXELS:
             expected = f"at most {MAX_PIXELS} pixels, not {height} x {width}"
         else:
-            (
-                opened.load if is_jpeg else opened.verify
-            )()  # OpenCV fills missing parts of an image with grey
+            # OpenCV fills missing parts of an image with grey
+            (opened.load if is_jpeg else opened.verify)()
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         raise InputError(

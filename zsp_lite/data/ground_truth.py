@@ -14,9 +14,8 @@ from zsp_lite.errors import InputError, rigid_matrix
 from zsp_lite.io.files import read_json
 
 _warn_once = functools.cache(logging.getLogger(__name__).warning)
-POSES_FILE = (
-    "object_poses.json"  # in each category folder: the pose of each sequence's object in its world
-)
+# in each category folder: the pose of each sequence's object in its world
+POSES_FILE = "object_poses.json"
 _Vector = tuple[float, float, float]
 _Row = tuple[float, float, float, float]
 
@@ -29,9 +28,8 @@ class ObjectPose(msgspec.Struct):
     scale: float
     low: _Vector  # corners of the box
     high: _Vector
-    turns: tuple[
-        int, ...
-    ] = ()  # about the up axis, in degrees, after which the shape is the same; 0 is not among them
+    # about the up axis, in degrees, after which the shape is the same; 0 is not among them
+    turns: tuple[int, ...] = ()
 
     @property
     def R(self) -> Float[np.ndarray, "3 3"]:

@@ -37,9 +37,8 @@ def import_labels(
     sources = {}
     for category, labels in _published_labels(source, categories).items():
         folder = label_folder(root, category)
-        read_label_folder(
-            folder, added={one.seq: one for one in labels.values()}
-        )  # checks that they fit together
+        # checks that they fit together
+        read_label_folder(folder, added={one.seq: one for one in labels.values()})
         sources |= {folder / path.name: path for path in labels}
     for path in sorted(source.glob("**/determ_eval/*/*.pt")):
         if categories is None or path.stem in categories:

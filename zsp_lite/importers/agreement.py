@@ -23,25 +23,24 @@ from zsp_lite.metrics import rotation_angle
 from zsp_lite.points import object_pixels, world_points
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+# points of a frame, at most and at least, and pairs of frames
 _POINTS, _LEAST_POINTS, _PAIRS = (
     500,
     50,
     8,
-)  # points of a frame, at most and at least, and pairs of frames
+)
 _NEAREST, _BEST, _FARTHEST = 4.0, 20.0, 50.0  # angle between two cameras that are compared, degrees
 _TOLERANCE = 0.05  # of depth, relative to that of the object
 _AGREEING = 0.6  # share of points above which frames agree without doubt
 _FITTING, _GAIN = 0.5, 0.25  # least share of points by the right correction, and its least gain
 _ALIKE = 0.03  # difference of shares below which the likelier correction is named
-_RAY_GAIN = (
-    1.2  # least ratio of the share if depth is along the ray, which changes little near the axis
-)
+# least ratio of the share if depth is along the ray, which changes little near the axis
+_RAY_GAIN = 1.2
 _CONTRADICTING = 0.4  # share of points below which frames contradict each other
 _UNITS = {1.0: "metres", 0.001: "millimetres", 0.0002: "1/5000 m"}
 _FACTORS = (1000.0, 0.001, 5.0, 0.2, 10.0, 0.1)  # from one common unit to another
-_SCALES = [
-    scale for scale in np.geomspace(1e-3, 1e3, 280).tolist() if not 0.96 < scale < 1.04
-]  # steps of 5 %
+# steps of 5 %
+_SCALES = [scale for scale in np.geomspace(1e-3, 1e3, 280).tolist() if not 0.96 < scale < 1.04]
 
 _Pose = Float[np.ndarray, "4 4"]  # world to camera
 _Correction = Callable[[_Pose], _Pose]

@@ -38,18 +38,15 @@ class CaptureFrame:
     depth: Path  # of the image's aspect ratio; phones store it smaller than the image
     camera: Camera
     depth_unit: float = 0.001  # world units per stored depth value
-    distortion: tuple[
-        float, ...
-    ] = ()  # OpenCV's k1, k2, p1, p2, k3; image, depth and mask are undistorted
+    # OpenCV's k1, k2, p1, p2, k3; image, depth and mask are undistorted
+    distortion: tuple[float, ...] = ()
     mask: Path | None = None
-    fisheye: bool = (
-        False  # whether the distortion is that of OpenCV's fisheye cameras, k1, k2, k3, k4
-    )
+    # whether the distortion is that of OpenCV's fisheye cameras, k1, k2, k3, k4
+    fisheye: bool = False
     confidence: Path | None = None  # of each pixel of the depth map, see `trusted`
     label: int | None = None  # of the object, where masks have the labels of several
-    orientation: str | None = (
-        None  # "stored" or "displayed": how camera, depth and mask refer to a turned photograph
-    )
+    # "stored" or "displayed": how camera, depth and mask refer to a turned photograph
+    orientation: str | None = None
     posed: bool = True  # False for a single image, whose world is its camera's frame
 
     def load(self) -> Frame:
@@ -99,10 +96,11 @@ class CaptureFrame:
         else:
             undistortion = cv2.initUndistortRectifyMap
             p1, p2 = coefficients[2:4]
+            # a vector: it turns with the image
             coefficients[[3, 2]] = (camera.R @ self.camera.R.T)[:2, :2] @ (
                 p2,
                 p1,
-            )  # a vector: it turns with the image
+            )
         return undistortion(
             matrix, coefficients, np.eye(3), matrix, camera.size[::-1], cv2.CV_32FC1
         )
@@ -116,9 +114,8 @@ class Capture(NamedTuple):
     left_out: list[str]  # what is wrong with each frame that is left out
 
 
-Makers = Iterator[
-    Callable[[], CaptureFrame]
-]  # what a reader returns; a frame that cannot be used raises InputError
+# what a reader returns; a frame that cannot be used raises InputError
+Makers = Iterator[Callable[[], CaptureFrame]]
 
 
 def make_frame(

@@ -18,14 +18,12 @@ from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import load_open3d
 from zsp_lite.points import axis_deviation, object_pixels, sampling_step, world_points
 
-_VOXELS = (
-    96  # voxels per three standard deviations of the object; finer than the noise of depth cameras
-)
+# voxels per three standard deviations of the object; finer than the noise of depth cameras
+_VOXELS = 96
 _MAX_POINTS = 50_000
 _LEAST_STEP = 7  # between the pixels by which the size of the object is estimated
-_UNFINISHED = (
-    ".unfinished"  # file in the folder of a sequence whose import goes on, or was interrupted
-)
+# file in the folder of a sequence whose import goes on, or was interrupted
+_UNFINISHED = ".unfinished"
 _MIN_VIEWS = 3  # number of frames that must see a surface, if there are that many frames
 
 
@@ -168,6 +166,5 @@ def _spread(frames: Collection[Frame]) -> float:
             "the masks"
         )
     deviation = np.abs(points - np.median(points, axis=0))
-    return float(
-        1.48 * np.median(deviation, axis=0).mean()
-    )  # 1.48: ratio to the standard deviation for normal noise
+    # 1.48: ratio to the standard deviation for normal noise
+    return float(1.48 * np.median(deviation, axis=0).mean())

@@ -80,9 +80,8 @@ def read_depth_file(path: str | Path) -> Float32[np.ndarray, "h w"]:
     if path.name.endswith(CO3D_DEPTH):
         return read_depth(path)
     values = _read_values(path, "depth")
-    if values.ndim == 3 and (
-        values.shape[2] == 1 or path.suffix.lower() == ".exr"
-    ):  # Blender repeats it as colours
+    # Blender repeats it as colours
+    if values.ndim == 3 and (values.shape[2] == 1 or path.suffix.lower() == ".exr"):
         values = values[..., 0]
     if (
         values.ndim != 2
@@ -293,9 +292,8 @@ def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
         doubts.append("have their principal point far from the middle, as those of a crop")
     elif focal.max() > _UNEQUAL * focal.min():
         doubts.append("have unequal focal lengths")
-    whole = 2 * np.maximum(
-        centre, side - centre
-    )  # of the smallest image around this one with its centre there
+    # of the smallest image around this one with its centre there
+    whole = 2 * np.maximum(centre, side - centre)
     view = np.degrees(2 * np.arctan(whole / focal / 2)).max()
     if not _LEAST_VIEW <= view <= _LARGEST_VIEW:
         found = (

@@ -9,16 +9,18 @@ from scipy.spatial import cKDTree
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import Makers, make_frame, read_numbers, read_text_lines
 
+# the benchmark's default, with pixel centres at half-integers
 _TUM_INTRINSICS = (
     525.0,
     525.0,
     320.0,
     240.0,
-)  # the benchmark's default, with pixel centres at half-integers
+)
+# metres per stored depth value; seconds between an image and its depth
 _TUM_UNIT, _TUM_TOLERANCE = (
     1 / 5000,
     0.02,
-)  # metres per stored depth value; seconds between an image and its depth
+)
 
 
 def read_lists(folder: Path) -> Makers:

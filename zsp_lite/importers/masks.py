@@ -28,9 +28,8 @@ _ITERATIONS = 4  # of GrabCut
 _LONGEST_SIDE = 320  # pixels of an image in GrabCut, whose time is proportional to the area
 _PADDING = 0.1  # of the projected bounding box, relative to its longer side
 _SMALLEST_BOX = 4  # pixels
-_BALL_OFFSET = (
-    0.6  # distance of the ball's centre behind the visible surface, relative to its radius
-)
+# distance of the ball's centre behind the visible surface, relative to its radius
+_BALL_OFFSET = 0.6
 _POINTS = 4000
 # By depth: all lengths are relative to the distance of the cameras from the point that they look
 # at.
@@ -60,18 +59,18 @@ _PARTS = 0.25  # share of the mask outside its largest region
 _COLOUR_IOU = 0.5  # least overlap with the mask that GrabCut finds in the padded bounding box
 _LEAST_SIGNS = 0.5  # per frame, below which masks are not flagged
 _LYING = 0.5  # share of the object's points that may lie in the plane around it
+# shares of the object's points in and above one plane, such as a table's
 _CARRYING, _CARRIED = (
     0.4,
     0.05,
-)  # shares of the object's points in and above one plane, such as a table's
+)
 
 PLAUSIBLE = 0.05, 20.0  # distance of an object, metres
 _LEAST_KNOWN = 0.4  # share of the pixels on the object
 DOUBTFUL = "the masks may be wrong"
 
-Plane = tuple[
-    Float[np.ndarray, "3"], float
-]  # unit normal, to the side of the cameras, and offset: normal @ x = offset
+# unit normal, to the side of the cameras, and offset: normal @ x = offset
+Plane = tuple[Float[np.ndarray, "3"], float]
 
 
 def masks_from_box(frames: Iterable[Frame], box: Box) -> Iterator[Frame]:
@@ -203,9 +202,8 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
             near[near] = world_points(frame, near) @ plane[0] - plane[1] > _CLEARANCE * distance
     parts = _part_at(focus, frames, pixels, _VOXEL * distance)
     if len(frames) >= _MANY:
-        _part_at(
-            focus, frames, parts, _VOXEL / _FINER * distance
-        )  # refuses a part that is two objects close together
+        # refuses a part that is two objects close together
+        _part_at(focus, frames, parts, _VOXEL / _FINER * distance)
     masked = [
         replace(frame, mask=_with_unknown(frame, part))
         for frame, part in zip(frames, parts, strict=True)
@@ -231,9 +229,8 @@ def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
     if found.total() < _LEAST_SIGNS * usable:
         return ()
     signs = [f"{sign} ({count} of {usable} frames)" for sign, count in found.items()]
-    if (
-        signs and plane is None
-    ):  # alone it is no reason: many objects fill the image, or stand on a dark turntable
+    # alone it is no reason: many objects fill the image, or stand on a dark turntable
+    if signs and plane is None:
         signs.append("no plane is found that the object stands on")
     return (f"{DOUBTFUL}: {', '.join(signs)}",) if signs else ()
 
@@ -363,9 +360,8 @@ def _part_at(
 
     InputError if a second part is alike.
     """
-    clouds = [
-        partial(world_points, *one) for one in zip(frames, pixels, strict=True)
-    ]  # to be computed twice, not kept
+    # to be computed twice, not kept
+    clouds = [partial(world_points, *one) for one in zip(frames, pixels, strict=True)]
     corners = [
         (cloud.min(axis=0), cloud.max(axis=0))
         for cloud in (make() for make in clouds)

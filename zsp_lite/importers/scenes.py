@@ -103,9 +103,8 @@ def read_open3d(folder: Path) -> Makers:
         for path in (folder / "color").glob("*")
         if path.suffix.lower() in (".jpg", ".png")
     )
-    lines = read_numbers(
-        log, (4,), usecols=(0, 1, 2, -1)
-    )  # three frame numbers, and four lines of a matrix
+    # three frame numbers, and four lines of a matrix
+    lines = read_numbers(log, (4,), usecols=(0, 1, 2, -1))
     if len(lines) != 5 * len(images):
         raise InputError(
             f"{log} has {len(lines)} lines, expected 5 for each of {len(images)} images"

@@ -56,22 +56,18 @@ class Source:
 
     path: Path  # the sequence, the capture or the image; a name for frames in memory
     format: str  # "sequence", "image", "frames", or the format of a capture
-    numbers: tuple[
-        int, ...
-    ]  # number of each frame: that of the annotations, or its position in the capture
-    read: Callable[
-        [int], Frame
-    ]  # reads the frame at a position of `numbers`, with the mask that comes with it, if any
+    # number of each frame: that of the annotations, or its position in the capture
+    numbers: tuple[int, ...]
+    # reads the frame at a position of `numbers`, with the mask that comes with it, if any
+    read: Callable[[int], Frame]
     # where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours)
     mask: str
     box: Box | None = None  # bounding box of the object in the first frame, for "box"
-    cameras: tuple[
-        Camera, ...
-    ] = ()  # of the frames, where these are chosen by their directions, not by their order
+    # of the frames, where these are chosen by their directions, not by their order
+    cameras: tuple[Camera, ...] = ()
     left_out: Sequence[str] = ()  # what is wrong with each frame that cannot be used
-    missing: Mapping[int, str] = field(
-        default_factory=dict
-    )  # positions and names of frames without a given mask
+    # positions and names of frames without a given mask
+    missing: Mapping[int, str] = field(default_factory=dict)
     doubts: tuple[str, ...] = ()  # what speaks against the intrinsics
     depth_unit: float | None = None  # world units per stored depth value, of an image or a capture
 
@@ -217,9 +213,8 @@ class Source:
         ]
 
 
-SourceLike = (
-    str | Path | Frame | Sequence[Frame] | Source
-)  # a path, frames, or what `open_source` returns
+# a path, frames, or what `open_source` returns
+SourceLike = str | Path | Frame | Sequence[Frame] | Source
 
 
 def open_source(
@@ -410,10 +405,11 @@ def _format(side: SourceLike) -> str:
 def _sequence_folder(path: Path) -> Path | None:
     """Return the folder of a sequence in its data folder, also where the path is a link to it; None
     if it is none."""
+    # absolute for the names of "." and of "mine/cup/.."
     folders = (
         Path(os.path.abspath(path)),
         path.resolve(),
-    )  # absolute for the names of "." and of "mine/cup/.."
+    )
     return next(
         (one for one in folders if one.is_dir() and (one.parent / FRAMES_FILE).is_file()), None
     )
@@ -440,9 +436,8 @@ def _open_image(
         np.linalg.norm(2 * camera.principal_point - side)
         for side in (camera.size[::-1], camera.size)
     )
-    if (
-        orientation > 4 and displayed < stored
-    ):  # the principal point is nearer to the middle of the displayed form
+    # the principal point is nearer to the middle of the displayed form
+    if orientation > 4 and displayed < stored:
         camera = replace(camera, size=camera.size[::-1])
     return CaptureFrame(
         path, depth, camera, depth_unit, mask=_beside(path, "mask", MASKS), posed=False
@@ -473,18 +468,18 @@ def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
         np.stack([one.centre for one in cameras]),
         np.stack([one.R[2] for one in cameras]),
     )
-    across = (
-        np.eye(3) - axes[:, :, None] * axes[:, None]
-    )  # the point that is nearest to all optical axes is the object
+    # the point that is nearest to all optical axes is the object
+    across = np.eye(3) - axes[:, :, None] * axes[:, None]
     point = np.linalg.lstsq(
         across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None
     )[0]
     directions = centres - point
     directions /= np.linalg.norm(directions, axis=1, keepdims=True).clip(1e-9)
+    # the same for every order of the other cameras
     order = [
         0,
         *(1 + np.lexsort(directions[1:].T.round(6))),
-    ]  # the same for every order of the other cameras
+    ]
     gaps = directions[order][:, None] - directions[order]
     energy = 1 / (np.sum(gaps**2, axis=-1) + 1e-9)
     np.fill_diagonal(energy, np.inf)  # no camera is chosen twice

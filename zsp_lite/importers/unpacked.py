@@ -20,11 +20,12 @@ from zsp_lite.data.frames import MAX_PIXELS
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import file_size, path_inside
 
+# bytes of an unpacked zip; above the second at most 200 times those of the zip
 _MOST, _LARGE, _RATIO = (
     20e9,
     1e9,
     200,
-)  # bytes of an unpacked zip; above the second at most 200 times those of the zip
+)
 _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
@@ -73,9 +74,8 @@ def open_video(path: Path) -> Callable[[int], UInt8[np.ndarray, "h w 3"]]:
     """
     file_size(path, "video")
     with open(path, "rb") as file:
-        is_video = (
-            file.read(8)[4:] == b"ftyp"
-        )  # other files may name addresses, which are not to be opened
+        # other files may name addresses, which are not to be opened
+        is_video = file.read(8)[4:] == b"ftyp"
     video, position = (
         cv2.VideoCapture(str(path), cv2.CAP_FFMPEG) if is_video else cv2.VideoCapture(),
         -1,

@@ -28,9 +28,8 @@ from zsp_lite.verified.verification import VIEWPOINT_SIGMA
 # Hypotheses whose rotations differ by more than this many degrees are distinct: the paper's wider
 # error threshold.
 MODE_ANGLE = 30.0
-TIE_RATIO = float(
-    np.exp(-1)
-)  # of the best pose's probability: above it, another pose is nearly as probable
+# of the best pose's probability: above it, another pose is nearly as probable
+TIE_RATIO = float(np.exp(-1))
 # fraction of points on an observed surface; with less in both directions, a pose is flagged
 _MIN_OVERLAP = 0.05
 # The same of the similarity term. Correct and wrong poses have 0.06 and more, views that share no

@@ -29,9 +29,8 @@ MAX_HYPOTHESES, MIN_ANGLE = 6, 15.0
 _MAX_POLISHED = 3  # of these, the best that are polished
 # About this many points of the reference and of the targets are scored during the search.
 _SEARCH_POINTS, _POLISH_POINTS = (150, 375), (450, 2000)
-_PARENTS = (
-    6  # steps of a round that are recombined into one candidate of the next round (mu in CMA-ES)
-)
+# steps of a round that are recombined into one candidate of the next round (mu in CMA-ES)
+_PARENTS = 6
 
 
 class SearchSchedule(NamedTuple):

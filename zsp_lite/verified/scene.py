@@ -48,13 +48,11 @@ _Rigid = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]  # rotation and
 class ViewMaps:
     """Cameras of v views in working units, and one table row for each of their pixels."""
 
-    rotation: Float[
-        Tensor, "v 3 3"
-    ]  # world-to-camera: `x_cam = rotation @ x + translation`, x in the working frame
+    # world-to-camera: `x_cam = rotation @ x + translation`, x in the working frame
+    rotation: Float[Tensor, "v 3 3"]
     translation: Float[Tensor, "v 3"]  # working units
-    focal_length: Float[
-        Tensor, " v"
-    ]  # in map pixels; the maps are resampled so that it is equal along both axes
+    # in map pixels; the maps are resampled so that it is equal along both axes
+    focal_length: Float[Tensor, " v"]
     principal_point: Float[Tensor, "v 2"]  # (x, y) in map pixels
     size: Float[Tensor, "v 2"]  # (width, height) in map pixels, whole numbers
     first_row: Int[Tensor, " v"]  # table row of each view's first pixel
@@ -71,9 +69,8 @@ class Projection:
 
     depth: Float[Tensor, "m v n"]  # depth of the point, working units
     surface_depth: Float[Tensor, "m v n"]  # measured depth at its pixel, working units
-    weight: Float[
-        Tensor, "m v n"
-    ]  # of the measured depth, in [0, 1]; 0 where it is unknown or background
+    # of the measured depth, in [0, 1]; 0 where it is unknown or background
+    weight: Float[Tensor, "m v n"]
     silhouette_distance: Float[Tensor, "m v n"]  # at the point's depth, working units; 0 inside
     patch: Int[Tensor, "m v n"]  # similarity column of the patch at its pixel, -1 for none
     pixels: Float[Tensor, "m v n 2"]  # (x, y) in map pixels
@@ -83,25 +80,21 @@ class Projection:
 class Scene:
     """A reference view and v target views of another object, prepared for scoring poses."""
 
-    reference_points: Float[
-        Tensor, "n 3"
-    ]  # foreground patches of known depth in the reference, working units
+    # foreground patches of known depth in the reference, working units
+    reference_points: Float[Tensor, "n 3"]
     target_points: Float[Tensor, "m 3"]  # the same of all target views
     target_column: Int[Tensor, " m"]  # column of each target point in `similarity`
-    target_weight: Float[
-        Tensor, " m"
-    ]  # share of the surface that each target point represents; they sum to 1
-    similarity: Float[
-        Tensor, "n columns"
-    ]  # of each point to each foreground patch of all targets, double-centred
+    # share of the surface that each target point represents; they sum to 1
+    target_weight: Float[Tensor, " m"]
+    # of each point to each foreground patch of all targets, double-centred
+    similarity: Float[Tensor, "n columns"]
     reference_maps: ViewMaps  # per-pixel maps of the reference
     target_maps: ViewMaps  # per-pixel maps of the targets
     reference_to_working: Sim3  # Reference camera to working units
     target_to_working: Sim3  # first target camera to working units
     target_cameras: tuple[Camera, ...]  # cameras of the targets
-    matches: tuple[
-        tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...
-    ]  # points of reference and target, per target
+    # points of reference and target, per target
+    matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]
     view_similarity: Float[Tensor, " v"]  # of each target view to the reference, less their mean
     view_similarity_std: float  # standard deviation of that similarity over the target views
     view_span: float  # angle in degrees that the target views span around the target
@@ -109,9 +102,8 @@ class Scene:
     def to_sim3(self, poses: Poses, index: int, view: int) -> Sim3:
         """Convert a pose from working units to a similarity from the reference camera to a target
         view's camera."""
-        left, _, right = np.linalg.svd(
-            poses.rotation[index].double().numpy()
-        )  # orthogonal again in float64
+        # orthogonal again in float64
+        left, _, right = np.linalg.svd(poses.rotation[index].double().numpy())
         pose = Sim3(
             float(poses.scale[index]), left @ right, poses.translation[index].double().numpy()
         )
@@ -148,9 +140,8 @@ def build_scene(
     target_to_working, valid = _normalisation(cloud, known, "target views")
     source, cloud = reference_to_working.apply(source), target_to_working.apply(cloud)
 
-    starts = np.cumsum([len(one) for one in clouds])[
-        :-1
-    ]  # of the patches of each target but the first
+    # of the patches of each target but the first
+    starts = np.cumsum([len(one) for one in clouds])[:-1]
     foregrounds = [target.foreground.ravel() for target in targets]
     column = _number(np.concatenate(foregrounds))
     reference_foreground = reference.foreground.ravel()

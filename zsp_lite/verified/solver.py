@@ -31,9 +31,8 @@ class Solution:
     """Hypotheses of the verified solver, and what they were scored on."""
 
     hypotheses: tuple[Hypothesis, ...]  # best score first, at least one, at least 15 degrees apart
-    view_angles: Float[
-        np.ndarray, " n"
-    ]  # degrees from the reference's camera to each target view's under the best one
+    # degrees from the reference's camera to each target view's under the best one
+    view_angles: Float[np.ndarray, " n"]
     timings: dict[str, float]  # seconds per stage
     scene: Scene  # the scene that poses were scored on
     view_order: tuple[int, ...]  # index of the target view behind each view of the scene
@@ -137,13 +136,11 @@ class VerifiedSolver:
                     scene.view_similarity_std,
                     float(shape_fit[0]),
                 )
-                deficit = np.where(
-                    mode == np.arange(len(mode)), score[0] - score, np.inf
-                )  # of different poses
+                # of different poses
+                deficit = np.where(mode == np.arange(len(mode)), score[0] - score, np.inf)
                 confidence = Calibration().probabilities(deficit, evidence(*facts))[mode]
-                nearest = angles.argmin(
-                    axis=1
-                ).tolist()  # the scene's view that is closest under each pose
+                # the scene's view that is closest under each pose
+                nearest = angles.argmin(axis=1).tolist()
                 sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(nearest)]
                 named = [dict(zip(TERM_NAMES, row)) for row in terms.tolist()]
                 views = [order[view] for view in nearest]

@@ -80,11 +80,12 @@ class ScoreCoefficients:
 
 
 TERM_NAMES = tuple(field.name for field in fields(ScoreCoefficients))
+# the other terms compare shapes
 FEATURE_TERMS = (
     "forward_similarity",
     "reverse_similarity",
     "viewpoint",
-)  # the other terms compare shapes
+)
 WEIGHTS = ScoreCoefficients()
 
 
@@ -94,14 +95,12 @@ class PointTerms:
     docstring)."""
 
     projection: Projection  # where the n points fall in the v views under m poses
-    surface: Float[
-        Tensor, "m v n"
-    ]  # a: weight in [0, 1] with which the point lies on the measured surface
+    # a: weight in [0, 1] with which the point lies on the measured surface
+    surface: Float[Tensor, "m v n"]
     silhouette: Float[Tensor, "m v n"]  # c: in [0, 1]
     free_space: Float[Tensor, "m v n"]  # b: in [0, 1]
-    similarity: Float[
-        Tensor, "m v n"
-    ]  # s: feature similarity to the patch at the pixel, 0 without one
+    # s: feature similarity to the patch at the pixel, 0 without one
+    similarity: Float[Tensor, "m v n"]
 
     def averages(self, point_weights: Float[Tensor, " n"]) -> Iterator[Float[Tensor, " m"]]:
         """Yield similarity, overlap, silhouette and free space of each pose, averaged over views

@@ -29,13 +29,11 @@ class Coverage:
     """Directions from the target object to the cameras, seen from above with the reference camera
     below."""
 
-    targets: dict[
-        int, Float[np.ndarray, "2"]
-    ]  # unit vectors towards target cameras without their vertical part
+    # unit vectors towards target cameras without their vertical part
+    targets: dict[int, Float[np.ndarray, "2"]]
     reference: Float[np.ndarray, "2"]  # the same of the reference camera under the estimated pose
-    gap: tuple[
-        float, float
-    ]  # no target camera is between these angles (degrees, counter-clockwise from the right)
+    # no target camera is between these angles (degrees, counter-clockwise from the right)
+    gap: tuple[float, float]
     nearest: int  # number of the target view closest to the reference viewpoint
     angle: float  # angle in degrees between the directions of that view and of the reference
     centre: Float[np.ndarray, "3"]  # middle of the target object in the world

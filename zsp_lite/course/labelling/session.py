@@ -89,9 +89,8 @@ class Progress:
     sequence: str
     state: str  # "reference", "open", "accepted" or "skipped"
     picks: int
-    rms: (
-        float | None
-    )  # of the residuals relative to the spread of the picks; None before all keypoints are picked
+    # of the residuals relative to the spread of the picks; None before all keypoints are picked
+    rms: float | None
     problem: str = ""  # why the picks give no alignment, such as all on one line
 
 

@@ -62,9 +62,8 @@ def make_shape(
     build(assembly)
     vertices, faces = joined(assembly.meshes)
     material = np.repeat(assembly.materials, [len(mesh.faces) for mesh in assembly.meshes])
-    vertices = vertices * np.exp(
-        assembly.rng.normal(0, 0.08, 3)
-    )  # a small random scale along each axis
+    # a small random scale along each axis
+    vertices = vertices * np.exp(assembly.rng.normal(0, 0.08, 3))
     vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
     vertices, n = vertices / surface_spread(vertices, faces), len(faces)
     uv, white = np.zeros((n, 3, 2), np.float32), np.ones((n, 3, 3), np.float32)
@@ -77,9 +76,8 @@ def rounded_box(size, centre=(0, 0, 0), squareness: float = 5.0) -> Mesh:
     n = 11  # points along a side of a cube, denser at the edges, where the curvature is largest
     line = np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
     u, v = (grid.ravel() for grid in np.meshgrid(line, line, indexing="ij"))
-    corner = (
-        np.arange(n * n).reshape(n, n)[:-1, :-1].ravel()
-    )  # of each cell, the one with the lowest index
+    # of each cell, the one with the lowest index
+    corner = np.arange(n * n).reshape(n, n)[:-1, :-1].ravel()
     cells = np.concatenate([corner[:, None] + [0, n, n + 1], corner[:, None] + [0, n + 1, 1]])
     sides = [np.stack([np.full(n * n, sign), sign * u, v], 1) for sign in (-1.0, 1.0)]
     vertices = np.concatenate([np.roll(side, axis, axis=1) for axis in range(3) for side in sides])
@@ -123,9 +121,8 @@ class _Kind(NamedTuple):
     value: tuple[float, float]
     roughness: tuple[float, float]
     specular: float = 0.04
-    waves: tuple[int, ...] = (
-        5,
-    )  # numbers of waves of the pattern: 1 for stripes, 2 for checks, more for patches
+    # numbers of waves of the pattern: 1 for stripes, 2 for checks, more for patches
+    waves: tuple[int, ...] = (5,)
     frequency: tuple[float, float] = (2, 8)  # of the pattern, in radians per unit
     contrast: tuple[float, float] = (0.05, 0.2)  # of the pattern
 
@@ -133,16 +130,13 @@ class _Kind(NamedTuple):
 _ANY = (0, 360)
 _KINDS = (
     _Kind(0.22, _ANY, (0, 0.8), (0.25, 0.95), (0.35, 0.75)),  # paint
-    _Kind(
-        0.13, _ANY, (0, 0.8), (0.25, 0.95), (0.35, 0.75), 0.04, (1, 2, 5), (3, 14), (0.3, 1)
-    ),  # printed paint
+    # printed paint
+    _Kind(0.13, _ANY, (0, 0.8), (0.25, 0.95), (0.35, 0.75), 0.04, (1, 2, 5), (3, 14), (0.3, 1)),
     _Kind(0.23, _ANY, (0, 0.9), (0.25, 0.95), (0.15, 0.4), 0.05),  # plastic
-    _Kind(
-        0.12, (18, 38), (0.3, 0.65), (0.4, 0.85), (0.4, 0.8), 0.04, (1,), (10, 24), (0.2, 0.4)
-    ),  # wood
-    _Kind(
-        0.14, _ANY, (0, 0.8), (0.25, 0.95), (0.95, 0.95), 0.02, (3,), (28, 40), (0.15, 0.4)
-    ),  # cloth
+    # wood
+    _Kind(0.12, (18, 38), (0.3, 0.65), (0.4, 0.85), (0.4, 0.8), 0.04, (1,), (10, 24), (0.2, 0.4)),
+    # cloth
+    _Kind(0.14, _ANY, (0, 0.8), (0.25, 0.95), (0.95, 0.95), 0.02, (3,), (28, 40), (0.15, 0.4)),
     _Kind(0.08, (20, 60), (0, 0.3), (0.65, 0.95), (0.2, 0.55), 0.4),  # metal
     _Kind(0.08, _ANY, (0, 0), (0.08, 0.3), (0.7, 0.95)),  # rubber
 )

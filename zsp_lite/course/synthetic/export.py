@@ -23,16 +23,15 @@ from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
 
-SETTINGS_FILE = (
-    "synthetic.json"  # in the data folder of procedural objects: the settings of the export
-)
-RENDERED_FILE = (
-    "rendered_models.json"  # in that of models: the settings, and the model of each sequence
-)
+# in the data folder of procedural objects: the settings of the export
+SETTINGS_FILE = "synthetic.json"
+# in that of models: the settings, and the model of each sequence
+RENDERED_FILE = "rendered_models.json"
+# pairs per category of models, for each of these numbers of target views
 _MODEL_PAIRS, _MODEL_TARGETS = (
     20,
     (1, 3, 5),
-)  # pairs per category of models, for each of these numbers of target views
+)
 
 
 @dataclass(frozen=True)
@@ -124,9 +123,8 @@ def sequence_name(seed: int, category: str, index: int) -> str:
 
 class _Rendered(msgspec.Struct):
     settings: dict[str, int | str]
-    sequences: dict[
-        str, dict[str, dict]
-    ]  # the origin of each rendered sequence, by category and name
+    # the origin of each rendered sequence, by category and name
+    sequences: dict[str, dict[str, dict]]
 
 
 def export_models(

@@ -36,15 +36,12 @@ class Material:
     """Surface of a part of a mesh; its colour is the product of `colour`, `texture` and `pattern`,
     all sRGB."""
 
-    colour: Float[
-        np.ndarray, "4"
-    ]  # with opacity, in [0, 1]; an opacity below 1 lets the room shine through
-    texture: UInt8[np.ndarray, "h w 4"] | None = (
-        None  # rows from top to bottom; opacity below 128 means a hole
-    )
-    pattern: Callable[[np.ndarray], np.ndarray] | None = (
-        None  # colours (n, 3) of points (n, 3) in object coordinates
-    )
+    # with opacity, in [0, 1]; an opacity below 1 lets the room shine through
+    colour: Float[np.ndarray, "4"]
+    # rows from top to bottom; opacity below 128 means a hole
+    texture: UInt8[np.ndarray, "h w 4"] | None = None
+    # colours (n, 3) of points (n, 3) in object coordinates
+    pattern: Callable[[np.ndarray], np.ndarray] | None = None
     specular: float = 0.04  # reflectance at normal incidence
     roughness: float = 0.7  # as in glTF: 0 for a mirror, 1 for a matte surface
 
@@ -56,12 +53,10 @@ class TexturedMesh:
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]  # indices of vertices
     normals: Float[np.ndarray, "f 3 3"]  # unit shading normal of each corner of each face
-    uv: Float[
-        np.ndarray, "f 3 2"
-    ]  # of each corner; (0, 0) is the lower left corner of the texture, which repeats
-    colours: Float[
-        np.ndarray, "f 3 3"
-    ]  # sRGB in [0, 1] of each corner, a factor of the material's colour
+    # of each corner; (0, 0) is the lower left corner of the texture, which repeats
+    uv: Float[np.ndarray, "f 3 2"]
+    # sRGB in [0, 1] of each corner, a factor of the material's colour
+    colours: Float[np.ndarray, "f 3 3"]
     material: Int[np.ndarray, " f"]  # index of each face
     materials: tuple[Material, ...] = ()
 
@@ -79,9 +74,8 @@ class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
     def axes(self, extension: str) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from the axes of the file to the canonical frame (front +x, left +y,
         up +z)."""
-        front, up = (
-            ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")
-        )  # the latter as in glTF
+        # the latter as in glTF
+        front, up = ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")
         front, up = self.front or front, self.up or up
         given = [_AXES[one] if isinstance(one, str) else np.array(one) for one in (front, up)]
         x, z = (vector / max(np.linalg.norm(vector), 1e-6) for vector in given)
@@ -150,9 +144,8 @@ def read_mesh(path: str | Path) -> TexturedMesh:
         raise InputError(f"model {path} lacks {missing}")
     try:
         scene = trimesh.load_scene(path, process=False)
-        placed = [
-            scene.graph[node] for node in scene.graph.nodes_geometry
-        ]  # transforms and names of geometries
+        # transforms and names of geometries
+        placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
         parts = [
             _part(scene.geometry[name], transform)
             for transform, name in placed

@@ -7,11 +7,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 TAU = 2 * np.pi
+# axes of the outline, and that of the thickness
 _PLANES = {
     "xz": (0, 2, 1),
     "xy": (0, 1, 2),
     "yz": (1, 2, 0),
-}  # axes of the outline, and that of the thickness
+}
 
 
 @dataclass(frozen=True)

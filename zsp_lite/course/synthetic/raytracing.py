@@ -22,9 +22,8 @@ from zsp_lite.io.ply import load_open3d
 _LAYERS = 4  # surfaces with holes that a ray passes through
 _OFFSET = 2e-3  # of the start of a ray from the surface that it leaves, in units
 _RAYS = 4  # per sample towards the room, and per point of the floor towards the key light
-_BLOCKED = (
-    0.25  # light from parts of the object that block the room, relative to the light of the room
-)
+# light from parts of the object that block the room, relative to the light of the room
+_BLOCKED = 0.25
 _SHADOW_CELLS = 96  # along each side of the grid on which the shadow on the floor is known
 
 
@@ -33,14 +32,12 @@ class Rendering:
     """One rendered view with its exact geometry."""
 
     rgb: UInt8[np.ndarray, "h w 3"]
-    depth: Float[
-        np.ndarray, "h w"
-    ]  # z in the camera frame, 0 where the ray hits neither the object nor the floor
+    # z in the camera frame, 0 where the ray hits neither the object nor the floor
+    depth: Float[np.ndarray, "h w"]
     mask: Bool[np.ndarray, "h w"]  # pixels of the object
     canonical: Float[np.ndarray, "h w 3"]  # object coordinates of each object pixel, NaN elsewhere
-    normals: Float[
-        np.ndarray, "h w 3"
-    ]  # unit normals of the object pixels in the camera frame, 0 elsewhere
+    # unit normals of the object pixels in the camera frame, 0 elsewhere
+    normals: Float[np.ndarray, "h w 3"]
     camera: Camera
 
 
@@ -76,9 +73,8 @@ class MeshScene:
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
         self.origin = np.array([*(low + high)[:2] / 2, low[2]], np.float32)  # of the room
         first, second, third = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float32), 1, 0)
-        cross = np.cross(
-            second - first, third - first
-        )  # normal, with twice the area of the face as its length
+        # normal, with twice the area of the face as its length
+        cross = np.cross(second - first, third - first)
         self._flat = unit(cross)
         self._coordinates = (mesh.vertices if coordinates is None else coordinates)[
             mesh.faces
@@ -175,9 +171,8 @@ class MeshScene:
         opacity."""
         size = rays.shape[:2]
         rays, material = rays.reshape(-1, 3)[hits.ray], self.mesh.material[hits.face]
-        footprint = hits.distance / (
-            camera.focal_length.mean() * self._samples
-        )  # width of a sample, in units
+        # width of a sample, in units
+        footprint = hits.distance / (camera.focal_length.mean() * self._samples)
         albedo = self._albedo(hits, footprint)
         view, flat = unit(rays), _towards(self._flat[hits.face], rays)
         normal = _interpolated(hits.weights, self.mesh.normals[hits.face])
@@ -332,8 +327,7 @@ def _spread_directions(
     at random."""
     index = np.arange(count, dtype=np.float32)
     z = 1 - 2 * (index + rng.random((n, 1), np.float32)) / count
-    angle = np.float32(2 * np.pi) * (
-        index * np.float32(0.618034) + rng.random((n, 1), np.float32)
-    )  # golden ratio
+    # golden ratio
+    angle = np.float32(2 * np.pi) * (index * np.float32(0.618034) + rng.random((n, 1), np.float32))
     radius = np.sqrt(np.maximum(1 - z**2, 0))
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], -1)

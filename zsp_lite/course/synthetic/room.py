@@ -33,11 +33,12 @@ class CheapCamera:
     """Response of a camera: from linear radiance to 8-bit sRGB."""
 
     exposure: float = 0.2  # mean luminance after automatic exposure, with 1 for white
+    # error of automatic balance, a factor per channel
     white_balance: tuple[float, float, float] = (
         1.0,
         1.0,
         1.0,
-    )  # error of automatic balance, a factor per channel
+    )
     noise: float = 0.01  # standard deviation at mid-grey, relative to white
     vignetting: float = 0.1  # loss of light in the corners, as a fraction
 
@@ -60,9 +61,8 @@ class CheapCamera:
         falloff = 1 - self.vignetting * (x**2 + y**2) / 2
         image = (radiance * (gain * falloff)[..., None] * self.white_balance).astype(np.float32)
         image = blur(image, 0.4 * pixel)  # of the lens
-        noise = blur(
-            rng.standard_normal((height, width, 3), np.float32), 0.5 * pixel
-        )  # smoothed by demosaicing
+        # smoothed by demosaicing
+        noise = blur(rng.standard_normal((height, width, 3), np.float32), 0.5 * pixel)
         image = np.maximum(image + 1.6 * self.noise * noise * np.sqrt(0.16 * image + 0.006), 0)
         # A filmic tone curve, Narkowicz's fit to ACES.
         image = linear_to_srgb(
@@ -214,13 +214,13 @@ def _wall(
     while left < width - 2:
         wide, tall = rng.uniform(1, 4), rng.uniform(1.2, 5)
         hangs = rng.random() < 0.5
-        brightness = (
-            3.0 if hangs and rng.random() < 0.4 else 1.0
-        )  # of a window, or of anything else
+        # of a window, or of anything else
+        brightness = 3.0 if hangs and rng.random() < 0.4 else 1.0
+        # a row of twelve is one of books
         cells = (
             int(rng.integers(1, 5)),
             int(rng.choice([1, 2, 12])),
-        )  # a row of twelve is one of books
+        )
         colours = hsv(rng.uniform(0, 360), rng.uniform(0, 0.4), rng.uniform(0.2, 0.9)) + np.zeros(
             (*cells, 3)
         )

@@ -24,10 +24,11 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.points import axis_deviation
 
 _ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
+# lowest and highest mean elevation of a sequence's cameras above the object, degrees
 HEIGHTS = (
     19.0,
     30.0,
-)  # lowest and highest mean elevation of a sequence's cameras above the object, degrees
+)
 _FRAME_MARGIN = 0.03  # free border at each image side, as a fraction of that side
 _DEPTH_NOISE = 0.005  # standard deviation relative to the depth, at the object
 # Range of the fraction of pixels without depth, drawn per sequence. The wall has no depth at all.
@@ -119,9 +120,8 @@ def render_sequence(
     size = round(tall / min(tall, wide) * image_size), round(wide / min(tall, wide) * image_size)
     cameras = handheld_sweep(mesh.vertices, rng, frames, size, heights)
     scene = MeshScene(mesh, random_room(rng), rng)
-    first = cameras[
-        0
-    ].matrix  # its frame is the world, so that the object's pose does not depend on the category
+    # its frame is the world, so that the object's pose does not depend on the category
+    first = cameras[0].matrix
     to_object = np.linalg.inv(first)
     # The last digits of sines and products depend on the processor; rounding makes the files equal
     # everywhere.
@@ -143,9 +143,8 @@ def stereo_depth(
     for region, holes in ((view.mask, object_holes), (~view.mask & (view.depth > 0), floor_holes)):
         if region.any():
             known |= region & (confidence >= np.quantile(confidence[region], holes))
-    near = (
-        np.median(view.depth[view.mask]) if view.mask.any() else np.inf
-    )  # a flat object may be seen edge-on
+    # a flat object may be seen edge-on
+    near = np.median(view.depth[view.mask]) if view.mask.any() else np.inf
     # The noise, mostly correlated between pixels, grows with the square of the depth.
     noise = 0.95 * smooth_noise(rng, view.mask.shape, 2.0) + 0.3 * rng.standard_normal(
         view.mask.shape

@@ -71,9 +71,8 @@ def surface(
         board = int(tile * rng.choice([1, 4, 10]))
         stretch = 1.0 if board == tile else 12.0  # boards have the grain of wood
         row = np.arange(height)[:, None]
-        column = np.arange(width) + row // tile * rng.integers(
-            1, board
-        )  # each row begins elsewhere
+        # each row begins elsewhere
+        column = np.arange(width) + row // tile * rng.integers(1, board)
         of_board = rng.normal(
             1, rng.uniform(0.02, 0.1), (height // tile + 1, column.max() // board + 1)
         )

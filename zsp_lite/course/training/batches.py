@@ -21,12 +21,10 @@ class Batch:
     by row."""
 
     images: Float[Tensor, "crops 3 side side"]  # normalised RGB
-    surface: Float[
-        Tensor, "crops n 3"
-    ]  # object coordinates at the centre of each patch, NaN on the background
-    geometry: Float[
-        Tensor, "crops n 4"
-    ]  # there: normal in the camera frame, and depth standardised over the object
+    # object coordinates at the centre of each patch, NaN on the background
+    surface: Float[Tensor, "crops n 3"]
+    # there: normal in the camera frame, and depth standardised over the object
+    geometry: Float[Tensor, "crops n 4"]
     coverage: Float[Tensor, "crops n"]  # fraction of each patch that the object covers
     objects: int  # their number
 

@@ -23,10 +23,11 @@ from torch import Tensor, nn
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.course.training.batches import crop_grids, recolour
 
+# widths of the crops as a fraction of the image's
 GLOBAL_SCALE, LOCAL_SCALE = (
     (0.6, 1.0),
     (0.25, 0.6),
-)  # widths of the crops as a fraction of the image's
+)
 HIDDEN, BOTTLENECK = 256, 64  # widths of the head's layers
 STUDENT_TEMPERATURE = 0.1
 CENTRE_MOMENTUM = 0.9  # decay per step of the average of the teacher's logits
@@ -154,9 +155,8 @@ class Distillation:
         self.teacher = copy.deepcopy(self.student).requires_grad_(False)
         self.centre = torch.zeros(config.outputs)
         matrices = [p for p in self.student.parameters() if p.ndim > 1]
-        vectors = [
-            p for p in self.student.parameters() if p.ndim <= 1
-        ]  # biases and norms: no weight decay
+        # biases and norms: no weight decay
+        vectors = [p for p in self.student.parameters() if p.ndim <= 1]
         groups = [{"params": matrices}, {"params": vectors, "weight_decay": 0.0}]
         self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate)
 
@@ -167,9 +167,8 @@ class Distillation:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.param_groups[0]["weight_decay"] = cosine(WEIGHT_DECAY, progress)
-        self.student.head.directions.requires_grad_(
-            progress >= 0.05
-        )  # DINO fixes the last layer in the first epoch
+        # DINO fixes the last layer in the first epoch
+        self.student.head.directions.requires_grad_(progress >= 0.05)
 
         rng = np.random.default_rng([config.seed, 3, self.steps_done])
         objects, views = (rng.integers(count, size=config.images) for count in self.rgb.shape[:2])

@@ -37,10 +37,11 @@ GRID = 48  # points along each side of a view at which geometry is known
 # Smallest and largest difference in azimuth of the two views of a pair, about that of a reference
 # and the nearest of a few target views, and never more than that of two views of different pairs.
 PAIR_ANGLES = np.radians((5, 45))
+# so many rooms for so many consecutive objects: a room takes five times as long as a view
 ROOMS, SHARING = (
     8,
     100,
-)  # so many rooms for so many consecutive objects: a room takes five times as long as a view
+)
 
 
 @dataclass(frozen=True)
@@ -51,9 +52,8 @@ class RenderSet:
     # Object coordinates, NaN on the background. Two views of one object correspond where these
     # agree; they have no meaning across objects.
     surface: Float[np.ndarray, "n views grid grid 3"]
-    geometry: Float[
-        np.ndarray, "n views grid grid 4"
-    ]  # normal in the camera frame, depth standardised over the object
+    # normal in the camera frame, depth standardised over the object
+    geometry: Float[np.ndarray, "n views grid grid 4"]
 
 
 def render_set(numbers: Iterable[int]) -> RenderSet:
@@ -147,9 +147,8 @@ def _room(index: int) -> Room:
 def build_random_object(a: Assembly) -> None:
     """Build a tree of 5 to 10 random parts, left and right alike, each attached to one of those
     before it."""
-    nodes = [
-        (np.zeros(3), np.array([a.u(0.5, 1.3), a.u(0.4, 1.0), a.u(0.4, 1.2)]))
-    ]  # centre and size of each part
+    # centre and size of each part
+    nodes = [(np.zeros(3), np.array([a.u(0.5, 1.3), a.u(0.4, 1.0), a.u(0.4, 1.2)]))]
     a.add(_random_solid(a, nodes[0][1]), a.choice(5))
     for _ in range(4 + a.choice(6)):
         parent, parent_size = nodes[a.choice(len(nodes))]

@@ -19,9 +19,8 @@ from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, ORANGE
 
 MAX_POINTS = 6000  # points drawn; more are slow in the browser
-_DEPTH_TOLERANCE = (
-    0.15  # points farther behind the front point under the pointer cannot be clicked; in view units
-)
+# points farther behind the front point under the pointer cannot be clicked; in view units
+_DEPTH_TOLERANCE = 0.15
 
 _STYLE = """
 .zsp-cloud { border: 1px solid #888; background: white; cursor: crosshair; touch-action: none; }

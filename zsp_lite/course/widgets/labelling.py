@@ -70,9 +70,8 @@ class _LabellingWidget:
     def __init__(self, labelling: Labelling):
         self.labelling = labelling
         self.shown: dict[str, object] = {}
-        self.asked: tuple[str, bytes] | None = (
-            None  # the label in doubt that accept was pressed for
-        )
+        # the label in doubt that accept was pressed for
+        self.asked: tuple[str, bytes] | None = None
         self.refreshing = False
         self.box = self._build()
         started = any(row.picks for row in labelling.progress())

@@ -50,9 +50,8 @@ def self_check(notebook: str, number: int) -> None:
         )
     with ipython.utils.capture.capture_output() as captured:
         jupyterquiz.display_quiz(checks[number - 1], colors=_COLOURS)
-    form, script = (
-        output.data for output in captured.outputs
-    )  # the form is a <div> that jupyterquiz leaves open
+    # the form is a <div> that jupyterquiz leaves open
+    form, script = (output.data for output in captured.outputs)
     ipython.display.display(
         ipython.display.HTML(form["text/html"] + f"<style>{_STYLE}</style></div>")
     )

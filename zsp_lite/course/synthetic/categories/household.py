@@ -90,11 +90,12 @@ def chair(a: Assembly) -> None:
 def toilet(a: Assembly) -> None:
     """Build a toilet: bowl at the front, seat, open or closed lid, cistern behind with a button or
     a side lever."""
+    # length and width are radii of the bowl
     length, width, height = (
         a.u(0.5, 0.66),
         a.u(0.36, 0.46),
         a.u(0.6, 0.8),
-    )  # length and width are radii of the bowl
+    )
     foot, bowl_x = a.u(0.5, 0.75), length * 0.75
     outside = [
         [0.001, 0],
@@ -168,9 +169,8 @@ def hairdryer(a: Assembly) -> None:
         np.array([-0.08 + a.u(-0.25, 0.15), 0, -a.u(0.7, 1.1)]),
     )
     a.add(capsule(top, bottom, a.u(0.11, 0.16), a.u(0.09, 0.13)), 0 if a.chance(0.5) else 2)
-    a.add(
-        box((0.06, 0.1, 0.22), top + (bottom - top) * a.u(0.35, 0.6) + [0.13, 0, 0]), 3
-    )  # the switch
+    # the switch
+    a.add(box((0.06, 0.1, 0.22), top + (bottom - top) * a.u(0.35, 0.6) + [0.13, 0, 0]), 3)
     a.add(capsule(bottom, bottom + [-a.u(0.1, 0.35), a.u(-0.2, 0.2), -0.38], 0.035, 0.025), 3)
 
 

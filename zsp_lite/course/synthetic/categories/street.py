@@ -67,9 +67,8 @@ def bicycle(a: Assembly) -> None:
         pedal = crank + side * np.array([0.13, 0.13, -0.13])
         a.add(rod(crank + [0, side * 0.09, 0], pedal, 0.02), 2)
         a.add(box((0.1, 0.1, 0.025), pedal + [0, side * 0.05, 0]), 3)
-    a.add(
-        disc(0.12, 0.02, crank - [0, 0.06, 0]), 2
-    )  # the chain ring of a bicycle is on its right side
+    # the chain ring of a bicycle is on its right side
+    a.add(disc(0.12, 0.02, crank - [0, 0.06, 0]), 2)
     if a.chance(0.35):
         a.add(box((0.28, 0.34, 0.22), head + [0.2, 0, 0.05]), 5)  # the basket
 

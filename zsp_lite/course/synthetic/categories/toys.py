@@ -128,10 +128,11 @@ def toytruck(a: Assembly) -> None:
         a.add(rounded_box(size, (nose - bonnet * 0.5, 0, deck + cab_height * 0.26), 6), 0)
     front, roof = nose - bonnet * 0.85, deck + cab_height
     rear = front - cab_length
+    # lower and upper edge of the windscreen
     bend, top = (
         (front, deck + cab_height * 0.5),
         (front - slope, roof),
-    )  # lower and upper edge of the windscreen
+    )
     a.add(extrusion([(rear, deck + 0.04), (front, deck + 0.04), bend, top, (rear, roof)], width), 0)
     side_window = (cab_length * 0.5, width * 1.02, cab_height * 0.3)
     a.add(box(side_window, (rear + cab_length * 0.48, 0, deck + cab_height * 0.72)), 4)
@@ -185,9 +186,8 @@ def toybus(a: Assembly) -> None:
         size = (bonnet * 1.4, width * 0.8, height * 0.5)
         a.add(rounded_box(size, (nose - bonnet * 0.6, 0, floor + height * 0.25), 6), 0)
     else:
-        a.add(
-            box((0.05, width * 0.7, height * 0.1), (nose, 0, floor + height * 0.93)), 6
-        )  # the destination sign
+        # the destination sign
+        a.add(box((0.05, width * 0.7, height * 0.1), (nose, 0, floor + height * 0.93)), 6)
     front = nose - bonnet
     body, middle = front - tail, (front + tail) / 2
     a.add(rounded_box((body, width, height), (middle, 0, floor + height / 2), a.u(7, 14)), 0)
