@@ -7,7 +7,7 @@ import torch
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite.choices import SOLVERS
-from zsp_lite.course.widgets import matching
+from zsp_lite.course.widgets import cycles
 from zsp_lite.features import FeatureMap
 from zsp_lite.matchers import MATCHERS
 from zsp_lite.matching import similarity
@@ -50,7 +50,7 @@ def test_a_backbone_on_another_device_gives_the_pose_of_the_cpu(ellipsoids, solv
     )
     np.testing.assert_array_equal(first.sim3.matrix, second.sim3.matrix)
     pair = second.reference_view, second.target_views[0]
-    matching.cycle(*pair, similarity(*(view.features for view in pair)))
+    cycles.cycle(*pair, similarity(*(view.features for view in pair)))
 
 
 @pytest.mark.parametrize("name", MATCHERS)

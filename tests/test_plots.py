@@ -8,7 +8,7 @@ import torch
 from zsp_lite.data.cameras import Camera
 from zsp_lite.verified.scene import Projection
 from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, PointTerms
-from zsp_lite.viz import plots, verified
+from zsp_lite.viz import plots, point_classes
 
 IMAGE = np.zeros((60, 80, 3), np.uint8)
 pytestmark = pytest.mark.usefixtures("closed_figures")
@@ -76,10 +76,10 @@ def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects(
     terms = PointTerms(
         Projection(*(x[None, None] for x in parts)), *(x[None, None] for x in values)
     )
-    assert verified.classify_points(terms).tolist() == [[0, 1, 2, 3, 4]]
-    assert list(verified.POINT_CLASSES)[2:4] == ["in free space", "outside the silhouette"]
-    figure = verified.show_point_classes(
-        [IMAGE], ["view"], [2 * pixels.numpy()], [*verified.classify_points(terms)]
+    assert point_classes.classify_points(terms).tolist() == [[0, 1, 2, 3, 4]]
+    assert list(point_classes.POINT_CLASSES)[2:4] == ["in free space", "outside the silhouette"]
+    figure = point_classes.show_point_classes(
+        [IMAGE], ["view"], [2 * pixels.numpy()], [*point_classes.classify_points(terms)]
     )
     drawn = np.concatenate([collection.get_offsets() for collection in figure.axes[0].collections])
     # The point beyond the border (110) stands at it (80).

@@ -20,7 +20,7 @@ pytest.importorskip("ipywidgets", reason="widgets are optional: pip install ipyw
 matplotlib.use("agg")
 
 from tools import widget_examples as examples  # noqa: E402
-from zsp_lite.course.widgets import alignment, common, features, matching  # noqa: E402
+from zsp_lite.course.widgets import common, cycles, outliers, patches  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("closed_figures")]
 
@@ -73,7 +73,7 @@ def sim():
 
 def test_attention_names_the_patch_with_the_largest_weight():
     backbone, widget = load_backbone("zsp-tiny", "cpu"), examples.attention()
-    facets = features.all_facets(backbone, [examples.sample_pair().reference.rgb])
+    facets = patches.all_facets(backbone, [examples.sample_pair().reference.rgb])
     widget.controls["layer"].value, widget.controls["head"].value, widget.controls["row"].value = (
         4,
         2,
@@ -88,7 +88,7 @@ def test_attention_names_the_patch_with_the_largest_weight():
 def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim):
     pair = examples.sample_pair()
     kinds, cells = {"one": sim, "other": -sim}, np.stack(np.divmod(sim.argmax(1).numpy(), 28), -1)
-    widget = features.patch_similarities(
+    widget = patches.patch_similarities(
         pair.reference.rgb, pair.target.rgb, kinds, pair.cells, pair.valid, "other"
     )
     widget.controls["kind"].value, widget.controls["row"].value, widget.controls["col"].value = (
@@ -117,7 +117,7 @@ def test_saliency_counts_the_patches_above_the_threshold_and_an_empty_box_has_no
 
 def test_the_cycle_has_the_cyclical_distance_and_names_the_background(sim):
     pair = examples.sample_views()
-    widget = matching.cycle(*pair, sim)
+    widget = cycles.cycle(*pair, sim)
     distances = -cyclical_distances(sim, (28, 28), (28, 28)).numpy()
     valid = np.isfinite(
         cyclical_distances(sim, (28, 28), (28, 28), *(view.foreground for view in pair)).numpy()
@@ -135,7 +135,7 @@ def test_the_caption_agrees_with_ransac():
     target = Sim3(1.3, TURN, np.ones(3)).apply(source) + 0.03 * rng.normal(size=(40, 3))
     target[:10] = 2 * rng.normal(size=(10, 3))
     images, pixels = np.zeros((2, 60, 60, 3)), rng.uniform(0, 60, (2, 40, 2))
-    widget = alignment.ransac_settings(tuple(images), tuple(pixels), (source, target), TURN)
+    widget = outliers.ransac_settings(tuple(images), tuple(pixels), (source, target), TURN)
     for trials, threshold, seed in ((1000, 0.2, 0), (5, 0.1, 3), (100, 0.9, 7)):
         for name, value in (("trials", trials), ("threshold", threshold), ("seed", seed)):
             widget.controls[name].value = value
@@ -146,13 +146,13 @@ def test_the_caption_agrees_with_ransac():
         )
         assert f"rotation error {rotation_error(sim3.R, TURN):.0f}°" in widget.caption.value
     line = np.outer(np.arange(40.0), [1, 2, 3])
-    widget = alignment.ransac_settings(tuple(images), tuple(pixels), (line, line))
+    widget = outliers.ransac_settings(tuple(images), tuple(pixels), (line, line))
     assert widget.caption.value.startswith("No fit: ")
 
 
 def test_the_caption_agrees_with_least_squares():
     source = np.random.default_rng(2).normal(size=(9, 3))
-    widget = alignment.one_outlier(source, source)
+    widget = outliers.one_outlier(source, source)
     widget.controls["distance"].value = 3.0
     fit = umeyama(source, source + np.outer(np.arange(9) == 8, [3.0, 0, 0]))
     assert f"rotation changes by {rotation_error(fit.R, np.eye(3)):.1f}°" in widget.caption.value

@@ -15,8 +15,7 @@ from zsp_lite.course.demo import demo_pairs
 from zsp_lite.course.labelling.session import Labelling
 from zsp_lite.course.samples import sample_data
 from zsp_lite.course.true_matches import GroundTruthPair, ground_truth_pair
-from zsp_lite.course.widgets import alignment as alignment_widgets
-from zsp_lite.course.widgets import features, labelling, masks, matching
+from zsp_lite.course.widgets import cycles, labelling, mask_box, outliers, patches
 from zsp_lite.course.widgets.common import Widget
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import mask_to_bbox
@@ -43,62 +42,62 @@ def sample_views() -> tuple[View, View]:
 
 
 def attention() -> Widget:
-    """`features.attention` on a sample object."""
+    """`patches.attention` on a sample object."""
     image, backbone = sample_pair().reference.rgb, _backbone()
-    facets = features.all_facets(backbone, [image])
+    facets = patches.all_facets(backbone, [image])
     queries, keys = (
         torch.cat([facets[layer, facet] for layer in range(backbone.model.depth)])
         for facet in ("query", "key")
     )
-    return features.attention(image, queries, keys, GRID, backbone.model.num_heads)
+    return patches.attention(image, queries, keys, GRID, backbone.model.num_heads)
 
 
 def patch_similarities() -> Widget:
-    """`features.patch_similarities` on a sample pair: the keys of two layers, and those of the last
+    """`patches.patch_similarities` on a sample pair: the keys of two layers, and those of the last
     with context."""
     pair, (first, second) = sample_pair(), sample_views()
-    tokens = features.all_facets(_backbone(), [pair.reference.rgb, pair.target.rgb])
+    tokens = patches.all_facets(_backbone(), [pair.reference.rgb, pair.target.rgb])
     sims = {
         f"layer {n}, key": similarity(*tokens[n, "key"][:, 1:].unflatten(1, GRID)) for n in (3, 11)
     }
     sims["bare key"] = key_similarities(first.features.keys, [second.features.keys])[0]
-    return features.patch_similarities(
+    return patches.patch_similarities(
         pair.reference.rgb, pair.target.rgb, sims, pair.cells, pair.valid
     )
 
 
 def saliency() -> Widget:
-    """`features.saliency` on a sample object."""
-    return features.saliency(sample_views()[0])
+    """`patches.saliency` on a sample object."""
+    return patches.saliency(sample_views()[0])
 
 
 def cycle() -> Widget:
-    """`matching.cycle` on a sample pair."""
-    return matching.cycle(*sample_views(), similarity(*(view.features for view in sample_views())))
+    """`cycles.cycle` on a sample pair."""
+    return cycles.cycle(*sample_views(), similarity(*(view.features for view in sample_views())))
 
 
 def ransac_settings() -> Widget:
-    """`alignment.ransac_settings` on a sample pair."""
+    """`outliers.ransac_settings` on a sample pair."""
     pair = sample_views()
     found = match(pair[0].features, pair[1].features)
     images = tuple(view.frame.rgb for view in pair)
-    return alignment_widgets.ransac_settings(
+    return outliers.ransac_settings(
         images, tuple(match_pixels(pair, found)), match_points(*pair, found)
     )
 
 
 def one_outlier() -> Widget:
-    """`alignment.one_outlier` on random points."""
+    """`outliers.one_outlier` on random points."""
     points = np.random.default_rng(0).normal(size=(12, 3))
-    return alignment_widgets.one_outlier(points, points)
+    return outliers.one_outlier(points, points)
 
 
 def box_to_mask() -> Widget:
-    """`masks.box_to_mask` on a sample frame."""
+    """`mask_box.box_to_mask` on a sample frame."""
     dataset = Co3D(sample_data())
     category = dataset.categories()[0]
     frame = dataset.load(dataset.frames(category, dataset.sequences(category)[0].sequence_name)[0])
-    return masks.box_to_mask(frame, mask_to_bbox(frame.mask))
+    return mask_box.box_to_mask(frame, mask_to_bbox(frame.mask))
 
 
 def label_poses() -> Widget:

@@ -17,6 +17,8 @@ Read the files in this order:
     points       points of the object
     estimates    the results, and the protocol of solvers
     metrics      rotation errors, medians and accuracies
+    pair_result  the results of a pair, and its errors against labels
+    scans        frames of objects of your own, loaded for an estimate
     own_objects  one pair of your own, from files to files
     category     all objects of a category in one frame, by the verified solver
 

@@ -52,11 +52,10 @@ def pair_solver(root: str, backbone: BackboneLike, threads: int) -> Evaluate:
         line: dict[str, Any] = {"pair": pair.key}
         with suppress(NoPoseError):
             found = hypotheses(PairProblem(pair, store))
-            line |= {
-                "centre": found.centre.tolist(),
-                "matrices": [one.matrix.tolist() for one in found.sim3s],
-            }
-            line |= {"probabilities": found.probabilities.tolist(), "span": found.span}
+            line["centre"] = found.centre.tolist()
+            line["matrices"] = [one.matrix.tolist() for one in found.sim3s]
+            line["probabilities"] = found.probabilities.tolist()
+            line["span"] = found.span
         return line
 
     return solve

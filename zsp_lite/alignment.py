@@ -263,9 +263,8 @@ def _draw_samples(
     """Draw `trials` samples of `size` different indices below n, uniformly, without a loop over the
     trials."""
     samples = np.empty((trials, size), dtype=np.int64)
-    for k in range(
-        size
-    ):  # a rank among the n - k indices left, moved up past each earlier index that is not larger
+    # A rank among the n - k indices left, moved up past each earlier index that is not larger.
+    for k in range(size):
         draw = rng.integers(n - k, size=trials)
         for earlier in np.sort(samples[:, :k], axis=1).T:
             draw += draw >= earlier

@@ -69,10 +69,8 @@ def global_score(reference: FeatureMap, target: FeatureMap) -> float:
 def mask_iou(first: Mask, second: Mask) -> float:
     """Compute the intersection over union of two masks, 0 if both are empty ("SaliencyIoU" of two
     foregrounds)."""
-    first, second = (
-        torch.as_tensor(first, dtype=torch.bool),
-        torch.as_tensor(second, dtype=torch.bool),
-    )
+    first = torch.as_tensor(first, dtype=torch.bool)
+    second = torch.as_tensor(second, dtype=torch.bool)
     return float((first & second).sum() / (first | second).sum().clamp_min(1))
 
 

@@ -44,13 +44,10 @@ KAPPA, FLOOR = 16.0, 0.1  # \kappa, with which a hypothesis 20 degrees off count
 SAME_ANGLE = 30.0  # degrees; rotations further apart disagree
 ALL_PAIRS_BELOW, PAIRS_PER_OBJECT = 12, 6  # see `object_pairs`
 _REFERENCES, _REFERENCES_OF_ONE = 3, 16  # see `references_per_pair`
-# of each sweep: at 0, coordinate ascent
-_CHAINS, _TEMPERATURES = (
-    48,
-    (*np.geomspace(1, 0.3, 12), *[0.0] * 4),
-)
+_CHAINS = 48
+_TEMPERATURES = (*np.geomspace(1, 0.3, 12), *[0.0] * 4)  # of each sweep: at 0, coordinate ascent
 _PROPOSERS, _AVERAGING_SWEEPS, _REWEIGHTINGS = 8, 6, 10
-# weight of hypotheses that disagree, so that every object gets a scale and a translation
+# Weight of hypotheses that disagree, so that every object gets a scale and a translation.
 _WEAK = 1e-3
 # Coefficients of `_judge`, fitted by tools/category_fit.py on validation categories to sets of
 # three to five objects.
@@ -78,7 +75,7 @@ class PairHypotheses:
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectPose:
+class AlignedObject:
     """Pose of one object in the common frame of its category."""
 
     sim3: Sim3  # from the object's world to the common frame
@@ -95,7 +92,7 @@ class CategoryAlignment:
     """All objects of a category in one frame: that of the first object, with a mean log scale of
     zero."""
 
-    objects: dict[str, ObjectPose]  # by name, sorted
+    objects: dict[str, AlignedObject]  # by name, sorted
     pairs: tuple[PairHypotheses, ...]  # what it was found from
     # median angle from the best hypothesis of the pairs (reference, target), where above 30
     # degrees; largest first
@@ -133,8 +130,8 @@ def object_pairs(
         per_object = n - 1 if n < ALL_PAIRS_BELOW else PAIRS_PER_OBJECT
     rng = np.random.default_rng(0)
     circle = rng.permutation(n).tolist()
-    # the first connects all objects
-    steps = [1, *(2 + rng.permutation(n - 2)).tolist()][:per_object]
+    steps = [1, *(2 + rng.permutation(n - 2)).tolist()]  # the first connects all objects
+    steps = steps[:per_object]
     pairs = []
     for a, b in sorted((circle[k], circle[(k + step) % n]) for k in range(n) for step in steps):
         reference, target = names[a], names[b]
@@ -209,6 +206,7 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
         raise InputError(
             f"pairs connect {len(order)} of {len(names)} objects with {names[0]}, expected all"
         )
+
     nodes = _build_nodes(pairs, ends)
     rotations = _search(nodes, order, np.random.default_rng(0))
     scales, translations, centres = _scales_and_translations(pairs, ends, rotations)
@@ -218,34 +216,36 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
             for (a, b), one in zip(ends, pairs)
         ]
     )
+
     objects = {}
+    spans = np.array([pair.span for pair in pairs])
     for i, name in enumerate(names):
-        sim3, agreeing = (
-            Sim3(scales[i], rotations[i], translations[i]),
-            off[(ends == i).any(axis=1)] < SAME_ANGLE,
-        )
+        sim3 = Sim3(scales[i], rotations[i], translations[i])
         if len(names) > 2:
+            agreeing = off[(ends == i).any(axis=1)] < SAME_ANGLE
             probability, turned, other = _judge(nodes[i], rotations, i, float(agreeing.mean()))
         else:
-            margin, turned, known = compare_two(
-                nodes[i], rotations, i, np.array([pair.span for pair in pairs])
-            )
+            margin, turned, known = compare_two(nodes[i], rotations, i, spans)
             probability, other = OF_TWO.probabilities(np.array([0.0, margin]), known).tolist()
         alternative = None
         if turned is not None:  # about the object's centre
             alternative = Sim3(
                 scales[i], turned, sim3.apply(centres[i]) - scales[i] * turned @ centres[i]
             )
-        objects[name] = ObjectPose(sim3, centres[i], probability, alternative, other)
-    angles = {
-        (names[a], names[b]): float(np.median(off[(ends == (a, b)).all(axis=1)])) for a, b in ends
-    }
-    worst = {
-        key: angles[key]
-        for key in sorted(angles, key=angles.get, reverse=True)
-        if angles[key] > SAME_ANGLE
-    }
-    return CategoryAlignment(objects, tuple(pairs), worst)
+        objects[name] = AlignedObject(sim3, centres[i], probability, alternative, other)
+    return CategoryAlignment(objects, tuple(pairs), _disagreements(names, ends, off))
+
+
+def _disagreements(
+    names: Sequence[str], ends: Int[np.ndarray, "e 2"], off: Float[np.ndarray, " e"]
+) -> dict[tuple[str, str], float]:
+    """Return the median angle of each pair of objects that disagrees, largest first."""
+    angles = {}
+    for a, b in ends:
+        of_both = (ends == (a, b)).all(axis=1)
+        angles[names[a], names[b]] = float(np.median(off[of_both]))
+    worst_first = sorted(angles, key=angles.get, reverse=True)
+    return {key: angles[key] for key in worst_first if angles[key] > SAME_ANGLE}
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,8 +290,8 @@ def _build_nodes(pairs: Sequence[PairHypotheses], ends: Int[np.ndarray, "e 2"]) 
     most = max(len(pair.sim3s) for pair in pairs)
     rows: list[list[tuple]] = [[] for _ in range(ends.max() + 1)]
     for (a, b), pair in zip(ends, pairs):
-        # padded by repetition
-        turn = np.resize(np.array([one.R for one in pair.sim3s], np.float32), (most, 3, 3))
+        turn = np.array([one.R for one in pair.sim3s], np.float32)
+        turn = np.resize(turn, (most, 3, 3))  # padded by repetition
         weight = np.pad(pair.probabilities, (0, most - len(pair.sim3s))).astype(np.float32)
         rows[a].append((b, turn, weight))
         rows[b].append((a, turn.swapaxes(1, 2), weight))
@@ -303,9 +303,8 @@ def _search(
 ) -> Float[np.ndarray, "n 3 3"]:
     """Return the rotations that maximise the objective, relative to the first object's."""
     rotations = np.tile(np.eye(3, dtype=np.float32), (_CHAINS, len(nodes), 1, 1))
-    for k, i in enumerate(
-        order[1:], 1
-    ):  # in this order, each object has a pair with an earlier one
+    # In this order, each object has a pair with an earlier one.
+    for k, i in enumerate(order[1:], 1):
         earlier = np.isin(nodes[i].neighbour, order[:k])
         known = _Node(nodes[i].neighbour[earlier], nodes[i].turn[earlier], nodes[i].weight[earlier])
         _sample(known, rotations, int(i), 1.0, rng)
@@ -333,7 +332,7 @@ def _sample(
         [rotations[:, i, None], proposals[:, some].reshape(t, -1, 3, 3)], axis=1
     )
     score = node.score(candidates, proposals)
-    # the largest is then a sample of the softmax
+    # The largest is then a sample of the softmax.
     score += temperature * rng.gumbel(size=score.shape)
     rotations[:, i] = candidates[np.arange(t), score.argmax(axis=1)]
 
@@ -346,10 +345,8 @@ def _judge(
     margin, best = _margin(node, rotations, i)
     # The pairs of an object err together, so the margin counts by the root of their number. A
     # conditional logit; that none is right is less probable if more of the object's pairs agree.
-    other, none = (
-        np.exp(-MARGIN * margin / np.sqrt(len(node.neighbour))),
-        np.exp(NONE + NONE_AGREEING * agreeing),
-    )
+    other = np.exp(-MARGIN * margin / np.sqrt(len(node.neighbour)))
+    none = np.exp(NONE + NONE_AGREEING * agreeing)
     return float(1 / (1 + other + none)), best, float(other / (1 + other + none))
 
 
@@ -403,16 +400,13 @@ def _scales_and_translations(
     # Hypothesis (lambda, H, tau) demands log s_a - log s_b = log(lambda), and t_a - t_b = s_b Q_b y
     # - s_a Q_a c with y = lambda H c + tau, the place in the world of b of the centre c of a.
     incidence = np.eye(len(rotations))[a] - np.eye(len(rotations))[b]
-    scales = np.exp(_least_absolute(incidence, np.log([[one.scale] for one in sim3s]), weight))[
-        :, 0
-    ]
+    log_ratios = np.log([[one.scale] for one in sim3s])
+    scales = np.exp(_least_absolute(incidence, log_ratios, weight))[:, 0]
     linear = scales[:, None, None] * rotations
     shift = np.einsum("kij,kj->ki", linear[b], y) - np.einsum("kij,kj->ki", linear[a], c)
     t = _least_absolute(incidence, shift, weight)
-    seen = (
-        np.concatenate([np.eye(len(rotations))[a], np.eye(len(rotations))[b]])
-        * np.r_[weight, weight][:, None]
-    )
+    seen = np.concatenate([np.eye(len(rotations))[a], np.eye(len(rotations))[b]])
+    seen *= np.r_[weight, weight][:, None]
     return scales, t - t[0], (seen / seen.sum(axis=0)).T @ np.r_[c, y]
 
 
@@ -426,7 +420,7 @@ def _least_absolute(
     scaled = weight
     for _ in range(_REWEIGHTINGS):
         weighted = incidence.T * scaled
-        # of least norm: mean zero
+        # Of least norm: mean zero.
         x = np.linalg.lstsq(weighted @ incidence, weighted @ difference, rcond=None)[0]
         scaled = weight / (np.linalg.norm(incidence @ x - difference, axis=1) + 1e-9)
     return x

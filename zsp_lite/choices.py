@@ -26,10 +26,5 @@ METRICS = {
     "scale": "scale ratio",
     "milliseconds": "ms per pair",
 }
-# by default: the paper's, and one more
-METRICS_SHOWN = (
-    "mean_category_median",
-    "acc30",
-    "acc15",
-    "auc30",
-)
+# By default: the paper's, and one more.
+METRICS_SHOWN = ("mean_category_median", "acc30", "acc15", "auc30")

@@ -123,7 +123,7 @@ def real_array(
     import numpy as np
 
     found, expected = None, "real numbers"
-    # of NumPy, for instance for rows of different lengths
+    # Errors of NumPy, for instance for rows of different lengths.
     with suppress(TypeError, ValueError, RuntimeError):
         array = np.asarray(values)
         if array.dtype.kind in "biuf":
@@ -173,8 +173,8 @@ def rigid_matrix(name: str, values: object) -> "np.ndarray":
 
     matrix = real_array(name, values, (4, 4)).copy()
     check_magnitude(name, matrix)
-    # for instance a transposed matrix
-    if (off := np.abs(matrix[3] - (0, 0, 0, 1)).max()) > ROTATION_TOLERANCE:
+    off = np.abs(matrix[3] - (0, 0, 0, 1)).max()
+    if off > ROTATION_TOLERANCE:  # for instance a transposed matrix
         raise InputError(
             f"{name} has the last row {matrix[3].tolist()}, {off:.2g} off the expected 0 0 0 1"
         )

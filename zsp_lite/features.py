@@ -146,9 +146,6 @@ def log_bin(
     b, h, w, d = x.shape
     pooled = average_pool(x, (1, 2))
     index = bin_indices((h, w)).to(x.device)
-    # (B, 9 or 8, H*W, D)
-    near, far = (
-        x.flatten(1, 2)[:, index[:9]],
-        pooled.flatten(1, 2)[:, index[9:]],
-    )
+    near = x.flatten(1, 2)[:, index[:9]]  # (B, 9, H*W, D)
+    far = pooled.flatten(1, 2)[:, index[9:]]  # (B, 8, H*W, D)
     return torch.cat([near, far], dim=1).transpose(1, 2).reshape(b, h, w, 17 * d)

@@ -16,7 +16,7 @@ additions of S to itself.
 import threading
 import warnings
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -161,39 +161,74 @@ def match(
     on_ref = ref.foreground() if ref_foreground is None else ref_foreground
     on_target = target.foreground() if target_foreground is None else target_foreground
     on_ref, on_target = torch.as_tensor(on_ref), torch.as_tensor(on_target)
-    if cycle_from == "reference":
+
+    # Both stages are about the image in which cycles start.
+    forward = cycle_from == "reference"
+    if forward:
         start, end, on_start, on_end = ref, target, on_ref, on_target
     else:
         start, end, on_start, on_end, sim = target, ref, on_target, on_ref, sim.T
+    ranked = _rank(sim, on_start, on_end, matcher, published=not forward)
+    chosen = _select(ranked, start, k, kmeans, seed, binning)
+
+    u = np.stack(np.unravel_index(chosen, start.grid), axis=-1)
+    v = np.stack(np.unravel_index(ranked.partner[chosen], end.grid), axis=-1)
+    reference, matched = (u, v) if forward else (v, u)
+    return Matches(reference, matched, ranked.similarity[chosen], -ranked.score[chosen])
+
+
+class _Ranked(NamedTuple):
+    """What a matcher says of each patch of one image."""
+
+    score: Float[np.ndarray, " n1"]  # higher is better; not finite without a match
+    partner: Int[np.ndarray, " n1"]  # index of a patch of the other image
+    similarity: Float[np.ndarray, " n1"]  # of the patch and its partner
+
+
+def _rank(
+    sim: Float[Tensor, "n1 n2"],
+    on_start: Bool[Tensor, "h1 w1"],
+    on_end: Bool[Tensor, "h2 w2"],
+    matcher: str | Matcher,
+    published: bool,
+) -> _Ranked:
+    """Find the partner of each patch of the first image, and the score of the two."""
     if matcher == "cyclical":
-        score, neighbour = _cycles(sim, on_start, on_end, published=cycle_from == "target")
+        score, partner = _cycles(sim, on_start, on_end, published)
     else:
-        rank = MATCHERS[matcher] if isinstance(matcher, str) else matcher
+        ask = MATCHERS[matcher] if isinstance(matcher, str) else matcher
         # Copies, since a matcher may overwrite what it gets, such as the similarities of the
         # background.
-        answer = rank(sim.clone(), on_start.flatten().clone(), on_end.flatten().clone())
-        neighbour, score = (torch.as_tensor(one).cpu() for one in answer)
-        if not len(neighbour) == len(score) == len(sim):
-            found = f"{len(neighbour)} partners and {len(score)} scores"
+        answer = ask(sim.clone(), on_start.flatten().clone(), on_end.flatten().clone())
+        partner, score = (torch.as_tensor(one).cpu() for one in answer)
+        if not len(partner) == len(score) == len(sim):
+            found = f"{len(partner)} partners and {len(score)} scores"
             raise InputError(
                 f"the matcher returned {found}, expected one for each of {len(sim)} patches"
             )
-    best = sim.gather(1, neighbour[:, None])[:, 0]
+    cosines = sim.gather(1, partner[:, None])[:, 0]
+    return _Ranked(score.numpy(), partner.numpy(), cosines.numpy())
 
-    # The rest works on a few hundred numbers, in NumPy.
-    score, best, neighbour = score.numpy(), best.numpy(), neighbour.numpy()
-    order = np.lexsort((-best, -score))
-    order = order[np.isfinite(score[order])][: 2 * k if kmeans else k]
-    if kmeans and len(order) > k:
-        clusters = _cluster(_gram(start, order, binning), k, np.random.default_rng(seed))
-        # the most salient first
-        by_cluster = np.lexsort((-start.saliency.flatten().numpy()[order], clusters))
-        first = np.unique(clusters[by_cluster], return_index=True)[1]
-        order = order[np.sort(by_cluster[first])]
-    u = np.stack(np.unravel_index(order, start.grid), axis=-1)
-    v = np.stack(np.unravel_index(neighbour[order], end.grid), axis=-1)
-    reference, matched = (u, v) if cycle_from == "reference" else (v, u)
-    return Matches(reference, matched, best[order], -score[order])
+
+def _select(
+    ranked: _Ranked,
+    features: FeatureMap,
+    k: int,
+    kmeans: bool,
+    seed: int | np.random.Generator,
+    binning: bool,
+) -> Int[np.ndarray, " m"]:
+    """Select at most k patches, best first: those of the highest scores, or of twice as many the
+    most salient of each cluster."""
+    order = np.lexsort((-ranked.similarity, -ranked.score))
+    order = order[np.isfinite(ranked.score[order])][: 2 * k if kmeans else k]
+    if not kmeans or len(order) <= k:
+        return order
+    clusters = _cluster(_gram(features, order, binning), k, np.random.default_rng(seed))
+    saliency = features.saliency.flatten().numpy()[order]
+    by_cluster = np.lexsort((-saliency, clusters))  # the most salient of each cluster first
+    first = np.unique(clusters[by_cluster], return_index=True)[1]
+    return order[np.sort(by_cluster[first])]
 
 
 def _cycles(
@@ -246,10 +281,9 @@ def _bin_products(products: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w
     # Every sum and average is separable: along the rows of both images (axes 0 and 2), then along
     # their columns.
     pooled = average_pool(products, (0, 2))
-    near, far, centre = (
-        columns(x) for x in (_joint_shifts(products, 1), _joint_shifts(pooled, 3), pooled)
-    )
-    far, centre = average_pool(far, (0, 2)), average_pool(centre, (0, 2))
+    near = columns(_joint_shifts(products, 1))
+    far = average_pool(columns(_joint_shifts(pooled, 3)), (0, 2))
+    centre = average_pool(columns(pooled), (0, 2))
     return columns(_joint_shifts(near, 1).add_(_joint_shifts(far, 3)).sub_(centre))
 
 
@@ -258,10 +292,12 @@ def _joint_shifts(x: Float[Tensor, "a b c d"], step: int) -> Float[Tensor, "a b 
     border."""
     total = x.clone()
     for shift in (-step, step):
-        index1, index2 = (
-            (torch.arange(n, device=x.device) + shift).clamp(0, n - 1) for n in x.shape[::2]
-        )
-        total.add_(x.index_select(0, index1).index_select(2, index2))
+        shifted = x
+        for axis in (0, 2):
+            last = x.shape[axis] - 1
+            index = (torch.arange(last + 1, device=x.device) + shift).clamp(0, last)
+            shifted = shifted.index_select(axis, index)
+        total.add_(shifted)
     return total
 
 
@@ -283,9 +319,8 @@ def _gram(
     descriptors = keys.flatten(0, 1)[index]
     if binning:
         bins, pooled = bin_indices(features.grid)[:, index], average_pool(keys, (0, 1))
-        # (17, m, D)
-        descriptors = torch.cat([keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]])
-        descriptors = descriptors.transpose(0, 1).flatten(1)
+        near, far = keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]
+        descriptors = torch.cat([near, far]).transpose(0, 1).flatten(1)  # (m, 17 D)
     descriptors = F.normalize(descriptors, dim=1)
     # Rounded, because greedy k-means++ has exact ties (of two points that are each other's nearest,
     # either lowers the sum of squares by the same amount), which rounding errors would break

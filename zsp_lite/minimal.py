@@ -1,8 +1,8 @@
 """The whole method on one page (Goodwin et al., ECCV 2022): features of object crops in, pose out.
 
-Each step is its definition; the library's other modules compute the same with fewer operations, its
-`estimate_pose` from files. I1 is the reference image, I2 a target image, Phi(I) the descriptors of
-I, u a patch of I1 and v one of I2.
+Each step is its definition; the library's other modules compute the same with fewer operations. The
+one exception is `estimate_pose`: here it takes crops, in the library files or frames. I1 is the
+reference image, I2 a target image, Phi(I) the descriptors of I, u a patch of I1 and v one of I2.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""One's own pair, from files or frames to files: open, load and mask, estimate, write.
+"""One's own pair, from files or frames to files: open, load (see `scans`), estimate, write.
 
 A source is a sequence of a data folder, a folder with a capture, an image with depth, or frames in
 memory.
@@ -7,92 +7,38 @@ memory.
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from tqdm import tqdm
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import DEFAULT, BackboneLike, as_backbone
 from zsp_lite.category import SAME_ANGLE, references_per_pair, synchronise, world_hypotheses
 from zsp_lite.choices import SOLVERS
-from zsp_lite.data.cameras import Values, view_span
-from zsp_lite.data.frames import Frame, frame_defect, turn_frame
+from zsp_lite.data.cameras import Values
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
-from zsp_lite.estimates import Hypothesis, PairResult, PoseEstimate, Vote, label_errors, timed
+from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.masks import DOUBTFUL
 from zsp_lite.importers.sources import Source, SourceLike, open_pair
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.metrics import rotation_angle, rotation_error
+from zsp_lite.pair_result import PairResult, Vote, label_errors
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.points import axis_deviation, world_cloud
+from zsp_lite.points import world_cloud
+from zsp_lite.scans import Scan, scan_flags, stood_up
 from zsp_lite.verified.confidence import reliability_flags
 from zsp_lite.verified.solver import measured_inliers
-from zsp_lite.views import View
 
-_ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
 _TARGETS = 5
 _REFERENCES = 4  # frames of each object that are solved against views of the other
 _MOST_DOUBTFUL = 0.8  # largest confidence by masks that are flagged
 _LEAST_PROBABLE = 0.005  # an alternative is named above this
 _Ends = tuple[int, int, int]  # numbers of two objects, and the position of a frame of the first
-
-
-@dataclass(frozen=True, eq=False)
-class _Scan:
-    """The frames of a source that an estimate uses, whole and as views of an object of unit
-    standard deviation."""
-
-    source: Source
-    # positions of the frames that are solved against target views of other objects
-    references: list[int]
-    targets: list[int]  # positions of the target views
-    frames: dict[int, Frame]
-    views: dict[int, View]
-    scale: float  # from the lengths of the frames to those of the views
-    cloud: Float[np.ndarray, "n 3"]
-
-    @classmethod
-    def of(
-        cls,
-        source: Source,
-        method: ZeroShotPose,
-        references: int,
-        targets: int,
-        first: int | None = None,
-    ) -> "_Scan":
-        """Load frames of a source (see `Source.select`), and extract their features."""
-        chosen, shown, frames = source.select(references, targets, first)
-        cloud = world_cloud([frames[position] for position in shown or chosen])[0]
-        # The method expects objects of about unit standard deviation. Sequences of data folders
-        # have it.
-        scale = (
-            1.0
-            if source.format == "sequence" or not len(cloud)
-            else 1 / (axis_deviation(cloud) or 1)
-        )
-        used = dict.fromkeys([*chosen, *shown])
-        views = method.views([scale_frame(frames[position], scale) for position in used])
-        return cls(source, chosen, shown, frames, dict(zip(used, views, strict=True)), scale, cloud)
-
-    @property
-    def target_views(self) -> list[View]:
-        """The views that reference frames of other objects are solved against."""
-        return [self.views[position] for position in self.targets]
-
-    @property
-    def seen(self) -> tuple[int, float]:
-        """Number of usable target views, and the angle in degrees that they span around the
-        object."""
-        cameras = [self.frames[k].camera for k in self.targets if not frame_defect(self.frames[k])]
-        return len(cameras), view_span(cameras, np.median(self.cloud, axis=0)) if len(
-            self.cloud
-        ) else 0.0
 
 
 def estimate_pose(
@@ -153,115 +99,115 @@ def estimate_pose(
         references = references_per_pair(2 + len(helpers)) if helpers else alone
     check_integer("references", references, 1)
     several = "verified" in SOLVERS[solver] and (references > 1 or bool(helpers))
-    given = {
-        name: (one,)
-        for name, one in (("mask", mask), ("intrinsics", intrinsics))
-        if one is not None
-    }
-    # a folder that cannot be written is an error at once
+
+    # A folder that cannot be written is an error at once.
     with nullcontext() if out is None else writing(out):
-        sources = open_pair(reference, target, given, helpers)
-        if helpers and len({one.path.resolve() for one in sources}) < len(sources):
-            raise InputError(
-                f"{', '.join(str(one.path) for one in sources)}: expected different objects"
-            )
+        sources = _open_objects(reference, target, mask, intrinsics, helpers)
         model = as_backbone(backbone)
         foreground = "saliency" if getattr(model, "has_saliency", True) else "mask"
         method = ZeroShotPose(model, foreground=foreground, solver="verified")
+
         counts = (references, targets) if several else (1, 0)
-        before: dict[str, float] = {}
+        before: dict[str, float] = {}  # seconds of the stages that all solvers share
         with timed(before, "features"):
-            scans = [_Scan.of(sources[0], method, *counts, reference_frame)]
+            scans = [Scan.of(sources[0], method, *counts, reference_frame)]
             scans += [
-                _Scan.of(one, method, references if several else 0, targets) for one in sources[1:]
+                Scan.of(one, method, references if several else 0, targets) for one in sources[1:]
             ]
-        flags = _pair_flags(scans)
+        flags = scan_flags(scans)
         if wanted and wanted > len(scans[1].targets):
-            flags = (
-                *flags,
-                f"number of target views: {len(scans[1].targets)}, all that there are, not "
-                f"{wanted}",
-            )
+            there = f"{len(scans[1].targets)}, all that there are, not {wanted}"
+            flags = (*flags, f"number of target views: {there}")
         if not upright:
             with timed(before, "turns"):
-                scans[0], turn = _stood_up(*scans[:2], replace(method, solver=SOLVERS[solver][-1]))
-            flags = (
-                *flags,
-                f"the reference is turned by {turn}° counterclockwise: the pose is that of "
-                "the turned image",
-            )
-        first, second, position = *scans[:2], scans[0].references[0]
-        views = first.views[position], second.target_views
-        solved = {
-            name: replace(method, solver=name).estimate_from_views(*views)
-            for name in SOLVERS[solver]
-        }
-        votes = ()
-        if several:
-            timings = dict(solved["verified"].timings)
-            with timed(timings, "other frames"):
-                found = {
-                    (0, 1, position): solved["verified"],
-                    **_solve_others(scans, method, workers),
-                }
-                agreed, votes = _agreed_pose(scans, method, found)
-            solved["verified"] = replace(agreed, timings=timings)
-        estimates = {
-            name: _in_units(
-                replace(one, timings=before | one.timings), first.scale, second.scale, flags
-            )
-            for name, one in solved.items()
-        }
-        where = first.source.describe(first.references), second.source.describe(second.targets)
-        if helpers:
-            where = (
-                where[0],
-                f"{where[1]}; helpers: {', '.join(str(one.path) for one in sources[2:])}",
-            )
-        result = PairResult(
-            f"{sources[0].name} to {sources[1].name}",
-            where,
-            first.frames[position],
-            tuple(second.frames[k] for k in second.targets),
-            estimates,
-            {},
-            masks=(sources[0].mask, sources[1].mask),
-            backbone=getattr(model, "name", str(backbone)),
-            votes=votes,
-        )
-        one, other = (source.path.resolve() for source in sources[:2])
-        if first.source.format == second.source.format == "sequence" and one.parent == other.parent:
-            result = replace(
-                result, errors=label_errors(result, one.parent, (one.name, other.name))
-            )
+                scans[0], turn = stood_up(*scans[:2], replace(method, solver=SOLVERS[solver][-1]))
+            turned = f"the reference is turned by {turn}° counterclockwise"
+            flags = (*flags, f"{turned}: the pose is that of the turned image")
+
+        solved, votes = _solve(scans, method, solver, several, workers)
+        estimates = {}
+        for name, one in solved.items():
+            one = replace(one, timings=before | one.timings)
+            estimates[name] = _in_units(one, scans[0].scale, scans[1].scale, flags)
+
+        result = _pair_result(scans, estimates, votes, getattr(model, "name", str(backbone)))
         if out is not None:
             write_pair(result, out)
     return result
 
 
-def _stood_up(scan: _Scan, target: _Scan, method: ZeroShotPose) -> tuple[_Scan, int]:
-    """Turn the frames of a scan by the quarter turns that suit its first reference frame best;
-    return the degrees."""
-    scores, position = {}, scan.references[0]
-    for quarters in range(4):
-        (view,) = method.views(
-            [turn_frame(scale_frame(scan.frames[position], scan.scale), quarters)]
-        )
-        with suppress(NoPoseError):
-            one = method.estimate_from_views(view, target.target_views)
-            scores[quarters] = (
-                one.hypotheses[0].score if one.hypotheses else one.view_scores[one.view]
-            )
-    quarters = max(scores, key=scores.get, default=0)
-    frames = {key: turn_frame(frame, quarters) for key, frame in scan.frames.items()}
-    views = method.views([scale_frame(frames[key], scan.scale) for key in scan.views])
-    return replace(
-        scan, frames=frames, views=dict(zip(scan.views, views, strict=True))
-    ), 90 * quarters
+def _open_objects(
+    reference: SourceLike,
+    target: SourceLike,
+    mask: str | None,
+    intrinsics: Values | None,
+    helpers: Sequence[SourceLike],
+) -> list[Source]:
+    """Open the sources of all objects; InputError if two of several are the same."""
+    given = {}
+    if mask is not None:
+        given["mask"] = (mask,)
+    if intrinsics is not None:
+        given["intrinsics"] = (intrinsics,)
+    sources = open_pair(reference, target, given, helpers)
+    if helpers and len({one.path.resolve() for one in sources}) < len(sources):
+        named = ", ".join(str(one.path) for one in sources)
+        raise InputError(f"{named}: expected different objects")
+    return sources
+
+
+def _solve(
+    scans: Sequence[Scan], method: ZeroShotPose, solver: str, several: bool, workers: int
+) -> tuple[dict[str, PoseEstimate], tuple[Vote, ...]]:
+    """Solve the first reference frame by each solver; with several frames, the verified solver's
+    pose becomes the one that most of them agree on, and these vote."""
+    position = scans[0].references[0]
+    reference, targets = scans[0].views[position], scans[1].target_views
+    solved = {}
+    for name in SOLVERS[solver]:
+        solved[name] = replace(method, solver=name).estimate_from_views(reference, targets)
+    if not several:
+        return solved, ()
+
+    timings = dict(solved["verified"].timings)
+    with timed(timings, "other frames"):
+        found = {(0, 1, position): solved["verified"], **_solve_others(scans, method, workers)}
+        agreed, votes = _agreed_pose(scans, method, found)
+    solved["verified"] = replace(agreed, timings=timings)
+    return solved, votes
+
+
+def _pair_result(
+    scans: Sequence[Scan],
+    estimates: dict[str, PoseEstimate],
+    votes: tuple[Vote, ...],
+    backbone: str,
+) -> PairResult:
+    """Collect the result, with its errors if both objects are labelled sequences of one folder."""
+    first, second, *helpers = scans
+    shown = second.source.describe(second.targets)
+    if helpers:
+        shown += f"; helpers: {', '.join(str(one.source.path) for one in helpers)}"
+    result = PairResult(
+        f"{first.source.name} to {second.source.name}",
+        (first.source.describe(first.references), shown),
+        first.frames[first.references[0]],
+        tuple(second.frames[k] for k in second.targets),
+        estimates,
+        {},
+        masks=(first.source.mask, second.source.mask),
+        backbone=backbone,
+        votes=votes,
+    )
+    one, other = first.source.path.resolve(), second.source.path.resolve()
+    if first.source.format == second.source.format == "sequence" and one.parent == other.parent:
+        errors = label_errors(result, one.parent, (one.name, other.name))
+        result = replace(result, errors=errors)
+    return result
 
 
 def _solve_others(
-    scans: Sequence[_Scan], method: ZeroShotPose, workers: int
+    scans: Sequence[Scan], method: ZeroShotPose, workers: int
 ) -> dict[_Ends, PoseEstimate]:
     """Solve every reference frame of each object against the views of each other one, but for the
     first of all."""
@@ -289,7 +235,7 @@ def _solve_others(
 
 
 def _agreed_pose(
-    scans: Sequence[_Scan], method: ZeroShotPose, found: Mapping[_Ends, PoseEstimate]
+    scans: Sequence[Scan], method: ZeroShotPose, found: Mapping[_Ends, PoseEstimate]
 ) -> tuple[PoseEstimate, tuple[Vote, ...]]:
     """Find the pose that the hypotheses of all frames agree on, in the first frame's camera, and
     their votes."""
@@ -389,32 +335,6 @@ def write_pair(result: PairResult, out: str | Path) -> list[Path]:
                 colours,
             )
     return [write_pair_report(out / "report.html", result), *paths]
-
-
-def _pair_flags(scans: Sequence[_Scan]) -> tuple[str, ...]:
-    """Name two categories, and what is doubtful about the frames in use and the sides that they
-    show."""
-    kinds = sorted(
-        {one.source.path.resolve().parent.name for one in scans if one.source.format == "sequence"}
-    )
-    flags = (
-        [f"the objects are of different categories: {', '.join(kinds)}"] if len(kinds) > 1 else []
-    )
-    for scan in scans:
-        found = scan.source.flags([scan.frames[position] for position in scan.views])
-        flags += [f"{scan.source.path}: {flag}" for flag in found]
-    seen = [scan.seen for scan in scans[:2] if scan.targets]
-    count, span = max(seen, key=lambda one: (one[1], one[0]))
-    if count < 3 or span < _ALL_SIDES:
-        sides = "two sides" if span >= _ALL_SIDES else "one side"
-        what, other = (
-            ("the target was", "the reference") if len(seen) < 2 else ("each object was", "one")
-        )
-        seen_from = f"seen from {sides} only ({span:.0f} degrees)"
-        flags.append(
-            f"{what} {seen_from}: if {other} was taken from another side, this pose is wrong"
-        )
-    return tuple(flags)
 
 
 def _in_units(

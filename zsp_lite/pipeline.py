@@ -263,10 +263,8 @@ def align_best_view(
             if (agreeing := int(inliers.sum())) < sample_size:
                 flags = (f"only {agreeing} of {len(inliers)} matches agree with the pose",)
         except InputError as error:
-            sim3, inliers = (
-                view_alignment(reference, targets[best]),
-                np.zeros(len(points[0]), dtype=bool),
-            )
+            sim3 = view_alignment(reference, targets[best])
+            inliers = np.zeros(len(points[0]), dtype=bool)
             flags = (f"pose is the best view's, not a fit: {error}",)
     return PoseEstimate(
         sim3, best, matches, inliers, scores, reference, tuple(targets), timings, flags

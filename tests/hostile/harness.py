@@ -18,7 +18,7 @@ from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D, write_co3d
-from zsp_lite.data.exchange import read_poses
+from zsp_lite.data.exchange import read_stored_poses
 from zsp_lite.data.frames import read_depth, read_image, read_mask
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.data.pairs import shipped_pairs
@@ -147,7 +147,7 @@ READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
     "safetensors": ("x.safetensors", lambda folder: load_backbone(folder / "x.safetensors", "cpu")),
     "lists": ("capture/rgb.txt", read_capture("lists")),
     "nerfstudio": ("capture/transforms.json", read_capture("nerfstudio")),
-    "poses": ("poses.csv", lambda folder: read_poses(folder / "poses.csv")),
+    "poses": ("poses.csv", lambda folder: read_stored_poses(folder / "poses.csv")),
 }
 BENCHMARK = ("benchmark", "--pairs", "2", "--targets", "2", "--methods", "icp")
 POSES = """pair,target_frame,rotation,translation,scale

@@ -14,7 +14,7 @@ from zsp_lite.baselines.sift import RootSift, Sift
 from zsp_lite.benchmark import baseline_rows
 from zsp_lite.benchmark.identity import described
 from zsp_lite.benchmark.own import Estimator, KeypointMatcher, StoredPoses, kind_of
-from zsp_lite.data.exchange import read_poses
+from zsp_lite.data.exchange import read_stored_poses
 from zsp_lite.errors import InputError, check_number
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.modules import import_object
@@ -164,7 +164,7 @@ def _method(name: str, meant: Any) -> Method:
         if row in METHODS:
             return replace(METHODS[row], targets=int(views)) if views else METHODS[row]
         if meant.endswith(".csv"):
-            return Method("none", solve=StoredPoses(meant, *read_poses(meant)))
+            return Method("none", solve=StoredPoses(meant, *read_stored_poses(meant)))
         if ":" not in meant:
             raise InputError(
                 f"method {meant!r} is unknown; `zsp-lite benchmark --list` lists all, "

@@ -67,6 +67,7 @@ def align(
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.labels import read_labels
     from zsp_lite.importers.convert import import_captures
+    from zsp_lite.metrics import accuracy
     from zsp_lite.viz.category_sheet import COLUMNS, object_rows
     from zsp_lite.viz.report import write_category_report
 
@@ -87,16 +88,13 @@ def align(
     )
     for (first, second), angle in found.disagreements.items():
         print(f"{first} to {second}: the best pose of the pair alone is {angle:.0f}° away")
-    errors, alone = alignment_errors(found, read_labels(dataset.root, category))
-    if errors:
-        right, before = (
-            sum(error < SAME_ANGLE for error in some) / len(some) for some in (errors, alone)
-        )
+    together, alone = alignment_errors(found, read_labels(dataset.root, category))
+    if alone:
+        right, before = accuracy(together, SAME_ANGLE), accuracy(alone, SAME_ANGLE)
         print(
-            f"By the pose labels, {right:.1%} of {len(errors)} ordered pairs are within "
-            f"{SAME_ANGLE:.0f}°;",
-            end=" ",
+            f"By the pose labels, {right:.1f}% of {len(together)} ordered pairs are within "
+            f"{SAME_ANGLE:.0f}°; of the best poses of {len(alone)} pairs of views and objects "
+            f"alone, {before:.1f}%."
         )
-        print(f"of the best poses of {len(alone)} pairs of views and objects alone, {before:.1%}.")
     for path in written:
         print(f"Written: {path}")

@@ -48,11 +48,12 @@ def synth(preset, categories, models_folder, seed, out, **given) -> None:
     """Render procedural objects or your own models into a CO3D folder; the same seed gives the same
     files.
 
-    \b --preset    demo (3 categories, 15 s), paper-small (20 of 5 sequences of 24 frames), or paper
-    (20 of 10 sequences of 100 frames, 1.5 hours, 1.4 GB) --category  one of the paper's twenty
-    categories; may be repeated --models    files CATEGORY/NAME.EXT with EXT one of obj, glb, gltf,
-    ply, stl, dae: a sequence each; --front and --up are axes of these files, and models.json
-    overrides them
+    \b
+    --preset    demo (3 categories, 15 s), paper-small (20 of 5 sequences of 24 frames), or paper
+                (20 of 10 sequences of 100 frames, 1.5 hours, 1.4 GB)
+    --category  one of the paper's twenty categories; may be repeated
+    --models    files CATEGORY/NAME.EXT with EXT one of obj, glb, gltf, ply, stl, dae: a sequence
+                each; --front and --up are axes of these files, and models.json overrides them
 
     An existing folder is completed.
     """

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.pairs import category_pairs, labelled_categories
-from zsp_lite.estimates import PairResult, label_errors
 from zsp_lite.features import FeatureExtractor
+from zsp_lite.pair_result import PairResult, label_errors
 from zsp_lite.pipeline import ZeroShotPose, solve_pair
 
 N_TARGETS = 5

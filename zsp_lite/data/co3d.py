@@ -92,9 +92,8 @@ class Co3D:
         selected = []
         for sequence in self.sequences(category):
             cloud = sequence.point_cloud.quality_score if sequence.point_cloud else None
-            if (cloud or 0) > _MIN_CLOUD_QUALITY and (
-                sequence.viewpoint_quality_score or 0
-            ) > _MIN_VIEW_QUALITY:
+            views = sequence.viewpoint_quality_score
+            if (cloud or 0) > _MIN_CLOUD_QUALITY and (views or 0) > _MIN_VIEW_QUALITY:
                 selected.append(sequence)
         return sorted(
             selected, key=lambda one: (-one.point_cloud.quality_score, one.sequence_name)
@@ -143,12 +142,9 @@ class Co3D:
         camera, size = self.camera(annotation), annotation.image.size
         name = f"{annotation.sequence_name}/{annotation.frame_number}"
         rgb = self._read(images.read_image, annotation.image.path, size)
-        mask = (
-            None
-            if annotation.mask is None
-            else self._read(images.read_mask, annotation.mask.path, size)
-        )
-        depth = None
+        mask = depth = None
+        if annotation.mask is not None:
+            mask = self._read(images.read_mask, annotation.mask.path, size)
         if annotation.depth is not None:
             depth = self._read(
                 images.read_depth, annotation.depth.path, size, annotation.depth.scale_adjustment
@@ -280,10 +276,8 @@ def _write_sequence(
         images.write_image(root / image.path, frame.rgb, quality)
         depth = mask = None
         if frame.depth is not None:
-            path, mask_path = (
-                f"{base}/depths/{stem}.jpg.geometric.png",
-                f"{base}/depth_masks/{stem}.png",
-            )
+            path = f"{base}/depths/{stem}.jpg.geometric.png"
+            mask_path = f"{base}/depth_masks/{stem}.png"
             depth = records.DepthAnnotation(path, float(sequence.depth_scale_adjustment), mask_path)
             images.write_depth(root / path, frame.depth, sequence.depth_scale_adjustment)
             images.write_mask(root / mask_path, frame.depth > 0)

@@ -75,7 +75,7 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
     return Path(path)
 
 
-def read_poses(path: str | Path) -> tuple[dict[str, StoredPose], str]:
+def read_stored_poses(path: str | Path) -> tuple[dict[str, StoredPose], str]:
     """Read poses by the key of their pair, and the hash of the file."""
     data, poses = read_bytes(path, "poses"), {}
     for number, line in _read_lines(path, data):

@@ -56,9 +56,9 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
             f"{n_targets}"
         )
 
-    # frames; each is the start of one choice of target frames
+    # Each frame is the start of one choice of target frames.
     every = sum(map(len, numbers.values()))
-    # pairs that are not sampled yet
+    # Pairs that are not sampled yet.
     left = {name: len(own) * (every - len(own)) for name, own in numbers.items()}
     if (total := sum(left.values())) < n:
         logger.warning(
@@ -79,11 +79,8 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
             frame = numbers[reference][rng.integers(len(numbers[reference]))]
             length = len(numbers[target])
             positions = (rng.integers(length) + np.arange(n_targets) * length // n_targets) % length
-            pairs[
-                Pair(
-                    category, reference, frame, target, tuple(numbers[target][p] for p in positions)
-                )
-            ] = None
+            views = tuple(numbers[target][position] for position in positions)
+            pairs[Pair(category, reference, frame, target, views)] = None
         left[reference] -= len(pairs) - found
 
 

@@ -261,7 +261,7 @@ def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
     return found
 
 
-def read_lines(path: Path) -> list[str]:
+def read_text_lines(path: Path) -> list[str]:
     """Read the lines of a text file but for empty ones and those that begin with #."""
     text = read_bytes(path, "list").decode("utf-8-sig", "replace")
     if not (
@@ -276,7 +276,7 @@ def read_numbers(
 ) -> Float[np.ndarray, "rows columns"]:
     """Read a text file of numbers by `numpy.loadtxt` with its options, as many in each line as one
     of `columns`."""
-    lines = read_lines(path)
+    lines = read_text_lines(path)
     try:
         values = np.loadtxt(lines, ndmin=2, **options)
     except ValueError as error:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import Makers, make_frame, read_lines, read_numbers
+from zsp_lite.importers.capture import Makers, make_frame, read_numbers, read_text_lines
 
 # the benchmark's default, with pixel centres at half-integers
 _TUM_INTRINSICS = (
@@ -26,7 +26,7 @@ _TUM_UNIT, _TUM_TOLERANCE = (
 def read_lists(folder: Path) -> Makers:
     """Read a capture given as plain text lists, of which line n describes frame n (see `zsp-lite
     data import -h`)."""
-    images, depths = (read_lines(folder / name) for name in ("rgb.txt", "depth.txt"))
+    images, depths = (read_text_lines(folder / name) for name in ("rgb.txt", "depth.txt"))
     poses = read_numbers(folder / "poses.txt", (12, 16))
     intrinsics = read_numbers(folder / "intrinsics.txt", (3, 4))
     if intrinsics.shape[1] == 3 or len(intrinsics) == 1:
@@ -53,7 +53,9 @@ def read_tum(
     poses = read_numbers(folder / "groundtruth.txt", (8,))
     names = [folder / name for name in ("rgb.txt", "depth.txt")]
     times, depth_times = (read_numbers(name, (1,), usecols=0)[:, 0] for name in names)
-    images, depths = ([line.split(maxsplit=1)[-1] for line in read_lines(name)] for name in names)
+    images, depths = (
+        [line.split(maxsplit=1)[-1] for line in read_text_lines(name)] for name in names
+    )
     for time, image, depth, pose in zip(
         times, images, _nearest(depth_times, times), _nearest(poses[:, 0], times)
     ):

@@ -14,7 +14,7 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera, azimuths, ground_axes
 from zsp_lite.data.frames import ON_OBJECT
 from zsp_lite.errors import InputError
-from zsp_lite.estimates import PairResult
+from zsp_lite.pair_result import PairResult
 from zsp_lite.points import world_cloud
 from zsp_lite.viz import plots
 

@@ -101,7 +101,7 @@ def export_categories(
                 out, category, mesh, record_sequence(mesh, name, key, frames, image_size, heights)
             )
     for category in categories:
-        write_labels(
+        write_true_labels(
             out, category, [sequence_name(seed, category, index) for index in range(sequences)]
         )
 
@@ -186,7 +186,7 @@ def export_models(
         key, reason = next(iter(left_out.items()))
         raise InputError(f"{folder} holds no usable model; {key}: {reason}")
     for category, sequences in rendered.sequences.items():
-        write_labels(out, category, sorted(sequences))
+        write_true_labels(out, category, sorted(sequences))
         if len(sequences) > 1:
             write_pairs(
                 out, category, _MODEL_PAIRS, [n for n in _MODEL_TARGETS if n <= frames], seed
@@ -237,7 +237,7 @@ def shape_turns(vertices: Float[np.ndarray, "v 3"]) -> tuple[int, ...]:
     return tuple(turn for turn, farthest in distance.items() if farthest < 0.03 * np.ptp(points))
 
 
-def write_labels(out: Path, category: str, names: Sequence[str]) -> None:
+def write_true_labels(out: Path, category: str, names: Sequence[str]) -> None:
     """Write the pose labels of sequences from their object poses; the first name is the
     reference."""
     poses = {name: np.array(pose.trans) for name, pose in read_poses(out, category).items()}

@@ -1,0 +1,139 @@
+"""What is found for one pair: the estimates of its solvers, the votes of its frames, and the errors
+against pose labels."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.data.co3d import Pair
+from zsp_lite.data.frames import Frame
+from zsp_lite.data.labels import read_labels, relative_pose
+from zsp_lite.estimates import PoseEstimate
+from zsp_lite.metrics import rotation_error
+
+
+@dataclass(frozen=True, eq=False)
+class Vote:
+    """What one frame of one object says of a pose that several frames of both determine."""
+
+    name: str  # the frame, such as "frame 12 of my_cup"
+    estimate: PoseEstimate  # its own: of this frame's object in views of the other
+    degrees: float  # angle from its best rotation to that of the answer
+    backward: bool  # whether it is a frame of the target, in views of the reference
+
+
+@dataclass(frozen=True, eq=False)
+class PairResult:
+    """Pose estimates of one pair by one solver, or by both. `print` shows them."""
+
+    title: str  # name of the pair, such as its category
+    sources: tuple[str, str]  # where the reference and the target views come from, in words
+    reference: Frame  # reference frame, whole
+    targets: tuple[Frame, ...]  # target frames, whole
+    estimates: dict[str, PoseEstimate]  # estimate of each solver by its name, at least one
+    # rotation error of each estimate in degrees; empty without pose labels
+    errors: dict[str, float]
+    pair: Pair | None = None  # the evaluation pair, or None
+    # where the masks of the reference and of the targets come from: "given", "box" or "auto"
+    masks: tuple[str, str] = ("given", "given")
+    backbone: str = ""  # name of the backbone
+    # of the frames of both objects, the reference frame's first; () for one frame
+    votes: tuple[Vote, ...] = ()
+
+    @property
+    def world_sim3(self) -> Sim3:
+        """Similarity from the world of the reference to that of the target, by the first solver."""
+        return self.estimate.world_sim3
+
+    @property
+    def estimate(self) -> PoseEstimate:
+        """Estimate of the first solver."""
+        return next(iter(self.estimates.values()))
+
+    @property
+    def error(self) -> float:
+        """Rotation error of the first solver in degrees; NaN without pose labels."""
+        return next(iter(self.errors.values()), float("nan"))
+
+    @property
+    def disagreement(self) -> float | None:
+        """Angle in degrees between the rotations of two solvers; None if only one ran."""
+        if len(self.estimates) < 2:
+            return None
+        first, second = (one.world_rotation() for one in self.estimates.values())
+        return float(rotation_error(first, second))
+
+    def __repr__(self) -> str:
+        return "\n".join(f"{solver}: {estimate!r}" for solver, estimate in self.estimates.items())
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all numbers in the types of JSON.
+
+        Matrices are for column vectors; `null` marks what is unknown.
+        """
+        solved = {}
+        for solver, estimate in self.estimates.items():
+            solved[solver] = {
+                "view": estimate.view,
+                "view_name": self.targets[estimate.view].name,
+                "matrix": estimate.sim3.matrix.tolist(),
+                "rotation": estimate.sim3.R.tolist(),
+                "translation": estimate.sim3.t.tolist(),
+                "scale": float(estimate.sim3.scale),
+                "inliers": int(estimate.inliers.sum()),
+                "matches": len(estimate.matches),
+                "world_matrix": estimate.world_sim3.matrix.tolist(),
+                "confidence": estimate.confidence,
+                "error_degrees": self.errors.get(solver),
+                "flags": list(estimate.flags),
+                "one_of_two": estimate.one_of_two,
+                "alternatives": _alternatives(estimate),
+                "seconds": dict(estimate.timings),
+            }
+        views = [frame.name for frame in self.targets]
+        return {
+            "reference": {"source": self.sources[0], "masks": self.masks[0]},
+            "target": {"source": self.sources[1], "masks": self.masks[1], "views": views},
+            "backbone": self.backbone,
+            "estimates": solved,
+            "degrees_between_solvers": self.disagreement,
+            "votes": [
+                {
+                    "frame": one.name,
+                    "confidence": one.estimate.confidence,
+                    "degrees_from_answer": one.degrees,
+                }
+                for one in self.votes
+            ],
+        }
+
+
+def _alternatives(estimate: PoseEstimate) -> list[dict[str, Any]]:
+    """List the alternatives of an estimate in the types of JSON."""
+    return [
+        {
+            "view": one.view,
+            "matrix": one.sim3.matrix.tolist(),
+            "probability": one.confidence,
+            "degrees_from_best": estimate.angle_to(one),
+            "score_below_best": estimate.hypotheses[0].score - one.score,
+        }
+        for one in estimate.alternatives
+    ]
+
+
+def label_errors(found: PairResult, category: Path, sequences: Sequence[str]) -> dict[str, float]:
+    """Compute rotation errors in degrees; {} unless both sequences of the folder of a category have
+    labels."""
+    labels, errors = read_labels(category.parent, category.name), {}
+    if not set(sequences) <= set(labels):
+        return errors
+    first, second = (labels[name] for name in sequences)
+    for name, estimate in found.estimates.items():
+        truth = relative_pose(
+            first, found.reference.camera, second, found.targets[estimate.view].camera
+        )
+        errors[name] = float(rotation_error(estimate.sim3.R, truth[:3, :3]))
+    return errors

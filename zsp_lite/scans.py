@@ -1,0 +1,116 @@
+"""The frames of one's own objects that an estimate uses: loaded, scaled, turned, and doubted."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from zsp_lite.data.cameras import view_span
+from zsp_lite.data.frames import Frame, frame_defect, turn_frame
+from zsp_lite.errors import NoPoseError
+from zsp_lite.importers.convert import scale_frame
+from zsp_lite.importers.sources import Source
+from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.points import axis_deviation, world_cloud
+from zsp_lite.views import View
+
+_ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """The frames of a source that an estimate uses, whole and as views of an object of unit
+    standard deviation."""
+
+    source: Source
+    # positions of the frames that are solved against target views of other objects
+    references: list[int]
+    targets: list[int]  # positions of the target views
+    frames: dict[int, Frame]
+    views: dict[int, View]
+    scale: float  # from the lengths of the frames to those of the views
+    cloud: Float[np.ndarray, "n 3"]
+
+    @classmethod
+    def of(
+        cls,
+        source: Source,
+        method: ZeroShotPose,
+        references: int,
+        targets: int,
+        first: int | None = None,
+    ) -> "Scan":
+        """Load frames of a source (see `Source.select`), and extract their features."""
+        chosen, shown, frames = source.select(references, targets, first)
+        cloud = world_cloud([frames[position] for position in shown or chosen])[0]
+        # The method expects objects of about unit standard deviation. Sequences of data folders
+        # have it.
+        scale = 1.0
+        if source.format != "sequence" and len(cloud):
+            scale = 1 / (axis_deviation(cloud) or 1)
+        used = dict.fromkeys([*chosen, *shown])
+        views = method.views([scale_frame(frames[position], scale) for position in used])
+        return cls(source, chosen, shown, frames, dict(zip(used, views, strict=True)), scale, cloud)
+
+    @property
+    def target_views(self) -> list[View]:
+        """The views that reference frames of other objects are solved against."""
+        return [self.views[position] for position in self.targets]
+
+    @property
+    def seen(self) -> tuple[int, float]:
+        """Number of usable target views, and the angle in degrees that they span around the
+        object."""
+        cameras = [self.frames[k].camera for k in self.targets if not frame_defect(self.frames[k])]
+        if not len(self.cloud):
+            return len(cameras), 0.0
+        return len(cameras), view_span(cameras, np.median(self.cloud, axis=0))
+
+
+def stood_up(scan: Scan, target: Scan, method: ZeroShotPose) -> tuple[Scan, int]:
+    """Turn the frames of a scan by the quarter turns that suit its first reference frame best;
+    return the degrees."""
+    scores, position = {}, scan.references[0]
+    for quarters in range(4):
+        (view,) = method.views(
+            [turn_frame(scale_frame(scan.frames[position], scan.scale), quarters)]
+        )
+        with suppress(NoPoseError):
+            one = method.estimate_from_views(view, target.target_views)
+            scores[quarters] = (
+                one.hypotheses[0].score if one.hypotheses else one.view_scores[one.view]
+            )
+    quarters = max(scores, key=scores.get, default=0)
+    frames = {key: turn_frame(frame, quarters) for key, frame in scan.frames.items()}
+    views = method.views([scale_frame(frames[key], scan.scale) for key in scan.views])
+    return replace(
+        scan, frames=frames, views=dict(zip(scan.views, views, strict=True))
+    ), 90 * quarters
+
+
+def scan_flags(scans: Sequence[Scan]) -> tuple[str, ...]:
+    """Name two categories, and what is doubtful about the frames in use and the sides that they
+    show."""
+    kinds = sorted(
+        {one.source.path.resolve().parent.name for one in scans if one.source.format == "sequence"}
+    )
+    flags = (
+        [f"the objects are of different categories: {', '.join(kinds)}"] if len(kinds) > 1 else []
+    )
+    for scan in scans:
+        found = scan.source.flags([scan.frames[position] for position in scan.views])
+        flags += [f"{scan.source.path}: {flag}" for flag in found]
+    seen = [scan.seen for scan in scans[:2] if scan.targets]
+    count, span = max(seen, key=lambda one: (one[1], one[0]))
+    if count < 3 or span < _ALL_SIDES:
+        sides = "two sides" if span >= _ALL_SIDES else "one side"
+        what, other = (
+            ("the target was", "the reference") if len(seen) < 2 else ("each object was", "one")
+        )
+        seen_from = f"seen from {sides} only ({span:.0f} degrees)"
+        flags.append(
+            f"{what} {seen_from}: if {other} was taken from another side, this pose is wrong"
+        )
+    return tuple(flags)
