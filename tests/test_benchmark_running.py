@@ -341,7 +341,7 @@ def test_the_note_of_a_run_says_that_several_versions_of_the_library_evaluated_i
     )
     run(["ours-bv"])
     first, other = library_version(), {"version": "1", "commit": "0123abc"}
-    monkeypatch.setattr("zsp_lite.benchmark.run.library_version", lambda: other)
+    monkeypatch.setattr("zsp_lite.benchmark.identity.library_version", lambda: other)
     assert "note" not in read_run(tmp_path).summary
     run(["ours"])
     assert json.loads((tmp_path / SETTINGS).read_text())["library"] == [first, other]

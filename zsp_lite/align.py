@@ -18,9 +18,9 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.benchmark.baseline_rows import hypotheses
 from zsp_lite.benchmark.execution import Evaluate, evaluate_pairs, open_workers
-from zsp_lite.benchmark.identity import environment, fingerprint, library_version
+from zsp_lite.benchmark.identity import run_settings
 from zsp_lite.benchmark.problem import FrameStore, PairProblem
-from zsp_lite.benchmark.runs import Call, Settings, open_run, read_lines
+from zsp_lite.benchmark.runs import open_run, read_lines
 from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
@@ -99,21 +99,14 @@ def align_category(
         tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder,
         open_workers(executor) as (pool, workers),
     ):
-        settings = Settings(
-            data=str(dataset.root).encode(errors="replace").decode(),
-            backbone=fingerprint(loaded),
-            targets=targets,
-            library=[library_version()],
-            methods={"alignment": "hypotheses of the verified solver"},
-            labels={},
-            calls=[
-                Call(
-                    **environment(),
-                    workers=workers,
-                    rows=["alignment"],
-                    pairs={category: len(chosen)},
-                )
-            ],
+        settings = run_settings(
+            dataset.root,
+            loaded,
+            targets,
+            {"alignment": "hypotheses of the verified solver"},
+            {},
+            workers=workers,
+            pairs={category: len(chosen)},
         )
         with open_run(folder, settings):
             make = partial(pair_solver, str(dataset.root.resolve()), backbone if pool else loaded)

@@ -17,6 +17,7 @@ import torch
 
 from zsp_lite import __version__
 from zsp_lite.backbones.backbone import Backbone
+from zsp_lite.benchmark.runs import Call, Settings
 from zsp_lite.io.files import REPOSITORY, digest
 
 
@@ -61,28 +62,38 @@ def library_version() -> dict[str, str | None]:
     commit = None
     # An installed copy may lie inside the repository of another project, whose commit says nothing.
     if (REPOSITORY / ".git").exists():
-        describe = [
-            "git",
-            "-C",
-            str(REPOSITORY),
-            "describe",
-            "--always",
-            "--abbrev=40",
-            "--dirty",
-            "--exclude",
-            "*",
-        ]
+        words = "describe --always --abbrev=40 --dirty --exclude *".split()
+        describe = ["git", "-C", str(REPOSITORY), *words]
         with suppress(OSError):  # git is not installed
             commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip() or None
     return {"version": __version__, "commit": commit}
 
 
-def environment() -> dict[str, Any]:
-    """Describe this call: time, command, and versions of the library's dependencies."""
+def run_settings(
+    data: str | Path,
+    backbone: Any,
+    targets: int,
+    methods: dict[str, str],
+    labels: dict[str, str],
+    **call: Any,
+) -> Settings:
+    """Describe a run, and this call of it: time, command, and versions of what computes."""
     words = [Path(sys.argv[0]).name.replace("__main__.py", "zsp-lite"), *sys.argv[1:]]
-    return {
-        "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": [text.encode(errors="replace").decode() for text in words],
-        "versions": {one.__name__: str(one.__version__) for one in (torch, np, scipy, cv2)}
-        | {"python": platform.python_version(), "machine": platform.platform()},
-    }
+    versions = {one.__name__: str(one.__version__) for one in (torch, np, scipy, cv2)}
+    versions |= {"python": platform.python_version(), "machine": platform.platform()}
+    this_call = Call(
+        time=datetime.now(UTC).isoformat(timespec="seconds"),
+        command=[text.encode(errors="replace").decode() for text in words],
+        versions=versions,
+        rows=list(methods),
+        **call,
+    )
+    return Settings(
+        data=str(data).encode(errors="replace").decode(),
+        backbone=fingerprint(backbone),
+        targets=targets,
+        library=[library_version()],
+        labels=labels,
+        methods=methods,
+        calls=[this_call],
+    )

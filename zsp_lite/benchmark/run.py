@@ -23,7 +23,7 @@ from jaxtyping import Float
 from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.baselines.geometry import essential_rotation
 from zsp_lite.benchmark import execution
-from zsp_lite.benchmark.identity import environment, fingerprint, library_version
+from zsp_lite.benchmark.identity import run_settings
 from zsp_lite.benchmark.methods import (
     GROUPS,
     Method,
@@ -36,10 +36,8 @@ from zsp_lite.benchmark.methods import (
 from zsp_lite.benchmark.own import StoredPoses, fails_alone, given
 from zsp_lite.benchmark.problem import Answer, FrameStore, PairProblem, as_answer, seeded
 from zsp_lite.benchmark.runs import (
-    Call,
     ResultLine,
     Run,
-    Settings,
     open_run,
     read_run,
 )
@@ -114,22 +112,16 @@ def evaluate(
     }
 
     with execution.open_workers(executor) as (pool, workers):
-        call = Call(
-            **environment(),
+        settings = run_settings(
+            data,
+            loaded,
+            targets,
+            {name: description(row) for name, row in rows.items()},
+            {category: _labels(dataset, category) for category in numbers},
             workers=workers,
-            rows=list(rows),
             pairs=dict(numbers),
             seeds=seeds,
             remarks=remarks,
-        )
-        settings = Settings(
-            data=str(data).encode(errors="replace").decode(),
-            backbone=fingerprint(loaded),
-            targets=targets,
-            library=[library_version()],
-            labels={category: _labels(dataset, category) for category in numbers},
-            methods={name: description(row) for name, row in rows.items()},
-            calls=[call],
         )
         # Workers load a named backbone themselves; an object travels to them.
         travels = backbone if pool else loaded
