@@ -25,7 +25,8 @@ class Parsed(click.ParamType):
 
     def convert(self, value, parameter, context):
         with suppress(ValueError, OverflowError):
-            if self.valid(found := self.parse(value)):
+            found = self.parse(value)
+            if self.valid(found):
                 return found
         self.fail(f"got {value!r}, expected {self.expected}", parameter, context)
 

@@ -72,8 +72,9 @@ def synth(preset, categories, models_folder, seed, out, **given) -> None:
             export_categories(list(categories), out, sequences, frames, seed)
         else:
             refuse_options(given, ("frames", "image_size", "front", "up"), "--models")
-            size, front, up = given["image_size"] or 256, given["front"], given["up"]
-            left_out = export_models(models_folder, out, frames, seed, size, front, up)
+            size = given["image_size"] or 256
+            axes = given["front"], given["up"]
+            left_out = export_models(models_folder, out, frames, seed, size, *axes)
     for key, reason in left_out.items():
         print(f"Left out {key}: {reason}")
     print(f"Written: {out}")

@@ -29,7 +29,7 @@ def print_table(table: Any) -> None:
     look = {"box": SIMPLE_HEAD, "pad_edge": False, "caption_justify": "left"}
     made = RichTable(title=table.title, caption=table.note or None, **look)
     longest = max(map(len, table.text.index), default=0)
-    # a row's name is never cut off
+    # A row's name is folded, never cut off.
     made.add_column("", justify="left", min_width=min(longest, 14), overflow="fold")
     for title in table.text.columns:
         style = "dim" if title.startswith(PUBLISHED) else None

@@ -28,7 +28,7 @@ class ImageAnnotation(msgspec.Struct, frozen=True, gc=False):
 
 class DepthAnnotation(msgspec.Struct, frozen=True, gc=False):
     path: str
-    # factor from stored depth to depth
+    # Factor from stored depth to depth
     scale_adjustment: Annotated[float, msgspec.Meta(gt=0, le=MAX_LENGTH)]
     mask_path: str | None = None
 
@@ -88,7 +88,7 @@ class FrameIndex:
     path: Path
     entries: list[msgspec.Raw]  # JSON of each frame
     keys: list[FrameKey]
-    # of each sequence, the positions in `entries` by frame number, sorted
+    # Of each sequence, the positions in `entries` by frame number, sorted
     by_sequence: dict[str, dict[int, int]]
 
     def positions(self, sequence: str) -> dict[int, int]:
@@ -122,8 +122,7 @@ def read_frame_index(path: Path) -> FrameIndex:
         if first != position:
             raise InputError(
                 f"frame annotations {path}: entries {first} and {position} are both frame "
-                f"{key.frame_number} of "
-                f"{key.sequence_name}, expected each frame once"
+                f"{key.frame_number} of {key.sequence_name}, expected each frame once"
             )
     return FrameIndex(path, entries, keys, by_sequence)
 

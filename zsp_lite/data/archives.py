@@ -58,10 +58,8 @@ def list_archives(
     """List the first archives of a category of "co3d" (v2) or "co3d-v1"; the very first holds the
     annotations."""
     subset, suffix = ("single-sequence", "_singlesequence") if single_sequence else ("full", "")
-    catalogue, origin = (
-        msgspec.json.decode(CATALOGUE.read_bytes())[dataset],
-        f"{dataset} ({subset})",
-    )
+    catalogue = msgspec.json.decode(CATALOGUE.read_bytes())[dataset]
+    origin = f"{dataset} ({subset})"
     digests = catalogue.get(subset, {})
     check_choice(f"category of {origin}", category, digests)
     base = (os.environ.get(URL_VARIABLES[dataset]) or catalogue["url"]).rstrip("/")
@@ -120,8 +118,7 @@ def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | Non
     if needed > (free := shutil.disk_usage(existing).free):
         raise InputError(
             f"disk of {root} has {free / 1e9:.1f} GB free, expected at least "
-            f"{needed / 1e9:.1f} GB; choose another "
-            "folder, or fewer chunks"
+            f"{needed / 1e9:.1f} GB; choose another folder, or fewer chunks"
         )
     return max(0, needed)
 
@@ -130,9 +127,8 @@ def download_archives(root: Path, archives: Sequence[Archive]) -> None:
     """Download archives, verify them, and unpack them, or sequences of them; continues an
     interrupted download."""
     with writing(root / _WORK):
-        for archive in reversed(
-            missing_archives(root, archives)
-        ):  # the first, with the annotations, comes last
+        # The first archive has the annotations: it comes last.
+        for archive in reversed(missing_archives(root, archives)):
             path = root / _WORK / archive.name
             if not archive.sequences and not path.exists():
                 fetch(archive.url, path, remote_size(archive.url), digest=archive.sha256)
@@ -151,7 +147,7 @@ def download_archives(root: Path, archives: Sequence[Archive]) -> None:
 def _unpack(zipped: zipfile.ZipFile, root: Path, members: Sequence[zipfile.ZipInfo]) -> None:
     """Unpack members of a zip archive, annotations last, so that a category is read only if it is
     complete."""
-    # checks all before the first is written
+    # All paths are checked before the first file is written.
     targets = {one: path_inside(root, one.filename) for one in members}
     members = sorted(members, key=lambda one: (_is_annotation(one), one.header_offset))
     for one in tqdm(members, "unpacking", disable=None):

@@ -76,10 +76,8 @@ def check_folder(
 
 def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> CategoryCheck:
     check = CategoryCheck(category)
-    keys, sequences = (
-        check.attempt(dataset.frame_list, category),
-        check.attempt(dataset.sequences, category),
-    )
+    keys = check.attempt(dataset.frame_list, category)
+    sequences = check.attempt(dataset.sequences, category)
     if keys is None or sequences is None:
         return check
     clouds = {one.sequence_name: one.point_cloud for one in sequences}

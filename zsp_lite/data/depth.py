@@ -117,7 +117,7 @@ def fit_plane(
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.where(lengths > 0, lengths, 1)
     distances = np.abs(normals @ points.T - (normals * corners[:, 0]).sum(axis=1, keepdims=True))
-    # 0 for a sample of collinear points
+    # Collinear points span no plane: such a sample counts 0.
     counts = (distances < threshold).sum(axis=1) * (lengths[:, 0] > 0)
     inliers = points[distances[counts.argmax()] < threshold]
     centre = inliers.mean(axis=0)

@@ -43,15 +43,12 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
     """Write pairs, with a line for each frame."""
     lines = []
     for pair in pairs:
-        targets = [("target", pair.target_sequence, frame) for frame in pair.target_frames]
-        for role, sequence, frame in [
-            ("reference", pair.reference_sequence, pair.reference_frame),
-            *targets,
-        ]:
+        views = [("reference", pair.reference_sequence, pair.reference_frame)]
+        views += [("target", pair.target_sequence, frame) for frame in pair.target_frames]
+        for role, sequence, frame in views:
             found = dataset.frame(pair.category, sequence, frame)
             camera, depth, mask = dataset.camera(found), found.depth, found.mask
             (fx, fy), (cx, cy) = camera.focal_length.tolist(), camera.principal_point.tolist()
-            R, t = (" ".join(map(repr, part.ravel().tolist())) for part in (camera.R, camera.t))
             lines.append(
                 {
                     "pair": pair.key,
@@ -67,8 +64,8 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
                     "fy": fy,
                     "cx": cx,
                     "cy": cy,
-                    "R": R,
-                    "t": t,
+                    "R": " ".join(map(repr, camera.R.ravel().tolist())),
+                    "t": " ".join(map(repr, camera.t.tolist())),
                 }
             )
     write_atomic(path, pd.DataFrame(lines).to_csv(index=False, lineterminator="\n").encode())
@@ -115,7 +112,7 @@ def _read_pose(number: int, line: dict) -> StoredPose:
     if any(line.pop(None, ())):
         raise ValueError("more fields than the header; a pair has commas and needs quotes")
     rotation = rotation_matrix("rotation", _numbers("rotation", line["rotation"], 9).reshape(3, 3))
-    translation, scale = (line.get(name, "").strip() for name in ("translation", "scale"))
+    translation, scale = line.get("translation", "").strip(), line.get("scale", "").strip()
     translation = _numbers("translation", translation, 3) if translation else None
     scale = float(_numbers("scale", scale, 1)[0]) if scale else None
     if scale is not None:
@@ -164,10 +161,8 @@ def other_convention(dataset: Co3D, poses: Mapping[Pair, StoredPose]) -> str:
     readings = {"": given}
     for signs in ((1, -1, -1), (-1, -1, 1)):
         readings[f"conjugated by diag{signs}"] = given * np.outer(signs, signs)
-    readings |= {
-        f"inverted and {name}".removesuffix(" and "): one.swapaxes(1, 2)
-        for name, one in readings.items()
-    }
+    for name, one in list(readings.items()):
+        readings[f"inverted and {name}".removesuffix(" and ")] = one.swapaxes(1, 2)
     errors = {name: rotation_error(rotations, truths) for name, rotations in readings.items()}
     medians = {name: float(np.median(error)) for name, error in errors.items()}
     best = min(medians, key=medians.get)

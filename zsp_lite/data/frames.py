@@ -54,7 +54,7 @@ class Frame:
                 values = np.array(values)
             else:
                 values = real_array(f"{label} {name}", values).astype(np.float32)
-            # not, because of NaN
+            # `not` of the valid range, so that NaN is refused, too.
             if values.shape != size or not (values.min() >= 0 and values.max() <= top):
                 found = (
                     f"shape {values.shape}"
@@ -224,7 +224,7 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     )
     rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR)
     depth, mask = frame.depth, frame.mask
-    # of the nearest pixel, since values interpolated at an edge or hole lie on no surface
+    # By the nearest pixel: values interpolated at an edge or hole lie on no surface.
     if depth is not None:
         rows = (2 * np.arange(height) + 1) * old_height // (2 * height)
         cols = (2 * np.arange(width) + 1) * old_width // (2 * width)
@@ -290,11 +290,8 @@ def write_depth(
 def _changed(frame: Frame, camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Frame:
     """Return a frame with another camera and `change` applied to its colours, depth and mask."""
     images = {"rgb": frame.rgb, "depth": frame.depth, "mask": frame.mask}
-    return replace(
-        frame,
-        camera=camera,
-        **{name: one if one is None else change(one) for name, one in images.items()},
-    )
+    changed = {name: change(one) for name, one in images.items() if one is not None}
+    return replace(frame, camera=camera, **changed)
 
 
 def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
@@ -311,15 +308,15 @@ def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
     data = read_bytes(path, what)
     is_jpeg = data[:2] == b"\xff\xd8"
     image, expected = None, "a complete JPEG or PNG"
-    # of Pillow, for another format or a damaged header
+    # What Pillow and OpenCV raise for another format or a damaged header.
     with suppress(OSError, SyntaxError, ValueError, cv2.error):
-        # reads the header only
+        # This reads the header only.
         opened = (JpegImageFile if is_jpeg else PngImageFile)(io.BytesIO(data))
         width, height = opened.size
         if width * height > MAX_PIXELS:
             expected = f"at most {MAX_PIXELS} pixels, not {height} x {width}"
         else:
-            # OpenCV fills missing parts of an image with grey
+            # OpenCV would fill missing parts of an image with grey.
             (opened.load if is_jpeg else opened.verify)()
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:

@@ -28,7 +28,7 @@ class ObjectPose(msgspec.Struct):
     scale: float
     low: _Vector  # corners of the box
     high: _Vector
-    # about the up axis, in degrees, after which the shape is the same; 0 is not among them
+    # About the up axis, in degrees, after which the shape is the same; 0 is not among them
     turns: tuple[int, ...] = ()
 
     @property

@@ -57,7 +57,8 @@ def read_label_folder(folder: Path, added: Mapping[str, PoseLabel] = {}) -> dict
     """Read the labels of one category in a folder by sequence, together with labels that will be
     added to it."""
     labels = {path.stem: read_label(path) for path in sorted(folder.glob("*.json"))} | added
-    if len(references := sorted({label.reference_seq for label in labels.values()})) > 1:
+    references = sorted({label.reference_seq for label in labels.values()})
+    if len(references) > 1:
         raise InputError(
             f"labels in {folder} have reference sequences {', '.join(references)}, expected one"
         )

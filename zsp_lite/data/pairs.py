@@ -56,9 +56,9 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
             f"{n_targets}"
         )
 
-    # Each frame is the start of one choice of target frames.
+    # All frames; each is the start of one choice of target frames.
     every = sum(map(len, numbers.values()))
-    # Pairs that are not sampled yet.
+    # Pairs of each reference sequence that are not sampled yet.
     left = {name: len(own) * (every - len(own)) for name, own in numbers.items()}
     if (total := sum(left.values())) < n:
         logger.warning(
@@ -79,8 +79,8 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
             frame = numbers[reference][rng.integers(len(numbers[reference]))]
             length = len(numbers[target])
             positions = (rng.integers(length) + np.arange(n_targets) * length // n_targets) % length
-            views = tuple(numbers[target][position] for position in positions)
-            pairs[Pair(category, reference, frame, target, views)] = None
+            targets = tuple(numbers[target][position] for position in positions)
+            pairs[Pair(category, reference, frame, target, targets)] = None
         left[reference] -= len(pairs) - found
 
 
@@ -117,14 +117,10 @@ def true_pose(
 ) -> Float[np.ndarray, "4 4"]:
     """Compute the labelled pose of a pair from its reference's camera to that of a target view, by
     its index."""
-    frames = (
-        (pair.reference_sequence, pair.reference_frame),
-        (pair.target_sequence, pair.target_frames[view]),
-    )
-    reference, target = (dataset.camera(dataset.frame(pair.category, *frame)) for frame in frames)
-    return relative_pose(
-        labels[pair.reference_sequence], reference, labels[pair.target_sequence], target
-    )
+    first, second = pair.reference_sequence, pair.target_sequence
+    reference = dataset.camera(dataset.frame(pair.category, first, pair.reference_frame))
+    target = dataset.camera(dataset.frame(pair.category, second, pair.target_frames[view]))
+    return relative_pose(labels[first], reference, labels[second], target)
 
 
 def pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:
@@ -148,7 +144,8 @@ def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 
         for path in pair_files(dataset, category, f"*samples_{n_targets}tgt")
     )
     pairs = next((pairs for pairs in sets if len(pairs) >= at_least), [])
-    if len(different := [*dict.fromkeys(pairs)]) < len(pairs):
+    different = [*dict.fromkeys(pairs)]
+    if len(different) < len(pairs):
         logger.warning(
             "category %s: %d of %d stored pairs are different", category, len(different), len(pairs)
         )
@@ -179,10 +176,9 @@ def read_published_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
             if not 0 <= position < len(frames) or frames[position].sequence_name != sequence:
                 raise InputError(
                     f"evaluation pairs {path}, pair {number}: frame id {position} is not of "
-                    f"{sequence}, expected a "
-                    f"position in the list of {len(frames)} frames"
+                    f"{sequence}, expected a position in the list of {len(frames)} frames"
                 )
-        reference, *targets = (frames[position].frame_number for _, position in chosen)
+        reference, *targets = [frames[position].frame_number for _, position in chosen]
         pairs.append(
             Pair(
                 item.category,

@@ -37,9 +37,10 @@ def import_labels(
     sources = {}
     for category, labels in _published_labels(source, categories).items():
         folder = label_folder(root, category)
-        # checks that they fit together
+        # This checks that they fit together.
         read_label_folder(folder, added={one.seq: one for one in labels.values()})
-        sources |= {folder / path.name: path for path in labels}
+        for path in labels:
+            sources[folder / path.name] = path
     for path in sorted(source.glob("**/determ_eval/*/*.pt")):
         if categories is None or path.stem in categories:
             read_pair_file(path)
@@ -121,8 +122,7 @@ def transfer_labels(
         if residuals[name] > _MAX_RESIDUAL:
             raise InputError(
                 f"sequence {category}/{name}: camera centres differ by {residuals[name]:.3f} "
-                "of their spread after "
-                f"alignment, expected at most {_MAX_RESIDUAL:g}"
+                f"of their spread after alignment, expected at most {_MAX_RESIDUAL:g}"
             )
     centre = new.point_cloud(category, reference)[0].mean(axis=0)
     transferred = {}
@@ -160,9 +160,8 @@ def align_worlds(old: Co3D, new: Co3D, category: str, sequence: str) -> tuple[Si
             f"sequence {category}/{sequence}: {len(common)} frames have cameras in both data sets, "
             f"expected at least {_MIN_CAMERAS}"
         )
-    first, second = (np.array([one[number] for number in common]) for one in centres)
+    first, second = np.array([[one[number] for number in common] for one in centres])
     sim3 = umeyama(first, second)
     distance = np.square(sim3.apply(first) - second).sum(axis=1).mean()
-    return sim3, float(
-        np.sqrt(distance / np.square(second - second.mean(axis=0)).sum(axis=1).mean())
-    )
+    spread = np.square(second - second.mean(axis=0)).sum(axis=1).mean()
+    return sim3, float(np.sqrt(distance / spread))

@@ -96,7 +96,10 @@ def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
     if path.is_file() and path.match("transforms*.json"):
         return "nerfstudio", path
     files = [one for one in folder.glob("*") if not one.name.startswith((".", "__MACOSX"))]
-    for place in (folder, *files[: len(files) == 1]):  # an app may put a folder into its zip
+    places = [folder]
+    if len(files) == 1:  # an app may put a folder into its zip
+        places += files
+    for place in places:
         for name, one in FORMATS.items():
             if all(any(place.glob(sign)) for sign in one.signs):
                 return name, place
@@ -127,7 +130,8 @@ def open_capture(
         found, place = recognise(path)
         layout = layout or found
         path = place if found == layout else path
-    options |= {"count": count} if layout == "stray" else {}
+    if layout == "stray":  # its reader keeps the sharp frames of a video only
+        options["count"] = count
     frames, left_out = collect(FORMATS[layout].read(path, **options))
     images = [frame.image for frame in frames]
     found = find_masks(masks or (path if path.is_dir() else path.parent) / "masks", images)
@@ -143,10 +147,8 @@ def open_capture(
         frame for frame, _ in sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
     ]
     if not frames:
-        found = (
-            f"none of {len(left_out)} frames can be used: {left_out[0]}"
-            if left_out
-            else "no frame, expected some"
-        )
+        found = "no frame, expected some"
+        if left_out:
+            found = f"none of {len(left_out)} frames can be used: {left_out[0]}"
         raise InputError(f"capture {source}: {found}")
     return Capture(frames, left_out)

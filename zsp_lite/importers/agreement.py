@@ -23,12 +23,8 @@ from zsp_lite.metrics import rotation_angle
 from zsp_lite.points import object_pixels, world_points
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-# points of a frame, at most and at least, and pairs of frames
-_POINTS, _LEAST_POINTS, _PAIRS = (
-    500,
-    50,
-    8,
-)
+# Points of a frame, at most and at least, and pairs of frames
+_POINTS, _LEAST_POINTS, _PAIRS = 500, 50, 8
 _NEAREST, _BEST, _FARTHEST = 4.0, 20.0, 50.0  # angle between two cameras that are compared, degrees
 _TOLERANCE = 0.05  # of depth, relative to that of the object
 _AGREEING = 0.6  # share of points above which frames agree without doubt
@@ -39,7 +35,7 @@ _RAY_GAIN = 1.2
 _CONTRADICTING = 0.4  # share of points below which frames contradict each other
 _UNITS = {1.0: "metres", 0.001: "millimetres", 0.0002: "1/5000 m"}
 _FACTORS = (1000.0, 0.001, 5.0, 0.2, 10.0, 0.1)  # from one common unit to another
-# steps of 5 %
+# Steps of 5 %, without those near 1, which correct nothing.
 _SCALES = [scale for scale in np.geomspace(1e-3, 1e3, 280).tolist() if not 0.96 < scale < 1.04]
 
 _Pose = Float[np.ndarray, "4 4"]  # world to camera
@@ -131,9 +127,9 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
 def neighbours(count: int) -> list[int]:
     """Choose up to six positions among `count` frames that go once around an object: three and
     those beside them."""
-    return sorted(
-        {(k * count // 3 + beside) % count for k in range(3) for beside in (0, max(1, count // 18))}
-    )
+    thirds = [k * count // 3 for k in range(3)]
+    steps = 0, max(1, count // 18)  # 20 degrees of a turn around the object
+    return sorted({(third + step) % count for third in thirds for step in steps})
 
 
 def _pairs(surfaces: Sequence[_Surface]) -> list[_Pair]:

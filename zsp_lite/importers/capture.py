@@ -96,11 +96,8 @@ class CaptureFrame:
         else:
             undistortion = cv2.initUndistortRectifyMap
             p1, p2 = coefficients[2:4]
-            # a vector: it turns with the image
-            coefficients[[3, 2]] = (camera.R @ self.camera.R.T)[:2, :2] @ (
-                p2,
-                p1,
-            )
+            # The tangential coefficients are a vector, which turns with the image.
+            coefficients[[3, 2]] = (camera.R @ self.camera.R.T)[:2, :2] @ (p2, p1)
         return undistortion(
             matrix, coefficients, np.eye(3), matrix, camera.size[::-1], cv2.CV_32FC1
         )
@@ -114,7 +111,7 @@ class Capture(NamedTuple):
     left_out: list[str]  # what is wrong with each frame that is left out
 
 
-# what a reader returns; a frame that cannot be used raises InputError
+# What a reader returns; a frame that cannot be used raises InputError
 Makers = Iterator[Callable[[], CaptureFrame]]
 
 

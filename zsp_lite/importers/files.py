@@ -80,7 +80,7 @@ def read_depth_file(path: str | Path) -> Float32[np.ndarray, "h w"]:
     if path.name.endswith(CO3D_DEPTH):
         return read_depth(path)
     values = _read_values(path, "depth")
-    # Blender repeats it as colours
+    # Blender repeats the depth as three colours.
     if values.ndim == 3 and (values.shape[2] == 1 or path.suffix.lower() == ".exr"):
         values = values[..., 0]
     if (
@@ -266,10 +266,8 @@ def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
 
     The principal point of an image is near its middle, unless it is a crop of a larger one.
     """
-    side, values = (
-        np.array(camera.size[::-1], float),
-        np.concatenate([camera.focal_length, camera.principal_point]),
-    )
+    side = np.array(camera.size[::-1], float)
+    values = np.concatenate([camera.focal_length, camera.principal_point])
     focal, centre = values[:2], values[2:]
     ratios = 2 * centre / side  # of the image that the intrinsics fit to this one
     doubts = [f"the intrinsics {_listed(values)}"]
@@ -292,7 +290,7 @@ def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
         doubts.append("have their principal point far from the middle, as those of a crop")
     elif focal.max() > _UNEQUAL * focal.min():
         doubts.append("have unequal focal lengths")
-    # of the smallest image around this one with its centre there
+    # Size of the smallest image around this one with its centre there.
     whole = 2 * np.maximum(centre, side - centre)
     view = np.degrees(2 * np.arctan(whole / focal / 2)).max()
     if not _LEAST_VIEW <= view <= _LARGEST_VIEW:

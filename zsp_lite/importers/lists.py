@@ -9,24 +9,17 @@ from scipy.spatial import cKDTree
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import Makers, make_frame, read_numbers, read_text_lines
 
-# the benchmark's default, with pixel centres at half-integers
-_TUM_INTRINSICS = (
-    525.0,
-    525.0,
-    320.0,
-    240.0,
-)
-# metres per stored depth value; seconds between an image and its depth
-_TUM_UNIT, _TUM_TOLERANCE = (
-    1 / 5000,
-    0.02,
-)
+# The benchmark's default, with pixel centres at half-integers
+_TUM_INTRINSICS = (525.0, 525.0, 320.0, 240.0)
+# Metres per stored depth value; seconds between an image and its depth
+_TUM_UNIT, _TUM_TOLERANCE = 1 / 5000, 0.02
 
 
 def read_lists(folder: Path) -> Makers:
     """Read a capture given as plain text lists, of which line n describes frame n (see `zsp-lite
     data import -h`)."""
-    images, depths = (read_text_lines(folder / name) for name in ("rgb.txt", "depth.txt"))
+    images = read_text_lines(folder / "rgb.txt")
+    depths = read_text_lines(folder / "depth.txt")
     poses = read_numbers(folder / "poses.txt", (12, 16))
     intrinsics = read_numbers(folder / "intrinsics.txt", (3, 4))
     if intrinsics.shape[1] == 3 or len(intrinsics) == 1:
@@ -51,11 +44,11 @@ def read_tum(
     """Read a sequence of TUM's RGB-D benchmark: image, depth and pose of the nearest times are a
     frame."""
     poses = read_numbers(folder / "groundtruth.txt", (8,))
-    names = [folder / name for name in ("rgb.txt", "depth.txt")]
-    times, depth_times = (read_numbers(name, (1,), usecols=0)[:, 0] for name in names)
-    images, depths = (
-        [line.split(maxsplit=1)[-1] for line in read_text_lines(name)] for name in names
-    )
+    image_list, depth_list = folder / "rgb.txt", folder / "depth.txt"
+    times = read_numbers(image_list, (1,), usecols=0)[:, 0]
+    depth_times = read_numbers(depth_list, (1,), usecols=0)[:, 0]
+    images = [line.split(maxsplit=1)[-1] for line in read_text_lines(image_list)]
+    depths = [line.split(maxsplit=1)[-1] for line in read_text_lines(depth_list)]
     for time, image, depth, pose in zip(
         times, images, _nearest(depth_times, times), _nearest(poses[:, 0], times)
     ):

@@ -59,17 +59,14 @@ _PARTS = 0.25  # share of the mask outside its largest region
 _COLOUR_IOU = 0.5  # least overlap with the mask that GrabCut finds in the padded bounding box
 _LEAST_SIGNS = 0.5  # per frame, below which masks are not flagged
 _LYING = 0.5  # share of the object's points that may lie in the plane around it
-# shares of the object's points in and above one plane, such as a table's
-_CARRYING, _CARRIED = (
-    0.4,
-    0.05,
-)
+# Shares of the object's points in and above one plane, such as a table's
+_CARRYING, _CARRIED = 0.4, 0.05
 
 PLAUSIBLE = 0.05, 20.0  # distance of an object, metres
 _LEAST_KNOWN = 0.4  # share of the pixels on the object
 DOUBTFUL = "the masks may be wrong"
 
-# unit normal, to the side of the cameras, and offset: normal @ x = offset
+# Unit normal, to the side of the cameras, and offset: normal @ x = offset
 Plane = tuple[Float[np.ndarray, "3"], float]
 
 
@@ -202,7 +199,7 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
             near[near] = world_points(frame, near) @ plane[0] - plane[1] > _CLEARANCE * distance
     parts = _part_at(focus, frames, pixels, _VOXEL * distance)
     if len(frames) >= _MANY:
-        # refuses a part that is two objects close together
+        # This refuses a part that is two objects close together.
         _part_at(focus, frames, parts, _VOXEL / _FINER * distance)
     masked = [
         replace(frame, mask=_with_unknown(frame, part))
@@ -211,8 +208,7 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
     if not any(frame.mask.sum() >= _MIN_PIXELS for frame in masked):
         raise InputError(
             f"{frames[0].name or 'frame'}: nothing stands out from a plane where the camera "
-            "looks, expected "
-            "--box TOP,LEFT,HEIGHT,WIDTH around the object"
+            "looks, expected --box TOP,LEFT,HEIGHT,WIDTH around the object"
         )
     return masked
 
@@ -229,7 +225,7 @@ def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
     if found.total() < _LEAST_SIGNS * usable:
         return ()
     signs = [f"{sign} ({count} of {usable} frames)" for sign, count in found.items()]
-    # alone it is no reason: many objects fill the image, or stand on a dark turntable
+    # Alone it is no reason: many objects fill the image, or stand on a dark turntable
     if signs and plane is None:
         signs.append("no plane is found that the object stands on")
     return (f"{DOUBTFUL}: {', '.join(signs)}",) if signs else ()
@@ -313,9 +309,8 @@ def _supporting_plane(
         height = cloud @ normal - offset
         on = np.abs(height) < _PLANE_DISTANCE * distance
         below = (height < -3 * _PLANE_DISTANCE * distance).mean()
-        spread, other_spread = (
-            standard_deviation(cloud[some]) if some.any() else 0.0 for some in (on, ~on)
-        )
+        spread = standard_deviation(cloud[on]) if on.any() else 0.0
+        other_spread = 0.0 if on.all() else standard_deviation(cloud[~on])
         if (
             spread >= _MIN_SPREAD * other_spread
             and on.mean() >= _MIN_ON_PLANE
@@ -360,30 +355,32 @@ def _part_at(
 
     InputError if a second part is alike.
     """
-    # to be computed twice, not kept
+    # Clouds are large: they are computed twice, and not kept.
     clouds = [partial(world_points, *one) for one in zip(frames, pixels, strict=True)]
-    corners = [
-        (cloud.min(axis=0), cloud.max(axis=0))
-        for cloud in (make() for make in clouds)
-        if len(cloud)
-    ]
+    corners = []
+    for make in clouds:
+        points = make()
+        if len(points):
+            corners += [points.min(axis=0), points.max(axis=0)]
     if not corners:
         return list(pixels)
-    low, high = np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+
+    # Voxels with points, weighed by these, and the voxel of each pixel.
     shape = np.floor((high - low) / voxel).astype(int) + 1
     weight, cells = np.zeros(shape.prod()), []
     for points in (make() for make in clouds):
-        cells.append(
-            np.ravel_multi_index(np.floor((points - low) / voxel).astype(int).T, shape).astype(
-                np.int32
-            )
-        )
+        indices = np.floor((points - low) / voxel).astype(int)
+        cells.append(np.ravel_multi_index(indices.T, shape).astype(np.int32))
         near = np.exp(-np.square(np.linalg.norm(points - focus, axis=1) / (8 * voxel)))
         weight += np.bincount(cells[-1], near, len(weight))
+
+    # Connected parts of voxels, of which the one with the most weight is the object.
     part = ndimage.label(weight.reshape(shape) > 0, np.ones((3, 3, 3)))[0].ravel()
     sizes = np.bincount(part, weight)
     first = sizes.argmax()
     large = np.flatnonzero(sizes > _COMPARABLE * sizes[first])
+    # Only a part of like extent may be the object, too: a far larger one is a table or a wall.
     extents = np.array(
         [np.argwhere((part == one).reshape(shape)).std(axis=0).mean() for one in large]
     )
@@ -391,9 +388,9 @@ def _part_at(
     if ((likeness > _ALIKE) & (likeness < 1 / _ALIKE)).sum() > 1:
         raise InputError(
             f"{frames[0].name or 'frame'}: two objects of like size stand where the camera "
-            "looks, expected "
-            "--box TOP,LEFT,HEIGHT,WIDTH around one of them"
+            "looks, expected --box TOP,LEFT,HEIGHT,WIDTH around one of them"
         )
+
     chosen = part == first
     selected = [some.copy() for some in pixels]
     for mask, cell in zip(selected, cells, strict=True):
@@ -415,13 +412,11 @@ def _colours_around(
 ) -> Bool[np.ndarray, "h w"]:
     """Separate the colours in the box of a mask by GrabCut; around a `certain` mask only pixels of
     unknown depth."""
-    boxes = [
-        mask_to_bbox(mask.astype(np.uint8), padding=padding)
-        for padding in (_UNKNOWN_PADDING, _CONTEXT_PADDING)
-    ]
-    inner, context = (
-        np.s_[top : top + height, left : left + width] for top, left, height, width in boxes
-    )
+    windows = []
+    for padding in (_UNKNOWN_PADDING, _CONTEXT_PADDING):
+        top, left, height, width = mask_to_bbox(mask.astype(np.uint8), padding=padding)
+        windows.append(np.s_[top : top + height, left : left + width])
+    inner, context = windows
     possible, found = np.zeros_like(mask), np.zeros_like(mask)
     possible[inner] = (frame.depth[inner] == 0) | (not certain)
     found[context] = separate_colours(

@@ -94,10 +94,8 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     fy = frame.fl_y or (
         height / 2 / math.tan(frame.camera_angle_y / 2) if frame.camera_angle_y else fx
     )
-    cx, cy = (
-        (width / 2 if frame.cx is None else frame.cx),
-        (height / 2 if frame.cy is None else frame.cy),
-    )
+    cx = width / 2 if frame.cx is None else frame.cx
+    cy = height / 2 if frame.cy is None else frame.cy
     if found not in (None, (height, width)) and math.isclose(
         height * found[1], width * found[0], rel_tol=0.01
     ):

@@ -83,7 +83,7 @@ class _Record3D(msgspec.Struct):
 def read_record3d(folder: Path) -> Makers:
     """Read a scan of Record3D; its depth is decompressed to a temporary folder."""
     scan, unpacked = read_json(folder / "metadata", _Record3D, "capture"), new_folder()
-    if not any(number for pose in scan.poses for number in pose):
+    if not any(map(any, scan.poses)):
         found = f"all {len(scan.poses)} poses are zero: the tracking failed"
         raise InputError(f"{folder}/metadata: {found}, expected another scan")
     every = scan.perFrameIntrinsicCoeffs or [[scan.K[k] for k in (0, 4, 6, 7)]] * len(scan.poses)

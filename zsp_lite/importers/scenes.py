@@ -28,7 +28,7 @@ def read_bop(folder: Path, object: int | None = None) -> Makers:
     scene = read_json(folder / "scene_gt.json", dict[str, list[_Annotation]], "capture")
     cameras = read_json(folder / "scene_camera.json", dict[str, dict[str, Any]], "capture")
     numbers = {image: [one.obj_id for one in placed] for image, placed in scene.items()}
-    known = sorted({number for some in numbers.values() for number in some})
+    known = sorted(set().union(*numbers.values()))
     if object is None and len(known) == 1:
         object = known[0]
     if object not in known:
@@ -103,7 +103,7 @@ def read_open3d(folder: Path) -> Makers:
         for path in (folder / "color").glob("*")
         if path.suffix.lower() in (".jpg", ".png")
     )
-    # three frame numbers, and four lines of a matrix
+    # Three frame numbers, and four lines of a matrix
     lines = read_numbers(log, (4,), usecols=(0, 1, 2, -1))
     if len(lines) != 5 * len(images):
         raise InputError(

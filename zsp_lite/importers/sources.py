@@ -42,9 +42,7 @@ _TAKEN = {
     "image": (*_MASKED, *_FILES, "intrinsics", "depth"),
     "sequence": _MASKED,
     "frames": _MASKED,
-}
-_TAKEN |= {
-    name: (*_MASKED, *_FILES, "masks", "count", *one.options) for name, one in FORMATS.items()
+    **{name: (*_MASKED, *_FILES, "masks", "count", *one.options) for name, one in FORMATS.items()},
 }
 _SWEEPS = 20  # over the chosen views, which mostly stay after ten
 _CONTEXT = 8  # frames of a source that are segmented together, or tried as the reference
@@ -56,17 +54,17 @@ class Source:
 
     path: Path  # the sequence, the capture or the image; a name for frames in memory
     format: str  # "sequence", "image", "frames", or the format of a capture
-    # number of each frame: that of the annotations, or its position in the capture
+    # Number of each frame: that of the annotations, or its position in the capture
     numbers: tuple[int, ...]
-    # reads the frame at a position of `numbers`, with the mask that comes with it, if any
+    # Reads the frame at a position of `numbers`, with the mask that comes with it, if any
     read: Callable[[int], Frame]
     # where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours)
     mask: str
     box: Box | None = None  # bounding box of the object in the first frame, for "box"
-    # of the frames, where these are chosen by their directions, not by their order
+    # Of the frames, where these are chosen by their directions, not by their order
     cameras: tuple[Camera, ...] = ()
     left_out: Sequence[str] = ()  # what is wrong with each frame that cannot be used
-    # positions and names of frames without a given mask
+    # Positions and names of frames without a given mask
     missing: Mapping[int, str] = field(default_factory=dict)
     doubts: tuple[str, ...] = ()  # what speaks against the intrinsics
     depth_unit: float | None = None  # world units per stored depth value, of an image or a capture
@@ -207,13 +205,11 @@ class Source:
         or by the order."""
         if not self.cameras or count == 0:
             return [positions[k] for k in spread(count, len(positions))]
-        return [
-            positions[k]
-            for k in spread_views([self.cameras[position] for position in positions], count)
-        ]
+        cameras = [self.cameras[position] for position in positions]
+        return [positions[k] for k in spread_views(cameras, count)]
 
 
-# a path, frames, or what `open_source` returns
+# A path, frames, or what `open_source` returns
 SourceLike = str | Path | Frame | Sequence[Frame] | Source
 
 
@@ -265,10 +261,14 @@ def open_source(
         "depth_unit": depth_unit,
         "object": object,
         "masks": masks,
+        "count": count,
+        "label": label,
+        "orientation": orientation,
     }
-    options |= {"count": count, "label": label, "orientation": orientation}
     options = {name: value for name, value in options.items() if value is not None}
     layout, unit = layout or _format(path), None
+
+    # Refuse options that do not fit the format, or each other.
     if layout == "frames":
         frames = _check_frames([path] if isinstance(path, Frame) else path)
         path = frames[0].name or f"{len(frames)} frames"
@@ -281,9 +281,12 @@ def open_source(
         if name not in _TAKEN[layout]:
             option = {"count": "frames"}.get(name, name.replace("_", "-"))
             raise InputError(f"--{option} does not go with {path}, of the format {layout}")
-    if mask not in (None, *(("box",) if box is not None else ("given", "auto"))):
+    ways = ("given", "auto") if box is None else ("box",)
+    if mask not in (None, *ways):
         expected = "--mask given, --mask auto, or --mask box with --box TOP,LEFT,HEIGHT,WIDTH"
         raise InputError(f"{path}: mask is {mask!r} and box is {box}, expected {expected}")
+
+    # Each format gives the numbers of its frames, a function that reads one, and which have a mask.
     cameras, left_out, doubts = (), (), ()
     if layout == "frames":
         read, masked = frames.__getitem__, [frame.mask is not None for frame in frames]
@@ -293,9 +296,8 @@ def open_source(
         folder = _sequence_folder(path)
         dataset = Co3D(folder.parents[1])
         every = dataset.frames(folder.parent.name, folder.name)
-        if not (
-            frames := [one for one in every if one.viewpoint is not None and one.depth is not None]
-        ):
+        frames = [one for one in every if one.viewpoint is not None and one.depth is not None]
+        if not frames:
             raise InputError(f"{path}: no frame has a camera and depth, expected some")
         read, masked = (lambda k: dataset.load(frames[k])), [one.mask is not None for one in frames]
         names = numbers = [one.frame_number for one in frames]
@@ -311,13 +313,16 @@ def open_source(
         cameras, unit = tuple(frame.camera for frame in capture), capture[0].depth_unit
         different = {camera.K.tobytes(): camera for camera in reversed(cameras)}.values()
         doubts = tuple(line for one in different for line in question_intrinsics(one, str(path)))
-    if mask is None:
-        mask = "box" if box is not None else "given" if any(masked) else "auto"
+    if mask is None and box is not None:
+        mask = "box"
+    elif mask is None:
+        mask = "given" if any(masked) else "auto"
     if mask == "given" and not any(masked):
         raise InputError(
             f"{path}: no mask, expected masks named like the images, --mask auto or --box "
             "TOP,LEFT,HEIGHT,WIDTH"
         )
+
     missing = {k: str(name) for k, name in enumerate(names) if not masked[k]}
     return Source(
         path, layout, tuple(numbers), read, mask, box, cameras, left_out, missing, doubts, unit
@@ -342,9 +347,9 @@ def open_pair(
     given: list[dict] = [{} for _ in sides]
     for name, values in options.items():
         takers = [k for k, one in enumerate(formats) if name in _TAKEN[one]]
-        counts = {len(takers), sum(k < 2 for k in takers)} | (
-            {1} if takers and name != "depth" else set()
-        )
+        counts = {len(takers), sum(k < 2 for k in takers)}
+        if takers and name != "depth":  # each image has its own depth
+            counts.add(1)
         if values and len(values) not in counts:
             option, expected = f"--{name.replace('_', '-')}", " or ".join(map(str, sorted(counts)))
             raise InputError(
@@ -355,9 +360,9 @@ def open_pair(
                 k for k, way in enumerate(options.get("mask", ())) if way == "box" and k in takers
             ]
             takers = (boxed or takers)[:1]
-        for k, value in zip(
-            takers, values if len(values) > 1 or name == "depth" else [*values] * len(takers)
-        ):
+        if len(values) == 1 and name != "depth":
+            values = [*values] * len(takers)
+        for k, value in zip(takers, values):
             given[k][name] = value
     return [
         side if isinstance(side, Source) else open_source(side, **some)
@@ -405,11 +410,8 @@ def _format(side: SourceLike) -> str:
 def _sequence_folder(path: Path) -> Path | None:
     """Return the folder of a sequence in its data folder, also where the path is a link to it; None
     if it is none."""
-    # absolute for the names of "." and of "mine/cup/.."
-    folders = (
-        Path(os.path.abspath(path)),
-        path.resolve(),
-    )
+    # Both are absolute, so that "." and "mine/cup/.." have names.
+    folders = (Path(os.path.abspath(path)), path.resolve())
     return next(
         (one for one in folders if one.is_dir() and (one.parent / FRAMES_FILE).is_file()), None
     )
@@ -432,11 +434,9 @@ def _open_image(
     depth_unit = 1.0 if depth.name.endswith(CO3D_DEPTH) else 0.001
     rgb, orientation = read_picture(path)
     camera = camera_from_pose(np.eye(4), intrinsics, rgb.shape[:2], f"image {path}")
-    stored, displayed = (
-        np.linalg.norm(2 * camera.principal_point - side)
-        for side in (camera.size[::-1], camera.size)
-    )
-    # the principal point is nearer to the middle of the displayed form
+    stored = np.linalg.norm(2 * camera.principal_point - camera.size[::-1])
+    displayed = np.linalg.norm(2 * camera.principal_point - camera.size)
+    # The principal point is nearer to the middle of the displayed form
     if orientation > 4 and displayed < stored:
         camera = replace(camera, size=camera.size[::-1])
     return CaptureFrame(
@@ -464,22 +464,17 @@ def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
     """
     if len(cameras) <= count:
         return list(range(len(cameras)))
-    centres, axes = (
-        np.stack([one.centre for one in cameras]),
-        np.stack([one.R[2] for one in cameras]),
-    )
-    # the point that is nearest to all optical axes is the object
+    centres = np.stack([one.centre for one in cameras])
+    axes = np.stack([one.R[2] for one in cameras])
+    # The object is at the point that is nearest to all optical axes.
     across = np.eye(3) - axes[:, :, None] * axes[:, None]
     point = np.linalg.lstsq(
         across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None
     )[0]
     directions = centres - point
     directions /= np.linalg.norm(directions, axis=1, keepdims=True).clip(1e-9)
-    # the same for every order of the other cameras
-    order = [
-        0,
-        *(1 + np.lexsort(directions[1:].T.round(6))),
-    ]
+    # Sorted, so that the choice is the same for every order of the other cameras.
+    order = [0, *(1 + np.lexsort(directions[1:].T.round(6)))]
     gaps = directions[order][:, None] - directions[order]
     energy = 1 / (np.sum(gaps**2, axis=-1) + 1e-9)
     np.fill_diagonal(energy, np.inf)  # no camera is chosen twice

@@ -20,12 +20,8 @@ from zsp_lite.data.frames import MAX_PIXELS
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import file_size, path_inside
 
-# bytes of an unpacked zip; above the second at most 200 times those of the zip
-_MOST, _LARGE, _RATIO = (
-    20e9,
-    1e9,
-    200,
-)
+# Bytes of an unpacked zip; above the second at most 200 times those of the zip
+_MOST, _LARGE, _RATIO = 20e9, 1e9, 200
 _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
@@ -74,12 +70,10 @@ def open_video(path: Path) -> Callable[[int], UInt8[np.ndarray, "h w 3"]]:
     """
     file_size(path, "video")
     with open(path, "rb") as file:
-        # other files may name addresses, which are not to be opened
+        # Other files may name addresses, which are not to be opened
         is_video = file.read(8)[4:] == b"ftyp"
-    video, position = (
-        cv2.VideoCapture(str(path), cv2.CAP_FFMPEG) if is_video else cv2.VideoCapture(),
-        -1,
-    )
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG) if is_video else cv2.VideoCapture()
+    position = -1
     pixels = video.get(cv2.CAP_PROP_FRAME_WIDTH) * video.get(cv2.CAP_PROP_FRAME_HEIGHT)
     if not video.isOpened() or pixels > MAX_PIXELS:
         raise InputError(

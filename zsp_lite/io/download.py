@@ -85,12 +85,10 @@ def remote_size(url: str) -> int | None:
     """Ask a server for the size of a file in bytes, None if it does not tell; InputError if it has
     no such file."""
     try:
-        with urllib.request.urlopen(
-            urllib.request.Request(url, method="HEAD"), timeout=TIMEOUT
-        ) as response:
-            return (
-                None if (length := response.headers.get("Content-Length")) is None else int(length)
-            )
+        request = urllib.request.Request(url, method="HEAD")
+        with urllib.request.urlopen(request, timeout=TIMEOUT) as response:
+            length = response.headers.get("Content-Length")
+            return None if length is None else int(length)
     except NETWORK_ERRORS as error:
         raise InputError(f"{url} cannot be reached: {error}") from error
 

@@ -108,9 +108,8 @@ def load_torch(path: str | Path, what: str) -> Any:
     file_size(path, what, MAX_WEIGHTS)
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
-    except (
-        Exception
-    ) as error:  # a damaged file can raise almost any; torch's message recommends unsafe loading
+    # A damaged file can raise almost anything; torch's message recommends unsafe loading.
+    except Exception as error:
         raise InputError(
             f"{what} {path}: damaged, or contains more than tensors ({type(error).__name__})"
         ) from error
@@ -142,7 +141,8 @@ def decompress(data: bytes, what: str) -> bytes:
     limit = min(MAX_FILE, max(GROWTH_ALLOWED, _GROWTH_FACTOR * len(data)))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
-            if len(content := file.read(limit + 1)) <= limit:
+            content = file.read(limit + 1)
+            if len(content) <= limit:
                 return content
         problem = f"{len(data)} bytes grow to more than {limit}"
     except (OSError, EOFError, zlib.error) as error:

@@ -120,7 +120,7 @@ def _colours(columns: dict[str, np.ndarray]) -> UInt8[np.ndarray, "n 3"] | None:
 @functools.cache
 def load_open3d():
     """Import and return the `open3d` module."""
-    # it would start a server in a notebook
+    # Open3D would start a server in a notebook.
     os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
     # Open3D's Linux wheels link against libusb-1.0, which is often not installed: it is loaded from
     # a package.
