@@ -70,12 +70,17 @@ class Backbone:
                 f"{heads[-1]}"
             )
         check_choice(f"{name}: facet", facet, FACETS)
-        self.name, self.facet, self.saliency_heads = name, facet, tuple(saliency_heads)
+        self.name = name
+        self.facet = facet
+        self.saliency_heads = tuple(saliency_heads)
         self.layer = block_index(
             min(9, model.depth - 1) if layer is None else layer, model.depth, name
         )
-        self.mean, self.std, self.batch_size = tuple(mean), tuple(std), batch_size
-        self.patch_size, self.embed_dim = model.patch_size, model.embed_dim
+        self.mean = tuple(mean)
+        self.std = tuple(std)
+        self.batch_size = batch_size
+        self.patch_size = model.patch_size
+        self.embed_dim = model.embed_dim
         self.image_size = nearest_multiple(
             model.image_size if image_size is None else image_size, model.patch_size
         )
@@ -114,7 +119,8 @@ class Backbone:
                 normalize(batch, self.mean, self.std), self.layer, self.facet
             )
             saliency = tokens.attention[:, list(self.saliency_heads)].float().mean(1)
-            low, high = saliency.amin(1, keepdim=True), saliency.amax(1, keepdim=True)
+            low = saliency.amin(1, keepdim=True)
+            high = saliency.amax(1, keepdim=True)
             saliency = (saliency - low) / (high - low).clamp_min(1e-12)
             parts = (
                 tokens.keys.unflatten(1, tokens.grid),
@@ -133,8 +139,7 @@ def block_index(layer: int | str, depth: int, name: str = "backbone") -> int:
     if not found or not -depth <= int(found[1]) < depth:
         raise InputError(
             f"{name}: layer is {layer!r}, expected 'last', 'block0' to 'block{depth - 1}', or "
-            f"a number from {-depth} "
-            f"to {depth - 1}"
+            f"a number from {-depth} to {depth - 1}"
         )
     return int(found[1]) % depth
 
@@ -175,7 +180,8 @@ def normalize(
     std: Sequence[float] = IMAGENET_STD,
 ) -> Float[Tensor, "b 3 h w"]:
     """Subtract the mean and divide by the standard deviation, per channel."""
-    mean, std = (images.new_tensor(x).view(3, 1, 1) for x in (mean, std))
+    mean = images.new_tensor(mean).view(3, 1, 1)
+    std = images.new_tensor(std).view(3, 1, 1)
     return (images - mean) / std
 
 

@@ -33,11 +33,8 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
                 f"checkpoint {path}: damaged, or contains more than tensors ({reason[:120]})"
             ) from error
     content = load_torch(path, "checkpoint")
-    for nested in (
-        "teacher",
-        "state_dict",
-        "model",
-    ):  # DINO's training checkpoints contain teacher and student
+    # DINO's training checkpoints contain teacher and student.
+    for nested in ("teacher", "state_dict", "model"):
         if isinstance(content, dict) and isinstance(content.get(nested), dict):
             content = content[nested]
             break
@@ -73,14 +70,13 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> 
         depth = len({key.split(".")[1] for key in weights if key.startswith("blocks.")})
         if num_heads is None:
             num_heads = dim // 64 if dim % 64 == 0 else 0  # the transformer refuses 0 heads
-        # the checkpoint replaces the initial values: do not compute them
+        # The checkpoint replaces the initial values: do not compute them.
         with torch.device("meta"):
             model = VisionTransformer(side * patch_size, patch_size, dim, depth, num_heads)
     except (KeyError, ValueError, IndexError) as error:
         raise InputError(
             f"{path.name}: not a vision transformer in the DINO layout ({error}); num_heads "
-            "is read from the metadata, "
-            "by default one per 64 channels"
+            "is read from the metadata, by default one per 64 channels"
         ) from error
     for key, values in weights.items():
         if not values.isfinite().all():

@@ -59,14 +59,13 @@ class HuggingFaceViT(nn.Module):
             isinstance(size, int) for size in (self.patch_size, self.num_heads, self.depth)
         )
         # In a plain list, so that the modules are not registered a second time.
-        self._projections = [found for module in model.modules() if (found := _projections(module))]
+        self._projections = list(filter(None, map(_projections, model.modules())))
         special = {key.rpartition(".")[2]: x for key, x in model.named_parameters()}
         if not sizes_known or len(self._projections) != self.depth or not _CLS & special.keys():
             raise InputError(
                 f"{name}: a {config.model_type} model, expected a vision transformer with one "
-                "square patch_size, "
-                "num_attention_heads, a CLS token, and in each of num_hidden_layers blocks "
-                "the projections "
+                "square patch_size, num_attention_heads, a CLS token, and in each of "
+                "num_hidden_layers blocks the projections "
                 f"{', '.join(map(' or '.join, _PROJECTIONS.values()))}"
             )
         self.image_size = nearest_multiple(image_size, self.patch_size)
@@ -151,7 +150,7 @@ def load_huggingface(
     local = {"local_files_only": True, "trust_remote_code": False}
     try:
         config = AutoConfig.from_pretrained(folder, **local)
-        # CLIP and similar models: the image encoder
+        # Of CLIP and similar models: the image encoder.
         vision = getattr(config, "vision_config", config)
         if hasattr(vision, "mask_ratio"):
             vision.mask_ratio = 0.0  # a masked autoencoder must see the whole image
@@ -173,9 +172,8 @@ def load_huggingface(
         )
         if missing:
             raise ValueError(f"{len(missing)} weights are not in the file, first {missing[0]}")
-    except (
-        Exception
-    ) as error:  # damaged JSON, unknown types, wrong fields or shapes: no common base class
+    # Damaged JSON, unknown types, wrong fields or shapes: no common base class.
+    except Exception as error:
         raise InputError(
             f"{name}: cannot be loaded by the package transformers ({_one_line(error)})"
         ) from error
@@ -215,9 +213,8 @@ def model_folder(name: str) -> Path:
             f"{name}: needs the package transformers: pip install transformers "
             f"huggingface-hub ({_one_line(error)})"
         ) from error
-    except (
-        Exception
-    ) as error:  # no such model, no permission, no network: the hub's client says which
+    # No such model, no permission, no network: the hub's client says which.
+    except Exception as error:
         raise InputError(
             f"{name}: neither a folder nor a model OWNER/MODEL that the Hugging Face hub "
             f"gives ({_one_line(error)})"

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from zsp_lite.choices import Facet
 from zsp_lite.errors import InputError, check_integer
 
-# pixels of an image's side; the time of attention grows with the fourth power of the side
+# Pixels of an image's side; the time of attention grows with the fourth power of the side.
 MOST_INPUT = 2048
 
 
@@ -169,8 +169,11 @@ class VisionTransformer(nn.Module):
                 f"VisionTransformer: {found}, expected positive multiples of patch_size and "
                 "num_heads"
             )
-        self.image_size, self.patch_size, self.embed_dim = image_size, patch_size, embed_dim
-        self.depth, self.num_heads = depth, num_heads
+        self.image_size = image_size
+        self.patch_size = patch_size
+        self.embed_dim = embed_dim
+        self.depth = depth
+        self.num_heads = num_heads
         self.cls_token = nn.Parameter(torch.zeros(1, 1, embed_dim))
         self.pos_embed = nn.Parameter(
             torch.zeros(1, 1 + (image_size // patch_size) ** 2, embed_dim)
@@ -246,7 +249,8 @@ class VisionTransformer(nn.Module):
         for block in self.blocks:
             activations.append(block(x))
             x = activations[-1].token
-        chosen, last = activations[layer], activations[-1]
+        chosen = activations[layer]
+        last = activations[-1]
         logits = self.blocks[-1].attn.cls_logits(last.query, last.key)
         return TrainingTokens(
             self.norm(last.token), chosen.key[:, 1:], chosen.normed[:, 1:], logits

@@ -1,7 +1,4 @@
-"""Poses by geometry alone (supplement):
-
-ICP with scale on depth maps; the essential matrix of matches without depth.
-"""
+"""Poses by geometry alone (supplement): ICP with scale; the essential matrix without depth."""
 
 from collections.abc import Sequence
 
@@ -59,8 +56,10 @@ def align(
     target = _subsample(np.concatenate(parts), rng)
     # Both cameras start where the first camera of their sequence is (supplement), because the
     # worlds of CO3D's sequences are nearly aligned already, which would help.
-    aligned = icp(firsts[0].to_world(source), firsts[1].to_world(target))
-    to_reference, to_target = (Sim3(1.0, first.R, first.t) for first in firsts)
+    first, second = firsts
+    aligned = icp(first.to_world(source), second.to_world(target))
+    to_reference = Sim3(1.0, first.R, first.t)
+    to_target = Sim3(1.0, second.R, second.t)
     return to_target @ aligned @ to_reference.inverse()
 
 
@@ -85,7 +84,7 @@ def essential_rotation(
     first = _directions(reference.camera, matches.reference, grid)
     second = _directions(target.camera, matches.target, grid)
     focal = np.concatenate([reference.camera.focal_length, target.camera.focal_length]).mean()
-    # matches are patch centres: a patch is as far as one is off
+    # Matches are patch centres: a patch is as far as one is off.
     threshold = reference.camera.size[0] / grid[0] / focal
     poses = []
     if len(matches) >= 5:  # five-point RANSAC; OpenCV's draws are always the same

@@ -16,12 +16,14 @@ from zsp_lite.features import FeatureMap
 from zsp_lite.matchers import mutual_nearest_neighbours
 
 KEYPOINT_SIZE = 24.0  # of RootSIFT, pixels
-_CELLS, _BINS = 4, 8  # cells along each side of a descriptor, orientations per cell
+_CELLS = 4  # along each side of a descriptor
+_BINS = 8  # orientations per cell
 _CELL = 1.5  # side of a cell, in keypoint sizes
 # OpenCV's constants: blur of the first octave (the image is assumed to have a blur of 0.5),
 # clipping, scale.
 _BLUR = (1.6**2 - 0.5**2) ** 0.5
-_CLIP, _SCALE = 0.2, 512.0
+_CLIP = 0.2
+_SCALE = 512.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +97,9 @@ class RootSift:
 
     def __call__(self, images: Sequence[Image]) -> list[FeatureMap]:
         """Extract the features of (H, W, 3) images, uint8 or float in [0, 1]."""
-        maps, side = [], self.image_size // self.patch_size
-        # OpenCV's origin is the centre of pixel 0
+        maps = []
+        side = self.image_size // self.patch_size
+        # OpenCV's origin is the centre of pixel 0.
         centres = (np.arange(side) + 0.5) * self.patch_size - 0.5
         for rgb in prepare_images(images, self.image_size).mul(255).round().to(torch.uint8):
             grey = cv2.cvtColor(

@@ -28,9 +28,9 @@ from zsp_lite.verified.verification import VIEWPOINT_SIGMA
 # Hypotheses whose rotations differ by more than this many degrees are distinct: the paper's wider
 # error threshold.
 MODE_ANGLE = 30.0
-# of the best pose's probability: above it, another pose is nearly as probable
+# Of the best pose's probability: above it, another pose is nearly as probable.
 TIE_RATIO = float(np.exp(-1))
-# fraction of points on an observed surface; with less in both directions, a pose is flagged
+# Fraction of points on an observed surface; with less in both directions, a pose is flagged.
 _MIN_OVERLAP = 0.05
 # The same of the similarity term. Correct and wrong poses have 0.06 and more, views that share no
 # side 0.01.
@@ -48,18 +48,14 @@ def evidence(
     # part of the best score from overlap, silhouettes and free space; small if shapes do not fit
     shape_fit: float,
 ) -> Float[np.ndarray, "6"]:
-    """Return a constant and what the probabilities of an estimate depend on, beside the scores of
-    its poses."""
+    """Return a constant and what probabilities depend on beside the scores of the poses."""
     nearness = np.exp(-((nearest / VIEWPOINT_SIGMA) ** 2))
     return np.array([1.0, span / 360, np.log(n_views), nearness, view_std, shape_fit])
 
 
 @dataclass(frozen=True)
 class Calibration:
-    r"""The coefficients \alpha and \beta of the `evidence`, in its order, and \lambda (fit:
-
-    `tools/tuning.py`).
-    """
+    r"""The coefficients \alpha, \beta of the `evidence`, and \lambda (fit: `tools/tuning.py`)."""
 
     scale: tuple[float, ...] = (-0.40, 1.46, 0.025, -0.93, 2.90, -0.063)  # \alpha
     none: tuple[float, ...] = (0.55, -2.87, 0.72, 0.61, -28.5, -0.501)  # \beta
@@ -68,8 +64,7 @@ class Calibration:
     def probabilities(
         self, deficit: Float[np.ndarray, " m"], x: Float[np.ndarray, " k"]
     ) -> Float[np.ndarray, " m"]:
-        """Return the probabilities of poses by their `deficit` S_1 - S_k, which is infinite for a
-        pose that is none."""
+        """Return the probabilities of poses by their `deficit` S_1 - S_k; infinite for none."""
         odds = np.exp(-np.exp(x @ self.scale) * deficit)
         return (1 - self.unseen * hidden_share(x[1])) * odds / (np.exp(x @ self.none) + odds.sum())
 
@@ -80,8 +75,7 @@ def hidden_share(span: float | Float[np.ndarray, " n"]) -> float | Float[np.ndar
 
 
 def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
-    """Return whose pose each hypothesis has: the nearest better one's that is within 30 degrees,
-    else its own."""
+    """Say whose pose each hypothesis has: its own or the nearest better one's within 30 degrees."""
     found: list[int] = []
     for i, row in enumerate(angle):
         near = [j for j in range(i) if found[j] == j and row[j] < MODE_ANGLE]
@@ -92,9 +86,9 @@ def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
 def reliability_flags(
     hypotheses: Sequence[Hypothesis], angle: Float[np.ndarray, "m m"]
 ) -> tuple[tuple[str, ...], bool]:
-    """Say why the best hypothesis may be wrong, one line per reason, and whether the answer is one
-    of two poses."""
-    terms, flags = hypotheses[0].terms, []
+    """Say why the best hypothesis may be wrong, a line per reason, and whether it is one of two."""
+    terms = hypotheses[0].terms
+    flags = []
     probability = np.array([one.confidence for one in hypotheses])
     tied = [
         k
@@ -116,9 +110,8 @@ def reliability_flags(
             else f"{len(tied)} poses more than 30"
         )
         flags.append(
-            f"{start} degrees apart explain the views about equally well (probabilities "
-            f"{shown}): the object may be "
-            "symmetric"
+            f"{start} degrees apart explain the views about equally well "
+            f"(probabilities {shown}): the object may be symmetric"
         )
     if terms and max(terms["forward_overlap"], terms["reverse_overlap"]) < _MIN_OVERLAP:
         flags.append("no view confirms the pose: nearly no point lies on an observed surface")

@@ -18,8 +18,7 @@ SCALE_RANGE = (0.5, 2.0)
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """m similarity transforms `y = scale * rotation @ x + translation` in working units,
-    float32."""
+    """m similarities `y = scale * rotation @ x + translation` in working units, float32."""
 
     scale: Float[Tensor, " m"]  # positive
     rotation: Float[Tensor, "m 3 3"]
@@ -50,12 +49,8 @@ class Poses:
 
 def concatenate(batches: Sequence[Poses]) -> Poses:
     """Concatenate batches of poses."""
-    return Poses(
-        *(
-            torch.cat([getattr(p, name) for p in batches])
-            for name in ("scale", "rotation", "translation")
-        )
-    )
+    parts = [(one.scale, one.rotation, one.translation) for one in batches]
+    return Poses(*map(torch.cat, zip(*parts)))
 
 
 def float_tensor(values) -> Tensor:
@@ -71,19 +66,18 @@ def exp_(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 def rotation_angles(
     first: Float[Tensor, "m 3 3"], second: Float[Tensor, "n 3 3"]
 ) -> Float[Tensor, "m n"]:
-    """Compute the geodesic angle in degrees between each rotation of one batch and each of the
-    other."""
+    """Compute the angle in degrees between each rotation of one batch and each of the other."""
     return torch.from_numpy(rotation_angle(first[:, None].numpy(), second[None].numpy()))
 
 
 def rotation_matrices(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
-    """Convert rotation vectors (axis times angle in radians) to matrices by Rodrigues' formula, in
-    float32."""
+    """Convert rotation vectors (axis times angle in radians) by Rodrigues' formula, in float32."""
     angle = vectors.norm(dim=-1, keepdim=True)
     x, y, z = (vectors / angle.clamp_min(1e-12)).unbind(-1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(-1, 3, 3)
-    sine, cosine = angle.sin()[..., None], angle.cos()[..., None]
+    sine = angle.sin()[..., None]
+    cosine = angle.cos()[..., None]
     return torch.eye(3) + sine * cross + (1 - cosine) * (cross @ cross)
 
 

@@ -35,10 +35,10 @@ _VIEW_SCALE = 0.9
 def poses_from_matches(
     source: Float[Tensor, "k 3"], target: Float[Tensor, "k 3"], rng: np.random.Generator
 ) -> Poses:
-    """Fit poses to random samples of three matches and keep the best that differ by at least 20
-    degrees."""
+    """Fit poses to random samples of three matches and keep the best that differ."""
     if len(source) < 3:
         return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
+    # The three smallest of random numbers are a sample without repetition: (trials, 3).
     sample = np.argpartition(rng.random((_TRIALS, len(source))), (0, 1, 2), axis=1)[:, :3]
     fitted = umeyama_batch(*(points.double().numpy()[sample] for points in (source, target)))[:3]
     poses = Poses(*map(float_tensor, fitted))
@@ -47,14 +47,12 @@ def poses_from_matches(
     # As in MSAC (Torr and Zisserman 2000), sum_i max(0, 1 - (|T x_i - y_i| / 0.3)^2).
     score = (1 - squared_residual / _INLIER_DISTANCE**2).clamp_min_(0).sum(dim=1)
     best = torch.argsort(score, descending=True, stable=True)[:_POOL]
-    return poses[
-        best[non_maximum_suppression(poses.rotation[best], score[best], _MIN_ANGLE, _PER_VIEW)]
-    ]
+    kept = non_maximum_suppression(poses.rotation[best], score[best], _MIN_ANGLE, _PER_VIEW)
+    return poses[best[kept]]
 
 
 def poses_from_views(scene: Scene) -> Poses:
-    """Return poses with the viewpoints of the target views, and that of the first one turned about
-    the vertical."""
+    """Return poses with the target views' viewpoints, and the first turned about the vertical."""
     views = scene.target_maps.rotation.transpose(1, 2)
     # The mean of the directions that are up in the target images.
     vertical = F.normalize(-scene.target_maps.rotation[:, 1].mean(dim=0), dim=0)

@@ -24,21 +24,21 @@ from zsp_lite.verified.poses import (
 from zsp_lite.verified.scene import Scene
 from zsp_lite.verified.verification import WEIGHTS, score_terms
 
-# Hypotheses kept from round to round, and the smallest angle between them in degrees.
-MAX_HYPOTHESES, MIN_ANGLE = 6, 15.0
+MAX_HYPOTHESES = 6  # kept from search to search
+MIN_ANGLE = 15.0  # degrees between them
 _MAX_POLISHED = 3  # of these, the best that are polished
 # About this many points of the reference and of the targets are scored during the search.
-_SEARCH_POINTS, _POLISH_POINTS = (150, 375), (450, 2000)
-# steps of a round that are recombined into one candidate of the next round (mu in CMA-ES)
+_SEARCH_POINTS = (150, 375)
+_POLISH_POINTS = (450, 2000)  # the same during the polish
+# Steps of a round that are recombined into one candidate of the next round (mu in CMA-ES).
 _PARENTS = 6
 
 
 class SearchSchedule(NamedTuple):
-    """Number of rounds and of steps per round and pose, and standard deviations of the steps in the
-    first round."""
+    """The rounds of a search, and standard deviations of the steps in the first round."""
 
     rounds: int
-    samples: int
+    samples: int  # steps per round and pose
     rotation: float  # of each component of the rotation vector, degrees
     translation: float  # of each component, working units
     scale: float  # of the logarithm
@@ -55,8 +55,7 @@ POLISH = SearchSchedule(
 
 
 def refine_coarse_to_fine(scene: Scene, poses: Poses, rng: np.random.Generator) -> Poses:
-    """Refine poses in three searches of decreasing width, scored on some of the points; keep those
-    that differ."""
+    """Refine poses in three searches of decreasing width, on some of the points."""
 
     def score(poses: Poses, points: tuple[int, int] = _SEARCH_POINTS) -> Float[Tensor, " m"]:
         totals = len(scene.reference_points), len(scene.target_points)
@@ -76,9 +75,9 @@ def refine(
     schedule: SearchSchedule,
     rng: np.random.Generator,
 ) -> tuple[Poses, Float[Tensor, " m"]]:
-    """Improve every pose by random search within `SCALE_RANGE`; return the poses and their
-    scores."""
-    best_score, m = score(poses), len(poses)
+    """Improve every pose by random search within `SCALE_RANGE`; return poses and scores."""
+    best_score = score(poses)
+    m = len(poses)
     rows = torch.arange(m)
     # A candidate of the next round is the mean of the best steps, with the weights of CMA-ES
     # (Hansen 2016).
@@ -92,10 +91,12 @@ def refine(
         steps = torch.from_numpy(draws).repeat(m, 1, 1)
         if recombined is not None:
             steps[:, 0] = recombined
+
         candidates = _perturb(poses, steps, schedule)
         top_score, top = score(candidates).view(m, -1).topk(_PARENTS, dim=1)
         index = rows * schedule.samples + top[:, 0]
         improved = top_score[:, 0] > best_score
+
         mean = (steps[rows[:, None], top] * weights).sum(dim=1)
         # Relative to the pose from which the next round starts.
         recombined = mean - torch.where(improved[:, None], steps[rows, top[:, 0]], 0)
@@ -105,8 +106,7 @@ def refine(
 
 
 def _perturb(poses: Poses, steps: Float[Tensor, "m samples 7"], schedule: SearchSchedule) -> Poses:
-    """Apply each step to its pose: three components of rotation, three of translation, one of
-    log-scale."""
+    """Apply each step to its pose: 3 components of rotation, 3 of translation, 1 of log-scale."""
     vectors = torch.deg2rad(schedule.rotation * steps[..., :3]).flatten(0, 1)
     rotation = rotation_matrices(vectors).view(*steps.shape[:2], 3, 3) @ poses.rotation[:, None]
     scale = (poses.scale[:, None] * torch.exp(schedule.scale * steps[..., 6])).clamp(*SCALE_RANGE)

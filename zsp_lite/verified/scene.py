@@ -100,9 +100,8 @@ class Scene:
     view_span: float  # angle in degrees that the target views span around the target
 
     def to_sim3(self, poses: Poses, index: int, view: int) -> Sim3:
-        """Convert a pose from working units to a similarity from the reference camera to a target
-        view's camera."""
-        # orthogonal again in float64
+        """Convert a pose from working units to one from the reference camera to a view's camera."""
+        # Orthogonal again in float64.
         left, _, right = np.linalg.svd(poses.rotation[index].double().numpy())
         pose = Sim3(
             float(poses.scale[index]), left @ right, poses.translation[index].double().numpy()
@@ -129,19 +128,19 @@ def build_scene(
     clouds = [
         (view.measured_points[0].reshape(-1, 3) - t) @ R for view, (R, t) in zip(targets, to_camera)
     ]
-    cloud, known = (
-        np.concatenate(clouds),
-        np.concatenate([target.known_foreground.ravel() for target in targets]),
-    )
+    cloud = np.concatenate(clouds)
+    known = np.concatenate([target.known_foreground.ravel() for target in targets])
+
+    # To working units.
     name = reference.frame.name or "reference"
     reference_to_working, source_valid = _normalisation(
         source, reference.known_foreground.ravel(), name
     )
     target_to_working, valid = _normalisation(cloud, known, "target views")
-    source, cloud = reference_to_working.apply(source), target_to_working.apply(cloud)
+    source = reference_to_working.apply(source)
+    cloud = target_to_working.apply(cloud)
 
-    # of the patches of each target but the first
-    starts = np.cumsum([len(one) for one in clouds])[:-1]
+    # Similarities of the foreground patches.
     foregrounds = [target.foreground.ravel() for target in targets]
     column = _number(np.concatenate(foregrounds))
     reference_foreground = reference.foreground.ravel()
@@ -155,12 +154,15 @@ def build_scene(
     view_similarity = torch.stack(best) - torch.stack(best).mean()
     valid_rows = torch.from_numpy(source_valid)[reference_foreground]
 
+    # Points of the matches with measured depth on both sides.
+    starts = np.cumsum([len(one) for one in clouds])[:-1]  # of each target but the first
     matched = []
     for target, points, match in zip(targets, np.split(cloud, starts), matches):
         u = np.ravel_multi_index(tuple(match.reference.T), reference.features.grid)
         v = np.ravel_multi_index(tuple(match.target.T), target.features.grid)
         both = reference.measured_points[1].ravel()[u] & target.measured_points[1].ravel()[v]
         matched.append((float_tensor(source[u[both]]), float_tensor(points[v[both]])))
+
     still = [(np.eye(3), np.zeros(3))]  # the reference's points are in its camera's frame
     return Scene(
         reference_points=float_tensor(source[source_valid]),
@@ -213,9 +215,9 @@ def project_points(
     translation: Float[Tensor, "m 3"],
     points: Float[Tensor, "n 3"],
 ) -> Projection:
-    """Transform points by `linear @ x + translation`, project them into every view and read the
-    maps."""
-    m, v = len(linear), len(maps.size)
+    """Project the points `linear @ x + translation` into every view and read the maps."""
+    m = len(linear)
+    v = len(maps.size)
     camera_linear = (maps.rotation @ linear[:, None]).reshape(-1, 3)
     camera_translation = (maps.rotation @ translation[:, None, :, None])[..., 0] + maps.translation
     in_camera = (camera_linear @ points.T).view(m, v, 3, -1).add_(camera_translation[..., None])
@@ -231,9 +233,11 @@ def project_points(
     nearest = torch.minimum(pixels.clamp_min(0), last)
     column, row = nearest.int().unbind(2)
     index = (row * maps.size[:, :1].int()).add_(column).add_(maps.first_row[:, None].int())
-    surface_depth, weight, distance, patch = (
+    # One column of the table at a time: (m, v, n) each.
+    read = [
         values.index_select(0, index.flatten()).view(index.shape) for values in maps.table.unbind(1)
-    )
+    ]
+    surface_depth, weight, distance, patch = read
     beyond = torch.sub(pixels, nearest).abs_().sum(2)  # 0 within the image
     distance = distance.addcmul_(beyond, distance.sign()).div_(pixels_per_unit)
     return Projection(depth, surface_depth, weight, distance, patch.int(), pixels.transpose(2, 3))
@@ -242,9 +246,9 @@ def project_points(
 def _table(
     view: View, columns: Int[np.ndarray, " patches"], scale: float
 ) -> tuple[Camera, Float[np.ndarray, "4 pixels"]]:
-    """Resize the camera to about _MAP_PIXELS pixels, with equal focal lengths along both axes, and
-    fill its table."""
-    camera, grid = view.frame.camera, view.features.grid
+    """Resize the camera to about _MAP_PIXELS pixels, with equal focal lengths; fill its table."""
+    camera = view.frame.camera
+    grid = view.features.grid
     aspect = (camera.size[0] / camera.focal_length[1]) / (camera.size[1] / camera.focal_length[0])
     height = max(round(float(np.sqrt(_MAP_PIXELS * aspect))), 1)
     width = max(round(_MAP_PIXELS / height), 1)
@@ -256,33 +260,30 @@ def _table(
     ]
     column = columns.reshape(grid)[_at_centres((height, width), grid)]
     table = depth * scale, np.where(depth > 0, mask, 0), np.mean(distance, axis=0), column
-    return camera.resize((height, width)), np.stack(
-        [values.astype(np.float32) for values in table]
-    ).reshape(4, -1)
+    stacked = np.stack([values.astype(np.float32) for values in table])
+    return camera.resize((height, width)), stacked.reshape(4, -1)
 
 
 def _at_centres(size: tuple[int, int], grid: tuple[int, int]) -> tuple[Int[np.ndarray, "_ _"], ...]:
-    """Index a grid over an image of (height, width) pixels, such as its patches, by the cell at
-    each pixel's centre."""
+    """Index a grid over an image of (height, width) pixels by the cell at each pixel's centre."""
     return np.ix_(*((2 * np.arange(n) + 1) * cells // (2 * n) for n, cells in zip(size, grid)))
 
 
 def double_centre(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
-    """Subtract the means of rows and columns, because patches amid an object are similar to most,
-    at its rim to few."""
-    rows, columns = similarity.mean(dim=1, keepdim=True), similarity.mean(dim=0, keepdim=True)
+    """Subtract the means of rows and columns."""
+    # Patches amid an object are similar to most, those at its rim to few.
+    rows = similarity.mean(dim=1, keepdim=True)
+    columns = similarity.mean(dim=0, keepdim=True)
     return similarity - rows - columns + similarity.mean()
 
 
 def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
-    """Weight points by the inverse of a Gaussian kernel density: what three views show has three
-    times the points."""
+    """Weight points by the inverse of a Gaussian kernel density."""
+    # What three views show has three times the points.
     points = points / _DENSITY_SIGMA
     square = points.square().sum(dim=1, keepdim=True)
-    left, right = (
-        torch.cat([points, square], dim=1),
-        torch.cat([points, torch.full_like(square, -0.5)], dim=1),
-    )
+    left = torch.cat([points, square], dim=1)
+    right = torch.cat([points, torch.full_like(square, -0.5)], dim=1)
     # |x - y|^2 / 2 is a product of few rows at a time with all, so that it stays in the processor's
     # cache.
     products = (torch.addmm(-square.T / 2, part, right.T) for part in left.split(_DENSITY_ROWS))
@@ -304,13 +305,14 @@ def _number(selected: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
 def _normalisation(
     points: Float[np.ndarray, "n 3"], valid: Bool[np.ndarray, " n"], name: str
 ) -> tuple[Sim3, Bool[np.ndarray, " n"]]:
-    """Compute the similarity that gives the valid points mean 0 and unit spread, and mark the
-    outliers as invalid."""
-    if (n := int(valid.sum())) < MIN_POINTS:
+    """Give the valid points mean 0 and unit spread, and mark the outliers as invalid."""
+    n = int(valid.sum())
+    if n < MIN_POINTS:
         raise NoPoseError(
             f"{name}: {n} foreground patches of known depth, expected at least {MIN_POINTS}"
         )
     kept = valid.copy()
     kept[valid] = near_median(points[valid], _OUTLIER_DISTANCE)
-    mean, spread = points[kept].mean(axis=0), standard_deviation(points[kept])
+    mean = points[kept].mean(axis=0)
+    spread = standard_deviation(points[kept])
     return Sim3(1 / spread, np.eye(3), -mean / spread), kept

@@ -28,35 +28,41 @@ _OUTLIER_AFFINITY = 0.01  # a_0 divided by the number of target points
 
 def soft_icp(scene: Scene, poses: Poses) -> Poses:
     """Align every pose to the local optimum, independently of the others."""
+    # Evenly spaced points of both sides.
     totals = len(scene.reference_points), len(scene.target_points)
-    rows, columns = (
+    rows, columns = [
         torch.arange(min(n, most)) * n // min(n, most) for n, most in zip(totals, _MAX_POINTS)
-    )
-    source, target = scene.reference_points[rows], scene.target_points[columns]
+    ]
+    source = scene.reference_points[rows]
+    target = scene.target_points[columns]
     feature_term = _FEATURE_WEIGHT * scene.similarity[rows][:, scene.target_column[columns]]
     target_square = target.square().sum(dim=1)
     for sigma in np.geomspace(*_SIGMAS, _ITERATIONS):
+        # Squared distances |x|^2 + |y|^2 - 2 x.y of each source to each target point: (m, n, k).
         moved = poses.apply(source)
         square = moved.square().sum(dim=2, keepdim=True) + target_square
-        square = torch.baddbmm(
-            square, moved, target.T.expand(len(moved), 3, -1), alpha=-2
-        ).clamp_min_(0)
+        every = target.T.expand(len(moved), 3, -1)
+        square = torch.baddbmm(square, moved, every, alpha=-2).clamp_min_(0)
+
+        # Each source point gets a soft partner, (m, n, 3), and a weight that says if it has one.
         affinity = exp_(square.mul_(-0.5 / sigma**2).add_(feature_term))
         total = affinity.sum(dim=2, keepdim=True)
         partner = (affinity @ target) / total.clamp_min(1e-12)
         weight = total / (total + _OUTLIER_AFFINITY * len(target))
         weight = weight / weight.sum(dim=1, keepdim=True).clamp_min(1e-6)
-        source_mean, partner_mean = (weight * source).sum(dim=1), (weight * partner).sum(dim=1)
-        x, y = source - source_mean[:, None], partner - partner_mean[:, None]
-        rotation = float_tensor(
-            nearest_rotation(((weight * y).transpose(1, 2) @ x).double().numpy())[0]
-        )
+
+        # Weighted alignment of the source to the partners.
+        source_mean = (weight * source).sum(dim=1)
+        partner_mean = (weight * partner).sum(dim=1)
+        x = source - source_mean[:, None]
+        y = partner - partner_mean[:, None]
+        covariance = (weight * y).transpose(1, 2) @ x
+        rotation = float_tensor(nearest_rotation(covariance.double().numpy())[0])
         # Soft partners are averages and have a smaller spread than the targets, so the
         # least-squares scale would shrink in each iteration. The ratio of spreads does not; half
         # steps make it converge.
-        variance_ratio = (weight * y.square()).sum(dim=(1, 2)) / (weight * x.square()).sum(
-            dim=(1, 2)
-        ).clamp_min(1e-9)
+        source_variance = (weight * x.square()).sum(dim=(1, 2)).clamp_min(1e-9)
+        variance_ratio = (weight * y.square()).sum(dim=(1, 2)) / source_variance
         scale = (variance_ratio.sqrt().clamp(*SCALE_RANGE) + poses.scale) / 2
         rotated_mean = (rotation @ source_mean[..., None])[..., 0]
         poses = Poses(scale, rotation, partner_mean - scale[:, None] * rotated_mean)

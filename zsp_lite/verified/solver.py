@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from torch import Tensor
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.best_view import ViewMatch
@@ -21,9 +22,8 @@ from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import TERM_NAMES, WEIGHTS, score_terms
 from zsp_lite.views import View
 
-# Poses that go from the proposals to the refinement, and the smallest angle between them in
-# degrees.
-_MAX_REFINED, _MIN_ANGLE_REFINED = 12, 20.0
+_MAX_REFINED = 12  # poses that go from the proposals to the refinement
+_MIN_ANGLE_REFINED = 20.0  # degrees between them
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,8 @@ class VerifiedSolver:
         Inliers have measured depth on both sides.
         """
         solution = self.solve(reference, targets, matched, seed)
-        rotation, best = solution.poses.rotation, solution.hypotheses[0]
+        rotation = solution.poses.rotation
+        best = solution.hypotheses[0]
         flags, one_of_two = reliability_flags(
             solution.hypotheses, rotation_angles(rotation, rotation).numpy()
         )
@@ -84,78 +85,88 @@ class VerifiedSolver:
     def solve(
         self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], seed: int = 0
     ) -> Solution:
-        """Run all stages on usable target views, in any order and any world, and their matches with
-        the reference."""
-        rng, timings = np.random.default_rng(seed), {}
+        """Run all stages on usable target views, in any order and any world, and their matches."""
+        rng = np.random.default_rng(seed)
+        timings = {}
         with torch.no_grad():
             with timed(timings, "scene"):
-                # By a hash of their content, which neither the order of the targets nor the world's
-                # axes change.
-                content = [
-                    target.frame.rgb.tobytes() + target.foreground.numpy().tobytes()
-                    for target in targets
-                ]
-                digests = [hashlib.blake2b(one, digest_size=16).digest() for one in content]
-                order = tuple(sorted(range(len(targets)), key=digests.__getitem__))
-                targets, matched = ([some[k] for k in order] for some in (targets, matched))
-                similarities, matches = (
-                    [one.similarity for one in matched],
-                    [one.matches for one in matched],
-                )
+                order = _content_order(targets)
+                targets = [targets[k] for k in order]
+                matched = [matched[k] for k in order]
+                similarities = [one.similarity for one in matched]
+                matches = [one.matches for one in matched]
                 scene = build_scene(reference, targets, similarities, matches)
+
             with timed(timings, "proposals"):
                 by_view = [poses_from_matches(*points, rng) for points in scene.matches]
                 poses = concatenate([*by_view, poses_from_views(scene)])
+
             with timed(timings, "alignment"):
                 poses = soft_icp(scene, poses)
+
             with timed(timings, "verification"):
                 score = WEIGHTS.score(score_terms(scene, poses))
-                poses = poses[
-                    non_maximum_suppression(poses.rotation, score, _MIN_ANGLE_REFINED, _MAX_REFINED)
-                ]
+                kept = non_maximum_suppression(
+                    poses.rotation, score, _MIN_ANGLE_REFINED, _MAX_REFINED
+                )
+                poses = poses[kept]
+
             with timed(timings, "refinement"):
                 poses = refine_coarse_to_fine(scene, poses, rng)
+
             with timed(timings, "ranking"):
                 terms = score_terms(scene, poses)
-                best = non_maximum_suppression(
-                    poses.rotation, WEIGHTS.score(terms), MIN_ANGLE, MAX_HYPOTHESES
-                )
-                poses, terms = poses[best], terms[best]
-                angles = rotation_angles(
-                    poses.rotation, scene.target_maps.rotation.transpose(1, 2)
-                ).numpy()
-                score, shape_fit = (
-                    one.score(terms).double().numpy() for one in (WEIGHTS, WEIGHTS.of_shape())
-                )
-                mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
-                apart = float(angles[0].min())
-                facts = (
-                    scene.view_span,
-                    len(order),
-                    apart,
-                    scene.view_similarity_std,
-                    float(shape_fit[0]),
-                )
-                # of different poses
-                deficit = np.where(mode == np.arange(len(mode)), score[0] - score, np.inf)
-                confidence = Calibration().probabilities(deficit, evidence(*facts))[mode]
-                # the scene's view that is closest under each pose
-                nearest = angles.argmin(axis=1).tolist()
-                sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(nearest)]
-                named = [dict(zip(TERM_NAMES, row)) for row in terms.tolist()]
-                views = [order[view] for view in nearest]
-                parts = sim3s, views, score.tolist(), named, confidence.tolist(), mode.tolist()
-                hypotheses = tuple(Hypothesis(*one) for one in zip(*parts))
+                score = WEIGHTS.score(terms)
+                best = non_maximum_suppression(poses.rotation, score, MIN_ANGLE, MAX_HYPOTHESES)
+                poses = poses[best]
+                views = scene.target_maps.rotation.transpose(1, 2)
+                angles = rotation_angles(poses.rotation, views).numpy()  # (poses, views)
+                hypotheses = _hypotheses(scene, poses, terms[best], angles, order)
+        # From the scene's order of the views back to the caller's.
         view_angles = angles[0][np.argsort(order)].astype(np.float64)
         return Solution(hypotheses, view_angles, timings, scene, order, poses)
+
+
+def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
+    """Order views by a hash, which neither their order nor the axes of their world change."""
+    digests = []
+    for target in targets:
+        content = target.frame.rgb.tobytes() + target.foreground.numpy().tobytes()
+        digests.append(hashlib.blake2b(content, digest_size=16).digest())
+    return tuple(sorted(range(len(targets)), key=digests.__getitem__))
+
+
+def _hypotheses(
+    scene: Scene, poses: Poses, terms: Tensor, angles: np.ndarray, order: tuple[int, ...]
+) -> tuple[Hypothesis, ...]:
+    """Give each pose, best first, its view, score and probability."""
+    score = WEIGHTS.score(terms).double().numpy()
+    shape_fit = WEIGHTS.of_shape().score(terms).double().numpy()
+
+    # Poses of one mode share a probability: only its best pose enters, the others' odds are 0.
+    mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
+    deficit = np.where(mode == np.arange(len(mode)), score[0] - score, np.inf)
+    facts = float(angles[0].min()), scene.view_similarity_std, float(shape_fit[0])
+    known = evidence(scene.view_span, len(order), *facts)
+    confidence = Calibration().probabilities(deficit, known)[mode]
+
+    # The scene's view that is closest under each pose.
+    nearest = angles.argmin(axis=1).tolist()
+    sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(nearest)]
+    named = [dict(zip(TERM_NAMES, row)) for row in terms.tolist()]
+    views = [order[view] for view in nearest]
+    parts = sim3s, views, score.tolist(), named, confidence.tolist(), mode.tolist()
+    return tuple(Hypothesis(*one) for one in zip(*parts))
 
 
 def measured_inliers(
     reference: View, target: View, matches: Matches, sim3: Sim3, threshold: float
 ) -> Bool[np.ndarray, " k"]:
-    """Return which matches have measured depth on both sides and a residual below the threshold
-    under a pose."""
-    (source, known), (destination, seen) = reference.measured_points, target.measured_points
-    u, v = tuple(matches.reference.T), tuple(matches.target.T)
+    """Return which matches have measured depth on both sides and a small residual under a pose."""
+    source, known = reference.measured_points
+    destination, seen = target.measured_points
+    # (row, col) of patches, as indices of the grids
+    u = tuple(matches.reference.T)
+    v = tuple(matches.target.T)
     residual = np.linalg.norm(sim3.apply(source[u]) - destination[v], axis=1)
     return known[u] & seen[v] & (residual < threshold)

@@ -80,19 +80,14 @@ class ScoreCoefficients:
 
 
 TERM_NAMES = tuple(field.name for field in fields(ScoreCoefficients))
-# the other terms compare shapes
-FEATURE_TERMS = (
-    "forward_similarity",
-    "reverse_similarity",
-    "viewpoint",
-)
+# The other terms compare shapes.
+FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint")
 WEIGHTS = ScoreCoefficients()
 
 
 @dataclass(frozen=True, eq=False)
 class PointTerms:
-    """The parts of the terms for each point in each view, before averaging (see the module's
-    docstring)."""
+    """The terms of each point in each view, before averaging (see the module's docstring)."""
 
     projection: Projection  # where the n points fall in the v views under m poses
     # a: weight in [0, 1] with which the point lies on the measured surface
@@ -103,8 +98,7 @@ class PointTerms:
     similarity: Float[Tensor, "m v n"]
 
     def averages(self, point_weights: Float[Tensor, " n"]) -> Iterator[Float[Tensor, " m"]]:
-        """Yield similarity, overlap, silhouette and free space of each pose, averaged over views
-        and points."""
+        """Yield similarity, overlap, silhouette and free space of each pose: averages."""
         q = point_weights / point_weights.sum()
         surface = self.surface * (self.projection.patch >= 0)
         total = surface.sum(dim=1)
@@ -124,7 +118,8 @@ def forward_terms(scene: Scene, poses: Poses, stride: int = 1) -> PointTerms:
 
 def reverse_terms(scene: Scene, poses: Poses, stride: int = 1) -> PointTerms:
     """Project every `stride`-th target point into the reference view, by the inverse poses."""
-    inverse, points = poses.inverse(), scene.target_points[::stride]
+    inverse = poses.inverse()
+    points = scene.target_points[::stride]
     projection = project_points(scene.reference_maps, inverse.linear, inverse.translation, points)
     return _point_terms(scene, projection, scene.target_column[::stride], scene.similarity.shape[1])
 
@@ -132,20 +127,16 @@ def reverse_terms(scene: Scene, poses: Poses, stride: int = 1) -> PointTerms:
 def score_terms(
     scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)
 ) -> Float[Tensor, "m 9"]:
-    """Compute the terms of every pose, a column per term in the order of `TERM_NAMES`, on a part of
-    the points."""
+    """Compute the terms of every pose, columns as in `TERM_NAMES`, on a part of the points."""
     target_weights = scene.target_weight[:: stride[1]]
     reference_weights = torch.ones(len(scene.reference_points[:: stride[0]]))
-    size = max(
-        _CHUNK // (len(reference_weights) * len(scene.target_cameras) + len(target_weights)), 1
-    )
+    per_pose = len(reference_weights) * len(scene.target_cameras) + len(target_weights)
+    size = max(_CHUNK // per_pose, 1)
     chunks = []
     for first in range(0, len(poses), size):
         some = poses[first : first + size]
-        forward, reverse = (
-            forward_terms(scene, some, stride[0]),
-            reverse_terms(scene, some, stride[1]),
-        )
+        forward = forward_terms(scene, some, stride[0])
+        reverse = reverse_terms(scene, some, stride[1])
         chunks.append((*forward.averages(reference_weights), *reverse.averages(target_weights)))
     # The angle includes rotation about the line of sight, with which features change.
     angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2))

@@ -28,14 +28,16 @@ def objects_figure(
     objects are shown in their next best turn, too. At most ten objects are shown.
     """
     names = list(names or alignment.objects)[:MOST]
-    objects, look = alignment.objects, doubtful(alignment)
+    objects = alignment.objects
+    look = doubtful(alignment)
     surest, first = max(objects.items(), key=lambda item: item[1].probability)
     camera = dataset.camera(_frames(dataset, category, surest)[0]).R
     common = camera @ first.sim3.R.T
     rows = {"as scanned": dict.fromkeys(names, camera)}
     rows["aligned"] = {name: common @ objects[name].sim3.R for name in names}
     others = {name: objects[name].alternative for name in names if name in look}
-    if turned := {name: common @ other.R for name, other in others.items() if other}:
+    turned = {name: common @ other.R for name, other in others.items() if other}
+    if turned:
         rows["or turned"] = turned
     size = 1.25 * len(names) + 0.3, 1.35 * len(rows) + 0.3
     figure, axes = plt.subplots(
@@ -52,10 +54,8 @@ def objects_figure(
                 )
                 axis.imshow(object_crop(dataset.load(frames[int(np.argmin(angles))])).rgb)
     for axis, name in zip(axes[1], names, strict=True):
-        text, colour = (
-            f"{name[:16]}\n{100 * objects[name].probability:.0f} %",
-            VERMILLION if name in look else "black",
-        )
+        text = f"{name[:16]}\n{100 * objects[name].probability:.0f} %"
+        colour = VERMILLION if name in look else "black"
         axis.set_xlabel(text, fontsize=8, color=colour, parse_math=False)
     return figure
 
@@ -66,8 +66,7 @@ def doubtful(alignment: CategoryAlignment) -> list[str]:
 
 
 def object_rows(alignment: CategoryAlignment) -> list[tuple[str, ...]]:
-    """Return the lines of the table of objects: name, probability, and the next best turn with its
-    probability."""
+    """Return the table of objects: name, probability, next best turn and its probability."""
     rows = []
     for name, one in alignment.objects.items():
         other = "", ""

@@ -364,7 +364,8 @@ def show_dots(
     """
     rows = list(next(iter(groups.values())))
     figure, axis = plt.subplots(figsize=(8, 1.1 + 0.42 * len(rows)), layout="constrained")
-    rng, width = np.random.default_rng(0), 0.5 / len(groups)
+    rng = np.random.default_rng(0)
+    width = 0.5 / len(groups)
     for index, ((group, values), colour, marker) in enumerate(
         zip(groups.items(), cycle(COLOURS), cycle(_MARKERS))
     ):
@@ -538,7 +539,8 @@ def draw_moved_cloud(
     The colour of a point is its position along the object. `names` are the labels of the axes; None
     draws no axes.
     """
-    colours, middle = coordinate_colours(cloud), cloud.mean(axis=0)
+    colours = coordinate_colours(cloud)
+    middle = cloud.mean(axis=0)
     ends = middle + 2 * axis_deviation(cloud) * np.eye(3)
     for axis, camera, pose in zip(axes, cameras, poses):
         draw_points(axis, camera, pose.apply(cloud), colours, size)
@@ -569,25 +571,20 @@ def draw_estimates(
 ) -> None:
     """Draw at most `most` points of the reference over the images of `chosen_views`, moved by each
     estimate."""
-    views, poses = (
-        chosen_views(estimates),
-        [Sim3.identity(), *(_rounded(one.sim3) for one in estimates)],
-    )
-    draw_moved_cloud(
-        axes, [view.frame.camera for view in views], object_cloud(views[0], most), poses, None, size
-    )
+    views = chosen_views(estimates)
+    cameras = [view.frame.camera for view in views]
+    poses = [Sim3.identity(), *(_rounded(one.sim3) for one in estimates)]
+    draw_moved_cloud(axes, cameras, object_cloud(views[0], most), poses, None, size)
 
 
 def _rounded(pose: Sim3) -> Sim3:
-    """Round a pose: the number of threads changes its last digits, and should not change a
-    picture."""
+    """Round a pose: the number of threads changes its last digits, but shall not a picture."""
     turn = Rotation.from_rotvec(Rotation.from_matrix(pose.R).as_rotvec().round(3))
     return Sim3(round(pose.scale, 3), turn.as_matrix(), pose.t.round(3))
 
 
 def coordinate_colours(points: Real[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Colour points by their position along the first principal axis of the cloud, which shows its
-    orientation."""
+    """Colour points by their position along the cloud's first principal axis."""
     points = np.asarray(points, dtype=np.float64)
     centred = points - points.mean(axis=0)
     along = centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1]

@@ -28,8 +28,10 @@ def classify_points(terms: PointTerms, pose: int = 0) -> Int[np.ndarray, "v n"]:
     the surface. The points that are left are behind it: occluded.
     """
     projection = terms.projection
-    distance, weight = projection.silhouette_distance[pose].numpy(), projection.weight[pose].numpy()
-    surface, free_space = terms.surface[pose].numpy(), terms.free_space[pose].numpy()
+    distance = projection.silhouette_distance[pose].numpy()
+    weight = projection.weight[pose].numpy()
+    surface = terms.surface[pose].numpy()
+    free_space = terms.free_space[pose].numpy()
     return np.select(
         [distance > 0, weight <= 0, surface >= weight / 2, free_space > 0], [3, 4, 0, 2], 1
     )

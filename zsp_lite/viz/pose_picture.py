@@ -26,8 +26,7 @@ _OBJECT = 0.45
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Directions from the target object to the cameras, seen from above with the reference camera
-    below."""
+    """Directions from the target object to the cameras, from above, reference camera below."""
 
     # unit vectors towards target cameras without their vertical part
     targets: dict[int, Float[np.ndarray, "2"]]
@@ -45,7 +44,8 @@ def coverage(
 ) -> Coverage:
     """Compute where the target cameras, by number, and the centre of the reference camera are
     around an object."""
-    numbers, cameras = list(cameras), list(cameras.values())
+    numbers = list(cameras)
+    cameras = list(cameras.values())
     places = np.stack([*(camera.centre for camera in cameras), reference])
     directions = (places - centre) / np.linalg.norm(places - centre, axis=1, keepdims=True)
     axes = ground_axes(cameras)
@@ -74,17 +74,15 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
     The colour of a point is its position along the reference object.
     """
     estimate = result.estimates[solver]
-    chosen, frames, reference = (
-        estimate.view,
-        [view.frame for view in estimate.target_views],
-        estimate.reference_view,
-    )
+    chosen = estimate.view
+    frames = [view.frame for view in estimate.target_views]
+    reference = estimate.reference_view
+
+    # The views and their titles.
     used = np.flatnonzero(np.isfinite(estimate.view_scores))  # others were left out
     others = used[used != chosen]
-    shown = [
-        chosen,
-        *others[np.linspace(0, len(others), min(_OTHERS, len(others)), endpoint=False).astype(int)],
-    ]
+    spaced = np.linspace(0, len(others), min(_OTHERS, len(others)), endpoint=False)
+    shown = [chosen, *others[spaced.astype(int)]]
     names = [f"view {number + 1}" for number in range(len(frames))]
     if solver == "paper":
         names = [f"{name}, score {score:.1f}" for name, score in zip(names, estimate.view_scores)]
@@ -99,15 +97,19 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
         [*images, np.full_like(images[0], 255)], titles, columns=4, size=2.5
     )
     figure.set_figheight(figure.get_figheight() + 0.4)  # space for the legend
-    if (mask := frames[chosen].mask) is not None:
-        columns, rows = (np.arange(size) + 0.5 for size in mask.shape[::-1])
+
+    # The mask, and the reference's points moved into each view.
+    mask = frames[chosen].mask
+    if mask is not None:
+        rows = np.arange(mask.shape[0]) + 0.5
+        columns = np.arange(mask.shape[1]) + 0.5
         axes[1].contour(columns, rows, mask, [ON_OBJECT], colors=["white"], linewidths=1.5)
-    cloud, cameras = (
-        plots.object_cloud(reference, most=20000),
-        [frames[view].camera for view in shown],
-    )
+    cloud = plots.object_cloud(reference, most=20000)
+    cameras = [frames[view].camera for view in shown]
     plots.draw_moved_cloud(axes[:1], [reference.frame.camera], cloud, [Sim3.identity()], None)
     plots.draw_moved_cloud(axes[2:], cameras, cloud, estimate.propagate(cameras), None)
+
+    # Seen from above.
     target_cloud = world_cloud(result.targets)[0]
     if not len(target_cloud):
         raise InputError(
@@ -169,10 +171,8 @@ def _draw_from_above(axis: Axes, seen: Coverage, target: np.ndarray, reference: 
     axis.images[0].remove()
     axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0))
     axis.add_patch(Arc((0, 0), 2, 2, theta1=end, theta2=begin + 360, color=plots.BLUE, linewidth=4))
-    empty, spanned = (
-        f"no target view in these {end - begin:.0f}°",
-        f"the target views span {360 - end + begin:.0f}°",
-    )
+    empty = f"no target view in these {end - begin:.0f}°"
+    spanned = f"the target views span {360 - end + begin:.0f}°"
     axis.plot([], [], "s", color="0.5", alpha=0.25, markersize=14, label=empty)
     axis.plot([], [], color=plots.BLUE, linewidth=4, label=spanned)
     flat = [

@@ -125,10 +125,8 @@ def write_report(
 
 def _pair_parts(result: PairResult, scene_id: str) -> dict[str, Any]:
     """Make the rows and the pictures of a pair for the template."""
-    estimates, votes = (
-        result.estimates,
-        [votes_figure(result.votes), ring_figure(result)] if result.votes else [],
-    )
+    estimates = result.estimates
+    votes = [votes_figure(result.votes), ring_figure(result)] if result.votes else []
     return {
         "result": result,
         "rows": table_rows(result),
@@ -144,12 +142,9 @@ def _pair_parts(result: PairResult, scene_id: str) -> dict[str, Any]:
 
 
 def _notebook_link(name: str, folder: Path) -> Markup:
-    """Link to a notebook of the clone; its number alone if there is none, or if it is on another
-    drive."""
-    label, local = (
-        Markup("notebook {}").format(name[:2]),
-        REPOSITORY / "notebooks" / f"{name}.ipynb",
-    )
+    """Link to a notebook of the clone; its number alone if there is none, or on another drive."""
+    label = Markup("notebook {}").format(name[:2])
+    local = REPOSITORY / "notebooks" / f"{name}.ipynb"
     try:
         address = Path(os.path.relpath(local, folder)).as_posix()
     except ValueError:
@@ -193,10 +188,9 @@ def overview(results: Sequence[PairResult]) -> Figure:
     titles = ["reference", *(f"{solver} solver" for solver in results[0].estimates)]
     images = []
     for result in results:
-        reference, *targets = (
-            view.frame.rgb for view in plots.chosen_views(result.estimates.values())
-        )
-        images += [reference, *map(plots.pale, targets)]
+        reference, *targets = plots.chosen_views(result.estimates.values())
+        images.append(reference.frame.rgb)
+        images += [plots.pale(view.frame.rgb) for view in targets]
     figure, axes = plots.show_images(images, columns=len(titles), size=2.4)
     figure.set_layout_engine("compressed")
     for axis, title in zip(axes, titles):
@@ -211,12 +205,13 @@ def overview(results: Sequence[PairResult]) -> Figure:
 
 
 def _stages(result: PairResult, scene_id: str) -> dict[str, str]:
-    """Draw the method's stages for the chosen view of the first solver; `scene_id` is unique on the
-    page."""
-    views, names = plots.chosen_views([result.estimate]), ("reference", "chosen target")
+    """Draw the stages for the first solver's chosen view; `scene_id` is unique on the page."""
+    views = plots.chosen_views([result.estimate])
+    names = "reference", "chosen target"
     images = [view.frame.rgb for view in views]
     saliency = dict(zip(names, (view.features.saliency.numpy() for view in views)))
-    cycles, sim = {}, similarity(views[0].features, views[1].features)
+    sim = similarity(views[0].features, views[1].features)
+    cycles = {}
     for name, start, end, table in ((names[0], *views, sim), (names[1], *views[::-1], sim.T)):
         distances = cyclical_distances(
             table, start.features.grid, end.features.grid, start.foreground, end.foreground
