@@ -145,7 +145,7 @@ def site(tmp_path_factory):
     A warning of Sphinx, such as an unknown link in a source, is an error.
     """
     folder = tmp_path_factory.mktemp("site")
-    options = ["-q", "-W", "--keep-going", "-c", "docs/site", "-d", folder / "doctrees"]
+    options = [*"-q -W --keep-going -c docs/site -d".split(), folder / "doctrees"]
     command = [sys.executable, "-m", "sphinx", *options, ".", folder / "html"]
     result = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
     assert result.returncode == 0, f"warnings of Sphinx:\n{result.stderr}"

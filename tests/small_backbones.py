@@ -11,11 +11,13 @@ from transformers import AutoModel
 
 from zsp_lite.backbones.vit import VisionTransformer
 
-DEPTH, HEADS, DIM = 3, 4, 32  # of the models in Hugging Face's format
+# Of the models in Hugging Face's format: small, for speed, with more than one of each.
+DEPTH, HEADS, DIM = 3, 4, 32
 
 
 def small_vit(seed: int = 0, **sizes) -> VisionTransformer:
     torch.manual_seed(seed)
+    # A grid of 4 x 4 patches; one head has the 64 dimensions of a head of every DINO model.
     standard = {"image_size": 32, "patch_size": 8, "embed_dim": 64, "depth": 3, "num_heads": 1}
     return with_large_weights(VisionTransformer(**(standard | sizes)))
 
@@ -36,7 +38,7 @@ class Architecture:
     special: int  # tokens before the patches
     norm: str = "layernorm_before"
     settings: dict = field(default_factory=dict)
-    interpolates: bool = True  # only when asked to
+    interpolates: bool = True  # if interpolate_pos_encoding=True; the others always do
 
 
 _REGISTERS = {"num_register_tokens": 4}
@@ -62,6 +64,7 @@ def configuration(kind: str, patch: int = 16, **settings):
     }
     vision = sizes | {"patch_size": patch, "image_size": 3 * patch} | settings
     if kind in ("clip", "siglip", "blip"):
+        # Its text model is never run: any small vocabulary with three special tokens serves.
         text = sizes | {"vocab_size": 99, "bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 0}
         return transformers.CONFIG_MAPPING[kind](vision_config=vision, text_config=text)
     return transformers.CONFIG_MAPPING[kind](**vision)

@@ -65,14 +65,22 @@ def place(request, places) -> str:
     return places[request.param]
 
 
-def test_features_depend_on_nothing_but_the_image(place, pictures):
-    size = 4 * load_backbone(place, "cpu").patch_size
-    backbone = load_backbone(place, "cpu", image_size=size)
+@pytest.fixture
+def backbone(place):
+    """One of 4 x 4 patches."""
+    return load_backbone(place, "cpu", image_size=4 * load_backbone(place, "cpu").patch_size)
+
+
+def test_keys_are_float32_per_patch_and_saliency_spans_0_to_1(backbone, pictures):
     features = backbone(pictures)
     for one in features:
         assert one.keys.shape == (4, 4, backbone.embed_dim) and one.keys.dtype == torch.float32
         assert one.saliency.min() == 0 and one.saliency.max() == 1 and one.saliency.std() > 0.05
     assert not torch.allclose(features[0].keys, features[1].keys)
+
+
+def test_features_depend_on_nothing_but_the_image(backbone, pictures):
+    features = backbone(pictures)
     frozen = pictures[2].copy()
     frozen.flags.writeable = False
     assert_same_features(
@@ -80,11 +88,16 @@ def test_features_depend_on_nothing_but_the_image(place, pictures):
     )
     assert_same_features(backbone([pictures[1][::-1][::-1]]), features[1:2])
     assert backbone([]) == []
-    again = load_backbone(place, "cpu", image_size=size)
+
+
+def test_a_backbone_loaded_twice_has_one_fingerprint(backbone, place):
+    again = load_backbone(place, "cpu", image_size=backbone.image_size)
     assert fingerprint(again) == fingerprint(backbone)
-    # Ordinary tensors of their own: they do not keep the batch in memory, and can enter a graph
-    # with gradients.
-    keys = features[0].keys
+
+
+def test_keys_are_tensors_of_their_own_that_can_enter_a_graph_with_gradients(backbone, pictures):
+    keys = backbone(pictures)[0].keys
+    # They do not keep the batch in memory.
     assert keys.untyped_storage().nbytes() == keys.numel() * 4
     layer = nn.Linear(backbone.embed_dim, 2)
     layer(keys).sum().backward()

@@ -13,7 +13,7 @@ from synthetic_views import look_at, render, true_pose
 from zsp_lite.alignment import Sim3
 from zsp_lite.baselines import geometry
 from zsp_lite.baselines.geometry import align, essential_rotation, icp
-from zsp_lite.baselines.sift import Keypoints, Sift, dense_sift, mutual_matches
+from zsp_lite.baselines.sift import Sift, dense_sift, mutual_matches
 from zsp_lite.data.frames import Frame
 from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error
@@ -50,7 +50,9 @@ def test_icp_is_initialised_by_the_first_cameras(monkeypatch):
     assert len(source) <= geometry.POINTS and len(target) == geometry.POINTS
     distance, _ = cKDTree(target).query(source)
     truth = true_pose(first.camera, placements[0], cameras[0], placements[1])
-    assert np.median(distance) < 0.15 and 2 < rotation_error(found.R, truth.R) < 10
+    assert np.median(distance) < 0.15
+    # The first cameras differ by a few degrees, which only ICP could mend.
+    assert 2 < rotation_error(found.R, truth.R) < 10
     # With the true pose, both clouds coincide.
     placed = firsts[1].to_world(truth.apply(firsts[0].to_camera(source)))
     assert np.median(cKDTree(target).query(placed)[0]) < 0.05
@@ -69,15 +71,22 @@ def test_sift_matches_an_image_with_its_rotated_copy(picture):
     turned = Frame(np.ascontiguousarray(np.rot90(picture)), None, np.rot90(mask), camera)
     one, two = Sift().describe([Frame(picture, None, mask, camera), turned])
     a, b, similarity = mutual_matches(one, two)
-    assert len(a) == 50 and (np.diff(similarity) <= 0).all()
+    assert len(a) == 50  # as many as `mutual_matches` keeps
+    assert (np.diff(similarity) <= 0).all()
     x, y = one.pixels[a].T
     turned = np.stack([y, 224 - x], axis=1)
     assert np.median(np.linalg.norm(turned - two.pixels[b], axis=1)) < 0.1
+    # Keypoints lie on the mask, or at most a pixel beside it.
     assert (one.pixels > (29, 39)).all() and (one.pixels < (191, 201)).all()
-    empty = Keypoints(np.empty((0, 2)), np.empty((0, 128), np.float32))
-    assert len(mutual_matches(one, empty)[0]) == 0
-    blank = Frame(np.zeros((224, 224, 3), np.uint8), None, mask, camera)
-    assert len(Sift().describe([blank])[0].pixels) == 0
+
+
+def test_an_image_without_keypoints_has_no_matches(picture):
+    camera = look_at((1, 0, 0), size=(224, 224))
+    one, blank = Sift().describe(
+        [Frame(image, None, None, camera) for image in (picture, np.zeros_like(picture))]
+    )
+    assert len(one.pixels) > 0 == len(blank.pixels)
+    assert len(mutual_matches(one, blank)[0]) == 0
 
 
 def test_the_essential_matrix_gives_the_rotation_between_cameras_with_other_intrinsics():
@@ -96,7 +105,9 @@ def test_the_essential_matrix_gives_the_rotation_between_cameras_with_other_intr
     frames = [Frame(image, None, None, camera) for camera in (first, second)]
     matches = Matches(pixels[0], pixels[1], np.ones(60), np.zeros(60))
     rotation, inliers, note = essential_rotation(*frames, matches, grid)
-    assert rotation_error(rotation, second.R @ first.R.T) < 5 and 30 <= inliers <= 50 and note == ""
+    assert rotation_error(rotation, second.R @ first.R.T) < 5
+    # 45 of the 60 matches are right; rounding to pixels loses some, chance adds some.
+    assert 30 <= inliers <= 50 and note == ""
     few = Matches(pixels[0][:4], pixels[1][:4], np.ones(4), np.zeros(4))
     rotation, inliers, note = essential_rotation(*frames, few, grid)
     assert (rotation == np.eye(3)).all() and inliers == 0 and "4 matches" in note

@@ -72,29 +72,29 @@ WRONG = [
     (["benchmark", "--metrics", "acc30,speed"], "got 'acc30,speed'"),
     (["synth", "--preset", "demo"], "Missing option '--out'"),
     (
-        ["synth", "--preset", "a", "--category", "b", "--out", "x"],
+        "synth --preset a --category b --out x".split(),
         "expected either --preset or --category",
     ),
     (
-        ["synth", "--preset", "demo", "--frames", "3", "--out", "x"],
+        "synth --preset demo --frames 3 --out x".split(),
         "--frames does not go with --preset",
     ),
     (
-        ["synth", "--category", "mouse", "--up", "+z", "--out", "x"],
+        "synth --category mouse --up +z --out x".split(),
         "--up does not go with --category",
     ),
-    (["estimate", "a", "b", "--depth-unit", "0"], "got '0', expected a positive number"),
-    (["estimate", "a", "b", "--box", "1,2,3,4.5"], "got '1,2,3,4.5', expected four integers"),
-    (["estimate", "a", "b", "--intrinsics", "inf,1,2,3"], "got 'inf,1,2,3', expected four numbers"),
+    ("estimate a b --depth-unit 0".split(), "got '0', expected a positive number"),
+    ("estimate a b --box 1,2,3,4.5".split(), "got '1,2,3,4.5', expected four integers"),
+    ("estimate a b --intrinsics inf,1,2,3".split(), "got 'inf,1,2,3', expected four numbers"),
     (["estimate", "a", "b", "c"], "1 more paths, expected these after --helpers"),
-    (["estimate", "a", "b", "--helpers", "c", "--solver", "paper"], "--helpers"),
+    ("estimate a b --helpers c --solver paper".split(), "--helpers"),
     (["demo", "--data", "no/such/folder"], str(Path("no/such/folder"))),
     (["demo", "--backbone", "resnet"], "resnet"),
     (["demo", "--layer", "block12"], "'block0' to 'block11'"),
     (["benchmark", "--methods", "magic"], "magic"),
     (["benchmark", "--categories", "ellipsoid,cube"], "'cube'"),
     (["tables", "."], "run.json"),
-    (["synth", "--category", "sofa", "--out", "x"], "sofa"),
+    ("synth --category sofa --out x".split(), "sofa"),
     (
         [*DOWNLOAD, "co3d", "--category", "spaceship"],
         "co3d (full) is 'spaceship', expected one of ",
@@ -108,7 +108,7 @@ WRONG = [
         "--labelled-only goes with --labels",
     ),
     (
-        [*DOWNLOAD, "co3d", "--category", "toaster", "--labels", "x"],
+        [*DOWNLOAD, *"co3d --category toaster --labels x".split()],
         "--labels does not go with co3d: labels are of v1",
     ),
     ([*IMPORT, "lists", "/nowhere"], "rgb.txt"),
@@ -210,12 +210,7 @@ def test_a_run_is_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, load
         "benchmark",
         "--data",
         str(ellipsoids.root),
-        "--pairs",
-        "2",
-        "--targets",
-        "3",
-        "--methods",
-        "table3",
+        *"--pairs 2 --targets 3 --methods table3".split(),
     ]
     for name, options in (("a", []), ("b", ["--quiet"])):
         assert ("ours-globalsim" in run([*rows, "--out", str(tmp_path / name), *options])) == (
@@ -238,13 +233,7 @@ def test_a_run_is_tabulated_and_compared(ellipsoids, tmp_path, monkeypatch, load
         == [False, True]
     )
     more = [
-        "--rows",
-        "ours-globalsim,ours",
-        "--latex",
-        "time,intervals",
-        "--size",
-        "3,2",
-        "--out",
+        *"--rows ours-globalsim,ours --latex time,intervals --size 3,2 --out".split(),
         tmp_path / "d",
     ]
     assert "ms per pair" in run(["tables", tmp_path / "a", *more])
@@ -340,7 +329,7 @@ def test_options_of_the_import_reach_the_library(monkeypatch, run):
         {"layout": "nerfstudio", "count": 7, "mask": "box", "box": (1, 2, 3, 4)},
     )
     assert "flag: the masks may be wrong: why\n" in text
-    more = ["--depth-unit", "0.5", "--object", "0", "--label", "3", "--orientation", "stored"]
+    more = "--depth-unit 0.5 --object 0 --label 3 --orientation stored".split()
     assert main(["data", "import", "scan", *words, "--masks", "there", *more]) == 0
     options = {
         "depth_unit": 0.5,

@@ -183,7 +183,7 @@ def test_the_examples_of_methods_of_ones_own_run_as_they_stand(
     names = re.findall(r"`(\w+\.py)`:?\n", markdown(page))
     for name, block in zip(names, python_blocks(page), strict=True):
         Path(name).write_text(block, encoding="utf-8")
-    few = ["--categories", "bicycle", "--pairs", "1", "--targets", "2"]
+    few = "--categories bicycle --pairs 1 --targets 2".split()
     rows = {}
     for line in command_blocks(page):
         program, *words = shlex.split(line) or [""]

@@ -1,5 +1,4 @@
-"""Gradients of log-binned descriptors (`test_sample_pairs.py` has their values), and the
-FeatureMap's own checks."""
+"""Log-binned descriptors carry gradients, and a FeatureMap checks its parts."""
 
 import pytest
 import torch

@@ -126,15 +126,7 @@ def test_the_command_line_renders_models_and_names_those_left_out(folder, tmp_pa
     write_wedge(mine / "chair" / "a.obj")
     shutil.copytree(folder / "sign", mine / "sign")
     arguments = [
-        "--frames",
-        "1",
-        "--image-size",
-        "48",
-        "--front",
-        "-x",
-        "--up",
-        "+z",
-        "--out",
+        *"--frames 1 --image-size 48 --front -x --up +z --out".split(),
         str(out),
     ]
     assert "Left out sign/stop" in run(["synth", "--models", str(mine), *arguments])
@@ -146,7 +138,8 @@ def test_the_code_of_the_page_on_own_models_writes_labels_that_align_the_objects
     (code,) = re.findall(
         r"```python\n(.*?)```", (REPOSITORY / "docs" / "own_models.md").read_text(), re.DOTALL
     )
-    exec(code, names := {})
+    names = {}
+    exec(code, names)
     rng = np.random.default_rng(0)
     points, poses = rng.normal(size=(50, 3)), [np.eye(4), np.eye(4)]
     poses[1][:3] = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]

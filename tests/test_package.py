@@ -76,13 +76,7 @@ def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
     empty.mkdir()
     install = [
         sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--no-index",
-        "--no-compile",
+        *"-m pip install --quiet --no-deps --no-index --no-compile".split(),
     ]
     subprocess.run([*install, "--target", str(site), str(wheel)], check=True)
     readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")

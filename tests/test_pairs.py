@@ -87,7 +87,8 @@ def test_all_pairs_are_different_and_too_large_a_number_gives_all_there_are(tmp_
     )
     for name in lengths:
         write_label(tmp_path, "chair", PoseLabel(np.eye(4), name, "a"))
-    every = sample_pairs(Co3D(tmp_path), "chair", total := 62, 2)  # 2 * (2 * 3 + 2 * 5 + 3 * 5)
+    total = 62  # both directions of every two sequences: 2 * (2 * 3 + 2 * 5 + 3 * 5)
+    every = sample_pairs(Co3D(tmp_path), "chair", total, 2)
     assert len({pair.key for pair in every}) == total and {
         pair.reference_sequence for pair in every[-4:]
     } == {"c"}

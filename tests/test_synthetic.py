@@ -75,12 +75,15 @@ def test_objects_of_a_category_have_unit_size_vary_and_differ_from_their_half_tu
     )
 
 
-def test_depth_has_holes_and_noise_and_masks_are_soft_and_accurate_to_two_pixels(chairs):
+def test_a_soft_mask_is_1_inside_0_outside_and_between_at_the_edge():
     truth = np.zeros((80, 80), bool)
     truth[20:60, 20:60] = True
     mask = soft_mask(truth, np.random.default_rng(0))
     assert mask[30:50, 30:50].min() > 0.99 and mask[:16].max() < 0.1
     assert ((mask > 0.1) & (mask < 0.9)).sum() > 100
+
+
+def test_depth_has_holes_and_noise_and_masks_are_accurate_to_two_pixels(chairs):
     for data, _, scale, views in chairs:
         for frame, view in zip(data.frames, views, strict=True):
             known = frame.depth[view.mask] > 0

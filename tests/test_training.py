@@ -59,22 +59,27 @@ def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(rendered)
         assert (apart.min(1) >= 45).all()
 
 
-def test_renders_hold_unit_normals_and_centred_depth_on_the_object(renders):
+def test_a_number_stands_for_one_rendered_object(renders):
     for array, rows in zip(
         render_object(1), (renders.rgb, renders.surface, renders.geometry), strict=True
     ):
-        np.testing.assert_array_equal(array, rows[1])  # a number stands for one object
+        np.testing.assert_array_equal(array, rows[1])
+
+
+def test_surface_points_of_renders_are_coordinates_of_the_object(renders):
     inside = ~np.isnan(renders.surface[..., 0])
     assert renders.rgb.shape == (3, VIEWS, SIZE, SIZE, 3) and inside.shape == (3, VIEWS, GRID, GRID)
     assert 0.05 < inside.mean() < 0.9
-    for number, points in enumerate(
-        renders.surface
-    ):  # coordinates of the object, not of its instances
+    for number, points in enumerate(renders.surface):
         shape, seen = (
             make_shape(rendering.build_random_object, [number, 1]).vertices,
             points[inside[number]],
         )
         assert (seen > shape.min(0) - 0.01).all() and (seen < shape.max(0) + 0.01).all()
+
+
+def test_renders_hold_unit_normals_and_centred_depth_on_the_object(renders):
+    inside = ~np.isnan(renders.surface[..., 0])
     normals = np.linalg.norm(renders.geometry[..., :3].astype(np.float64), axis=-1)
     np.testing.assert_allclose(normals[inside], 1, atol=5e-3)
     np.testing.assert_array_equal(renders.geometry[~inside], 0)

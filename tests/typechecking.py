@@ -1,6 +1,7 @@
 """The checker of annotations.
 
-It is looked up by the name of its module, and `conftest` is the name of two.
+A module of its own, since tests/ and tests/browser/ both have a `conftest`: an import of that name
+would be ambiguous.
 """
 
 from beartype import BeartypeConf, beartype
