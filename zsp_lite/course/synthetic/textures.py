@@ -112,8 +112,10 @@ def sample_pyramid(
 def sample_image(
     image: np.ndarray, u: np.ndarray, v: np.ndarray, border: int
 ) -> Float[np.ndarray, "n c"]:
-    """Interpolate an image bilinearly at (u, v) in [0, 1] (v from the top); outside,
-    BORDER_CONSTANT means 1."""
+    """Interpolate an image bilinearly at (u, v) in [0, 1], v from the top.
+
+    Outside the image, `border` continues it as in OpenCV; with BORDER_CONSTANT, by ones.
+    """
     if border == cv2.BORDER_WRAP:
         u, v = u % 1, v % 1
     height, width = image.shape[:2]
