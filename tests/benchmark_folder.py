@@ -188,7 +188,7 @@ def made_up_run(out, rows):
 
 
 def after_each_save(act: Callable[[], None]) -> Callable[..., None]:
-    """Return a substitute of `run.add_lines` that calls `act` after it has added pairs."""
+    """Return a substitute of `execution.add_lines` that calls `act` after it has added pairs."""
 
     def add_and_act(out, lines, kind):
         add_lines(out, lines, kind)
@@ -198,8 +198,8 @@ def after_each_save(act: Callable[[], None]) -> Callable[..., None]:
 
 
 if __name__ == "__main__":
-    from zsp_lite.benchmark import run
+    from zsp_lite.benchmark import execution, run
 
     data, out, workers = sys.argv[1:]
-    run.add_lines = after_each_save(lambda: print(flush=True))
+    execution.add_lines = after_each_save(lambda: print(flush=True))
     run.evaluate(data, SlowBackbone(grid=8), ("ours", "ours-bv"), 6, 3, out, int(workers))

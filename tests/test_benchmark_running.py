@@ -201,7 +201,7 @@ def test_an_interrupt_ends_a_run_and_its_workers_with_one_line(tmp_path, monkeyp
     stored = pairs_in(tmp_path / "run")
     assert 0 < len(stored) < 24
     (tmp_path / "go").touch()
-    assert main(words) == 0, "an interrupted run can be continued"
+    assert main(words) == 0  # an interrupted run can be continued
     assert pairs_in(tmp_path / "run")[: len(stored)] == stored
 
 
