@@ -333,7 +333,7 @@ def test_the_papers_figures_were_copied_right():
     ]
     for table in read_paper_tables():
         assert all(len(line["published"]) == len(table["published"]) for line in table["rows"])
-        # others have published figures only
+        # The other rows have published figures only.
         assert all(resolve(line["row"]) for line in table["rows"] if line["row"])
 
 

@@ -179,7 +179,7 @@ def test_missing_weights_are_refused_and_not_made_up(tmp_path):
     weights = load((folder / "model.safetensors").read_bytes())
     kept = {key: x for key, x in weights.items() if "pooler" not in key}
     save_file(kept, folder / "model.safetensors", metadata={"format": "pt"})
-    # nobody reads the pooler
+    # Nobody reads the pooler.
     first, second = (load_backbone(f"hf:{folder}", "cpu", image_size=48) for _ in range(2))
     assert fingerprint(first) == fingerprint(second)
     del kept["layernorm.weight"]

@@ -94,7 +94,7 @@ def check_number(name: str, value: object, above: float) -> None:
 def check_magnitude(name: str, values: object) -> None:
     """Raise InputError if a number of an array is not finite, or above `MAX_LENGTH` in
     magnitude."""
-    # here, because `zsp-lite --help` imports this module and does not need NumPy
+    # Imported here, because `zsp-lite --help` imports this module and does not need NumPy
     import numpy as np
 
     sizes = np.abs(values)

@@ -157,7 +157,7 @@ def prepare_images(
         # Copied, because torch does not accept read-only arrays and negative strides.
         image = image if torch.is_tensor(image) else torch.from_numpy(np.array(image))
         is_bytes = image.dtype == torch.uint8
-        # false for NaN too
+        # The comparison is false for NaN, too.
         is_unit = image.is_floating_point() and bool(((image >= 0) & (image <= 1)).all())
         if image.shape[2:] != (3,) or not image.numel() or not (is_bytes or is_unit):
             found = f"{image.dtype} of shape {tuple(image.shape)}"

@@ -127,7 +127,7 @@ def _rows_for_workers(
             f"a worker cannot import the rows: {error}, expected the module there, too"
         ) from error
     except Exception as error:
-        # the second is Dask's
+        # Dask's KilledWorker is known by its name only: Dask may not be installed.
         if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
             raise
         raise InputError(
@@ -141,7 +141,7 @@ def _rows_for_workers(
 def _pickle(make: Callable[[], Any], executor: Executor) -> bytes:
     """Pickle by value what a notebook, or a module in the current folder, defines: workers need not
     see it."""
-    # whose processes import what this one can import
+    # Processes of this machine import what this one can import.
     if not isinstance(executor, ProcessPoolExecutor):
         found = {name for _, name, _ in pkgutil.iter_modules([os.getcwd()])} - {"zsp_lite"}
         for name in found & sys.modules.keys():

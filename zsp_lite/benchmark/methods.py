@@ -144,7 +144,7 @@ def resolve(
     if not methods:
         raise InputError("no methods, expected some; `zsp-lite benchmark --list` lists them")
     labels = [line["label"] for table in read_paper_tables() for line in table["rows"]]
-    # the last is the row of `align`
+    # "alignment" is the row that `align` stores.
     taken = {*map(str.casefold, [*METHODS, *GROUPS, *labels, "alignment"])}
     for name, meant in methods.items():
         plain, text = str(name).strip().casefold(), meant if isinstance(meant, str) else ""

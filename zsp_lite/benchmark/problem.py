@@ -72,7 +72,7 @@ def as_answer(found: Any) -> Answer:
         return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, inliers, found.confidence)
     if isinstance(found, Answer):
         move, scale = found.translation, 1.0 if found.scale is None else found.scale
-        # refuses what is no pose
+        # Sim3 refuses what is no pose.
         exact = Sim3(scale, found.rotation, np.zeros(3) if move is None else move)
         return replace(found, rotation=exact.R, translation=None if move is None else exact.t)
     pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)

@@ -74,7 +74,7 @@ class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
     def axes(self, extension: str) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from the axes of the file to the canonical frame (front +x, left +y,
         up +z)."""
-        # the latter as in glTF
+        # What the list of models does not name is as usual in STL, or as in glTF.
         front, up = ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")
         front, up = self.front or front, self.up or up
         given = [_AXES[one] if isinstance(one, str) else np.array(one) for one in (front, up)]
