@@ -13,6 +13,7 @@ import click
 
 from zsp_lite.cli.common import (
     COUNT,
+    NAMES,
     PATH,
     examples,
     refuse_options,
@@ -244,8 +245,22 @@ def transfer(v1, v2, category, replace) -> None:
     print(f"Written: {len(residuals)} labels of {category} in {v2}")
 
 
+class _Import(click.Command):
+    """The command `data import`; after `uco3d` follow the arguments of another command."""
+
+    def make_context(self, info_name, args, parent=None, **extra):
+        if args[:1] == ["uco3d"]:
+            return uco3d.make_context(f"{info_name} uco3d", args[1:], parent, **extra)
+        return super().make_context(info_name, args, parent, **extra)
+
+
 @data.command(
-    "import", epilog=examples("data import scan.zip --root mine --category cup --sequence one")
+    "import",
+    cls=_Import,
+    epilog=examples(
+        "data import scan.zip --root mine --category cup --sequence one",
+        "data import uco3d --help",
+    ),
 )
 @click.argument("source", metavar="[FORMAT] SCAN", type=PATH, nargs=-1, required=True)
 @root_option
@@ -281,6 +296,8 @@ def import_(source, root, category, sequence, mask, box, **options) -> None:
     given by --box, by which GrabCut segments it in all images, by --masks, or by masks of the
     capture, in masks/ with the names of the images; frames without it are left out. --mask auto
     finds it by depth and colours, as is done for single frames without a mask, too.
+
+    `data import uco3d ROOT --category NAME --out DATA` imports many sequences of uCO3D.
     """
     from zsp_lite.importers import FORMATS
     from zsp_lite.importers.convert import import_source
@@ -296,9 +313,37 @@ def import_(source, root, category, sequence, mask, box, **options) -> None:
     )
     mask = mask or ("box" if box else "given")
     opened = open_source(source[-1], mask=mask, box=box, layout=layout, **options)
-    done = import_source(opened, root, category, sequence)
+    _print_import(root / category / sequence, import_source(opened, root, category, sequence))
+
+
+@click.command(
+    epilog=examples(
+        "data import uco3d path/to/uco3d --category mug --out mugs",
+        "data import uco3d path/to/uco3d --category mug --best 20 --frames 50 --out mugs",
+    )
+)
+@click.argument("root", type=PATH)
+@click.option("--category", metavar="NAME", required=True, help="Category of the objects.")
+@click.option("--sequences", type=NAMES, show_default="--best", help="Names of the sequences.")
+@click.option("--best", type=COUNT, default=10, help="Number of sequences, best cameras first.")
+@click.option("--frames", "count", type=COUNT, default=24, help="Frames of each sequence.")
+@click.option("--out", type=PATH, required=True, help="Data folder.")
+def uco3d(root, category, sequences, best, count, out) -> None:
+    """Import sequences of uCO3D into a data folder, with its alignment as proposed pose labels.
+
+    ROOT is the folder in which uCO3D's script has put metadata.sqlite and the sequences; needs
+    `pip install h5py`. Sequences that are in the data folder already stay as they are.
+    """
+    from zsp_lite.importers.uco3d import import_uco3d
+
+    for name, done in import_uco3d(root, out, category, sequences, best, count):
+        _print_import(out / category / name, done)
+
+
+def _print_import(folder: Path, done: Any) -> None:
+    """Print the numbers of an `ImportResult`."""
     print(
-        f"Written: {root / category / sequence}: {done.frames} frames, {done.points:,} points, "
+        f"Written: {folder}: {done.frames} frames, {done.points:,} points, "
         f"scaled by {done.scale:.4g}"
         + (f"; {done.empty} frames without the object left out" if done.empty else "")
     )

@@ -24,7 +24,7 @@ _MAX_POINTS = 50_000
 _LEAST_STEP = 7  # between the pixels by which the size of the object is estimated
 # file in the folder of a sequence whose import goes on, or was interrupted
 _UNFINISHED = ".unfinished"
-_MIN_VIEWS = 3  # number of frames that must see a surface, if there are that many frames
+MIN_VIEWS = 3  # number of frames that must see a surface, if there are that many frames
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
     sequence exists.
     """
     folder = Path(root) / plain_name(category, "category") / plain_name(sequence, "sequence")
-    unfinished, count = folder / _UNFINISHED, len(source.numbers)
-    if folder.exists() and not unfinished.is_file():
+    count = len(source.numbers)
+    if is_imported(folder):
         raise InputError(f"{folder} exists already, expected another sequence name")
-    if source.left_out and count < _MIN_VIEWS:
+    if source.left_out and count < MIN_VIEWS:
         raise InputError(
-            f"{source.path}: {count} frames remain, expected {_MIN_VIEWS}: {source.left_out[0]}"
+            f"{source.path}: {count} frames remain, expected {MIN_VIEWS}: {source.left_out[0]}"
         )
     if line := source.contradiction():
         raise InputError(f"{source.path}: {line}")
@@ -68,14 +68,25 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
     data = SequenceData(
         sequence, scaled, [float(position) for position in seen], points * scale, colours, normals
     )
-    with writing(root):
-        folder.mkdir(parents=True, exist_ok=True)
-        unfinished.touch()
-        write_co3d(root, category, [data])
-        unfinished.unlink()
+    write_sequence(root, category, data)
     return ImportResult(
         len(seen), count - len(seen), len(points), scale, tuple(source.flags(frames))
     )
+
+
+def is_imported(folder: Path) -> bool:
+    """Whether the folder of a sequence exists, and no import to it was interrupted."""
+    return folder.exists() and not (folder / _UNFINISHED).is_file()
+
+
+def write_sequence(root: str | Path, category: str, data: SequenceData) -> None:
+    """Write a new sequence, or one whose import was interrupted."""
+    folder = Path(root, category, data.name)
+    with writing(root):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / _UNFINISHED).touch()
+        write_co3d(root, category, [data])
+        (folder / _UNFINISHED).unlink()
 
 
 def import_captures(
@@ -85,10 +96,7 @@ def import_captures(
     what was done."""
     for path in sorted(Path(folder).iterdir()):
         name = path.stem if path.is_file() else path.name
-        place = Path(root) / category / name
-        if not path.name.startswith(".") and (
-            not place.exists() or (place / _UNFINISHED).is_file()
-        ):
+        if not path.name.startswith(".") and not is_imported(Path(root) / category / name):
             yield name, import_source(open_source(path), root, category, name)
 
 
@@ -132,7 +140,7 @@ def fuse(
         colour = o3d.t.geometry.Image(frame.rgb.astype(np.float32) / 255)
         blocks = volume.compute_unique_block_coordinates(depth, intrinsic, extrinsic, **options)
         volume.integrate(blocks, depth, colour, intrinsic, intrinsic, extrinsic, **options)
-    weight = min(_MIN_VIEWS, len(frames)) - 0.5  # Open3D keeps voxels of a greater weight
+    weight = min(MIN_VIEWS, len(frames)) - 0.5  # Open3D keeps voxels of a greater weight
     cloud = volume.extract_point_cloud(weight_threshold=weight).to_legacy()
     cloud, _ = cloud.remove_statistical_outlier(nb_neighbors=20, std_ratio=2.5)
     if len(cloud.points) > _MAX_POINTS:

@@ -22,7 +22,7 @@ from zsp_lite.importers.capture import (
     refuse,
     sharpest,
 )
-from zsp_lite.importers.unpacked import new_folder, open_video
+from zsp_lite.importers.unpacked import Video, new_folder
 from zsp_lite.io.files import read_bytes, read_json
 
 
@@ -31,8 +31,8 @@ def read_stray(folder: Path, count: int) -> Makers:
     rows = read_numbers(folder / "odometry.csv", (9,), delimiter=",", skiprows=1)
     K = read_numbers(folder / "camera_matrix.csv", (3,), delimiter=",")
     rows[:, 1] = np.nan_to_num(rows[:, 1], nan=-1)  # numbers of the video's frames
-    pictures, read, left_out = new_folder(), open_video(folder / "rgb.mp4"), []
-    for row, image in sharpest(list(rows), count, lambda row: read(int(row[1])), left_out):
+    pictures, video, left_out = new_folder(), Video(folder / "rgb.mp4"), []
+    for row, image in sharpest(list(rows), count, lambda row: video.frame(int(row[1])), left_out):
         name, where = f"{row[1]:06.0f}.png", f"{folder}/odometry.csv, frame {row[1]:.0f}"
         picture = (pictures / name).with_suffix(".jpg")
         write_image(picture, image, 95)

@@ -7,7 +7,6 @@ import struct
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable
 from functools import cache
 from lzma import LZMAError
 from pathlib import Path
@@ -32,6 +31,7 @@ _DAMAGE = (
     RuntimeError,
     ValueError,
 )
+_MATROSKA = b"\x1aE\xdf\xa3"  # the first bytes of such a file
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # silent
 
 
@@ -62,32 +62,42 @@ def unpack(path: Path) -> Path:
     return folder
 
 
-def open_video(path: Path) -> Callable[[int], UInt8[np.ndarray, "h w 3"]]:
-    """Return a function that decodes the frame with a number, as it is stored; the numbers may not
-    decrease.
+class Video:
+    """Frames of an MP4 or Matroska file."""
 
-    InputError if the file is no video, and by the function if it has no such frame.
-    """
-    file_size(path, "video")
-    with open(path, "rb") as file:
+    def __init__(self, path: Path, displayed: bool = False):
+        """Open a file; `displayed` frames are turned as players show them, others lie as stored.
+
+        InputError if the file is no such video.
+        """
+        file_size(path, "video")
+        with open(path, "rb") as file:
+            header = file.read(8)
         # Other files may name addresses, which are not to be opened
-        is_video = file.read(8)[4:] == b"ftyp"
-    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG) if is_video else cv2.VideoCapture()
-    position = -1
-    pixels = video.get(cv2.CAP_PROP_FRAME_WIDTH) * video.get(cv2.CAP_PROP_FRAME_HEIGHT)
-    if not video.isOpened() or pixels > MAX_PIXELS:
-        raise InputError(
-            f"video {path} cannot be decoded, expected an MP4 file of at most {MAX_PIXELS} pixels"
-        )
-    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        is_video = header[4:] == b"ftyp" or header.startswith(_MATROSKA)
+        video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG) if is_video else cv2.VideoCapture()
+        pixels = video.get(cv2.CAP_PROP_FRAME_WIDTH) * video.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        if not video.isOpened() or pixels > MAX_PIXELS:
+            raise InputError(
+                f"video {path} cannot be decoded, expected an MP4 or Matroska file of at most "
+                f"{MAX_PIXELS} pixels"
+            )
+        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(displayed))
+        self.path, self._video, self._position = path, video, -1
 
-    def read(number: int) -> UInt8[np.ndarray, "h w 3"]:
-        nonlocal position
-        while position < number and video.grab():
-            position += 1
-        decoded, image = video.retrieve() if position == number else (False, None)
+    def frame(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
+        """Decode the frame with a number, from 0 on; the numbers may not decrease."""
+        while self._position < number and self._video.grab():
+            self._position += 1
+        decoded, image = self._video.retrieve() if self._position == number else (False, None)
         if not decoded:
-            raise InputError(f"video {path} ends before frame {number}")
+            raise InputError(f"video {self.path} ends before frame {number}")
         return image[..., ::-1]
 
-    return read
+    def at(self, seconds: float) -> UInt8[np.ndarray, "h w 3"]:
+        """Decode the frame at a time."""
+        self._video.set(cv2.CAP_PROP_POS_MSEC, 1000 * seconds)
+        decoded, image = self._video.read()
+        if not decoded:
+            raise InputError(f"video {self.path} ends before {seconds:.2f} s")
+        return image[..., ::-1]

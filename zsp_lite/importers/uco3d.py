@@ -1,0 +1,419 @@
+"""Import of uCO3D (Liu et al., UnCommon Objects in 3D, CVPR 2025), as its own script downloads it.
+
+ROOT/metadata.sqlite has the tables `sequence_annots` and `frame_annots`.
+ROOT/SUPER/CATEGORY/SEQUENCE/ has videos of images and of masks, depth maps in an HDF5 file, and the
+point cloud of the object.
+"""
+
+import logging
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import cv2
+import msgspec
+import numpy as np
+from jaxtyping import Float, Float32
+
+from zsp_lite.data.cameras import NDC_ISOTROPIC, Camera
+from zsp_lite.data.co3d import SequenceData
+from zsp_lite.data.frames import MAX_PIXELS, Frame, check_pixels
+from zsp_lite.data.labels import PoseLabel, label_bytes
+from zsp_lite.errors import (
+    InputError,
+    check_choice,
+    check_magnitude,
+    check_number,
+    rotation_matrix,
+)
+from zsp_lite.importers.capture import HALF_PIXEL
+from zsp_lite.importers.convert import (
+    MIN_VIEWS,
+    ImportResult,
+    LazyFrames,
+    is_imported,
+    scale_frame,
+    write_sequence,
+)
+from zsp_lite.importers.sources import spread
+from zsp_lite.importers.unpacked import Video
+from zsp_lite.io.files import file_size, path_inside, write_atomic
+from zsp_lite.io.ply import read_ply
+from zsp_lite.points import axis_deviation
+
+logger = logging.getLogger(__name__)
+
+# Limits of a query. The rows of a sequence need about 100,000 steps of SQLite's machine; a search
+# through the rows of all categories needs a thousand times as many.
+_MOST_STEPS = 10_000_000
+_LONGEST_VALUE = 1 << 20  # bytes; the longest values are captions
+# A frame agrees if the median distance of its depth from the point cloud is below this multiple of
+# the object's standard deviation, so that most of its points can be inliers of RANSAC. Depth is a
+# network's, which is right in scale at best.
+_TOLERANCE = 0.2
+# The nearest point of the cloud in each cell is one that the camera sees. The longer side of an
+# image has 48 cells: an object then covers several hundred, and a cloud has points in all of them.
+_CELLS = 48
+_LONGEST_VIDEO = 1e6  # seconds
+_PLAIN_COLUMNS = ("sequence_name", "frame_number", "frame_timestamp")
+# What the proposed labels refer to: uCO3D's aligned frame, which is the world of no sequence
+_ALIGNED_FRAME = "uco3d"
+_ATTRIBUTION = """\
+# Authors and licence
+
+The sequences are from **uCO3D**: Liu et al., *UnCommon Objects in 3D*, CVPR 2025,
+<https://uco3d.github.io>, under [CC BY 4.0](https://creativecommons.org/licenses/by/4.0/).
+
+Changes: some frames of each video were chosen and undistorted, and all lengths were scaled.
+"""
+
+
+def _column(field: str) -> str:
+    """Return the column of a field; most columns begin with an underscore."""
+    return field if field in _PLAIN_COLUMNS else f"_{field}"
+
+
+class _Row(msgspec.Struct, rename=_column):
+    """A row of a table, in which tuples of numbers are blobs."""
+
+    sequence_name: str
+
+    def numbers(self, field: str, shape: tuple[int, ...], kind: str = "<f4") -> np.ndarray:
+        """Decode a blob: numbers of four bytes one after the other."""
+        blob, expected = getattr(self, field), 4 * int(np.prod(shape))
+        if len(blob) != expected:
+            raise InputError(
+                f"{_column(field)} has {len(blob)} bytes, expected {expected} for numbers of "
+                f"shape {shape}"
+            )
+        values = np.frombuffer(blob, kind).reshape(shape).astype(np.float64)
+        check_magnitude(_column(field), values)
+        return values
+
+
+class _SequenceRow(_Row, rename=_column):
+    """A row of `sequence_annots`; paths are relative to ROOT."""
+
+    video_path: str
+    mask_video_path: str
+    depth_video_path: str  # the HDF5 file
+    segmented_point_cloud_path: str
+    reconstruction_quality_viewpoint: float | None
+    # Rotation and translation of row vectors: aligned points are a multiple of `x @ R + T`.
+    alignment_R: bytes | None
+    alignment_T: bytes | None
+
+
+class _FrameRow(_Row, rename=_column):
+    """A row of `frame_annots`."""
+
+    frame_number: int
+    frame_timestamp: Annotated[float, msgspec.Meta(ge=0, le=_LONGEST_VIDEO)]  # seconds
+    depth_scale_adjustment: float
+    image_size: bytes
+    viewpoint_R: bytes
+    viewpoint_T: bytes
+    viewpoint_focal_length: bytes
+    viewpoint_principal_point: bytes
+    viewpoint_colmap_distortion_coeffs: bytes
+
+    def camera(self) -> Camera:
+        """Return the camera of the stored image, without its distortion."""
+        height, width = self.numbers("image_size", (2,), "<i4")
+        return Camera.from_pytorch3d(
+            self.numbers("viewpoint_R", (3, 3)),
+            self.numbers("viewpoint_T", (3,)),
+            self.numbers("viewpoint_focal_length", (2,)),
+            self.numbers("viewpoint_principal_point", (2,)),
+            NDC_ISOTROPIC,
+            (int(height), int(width)),
+        )
+
+
+_AnyRow = TypeVar("_AnyRow", _SequenceRow, _FrameRow)
+
+
+def import_uco3d(
+    root: str | Path,
+    out: str | Path,
+    category: str,
+    sequences: Sequence[str] | None = None,
+    best: int = 10,
+    count: int = 24,
+) -> Iterator[tuple[str, ImportResult]]:
+    """Write sequences of a category as OUT/CATEGORY/SEQUENCE; give the names and what was done.
+
+    uCO3D's alignment of the objects becomes pose labels in OUT/label_proposals. Sequences that are
+    there already stay as they are. Those that cannot be imported are left out with a warning.
+
+    Args:
+        root: uCO3D's folder, in which single categories or sequences may be missing.
+        out: Data folder.
+        category: Name of the category.
+        sequences: Their names; by default those with the best cameras.
+        best: Number of sequences without `sequences`.
+        count: Number of frames per sequence, evenly spaced among those with a mask and depth.
+
+    Raises:
+        InputError: Category or sequence is not on the disk, the metadata are not those of uCO3D, or
+            none of the sequences can be imported.
+    """
+    root, out = Path(root), Path(out)
+    with closing(_open_metadata(root / "metadata.sqlite")) as metadata:
+        names = _downloaded(root, category)
+        for name in sequences or ():
+            check_choice(f"{root}: sequence of {category}", name, names)
+        rows = _ranked(metadata, list(sequences or names))
+        if sequences is None:
+            rows = rows[:best]
+        problem, present = "no sequence on the disk is in the metadata", 0
+        for row in rows:
+            name = row["sequence_name"]
+            if is_imported(out / category / name):
+                present += 1
+                continue
+            try:
+                sequence = _Sequence(root, metadata, _decoded(row, _SequenceRow))
+                result = sequence.write(out, category, count)
+            except InputError as error:
+                problem = f"{name}: {error}"
+                logger.warning("%s is left out: %s", name, error)
+                continue
+            present += 1
+            yield name, result
+    if not present:
+        raise InputError(f"{root}: no sequence of {category} can be imported: {problem}")
+
+
+def _open_metadata(path: Path) -> sqlite3.Connection:
+    """Open a database for reading."""
+    file_size(path, "uCO3D's metadata")
+    metadata = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
+    metadata.row_factory = sqlite3.Row
+    metadata.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE)
+    metadata.set_progress_handler(lambda: 1, _MOST_STEPS)  # 1 ends the query with an error
+    return metadata
+
+
+def _downloaded(root: Path, category: str) -> list[str]:
+    """List the sequences of a category whose folders are on the disk."""
+    folders = [path for path in root.glob("*/*") if path.is_dir()]
+    check_choice(f"{root}: category", category, sorted({path.name for path in folders}))
+    places = [path for path in folders if path.name == category]
+    return sorted(path.name for place in places for path in place.iterdir() if path.is_dir())
+
+
+def _ranked(metadata: sqlite3.Connection, names: list[str]) -> list[dict[str, Any]]:
+    """Return the rows of sequences, those with the best cameras first."""
+    places = ", ".join("?" * len(names))
+    condition = f"sequence_name IN ({places})"
+    order = "_reconstruction_quality_viewpoint DESC, sequence_name"
+    return _select(
+        metadata, _SequenceRow, f"sequence_annots WHERE {condition} ORDER BY {order}", names
+    )
+
+
+def _select(
+    metadata: sqlite3.Connection, kind: type[_Row], source: str, values: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Return the columns of a kind of rows."""
+    columns = ", ".join(field.encode_name for field in msgspec.structs.fields(kind))
+    try:
+        found = metadata.execute(f"SELECT {columns} FROM {source}", values)
+        return [dict(row) for row in found]
+    except sqlite3.Error as error:
+        raise InputError(
+            f"metadata.sqlite: {error}, expected uCO3D's tables with their keys"
+        ) from error
+
+
+def _decoded(row: dict[str, Any], kind: type[_AnyRow]) -> _AnyRow:
+    """Check the types of the values of a row."""
+    try:
+        return msgspec.convert(row, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(f"metadata.sqlite: {error}") from error
+
+
+class _DepthMaps:
+    """The depth maps in an HDF5 file, by names."""
+
+    def __init__(self, path: Path):
+        try:
+            import h5py
+        except ImportError as error:
+            raise InputError(
+                f"{path.name} is an HDF5 file, expected its package: pip install h5py"
+            ) from error
+        file_size(path, "depth maps")
+        try:
+            self._file = h5py.File(path, "r")
+        except OSError as error:
+            raise InputError(f"depth maps {path}: {error}, expected an HDF5 file") from error
+        # Links to other files are not followed
+        self.names = {
+            name
+            for name in self._file
+            if isinstance(self._file.get(name, getlink=True), h5py.HardLink)
+        }
+        self.path = path
+
+    def read(self, name: str) -> Float32[np.ndarray, "h w"]:
+        """Read a depth map, as it is stored."""
+        try:
+            values = self._file[name]
+            if values.external or values.is_virtual:
+                raise ValueError("stored in another file")
+            if len(values.shape) != 2 or not 0 < values.size <= MAX_PIXELS:
+                raise ValueError(f"shape {values.shape}")
+            return values.astype(np.float32)[:]
+        # Damaged files raise all of these; a group or a table has no such attributes or values.
+        except (AttributeError, KeyError, OSError, RuntimeError, TypeError, ValueError) as error:
+            raise InputError(
+                f"depth maps {self.path}: {name}: {error}, expected (H, W) numbers"
+            ) from error
+
+
+class _Sequence:
+    """A sequence with its open files; its frames are rows."""
+
+    def __init__(self, root: Path, metadata: sqlite3.Connection, row: _SequenceRow):
+        self.row = row
+        self.points, self.colours = read_ply(path_inside(root, row.segmented_point_cloud_path))
+        self.deviation = axis_deviation(self.points)
+        check_number("standard deviation of the point cloud", self.deviation, above=0)
+        self.images = Video(path_inside(root, row.video_path), displayed=True)
+        self.masks = Video(path_inside(root, row.mask_video_path), displayed=True)
+        self.depths = _DepthMaps(path_inside(root, row.depth_video_path))
+        usable = "_mask_mass IS NOT 0 AND _viewpoint_R IS NOT NULL"
+        rows = _select(
+            metadata,
+            _FrameRow,
+            f"frame_annots WHERE sequence_name = ? AND {usable} "
+            "AND _depth_scale_adjustment > 0 ORDER BY frame_number",
+            [row.sequence_name],
+        )
+        frames = [_decoded(one, _FrameRow) for one in rows]
+        self.frames = [one for one in frames if _depth_name(one) in self.depths.names]
+
+    def write(self, out: Path, category: str, count: int) -> ImportResult:
+        """Write at most `count` frames, whose depth agrees with the point cloud, and the label."""
+        chosen = [self.frames[position] for position in spread(count, len(self.frames))]
+        agreeing = [frame for frame in chosen if self._agrees(frame)]
+        if len(agreeing) < MIN_VIEWS:
+            raise InputError(
+                f"{len(agreeing)} of {len(chosen)} frames have depth that agrees with the point "
+                f"cloud, expected {MIN_VIEWS}"
+            )
+        scale = 1 / self.deviation
+        frames = LazyFrames(
+            lambda k: scale_frame(self._load(agreeing[k]), scale), range(len(agreeing))
+        )
+        frames[-1]  # InputError before anything is written, if a video ends too early
+        label = self._label(scale)
+        colours = (
+            np.full(self.points.shape, 128, np.uint8) if self.colours is None else self.colours
+        )
+        data = SequenceData(
+            self.row.sequence_name,
+            frames,
+            [frame.frame_timestamp for frame in agreeing],
+            self.points * scale,
+            colours,
+            viewpoint_quality=self.row.reconstruction_quality_viewpoint,
+        )
+        write_sequence(out, category, data)
+        write_atomic(out / category / "ATTRIBUTION.md", _ATTRIBUTION.encode())
+        if label is not None:
+            path = out / "label_proposals" / category / f"{label.seq}.json"
+            write_atomic(path, label_bytes(label))
+        flags = ()
+        if left_out := len(chosen) - len(agreeing):
+            flags = (
+                f"{left_out} of {len(chosen)} frames left out, whose depth disagrees with the "
+                "point cloud",
+            )
+        return ImportResult(len(agreeing), 0, len(self.points), scale, flags)
+
+    def _load(self, frame: _FrameRow) -> Frame:
+        """Load a frame without distortion."""
+        stored, camera, coefficients = _undistorted(frame)
+        rgb, mask = (video.at(frame.frame_timestamp) for video in (self.images, self.masks))
+        check_pixels(self.images.path, rgb, camera.size)
+        check_pixels(self.masks.path, mask, camera.size)
+        maps = cv2.initUndistortRectifyMap(
+            stored.K - HALF_PIXEL,
+            coefficients,
+            np.eye(3),
+            camera.K - HALF_PIXEL,
+            camera.size[::-1],
+            cv2.CV_32FC1,
+        )
+        rgb = cv2.remap(rgb, *maps, cv2.INTER_LINEAR)
+        mask = cv2.remap(mask[..., 0].astype(np.float32) / 255, *maps, cv2.INTER_LINEAR)
+        depth = self._depth(frame, camera)
+        return Frame(rgb, depth, mask, camera, f"{frame.sequence_name}/{frame.frame_number}")
+
+    def _depth(self, frame: _FrameRow, camera: Camera) -> Float32[np.ndarray, "h w"]:
+        """Read the depth of a frame, which has no distortion, in the size of the image."""
+        depth = self.depths.read(_depth_name(frame)) * np.float32(frame.depth_scale_adjustment)
+        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+        return cv2.resize(depth, camera.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+
+    def _agrees(self, frame: _FrameRow) -> bool:
+        """Whether the depth of a frame lies on the side of the point cloud that it shows."""
+        _, camera, _ = _undistorted(frame)
+        pixels, distances = camera.project(self.points)
+        inside = (
+            (distances > 0) & (pixels >= 0).all(axis=1) & (pixels < camera.size[::-1]).all(axis=1)
+        )
+        columns, rows = pixels[inside].astype(int).T
+        distances = distances[inside]
+        # The nearest point of each cell: the first of the cell's points, sorted by distance
+        side = max(camera.size) / _CELLS
+        cells = (rows // side) * _CELLS + columns // side
+        order = np.argsort(distances)
+        front = order[np.unique(cells[order], return_index=True)[1]]
+        surface = self._depth(frame, camera)[rows, columns][front]
+        known = surface > 0
+        errors = np.abs(surface - distances[front])[known]
+        return bool(known.any() and np.median(errors) < _TOLERANCE * self.deviation)
+
+    def _label(self, scale: float) -> PoseLabel | None:
+        """Propose the label that leads from uCO3D's aligned frame to the scaled world."""
+        if self.row.alignment_R is None or self.row.alignment_T is None:
+            return None
+        rotation = rotation_matrix("_alignment_R", self.row.numbers("alignment_R", (3, 3)))
+        translation = scale * self.row.numbers("alignment_T", (3,))
+        # Of row vectors, aligned = x @ R + T; so for columns x = R @ (aligned - T).
+        trans = np.eye(4)
+        trans[:3, :3] = rotation
+        trans[:3, 3] = -rotation @ translation
+        return PoseLabel(trans, self.row.sequence_name, _ALIGNED_FRAME)
+
+
+def _depth_name(frame: _FrameRow) -> str:
+    """Return the name of a frame's depth map."""
+    return str(frame.frame_number + 1)
+
+
+def _undistorted(frame: _FrameRow) -> tuple[Camera, Camera, Float[np.ndarray, "12"]]:
+    """Return the camera of a stored image, the camera after its undistortion, and the coefficients.
+
+    The coefficients are those of OpenCV's rational model with thin prism. All pixels of the
+    undistorted image are inside the stored one.
+    """
+    camera = frame.camera()
+    coefficients = frame.numbers("viewpoint_colmap_distortion_coeffs", (12,))
+    K, _ = cv2.getOptimalNewCameraMatrix(
+        camera.K - HALF_PIXEL, coefficients, camera.size[::-1], alpha=0
+    )
+    K = K + HALF_PIXEL
+    return (
+        camera,
+        replace(camera, focal_length=K[[0, 1], [0, 1]], principal_point=K[:2, 2]),
+        coefficients,
+    )
