@@ -8,7 +8,7 @@ point cloud of the object.
 import logging
 import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -239,41 +239,44 @@ def _decoded(row: dict[str, Any], kind: type[_AnyRow]) -> _AnyRow:
 
 
 class _DepthMaps:
-    """The depth maps in an HDF5 file, by names."""
+    """The depth maps in an HDF5 file, by names; the file is open during each access only."""
 
     def __init__(self, path: Path):
-        try:
-            import h5py
-        except ImportError as error:
-            raise InputError(
-                f"{path.name} is an HDF5 file, expected its package: pip install h5py"
-            ) from error
-        file_size(path, "depth maps")
-        try:
-            self._file = h5py.File(path, "r")
-        except OSError as error:
-            raise InputError(f"depth maps {path}: {error}, expected an HDF5 file") from error
-        # Links to other files are not followed
-        self.names = {
-            name
-            for name in self._file
-            if isinstance(self._file.get(name, getlink=True), h5py.HardLink)
-        }
         self.path = path
+        file_size(path, "depth maps")
+        with self._open() as file:
+            self.names = set(file)
 
     def read(self, name: str) -> Float32[np.ndarray, "h w"]:
         """Read a depth map, as it is stored."""
-        try:
-            values = self._file[name]
+        import h5py
+
+        with self._open() as file:
+            if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+                raise ValueError("a link")
+            values = file[name]
             if values.external or values.is_virtual:
                 raise ValueError("stored in another file")
             if len(values.shape) != 2 or not 0 < values.size <= MAX_PIXELS:
                 raise ValueError(f"shape {values.shape}")
             return values.astype(np.float32)[:]
-        # Damaged files raise all of these; a group or a table has no such attributes or values.
+
+    @contextmanager
+    def _open(self) -> Iterator[Any]:
+        """Open the file; InputError for what the block finds wrong with it."""
+        try:
+            import h5py
+        except ImportError as error:
+            raise InputError(
+                f"{self.path.name} is an HDF5 file, expected its package: pip install h5py"
+            ) from error
+        try:
+            with h5py.File(self.path, "r") as file:
+                yield file
+        # A damaged file may raise any of these; a group has none of the attributes of a depth map.
         except (AttributeError, KeyError, OSError, RuntimeError, TypeError, ValueError) as error:
             raise InputError(
-                f"depth maps {self.path}: {name}: {error}, expected (H, W) numbers"
+                f"depth maps {self.path}: {error}, expected an HDF5 file of (H, W) numbers"
             ) from error
 
 

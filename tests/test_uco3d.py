@@ -1,0 +1,228 @@
+"""uCO3D: its sequences become those of a data folder; what is wrong with one is said in a line."""
+
+import shutil
+import sqlite3
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from uco3d_folders import RATE, STEP, WORLD, blob, write_uco3d
+
+import zsp_lite
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.labels import read_label, read_labels
+from zsp_lite.errors import InputError
+from zsp_lite.importers.uco3d import import_uco3d
+from zsp_lite.metrics import rotation_error
+from zsp_lite.points import object_pixels, world_points
+
+SAMPLES = Path(__file__).parents[1] / "data_samples"
+CAR, SUV = "peugeot_308", "suv"
+FRAMES = 24  # of a sequence of the samples
+
+
+@pytest.fixture(scope="module")
+def uco3d(tmp_path_factory):
+    """Two cars; the camera quality of the second is higher."""
+    return write_uco3d(tmp_path_factory.mktemp("u") / "uco3d", Co3D(SAMPLES), "car", [CAR, SUV])
+
+
+@pytest.fixture
+def changed(uco3d, tmp_path):
+    """A copy that a test may change."""
+    return shutil.copytree(uco3d, tmp_path / "changed")
+
+
+@pytest.fixture(scope="module")
+def imported(uco3d, tmp_path_factory):
+    out = tmp_path_factory.mktemp("imported")
+    done = dict(import_uco3d(uco3d, out, "car"))
+    assert list(done) == [SUV, CAR]
+    for result in done.values():
+        assert result.frames == FRAMES and result.flags == ()
+        assert result.scale == pytest.approx(1 / WORLD)
+    return Co3D(out)
+
+
+def execute(root, statement, *values):
+    with closing(sqlite3.connect(root / "metadata.sqlite")) as metadata, metadata:
+        metadata.execute(statement, values)
+
+
+def loaded(dataset, name, numbers=range(FRAMES)):
+    frames = dataset.frames("car", name)
+    return [dataset.load(frames[number]) for number in numbers]
+
+
+@pytest.mark.parametrize("name", [CAR, SUV])
+def test_frames_show_the_same_points_as_those_of_the_data_folder(imported, name):
+    for true, found in zip(loaded(Co3D(SAMPLES), name), loaded(imported, name), strict=True):
+        np.testing.assert_allclose(found.camera.R, true.camera.R, atol=1e-6)
+        np.testing.assert_allclose(found.camera.t, true.camera.t, atol=1e-5)
+        points = world_points(true, object_pixels(true))
+        columns, rows = found.camera.project(points)[0].astype(int).T
+        before, after = true.rgb[object_pixels(true)], found.rgb[rows, columns]
+        assert np.abs(before.astype(float) - after).mean() < 6  # 13 without the undistortion
+        assert (found.mask[rows, columns] > 0.5).mean() > 0.98
+        depth = found.camera.project(points)[1]
+        assert np.median(np.abs(found.depth[rows, columns] - depth)) < 0.002
+
+
+def test_clouds_have_unit_deviation_and_the_alignment_gives_the_labels(imported):
+    for name, label in read_labels(SAMPLES, "car").items():
+        if name in (CAR, SUV):
+            points, _ = imported.point_cloud("car", name)
+            assert points.std(axis=0).mean() == pytest.approx(1, abs=1e-6)
+            path = imported.root / f"label_proposals/car/{name}.json"
+            np.testing.assert_allclose(read_label(path).trans, label.trans, atol=1e-5)
+    assert not (imported.root / "class_labels").exists()
+    assert "CC BY 4.0" in (imported.root / "car/ATTRIBUTION.md").read_text()
+
+
+def test_the_pose_between_two_objects_is_that_of_the_data_folder(imported):
+    rotations = []
+    for dataset in (Co3D(SAMPLES), imported):
+        (reference,), targets = loaded(dataset, CAR, [0]), loaded(dataset, SUV, range(1, FRAMES, 5))
+        estimate = zsp_lite.ZeroShotPose(zsp_lite.load_backbone(), solver="verified").estimate(
+            reference, targets
+        )
+        rotations.append(targets[estimate.view].camera.R.T @ estimate.sim3.R @ reference.camera.R)
+    assert rotation_error(*rotations) < 3
+
+
+def test_chosen_frames_are_evenly_spaced_and_have_depth_that_agrees(changed, tmp_path):
+    # Half of the frames have a mask. Six are chosen, and the depth of two of them is made wrong.
+    execute(changed, f"UPDATE frame_annots SET _mask_mass = 0 WHERE frame_number % {2 * STEP} != 0")
+    numbers = [4 * STEP * k for k in range(6)]
+    with h5py.File(changed / "things/car/suv/depth_maps.h5", "a") as depths:
+        for number, factor in ((numbers[1], 1.1), (numbers[3], 0.5)):
+            depth = depths[str(number + 1)]
+            depth[...] = factor * depth[...]
+    ((_, done),) = import_uco3d(changed, tmp_path / "out", "car", [SUV], count=6)
+    frames = Co3D(tmp_path / "out").frames("car", SUV)
+    times = [numbers[k] / RATE for k in (0, 2, 4, 5)]
+    assert [frame.frame_timestamp for frame in frames] == times and done.frames == 4
+    assert done.flags[0].startswith("2 of 6 frames left out")
+
+
+def test_the_best_sequences_are_chosen_and_those_that_are_there_stay(changed, run, tmp_path):
+    out, words = tmp_path / "out", ["data", "import", "uco3d", changed, "--category", "car"]
+    execute(changed, "UPDATE sequence_annots SET _alignment_R = NULL")
+    text = run([*words, "--best", 1, "--frames", 4, "--out", out])
+    assert f"{out / 'car' / SUV}: 4 frames" in text and CAR not in text
+    assert not (out / "label_proposals").exists()
+    before = (out / "car" / SUV / "pointcloud.ply").stat().st_mtime_ns
+    text = run([*words, "--sequences", f"{CAR},{SUV}", "--frames", 3, "--out", out])
+    assert f"{out / 'car' / CAR}: 3 frames" in text and SUV not in text
+    assert (out / "car" / SUV / "pointcloud.ply").stat().st_mtime_ns == before
+    assert "No problems." in run(["data", "check", out, "--deep"])
+
+
+def test_queries_use_the_keys_and_nothing_is_written_to_the_metadata(
+    changed, tmp_path, monkeypatch
+):
+    statements, connect = [], sqlite3.connect
+
+    def traced(*arguments, **options):
+        metadata = connect(*arguments, **options)
+        metadata.set_trace_callback(statements.append)
+        with pytest.raises(sqlite3.OperationalError, match="readonly"):
+            metadata.execute("DELETE FROM frame_annots")
+        return metadata
+
+    monkeypatch.setattr(sqlite3, "connect", traced)
+    list(import_uco3d(changed, tmp_path / "out", "car", count=4))
+    monkeypatch.undo()
+    selects = [statement for statement in statements if statement.startswith("SELECT")]
+    assert len(selects) == 3  # sequences, and the frames of each
+    with closing(connect(changed / "metadata.sqlite")) as metadata:
+        for select in selects:
+            steps = [row[3] for row in metadata.execute(f"EXPLAIN QUERY PLAN {select}")]
+            assert "INDEX sqlite_autoindex" in steps[0] and "(sequence_name=?)" in steps[0]
+            assert not any(step.startswith("SCAN") for step in steps)
+
+
+def refuse(root, tmp_path, expected, category="car", sequences=(SUV,)):
+    with pytest.raises(InputError) as caught:
+        list(import_uco3d(root, tmp_path / "out", category, sequences))
+    line = str(caught.value)
+    assert expected in line and "\n" not in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "expected"),
+    [
+        ("_viewpoint_R", b"12345678", "_viewpoint_R has 8 bytes, expected 36 for numbers of shape"),
+        ("_viewpoint_T", b"\xff" * 12, "_viewpoint_T holds nan, expected finite numbers"),
+        ("_image_size", None, "Expected `bytes`, got `null` - at `$._image_size`"),
+        (
+            "_image_size",
+            blob([120, 160], "<i4"),
+            "rgb_video.mp4 is (240, 320) pixels, expected (H, W)",
+        ),
+        ("frame_timestamp", 1000.0, "rgb_video.mp4 ends before 1000.00 s"),
+        ("frame_timestamp", "noon", "Expected `float`, got `str` - at `$.frame_timestamp`"),
+        ("_depth_scale_adjustment", 2.0, "0 of 24 frames have depth that agrees with the point"),
+    ],
+)
+def test_a_wrong_value_of_a_frame_is_told_in_one_line(changed, tmp_path, column, value, expected):
+    execute(changed, f"UPDATE frame_annots SET {column} = ?", value)
+    refuse(changed, tmp_path, expected)
+
+
+@pytest.mark.parametrize(
+    ("statement", "expected"),
+    [
+        (
+            "UPDATE sequence_annots SET _alignment_T = x'00'",
+            "_alignment_T has 1 bytes, expected 12",
+        ),
+        ("UPDATE sequence_annots SET _video_path = '../x'", "leads out of the data folder"),
+        ("UPDATE sequence_annots SET _video_path = NULL", "`null` - at `$._video_path`"),
+        ("DELETE FROM sequence_annots", "no sequence on the disk is in the metadata"),
+        ("DROP TABLE sequence_annots", "no such table: sequence_annots, expected uCO3D's tables"),
+    ],
+)
+def test_wrong_rows_of_sequences_are_told_in_one_line(changed, tmp_path, statement, expected):
+    execute(changed, statement)
+    refuse(changed, tmp_path, expected)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "expected"),
+    [
+        ("depth_maps.h5", None, "depth maps "),
+        ("depth_maps.h5", b"no HDF5", "expected an HDF5 file"),
+        ("mask_video.mkv", b"#EXTM3U\n/etc/passwd\n", "cannot be decoded"),
+        ("segmented_point_cloud.ply", b"ply\n", "is not a complete PLY file"),
+        ("../../../metadata.sqlite", b"no database" * 99, "file is not a database"),
+    ],
+)
+def test_files_that_are_missing_or_damaged(changed, tmp_path, file, content, expected):
+    path = changed / "things/car/suv" / file
+    path.unlink()
+    if content is not None:
+        path.write_bytes(content)
+    refuse(changed, tmp_path, expected)
+
+
+def test_depth_that_is_elsewhere_or_of_another_kind_is_refused(changed, tmp_path):
+    (tmp_path / "secret").write_bytes(bytes(4 * 320 * 240))
+    with h5py.File(changed / "things/car/suv/depth_maps.h5", "w") as depths:
+        outside = [(str(tmp_path / "secret"), 0, h5py.h5f.UNLIMITED)]
+        depths.create_dataset("1", (240, 320), np.float32, external=outside)
+    refuse(changed, tmp_path, "stored in another file, expected an HDF5 file")
+    with h5py.File(changed / "things/car/suv/depth_maps.h5", "w") as depths:
+        depths["1"] = np.zeros((2, 3, 4))
+    refuse(changed, tmp_path, "shape (2, 3, 4), expected an HDF5 file of (H, W)")
+
+
+def test_what_is_not_on_the_disk_and_the_missing_package(uco3d, tmp_path, monkeypatch):
+    refuse(uco3d, tmp_path, "category is 'mug', expected one of car", category="mug")
+    refuse(uco3d, tmp_path, f"sequence of car is 'van', expected one of {CAR}", sequences=["van"])
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    refuse(uco3d, tmp_path, "is an HDF5 file, expected its package: pip install h5py")
