@@ -9,17 +9,21 @@ import sys
 import warnings
 import zipfile
 import zlib
+from contextlib import closing
 from dataclasses import replace
 
+import h5py
 import numpy as np
 from co3d_folders import sequence_data
 from PIL import Image
 from test_readers import write as write_scan
+from uco3d_folders import open_metadata
 
 from tests.hostile.harness import (
     BENCHMARK,
     CASES,
     FRAMES,
+    OF_UCO3D,
     READERS_OF,
     RESULTS,
     STRANGE,
@@ -271,6 +275,33 @@ for name, layout, change in (
     ("matrix of nothing", "open3d", written("intrinsic.json", '{"intrinsic_matrix": [[], [[]]]}')),
 ):
     case("scan", f"{layout}: {name}", read_scan, scan(layout, change))
+
+
+# uCO3D's tables and depth maps
+def rows_without_end(folder):
+    with closing(open_metadata(folder / "uco3d")) as metadata, metadata:
+        metadata.execute("DROP TABLE frame_annots")
+        endless = "SELECT 1 AS n UNION ALL SELECT n + 1 FROM numbers"
+        metadata.execute(
+            f"CREATE VIEW frame_annots AS WITH RECURSIVE numbers AS ({endless}) SELECT 'b' AS "
+            "sequence_name, n AS frame_number FROM numbers"
+        )
+
+
+def depth_of(shape, **options):
+    def write(folder):
+        with h5py.File(folder / OF_UCO3D / "depth_maps.h5", "w") as depths:
+            depths.create_dataset("1", shape, np.float32, **options)
+
+    return write
+
+
+for name, change in (
+    ("rows without end", rows_without_end),
+    ("depth map of 10^15 numbers", depth_of((10**7, 10**8), chunks=(64, 64))),
+    ("depth map in /etc/passwd", depth_of((8, 8), external=[("/etc/passwd", 0, 256)])),
+):
+    case("uCO3D", name, READERS_OF["uCO3D's depth"][1], change)
 
 
 # pictures, depth maps and masks of other kinds

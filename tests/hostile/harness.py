@@ -13,6 +13,7 @@ import numpy as np
 from co3d_folders import sequence_data
 from safetensors.torch import save_file
 from test_importers import write_lists, write_nerfstudio
+from uco3d_folders import write_uco3d
 
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
@@ -25,6 +26,7 @@ from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.data.published import import_labels
 from zsp_lite.importers import open_capture
 from zsp_lite.importers.files import read_depth_file
+from zsp_lite.importers.uco3d import import_uco3d
 
 CASES: list["Case"] = []
 
@@ -78,13 +80,14 @@ def prepare(folder: Path) -> Path:
     """Write what the cases change, each in its own copy.
 
     data: two labelled sequences of one category; out: a benchmark run on them; capture: one frame
-    as lists and as nerfstudio's; a.png and b.png: pictures with depth and mask; x.safetensors: a
-    small network; poses.csv: one pose.
+    as lists and as nerfstudio's; uco3d: a sequence of uCO3D; a.png and b.png: pictures with depth
+    and mask; x.safetensors: a small network; poses.csv: one pose.
     """
     data = folder / "data"
     write_co3d(data, "cup", [sequence_data("a", 6), sequence_data("b", 6, seed=1)])
     for name in ("a", "b"):
         write_label(data, "cup", PoseLabel(np.eye(4), name, "a"))
+    write_uco3d(folder / "uco3d", Co3D(data), "cup", ["a"])
     assert main([*BENCHMARK, "--data", str(data), "--out", str(folder / "out"), "--quiet"]) == 0
     for write in (write_lists, write_nerfstudio):
         write(folder / "capture", [replace(sequence_data("c", 1).frames[0], name="0")])
@@ -119,6 +122,11 @@ def read_capture(layout: str) -> Callable[[Path], object]:
     ]
 
 
+def read_uco3d(folder: Path):
+    return list(import_uco3d(folder / "uco3d", folder / "imported", "cup"))
+
+
+OF_UCO3D = "uco3d/things/cup/a"
 FRAMES, SEQUENCES = "data/cup/frame_annotations.jgz", "data/cup/sequence_annotations.jgz"
 PAIRS, LABEL, RESULTS = (
     "data/determ_eval/1samples_2tgt/cup.pt",
@@ -147,6 +155,10 @@ READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
     "safetensors": ("x.safetensors", lambda folder: load_backbone(folder / "x.safetensors", "cpu")),
     "lists": ("capture/rgb.txt", read_capture("lists")),
     "nerfstudio": ("capture/transforms.json", read_capture("nerfstudio")),
+    "uCO3D's metadata": ("uco3d/metadata.sqlite", read_uco3d),
+    "uCO3D's images": (f"{OF_UCO3D}/rgb_video.mp4", read_uco3d),
+    "uCO3D's masks": (f"{OF_UCO3D}/mask_video.mkv", read_uco3d),
+    "uCO3D's depth": (f"{OF_UCO3D}/depth_maps.h5", read_uco3d),
     "poses": ("poses.csv", lambda folder: read_stored_poses(folder / "poses.csv")),
 }
 BENCHMARK = ("benchmark", "--pairs", "2", "--targets", "2", "--methods", "icp")

@@ -46,9 +46,9 @@ from zsp_lite.points import axis_deviation
 
 logger = logging.getLogger(__name__)
 
-# Limits of a query. The rows of a sequence need about 100,000 steps of SQLite's machine; a search
-# through the rows of all categories needs a thousand times as many.
-_MOST_STEPS = 10_000_000
+# Limits of a query. The rows of a sequence need some 10,000 steps of SQLite's machine; a search
+# through the rows of all categories needs hundreds of millions.
+_MOST_STEPS = 1_000_000
 _LONGEST_VALUE = 1 << 20  # bytes; the longest values are captions
 # A frame agrees if the median distance of its depth from the point cloud is below this multiple of
 # the object's standard deviation, so that most of its points can be inliers of RANSAC. Depth is a
