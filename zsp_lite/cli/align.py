@@ -59,13 +59,14 @@ def align(
     rotation is within 30 degrees of the one that most objects agree with. OUT gets them as
     alignment.json, as pose labels in class_labels/CATEGORY/, which `zsp-lite data labels OUT --root
     DATA` takes, and as pictures in report.html. With fewer than five objects, or where objects look
-    alike from two sides, some may be turned round against the rest: look at the report.
+    alike from two sides, some may be turned round against the rest: look at the report. Pose labels
+    and proposals that DATA has already, such as those of uCO3D, are compared with the result.
     """
     from zsp_lite.align import align_category, alignment_errors, write_alignment, write_labels
     from zsp_lite.category import SAME_ANGLE
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.data.co3d import Co3D
-    from zsp_lite.data.labels import read_labels
+    from zsp_lite.data.labels import read_label_folder
     from zsp_lite.importers.convert import import_captures
     from zsp_lite.metrics import accuracy
     from zsp_lite.viz.category_sheet import COLUMNS, object_rows
@@ -81,20 +82,22 @@ def align(
     found = align_category(dataset, category, backbone, sequences, pairs, targets, out, workers)
     written = [write_alignment(found, out), write_labels(found, out, category, replace=True)]
     written.append(write_category_report(out / "report.html", found, dataset, category))
-    if propose:
-        written.append(write_labels(found, dataset.root, category, "label_proposals", replace))
     print_rows(
         f"{category}: {len(found.objects)} objects in one frame", COLUMNS, object_rows(found)
     )
     for (first, second), angle in found.disagreements.items():
         print(f"{first} to {second}: the best pose of the pair alone is {angle:.0f}° away")
-    together, alone = alignment_errors(found, read_labels(dataset.root, category))
-    if alone:
-        right, before = accuracy(together, SAME_ANGLE), accuracy(alone, SAME_ANGLE)
-        print(
-            f"By the pose labels, {right:.1f}% of {len(together)} ordered pairs are within "
-            f"{SAME_ANGLE:.0f}°; of the best poses of {len(alone)} pairs of views and objects "
-            f"alone, {before:.1f}%."
-        )
+    for kind, what in (("class_labels", "pose labels"), ("label_proposals", "proposals")):
+        labels = read_label_folder(dataset.root / kind / category)
+        together, alone = alignment_errors(found, labels)
+        if alone:
+            right, before = accuracy(together, SAME_ANGLE), accuracy(alone, SAME_ANGLE)
+            print(
+                f"By the {what}, {right:.1f}% of {len(together)} ordered pairs are within "
+                f"{SAME_ANGLE:.0f}°; of the best poses of {len(alone)} pairs of views and objects "
+                f"alone, {before:.1f}%."
+            )
+    if propose:
+        written.append(write_labels(found, dataset.root, category, "label_proposals", replace))
     for path in written:
         print(f"Written: {path}")
