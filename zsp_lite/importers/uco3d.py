@@ -57,6 +57,7 @@ _TOLERANCE = 0.2
 # The nearest point of the cloud in each cell is one that the camera sees. The longer side of an
 # image has 48 cells: an object then covers several hundred, and a cloud has points in all of them.
 _CELLS = 48
+_GREY = 128  # of points without colours
 _LONGEST_VIDEO = 1e6  # seconds
 _PLAIN_COLUMNS = ("sequence_name", "frame_number", "frame_timestamp")
 # What the proposed labels refer to: uCO3D's aligned frame, which is the world of no sequence
@@ -83,7 +84,8 @@ class _Row(msgspec.Struct, rename=_column):
 
     def numbers(self, field: str, shape: tuple[int, ...], kind: str = "<f4") -> np.ndarray:
         """Decode a blob: numbers of four bytes one after the other."""
-        blob, expected = getattr(self, field), 4 * int(np.prod(shape))
+        blob = getattr(self, field)
+        expected = 4 * int(np.prod(shape))
         if len(blob) != expected:
             raise InputError(
                 f"{_column(field)} has {len(blob)} bytes, expected {expected} for numbers of "
@@ -120,8 +122,16 @@ class _FrameRow(_Row, rename=_column):
     viewpoint_principal_point: bytes
     viewpoint_colmap_distortion_coeffs: bytes
 
+    def depth_name(self) -> str:
+        """Return the name of the frame's depth map."""
+        return str(self.frame_number + 1)
+
+    def distortion(self) -> Float[np.ndarray, "12"]:
+        """Return the coefficients of OpenCV's rational model with a thin prism."""
+        return self.numbers("viewpoint_colmap_distortion_coeffs", (12,))
+
     def camera(self) -> Camera:
-        """Return the camera of the stored image, without its distortion."""
+        """Return the camera of the image in the video, without its distortion."""
         height, width = self.numbers("image_size", (2,), "<i4")
         return Camera.from_pytorch3d(
             self.numbers("viewpoint_R", (3, 3)),
@@ -131,6 +141,15 @@ class _FrameRow(_Row, rename=_column):
             NDC_ISOTROPIC,
             (int(height), int(width)),
         )
+
+    def undistorted(self) -> Camera:
+        """Return the camera of the undistorted image, whose pixels are all inside the video's."""
+        camera = self.camera()
+        K, _ = cv2.getOptimalNewCameraMatrix(
+            camera.K - HALF_PIXEL, self.distortion(), camera.size[::-1], alpha=0
+        )
+        K = K + HALF_PIXEL
+        return replace(camera, focal_length=K[[0, 1], [0, 1]], principal_point=K[:2, 2])
 
 
 _AnyRow = TypeVar("_AnyRow", _SequenceRow, _FrameRow)
@@ -166,10 +185,15 @@ def import_uco3d(
         names = _downloaded(root, category)
         for name in sequences or ():
             check_choice(f"{root}: sequence of {category}", name, names)
-        rows = _ranked(metadata, list(sequences or names))
+        asked = set(sequences or names)
+        rows = _ranked(metadata, sorted(asked))
+        if len(rows) < len(asked):
+            absent = len(asked) - len(rows)
+            logger.warning("%d of %d sequences are not in the metadata", absent, len(asked))
         if sequences is None:
             rows = rows[:best]
-        problem, present = "no sequence on the disk is in the metadata", 0
+        present = 0
+        problem = "no sequence on the disk is in the metadata"
         for row in rows:
             name = row["sequence_name"]
             if is_imported(out / category / name):
@@ -285,7 +309,8 @@ class _Sequence:
 
     def __init__(self, root: Path, metadata: sqlite3.Connection, row: _SequenceRow):
         self.row = row
-        self.points, self.colours = read_ply(path_inside(root, row.segmented_point_cloud_path))
+        self.points, colours = read_ply(path_inside(root, row.segmented_point_cloud_path))
+        self.colours = np.full(self.points.shape, _GREY, np.uint8) if colours is None else colours
         self.deviation = axis_deviation(self.points)
         check_number("standard deviation of the point cloud", self.deviation, above=0)
         self.images = Video(path_inside(root, row.video_path), displayed=True)
@@ -300,10 +325,11 @@ class _Sequence:
             [row.sequence_name],
         )
         frames = [_decoded(one, _FrameRow) for one in rows]
-        self.frames = [one for one in frames if _depth_name(one) in self.depths.names]
+        self.frames = [one for one in frames if one.depth_name() in self.depths.names]
 
     def write(self, out: Path, category: str, count: int) -> ImportResult:
         """Write at most `count` frames, whose depth agrees with the point cloud, and the label."""
+        # Choose frames, and leave out those with wrong depth.
         chosen = [self.frames[position] for position in spread(count, len(self.frames))]
         agreeing = [frame for frame in chosen if self._agrees(frame)]
         if len(agreeing) < MIN_VIEWS:
@@ -311,76 +337,82 @@ class _Sequence:
                 f"{len(agreeing)} of {len(chosen)} frames have depth that agrees with the point "
                 f"cloud, expected {MIN_VIEWS}"
             )
+        # Scale the scene; a video that ends too early is an InputError before anything is written.
         scale = 1 / self.deviation
         frames = LazyFrames(
             lambda k: scale_frame(self._load(agreeing[k]), scale), range(len(agreeing))
         )
-        frames[-1]  # InputError before anything is written, if a video ends too early
+        frames[-1]
         label = self._label(scale)
-        colours = (
-            np.full(self.points.shape, 128, np.uint8) if self.colours is None else self.colours
-        )
         data = SequenceData(
             self.row.sequence_name,
             frames,
             [frame.frame_timestamp for frame in agreeing],
             self.points * scale,
-            colours,
+            self.colours,
             viewpoint_quality=self.row.reconstruction_quality_viewpoint,
         )
+        # Write the sequence, and beside it the licence and the proposed label.
         write_sequence(out, category, data)
         write_atomic(out / category / "ATTRIBUTION.md", _ATTRIBUTION.encode())
         if label is not None:
             path = out / "label_proposals" / category / f"{label.seq}.json"
             write_atomic(path, label_bytes(label))
-        flags = ()
-        if left_out := len(chosen) - len(agreeing):
-            flags = (
+        flags = []
+        left_out = len(chosen) - len(agreeing)
+        if left_out:
+            flags.append(
                 f"{left_out} of {len(chosen)} frames left out, whose depth disagrees with the "
-                "point cloud",
+                "point cloud"
             )
-        return ImportResult(len(agreeing), 0, len(self.points), scale, flags)
+        return ImportResult(len(agreeing), 0, len(self.points), scale, tuple(flags))
 
     def _load(self, frame: _FrameRow) -> Frame:
         """Load a frame without distortion."""
-        stored, camera, coefficients = _undistorted(frame)
-        rgb, mask = (video.at(frame.frame_timestamp) for video in (self.images, self.masks))
+        stored = frame.camera()
+        camera = frame.undistorted()
+        size = camera.size[::-1]
+        rgb = self.images.at(frame.frame_timestamp)
+        mask = self.masks.at(frame.frame_timestamp)
         check_pixels(self.images.path, rgb, camera.size)
         check_pixels(self.masks.path, mask, camera.size)
         maps = cv2.initUndistortRectifyMap(
             stored.K - HALF_PIXEL,
-            coefficients,
+            frame.distortion(),
             np.eye(3),
             camera.K - HALF_PIXEL,
-            camera.size[::-1],
+            size,
             cv2.CV_32FC1,
         )
         rgb = cv2.remap(rgb, *maps, cv2.INTER_LINEAR)
+        # A video has three channels, which are equal for masks.
         mask = cv2.remap(mask[..., 0].astype(np.float32) / 255, *maps, cv2.INTER_LINEAR)
-        depth = self._depth(frame, camera)
+        depth = cv2.resize(self._depth(frame), size, interpolation=cv2.INTER_NEAREST_EXACT)
         return Frame(rgb, depth, mask, camera, f"{frame.sequence_name}/{frame.frame_number}")
 
-    def _depth(self, frame: _FrameRow, camera: Camera) -> Float32[np.ndarray, "h w"]:
-        """Read the depth of a frame, which has no distortion, in the size of the image."""
-        depth = self.depths.read(_depth_name(frame)) * np.float32(frame.depth_scale_adjustment)
-        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-        return cv2.resize(depth, camera.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+    def _depth(self, frame: _FrameRow) -> Float32[np.ndarray, "h w"]:
+        """Read the depth of a frame, which has no distortion and a size of its own."""
+        stored = self.depths.read(frame.depth_name())
+        depth = stored * np.float32(frame.depth_scale_adjustment)
+        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
     def _agrees(self, frame: _FrameRow) -> bool:
         """Whether the depth of a frame lies on the side of the point cloud that it shows."""
-        _, camera, _ = _undistorted(frame)
-        pixels, distances = camera.project(self.points)
+        depth = self._depth(frame)
+        height, width = depth.shape
+        pixels, distances = frame.undistorted().resize(depth.shape).project(self.points)
         inside = (
-            (distances > 0) & (pixels >= 0).all(axis=1) & (pixels < camera.size[::-1]).all(axis=1)
+            (distances > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
         )
         columns, rows = pixels[inside].astype(int).T
         distances = distances[inside]
-        # The nearest point of each cell: the first of the cell's points, sorted by distance
-        side = max(camera.size) / _CELLS
+        # With the points in the order of their distances, the first of each cell is the nearest.
+        side = max(height, width) / _CELLS
         cells = (rows // side) * _CELLS + columns // side
         order = np.argsort(distances)
-        front = order[np.unique(cells[order], return_index=True)[1]]
-        surface = self._depth(frame, camera)[rows, columns][front]
+        _, first = np.unique(cells[order], return_index=True)
+        front = order[first]
+        surface = depth[rows[front], columns[front]]
         known = surface > 0
         errors = np.abs(surface - distances[front])[known]
         return bool(known.any() and np.median(errors) < _TOLERANCE * self.deviation)
@@ -396,27 +428,3 @@ class _Sequence:
         trans[:3, :3] = rotation
         trans[:3, 3] = -rotation @ translation
         return PoseLabel(trans, self.row.sequence_name, _ALIGNED_FRAME)
-
-
-def _depth_name(frame: _FrameRow) -> str:
-    """Return the name of a frame's depth map."""
-    return str(frame.frame_number + 1)
-
-
-def _undistorted(frame: _FrameRow) -> tuple[Camera, Camera, Float[np.ndarray, "12"]]:
-    """Return the camera of a stored image, the camera after its undistortion, and the coefficients.
-
-    The coefficients are those of OpenCV's rational model with thin prism. All pixels of the
-    undistorted image are inside the stored one.
-    """
-    camera = frame.camera()
-    coefficients = frame.numbers("viewpoint_colmap_distortion_coeffs", (12,))
-    K, _ = cv2.getOptimalNewCameraMatrix(
-        camera.K - HALF_PIXEL, coefficients, camera.size[::-1], alpha=0
-    )
-    K = K + HALF_PIXEL
-    return (
-        camera,
-        replace(camera, focal_length=K[[0, 1], [0, 1]], principal_point=K[:2, 2]),
-        coefficients,
-    )
