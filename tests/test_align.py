@@ -136,6 +136,8 @@ def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     )
     labelling = Labelling(root, "lump")
     assert rotation_error(labelling.proposal(C).R, run[1].between(A, C).R) < 0.01
+    assert cli.main(["align", str(root), "--category", "lump", "--out", str(out)]) == 0
+    assert "By the proposals, 100.0% of 6 ordered pairs" in capsys.readouterr().out
 
 
 def test_the_objects_of_a_category_without_masks_are_shown_in_whole_frames(run, monkeypatch):

@@ -122,6 +122,8 @@ def test_the_best_sequences_are_chosen_and_those_that_are_there_stay(changed, ru
     assert f"{out / 'car' / CAR}: 3 frames" in text and SUV not in text
     assert (out / "car" / SUV / "pointcloud.ply").stat().st_mtime_ns == before
     assert "No problems." in run(["data", "check", out, "--deep"])
+    text = run([*words, "--sequences", CAR, "--best", 2, "--out", out], code=2)
+    assert "--best does not go with --sequences (see: zsp-lite data import uco3d --help)" in text
 
 
 def test_queries_use_the_keys_and_nothing_is_written_to_the_metadata(

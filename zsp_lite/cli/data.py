@@ -325,7 +325,12 @@ def import_(source, root, category, sequence, mask, box, **options) -> None:
 @click.argument("root", type=PATH)
 @click.option("--category", metavar="NAME", required=True, help="Category of the objects.")
 @click.option("--sequences", type=NAMES, show_default="--best", help="Names of the sequences.")
-@click.option("--best", type=COUNT, default=10, help="Number of sequences, best cameras first.")
+@click.option(
+    "--best",
+    type=COUNT,
+    show_default="10",
+    help="Number of sequences, those with the best cameras.",
+)
 @click.option("--frames", "count", type=COUNT, default=24, help="Frames of each sequence.")
 @click.option("--out", type=PATH, required=True, help="Data folder.")
 def uco3d(root, category, sequences, best, count, out) -> None:
@@ -336,7 +341,8 @@ def uco3d(root, category, sequences, best, count, out) -> None:
     """
     from zsp_lite.importers.uco3d import import_uco3d
 
-    for name, done in import_uco3d(root, out, category, sequences, best, count):
+    refuse_options({"best": sequences and best}, (), "--sequences")
+    for name, done in import_uco3d(root, out, category, sequences, best or 10, count):
         _print_import(out / category / name, done)
 
 
