@@ -86,6 +86,7 @@ def test_clouds_have_unit_deviation_and_the_alignment_gives_the_labels(imported)
     assert "CC BY 4.0" in (imported.root / "car/ATTRIBUTION.md").read_text()
 
 
+@pytest.mark.slow
 def test_the_pose_between_two_objects_is_that_of_the_data_folder(imported):
     backbone, rotations = zsp_lite.load_backbone(), []
     for dataset in (Co3D(SAMPLES), imported):

@@ -316,7 +316,7 @@ class _Sequence:
         self.images = Video(path_inside(root, row.video_path), displayed=True)
         self.masks = Video(path_inside(root, row.mask_video_path), displayed=True)
         self.depths = _DepthMaps(path_inside(root, row.depth_video_path))
-        usable = "_mask_mass IS NOT 0 AND _viewpoint_R IS NOT NULL"
+        usable = "_mask_mass IS NOT 0 AND _viewpoint_R IS NOT NULL AND frame_timestamp IS NOT NULL"
         rows = _select(
             metadata,
             _FrameRow,
