@@ -65,8 +65,10 @@ def make_shape(
     # a small random scale along each axis
     vertices = vertices * np.exp(assembly.rng.normal(0, 0.08, 3))
     vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
-    vertices, n = vertices / surface_spread(vertices, faces), len(faces)
-    uv, white = np.zeros((n, 3, 2), np.float32), np.ones((n, 3, 3), np.float32)
+    vertices = vertices / surface_spread(vertices, faces)
+    n = len(faces)
+    uv = np.zeros((n, 3, 2), np.float32)
+    white = np.ones((n, 3, 3), np.float32)
     return TexturedMesh(vertices, faces, smooth_normals(vertices, faces), uv, white, material)
 
 
@@ -97,7 +99,8 @@ def tapered(mesh: Mesh, low: float, high: float, factor: float) -> Mesh:
 def pane(start, end, width: float, thickness: float = 0.04) -> Mesh:
     """Return a slab between two points (x, z) of width `width` along y, for example a
     windscreen."""
-    start, end = np.asarray(start, float), np.asarray(end, float)
+    start = np.asarray(start, float)
+    end = np.asarray(end, float)
     along = (end - start) / np.linalg.norm(end - start)
     across = thickness / 2 * np.array([-along[1], along[0]])
     return extrusion([start - across, end - across, end + across, start + across], width)
@@ -158,7 +161,8 @@ def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
     other = colour + rng.uniform(*kind.contrast) * ((0 if darker else other) - colour)
     waves = rng.normal(size=(rng.choice(kind.waves), 3))
     waves *= rng.uniform(*kind.frequency) / np.linalg.norm(waves, axis=1, keepdims=True)
-    phases, warp = rng.uniform(0, 2 * np.pi, len(waves)), rng.normal(0, 2, 3)
+    phases = rng.uniform(0, 2 * np.pi, len(waves))
+    warp = rng.normal(0, 2, 3)
     sharpness = float(rng.choice([1.0, 2.0, 6.0]))  # 1 for a sine, more for clear edges
 
     def pattern(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -28,10 +28,8 @@ SETTINGS_FILE = "synthetic.json"
 # in that of models: the settings, and the model of each sequence
 RENDERED_FILE = "rendered_models.json"
 # pairs per category of models, for each of these numbers of target views
-_MODEL_PAIRS, _MODEL_TARGETS = (
-    20,
-    (1, 3, 5),
-)
+_MODEL_PAIRS = 20
+_MODEL_TARGETS = (1, 3, 5)
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,8 @@ def export_categories(
     """
     for category in categories:
         check_choice("category", category, builders)
-    out, settings = Path(out), {"seed": seed, "frames": frames, "image_size": image_size}
+    out = Path(out)
+    settings = {"seed": seed, "frames": frames, "image_size": image_size}
     if (out / SETTINGS_FILE).is_file():
         _check_same_settings(
             out, read_json(out / SETTINGS_FILE, dict[str, int], "settings"), settings
@@ -94,7 +93,8 @@ def export_categories(
     write_atomic(out / SETTINGS_FILE, json.dumps(settings).encode())
     jobs = [(category, index) for category in categories for index in range(sequences)]
     for category, index in tqdm(jobs, "rendering", disable=None):
-        name, key = sequence_name(seed, category, index), _key(seed, category, index)
+        name = sequence_name(seed, category, index)
+        key = _key(seed, category, index)
         if name not in read_poses(out, category):
             mesh = make_object(category, index, seed, builders)
             write_sequence(
@@ -144,9 +144,11 @@ def export_models(
     Returns the models that were left out ("CATEGORY/NAME"), with the reason. InputError if no model
     is usable, or if `out` holds other data.
     """
-    models, out = list_models(folder, front, up), Path(out)
+    models = list_models(folder, front, up)
+    out = Path(out)
     settings = {"seed": seed, "frames": frames, "image_size": image_size}
-    rendered, left_out = _Rendered(settings, {}), {}
+    rendered = _Rendered(settings, {})
+    left_out = {}
     if (out / RENDERED_FILE).is_file():
         rendered = read_json(out / RENDERED_FILE, _Rendered, "records")
         _check_same_settings(out, rendered.settings, settings)
@@ -217,7 +219,8 @@ def write_sequence(
     one is complete."""
     data, pose, scale = recorded
     write_co3d(out, category, [data], quality=88)
-    low, high = mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()
+    low = mesh.vertices.min(0).tolist()
+    high = mesh.vertices.max(0).tolist()
     poses = read_poses(out, category)
     poses[data.name] = ObjectPose(pose.tolist(), scale, low, high, shape_turns(mesh.vertices))
     write_atomic(

@@ -76,7 +76,8 @@ class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
         up +z)."""
         # What the list of models does not name is as usual in STL, or as in glTF.
         front, up = ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")
-        front, up = self.front or front, self.up or up
+        front = self.front or front
+        up = self.up or up
         given = [_AXES[one] if isinstance(one, str) else np.array(one) for one in (front, up)]
         x, z = (vector / max(np.linalg.norm(vector), 1e-6) for vector in given)
         return rotation_matrix(
@@ -157,7 +158,8 @@ def read_mesh(path: str | Path) -> TexturedMesh:
     if not 0 < sum(n_faces) <= MAX_FACES:
         raise InputError(f"model {path} has {sum(n_faces):,} faces, expected 1 to {MAX_FACES:,}")
     meshes, uv, colours, materials = zip(*parts, strict=True)
-    (vertices, faces), material = joined(meshes), np.repeat(np.arange(len(parts)), n_faces)
+    (vertices, faces) = joined(meshes)
+    material = np.repeat(np.arange(len(parts)), n_faces)
     check_magnitude(f"model {path}: vertices", vertices)
     a, b, c = np.moveaxis(vertices[faces] / _size(vertices), 1, 0)
     opacity = np.array([one.colour[3] for one in materials])
@@ -167,7 +169,8 @@ def read_mesh(path: str | Path) -> TexturedMesh:
     if not visible.any():
         raise InputError(f"model {path} has no visible face with an area")
     used, faces = np.unique(faces[visible], return_inverse=True)
-    vertices, faces = vertices[used], faces.reshape(-1, 3)
+    vertices = vertices[used]
+    faces = faces.reshape(-1, 3)
     uv, colours = (np.concatenate(corners)[visible] for corners in (uv, colours))
     return TexturedMesh(
         vertices, faces, smooth_normals(vertices, faces), uv, colours, material[visible], materials
@@ -217,9 +220,11 @@ def _values(path: Path, key: bytes) -> list[str]:
 def _part(mesh, transform: np.ndarray) -> tuple[Mesh, np.ndarray, np.ndarray, Material]:
     """Return one geometry of a trimesh scene, its texture coordinates and colours (f, 3, ...), and
     its material."""
-    faces, visual = np.asarray(mesh.faces, np.int64), mesh.visual
+    faces = np.asarray(mesh.faces, np.int64)
+    visual = mesh.visual
     vertices = np.asarray(mesh.vertices, float) @ transform[:3, :3].T + transform[:3, 3]
-    uv, colours = np.zeros((len(faces), 3, 2), np.float32), np.ones((len(faces), 3, 3), np.float32)
+    uv = np.zeros((len(faces), 3, 2), np.float32)
+    colours = np.ones((len(faces), 3, 3), np.float32)
     material = Material(np.ones(4))
     if visual.kind == "texture":
         if visual.uv is not None and len(visual.uv) == len(vertices):
@@ -236,7 +241,8 @@ def _material(given) -> Material:
     """Convert a material of trimesh: Phong's of an OBJ or COLLADA file, or glTF's."""
     if hasattr(given, "baseColorFactor"):
         return _gltf_material(given)
-    colour, texture = _rgba(given.diffuse), _image(given.image)
+    colour = _rgba(given.diffuse)
+    texture = _image(given.image)
     if texture is not None and colour[:3].max() < 0.02:
         colour[:3] = 1  # some exporters write black beside a texture, and mean white
     keys = given.kwargs  # of the material file
@@ -260,7 +266,8 @@ def _gltf_material(given) -> Material:
     metallic, roughness = (1.0 if factor is None else float(factor) for factor in factors)
     if given.metallicRoughnessTexture is not None:
         mean = _image(given.metallicRoughnessTexture).mean((0, 1)) / 255
-        metallic, roughness = metallic * float(mean[2]), roughness * float(mean[1])
+        metallic = metallic * float(mean[2])
+        roughness = roughness * float(mean[1])
     return Material(colour, texture, specular=0.04 + 0.36 * metallic, roughness=roughness)
 
 

@@ -37,7 +37,8 @@ class Mesh:
         j, k = (i + 1) % 3, (i + 2) % 3
         R = np.eye(3)
         R[j, j] = R[k, k] = np.cos(angle)
-        R[j, k], R[k, j] = -np.sin(angle), np.sin(angle)
+        R[j, k] = -np.sin(angle)
+        R[k, j] = np.sin(angle)
         return Mesh(self.vertices @ R.T, self.faces)
 
     def pointing(self, direction) -> "Mesh":
@@ -93,11 +94,13 @@ def lathe(profile, sides: int = 20, start: float = 0.0, stop: float = TAU) -> Me
     profile = np.asarray(profile, float)
     closed = np.isclose(stop - start, TAU)
     angle = np.linspace(start, stop, sides, endpoint=not closed)
-    x, y = np.outer(profile[:, 0], np.cos(angle)), np.outer(profile[:, 0], np.sin(angle))
+    x = np.outer(profile[:, 0], np.cos(angle))
+    y = np.outer(profile[:, 0], np.sin(angle))
     vertices = np.stack([x, y, np.repeat(profile[:, 1:], sides, 1)], -1).reshape(-1, 3)
     columns = np.arange(sides if closed else sides - 1)
     ring, j = np.meshgrid(np.arange(len(profile) - 1) * sides, columns, indexing="ij")
-    a, b = (ring + j).ravel(), (ring + (j + 1) % sides).ravel()
+    a = (ring + j).ravel()
+    b = (ring + (j + 1) % sides).ravel()
     faces = np.stack([np.stack([a, b, b + sides], 1), np.stack([a, b + sides, a + sides], 1)], 1)
     return Mesh(vertices, faces.reshape(-1, 3))
 
@@ -130,7 +133,8 @@ def capsule(start, end, radius: float, end_radius: float | None = None) -> Mesh:
     half = np.linalg.norm(along) / 2
     t = np.linspace(0, np.pi / 2, 5)
     round_end = np.stack([np.cos(t) + 1e-5, np.sin(t)], 1)
-    tail, head = round_end[::-1] * [radius, -radius], round_end * (end_radius or radius)
+    tail = round_end[::-1] * [radius, -radius]
+    head = round_end * (end_radius or radius)
     mesh = lathe(np.concatenate([tail - [0, half], head + [0, half]]), sides=14)
     return mesh.pointing(along).translated(np.add(start, end) / 2)
 
@@ -152,7 +156,9 @@ def extrusion(outline, thickness: float, plane: str = "xz", offset: float = 0.0)
     flat = np.concatenate([outline, [outline.mean(0)]])
     across = np.repeat([-thickness / 2, thickness / 2], n + 1) + offset
     i, k = np.arange(n), (np.arange(n) + 1) % n
-    back, front, hub = np.full(n, n), n + 1, np.full(n, 2 * n + 1)
+    back = np.full(n, n)
+    front = n + 1
+    hub = np.full(n, 2 * n + 1)
     faces = [
         [back, i, k],
         [hub, front + k, front + i],

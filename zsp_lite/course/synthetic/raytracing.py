@@ -65,12 +65,14 @@ class MeshScene:
     ):
         o3d = load_open3d()
         self.mesh, self.room = mesh, room
-        self._rng, self._samples = np.random.default_rng(seed), samples
+        self._rng = np.random.default_rng(seed)
+        self._samples = samples
         self._tensor = o3d.core.Tensor
         self._rays = o3d.t.geometry.RaycastingScene(nthreads=1)
         triangles = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
         self._rays.add_triangles(*map(self._tensor, triangles))
-        low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+        low = mesh.vertices.min(0)
+        high = mesh.vertices.max(0)
         self.origin = np.array([*(low + high)[:2] / 2, low[2]], np.float32)  # of the room
         first, second, third = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float32), 1, 0)
         # normal, with twice the area of the face as its length
@@ -99,9 +101,12 @@ class MeshScene:
         radiance, depth = self._background(camera, rays)
         hits = self._cast(camera.centre, rays)
         pixel = np.unravel_index(hits.ray, camera.size)
-        mask, normals = np.zeros(camera.size, bool), np.zeros((*camera.size, 3), np.float32)
+        mask = np.zeros(camera.size, bool)
+        normals = np.zeros((*camera.size, 3), np.float32)
         canonical = np.full_like(normals, np.nan)
-        mask[pixel], depth[pixel] = True, hits.distance  # rays have unit z in the camera frame
+        # rays have unit z in the camera frame
+        mask[pixel] = True
+        depth[pixel] = hits.distance
         canonical[pixel] = _interpolated(hits.weights, self._coordinates[hits.face])
         normals[pixel] = _towards(
             self._flat[hits.face], rays.reshape(-1, 3)[hits.ray]
@@ -125,17 +130,17 @@ class MeshScene:
         textures."""
         origin = np.broadcast_to(origin.astype(np.float32), rays.shape).reshape(-1, 3)
         rays = rays.reshape(-1, 3)
-        start, active, found = np.zeros(len(rays), np.float32), np.arange(len(rays)), []
+        start = np.zeros(len(rays), np.float32)
+        active = np.arange(len(rays))
+        found = []
         for _ in range(_LAYERS):
             points = origin[active] + start[active, None] * rays[active]
             result = self._rays.cast_rays(self._tensor(np.concatenate([points, rays[active]], 1)))
             reach = result["t_hit"].numpy()
             on = np.flatnonzero(np.isfinite(reach))
             uv = result["primitive_uvs"].numpy()[on]
-            face, weights = (
-                result["primitive_ids"].numpy()[on].astype(np.int64),
-                np.column_stack([1 - uv.sum(1), uv]),
-            )
+            face = result["primitive_ids"].numpy()[on].astype(np.int64)
+            weights = np.column_stack([1 - uv.sum(1), uv])
             ray = active[on]
             distance = start[ray] + reach[on]
             hole = self._is_hole(face, weights)
@@ -170,11 +175,13 @@ class MeshScene:
         """Return the radiance of the object along rays, multiplied by its opacity, and the
         opacity."""
         size = rays.shape[:2]
-        rays, material = rays.reshape(-1, 3)[hits.ray], self.mesh.material[hits.face]
+        rays = rays.reshape(-1, 3)[hits.ray]
+        material = self.mesh.material[hits.face]
         # width of a sample, in units
         footprint = hits.distance / (camera.focal_length.mean() * self._samples)
         albedo = self._albedo(hits, footprint)
-        view, flat = unit(rays), _towards(self._flat[hits.face], rays)
+        view = unit(rays)
+        flat = _towards(self._flat[hits.face], rays)
         normal = _interpolated(hits.weights, self.mesh.normals[hits.face])
         normal *= np.where(_dot(normal, flat) < 0, np.float32(-1), np.float32(1))[:, None]
         # Visible points do not face away, though their interpolated normals may.
@@ -183,12 +190,11 @@ class MeshScene:
         facing = np.maximum(-_dot(normal, view), 0.02)
         point = camera.centre.astype(np.float32) + hits.distance[:, None] * rays + _OFFSET * flat
 
-        light, light_colour = (
-            self.room.light.astype(np.float32),
-            self.room.light_colour.astype(np.float32),
-        )
+        light = self.room.light.astype(np.float32)
+        light_colour = self.room.light_colour.astype(np.float32)
         key = np.maximum(normal @ light, 0) * (flat @ light > 0)
-        lit, of_light = np.flatnonzero(key), np.ones(len(key), np.float32)
+        lit = np.flatnonzero(key)
+        of_light = np.ones(len(key), np.float32)
         of_light[lit] = self._lit_share(point[lit], 1)
         # Directions with a density of the cosine about the normal.
         towards_room = unit(
@@ -199,7 +205,8 @@ class MeshScene:
         shares = np.zeros((*size, 3), np.float32)
         shares.reshape(-1, 3)[hits.ray] = np.column_stack([of_light, of_room, np.ones(len(key))])
         of_light, of_room, neighbours = cv2.blur(shares, (3, 3)).reshape(-1, 3)[hits.ray].T
-        key, visible = key * of_light / neighbours, of_room / neighbours
+        key = key * of_light / neighbours
+        visible = of_room / neighbours
         around = self.room.irradiance(normal) * (_BLOCKED + (1 - _BLOCKED) * visible)[:, None]
         diffuse = (key[:, None] * light_colour + around) * albedo
 
@@ -228,11 +235,14 @@ class MeshScene:
     def _albedo(self, hits: _Hits, footprint: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Return the linear colours of surface points; `footprint` is the width of a sample, in
         units."""
-        face, weights, material = hits.face, hits.weights, self.mesh.material[hits.face]
+        face = hits.face
+        weights = hits.weights
+        material = self.mesh.material[hits.face]
         albedo = srgb_to_linear(_interpolated(weights, self.mesh.colours[face]))
         for index in np.unique(material):
             on = np.flatnonzero(material == index)
-            look, texture = self.mesh.materials[index], self._textures[index]
+            look = self.mesh.materials[index]
+            texture = self._textures[index]
             albedo[on] *= srgb_to_linear(look.colour[:3])
             if look.pattern:
                 points = _interpolated(weights[on], self._coordinates[face[on]])
@@ -261,9 +271,11 @@ class MeshScene:
     def _shadow_on_the_floor(self) -> tuple[Float[np.ndarray, "n n 2"], float]:
         """Return the visible shares of the key light and of the room on a grid below the object,
         and its width."""
-        extent, light = np.ptp(self.mesh.vertices, axis=0), self.room.light
+        extent = np.ptp(self.mesh.vertices, axis=0)
+        light = self.room.light
         length = extent[2] * max(float(np.linalg.norm(light[:2]) / max(light[2], 0.3)), 0.8)
-        n, width = _SHADOW_CELLS, float(extent[:2].max()) + 2 * min(length, 5.0)
+        n = _SHADOW_CELLS
+        width = float(extent[:2].max()) + 2 * min(length, 5.0)
         line = ((np.arange(n, dtype=np.float32) + 0.5) / n - 0.5) * width
         x, y = np.meshgrid(line, line)
         point = np.stack([x, y, np.full_like(x, _OFFSET)], -1).reshape(-1, 3) + self.origin
@@ -281,7 +293,8 @@ class MeshScene:
     ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
         """Return the radiance of the room with the shadow of the object, and the depth of the
         floor."""
-        eye, flat_rays = camera.centre - self.origin, rays.reshape(-1, 3)
+        eye = camera.centre - self.origin
+        flat_rays = rays.reshape(-1, 3)
         radiance, reach = self.room.radiance(eye, flat_rays, 1 / camera.focal_length.mean())
         floor = np.flatnonzero(reach)
         u, v = ((eye + reach[floor, None] * flat_rays[floor])[:, :2] / self._shadow_width + 0.5).T

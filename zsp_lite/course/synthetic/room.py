@@ -22,7 +22,9 @@ from zsp_lite.course.synthetic.textures import (
 )
 
 FLOOR_REACH = 25.0  # distance in units up to which the floor has depth
-_FLOOR, _CEILING = 4, 5  # among the faces of a room
+# among the faces of a room
+_FLOOR = 4
+_CEILING = 5
 _MIDDLE = np.array([0, 0, 1.5])  # about the middle of an object
 _FLOOR_PIXELS = 1024  # along each side of the floor's image
 _WALL_DENSITY = 20  # pixels per unit
@@ -57,7 +59,8 @@ class CheapCamera:
         """Return the 8-bit picture of linear radiance; `gain` is that of `exposure_gain`."""
         height, width = radiance.shape[:2]
         pixel = min(height, width) / 256  # blurs are those of a picture of 256 pixels
-        y, x = np.linspace(-1, 1, height)[:, None], np.linspace(-1, 1, width)
+        y = np.linspace(-1, 1, height)[:, None]
+        x = np.linspace(-1, 1, width)
         falloff = 1 - self.vignetting * (x**2 + y**2) / 2
         image = (radiance * (gain * falloff)[..., None] * self.white_balance).astype(np.float32)
         image = blur(image, 0.4 * pixel)  # of the lens
@@ -132,14 +135,16 @@ class Room:
         eye = np.clip(eye[:, None], low + 0.05, high - 0.05).astype(np.float32)
         rays = np.ascontiguousarray(np.where(np.abs(rays) < 1e-9, np.float32(1e-9), rays).T)
         reach = (np.where(rays > 0, high, low) - eye) / rays
-        nearest, axis = reach.min(0), reach.argmin(0)
+        nearest = reach.min(0)
+        axis = reach.argmin(0)
         face = 2 * axis + (np.take_along_axis(rays, axis[None], 0)[0] > 0)
         x, y, z = (eye + nearest * rays - low) / (high - low)
         texels = nearest * np.sqrt((rays**2).sum(0)) * blur
         radiance = np.empty((len(nearest), 3), np.float32)
         for index, image in enumerate(self._pyramids):
             on = np.flatnonzero(face == index)
-            u, v = (y if index < 2 else x)[on], (1 - z if index < _FLOOR else y)[on]
+            u = (y if index < 2 else x)[on]
+            v = (1 - z if index < _FLOOR else y)[on]
             density = image[0].shape[1] / float((high - low)[1 if index < 2 else 0, 0])
             radiance[on] = sample_pyramid(image, u, v, texels[on] * density, cv2.BORDER_REPLICATE)
         return radiance, np.where(face == _FLOOR, nearest, 0)
@@ -157,12 +162,11 @@ def random_room(seed: int | np.random.Generator) -> Room:
     """Draw a room, independent of the object."""
     rng = np.random.default_rng(seed)
     sides = rng.uniform(11.5, 17, 4)
-    low, high = (
-        np.array([-sides[0], -sides[1], 0]),
-        np.array([sides[2], sides[3], rng.uniform(12, 14)]),
-    )
+    low = np.array([-sides[0], -sides[1], 0])
+    high = np.array([sides[2], sides[3], rng.uniform(12, 14)])
     width, depth, height = high - low
-    azimuth, elevation = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 1.4)
+    azimuth = rng.uniform(0, 2 * np.pi)
+    elevation = rng.uniform(0.5, 1.4)
     light = np.array(
         [
             np.cos(azimuth) * np.cos(elevation),
@@ -170,7 +174,8 @@ def random_room(seed: int | np.random.Generator) -> Room:
             np.sin(elevation),
         ]
     )
-    warmth, temperature = rng.uniform(-0.08, 0.2), rng.normal(0, 0.045)
+    warmth = rng.uniform(-0.08, 0.2)
+    temperature = rng.normal(0, 0.045)
 
     floor_colour = hsv(rng.uniform(15, 60), rng.uniform(0.02, 0.6), rng.uniform(0.3, 0.8))
     floor = surface(
@@ -207,12 +212,14 @@ def _wall(
 ) -> np.ndarray:
     """Return the radiance of a wall, with furniture, pictures and windows as rectangles that are
     divided into cells."""
-    rows, cols = round(height * _WALL_DENSITY), round(width * _WALL_DENSITY)
+    rows = round(height * _WALL_DENSITY)
+    cols = round(width * _WALL_DENSITY)
     image = surface(rng, (rows, cols), colour, 0.2)
     image[-8:] *= 0.4  # skirting board
     left = rng.uniform(0.3, 2)
     while left < width - 2:
-        wide, tall = rng.uniform(1, 4), rng.uniform(1.2, 5)
+        wide = rng.uniform(1, 4)
+        tall = rng.uniform(1.2, 5)
         hangs = rng.random() < 0.5
         # of a window, or of anything else
         brightness = 3.0 if hangs and rng.random() < 0.4 else 1.0

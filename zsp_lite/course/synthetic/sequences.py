@@ -32,7 +32,8 @@ HEIGHTS = (
 _FRAME_MARGIN = 0.03  # free border at each image side, as a fraction of that side
 _DEPTH_NOISE = 0.005  # standard deviation relative to the depth, at the object
 # Range of the fraction of pixels without depth, drawn per sequence. The wall has no depth at all.
-_OBJECT_HOLES, _FLOOR_HOLES = (0.28, 0.46), (0.1, 0.3)
+_OBJECT_HOLES = (0.28, 0.46)
+_FLOOR_HOLES = (0.1, 0.3)
 # Ranges of CO3D's viewpoint quality and point cloud quality in the sequences that the paper labels,
 # and of CO3D's factor from stored depth to depth.
 _SCORES = (1.3, 3.0), (0.35, 1.0), (0.4, 2.5)
@@ -93,7 +94,8 @@ def handheld_sweep(
 
     # Bounding box of the object's image at focal length 1, relative to the optical axis.
     plane = [(v := vertices @ R.T + t)[:, :2] / v[:, 2:] for R, t in poses]
-    low, high = np.array([p.min(0) for p in plane]), np.array([p.max(0) for p in plane])
+    low = np.array([p.min(0) for p in plane])
+    high = np.array([p.max(0) for p in plane])
     sides = np.array(size[::-1], float)
     principal_point = np.round(sides / 2 + rng.normal(0, 0.004, 2) * sides, 6)
     room = np.minimum(principal_point, sides - principal_point) - _FRAME_MARGIN * sides
@@ -223,7 +225,8 @@ def record_sequence(
     views, pose = render_sequence(mesh, rng, frames, image_size, heights)
     seconds = np.round(np.arange(frames) * rng.uniform(0.4, 0.9), 3).tolist()
     rng = np.random.default_rng([key, 2])
-    object_holes, floor_holes = rng.uniform(*_OBJECT_HOLES), rng.uniform(*_FLOOR_HOLES)
+    object_holes = rng.uniform(*_OBJECT_HOLES)
+    floor_holes = rng.uniform(*_FLOOR_HOLES)
     depths, masks = [], []
     for view in views:
         shares = np.clip(np.array([object_holes, floor_holes]) + rng.normal(0, 0.03, 2), 0.05, 0.9)

@@ -12,7 +12,9 @@ from torch import Tensor
 from zsp_lite.course.training.renders import VIEWS, RenderSet
 
 PATCH_SIZE = 8  # pixels
-MEAN, STD = 0.45, 0.25  # normalisation of RGB values in [0, 1] during training
+# normalisation of RGB values in [0, 1] during training
+MEAN = 0.45
+STD = 0.25
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,8 @@ def crop_grids(
     image to the crop's."""
     size = rng.uniform(*scale, n)
     ratio = np.exp(rng.uniform(-0.25, 0.25, n))
-    width, height = np.minimum(size * ratio, 1), np.minimum(size / ratio, 1)
+    width = np.minimum(size * ratio, 1)
+    height = np.minimum(size / ratio, 1)
     angle = rng.normal(0, 0.12, n)
     x, y = (rng.uniform(-1, 1, n) * (1 - extent) * 0.9 for extent in (width, height))
     # Each group is mirrored as a whole or not.

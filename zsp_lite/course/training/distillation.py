@@ -24,11 +24,11 @@ from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.course.training.batches import crop_grids, recolour
 
 # widths of the crops as a fraction of the image's
-GLOBAL_SCALE, LOCAL_SCALE = (
-    (0.6, 1.0),
-    (0.25, 0.6),
-)
-HIDDEN, BOTTLENECK = 256, 64  # widths of the head's layers
+GLOBAL_SCALE = (0.6, 1.0)
+LOCAL_SCALE = (0.25, 0.6)
+# widths of the head's layers
+HIDDEN = 256
+BOTTLENECK = 64
 STUDENT_TEMPERATURE = 0.1
 CENTRE_MOMENTUM = 0.9  # decay per step of the average of the teacher's logits
 TEACHER_MOMENTUM = 0.99, 1.0  # decay of the teacher's average at the first and the last step
@@ -59,11 +59,9 @@ class Head(nn.Module):
 
     def __init__(self, dim: int, outputs: int):
         super().__init__()
-        first, middle, last = (
-            nn.Linear(dim, HIDDEN),
-            nn.Linear(HIDDEN, HIDDEN),
-            nn.Linear(HIDDEN, BOTTLENECK),
-        )
+        first = nn.Linear(dim, HIDDEN)
+        middle = nn.Linear(HIDDEN, HIDDEN)
+        last = nn.Linear(HIDDEN, BOTTLENECK)
         self.mlp = nn.Sequential(first, nn.GELU(), middle, nn.GELU(), last)
         self.directions = nn.Parameter(torch.randn(outputs, BOTTLENECK))
         for module in (first, middle, last):
@@ -150,7 +148,9 @@ class Distillation:
         rgb: UInt8[np.ndarray, "n views size size 3"],
     ):
         torch.manual_seed(config.seed)
-        self.config, self.rgb, self.steps_done = config, rgb, 0
+        self.config = config
+        self.rgb = rgb
+        self.steps_done = 0
         self.student = Network(copy.deepcopy(backbone), config.outputs).requires_grad_(True)
         self.teacher = copy.deepcopy(self.student).requires_grad_(False)
         self.centre = torch.zeros(config.outputs)
@@ -162,7 +162,8 @@ class Distillation:
 
     def step(self) -> dict[str, float]:
         """Take one step and return its figures (see `distillation_loss`)."""
-        config, progress = self.config, self.steps_done / self.config.steps
+        config = self.config
+        progress = self.steps_done / self.config.steps
         rate = config.learning_rate * min(1.0, 10 * progress) * cosine((1.0, 0.01), progress)
         for group in self.optimizer.param_groups:
             group["lr"] = rate

@@ -53,7 +53,8 @@ def correspondence_loss(
         seen_again = target.amax(1) > 0.5
         if seen_again.sum() < 5:
             continue
-        target, query = target[seen_again], query[seen_again]
+        target = target[seen_again]
+        query = query[seen_again]
         target = target * (target > 0.05)
         target = target / target.sum(1, keepdim=True)
         logits = (z[k, query] @ z[k].T / temperature).masked_fill(same_view[seen_again], -1e4)
@@ -93,7 +94,8 @@ def attention_loss(
     visible = coverage.sum(1) > 2
     if not visible.any():
         return cls_logits.sum() * 0, 0.0
-    attention, coverage = attention[visible].clamp_min(1e-8), coverage[visible]
+    attention = attention[visible].clamp_min(1e-8)
+    coverage = coverage[visible]
     target = coverage / coverage.sum(1, keepdim=True)
     spread = F.kl_div(attention.log(), target, reduction="batchmean")
     level = (attention * coverage).sum(1, keepdim=True) / coverage.sum(1, keepdim=True)
@@ -101,8 +103,10 @@ def attention_loss(
         attention.log() - (0.12 * level.detach()).log(), coverage
     )
     with torch.no_grad():
-        low, high = attention.amin(1, keepdim=True), attention.amax(1, keepdim=True)
-        found, truth = (attention - low) / (high - low + 1e-12) > 0.05, coverage > 0.25
+        low = attention.amin(1, keepdim=True)
+        high = attention.amax(1, keepdim=True)
+        found = (attention - low) / (high - low + 1e-12) > 0.05
+        truth = coverage > 0.25
         iou = ((found & truth).sum(1) / (found | truth).sum(1).clamp_min(1)).mean().item()
     return spread + 0.25 * side, iou
 

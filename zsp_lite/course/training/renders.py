@@ -66,10 +66,13 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     `RenderSet`."""
     rng = np.random.default_rng([number, 0])  # [number, 1] draws the object itself
     shape = make_shape(build_random_object, [number, 1])
-    start, step, views = rng.uniform(0, TAU), SIZE // GRID, []
+    start = rng.uniform(0, TAU)
+    step = SIZE // GRID
+    views = []
     for view in range(VIEWS):
         if view % 2 == 0:
-            azimuth, apart = start + (view // 2) * np.pi / 2, rng.uniform(*PAIR_ANGLES)
+            azimuth = start + (view // 2) * np.pi / 2
+            apart = rng.uniform(*PAIR_ANGLES)
             elevation = rng.uniform(0, 0.9)
         instance = make_shape(build_random_object, [number, 1], variation=rng)
         mesh = replace(instance, materials=random_materials(rng))
@@ -85,8 +88,10 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         )
         image = render_instance(number, mesh, shape.vertices, camera, rng)
         every = (slice(step // 2, None, step),) * 2
-        depth, on_object = image.depth[every], image.mask[every]
-        seen, relative = depth[on_object], np.zeros_like(depth)
+        depth = image.depth[every]
+        on_object = image.mask[every]
+        seen = depth[on_object]
+        relative = np.zeros_like(depth)
         relative[on_object] = (seen - seen.mean()) / max(float(seen.std()), 1e-6)
         maps = image.canonical[every], np.dstack([image.normals[every], relative])
         views.append((image.rgb, *(one.astype(np.float16) for one in maps)))
@@ -107,7 +112,8 @@ def framed_camera(
     plane = in_camera[:, :2] / in_camera[:, 2:]
     low, high = plane.min(0), plane.max(0)
     width = (high - low).max() * margin  # of the image; the shift is a fraction of it
-    centre, focal_length = (low + high) / 2 + np.multiply(shift, width), size / width
+    centre = (low + high) / 2 + np.multiply(shift, width)
+    focal_length = size / width
     return Camera(R, t, np.full(2, focal_length), size / 2 - centre * focal_length, (size, size))
 
 
@@ -152,9 +158,11 @@ def build_random_object(a: Assembly) -> None:
     a.add(_random_solid(a, nodes[0][1]), a.choice(5))
     for _ in range(4 + a.choice(6)):
         parent, parent_size = nodes[a.choice(len(nodes))]
-        direction, size = a.rng.normal(size=3), a.rng.uniform(0.12, 0.8, 3) * a.u(0.5, 1.0)
+        direction = a.rng.normal(size=3)
+        size = a.rng.uniform(0.12, 0.8, 3) * a.u(0.5, 1.0)
         centre = parent + direction / np.abs(direction).max() * (parent_size * 0.4 + size * 0.3)
-        mesh, mirror = _random_solid(a, size), a.chance(0.55)
+        mesh = _random_solid(a, size)
+        mirror = a.chance(0.55)
         centre[1] = abs(centre[1]) if mirror else 0
         if mirror and a.chance(0.5):
             mesh = mesh.rotated("z", a.u(-0.7, 0.7)).rotated("x", a.u(-0.7, 0.7))

@@ -66,11 +66,9 @@ def initial_backbone(
     so that noise is not amplified: a random linear embedding would pass on little more than the
     mean brightness.
     """
-    backbone, dim, p = (
-        VisionTransformer(224, PATCH_SIZE, embed_dim, depth, num_heads),
-        embed_dim,
-        PATCH_SIZE,
-    )
+    backbone = VisionTransformer(224, PATCH_SIZE, embed_dim, depth, num_heads)
+    dim = embed_dim
+    p = PATCH_SIZE
     generator = torch.Generator().manual_seed(0)
     for name, module in backbone.named_modules():
         if isinstance(module, nn.Linear):

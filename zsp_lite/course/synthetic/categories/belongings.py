@@ -21,11 +21,16 @@ from zsp_lite.course.synthetic.primitives import (
 def backpack(a: Assembly) -> None:
     """Build a backpack, with or without a flap: pockets at the front, shoulder straps behind,
     handle on top."""
-    depth, width, height = a.u(0.42, 0.62), a.u(0.7, 1.0), a.u(1.1, 1.5)
-    front, back, narrowing = depth / 2, -depth / 2, a.u(0.7, 1.0)
+    depth = a.u(0.42, 0.62)
+    width = a.u(0.7, 1.0)
+    height = a.u(1.1, 1.5)
+    front = depth / 2
+    back = -depth / 2
+    narrowing = a.u(0.7, 1.0)
     body = rounded_box((depth, width, height), (0, 0, height / 2), a.u(3.5, 6))
     a.add(tapered(body, height / 2, height, narrowing), 0)
-    pocket_depth, pocket_height = depth * a.u(0.45, 0.7), height * a.u(0.35, 0.5)
+    pocket_depth = depth * a.u(0.45, 0.7)
+    pocket_height = height * a.u(0.35, 0.5)
     pocket_z = height * a.u(0.06, 0.12) + pocket_height / 2
     a.add(
         rounded_box(
@@ -58,7 +63,8 @@ def backpack(a: Assembly) -> None:
         ),
         3,
     )
-    strap_y, bulge = width * a.u(0.22, 0.3), a.u(0.12, 0.22)
+    strap_y = width * a.u(0.22, 0.3)
+    bulge = a.u(0.12, 0.22)
     bend = (back - bulge, strap_y, height * 0.7)
     a.add(capsule((back + 0.02, strap_y * 0.8, height * 0.93), bend, 0.05), 4, mirror=True)
     a.add(capsule(bend, (back + 0.02, strap_y * 1.35, height * 0.12), 0.05), 4, mirror=True)
@@ -70,14 +76,17 @@ def backpack(a: Assembly) -> None:
 def handbag(a: Assembly) -> None:
     """Build a tote, flap bag or bowling bag: one or two handles, clasp and pocket at the front, tag
     on one side."""
-    depth, width, height = a.u(0.3, 0.5), a.u(1.0, 1.5), a.u(0.7, 1.1)
+    depth = a.u(0.3, 0.5)
+    width = a.u(1.0, 1.5)
+    height = a.u(0.7, 1.1)
     style = ("tote", "flap bag", "bowling bag")[a.choice(3)]
     narrowing = a.u(1.0, 1.2) if style == "tote" else a.u(0.65, 0.95)
     body = rounded_box(
         (depth, width, height), (0, 0, height / 2), 8 if style == "tote" else a.u(3, 5)
     )
     a.add(tapered(body, 0, height, narrowing), 0)
-    front, top_width = depth / 2, width * narrowing
+    front = depth / 2
+    top_width = width * narrowing
     if style == "flap bag":
         drop = height * a.u(0.45, 0.65)
         a.add(rounded_box((0.06, top_width, drop), (front + 0.02, 0, height - drop / 2), 6), 1)
@@ -88,10 +97,13 @@ def handbag(a: Assembly) -> None:
             3,
         )
     else:
-        pocket_width, pocket_height = width * a.u(0.45, 0.7), height * a.u(0.35, 0.5)
+        pocket_width = width * a.u(0.45, 0.7)
+        pocket_height = height * a.u(0.35, 0.5)
         a.add(rounded_box((0.1, pocket_width, pocket_height), (front, 0, height * 0.35), 4), 1)
         a.add(box((0.04, 0.1, 0.14), (front + 0.03, 0, height * 0.82)), 3)
-    loop, strap, rise = top_width * a.u(0.2, 0.3), a.u(0.025, 0.045), a.u(0.9, 1.6)
+    loop = top_width * a.u(0.2, 0.3)
+    strap = a.u(0.025, 0.045)
+    rise = a.u(0.9, 1.6)
     for x in (0.0,) if a.chance(0.35) else (front * 0.7, -front * 0.7):
         handle = torus(loop, strap, (1, 0, 0), start=TAU / 4, stop=TAU * 3 / 4, sides=20)
         a.add(handle.scaled((1, 1, rise)).translated((x, 0, height * 0.95)), 2)
@@ -102,7 +114,10 @@ def book(a: Assembly) -> None:
     """Build a book: closed or slightly open, spine on the left; title and picture or band on the
     cover."""
     # The top of the page points backwards (-x); the reader is at the front.
-    height, width, thick, board = a.u(1.3, 1.7), a.u(0.9, 1.25), a.u(0.12, 0.4), a.u(0.025, 0.05)
+    height = a.u(1.3, 1.7)
+    width = a.u(0.9, 1.25)
+    thick = a.u(0.12, 0.4)
+    board = a.u(0.025, 0.05)
     spine = width / 2
     a.add(box((height * 0.96, width * 0.95, thick), (0, -width * 0.01, thick / 2)), 1)
     a.add(box((height, width, board)), 0)
@@ -139,10 +154,15 @@ def book(a: Assembly) -> None:
 def laptop(a: Assembly) -> None:
     """Build a laptop: keys and touchpad on the base, towards the user at the front; opened by 80 to
     130 degrees."""
-    depth, width, thick = a.u(0.8, 1.1), a.u(1.2, 1.6), a.u(0.05, 0.1)
+    depth = a.u(0.8, 1.1)
+    width = a.u(1.2, 1.6)
+    thick = a.u(0.05, 0.1)
     a.add(rounded_box((depth, width, thick), (0, 0, thick / 2), 12), 0)
-    n_rows, n_keys = 4 + a.choice(2), 10 + a.choice(4)
-    field, front = depth * a.u(0.4, 0.5), depth * a.u(0.08, 0.14)  # of the keys
+    n_rows = 4 + a.choice(2)
+    n_keys = 10 + a.choice(4)
+    # of the keys
+    field = depth * a.u(0.4, 0.5)
+    front = depth * a.u(0.08, 0.14)
     a.add(box((field * 1.06, width * 0.88, 0.01), (front - field / 2, 0, thick)), 5)
     _add_keys(
         a.add,
@@ -159,11 +179,9 @@ def laptop(a: Assembly) -> None:
         2,
     )
     hinge = (-depth / 2 + 0.03, 0, thick + 0.02)
-    opening, lid, rim = (
-        a.u(np.radians(80), np.radians(130)),
-        depth * a.u(0.9, 1.02),
-        a.u(0.04, 0.09),
-    )
+    opening = a.u(np.radians(80), np.radians(130))
+    lid = depth * a.u(0.9, 1.02)
+    rim = a.u(0.04, 0.09)
 
     def add_to_lid(mesh: Mesh, material: int) -> None:
         # The part is given for the closed lid: the screen faces down, the hinge is at x = 0.
@@ -195,7 +213,9 @@ def _add_keys(
 def mouse(a: Assembly) -> None:
     """Build a computer mouse: buttons and wheel at the front, optional cable, thumb rest on the
     left."""
-    length, width, height = a.u(1.1, 1.5), a.u(0.65, 0.9), a.u(0.32, 0.55)
+    length = a.u(1.1, 1.5)
+    width = a.u(0.65, 0.9)
+    height = a.u(0.32, 0.55)
     shell = rounded_box((length, width, 2 * height), squareness=a.u(2.2, 3.5))
     vertices = shell.vertices.copy()
     vertices[:, 2] = np.maximum(vertices[:, 2], 0) * (
@@ -222,7 +242,10 @@ def mouse(a: Assembly) -> None:
 def keyboard(a: Assembly) -> None:
     """Build a keyboard: rows of keys, space bar towards the user, optional number pad on the right,
     optional cable."""
-    depth, width, thick, tilt = a.u(0.55, 0.8), a.u(1.6, 2.2), a.u(0.08, 0.16), a.u(0.03, 0.16)
+    depth = a.u(0.55, 0.8)
+    width = a.u(1.6, 2.2)
+    thick = a.u(0.08, 0.16)
+    tilt = a.u(0.03, 0.16)
     has_pad = a.chance(0.6)
 
     def add_tilted(mesh: Mesh, material: int) -> None:
@@ -232,8 +255,10 @@ def keyboard(a: Assembly) -> None:
         )
 
     add_tilted(rounded_box((depth, width, thick), squareness=a.u(8, 14)), 0)
-    n_rows, n_keys = 5 + a.choice(2), 11 + a.choice(4)
-    field, row_depth = width * (0.68 if has_pad else 0.92), depth * 0.86 / n_rows
+    n_rows = 5 + a.choice(2)
+    n_keys = 11 + a.choice(4)
+    field = width * (0.68 if has_pad else 0.92)
+    row_depth = depth * 0.86 / n_rows
     _add_keys(
         add_tilted,
         n_rows,
@@ -270,21 +295,26 @@ def keyboard(a: Assembly) -> None:
 def remote(a: Assembly) -> None:
     """Build a remote control: power key and emitter at the front, ring in the middle, number keys
     behind."""
-    length, width, thick = a.u(1.4, 2.0), a.u(0.38, 0.58), a.u(0.14, 0.26)
+    length = a.u(1.4, 2.0)
+    width = a.u(0.38, 0.58)
+    thick = a.u(0.14, 0.26)
     body = rounded_box((thick, width, length), (0, 0, length / 2), a.u(4, 9))
     waist, top = a.u(0.8, 1.0), thick + 0.005
     body = tapered(body, length / 2, 0, waist).rotated("y", np.pi / 2)  # narrower behind
     a.add(body.translated((-length / 2, 0, thick / 2)), 0)
     a.add(ellipsoid((0.06, width * 0.2, thick * 0.3), (length / 2 - 0.02, 0, thick * 0.55)), 5)
     a.add(cylinder(0.055, 0.05, 0.06).translated((length * 0.41, width * a.u(0.15, 0.28), top)), 3)
-    ring_x, ring = length * a.u(0.08, 0.22), width * a.u(0.26, 0.34)
+    ring_x = length * a.u(0.08, 0.22)
+    ring = width * a.u(0.26, 0.34)
     if a.chance(0.7):
         a.add(torus(ring, 0.035, centre=(ring_x, 0, top)), 4)
     else:
         for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
             a.add(box((0.09, 0.09, 0.06), (ring_x + ring * x, ring * y, top)), 4)
     a.add(cylinder(ring * 0.45, ring * 0.4, 0.06).translated((ring_x, 0, top)), 3)
-    n_rows, round_keys, pitch = 3 + a.choice(3), a.chance(0.5), width * 0.27
+    n_rows = 3 + a.choice(3)
+    round_keys = a.chance(0.5)
+    pitch = width * 0.27
     for row in range(n_rows):
         for column in (-1, 0, 1):
             key = cylinder(0.045, 0.04, 0.05) if round_keys else box((0.07, pitch * 0.7, 0.05))

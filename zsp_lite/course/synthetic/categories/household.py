@@ -20,8 +20,13 @@ from zsp_lite.course.synthetic.primitives import (
 def chair(a: Assembly) -> None:
     """Build a chair: back of a panel, slats, rungs or a round frame; legs, swivel base or
     cantilever; optional arms."""
-    width, depth, height = a.u(0.8, 1.2), a.u(0.8, 1.1), a.u(0.6, 1.1)
-    thick, back, leg, lean = a.u(0.06, 0.16), a.u(0.7, 1.3), a.u(0.03, 0.075), a.u(0, 0.3)
+    width = a.u(0.8, 1.2)
+    depth = a.u(0.8, 1.1)
+    height = a.u(0.6, 1.1)
+    thick = a.u(0.06, 0.16)
+    back = a.u(0.7, 1.3)
+    leg = a.u(0.03, 0.075)
+    lean = a.u(0, 0.3)
     seat = (
         rounded_box((depth, width, thick * 1.4), squareness=6)
         if a.chance(0.4)
@@ -50,11 +55,9 @@ def chair(a: Assembly) -> None:
         for share in rungs:
             add_to_back(box((thick * 0.8, width, rung_height), (0, 0, back * share)), 1)
 
-    x, y, base = (
-        depth / 2 - 0.06,
-        width / 2 - 0.06,
-        ("swivel", "cantilever", "legs", "legs")[a.choice(4)],
-    )
+    x = depth / 2 - 0.06
+    y = width / 2 - 0.06
+    base = ("swivel", "cantilever", "legs", "legs")[a.choice(4)]
     if base == "swivel":
         a.add(rod((0, 0, 0.1), (0, 0, height), leg * 1.3), 2)
         for angle in np.arange(5) * TAU / 5 + a.u(0, 1):
@@ -91,11 +94,9 @@ def toilet(a: Assembly) -> None:
     """Build a toilet: bowl at the front, seat, open or closed lid, cistern behind with a button or
     a side lever."""
     # length and width are radii of the bowl
-    length, width, height = (
-        a.u(0.5, 0.66),
-        a.u(0.36, 0.46),
-        a.u(0.6, 0.8),
-    )
+    length = a.u(0.5, 0.66)
+    width = a.u(0.36, 0.46)
+    height = a.u(0.6, 0.8)
     foot, bowl_x = a.u(0.5, 0.75), length * 0.75
     outside = [
         [0.001, 0],
@@ -114,14 +115,18 @@ def toilet(a: Assembly) -> None:
     )
     seat = torus(0.88, 0.14, sides=32).scaled((length, width, 0.5))
     a.add(seat.translated((bowl_x, 0, height + 0.04)), 1)
-    is_open, hinge = a.chance(0.6), (bowl_x - length, 0, height + 0.1)
+    is_open = a.chance(0.6)
+    hinge = (bowl_x - length, 0, height + 0.1)
     lid = ellipsoid((length * 1.02, width * 1.02, 0.04), (length, 0, 0), sides=28)
     a.add(
         lid.rotated("y", -a.u(1.6, 1.85) if is_open else 0).translated(hinge),
         1 if a.chance(0.6) else 2,
     )
-    depth, tank_width, tank_height = a.u(0.28, 0.38), width * a.u(1.7, 2.3), a.u(0.6, 0.9)
-    tank_x, tank_z = hinge[0] - depth / 2 - (0.12 if is_open else 0), height * a.u(0.85, 1.05)
+    depth = a.u(0.28, 0.38)
+    tank_width = width * a.u(1.7, 2.3)
+    tank_height = a.u(0.6, 0.9)
+    tank_x = hinge[0] - depth / 2 - (0.12 if is_open else 0)
+    tank_z = height * a.u(0.85, 1.05)
     top = tank_z + tank_height
     a.add(
         rounded_box(
@@ -146,14 +151,17 @@ def toilet(a: Assembly) -> None:
 def hairdryer(a: Assembly) -> None:
     """Build a hair dryer: barrel, nozzle or diffuser at the front, grille at the back, handle below
     with a switch."""
-    length, radius = a.u(0.9, 1.3), a.u(0.22, 0.34)
+    length = a.u(0.9, 1.3)
+    radius = a.u(0.22, 0.34)
     mouth = radius * a.u(0.55, 0.85)
     rear, front = -length * 0.43, length * 0.57
     back = [[0.001, rear], [radius * 0.7, rear], [radius, -length * 0.3]]
     a.add(lathe([*back, [radius, 0], [mouth, front], [0.001, front]], 24).rotated("y", TAU / 4), 0)
     if a.chance(0.6):
         # A nozzle becomes more or less flat towards its slot.
-        reach, high, wide = a.u(0.15, 0.4), a.u(0.25, 0.8), a.u(0.8, 1.5)
+        reach = a.u(0.15, 0.4)
+        high = a.u(0.25, 0.8)
+        wide = a.u(0.8, 1.5)
         cone = cylinder(mouth, mouth, reach, 20).translated((0, 0, reach / 2))
         share = cone.vertices[:, 2:] / reach
         flat = Mesh(cone.vertices * (1 + share * (np.array([high, wide, 1]) - 1)), cone.faces)
@@ -164,10 +172,8 @@ def hairdryer(a: Assembly) -> None:
         a.add(lathe(bowl, 24).rotated("y", TAU / 4).translated((front, 0, 0)), 1)
     for y in (-0.4, 0, 0.4):
         a.add(box((0.03, 0.05, radius * 1.1), (rear, y * radius, 0)), 3)  # a bar of the grille
-    top, bottom = (
-        np.array([-0.08, 0, -radius * 0.5]),
-        np.array([-0.08 + a.u(-0.25, 0.15), 0, -a.u(0.7, 1.1)]),
-    )
+    top = np.array([-0.08, 0, -radius * 0.5])
+    bottom = np.array([-0.08 + a.u(-0.25, 0.15), 0, -a.u(0.7, 1.1)])
     a.add(capsule(top, bottom, a.u(0.11, 0.16), a.u(0.09, 0.13)), 0 if a.chance(0.5) else 2)
     # the switch
     a.add(box((0.06, 0.1, 0.22), top + (bottom - top) * a.u(0.35, 0.6) + [0.13, 0, 0]), 3)
@@ -177,8 +183,13 @@ def hairdryer(a: Assembly) -> None:
 def toaster(a: Assembly) -> None:
     """Build a toaster: two or four slots; lever, dial and buttons at the front end; nearly
     symmetric otherwise."""
-    length, width, height, feet = a.u(1.0, 1.6), a.u(0.55, 0.85), a.u(0.65, 0.95), a.u(0.03, 0.08)
-    end, top, middle = length / 2, feet + height, feet + height / 2
+    length = a.u(1.0, 1.6)
+    width = a.u(0.55, 0.85)
+    height = a.u(0.65, 0.95)
+    feet = a.u(0.03, 0.08)
+    end = length / 2
+    top = feet + height
+    middle = feet + height / 2
     if a.chance(0.6):
         a.add(rounded_box((length, width, height), (0, 0, middle), a.u(4, 9)), 0)
     else:
@@ -211,7 +222,8 @@ def toaster(a: Assembly) -> None:
         ),
         4,
     )
-    knob_y, knob_z = a.u(0.18, 0.28) * width, feet + height * 0.25
+    knob_y = a.u(0.18, 0.28) * width
+    knob_z = feet + height * 0.25
     a.add(rod((end - 0.03, knob_y, knob_z), (end + 0.07, knob_y, knob_z), a.u(0.06, 0.1)), 5)
     for z in knob_z + height * 0.14 * np.arange(1 + a.choice(3)):
         a.add(rod((end - 0.03, -knob_y, z), (end + 0.04, -knob_y, z), 0.035), 5)  # a button

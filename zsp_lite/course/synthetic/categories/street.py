@@ -26,13 +26,12 @@ from zsp_lite.course.synthetic.primitives import (
 
 def bicycle(a: Assembly) -> None:
     """Build a bicycle: diamond or step-through frame; flat, swept or drop bars; optional basket."""
-    wheel, tyre, tube, half_base = (
-        a.u(0.36, 0.52),
-        a.u(0.022, 0.05),
-        a.u(0.028, 0.048),
-        a.u(0.5, 0.66),
-    )
-    front, rear = np.array([half_base, 0, wheel]), np.array([-half_base, 0, wheel])
+    wheel = a.u(0.36, 0.52)
+    tyre = a.u(0.022, 0.05)
+    tube = a.u(0.028, 0.048)
+    half_base = a.u(0.5, 0.66)
+    front = np.array([half_base, 0, wheel])
+    rear = np.array([-half_base, 0, wheel])
     for hub in (front, rear):
         a.add(torus(wheel - tyre, tyre, Y, hub, sides=32), 3)
         a.add(disc(0.05, 0.16, hub), 2)
@@ -55,7 +54,8 @@ def bicycle(a: Assembly) -> None:
         a.add(rod(rear + [0, 0.05, 0], end, tube * 0.6), 0, mirror=True)
     a.add(ellipsoid((a.u(0.15, 0.24), a.u(0.06, 0.11), 0.05), saddle + [0, 0, 0.05]), 4)
 
-    stem, bars = head + [0.02, 0, a.u(0.08, 0.2)], ("flat", "swept", "drop")[a.choice(3)]
+    stem = head + [0.02, 0, a.u(0.08, 0.2)]
+    bars = ("flat", "swept", "drop")[a.choice(3)]
     a.add(rod(head, stem, tube), 2)
     grip = stem + [0.02, a.u(0.18, 0.28) if bars == "drop" else a.u(0.25, 0.4), a.u(0, 0.12)]
     a.add(rod(stem, grip, 0.024), 3, mirror=True)
@@ -77,9 +77,11 @@ def motorcycle(a: Assembly) -> None:
     """Build a cruiser, a sport motorcycle with a fairing, or a scooter with a leg shield; exhaust
     on the right."""
     style = ("cruiser", "sport", "scooter")[a.choice(3)]
-    wheel, tyre = a.u(0.26, 0.32) if style == "scooter" else a.u(0.36, 0.46), a.u(0.07, 0.11)
+    wheel = a.u(0.26, 0.32) if style == "scooter" else a.u(0.36, 0.46)
+    tyre = a.u(0.07, 0.11)
     half_base = a.u(0.6, 0.72) + (0.1 if style == "cruiser" else 0)
-    front, rear = np.array([half_base, 0, wheel]), np.array([-half_base, 0, wheel])
+    front = np.array([half_base, 0, wheel])
+    rear = np.array([-half_base, 0, wheel])
     for hub, start, stop in ((rear, -1.5, 0.6), (front, -0.8, 0.7)):
         a.add(torus(wheel - tyre, tyre, Y, hub), 3)
         a.add(disc(wheel * 0.62, 0.06, hub), 2)
@@ -131,10 +133,15 @@ def motorcycle(a: Assembly) -> None:
 def car(a: Assembly) -> None:
     """Build a saloon, hatchback, pickup or van: bonnet, cabin with windows, lights, wheels."""
     style = ("saloon", "hatchback", "pickup", "van")[a.choice(4)]
-    length, width, wheel = a.u(2.2, 2.8), a.u(0.95, 1.15), a.u(0.2, 0.27)
+    length = a.u(2.2, 2.8)
+    width = a.u(0.95, 1.15)
+    wheel = a.u(0.2, 0.27)
     nose, tail = length / 2, -length / 2
-    sill, belt = wheel * a.u(0.6, 0.9), wheel * a.u(2.1, 2.5)  # lower and upper edge of the body
-    roof, taper = belt + a.u(0.3, 0.45) + (0.15 if style == "van" else 0), a.u(0.76, 0.88)
+    # lower and upper edge of the body
+    sill = wheel * a.u(0.6, 0.9)
+    belt = wheel * a.u(2.1, 2.5)
+    roof = belt + a.u(0.3, 0.45) + (0.15 if style == "van" else 0)
+    taper = a.u(0.76, 0.88)
     bonnet_end = nose - length * (a.u(0.11, 0.18) if style == "van" else a.u(0.24, 0.31))
     boot_start = tail + length * {"saloon": 0.18, "pickup": 0.43}.get(style, 0.02)
     nose_z = belt - (belt - sill) * a.u(0.15, 0.35)
@@ -167,7 +174,8 @@ def car(a: Assembly) -> None:
         0,
     )
     if style == "pickup":
-        wall, bed = a.u(0.08, 0.18), boot_start - tail
+        wall = a.u(0.08, 0.18)
+        bed = boot_start - tail
         a.add(
             box((bed, 0.06, wall), (tail + bed / 2, width * 0.44, belt + wall / 2)), 0, mirror=True
         )
@@ -189,8 +197,11 @@ def car(a: Assembly) -> None:
 def hydrant(a: Assembly) -> None:
     """Build a hydrant: barrel, flange and bonnet; large outlet at the front, small outlets at the
     sides; chain."""
-    radius, height = a.u(0.24, 0.36), a.u(0.9, 1.35)
-    neck, rim, cap = radius * a.u(0.85, 1), radius * 1.22, height * 0.82
+    radius = a.u(0.24, 0.36)
+    height = a.u(0.9, 1.35)
+    neck = radius * a.u(0.85, 1)
+    rim = radius * 1.22
+    cap = height * 0.82
     foot = [[0.001, 0], [radius * 1.45, 0], [radius * 1.45, 0.09], [radius, 0.11]]
     a.add(
         lathe(
@@ -199,16 +210,15 @@ def hydrant(a: Assembly) -> None:
         0,
     )
     t = np.linspace(0, np.pi / 2, 7)
-    dome, cone = (
-        np.stack([np.cos(t), 0.25 * np.sin(t)], 1),
-        [[1.05, 0], [0.9, 0.14], [0.35, 0.2], [0, 0.22]],
-    )
+    dome = np.stack([np.cos(t), 0.25 * np.sin(t)], 1)
+    cone = [[1.05, 0], [0.9, 0.14], [0.35, 0.2], [0, 0.22]]
     bonnet = np.array(dome if a.chance(0.5) else cone) * [radius, height]
     a.add(lathe(bonnet + [0, cap], 24), 1 if a.chance(0.6) else 0)
     top = cap + bonnet[-1, 1]
     a.add(rod((0, 0, top - 0.04), (0, 0, top + a.u(0.07, 0.14)), 0.07, sides=6), 2)
 
-    outlet, bore = height * a.u(0.5, 0.64), a.u(0.15, 0.21)
+    outlet = height * a.u(0.5, 0.64)
+    bore = a.u(0.15, 0.21)
     large = (outlet, radius + a.u(0.14, 0.26), bore)  # height, reach and radius
     small = (outlet + a.u(-0.03, 0.13), radius + a.u(0.1, 0.2), a.u(0.09, 0.13))
     for turn, (z, reach, pipe) in ((0, large), (TAU / 4, small), (-TAU / 4, small)):

@@ -18,13 +18,16 @@ from zsp_lite.course.synthetic.primitives import (
 def teddybear(a: Assembly) -> None:
     """Build a sitting or standing teddy bear: round or long muzzle, arms raised or hanging,
     optional shirt."""
-    belly, tall, skull = a.u(0.36, 0.55), a.u(0.48, 0.68), a.u(0.32, 0.46)
+    belly = a.u(0.36, 0.55)
+    tall = a.u(0.48, 0.68)
+    skull = a.u(0.32, 0.46)
     standing = a.chance(0.3)
     floor = a.u(0.35, 0.5) if standing else 0.0
     a.add(ellipsoid((belly * 0.85, belly, tall), (0, 0, floor + tall)), 0)
     head = np.array([0.05, 0, floor + tall * 1.85 + skull * 0.68])
     a.add(ellipsoid((skull * 0.9, skull * a.u(0.95, 1.18), skull), head), 0)
-    snout, face = a.u(0.13, 0.26), head + [skull * 0.82, 0, 0]
+    snout = a.u(0.13, 0.26)
+    face = head + [skull * 0.82, 0, 0]
     a.add(ellipsoid((snout, a.u(0.15, 0.21), 0.15), face - [0, 0, 0.09]), 1)
     a.add(ellipsoid((0.06, 0.075, 0.05), face + [snout * 0.92, 0, -0.04]), 3)
     a.add(ellipsoid((0.05, 0.05, 0.06), face + [0, skull * 0.36, skull * 0.22]), 3, mirror=True)
@@ -62,12 +65,18 @@ def teddybear(a: Assembly) -> None:
 def toyplane(a: Assembly) -> None:
     """Build a propeller plane or jet: low, middle, high or double wing, straight or swept; optional
     wheels."""
-    length, radius = a.u(1.6, 2.6), a.u(0.16, 0.32)
-    nose, tail, jet = length / 2, -length / 2, a.chance(0.4)
+    length = a.u(1.6, 2.6)
+    radius = a.u(0.16, 0.32)
+    nose = length / 2
+    tail = -length / 2
+    jet = a.chance(0.4)
     a.add(capsule((tail, 0, 0), (nose - radius, 0, 0), radius * a.u(0.35, 0.7), radius), 0)
-    span, chord, wing_x = a.u(0.8, 1.5), a.u(0.3, 0.6), a.u(-0.1, 0.3)
+    span = a.u(0.8, 1.5)
+    chord = a.u(0.3, 0.6)
+    wing_x = a.u(-0.1, 0.3)
     sweep = a.u(0.25, 0.6) if jet else a.u(-0.05, 0.2)
-    lead, trail = wing_x + chord / 2, wing_x - chord / 2
+    lead = wing_x + chord / 2
+    trail = wing_x - chord / 2
     wing = [
         [lead, 0],
         [lead - sweep, span],
@@ -83,7 +92,8 @@ def toyplane(a: Assembly) -> None:
         for x in (lead - 0.1, trail + 0.1):
             place = np.array([x - sweep * 0.6, span * 0.65, 0])
             a.add(rod(place + [0, 0, wing_z], place + [0, 0, upper], 0.02), 3, mirror=True)
-    fin, stabiliser = a.u(0.3, 0.6), a.u(0.3, 0.55)
+    fin = a.u(0.3, 0.6)
+    stabiliser = a.u(0.3, 0.55)
     a.add(
         extrusion(
             [[tail + 0.35, 0], [tail + 0.05, fin], [tail - 0.12, fin], [tail - 0.02, 0]], 0.06
@@ -98,7 +108,9 @@ def toyplane(a: Assembly) -> None:
         a.add(rod(engine - [0.2, 0, 0], engine + [0.2, 0, 0], 0.08, a.u(0.1, 0.13)), 3, mirror=True)
     else:
         a.add(ellipsoid((0.12, 0.09, 0.09), (nose + 0.05, 0, 0)), 3)
-        blade, turn, n_blades = a.u(0.3, 0.45), a.u(0, np.pi), 2 + a.choice(3)
+        blade = a.u(0.3, 0.45)
+        turn = a.u(0, np.pi)
+        n_blades = 2 + a.choice(3)
         for k in range(n_blades):
             upright = box((0.035, 0.1, blade), (nose + 0.08, 0, blade / 2))
             a.add(upright.rotated("x", turn + k * TAU / n_blades), 5)
@@ -118,21 +130,26 @@ def toyplane(a: Assembly) -> None:
 def toytruck(a: Assembly) -> None:
     """Build a truck: cab over engine or with a bonnet; box, flat bed, tank, tipper or crane
     behind."""
-    length, width, wheel = a.u(1.7, 2.6), a.u(0.7, 1.0), a.u(0.16, 0.28)
-    nose, tail, deck = length / 2, -length / 2, wheel * 1.3
-    cab_length, cab_height, slope = a.u(0.4, 0.65), a.u(0.5, 0.85), a.u(0.04, 0.18)
+    length = a.u(1.7, 2.6)
+    width = a.u(0.7, 1.0)
+    wheel = a.u(0.16, 0.28)
+    nose = length / 2
+    tail = -length / 2
+    deck = wheel * 1.3
+    cab_length = a.u(0.4, 0.65)
+    cab_height = a.u(0.5, 0.85)
+    slope = a.u(0.04, 0.18)
     a.add(box((length, width * 0.8, 0.12), (0, 0, deck)), 2)
     bonnet = a.u(0.25, 0.45) if a.chance(0.5) else 0.0
     if bonnet:
         size = (bonnet * 1.3, width * 0.85, cab_height * 0.55)
         a.add(rounded_box(size, (nose - bonnet * 0.5, 0, deck + cab_height * 0.26), 6), 0)
-    front, roof = nose - bonnet * 0.85, deck + cab_height
+    front = nose - bonnet * 0.85
+    roof = deck + cab_height
     rear = front - cab_length
     # lower and upper edge of the windscreen
-    bend, top = (
-        (front, deck + cab_height * 0.5),
-        (front - slope, roof),
-    )
+    bend = (front, deck + cab_height * 0.5)
+    top = (front - slope, roof)
     a.add(extrusion([(rear, deck + 0.04), (front, deck + 0.04), bend, top, (rear, roof)], width), 0)
     side_window = (cab_length * 0.5, width * 1.02, cab_height * 0.3)
     a.add(box(side_window, (rear + cab_length * 0.48, 0, deck + cab_height * 0.72)), 4)
@@ -145,7 +162,8 @@ def toytruck(a: Assembly) -> None:
     a.add(box((0.06, width * 0.4, cab_height * 0.2), (nose + 0.01, 0, deck + cab_height * 0.27)), 6)
 
     load = rear - 0.05 - tail  # the length behind the cab
-    load_x, style = tail + load / 2, ("box", "tank", "crane", "tipper", "flat bed")[a.choice(5)]
+    load_x = tail + load / 2
+    style = ("box", "tank", "crane", "tipper", "flat bed")[a.choice(5)]
     if style == "box":
         height = a.u(0.6, 1.0)
         a.add(box((load, width * a.u(0.95, 1.1), height), (load_x, 0, deck + 0.08 + height / 2)), 1)
@@ -161,11 +179,10 @@ def toytruck(a: Assembly) -> None:
         a.add(rod(jib, jib - [0, 0, 0.45], 0.02), 3)
     else:
         # A tipper is a flat bed that is tilted about its rear edge.
-        tilt, wall = a.u(0.15, 0.6) if style == "tipper" else 0.0, a.u(0.2, 0.45)
-        bottom, front_wall = (
-            box((load, width, 0.06), (load / 2, 0, 0)),
-            box((0.06, width, wall), (load, 0, wall / 2)),
-        )
+        tilt = a.u(0.15, 0.6) if style == "tipper" else 0.0
+        wall = a.u(0.2, 0.45)
+        bottom = box((load, width, 0.06), (load / 2, 0, 0))
+        front_wall = box((0.06, width, wall), (load, 0, wall / 2))
         side_wall = box((load, 0.06, wall), (load / 2, width / 2, wall / 2))
         for mesh in (bottom, front_wall, side_wall, side_wall.mirrored()):
             a.add(mesh.rotated("y", -tilt).translated((tail, 0, deck + 0.1)), 1)
@@ -178,9 +195,13 @@ def toybus(a: Assembly) -> None:
     """Build a city bus, double-decker or school bus with a bonnet; doors on the right."""
     style = ("city bus", "double-decker", "school bus")[a.choice(3)]
     n_floors = 2 if style == "double-decker" else 1
-    length, width, wheel = a.u(1.9, 2.9), a.u(0.65, 0.9), a.u(0.15, 0.22)
+    length = a.u(1.9, 2.9)
+    width = a.u(0.65, 0.9)
+    wheel = a.u(0.15, 0.22)
     height = a.u(0.65, 0.85) * (1.6 if n_floors == 2 else 1)
-    nose, tail, floor = length / 2, -length / 2, wheel * 0.8
+    nose = length / 2
+    tail = -length / 2
+    floor = wheel * 0.8
     bonnet = a.u(0.3, 0.45) if style == "school bus" else 0.0
     if bonnet:
         size = (bonnet * 1.4, width * 0.8, height * 0.5)
@@ -189,7 +210,8 @@ def toybus(a: Assembly) -> None:
         # the destination sign
         a.add(box((0.05, width * 0.7, height * 0.1), (nose, 0, floor + height * 0.93)), 6)
     front = nose - bonnet
-    body, middle = front - tail, (front + tail) / 2
+    body = front - tail
+    middle = (front + tail) / 2
     a.add(rounded_box((body, width, height), (middle, 0, floor + height / 2), a.u(7, 14)), 0)
     a.add(
         box(
@@ -197,7 +219,8 @@ def toybus(a: Assembly) -> None:
         ),
         1,
     )
-    n_windows, window_height = 4 + a.choice(4), height * (0.2 if n_floors == 2 else 0.3)
+    n_windows = 4 + a.choice(4)
+    window_height = height * (0.2 if n_floors == 2 else 0.3)
     pitch = body * 0.9 / n_windows
     for share in (0.36, 0.78) if n_floors == 2 else (0.66,):
         z = floor + height * share
@@ -219,11 +242,17 @@ def toybus(a: Assembly) -> None:
 
 def toytrain(a: Assembly) -> None:
     """Build a locomotive: steam engine with boiler, chimney and cab, or diesel with a long hood."""
-    length, width, wheel = a.u(1.6, 2.3), a.u(0.6, 0.8), a.u(0.14, 0.24)
-    nose, tail, deck = length / 2, -length / 2, wheel * 1.5
+    length = a.u(1.6, 2.3)
+    width = a.u(0.6, 0.8)
+    wheel = a.u(0.14, 0.24)
+    nose = length / 2
+    tail = -length / 2
+    deck = wheel * 1.5
     a.add(box((length, width * 0.85, 0.12), (0, 0, deck)), 2)
-    cab_length, cab_height = length * a.u(0.22, 0.34), a.u(0.65, 0.95)
-    cab_x, floor = tail + cab_length / 2 + 0.04, deck + 0.06
+    cab_length = length * a.u(0.22, 0.34)
+    cab_height = a.u(0.65, 0.95)
+    cab_x = tail + cab_length / 2 + 0.04
+    floor = deck + 0.06
     a.add(box((cab_length, width, cab_height), (cab_x, 0, floor + cab_height / 2)), 0)
     a.add(
         box(
@@ -237,20 +266,25 @@ def toytrain(a: Assembly) -> None:
         ),
         1,
     )
-    rear, front = tail + cab_length, nose - 0.06  # of the hood
+    # of the hood
+    rear = tail + cab_length
+    front = nose - 0.06
     if a.chance(0.7):
         radius = width * a.u(0.34, 0.46)
-        boiler, top = floor + radius, floor + radius * 1.9
+        boiler = floor + radius
+        top = floor + radius * 1.9
         a.add(rod((rear, 0, boiler), (front, 0, boiler), radius, sides=24), 0)
         a.add(rod((front, 0, boiler), (front + 0.05, 0, boiler), radius * 0.86, sides=24), 6)
-        chimney, mouth = a.u(0.2, 0.45), a.u(0.08, 0.18)
+        chimney = a.u(0.2, 0.45)
+        mouth = a.u(0.08, 0.18)
         # Its ends are closed; the radius 0 would give triangles without an area.
         profile = [[0.001, 0], [0.09, 0], [0.09, chimney * 0.6], [mouth, chimney], [0.001, chimney]]
         a.add(lathe(profile).translated((front - 0.2, 0, top)), 3)
         a.add(ellipsoid((0.13, 0.13, a.u(0.12, 0.2)), (rear + (front - rear) * 0.42, 0, top)), 7)
         a.add(rod((front, 0, boiler), (front + 0.15, 0, boiler), 0.08, 0.1), 5)
     else:
-        hood_width, hood_height = width * a.u(0.7, 0.95), cab_height * a.u(0.55, 0.8)
+        hood_width = width * a.u(0.7, 0.95)
+        hood_height = cab_height * a.u(0.55, 0.8)
         middle = (rear + front) / 2
         a.add(
             rounded_box(
