@@ -1,7 +1,7 @@
 """Procedural objects: meshes composed of primitives, parts of several, and random materials."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -40,6 +40,10 @@ class Assembly:
     def choice(self, n: int) -> int:
         """Draw uniformly from 0 .. n - 1."""
         return int(self.rng.integers(n))
+
+    def pick(self, *options: Any) -> Any:
+        """Draw one of the options."""
+        return options[self.choice(len(options))]
 
     def add(self, mesh: Mesh, material: int, mirror: bool = False) -> None:
         """Add a part of material 0 .. 7; with `mirror`, also its image in the plane y = 0."""

@@ -60,12 +60,19 @@ def joined(meshes: Sequence[Mesh]) -> tuple[Float[np.ndarray, "v 3"], Int[np.nda
 
 def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
     """Return the standard deviation of the surface's points, averaged over the three axes."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
     # Each face counts as its middle, weighted by its (twofold) area.
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)[:, None]
-    middle = (a + b + c) / 3
+    area = np.linalg.norm(area_normals(vertices, faces), axis=1, keepdims=True)
+    middle = vertices[faces].sum(1) / 3
     mean = (middle * area).sum(0) / area.sum()
     return float(np.sqrt(((middle - mean) ** 2 * area).sum(0) / area.sum()).mean())
+
+
+def area_normals(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "f 3"]:
+    """Return the normals of faces, with twice their areas as lengths."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    return np.cross(b - a, c - a)
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:

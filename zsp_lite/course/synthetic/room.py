@@ -21,6 +21,10 @@ from zsp_lite.course.synthetic.textures import (
     surface_albedo,
 )
 
+# A row per point or ray.
+Vectors = Float[np.ndarray, "n 3"]
+Values = Float[np.ndarray, " n"]
+
 FLOOR_REACH = 25.0  # distance in units up to which the floor has depth
 # indices among the faces of a room; those below 4 are the walls
 _FLOOR = 4
@@ -73,9 +77,10 @@ class CheapCamera:
 class Room:
     """A box around objects, and the light on them.
 
-    The origin of all points is on the floor below the object. `images` are those of the faces -x, +x, -y, +y, floor, ceiling: an albedo of the floor, else
-    radiances. The rows of a wall run down, those of floor and ceiling along y; the columns run
-    along y on the first two walls, else along x.
+    The origin of all points is on the floor below the object. `images` are those of the faces -x,
+    +x, -y, +y, floor, ceiling: an albedo of the floor, else radiances. The rows of a wall run down,
+    those of floor and ceiling along y; the columns run along y on the first two walls, else along
+    x.
     """
 
     low: Float[np.ndarray, "3"]  # corners of the box; low[2] is 0
@@ -99,15 +104,13 @@ class Room:
         opposite = faces.reshape(3, 2, 3)[:, ::-1].reshape(6, 3)
         self._irradiance = (faces + (faces.sum(0) - faces - opposite) / 4) / 2
 
-    def irradiance(self, normal: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def irradiance(self, normal: Vectors) -> Vectors:
         """Return the irradiance from the room, without its key light, where nothing blocks it."""
         # the face that the normal points to along each axis; the squares of a unit vector sum to 1
         face = 2 * np.arange(3) + (normal > 0)
         return np.einsum("nf,nfc->nc", normal**2, self._irradiance[face])
 
-    def reflection(
-        self, rays: Float[np.ndarray, "n 3"], roughness: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, "n 3"]:
+    def reflection(self, rays: Vectors, roughness: Values) -> Vectors:
         """Return the radiance that an object receives from rays, blurred by its roughness."""
         radiance, reach = self.radiance(_MIDDLE, rays, roughness)
         floor = np.flatnonzero(reach)
@@ -118,9 +121,9 @@ class Room:
     def radiance(
         self,
         eye: Float[np.ndarray, "3"],
-        rays: Float[np.ndarray, "n 3"],
-        blur: float | Float[np.ndarray, " n"],
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+        rays: Vectors,
+        blur: float | Values,
+    ) -> tuple[Vectors, Values]:
         """Return the room's radiance along rays, of the floor its albedo; and the floor's reach.
 
         Each ray covers the angle `blur`, in radians; the reach is its parameter on the floor, 0
@@ -152,9 +155,7 @@ class Room:
             radiance[on] = sample_pyramid(image, u, v, width[on] * density, cv2.BORDER_REPLICATE)
         return radiance, np.where(face == _FLOOR, nearest, 0)
 
-    def on_the_floor(
-        self, key: Float[np.ndarray, " n"], around: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, "n 3"]:
+    def on_the_floor(self, key: Values, around: Values) -> Vectors:
         """Return the irradiance of the floor from the visible shares of key light and room."""
         direct = max(float(self.light[2]), 0) * self.light_colour.astype(np.float32)
         return key[:, None] * direct + around[:, None] * self._ambient

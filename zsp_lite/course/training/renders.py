@@ -157,7 +157,7 @@ def build_random_object(a: Assembly) -> None:
     nodes = [(np.zeros(3), np.array([a.u(0.5, 1.3), a.u(0.4, 1.0), a.u(0.4, 1.2)]))]
     a.add(_random_solid(a, nodes[0][1]), a.choice(5))
     for _ in range(4 + a.choice(6)):
-        parent, parent_size = nodes[a.choice(len(nodes))]
+        parent, parent_size = a.pick(*nodes)
         direction = a.rng.normal(size=3)
         size = a.rng.uniform(0.12, 0.8, 3) * a.u(0.5, 1.0)
         centre = parent + direction / np.abs(direction).max() * (parent_size * 0.4 + size * 0.3)
@@ -179,8 +179,8 @@ def _random_solid(a: Assembly, size: np.ndarray) -> Mesh:
         ellipsoid((0.55, 0.55, 0.55)),
         cylinder(0.5, 0.5 * a.u(0.3, 1), 1.0),
         capsule((-0.25, 0, 0), (0.25, 0, 0), 0.25).scaled((1, 2, 2)),
-        torus(0.36, 0.12, np.eye(3)[a.choice(3)]),
-        extrusion(outline, a.u(0.1, 0.9), ("xz", "xy", "yz")[a.choice(3)]),
+        torus(0.36, 0.12, a.pick(*np.eye(3))),
+        extrusion(outline, a.u(0.1, 0.9), a.pick("xz", "xy", "yz")),
     )
-    mesh = solids[a.choice(len(solids))].scaled(size)
+    mesh = a.pick(*solids).scaled(size)
     return mesh.rotated("y", a.u(-0.8, 0.8)) if a.chance(0.4) else mesh

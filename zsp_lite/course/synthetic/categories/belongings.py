@@ -79,7 +79,7 @@ def handbag(a: Assembly) -> None:
     depth = a.u(0.3, 0.5)
     width = a.u(1.0, 1.5)
     height = a.u(0.7, 1.1)
-    style = ("tote", "flap bag", "bowling bag")[a.choice(3)]
+    style = a.pick("tote", "flap bag", "bowling bag")
     narrowing = a.u(1.0, 1.2) if style == "tote" else a.u(0.65, 0.95)
     body = rounded_box(
         (depth, width, height), (0, 0, height / 2), 8 if style == "tote" else a.u(3, 5)

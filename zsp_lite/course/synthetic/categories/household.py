@@ -41,7 +41,7 @@ def chair(a: Assembly) -> None:
             mirror,
         )
 
-    style = ("panel", "round", "slats", "rungs")[a.choice(4)]
+    style = a.pick("panel", "round", "slats", "rungs")
     if style == "panel":
         add_to_back(box((thick, width * a.u(0.8, 1), back), (0, 0, back / 2)), 1)
     elif style == "round":
@@ -57,7 +57,7 @@ def chair(a: Assembly) -> None:
 
     x = depth / 2 - 0.06
     y = width / 2 - 0.06
-    base = ("swivel", "cantilever", "legs", "legs")[a.choice(4)]
+    base = a.pick("swivel", "cantilever", "legs", "legs")
     if base == "swivel":
         a.add(rod((0, 0, 0.1), (0, 0, height), leg * 1.3), 2)
         for angle in np.arange(5) * TAU / 5 + a.u(0, 1):

@@ -55,7 +55,7 @@ def bicycle(a: Assembly) -> None:
     a.add(ellipsoid((a.u(0.15, 0.24), a.u(0.06, 0.11), 0.05), saddle + [0, 0, 0.05]), 4)
 
     stem = head + [0.02, 0, a.u(0.08, 0.2)]
-    bars = ("flat", "swept", "drop")[a.choice(3)]
+    bars = a.pick("flat", "swept", "drop")
     a.add(rod(head, stem, tube), 2)
     grip = stem + [0.02, a.u(0.18, 0.28) if bars == "drop" else a.u(0.25, 0.4), a.u(0, 0.12)]
     a.add(rod(stem, grip, 0.024), 3, mirror=True)
@@ -76,7 +76,7 @@ def bicycle(a: Assembly) -> None:
 def motorcycle(a: Assembly) -> None:
     """Build a cruiser, a sport motorcycle with a fairing, or a scooter with a leg shield; exhaust
     on the right."""
-    style = ("cruiser", "sport", "scooter")[a.choice(3)]
+    style = a.pick("cruiser", "sport", "scooter")
     wheel = a.u(0.26, 0.32) if style == "scooter" else a.u(0.36, 0.46)
     tyre = a.u(0.07, 0.11)
     half_base = a.u(0.6, 0.72) + (0.1 if style == "cruiser" else 0)
@@ -132,7 +132,7 @@ def motorcycle(a: Assembly) -> None:
 
 def car(a: Assembly) -> None:
     """Build a saloon, hatchback, pickup or van: bonnet, cabin with windows, lights, wheels."""
-    style = ("saloon", "hatchback", "pickup", "van")[a.choice(4)]
+    style = a.pick("saloon", "hatchback", "pickup", "van")
     length = a.u(2.2, 2.8)
     width = a.u(0.95, 1.15)
     wheel = a.u(0.2, 0.27)

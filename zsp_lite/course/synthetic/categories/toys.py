@@ -163,7 +163,7 @@ def toytruck(a: Assembly) -> None:
 
     load = rear - 0.05 - tail  # the length behind the cab
     load_x = tail + load / 2
-    style = ("box", "tank", "crane", "tipper", "flat bed")[a.choice(5)]
+    style = a.pick("box", "tank", "crane", "tipper", "flat bed")
     if style == "box":
         height = a.u(0.6, 1.0)
         a.add(box((load, width * a.u(0.95, 1.1), height), (load_x, 0, deck + 0.08 + height / 2)), 1)
@@ -193,7 +193,7 @@ def toytruck(a: Assembly) -> None:
 
 def toybus(a: Assembly) -> None:
     """Build a city bus, double-decker or school bus with a bonnet; doors on the right."""
-    style = ("city bus", "double-decker", "school bus")[a.choice(3)]
+    style = a.pick("city bus", "double-decker", "school bus")
     n_floors = 2 if style == "double-decker" else 1
     length = a.u(1.9, 2.9)
     width = a.u(0.65, 0.9)
