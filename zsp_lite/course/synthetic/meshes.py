@@ -73,15 +73,21 @@ class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
 
     def axes(self, extension: str) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from the file's axes to the canonical: front +x, left +y, up +z."""
-        # What the list of models does not name is as usual in STL, or as in glTF.
+        # What `models.json` does not name is as usual in STL, or as in glTF.
         front, up = ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")
         front = self.front or front
         up = self.up or up
-        given = [_AXES[one] if isinstance(one, str) else np.array(one) for one in (front, up)]
-        x, z = (vector / max(np.linalg.norm(vector), 1e-6) for vector in given)
+        x = _unit_vector(front)
+        z = _unit_vector(up)
         return rotation_matrix(
             f"front {front} and up {up}: the axes", np.stack([x, np.cross(z, x), z])
         )
+
+
+def _unit_vector(direction: _Direction) -> Float[np.ndarray, "3"]:
+    """Return a direction in the axes of a file as a vector."""
+    vector = _AXES[direction] if isinstance(direction, str) else np.array(direction)
+    return vector / max(np.linalg.norm(vector), 1e-6)
 
 
 @dataclass(frozen=True)
@@ -107,7 +113,8 @@ def list_models(folder: str | Path, front: str | None = None, up: str | None = N
         InputError: if there is no model, two files of one model, or an entry without a file.
     """
     folder = Path(folder)
-    infos, models = read_infos(folder), {}
+    infos = read_infos(folder)
+    models = {}
     files = [(path.parent.name, path.stem, path) for path in folder.glob("*/*")]
     files += [(path.parts[-3], path.parts[-2], path) for path in folder.glob("*/*/*")]
     for category, name, path in sorted(files):
@@ -122,13 +129,12 @@ def list_models(folder: str | Path, front: str | None = None, up: str | None = N
         info = msgspec.structs.replace(info, front=info.front or front, up=info.up or up)
         models[key] = Model(plain_name(category, "category"), plain_name(name, "model"), path, info)
     if not models:
-        kinds = (
-            f"CATEGORY/NAME.EXT or CATEGORY/NAME/FILE.EXT with EXT one of {', '.join(EXTENSIONS)}"
-        )
+        problem = "holds no model" if folder.is_dir() else "does not exist"
         raise InputError(
-            f"{folder} {'holds no model' if folder.is_dir() else 'does not exist'}, expected "
-            f"{kinds}"
+            f"{folder} {problem}, expected CATEGORY/NAME.EXT or CATEGORY/NAME/FILE.EXT with EXT "
+            f"one of {', '.join(EXTENSIONS)}"
         )
+    # The entries of the models that were found are taken out above.
     if infos:
         raise InputError(
             f"{folder / MODELS_FILE} names {min(infos)!r}, which has no file in {folder}"

@@ -15,7 +15,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 from zsp_lite.course.synthetic.meshes import TexturedMesh
 from zsp_lite.course.synthetic.primitives import area_normals, unit
 from zsp_lite.course.synthetic.room import FLOOR_REACH, Room, Values, Vectors
-from zsp_lite.course.synthetic.textures import pyramid, sample_image, sample_pyramid, srgb_to_linear
+from zsp_lite.course.synthetic.textures import (
+    Image,
+    pyramid,
+    sample_image,
+    sample_pyramid,
+    srgb_to_linear,
+)
 from zsp_lite.data.cameras import Camera
 from zsp_lite.io.ply import load_open3d
 
@@ -37,9 +43,9 @@ class Rendering:
     # z in the camera frame, 0 where the ray hits neither the object nor the floor
     depth: Float[np.ndarray, "h w"]
     mask: Bool[np.ndarray, "h w"]  # pixels of the object
-    canonical: Float[np.ndarray, "h w 3"]  # object coordinates of each object pixel, NaN elsewhere
+    canonical: Image  # object coordinates of each object pixel, NaN elsewhere
     # unit normals of the object pixels in the camera frame, 0 elsewhere
-    normals: Float[np.ndarray, "h w 3"]
+    normals: Image
     camera: Camera
 
 
@@ -180,9 +186,7 @@ class MeshScene:
         blocked = np.bincount(self._cast(point[:, None], directions).ray // k, minlength=n)
         return 1 - blocked.astype(np.float32) / np.float32(k)
 
-    def _shade(
-        self, camera: Camera, rays: Float[np.ndarray, "h w 3"], hits: _Hits
-    ) -> Float[np.ndarray, "h w 4"]:
+    def _shade(self, camera: Camera, rays: Image, hits: _Hits) -> Float[np.ndarray, "h w 4"]:
         """Return the object's radiance along rays, multiplied by its opacity; and the opacity."""
         size = rays.shape[:2]
         rays = rays.reshape(-1, 3)[hits.ray]
@@ -304,9 +308,7 @@ class MeshScene:
         around = cv2.GaussianBlur(around, (0, 0), 2.0)
         return np.dstack([key, around]), width
 
-    def _background(
-        self, camera: Camera, rays: Float[np.ndarray, "h w 3"]
-    ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+    def _background(self, camera: Camera, rays: Image) -> tuple[Image, Float[np.ndarray, "h w"]]:
         """Return the room's radiance with the shadow of the object, and the depth of the floor."""
         eye = camera.centre - self.origin
         flat_rays = rays.reshape(-1, 3)
@@ -320,7 +322,7 @@ class MeshScene:
         return radiance.reshape(rays.shape), depth.reshape(rays.shape[:2])
 
 
-def _pixel_rays(camera: Camera, n: int) -> Float[np.ndarray, "h w 3"]:
+def _pixel_rays(camera: Camera, n: int) -> Image:
     """Return rays of unit z in the camera frame through n x n points of each pixel."""
     height, width = camera.size
     x = ((np.arange(width * n) + 0.5) / n - camera.principal_point[0]) / camera.focal_length[0]

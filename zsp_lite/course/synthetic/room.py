@@ -12,6 +12,8 @@ from jaxtyping import Float, UInt8
 
 from zsp_lite.course.synthetic.primitives import direction
 from zsp_lite.course.synthetic.textures import (
+    Colour,
+    Image,
     blur,
     linear_to_srgb,
     pyramid,
@@ -21,6 +23,7 @@ from zsp_lite.course.synthetic.textures import (
     surface_albedo,
 )
 
+Vector = Float[np.ndarray, "3"]
 # A row per point or ray.
 Vectors = Float[np.ndarray, "n 3"]
 Values = Float[np.ndarray, " n"]
@@ -44,7 +47,7 @@ class CheapCamera:
     noise: float = 0.01  # standard deviation at mid-grey, relative to white
     vignetting: float = 0.1  # loss of light in the corners, as a fraction
 
-    def exposure_gain(self, radiance: Float[np.ndarray, "h w 3"]) -> float:
+    def exposure_gain(self, radiance: Image) -> float:
         """Return the factor of automatic exposure, which bright windows affect little."""
         luminance = radiance @ np.float32([0.2126, 0.7152, 0.0722])  # weights of ITU-R BT.709
         median = np.median(luminance)
@@ -52,7 +55,7 @@ class CheapCamera:
         return float(2 * self.exposure / max(median + mean, 1e-6))
 
     def develop(
-        self, radiance: Float[np.ndarray, "h w 3"], gain: float, rng: np.random.Generator
+        self, radiance: Image, gain: float, rng: np.random.Generator
     ) -> UInt8[np.ndarray, "h w 3"]:
         """Return the 8-bit picture of linear radiance; `gain` is that of `exposure_gain`."""
         height, width = radiance.shape[:2]
@@ -83,12 +86,12 @@ class Room:
     x.
     """
 
-    low: Float[np.ndarray, "3"]  # corners of the box; low[2] is 0
-    high: Float[np.ndarray, "3"]
+    low: Vector  # corners of the box; low[2] is 0
+    high: Vector
     images: tuple[np.ndarray, ...]
-    light: Float[np.ndarray, "3"]  # unit vector towards the key light
+    light: Vector  # unit vector towards the key light
     light_radius: float  # angular radius of the key light in radians
-    light_colour: Float[np.ndarray, "3"]  # irradiance of the key light on a surface that faces it
+    light_colour: Colour  # irradiance of the key light on a surface that faces it
     camera: CheapCamera
 
     def __post_init__(self):
@@ -120,7 +123,7 @@ class Room:
 
     def radiance(
         self,
-        eye: Float[np.ndarray, "3"],
+        eye: Vector,
         rays: Vectors,
         blur: float | Values,
     ) -> tuple[Vectors, Values]:
@@ -210,9 +213,7 @@ def _floor(rng: np.random.Generator) -> Float[np.ndarray, "n n 3"]:
     return floor
 
 
-def _wall(
-    rng: np.random.Generator, width: float, height: float, colour: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "h w 3"]:
+def _wall(rng: np.random.Generator, width: float, height: float, colour: Colour) -> Image:
     """Return the radiance of a wall with rectangles: furniture, pictures, windows."""
     rows = round(height * _WALL_DENSITY)
     cols = round(width * _WALL_DENSITY)

@@ -6,6 +6,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+Colour = Float[np.ndarray, "3"]
+# A colour, vector or point per pixel.
+Image = Float[np.ndarray, "h w 3"]
+
 _FOLD = 4096  # points per row of OpenCV's maps, whose sides are limited to 32,767
 _JOINT = 3  # pixels between boards or tiles
 # Layers of grain, fine to cloudy: width in pixels and amount.
@@ -29,7 +33,7 @@ def linear_to_srgb(colour: np.ndarray) -> np.ndarray:
     )
 
 
-def hsv(hue: float, saturation: float, value: float) -> Float[np.ndarray, "3"]:
+def hsv(hue: float, saturation: float, value: float) -> Colour:
     """Return an sRGB colour from its hue in degrees, its saturation and its value."""
     # Each channel has a cycle of six: lowest from 1 to 3, full from 4 to 6, linear in between.
     # The offsets put 5, the middle of the full part, at 0 degrees (red), 120 (green), 240 (blue).
@@ -42,7 +46,7 @@ def random_colour(
     hue: tuple[float, float],
     saturation: tuple[float, float],
     value: tuple[float, float],
-) -> Float[np.ndarray, "3"]:
+) -> Colour:
     """Draw an sRGB colour from ranges of the arguments of `hsv`."""
     return hsv(rng.uniform(*hue), rng.uniform(*saturation), rng.uniform(*value))
 
@@ -74,10 +78,10 @@ def smooth_noise(
 def surface_albedo(
     rng: np.random.Generator,
     size: tuple[int, int],
-    colour: Float[np.ndarray, "3"],
+    colour: Colour,
     grain: float,
     tiled: bool = False,
-) -> Float[np.ndarray, "h w 3"]:
+) -> Image:
     """Return the albedo of a surface of an sRGB colour with grain; `tiled` for boards or tiles."""
     stretch = 1.0
     brightness = np.ones(size, np.float32)
