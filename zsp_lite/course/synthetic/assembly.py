@@ -5,10 +5,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from zsp_lite.course.synthetic.meshes import Material, TexturedMesh, smooth_normals
-from zsp_lite.course.synthetic.primitives import Mesh, cylinder, extrusion, joined, surface_spread
+from zsp_lite.course.synthetic.primitives import (
+    Coordinates,
+    Mesh,
+    cylinder,
+    extrusion,
+    joined,
+    surface_spread,
+)
 from zsp_lite.course.synthetic.textures import random_colour
 
 Y = (0.0, 1.0, 0.0)
@@ -74,7 +80,9 @@ def make_shape(
     return TexturedMesh(vertices, faces, smooth_normals(vertices, faces), uv, white, material)
 
 
-def rounded_box(size: ArrayLike, centre: ArrayLike = (0, 0, 0), squareness: float = 5.0) -> Mesh:
+def rounded_box(
+    size: Coordinates, centre: Coordinates = (0, 0, 0), squareness: float = 5.0
+) -> Mesh:
     """Return a superellipsoid of the given size (3,).
 
     Squareness 2 gives an ellipsoid, 10 nearly a box.
@@ -104,7 +112,7 @@ def tapered(mesh: Mesh, low: float, high: float, factor: float) -> Mesh:
     return Mesh(vertices, mesh.faces)
 
 
-def pane(start: ArrayLike, end: ArrayLike, width: float, thickness: float = 0.04) -> Mesh:
+def pane(start: Coordinates, end: Coordinates, width: float, thickness: float = 0.04) -> Mesh:
     """Return a slab between two points (x, z), for example a windscreen; the width is along y."""
     start = np.asarray(start, float)
     end = np.asarray(end, float)
@@ -114,7 +122,7 @@ def pane(start: ArrayLike, end: ArrayLike, width: float, thickness: float = 0.04
     return extrusion([start - across, end - across, end + across, start + across], width)
 
 
-def disc(radius: float, thickness: float, centre: ArrayLike) -> Mesh:
+def disc(radius: float, thickness: float, centre: Coordinates) -> Mesh:
     """Return a disc at `centre` whose axis is y, for example a wheel."""
     return cylinder(radius, radius, thickness, 22).rotated("x", np.pi / 2).translated(centre)
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
 TAU = 2 * np.pi
+Coordinates = Sequence | np.ndarray  # of a point (3,), or of the points of an outline (n, 2)
 # Radius where a lathe's profile meets the axis; zero would give triangles without an area.
 _ON_AXIS = 1e-4
 # axes of the outline, and that of the thickness
@@ -25,11 +25,11 @@ class Mesh:
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
 
-    def translated(self, offset: ArrayLike) -> "Mesh":
+    def translated(self, offset: Coordinates) -> "Mesh":
         """Return the mesh shifted by `offset` (3,)."""
         return Mesh(self.vertices + np.asarray(offset, float), self.faces)
 
-    def scaled(self, factors: ArrayLike) -> "Mesh":
+    def scaled(self, factors: float | Coordinates) -> "Mesh":
         """Return the mesh scaled about the origin by `factors`, one number or (3,)."""
         return Mesh(self.vertices * np.asarray(factors, float), self.faces)
 
@@ -37,7 +37,7 @@ class Mesh:
         """Return the mesh turned about an axis through the origin, see `rotation`."""
         return Mesh(self.vertices @ rotation(axis, angle).T, self.faces)
 
-    def pointing(self, direction: ArrayLike) -> "Mesh":
+    def pointing(self, direction: Coordinates) -> "Mesh":
         """Return the mesh rotated so that its z axis points along `direction` (3,)."""
         z = np.asarray(direction, float) / np.linalg.norm(direction)
         # any direction that is not nearly parallel to z gives an x
@@ -98,7 +98,7 @@ def direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
     return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
 
 
-def box(size: ArrayLike, centre: ArrayLike = (0, 0, 0)) -> Mesh:
+def box(size: Coordinates, centre: Coordinates = (0, 0, 0)) -> Mesh:
     """Return an axis-aligned box of the given size (3,)."""
     # corner 4 i + 2 j + k is on the side i of x, j of y, k of z
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -110,7 +110,7 @@ def box(size: ArrayLike, centre: ArrayLike = (0, 0, 0)) -> Mesh:
     return Mesh(corners, faces).scaled(size).translated(centre)
 
 
-def lathe(profile: ArrayLike, sides: int = 20, start: float = 0.0, stop: float = TAU) -> Mesh:
+def lathe(profile: Coordinates, sides: int = 20, start: float = 0.0, stop: float = TAU) -> Mesh:
     """Revolve a profile (n, 2) of radii and heights about z, upwards for normals that point out."""
     profile = np.asarray(profile, float)
     closed = np.isclose(stop - start, TAU)
@@ -134,7 +134,7 @@ def cylinder(bottom: float, top: float, height: float, sides: int = 18) -> Mesh:
     return lathe([[_ON_AXIS, low], [bottom, low], [top, high], [_ON_AXIS, high]], sides)
 
 
-def ellipsoid(radii: ArrayLike, centre: ArrayLike = (0, 0, 0), sides: int = 18) -> Mesh:
+def ellipsoid(radii: Coordinates, centre: Coordinates = (0, 0, 0), sides: int = 18) -> Mesh:
     """Return an axis-aligned ellipsoid with the given radii (3,)."""
     t = np.linspace(-np.pi / 2, np.pi / 2, 12)  # from pole to pole, whose radius is not quite 0
     sphere = lathe(np.stack([np.cos(t) + 1e-5, np.sin(t)], 1), sides)
@@ -142,8 +142,8 @@ def ellipsoid(radii: ArrayLike, centre: ArrayLike = (0, 0, 0), sides: int = 18) 
 
 
 def rod(
-    start: ArrayLike,
-    end: ArrayLike,
+    start: Coordinates,
+    end: Coordinates,
     radius: float,
     end_radius: float | None = None,
     sides: int = 12,
@@ -155,7 +155,7 @@ def rod(
 
 
 def capsule(
-    start: ArrayLike, end: ArrayLike, radius: float, end_radius: float | None = None
+    start: Coordinates, end: Coordinates, radius: float, end_radius: float | None = None
 ) -> Mesh:
     """Return a rod from `start` (3,) to `end` (3,) with hemispherical ends."""
     along = np.subtract(end, start)
@@ -171,8 +171,8 @@ def capsule(
 def torus(
     major: float,
     minor: float,
-    axis: ArrayLike = (0, 0, 1),
-    centre: ArrayLike = (0, 0, 0),
+    axis: Coordinates = (0, 0, 1),
+    centre: Coordinates = (0, 0, 0),
     start: float = 0.0,
     stop: float = TAU,
     sides: int = 24,
@@ -183,7 +183,9 @@ def torus(
     return lathe(tube, sides, start, stop).pointing(axis).translated(centre)
 
 
-def extrusion(outline: ArrayLike, thickness: float, plane: str = "xz", offset: float = 0.0) -> Mesh:
+def extrusion(
+    outline: Coordinates, thickness: float, plane: str = "xz", offset: float = 0.0
+) -> Mesh:
     """Return a slab at `offset` from the plane "xz", "xy" or "yz", with an outline (n, 2) in it.
 
     The outline is star-shaped about its mean.

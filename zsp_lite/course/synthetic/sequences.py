@@ -11,10 +11,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from numpy.typing import ArrayLike
 
 from zsp_lite.course.synthetic.meshes import TexturedMesh
-from zsp_lite.course.synthetic.primitives import TAU, direction, rotation
+from zsp_lite.course.synthetic.primitives import TAU, Coordinates, direction, rotation
 from zsp_lite.course.synthetic.raytracing import MeshScene, Rendering
 from zsp_lite.course.synthetic.room import random_room
 from zsp_lite.course.synthetic.textures import blur, smooth_noise
@@ -37,7 +36,7 @@ _SCORES = (1.3, 3.0), (0.35, 1.0), (0.4, 2.5)
 
 
 def orbit_pose(
-    azimuth: float, elevation: float, roll: float, distance: float, target: ArrayLike
+    azimuth: float, elevation: float, roll: float, distance: float, target: Coordinates
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """Return R and t, world to camera, of a camera that looks at `target` (3,); angles in radians.
 

@@ -86,7 +86,7 @@ def surface_albedo(
     stretch = 1.0
     brightness = np.ones(size, np.float32)
     if tiled:
-        tile = rng.integers(40, 160)  # pixels
+        tile = int(rng.integers(40, 160))  # pixels
         board = int(tile * rng.choice([1, 4, 10]))
         # boards have the grain of wood, along the rows
         stretch = 1.0 if board == tile else 12.0

@@ -12,12 +12,12 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from numpy.typing import ArrayLike
 
 from zsp_lite.course.synthetic.assembly import Assembly, make_shape, random_materials
 from zsp_lite.course.synthetic.meshes import TexturedMesh
 from zsp_lite.course.synthetic.primitives import (
     TAU,
+    Coordinates,
     Mesh,
     box,
     capsule,
@@ -115,7 +115,7 @@ def framed_camera(
     t: np.ndarray,
     size: int,
     margin: float = 1.1,
-    shift: ArrayLike = (0, 0),
+    shift: Coordinates = (0, 0),
 ) -> Camera:
     """Return a camera whose image frames an object.
 
