@@ -60,6 +60,10 @@ class Assembly:
         if mirror:
             self.add(mesh.mirrored(), material)
 
+    def add_pair(self, mesh: Mesh, material: int) -> None:
+        """Add a part and its mirror image in the plane y = 0."""
+        self.add(mesh, material, mirror=True)
+
 
 Builder = Callable[[Assembly], None]  # adds the parts of one random object of a category
 
@@ -131,8 +135,8 @@ def disc(radius: float, thickness: float, centre: Coordinates) -> Mesh:
 
 def add_wheels(a: Assembly, x: float, y: float, radius: float, width: float) -> None:
     """Add the two wheels of an axle at x, standing on the ground at y and -y."""
-    a.add(disc(radius, width, (x, y, radius)), 3, mirror=True)
-    a.add(disc(radius * 0.6, width * 1.2, (x, y, radius)), 2, mirror=True)
+    a.add_pair(disc(radius, width, (x, y, radius)), 3)
+    a.add_pair(disc(radius * 0.6, width * 1.2, (x, y, radius)), 2)
 
 
 class _Kind(NamedTuple):

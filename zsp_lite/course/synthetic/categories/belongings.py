@@ -45,7 +45,7 @@ def backpack(a: Assembly) -> None:
         flap = rounded_box(flap, (depth * 0.08, 0, height * 0.92), 4)
         a.add(tapered(flap, height / 2, height, narrowing), 2)
         belt = box((0.04, 0.1, height * 0.38), (depth * 0.6, width * 0.2, height * 0.66))
-        a.add(belt, 3, mirror=True)
+        a.add_pair(belt, 3)
     else:
         upper_pocket = (depth * 0.4, width * 0.6, height * a.u(0.18, 0.26))
         a.add(rounded_box(upper_pocket, (depth * 0.38, 0, height * 0.74), 4), 2)
@@ -55,11 +55,11 @@ def backpack(a: Assembly) -> None:
     strap_y = width * a.u(0.22, 0.3)
     bulge = a.u(0.12, 0.22)
     bend = (back - bulge, strap_y, height * 0.7)
-    a.add(capsule((back + 0.02, strap_y * 0.8, height * 0.93), bend, 0.05), 4, mirror=True)
-    a.add(capsule(bend, (back + 0.02, strap_y * 1.35, height * 0.12), 0.05), 4, mirror=True)
+    a.add_pair(capsule((back + 0.02, strap_y * 0.8, height * 0.93), bend, 0.05), 4)
+    a.add_pair(capsule(bend, (back + 0.02, strap_y * 1.35, height * 0.12), 0.05), 4)
     if a.chance(0.6):
         bottle_pocket = lathe([[0.12, 0], [0.15, 0.35], [0.14, 0.35], [0.001, 0.3]], 14)
-        a.add(bottle_pocket.translated((0, width / 2, height * 0.08)), 2, mirror=True)
+        a.add_pair(bottle_pocket.translated((0, width / 2, height * 0.08)), 2)
 
 
 def handbag(a: Assembly) -> None:
@@ -200,7 +200,7 @@ def mouse(a: Assembly) -> None:
     button = vertices * [1.02, 1.0, 1.06] + [0, 0, 0.015]
     button[:, 0] = np.maximum(button[:, 0], length * a.u(0.02, 0.12))
     button[:, 1] = np.maximum(button[:, 1], 0.025)
-    a.add(Mesh(button, shell.faces), 1, mirror=True)
+    a.add_pair(Mesh(button, shell.faces), 1)
     a.add(torus(0.09, 0.045, Y, (length * a.u(0.25, 0.33), 0, height * 0.78), sides=16), 2)
     if a.chance(0.5):
         rest = (length * 0.5, 0.12, height * 0.3)
@@ -277,4 +277,4 @@ def remote(a: Assembly) -> None:
             key = cylinder(0.045, 0.04, 0.05) if round_keys else box((0.07, pitch * 0.7, 0.05))
             place = (ring_x - ring - 0.12 - row * length * 0.085, column * pitch * waist, top)
             a.add(key.translated(place), 1 if row < n_rows - 1 else 2)
-    a.add(box((0.06, pitch * 0.75, 0.05), (ring_x + ring + 0.11, pitch, top)), 2, mirror=True)
+    a.add_pair(box((0.06, pitch * 0.75, 0.05), (ring_x + ring + 0.11, pitch, top)), 2)

@@ -36,16 +36,18 @@ def chair(a: Assembly) -> None:
     a.add(seat.translated((0, 0, height)), 0)
 
     # The back is built upright at the origin; it leans about its lower edge.
-    def add_to_back(mesh: Mesh, material: int, mirror: bool = False) -> None:
+    def add_to_back(mesh: Mesh, material: int) -> None:
         leaning = mesh.rotated("y", -lean)
-        a.add(leaning.translated((-depth / 2 + thick / 2, 0, height)), material, mirror)
+        a.add(leaning.translated((-depth / 2 + thick / 2, 0, height)), material)
 
     style = a.pick("panel", "round", "slats", "rungs")
     if style == "panel":
         add_to_back(box((thick, width * a.u(0.8, 1), back), (0, 0, back / 2)), 1)
     elif style == "round":
         add_to_back(rounded_box((thick * 1.5, width * 0.95, back * 0.6), (0, 0, back * 0.7), 3), 1)
-        add_to_back(rod((0, width * 0.3, 0), (0, width * 0.3, back * 0.6), leg), 2, mirror=True)
+        post = rod((0, width * 0.3, 0), (0, width * 0.3, back * 0.6), leg)
+        add_to_back(post, 2)
+        add_to_back(post.mirrored(), 2)
     else:
         # Slats are many posts with one rung on top.
         rungs = (0.35, 0.65, 0.95)
@@ -77,20 +79,20 @@ def chair(a: Assembly) -> None:
             (-x, y, leg),
         ]
         for start, end in zip(corners, corners[1:]):
-            a.add(capsule(start, end, leg), 2, mirror=True)
+            a.add_pair(capsule(start, end, leg), 2)
         a.add(rod((-x, y, leg), (-x, -y, leg), leg), 2)
     else:
         splay = a.u(0, 0.14)
         for side in (-1, 1):
             foot = (side * (x + splay), y + splay, 0)
-            a.add(rod((side * x, y, height), foot, leg), 2, mirror=True)
+            a.add_pair(rod((side * x, y, height), foot, leg), 2)
     # The arms.
     if a.chance(0.45):
         rest = height + a.u(0.22, 0.4)
         arm = rounded_box((depth * a.u(0.7, 0.95), 0.12, 0.09), (0, width / 2, rest), 5)
-        a.add(arm, 3, mirror=True)
+        a.add_pair(arm, 3)
         for post_x in (depth * 0.3, -depth * 0.38):
-            a.add(rod((post_x, width / 2, height), (post_x, width / 2, rest), leg), 2, mirror=True)
+            a.add_pair(rod((post_x, width / 2, height), (post_x, width / 2, rest), leg), 2)
 
 
 def toilet(a: Assembly) -> None:
@@ -200,6 +202,7 @@ def toaster(a: Assembly) -> None:
     a.add(box((length * 0.8, width * 0.78, 0.03), (0, 0, top)), 2)
     # One or two rows of slots side by side; in a long toaster, each may be divided in two.
     slot_y = width * (0.22 if a.chance(0.75) else 0)
+    add_slot = a.add_pair if slot_y else a.add
     slots = (0,)
     slot = length * 0.66
     if length > 1.35 and a.chance(0.6):
@@ -207,10 +210,10 @@ def toaster(a: Assembly) -> None:
         slot = length * 0.34
     toasting = a.chance(0.3)
     for x in slots:
-        a.add(box((slot, 0.1, 0.02), (x * length, slot_y, top + 0.016)), 3, mirror=slot_y > 0)
+        add_slot(box((slot, 0.1, 0.02), (x * length, slot_y, top + 0.016)), 3)
         if toasting:
             place = (x * length, slot_y, top + a.u(-0.12, 0))
-            a.add(rounded_box((slot * 0.9, 0.07, 0.5), place, 6), 6, mirror=slot_y > 0)
+            add_slot(rounded_box((slot * 0.9, 0.07, 0.5), place, 6), 6)
     # At the front end: the lever in its slit, a dial on the left, buttons on the right.
     a.add(box((0.02, 0.05, height * a.u(0.25, 0.45)), (end, 0, middle + 0.05)), 3)
     lever = (0.16, a.u(0.14, 0.3), 0.08)
@@ -223,7 +226,7 @@ def toaster(a: Assembly) -> None:
     # The feet, and a cable.
     for x in (-0.36, 0.36):
         foot = cylinder(0.06, 0.07, feet * 2)
-        a.add(foot.translated((x * length, width * 0.32, feet / 2)), 3, mirror=True)
+        a.add_pair(foot.translated((x * length, width * 0.32, feet / 2)), 3)
     if a.chance(0.6):
         cable_end = (-end - a.u(0.1, 0.25), a.u(-0.2, 0.2), 0.03)
         a.add(capsule((-end, 0.1, feet + 0.1), cable_end, 0.025), 3)

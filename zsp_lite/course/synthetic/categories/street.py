@@ -49,7 +49,7 @@ def bicycle(a: Assembly) -> None:
     crank = np.array([a.u(-0.12, 0.04), 0, wheel * a.u(0.6, 0.9)])
     # low on the seat tube in a step-through frame
     top_tube_end = crank + (saddle - crank) * (0.35 if a.chance(0.35) else 0.85)
-    a.add(rod(head, front + [0, 0.07, 0], tube * 0.8), 2, mirror=True)
+    a.add_pair(rod(head, front + [0, 0.07, 0], tube * 0.8), 2)
     for start, end in (
         (head - [0, 0, 0.14], crank),
         (saddle, crank),
@@ -57,7 +57,7 @@ def bicycle(a: Assembly) -> None:
     ):
         a.add(rod(start, end, tube), 0)
     for end in (crank, saddle - [0, 0, 0.12]):
-        a.add(rod(rear + [0, 0.05, 0], end, tube * 0.6), 0, mirror=True)
+        a.add_pair(rod(rear + [0, 0.05, 0], end, tube * 0.6), 0)
     a.add(ellipsoid((a.u(0.15, 0.24), a.u(0.06, 0.11), 0.05), saddle + [0, 0, 0.05]), 4)
 
     # The bars.
@@ -66,11 +66,11 @@ def bicycle(a: Assembly) -> None:
     a.add(rod(head, stem, tube), 2)
     half_width = a.u(0.18, 0.28) if bars == "drop" else a.u(0.25, 0.4)
     grip = stem + [0.02, half_width, a.u(0, 0.12)]
-    a.add(rod(stem, grip, 0.024), 3, mirror=True)
+    a.add_pair(rod(stem, grip, 0.024), 3)
     if bars == "swept":
-        a.add(capsule(grip, grip + [-a.u(0.15, 0.28), 0.02, -0.02], 0.028), 3, mirror=True)
+        a.add_pair(capsule(grip, grip + [-a.u(0.15, 0.28), 0.02, -0.02], 0.028), 3)
     elif bars == "drop":
-        a.add(torus(0.09, 0.024, Y, grip - [0, 0, 0.09], 0, np.pi, sides=12), 3, mirror=True)
+        a.add_pair(torus(0.09, 0.024, Y, grip - [0, 0, 0.09], 0, np.pi, sides=12), 3)
     # Pedals half a turn apart, and the chain ring, which is on the right side of a bicycle.
     for side in (1, -1):
         pedal = crank + side * np.array([0.13, 0.13, -0.13])
@@ -96,12 +96,12 @@ def motorcycle(a: Assembly) -> None:
         a.add(torus(wheel + 0.04, 0.05, Y, hub, start, stop, sides=14), 0)
     # Fork, headlamp and bars.
     head = front + [-a.u(0.2, 0.28) - (0.15 if style == "cruiser" else 0), 0, a.u(0.55, 0.72)]
-    a.add(rod(head, front + [0, 0.11, 0], 0.04), 2, mirror=True)
+    a.add_pair(rod(head, front + [0, 0.11, 0], 0.04), 2)
     a.add(ellipsoid((0.1, 0.12, 0.12), head + [0.12, 0, a.u(-0.06, 0.04)]), 4)
     grip = head + [-a.u(0.12, 0.25), a.u(0.3, 0.42), 0]
     grip[2] += a.u(0.2, 0.4) if style == "cruiser" else a.u(0.02, 0.2)
-    a.add(rod(head, grip + [0.1, -0.06, 0], 0.026), 2, mirror=True)
-    a.add(capsule(grip + [0.1, -0.06, 0], grip, 0.035), 3, mirror=True)
+    a.add_pair(rod(head, grip + [0.1, -0.06, 0], 0.026), 2)
+    a.add_pair(capsule(grip + [0.1, -0.06, 0], grip, 0.035), 3)
 
     seat_z = wheel * 2 + a.u(0, 0.12)
     if style == "scooter":
@@ -121,7 +121,7 @@ def motorcycle(a: Assembly) -> None:
         tank = np.array([head[0] * 0.45, 0, seat_z + 0.14])
         a.add(ellipsoid((a.u(0.28, 0.36), a.u(0.14, 0.19), a.u(0.13, 0.18)), tank), 0)
         for start, end in ((head, engine), (head, tank), (engine, rear)):
-            a.add(rod(start + [0, 0.04, 0], end + [0, 0.06, 0], 0.032), 2, mirror=True)
+            a.add_pair(rod(start + [0, 0.04, 0], end + [0, 0.06, 0], 0.032), 2)
         a.add(rounded_box((half_base * 0.95, 0.28, 0.13), (-half_base * 0.48, 0, seat_z), 3), 6)
         tail = np.array([-half_base * a.u(0.95, 1.25), 0, seat_z + a.u(0.08, 0.25)])
         a.add(capsule((-half_base * 0.7, 0, seat_z), tail, 0.12, 0.06), 0)
@@ -183,14 +183,14 @@ def car(a: Assembly) -> None:
         wall = a.u(0.08, 0.18)
         bed = boot_start - tail
         side = box((bed, 0.06, wall), (tail + bed / 2, width * 0.44, belt + wall / 2))
-        a.add(side, 0, mirror=True)
+        a.add_pair(side, 0)
         a.add(box((0.06, width * 0.9, wall), (tail + 0.03, 0, belt + wall / 2)), 0)
     # Headlamps, grille, rear lights, bumpers and wheels.
     light_z = sill + (nose_z - sill) * 0.72
     lamp = ellipsoid((0.06, a.u(0.09, 0.15), a.u(0.05, 0.08)), (nose, width * 0.34, light_z))
-    a.add(lamp, 5, mirror=True)
+    a.add_pair(lamp, 5)
     a.add(box((0.05, width * a.u(0.25, 0.4), a.u(0.07, 0.12)), (nose + 0.01, 0, light_z)), 6)
-    a.add(box((0.04, 0.1, a.u(0.1, 0.2)), (tail - 0.01, width * 0.4, belt - 0.16)), 7, mirror=True)
+    a.add_pair(box((0.04, 0.1, a.u(0.1, 0.2)), (tail - 0.01, width * 0.4, belt - 0.16)), 7)
     for x in (nose + 0.02, tail - 0.02):
         a.add(rounded_box((0.12, width, 0.12), (x, 0, sill + 0.06), 4), 2)
     for x in (nose - length * a.u(0.16, 0.2), tail + length * a.u(0.17, 0.21)):

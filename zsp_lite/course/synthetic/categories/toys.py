@@ -33,10 +33,10 @@ def teddybear(a: Assembly) -> None:
     face = head + [skull * 0.82, 0, 0]
     a.add(ellipsoid((snout, a.u(0.15, 0.21), 0.15), face - [0, 0, 0.09]), 1)
     a.add(ellipsoid((0.06, 0.075, 0.05), face + [snout * 0.92, 0, -0.04]), 3)
-    a.add(ellipsoid((0.05, 0.05, 0.06), face + [0, skull * 0.36, skull * 0.22]), 3, mirror=True)
+    a.add_pair(ellipsoid((0.05, 0.05, 0.06), face + [0, skull * 0.36, skull * 0.22]), 3)
     ear = a.u(0.12, 0.2)
     ear_at = head + [0, skull * a.u(0.65, 0.85), skull * a.u(0.65, 0.85)]
-    a.add(ellipsoid((0.075, ear, ear), ear_at), 1, mirror=True)
+    a.add_pair(ellipsoid((0.075, ear, ear), ear_at), 1)
     # Each arm has its own pose, raised or hanging.
     for side in (1, -1):
         shoulder = np.array([0, side * belly * 0.8, floor + tall * 1.45])
@@ -46,13 +46,13 @@ def teddybear(a: Assembly) -> None:
     leg = a.u(0.14, 0.21)
     if standing:
         foot = np.array([0.08, belly * 0.6, leg])
-        a.add(capsule((0, belly * 0.5, floor + tall * 0.4), foot, leg), 0, mirror=True)
-        a.add(ellipsoid((leg * 1.5, leg, leg * 0.7), foot + [0.1, 0, -leg * 0.35]), 2, mirror=True)
+        a.add_pair(capsule((0, belly * 0.5, floor + tall * 0.4), foot, leg), 0)
+        a.add_pair(ellipsoid((leg * 1.5, leg, leg * 0.7), foot + [0.1, 0, -leg * 0.35]), 2)
     else:
         foot = np.array([a.u(0.45, 0.75), belly * a.u(0.7, 1.1), leg])
-        a.add(capsule((0.1, belly * 0.55, 0.15), foot, leg), 0, mirror=True)
+        a.add_pair(capsule((0.1, belly * 0.55, 0.15), foot, leg), 0)
         sole = ellipsoid((0.07, leg * 0.85, leg * 1.15), foot + [leg * 0.85, 0, 0.05])
-        a.add(sole, 1, mirror=True)
+        a.add_pair(sole, 1)
     # The tail; then a light belly, a shirt, or neither.
     a.add(ellipsoid((0.1, 0.1, 0.1), (-belly * 0.85, 0, floor + 0.25)), 0)
     if a.chance(0.6):
@@ -91,14 +91,14 @@ def toyplane(a: Assembly) -> None:
         wing_z = a.u(-0.12, 0.1)
     else:
         wing_z = radius
-    a.add(extrusion(wing, 0.06, "xy", wing_z), 1, mirror=True)
+    a.add_pair(extrusion(wing, 0.06, "xy", wing_z), 1)
     # A biplane has a second wing, and struts between the two.
     if biplane:
         upper = radius * 1.6
-        a.add(extrusion(wing, 0.06, "xy", upper), 1, mirror=True)
+        a.add_pair(extrusion(wing, 0.06, "xy", upper), 1)
         for x in (lead - 0.1, trail + 0.1):
             place = np.array([x - sweep * 0.6, span * 0.65, 0])
-            a.add(rod(place + [0, 0, wing_z], place + [0, 0, upper], 0.02), 3, mirror=True)
+            a.add_pair(rod(place + [0, 0, wing_z], place + [0, 0, upper], 0.02), 3)
     # The tail: a fin, and a stabiliser at its foot or at its top.
     fin = a.u(0.3, 0.6)
     stabiliser = a.u(0.3, 0.55)
@@ -106,12 +106,12 @@ def toyplane(a: Assembly) -> None:
     a.add(extrusion(outline, 0.06), 2)
     outline = [[tail + 0.3, 0], [tail + 0.1, stabiliser], [tail - 0.1, stabiliser], [tail, 0]]
     z = 0.05 if a.chance(0.75) else fin * 0.92
-    a.add(extrusion(outline, 0.05, "xy", z), 1, mirror=True)
+    a.add_pair(extrusion(outline, 0.05, "xy", z), 1)
     # Two jet engines, or a propeller.
     if jet:
         below_wing = (wing_x - sweep * 0.4, span * 0.4, wing_z - 0.13)
         engine = np.array(below_wing if a.chance(0.6) else (tail + 0.55, radius + 0.1, 0.08))
-        a.add(rod(engine - [0.2, 0, 0], engine + [0.2, 0, 0], 0.08, a.u(0.1, 0.13)), 3, mirror=True)
+        a.add_pair(rod(engine - [0.2, 0, 0], engine + [0.2, 0, 0], 0.08, a.u(0.1, 0.13)), 3)
     else:
         a.add(ellipsoid((0.12, 0.09, 0.09), (nose + 0.05, 0, 0)), 3)
         blade = a.u(0.3, 0.45)
@@ -125,8 +125,8 @@ def toyplane(a: Assembly) -> None:
     a.add(ellipsoid(cockpit, (length * a.u(0.16, 0.28), 0, radius * 0.75)), 4)
     if a.chance(0.6):
         gear = np.array([wing_x + 0.1, 0.25, -radius - 0.22])
-        a.add(rod(gear * [1, 0.6, 0], gear, 0.025), 3, mirror=True)
-        a.add(disc(0.1, 0.07, gear), 6, mirror=True)
+        a.add_pair(rod(gear * [1, 0.6, 0], gear, 0.025), 3)
+        a.add_pair(disc(0.1, 0.07, gear), 6)
 
 
 def toytruck(a: Assembly) -> None:
@@ -157,7 +157,7 @@ def toytruck(a: Assembly) -> None:
     a.add(box(side_window, (rear + cab_length * 0.48, 0, deck + cab_height * 0.72)), 4)
     a.add(pane(np.add(bend, [0.01, 0.04]), np.add(top, [0.01, -0.04]), width * 0.84), 4)
     lamp = ellipsoid((0.05, 0.08, 0.08), (nose, width * 0.34, deck + cab_height * 0.28))
-    a.add(lamp, 5, mirror=True)
+    a.add_pair(lamp, 5)
     a.add(box((0.06, width * 0.4, cab_height * 0.2), (nose + 0.01, 0, deck + cab_height * 0.27)), 6)
 
     load = rear - 0.05 - tail  # the length behind the cab
@@ -232,8 +232,8 @@ def toybus(a: Assembly) -> None:
     door = height * (0.42 if n_floors == 2 else 0.72)
     place = (front - body * 0.12, -width / 2, floor + 0.06 + door / 2)
     a.add(box((pitch * 0.9, 0.04, door), place), 6)
-    a.add(ellipsoid((0.05, 0.07, 0.07), (nose, width * 0.33, floor + 0.14)), 5, mirror=True)
-    a.add(box((0.03, 0.09, 0.14), (tail, width * 0.4, floor + 0.2)), 7, mirror=True)
+    a.add_pair(ellipsoid((0.05, 0.07, 0.07), (nose, width * 0.33, floor + 0.14)), 5)
+    a.add_pair(box((0.03, 0.09, 0.14), (tail, width * 0.4, floor + 0.2)), 7)
     for x in (nose - length * a.u(0.18, 0.24), tail + length * a.u(0.17, 0.24)):
         add_wheels(a, x, width / 2 - 0.04, wheel, 0.12)
 
@@ -280,7 +280,7 @@ def toytrain(a: Assembly) -> None:
         hood = (front - rear, hood_width, hood_height)
         a.add(rounded_box(hood, (middle, 0, floor + hood_height / 2), 9), 0)
         lamp = ellipsoid((0.05, 0.07, 0.07), (front, width * 0.22, deck + hood_height * 0.8))
-        a.add(lamp, 5, mirror=True)
+        a.add_pair(lamp, 5)
         a.add(box((0.25, width * 0.3, 0.14), (middle, 0, deck + 0.1 + hood_height)), 3)
     # The cowcatcher; wheels on two to four axles, and the rods that connect them.
     cowcatcher = [[nose, deck + 0.05], [nose + a.u(0.12, 0.25), 0.05], [nose, 0.05]]
@@ -289,4 +289,4 @@ def toytrain(a: Assembly) -> None:
     for x in axles:
         add_wheels(a, x, width / 2 - 0.03, wheel, 0.08)
     connection = (axles[-1] - axles[0], 0.03, 0.05)
-    a.add(box(connection, (axles.mean(), width / 2 + 0.06, wheel)), 7, mirror=True)
+    a.add_pair(box(connection, (axles.mean(), width / 2 + 0.06, wheel)), 7)
