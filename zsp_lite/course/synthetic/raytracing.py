@@ -78,7 +78,8 @@ class MeshScene:
         samples: int = 2,
     ):
         o3d = load_open3d()
-        self.mesh, self.room = mesh, room
+        self.mesh = mesh
+        self.room = room
         self._rng = np.random.default_rng(seed)
         self._samples = samples
         self._tensor = o3d.core.Tensor
@@ -138,6 +139,7 @@ class MeshScene:
         radiance = shaded[..., :3] + (1 - shaded[..., 3:]) * radiance
         if self._gain is None:
             self._gain = self.room.camera.exposure_gain(radiance)
+        # Automatic exposure varies by 2.5 % from view to view.
         gain = self._gain * np.exp(self._rng.normal(0, 0.025))
         rgb = self.room.camera.develop(radiance, gain, self._rng)
         return Rendering(rgb, depth, mask, canonical, normals, camera)
@@ -214,6 +216,7 @@ class MeshScene:
         reflectance = reflectance[:, None]
         mirrored = self.room.reflection(view + 2 * facing[:, None] * normal, roughness)
         mirrored *= visible[:, None]
+        # No highlight is narrower than that of roughness 0.25.
         exponent = 2 / np.maximum(roughness, 0.25) ** 4 - 2
         cosine = np.maximum(_dot(normal, unit(light - view)), 0)
         highlight = key * (exponent + 8) / 8 * cosine**exponent
@@ -228,6 +231,7 @@ class MeshScene:
     def _shading_normals(self, hits: _Hits, view: Vectors, flat: Vectors) -> Vectors:
         """Return interpolated normals, turned so that no visible point faces away."""
         normal = _interpolated(hits.weights, self.mesh.normals[hits.face])
+        # on the same side of the surface as the flat normal
         normal *= np.where(_dot(normal, flat) < 0, np.float32(-1), np.float32(1))[:, None]
         normal = unit(normal)
         # Visible points do not face away, though their interpolated normals may.

@@ -58,11 +58,11 @@ def crop_grids(
     y = rng.uniform(-1, 1, n) * (1 - height) * 0.9
     flip = np.repeat(rng.choice([-1.0, 1.0], n // per_object), per_object)
     c, s = np.cos(angle), np.sin(angle)
+    # Both are (2, ..., n): points of the crop to the image, directions in the image to the crop.
     affine = np.array(
         [[width * c * flip, -width * s, x], [height * s * flip, height * c, y]], np.float32
     )
     turn = np.array([[flip * c, flip * s], [-s, c]], np.float32)
-    # The crops are the last axis of both, and become the first.
     affine = torch.from_numpy(affine).permute(2, 0, 1).contiguous()
     turn = torch.from_numpy(turn).permute(2, 0, 1).contiguous()
     return F.affine_grid(affine, (n, 1, side, side), align_corners=False), turn

@@ -101,6 +101,7 @@ def attention_loss(
     target = coverage / coverage.sum(1, keepdim=True)
     spread = F.kl_div(attention.log(), target, reduction="batchmean")
     level = (attention * coverage).sum(1, keepdim=True) / coverage.sum(1, keepdim=True)
+    # The logit of a patch is positive where its attention exceeds 0.12 of the level.
     side = F.binary_cross_entropy_with_logits(
         attention.log() - (0.12 * level.detach()).log(), coverage
     )

@@ -166,8 +166,9 @@ def _room(index: int) -> Room:
 def build_random_object(a: Assembly) -> None:
     """Build a tree of 5 to 10 random parts, symmetric, each attached to one of those before it."""
     # centre and size of each part
-    nodes = [(np.zeros(3), np.array([a.u(0.5, 1.3), a.u(0.4, 1.0), a.u(0.4, 1.2)]))]
-    a.add(_random_solid(a, nodes[0][1]), a.choice(5))
+    body = np.array([a.u(0.5, 1.3), a.u(0.4, 1.0), a.u(0.4, 1.2)])
+    nodes = [(np.zeros(3), body)]
+    a.add(_random_solid(a, body), a.choice(5))
     for _ in range(4 + a.choice(6)):
         parent, parent_size = a.pick(*nodes)
         direction = a.rng.normal(size=3)
