@@ -18,7 +18,7 @@ from zsp_lite.course.synthetic.primitives import (
 from zsp_lite.course.synthetic.textures import random_colour
 
 # Axes.
-X = (1, 0, 0)
+X = (1.0, 0.0, 0.0)
 Y = (0.0, 1.0, 0.0)
 
 

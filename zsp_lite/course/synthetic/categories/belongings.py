@@ -20,7 +20,6 @@ from zsp_lite.course.synthetic.primitives import (
     torus,
 )
 
-
 _ARCH = (TAU / 4, TAU * 3 / 4)  # angles of the upper half of a torus about x
 
 
