@@ -40,8 +40,8 @@ def backpack(a: Assembly) -> None:
     a.add(rounded_box(pocket, (front, 0, pocket_z), 4), 1)
     if a.chance(0.4):
         # A flap with two belts.
-        flap = (depth * 1.15, width * 1.02, height * 0.3)
-        flap = rounded_box(flap, (depth * 0.08, 0, height * 0.92), 4)
+        flap_size = (depth * 1.15, width * 1.02, height * 0.3)
+        flap = rounded_box(flap_size, (depth * 0.08, 0, height * 0.92), 4)
         a.add(tapered(flap, height / 2, height, narrowing), 2)
         belt = box((0.04, 0.1, height * 0.38), (depth * 0.6, width * 0.2, height * 0.66))
         a.add_pair(belt, 3)
