@@ -190,8 +190,8 @@ def made_up_run(out, rows):
 def after_each_save(act: Callable[[], None]) -> Callable[..., None]:
     """Return a substitute of `execution.add_lines` that calls `act` after it has added pairs."""
 
-    def add_and_act(out, lines, kind):
-        add_lines(out, lines, kind)
+    def add_and_act(out, lines):
+        add_lines(out, lines)
         act()
 
     return add_and_act

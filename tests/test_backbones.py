@@ -24,7 +24,7 @@ from zsp_lite.backbones.load import (
     obtained_by,
 )
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark.identity import fingerprint
+from zsp_lite.benchmark.runs import fingerprint
 from zsp_lite.choices import FACETS
 from zsp_lite.errors import InputError
 from zsp_lite.io.download import fetch

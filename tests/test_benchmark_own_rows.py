@@ -37,8 +37,7 @@ from zsp_lite.align import align_category
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark import identity, own
-from zsp_lite.benchmark.identity import fingerprint
+from zsp_lite.benchmark import own, runs
 from zsp_lite.benchmark.methods import (
     GROUPS,
     METHODS,
@@ -50,7 +49,7 @@ from zsp_lite.benchmark.methods import (
 from zsp_lite.benchmark.own import StoredPoses, kind_of
 from zsp_lite.benchmark.problem import Answer, FrameStore
 from zsp_lite.benchmark.run import evaluate, evaluate_pair
-from zsp_lite.benchmark.runs import LINES, read_run
+from zsp_lite.benchmark.runs import LINES, fingerprint, read_run
 from zsp_lite.benchmark.tables import every_table
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.co3d import Co3D, Pair
@@ -946,8 +945,8 @@ def test_a_backbone_of_ones_own_is_known_by_its_name_and_its_weights():
 
 
 def test_the_library_is_known_by_version_and_commit(tmp_path, monkeypatch):
-    monkeypatch.setattr(identity, "REPOSITORY", tmp_path)
-    version, found = identity.library_version.__wrapped__, []
+    monkeypatch.setattr(runs, "REPOSITORY", tmp_path)
+    version, found = runs.library_version.__wrapped__, []
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=b"]
     (tmp_path / "__init__.py").touch()
     for step in (["init"], ["add", "."], ["commit", "-m", "x"]):

@@ -29,10 +29,16 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.execution import make_chunks, open_workers
-from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
 from zsp_lite.benchmark.run import evaluate, pair_evaluator, pairs_of_rows, write_reports
-from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, read_lines, read_run
+from zsp_lite.benchmark.runs import (
+    LINES,
+    SETTINGS,
+    add_lines,
+    library_version,
+    read_lines,
+    read_run,
+)
 from zsp_lite.benchmark.tables import compare
 from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import Co3D
@@ -341,7 +347,7 @@ def test_the_note_of_a_run_says_that_several_versions_of_the_library_evaluated_i
     )
     run(["ours-bv"])
     first, other = library_version(), {"version": "1", "commit": "0123abc"}
-    monkeypatch.setattr("zsp_lite.benchmark.identity.library_version", lambda: other)
+    monkeypatch.setattr("zsp_lite.benchmark.runs.library_version", lambda: other)
     assert "note" not in read_run(tmp_path).summary
     run(["ours"])
     assert json.loads((tmp_path / SETTINGS).read_text())["library"] == [first, other]

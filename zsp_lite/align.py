@@ -18,9 +18,8 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.benchmark.baseline_rows import hypotheses
 from zsp_lite.benchmark.execution import Evaluate, evaluate_pairs, open_workers
-from zsp_lite.benchmark.identity import run_settings
 from zsp_lite.benchmark.problem import FrameStore, PairProblem
-from zsp_lite.benchmark.runs import open_run, read_lines
+from zsp_lite.benchmark.runs import open_run, read_lines, run_settings
 from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label

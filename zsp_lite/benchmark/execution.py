@@ -87,7 +87,7 @@ def evaluate_pairs(
     with tqdm(total=len(work), initial=done, unit="pair", delay=1, disable=hidden) as bar:
 
         def store(lines: list[dict[str, Any]]) -> None:
-            add_lines(out, lines, kind)
+            add_lines(out, lines)
             bar.update(len(lines))
 
         if executor is None:

@@ -12,8 +12,8 @@ from typing import Any, Literal
 
 from zsp_lite.baselines.sift import RootSift, Sift
 from zsp_lite.benchmark import baseline_rows
-from zsp_lite.benchmark.identity import described
 from zsp_lite.benchmark.own import Estimator, KeypointMatcher, StoredPoses, kind_of
+from zsp_lite.benchmark.runs import described
 from zsp_lite.data.exchange import read_stored_poses
 from zsp_lite.errors import InputError, check_number
 from zsp_lite.features import FeatureExtractor

@@ -5,23 +5,41 @@ run.jsonl.gz, is what `evaluate_pair` returned for a pair. One process writes to
 can read it meanwhile.
 """
 
+import dataclasses
+import functools
 import os
+import platform
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cached_property
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
+import cv2
 import msgspec
 import numpy as np
 import pandas as pd
+import scipy
+import torch
 from jaxtyping import Float, Int
 
+from zsp_lite import __version__
+from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.benchmark.statistics import summarise
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import decode_json, decompress, read_bytes, read_json, write_atomic
+from zsp_lite.io.files import (
+    REPOSITORY,
+    decode_json,
+    decompress,
+    digest,
+    read_bytes,
+    read_json,
+    write_atomic,
+)
 from zsp_lite.io.locks import writing
 
 SETTINGS, LINES = "run.json", "run.jsonl"
@@ -57,7 +75,7 @@ class Settings(msgspec.Struct):
     folder: str = ""  # absolute path of the data, without links
 
 
-class _Result(msgspec.Struct):
+class Result(msgspec.Struct):
     """What a row found for a pair (see `evaluate_pair`); other members are not part of the
     table."""
 
@@ -79,9 +97,86 @@ class _Result(msgspec.Struct):
 
 class ResultLine(msgspec.Struct):
     pair: Annotated[str, msgspec.Meta(pattern=_KEY)]
-    results: dict[str, _Result]
+    results: dict[str, Result]
     repeat: int = 0
     timings: dict[str, float] = {}
+
+
+def described(value: Any) -> str:
+    """Describe a setting as text: an object by "module:name", whatever its code; a dataclass with
+    its public fields."""
+    if value is None or isinstance(value, bool | int | float | str | list | tuple):
+        return str(value)
+    named = value if hasattr(value, "__qualname__") else type(value)
+    name = f"{named.__module__}:{named.__qualname__}"
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        names = [one.name for one in dataclasses.fields(value) if not one.name.startswith("_")]
+        fields = ", ".join(f"{one}={described(getattr(value, one))}" for one in names)
+        return f"{name}({fields})"
+    return name
+
+
+def fingerprint(extractor: Any) -> str:
+    """Return the name of an extractor (by default "module:name"), and a hash of its `state_dict`
+    and settings."""
+    name = getattr(extractor, "name", None) or described(extractor)
+    network, settings = extractor, ""
+    if isinstance(extractor, Backbone):
+        network = extractor.model
+        fields = ("layer", "facet", "saliency_heads", "image_size", "mean", "std")
+        settings = repr(tuple(getattr(extractor, one) for one in fields))
+    if not callable(getattr(network, "state_dict", None)):
+        return name
+    parts: list[str | bytes] = []
+    for key, weight in sorted(network.state_dict().items()):
+        content = weight.detach().cpu().contiguous().reshape(-1).view(torch.uint8)
+        parts += [key, content.numpy().tobytes()]
+    return f"{name} {digest(settings, *parts)}" if parts else name
+
+
+@functools.cache
+def library_version() -> dict[str, str | None]:
+    """Return the version of zsp_lite, and the commit of its checkout, "-dirty" if files differ;
+    None if installed."""
+    commit = None
+    # An installed copy may lie inside the repository of another project, whose commit says nothing.
+    if (REPOSITORY / ".git").exists():
+        words = "describe --always --abbrev=40 --dirty --exclude *".split()
+        describe = ["git", "-C", str(REPOSITORY), *words]
+        with suppress(OSError):  # git is not installed
+            commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip() or None
+    return {"version": __version__, "commit": commit}
+
+
+def run_settings(
+    data: str | Path,
+    backbone: Any,
+    targets: int,
+    methods: dict[str, str],
+    labels: dict[str, str],
+    **call: Any,
+) -> Settings:
+    """Describe a run, and this call of it: time, command, and versions of what computes."""
+    words = [Path(sys.argv[0]).name.replace("__main__.py", "zsp-lite"), *sys.argv[1:]]
+    versions = {one.__name__: str(one.__version__) for one in (torch, np, scipy, cv2)}
+    versions["python"] = platform.python_version()
+    versions["machine"] = platform.platform()
+    this_call = Call(
+        time=datetime.now(UTC).isoformat(timespec="seconds"),
+        command=[text.encode(errors="replace").decode() for text in words],
+        versions=versions,
+        rows=list(methods),
+        **call,
+    )
+    return Settings(
+        data=str(data).encode(errors="replace").decode(),
+        backbone=fingerprint(backbone),
+        targets=targets,
+        library=[library_version()],
+        labels=labels,
+        methods=methods,
+        calls=[this_call],
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +187,12 @@ class Run:
     settings: Settings
     # A line for each row, pair and seed, in this order: "row", "category", "pair" (its key),
     # "repeat" (of the seed), "problem" (the key without target frames), "reference" and "target"
-    # (the objects, CATEGORY/SEQUENCE), the members of `_Result`, and "milliseconds".
+    # (the objects, CATEGORY/SEQUENCE), the members of `Result`, and "milliseconds".
     table: pd.DataFrame
     timings: Mapping[str, float]  # median seconds by stage
     note: str = ""  # what is missing
 
-    @cached_property
+    @functools.cached_property
     def summary(self) -> dict[str, Any]:
         """The content of summary.json."""
         # A backbone's fingerprint is its name and a hash.
@@ -116,7 +211,7 @@ class Run:
             | {"timings": dict(self.timings)}
         )
 
-    @cached_property
+    @functools.cached_property
     def failures(self) -> list[str]:
         """Of each row that failed on pairs: on how many, and the reason of the first."""
         failed = self.table[self.table["failed"] != ""].groupby("row", sort=False)
@@ -209,19 +304,14 @@ def _compared(settings: Settings) -> dict[str, Any]:
     return {"command": command} | whole | parts
 
 
-def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]], kind: type = ResultLine) -> None:
-    """Add the results of pairs to run.jsonl; InputError if they could not be read again."""
-    lines = list(lines)
+def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]]) -> None:
+    """Add the results of pairs to run.jsonl; InputError if they cannot be written."""
+    path = Path(out) / LINES
     try:
-        msgspec.convert(lines, list[kind])
-        with open(Path(out) / LINES, "ab") as file:
+        with path.open("ab") as file:
             file.write(msgspec.json.Encoder().encode_lines(lines))
-    except (
-        OSError,
-        ValueError,
-        msgspec.ValidationError,
-    ) as error:  # ValueError: a text that is not Unicode
-        raise InputError(f"{Path(out) / LINES} cannot be written: {error}") from error
+    except (OSError, ValueError) as error:  # ValueError: a text that is not Unicode
+        raise InputError(f"{path} cannot be written: {error}") from error
 
 
 def read_lines(out: str | Path, kind: type = ResultLine) -> list[Any]:
@@ -282,7 +372,7 @@ def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
         for line in lines
         for row, one in line.results.items()
     ]
-    table = pd.DataFrame(results, columns=["row", "pair", "repeat", *_Result.__struct_fields__])
+    table = pd.DataFrame(results, columns=["row", "pair", "repeat", *Result.__struct_fields__])
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
     table["milliseconds"] = 1000 * table["seconds"].astype(float)
     table["target"] = table["category"] + "/" + table["target"]
