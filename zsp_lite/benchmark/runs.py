@@ -189,7 +189,7 @@ class Run:
     # "repeat" (of the seed), "problem" (the key without target frames), "reference" and "target"
     # (the objects, CATEGORY/SEQUENCE), the members of `Result`, and "milliseconds".
     table: pd.DataFrame
-    timings: Mapping[str, float]  # median seconds by stage
+    timings: dict[str, float]  # median seconds by stage
     note: str = ""  # what is missing
 
     @functools.cached_property
@@ -197,30 +197,27 @@ class Run:
         """The content of summary.json."""
         # A backbone's fingerprint is its name and a hash.
         backbone = self.settings.backbone.rpartition(" ")[0] or self.settings.backbone
-        data = {"root": self.settings.data, "categories": list(self.table["category"].unique())}
-        data |= {
+        data = {
+            "root": self.settings.data,
+            "categories": list(self.table["category"].unique()),
             "pairs": int(self.table.groupby("row")["pair"].nunique().max()),
             "targets": self.settings.targets,
         }
+        summary = {"data": data, "backbone": backbone}
         notes = " ".join(filter(None, [self.note, *self.failures]))
-        note = {"note": notes} if notes else {}
-        return (
-            {"data": data, "backbone": backbone}
-            | note
-            | summarise(self.table)
-            | {"timings": dict(self.timings)}
-        )
+        if notes:
+            summary["note"] = notes
+        return summary | summarise(self.table) | {"timings": self.timings}
 
     @functools.cached_property
     def failures(self) -> list[str]:
         """Of each row that failed on pairs: on how many, and the reason of the first."""
         failed = self.table[self.table["failed"] != ""].groupby("row", sort=False)
-        counts, pairs = failed["pair"].nunique(), self.table.groupby("row")["pair"].nunique()
+        counts = failed["pair"].nunique()
+        pairs = self.table.groupby("row")["pair"].nunique()
         return [
-            (
-                f"{name} failed on {counts[name]} of {pairs[name]} pairs, counted as 180°; the "
-                f"first: {reason}."
-            )
+            f"{name} failed on {counts[name]} of {pairs[name]} pairs, counted as 180°; the first: "
+            f"{reason}."
             for name, reason in failed["failed"].first().items()
         ]
 
@@ -244,14 +241,10 @@ class Run:
         found = self.row(name).dropna(subset=["rotation", "view"])
         if found.empty:
             raise InputError(f"row {name!r} has no poses in the run")
+        pairs = [Pair.from_key(key) for key in found.index]
         rotations = np.array(found["rotation"].tolist()).reshape(-1, 3, 3)
         positions = np.array([position or [np.nan] * 3 for position in found["position"]])
-        return (
-            [Pair.from_key(key) for key in found.index],
-            found["view"].to_numpy(int),
-            rotations,
-            positions,
-        )
+        return pairs, found["view"].to_numpy(int), rotations, positions
 
 
 @contextmanager
@@ -280,28 +273,35 @@ def _continued(out: Path, now: Settings) -> Settings:
     """Merge settings with those of the run that a folder holds; InputError if they do not go
     together."""
     before = read_json(out / SETTINGS, Settings, "settings of a run")
-    held, asked = _compared(before), _compared(now)
+    held, asked = _decisive(before), _decisive(now)
     for name in asked:
         if held.get(name, asked[name]) != asked[name]:
             raise InputError(
                 f"{out} holds a run with {name} {held[name]}, this is {asked[name]}; choose "
                 "another folder"
             )
-    merged = {name: getattr(before, name) | getattr(now, name) for name in ("methods", "labels")}
-    library = [*(one for one in before.library if one != now.library[0]), *now.library]
-    return msgspec.structs.replace(now, library=library, calls=before.calls + now.calls, **merged)
+    return msgspec.structs.replace(
+        now,
+        library=[one for one in before.library if one not in now.library] + now.library,
+        methods=before.methods | now.methods,
+        labels=before.labels | now.labels,
+        calls=before.calls + now.calls,
+    )
 
 
-def _compared(settings: Settings) -> dict[str, Any]:
+def _decisive(settings: Settings) -> dict[str, Any]:
     """What has to be equal in two calls that add to one run, where both have it, by its name."""
-    groups = {name: getattr(settings, name) for name in ("methods", "labels")}
-    parts = {
-        f"{name} of {key}": value for name, group in groups.items() for key, value in group.items()
+    parts: dict[str, Any] = {
+        "command": "align" if "alignment" in settings.methods else "benchmark",
+        "backbone": settings.backbone,
+        "targets": settings.targets,
+        "data": settings.folder or os.path.realpath(settings.data),
     }
-    whole = {name: getattr(settings, name) for name in ("backbone", "targets")}
-    whole["data"] = settings.folder or os.path.realpath(settings.data)
-    command = "align" if "alignment" in settings.methods else "benchmark"
-    return {"command": command} | whole | parts
+    for row, description in settings.methods.items():
+        parts[f"methods of {row}"] = description
+    for category, code in settings.labels.items():
+        parts[f"labels of {category}"] = code
+    return parts
 
 
 def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]]) -> None:
@@ -340,38 +340,37 @@ def read_run(out: str | Path) -> Run:
     that have these pairs. Pairs of different numbers of target views are the same if they are the
     same "problem".
     """
-    settings, lines = (
-        read_json(Path(out) / SETTINGS, Settings, "settings of a run"),
-        read_lines(out),
-    )
-    table, last = _finished(_table(lines, settings), settings), settings.calls[-1]
+    settings = read_json(Path(out) / SETTINGS, Settings, "settings of a run")
+    lines = read_lines(out)
+    last = settings.calls[-1]
+    table = _finished(_table(lines, settings), settings)
     if table.empty:
         raise InputError(f"{out}: the run has no pair that all its rows have finished")
     timings = pd.DataFrame([line.timings for line in lines]).median().to_dict()
-    notes, rows = [], table["row"].unique()
+    rows = table["row"].unique()
+    notes = []
     if not last.finished:
         most = table.groupby("row")["pair"].nunique().max()
         notes.append(f"Not finished: {most} of {sum(last.pairs.values())} pairs.")
     if len(settings.library) > 1:
         notes.append("Evaluated by several versions of zsp-lite (run.json lists them).")
-    if hidden := [name for name in settings.methods if name not in rows]:
+    hidden = [name for name in settings.methods if name not in rows]
+    if hidden:
         notes.append(f"Without {', '.join(hidden)}, which lack pairs of the last call.")
-    remarks = {
-        name: remark
-        for call in settings.calls
-        for name, remark in call.remarks.items()
-        if name in rows
-    }
-    return Run(settings, table, timings, " ".join(filter(None, [*notes, *remarks.values()])))
+    remarks: dict[str, str] = {}
+    for call in settings.calls:
+        remarks |= call.remarks
+    notes += [remark for name, remark in remarks.items() if name in rows]
+    return Run(settings, table, timings, " ".join(filter(None, notes)))
 
 
 def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
     """Tabulate the results in the categories of the last call, by row, category and pair."""
-    results = [
-        {"row": row, "pair": line.pair, "repeat": line.repeat} | msgspec.structs.asdict(one)
-        for line in lines
-        for row, one in line.results.items()
-    ]
+    results = []
+    for line in lines:
+        for row, found in line.results.items():
+            names = {"row": row, "pair": line.pair, "repeat": line.repeat}
+            results.append(names | msgspec.structs.asdict(found))
     table = pd.DataFrame(results, columns=["row", "pair", "repeat", *Result.__struct_fields__])
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
     table["milliseconds"] = 1000 * table["seconds"].astype(float)
@@ -387,17 +386,19 @@ def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
 def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
     """Keep the pairs that all rows of the last call have finished, and the rows, by seed, that have
     all of these."""
+    last = settings.calls[-1]
     views = table["pair"].str.count(",")  # one less than the target views
     finished = {}  # by number of views
-    for number, found in table[table["row"].isin(settings.calls[-1].rows)].groupby(views):
+    for number, found in table[table["row"].isin(last.rows)].groupby(views):
         cases_of_pair = found.groupby("pair").size()
-        wanted = found["row"].nunique() * settings.calls[-1].seeds
+        wanted = found["row"].nunique() * last.seeds
         finished[number] = set(cases_of_pair.index[cases_of_pair == wanted])
     problems = set(table["problem"][table["pair"].isin(set().union(*finished.values()))])
     kept = [table[:0]]
     for _, found in table.groupby(["row", "repeat"]):
-        number = views[found.index[0]]
-        column, wanted = ("pair", finished[number]) if number in finished else ("problem", problems)
+        column, wanted = "pair", finished.get(views[found.index[0]])
+        if wanted is None:  # the last call has no row of as many views
+            column, wanted = "problem", problems
         found = found[found[column].isin(wanted)]
         if wanted <= set(found[column]):
             kept.append(found)
