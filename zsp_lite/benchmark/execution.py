@@ -70,9 +70,9 @@ def evaluate_pairs(
         executor: Where to evaluate, with its number of workers; None for this process.
         kind: Type of the lines.
     """
-    known = {
-        (row, line.pair, line.repeat) for line in read_lines(out, kind) for row in line.results
-    }
+    known = set()
+    for line in read_lines(out, kind):
+        known |= {(row, line.pair, line.repeat) for row in line.results}
     todo = {}
     for pair, names in work.items():
         new = [name for name in names if (name, pair.key, pair.repeat) not in known]
@@ -175,11 +175,8 @@ def open_workers(executor: Executor | int = 1) -> Iterator[tuple[Executor | None
     It is a number of processes, 1 for this one, or an Executor, which stays open.
     """
     if isinstance(executor, Executor):
-        yield (
-            executor,
-            getattr(executor, "_max_workers", None)
-            or getattr(executor, "num_workers", _UNKNOWN_WORKERS),
-        )
+        known = getattr(executor, "_max_workers", None)
+        yield executor, known or getattr(executor, "num_workers", _UNKNOWN_WORKERS)
         return
     check_integer("workers", executor, 1, 4096)
     if executor == 1:

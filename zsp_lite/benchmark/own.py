@@ -20,13 +20,8 @@ from zsp_lite.errors import InputError, describe_failure, ends_the_run, real_arr
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import object_crop
 
-# functions of one, two and three arguments, and a solver
-KINDS = (
-    "problem",
-    "keypoints",
-    "matcher",
-    "solver",
-)
+# Functions of one, two and three arguments, and a solver.
+KINDS = ("problem", "keypoints", "matcher", "solver")
 
 
 def kind_of(name: str, thing: Any) -> str:
@@ -40,8 +35,8 @@ def kind_of(name: str, thing: Any) -> str:
     if not isinstance(thing, type):
         if callable(getattr(thing, "estimate", None)):
             return "estimator"
-        if (kind := getattr(thing, "kind", None)) in KINDS:
-            return kind
+        if getattr(thing, "kind", None) in KINDS:
+            return thing.kind
         known = parameters(thing)
         others = [one for name, one in known.items() if name not in ("seed", "threshold")]
         needed = [
@@ -89,11 +84,10 @@ def fails_alone(seconds: int) -> Iterator[None]:
             watcher.join()  # what it has raised comes here at the latest
     except (InputError, KeyboardInterrupt):
         raise
+    except OutOfTime as error:
+        raise InputError(f"takes more than {seconds} s") from error
     except BaseException as error:
-        late = f"takes more than {seconds} s"
-        raise InputError(
-            late if isinstance(error, OutOfTime) else describe_failure(error)
-        ) from error
+        raise InputError(describe_failure(error)) from error
 
 
 def given(method: Any, problem: PairProblem) -> Any:
@@ -117,9 +111,9 @@ class Estimator:
 
     def __call__(self, problem: Problem) -> Any:
         reference, *targets = problem.frames()
-        own = (
-            replace(self.own, seed=problem.seed) if isinstance(self.own, ZeroShotPose) else self.own
-        )
+        own = self.own
+        if isinstance(own, ZeroShotPose):
+            own = replace(own, seed=problem.seed)
         return seeded(own.estimate, problem.seed)(reference, targets)
 
 
@@ -149,10 +143,8 @@ def fit_keypoints(
     (sec. 4.3)."""
     reference, *targets = problem.frames(depth=True)
     empty = np.zeros((0, 2))
-    first, second = (
-        real_array("matched points", one if len(one) else empty, (None, 2))
-        for one in (first, second)
-    )
+    first = real_array("matched points", first if len(first) else empty, (None, 2))
+    second = real_array("matched points", second if len(second) else empty, (None, 2))
     if len(first) != len(second):
         raise InputError(
             f"matched points are {len(first)} and {len(second)}, expected as many in both images"
@@ -178,7 +170,8 @@ class StoredPoses:
     digest: str  # of the file
 
     def __call__(self, problem: PairProblem) -> Answer:
-        if (pose := self._poses.get(problem.pair.key)) is None:
+        pose = self._poses.get(problem.pair.key)
+        if pose is None:
             raise InputError(f"{self.path} has no pose")
         view = problem.pair.target_frames.index(pose.target_frame)
         return Answer(pose.rotation, view, pose.translation, pose.scale)

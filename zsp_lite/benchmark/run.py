@@ -97,15 +97,12 @@ def evaluate(
     check_integer("targets", targets, 1)
     check_integer("row_seconds", row_seconds, 1, 1_000_000)
     check_integer("seeds", seeds, 1, 1000)
-    # The rows, and the pairs that each is evaluated on.
-    rows = {
-        name: replace(row, seconds=row_seconds) for name, row in resolve(methods, sweep).items()
-    }
+    rows = resolve(methods, sweep)
     dataset = Co3D(data)
     numbers = pairs
     if not isinstance(pairs, Mapping):
         numbers = dict.fromkeys(labelled_categories(dataset), pairs)
-    work = pairs_of_rows(dataset, rows, numbers, targets)
+    work = pairs_of_rows(dataset, rows, numbers, targets)  # the rows of each pair
     loaded = as_backbone(backbone)
     remarks = _check_rows(rows, make_extractors(loaded, rows), dataset, work)
     repeated = {
@@ -126,7 +123,9 @@ def evaluate(
         )
         # Workers load a named backbone themselves; an object travels to them.
         travels = backbone if pool else loaded
-        make = partial(pair_evaluator, str(Path(data).resolve()), rows, travels)
+        make = partial(
+            pair_evaluator, str(Path(data).resolve()), rows, travels, row_seconds=row_seconds
+        )
         with open_run(out, settings):
             execution.evaluate_pairs(out, make, repeated, pool, workers)
 
@@ -150,6 +149,7 @@ def _check_rows(
         elif isinstance(row.solve, StoredPoses):
             asked = [pair for pair, names in work.items() if name in names]
             remark = row.solve.remark(dataset, asked)
+            # Empty, too: it replaces that of an earlier call.
             remarks[name] = f"{name}: {remark}." if remark else ""
     return remarks
 
@@ -210,16 +210,20 @@ def _labels(dataset: Co3D, category: str) -> str:
 
 
 def pair_evaluator(
-    root: str, methods: Mapping[str, Method], backbone: Any, threads: int
+    root: str, methods: Mapping[str, Method], backbone: Any, threads: int, row_seconds: int = 60
 ) -> execution.Evaluate:
     """Make what evaluates pairs in one process; frames, and features by some `threads`, are kept
     from pair to pair."""
     store = FrameStore(Co3D(root), make_extractors(as_backbone(backbone), methods), threads)
-    return partial(evaluate_pair, methods=methods, store=store)
+    return partial(evaluate_pair, methods=methods, store=store, row_seconds=row_seconds)
 
 
 def evaluate_pair(
-    pair: Pair, names: Iterable[str], methods: Mapping[str, Method], store: FrameStore
+    pair: Pair,
+    names: Iterable[str],
+    methods: Mapping[str, Method],
+    store: FrameStore,
+    row_seconds: int = 60,
 ) -> dict[str, Any]:
     """Evaluate the named rows on a pair: a line of the run's results (see `runs.ResultLine`)."""
     store.timings.clear()
@@ -237,7 +241,7 @@ def evaluate_pair(
         own = is_own(name) and type(method.solve) is not StoredPoses
         seen = given(method.solve, problem) if own and method.solve else problem
         try:
-            with fails_alone(method.seconds) if own else nullcontext():
+            with fails_alone(row_seconds) if own else nullcontext():
                 start = time.perf_counter()
                 answer = _ask(method, seen, truths)
                 seconds = time.perf_counter() - start

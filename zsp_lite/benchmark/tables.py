@@ -239,18 +239,20 @@ def compare(
     cells = {}
     for text in rows:
         one, _, other = (text, "", text) if text in of_first else text.partition(":")
-        both = _by_seed(first, one).join(
-            _by_seed(second, other)["error"], rsuffix="_b", how="inner"
-        )
+        errors_b = _by_seed(second, other)["error"].rename("error_b")
+        both = _by_seed(first, one).join(errors_b, how="inner").sort_index()
         if both.empty:
             raise InputError(
                 f"rows {one} and {other} have no pair in common: other data or number of views"
             )
-        both = both.sort_index()
         errors = both[["error", "error_b"]].to_numpy().T
         gain = paired_difference(*errors, weights=draws_of(both))
-        accuracies, medians = map(Cell, accuracy(errors, 30)), map(Cell, median(errors))
-        cells[text] = [_count(len(both)), *accuracies, *_difference(gain), *medians]
+        cells[text] = [
+            _count(len(both)),
+            *map(Cell, accuracy(errors, 30)),
+            *_difference(gain),
+            *map(Cell, median(errors)),
+        ]
     titles = ["pairs", "Acc30 of A (%)", "Acc30 of B (%)", "B − A", "p"]
     titles += [f"{run}: {METRICS['median']}" for run in "AB"]
     note = (
