@@ -48,7 +48,6 @@ SEE_MORE = {
     "with_scans": ("With several frames of the reference object", GROUPS["scans"]),
     "with_others": ("With other unlabelled objects of the category", ["category"]),
 }
-_LOWEST_IS_BEST = ("mean_category_median", "median", "above150", "translation", "milliseconds")
 # Characters that LaTeX reads as commands or does not have in text mode.
 _LATEX = {
     "\\": r"\textbackslash{}",
@@ -70,7 +69,6 @@ class Cell:
     low: float | None = None
     high: float | None = None
     decimals: int = 1
-    metric: str = ""  # of `METRICS`
 
     def __str__(self) -> str:
         if self.decimals == 3 and self.value < 0.001:  # a p value
@@ -89,7 +87,6 @@ class Table:
     cells: pd.DataFrame  # of `Cell`, or None
     note: str = ""  # how to read it
     data: str = ""  # what was evaluated
-    across: bool = False  # the columns are methods, not the rows
 
     @property
     def text(self) -> pd.DataFrame:
@@ -217,7 +214,7 @@ def by_category(
     }
     rows["all"] = [_cell(row, metric) for row in methods.values()]
     name, title = f"categories_{metric.rpartition('_')[2]}", f"By category: {METRICS[metric]}"
-    return _table(summary, name, title, rows, list(methods), [metric], across=True)
+    return _table(summary, name, title, rows, list(methods), [metric])
 
 
 def compare(
@@ -312,7 +309,7 @@ def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:
     if row.get(found) is None:
         return None
     decimals = 2 if metric in ("scale", "translation") else 1
-    return Cell(row[found], *row.get(f"{found}_ci", ()), decimals=decimals, metric=found)
+    return Cell(row[found], *row.get(f"{found}_ci", ()), decimals=decimals)
 
 
 def _table(
@@ -323,7 +320,6 @@ def _table(
     titles: Sequence[str],
     metrics: Sequence[str],
     *more: str,
-    across: bool = False,
 ) -> Table:
     """Make a table of a run, with notes on how to read it, and with what the run has evaluated."""
     data, notes = summary["data"], [summary.get("note", "")]
@@ -356,7 +352,7 @@ def _table(
         f"views, backbone {summary['backbone']}"
     )
     cells = pd.DataFrame.from_dict(rows, "index", object, titles)
-    return Table(name, title, cells, " ".join(filter(None, notes)), what, across)
+    return Table(name, title, cells, " ".join(filter(None, notes)), what)
 
 
 def as_csv(table: Table) -> str:
@@ -383,50 +379,23 @@ def as_markdown(table: Table) -> str:
 
 
 def as_latex(table: Table, intervals: bool = False) -> str:
-    """Format three columns and the time as a booktabs table, the best value of a metric in bold.
-
-    The paper's figures of these columns follow in lines of their own.
-    """
+    """Format three columns and the time as a booktabs table."""
     time = METRICS["milliseconds"]
     titles = [title for title in table.cells if title not in ("pairs", time)][:3]
     if time in table.cells:
         titles.append(time)
-    shown = table.cells[titles].dropna(how="all")
-    best = shown.apply(_are_best, axis=int(table.across))
-    texts = shown.map(_number, interval=intervals)
-    texts = texts.mask(best, r"\textbf{" + texts + "}")
-    of_paper = [f"{PUBLISHED}: {title}" for title in titles]
-    published = table.cells.reindex(columns=of_paper).dropna(how="all").map(_number)
-    published.columns = titles
-    published.index = [f"{PUBLISHED}: {label}" for label in published.index]
-
-    lines = pd.concat([texts, published]).rename(index=_escape, columns=_escape)
+    shown = table.cells[titles].dropna(how="all").map(_number, interval=intervals)
     # LaTeX counts tables itself
     title = re.sub(r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title)
-    parts = [title, table.data, _PUBLISHED_NOTE if len(published) else ""]
-    return lines.to_latex(
+    return shown.rename(index=_escape, columns=_escape).to_latex(
         position="tb",
         label=f"tab:{table.name}",
-        caption=_escape(". ".join(filter(None, parts))),
+        caption=_escape(". ".join(filter(None, [title, table.data]))),
         column_format="l" + "r" * len(titles),
     )
 
 
-def _are_best(cells: pd.Series) -> pd.Series:
-    """Tell which cells of one metric are the best, if there are rivals; a row that is told the true
-    view is none."""
-    values = {}
-    metric = ""
-    for name, cell in cells.items():
-        if cell and cell.metric and "oracle-view" not in name:
-            values[name] = round(cell.value, cell.decimals)
-            metric = cell.metric
-    rivals = pd.Series(values, cells.index, float)  # NaN for what is none
-    best = rivals.min() if metric in _LOWEST_IS_BEST else rivals.max()
-    return (rivals == best) & (len(values) > 1)
-
-
-def _number(cell: Any, interval: bool = False) -> str:
+def _number(cell: Any, interval: bool) -> str:
     if not isinstance(cell, Cell):
         return "--"
     text = str(cell) if interval else str(replace(cell, low=None))
