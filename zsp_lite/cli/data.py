@@ -87,7 +87,8 @@ def _print_checks(root: Path, checks: Sequence[Any]) -> int:
         ]
         found = [f"{count:,} of {every:,} {what}" for count, every, what in counted if count > 0]
         found += check.problems[:_PROBLEMS_SHOWN]
-        if (more := len(check.problems) - _PROBLEMS_SHOWN) > 0:
+        more = len(check.problems) - _PROBLEMS_SHOWN
+        if more > 0:
             found.append(f"and {more} more")
         lines += [f"{check.category}: {line}" for line in found]
     size = decimal(sum(check.size for check in checks))
@@ -297,10 +298,10 @@ def import_(source, root, category, sequence, mask, box, **options) -> None:
     mask = mask or ("box" if box else "given")
     opened = open_source(source[-1], mask=mask, box=box, layout=layout, **options)
     done = import_source(opened, root, category, sequence)
+    left_out = f"; {done.empty} frames without the object left out" if done.empty else ""
     print(
         f"Written: {root / category / sequence}: {done.frames} frames, {done.points:,} points, "
-        f"scaled by {done.scale:.4g}"
-        + (f"; {done.empty} frames without the object left out" if done.empty else "")
+        f"scaled by {done.scale:.4g}{left_out}"
     )
     for flag in done.flags:
         print(f"flag: {flag}")
