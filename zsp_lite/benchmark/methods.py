@@ -170,8 +170,7 @@ def _method(name: str, meant: Any) -> Method:
         if ":" not in meant:
             raise InputError(
                 f"method {meant!r} is unknown; `zsp-lite benchmark --list` lists all, "
-                "NAME=module:thing and "
-                "NAME=poses.csv are your own"
+                "NAME=module:thing and NAME=poses.csv are your own"
             )
         meant = import_object(meant)
     elif isinstance(meant, Method):

@@ -38,21 +38,24 @@ def kind_of(name: str, thing: Any) -> str:
         if getattr(thing, "kind", None) in KINDS:
             return thing.kind
         known = parameters(thing)
-        others = [one for name, one in known.items() if name not in ("seed", "threshold")]
         needed = [
-            one for one in others if one.default is one.empty and one.kind is not one.VAR_KEYWORD
+            one
+            for key, one in known.items()
+            if key not in ("seed", "threshold")
+            and one.default is one.empty
+            and one.kind is not one.VAR_KEYWORD
         ]
         positional = all(
             one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed
         )
+        if positional and len(needed) == 3 and known.keys() >= {"seed", "threshold"}:
+            return "solver"
         if positional and len(needed) in (1, 2, 3):
-            solves = len(needed) == 3 and known.keys() >= {"seed", "threshold"}
-            return "solver" if solves else KINDS[len(needed) - 1]
+            return KINDS[len(needed) - 1]
     raise InputError(
-        f"method {name!r} is of type {type(thing).__name__}, expected a function of one "
-        "argument (problem), two (two "
-        "images) or three (similarities, two foregrounds), a solver, or an object with "
-        "estimate(reference, targets)"
+        f"method {name!r} is of type {type(thing).__name__}, expected a function of one argument "
+        "(problem), two (two images) or three (similarities, two foregrounds), a solver, or an "
+        "object with estimate(reference, targets)"
     )
 
 

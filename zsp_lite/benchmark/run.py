@@ -97,18 +97,21 @@ def evaluate(
     check_integer("targets", targets, 1)
     check_integer("row_seconds", row_seconds, 1, 1_000_000)
     check_integer("seeds", seeds, 1, 1000)
+
+    # Rows, pairs, and the rows of each pair, by seed.
     rows = resolve(methods, sweep)
     dataset = Co3D(data)
     numbers = pairs
     if not isinstance(pairs, Mapping):
         numbers = dict.fromkeys(labelled_categories(dataset), pairs)
-    work = pairs_of_rows(dataset, rows, numbers, targets)  # the rows of each pair
+    work = pairs_of_rows(dataset, rows, numbers, targets)
     loaded = as_backbone(backbone)
     remarks = _check_rows(rows, make_extractors(loaded, rows), dataset, work)
     repeated = {
         replace(pair, repeat=k): names for k in range(seeds) for pair, names in work.items()
     }
 
+    # Lines of the run, pair by pair (see `evaluate_pair`).
     with execution.open_workers(executor) as (pool, workers):
         settings = run_settings(
             data,
@@ -129,6 +132,7 @@ def evaluate(
         with open_run(out, settings):
             execution.evaluate_pairs(out, make, repeated, pool, workers)
 
+    # The lines as one table, and its summary.
     found = read_run(out)
     for remark in filter(None, [*remarks.values(), *found.failures]):
         logger.warning("%s", remark)
@@ -197,7 +201,8 @@ def pairs_of_rows(
         names = [name for name, row in rows.items() if (row.targets or targets) == n_targets]
         for category, n in numbers.items():
             check_integer(f"pairs of {category}", n, 1)
-            work |= dict.fromkeys(category_pairs(dataset, category, n, n_targets), names)
+            for pair in category_pairs(dataset, category, n, n_targets):
+                work[pair] = names
     return work
 
 
