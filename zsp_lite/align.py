@@ -117,7 +117,8 @@ def align_category(
     if not found:
         raise InputError(f"category {category}: none of {len(chosen)} pairs determines a pose")
     posed = {name for one in found for name in (one.reference, one.target)}
-    for name in sorted({pair.reference_sequence for pair in chosen.values()} - posed):
+    asked = {pair.reference_sequence for pair in chosen.values()}
+    for name in sorted(asked - posed):
         logger.warning("%s/%s is left out: none of its pairs determines a pose", category, name)
     return synchronise(found)
 

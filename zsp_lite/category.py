@@ -145,12 +145,11 @@ def object_pairs(
         per_object = n - 1 if n < ALL_PAIRS_BELOW else PAIRS_PER_OBJECT
     # The objects stand in a random circle; each has pairs with those some steps further.
     rng = np.random.default_rng(0)
-    circle = rng.permutation(n).tolist()
+    circle = [names[k] for k in rng.permutation(n)]
     steps = [1, *(2 + rng.permutation(n - 2)).tolist()]  # the first connects all objects
     ends = [(circle[k], circle[(k + step) % n]) for k in range(n) for step in steps[:per_object]]
     pairs = []
-    for a, b in sorted(ends):
-        reference, target = names[a], names[b]
+    for reference, target in sorted(ends):
         rng = np.random.default_rng([0, stable_hash(f"{category}/{reference}/{target}") >> 1])
         # Frames that are evenly spaced over a sequence show several sides; the random starts depend
         # on the names only.
@@ -239,15 +238,15 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
             probability, other = OF_TWO.probabilities(np.array([0.0, margin]), known).tolist()
         alternative = None
         if turned is not None:  # about the object's centre
-            there = sim3.apply(centres[i])
-            alternative = Sim3(scales[i], turned, there - scales[i] * turned @ centres[i])
+            shift = sim3.apply(centres[i]) - scales[i] * turned @ centres[i]
+            alternative = Sim3(scales[i], turned, shift)
         objects[name] = AlignedObject(sim3, centres[i], probability, alternative, other)
     return CategoryAlignment(objects, tuple(pairs), _disagreements(names, ends, off))
 
 
 def _connected(names: Sequence[str], ends: Int[np.ndarray, "e 2"]) -> Int[np.ndarray, " n"]:
     """Order the objects so that each has a pair with an earlier one; InputError if none does."""
-    links = coo_array((np.ones(len(ends)), ends.T), (len(names), len(names)))
+    links = coo_array((np.ones(len(ends)), ends.T), [len(names)] * 2)
     order = breadth_first_order(links.tocsr(), 0, directed=False, return_predecessors=False)
     if len(order) < len(names):
         raise InputError(

@@ -289,9 +289,7 @@ def view_alignment(reference: View, target: View) -> Sim3:
     """
     first, second = _foreground_points(reference), _foreground_points(target)
     spread, target_spread = standard_deviation(first), standard_deviation(second)
-    scale = 1.0
-    if min(spread, target_spread) > 0:
-        scale = target_spread / spread
+    scale = target_spread / spread if min(spread, target_spread) > 0 else 1.0
     return Sim3(scale, np.eye(3), second.mean(axis=0) - scale * first.mean(axis=0))
 
 

@@ -82,10 +82,9 @@ def stood_up(scan: Scan, target: Scan, method: ZeroShotPose) -> tuple[Scan, int]
         (view,) = views_of(scan.references[:1], quarters)
         with suppress(NoPoseError):
             estimate = method.estimate_from_views(view, target.target_views)
-            score = estimate.view_scores[estimate.view]
+            scores[quarters] = estimate.view_scores.max()
             if estimate.hypotheses:
-                score = estimate.hypotheses[0].score
-            scores[quarters] = score
+                scores[quarters] = estimate.hypotheses[0].score
     best = max(scores, key=scores.get, default=0)
     frames = {position: turn_frame(frame, best) for position, frame in scan.frames.items()}
     views = dict(zip(scan.views, views_of(scan.views, best), strict=True))
@@ -96,8 +95,8 @@ def scan_flags(scans: Sequence[Scan]) -> tuple[str, ...]:
     """Name two categories, and what is doubtful about the frames in use and the sides that they
     show."""
     flags = []
-    sequences = [one.source.path.resolve() for one in scans if one.source.format == "sequence"]
-    categories = sorted({path.parent.name for path in sequences})
+    sources = [scan.source for scan in scans if scan.source.format == "sequence"]
+    categories = sorted({source.path.resolve().parent.name for source in sources})
     if len(categories) > 1:
         flags.append(f"the objects are of different categories: {', '.join(categories)}")
     for scan in scans:

@@ -67,10 +67,11 @@ class OutOfTime(BaseException):
 def fails_alone(seconds: int) -> Iterator[None]:
     """Turn an error of the block, or that it takes too long between two calls of compiled code,
     into an InputError."""
-    thread, ended = ctypes.c_ulong(threading.get_ident()), threading.Lock()
+    thread = ctypes.c_ulong(threading.get_ident())
+    ended = threading.Lock()
 
     def watch() -> None:
-        wait: float = seconds
+        wait = seconds
         while not ended.acquire(timeout=wait):
             ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(OutOfTime))
             wait = 1  # and again, for a block that goes on

@@ -175,7 +175,8 @@ def write_reports(
     """
     from zsp_lite.benchmark import tables  # workers need no matplotlib
 
-    found, out = read_run(run), Path(out or run)
+    found = read_run(run)
+    out = Path(out or run)
     shown = tables.choose(found, rows) if rows else found.summary
     for name in ("all_rows", *tables.SEE_MORE, *(spec["name"] for spec in read_paper_tables())):
         for path in (out / "tables").glob(f"{name}.*"):
@@ -302,7 +303,7 @@ def _measure(
         "rotation": answer.rotation.ravel().round(6).tolist(),
     }
     pair, store = problem.pair, problem.store
-    reference, *targets = (frame.camera for frame in problem.frames())
+    reference, *targets = [frame.camera for frame in problem.frames()]
     names = pair.reference_sequence, pair.target_sequence
 
     # Turns of the target object that look the same are no errors of its symmetric error.
@@ -313,7 +314,7 @@ def _measure(
         known["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
 
     # Where the reference object's centre comes to lie, in diameters of the target object.
-    reference_extent, target_extent = (store.extent(pair.category, name) for name in names)
+    reference_extent, target_extent = [store.extent(pair.category, name) for name in names]
     if answer.translation is not None:
         known["position"] = answer.translation.round(6).tolist()
         if reference_extent and target_extent:

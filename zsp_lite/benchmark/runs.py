@@ -252,7 +252,8 @@ def open_run(out: str | Path, settings: Settings) -> Iterator[None]:
     """Be the only writer of a run's folder, which is new or holds a run with these settings; then
     `add_lines` adds."""
     with writing(out):
-        out, packed = Path(out), Path(out) / f"{LINES}.gz"
+        out = Path(out)
+        packed = out / f"{LINES}.gz"
         settings.folder = os.path.realpath(settings.data).encode(errors="replace").decode()
         if any(path.exists() for path in (out / SETTINGS, out / LINES, packed)):
             settings = _continued(out, settings)

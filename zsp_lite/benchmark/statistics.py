@@ -105,12 +105,14 @@ def object_draws(
         first, second = sides.reshape(-1, 2).T
         drawn = np.zeros((resamples, len(members)))
         # A draw without both objects of any pair has no weight at all and is repeated.
-        while len(empty := np.nonzero(drawn.sum(axis=1) == 0)[0]):
+        empty = np.arange(resamples)
+        while len(empty):
             if len(names) < _FEWEST_OBJECTS:
                 drawn[empty] = _multiplicities(len(members), len(empty), rng)
             else:
                 counts = _multiplicities(len(names), len(empty), rng)
                 drawn[empty] = counts[:, first] * counts[:, second]
+            empty = np.flatnonzero(drawn.sum(axis=1) == 0)
         weights[:, members] = drawn * (len(members) / drawn.sum(axis=1, keepdims=True))
     return weights
 

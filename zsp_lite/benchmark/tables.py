@@ -322,7 +322,8 @@ def _table(
     *more: str,
 ) -> Table:
     """Make a table of a run, with notes on how to read it, and with what the run has evaluated."""
-    data, notes = summary["data"], [summary.get("note", "")]
+    data = summary["data"]
+    notes = [summary.get("note", "")]
     if "mean_category_median" in metrics:
         notes.append("Med. err.: mean of the categories' medians.")
     if {"translation", "scale"} & set(metrics):
@@ -465,7 +466,8 @@ def pair_figure(run: Run, key: str, dataset: Co3D, rows: Sequence[str] | None = 
     reference, targets = dataset.load_pair(Pair.from_key(key))
     crops = [object_crop(reference)]
     cloud = frame_cloud(crops[0])
-    poses, errors = [Sim3.identity()], []
+    poses = [Sim3.identity()]
+    errors = []
     for result in found.values():
         crops.append(object_crop(targets[int(result["view"])]))
         poses.append(_pose(result, cloud, crops[-1]))
