@@ -20,8 +20,8 @@ from zsp_lite.backbones.load import (
     BackboneConfig,
     PretrainedWeights,
     available_backbones,
+    how_to_obtain,
     load_backbone,
-    obtained_by,
 )
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.runs import fingerprint
@@ -321,7 +321,7 @@ def test_dino_models_come_from_the_server(server, vit, pictures, tmp_path, cache
     monkeypatch.setenv("ZSP_LITE_DINO_URL", f"{server.url}/dino")
     released = PretrainedWeights("some/vit.pth", hashlib.md5(content).hexdigest()[:6], len(content))
     monkeypatch.setitem(load.PRETRAINED, "dino_vits8", released)
-    assert obtained_by("dino_vits8") == "not downloaded: zsp-lite weights fetch dino_vits8"
+    assert how_to_obtain("dino_vits8") == "not downloaded: zsp-lite weights fetch dino_vits8"
     assert available_backbones()["dino_vits8"] is None
     loaded = load_backbone("dino_vits8", "cpu")
     assert loaded.name == "dino_vits8" and available_backbones()["dino_vits8"] == cache / "vit.pth"
