@@ -119,7 +119,7 @@ def reliability_flags(
         )
 
     terms = hypotheses[0].terms
-    if terms:  # a solver of the user's own may give none
+    if terms:  # a pose that is made of several estimates has none
         if max(terms["forward_overlap"], terms["reverse_overlap"]) < _MIN_OVERLAP:
             flags.append("no view confirms the pose: nearly no point lies on an observed surface")
         if max(terms["forward_similarity"], terms["reverse_similarity"]) < _MIN_SIMILARITY:
