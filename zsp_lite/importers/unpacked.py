@@ -20,8 +20,11 @@ from zsp_lite.data.frames import MAX_PIXELS
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import file_size, path_inside
 
-# Bytes of an unpacked zip; above the second at most 200 times those of the zip
-_MOST, _LARGE, _RATIO = 20e9, 1e9, 200
+# Limits of an unpacked zip: bytes; bytes above which it may have at most so many times those of the
+# zip.
+_MOST = 20e9
+_LARGE = 1e9
+_RATIO = 200
 _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
@@ -44,16 +47,16 @@ def new_folder() -> Path:
 
 @cache
 def unpack(path: Path) -> Path:
-    """Unpack a zip to a temporary folder; InputError if it is damaged, encrypted, too large, or has
-    paths out of it."""
-    size, folder = file_size(path, "zip"), new_folder()
+    """Unpack a zip to a temporary folder; InputError if it is damaged, encrypted or too large."""
+    size = file_size(path, "zip")
+    folder = new_folder()
     try:
         with zipfile.ZipFile(path) as zipped:
-            total = sum(one.file_size for one in zipped.infolist())
+            total = sum(member.file_size for member in zipped.infolist())
             if total > min(_MOST, max(_LARGE, _RATIO * size)):
                 raise InputError(f"{size:,} bytes unpack to {total:,}")
-            for one in zipped.infolist():
-                path_inside(folder, one.filename)
+            for member in zipped.infolist():
+                path_inside(folder, member.filename)
             zipped.extractall(folder)  # makes no links
     except _DAMAGE as error:
         raise InputError(
@@ -63,14 +66,14 @@ def unpack(path: Path) -> Path:
 
 
 def open_video(path: Path) -> Callable[[int], UInt8[np.ndarray, "h w 3"]]:
-    """Return a function that decodes the frame with a number, as it is stored; the numbers may not
-    decrease.
+    """Return a function that decodes the frame with a number, as it is stored.
 
-    InputError if the file is no video, and by the function if it has no such frame.
+    The numbers may not decrease. InputError if the file is no video, and by the function if it has
+    no such frame.
     """
     file_size(path, "video")
     with open(path, "rb") as file:
-        # Other files may name addresses, which are not to be opened
+        # An MP4 file. Others may name addresses, which are not to be opened.
         is_video = file.read(8)[4:] == b"ftyp"
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG) if is_video else cv2.VideoCapture()
     position = -1
