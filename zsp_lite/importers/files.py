@@ -129,10 +129,10 @@ def read_mask_file(path: str | Path, label: int | None = None) -> Float32[np.nda
     elif lossy:
         mask = values > levels[-1] / 2
     elif not has_labels:
-        one = max(1.0, levels[-1])  # the value that stands for a probability of 1
+        certain = max(1.0, levels[-1])  # the value for a probability of 1
         if integers:
-            one = 65535 if values.dtype == np.uint16 else 255
-        mask = values / one
+            certain = 65535 if values.dtype == np.uint16 else 255
+        mask = values / certain
     elif len(labels) == 1:
         mask = values == labels[0]
     else:
@@ -144,7 +144,7 @@ def read_mask_file(path: str | Path, label: int | None = None) -> Float32[np.nda
 
 
 def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
-    """Read the values of a mask file, and whether they number the colours of a palette or picture."""
+    """Read the values of a mask file, and whether they are numbers of colours."""
     values = _read_values(path, "mask")
     if path.suffix.lower() == ".png":
         with _decoding("mask", path):
