@@ -119,10 +119,10 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     everywhere_by_ray = _share(whole, along_ray=True)
     gains = everywhere_by_ray > max(_RAY_GAIN * everywhere, _FITTING)
     if gains and by_ray > _AGREEING:
-        mistake = "depth is the distance along the ray of a pixel, not along the optical axis"
         return (
             f"{found}; all that is seen agrees better ({everywhere_by_ray:.0%}, not "
-            f"{everywhere:.0%}) if {mistake}"
+            f"{everywhere:.0%}) if depth is the distance along the ray of a pixel, not along the "
+            "optical axis"
         )
     if given > _AGREEING:
         return ""

@@ -258,10 +258,10 @@ def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
         distances.append(np.quantile(depth, 0.25) if len(depth) else np.nan)
     distance = float(np.nanmedian(distances)) if known else PLAUSIBLE[0]
     if metric and not PLAUSIBLE[0] <= distance <= PLAUSIBLE[1]:
-        cure = "the unit of its depth is given by --depth-unit (0.001: millimetres, 1: metres)"
         yield (
             f"the object is {distance:.3g} m from the camera, expected {PLAUSIBLE[0]:g} to "
-            f"{PLAUSIBLE[1]:g} m; {cure}"
+            f"{PLAUSIBLE[1]:g} m; the unit of its depth is given by --depth-unit (0.001: "
+            "millimetres, 1: metres)"
         )
     if known < _LEAST_KNOWN * seen:
         yield f"depth is known on {known / seen:.0%} of the object only"

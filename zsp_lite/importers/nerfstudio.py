@@ -97,8 +97,10 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
         height * own_width, width * own_height, rel_tol=0.01
     ):
         fitted = ", ".join(f"{value * own_width / width:.4g}" for value in intrinsics)
-        expected = f"its own size {own_width} x {own_height} with the intrinsics {fitted}"
-        raise InputError(f"{where}: w and h of {image} are {width} x {height}, expected {expected}")
+        raise InputError(
+            f"{where}: w and h of {image} are {width} x {height}, expected its own size "
+            f"{own_width} x {own_height} with the intrinsics {fitted}"
+        )
 
     # OpenCV's order of the coefficients; its model has no r^8 term, k4.
     last = (frame.k3, frame.k4) if fisheye else (frame.p1, frame.p2, frame.k3)
@@ -118,9 +120,7 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     )
 
 
-def _intrinsics(
-    frame: _Frame, height: int, width: int, where: str
-) -> tuple[float, float, float, float]:
+def _intrinsics(frame: _Frame, height: int, width: int, where: str) -> list[float]:
     """Return fx, fy, cx, cy of a frame; by default both focal lengths are equal."""
     fx = frame.fl_x
     fy = frame.fl_y
@@ -132,4 +132,4 @@ def _intrinsics(
         fy = height / 2 / math.tan(frame.camera_angle_y / 2)
     cx = width / 2 if frame.cx is None else frame.cx
     cy = height / 2 if frame.cy is None else frame.cy
-    return fx, fy or fx, cx, cy
+    return [fx, fy or fx, cx, cy]
