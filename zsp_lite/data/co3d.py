@@ -121,7 +121,8 @@ class Co3D:
             if (cloud or 0) > _MIN_CLOUD_QUALITY and views > _MIN_VIEW_QUALITY:
                 selected.append(sequence)
         return sorted(
-            selected, key=lambda one: (-one.point_cloud.quality_score, one.sequence_name)
+            selected,
+            key=lambda sequence: (-sequence.point_cloud.quality_score, sequence.sequence_name),
         )[:top]
 
     def frame_list(self, category: str) -> list[FrameKey]:
@@ -215,9 +216,9 @@ class Co3D:
 
     def _cloud_path(self, category: str, sequence: str) -> Path | None:
         """Return the path of a sequence's point cloud, None if the annotations have none."""
-        clouds = {one.sequence_name: one.point_cloud for one in self.sequences(category)}
+        clouds = {entry.sequence_name: entry.point_cloud for entry in self.sequences(category)}
         cloud = clouds.get(sequence)
-        return cloud and path_inside(self.root, cloud.path)
+        return None if cloud is None else path_inside(self.root, cloud.path)
 
     def _read(
         self, reader: Callable[..., np.ndarray], relative: str, size: tuple[int, int], *options: Any
@@ -279,7 +280,7 @@ def write_co3d(
             index = read_frame_index(frames_path)
             frames = [(key.sequence_name, entry) for key, entry in zip(index.keys, index.entries)]
         if sequences_path.is_file():
-            listed = [(one.sequence_name, one) for one in read_sequences(sequences_path)]
+            listed = [(entry.sequence_name, entry) for entry in read_sequences(sequences_path)]
 
         for sequence in sequences:
             annotations, annotation = _write_sequence(root, category, sequence, quality)

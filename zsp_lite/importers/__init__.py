@@ -107,7 +107,7 @@ def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
         if any(file.name in signs or file.suffix.lower() in signs for file in (path, *files)):
             raise InputError(f"{path} {problem}, {_HOW}")
     found = "has another format" if path.exists() else "does not exist"
-    known = "; ".join(f"{one.what} ({', '.join(one.signs)})" for one in FORMATS.values())
+    known = "; ".join(f"{layout.what} ({', '.join(layout.signs)})" for layout in FORMATS.values())
     raise InputError(f"{path} {found}, expected {also}a folder or zip with the files of {known}")
 
 

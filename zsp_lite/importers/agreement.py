@@ -145,13 +145,13 @@ def neighbours(count: int) -> list[int]:
 def _pairs(surfaces: Sequence[_Surface]) -> list[_Pair]:
     """Pair each surface with that of a camera turned by about `_BEST` degrees."""
     # No mistake changes the angle between two cameras.
-    surfaces = [one for one in surfaces if len(one.points) >= _LEAST_POINTS]
+    surfaces = [surface for surface in surfaces if len(surface.points) >= _LEAST_POINTS]
     pairs = []
-    for one in surfaces:
-        angles = np.array([rotation_angle(one.camera.R, other.camera.R) for other in surfaces])
+    for surface in surfaces:
+        angles = np.array([rotation_angle(surface.camera.R, other.camera.R) for other in surfaces])
         angles[(angles < _NEAREST) | (angles > _FARTHEST)] = np.inf
         if np.isfinite(angles).any():
-            pairs.append((one, surfaces[int(np.abs(angles - _BEST).argmin())]))
+            pairs.append((surface, surfaces[int(np.abs(angles - _BEST).argmin())]))
     return pairs[:: len(pairs) // _PAIRS + 1]
 
 
@@ -163,10 +163,11 @@ def _share(
 ) -> float:
     """Return the median share of agreeing points, by corrected poses and with scaled depth."""
     shares = []
-    for one, other in pairs:
-        motion = corrected(other.camera.matrix) @ np.linalg.inv(corrected(one.camera.matrix))
+    for surface, other in pairs:
+        # From the camera of the surface to the other one; depth is scaled by its inverse.
+        motion = corrected(other.camera.matrix) @ np.linalg.inv(corrected(surface.camera.matrix))
         motion[:3, 3] /= scale
-        shares.append(one.share(other, motion, along_ray))
+        shares.append(surface.share(other, motion, along_ray))
     return float(np.median(shares))
 
 
@@ -175,7 +176,7 @@ def _explanations(pairs: Sequence[_Pair], unit: float | None) -> Iterator[tuple[
     shares = np.array([_share(pairs, correct) for _, correct in _CORRECTIONS])
     likeliest = int(np.argmax(shares > shares.max() - _ALIKE))
     yield shares[likeliest], f"the poses {_CORRECTIONS[likeliest][0]}"
-    distance = float(np.median([one.distance for one, _ in pairs]))
+    distance = float(np.median([surface.distance for surface, _ in pairs]))
     for factors in (_FACTORS, _SCALES):
         # The middle one of the factors that are about as good as the best.
         shares = np.array([_share(pairs, scale=factor) for factor in factors])

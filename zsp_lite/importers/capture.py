@@ -54,6 +54,7 @@ class CaptureFrame:
         lies_stored = partial(files.lies_as_stored, rgb.shape, turn, self.orientation, self.image)
 
         def displayed(image: np.ndarray) -> np.ndarray:
+            """Turn an image to the form that viewers display."""
             return files.display_image(image, turn) if lies_stored(image.shape) else image
 
         camera = self.camera
@@ -167,7 +168,8 @@ def refuse(problem: str) -> CaptureFrame:
 
 def collect(makers: Iterable[Callable[[], CaptureFrame]]) -> tuple[list[CaptureFrame], list[str]]:
     """Return the frames in the natural order of their images, and what is wrong with others."""
-    frames, left_out = [], []
+    frames = []
+    left_out = []
     for make in makers:
         try:
             frames.append(make())

@@ -292,7 +292,9 @@ def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
 
 def _doubt(values: Float[np.ndarray, "4"], side: Float[np.ndarray, "2"]) -> str:
     """Say what is unusual about intrinsics of an image of (width, height) pixels, or return ""."""
-    focal, centre = values[:2], values[2:]
+    focal = values[:2]
+    centre = values[2:]
+    # Focal lengths below 5 and a principal point below 1 are no pixels.
     if max(*centre, *focal / 5) <= 1:
         return f"look normalised: for this image they would be {_listed(values * np.tile(side, 2))}"
     # The principal point is near the middle of the image that the intrinsics fit, unless that is a

@@ -42,7 +42,8 @@ def read_tum(
 ) -> Makers:
     """Read a sequence of TUM's RGB-D benchmark; what has the nearest times is a frame."""
     poses = read_numbers(folder / "groundtruth.txt", (8,))
-    image_list, depth_list = folder / "rgb.txt", folder / "depth.txt"
+    image_list = folder / "rgb.txt"
+    depth_list = folder / "depth.txt"
     times = read_numbers(image_list, (1,), usecols=0)[:, 0]
     depth_times = read_numbers(depth_list, (1,), usecols=0)[:, 0]
     images = [line.split(maxsplit=1)[-1] for line in read_text_lines(image_list)]

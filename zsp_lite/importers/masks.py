@@ -413,7 +413,7 @@ def _part_at(
     large = np.flatnonzero(sizes > _COMPARABLE * sizes[first])
     # Only a part of like extent may be the object, too: a far larger one is a table or a wall.
     extents = np.array(
-        [np.argwhere((part == one).reshape(shape)).std(axis=0).mean() for one in large]
+        [np.argwhere((part == number).reshape(shape)).std(axis=0).mean() for number in large]
     )
     likeness = extents / extents[large == first]
     if ((likeness > _ALIKE) & (likeness < 1 / _ALIKE)).sum() > 1:

@@ -28,7 +28,7 @@ def read_bop(folder: Path, object: int | None = None) -> Makers:
     scene = read_json(folder / "scene_gt.json", dict[str, list[_Annotation]], "capture")
     cameras = read_json(folder / "scene_camera.json", dict[str, dict[str, Any]], "capture")
     # The objects of each image by their numbers.
-    numbers = {image: [one.obj_id for one in placed] for image, placed in scene.items()}
+    numbers = {image: [pose.obj_id for pose in poses] for image, poses in scene.items()}
     known = sorted(set().union(*numbers.values()))
     if object is None and len(known) == 1:
         object = known[0]
@@ -47,7 +47,7 @@ def _make_bop(
 ) -> CaptureFrame:
     """Make a frame of an object and a camera: pixel centres at integers, lengths in millimetres."""
     where = f"{folder}, image {image}"
-    indices = [index for index, one in enumerate(scene) if one.obj_id == object]
+    indices = [index for index, pose in enumerate(scene) if pose.obj_id == object]
     if len(indices) > 1:
         raise InputError(f"{where} shows object {object} {len(indices)} times, expected once")
     placed = scene[indices[0]]

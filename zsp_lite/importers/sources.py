@@ -37,12 +37,13 @@ from zsp_lite.importers.masks import (
 # Options that each format takes; "open" is a source that is open already.
 _MASKED = ("mask", "box")
 _FILES = ("label", "orientation", "depth_unit")  # values of `CaptureFrame`
+_CAPTURE = (*_MASKED, *_FILES, "masks", "count")
 _TAKEN = {
     "open": (),
     "image": (*_MASKED, *_FILES, "intrinsics", "depth"),
     "sequence": _MASKED,
     "frames": _MASKED,
-    **{name: (*_MASKED, *_FILES, "masks", "count", *one.options) for name, one in FORMATS.items()},
+    **{name: (*_CAPTURE, *layout.options) for name, layout in FORMATS.items()},
 }
 _SWEEPS = 20  # over the chosen views, which mostly stay after ten
 _CONTEXT = 8  # frames of a source that are segmented together, or tried as the reference

@@ -85,10 +85,13 @@ def open_video(path: Path) -> Callable[[int], UInt8[np.ndarray, "h w 3"]]:
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
 
     def read(number: int) -> UInt8[np.ndarray, "h w 3"]:
+        """Decode the frame with a number."""
         nonlocal position
         while position < number and video.grab():
             position += 1
-        decoded, image = video.retrieve() if position == number else (False, None)
+        decoded = False
+        if position == number:
+            decoded, image = video.retrieve()
         if not decoded:
             raise InputError(f"video {path} ends before frame {number}")
         return image[..., ::-1]

@@ -92,8 +92,8 @@ def non_maximum_suppression(
     order = torch.argsort(score, descending=True, stable=True)
     # (m, m), rows and columns in the order of the scores.
     near = (rotation_angles(rotation[order], rotation[order]) < min_angle).numpy()
-    kept: list[int] = []
+    selected: list[int] = []
     for candidate in range(len(order)):
-        if len(kept) < max_count and not near[candidate, kept].any():
-            kept.append(candidate)
-    return order[torch.tensor(kept, dtype=torch.long)]
+        if len(selected) < max_count and not near[candidate, selected].any():
+            selected.append(candidate)
+    return order[torch.tensor(selected, dtype=torch.long)]

@@ -48,8 +48,8 @@ def poses_from_matches(
     # As in MSAC (Torr and Zisserman 2000), sum_i max(0, 1 - (|T x_i - y_i| / 0.3)^2).
     score = (1 - squared_residual / _INLIER_DISTANCE**2).clamp_min_(0).sum(dim=1)
     best = torch.argsort(score, descending=True, stable=True)[:_POOL]
-    kept = non_maximum_suppression(poses.rotation[best], score[best], _MIN_ANGLE, _PER_VIEW)
-    return poses[best[kept]]
+    different = non_maximum_suppression(poses.rotation[best], score[best], _MIN_ANGLE, _PER_VIEW)
+    return poses[best[different]]
 
 
 def poses_from_views(scene: Scene) -> Poses:

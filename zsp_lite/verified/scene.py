@@ -157,13 +157,13 @@ def build_scene(
     # Of each view: each foreground patch's highest similarity in the other view, averaged in both
     # directions.
     best = torch.stack(
-        [(one.amax(dim=1).mean() + one.amax(dim=0).mean()) / 2 for one in between_foregrounds]
+        [(block.amax(dim=1).mean() + block.amax(dim=0).mean()) / 2 for block in between_foregrounds]
     )
     view_similarity = best - best.mean()
     valid_rows = torch.from_numpy(source_valid)[reference_foreground]
 
     # Points of the matches with measured depth on both sides.
-    starts = np.cumsum([len(one) for one in clouds])[:-1]  # of each target but the first
+    starts = np.cumsum([len(points) for points in clouds])[:-1]  # of each target but the first
     matched = []
     for target, points, match in zip(targets, np.split(cloud, starts), matches):
         # Patches as indices of the flattened grids.
@@ -178,7 +178,7 @@ def build_scene(
         target_column=torch.from_numpy(column[valid]),
         target_weight=surface_weights(float_tensor(cloud[valid])),
         similarity=torch.cat(
-            [double_centre(one[valid_rows]) for one in between_foregrounds], dim=1
+            [double_centre(block[valid_rows]) for block in between_foregrounds], dim=1
         ).contiguous(),
         # The world of the reference's points is its camera's frame.
         reference_maps=build_maps(
@@ -333,8 +333,8 @@ def _normalisation(
         raise NoPoseError(
             f"{name}: {n} foreground patches of known depth, expected at least {MIN_POINTS}"
         )
-    kept = valid.copy()
-    kept[valid] = near_median(points[valid], _OUTLIER_DISTANCE)
-    mean = points[kept].mean(axis=0)
-    spread = standard_deviation(points[kept])
-    return Sim3(1 / spread, np.eye(3), -mean / spread), kept
+    inliers = valid.copy()
+    inliers[valid] = near_median(points[valid], _OUTLIER_DISTANCE)
+    mean = points[inliers].mean(axis=0)
+    spread = standard_deviation(points[inliers])
+    return Sim3(1 / spread, np.eye(3), -mean / spread), inliers
