@@ -62,6 +62,7 @@ class HuggingFaceViT(nn.Module):
         sizes = (self.patch_size, self.num_heads, self.depth)
         # In a plain list, so that the modules are not registered a second time.
         self._projections = list(filter(None, map(_projections, model.modules())))
+        # Parameters by the last part of their names.
         special = {key.rpartition(".")[2]: x for key, x in model.named_parameters()}
         if (
             not all(isinstance(size, int) for size in sizes)
@@ -142,6 +143,7 @@ class HuggingFaceViT(nn.Module):
 
 def load_huggingface(name: str, image_size: int | None) -> tuple[HuggingFaceViT, Normalisation]:
     """Load the model of "hf:NAME": a folder in Hugging Face's format, or a model of the hub."""
+    # Imported after `model_folder`, which says in one line that the package is missing.
     folder = model_folder(name)
     from transformers import AutoConfig, AutoModel
 

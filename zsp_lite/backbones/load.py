@@ -39,10 +39,12 @@ class PretrainedWeights:
 
     @property
     def url(self) -> str:
+        """Address of the file."""
         return os.environ.get("ZSP_LITE_DINO_URL", DINO_URL).rstrip("/") + "/" + self.file
 
     @property
     def path(self) -> Path:
+        """Path of the downloaded file."""
         return cache_folder() / Path(self.file).name
 
 

@@ -140,8 +140,8 @@ def read_annotations(path: Path) -> bytes:
 
 
 def compress(data: bytes) -> bytes:
-    """Compress with gzip, without name and time in the header, so that equal data give
-    equal bytes."""
+    """Compress with gzip; equal data give equal bytes."""
+    # Without name and time in the header.
     buffer = io.BytesIO()  # gzip.compress would write the platform into the header
     with gzip.GzipFile(filename="", mode="wb", fileobj=buffer, mtime=0) as file:
         file.write(data)

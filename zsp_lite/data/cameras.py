@@ -81,8 +81,7 @@ class Camera:
         intrinsics_format: str,
         size: Sequence[int],
     ) -> "Camera":
-        """Convert a PyTorch3D camera, such as a CO3D viewpoint, of an image of `size` (height,
-        width) in pixels.
+        """Convert a PyTorch3D camera, such as a CO3D viewpoint, of an image of (height, width).
 
         `X_cam = X_world @ R + T` with row vectors, +x left, +y up. Each side of the image covers
         [-1, 1] in the format "ndc_norm_image_bounds", the shorter side in "ndc_isotropic".

@@ -202,10 +202,10 @@ class Co3D:
         return read_ply(path)
 
     def extent(self, category: str, sequence: str) -> tuple[Float64[np.ndarray, "3"], float] | None:
-        """Return the centre and the diameter of a sequence's object in its world; None without a
-        point cloud.
+        """Return the centre and the diameter of a sequence's object in its world.
 
         They are those of the box of the cloud's points, without the outermost 2 % on each side.
+        None without a point cloud.
         """
         path = self._cloud_path(category, sequence)
         if path is None or not path.is_file():

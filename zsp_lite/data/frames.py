@@ -169,8 +169,7 @@ def enlarge_depth(
 
 
 def frame_defect(frame: Frame) -> str:
-    """Say why a frame cannot be used for pose estimation, such as "black image"; "" for a usable
-    frame."""
+    """Say why a frame cannot be used, such as "black image"; "" for a usable frame."""
     if frame.rgb.max() < _BLACK:
         return "black image"
     if not frame.shows_object:

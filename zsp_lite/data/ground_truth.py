@@ -32,10 +32,12 @@ class ObjectPose(msgspec.Struct):
 
     @property
     def R(self) -> Float[np.ndarray, "3 3"]:
+        """Rotation from object to world."""
         return np.array(self.trans)[:3, :3]
 
     @property
     def t(self) -> Float[np.ndarray, "3"]:
+        """Translation from object to world."""
         return np.array(self.trans)[:3, 3]
 
     def to_object(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:

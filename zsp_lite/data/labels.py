@@ -101,8 +101,7 @@ def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> 
 def relative_pose(
     label_a: PoseLabel, camera_a: Camera, label_b: PoseLabel, camera_b: Camera
 ) -> Float[np.ndarray, "4 4"]:
-    """Compute the ground-truth pose between two frames: `T_ab = Tcam_b @ T0b @ inv(T0a) @
-    inv(Tcam_a)`.
+    """Compute the true pose between two frames: `T_ab = Tcam_b @ T0b @ inv(T0a) @ inv(Tcam_a)`.
 
     This is the composition in "Labelling pose for evaluation" of the supplement, which writes it
     from left to right. It leads from the coordinates of the reference frame's camera a to those of

@@ -110,11 +110,12 @@ def true_poses(
     """Compute the labelled pose of each pair for one of its target views, given by its index."""
     dataset = Co3D(root)
     labels = cache(partial(read_labels, root))
-    poses = [
-        true_pose(dataset, labels(pair.category), pair, int(view))
-        for pair, view in zip(pairs, views)
-    ]
-    return np.stack(poses)
+    return np.stack(
+        [
+            true_pose(dataset, labels(pair.category), pair, int(view))
+            for pair, view in zip(pairs, views)
+        ]
+    )
 
 
 def true_pose(

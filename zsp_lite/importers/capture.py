@@ -65,8 +65,10 @@ class CaptureFrame:
         check_pixels(self.image, rgb, camera.size)
         enlarged = enlarge_depth(depth, camera.size)
         if enlarged.shape != camera.size:
-            expected = f"(H, W) = {camera.size} as the image, or smaller with its aspect ratio"
-            raise InputError(f"depth {self.depth} is {depth.shape} pixels, expected {expected}")
+            raise InputError(
+                f"depth {self.depth} is {depth.shape} pixels, expected (H, W) = {camera.size} as "
+                "the image, or smaller with its aspect ratio"
+            )
         mask = None
         if self.mask is not None:
             mask = displayed(files.read_mask_file(self.mask, self.label))

@@ -379,10 +379,9 @@ def _part_at(
     pixels: Sequence[np.ndarray],
     voxel: float,
 ) -> list[Bool[np.ndarray, "_ _"]]:
-    """Select the pixels in the connected part with the most points; far from the focus, these count
-    less.
+    """Select the pixels in the connected part with the most points.
 
-    InputError if a second part is alike.
+    Points far from the focus count less. InputError if a second part is alike.
     """
     # The box of all points. Clouds are large: they are computed twice, and not kept.
     corners = []
@@ -402,6 +401,7 @@ def _part_at(
     for frame, selected in zip(frames, pixels):
         points = world_points(frame, selected)
         indices = np.floor((points - low) / voxel).astype(int)
+        # The index of the voxel in the flattened grid.
         cells.append(np.ravel_multi_index(indices.T, shape).astype(np.int32))
         near = np.exp(-np.square(np.linalg.norm(points - focus, axis=1) / (8 * voxel)))
         weight += np.bincount(cells[-1], near, len(weight))

@@ -37,8 +37,7 @@ def fetch(
     digest: str = "",
     most: float = math.inf,
 ) -> Path:
-    """Download a file unless it exists; it has `size` bytes, or at most `most`, and the given
-    checksums.
+    """Download a file of `size` bytes, or at most `most`, unless it exists.
 
     Data is written to `path`.part, which is renamed after its size, the first digits of its MD5
     digest and its SHA-256 `digest` were verified. An interrupted download is resumed, in up to
@@ -108,6 +107,7 @@ class RemoteFile(io.RawIOBase):
     seekable = readable
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Move to an offset from the start, the position or the end, as in `io.IOBase.seek`."""
         origins = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}
         self._position = max(0, origins[whence] + offset)
         return self._position

@@ -182,8 +182,7 @@ def find_inside(root: str | Path, text: str) -> Path | None:
 
 
 def plain_name(name: str, what: str) -> str:
-    """Return `name` if it is a valid name of a file or folder; else an InputError begins with
-    `what`."""
+    """Return the name of a file or folder; InputError, which begins with `what`, for no name."""
     separated = not name or name.startswith(".") or any(character in "/\\:\0" for character in name)
     if separated or len(os.fsencode(name)) > _LONGEST_NAME:
         raise InputError(

@@ -43,8 +43,10 @@ def write_ply(
     colours: UInt8[np.ndarray, "n 3"],
     normals: Real[np.ndarray, "n 3"] | None = None,
 ) -> None:
-    """Write a point cloud as CO3D: binary, float32 positions and normals (or zeros), 8-bit
-    colours."""
+    """Write a point cloud as CO3D does: binary, float32 positions and normals, 8-bit colours.
+
+    Normals that are not given are zeros.
+    """
     check_magnitude(f"point cloud {path}", points)
     vertices = np.zeros(len(points), dtype=_VERTEX)
     vertices["position"] = points

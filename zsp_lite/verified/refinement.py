@@ -59,6 +59,7 @@ def refine_coarse_to_fine(scene: Scene, poses: Poses, rng: np.random.Generator) 
     """Refine poses in three searches of decreasing width, on some of the points."""
 
     def score(poses: Poses, points: tuple[int, int] = _SEARCH_POINTS) -> Float[Tensor, " m"]:
+        """Score poses on about so many points of the reference and of the targets."""
         totals = (len(scene.reference_points), len(scene.target_points))
         # Every so many points are scored, of the reference and of the targets.
         stride = tuple(max(round(total / count), 1) for total, count in zip(totals, points))
