@@ -41,7 +41,7 @@ def poses_from_matches(
     # The three smallest of random numbers are a sample without repetition: (trials, 3).
     sample = np.argpartition(rng.random((_TRIALS, len(source))), (0, 1, 2), axis=1)[:, :3]
     fitted = umeyama_batch(source.double().numpy()[sample], target.double().numpy()[sample])
-    poses = Poses(*map(float_tensor, fitted[:3]))  # without the flags of singular samples
+    poses = Poses(*map(float_tensor, fitted[:3]))  # scales, rotations, translations
     poses = poses[poses.scale == poses.scale.clamp(*SCALE_RANGE)]
 
     squared_residual = (poses.apply(source) - target).square_().sum(dim=2)  # (trials, k)
