@@ -9,7 +9,6 @@ import pytest
 from tools.models import LICENCES, attribution, read_catalogue
 from tools.training_categories import TRAINING
 from tools.validation_categories import VALIDATION
-from zsp_lite.backbones.load import TINY
 from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.io.files import REPOSITORY
 
@@ -19,7 +18,7 @@ TRAINED, CHOSEN_BY = TOOLS / "training.json", TOOLS / "validation.json"
 CATALOGUES = {
     path.stem: read_catalogue(path).models for path in (ARTISTS, SAMPLES, TRAINED, CHOSEN_BY)
 }
-ATTRIBUTION = TINY.with_name("ATTRIBUTION.md")
+ATTRIBUTION = REPOSITORY / "zsp_lite/weights/ATTRIBUTION.md"
 
 CC = {"CC0 1.0", "CC BY 3.0", "CC BY 3.0 US"}
 
