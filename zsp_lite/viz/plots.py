@@ -128,10 +128,23 @@ def overlay_map(
 def mark(axis: Axes, text: str, colour: str = CHOSEN, size: float = _FONT) -> None:
     """Draw a coloured frame around the image of an axis and write `text` in its corner, `size`
     points high."""
-    frame = {"transform": axis.transAxes, "fill": False, "edgecolor": colour, "linewidth": 5}
-    axis.add_patch(Rectangle((0, 0), 1, 1, zorder=10, **frame))
-    font = {"fontsize": size, "weight": "bold", "va": "top", "parse_math": False}
-    axis.text(0.04, 0.95, text, transform=axis.transAxes, bbox=_WHITE_BOX, zorder=11, **font)
+    whole = axis.transAxes  # from fractions of the width and height of the axis
+    frame = Rectangle(
+        (0, 0), 1, 1, fill=False, edgecolor=colour, linewidth=5, transform=whole, zorder=10
+    )
+    axis.add_patch(frame)
+    axis.text(
+        0.04,
+        0.95,
+        text,
+        fontsize=size,
+        weight="bold",
+        va="top",
+        parse_math=False,
+        bbox=_WHITE_BOX,
+        transform=whole,
+        zorder=11,
+    )
 
 
 def patch_centres(
@@ -313,9 +326,9 @@ def show_panels(
     for axis, (title, curves) in zip(axes, panels.items()):
         styles = zip(curves.items(), cycle(COLOURS), cycle(_LINES), cycle(_MARKERS))
         for (name, (x, y)), colour, line, marker in styles:
-            style = {"marker": marker if len(x) <= _MARKED else None, "markersize": 5}
             if joined:
-                axis.plot(x, y, line, color=colour, label=name, **style)
+                marker = marker if len(x) <= _MARKED else None
+                axis.plot(x, y, line, color=colour, label=name, marker=marker, markersize=5)
             else:
                 axis.scatter(
                     x, y, 50, colour, marker, edgecolors="black", linewidths=0.4, label=name
@@ -349,8 +362,8 @@ def show_points(
     for axis, (title, sets), centre in zip(axes, panels.items(), ranges.mean(axis=1)):
         for (name, points), colour, marker in zip(sets.items(), colours, _CLOUD_MARKERS):
             area = np.clip(6000 / max(len(points), 1), 3, 40)  # of a mark: less for more points
-            style = {"marker": marker, "linewidths": 0.3 + 0.03 * area, "label": name}
-            axis.scatter(*points.T[:2], area, colour, **style)
+            thick = 0.3 + 0.03 * area
+            axis.scatter(*points.T[:2], area, colour, marker, linewidths=thick, label=name)
         axis.set_title(title, fontsize=_FONT, parse_math=False)
         left, bottom = centre - half
         right, top = centre + half
