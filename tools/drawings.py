@@ -11,30 +11,44 @@ import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import product
 from pathlib import Path
 from xml.sax.saxutils import escape
 
 import numpy as np
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.path import Path as Polygon
+from numpy.typing import ArrayLike
 
 from tools.rooms import ROOMS, flows
 from zsp_lite.viz.plots import BLUE, GREEN, ORANGE, VERMILLION
 
 FOLDER = Path(__file__).parents[1] / "notebooks" / "figures"
 ROOMS_FILE = FOLDER.parents[1] / "docs" / "rooms.svg"
-INK, GREY, PALE, LINE = "#1A1A1A", "#595959", "#F4F4F1", "#B8B8B0"
-SKY, PINK = "#56B4E9", "#CC79A7"
+INK = "#1A1A1A"
+GREY = "#595959"
+PALE = "#F4F4F1"
+LINE = "#B8B8B0"
+SKY = "#56B4E9"
+PINK = "#CC79A7"
 WIDTH = 940  # of the two large drawings, in pixels
 MARGIN = 14
-PICTOGRAM = 204, 110  # size of a stage's picture in `method.svg`
+PICTOGRAM = (204, 110)  # size of a stage's picture in `method.svg`
+# The camera of every `Photo`: it looks down by this angle (degrees) at this height of a chair, and
+# this length of the chair's world fills the picture.
+TILT = 20
+EYE_LEVEL = 0.92
+FIELD = 2.45
 
 # Parts of a chair as boxes, centre and size: x to the right of who sits on it, y forward, z up.
 Chair = dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]]
 
 
 def _chair(width: float, depth: float, seat: float, back: float, leg: float) -> Chair:
-    x, y = (width - leg) / 2, (depth - leg) / 2
+    """Build a chair by its width, its depth, the heights of seat and back, and the leg's width."""
+    x = (width - leg) / 2
+    y = (depth - leg) / 2
+    board = 0.14  # thickness of seat and back
     legs = {
         f"leg {side}{end}": ((i * x, j * y, seat / 2), (leg, leg, seat))
         for side, i in (("left", -1), ("right", 1))
@@ -42,8 +56,8 @@ def _chair(width: float, depth: float, seat: float, back: float, leg: float) -> 
     }
     return {
         **legs,
-        "seat": ((0, 0, seat + 0.07), (width, depth, 0.14)),
-        "back": ((0, -(depth - 0.14) / 2, seat + 0.14 + back / 2), (width, 0.14, back)),
+        "seat": ((0, 0, seat + board / 2), (width, depth, board)),
+        "back": ((0, -(depth - board) / 2, seat + board + back / 2), (width, board, back)),
     }
 
 
@@ -71,89 +85,92 @@ class Photo:
     size: float  # side of the picture
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the places (N, 2) of points (N, 3) in the drawing, and their distances (N,) from
-        the camera."""
-        angle, tilt = np.radians(self.azimuth), np.radians(20)
+        """Return the places (..., 2) of points (..., 3) in the drawing, and their distances (...)
+        from the camera."""
+        angle = np.radians(self.azimuth)
+        tilt = np.radians(TILT)
         right = np.array([-np.cos(angle), np.sin(angle), 0])
         to_camera = np.array(
             [np.sin(angle) * np.cos(tilt), np.cos(angle) * np.cos(tilt), np.sin(tilt)]
         )
         up = np.cross(to_camera, right)
-        centred = np.asarray(points, float) - [0, 0, 0.92]
-        scale = self.size / 2.45
-        places = np.stack([centred @ right, -(centred @ up)], -1) * scale + np.add(
-            [self.x, self.y], self.size / 2
-        )
+        centred = np.asarray(points, float) - [0, 0, EYE_LEVEL]
+        scale = self.size / FIELD
+        centre = np.add([self.x, self.y], self.size / 2)
+        # Without perspective: the camera is far away.
+        places = np.stack([centred @ right, -(centred @ up)], -1) * scale + centre
         return places, -(centred @ to_camera)
 
     @cached_property
     def faces(self) -> list[tuple[str, np.ndarray, np.ndarray, float]]:
         """Return the visible faces, far ones first: part, corners (4, 2), normal (3,), distance of
         the centre."""
-        found = []
-        for part, (centre, size) in self.chair.items():
-            for axis in range(3):
-                for sign in (-1, 1):
-                    normal = sign * np.eye(3)[axis]
-                    ends = [0.0, 0.0, 0.0], normal
-                    if np.diff(self.project(np.array(ends))[1])[0] >= -1e-9:
-                        continue  # turned away
-                    others = [other for other in range(3) if other != axis]
-                    corners = np.tile(normal, (4, 1))
-                    corners[:, others] = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
-                    places, distances = self.project(
-                        np.array(centre) + corners * np.array(size) / 2
-                    )
-                    found.append((part, places, normal, distances.mean()))
-        return sorted(found, key=lambda face: -face[3])
+        faces = []
+        for part, axis, sign in product(self.chair, range(3), (-1, 1)):
+            normal = sign * np.eye(3)[axis]
+            _, (start, end) = self.project(np.array([np.zeros(3), normal]))
+            if end - start >= -1e-9:
+                continue  # the normal does not lead towards the camera
+            others = [other for other in range(3) if other != axis]
+            corners = np.tile(normal, (4, 1))
+            corners[:, others] = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+            places, distances = self.project(self.in_box(part, corners))
+            faces.append((part, places, normal, distances.mean()))
+        return sorted(faces, key=lambda face: -face[3])
+
+    def in_box(self, part: str, signs: ArrayLike) -> np.ndarray:
+        """Return points (..., 3) of the chair's world by their places in a part, -1 to 1."""
+        centre, size = self.chair[part]
+        return np.array(centre) + np.array(signs) * np.array(size) / 2
 
     def place(self, name: str) -> np.ndarray:
         """Return where a place of `PLACES` is in the drawing, (2,)."""
-        part, signs = PLACES[name]
-        centre, size = self.chair[part]
-        return self.project(np.array([np.array(centre) + np.array(signs) * np.array(size) / 2]))[0][
-            0
-        ]
+        place, _ = self.project(self.in_box(*PLACES[name]))
+        return place
 
     def parts_at(self, points: np.ndarray) -> np.ndarray:
         """Return the parts (N,) that the picture shows at points (N, 2) of the drawing; "" on the
         background."""
-        found = np.full(len(points), "", dtype=object)
+        parts = np.full(len(points), "", dtype=object)
         for part, corners, _, _ in self.faces:
-            found[Polygon(corners).contains_points(points)] = part
-        return found
+            parts[Polygon(corners).contains_points(points)] = part
+        return parts
 
     def dots(self, step: float) -> np.ndarray:
         """Return places (N, 2) about `step` pixels apart on what the picture shows of the chair,
         far ones first."""
-        found = []
+        dots = []
         for part, (a, b, c, d), _, _ in self.faces:
-            along, across = (max(2, round(np.linalg.norm(end - a) / step)) for end in (b, d))
+            # The face is a parallelogram: shares i of the way from a to b, j of that from a to d.
+            along = max(2, round(np.linalg.norm(b - a) / step))
+            across = max(2, round(np.linalg.norm(d - a) / step))
             i, j = np.meshgrid((np.arange(along) + 0.5) / along, (np.arange(across) + 0.5) / across)
-            i, j = i.reshape(-1, 1), j.reshape(-1, 1)
+            i = i.reshape(-1, 1)
+            j = j.reshape(-1, 1)
             places = a * (1 - i) * (1 - j) + b * i * (1 - j) + c * i * j + d * (1 - i) * j
-            found.append(places[self.parts_at(places) == part])
-        return np.concatenate(found)
+            dots.append(places[self.parts_at(places) == part])
+        return np.concatenate(dots)
 
     def draw(self, colour: str, frame: str = LINE, thick: float = 1) -> str:
         """Draw the picture in shades of a colour."""
-        shades = {0: 0.78, 1: 0.9, 2: 1.0}
-        polygons = [
-            polygon(corners, mix(colour, INK, shades[int(np.abs(normal).argmax())]))
-            for _, corners, normal, _ in self.faces
-        ]
-        return self.ground(frame, thick) + "".join(polygons)
+        drawn = self.ground(frame, thick)
+        for _, corners, normal, _ in self.faces:
+            shade = (0.78, 0.9, 1.0)[int(np.abs(normal).argmax())]  # light from above
+            drawn += polygon(corners, mix(colour, INK, shade))
+        return drawn
 
     def draw_depth(self) -> str:
         """Draw its depth map: near is dark."""
-        faces = self.faces
-        near, far = min(face[3] for face in faces), max(face[3] for face in faces)
-        grey = [mix("#3A3A3A", "#C9C9C9", 1 - (face[3] - near) / (far - near)) for face in faces]
-        return self.ground() + "".join(
-            polygon(face[1], fill, fill) for face, fill in zip(faces, grey, strict=True)
-        )
+        far = self.faces[0][3]
+        near = self.faces[-1][3]
+        drawn = self.ground()
+        for _, corners, _, distance in self.faces:
+            grey = mix("#3A3A3A", "#C9C9C9", 1 - (distance - near) / (far - near))
+            drawn += polygon(corners, grey, grey)
+        return drawn
 
     def ground(self, frame: str = LINE, thick: float = 1) -> str:
+        """Draw the picture's frame on a pale ground."""
         return rect(self.x, self.y, self.size, self.size, PALE, frame, thick, corner=3)
 
 
@@ -171,23 +188,20 @@ def number(value: float) -> str:
 
 
 def attributes(**values: object) -> str:
-    pairs = (
-        (key.rstrip("_").replace("_", "-"), value)
-        for key, value in values.items()
-        if value is not None
-    )
-    return "".join(
-        f' {key}="{number(value) if isinstance(value, int | float) else value}"'
-        for key, value in pairs
-    )
+    """Write attributes; "_" in a name stands for "-", and a value None leaves it out."""
+    written = ""
+    for name, value in values.items():
+        if isinstance(value, int | float):
+            value = number(value)
+        if value is not None:
+            written += f' {name.replace("_", "-")}="{value}"'
+    return written
 
 
 def element(tag: str, content: str | None = None, **values: object) -> str:
-    return (
-        f"<{tag}{attributes(**values)}"
-        + ("/>" if content is None else f">{content}</{tag}>")
-        + "\n"
-    )
+    """Write an element with its attributes and content on a line."""
+    end = "/>" if content is None else f">{content}</{tag}>"
+    return f"<{tag}{attributes(**values)}{end}\n"
 
 
 def rect(
@@ -250,27 +264,28 @@ def curve(
     )
 
 
+def pair(place: np.ndarray) -> str:
+    """Write a place (2,) of a path."""
+    return f"{number(place[0])} {number(place[1])}"
+
+
 def straight(start: np.ndarray, end: np.ndarray, gap: float = 0) -> str:
     """Return the path from start to end, shorter by `gap` at both ends."""
-    start, end = np.asarray(start, float), np.asarray(end, float)
+    start = np.asarray(start, float)
+    end = np.asarray(end, float)
     step = (end - start) / np.linalg.norm(end - start) * gap
-    (a, b), (c, d) = start + step, end - step
-    return f"M{number(a)} {number(b)}L{number(c)} {number(d)}"
+    return f"M{pair(start + step)}L{pair(end - step)}"
 
 
 def arc(start: np.ndarray, end: np.ndarray, bend: float, gap: float = 6) -> str:
     """Return a bent path from start to end; a positive bend lies to its left."""
-    start, end = np.asarray(start, float), np.asarray(end, float)
+    start = np.asarray(start, float)
+    end = np.asarray(end, float)
     along = end - start
-    middle = (start + end) / 2 + bend * np.array([along[1], -along[0]])
-
-    def shorter(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return a + (b - a) / np.linalg.norm(b - a) * gap
-
-    (a, b), (c, d) = shorter(start, middle), shorter(end, middle)
-    return (
-        f"M{number(a)} {number(b)}Q{number(middle[0])} {number(middle[1])} {number(c)} {number(d)}"
-    )
+    control = (start + end) / 2 + bend * np.array([along[1], -along[0]])
+    start = start + (control - start) / np.linalg.norm(control - start) * gap
+    end = end + (control - end) / np.linalg.norm(control - end) * gap
+    return f"M{pair(start)}Q{pair(control)} {pair(end)}"
 
 
 _HEADS = {
@@ -282,6 +297,7 @@ _HEADS = {
     VERMILLION: "red",
 }
 _TOKEN = re.compile(r"\*(.+?)\*|_\{(.+?)\}|\^\{(.+?)\}")
+_SHIFTS = (0, 0, 0.28, -0.38)  # down, of plain, italic, subscript, superscript; 1 is the font size
 
 
 def text(
@@ -294,45 +310,38 @@ def text(
     bold: bool = False,
 ) -> str:
     """Draw a line of text; `*x*` is italic, `_{a}` a subscript, `^{b}` a superscript."""
-    parts, end, back = [], 0, 0.0
-    for found in [*_TOKEN.finditer(content), None]:
-        plain = content[end : found.start() if found else None]
-        if plain:
-            parts.append(
-                f"<tspan{attributes(dy=back or None)}>{escape(plain)}</tspan>"
-                if back
-                else escape(plain)
-            )
-            back = 0.0
-        if found:
-            italic, low, high = found.groups()
-            if italic:
-                parts.append(
-                    "<tspan "
-                    f'font-style="italic"{attributes(dy=back or None)}>{escape(italic)}</tspan>'
-                )
-                back = 0.0
-            else:
-                shift = size * (0.28 if low else -0.38)
-                style = attributes(dy=shift + back, font_size=0.72 * size)
-                parts.append(f"<tspan{style}>{escape(low or high)}</tspan>")
-                back = -shift
-            end = found.end()
-    weight = "bold" if bold else None
+    spans = ""
+    below = 0.0  # how far the present place is below the line
+    # The parts are in turn plain, italic, subscript and superscript; most are None.
+    for index, part in enumerate(_TOKEN.split(content)):
+        if not part:
+            continue
+        kind = index % 4
+        style = {"font_style": "italic"} if kind == 1 else {}
+        shift = size * _SHIFTS[kind]
+        if shift != below:
+            style["dy"] = shift - below
+        if shift:
+            style["font_size"] = 0.72 * size
+        spans += f"<tspan{attributes(**style)}>{escape(part)}</tspan>" if style else escape(part)
+        below = shift
     return element(
         "text",
-        "".join(parts),
+        spans,
         x=x,
         y=y,
         font_size=size,
         fill=fill,
         text_anchor=None if anchor == "start" else anchor,
-        font_weight=weight,
+        font_weight="bold" if bold else None,
     )
 
 
 def group(content: str, x: float = 0, y: float = 0, scale: float = 1) -> str:
-    transform = f"translate({number(x)} {number(y)})" + (f" scale({scale:g})" if scale != 1 else "")
+    """Move elements to a place, and scale them."""
+    transform = f"translate({number(x)} {number(y)})"
+    if scale != 1:
+        transform += f" scale({scale:g})"
     return f"<g{attributes(transform=transform)}>\n{content}</g>\n"
 
 
@@ -354,17 +363,17 @@ def svg(content: str, width: float, height: float, title: str, description: str)
         if f"url(#{name})" in content
     )
     defs = f"<defs>\n{heads}</defs>\n" if heads else ""
-    size = (
-        f'width="{number(width)}" height="{number(height)}" viewBox="0 0 {number(width)} '
-        f'{number(height)}"'
-    )
+    size = attributes(
+        width=width, height=height, viewBox=f"0 0 {number(width)} {number(height)}"
+    ).strip()
+    # Half a pixel inside, so that the line of the border is sharp.
     frame = rect(0.5, 0.5, width - 1, height - 1, "white", "#D9D9D4", 1, corner=10)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" role="img" '
         'aria-labelledby="title desc">\n'
-        f'<title id="title">{escape(title)}</title>\n<desc '
-        f'id="desc">{escape(description)}</desc>\n{defs}'
-        f"{frame}{content}</svg>\n"
+        f'<title id="title">{escape(title)}</title>\n'
+        f'<desc id="desc">{escape(description)}</desc>\n'
+        f"{defs}{frame}{content}</svg>\n"
     )
 
 
@@ -373,55 +382,58 @@ def svg(content: str, width: float, height: float, title: str, description: str)
 
 @cache
 def draw_images(words: bool = True) -> str:
+    """Draw the picture of the reference, and three of the target, one over the other."""
     width, _ = PICTOGRAM
-    reference = Photo(REFERENCE, 35, 2, 18, 76)
-    targets = [
-        Photo(TARGET, azimuth, width - 76 - 12 * i, 30 - 12 * i, 76)
-        for i, azimuth in ((2, 100), (1, 60), (0, 25))
-    ]
-    return reference.draw(BLUE) + "".join(target.draw(ORANGE) for target in targets)
+    drawn = Photo(REFERENCE, 35, 2, 18, 76).draw(BLUE)
+    for i, azimuth in ((2, 100), (1, 60), (0, 25)):
+        drawn += Photo(TARGET, azimuth, width - 76 - 12 * i, 30 - 12 * i, 76).draw(ORANGE)
+    return drawn
 
 
 def draw_grid(x: float, y: float, size: float, cells: int, thick: float = 0.8) -> str:
-    steps = [size * i / cells for i in range(1, cells)]
-    path = "".join(
-        f"M{number(x + s)} {number(y)}v{number(size)}M{number(x)} {number(y + s)}h{number(size)}"
-        for s in steps
-    )
+    """Draw white lines between the cells of a square grid."""
+    path = ""
+    for i in range(1, cells):
+        step = size * i / cells
+        path += f"M{pair((x + step, y))}v{number(size)}M{pair((x, y + step))}h{number(size)}"
     return curve(path, "white", thick)
 
 
 @cache
 def draw_features(words: bool = True) -> str:
-    photo, grid, cells = Photo(REFERENCE, 35, 4, 13, 84), Photo(REFERENCE, 35, 116, 13, 84), 9
+    """Draw the reference in patches, and their features: a colour for each part of the chair."""
+    cells = 9
+    photo = Photo(REFERENCE, 35, 4, 13, 84)
+    grid = Photo(REFERENCE, 35, 116, 13, 84)
     side = grid.size / cells
-    found = grid.ground()
+    features = grid.ground()
     for row, column in np.ndindex(cells, cells):
         corner = np.array([grid.x + column * side, grid.y + row * side])
-        inside = corner + side * (np.indices((3, 3)).reshape(2, -1).T * 0.3 + 0.2)
-        shown = [part for part in grid.parts_at(inside) if part]
+        # Nine places in the cell; a cell with three or more on the chair has a feature of the part
+        # that most of them show.
+        places = corner + side * (np.indices((3, 3)).reshape(2, -1).T * 0.3 + 0.2)
+        shown = [part for part in grid.parts_at(places) if part]
         if len(shown) > 2:
-            colour = {"back": PINK, "seat": SKY}.get(max(set(shown), key=shown.count), GREEN)
-            found += rect(
-                *corner, side, side, mix(colour, "white", 0.7 + 0.1 * ((3 * row + 5 * column) % 4))
-            )
-    arrow = curve("M92 55H111", INK, 1.8, head=True)
-    return (
-        photo.draw(BLUE)
-        + draw_grid(4, 13, 84, cells)
-        + arrow
-        + found
-        + draw_grid(116, 13, 84, cells)
-    )
+            part = max(set(shown), key=shown.count)
+            colour = {"back": PINK, "seat": SKY}.get(part, GREEN)
+            share = 0.7 + 0.1 * ((3 * row + 5 * column) % 4)  # irregular: no two features are equal
+            features += rect(*corner, side, side, mix(colour, "white", share))
+    drawn = photo.draw(BLUE) + draw_grid(photo.x, photo.y, photo.size, cells)
+    drawn += curve("M92 55H111", INK, 1.8, head=True)
+    return drawn + features + draw_grid(grid.x, grid.y, grid.size, cells)
 
 
 @cache
 def draw_cycle(words: bool = True) -> str:
-    first, second = Photo(REFERENCE, 35, 4, 13, 84), Photo(TARGET, 30, 116, 13, 84)
-    u, v = first.place("front left"), second.place("front left")
+    """Draw a cycle from the reference to the target and back."""
+    first = Photo(REFERENCE, 35, 4, 13, 84)
+    second = Photo(TARGET, 30, 116, 13, 84)
+    u = first.place("front left")
+    v = second.place("front left")
     drawn = first.draw(BLUE) + second.draw(ORANGE) + draw_walk(u, v, u + [9, 11])
     if words:
-        drawn += text("*u*", u[0] - 1, u[1] - 8, 14) + text("*v*", v[0] + 9, v[1] + 4, 14)
+        drawn += text("*u*", u[0] - 1, u[1] - 8, 14)
+        drawn += text("*v*", v[0] + 9, v[1] + 4, 14)
         drawn += text("*u*′", u[0] + 2, u[1] + 31, 14)
     return drawn
 
@@ -430,35 +442,33 @@ def draw_walk(
     u: np.ndarray, v: np.ndarray, end: np.ndarray, size: float = 5, bend: float = 0.42
 ) -> str:
     """Draw a cycle: from u to v (solid), from v to its end (dashed)."""
-    there = curve(arc(u, v, bend, size + 3), INK, 2, head=True)
-    back = curve(arc(v, end, 0.7 * bend, size + 4), INK, 2, "5 4", head=True)
-    return (
-        there
-        + back
-        + dot(u, BLUE, size)
-        + dot(v, ORANGE, size)
-        + dot(end, "white", size, BLUE, 2.2)
-    )
+    drawn = curve(arc(u, v, bend, size + 3), INK, 2, head=True)
+    drawn += curve(arc(v, end, 0.7 * bend, size + 4), INK, 2, "5 4", head=True)
+    drawn += dot(u, BLUE, size)
+    drawn += dot(v, ORANGE, size)
+    return drawn + dot(end, "white", size, BLUE, 2.2)
 
 
 @cache
 def draw_best_view(words: bool = True) -> str:
+    """Draw three target views with bars of their scores; the best one is framed."""
     drawn = ""
     for i, (azimuth, score) in enumerate(((110, 0.35), (30, 0.95), (-50, 0.6))):
-        x, chosen = 4 + 68 * i, i == 1
-        drawn += Photo(TARGET, azimuth, x, 6, 60).draw(
-            ORANGE, INK if chosen else LINE, 3 if chosen else 1
-        )
-        drawn += rect(x, 106 - 32 * score, 60, 32 * score, GREY if chosen else LINE, corner=2)
+        x = 4 + 68 * i
+        view = Photo(TARGET, azimuth, x, 6, 60)
+        best = i == 1
+        drawn += view.draw(ORANGE, INK, 3) if best else view.draw(ORANGE)
+        drawn += rect(x, 106 - 32 * score, 60, 32 * score, GREY if best else LINE, corner=2)
     return drawn
 
 
 @cache
 def draw_depth(words: bool = True) -> str:
-    photo = Photo(REFERENCE, 35, 4, 13, 84)
-    drawn = photo.draw_depth()
-    # Beside it, a camera: rays from its centre through the image plane to points.
-    eye, plane = np.array([112, 58]), 136
+    """Draw a depth map, and beside it a camera with rays from its centre through the image plane
+    to points."""
+    drawn = Photo(REFERENCE, 35, 4, 13, 84).draw_depth()
+    eye = np.array([112, 58])
+    plane = 136  # x of the image plane
     drawn += curve(f"M{plane} 26V90", GREY, 2)
     for place in (np.array([186, 14]), np.array([200, 52]), np.array([180, 98])):
         drawn += curve(straight(eye, place), LINE, 1.4)
@@ -469,6 +479,7 @@ def draw_depth(words: bool = True) -> str:
 
 @cache
 def draw_fit(words: bool = True) -> str:
+    """Draw matches between two sets of points, the last of them wrong and crossed out."""
     first = np.array([[20, 24], [66, 18], [18, 70], [62, 66], [40, 94]], float)
     angle = np.radians(18)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -476,28 +487,28 @@ def draw_fit(words: bool = True) -> str:
     second[4] = [196, 18]  # a wrong match
     drawn = ""
     for i, (a, b) in enumerate(zip(first, second, strict=True)):
-        wrong = i == 4
-        drawn += curve(
-            straight(a, b, 6), VERMILLION if wrong else GREEN, 1.8, "4 4" if wrong else None
-        )
-        if wrong:
+        if i == 4:
             x, y = a + (b - a) * 0.72
+            drawn += curve(straight(a, b, 6), VERMILLION, 1.8, "4 4")
             drawn += curve(f"M{x - 5:.1f} {y - 5:.1f}l10 10m0 -10l-10 10", VERMILLION, 2.4)
+        else:
+            drawn += curve(straight(a, b, 6), GREEN, 1.8)
         drawn += dot(a, BLUE, 5) + dot(b, ORANGE, 5)
     return drawn
 
 
 @cache
 def draw_pose(words: bool = True) -> str:
+    """Draw dots of the reference over the target, with arrows to its front and up."""
     photo = Photo(TARGET, 25, 52, 4, 102)
-    # the reference, scaled as a whole
+    # The reference, scaled as a whole to about the height of the target.
     moved = Photo(_chair(0.87, 0.87, 0.73, 0.91, 0.12), 25, 52, 4, 102)
-    drawn = photo.draw(mix(ORANGE, "white", 0.7)) + "".join(
-        dot(place, BLUE, 1.8, "white", 0.4) for place in moved.dots(5.5)
-    )
-    ends, _ = photo.project(np.array([[0, 0, 0.75], [0, 1.5, 0.75], [0, 0, 2.1]]))
-    for end in ends[1:]:
-        drawn += curve(straight(ends[0], end), INK, 2.4, head=True)
+    drawn = photo.draw(mix(ORANGE, "white", 0.7))
+    for place in moved.dots(5.5):
+        drawn += dot(place, BLUE, 1.8, "white", 0.4)
+    origin, *ends = photo.project(np.array([[0, 0, 0.75], [0, 1.5, 0.75], [0, 0, 2.1]]))[0]
+    for end in ends:
+        drawn += curve(straight(origin, end), INK, 2.4, head=True)
     if words:
         drawn += text("front", 158, 96, 13) + text("up", 158, 18, 13)
     return drawn
