@@ -337,6 +337,13 @@ def text(
     )
 
 
+def paragraph(
+    lines: Iterable[str], x: float, y: float, step: float, size: float, anchor: str = "start"
+) -> str:
+    """Draw lines of text below each other, the first at y."""
+    return "".join(text(line, x, y + step * i, size, anchor=anchor) for i, line in enumerate(lines))
+
+
 def group(content: str, x: float = 0, y: float = 0, scale: float = 1) -> str:
     """Move elements to a place, and scale them."""
     transform = f"translate({number(x)} {number(y)})"
@@ -527,22 +534,48 @@ STAGES: dict[str, tuple[str, Callable[..., str]]] = {
 # The whole method
 
 
+PANEL = (216, 208)  # width and height of the field of a stage
+_GROUND = "#FBFBF9"  # of a field
+
+
+def draw_panel(
+    x: float, y: float, title: str, notebook: str, lines: Iterable[str], picture: str
+) -> str:
+    """Draw the field of a stage: title, notebook, picture and two lines of text."""
+    width, height = PANEL
+    drawn = rect(x, y, width, height, _GROUND, LINE, 1.2, corner=8)
+    drawn += text(title, x + 12, y + 24, 15, bold=True)
+    drawn += text(notebook, x + width - 12, y + 24, 13, GREY, "end")
+    drawn += group(picture, x + (width - PICTOGRAM[0]) / 2, y + 40)
+    return drawn + paragraph(lines, x + 12, y + 174, 19, 13)
+
+
+def draw_given(x: float, y: float, width: float, height: float) -> str:
+    """Draw the field of what is given: an image of the reference with depth, and target views."""
+    drawn = rect(x, y, width, height, _GROUND, LINE, 1.2, corner=8)
+    drawn += text("Reference", x + 12, y + 24, 15, BLUE, bold=True)
+    drawn += Photo(REFERENCE, 35, x + 12, y + 38, 104).draw(BLUE)
+    drawn += Photo(REFERENCE, 35, x + 122, y + 86, 56).draw_depth()
+    drawn += text("depth", x + 150, y + 78, 13, GREY, "middle")
+    drawn += paragraph(("one image of an object,", "with depth"), x + 12, y + 164, 19, 13)
+    y += 200
+    drawn += curve(f"M{x + 12} {y + 2}h{width - 24}", LINE, 1.2)
+    drawn += text("Target", x + 12, y + 28, 15, mix(ORANGE, INK, 0.68), bold=True)
+    for i, azimuth in enumerate((110, 30, -50, 170)):
+        row, column = divmod(i, 2)
+        drawn += Photo(TARGET, azimuth, x + 12 + 86 * column, y + 38 + 75 * row, 68).draw(ORANGE)
+    words = ("several images of another", "object, with depth and", "known cameras")
+    return drawn + paragraph(words, x + 12, y + 201, 18, 13)
+
+
 def draw_method() -> str:
-    left, panel, gap, row = 190, 216, 24, 208
+    """Draw the whole method: what is given at the left, and the stages in two rows beside it."""
+    left = 190  # width of what is given
+    gap = 24
+    panel, row = PANEL
     column = [MARGIN + left + gap + i * (panel + gap) for i in range(3)]
     below = MARGIN + row + 30
-
-    def draw_panel(
-        x: float, y: float, title: str, notebook: str, lines: tuple[str, str], picture: str
-    ) -> str:
-        drawn = rect(x, y, panel, row, "#FBFBF9", LINE, 1.2, corner=8) + text(
-            title, x + 12, y + 24, 15, bold=True
-        )
-        drawn += text(notebook, x + panel - 12, y + 24, 13, GREY, "end")
-        drawn += group(picture, x + (panel - PICTOGRAM[0]) / 2, y + 40)
-        return drawn + "".join(text(line, x + 12, y + 174 + 19 * i) for i, line in enumerate(lines))
-
-    stages = [
+    stages = (
         ("Features", "01", ("A network describes each", "patch by a vector Φ."), draw_features()),
         (
             "Cycle",
@@ -569,18 +602,20 @@ def draw_method() -> str:
             draw_fit(),
         ),
         ("Pose", "05", ("*y* = *λRx* + *t* lays the", "reference on the target."), draw_pose()),
-    ]
+    )
     drawn = ""
-    for i, (title, notebook, lines, picture) in enumerate(stages):
-        drawn += draw_panel(
-            column[i % 3], MARGIN if i < 3 else below, title, notebook, lines, picture
-        )
+    for i, stage in enumerate(stages):
+        drawn += draw_panel(column[i % 3], MARGIN if i < 3 else below, *stage)
+
+    # Arrows between the fields of a row, from what is given, and from the first row to the second.
     for y in (MARGIN + 95, below + 95):
         for x in column[1:]:
             drawn += curve(f"M{x - gap + 3} {y}h{gap - 8}", INK, 2.2, head=True)
     drawn += curve(f"M{column[0] - gap + 3} {MARGIN + 95}h{gap - 8}", INK, 2.2, head=True)
-    middle, corner = below - 15, 8
-    start, end = column[2] + panel / 2, column[0] + panel / 2
+    middle = below - 15
+    corner = 8
+    start = column[2] + panel / 2
+    end = column[0] + panel / 2
     drawn += curve(
         f"M{start} {MARGIN + row + 3}V{middle - corner}q0 {corner} -{corner} "
         f"{corner}H{end + corner}"
@@ -590,44 +625,24 @@ def draw_method() -> str:
         head=True,
     )
 
-    height = below + row - MARGIN
-    x = MARGIN
-    drawn += rect(x, MARGIN, left, height, "#FBFBF9", LINE, 1.2, corner=8)
-    drawn += text("Reference", x + 12, MARGIN + 24, 15, BLUE, bold=True)
-    drawn += Photo(REFERENCE, 35, x + 12, MARGIN + 38, 104).draw(BLUE)
-    drawn += Photo(REFERENCE, 35, x + 122, MARGIN + 86, 56).draw_depth()
-    drawn += text("depth", x + 150, MARGIN + 78, 13, GREY, "middle")
-    drawn += text("one image of an object,", x + 12, MARGIN + 164) + text(
-        "with depth", x + 12, MARGIN + 183
-    )
-    y = MARGIN + 214
-    drawn += curve(f"M{x + 12} {y - 12}h{left - 24}", LINE, 1.2)
-    drawn += text("Target", x + 12, y + 14, 15, mix(ORANGE, INK, 0.68), bold=True)
-    for i, azimuth in enumerate((110, 30, -50, 170)):
-        drawn += Photo(TARGET, azimuth, x + 12 + 86 * (i % 2), y + 24 + 75 * (i // 2), 68).draw(
-            ORANGE
-        )
-    for i, line in enumerate(
-        ("several images of another", "object, with depth and", "known cameras")
-    ):
-        drawn += text(line, x + 12, y + 187 + 18 * i)
+    drawn += draw_given(MARGIN, MARGIN, left, below + row - MARGIN)
     return svg(
         drawn,
         WIDTH,
         below + row + MARGIN,
         "The method",
-        "From one image of a reference object and several images of a target object, both "
-        "with depth, to the pose: "
-        "features of patches, cycles of nearest neighbours, choice of the best view, depth "
-        "of the matched patches, a "
-        "fit by Umeyama's method in RANSAC, and the pose that lays the reference on the "
-        "target. The numbers are those "
-        "of the notebooks.",
+        "From one image of a reference object and several images of a target object, both with "
+        "depth, to the pose: features of patches, cycles of nearest neighbours, choice of the best "
+        "view, depth of the matched patches, a fit by Umeyama's method in RANSAC, and the pose "
+        "that lays the reference on the target. The numbers are those of the notebooks.",
     )
 
 
 # Where a notebook stands
 
+BOX = (136, 98)  # width and height of a stage in the strip
+BOX_GAP = 19.2  # between two stages, which makes the strip as wide as `WIDTH`
+PILL = 28  # height of the sign of a notebook below the stages
 # Below the stages: number and name of a notebook, its left end and its width.
 AROUND = {
     "10": ("own objects", MARGIN, 136),
@@ -636,6 +651,13 @@ AROUND = {
     "08": ("labels", 594, 86),
     "05": ("errors", 690, 88),
     "07": ("benchmark", 788, 138),
+}
+# The notebooks that a line leads to, by the stage that it begins at.
+BELOW_STAGE = {
+    "images": ["10"],
+    "features": ["09"],
+    "best view": ["11"],
+    "pose": ["08", "05", "07"],
 }
 WHOLE = tuple(STAGES)
 HERE: dict[str, tuple[str, ...]] = {
@@ -651,108 +673,101 @@ HERE: dict[str, tuple[str, ...]] = {
 
 def draw_here(notebook: str) -> str:
     """Draw the strip of stages with those of a notebook highlighted."""
-    here, width, gap, height = HERE[notebook], 136, 19.2, 98
-    top = 34 if here[0] in STAGES else MARGIN  # room for the sign above or below
-    below = top + height + 20
-    spans = {name: (MARGIN + i * (width + gap), width) for i, name in enumerate(STAGES)}
+    here = HERE[notebook]
+    on_stage = here[0] in STAGES
+    top = 34 if on_stage else MARGIN  # room for the sign above or below
+    below = top + BOX[1] + 20
+    foot = below + PILL
+
+    # The stages, with arrows between them.
+    spans = {name: (MARGIN + i * (BOX[0] + BOX_GAP), BOX[0]) for i, name in enumerate(STAGES)}
     drawn = ""
-    for name, (title, draw) in STAGES.items():
-        x, on = spans[name][0], name in here
-        drawn += rect(
-            x,
-            top,
-            width,
-            height,
-            mix(SKY, "white", 0.22) if on else "white",
-            BLUE if on else LINE,
-            3 if on else 1.2,
-            8,
-        )
-        picture = group(draw(words=False), x + (width - 0.58 * PICTOGRAM[0]) / 2, top + 8, 0.58)
-        drawn += picture if on else f'<g opacity="0.55">\n{picture}</g>\n'
-        drawn += text(
-            title, x + width / 2, top + height - 10, 13, INK if on else GREY, "middle", bold=on
-        )
-        if name != "images":
-            drawn += curve(
-                f"M{number(x - gap + 2)} {top + height / 2:g}h{gap - 6:g}", GREY, 2, head=True
-            )
-    line, centre = top + height + 10, {name: x + w / 2 for name, (x, w) in spans.items()}
-    below_stage = {
-        "images": ["10"],
-        "features": ["09"],
-        "best view": ["11"],
-        "pose": ["08", "05", "07"],
-    }
-    for stage, names in below_stage.items():
-        stops = [AROUND[name][1] + AROUND[name][2] / 2 for name in names]
-        path = f"M{number(centre[stage])} {top + height + 2}V{line}"
-        path += (
-            f"M{number(min([centre[stage], *stops]))} {line}H{number(max([centre[stage], *stops]))}"
-        )
-        path += "".join(f"M{number(stop)} {line}V{below}" for stop in stops)
+    for name in STAGES:
+        drawn += draw_stage(name, spans[name][0], top, name in here)
+
+    # Lines from the stages to the notebooks around them, by way of a height between the two.
+    line = top + BOX[1] + 10
+    for stage, names in BELOW_STAGE.items():
+        x, width = spans[stage]
+        start = x + width / 2
+        ends = [AROUND[name][1] + AROUND[name][2] / 2 for name in names]
+        path = f"M{number(start)} {line - 8}V{line}"
+        path += f"M{number(min([start, *ends]))} {line}H{number(max([start, *ends]))}"
+        for end in ends:
+            path += f"M{number(end)} {line}V{below}"
         drawn += curve(path, LINE, 1.4)
-    for name, (title, x, pill) in AROUND.items():
-        on = name in here
-        spans[name] = x, pill
-        drawn += rect(x, below, pill, 28, BLUE if on else "white", BLUE if on else LINE, 1.2, 14)
-        drawn += text(
-            f"{name} {title}",
-            x + pill / 2,
-            below + 18.5,
-            13,
-            "white" if on else GREY,
-            "middle",
-            bold=on,
-        )
-    start, end = min(spans[name][0] for name in here), max(sum(spans[name]) for name in here)
+    for name, (title, x, width) in AROUND.items():
+        spans[name] = (x, width)
+        centre = x + width / 2
+        label = f"{name} {title}"
+        if name in here:
+            drawn += rect(x, below, width, PILL, BLUE, BLUE, 1.2, PILL / 2)
+            drawn += text(label, centre, below + 18.5, 13, "white", "middle", bold=True)
+        else:
+            drawn += rect(x, below, width, PILL, "white", LINE, 1.2, PILL / 2)
+            drawn += text(label, centre, below + 18.5, 13, GREY, "middle")
+
+    # The sign: a bracket over the whole method, a triangle above a stage or below a notebook.
+    start = min(spans[name][0] for name in here)
+    end = max(sum(spans[name]) for name in here)
     middle = (start + end) / 2
-    if here[0] in STAGES:
-        if here == WHOLE:
-            drawn += curve(f"M{start} 27v-5H{end}v5", BLUE, 2)
-        label = "you are here: the whole method" if here == WHOLE else "you are here"
-        drawn += text(label, middle, 16, 13, BLUE, "middle", bold=True)
-        drawn += (
-            ""
-            if here == WHOLE
-            else polygon(np.array([[middle - 6, 21], [middle + 6, 21], [middle, 30]]), BLUE)
-        )
+    highlighted = ", ".join((STAGES | AROUND)[name][0] for name in here)
+    if here == WHOLE:
+        highlighted = "the whole method"
+        drawn += curve(f"M{start} 27v-5H{end}v5", BLUE, 2)
+        drawn += text(f"you are here: {highlighted}", middle, 16, 13, BLUE, "middle", bold=True)
+    elif on_stage:
+        drawn += text("you are here", middle, 16, 13, BLUE, "middle", bold=True)
+        drawn += polygon(np.array([[middle - 6, 21], [middle + 6, 21], [middle, 30]]), BLUE)
     else:
-        foot = below + 28
         drawn += polygon(
             np.array([[middle - 6, foot + 12], [middle + 6, foot + 12], [middle, foot + 3]]), BLUE
         )
         drawn += text("you are here", middle, foot + 27, 13, BLUE, "middle", bold=True)
-    names = (
-        ", ".join((STAGES | AROUND)[name][0] for name in here)
-        if here != WHOLE
-        else "the whole method"
-    )
     return svg(
         drawn,
         WIDTH,
-        below + 28 + (MARGIN if here[0] in STAGES else 36),
+        foot + (MARGIN if on_stage else 36),
         f"Where notebook {notebook} stands",
         "The stages of the method in a row: images, features, cycle, best view, depth and "
-        "RANSAC, pose. "
-        f"Highlighted: {names}.",
+        f"RANSAC, pose. Highlighted: {highlighted}.",
     )
 
 
+def draw_stage(name: str, x: float, y: float, on: bool) -> str:
+    """Draw a stage of the strip, highlighted if it is `on`, with an arrow from the one before."""
+    title, draw = STAGES[name]
+    width, height = BOX
+    scale = 0.58
+    picture = group(draw(words=False), x + (width - scale * PICTOGRAM[0]) / 2, y + 8, scale)
+    if on:
+        drawn = rect(x, y, width, height, mix(SKY, "white", 0.22), BLUE, 3, 8) + picture
+    else:
+        drawn = rect(x, y, width, height, "white", LINE, 1.2, 8)
+        drawn += f'<g opacity="0.55">\n{picture}</g>\n'
+    drawn += text(title, x + width / 2, y + height - 10, 13, INK if on else GREY, "middle", bold=on)
+    if name != "images":
+        start = f"M{number(x - BOX_GAP + 2)} {y + height / 2:g}"
+        drawn += curve(f"{start}h{BOX_GAP - 6:g}", GREY, 2, head=True)
+    return drawn
+
+
 # Single ideas
+
+WIDTH_OF_IDEAS = 860
 
 
 def draw_vector(
     x: float, y: float, colour: str, shades: tuple[float, ...], side: float = 15
 ) -> str:
     """Draw a vector as a row of cells."""
-    cells = (
-        rect(x + i * side, y, side, side, mix(colour, "white", share), "white")
-        for i, share in enumerate(shades)
-    )
-    return "".join(cells)
+    drawn = ""
+    for i, share in enumerate(shades):
+        drawn += rect(x + i * side, y, side, side, mix(colour, "white", share), "white")
+    return drawn
 
 
+# Of the three vectors of one patch, and of the values of four patches.
 _SHADES = (
     (0.9, 0.35, 0.7, 0.2),
     (0.3, 0.8, 0.45, 0.95),
@@ -762,123 +777,105 @@ _SHADES = (
 
 
 def draw_query_key_value() -> str:
-    width, height = 860, 330
+    """Draw how a patch gets its three vectors, and what it receives from all patches."""
+    height = 330
     drawn = text("One patch, three vectors", 20, 32, 15, bold=True)
     drawn += Photo(REFERENCE, 35, 20, 96, 112).draw(BLUE) + draw_grid(20, 96, 112, 4)
-    drawn += rect(76, 124, 28, 28, "none", INK, 2.6) + text(
-        "patch *i*", 76, 230, 13, anchor="middle"
-    )
+    drawn += rect(76, 124, 28, 28, "none", INK, 2.6)
+    drawn += text("patch *i*", 76, 230, 13, anchor="middle")
     drawn += curve("M106 138H152", INK, 2, head=True)
-    drawn += draw_vector(158, 130, GREY, (0.7, 0.3, 0.85, 0.5)) + text(
-        "token_{i}", 188, 118, 13, anchor="middle"
-    )
+    drawn += draw_vector(158, 130, GREY, (0.7, 0.3, 0.85, 0.5))
+    drawn += text("token_{i}", 188, 118, 13, anchor="middle")
     rows = (
         (56, BLUE, "query_{i}", "what the patch looks for"),
         (138, VERMILLION, "key_{i}", "what the patch offers"),
         (220, GREEN, "value_{i}", "what the patch hands on"),
     )
-    for i, (y, colour, title, meaning) in enumerate(rows):
+    for (y, colour, title, meaning), shades in zip(rows, _SHADES, strict=False):
         drawn += curve(f"M222 138L294 {y}", INK, 1.8, head=True)
-        drawn += draw_vector(302, y - 8, colour, _SHADES[i])
-        drawn += text(title, 372, y - 3, 13, bold=True) + text(meaning, 372, y + 15, 13, GREY)
+        drawn += draw_vector(302, y - 8, colour, shades)
+        drawn += text(title, 372, y - 3, 13, bold=True)
+        drawn += text(meaning, 372, y + 15, 13, GREY)
+
+    # The right half: a row for each patch, and below the rows their sum.
     x = 570
     drawn += curve(f"M{x - 24} 20V{height - 20}", LINE, 1.2)
     drawn += text("What patch *i* receives", x, 32, 15, bold=True)
-    drawn += text("keys", x + 30, 62, 13, VERMILLION, "middle") + text(
-        "weights", x + 128, 62, 13, GREY, "middle"
-    )
+    drawn += text("keys", x + 30, 62, 13, VERMILLION, "middle")
+    drawn += text("weights", x + 128, 62, 13, GREY, "middle")
     drawn += text("values", x + 232, 62, 13, mix(GREEN, INK, 0.8), "middle")
-    for i, (weight, keys) in enumerate(
-        zip((0.55, 0.25, 0.15, 0.05), np.roll(_SHADES, 1, 0), strict=True)
-    ):
+    for i, weight in enumerate((0.55, 0.25, 0.15, 0.05)):
         y = 76 + 30 * i
-        drawn += draw_vector(x, y, VERMILLION, tuple(keys)) + rect(
-            x + 84, y, 88 * weight / 0.55, 15, GREY
-        )
+        drawn += draw_vector(x, y, VERMILLION, _SHADES[i - 1])
+        drawn += rect(x + 84, y, 88 * weight / 0.55, 15, GREY)  # 88 pixels: the largest weight
         drawn += draw_vector(x + 202, y, mix(GREEN, "white", 0.35 + weight), _SHADES[i])
-    drawn += curve(f"M{x + 232} 196V222", INK, 2, head=True) + draw_vector(
-        x + 202, 230, GREEN, (0.55, 0.4, 0.65, 0.4)
-    )
+    drawn += curve(f"M{x + 232} 196V222", INK, 2, head=True)
+    drawn += draw_vector(x + 202, 230, GREEN, (0.55, 0.4, 0.65, 0.4))
     drawn += text("weighted sum", x + 190, 242, 13, anchor="end")
     drawn += text("weight_{ij} = softmax_{j} ( query_{i} · key_{j} / √*D* )", x, 282, 14)
     drawn += text("output_{i} = Σ_{j} weight_{ij} value_{j}", x, 310, 14)
     return svg(
         drawn,
-        width,
+        WIDTH_OF_IDEAS,
         height,
         "Query, key and value",
         "Three matrices turn the token of a patch i into its query, its key and its value. "
-        "The query is compared with "
-        "the keys of all patches. The softmax of these products gives weights, and patch i "
-        "receives the weighted sum "
-        "of the values.",
+        "The query is compared with the keys of all patches. The softmax of these products gives "
+        "weights, and patch i receives the weighted sum of the values.",
     )
 
 
 def draw_cycles() -> str:
-    width, height, size = 860, 280, 160
+    """Draw a cycle that ends beside its start, and one that ends on another part."""
+    height = 280
+    size = 160
 
-    def case(
-        x: float,
-        title: str,
-        places: tuple[str, str, str],
-        off: tuple[float, float],
-        lines: tuple[str, str],
-    ) -> str:
-        first, second = Photo(REFERENCE, 35, x, 50, size), Photo(TARGET, 30, x + 230, 50, size)
-        u, v, end = first.place(places[0]), second.place(places[1]), first.place(places[2]) + off
-        drawn = (
-            text(title, x, 32, 15, bold=True)
-            + first.draw(BLUE)
-            + draw_grid(x, 50, size, 12, thick=0.6)
-        )
+    def draw_pair(x: float, title: str) -> tuple[Photo, Photo, str]:
+        """Draw both pictures below a title."""
+        first = Photo(REFERENCE, 35, x, 50, size)
+        second = Photo(TARGET, 30, x + 230, 50, size)
+        drawn = text(title, x, 32, 15, bold=True)
+        drawn += first.draw(BLUE) + draw_grid(x, 50, size, 12, thick=0.6)
         drawn += second.draw(ORANGE) + draw_grid(x + 230, 50, size, 12, thick=0.6)
-        closed = max(np.abs(off)) > 0
-        drawn += curve(straight(u, end), GREEN if closed else VERMILLION, 3.5) + draw_walk(
-            u, v, end, 6, 0.26
-        )
-        drawn += text("*v*", v[0] + 11, v[1] + 6, 16)
-        if closed:
-            drawn += text("*u*", u[0] + 2, u[1] - 11, 16) + text(
-                "*u*′", end[0] - 4, end[1] + 24, 16
-            )
-        else:
-            drawn += text("*u*", u[0] - 12, u[1] + 18, 16, anchor="end") + text(
-                "*u*′", end[0] - 11, end[1] + 19, 16, anchor="end"
-            )
-        return drawn + "".join(text(line, x, 236 + 21 * i, 14) for i, line in enumerate(lines))
+        return first, second, drawn
 
-    drawn = case(
-        20,
-        "A short cycle",
-        ("front left", "front left", "front left"),
-        (12, 16),
-        (
-            "*v* is the nearest neighbour of *u*, *u*′ that of *v*.",
-            "*u*′ is next to *u*: the match (*u*, *v*) ranks high.",
-        ),
+    first, second, drawn = draw_pair(20, "A short cycle")
+    u = first.place("front left")
+    v = second.place("front left")
+    end = u + [12, 16]
+    drawn += curve(straight(u, end), GREEN, 3.5) + draw_walk(u, v, end, 6, 0.26)
+    drawn += text("*v*", v[0] + 11, v[1] + 6, 16)
+    drawn += text("*u*", u[0] + 2, u[1] - 11, 16)
+    drawn += text("*u*′", end[0] - 4, end[1] + 24, 16)
+    words = (
+        "*v* is the nearest neighbour of *u*, *u*′ that of *v*.",
+        "*u*′ is next to *u*: the match (*u*, *v*) ranks high.",
     )
+    drawn += paragraph(words, 20, 236, 21, 14)
     drawn += curve(f"M430 20V{height - 20}", LINE, 1.2)
-    drawn += case(
-        450,
-        "A long cycle",
-        ("foot left", "foot right", "top right"),
-        (0, 0),
-        (
-            "The way back leads to another part.",
-            "*d*(*u*, *u*′) is large: the match (*u*, *v*) ranks low.",
-        ),
+
+    first, second, pictures = draw_pair(450, "A long cycle")
+    u = first.place("foot left")
+    v = second.place("foot right")
+    end = first.place("top right")
+    drawn += pictures
+    drawn += curve(straight(u, end), VERMILLION, 3.5) + draw_walk(u, v, end, 6, 0.26)
+    drawn += text("*v*", v[0] + 11, v[1] + 6, 16)
+    drawn += text("*u*", u[0] - 12, u[1] + 18, 16, anchor="end")
+    drawn += text("*u*′", end[0] - 11, end[1] + 19, 16, anchor="end")
+    words = (
+        "The way back leads to another part.",
+        "*d*(*u*, *u*′) is large: the match (*u*, *v*) ranks low.",
     )
+    drawn += paragraph(words, 450, 236, 21, 14)
     return svg(
         drawn,
-        width,
+        WIDTH_OF_IDEAS,
         height,
         "The cycle",
-        "Left: from a patch u of the reference an arrow leads to its nearest neighbour v in "
-        "the target, a dashed "
-        "arrow leads back to u', close to u, and the match ranks high. Right: the dashed "
-        "arrow ends far from u, and "
-        "the match ranks low.",
+        "Left: from a patch u of the reference an arrow leads to its nearest neighbour v in the "
+        "target, a dashed arrow leads back to u', close to u, and the match ranks high. Right: "
+        "the dashed arrow ends far from u, and the match ranks low.",
     )
 
 
@@ -893,6 +890,7 @@ def draw_axes(place: np.ndarray, turn: float, size: float = 30) -> str:
 
 
 def draw_camera(place: np.ndarray, colour: str, flip: int) -> str:
+    """Draw a camera that looks to the right, or with `flip` -1 to the left."""
     x, y = place
     body = rect(x - 19, y - 13, 38, 26, colour, corner=4)
     lens = np.array([[x + 19 * flip, y], [x + 33 * flip, y - 11], [x + 33 * flip, y + 11]])
@@ -900,7 +898,8 @@ def draw_camera(place: np.ndarray, colour: str, flip: int) -> str:
 
 
 def draw_frames() -> str:
-    width, height, y = 860, 290, 118
+    """Draw the chain of frames from the reference camera to that of the target view."""
+    y = 118
     x = [80, 255, 430, 605, 780]
     names = (
         ("camera of the", "reference image *i*"),
@@ -909,39 +908,43 @@ def draw_frames() -> str:
         ("world of the", "target, *b*"),
         ("camera of the", "target view *j*"),
     )
-    steps = ("(*T*^{cam}_{ai})^{−1}", "*T*_{0a}^{−1}", "*T*_{0b}", "*T*^{cam}_{bj}")
-    kinds = "camera", "label", "label", "camera"
-    drawn = text("From camera to camera, step by step", 20, 34, 15, bold=True)
-    drawn += draw_camera(np.array([x[0], y]), BLUE, 1) + draw_camera(
-        np.array([x[4], y]), ORANGE, -1
+    steps = (
+        ("(*T*^{cam}_{ai})^{−1}", "camera"),
+        ("*T*_{0a}^{−1}", "label"),
+        ("*T*_{0b}", "label"),
+        ("*T*^{cam}_{bj}", "camera"),
     )
+    drawn = text("From camera to camera, step by step", 20, 34, 15, bold=True)
+
+    # The five frames, arrows between them, and their names.
+    drawn += draw_camera(np.array([x[0], y]), BLUE, 1)
+    drawn += draw_camera(np.array([x[4], y]), ORANGE, -1)
     for place, turn in ((x[1], 12), (x[2], 0), (x[3], -20)):
         drawn += draw_axes(np.array([place - 4, y + 10]), turn)
-    for i, (step, kind) in enumerate(zip(steps, kinds, strict=True)):
-        start, end = x[i] + 48, x[i + 1] - 48
-        drawn += curve(f"M{start} {y}H{end}", INK, 2.2, head=True)
-        drawn += text(step, (start + end) / 2, y - 14, 15, anchor="middle")
-        drawn += text(kind, (start + end) / 2, y + 22, 13, GREY, "middle")
+    for left, right, (step, kind) in zip(x[:-1], x[1:], steps, strict=True):
+        middle = (left + right) / 2
+        drawn += curve(f"M{left + 48} {y}H{right - 48}", INK, 2.2, head=True)
+        drawn += text(step, middle, y - 14, 15, anchor="middle")
+        drawn += text(kind, middle, y + 22, 13, GREY, "middle")
     for place, lines in zip(x, names, strict=True):
-        drawn += "".join(
-            text(line, place, y + 62 + 18 * i, 13, anchor="middle") for i, line in enumerate(lines)
-        )
+        drawn += paragraph(lines, place, y + 62, 18, 13, "middle")
+
+    # The arrow from the first to the last, and its formula.
     foot = y + 98
     drawn += curve(
         f"M{x[0]} {foot}v12q0 10 10 10H{x[4] - 10}q10 0 10 -10V{foot + 4}", INK, 2.2, head=True
     )
     formula = "the pose: *T* = *T*^{cam}_{bj} *T*_{0b} *T*_{0a}^{−1} (*T*^{cam}_{ai})^{−1}"
-    drawn += text(formula, width / 2, foot + 48, 15, anchor="middle")
+    drawn += text(formula, WIDTH_OF_IDEAS / 2, foot + 48, 15, anchor="middle")
     return svg(
         drawn,
-        width,
-        height,
+        WIDTH_OF_IDEAS,
+        290,
         "The chain of frames",
         "Five frames in a row: the camera of the reference image, the world of the reference "
-        "sequence, the frame of "
-        "the category, the world of the target sequence, and the camera of the target view. "
-        "Arrows between them are "
-        "the known cameras and the labels; one arrow from the first to the last is the pose.",
+        "sequence, the frame of the category, the world of the target sequence, and the camera of "
+        "the target view. Arrows between them are the known cameras and the labels; one arrow "
+        "from the first to the last is the pose.",
     )
 
 
