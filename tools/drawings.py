@@ -10,7 +10,7 @@ ground makes the drawings legible on dark pages.
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from itertools import product
 from pathlib import Path
 from xml.sax.saxutils import escape
@@ -949,29 +949,48 @@ def draw_frames() -> str:
 
 
 def _frame_of(chair: Chair) -> np.ndarray:
-    """Return the corners (10, 3) of a chair: feet, seat and top, back before front; left and right
-    alternate."""
-    feet = np.array(
-        [chair[f"leg {side}{end}"][0] for end in ("", " front") for side in ("left", "right")]
-    ) * [1, 1, 0]
-    seat, back = chair["seat"], chair["back"]
-    tops = feet[:2] * [1, 0, 0] + [0, back[0][1], back[0][2] + back[1][2] / 2]
-    return np.vstack([feet, feet + [0, 0, seat[0][2]], tops])
+    """Return corners (10, 3) of a chair: feet, seat and top, back before front, in turn left and
+    right."""
+    legs = [chair[f"leg {side}{end}"][0] for end in ("", " front") for side in ("left", "right")]
+    feet = np.array(legs) * [1, 1, 0]
+    _, _, seat_height = chair["seat"][0]
+    (_, back_y, back_z), (_, _, back_height) = chair["back"]
+    tops = feet[:2] * [1, 0, 0] + [0, back_y, back_z + back_height / 2]
+    return np.vstack([feet, feet + [0, 0, seat_height], tops])
+
+
+def best_matrix(x: np.ndarray, y: np.ndarray, proper: bool) -> np.ndarray:
+    """Return the orthogonal matrix that lays centred points x (n, d) best on y, by Umeyama's
+    method; a `proper` one is a rotation."""
+    u, _, vt = np.linalg.svd(y.T @ x)
+    signs = np.ones(len(u))
+    if proper:
+        signs[-1] = np.sign(np.linalg.det(u @ vt))
+    return u * signs @ vt
 
 
 def draw_mirror() -> str:
     """Draw the best orthogonal matrix and the best rotation for matches that confuse the left and
     the right."""
-    width, height, panel, size = 860, 300, 280, 176
+    height = 300
+    panel = 280
+    # Between the corners of `_frame_of`: legs, sides of the seat, sides of the back and its top.
     edges = [(0, 4), (1, 5), (2, 6), (3, 7), (4, 5), (5, 7), (7, 6), (6, 4), (4, 8), (5, 9), (8, 9)]
     x = _frame_of(REFERENCE)
     y = x[np.arange(len(x)) ^ 1]  # left and right exchanged
     centre = x.mean(0)
-    u, _, vt = np.linalg.svd((y - centre).T @ (x - centre))
-    sign = np.linalg.det(u @ vt)
-    fits = [(x - centre) @ (u * [1, 1, last] @ vt).T + centre for last in (1, sign)]
-    panels = (
-        ("The matches", ("They join the left of a chair", "with its right.")),
+
+    # The matches of some corners, between two pictures.
+    first = Photo(REFERENCE, 30, 14, 66, 126)
+    second = Photo(REFERENCE, 30, 154, 66, 126)
+    drawn = draw_title("The matches", 10, panel)
+    drawn += first.draw(BLUE) + second.draw(ORANGE)
+    drawn += draw_matches(first.project(x)[0], second.project(y)[0], [8, 9, 6, 7], GREY)
+    words = ("They join the left of a chair", "with its right.")
+    drawn += paragraph(words, 10 + panel / 2, 246, 20, 14, "middle")
+
+    # Both fits, each over a picture.
+    fits = (
         (
             "The best matrix: det = −1",
             ("Every point is on its match, but left", "is right now. No motion does this."),
@@ -981,48 +1000,51 @@ def draw_mirror() -> str:
             ("The fit is worse. It is a motion,", "and so it is the answer."),
         ),
     )
-    drawn = ""
-    for i, (title, words) in enumerate(panels):
-        left = 10 + panel * i
-        drawn += text(title, left + panel / 2, 34, 15, anchor="middle", bold=True)
-        if i == 0:
-            first, second = (
-                Photo(REFERENCE, 30, left + 4, 66, 126),
-                Photo(REFERENCE, 30, left + 144, 66, 126),
-            )
-            drawn += first.draw(BLUE) + second.draw(ORANGE)
-            moved, colour, ends = first.project(x)[0], GREY, [8, 9, 6, 7]
-        else:
-            second = Photo(REFERENCE, 30, left + (panel - size) / 2, 46, size)
-            drawn += second.draw(ORANGE)
-            moved, colour, ends = second.project(fits[i - 1])[0], VERMILLION, range(len(x))
-            drawn += "".join(curve(straight(moved[j], moved[k]), BLUE, 3) for j, k in edges)
-        goal = second.project(y)[0]
-        for j in ends:
-            if np.linalg.norm(goal[j] - moved[j]) > 1:
-                drawn += curve(straight(moved[j], goal[j]), colour, 1.8, "3 3")
-            drawn += dot(goal[j], ORANGE, 5) + dot(moved[j], BLUE, 4)
-        for j, line in enumerate(words):
-            drawn += text(line, left + panel / 2, 246 + 20 * j, 14, anchor="middle")
-        if i:
-            drawn += curve(f"M{left} 20V{height - 20}", LINE, 1.2)
+    for proper, (title, words) in enumerate(fits):
+        left = 10 + panel * (proper + 1)
+        photo = Photo(REFERENCE, 30, left + 52, 46, 176)
+        moved = (x - centre) @ best_matrix(x - centre, y - centre, bool(proper)).T + centre
+        places, _ = photo.project(moved)
+        drawn += draw_title(title, left, panel) + photo.draw(ORANGE)
+        for j, k in edges:
+            drawn += curve(straight(places[j], places[k]), BLUE, 3)
+        drawn += draw_matches(places, photo.project(y)[0], range(len(x)), VERMILLION)
+        drawn += paragraph(words, left + panel / 2, 246, 20, 14, "middle")
+        drawn += curve(f"M{left} 20V{height - 20}", LINE, 1.2)
     return svg(
         drawn,
-        width,
+        WIDTH_OF_IDEAS,
         height,
         "Mirror and rotation",
         "A chair whose matches confuse left and right. The best orthogonal matrix puts every "
-        "point on its match, but "
-        "it is a mirror, which no motion of the chair does. The best rotation leaves "
-        "distances between the points, and "
-        "is the answer.",
+        "point on its match, but it is a mirror, which no motion of the chair does. The best "
+        "rotation leaves distances between the points, and is the answer.",
     )
 
 
+def draw_title(title: str, left: float, width: float) -> str:
+    """Draw the title of a panel."""
+    return text(title, left + width / 2, 34, 15, anchor="middle", bold=True)
+
+
+def draw_matches(points: np.ndarray, matches: np.ndarray, shown: Iterable[int], colour: str) -> str:
+    """Draw some of the points (n, 2) and their matches (n, 2), with dashed lines between them."""
+    drawn = ""
+    for j in shown:
+        if np.linalg.norm(matches[j] - points[j]) > 1:
+            drawn += curve(straight(points[j], matches[j]), colour, 1.8, "3 3")
+        drawn += dot(matches[j], ORANGE, 5) + dot(points[j], BLUE, 4)
+    return drawn
+
+
 def draw_three() -> str:
-    width, height, panel, size = 860, 356, 280, 76
+    """Draw three cases of the turns between three objects."""
+    height = 356
+    panel = 280
+    size = 76
     third = _chair(1.1, 1, 0.7, 0.7, 0.1)
-    chairs = (REFERENCE, BLUE, (22, 66)), (TARGET, ORANGE, (182, 66)), (third, GREEN, (102, 190))
+    chairs = ((REFERENCE, BLUE, (22, 66)), (TARGET, ORANGE, (182, 66)), (third, GREEN, (102, 190)))
+    # Title, turns from a to b and from b to c, words. The third turn, from a to c, is 0.
     panels = (
         (
             "All right: it closes",
@@ -1037,44 +1059,40 @@ def draw_three() -> str:
         ),
     )
     drawn = ""
-    for i, (title, angles, words) in enumerate(panels):
+    for i, (title, (from_a, from_b), words) in enumerate(panels):
         x = 10 + panel * i
-        drawn += text(title, x + panel / 2, 34, 15, anchor="middle", bold=True)
-        drawn += curve(f"M{x} 20V{height - 20}", LINE, 1.2) if i else ""
-        for j, (chair, colour, (left, top)) in enumerate(chairs):
-            drawn += Photo(chair, 205 if i == 2 and j == 1 else 25, x + left, top, size).draw(
-                colour
-            )
-        a, b, c = (np.add(corner, size / 2) + [x, 0] for *_, corner in chairs)
-        lines = (a, b, angles[0], (140, 90)), (b, c, angles[1], (220, 182)), (a, c, 0, (54, 182))
-        for start, end, angle, at in lines:
-            drawn += curve(
-                straight(start, end, 50), colour := VERMILLION if angle else INK, 2.2, head=True
-            )
-            drawn += text(f"{angle}°", x + at[0], at[1], 14, colour, "middle", bold=True)
-        drawn += (
-            text("*a*", x + 10, 106, 15)
-            + text("*b*", x + 262, 106, 15)
-            + text("*c*", x + 186, 232, 15)
-        )
-        drawn += "".join(
-            text(line, x + panel / 2, 306 + 20 * j, 14, anchor="middle")
-            for j, line in enumerate(words)
-        )
+        drawn += draw_title(title, x, panel)
+        if i:
+            drawn += curve(f"M{x} 20V{height - 20}", LINE, 1.2)
+        for chair, colour, (left, top) in chairs:
+            azimuth = 205 if i == 2 and chair is TARGET else 25
+            drawn += Photo(chair, azimuth, x + left, top, size).draw(colour)
+        centres = [np.add(corner, size / 2) + [x, 0] for _, _, corner in chairs]
+        a, b, c = centres
+        lines = ((a, b, from_a, (140, 90)), (b, c, from_b, (220, 182)), (a, c, 0, (54, 182)))
+        for start, end, angle, (right, down) in lines:
+            colour = VERMILLION if angle else INK
+            drawn += curve(straight(start, end, 50), colour, 2.2, head=True)
+            drawn += text(f"{angle}°", x + right, down, 14, colour, "middle", bold=True)
+        drawn += text("*a*", x + 10, 106, 15)
+        drawn += text("*b*", x + 262, 106, 15)
+        drawn += text("*c*", x + 186, 232, 15)
+        drawn += paragraph(words, x + panel / 2, 306, 20, 14, "middle")
     return svg(
         drawn,
-        width,
+        WIDTH_OF_IDEAS,
         height,
         "Cycles of three objects",
-        "Three chairs a, b and c with arrows from a to b, b to c and a to c. If all turns "
-        "are right, the way by b "
-        "agrees with the direct one. If one is half a turn off, it does not. If both of b "
-        "are off, it does again.",
+        "Three chairs a, b and c with arrows from a to b, b to c and a to c. If all turns are "
+        "right, the way by b agrees with the direct one. If one is half a turn off, it does not. "
+        "If both of b are off, it does again.",
     )
 
 
 def draw_ransac() -> str:
-    width, height, panel, radius = 860, 330, 280, 15
+    """Draw the inliers of a sample with wrong matches, of one without, and of the last fit."""
+    panel = 280
+    radius = 15  # of the threshold
     random = np.random.default_rng(3)
     x = np.array(
         [
@@ -1093,34 +1111,37 @@ def draw_ransac() -> str:
     )
     y = x @ np.array([[0.96, -0.2], [0.2, 0.96]]).T + random.normal(0, 3.5, x.shape)
     y[[2, 6]] = [[74, 34], [-62, -22]]  # wrong matches, which agree by chance
-    samples = (2, 6, 8, 9), (0, 3, 5, 8)
+    panels = (
+        ("A sample with wrong matches", [2, 6, 8, 9], f" of {len(x)}: forgotten"),
+        ("A sample of right matches", [0, 3, 5, 8], f" of {len(x)}: kept"),
+        ("Fitted to all inliers", [], ": the result"),
+    )
     drawn = ""
-    good = np.array([], int)
-    for i, title in enumerate(
-        ("A sample with wrong matches", "A sample of right matches", "Fitted to all inliers")
-    ):
-        left = 10 + panel * i
-        sample = np.array(samples[i]) if i < 2 else good
-        a, b = x[sample].mean(0), y[sample].mean(0)
-        u, _, vt = np.linalg.svd((y[sample] - b).T @ (x[sample] - a))
-        moved = (x - a) @ (u * [1, np.sign(np.linalg.det(u @ vt))] @ vt).T + b
+    inliers = np.array([], int)
+    for i, (title, sample, words) in enumerate(panels):
+        # The fit to the sample, or to the inliers of the one before.
+        fitted = sample or inliers
+        centre = x[fitted].mean(0)
+        goal = y[fitted].mean(0)
+        matrix = best_matrix(x[fitted] - centre, y[fitted] - goal, proper=True)
+        moved = (x - centre) @ matrix.T + goal
         inside = np.linalg.norm(moved - y, axis=1) < radius
-        good = np.flatnonzero(inside)
+        inliers = np.flatnonzero(inside)
+
         picture = ""
-        for j, (a, b) in enumerate(zip(moved, y, strict=True)):
-            picture += ring(b, GREEN if inside[j] else LINE, radius, 2.6 if inside[j] else 1.2)
-            picture += "" if inside[j] else curve(straight(a, b), VERMILLION, 2.4, "4 4")
-            picture += dot(b, ORANGE, 5) + dot(a, BLUE, 5)
-            if i < 2 and j in sample:
-                picture += ring(a, INK, 8, 2)
-        drawn += text(title, left + panel / 2, 34, 15, anchor="middle", bold=True)
+        for j, (point, match) in enumerate(zip(moved, y, strict=True)):
+            if inside[j]:
+                picture += ring(match, GREEN, radius, 2.6)
+            else:
+                picture += ring(match, LINE, radius, 1.2)
+                picture += curve(straight(point, match), VERMILLION, 2.4, "4 4")
+            picture += dot(match, ORANGE, 5) + dot(point, BLUE, 5)
+            if j in sample:
+                picture += ring(point, INK, 8, 2)
+        left = 10 + panel * i
+        drawn += draw_title(title, left, panel)
         drawn += group(picture, left + panel / 2, 148)
-        words = (
-            f"{inside.sum()} inliers of {len(x)}: forgotten",
-            f"{inside.sum()} inliers of {len(x)}: kept",
-            f"{inside.sum()} inliers: the result",
-        )[i]
-        drawn += text(words, left + panel / 2, 262, 14, anchor="middle")
+        drawn += text(f"{len(inliers)} inliers{words}", left + panel / 2, 262, 14, anchor="middle")
         if i:
             drawn += curve(f"M{left} 20V270", LINE, 1.2)
     key = (
@@ -1131,49 +1152,52 @@ def draw_ransac() -> str:
         (curve("M556 300h22", VERMILLION, 2.4, "4 4"), "outlier", 584),
         (ring(np.array([664, 300]), INK, 8, 2), "drawn in the sample", 678),
     )
-    drawn += "".join(mark + text(word, at, 305, 13, GREY) for mark, word, at in key)
+    for mark, word, at in key:
+        drawn += mark + text(word, at, 305, 13, GREY)
     return svg(
         drawn,
-        width,
-        height,
+        WIDTH_OF_IDEAS,
+        330,
         "RANSAC",
-        "Three fits to the same matches, some of which are wrong. A sample with wrong "
-        "matches has few inliers and is "
-        "forgotten, a sample of right matches has many and is kept, and the last fit uses "
-        "all of its inliers.",
+        "Three fits to the same matches, some of which are wrong. A sample with wrong matches has "
+        "few inliers and is forgotten, a sample of right matches has many and is kept, and the "
+        "last fit uses all of its inliers.",
     )
 
 
 def draw_scan() -> str:
-    width, height, radius = 860, 280, 82
+    """Draw the places of a phone around an object, from above and from the side."""
+    radius = 82
     drawn = ""
     for x, title, turns in (
         (150, "once around: good", range(0, 360, 30)),
         (710, "an arc: one side", range(30, 151, 30)),
     ):
         middle = np.array([x, 166])
-        drawn += ring(middle, LINE, radius, 1.4) + rect(x - 20, 146, 40, 40, BLUE, corner=6)
+        drawn += ring(middle, LINE, radius, 1.4)
+        drawn += rect(x - 20, 146, 40, 40, BLUE, corner=6)
         for turn in np.radians(turns):
             away = np.array([np.cos(turn), -np.sin(turn)])
             drawn += _phone(middle + radius * away, -away)
-        drawn += text(title, x, 40, 15, anchor="middle", bold=True) + text(
-            "from above", x, 60, 13, GREY, "middle"
-        )
-    x, table, turn = 430, 226, np.radians(30)
+        drawn += text(title, x, 40, 15, anchor="middle", bold=True)
+        drawn += text("from above", x, 60, 13, GREY, "middle")
+
+    # From the side: the object stands on a table.
+    x = 430
+    table = 226
+    turn = np.radians(30)
     object_at = np.array([x + 60, table - 20])
     camera_at = object_at + 150 * np.array([-np.cos(turn), -np.sin(turn)])
-    drawn += curve(f"M{x - 120} {table}H{x + 120}", INK, 2) + rect(
-        x + 40, table - 40, 40, 40, BLUE, corner=6
-    )
-    drawn += curve(straight(camera_at, object_at, 24), GREY, 1.4, "5 4") + _phone(
-        camera_at, object_at - camera_at
-    )
+    drawn += curve(f"M{x - 120} {table}H{x + 120}", INK, 2)
+    drawn += rect(x + 40, table - 40, 40, 40, BLUE, corner=6)
+    drawn += curve(straight(camera_at, object_at, 24), GREY, 1.4, "5 4")
+    drawn += _phone(camera_at, object_at - camera_at)
     drawn += text("looking down by 30°", x, 40, 15, anchor="middle", bold=True)
     drawn += text("from the side; ½ to 1 m away", x, 60, 13, GREY, "middle")
     return svg(
         drawn,
-        width,
-        height,
+        WIDTH_OF_IDEAS,
+        280,
         "How to scan an object",
         "A phone goes once around an object and looks down at it by 30 degrees; an arc shows "
         "one side only.",
@@ -1183,7 +1207,7 @@ def draw_scan() -> str:
 def _phone(place: np.ndarray, towards: np.ndarray) -> str:
     """Draw a phone that looks in a direction."""
     towards = towards / np.linalg.norm(towards)
-    axes = np.stack([towards, (-towards[1], towards[0])])
+    axes = np.stack([towards, (-towards[1], towards[0])])  # rows: forward, sideways
     view = place + np.array([(0, 0), (26, 12), (26, -12)]) @ axes
     body = place + np.array([(-4, -11), (4, -11), (4, 11), (-4, 11)]) @ axes
     return polygon(view, PALE, LINE) + polygon(body, ORANGE)
@@ -1193,54 +1217,60 @@ def _phone(place: np.ndarray, towards: np.ndarray) -> str:
 
 
 def _types(names: Iterable[str]) -> list[str]:
-    """Return the first of the types among imported names, at most two, in at most three lines of 11
-    letters."""
+    """Write the first two types among imported names in at most three lines of 11 letters."""
     lines = []
-    for name in [name for name in names if name[0].isupper() and not name.isupper()][:2]:
-        own = [""]
-        for part in re.findall("[A-Z][a-z0-9]*", name):
-            if len(own[-1] + part) > 11:
-                own.append("")
-            own[-1] += part
-        if len(lines + own) <= 3:
-            lines += own
+    types = [name for name in names if name[0].isupper() and not name.isupper()]
+    for name in types[:2]:
+        broken = [""]
+        for word in re.findall("[A-Z][a-z0-9]*", name):
+            if len(broken[-1] + word) > 11:
+                broken.append("")
+            broken[-1] += word
+        if len(lines + broken) <= 3:
+            lines += broken
     return lines
 
 
 def draw_rooms() -> str:
     """Draw the rooms on a diagonal; what one gives to another is at the right of the one and above
     the other."""
-    across, down, wide, high = 74, 50, 68, 40
+    # From a room to the next, and size of a box, in pixels.
+    across = 74
+    down = 50
+    wide = 68
+    high = 40
     centre = {room: np.array([51 + across * i, 34 + down * i]) for i, room in enumerate(ROOMS)}
+
+    # What is on top of the others comes last: lines, the names of types, and the rooms.
     wires = parcels = boxes = ""
     for (giver, taker), names in sorted(flows().items()):
-        (x, _), (_, y) = centre[taker], centre[giver]
-        wires += curve(straight(centre[giver], (x, y)) + straight((x, y), centre[taker]), LINE, 1.2)
+        x = centre[taker][0]
+        y = centre[giver][1]
+        corner = np.array([x, y])
+        path = straight(centre[giver], corner) + straight(corner, centre[taker])
+        wires += curve(path, LINE, 1.2)
         wires += curve(f"M{x} {centre[taker][1] - high / 2 - 8:g}v7", GREY, 1.6, head=True)
         lines = _types(sorted(names, key=lambda name: (-names[name], name)))
         ground = rect(x - wide / 2, y - high / 2, wide, high, "white", LINE, 1, 3)
-        parcels += ground if lines else dot(np.array([x, y]), GREY)
-        for i, line in enumerate(lines):
-            parcels += text(line, x, y + 4 + 11 * (i - (len(lines) - 1) / 2), 10, anchor="middle")
+        parcels += ground if lines else dot(corner, GREY)
+        top = y + 4 - 11 * (len(lines) - 1) / 2
+        parcels += paragraph(lines, x, top, 11, 10, "middle")
     for room, (x, y) in centre.items():
         boxes += rect(x - wide / 2, y - high / 2, wide, high, mix(SKY, "white", 0.3), BLUE, 1.5, 5)
         boxes += text(room, x, y + 4, 12, anchor="middle", bold=True)
-    words = (
+    words = [
         "A room gives what is at its right, and takes what is above it.",
         "Shown are the types that are imported most; a dot: functions or constants only.",
         "Nothing flows back: the half below the rooms is empty.",
         "",
-        *(
-            f"{room}: {modules.replace(' ', ', ')}"
-            for room, modules in ROOMS.items()
-            if room != modules
-        ),
-    )
+    ]
+    for room, modules in ROOMS.items():
+        if room != modules:
+            words.append(f"{room}: {modules.replace(' ', ', ')}")
     foot = down * len(ROOMS)
-    legend = text("The rooms of zsp_lite", 20, foot - 18 * len(words) - 8, 15, bold=True)
-    legend += "".join(
-        text(line, 20, foot - 18 * (len(words) - 1 - i), 13) for i, line in enumerate(words)
-    )
+    top = foot - 18 * len(words)
+    legend = text("The rooms of zsp_lite", 20, top - 8, 15, bold=True)
+    legend += paragraph(words, 20, top + 18, 18, 13)
     return svg(
         wires + parcels + boxes + legend,
         102 + across * (len(ROOMS) - 1),
@@ -1260,14 +1290,12 @@ DRAWINGS: dict[str, Callable[[], str]] = {
     "three": draw_three,
     "ransac": draw_ransac,
     "scan": draw_scan,
-    **{
-        f"here_{notebook}": (lambda notebook=notebook: draw_here(notebook))
-        for notebook in sorted(HERE)
-    },
+    **{f"here_{notebook}": partial(draw_here, notebook) for notebook in sorted(HERE)},
 }
 
 
 def main() -> None:
+    """Write all drawings."""
     for name, draw in DRAWINGS.items():
         (FOLDER / f"{name}.svg").write_text(draw(), encoding="utf-8")
     ROOMS_FILE.write_text(draw_rooms(), encoding="utf-8")
