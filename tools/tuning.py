@@ -511,7 +511,7 @@ def check_sides(folders: Iterable[str | Path], side: str) -> None:
         sides = {row["name"]: row["side"] for row in csv.DictReader(file)}
     for folder in folders:
         for category in Co3D(folder).categories():
-            # The name of the concept, before the number of its model.
+            # A concept is the part of a name before its hyphen.
             found = sides.get(category.partition("-")[0], "no side")
             if found != side:
                 raise InputError(f"{folder}: category {category} is for {found}, expected {side}")
