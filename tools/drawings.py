@@ -242,9 +242,8 @@ def dot(
 
 
 def ring(place: np.ndarray, stroke: str, radius: float, thick: float) -> str:
-    return element(
-        "circle", cx=place[0], cy=place[1], r=radius, fill="none", stroke=stroke, stroke_width=thick
-    )
+    """Draw a circle that is not filled."""
+    return dot(place, "none", radius, stroke, thick)
 
 
 def curve(

@@ -92,6 +92,9 @@ _SETTINGS = {
 _FRAMES = (1, 2, 4, 8)  # reference frames of each object
 _OBJECTS = 8  # of a category, in pairs of scans
 _Fit = TypeVar("_Fit")
+# Of the different poses of a pair, best first: by how many nats each is below the best, and its
+# error in degrees.
+Poses = tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +117,8 @@ class Outcome:
         """How correct each hypothesis is, in [0, 1]."""
         return np.exp(-np.square(self.errors / _SOFT_ANGLE))
 
-    def ranked(
-        self, weights: ScoreCoefficients
-    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """Return by how many nats each different pose is below the best under the weights, and its
-        error."""
+    def ranked(self, weights: ScoreCoefficients) -> Poses:
+        """Return the different poses under the weights."""
         scores = self.terms @ np.array(astuple(weights))
         order = np.argsort(-scores, kind="stable")
         # `modes` names for each hypothesis the best one of the same pose: keep those themselves.
@@ -177,12 +177,10 @@ class ScanOutcome:
     category: str
     setting: str
     frames: int
-    poses: tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]  # see `Outcome.ranked`
+    poses: Poses
     known: Float[np.ndarray, "5"]
 
-    def ranked(
-        self, weights: ScoreCoefficients | None
-    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    def ranked(self, weights: ScoreCoefficients | None) -> Poses:
         return self.poses
 
     def evidence(self, weights: ScoreCoefficients | None) -> Float[np.ndarray, "5"]:
@@ -239,7 +237,7 @@ def collect_scans(
 
 def pose_of_two(
     pairs: Sequence[PairHypotheses], labels: Mapping[str, PoseLabel]
-) -> tuple[tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]], Float[np.ndarray, "5"]]:
+) -> tuple[Poses, Float[np.ndarray, "5"]]:
     """Align two objects by the hypotheses of their frames; return `ScanOutcome.poses` and
     `known`."""
     objects = synchronise(pairs).objects
