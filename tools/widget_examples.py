@@ -85,7 +85,7 @@ def ransac_settings() -> Widget:
     matches = match(reference.features, target.features)
     return outliers.ransac_settings(
         (reference.frame.rgb, target.frame.rgb),
-        match_pixels(sample_views(), matches),
+        tuple(match_pixels(sample_views(), matches)),
         match_points(reference, target, matches),
     )
 
