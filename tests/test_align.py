@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from benchmark_folder import SEQUENCES, SlowBackbone, run_rows, small_folder
+from numpy.testing import assert_allclose
 from refusals import refused
 
 from zsp_lite import align
@@ -55,7 +56,7 @@ def test_objects_are_aligned_as_their_labels_say_and_the_labels_that_are_written
     written = turns(tmp_path)
     for pair, true in turns(small_folder()).items():
         assert rotation_error(found.between(*pair).R, true) < 15
-        np.testing.assert_allclose(written[pair], found.between(*pair).R, atol=1e-6)
+        assert_allclose(written[pair], found.between(*pair).R, atol=1e-6)
     with pytest.raises(InputError, match="would be replaced by other content"):
         write_labels(
             replace(found, objects=dict(reversed(found.objects.items()))), tmp_path, "lump"
@@ -131,9 +132,7 @@ def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     ).stat().st_size > 1000
     alignment = json.loads((out / "alignment.json").read_text())
     assert alignment["disagreements"] == [{"pair": [A, C], "degrees": 179.96}]
-    np.testing.assert_allclose(
-        alignment["objects"][B]["world_to_frame"], run[1].objects[B].sim3.matrix
-    )
+    assert_allclose(alignment["objects"][B]["world_to_frame"], run[1].objects[B].sim3.matrix)
     labelling = Labelling(root, "lump")
     assert rotation_error(labelling.proposal(C).R, run[1].between(A, C).R) < 0.01
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
@@ -31,17 +32,17 @@ def cloud(seed: int, n: int = 20) -> np.ndarray:
 
 
 def assert_same(first: Sim3, second: Sim3, atol: float = 1e-9):
-    np.testing.assert_allclose(first.matrix, second.matrix, atol=atol)
+    assert_allclose(first.matrix, second.matrix, atol=atol)
 
 
 @given(seeds, scales)
 def test_composition_is_the_product_of_the_matrices_and_application_in_turn(seed, scale):
     a, b, points = similarity(seed, scale), similarity(seed + 7), cloud(seed)
     assert_same(a @ a.inverse(), Sim3.identity())
-    np.testing.assert_allclose((a @ b).matrix, a.matrix @ b.matrix, atol=1e-9)
-    np.testing.assert_allclose((a @ b).apply(points), a.apply(b.apply(points)), atol=1e-9)
+    assert_allclose((a @ b).matrix, a.matrix @ b.matrix, atol=1e-9)
+    assert_allclose((a @ b).apply(points), a.apply(b.apply(points)), atol=1e-9)
     homogeneous = np.c_[points, np.ones(len(points))] @ a.matrix.T
-    np.testing.assert_allclose(a.apply(points), homogeneous[:, :3], atol=1e-9)
+    assert_allclose(a.apply(points), homogeneous[:, :3], atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -76,11 +77,9 @@ def test_a_rounded_rotation_becomes_the_nearest_one_and_another_is_refused_with_
         found.R,
         camera.R,
     ):
-        np.testing.assert_allclose(one, nearest, atol=1e-12)
+        assert_allclose(one, nearest, atol=1e-12)
     assert found.scale == pytest.approx(2, abs=0.02)
-    np.testing.assert_array_equal(
-        Sim3(1.0, exact.astype(np.float32), np.zeros(3)).R, exact.astype(np.float32)
-    )
+    assert_array_equal(Sim3(1.0, exact.astype(np.float32), np.zeros(3)).R, exact.astype(np.float32))
     refused(
         r"Sim3: R is .*, 0\.029 off the nearest rotation, expected",
         Sim3,
@@ -118,10 +117,10 @@ def test_umeyama_is_the_best_rotation_by_scipy_also_for_a_mirrored_target(seed, 
     ):
         sim3 = umeyama(source, target)
         x, y = source - source.mean(axis=0), target - target.mean(axis=0)
-        np.testing.assert_allclose(sim3.R, Rotation.align_vectors(y, x)[0].as_matrix(), atol=1e-6)
+        assert_allclose(sim3.R, Rotation.align_vectors(y, x)[0].as_matrix(), atol=1e-6)
         # the least-squares scale
         assert sim3.scale == pytest.approx((x @ sim3.R.T * y).sum() / np.square(x).sum())
-        np.testing.assert_allclose(sim3.apply(source.mean(axis=0)), target.mean(axis=0), atol=1e-9)
+        assert_allclose(sim3.apply(source.mean(axis=0)), target.mean(axis=0), atol=1e-9)
 
 
 def test_without_scale_the_scale_is_one():
@@ -169,7 +168,7 @@ def test_ransac_recovers_the_pose_with_sixty_percent_outliers(seed):
     source, target, truth, right = contaminated(seed)
     sim3, inliers = ransac(source, target, seed=seed)
     assert inliers[right].mean() > 0.9
-    np.testing.assert_allclose(sim3.matrix, truth.matrix, atol=0.15)
+    assert_allclose(sim3.matrix, truth.matrix, atol=0.15)
 
 
 def test_the_same_seed_gives_the_same_result_and_a_generator_will_do():
@@ -192,11 +191,11 @@ def test_many_trials_on_many_points_need_little_memory_and_one_that_is_better_wi
     tracemalloc.stop()
     assert peak < 100e6  # all residuals at once are 160 MB, their offsets 480 MB
     assert inliers.reshape(20, 50).all(axis=0)[right].mean() > 0.9
-    np.testing.assert_allclose(found.matrix, truth.matrix, atol=0.15)
+    assert_allclose(found.matrix, truth.matrix, atol=0.15)
     monkeypatch.setattr("zsp_lite.alignment._BLOCK", 50 * 64)
     in_blocks, more = ransac(source, target, trials=20_000)
     assert more.sum() >= ransac(source, target, trials=64)[1].sum() and (more >= right).mean() > 0.9
-    np.testing.assert_allclose(in_blocks.matrix, truth.matrix, atol=0.15)
+    assert_allclose(in_blocks.matrix, truth.matrix, atol=0.15)
 
 
 def test_of_two_motions_with_as_many_inliers_the_closer_fit_wins():
@@ -224,8 +223,8 @@ def test_the_final_fit_keeps_to_the_scale_range():
     # by scipy.
     x, y = source[inliers], target[inliers]
     expected, _ = Rotation.align_vectors(y - y.mean(axis=0), x - x.mean(axis=0))
-    np.testing.assert_allclose(bounded.R, expected.as_matrix(), atol=1e-9)
-    np.testing.assert_allclose(bounded.apply(x).mean(axis=0), y.mean(axis=0), atol=1e-12)
+    assert_allclose(bounded.R, expected.as_matrix(), atol=1e-9)
+    assert_allclose(bounded.apply(x).mean(axis=0), y.mean(axis=0), atol=1e-12)
 
 
 @pytest.mark.parametrize(

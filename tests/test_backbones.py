@@ -13,6 +13,7 @@ from refusals import refused
 from safetensors.torch import save_file
 from small_backbones import ARCHITECTURES, save_all, small_vit
 from torch import nn
+from torch.testing import assert_close
 
 from zsp_lite.backbones import load
 from zsp_lite.backbones.backbone import Backbone
@@ -47,7 +48,7 @@ def pictures() -> list[np.ndarray]:
 def assert_same_features(first, second):
     for a, b in zip(first, second, strict=True):
         for name in ("keys", "saliency", "global_feature"):
-            torch.testing.assert_close(getattr(a, name), getattr(b, name), atol=2e-5, rtol=1e-4)
+            assert_close(getattr(a, name), getattr(b, name), atol=2e-5, rtol=1e-4)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +118,7 @@ def test_layer_and_facet_change_the_keys_alone_and_stand_in_the_name(place, pict
     keys, (first, *others) = [one.keys for one in found], found
     assert all(not torch.allclose(a, b) for i, a in enumerate(keys) for b in keys[:i])
     for other in others:
-        torch.testing.assert_close(
+        assert_close(
             (other.saliency, other.global_feature),
             (first.saliency, first.global_feature),
             atol=1e-5,
@@ -142,10 +143,10 @@ def test_features_are_the_models_keys_saliency_and_cls(pictures):
     mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
     with torch.no_grad():
         tokens = vit.extract((pixels - mean.view(3, 1, 1)) / std.view(3, 1, 1), 1)
-    torch.testing.assert_close(features[0].keys, tokens.keys[0].view(4, 4, 64))
-    torch.testing.assert_close(features[0].global_feature, tokens.cls[0])
+    assert_close(features[0].keys, tokens.keys[0].view(4, 4, 64))
+    assert_close(features[0].global_feature, tokens.cls[0])
     raw = tokens.attention[0, [0, 3]].mean(0).view(4, 4)
-    torch.testing.assert_close(features[0].saliency, (raw - raw.min()) / (raw.max() - raw.min()))
+    assert_close(features[0].saliency, (raw - raw.min()) / (raw.max() - raw.min()))
     assert_same_features(Backbone(vit, "small", 1, (0, 3), "cpu", batch_size=1)(pictures), features)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmark_folder import BACKBONE, own_method, run_rows, small_folder
+from numpy.testing import assert_allclose
 from refusals import refused
 from synthetic_views import CoordinateBackbone
 
@@ -125,9 +126,9 @@ def test_stored_poses_give_the_errors_again(run):
         truths = true_poses(small_folder(), pairs, views)
         errors = found.row(name)["error"][[pair.key for pair in pairs]]
         # Errors are stored with four decimals, rotations with fewer digits than a double has.
-        np.testing.assert_allclose(rotation_error(rotations, truths[:, :3, :3]), errors, atol=2e-4)
+        assert_allclose(rotation_error(rotations, truths[:, :3, :3]), errors, atol=2e-4)
     solved = errors < 1  # of "oracle-view"
-    np.testing.assert_allclose(positions[solved], truths[solved, :3, 3], atol=0.1)
+    assert_allclose(positions[solved], truths[solved, :3, 3], atol=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -262,7 +263,7 @@ def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(
     monkeypatch.setattr("zsp_lite.data.ground_truth.read_poses", lambda *_: poses)
     mine = run_rows({"mine": half_turned}, tmp_path, pairs=2, targets=1)["mine"]
     found = read_run(tmp_path).row("mine")[["symmetric_error", "error"]]
-    np.testing.assert_allclose(found, [[expected, 180]] * 2, atol=1e-5)
+    assert_allclose(found, [[expected, 180]] * 2, atol=1e-5)
     assert mine["symmetric_acc30"] == 100 * (expected < 30)
 
 

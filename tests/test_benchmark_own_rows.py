@@ -29,6 +29,7 @@ from benchmark_folder import (
     run_rows,
     small_folder,
 )
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone, true_pose
@@ -311,7 +312,7 @@ def test_a_matcher_of_keypoints_gets_the_crops_at_the_resolution_of_the_frames(t
     reference, (target,) = dataset.load_pair(pair)
     for crop, frame in zip(crops, (reference, target), strict=True):
         top, left, height, width = mask_to_bbox(frame.mask)
-        np.testing.assert_array_equal(crop, frame.rgb[top : top + height, left : left + width])
+        assert_array_equal(crop, frame.rgb[top : top + height, left : left + width])
 
 
 SWEPT = {
@@ -439,7 +440,7 @@ def test_poses_from_a_file_are_measured_like_any_others(
     assert (found.loc[answered, "error"] < 1e-5).all()  # degrees: equal but for rounding
     assert set(found.loc[answered, "view"]) == {1}
     similarity = found.loc[answered, ["translation", "scale"]].to_numpy(float)
-    np.testing.assert_allclose(similarity, [[translation, scale]] * 3, atol=1e-9)
+    assert_allclose(similarity, [[translation, scale]] * 3, atol=1e-9)
     assert found.loc[missing, ["error", "failed"]].tolist() == [180, f"{path} has no pose"]
 
 
@@ -605,7 +606,7 @@ def test_the_questions_have_the_files_and_the_camera_of_each_frame(asked):
         frame = dataset.load(dataset.frame(line["category"], line["sequence"], int(line["frame"])))
         camera = Camera(rotation, translation, focal, middle, frame.camera.size)
         expected, _ = frame.camera.project(points)
-        np.testing.assert_allclose(camera.project(points)[0], expected, atol=1e-9)
+        assert_allclose(camera.project(points)[0], expected, atol=1e-9)
 
 
 def test_a_row_is_remembered_by_its_settings_and_the_names_of_its_functions():

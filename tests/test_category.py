@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from refusals import refused
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -69,7 +70,7 @@ def test_poses_are_recovered_among_outliers_and_half_turns_whatever_the_order_of
     scale = np.exp(np.mean(np.log([one.scale for one in truth])))
     for (name, one), true in zip(alignment.objects.items(), truth, strict=True):
         expected = Sim3(truth[0].scale / scale, np.eye(3), np.zeros(3)) @ truth[0].inverse() @ true
-        np.testing.assert_allclose(one.sim3.matrix, expected.matrix, atol=2e-2)
+        assert_allclose(one.sim3.matrix, expected.matrix, atol=2e-2)
         assert np.array_equal(one.sim3.matrix, again.objects[name].sim3.matrix)
     assert len(alignment.disagreements) == 3 and min(alignment.disagreements.values()) > 150
 
@@ -87,7 +88,7 @@ def test_contradictory_evidence_lowers_the_probability_and_names_the_other_turn(
         and rotation_error(after.sim3.R, after.alternative.R) > 170
     )
     assert after.alternative_probability > before.alternative_probability + 0.1
-    np.testing.assert_allclose(
+    assert_allclose(
         after.alternative.apply(after.centre), after.sim3.apply(after.centre), atol=1e-6
     )
 

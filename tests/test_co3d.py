@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from co3d_folders import convert_to_v2, edit_json, sequence_data
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
 from zsp_lite.data.co3d import Co3D, Pair, write_co3d
@@ -50,16 +51,14 @@ def test_written_data_is_read_back(root, version):
     for annotation, expected in zip(annotations, written.frames, strict=True):
         frame = dataset.load(annotation)
         for name in ("R", "t", "focal_length", "principal_point"):
-            np.testing.assert_allclose(
-                getattr(frame.camera, name), getattr(expected.camera, name), atol=1e-9
-            )
-        np.testing.assert_array_equal(frame.mask, expected.mask)
-        np.testing.assert_allclose(frame.depth, expected.depth, rtol=2**-11)
+            assert_allclose(getattr(frame.camera, name), getattr(expected.camera, name), atol=1e-9)
+        assert_array_equal(frame.mask, expected.mask)
+        assert_allclose(frame.depth, expected.depth, rtol=2**-11)
         # JPEG, colours at half resolution
         assert np.abs(frame.rgb.astype(int) - expected.rgb).mean() < 8
     points, colours = dataset.point_cloud("chair", "b_2")
-    np.testing.assert_allclose(points, written.points, rtol=1e-6)
-    np.testing.assert_array_equal(colours, written.colours)
+    assert_allclose(points, written.points, rtol=1e-6)
+    assert_array_equal(colours, written.colours)
 
 
 def test_written_files_have_the_layout_of_co3d(root):
@@ -184,9 +183,9 @@ def test_the_depth_mask_makes_depth_unknown(root):
     allowed = np.arange(32) < np.full((24, 1), 16)
     write_mask(root / annotation.depth.mask_path, allowed)
     after = Co3D(root).load(annotation).depth
-    np.testing.assert_array_equal(after, np.where(allowed, before, 0))
+    assert_array_equal(after, np.where(allowed, before, 0))
     edit_first(root, lambda frame: frame["depth"].update(scale_adjustment=2.0, mask_path=None))
-    np.testing.assert_array_equal(Co3D(root).load(first(root)).depth, 2 * before)
+    assert_array_equal(Co3D(root).load(first(root)).depth, 2 * before)
 
 
 @pytest.mark.parametrize(

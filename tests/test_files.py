@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from co3d_folders import sequence_data
+from numpy.testing import assert_array_equal
 from refusals import refused
 from safetensors.torch import save
 
@@ -281,7 +282,7 @@ ENCODED = {
 def test_positions_are_read_in_every_encoding(path, encoding):
     path.write_bytes(_ply(len(POINTS), ENCODED[encoding], encoding))
     points, colours = read_ply(path)
-    np.testing.assert_array_equal(points, POINTS)
+    assert_array_equal(points, POINTS)
     assert points.dtype == np.float64 and colours is None
 
 
@@ -295,7 +296,7 @@ def test_colours_of_8_bits_or_from_0_to_1_are_read_as_8_bit(path, kind, code, sc
     path.write_bytes(_ply(len(POINTS), table.tobytes(), kind=kind))
     colours = read_ply(path)[1]
     assert colours.dtype == np.uint8
-    np.testing.assert_array_equal(colours, COLOURS)
+    assert_array_equal(colours, COLOURS)
 
 
 def test_faces_behind_the_vertices_of_a_mesh_are_left_out(path):
@@ -304,13 +305,13 @@ def test_faces_behind_the_vertices_of_a_mesh_are_left_out(path):
         b"end_header\n", faces, 1
     )
     path.write_bytes(data)
-    np.testing.assert_array_equal(read_ply(path)[0], POINTS)
+    assert_array_equal(read_ply(path)[0], POINTS)
 
 
 def test_written_data_is_read_back(path):
     write_ply(path, POINTS, COLOURS, POINTS)
-    np.testing.assert_array_equal(read_ply(path)[0], POINTS)
-    np.testing.assert_array_equal(read_ply(path)[1], COLOURS)
+    assert_array_equal(read_ply(path)[0], POINTS)
+    assert_array_equal(read_ply(path)[1], COLOURS)
     refused("expected finite", write_ply, path, np.full((5, 3), np.nan), COLOURS)
 
 

@@ -9,6 +9,7 @@ import pytest
 from co3d_folders import random_camera, seeds, sequence_data
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
 from zsp_lite.data.cameras import Camera
@@ -83,9 +84,9 @@ def test_cropping_keeps_every_pixels_world_point():
         == cropped.mask.shape
         == (height, width)
     )
-    np.testing.assert_array_equal(cropped.rgb, whole.rgb[top : top + height, left : left + width])
+    assert_array_equal(cropped.rgb, whole.rgb[top : top + height, left : left + width])
     pixel = np.array([3.5, 2.5])
-    np.testing.assert_allclose(
+    assert_allclose(
         cropped.camera.unproject(pixel, 2.0),
         whole.camera.unproject(pixel + (left, top), 2.0),
         atol=1e-12,
@@ -98,7 +99,7 @@ def test_resized_depth_is_the_depth_under_the_new_pixels_centre(seed, height, wi
     small = resize_frame(whole, (height, width))
     rows = np.floor((np.arange(height) + 0.5) * SIZE[0] / height).astype(int)
     cols = np.floor((np.arange(width) + 0.5) * SIZE[1] / width).astype(int)
-    np.testing.assert_array_equal(small.depth, whole.depth[rows][:, cols])
+    assert_array_equal(small.depth, whole.depth[rows][:, cols])
     assert small.camera.size == small.rgb.shape[:2] == small.mask.shape == (height, width)
 
 
@@ -145,12 +146,12 @@ def test_arrays_of_a_camera_become_a_frame_with_half_integer_pixel_centres():
     frame = Frame.from_arrays(**arrays(pose=pose, name="cup"))
     camera = frame.camera
     assert frame.name == "cup" and frame.mask is None and camera.size == SIZE
-    np.testing.assert_allclose([camera.focal_length, camera.principal_point], [[40, 41], [16, 12]])
-    np.testing.assert_allclose(camera.to_world(np.eye(3)), np.eye(3) @ pose[:3, :3].T + (1, 2, 3))
-    np.testing.assert_array_equal(frame.depth[:2, :8], 0)
-    np.testing.assert_array_equal(frame.depth[2:], np.float32(2))
+    assert_allclose([camera.focal_length, camera.principal_point], [[40, 41], [16, 12]])
+    assert_allclose(camera.to_world(np.eye(3)), np.eye(3) @ pose[:3, :3].T + (1, 2, 3))
+    assert_array_equal(frame.depth[:2, :8], 0)
+    assert_array_equal(frame.depth[2:], np.float32(2))
     four = Frame.from_arrays(**arrays(K=(40, 41, 15.5, 11.5)))
-    np.testing.assert_array_equal(four.camera.K, camera.K)
+    assert_array_equal(four.camera.K, camera.K)
 
 
 @pytest.mark.parametrize(
@@ -162,9 +163,7 @@ def test_arrays_of_a_camera_become_a_frame_with_half_integer_pixel_centres():
     ],
 )
 def test_grey_images_alpha_and_floats_are_colours(rgb):
-    np.testing.assert_array_equal(
-        Frame.from_arrays(**arrays(rgb=rgb)).rgb, np.full((*SIZE, 3), 128)
-    )
+    assert_array_equal(Frame.from_arrays(**arrays(rgb=rgb)).rgb, np.full((*SIZE, 3), 128))
 
 
 def test_a_mask_holds_booleans_zeros_and_ones_or_up_to_255():
@@ -176,7 +175,7 @@ def test_a_mask_holds_booleans_zeros_and_ones_or_up_to_255():
         inside.astype(np.float32),
         255 * inside.astype(np.uint8),
     ):
-        np.testing.assert_array_equal(Frame.from_arrays(**arrays(mask=mask)).mask > 0.5, inside)
+        assert_array_equal(Frame.from_arrays(**arrays(mask=mask)).mask > 0.5, inside)
 
 
 @pytest.mark.parametrize(
@@ -211,12 +210,12 @@ def test_depth_and_masks_survive_their_files(tmp_path):
     rng = np.random.default_rng(0)
     depth = np.where(rng.random(SIZE) < 0.5, rng.uniform(1, 9, SIZE), 0).astype(np.float32)
     write_depth(tmp_path / "depth.png", depth, 2.0)
-    np.testing.assert_allclose(read_depth(tmp_path / "depth.png", 2.0), depth, rtol=2**-11)
+    assert_allclose(read_depth(tmp_path / "depth.png", 2.0), depth, rtol=2**-11)
     mask = rng.integers(0, 256, SIZE).astype(np.float32) / 255
     write_mask(tmp_path / "mask.png", mask)
-    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), mask)
+    assert_array_equal(read_mask(tmp_path / "mask.png"), mask)
     write_mask(tmp_path / "known.png", depth > 0)
-    np.testing.assert_array_equal(read_mask(tmp_path / "known.png"), depth > 0)
+    assert_array_equal(read_mask(tmp_path / "known.png"), depth > 0)
     # bit depth in the PNG's header: a mask of booleans
     assert (tmp_path / "known.png").read_bytes()[24] == 1
 
@@ -246,7 +245,7 @@ def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension, opti
         b"IDAT IEND IDAT",
     ):
         path.write_bytes(data + behind)
-        np.testing.assert_array_equal(read_image(path), decoded)
+        assert_array_equal(read_image(path), decoded)
     for end in (*range(0, len(data), 37), len(data) - 2, len(data) - 1):
         path.write_bytes(data[:end])
         refused("cannot be decoded", read_image, path)
@@ -260,7 +259,7 @@ def test_a_mask_file_of_zeros_and_ones_is_an_empty_mask_for_all(tmp_path):
         and frame_defect(frame) == "empty object mask"
         and not len(world_cloud([frame])[0])
     )
-    np.testing.assert_array_equal(object_crop(frame, 8).rgb, resize_frame(frame, (8, 8)).rgb)
+    assert_array_equal(object_crop(frame, 8).rgb, resize_frame(frame, (8, 8)).rgb)
 
 
 def test_an_interrupted_write_leaves_the_old_file_alone(tmp_path, monkeypatch):
@@ -310,8 +309,8 @@ def test_a_hole_in_a_plane_is_filled_with_the_plane():
     holed = plane.copy()
     holed[10:20, 12:25] = 0
     filled = inpaint_depth(holed)
-    np.testing.assert_allclose(filled, plane, atol=0.05)  # the hole spans a range of 0.27
-    np.testing.assert_array_equal(filled[holed > 0], plane[holed > 0])
+    assert_allclose(filled, plane, atol=0.05)  # the hole spans a range of 0.27
+    assert_array_equal(filled[holed > 0], plane[holed > 0])
 
 
 @given(seeds)
@@ -321,7 +320,7 @@ def test_filled_depth_stays_between_the_known_depths(seed):
     depth[3, 4] = 2.0
     filled = inpaint_depth(depth)
     assert filled.min() >= depth[depth > 0].min() and filled.max() <= depth.max()
-    np.testing.assert_array_equal(inpaint_depth(filled), filled)  # complete depth needs no filling
+    assert_array_equal(inpaint_depth(filled), filled)  # complete depth needs no filling
     refused("no known pixel", inpaint_depth, 0 * depth)
 
 
@@ -329,9 +328,9 @@ def test_unprojected_depth_projects_onto_its_own_pixels():
     camera = random_camera(3, (7, 9))
     depth = np.random.default_rng(0).uniform(1, 2, (7, 9))
     pixels, back = camera.project(camera.to_world(unproject_depth(depth, camera)))
-    np.testing.assert_allclose(pixels[2, 5], [5.5, 2.5])  # pixel centres lie at half-integers
-    np.testing.assert_allclose(pixels[6, 0], [0.5, 6.5])
-    np.testing.assert_allclose(back, depth)
+    assert_allclose(pixels[2, 5], [5.5, 2.5])  # pixel centres lie at half-integers
+    assert_allclose(pixels[6, 0], [0.5, 6.5])
+    assert_allclose(back, depth)
 
 
 def patch_depths_one_by_one(depth, grid):
@@ -368,7 +367,7 @@ def test_a_patch_without_depth_takes_the_filled_depth_at_its_centre():
     points, known = patch_points(depth, camera, (4, 4))
     assert not known[1, 2] and known.sum() == 15
     centre = camera.unproject_camera(np.array([10.5, 6.5]), inpaint_depth(depth)[6, 10])
-    np.testing.assert_allclose(points[1, 2], centre)
+    assert_allclose(points[1, 2], centre)
     measured, same = patch_points(depth, camera, (4, 4), inpaint=False)
     assert (
         (same == known).all()

@@ -16,6 +16,7 @@ import transformers
 from refusals import refused
 from safetensors.torch import load, load_file, save_file
 from small_backbones import ARCHITECTURES, DEPTH, DIM, HEADS, configuration, save_all, save_model
+from torch.testing import assert_close
 from transformers import AutoModel
 
 from zsp_lite import load_backbone
@@ -88,7 +89,7 @@ def test_facets_are_the_projections_of_the_normalised_input_of_the_block_and_its
         for features, values in zip(
             backbone(PICTURES), expected[:, architecture.special :], strict=True
         ):
-            torch.testing.assert_close(features.keys, values.view(4, 4, DIM), atol=2e-5, rtol=1e-4)
+            assert_close(features.keys, values.view(4, 4, DIM), atol=2e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ARCHITECTURES)
@@ -111,8 +112,8 @@ def test_saliency_is_the_last_cls_attention_and_the_global_feature_the_cls_outpu
     expected = (expected / expected.amax(1, keepdim=True)).view(-1, 4, 4)
     features = load_backbone(f"hf:{folders[kind]}", "cpu", image_size=size)(PICTURES)
     for one, saliency, cls in zip(features, expected, output.last_hidden_state[:, 0], strict=True):
-        torch.testing.assert_close(one.saliency, saliency, atol=2e-5, rtol=1e-4)
-        torch.testing.assert_close(one.global_feature, cls, atol=2e-5, rtol=1e-4)
+        assert_close(one.saliency, saliency, atol=2e-5, rtol=1e-4)
+        assert_close(one.global_feature, cls, atol=2e-5, rtol=1e-4)
 
 
 def test_a_model_that_nobody_thought_of_is_read_by_the_names_of_its_parts(tmp_path):

@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from refusals import refused
 from scipy.spatial import cKDTree
 
@@ -124,12 +125,12 @@ def test_an_import_reads_as_a_data_folder_of_unit_scale(tmp_path, scan, views):
     for annotation, view in zip(dataset.frames("teapot", "mine"), views, strict=True):
         frame = dataset.load(annotation)
         inside = (frame.mask > 0.9) & (frame.depth > 0)
-        np.testing.assert_allclose(frame.depth[inside], done.scale * view.depth[inside], rtol=5e-3)
+        assert_allclose(frame.depth[inside], done.scale * view.depth[inside], rtol=5e-3)
         # The cloud projects into the mask of every view.
         pixels, depth = frame.camera.project(points)
         column, row = np.floor(pixels).astype(int).clip(0, np.array(frame.camera.size[::-1]) - 1).T
         assert (cv2.dilate(frame.mask, np.ones((5, 5)))[row, column] > 0.5).mean() > 0.97
-        np.testing.assert_allclose(frame.camera.t, done.scale * view.camera.t, rtol=1e-5)
+        assert_allclose(frame.camera.t, done.scale * view.camera.t, rtol=1e-5)
 
 
 @pytest.mark.parametrize("box", [None, (20, 30, 60, 70)])
@@ -198,7 +199,7 @@ def test_the_fused_cloud_lies_on_the_surface(views):
     spread = seen.std(axis=0).mean()
     assert np.percentile(cKDTree(seen).query(points)[0], 90) < 0.1 * spread
     assert np.percentile(cKDTree(points).query(seen)[0], 90) < 0.2 * spread
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-3)
+    assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-3)
     assert colours.shape == points.shape
 
 
@@ -282,7 +283,7 @@ def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
     )
     write_depth16(tmp_path / f"depths/{views[0].name}.png", plane / 1000)
     frame = open_capture(tmp_path, "nerfstudio").frames[0].load()
-    np.testing.assert_allclose(frame.depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
+    assert_allclose(frame.depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
 
 
 def test_a_single_frame_is_fused_and_a_surface_that_one_of_many_frames_saw_is_left_out(views):

@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 from co3d_folders import sequence_data
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
@@ -44,7 +45,7 @@ def test_residuals_are_relative_to_the_spread_of_the_keypoints():
     assert align_picks(points, target).residuals == pytest.approx(np.zeros(5), abs=1e-12)
     target[4] += 7 * np.array([0.3, 0, 0])
     small, large = (align_picks(points, scale * target).residuals for scale in (1, 100))
-    np.testing.assert_allclose(small, large)
+    assert_allclose(small, large)
     assert small.argmax() == 4
 
 
@@ -73,7 +74,7 @@ def test_the_reference_is_the_best_cloud_and_a_restart_loses_nothing(root):
     pick_all(labelling, "a", corners()[:2])
     again = Labelling(root, "chair")
     assert again.names == ("left arm", "keypoint 2", "keypoint 3", "keypoint 4", "keypoint 5")
-    np.testing.assert_array_equal(again.picks("a"), corners()[:2])
+    assert_array_equal(again.picks("a"), corners()[:2])
     assert [(row.sequence, row.state, row.picks) for row in again.progress()] == [
         ("best", "reference", 5),
         ("a", "open", 2),
@@ -90,11 +91,11 @@ def test_accepting_writes_the_published_format_and_the_references_identity(root)
     path = labelling.accept("a")
     assert json.loads(path.read_text()).keys() == {"trans", "seq", "reference_seq"}
     labels = read_labels(root, "chair")
-    np.testing.assert_allclose(labels["a"].trans[:3, :3], turn, atol=1e-9)
+    assert_allclose(labels["a"].trans[:3, :3], turn, atol=1e-9)
     # of the object, which the label maps to its centre
     centre = labelling.cloud("best")[0].mean(axis=0)
-    np.testing.assert_allclose(labels["a"].trans @ [*centre, 1], [*(1.3 * turn @ centre + 2), 1])
-    np.testing.assert_array_equal(labels["best"].trans, np.eye(4))
+    assert_allclose(labels["a"].trans @ [*centre, 1], [*(1.3 * turn @ centre + 2), 1])
+    assert_array_equal(labels["best"].trans, np.eye(4))
     states = {row.sequence: (row.state, row.rms) for row in Labelling(root, "chair").progress()}
     assert states["a"] == ("accepted", pytest.approx(0, abs=1e-9)) and states["b"] == ("open", None)
 
@@ -151,7 +152,7 @@ def test_invalid_categories_sequences_and_picks_are_refused(root):
     ):
         refused(message, call)
     assert read_labels(root, "chair") == {}
-    np.testing.assert_array_equal(Labelling(root, "chair").picks("a"), corners()[:3])
+    assert_array_equal(Labelling(root, "chair").picks("a"), corners()[:3])
     for name, message in (("a", "expected one reference sequence"), ("c", "c has no point cloud")):
         if name == "c":
             (root / "label_picks/chair.json").unlink()
@@ -214,11 +215,9 @@ def test_a_proposal_becomes_the_label_where_nothing_is_picked(root):
         )
     labelling = Labelling(root, "chair")
     assert labelling.reference == "best" and labelling.proposal("b") is None
-    np.testing.assert_allclose(labelling.proposal("a").R, turn[:3, :3].T)
+    assert_allclose(labelling.proposal("a").R, turn[:3, :3].T)
     refused("sequence b has 0 of 0 keypoints", labelling.accept, "b")
     labelling.accept("a")
-    np.testing.assert_allclose(
-        read_labels(root, "chair")["a"].trans[:3, :3], turn[:3, :3].T, atol=1e-12
-    )
+    assert_allclose(read_labels(root, "chair")["a"].trans[:3, :3], turn[:3, :3].T, atol=1e-12)
     write_atomic(root / "label_proposals" / "chair" / "b.json", b"{}")
     refused("proposal .*b.json|label .*b.json", Labelling, root, "chair")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from co3d_folders import contents, convert_to_v2, random_camera, seeds, sequence_data
 from hypothesis import given
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
@@ -138,13 +139,13 @@ def test_labels_are_transferred_between_worlds(tmp_path):
     residuals = transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair")
     assert max(residuals.values()) < 1e-6
     labels = read_labels(tmp_path / "v2", "chair")
-    np.testing.assert_array_equal(labels["a"].trans, np.eye(4))
+    assert_array_equal(labels["a"].trans, np.eye(4))
     expected = worlds["b"].R @ trans[:3, :3] @ worlds["a"].R.T
     assert rotation_error(labels["b"].trans[:3, :3], expected) < 0.01
     # Both labels map the centre of the reference cloud to the same point of the other object.
     centre = Co3D(tmp_path / "v2").point_cloud("chair", "a")[0].mean(axis=0)
     landed = labels["b"].trans[:3, :3] @ centre + labels["b"].trans[:3, 3]
-    np.testing.assert_allclose(
+    assert_allclose(
         landed, worlds["b"].apply(trans[:3, :3] @ worlds["a"].inverse().apply(centre)), atol=1e-3
     )
 
@@ -179,8 +180,8 @@ def test_the_relative_pose_takes_what_one_camera_sees_to_what_the_other_sees(see
     seen_a = camera_a.to_camera(Sim3.from_matrix(label_a.trans).apply(canonical))
     seen_b = camera_b.to_camera(Sim3.from_matrix(label_b.trans).apply(canonical))
     pose = relative_pose(label_a, camera_a, label_b, camera_b)
-    np.testing.assert_allclose(Sim3.from_matrix(pose).apply(seen_a), seen_b, atol=1e-9)
-    np.testing.assert_allclose(
+    assert_allclose(Sim3.from_matrix(pose).apply(seen_a), seen_b, atol=1e-9)
+    assert_allclose(
         pose @ relative_pose(label_b, camera_b, label_a, camera_a), np.eye(4), atol=1e-9
     )
 
@@ -198,7 +199,7 @@ def test_labels_are_read_back_from_files_in_the_published_format(tmp_path):
     read = read_labels(tmp_path, "chair")
     assert list(read) == ["a", "b"]
     for name, label in read.items():
-        np.testing.assert_array_equal(label.trans, written[name].trans)
+        assert_array_equal(label.trans, written[name].trans)
         assert (label.seq, label.reference_seq) == (name, "zero")
 
 

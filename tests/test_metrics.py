@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
@@ -44,10 +45,8 @@ def test_tiny_angles_and_angles_next_to_180_keep_their_digits():
 
 def test_batches_broadcast_and_tensors_are_taken():
     batch = np.stack([about((1, 0, 0), d) for d in (0, 10, 90)])
-    np.testing.assert_allclose(rotation_error(np.eye(3), batch), [0, 10, 90], atol=1e-12)
-    np.testing.assert_allclose(
-        rotation_error(torch.as_tensor(batch), torch.eye(3)), [0, 10, 90], atol=1e-6
-    )
+    assert_allclose(rotation_error(np.eye(3), batch), [0, 10, 90], atol=1e-12)
+    assert_allclose(rotation_error(torch.as_tensor(batch), torch.eye(3)), [0, 10, 90], atol=1e-6)
     assert rotation_error(batch[:, None], batch[None]).shape == (3, 3)
 
 
@@ -58,7 +57,7 @@ def test_what_is_no_rotation_is_refused(bad):
 
 def test_accuracy_counts_errors_strictly_below_the_threshold():
     assert accuracy([10, 29.9, 30, 170], 30) == 50
-    np.testing.assert_allclose(accuracy([[1, 40], [1, 2]], 30), [50, 100])
+    assert_allclose(accuracy([[1, 40], [1, 2]], 30), [50, 100])
     assert median([1, 2, 100]) == 2
 
 
@@ -73,7 +72,7 @@ def test_weights_count_errors_several_times():
         repeated = np.repeat(errors, weights)
         assert median(errors, weights) == np.median(repeated)
         assert accuracy(errors, 30, weights) == pytest.approx(100 * np.mean(repeated < 30))
-    np.testing.assert_array_equal(median([3.0, 1.0], [[1, 1], [0, 5]]), [2, 1])
+    assert_array_equal(median([3.0, 1.0], [[1, 1], [0, 5]]), [2, 1])
 
 
 def test_the_interval_of_an_accuracy_matches_the_binomial():
@@ -113,7 +112,7 @@ PAIRS = [("a", "b"), ("b", "c"), ("c", "d"), ("d", "a"), ("a", "c"), ("b", "d")]
 
 def test_a_pairs_weight_is_the_product_of_how_often_its_two_objects_are_drawn():
     weights = object_draws(PAIRS, resamples=500)
-    np.testing.assert_allclose(weights.sum(axis=1), len(PAIRS))
+    assert_allclose(weights.sum(axis=1), len(PAIRS))
     for row in weights:
         # Some multiplicities of a, b, c and d, which sum to 4, explain all six weights up to their
         # common factor.
@@ -131,13 +130,13 @@ def test_a_pairs_weight_is_the_product_of_how_often_its_two_objects_are_drawn():
 
 def test_neither_the_order_of_pairs_nor_other_categories_change_a_draw():
     weights = object_draws(PAIRS, ["x"] * 6)
-    np.testing.assert_array_equal(object_draws(PAIRS[::-1], ["x"] * 6)[:, ::-1], weights)
+    assert_array_equal(object_draws(PAIRS[::-1], ["x"] * 6)[:, ::-1], weights)
     both = object_draws(PAIRS * 2, ["w"] * 6 + ["x"] * 6)
-    np.testing.assert_array_equal(both[:, 6:], weights)
+    assert_array_equal(both[:, 6:], weights)
     assert (both[:, :6] != weights).any()
-    np.testing.assert_allclose(both[:, :6].sum(axis=1), 6)
+    assert_allclose(both[:, :6].sum(axis=1), 6)
     # Pairs of two objects are resampled one by one.
-    np.testing.assert_array_equal(np.unique(object_draws([("a", "b"), ("b", "a")])), [0, 1, 2])
+    assert_array_equal(np.unique(object_draws([("a", "b"), ("b", "a")])), [0, 1, 2])
 
 
 def test_the_mean_of_category_medians_is_over_categories():

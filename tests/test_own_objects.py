@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from synthetic_views import (
     AT_HOME,
@@ -76,8 +77,8 @@ def test_a_sequence_of_a_data_folder_is_read_with_its_numbers_and_masks(ellipsoi
     )
     frame = source.select(1, 3, 5)[2][5]
     expected = ellipsoids.load(ellipsoids.frame("ellipsoid", "b", 5))
-    np.testing.assert_array_equal(frame.rgb, expected.rgb)
-    np.testing.assert_array_equal(frame.mask, expected.mask)
+    assert_array_equal(frame.rgb, expected.rgb)
+    assert_array_equal(frame.mask, expected.mask)
     assert source.describe([0, 2]).endswith(f"{Path('ellipsoid/b')}, frames 0, 2")
     refused("no frame 7, expected one of 7 from 0 to 6", source.select, 1, 1, 7)
     monkeypatch.chdir(source.path)
@@ -112,7 +113,7 @@ def test_options_go_to_the_sources_that_take_them(image, tmp_path, ellipsoids, f
     pair = open_pair(
         image, sequence, {"intrinsics": (INTRINSICS,), "depth": (tmp_path / "mug_depth.png",)}
     )
-    np.testing.assert_allclose(pair[0].load([0])[0].depth, frames[1].depth, atol=6e-4)
+    assert_allclose(pair[0].load([0])[0].depth, frames[1].depth, atol=6e-4)
 
 
 @pytest.mark.parametrize(
@@ -240,10 +241,8 @@ def test_json_has_every_number_of_the_estimates(own):
     )
     for solver, estimate in found.estimates.items():
         one = content["estimates"][solver]
-        np.testing.assert_array_equal(one["matrix"], estimate.sim3.matrix)
-        np.testing.assert_allclose(
-            one["scale"] * np.array(one["rotation"]), np.array(one["matrix"])[:3, :3]
-        )
+        assert_array_equal(one["matrix"], estimate.sim3.matrix)
+        assert_allclose(one["scale"] * np.array(one["rotation"]), np.array(one["matrix"])[:3, :3])
         assert one["view_name"] == found.targets[one["view"]].name and one["flags"] == list(
             estimate.flags
         )
@@ -254,7 +253,7 @@ def test_json_has_every_number_of_the_estimates(own):
         assert one["one_of_two"] == estimate.one_of_two
         for other, alternative in zip(one["alternatives"], estimate.alternatives, strict=True):
             assert other["probability"] == alternative.confidence > 0
-            np.testing.assert_array_equal(other["matrix"], alternative.sim3.matrix)
+            assert_array_equal(other["matrix"], alternative.sim3.matrix)
         assert len(one["alternatives"]) > 0 or solver == "paper"
     assert content["degrees_between_solvers"] == found.disagreement < 20
 
@@ -269,13 +268,13 @@ def test_where_the_answer_is_one_of_two_both_clouds_are_written(own, tmp_path, m
     (first, _), (second, _) = (
         read_ply(tmp_path / f"aligned_verified{name}.ply") for name in ("", "_2")
     )
-    np.testing.assert_array_equal(first, read_ply(out / "aligned_verified.ply")[0])
+    assert_array_equal(first, read_ply(out / "aligned_verified.ply")[0])
     other = doubtful.alternatives[0]
     points = found.targets[doubtful.view].camera.to_camera(first)
     expected = found.targets[other.view].camera.to_world(
         other.sim3.apply(doubtful.sim3.inverse().apply(points))
     )
-    np.testing.assert_allclose(second, expected, atol=1e-3)
+    assert_allclose(second, expected, atol=1e-3)
 
 
 def test_two_pictures_give_the_true_pose_whatever_the_unit_of_length(pictures):
@@ -299,13 +298,13 @@ def test_two_pictures_give_the_true_pose_whatever_the_unit_of_length(pictures):
     assert rotation_error(metres.sim3.R, truth.R) < 20 and metres.sim3.scale == pytest.approx(
         truth.scale, rel=0.2
     )
-    np.testing.assert_array_equal(metres.inliers, millimetres.inliers)
+    assert_array_equal(metres.inliers, millimetres.inliers)
     assert [
         any("from the camera" in flag for flag in one.flags) for one in (metres, millimetres)
     ] == [False, True]
     assert rotation_error(metres.sim3.R, millimetres.sim3.R) < 0.1
     assert millimetres.sim3.scale == pytest.approx(1000 * metres.sim3.scale, rel=1e-3)
-    np.testing.assert_allclose(millimetres.sim3.t, 1000 * metres.sim3.t, rtol=1e-2)
+    assert_allclose(millimetres.sim3.t, 1000 * metres.sim3.t, rtol=1e-2)
     for estimate, unit in (
         (metres, 1),
         (millimetres, 1000),
@@ -355,7 +354,7 @@ def test_several_frames_of_both_objects_agree_on_the_similarity_between_their_wo
     camera = found.targets[found.estimate.view].camera
     expected = Sim3(1.0, camera.R, camera.t) @ found.world_sim3
     reference = Sim3(1.0, found.reference.camera.R, found.reference.camera.t)
-    np.testing.assert_allclose((found.estimate.sim3 @ reference).matrix, expected.matrix, atol=1e-9)
+    assert_allclose((found.estimate.sim3 @ reference).matrix, expected.matrix, atol=1e-9)
     frames = [
         [ellipsoids.load(one) for one in ellipsoids.frames("ellipsoid", name)] for name in "ab"
     ]
@@ -367,9 +366,7 @@ def test_several_frames_of_both_objects_agree_on_the_similarity_between_their_wo
     assert rotation_error(again.world_sim3.R, found.world_sim3.R) < 3
     assert again.world_sim3.scale == pytest.approx(1000 * found.world_sim3.scale, rel=0.05)
     numbers = found.as_json()
-    np.testing.assert_array_equal(
-        numbers["estimates"]["verified"]["world_matrix"], found.world_sim3.matrix
-    )
+    assert_array_equal(numbers["estimates"]["verified"]["world_matrix"], found.world_sim3.matrix)
     assert [one["frame"] for one in numbers["votes"]] == [vote.name for vote in found.votes]
 
 
@@ -441,7 +438,7 @@ def test_depth_in_another_unit_is_questioned(image, frames, tmp_path):
             == ("m from the camera, expected 0.05 to 20 m; " in flags)
             == ("--depth-unit" in flags)
         )
-    np.testing.assert_array_equal(frame.depth, frames[0].depth)
+    assert_array_equal(frame.depth, frames[0].depth)
 
 
 def test_the_command_prints_the_poses_and_names_its_files(loaded, ellipsoids, tmp_path, run):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageOps
 from refusals import refused
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, look_at, render
@@ -99,9 +100,7 @@ def test_every_kind_of_depth_file_is_read_with_zeros_where_it_is_unknown(tmp_pat
     else:
         cv2.imwrite(str(path), encode_depth(values) if "geometric" in name else values)
     expected = np.where(COUNT < 4, 0, values)
-    np.testing.assert_allclose(
-        read_depth_file(path), expected, rtol=1e-3 if "geometric" in name else 0
-    )
+    assert_allclose(read_depth_file(path), expected, rtol=1e-3 if "geometric" in name else 0)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     refused("cannot be decoded .* expected a complete", read_depth_file, path)
 
@@ -183,12 +182,10 @@ def test_a_photograph_is_upright_with_its_depth_mask_and_camera_in_either_form(
                 lambda: open_source(path, given).load([0]),
             )
         (frame,) = open_source(path, given, orientation=form if ambiguous else None).load([0])
-        np.testing.assert_allclose(frame.depth, portrait.depth, atol=6e-4)
-        np.testing.assert_array_equal(frame.mask, portrait.mask)
-        np.testing.assert_allclose(
-            frame.camera.K, [[190, 0, 74], [0, 190, 99], [0, 0, 1]], atol=1.01
-        )
-        np.testing.assert_allclose(frame.camera.R, np.eye(3), atol=1e-12)
+        assert_allclose(frame.depth, portrait.depth, atol=6e-4)
+        assert_array_equal(frame.mask, portrait.mask)
+        assert_allclose(frame.camera.K, [[190, 0, 74], [0, 190, 99], [0, 0, 1]], atol=1.01)
+        assert_allclose(frame.camera.R, np.eye(3), atol=1e-12)
         assert np.abs(frame.rgb.astype(int) - portrait.rgb).mean() < 3
 
 
@@ -204,9 +201,7 @@ def test_a_capture_of_turned_photographs_keeps_its_world_and_refuses_mirrored_on
     y, x = np.argwhere(frame.mask > 0)[::97].T
     points = frame.camera.unproject(np.stack([x, y], -1) + 0.5, frame.depth[y, x])
     assert frame.depth.shape == (180, 140)
-    np.testing.assert_allclose(
-        views[0].camera.project(points)[0], np.stack([y, 139 - x], -1) + 0.5, atol=0.01
-    )
+    assert_allclose(views[0].camera.project(points)[0], np.stack([y, 139 - x], -1) + 0.5, atol=0.01)
     assert "0001.jpg is mirrored by its EXIF orientation 5" in line
 
 
@@ -271,7 +266,7 @@ def test_frames_without_a_mask_get_one_by_depth_and_are_named(tmp_path):
     source = open_source(tmp_path)
     frames = source.load([0, 1])
     assert source.mask == "given" and overlap(frames[0].mask, scenes[0][1]) > 0.95
-    np.testing.assert_array_equal(frames[1].mask, views[1].mask)
+    assert_array_equal(frames[1].mask, views[1].mask)
     missing, inverted = source.flags(source.load([0, 1, 3]))
     assert inverted.endswith(
         "the masks may be wrong: those of 1 of 3 frames cover most of the border: inverted?"

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, true_pose
 
@@ -53,7 +54,7 @@ def test_the_true_pose_is_found_within_a_few_degrees(estimate, reference, target
     # Matches are whole patches apart from the truth, and least squares shrinks what is noisy.
     assert estimate.sim3.scale == pytest.approx(truth.scale, rel=0.1)
     centre = reference.camera.to_camera(np.zeros(3))
-    np.testing.assert_allclose(estimate.sim3.apply(centre), truth.apply(centre), atol=0.1)
+    assert_allclose(estimate.sim3.apply(centre), truth.apply(centre), atol=0.1)
     assert not estimate.flags and estimate.note == ""
     assert list(estimate.timings) == ["features", "matching", "view", "alignment"]
     assert estimate.alternatives == () and estimate.confidence is None
@@ -62,15 +63,15 @@ def test_the_true_pose_is_found_within_a_few_degrees(estimate, reference, target
 def test_propagation_gives_the_pose_against_every_target_view(estimate, reference, targets):
     cameras = [frame.camera for frame in targets]
     poses = estimate.propagate(cameras)
-    np.testing.assert_allclose(poses[estimate.view].matrix, estimate.sim3.matrix, atol=1e-12)
+    assert_allclose(poses[estimate.view].matrix, estimate.sim3.matrix, atol=1e-12)
     point = np.array([0.1, 0.2, 4.0])
     world = estimate.target_camera.to_world(estimate.sim3.apply(point))
     for pose, camera in zip(poses, cameras):
-        np.testing.assert_allclose(pose.apply(point), camera.to_camera(world), atol=1e-9)
+        assert_allclose(pose.apply(point), camera.to_camera(world), atol=1e-9)
     truths = [true_pose(reference.camera, AT_HOME, camera, ELSEWHERE) for camera in cameras]
     errors = [rotation_error(pose.R, truth.R) for pose, truth in zip(poses, truths)]
     # one rigid target: equal in every view
-    np.testing.assert_allclose(errors, errors[estimate.view], atol=1e-6)
+    assert_allclose(errors, errors[estimate.view], atol=1e-6)
 
 
 def test_the_best_view_alone_maps_spread_and_centroid_onto_the_targets(method, reference):
@@ -80,7 +81,7 @@ def test_the_best_view_alone_maps_spread_and_centroid_onto_the_targets(method, r
     sim3 = view_alignment(first, second)
     assert sim3.scale == pytest.approx(0.5, rel=1e-4)
     points, known = first.patch_points
-    np.testing.assert_allclose(sim3.apply(points[known]), second.patch_points[0][known], atol=1e-3)
+    assert_allclose(sim3.apply(points[known]), second.patch_points[0][known], atol=1e-3)
 
 
 class NoisyBackbone(CoordinateBackbone):
@@ -175,7 +176,7 @@ def test_a_given_matcher_selector_and_solver_are_called(views):
 
     estimate = estimate_noisy(views, solver=first_view, seed=5, threshold=0.3)
     alone = estimate_noisy(views[:2], trials=1000, seed=5, threshold=0.3)
-    np.testing.assert_array_equal(estimate.sim3.matrix, alone.sim3.matrix)
+    assert_array_equal(estimate.sim3.matrix, alone.sim3.matrix)
     assert list(estimate.timings) == ["matching", "solver"]
 
 
@@ -226,7 +227,7 @@ def test_nothing_that_a_plug_in_overwrites_reaches_the_rest(reference, targets, 
     found, expected = (
         ZeroShotPose(**backbone | some).estimate(reference, targets) for some in (spoiled, settings)
     )
-    np.testing.assert_array_equal(found.sim3.matrix, expected.sim3.matrix)
+    assert_array_equal(found.sim3.matrix, expected.sim3.matrix)
     views, others = ((one.reference_view, *one.target_views) for one in (found, expected))
     for one, other in zip(views, others, strict=True):
         assert torch.equal(one.features.keys, other.features.keys) and torch.equal(
@@ -259,10 +260,10 @@ def test_a_solver_says_whether_kmeans_selects_its_matches(views):
 
     clustered, best = matches(kmeans=True), matches(kmeans=False)
     assert not np.array_equal(clustered, best)
-    np.testing.assert_array_equal(matches(solver=pipeline.align_best_view), clustered)
+    assert_array_equal(matches(solver=pipeline.align_best_view), clustered)
     for chosen in ("verified", VerifiedSolver()):
-        np.testing.assert_array_equal(matches(solver=chosen), best)
-        np.testing.assert_array_equal(matches(solver=chosen, kmeans=True), clustered)
+        assert_array_equal(matches(solver=chosen), best)
+        assert_array_equal(matches(solver=chosen, kmeans=True), clustered)
 
 
 VERIFIED = replace(BASE, solver="verified")

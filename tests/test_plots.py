@@ -4,6 +4,7 @@ counts and intervals."""
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.verified.scene import Projection
@@ -17,7 +18,7 @@ CAMERA = Camera(np.eye(3), np.zeros(3), np.array([100.0, 100.0]), np.array([40.0
 
 def test_patches_are_marked_at_their_centres_in_pixels_x_y():
     centres = plots.patch_centres(np.array([[0, 0], [2, 3]]), (3, 4), (60, 80))
-    np.testing.assert_allclose(centres, [[10, 10], [70, 50]])
+    assert_allclose(centres, [[10, 10], [70, 50]])
     similar = np.zeros((3, 4))
     similar[2, 1] = 0.9
     maps, circles = {"this patch": None, "key": similar}, [(0, 0), (2, 1)]
@@ -52,7 +53,7 @@ def test_points_and_axes_are_drawn_at_their_projections_and_nothing_behind_the_c
     # With focal length 100 and principal point (40, 30), (0.1, 0, 1) is 10 pixels to the right of
     # the latter.
     plots.draw_points(axis, CAMERA, np.array([[0.1, 0, 1], [0, 0, 2], [0, 0, -1]]))
-    np.testing.assert_allclose(axis.collections[0].get_offsets(), [[40, 30], [50, 30]])
+    assert_allclose(axis.collections[0].get_offsets(), [[40, 30], [50, 30]])
     assert axis.get_xlim() == (0, 80) and axis.get_ylim() == (60, 0)
     plots.draw_axes(
         axis, CAMERA, np.array([0, 0, 2]), np.array([[0.2, 0, 2], [0, 0.2, 2], [0, 0, -1]]), "xyz"
@@ -83,6 +84,4 @@ def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects(
     )
     drawn = np.concatenate([collection.get_offsets() for collection in figure.axes[0].collections])
     # The point beyond the border (110) stands at it (80).
-    np.testing.assert_allclose(
-        sorted(map(tuple, drawn)), [(20, 10), (40, 10), (40, 40), (60, 10), (80, 10)]
-    )
+    assert_allclose(sorted(map(tuple, drawn)), [(20, 10), (40, 10), (40, 40), (60, 10), (80, 10)])

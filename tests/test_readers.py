@@ -14,6 +14,7 @@ import cv2
 import lzfse
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone
@@ -235,10 +236,10 @@ def test_each_layout_is_recognised_and_gives_the_cameras_the_depth_and_the_masks
     assert open_source(path, **options).mask == "given"
     for one, view in zip(capture.frames, views, strict=True):
         frame, known = one.load(), view.depth > 0
-        np.testing.assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
-        np.testing.assert_allclose(frame.camera.K, view.camera.K, atol=1e-6)
-        np.testing.assert_allclose(frame.depth[known], view.depth[known], atol=6e-4)
-        np.testing.assert_array_equal(frame.mask > 0.5, view.mask > 0.5)
+        assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
+        assert_allclose(frame.camera.K, view.camera.K, atol=1e-6)
+        assert_allclose(frame.depth[known], view.depth[known], atol=6e-4)
+        assert_array_equal(frame.mask > 0.5, view.mask > 0.5)
         assert np.abs(frame.rgb.astype(int) - view.rgb).mean() < 8
 
 
@@ -284,10 +285,10 @@ def test_relatives_of_nerfstudio_are_read(tmp_path, views, kind, links):
     capture = open_capture(RELATIVES[kind](tmp_path / "scan"))
     for one, view in zip(capture.frames, views, strict=True):
         frame = one.load()
-        np.testing.assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
+        assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
         # 0.6 pixels off the middle
-        np.testing.assert_allclose(frame.camera.K, view.camera.K, rtol=0.02)
-        np.testing.assert_allclose(frame.depth[view.mask > 0], view.depth[view.mask > 0], atol=6e-4)
+        assert_allclose(frame.camera.K, view.camera.K, rtol=0.02)
+        assert_allclose(frame.depth[view.mask > 0], view.depth[view.mask > 0], atol=6e-4)
 
 
 def first(change):
@@ -505,7 +506,7 @@ def test_depth_of_middle_confidence_is_dropped_in_thin_bands_only():
     # Polycam reach 255.
     dark = np.where(disc & ~wrong, 1, levels).astype(np.uint8)
     assert trusted(dark)[disc & ~wrong].mean() > 0.95
-    np.testing.assert_array_equal(trusted(dark * np.uint8(127) + (dark == 2)), trusted(dark))
+    assert_array_equal(trusted(dark * np.uint8(127) + (dark == 2)), trusted(dark))
     dark[:20] = 0
     assert not trusted(dark)[:20].any()
 
@@ -537,7 +538,7 @@ def test_views_are_spread_evenly_whatever_their_order(count):
     gaps = np.diff(chosen, append=chosen[0] + 360)
     assert len(chosen) == count and chosen[0] == 0 and np.abs(gaps - 360 / count).max() <= 15
     shuffled = np.array([0, *np.random.default_rng(0).permutation(degrees[1:])])
-    np.testing.assert_array_equal(np.sort(shuffled[spread_views(circle(shuffled), count)]), chosen)
+    assert_array_equal(np.sort(shuffled[spread_views(circle(shuffled), count)]), chosen)
 
 
 def test_an_object_that_is_twice_in_an_image_of_bop_leaves_it_out(tmp_path, views):

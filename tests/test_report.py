@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from plotly.offline import get_plotlyjs
 from synthetic_views import CoordinateBackbone
 
@@ -116,7 +117,7 @@ def test_two_poses_are_shown_in_the_same_view_where_the_answer_is_one_of_two(
     page = write_report(tmp_path / "report.html", [two], "name").read_text(encoding="utf-8")
     assert f"turned by {estimate.angle_to(other):.0f} degrees" in page and "One of two" in page
     _, best, second = _two_poses_figure(estimate).axes
-    np.testing.assert_array_equal(best.images[0].get_array(), second.images[0].get_array())
+    assert_array_equal(best.images[0].get_array(), second.images[0].get_array())
     camera, own = estimate.target_camera, estimate.target_views[other.view].frame.camera
     cloud = object_cloud(estimate.reference_view, most=1500)
     for axis, points in (
@@ -124,9 +125,7 @@ def test_two_poses_are_shown_in_the_same_view_where_the_answer_is_one_of_two(
         (second, own.to_world(other.sim3.apply(cloud))),
     ):
         pixels, depth = camera.project(points)
-        np.testing.assert_allclose(
-            axis.collections[0].get_offsets(), pixels[np.argsort(-depth)], atol=1e-6
-        )
+        assert_allclose(axis.collections[0].get_offsets(), pixels[np.argsort(-depth)], atol=1e-6)
 
 
 def test_the_scene_has_every_pose_in_one_frame(results, text):
@@ -142,10 +141,10 @@ def test_the_scene_has_every_pose_in_one_frame(results, text):
     ):
         own = estimate.target_views[one.view].frame.camera
         expected = result.estimate.target_camera.R @ own.R.T @ one.sim3.R
-        np.testing.assert_allclose(rotation / np.cbrt(np.linalg.det(rotation)), expected, atol=1e-4)
-    np.testing.assert_allclose(content["poses"][0], result.estimate.sim3.matrix[:3], atol=1e-5)
+        assert_allclose(rotation / np.cbrt(np.linalg.det(rotation)), expected, atol=1e-4)
+    assert_allclose(content["poses"][0], result.estimate.sim3.matrix[:3], atol=1e-5)
     moved = result.estimates["verified"].propagate([result.estimate.target_camera])[0]
-    np.testing.assert_allclose(content["poses"][1], moved.matrix[:3], atol=1e-5)
+    assert_allclose(content["poses"][1], moved.matrix[:3], atol=1e-5)
 
 
 def test_all_text_is_escaped(results, text, tmp_path):
@@ -186,6 +185,6 @@ def test_the_overview_marks_the_pose_of_each_solver_in_its_view(results, tmp_pat
         pixels, _ = one.target_camera.project(
             one.target_camera.to_world(cloud[np.argsort(-cloud[:, 2])])
         )
-        np.testing.assert_allclose(axis.collections[0].get_offsets(), pixels)
+        assert_allclose(axis.collections[0].get_offsets(), pixels)
     write_overview(tmp_path / "deep" / "overview.jpg", results)
     assert (tmp_path / "deep" / "overview.jpg").read_bytes()[:2] == b"\xff\xd8"

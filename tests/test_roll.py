@@ -6,6 +6,7 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, true_pose
 
 from zsp_lite.cli import main as cli
@@ -47,12 +48,12 @@ def test_a_turned_frame_shows_every_world_point_with_the_same_colour_and_depth(f
     points = frame.camera.unproject(np.stack([column, row], -1) + 0.5, frame.depth[row, column])
     pixels, depth = turned_frame.camera.project(points)
     there = tuple(np.floor(pixels).astype(int).T[::-1])
-    np.testing.assert_allclose(pixels % 1, 0.5, atol=1e-6)
-    np.testing.assert_array_equal(turned_frame.rgb[there], frame.rgb[row, column])
-    np.testing.assert_array_equal(turned_frame.depth[there], frame.depth[row, column])
-    np.testing.assert_allclose(depth, frame.depth[row, column], rtol=1e-6)
+    assert_allclose(pixels % 1, 0.5, atol=1e-6)
+    assert_array_equal(turned_frame.rgb[there], frame.rgb[row, column])
+    assert_array_equal(turned_frame.depth[there], frame.depth[row, column])
+    assert_allclose(depth, frame.depth[row, column], rtol=1e-6)
     assert turned_frame.camera.size == turned_frame.rgb.shape[:2]
-    np.testing.assert_array_equal(turned_frame.rgb, np.rot90(frame.rgb, quarters))
+    assert_array_equal(turned_frame.rgb, np.rot90(frame.rgb, quarters))
 
 
 @pytest.mark.slow
@@ -71,8 +72,8 @@ def test_a_turned_reference_stands_up_and_the_pose_is_that_of_the_turned_image(
         "the turned image"
     )
     assert rotation_error(one.sim3.R, truth.R) < 10 and flag in one.flags
-    np.testing.assert_array_equal(found.reference.rgb, frames[0].rgb)
-    np.testing.assert_allclose(found.reference.camera.matrix, frames[0].camera.matrix, atol=1e-9)
+    assert_array_equal(found.reference.rgb, frames[0].rgb)
+    assert_allclose(found.reference.camera.matrix, frames[0].camera.matrix, atol=1e-9)
     lying = estimate_pose(rolled, frames[1:4], solver, backbone=backbone, references=1)
     # the features are noise
     assert solver == "verified" or rotation_error(lying.estimate.sim3.R, truth.R) > 20

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
 import zsp_lite
@@ -63,13 +64,11 @@ def check_pair(method, reference, targets, name, **settings) -> None:
         as_crop(reference), [as_crop(target) for target in targets], **settings
     )
     assert found.view == expected.view, name
-    np.testing.assert_array_equal(found.matches[0], expected.matches.reference, name)
-    np.testing.assert_array_equal(found.matches[1], expected.matches.target, name)
-    np.testing.assert_array_equal(found.inliers, expected.inliers, name)
+    assert_array_equal(found.matches[0], expected.matches.reference, name)
+    assert_array_equal(found.matches[1], expected.matches.target, name)
+    assert_array_equal(found.inliers, expected.inliers, name)
     pose = Sim3(found.scale, found.R, found.t)
-    np.testing.assert_allclose(
-        pose.matrix, expected.sim3.matrix, rtol=1e-6, atol=1e-9, err_msg=name
-    )
+    assert_allclose(pose.matrix, expected.sim3.matrix, rtol=1e-6, atol=1e-9, err_msg=name)
 
 
 def test_it_is_one_page():

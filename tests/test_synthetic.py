@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from co3d_folders import contents
+from numpy.testing import assert_allclose
 from refusals import refused
 
 from tools.synthetic import SPLITS
@@ -105,7 +106,7 @@ def test_depth_has_holes_and_noise_and_masks_are_accurate_to_two_pixels(chairs):
 def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):
     for data, pose, scale, views in chairs:
         assert data.points.std(0).mean() == pytest.approx(1)
-        np.testing.assert_allclose(np.linalg.norm(data.normals, axis=1), 1, atol=1e-4)
+        assert_allclose(np.linalg.norm(data.normals, axis=1), 1, atol=1e-4)
         R, t = pose[:3, :3], pose[:3, 3]
         canonical = (data.points - t) @ R / scale
         seen = np.concatenate([view.canonical[view.mask] for view in views])
@@ -118,7 +119,7 @@ def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):
                 scale * view.canonical[row, col].astype(float) @ R.T + t
             )
             assert np.abs(pixels - np.stack([col + 0.5, row + 0.5], 1)).max() < 0.02
-            np.testing.assert_allclose(depth, scale * view.depth[row, col], rtol=1e-4)
+            assert_allclose(depth, scale * view.depth[row, col], rtol=1e-4)
 
 
 def test_an_export_reads_back(folder, chairs):
@@ -127,11 +128,9 @@ def test_an_export_reads_back(folder, chairs):
     assert len(dataset.select("toytruck")) == 2
     assert list(read_labels(folder, "chair")) == [data.name for data, *_ in chairs]
     for data, *_ in chairs:
-        np.testing.assert_allclose(
-            dataset.point_cloud("chair", data.name)[0], data.points, atol=1e-4
-        )
+        assert_allclose(dataset.point_cloud("chair", data.name)[0], data.points, atol=1e-4)
         for annotation, wanted in zip(dataset.frames("chair", data.name), data.frames, strict=True):
-            np.testing.assert_allclose(dataset.load(annotation).depth, wanted.depth, rtol=1e-3)
+            assert_allclose(dataset.load(annotation).depth, wanted.depth, rtol=1e-3)
 
 
 def test_an_interrupted_export_is_completed_and_complete_sequences_stay(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from numpy.testing import assert_allclose, assert_array_equal
 from small_backbones import small_vit
 
 from zsp_lite.course.synthetic.assembly import make_shape, random_materials
@@ -63,7 +64,7 @@ def test_a_number_stands_for_one_rendered_object(renders):
     for array, rows in zip(
         render_object(1), (renders.rgb, renders.surface, renders.geometry), strict=True
     ):
-        np.testing.assert_array_equal(array, rows[1])
+        assert_array_equal(array, rows[1])
 
 
 def test_surface_points_of_renders_are_coordinates_of_the_object(renders):
@@ -81,8 +82,8 @@ def test_surface_points_of_renders_are_coordinates_of_the_object(renders):
 def test_renders_hold_unit_normals_and_centred_depth_on_the_object(renders):
     inside = ~np.isnan(renders.surface[..., 0])
     normals = np.linalg.norm(renders.geometry[..., :3].astype(np.float64), axis=-1)
-    np.testing.assert_allclose(normals[inside], 1, atol=5e-3)
-    np.testing.assert_array_equal(renders.geometry[~inside], 0)
+    assert_allclose(normals[inside], 1, atol=5e-3)
+    assert_array_equal(renders.geometry[~inside], 0)
     # Visible surfaces face the camera, which looks along +z, up to the slant of the rays.
     assert np.mean(renders.geometry[..., 2][inside] < 0.2) > 0.99
     depth = renders.geometry[..., 3].astype(np.float64)

@@ -5,6 +5,7 @@ from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from refusals import refused
 
 from tools import tuning
@@ -38,7 +39,7 @@ def sample_outcomes(n: int, rng: np.random.Generator) -> list[Outcome]:
 
 def test_the_weights_of_the_sampling_distribution_are_recovered():
     fitted = fit_weights(sample_outcomes(1200, np.random.default_rng(0)), ridge=0)
-    np.testing.assert_allclose(astuple(fitted), astuple(TRUE_WEIGHTS), atol=1)
+    assert_allclose(astuple(fitted), astuple(TRUE_WEIGHTS), atol=1)
 
 
 def sample_ranked(n: int, true: Calibration, rng: np.random.Generator) -> list[Outcome]:
@@ -77,7 +78,7 @@ def test_the_coefficients_of_the_calibration_are_recovered():
     found = fit_calibration(outcomes, FIRST_TERMS, ridge=0)
     for name in ("scale", "none"):
         true, measured = (np.delete(getattr(one, name), 4) for one in (TRUE_CALIBRATION, found))
-        np.testing.assert_allclose(measured, true, atol=0.6)
+        assert_allclose(measured, true, atol=0.6)
         # of view_std
         assert getattr(found, name)[4] == pytest.approx(getattr(TRUE_CALIBRATION, name)[4], abs=2)
     assert found.unseen == pytest.approx(0.2, abs=0.1)

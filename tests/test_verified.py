@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from synthetic_views import ELSEWHERE, REACH, CoordinateBackbone, look_at, render, true_pose, turned
 
 from zsp_lite.alignment import Sim3
@@ -45,9 +46,7 @@ def test_perfect_features_give_the_true_pose(estimate, frames):
     assert rotation_error(estimate.sim3.R, truth(estimate, frames).R) < 4
     assert estimate.sim3.scale == pytest.approx(1.15, rel=0.08)
     centre = frames[0].camera.to_camera(np.zeros(3))
-    np.testing.assert_allclose(
-        estimate.sim3.apply(centre), truth(estimate, frames).apply(centre), atol=0.12
-    )
+    assert_allclose(estimate.sim3.apply(centre), truth(estimate, frames).apply(centre), atol=0.12)
     assert estimate.confidence > 0.5 and not estimate.flags
 
 
@@ -84,7 +83,7 @@ def test_the_estimate_is_for_the_view_closest_to_the_reference(estimate):
     poses = estimate.propagate([view.frame.camera for view in estimate.target_views])
     angles = [rotation_error(pose.R, np.eye(3)) for pose in poses]
     assert estimate.view == np.argmin(angles) == np.argmax(estimate.view_scores)
-    np.testing.assert_allclose(-estimate.view_scores, angles, atol=0.1)
+    assert_allclose(-estimate.view_scores, angles, atol=0.1)
 
 
 def test_inliers_agree_with_the_pose_within_a_fraction_of_the_objects_size(estimate, frames):
@@ -100,7 +99,7 @@ def test_inliers_agree_with_the_pose_within_a_fraction_of_the_objects_size(estim
     spread = np.sqrt(np.concatenate(seen).var(axis=0).mean())
     sure = np.abs(residual / (0.2 * spread) - 1) > 0.2  # the spread is that of what the views show
     assert estimate.inliers.sum() > 20 and sure.sum() > 40
-    np.testing.assert_array_equal(estimate.inliers[sure], (residual < 0.2 * spread)[sure])
+    assert_array_equal(estimate.inliers[sure], (residual < 0.2 * spread)[sure])
 
 
 def test_the_order_of_the_views_does_not_matter(method, estimate, views):
@@ -108,7 +107,7 @@ def test_the_order_of_the_views_does_not_matter(method, estimate, views):
     other = method.estimate_from_views(views[0], [views[1 + index] for index in order])
     assert order[other.view] == estimate.view
     assert (other.sim3.matrix == estimate.sim3.matrix).all()
-    np.testing.assert_array_equal(other.view_scores, estimate.view_scores[order])
+    assert_array_equal(other.view_scores, estimate.view_scores[order])
 
 
 def test_a_rotation_of_the_target_world_rotates_the_estimate(method, estimate, views):

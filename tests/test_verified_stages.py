@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 from synthetic_views import ELSEWHERE, CoordinateBackbone, matched_scene, true_pose, working_pose
@@ -116,7 +117,7 @@ def test_a_map_pixel_reads_the_patch_that_its_centre_lies_in(size, grid):
         for n, k in zip((height, width), grid)
     )
     expected = np.array(row)[:, None] * grid[1] + np.array(column)
-    np.testing.assert_array_equal(maps.table[:, 3].reshape(height, width), expected)
+    assert_array_equal(maps.table[:, 3].reshape(height, width), expected)
 
 
 def test_outliers_far_behind_the_object_are_left_out(views):
@@ -160,12 +161,12 @@ def test_a_view_rotation_sees_the_reference_from_that_view(scene):
     found = poses_from_views(scene)
     assert len(found) == 3 + 11
     for view in range(3):
-        np.testing.assert_allclose(scene.to_sim3(found, view, view).R, np.eye(3), atol=1e-5)
+        assert_allclose(scene.to_sim3(found, view, view).R, np.eye(3), atol=1e-5)
 
 
 def test_the_first_view_is_turned_about_the_vertical_in_steps_of_30_degrees(scene):
     turned = poses_from_views(scene).rotation[[0, *range(3, 14)]].double().numpy()
-    np.testing.assert_allclose(rotation_error(turned, np.roll(turned, 1, axis=0)), 30, atol=1e-3)
+    assert_allclose(rotation_error(turned, np.roll(turned, 1, axis=0)), 30, atol=1e-3)
     # The rotation axis is up in all target images: y points down in cameras.
     axis = np.linalg.svd(turned[1] @ turned[0].T - np.eye(3))[2][2]
     in_cameras = scene.target_maps.rotation.double().numpy() @ axis
@@ -291,11 +292,11 @@ def test_the_viewpoint_term_is_highest_from_the_viewpoint_of_the_most_similar_vi
     angle."""
     alike, other = torch.full((784, 784), 0.2), torch.full((784, 784), -0.4)
     scene = build_scene(views[0], views[1:3], [alike, other])
-    np.testing.assert_allclose(scene.view_similarity, [0.3, -0.3], atol=1e-6)
+    assert_allclose(scene.view_similarity, [0.3, -0.3], atol=1e-6)
     sides = poses_from_views(scene)[:2]
     apart = rotation_error(*sides.rotation.double().numpy())
     expected = 0.3 * (1 - np.exp(-((apart / 45) ** 2)))
-    np.testing.assert_allclose(score_terms(scene, sides)[:, -1], [expected, -expected], atol=1e-3)
+    assert_allclose(score_terms(scene, sides)[:, -1], [expected, -expected], atol=1e-3)
 
 
 def test_refinement_never_lowers_the_score():
@@ -318,7 +319,7 @@ def test_refinement_never_lowers_the_score():
     )
     found, reached = refine(start, score, search, np.random.default_rng(0))
     assert (reached >= score(start)).all()
-    np.testing.assert_allclose(reached, score(found), atol=1e-3)
+    assert_allclose(reached, score(found), atol=1e-3)
     assert (rotation_angles(found.rotation, goal.rotation)[:, 0] < 4).all()
 
 
@@ -354,13 +355,13 @@ def test_reliability_by_hand():
     confidence = np.array([0.1, 0.3, 0.5, 0.7, 0.8, 0.8])
     right = np.array([False, True, False, True, True, True])
     found = reliability(confidence, right, bins=2)
-    np.testing.assert_allclose(found.confidence, [0.3, 2.3 / 3])
-    np.testing.assert_allclose(found.accuracy, [1 / 3, 1])
+    assert_allclose(found.confidence, [0.3, 2.3 / 3])
+    assert_allclose(found.accuracy, [1 / 3, 1])
     assert found.calibration_error == pytest.approx((1 / 3 - 0.3 + 1 - 2.3 / 3) / 2)
     assert found.top_half_accuracy == 1 and "more confident half 100.0 %" in str(found)
     found = reliability(np.repeat([0.2, 0.9], 10), np.tile(np.arange(10) < 3, 2), bins=2)
     # Wilson's interval for 3 of 10, from a table: 10.8 % to 60.3 %.
-    np.testing.assert_allclose(found.interval, [[0.108] * 2, [0.603] * 2], atol=1e-3)
+    assert_allclose(found.interval, [[0.108] * 2, [0.603] * 2], atol=1e-3)
 
 
 # Angles between five rotations about one axis, of 0, 20, 180, 190 and 90 degrees.
@@ -369,10 +370,10 @@ APART = np.abs((TURNS[:, None] - TURNS + 180) % 360 - 180)
 
 
 def test_hypotheses_within_30_degrees_of_a_better_one_are_the_same_pose():
-    np.testing.assert_array_equal(modes(APART), [0, 0, 2, 2, 4])
+    assert_array_equal(modes(APART), [0, 0, 2, 2, 4])
     # The nearest of the better poses stands for it: 25 degrees from the first, 10 from the second.
     line = np.array([0.0, 35, 25])
-    np.testing.assert_array_equal(modes(np.abs(line[:, None] - line)), [0, 1, 1])
+    assert_array_equal(modes(np.abs(line[:, None] - line)), [0, 1, 1])
 
 
 def test_probabilities_by_hand():
@@ -387,7 +388,7 @@ def test_probabilities_by_hand():
     )
     odds = np.exp(-a * np.array([0.0, 0.5, 2.0, np.inf]))
     found = calibration.probabilities(np.array([0.0, 0.5, 2.0, np.inf]), known)
-    np.testing.assert_allclose(found, (1 - 0.4 / 4) * odds / (none + odds.sum()))
+    assert_allclose(found, (1 - 0.4 / 4) * odds / (none + odds.sum()))
     assert found[3] == 0
 
 

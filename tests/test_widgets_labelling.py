@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 from co3d_folders import sequence_data
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
@@ -88,11 +89,11 @@ def test_clicks_give_keypoints_and_an_accepted_label(labelling):
     box.controls["name"].value = "left arm"
     click_all(box, labelling, "reference", "best")
     assert labelling.names[0] == "left arm" and len(labelling.names) == 5
-    np.testing.assert_array_equal(labelling.picks("best"), corners(labelling, "best"))
+    assert_array_equal(labelling.picks("best"), corners(labelling, "best"))
     box.buttons["next"].click()
     assert box.controls["sequence"].value == "a"
     click_all(box, labelling, "sequence", "a")
-    np.testing.assert_array_equal(labelling.picks("a"), corners(labelling, "a"))
+    assert_array_equal(labelling.picks("a"), corners(labelling, "a"))
     assert box.controls["overlay"].value and "residual 0.0 %" in message(box)
     box.buttons["accept"].click()
     assert rotation_error(read_labels(labelling.root, "chair")["a"].trans[:3, :3], TURN) < 0.01
@@ -136,7 +137,7 @@ def test_proposals_are_looked_at_one_by_one_and_accepted_without_a_click(labelli
     assert "proposal is laid over" in message(box) and box.controls["overlay"].value
     first = box.controls["sequence"].value
     box.buttons["accept"].click()
-    np.testing.assert_allclose(
+    assert_allclose(
         read_labels(labelling.root, labelling.category)[first].trans[:3, :3], TURN, atol=1e-9
     )
     assert box.controls["sequence"].value != first and not box.buttons["accept"].disabled
@@ -147,9 +148,7 @@ def test_skip_and_next_go_through_the_open_sequences_and_the_slider_chooses_a_po
     box.controls["point"].value = 1234
     cursor = np.array(box.views["reference"].widget.cursor)
     box.buttons["pick"].click()
-    np.testing.assert_allclose(
-        box.views["reference"]._to_view.apply(labelling.picks("best")[0]), cursor
-    )
+    assert_allclose(box.views["reference"]._to_view.apply(labelling.picks("best")[0]), cursor)
     box.buttons["undo"].click()
     box.buttons["next"].click()
     assert box.controls["sequence"].value == "best" and "on the reference first" in message(box)

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import torch
 from lab_in_browser import REPOSITORY
+from numpy.testing import assert_allclose, assert_array_equal
+from torch.testing import assert_close
 
 from docs.playground.build import stored_pairs, write_page_data
 from zsp_lite import Co3D, FeatureMap, ZeroShotPose, load_backbone
@@ -119,9 +121,7 @@ def test_the_page_computes_what_the_library_computes(stored, method, index):
     stored.evaluate("index => openStored(index)", index)
     default = stored.evaluate(SOLVE, DEFAULTS)
     assert default["best"] == expected.view
-    np.testing.assert_allclose(
-        [one["score"] for one in default["targets"]], expected.view_scores, atol=0.05
-    )
+    assert_allclose([one["score"] for one in default["targets"]], expected.view_scores, atol=0.05)
     assert rotation_error(np.array(default["pose"]["R"]), expected.sim3.R) < 1
     assert default["error"] == pytest.approx(result.error, abs=1)
 
@@ -138,21 +138,17 @@ def test_the_page_computes_what_the_library_computes(stored, method, index):
     for i, view in enumerate(views[1:]):
         compared = (array(stored, f"state.views[{i + 1}].compared[{one}].sim") for one in (0, 1))
         bare, sim = (torch.from_numpy(one.reshape(784, 784)) for one in compared)
-        torch.testing.assert_close(
-            sim, similarity(views[0].features, view.features), atol=1e-3, rtol=0
-        )
-        torch.testing.assert_close(sim, similarity(kept[0], kept[i + 1]), atol=1e-5, rtol=0)
+        assert_close(sim, similarity(views[0].features, view.features), atol=1e-3, rtol=0)
+        assert_close(sim, similarity(kept[0], kept[i + 1]), atol=1e-5, rtol=0)
         (plain,) = key_similarities(views[0].features, [view.features])
-        torch.testing.assert_close(bare, plain, atol=3e-3, rtol=0)
+        assert_close(bare, plain, atol=3e-3, rtol=0)
         closed = -cyclical_distances(sim, (28, 28), (28, 28), views[0].foreground, view.foreground)
-        np.testing.assert_allclose(
-            solved[True]["targets"][i]["distances"], closed.flatten(), atol=1e-6
-        )
+        assert_allclose(solved[True]["targets"][i]["distances"], closed.flatten(), atol=1e-6)
         for cycle, matcher in ((True, "cyclical"), (False, nearest)):
             matches = match(kept[0], kept[i + 1], kmeans=False, sim=sim, matcher=matcher)
             found = solved[cycle]["targets"][i]
             pairs = np.stack([matches.reference @ (28, 1), matches.target @ (28, 1)], axis=1)
-            np.testing.assert_array_equal(found["matches"], pairs)
+            assert_array_equal(found["matches"], pairs)
             assert found["score"] == pytest.approx(correspondence_score(matches, 50), abs=1e-3)
     best, pose = solved[True]["best"], solved[True]["pose"]
     u, v = np.transpose(solved[True]["targets"][best]["matches"])
@@ -187,8 +183,8 @@ def test_photographs_get_the_features_of_the_library_and_no_pose(browser, site, 
     )
     for i, view in enumerate(views):
         keys, saliency = (array(page, f"state.views[{i}].{name}") for name in ("keys", "saliency"))
-        np.testing.assert_allclose(keys, view.features.keys.flatten(), atol=1e-3)
-        np.testing.assert_allclose(saliency, view.features.saliency.flatten(), atol=1e-3)
+        assert_allclose(keys, view.features.keys.flatten(), atol=1e-3)
+        assert_allclose(saliency, view.features.saliency.flatten(), atol=1e-3)
     page.select_option("#pair", "3")  # the pair shown before
     page.wait_for_function("/3D models/.test(document.getElementById('notice').textContent)")
     assert page.evaluate("state.views.length") == 6 and "No pose" not in page.inner_text("#stages")
