@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.data.cameras import Camera
@@ -16,7 +17,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 def random_camera(seed: int = 0, size: tuple[int, int] | None = None) -> Camera:
     """A random camera with unequal focal lengths."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     size = size or tuple(int(side) for side in rng.integers(8, 2000, 2))
     rotation = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
     focal = rng.uniform(0.5, 3, 2) * max(size)
@@ -30,7 +31,7 @@ def sequence_data(
 ) -> SequenceData:
     """`frames` views of 24 x 32 pixels with a smooth picture, a disc for a mask and depth with a
     hole."""
-    rng = np.random.default_rng([seed, *name.encode()])
+    rng = default_rng([seed, *name.encode()])
     height, width = 24, 32
     y, x = np.mgrid[:height, :width]
     made = []

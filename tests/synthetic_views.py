@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.random import default_rng
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
@@ -129,9 +130,9 @@ class CoordinateBackbone:
             ..., None
         ]
         coordinates = (mean / 127 - 1) * REACH
-        waves = np.random.default_rng(5).normal(0, 1.6, (3, self.frequencies))
+        waves = default_rng(5).normal(0, 1.6, (3, self.frequencies))
         keys = np.concatenate([np.sin(coordinates @ waves), np.cos(coordinates @ waves)], axis=-1)
-        keys[share < 0.5] = 0.05 * np.random.default_rng(6).normal(size=keys.shape[-1])
+        keys[share < 0.5] = 0.05 * default_rng(6).normal(size=keys.shape[-1])
         keys = torch.as_tensor(keys, dtype=torch.float32)
         saliency = torch.as_tensor(np.where(share < 0.5, 0, share), dtype=torch.float32)
         return FeatureMap(keys, saliency, keys[share >= 0.5].mean(dim=0).nan_to_num())

@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -23,12 +24,12 @@ scales = st.floats(0.3, 4.0)
 
 
 def similarity(seed: int, scale: float = 1.3) -> Sim3:
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     return Sim3(scale, Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3) * 3)
 
 
 def cloud(seed: int, n: int = 20) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=(n, 3)) * (1.0, 0.7, 0.4)
+    return default_rng(seed).normal(size=(n, 3)) * (1.0, 0.7, 0.4)
 
 
 def assert_same(first: Sim3, second: Sim3, atol: float = 1e-9):
@@ -154,7 +155,7 @@ def test_degenerate_or_malformed_points_are_refused_in_one_line(solver, points):
 
 def contaminated(seed: int, outliers: float = 0.6):
     """Source, target, true similarity, and which points are no outliers."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     source, truth = rng.normal(size=(50, 3)), similarity(seed, 1.2)
     target = truth.apply(source) + 0.01 * rng.normal(size=(50, 3))
     wrong = rng.permutation(50) < outliers * 50
@@ -175,7 +176,7 @@ def test_the_same_seed_gives_the_same_result_and_a_generator_will_do():
     source, target, _, _ = contaminated(4, outliers=0.8)
     first, second = (
         ransac(source, target, seed=5),
-        ransac(source, target, seed=np.random.default_rng(5)),
+        ransac(source, target, seed=default_rng(5)),
     )
     assert_same(first[0], second[0], atol=0)
     assert (first[1] == second[1]).all()
@@ -212,7 +213,7 @@ def test_scales_out_of_range_are_not_considered():
 
 def test_the_final_fit_keeps_to_the_scale_range():
     # The inliers fit a scale below 0.2, though samples of them fit scales above.
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     source = rng.normal(size=(40, 3))
     target = 0.19 * source + 0.05 * rng.normal(size=(40, 3))
     assert ransac(source, target)[0].scale < 0.2

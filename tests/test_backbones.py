@@ -9,6 +9,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from loopback import Server
+from numpy.random import default_rng
 from refusals import refused
 from safetensors.torch import save_file
 from small_backbones import ARCHITECTURES, save_all, small_vit
@@ -38,7 +39,7 @@ def vit() -> VisionTransformer:
 
 @pytest.fixture()
 def pictures() -> list[np.ndarray]:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     return [
         rng.integers(0, 256, shape, dtype=np.uint8)
         for shape in ((32, 32, 3), (50, 40, 3), (9, 64, 3))
@@ -279,7 +280,7 @@ def test_an_unknown_name_or_device_is_refused():
 def server(monkeypatch):
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
-    content = np.random.default_rng(0).bytes(10_000)
+    content = default_rng(0).bytes(10_000)
     server = Server({"/file": content})
     server.content, server.md5 = content, hashlib.md5(content).hexdigest()[:6]
     yield server

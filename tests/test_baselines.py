@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from refusals import refused
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -20,7 +21,7 @@ from zsp_lite.metrics import rotation_error
 
 
 def test_icp_finds_a_small_motion_of_a_cloud_and_its_scale():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     source = rng.normal(size=(400, 3)) * (1.5, 1.0, 0.6)
     truth = Sim3(
         1.1, Rotation.from_rotvec([0.05, -0.08, 0.06]).as_matrix(), np.array([0.05, 0.02, -0.04])
@@ -60,7 +61,7 @@ def test_icp_is_initialised_by_the_first_cameras(monkeypatch):
 
 @pytest.fixture(scope="module")
 def picture() -> np.ndarray:
-    noise = np.random.default_rng(0).integers(0, 256, (28, 28, 3), dtype=np.uint8)
+    noise = default_rng(0).integers(0, 256, (28, 28, 3), dtype=np.uint8)
     return cv2.resize(noise, (224, 224), interpolation=cv2.INTER_CUBIC)
 
 
@@ -90,7 +91,7 @@ def test_an_image_without_keypoints_has_no_matches(picture):
 
 
 def test_the_essential_matrix_gives_the_rotation_between_cameras_with_other_intrinsics():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     grid = (224, 224)  # one patch per pixel, for nearly exact matches
     first = replace(look_at((1, 0, 0.3), size=(224, 224)), focal_length=np.array([300.0, 260.0]))
     second = replace(

@@ -12,6 +12,7 @@ import click
 import numpy as np
 import pytest
 from co3d_folders import convert_to_v2, sequence_data
+from synthetic_views import CoordinateBackbone
 
 from zsp_lite import __version__, errors
 from zsp_lite.backbones.load import BackboneConfig
@@ -213,19 +214,26 @@ def test_a_reader_that_ends_early_ends_the_output_without_an_error():
         assert (done.returncode, done.stderr) == (0, ""), command
 
 
-@pytest.fixture
-def benchmark(ellipsoids, tmp_path, monkeypatch, loaded, run):
-    """Runs the rows of table 3 into a folder and returns what the command prints."""
-    monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.chdir(tmp_path)
-    words = "benchmark --pairs 2 --targets 3 --methods table3 --data".split()
-    return lambda out, *more: run([*words, ellipsoids.root, "--out", out, *more])
+@pytest.fixture(scope="module")
+def table3(ellipsoids, tmp_path_factory) -> Path:
+    """The folder of a run of the rows of table 3."""
+    from zsp_lite.benchmark.run import evaluate, write_reports
+
+    out = tmp_path_factory.mktemp("table3")
+    evaluate(ellipsoids.root, CoordinateBackbone(), ["table3"], {"ellipsoid": 2}, 3, out)
+    write_reports(out)
+    return out
 
 
 @pytest.mark.slow
-def test_a_benchmark_prints_its_rows_unless_it_is_quiet(benchmark, tmp_path):
-    assert "ours-globalsim" in benchmark("a")
-    assert benchmark("b", "--quiet") == ""
+def test_a_benchmark_prints_its_rows_unless_it_is_quiet(
+    ellipsoids, tmp_path, monkeypatch, loaded, run
+):
+    monkeypatch.setenv("COLUMNS", "200")
+    words = "benchmark --pairs 2 --targets 3 --methods table3 --data".split()
+    command = [*words, ellipsoids.root, "--out"]
+    assert "ours-globalsim" in run([*command, tmp_path / "a"])
+    assert run([*command, tmp_path / "b", "--quiet"]) == ""
     table, again = [(tmp_path / name / "tables/table_3.md").read_text() for name in "ab"]
     assert table == again
     methods = json.loads((tmp_path / "a/summary.json").read_text())["methods"]
@@ -233,33 +241,36 @@ def test_a_benchmark_prints_its_rows_unless_it_is_quiet(benchmark, tmp_path):
 
 
 @pytest.mark.slow
-def test_tables_are_made_again_from_a_run(benchmark, tmp_path, run):
-    benchmark("a")
-    assert "GlobalSim" in run(["tables", "a", "--out", "c"])
+def test_tables_are_made_again_from_a_run(table3, tmp_path, monkeypatch, run):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert "GlobalSim" in run(["tables", table3, "--out", tmp_path])
     for made in ("tables/table_3.md", "summary.json"):
-        assert (tmp_path / "a" / made).read_bytes() == (tmp_path / "c" / made).read_bytes()
+        assert (tmp_path / made).read_bytes() == (table3 / made).read_bytes()
     # More than the axes.
-    assert (tmp_path / "c" / "figures" / "error_distribution.png").stat().st_size > 5000
+    assert (tmp_path / "figures" / "error_distribution.png").stat().st_size > 5000
 
 
 @pytest.mark.slow
-def test_tables_have_the_chosen_metrics_and_rows(benchmark, tmp_path, run):
-    benchmark("a")
-    run("tables a --metrics scale --out b".split())
-    headings = [(tmp_path / name / "tables/all_rows.md").read_text() for name in "ab"]
+def test_tables_have_the_chosen_metrics(table3, tmp_path, run):
+    run(["tables", table3, "--metrics", "scale", "--out", tmp_path])
+    headings = [(folder / "tables/all_rows.md").read_text() for folder in (table3, tmp_path)]
     assert ["scale ratio" in text for text in headings] == [False, True]
     assert ["Acc15" in text for text in headings] == [True, False]
-    words = "tables a --rows ours-globalsim,ours --latex time,intervals --size 3,2 --out d"
-    assert "ms per pair" in run(words.split())
-    text = (tmp_path / "d/tables/all_rows.tex").read_text()
+
+
+@pytest.mark.slow
+def test_tables_have_the_chosen_rows_in_their_order(table3, tmp_path, monkeypatch, run):
+    monkeypatch.setenv("COLUMNS", "200")
+    options = "--rows ours-globalsim,ours --latex time,intervals --size 3,2 --out".split()
+    assert "ms per pair" in run(["tables", table3, *options, tmp_path])
+    text = (tmp_path / "tables/all_rows.tex").read_text()
     assert re.search(r"ms per pair.*ours-globalsim.* \[.*ours &", text, re.DOTALL)
 
 
 @pytest.mark.slow
-def test_a_pair_of_a_run_is_drawn(benchmark, tmp_path, run):
-    benchmark("a")
-    key = json.loads((tmp_path / "a/run.jsonl").read_text().splitlines()[0])["pair"]
-    command = ["tables", "a", "--pair", key]
+def test_a_pair_of_a_run_is_drawn(table3, run):
+    key = json.loads((table3 / "run.jsonl").read_text().splitlines()[0])["pair"]
+    command = ["tables", table3, "--pair", key]
     drawn = Path(run([*command, "--rows", "ours"]).removeprefix("Written: ").strip())
     assert drawn.name == f"pair_{re.sub('[/:]', '_', key)}.png"
     assert drawn.with_suffix(".pdf").is_file()
@@ -267,10 +278,10 @@ def test_a_pair_of_a_run_is_drawn(benchmark, tmp_path, run):
 
 
 @pytest.mark.slow
-def test_runs_are_compared(benchmark, run):
-    benchmark("a")
+def test_runs_are_compared(table3, monkeypatch, run):
+    monkeypatch.setenv("COLUMNS", "200")
     rows = "ours,ours:ours-globalsim"
-    assert "ours:ours-globalsim" in run(["compare", "a", "a", "--rows", rows])
+    assert "ours:ours-globalsim" in run(["compare", table3, table3, "--rows", rows])
 
 
 @pytest.mark.parametrize("size", ["3", "3,2,1", "0,2", "nan,2", "a,b"])

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from co3d_folders import sequence_data
+from numpy.random import default_rng
 from numpy.testing import assert_array_equal
 from refusals import refused
 from safetensors.torch import save
@@ -28,7 +29,7 @@ from zsp_lite.io.files import GROWTH_ALLOWED, decompress, path_inside, plain_nam
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import read_ply, write_ply
 
-PICTURE = cv2.resize(np.random.default_rng(0).integers(0, 255, (9, 16, 3), np.uint8), (160, 90))
+PICTURE = cv2.resize(default_rng(0).integers(0, 255, (9, 16, 3), np.uint8), (160, 90))
 JPEG, PNG = (cv2.imencode(extension, PICTURE)[1].tobytes() for extension in (".jpg", ".png"))
 FRAME = b'{"sequence_name": "a", "frame_number": %d}'
 COLOUR_NAMES = ("red", "green", "blue")
@@ -260,8 +261,8 @@ def test_a_long_message_keeps_its_beginning_and_end():
     assert len(message) < 1000 and message.startswith("begin") and message.endswith("end")
 
 
-POINTS = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
-COLOURS = np.random.default_rng(1).integers(0, 256, (5, 3)).astype(np.uint8)
+POINTS = default_rng(0).normal(size=(5, 3)).astype(np.float32)
+COLOURS = default_rng(1).integers(0, 256, (5, 3)).astype(np.uint8)
 COLOURS[0] = 0, 128, 255
 
 

@@ -9,6 +9,7 @@ import pytest
 from co3d_folders import random_camera, seeds, sequence_data
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
@@ -142,7 +143,7 @@ def arrays(**changes):
 
 def test_arrays_of_a_camera_become_a_frame_with_half_integer_pixel_centres():
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = random_camera(np.random.default_rng(0)).R, (1, 2, 3)
+    pose[:3, :3], pose[:3, 3] = random_camera(default_rng(0)).R, (1, 2, 3)
     frame = Frame.from_arrays(**arrays(pose=pose, name="cup"))
     camera = frame.camera
     assert frame.name == "cup" and frame.mask is None and camera.size == SIZE
@@ -207,7 +208,7 @@ def test_arrays_that_cannot_be_a_frame_are_refused_by_one_line(changes, message)
 
 
 def test_depth_and_masks_survive_their_files(tmp_path):
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     depth = np.where(rng.random(SIZE) < 0.5, rng.uniform(1, 9, SIZE), 0).astype(np.float32)
     write_depth(tmp_path / "depth.png", depth, 2.0)
     assert_allclose(read_depth(tmp_path / "depth.png", 2.0), depth, rtol=2**-11)
@@ -230,7 +231,7 @@ def test_depth_and_masks_survive_their_files(tmp_path):
     ],
 )
 def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension, options):
-    pixels = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
+    pixels = default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
     data, path = cv2.imencode(extension, pixels, options)[1].tobytes(), tmp_path / "image"
     if extension == ".jpg":  # a thumbnail in a segment of its own
         thumbnail = cv2.imencode(".jpg", pixels[::4, ::4])[1].tobytes()
@@ -315,7 +316,7 @@ def test_a_hole_in_a_plane_is_filled_with_the_plane():
 
 @given(seeds)
 def test_filled_depth_stays_between_the_known_depths(seed):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     depth = np.where(rng.random((20, 24)) < 0.3, rng.uniform(1, 5, (20, 24)), 0).astype(np.float32)
     depth[3, 4] = 2.0
     filled = inpaint_depth(depth)
@@ -326,7 +327,7 @@ def test_filled_depth_stays_between_the_known_depths(seed):
 
 def test_unprojected_depth_projects_onto_its_own_pixels():
     camera = random_camera(3, (7, 9))
-    depth = np.random.default_rng(0).uniform(1, 2, (7, 9))
+    depth = default_rng(0).uniform(1, 2, (7, 9))
     pixels, back = camera.project(camera.to_world(unproject_depth(depth, camera)))
     assert_allclose(pixels[2, 5], [5.5, 2.5])  # pixel centres lie at half-integers
     assert_allclose(pixels[6, 0], [0.5, 6.5])
@@ -345,7 +346,7 @@ def patch_depths_one_by_one(depth, grid):
 
 @given(seeds)
 def test_a_patchs_point_has_the_lower_quartile_of_its_known_depths(seed):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     depth = np.where(rng.random((24, 32)) < 0.2, rng.uniform(1, 5, (24, 32)), 0).astype(np.float32)
     depth[0, 0] = 3
     camera = frontal((24, 32))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from co3d_folders import contents, convert_to_v2, random_camera, seeds, sequence_data
 from hypothesis import given
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -101,7 +102,7 @@ def test_sources_without_labels_are_refused(root, tmp_path):
 
 def moved(sequence, world: Sim3, noise: float = 0.0):
     """The same sequence in another world."""
-    rng, frames = np.random.default_rng(0), []
+    rng, frames = default_rng(0), []
     for frame in sequence.frames:
         rotation = frame.camera.R @ world.R.T
         centre = world.apply(frame.camera.centre) + noise * rng.normal(size=3)
@@ -167,7 +168,7 @@ def test_the_residual_is_reported_and_a_large_one_refused(tmp_path):
 def random_label(seed, name="a"):
     trans = np.eye(4)
     trans[:3, :3] = Rotation.random(random_state=seed % 2**31).as_matrix()
-    trans[:3, 3] = np.random.default_rng(seed).normal(size=3)
+    trans[:3, 3] = default_rng(seed).normal(size=3)
     return PoseLabel(trans, name, "zero")
 
 
@@ -176,7 +177,7 @@ def test_the_relative_pose_takes_what_one_camera_sees_to_what_the_other_sees(see
     label_a, label_b = random_label(seed), random_label(seed + 1, "b")
     camera_a, camera_b = random_camera(seed), random_camera(seed + 1)
     # points of the reference sequence's cloud
-    canonical = np.random.default_rng(seed).normal(size=(6, 3))
+    canonical = default_rng(seed).normal(size=(6, 3))
     seen_a = camera_a.to_camera(Sim3.from_matrix(label_a.trans).apply(canonical))
     seen_b = camera_b.to_camera(Sim3.from_matrix(label_b.trans).apply(canonical))
     pose = relative_pose(label_a, camera_a, label_b, camera_b)

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from threadpoolctl import threadpool_info
 from torch.testing import assert_close
@@ -79,7 +80,7 @@ def test_descriptors_without_length_are_similar_to_nothing():
 @settings(max_examples=40)
 @given(sides, sides, sides, sides, seeds)
 def test_cyclical_distances_follow_equation_2(h1, w1, h2, w2, seed):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     sim = rng.normal(size=(h1 * w1, h2 * w2))
     fg1, fg2 = rng.random((h1, w1)) < 0.7, rng.random((h2, w2)) < 0.7
     expected = cycles_by_loops(sim, (h1, w1), (h2, w2), fg1, fg2)
@@ -179,5 +180,5 @@ def test_clusters_are_computed_by_one_thread(monkeypatch):
 
     threads = set()
     monkeypatch.setattr(matching, "KMeans", Observed)
-    matching._cluster(np.eye(8), 4, np.random.default_rng(0))
+    matching._cluster(np.eye(8), 4, default_rng(0))
     assert threads == {1}

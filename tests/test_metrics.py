@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -66,7 +67,7 @@ def acc30(errors, weights=None):
 
 
 def test_weights_count_errors_several_times():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     for n in (1, 2, 7, 8):
         errors, weights = rng.uniform(0, 60, n), rng.integers(0, 4, n) + np.eye(n, dtype=int)[0]
         repeated = np.repeat(errors, weights)
@@ -80,7 +81,7 @@ def test_the_interval_of_an_accuracy_matches_the_binomial():
     errors = np.r_[np.zeros(40), np.full(60, 90.0)]
     low, high = bootstrap_ci(errors, acc30)
     assert low == pytest.approx(30.4, abs=1.5) and high == pytest.approx(49.6, abs=1.5)
-    drawn = np.random.default_rng(0).integers(100, size=(2000, 100))
+    drawn = default_rng(0).integers(100, size=(2000, 100))
     assert (low, high) == pytest.approx(
         tuple(np.percentile(accuracy(errors[drawn], 30), [2.5, 97.5]))
     )
@@ -160,7 +161,7 @@ def test_the_sign_test_counts_the_pairs_that_only_one_method_solves():
 
 
 def test_a_paired_differences_interval_and_p_value_are_those_of_its_replicates():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     first, second = rng.uniform(0, 60, 6), rng.uniform(0, 40, 6)
     weights = object_draws(PAIRS)
     result = paired_test(first, second, weights=weights)

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, look_at, render
 
 from zsp_lite.cli.demo import MODELS_NOTE
@@ -95,7 +96,7 @@ def motorcycles(tmp_path_factory):
     """A synthetic category "motorcycle" with two sequences, elsewhere in their world, and their
     object poses."""
     root, sequences, poses = tmp_path_factory.mktemp("motorcycles"), [], {}
-    points = np.random.default_rng(0).uniform(-1, 1, (400, 3))
+    points = default_rng(0).uniform(-1, 1, (400, 3))
     for name in ("second", "first"):
         frames, colours = around(ELSEWHERE), np.full((400, 3), 128, np.uint8)
         sequences.append(
@@ -128,7 +129,7 @@ def test_with_perfect_features_the_directions_and_the_cloud_are_those_of_the_obj
     motorcycles, photograph
 ):
     truth = photograph.camera.R @ CANONICAL
-    points = photograph.camera.to_camera(np.random.default_rng(0).uniform(-1, 1, (400, 3)))
+    points = photograph.camera.to_camera(default_rng(0).uniform(-1, 1, (400, 3)))
     by_eye = np.array([FRONT, UP])
     results = list(run_photograph(motorcycles, CoordinateBackbone()))
     assert len(results) == 4  # two foregrounds, two solvers

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from co3d_folders import contents
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from refusals import refused
 
@@ -53,7 +54,7 @@ def chairs():
     def recorded(index):
         name, key = sequence_name(SEED, "chair", index), stable_hash(f"{SEED}/chair/{index}")
         mesh = make_object("chair", index, SEED)
-        views, _ = render_sequence(mesh, np.random.default_rng([key, 1]), FRAMES, SIZE)
+        views, _ = render_sequence(mesh, default_rng([key, 1]), FRAMES, SIZE)
         return *record_sequence(mesh, name, key, FRAMES, SIZE), views
 
     return [recorded(0), recorded(1)]
@@ -79,7 +80,7 @@ def test_objects_of_a_category_have_unit_size_vary_and_differ_from_their_half_tu
 def test_a_soft_mask_is_1_inside_0_outside_and_between_at_the_edge():
     truth = np.zeros((80, 80), bool)
     truth[20:60, 20:60] = True
-    mask = soft_mask(truth, np.random.default_rng(0))
+    mask = soft_mask(truth, default_rng(0))
     assert mask[30:50, 30:50].min() > 0.99 and mask[:16].max() < 0.1
     assert ((mask > 0.1) & (mask < 0.9)).sum() > 100
 
@@ -100,7 +101,7 @@ def test_depth_has_holes_and_noise_and_masks_are_accurate_to_two_pixels(chairs):
             wrong = (frame.mask > 0.5) != view.mask
             assert 0 < wrong.sum() and to_edge[wrong].max() <= 2.5
     edge_on = replace(view, mask=np.zeros_like(view.mask))  # of a flat object
-    assert np.isfinite(stereo_depth(edge_on, 0.3, 0.2, np.random.default_rng(0))).all()
+    assert np.isfinite(stereo_depth(edge_on, 0.3, 0.2, default_rng(0))).all()
 
 
 def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):

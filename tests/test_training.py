@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from small_backbones import small_vit
 
@@ -96,7 +97,7 @@ def test_renders_hold_unit_normals_and_centred_depth_on_the_object(renders):
 def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
     """A patch's surface point must be one that the uncropped view shows."""
     batch = sample_batch(
-        renders, np.random.default_rng(0), 3, VIEWS, 96, (0.4, 1.0), members=np.array([0, 1, 2])
+        renders, default_rng(0), 3, VIEWS, 96, (0.4, 1.0), members=np.array([0, 1, 2])
     )
     crops = 3 * VIEWS
     assert batch.images.shape == (crops, 3, 96, 96) and batch.surface.shape == (crops, 144, 3)
@@ -111,10 +112,8 @@ def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
 
 
 def test_normals_turn_and_flip_with_the_crop(renders):
-    grid, turn = crop_grids(np.random.default_rng(3), 3 * VIEWS, VIEWS, 96, (0.5, 1.0))
-    batch = sample_batch(
-        renders, np.random.default_rng(3), 3, VIEWS, 96, (0.5, 1.0), members=np.arange(3)
-    )
+    grid, turn = crop_grids(default_rng(3), 3 * VIEWS, VIEWS, 96, (0.5, 1.0))
+    batch = sample_batch(renders, default_rng(3), 3, VIEWS, 96, (0.5, 1.0), members=np.arange(3))
     assert set(torch.linalg.det(turn).round().tolist()) == {-1.0, 1.0}
     for crop in range(3 * VIEWS):
         right, down = grid[crop, 4, 5] - grid[crop, 4, 4], grid[crop, 5, 4] - grid[crop, 4, 4]
@@ -172,7 +171,7 @@ def test_views_of_a_deformed_copy_show_points_of_the_original_and_differ_in_room
     camera = rendering.framed_camera(copy, *orbit_pose(0.5, 0.4, 0, 7, np.zeros(3)), 96)
     meshes = (replace(shape, vertices=copy, materials=random_materials(seed)) for seed in (0, 1))
     one, two = (
-        rendering.render_instance(0, mesh, shape.vertices, camera, np.random.default_rng(seed))
+        rendering.render_instance(0, mesh, shape.vertices, camera, default_rng(seed))
         for seed, mesh in enumerate(meshes)
     )
     assert np.abs(one.rgb.astype(int) - two.rgb).mean() > 20
@@ -198,7 +197,7 @@ def test_a_few_steps_teach_a_network_where_the_object_is(renders):
     functions."""
     torch.manual_seed(0)
     model = Trainee(initial_backbone(renders, 24, 2, 2), 1)
-    batch = sample_batch(renders, np.random.default_rng(5), 2, VIEWS, 48, (0.8, 1.0))
+    batch = sample_batch(renders, default_rng(5), 2, VIEWS, 48, (0.8, 1.0))
     with torch.no_grad():
         total, figures = losses(model, batch, torch.Generator().manual_seed(0), helpers=0.5)
     expected = figures["match"] + 0.5 * (figures["geometry"] + figures["attention"])
@@ -226,7 +225,7 @@ TINY = DistillationConfig(
 def pictures() -> np.ndarray:
     """Eight objects, two views each, (8, 2, 48, 48, 3): stripes of each object's own colour and
     direction."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     y, x = np.mgrid[:48, :48]
     rgb = np.empty((8, 2, 48, 48, 3), np.uint8)
     for k in range(8):
@@ -238,7 +237,7 @@ def pictures() -> np.ndarray:
 
 
 def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_crop():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     student, teacher, centre = (
         rng.normal(size=(4, 3, 5)),
         rng.normal(size=(2, 3, 5)),

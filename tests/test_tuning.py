@@ -5,6 +5,7 @@ from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from refusals import refused
 
@@ -38,7 +39,7 @@ def sample_outcomes(n: int, rng: np.random.Generator) -> list[Outcome]:
 
 
 def test_the_weights_of_the_sampling_distribution_are_recovered():
-    fitted = fit_weights(sample_outcomes(1200, np.random.default_rng(0)), ridge=0)
+    fitted = fit_weights(sample_outcomes(1200, default_rng(0)), ridge=0)
     assert_allclose(astuple(fitted), astuple(TRUE_WEIGHTS), atol=1)
 
 
@@ -74,7 +75,7 @@ TRUE_CALIBRATION = Calibration(
 
 
 def test_the_coefficients_of_the_calibration_are_recovered():
-    outcomes = sample_ranked(6000, TRUE_CALIBRATION, np.random.default_rng(0))
+    outcomes = sample_ranked(6000, TRUE_CALIBRATION, default_rng(0))
     found = fit_calibration(outcomes, FIRST_TERMS, ridge=0)
     for name in ("scale", "none"):
         true, measured = (np.delete(getattr(one, name), 4) for one in (TRUE_CALIBRATION, found))
@@ -87,7 +88,7 @@ def test_the_coefficients_of_the_calibration_are_recovered():
 
 
 def test_no_fit_sees_the_category_it_is_evaluated_on():
-    outcomes = sample_outcomes(12, np.random.default_rng(4))
+    outcomes = sample_outcomes(12, default_rng(4))
     seen = leave_out(outcomes, lambda some: {one.category for one in some})
     assert all(
         one.category not in others and len(others) == 3 for one, others in zip(outcomes, seen)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -68,7 +69,7 @@ def truth(frames, scene):
 
 @given(seeds)
 def test_suppression_keeps_the_best_of_each_neighbourhood(seed):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     rotation = rotation_matrices(torch.tensor(rng.normal(0, 0.5, (12, 3)), dtype=torch.float32))
     score = torch.tensor(rng.normal(size=12))
     kept = non_maximum_suppression(rotation, score, 25.0, 12)
@@ -135,7 +136,7 @@ def test_outliers_far_behind_the_object_are_left_out(views):
 @pytest.mark.slow
 @given(seeds)
 def test_matches_with_outliers_propose_the_true_pose(seed):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     pose = Sim3(
         rng.uniform(0.7, 1.4), Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 0.1, 3)
     )
@@ -143,7 +144,7 @@ def test_matches_with_outliers_propose_the_true_pose(seed):
     target = pose.apply(source)
     target[:12] = rng.normal(size=(12, 3))
     points = (torch.tensor(part, dtype=torch.float32) for part in (source, target))
-    found = poses_from_matches(*points, np.random.default_rng(seed))
+    found = poses_from_matches(*points, default_rng(seed))
     assert rotation_error(found.rotation[0].double().numpy(), pose.R) < 1
     assert (
         len(found) <= 6
@@ -154,7 +155,7 @@ def test_matches_with_outliers_propose_the_true_pose(seed):
 def test_without_enough_matches_no_pose_is_proposed():
     for count in (2, 5):  # too few; all in one place, where no scale is plausible
         points = torch.zeros(count, 3)
-        assert len(poses_from_matches(points, points, np.random.default_rng(0))) == 0
+        assert len(poses_from_matches(points, points, default_rng(0))) == 0
 
 
 def test_a_view_rotation_sees_the_reference_from_that_view(scene):
@@ -317,7 +318,7 @@ def test_refinement_never_lowers_the_score():
     search = SearchSchedule(
         rounds=8, samples=40, rotation=6.0, translation=0.08, scale=0.06, decay=0.8
     )
-    found, reached = refine(start, score, search, np.random.default_rng(0))
+    found, reached = refine(start, score, search, default_rng(0))
     assert (reached >= score(start)).all()
     assert_allclose(reached, score(found), atol=1e-3)
     assert (rotation_angles(found.rotation, goal.rotation)[:, 0] < 4).all()
@@ -335,7 +336,7 @@ def test_bad_scenes_are_refused_in_one_line(views):
 
 
 def test_surface_weights_do_not_depend_on_the_sampling_density():
-    rng = np.random.default_rng(6)
+    rng = default_rng(6)
     angle = np.concatenate([rng.uniform(0, np.pi, 400), rng.uniform(np.pi, 2 * np.pi, 100)])
     ring = torch.tensor(
         np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) * 2, dtype=torch.float32

@@ -8,6 +8,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from refusals import refused
 
 from zsp_lite.alignment import Sim3, ransac, umeyama
@@ -130,7 +131,7 @@ def test_the_cycle_has_the_cyclical_distance_and_names_the_background(sim):
 
 
 def test_the_caption_agrees_with_ransac():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     source = rng.normal(size=(40, 3))
     target = Sim3(1.3, TURN, np.ones(3)).apply(source) + 0.03 * rng.normal(size=(40, 3))
     target[:10] = 2 * rng.normal(size=(10, 3))
@@ -151,7 +152,7 @@ def test_the_caption_agrees_with_ransac():
 
 
 def test_the_caption_agrees_with_least_squares():
-    source = np.random.default_rng(2).normal(size=(9, 3))
+    source = default_rng(2).normal(size=(9, 3))
     widget = outliers.one_outlier(source, source)
     widget.controls["distance"].value = 3.0
     fit = umeyama(source, source + np.outer(np.arange(9) == 8, [3.0, 0, 0]))
