@@ -70,7 +70,7 @@ def farther(frame):
 
 
 @pytest.mark.parametrize(
-    ("mistake", "named"),
+    "mistake, named",
     [
         (inverted, r"agree \(\d+%\) if the poses are world to camera$"),
         (flipped, "if the poses have the other axes, OpenGL's for OpenCV's or the reverse"),

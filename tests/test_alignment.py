@@ -47,7 +47,7 @@ def test_composition_is_the_product_of_the_matrices_and_application_in_turn(seed
 
 
 @pytest.mark.parametrize(
-    ("scale", "R", "t"),
+    "scale, R, t",
     [
         (0.0, np.eye(3), np.zeros(3)),
         (np.nan, np.eye(3), np.zeros(3)),

@@ -196,7 +196,7 @@ def test_sequences_of_an_archive_need_a_server_that_sends_parts(server, source, 
     download(tmp_path / "v1", *options, dataset="co3d-v1")
 
 
-@pytest.mark.parametrize(("answer", "code"), [("\n", 1), ("Y\n", 0), ("", 130), (None, 2)])
+@pytest.mark.parametrize("answer, code", [("\n", 1), ("Y\n", 0), ("", 130), (None, 2)])
 def test_the_user_is_asked_on_a_terminal_or_has_said_yes(
     server, tmp_path, capsys, monkeypatch, answer, code
 ):
@@ -278,7 +278,7 @@ def test_a_link_in_the_folder_is_not_followed_out_of_it(server, tmp_path, downlo
 
 
 @pytest.mark.parametrize(
-    ("damage", "listed", "message"),
+    "damage, listed, message",
     [
         (lambda whole: b"not a zip archive", True, "is damaged or encrypted"),
         (lambda whole: whole.replace(b"JFIF", b"XXXX"), True, "is damaged or encrypted"),

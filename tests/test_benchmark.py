@@ -160,7 +160,7 @@ def test_the_picture_of_a_pair_shows_each_rows_pose_in_its_target_view(pictured,
 
 
 @pytest.mark.parametrize(
-    ("pair", "rows", "message"),
+    "pair, rows, message",
     [
         ("lump", None, "pair 'lump' has no pose in the run, expected a key such as lump/"),
         ("of the run", ["blind"], "has no pose in the run"),
@@ -175,7 +175,7 @@ def test_a_pair_or_a_row_without_a_pose_has_no_picture(pictured, pair, rows, mes
 def test_shipped_pairs_come_first_and_only_where_there_are_enough(tmp_path):
     dataset = Co3D(shutil.copytree(small_folder(), tmp_path / "copy"))
     shipped = sample_pairs(dataset, "lump", 4, 3, seed=9)
-    path = dataset.root / "determ_eval" / "4samples_3tgt" / "lump.pt"
+    path = dataset.root / "determ_eval/4samples_3tgt/lump.pt"
     write_published_pairs(path, shipped, dataset)
     assert category_pairs(dataset, "lump", 3, 3) == shipped[:3]
     assert category_pairs(dataset, "lump", 5, 3) == sample_pairs(dataset, "lump", 5, 3)
@@ -216,7 +216,7 @@ class Renamed(CoordinateBackbone):
 
 
 @pytest.mark.parametrize(
-    ("backbone", "options", "message"),
+    "backbone, options, message",
     [
         (BACKBONE, {"targets": 3}, "a run with targets 5, this is 3"),
         (Renamed(grid=8), {}, "a run with backbone .*Renamed"),
@@ -227,7 +227,7 @@ def test_the_folder_of_another_run_is_refused(run, backbone, options, message):
 
 
 @pytest.mark.parametrize(
-    ("root", "options", "message"),
+    "root, options, message",
     [
         (small_folder(), {"pairs": {"teapot": 1}}, "category is 'teapot', expected one of lump"),
         (small_folder(), {"pairs": {"lump": 0}}, "pairs of lump is 0"),
@@ -245,7 +245,7 @@ def _object_pose(matrix: np.ndarray) -> dict:
     return {"trans": matrix.tolist(), "scale": 1.0, "low": [0, 0, 0], "high": [1, 1, 1]}
 
 
-@pytest.mark.parametrize(("turns", "expected"), [((180,), 0), ((90,), 90), ((), 180)])
+@pytest.mark.parametrize("turns, expected", [((180,), 0), ((90,), 90), ((), 180)])
 def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(
     tmp_path, monkeypatch, turns, expected
 ):
@@ -268,7 +268,7 @@ def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    "text, expected",
     [
         ('{"100_a": {"trans": [[1, 0, 0, 0]], "scale": 1}}', "Expected"),
         (json.dumps({"100_a": _object_pose(1.05 * np.eye(4))}), "100_a is"),

@@ -100,7 +100,7 @@ def test_rows_of_every_kind_answer_every_pair(own_run):
     assert [row["failed"] for row in methods.values()] == [0] * len(methods)
 
 
-@pytest.mark.parametrize(("name", "view"), [("own_method", 0), ("own_estimator", 1)])
+@pytest.mark.parametrize("name, view", [("own_method", 0), ("own_estimator", 1)])
 def test_ones_own_row_chooses_the_view(own_run, name, view):
     assert set(own_run.row(name)["view"]) == {view}
 
@@ -132,7 +132,7 @@ def test_a_row_that_is_imported_without_a_name_is_called_as_it_is_imported(tmp_p
 
 
 @pytest.mark.parametrize(
-    ("thing", "told"),
+    "thing, told",
     [
         (3, "'mine' is of type int, expected"),
         (ZeroShotPose, "'mine' is of type type, expected"),
@@ -170,7 +170,7 @@ class NetworkOfProblems(Network):
 
 
 @pytest.mark.parametrize(
-    ("thing", "kind"),
+    "thing, kind",
     [
         (lambda one, other=None, *, third=3: 0, "problem"),
         (lambda one, two, three=3, **options: 0, "keypoints"),
@@ -187,7 +187,7 @@ def test_arguments_without_a_default_or_the_attribute_kind_tell_the_kind(thing, 
 
 
 @pytest.mark.parametrize(
-    ("rows", "message"),
+    "rows, message",
     [
         ([], "no methods, expected some"),
         (["ours-n0"], "'ours-n0' is unknown"),
@@ -357,7 +357,7 @@ def test_the_default_threshold_in_a_sweep_gives_the_row_without_a_sweep(sweep, t
 
 
 @pytest.mark.parametrize(
-    ("row", "threshold", "message"),
+    "row, threshold, message",
     [
         (own_method, 0.1, "'mine' has no threshold, expected a matcher or a solver"),
         (benchmark_folder.own_keypoints, -1, "threshold is -1, expected"),
@@ -379,7 +379,7 @@ def test_keypoints_that_fit_no_pose_are_noted(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("keypoints", "message"),
+    "keypoints, message",
     [
         (("a", "b", [1]), "matched points is .a., expected real numbers"),
         ((ONES, ONES[1:], ONES[:, 0]), "matched points are 9 and 8, expected as many in both"),
@@ -428,7 +428,7 @@ def answers(tmp_path) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("name", "translation", "scale"), [("exact", 0, 1), ("rotations", np.nan, np.nan)]
+    "name, translation, scale", [("exact", 0, 1), ("rotations", np.nan, np.nan)]
 )
 def test_poses_from_a_file_are_measured_like_any_others(
     answers, tmp_path, name, translation, scale
@@ -527,7 +527,7 @@ RIGHT = '"lump/a:0/b:1,5",1,1 0 0 0 1 0 0 0 1,0 0 1,1'
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    "text, told",
     [
         ("", "a CSV file"),
         ("\xff", "codec.* a CSV file"),
@@ -976,7 +976,7 @@ class Broken(CoordinateBackbone):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    "wrong, told",
     [
         (
             lambda maps: [replace(one, keys=one.keys * float("nan")) for one in maps],

@@ -116,8 +116,8 @@ def test_an_interrupted_run_has_tables_figures_and_comparisons_of_what_is_finish
     stored = len(pairs_in(killed))
     assert 4 <= stored < PAIRS
     assert main(["tables", str(killed), "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "tables" / "all_rows.csv").is_file()
-    assert (tmp_path / "figures" / "error_curves.pdf").is_file()
+    assert (tmp_path / "tables/all_rows.csv").is_file()
+    assert (tmp_path / "figures/error_curves.pdf").is_file()
     assert read_run(killed).summary["methods"]["ours"]["n"] == stored
     compared = compare(read_run(killed), read_run(undisturbed[0])).cells
     assert {one.value for one in compared["pairs"]} == {stored}

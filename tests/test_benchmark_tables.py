@@ -165,7 +165,7 @@ def test_the_tables_by_category_have_the_important_rows(run):
 
 
 @pytest.mark.parametrize(
-    ("name", "metric", "of_all"),
+    "name, metric, of_all",
     [
         ("median", "median", "mean_category_median"),
         ("acc30", "acc30", "acc30"),
@@ -458,7 +458,7 @@ def test_a_row_without_poses_is_refused(folder):
 
 
 @pytest.mark.parametrize(
-    ("right", "wrong"),
+    "right, wrong",
     [
         ('"error":1.0', "[]"),
         ('"error":1.0', '"error":"1"'),
@@ -488,7 +488,7 @@ def test_a_damaged_gzip_is_refused(folder):
 
 
 @pytest.mark.parametrize(
-    ("right", "wrong"),
+    "right, wrong",
     [(".*", "{}"), ('"calls"', '"call"'), ('"targets": 5', '"targets": "5"')],
 )
 def test_settings_of_another_form_are_refused(folder, right, wrong):
@@ -535,7 +535,7 @@ def test_rows_of_one_run_are_compared_under_chosen_names(run):
 
 
 @pytest.mark.parametrize(
-    ("rows", "message"),
+    "rows, message",
     [
         ("ours-n1:ours", "rows ours-n1 and ours have no pair in common"),
         ("ours:", "row '.*' is not in the run, expected one of "),

@@ -56,7 +56,7 @@ def test_cropping_shifts_pixels_and_resizing_scales_them(seed, top, left, height
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes, message",
     [
         ({"R": np.eye(2)}, r"R has shape \(2, 2\)"),
         ({"R": 2 * np.eye(3)}, "expected a rotation"),

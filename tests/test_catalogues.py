@@ -25,7 +25,7 @@ CC = {"CC0 1.0", "CC BY 3.0", "CC BY 3.0 US"}
 
 
 @pytest.mark.parametrize(
-    ("path", "categories", "count", "licences"),
+    "path, categories, count, licences",
     [
         (ARTISTS, 8, 59, CC | {"Public Domain Mark 1.0", "GPL-2+"}),
         (SAMPLES, 4, 16, CC),
@@ -56,7 +56,7 @@ def test_no_file_is_in_two_catalogues_and_the_sample_data_show_those_of_theirs()
             for one in entries.values()
         ]
         assert len(set(files)) == len(files)
-    records = json.loads((REPOSITORY / "data_samples" / "rendered_models.json").read_text())
+    records = json.loads((REPOSITORY / "data_samples/rendered_models.json").read_text())
     shown = {
         record["sha256"] for models in records["sequences"].values() for record in models.values()
     }

@@ -93,7 +93,7 @@ def test_contradictory_evidence_lowers_the_probability_and_names_the_other_turn(
     )
 
 
-@pytest.mark.parametrize(("n", "per_object"), [(2, 1), (4, 3), (11, 10), (12, 6), (40, 6)])
+@pytest.mark.parametrize("n, per_object", [(2, 1), (4, 3), (11, 10), (12, 6), (40, 6)])
 def test_pairs_connect_all_objects_and_see_each_reference_from_evenly_spaced_sides(n, per_object):
     names = Mock(
         Co3D, frame_numbers=lambda category: {f"{k:02d}": list(range(12)) for k in range(n)}

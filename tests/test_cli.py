@@ -132,7 +132,7 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "part"), WRONG)
+@pytest.mark.parametrize("arguments, part", WRONG)
 def test_bad_input_is_one_line_exit_code_2_and_no_file(
     arguments, part, run, ellipsoids, tmp_path, monkeypatch
 ):
@@ -147,7 +147,7 @@ def test_bad_input_is_one_line_exit_code_2_and_no_file(
 
 
 @pytest.mark.parametrize(
-    ("error", "code"),
+    "error, code",
     [
         (errors.InputError("two\nlines"), 2),
         (PermissionError(13, "Permission denied", "/there"), 2),
@@ -171,7 +171,7 @@ def test_the_demo_prints_a_table_and_writes_its_report(ellipsoids, tmp_path, loa
 
 
 @pytest.mark.parametrize(
-    ("words", "inside"),
+    "words, inside",
     [("demo --data .", ""), ("estimate ellipsoid/a ellipsoid/b", "deeper")],
 )
 def test_an_output_folder_that_is_a_file_is_refused_before_any_computation(
@@ -247,7 +247,7 @@ def test_tables_are_made_again_from_a_run(table3, tmp_path, monkeypatch, run):
     for made in ("tables/table_3.md", "summary.json"):
         assert (tmp_path / made).read_bytes() == (table3 / made).read_bytes()
     # More than the axes.
-    assert (tmp_path / "figures" / "error_distribution.png").stat().st_size > 5000
+    assert (tmp_path / "figures/error_distribution.png").stat().st_size > 5000
 
 
 @pytest.mark.slow
@@ -350,7 +350,7 @@ WORDS = "--root mine --category cup --sequence one --frames 7".split()
 
 
 @pytest.mark.parametrize(
-    ("words", "options"),
+    "words, options",
     [
         (
             "nerfstudio scan --box 1,2,3,4",

@@ -112,7 +112,7 @@ def test_optional_fields_may_be_null_and_unknown_ones_are_ignored(root):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change, message",
     [
         (
             lambda frame: frame.pop("sequence_name"),
@@ -172,7 +172,7 @@ def test_paths_that_leave_the_folder_are_refused(root):
     for part in ("image", "depth", "mask"):
         edit_first(root, lambda frame, part=part: frame[part].update(path="chair/../../secret.jpg"))
         refused("leads out of the data folder", lambda: Co3D(root).load(first(root)))
-    items = root / "chair" / "sequence_annotations.jgz"
+    items = root / "chair/sequence_annotations.jgz"
     edit_json(items, lambda items: items[0]["point_cloud"].update(path="../secret.ply"))
     refused("leads out of the data folder", lambda: Co3D(root).point_cloud("chair", "b_2"))
 
@@ -189,7 +189,7 @@ def test_the_depth_mask_makes_depth_unknown(root):
 
 
 @pytest.mark.parametrize(
-    ("part", "write"), [("image", write_image), ("depth", write_depth), ("mask", write_mask)]
+    "part, write", [("image", write_image), ("depth", write_depth), ("mask", write_mask)]
 )
 def test_missing_files_and_files_of_another_size_are_refused(root, part, write):
     annotation = first(root)
@@ -218,7 +218,7 @@ def test_selection_takes_the_best_clouds_above_both_bounds(tmp_path):
                 item["sequence_name"]
             ]
 
-    edit_json(tmp_path / "chair" / "sequence_annotations.jgz", score)
+    edit_json(tmp_path / "chair/sequence_annotations.jgz", score)
     dataset = Co3D(tmp_path)
     assert [sequence.sequence_name for sequence in dataset.select("chair")] == [
         "best",

@@ -57,7 +57,7 @@ def test_a_missing_and_an_empty_file_are_named(root, part):
 
 
 def test_a_broken_file_is_found_by_a_deep_check_alone(root):
-    for path in (frame_file(root, "images"), root / "chair" / "b" / "pointcloud.ply"):
+    for path in (frame_file(root, "images"), root / "chair/b/pointcloud.ply"):
         path.write_bytes(path.read_bytes()[:60])
     assert not check_folder(root)[0].problems
     problems = check_folder(root, deep=True)[0].problems
@@ -68,7 +68,7 @@ def test_a_broken_file_is_found_by_a_deep_check_alone(root):
 
 def test_black_and_empty_frames_are_counted_by_a_deep_check(root, run):
     for part, count in (("images", 3), ("masks", 2)):
-        for path in sorted((root / "chair" / "a" / part).iterdir())[-count:]:
+        for path in sorted((root / "chair/a" / part).iterdir())[-count:]:
             cv2.imwrite(str(path), np.zeros((24, 32), np.uint8))
     assert check_folder(root)[0].defects == {} and check_folder(root)[0].usable == 2
     (check,) = check_folder(root, deep=True)
@@ -81,13 +81,13 @@ def test_black_and_empty_frames_are_counted_by_a_deep_check(root, run):
 def test_sequences_without_a_point_cloud_are_counted(root, run):
     """A cloud that the annotations lack is no problem, a file that is missing is one."""
     edit_json(
-        root / "chair" / "sequence_annotations.jgz", lambda found: found[0].update(point_cloud=None)
+        root / "chair/sequence_annotations.jgz", lambda found: found[0].update(point_cloud=None)
     )
     write_co3d(root, "stool", [sequence_data("c")])
     check, stool = check_folder(root)
     assert (check.cloudless, check.problems, check.complete, stool.cloudless) == (1, [], 2, 0)
     assert "No problems" in run(["data", "check", str(root)])
-    (root / "chair" / "b" / "pointcloud.ply").unlink()
+    (root / "chair/b/pointcloud.ply").unlink()
     text = run(["data", "check", str(root)], 1)
     assert (
         "chair: 2 of 2 sequences have no point cloud" in text
@@ -97,7 +97,7 @@ def test_sequences_without_a_point_cloud_are_counted(root, run):
 
 def test_an_invalid_camera_is_named(root):
     edit_json(
-        root / "chair" / "frame_annotations.jgz",
+        root / "chair/frame_annotations.jgz",
         lambda frames: frames[1]["viewpoint"].update(T=[0, None, 1]),
     )
     (check,) = check_folder(root)
@@ -118,7 +118,7 @@ def test_labels_of_unknown_sequences_and_of_two_references_are_named(root):
 
 def test_annotations_that_cannot_be_read_are_a_problem_of_their_category(root, tmp_path_factory):
     write_co3d(root, "stool", [sequence_data("c")])
-    (root / "chair" / "frame_annotations.jgz").write_bytes(b"no gzip")
+    (root / "chair/frame_annotations.jgz").write_bytes(b"no gzip")
     chair, stool = check_folder(root)
     assert len(chair.problems) == 1 and chair.frames == 0
     assert not stool.problems and stool.frames == 4

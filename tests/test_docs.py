@@ -28,9 +28,9 @@ PAGES = [
     REPOSITORY / "README.md",
     *sorted((REPOSITORY / "docs").rglob("*.md")),
     *sorted((REPOSITORY / "notebooks").rglob("README.md")),
-    REPOSITORY / "zsp_lite" / "weights" / "MODEL_CARD.md",
+    REPOSITORY / "zsp_lite/weights/MODEL_CARD.md",
     *NOTEBOOKS,
-    *sorted((REPOSITORY / "notebooks" / "exercises" / "source").glob("*/*.ipynb")),
+    *sorted((REPOSITORY / "notebooks/exercises/source").glob("*/*.ipynb")),
 ]
 ids = {"ids": [str(page.relative_to(REPOSITORY)) for page in PAGES]}
 
@@ -176,7 +176,7 @@ def test_python_code_compiles_and_imports_what_exists(page, xfeat):
 def test_the_examples_of_methods_of_ones_own_run_as_they_stand(
     tmp_path, monkeypatch, capsys, links, xfeat
 ):
-    page = REPOSITORY / "docs" / "benchmark_your_own.md"
+    page = REPOSITORY / "docs/benchmark_your_own.md"
     (tmp_path / "data_samples").symlink_to(REPOSITORY / "data_samples")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -256,7 +256,7 @@ def test_the_readme_says_how_many_lines_the_library_has_without_the_course():
         r"the library has about ([\d,]+) lines", markdown(REPOSITORY / "README.md")
     )
     library = set((REPOSITORY / "zsp_lite").rglob("*.py"))
-    course = set((REPOSITORY / "zsp_lite" / "course").rglob("*.py"))
+    course = set((REPOSITORY / "zsp_lite/course").rglob("*.py"))
     counted = sum(len(path.read_text("utf-8").splitlines()) for path in library - course)
     assert abs(int(claimed.replace(",", "")) - counted) <= 500
 

@@ -33,7 +33,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::sqlalchemy.exc.SAWarning"),
 ]
 
-EXERCISES = Path(__file__).parents[1] / "notebooks" / "exercises"
+EXERCISES = Path(__file__).parents[1] / "notebooks/exercises"
 ASSIGNMENTS = sorted(folder.name for folder in (EXERCISES / "source").iterdir())
 
 # For each assignment and task: the name of a mistake, the part of the solution to replace, and its
@@ -248,7 +248,7 @@ def test_the_solutions_pass_every_test_and_the_students_version_none(prepared, c
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # some mistakes divide by zero or overflow
 @pytest.mark.parametrize(
-    ("assignment", "task", "mistake"),
+    "assignment, task, mistake",
     [
         (assignment, task, mistake)
         for assignment, of_tasks in MISTAKES.items()
@@ -351,7 +351,7 @@ def git(root: Path, *words: str) -> str:
 
 def copy_course(root: Path) -> Path:
     """Copy what a lecturer needs of the repository; returns the folder of the exercises."""
-    folder = root / "notebooks" / "exercises"
+    folder = root / "notebooks/exercises"
     shutil.copytree(EXERCISES / "source" / METRICS, folder / "source" / METRICS)
     shutil.copy(EXERCISES / "nbgrader_config.py", folder)
     shutil.copy(EXERCISES.parents[1] / ".gitignore", root)
@@ -390,7 +390,7 @@ def download(folder: Path, notebook: NotebookNode) -> None:
         f"Dan_126_assignsubmission_file_{METRICS}.ipynb": whole,
         f"Dan_126_assignsubmission_file_{METRICS} (1).ipynb": whole,
     }
-    with zipfile.ZipFile(downloads / "archive" / "all.zip", "w") as archive:
+    with zipfile.ZipFile(downloads / "archive/all.zip", "w") as archive:
         for name, content in files.items():
             archive.writestr(name, content)
     lines = "".join(f"\nParticipant {number}," for number in range(123, 127))
@@ -457,7 +457,7 @@ def test_git_sees_no_hand_in(collected):
 @pytest.fixture
 def feedback(collected) -> str:
     """The page for Ada."""
-    path = collected.folder / "feedback" / "123" / METRICS / f"{METRICS}.html"
+    path = collected.folder / "feedback/123" / METRICS / f"{METRICS}.html"
     return path.read_text(encoding="utf-8")
 
 

@@ -288,7 +288,7 @@ def test_positions_are_read_in_every_encoding(path, encoding):
 
 
 @pytest.mark.parametrize(
-    ("kind", "code", "scale"),
+    "kind, code, scale",
     [("uchar", "u1", 1), ("int", "i4", 1), ("float", "f4", 1 / 255), ("double", "f8", 1 / 255)],
 )
 def test_colours_of_8_bits_or_from_0_to_1_are_read_as_8_bit(path, kind, code, scale):

@@ -47,7 +47,7 @@ SIZE = (24, 32)
 
 
 @pytest.mark.parametrize(
-    ("parts", "padding", "box"),
+    "parts, padding, box",
     [
         ([(20, 40, 40, 60, 1.0)], 0.1, (18, 37, 44, 66)),  # a tenth, half of it on each side
         ([(0, 0, 100, 200, 1.0)], 0.1, (0, 0, 100, 200)),  # in the image
@@ -114,7 +114,7 @@ def test_colours_are_averaged_along_a_side_that_shrinks_while_the_other_grows(si
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes, message",
     [
         ({"rgb": np.zeros((*SIZE, 3))}, "rgb is float64"),
         ({"rgb": np.zeros((5, 5, 3), np.uint8)}, r"rgb is uint8 \(5, 5, 3\)"),
@@ -180,7 +180,7 @@ def test_a_mask_holds_booleans_zeros_and_ones_or_up_to_255():
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes, message",
     [
         (
             {"rgb": np.zeros((3, *SIZE), np.uint8)},
@@ -222,7 +222,7 @@ def test_depth_and_masks_survive_their_files(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("extension", "options"),
+    "extension, options",
     [
         (".png", ()),
         (".jpg", ()),

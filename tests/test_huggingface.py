@@ -230,7 +230,7 @@ def offline(tmp_path, monkeypatch) -> Path:
 def test_what_is_in_the_cache_needs_no_hub(offline):
     repository = offline / "models--someone--small"
     (repository / "refs").mkdir(parents=True)
-    (repository / "refs" / "main").write_text("0" * 40)
+    (repository / "refs/main").write_text("0" * 40)
     folder = save_model(repository / "snapshots" / ("0" * 40), configuration("vit"))
     backbone = load_backbone("hf:someone/small", "cpu")
     assert backbone.name == "hf:someone/small"

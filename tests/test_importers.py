@@ -222,7 +222,7 @@ def edited(*changes, encoding="utf-8", name="transforms.json"):
 
 
 @pytest.mark.parametrize(
-    ("kind", "damage", "message"),
+    "kind, damage, message",
     [
         (
             "nerfstudio",

@@ -50,7 +50,7 @@ def test_residuals_are_relative_to_the_spread_of_the_keypoints():
 
 
 @pytest.mark.parametrize(
-    ("reference", "picks", "message"),
+    "reference, picks, message",
     [
         (
             corners()[:3],
@@ -210,7 +210,7 @@ def test_a_proposal_becomes_the_label_where_nothing_is_picked(root):
         ("best", turn),
     ):  # the reference of proposals may be another one
         write_atomic(
-            root / "label_proposals" / "chair" / f"{name}.json",
+            root / "label_proposals/chair" / f"{name}.json",
             label_bytes(PoseLabel(trans, name, "a")),
         )
     labelling = Labelling(root, "chair")
@@ -219,5 +219,5 @@ def test_a_proposal_becomes_the_label_where_nothing_is_picked(root):
     refused("sequence b has 0 of 0 keypoints", labelling.accept, "b")
     labelling.accept("a")
     assert_allclose(read_labels(root, "chair")["a"].trans[:3, :3], turn[:3, :3].T, atol=1e-12)
-    write_atomic(root / "label_proposals" / "chair" / "b.json", b"{}")
+    write_atomic(root / "label_proposals/chair/b.json", b"{}")
     refused("proposal .*b.json|label .*b.json", Labelling, root, "chair")

@@ -64,7 +64,7 @@ def test_labels_and_pairs_are_imported_and_replace_others_only_on_request(clone,
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "message"),
+    "file, content, message",
     [
         ("clone/data/class_labels/chair/b.json", b"{", "Input data was truncated"),
         (
@@ -205,7 +205,7 @@ def test_labels_are_read_back_from_files_in_the_published_format(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change, message",
     [
         (
             {"trans": np.diag([2.0, 2, 2, 1]).tolist()},

@@ -50,7 +50,7 @@ def overlap(mask, truth):
     return (found & truth).sum() / (found | truth).sum()
 
 
-@pytest.mark.parametrize(("count", "unit"), [(1, 1), (4, 1), (1, 1000)])
+@pytest.mark.parametrize("count, unit", [(1, 1), (4, 1), (1, 1000)])
 def test_the_object_on_a_floor_is_found_without_a_box_in_any_unit_of_length(count, unit):
     scenes = [ball_on_floor(direction) for direction in DIRECTIONS[:count]]
     masked = masks_from_depth([scale_frame(frame, unit) for frame, _ in scenes])
@@ -100,7 +100,7 @@ def on_the_floor_too(mask):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "sign"),
+    "spoil, sign",
     [
         (in_the_corner, "several borders of the image are touched"),
         (in_two_parts, "several separate parts"),

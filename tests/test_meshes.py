@@ -80,7 +80,7 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "reason"),
+    "name, content, reason",
     [
         (
             "nan.obj",
@@ -130,7 +130,7 @@ def test_orientations_are_rotations_to_front_x_and_up_z():
 
 
 @pytest.mark.parametrize(
-    ("folder", "entries", "message"),
+    "folder, entries, message",
     [
         ("", '{"chair/gone": {}}', "names 'chair/gone', which has no file"),
         ("", '{"chair/a": {"front": 3}}', "front"),
@@ -140,7 +140,7 @@ def test_orientations_are_rotations_to_front_x_and_up_z():
     ],
 )
 def test_a_folder_without_models_and_a_wrong_list_are_refused(tmp_path, folder, entries, message):
-    write_wedge(tmp_path / "chair" / "a.obj")
+    write_wedge(tmp_path / "chair/a.obj")
     (tmp_path / "models.json").write_text(entries)
     refused(message, list_models, tmp_path / folder)
 

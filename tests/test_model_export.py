@@ -30,8 +30,8 @@ def folder(tmp_path_factory):
     """Two chairs, one of which lies on its back in its file, and a sign whose texture is
     missing."""
     root = tmp_path_factory.mktemp("models")
-    write_wedge(root / "chair" / "high.obj", seat=0.9)
-    path = write_wedge(root / "chair" / "low.obj", seat=0.4)
+    write_wedge(root / "chair/high.obj", seat=0.9)
+    path = write_wedge(root / "chair/low.obj", seat=0.4)
     lines = path.read_text().splitlines()
     lying = [
         f"v {x} {-z} {y}"
@@ -40,8 +40,8 @@ def folder(tmp_path_factory):
     path.write_text("\n".join(lying + [line for line in lines if line[0] == "f"]) + "\n")
     info = {"front": "-y", "up": "+z", "author": "Ann", "licence": "CC0-1.0"}
     (root / "models.json").write_text(json.dumps({"chair/low": info}))
-    write_quad(root / "sign" / "stop.obj", np.full((4, 4, 3), 200, np.uint8))
-    (root / "sign" / "stop.png").unlink()
+    write_quad(root / "sign/stop.obj", np.full((4, 4, 3), 200, np.uint8))
+    (root / "sign/stop.png").unlink()
     return root
 
 
@@ -109,7 +109,7 @@ def test_complete_sequences_stay_and_turned_models_are_rendered_again(
 
 
 def test_a_folder_of_other_data_or_without_a_usable_model_is_refused(data, folder, tmp_path):
-    write_quad(tmp_path / "models" / "sign" / "stop.obj", opacity=0)
+    write_quad(tmp_path / "models/sign/stop.obj", opacity=0)
     refused(
         "no usable model; sign/stop: .* no visible face",
         export_models,
@@ -123,7 +123,7 @@ def test_a_folder_of_other_data_or_without_a_usable_model_is_refused(data, folde
 
 def test_the_command_line_renders_models_and_names_those_left_out(folder, tmp_path, run):
     out, mine = tmp_path / "data", tmp_path / "mine"
-    write_wedge(mine / "chair" / "a.obj")
+    write_wedge(mine / "chair/a.obj")
     shutil.copytree(folder / "sign", mine / "sign")
     arguments = [
         *"--frames 1 --image-size 48 --front -x --up +z --out".split(),
@@ -136,7 +136,7 @@ def test_the_command_line_renders_models_and_names_those_left_out(folder, tmp_pa
 
 def test_the_code_of_the_page_on_own_models_writes_labels_that_align_the_objects(tmp_path):
     (code,) = re.findall(
-        r"```python\n(.*?)```", (REPOSITORY / "docs" / "own_models.md").read_text(), re.DOTALL
+        r"```python\n(.*?)```", (REPOSITORY / "docs/own_models.md").read_text(), re.DOTALL
     )
     names = {}
     exec(code, names)

@@ -129,7 +129,7 @@ def test_options_go_to_the_sources_that_take_them(image, tmp_path, ellipsoids, f
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    "options, message",
     [
         ({}, "no intrinsics, expected --intrinsics FX,FY,CX,CY"),
         ({"intrinsics": INTRINSICS, "mask": "box"}, "--mask box with --box TOP,LEFT,HEIGHT,WIDTH"),
@@ -162,7 +162,7 @@ def test_masks_and_depth_that_are_not_there_are_named_with_the_option_that_cures
 
 
 @pytest.mark.parametrize(
-    ("path", "message"),
+    "path, message",
     [
         ("nowhere", "nowhere does not exist, expected a picture .*, CATEGORY/SEQUENCE"),
         ("notes.txt", "notes.txt has another format, expected"),
@@ -191,7 +191,7 @@ def test_options_that_no_source_takes_are_refused(sequence, image):
 @pytest.fixture(scope="module")
 def own(ellipsoids, tmp_path_factory) -> tuple[PairResult, Path]:
     """Both solvers on two labelled sequences, and the folder of their files."""
-    out = tmp_path_factory.mktemp("own") / "deep" / "out"
+    out = tmp_path_factory.mktemp("own") / "deep/out"
     settings = {"reference_frame": 2, "targets": 3, "backbone": CoordinateBackbone(), "out": out}
     folder = ellipsoids.root / "ellipsoid"
     return estimate_pose(folder / "a", folder / "b", "both", **settings), out
@@ -414,7 +414,7 @@ def test_frames_in_memory_in_other_units_and_by_threads_give_the_same(several, e
 
 
 @pytest.mark.parametrize(
-    ("choice", "frame"),
+    "choice, frame",
     [
         ({"reference_frame": 2}, 2),
         ({"reference_frame": 2, "references": 1}, 2),
@@ -435,7 +435,7 @@ ONE = around(AT_HOME, 1)[0]
 
 
 @pytest.mark.parametrize(
-    ("frames", "message"),
+    "frames, message",
     [
         ([], r"frames are \[\], expected a sequence of zsp_lite.Frame"),
         ([1.0], r"frames are \[1.0\], expected"),
@@ -464,7 +464,7 @@ def test_objects_of_two_categories_are_flagged():
     assert first == "the objects are of different categories: car, chair"
 
 
-@pytest.mark.parametrize(("unit", "questioned"), [(None, True), (30.0, True), (1.0, False)])
+@pytest.mark.parametrize("unit, questioned", [(None, True), (30.0, True), (1.0, False)])
 def test_depth_in_another_unit_is_questioned(image, frames, tmp_path, unit, questioned):
     np.save(tmp_path / "z.npy", frames[0].depth)  # in metres
     source = open_source(image, INTRINSICS, depth=tmp_path / "z.npy", depth_unit=unit)

@@ -126,7 +126,7 @@ def test_samples_are_made_in_the_cache_and_completed_after_an_interruption(tmp_p
     monkeypatch.setattr("zsp_lite.course.synthetic.export.export_preset", export)
     with pytest.raises(KeyboardInterrupt):
         samples.sample_data()
-    made = tmp_path / "cache" / "samples"
+    made = tmp_path / "cache/samples"
     assert not made.exists()
     for _ in range(2):  # the second time they are there
         assert samples.sample_data() == made

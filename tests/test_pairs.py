@@ -30,7 +30,7 @@ def dataset(tmp_path_factory):
         for name in NAMES:
             write_label(root, category, PoseLabel(np.eye(4), name, "s1"))
     # Frame numbers are not positions: the list is shuffled, and numbers start at 100.
-    path = root / "chair" / "frame_annotations.jgz"
+    path = root / "chair/frame_annotations.jgz"
 
     def shuffle(frames):
         for frame in frames:
@@ -121,7 +121,7 @@ def test_a_pairs_seed_is_a_function_of_its_key():
 def test_pairs_are_read_back_from_the_published_format(dataset, tmp_path):
     pairs = sample_pairs(dataset, "chair", 10, 5)
     path = pairs_path(tmp_path, "chair", 10, 5)
-    assert path == tmp_path / "determ_eval" / "10samples_5tgt" / "chair.pt"
+    assert path == tmp_path / "determ_eval/10samples_5tgt/chair.pt"
     write_published_pairs(path, pairs, dataset)
     assert read_published_pairs(path, dataset) == pairs
     before = path.read_bytes()
@@ -163,7 +163,7 @@ def test_a_folders_own_pairs_are_found(tmp_path, caplog):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes, message",
     [
         (
             {"reference_frame_id": 48},

@@ -111,7 +111,7 @@ def motorcycles(tmp_path_factory):
             "high": [1.0] * 3,
         }
     write_co3d(root, "motorcycle", sequences, quality=98)
-    (root / "motorcycle" / "object_poses.json").write_text(json.dumps(poses))
+    (root / "motorcycle/object_poses.json").write_text(json.dumps(poses))
     (root / "rendered_models.json").write_text("{}")
     return Co3D(root)
 

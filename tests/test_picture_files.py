@@ -206,7 +206,7 @@ def test_a_capture_of_turned_photographs_keeps_its_world_and_refuses_mirrored_on
 
 
 @pytest.mark.parametrize(
-    ("values", "message"),
+    "values, message",
     [
         ((600, 600, 320, 240), None),
         ((600, 600, 280, 260), None),

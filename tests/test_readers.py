@@ -296,7 +296,7 @@ def first(change):
 
 
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    "damage, message",
     [
         (
             first(lambda f: f["transform_matrix"][0].__setitem__(0, float("nan"))),
@@ -413,7 +413,7 @@ def test_options_of_formats(tmp_path, views):
 
 
 @pytest.mark.parametrize(
-    ("files", "message"),
+    "files, message",
     [
         (
             ["sparse/0/images.bin"],
@@ -446,7 +446,7 @@ def zipped(path, name="rgb.txt", data=b"", flag=0):
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    "make, message",
     [
         (lambda path: path.write_bytes(b"PK\3\4" + bytes(99)), "File is not a zip file"),
         (lambda path: zipped(path, "../../climbs"), "path ../../climbs leads out of"),

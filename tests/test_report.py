@@ -38,7 +38,7 @@ def results(ellipsoids):
 
 @pytest.fixture(scope="module")
 def page(results, tmp_path_factory):
-    path = tmp_path_factory.mktemp("demo") / "in" / "report.html"
+    path = tmp_path_factory.mktemp("demo") / "in/report.html"
     return write_report(path, results, "a & b", "some/folder", "synthetic ellipsoids <script>")
 
 
@@ -186,5 +186,5 @@ def test_the_overview_marks_the_pose_of_each_solver_in_its_view(results, tmp_pat
             one.target_camera.to_world(cloud[np.argsort(-cloud[:, 2])])
         )
         assert_allclose(axis.collections[0].get_offsets(), pixels)
-    write_overview(tmp_path / "deep" / "overview.jpg", results)
-    assert (tmp_path / "deep" / "overview.jpg").read_bytes()[:2] == b"\xff\xd8"
+    write_overview(tmp_path / "deep/overview.jpg", results)
+    assert (tmp_path / "deep/overview.jpg").read_bytes()[:2] == b"\xff\xd8"

@@ -57,7 +57,7 @@ def test_a_turned_frame_shows_every_world_point_with_the_same_colour_and_depth(f
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("solver", "quarters"), [("paper", 1), ("paper", 2), ("verified", 3)])
+@pytest.mark.parametrize("solver, quarters", [("paper", 1), ("paper", 2), ("verified", 3)])
 def test_a_turned_reference_stands_up_and_the_pose_is_that_of_the_turned_image(
     frames, solver, quarters
 ):

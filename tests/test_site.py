@@ -14,8 +14,8 @@ import zsp_lite
 
 REPOSITORY = Path(__file__).parents[1]
 NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
-EXERCISES = sorted((REPOSITORY / "notebooks" / "exercises" / "source").glob("*/*.ipynb"))
-DECKS = sorted((REPOSITORY / "docs" / "slides").glob("*.md"))
+EXERCISES = sorted((REPOSITORY / "notebooks/exercises/source").glob("*/*.ipynb"))
+DECKS = sorted((REPOSITORY / "docs/slides").glob("*.md"))
 
 
 class Page:
@@ -175,7 +175,7 @@ def test_every_notebook_can_be_downloaded_with_its_drawings(site, pages):
 
 
 def test_with_an_address_a_notebook_has_links_to_run_it_and_an_install_cell(monkeypatch):
-    monkeypatch.syspath_prepend(REPOSITORY / "docs" / "site")
+    monkeypatch.syspath_prepend(REPOSITORY / "docs/site")
     course = importlib.import_module("course")
     address = "https://github.com/someone/zsp"
     links = course.run_links("notebooks/00_quickstart", address)

@@ -394,7 +394,7 @@ def test_probabilities_by_hand():
 
 
 @pytest.mark.parametrize(
-    ("probabilities", "angles", "one_of_two", "start"),
+    "probabilities, angles, one_of_two, start",
     [
         ((0.45, 0.35, 0.1), APART, True, "one of two: poses 180 degrees apart"),
         ((0.5, 0.3, 0.18), APART, True, "one of two"),  # the third is below 1/e of the first

@@ -204,7 +204,7 @@ def test_a_click_beside_the_cloud_is_no_keypoint(labelling):
     beside = {"at": [5.0, 5.0], "view": np.eye(3).ravel().tolist(), "reach": REACH}
     box.views["reference"].widget._handle_custom_msg(beside, [])
     assert message(box) == "There is no point of the cloud at the click."
-    assert labelling.names == []
+    assert labelling.names == ()
 
 
 def test_a_click_on_a_sequence_before_four_on_the_reference_is_refused(labelling):
@@ -216,15 +216,17 @@ def test_a_click_on_a_sequence_before_four_on_the_reference_is_refused(labelling
 
 
 @pytest.mark.parametrize("use", ["overlay", "accept"])
-def test_a_fit_to_points_on_a_line_is_refused(clicked, labelling, use):
+def test_a_fit_to_points_on_a_line_is_refused(labelling, use):
+    box = label_poses(labelling)
+    click_all(box, labelling, "reference", "best", 4)
     labelling.put("a", np.outer(np.arange(4), (1, 2, 3)))
-    clicked.buttons["next"].click()
+    box.buttons["next"].click()
     if use == "overlay":
-        clicked.controls["overlay"].value = True
+        box.controls["overlay"].value = True
     else:
-        clicked.buttons["accept"].click()
-    assert "collinear" in message(clicked)
-    assert not clicked.controls["overlay"].value
+        box.buttons["accept"].click()
+    assert "collinear" in message(box)
+    assert not box.controls["overlay"].value
     assert read_labels(labelling.root, "chair") == {}
 
 

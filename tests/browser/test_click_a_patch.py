@@ -72,7 +72,7 @@ def site(tmp_path_factory):
     ]
     # links to other pages are missing
     subprocess.run(command, cwd=REPOSITORY, check=True, stderr=subprocess.DEVNULL)
-    write_page_data(folder / "docs" / "playground")
+    write_page_data(folder / "docs/playground")
     return folder
 
 

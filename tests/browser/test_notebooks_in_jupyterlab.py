@@ -13,7 +13,7 @@ import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 NOTEBOOKS = sorted(path.name for path in (reader.REPOSITORY / "notebooks").glob("*.ipynb"))
-PICTURES = reader.REPOSITORY / "outputs" / "browser"
+PICTURES = reader.REPOSITORY / "outputs/browser"
 LABELLING = {"08_label_poses.ipynb"}  # have a 3D view that a click labels
 WIDGET = "application/vnd.jupyter.widget-view+json"
 MINUTES = 20  # a notebook may take on a busy machine
@@ -37,7 +37,7 @@ def lab(browser, tmp_path_factory):
     asking = new_notebook(
         cells=[new_markdown_cell("A formula, for MathJax: $x^2$"), check], metadata=python
     )
-    nbformat.write(asking, folder / "notebooks" / "asking.ipynb")
+    nbformat.write(asking, folder / "notebooks/asking.ipynb")
     with reader.serve(folder / "notebooks", folder, folder / "data_samples") as running:
         yield running
 

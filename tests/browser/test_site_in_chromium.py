@@ -15,7 +15,7 @@ def test_no_page_is_wider_than_the_screen_of_a_phone(browser, site):
 
 def test_notes_are_shown_in_the_presenters_view_alone(browser, site):
     page = browser.new_page()
-    page.goto((site / "docs" / "slides" / "lab_2.html").as_uri())
+    page.goto((site / "docs/slides/lab_2.html").as_uri())
     with page.expect_popup() as opened:
         page.keyboard.press("n")
     presenter = opened.value

@@ -174,7 +174,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.gpu")
     parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts))
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
-    parser.add_argument("--out", type=Path, default=REPOSITORY / "outputs" / "gpu")
+    parser.add_argument("--out", type=Path, default=REPOSITORY / "outputs/gpu")
     options = parser.parse_args()
     if options.device == "cuda" and not torch.cuda.is_available():
         print("skipped: no CUDA device")
