@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.data.cameras import Camera
+from zsp_lite import Camera, Frame
 from zsp_lite.data.co3d import SequenceData
-from zsp_lite.data.frames import Frame
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -5,12 +5,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from zsp_lite import Camera
 from zsp_lite.course.synthetic.meshes import Material, TexturedMesh, smooth_normals
 from zsp_lite.course.synthetic.primitives import Mesh, box, joined
 from zsp_lite.course.synthetic.room import CheapCamera, Room
 from zsp_lite.course.synthetic.sequences import orbit_pose
 from zsp_lite.course.training.renders import framed_camera
-from zsp_lite.data.cameras import Camera
 
 # Two triangles in the plane z = 0 of the file, 2 x 2, seen upright from +z.
 _QUAD = """mtllib {stem}.mtl

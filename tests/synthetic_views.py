@@ -11,10 +11,7 @@ import numpy as np
 import torch
 from numpy.random import default_rng
 
-from zsp_lite.alignment import Sim3
-from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import Frame
-from zsp_lite.features import FeatureMap
+from zsp_lite import Camera, FeatureMap, Frame, Sim3
 from zsp_lite.matching import match, similarities
 from zsp_lite.verified.poses import Poses
 from zsp_lite.verified.scene import Scene, build_scene

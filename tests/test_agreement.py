@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic_views import ELSEWHERE, look_at, render
 
-from zsp_lite.data.frames import Frame
+from zsp_lite import Frame
 from zsp_lite.importers.agreement import disagreement
 
 FLIP = np.diag([1.0, -1, -1, 1])

@@ -14,19 +14,16 @@ from benchmark_folder import SEQUENCES, SlowBackbone, run_rows, small_folder
 from numpy.testing import assert_allclose
 from refusals import refused
 
-from zsp_lite import align
-from zsp_lite.align import align_category, read_hypotheses, write_labels
+from zsp_lite import Co3D, InputError, ZeroShotPose, align, align_category, estimate_pose
+from zsp_lite.align import read_hypotheses, write_labels
 from zsp_lite.benchmark.run import evaluate
 from zsp_lite.category import synchronise
 from zsp_lite.cli import main as cli
 from zsp_lite.course.labelling.session import Labelling
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import resize_frame
 from zsp_lite.data.labels import read_labels
-from zsp_lite.errors import InputError, NoPoseError
+from zsp_lite.errors import NoPoseError
 from zsp_lite.metrics import rotation_error
-from zsp_lite.own_objects import estimate_pose
-from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.viz.category_sheet import objects_figure
 
 BACKBONE = SlowBackbone(grid=8, _seconds=0)

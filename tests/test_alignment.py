@@ -12,12 +12,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.alignment import Sim3, ransac, umeyama
-from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import Frame
+from zsp_lite import Camera, FeatureMap, Frame, Sim3
+from zsp_lite.alignment import ransac, umeyama
 from zsp_lite.data.labels import PoseLabel
 from zsp_lite.errors import rotation_matrix
-from zsp_lite.features import FeatureMap
 
 seeds = st.integers(0, 2**32 - 1)
 scales = st.floats(0.3, 4.0)

@@ -16,19 +16,17 @@ from small_backbones import ARCHITECTURES, save_all, small_vit
 from torch import nn
 from torch.testing import assert_close
 
+from zsp_lite import Backbone, InputError, load_backbone
 from zsp_lite.backbones import load
-from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import (
     BackboneConfig,
     PretrainedWeights,
     available_backbones,
-    load_backbone,
     obtained_by,
 )
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.identity import fingerprint
 from zsp_lite.choices import FACETS
-from zsp_lite.errors import InputError
 from zsp_lite.io.download import fetch
 
 

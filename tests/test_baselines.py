@@ -14,13 +14,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from synthetic_views import AT_HOME, look_at, render, true_pose, turned
 
-from zsp_lite.alignment import Sim3
+from zsp_lite import Camera, Frame, Matches, Sim3
 from zsp_lite.baselines import geometry
 from zsp_lite.baselines.geometry import align, essential_rotation, icp
 from zsp_lite.baselines.sift import Sift, dense_sift, mutual_matches
-from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import Frame
-from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error
 
 

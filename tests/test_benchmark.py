@@ -14,15 +14,14 @@ from numpy.testing import assert_allclose
 from refusals import refused
 from synthetic_views import CoordinateBackbone
 
+from zsp_lite import Co3D, InputError
 from zsp_lite.benchmark.run import evaluate, write_reports
 from zsp_lite.benchmark.runs import Run, add_lines, read_lines, read_run
 from zsp_lite.benchmark.tables import pair_figure
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import write_mask
 from zsp_lite.data.ground_truth import POSES_FILE, ObjectPose, object_poses
 from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.data.pairs import category_pairs, sample_pairs, true_poses, write_published_pairs
-from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.views import object_crop
 

@@ -34,9 +34,7 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone, true_pose
 
-from zsp_lite.align import align_category
-from zsp_lite.alignment import Sim3
-from zsp_lite.backbones.backbone import Backbone
+from zsp_lite import Backbone, Camera, Co3D, Frame, InputError, Sim3, ZeroShotPose, align_category
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark import identity, own
 from zsp_lite.benchmark.identity import fingerprint
@@ -53,14 +51,13 @@ from zsp_lite.benchmark.problem import Answer, FrameStore
 from zsp_lite.benchmark.run import evaluate, evaluate_pair
 from zsp_lite.benchmark.runs import LINES, Run, read_run
 from zsp_lite.benchmark.tables import every_table
-from zsp_lite.data.cameras import Camera
-from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.co3d import Pair
 from zsp_lite.data.exchange import write_questions
-from zsp_lite.data.frames import Frame, mask_to_bbox
+from zsp_lite.data.frames import mask_to_bbox
 from zsp_lite.data.labels import PoseLabel
 from zsp_lite.data.pairs import category_pairs
-from zsp_lite.errors import FatalError, InputError
-from zsp_lite.pipeline import ZeroShotPose, align_best_view
+from zsp_lite.errors import FatalError
+from zsp_lite.pipeline import align_best_view
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.views import object_crop
 

@@ -6,15 +6,14 @@ import pytest
 from benchmark_folder import BACKBONE, run_rows, small_folder
 from refusals import refused
 
+from zsp_lite import Co3D, ZeroShotPose
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.benchmark.methods import GROUPS, METHODS, resolve
 from zsp_lite.benchmark.problem import FrameStore, PairProblem
 from zsp_lite.benchmark.runs import Run, read_run
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import category_pairs
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import ZeroShotPose
 
 pytestmark = pytest.mark.slow
 

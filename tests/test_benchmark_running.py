@@ -26,7 +26,7 @@ from refusals import refused
 from synthetic_views import CoordinateBackbone
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from zsp_lite.backbones.backbone import Backbone
+from zsp_lite import Backbone, Co3D, InputError
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.execution import make_chunks, open_workers
 from zsp_lite.benchmark.identity import library_version
@@ -35,9 +35,8 @@ from zsp_lite.benchmark.run import evaluate, pair_evaluator, pairs_of_rows, writ
 from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, read_lines, read_run
 from zsp_lite.benchmark.tables import compare
 from zsp_lite.cli.main import main
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels, write_label
-from zsp_lite.errors import FatalError, InputError
+from zsp_lite.errors import FatalError
 from zsp_lite.threads import one_thread
 
 pytestmark = pytest.mark.slow

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from zsp_lite import FeatureMap, Matches
 from zsp_lite.best_view import correspondence_score, cyclical_iou, global_score, mask_iou
-from zsp_lite.features import FeatureMap
-from zsp_lite.matching import Matches
 
 
 def matches(similarities) -> Matches:

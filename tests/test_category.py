@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone
 
-from zsp_lite.alignment import Sim3
+from zsp_lite import Co3D, Sim3, ZeroShotPose
 from zsp_lite.category import (
     PairHypotheses,
     object_pairs,
@@ -24,10 +24,9 @@ from zsp_lite.category import (
     synchronise,
     world_hypotheses,
 )
-from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.co3d import Pair
 from zsp_lite.data.labels import read_labels
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import ZeroShotPose
 
 seeds = st.integers(0, 2**32 - 1)
 HALF_TURN = Sim3(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))

@@ -6,12 +6,11 @@ import pytest
 import torch
 from synthetic_views import CoordinateBackbone
 
+from zsp_lite import FeatureMap, ZeroShotPose
 from zsp_lite.choices import SOLVERS
 from zsp_lite.course.widgets import cycles
-from zsp_lite.features import FeatureMap
 from zsp_lite.matchers import MATCHERS
 from zsp_lite.matching import similarity
-from zsp_lite.pipeline import ZeroShotPose
 
 
 class Elsewhere(torch.Tensor):

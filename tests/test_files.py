@@ -18,13 +18,13 @@ from numpy.testing import assert_array_equal
 from refusals import refused
 from safetensors.torch import save
 
+from zsp_lite import Co3D, InputError
 from zsp_lite.backbones.checkpoints import read_checkpoint
 from zsp_lite.data import frames
 from zsp_lite.data.annotations import read_frame_index
-from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.frames import read_depth, read_image, read_mask
 from zsp_lite.data.pairs import read_pair_file
-from zsp_lite.errors import InputError
 from zsp_lite.io.files import GROWTH_ALLOWED, decompress, path_inside, plain_name, read_bytes
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import read_ply, write_ply

@@ -13,7 +13,7 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
-from zsp_lite.data.cameras import Camera
+from zsp_lite import Camera, Frame
 from zsp_lite.data.depth import (
     decode_depth,
     encode_depth,
@@ -22,7 +22,6 @@ from zsp_lite.data.depth import (
     unproject_depth,
 )
 from zsp_lite.data.frames import (
-    Frame,
     crop_to_object,
     frame_defect,
     mask_to_bbox,

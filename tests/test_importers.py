@@ -12,16 +12,14 @@ from numpy.testing import assert_allclose
 from refusals import refused
 from scipy.spatial import cKDTree
 
+from zsp_lite import Co3D, Frame, InputError, open_source
 from zsp_lite.course.synthetic.export import make_object
 from zsp_lite.course.synthetic.sequences import render_sequence
 from zsp_lite.data.check import check_folder
-from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.frames import Frame, write_image, write_mask
-from zsp_lite.errors import InputError
+from zsp_lite.data.frames import write_image, write_mask
 from zsp_lite.importers import CaptureFrame, open_capture
 from zsp_lite.importers.convert import fuse, import_captures, import_source
 from zsp_lite.importers.masks import masks_from_box
-from zsp_lite.importers.sources import open_source
 
 METRES = 0.13  # per unit of the rendered world: the object is about 30 cm wide
 

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.alignment import Sim3
+from zsp_lite import Sim3
 from zsp_lite.course.labelling import Labelling, align_picks
 from zsp_lite.course.labelling.session import MAX_RESIDUAL
 from zsp_lite.data.co3d import write_co3d

@@ -13,8 +13,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.alignment import Sim3
-from zsp_lite.data.co3d import Co3D, Pair, write_co3d
+from zsp_lite import Co3D, Sim3
+from zsp_lite.data.co3d import Pair, write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose, write_label
 from zsp_lite.data.pairs import shipped_pairs, write_published_pairs
 from zsp_lite.data.published import align_worlds, import_labels, transfer_labels

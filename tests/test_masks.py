@@ -9,9 +9,8 @@ import pytest
 from refusals import refused
 from synthetic_views import look_at
 
+from zsp_lite import Frame, InputError
 from zsp_lite.course.motorcycle import load_photograph
-from zsp_lite.data.frames import Frame
-from zsp_lite.errors import InputError
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth, separate_colours
 

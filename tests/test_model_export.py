@@ -10,12 +10,11 @@ import pytest
 from model_files import write_quad, write_wedge
 from refusals import refused
 
+from zsp_lite import Camera, Co3D, Frame
 from zsp_lite.course.synthetic import export
 from zsp_lite.course.synthetic.export import RENDERED_FILE, export_models
 from zsp_lite.course.true_matches import ground_truth_pair
-from zsp_lite.data.cameras import Camera
-from zsp_lite.data.co3d import Co3D, SequenceData
-from zsp_lite.data.frames import Frame
+from zsp_lite.data.co3d import SequenceData
 from zsp_lite.data.ground_truth import object_poses
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import shipped_pairs

@@ -26,19 +26,17 @@ from test_importers import write_lists
 from test_masks import overlap
 
 import zsp_lite
-from zsp_lite.alignment import Sim3
+from zsp_lite import Frame, PoseEstimate, Sim3, ZeroShotPose, estimate_pose, open_source
 from zsp_lite.course.samples import sample_data
 from zsp_lite.data.co3d import Pair
-from zsp_lite.data.frames import Frame, write_image, write_mask
+from zsp_lite.data.frames import write_image, write_mask
 from zsp_lite.data.labels import read_labels
-from zsp_lite.estimates import PoseEstimate
 from zsp_lite.importers.convert import scale_frame
-from zsp_lite.importers.sources import Source, open_pair, open_source, spread
+from zsp_lite.importers.sources import Source, open_pair, spread
 from zsp_lite.io.ply import read_ply
 from zsp_lite.metrics import rotation_error
-from zsp_lite.own_objects import estimate_pose, write_pair
+from zsp_lite.own_objects import write_pair
 from zsp_lite.pair_result import PairResult
-from zsp_lite.pipeline import ZeroShotPose
 
 pytestmark = pytest.mark.slow
 

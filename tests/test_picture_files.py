@@ -14,9 +14,9 @@ from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, look
 from test_importers import write_lists, write_nerfstudio
 from test_masks import DIRECTIONS, ball_on_floor, overlap
 
+from zsp_lite import InputError, estimate_pose, open_source
 from zsp_lite.data.cameras import camera_from_pose
 from zsp_lite.data.frames import encode_depth, write_mask
-from zsp_lite.errors import InputError
 from zsp_lite.importers import open_capture
 from zsp_lite.importers.convert import import_source
 from zsp_lite.importers.files import (
@@ -26,9 +26,8 @@ from zsp_lite.importers.files import (
     read_mask_file,
     read_picture,
 )
-from zsp_lite.importers.sources import open_pair, open_source
+from zsp_lite.importers.sources import open_pair
 from zsp_lite.metrics import rotation_error
-from zsp_lite.own_objects import estimate_pose
 
 DISC = np.hypot(*np.mgrid[-16:16, -20:20]) < 9  # the object, at (32, 40) pixels
 RING = (np.hypot(*np.mgrid[-16:16, -20:20]) < 11) & ~DISC

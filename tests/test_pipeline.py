@@ -16,14 +16,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, true_pose
 
-from zsp_lite import pipeline
+from zsp_lite import FeatureMap, InputError, PoseEstimate, ZeroShotPose, pipeline
 from zsp_lite.alignment import ransac
 from zsp_lite.best_view import correspondence_score
-from zsp_lite.errors import FatalError, InputError
-from zsp_lite.estimates import PoseEstimate, match_points
-from zsp_lite.features import FeatureMap
+from zsp_lite.errors import FatalError
+from zsp_lite.estimates import match_points
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import ZeroShotPose, align_best_view, view_alignment
+from zsp_lite.pipeline import align_best_view, view_alignment
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.views import extract_views, object_crop, patch_mask
 

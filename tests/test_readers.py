@@ -27,12 +27,11 @@ from test_importers import (
     write_nerfstudio,
 )
 
-from zsp_lite.data.cameras import Camera
+from zsp_lite import Camera, estimate_pose, open_source
 from zsp_lite.data.frames import write_image, write_mask
 from zsp_lite.importers import open_capture, recognise
 from zsp_lite.importers.capture import find_masks, sharpest, trusted
-from zsp_lite.importers.sources import open_source, spread_views
-from zsp_lite.own_objects import estimate_pose
+from zsp_lite.importers.sources import spread_views
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 

@@ -13,9 +13,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from plotly.offline import get_plotlyjs
 from synthetic_views import CoordinateBackbone
 
+from zsp_lite import Co3D
 from zsp_lite.choices import SOLVERS
 from zsp_lite.course.demo import N_TARGETS, demo_pairs, run_demo
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 from zsp_lite.io.files import REPOSITORY
 from zsp_lite.metrics import rotation_error

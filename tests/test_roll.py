@@ -9,11 +9,10 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, true_pose
 
+from zsp_lite import FeatureMap, estimate_pose
 from zsp_lite.cli import main as cli
 from zsp_lite.data.frames import turn_frame
-from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
-from zsp_lite.own_objects import estimate_pose
 
 
 class UprightBackbone(CoordinateBackbone):

@@ -17,9 +17,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
 import zsp_lite
-from zsp_lite import minimal
-from zsp_lite.alignment import Sim3
-from zsp_lite.backbones.load import load_backbone
+from zsp_lite import Sim3, load_backbone, minimal
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.pairs import labelled_categories, shipped_pairs
 from zsp_lite.features import log_bin

@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose
 from refusals import refused
 
 from tools.synthetic import SPLITS
+from zsp_lite import Co3D
 from zsp_lite.course.synthetic import export
 from zsp_lite.course.synthetic.assembly import make_shape
 from zsp_lite.course.synthetic.categories import CATEGORIES
@@ -29,7 +30,6 @@ from zsp_lite.course.synthetic.sequences import (
     soft_mask,
     stereo_depth,
 )
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.io.files import stable_hash
 

@@ -8,10 +8,8 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic_views import ELSEWHERE, REACH, CoordinateBackbone, look_at, render, true_pose, turned
 
-from zsp_lite.alignment import Sim3
-from zsp_lite.features import FeatureMap
+from zsp_lite import FeatureMap, Sim3, ZeroShotPose
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 from zsp_lite.views import extract_views, object_crop
 

@@ -15,11 +15,8 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 from synthetic_views import ELSEWHERE, CoordinateBackbone, matched_scene, true_pose, working_pose
 
-from zsp_lite.alignment import Sim3
-from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import Frame
+from zsp_lite import Camera, FeatureMap, Frame, Sim3
 from zsp_lite.estimates import Hypothesis
-from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
 from zsp_lite.verified.confidence import Calibration, evidence, modes, reliability_flags
 from zsp_lite.verified.poses import (

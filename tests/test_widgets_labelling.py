@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.alignment import Sim3
+from zsp_lite import Sim3
 from zsp_lite.course.labelling import Labelling
 from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label

@@ -21,17 +21,14 @@ import numpy as np
 import torch
 
 from tools.speed import seconds
-from zsp_lite.backbones.backbone import Backbone
-from zsp_lite.backbones.load import load_backbone
+from zsp_lite import Backbone, Co3D, ZeroShotPose, load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.choices import SOLVERS
 from zsp_lite.course.demo import example_pair
 from zsp_lite.course.samples import sample_data
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.pairs import labelled_categories, shipped_pairs
 from zsp_lite.io.files import REPOSITORY
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import extract_views, object_crop
 
 CORES, LARGEST_ANGLE = os.cpu_count(), 1.0  # degrees between the poses of two devices

@@ -14,10 +14,10 @@ from co3d_folders import sequence_data
 from safetensors.torch import save_file
 from test_importers import write_lists, write_nerfstudio
 
-from zsp_lite.backbones.load import load_backbone
+from zsp_lite import Co3D, load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.cli.main import main
-from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.exchange import read_stored_poses
 from zsp_lite.data.frames import read_depth, read_image, read_mask
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
