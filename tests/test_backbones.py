@@ -74,8 +74,11 @@ def backbone(place):
 def test_keys_are_float32_per_patch_and_saliency_spans_0_to_1(backbone, pictures):
     features = backbone(pictures)
     for one in features:
-        assert one.keys.shape == (4, 4, backbone.embed_dim) and one.keys.dtype == torch.float32
-        assert one.saliency.min() == 0 and one.saliency.max() == 1 and one.saliency.std() > 0.05
+        assert one.keys.shape == (4, 4, backbone.embed_dim)
+        assert one.keys.dtype == torch.float32
+        assert one.saliency.min() == 0
+        assert one.saliency.max() == 1
+        assert one.saliency.std() > 0.05
     assert not torch.allclose(features[0].keys, features[1].keys)
 
 
@@ -224,9 +227,8 @@ def test_the_embedded_backbone_is_found_by_its_name(vit, tmp_path, monkeypatch):
         "checkpoint .*zsp-tiny.safetensors cannot be read: no such file", load_backbone, "zsp-tiny"
     )
     save_file(vit.state_dict(), path, metadata={"num_heads": "1"})
-    assert (
-        load_backbone("zsp-tiny").name == "zsp-tiny" and available_backbones()["zsp-tiny"] == path
-    )
+    assert load_backbone("zsp-tiny").name == "zsp-tiny"
+    assert available_backbones()["zsp-tiny"] == path
     assert (
         load.as_backbone(path).embed_dim == load.as_backbone(str(path)).embed_dim == vit.embed_dim
     )
@@ -324,7 +326,8 @@ def test_dino_models_come_from_the_server(server, vit, pictures, tmp_path, cache
     assert obtained_by("dino_vits8") == "not downloaded: zsp-lite weights fetch dino_vits8"
     assert available_backbones()["dino_vits8"] is None
     loaded = load_backbone("dino_vits8", "cpu")
-    assert loaded.name == "dino_vits8" and available_backbones()["dino_vits8"] == cache / "vit.pth"
+    assert loaded.name == "dino_vits8"
+    assert available_backbones()["dino_vits8"] == cache / "vit.pth"
     assert_same_features(loaded(pictures), Backbone(vit, "small", device="cpu")(pictures))
 
 

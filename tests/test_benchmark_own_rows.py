@@ -506,7 +506,7 @@ def test_a_spreadsheets_poses_are_read_and_the_note_names_their_convention(
             rotation = true.T if index < 8 else true
         numbers = " ".join(f"{value:.4f}".replace(".", ",") for value in rotation.ravel())
         lines.append(f"{pair.key};{pair.target_frames[1]};{numbers};;")
-    (tmp_path / "mine.csv").write_text("\ufeff" + "\r\n".join(lines), encoding="utf-8")
+    (tmp_path / "mine.csv").write_text("\ufeff" + "\r\n".join(lines), "utf-8")
     run_rows({"mine": str(tmp_path / "mine.csv")}, tmp_path / "run", 12, 3)
     found = read_run(tmp_path / "run")
     run_rows(["oracle-view"], tmp_path / "run", 12, 3)  # the note stays with the row
@@ -830,10 +830,8 @@ def test_a_row_that_fails_does_not_stop_the_others(workers, tmp_path, monkeypatc
     )["methods"]
     assert found.pop("ours") == run_rows(["ours"], tmp_path / "alone", 2)["ours"]
     for name, (_, told) in rows.items():
-        assert (
-            re.match(told, read_run("run").row(name)["failed"].iloc[0])
-            and found[name]["median"] == 180
-        )
+        assert re.match(told, read_run("run").row(name)["failed"].iloc[0])
+        assert found[name]["median"] == 180
         assert f"{name} failed on 2 of 2 pairs" in caplog.text
 
 

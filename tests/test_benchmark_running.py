@@ -114,7 +114,7 @@ def test_an_interrupted_run_has_tables_figures_and_comparisons_of_what_is_finish
 ):
     stored = len(pairs_in(killed))
     assert 4 <= stored < PAIRS
-    assert main(["tables", str(killed), "--out", str(tmp_path)]) == 0
+    assert main(f"tables {killed} --out {tmp_path}".split()) == 0
     assert (tmp_path / "tables/all_rows.csv").is_file()
     assert (tmp_path / "figures/error_curves.pdf").is_file()
     assert read_run(killed).summary["methods"]["ours"]["n"] == stored
@@ -199,8 +199,8 @@ def row(problem):
 def test_an_interrupt_ends_a_run_and_its_workers_with_one_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "waiting_rows.py").write_text(WAITS)
-    words = ["benchmark", "--data", str(small_folder()), "--pairs", "12", "--out", "run"]
-    words += ["--methods", "waits=waiting_rows:row"]
+    options = "--pairs 12 --out run --methods waits=waiting_rows:row"
+    words = f"benchmark --data {small_folder()} {options}".split()
     command = [sys.executable, "-m", "zsp_lite", *words, "--workers", "2"]
     with subprocess.Popen(
         command, env=PATHS, stderr=subprocess.PIPE, text=True, start_new_session=True
@@ -257,7 +257,7 @@ def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch
     def look() -> None:
         seen.append(read_run(tmp_path).summary["methods"]["ours-bv"]["n"])
         if len(seen) == 3:
-            assert main(["tables", str(tmp_path), "--out", str(tmp_path / "reports")]) == 0
+            assert main(f"tables {tmp_path} --out {tmp_path}/reports".split()) == 0
             refused("another process is writing", evaluate, *arguments)
 
     arguments = (small_folder(), QUICK, ["ours-bv"], 2, 3, tmp_path)
@@ -377,7 +377,7 @@ def test_features_are_computed_once_for_all_rows(tmp_path):
             batches.append(len(images))
             return super().__call__(images)
 
-    rows = ["ours", "ours-k30", "ours-n1", "ours-globalsim", "ours-n6"]
+    rows = "ours ours-k30 ours-n1 ours-globalsim ours-n6".split()
     run_rows(rows, tmp_path, 4, 3, backbone=Counting(grid=8))
     frames = set()
     for pair in pairs_to_evaluate(rows, 4, 3):

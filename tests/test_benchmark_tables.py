@@ -32,7 +32,7 @@ from zsp_lite.data.co3d import Pair
 
 pytestmark = pytest.mark.slow
 
-ROWS = list(resolve(["table1", "ablations", "views", "ours-bv", "rootsift", "verified"]))
+ROWS = list(resolve("table1 ablations views ours-bv rootsift verified".split()))
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_the_table_of_all_rows_has_chosen_metrics(three):
 
 
 def test_rows_that_see_more_stand_apart_from_those_that_see_the_pair_only(tmp_path):
-    rows = ["ours", "category", "scans-8", "verified", "category-n3", "scans-2"]
+    rows = "ours category scans-8 verified category-n3 scans-2".split()
     summary = made_up_run(tmp_path, rows).summary
     found = by_name(every_table(summary))
     stand = {name: list(found[name].cells.index) for name in ("with_others", "with_scans")}

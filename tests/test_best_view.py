@@ -66,4 +66,5 @@ def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
     # view.
     shifted = torch.eye(6).roll(1, 0)
     first, last = everything & (torch.arange(6) == 0), everything & (torch.arange(6) == 5)
-    assert cyclical_iou(shifted, first, last) == 1 and cyclical_iou(shifted, last, first) == 0
+    assert cyclical_iou(shifted, first, last) == 1
+    assert cyclical_iou(shifted, last, first) == 0

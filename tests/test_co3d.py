@@ -30,7 +30,8 @@ def first(root):
 
 def test_a_pair_is_loaded_as_its_reference_frame_and_its_target_frames_in_order(root):
     reference, targets = Co3D(root).load_pair(Pair("chair", "a_1", 2, "b_2", (3, 0)))
-    assert reference.name == "a_1/2" and [target.name for target in targets] == ["b_2/3", "b_2/0"]
+    assert reference.name == "a_1/2"
+    assert [target.name for target in targets] == ["b_2/3", "b_2/0"]
     refused(
         "chair/b_2 has no frame number 9",
         lambda: Co3D(root).load_pair(Pair("chair", "a_1", 2, "b_2", (9,))),
@@ -103,7 +104,8 @@ def test_the_frame_list_keeps_file_order_and_frames_are_sorted_by_number(root):
 def test_optional_fields_may_be_null_and_unknown_ones_are_ignored(root):
     edit_first(root, lambda frame: frame.update(depth=None, mask=None, novelty={"deep": [1, 2]}))
     frame = Co3D(root).load(first(root))
-    assert frame.depth is None and frame.mask is None
+    assert frame.depth is None
+    assert frame.mask is None
     nothing = dict.fromkeys(("video", "point_cloud", "viewpoint_quality_score"))
     edit_json(root / "chair/sequence_annotations.jgz", lambda items: items[0].update(nothing))
     dataset = Co3D(root)

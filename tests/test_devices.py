@@ -58,4 +58,5 @@ def test_a_matcher_does_not_ask_another_device_for_float64(name):
     expected, found = (
         MATCHERS[name](*some) for some in (arguments, [x.as_subclass(Elsewhere) for x in arguments])
     )
-    assert torch.equal(found[0], expected[0]) and torch.equal(found[1], expected[1])
+    assert torch.equal(found[0], expected[0])
+    assert torch.equal(found[1], expected[1])

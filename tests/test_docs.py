@@ -41,7 +41,7 @@ _INLINE_CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 def markdown(page: Path) -> str:
     """The text of a Markdown file, or of a notebook's Markdown cells."""
     if page.suffix != ".ipynb":
-        return page.read_text(encoding="utf-8")
+        return page.read_text("utf-8")
     cells = json.loads(page.read_bytes())["cells"]
     return "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
 
@@ -75,7 +75,7 @@ def test_every_module_and_file_of_the_package_that_is_named_exists(page):
 def all_code() -> str:
     folders = REPOSITORY / "zsp_lite", REPOSITORY / "notebooks"
     paths = (path for folder in folders for path in folder.rglob("*") if path.suffix in CODE)
-    return "\n".join(path.read_text(encoding="utf-8") for path in paths)
+    return "\n".join(path.read_text("utf-8") for path in paths)
 
 
 @pytest.mark.parametrize("page", PAGES, **ids)
@@ -182,7 +182,7 @@ def test_the_examples_of_methods_of_ones_own_run_as_they_stand(
     monkeypatch.syspath_prepend(tmp_path)
     names = re.findall(r"`(\w+\.py)`:?\n", markdown(page))
     for name, block in zip(names, python_blocks(page), strict=True):
-        Path(name).write_text(block, encoding="utf-8")
+        Path(name).write_text(block, "utf-8")
     few = "--categories bicycle --pairs 1 --targets 2".split()
     rows = {}
     for line in command_blocks(page):
@@ -216,11 +216,12 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(REPOSITORY)
     names: dict = {}
     exec(first, names)
-    assert not names["estimate"].flags and capsys.readouterr().out
+    assert not names["estimate"].flags
+    assert capsys.readouterr().out
 
     # The second block gets frames of a camera, and reads the scan of another object: here sample
     # sequences.
-    from test_importers import write_lists
+    from test_importers import HALF_PIXEL, write_lists
 
     dataset, scans = names["dataset"], []
     for name in ("scooter", "scooter2"):
@@ -228,14 +229,15 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
         scans.append([replace(dataset.load(frame), name=str(k)) for k, frame in enumerate(frames)])
     (tmp_path / "scans/other_cup/pictures").mkdir(parents=True)
     write_lists(tmp_path / "scans/other_cup", scans[1])
-    names["K"] = scans[0][0].camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    names["K"] = scans[0][0].camera.K - HALF_PIXEL
     names["camera"] = [
         (one.rgb, np.rint(1000 * one.depth).astype(np.uint16), np.linalg.inv(one.camera.matrix))
         for one in scans[0]
     ]
     monkeypatch.chdir(tmp_path)
     exec(second, names)
-    assert names["pose"].confidence > 0.5 and len(names["cups"].votes) == 8
+    assert names["pose"].confidence > 0.5
+    assert len(names["cups"].votes) == 8
     labels = read_labels(REPOSITORY / "data_samples", "motorcycle")
     between = labels["scooter2"].trans @ np.linalg.inv(labels["scooter"].trans)
     assert rotation_error(names["cups"].world_sim3.R, between[:3, :3]) < 15
@@ -245,8 +247,8 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
 def test_the_stored_drawings_are_those_of_the_script():
     assert {path.stem for path in drawings.FOLDER.iterdir()} == set(drawings.DRAWINGS)
     for name, draw in drawings.DRAWINGS.items():
-        assert (drawings.FOLDER / f"{name}.svg").read_text(encoding="utf-8") == draw(), name
-    assert drawings.ROOMS_FILE.read_text(encoding="utf-8") == drawings.draw_rooms(), (
+        assert (drawings.FOLDER / f"{name}.svg").read_text("utf-8") == draw(), name
+    assert drawings.ROOMS_FILE.read_text("utf-8") == drawings.draw_rooms(), (
         "run python -m tools.drawings"
     )
 

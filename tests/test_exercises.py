@@ -38,9 +38,7 @@ ASSIGNMENTS = sorted(folder.name for folder in (EXERCISES / "source").iterdir())
 
 # For each assignment and task: the name of a mistake, the part of the solution to replace, and its
 # replacement.
-MISTAKES = json.loads(
-    Path(__file__).with_name("exercise_mistakes.json").read_text(encoding="utf-8")
-)
+MISTAKES = json.loads(Path(__file__).with_name("exercise_mistakes.json").read_text("utf-8"))
 
 # For each assignment: a statement of a marking guide, and an expression that holds for what the
 # given cells computed.
@@ -458,7 +456,7 @@ def test_git_sees_no_hand_in(collected):
 def feedback(collected) -> str:
     """The page for Ada."""
     path = collected.folder / "feedback/123" / METRICS / f"{METRICS}.html"
-    return path.read_text(encoding="utf-8")
+    return path.read_text("utf-8")
 
 
 def test_the_feedback_has_a_score_for_each_task_and_answer_and_the_hidden_tests(feedback):
@@ -535,7 +533,7 @@ def test_there_are_five_exercises():
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
 def test_the_readme_lists_the_five_tasks_of_an_exercise(assignment):
-    readme = (EXERCISES / "README.md").read_text(encoding="utf-8").lower()
+    readme = (EXERCISES / "README.md").read_text("utf-8").lower()
     text = "\n".join(cell.source for cell in source(assignment).cells)
     titles = re.findall(r"^## Task \d · (.*) \(4 points", text, re.MULTILINE)
     assert len(titles) == 5

@@ -145,7 +145,9 @@ def test_arrays_of_a_camera_become_a_frame_with_half_integer_pixel_centres():
     pose[:3, :3], pose[:3, 3] = random_camera(default_rng(0)).R, (1, 2, 3)
     frame = Frame.from_arrays(**arrays(pose=pose, name="cup"))
     camera = frame.camera
-    assert frame.name == "cup" and frame.mask is None and camera.size == SIZE
+    assert frame.name == "cup"
+    assert frame.mask is None
+    assert camera.size == SIZE
     assert_allclose([camera.focal_length, camera.principal_point], [[40, 41], [16, 12]])
     assert_allclose(camera.to_world(np.eye(3)), np.eye(3) @ pose[:3, :3].T + (1, 2, 3))
     assert_array_equal(frame.depth[:2, :8], 0)
@@ -254,11 +256,9 @@ def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension, opti
 def test_a_mask_file_of_zeros_and_ones_is_an_empty_mask_for_all(tmp_path):
     assert cv2.imwrite(str(tmp_path / "mask.png"), np.eye(*SIZE, dtype=np.uint8))
     frame = replace(sequence_data("one").frames[0], mask=read_mask(tmp_path / "mask.png"))
-    assert (
-        frame.mask.any()
-        and frame_defect(frame) == "empty object mask"
-        and not len(world_cloud([frame])[0])
-    )
+    assert frame.mask.any()
+    assert frame_defect(frame) == "empty object mask"
+    assert not len(world_cloud([frame])[0])
     assert_array_equal(object_crop(frame, 8).rgb, resize_frame(frame, (8, 8)).rgb)
 
 
@@ -275,7 +275,7 @@ def test_an_interrupted_write_leaves_the_old_file_alone(tmp_path, monkeypatch):
     assert (tmp_path / "file").read_bytes() == b"old"
 
 
-def test_a_pixel_is_on_the_object_if_that_is_more_probable_than_not_and_its_depth_is_known():
+def test_a_pixel_is_on_the_object_if_probably_so_and_of_known_depth():
     mask = np.array([[0.0, 0.5, 0.55, 0.85, 1.0, 1.0]], np.float32)
     depth = np.array([[2.0, 2.0, 2.0, 2.0, 2.0, 0.0]], np.float32)
     frame = Frame(np.zeros((1, 6, 3), np.uint8), depth, mask, random_camera(0, (1, 6)))
@@ -296,7 +296,7 @@ def frontal(size):
     return Camera(np.eye(3), np.zeros(3), np.array([50.0, 60.0]), centre, size)
 
 
-def test_the_bits_are_those_of_a_float16_and_values_that_are_not_positive_and_finite_are_unknown():
+def test_the_bits_are_those_of_a_float16_and_only_positive_finite_values_known():
     assert encode_depth(np.array([[1.0, 0.0]])).tolist() == [[0x3C00, 0]]
     assert decode_depth(np.array([[0x4000]], np.uint16), 3.0).tolist() == [[6.0]]
     infinite, nan, negative = 0x7C00, 0x7E00, 0xBC00
@@ -319,7 +319,8 @@ def test_filled_depth_stays_between_the_known_depths(seed):
     depth = np.where(rng.random((20, 24)) < 0.3, rng.uniform(1, 5, (20, 24)), 0).astype(np.float32)
     depth[3, 4] = 2.0
     filled = inpaint_depth(depth)
-    assert filled.min() >= depth[depth > 0].min() and filled.max() <= depth.max()
+    assert filled.min() >= depth[depth > 0].min()
+    assert filled.max() <= depth.max()
     assert_array_equal(inpaint_depth(filled), filled)  # complete depth needs no filling
     refused("no known pixel", inpaint_depth, 0 * depth)
 
@@ -355,7 +356,8 @@ def test_a_patchs_point_has_the_lower_quartile_of_its_known_depths(seed):
     for row, col, expected in patch_depths_one_by_one(depth, (6, 8)):
         assert known[row, col] == (expected is not None)
         # the pixel is one of the patch
-        assert rows[row, col] // 4 == row and cols[row, col] // 4 == col
+        assert rows[row, col] // 4 == row
+        assert cols[row, col] // 4 == col
         if expected is not None:
             assert points[row, col, 2] == expected == depth[rows[row, col], cols[row, col]]
 
@@ -365,19 +367,19 @@ def test_a_patch_without_depth_takes_the_filled_depth_at_its_centre():
     depth[4:8, 8:12] = 0
     camera = frontal((16, 16))
     points, known = patch_points(depth, camera, (4, 4))
-    assert not known[1, 2] and known.sum() == 15
+    assert not known[1, 2]
+    assert known.sum() == 15
     centre = camera.unproject_camera(np.array([10.5, 6.5]), inpaint_depth(depth)[6, 10])
     assert_allclose(points[1, 2], centre)
     measured, same = patch_points(depth, camera, (4, 4), inpaint=False)
-    assert (
-        (same == known).all()
-        and (measured[known] == points[known]).all()
-        and (measured[1, 2] == 0).all()
-    )
+    assert (same == known).all()
+    assert (measured[known] == points[known]).all()
+    assert (measured[1, 2] == 0).all()
 
 
 def test_patches_need_not_divide_the_image():
     depth = np.arange(1, 36, dtype=np.float32).reshape(5, 7)
     points, known = patch_points(depth, frontal((5, 7)), (2, 3))
-    assert points.shape == (2, 3, 3) and known.all()
+    assert points.shape == (2, 3, 3)
+    assert known.all()
     assert points[1, 2, 2] == np.sort(depth[2:, 4:].ravel())[2]

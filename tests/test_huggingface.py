@@ -72,7 +72,7 @@ def projection(architecture, block, x, facet: str):
 
 @pytest.mark.parametrize("kind", ARCHITECTURES)
 @pytest.mark.parametrize("facet", FACETS)
-def test_facets_are_the_projections_of_the_normalised_input_of_the_block_and_its_output(
+def test_facets_are_the_projections_of_the_blocks_normalised_input_and_its_output(
     kind, folders, facet
 ):
     architecture = ARCHITECTURES[kind]

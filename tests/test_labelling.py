@@ -97,7 +97,8 @@ def test_accepting_writes_the_published_format_and_the_references_identity(root)
     assert_allclose(labels["a"].trans @ [*centre, 1], [*(1.3 * turn @ centre + 2), 1])
     assert_array_equal(labels["best"].trans, np.eye(4))
     states = {row.sequence: (row.state, row.rms) for row in Labelling(root, "chair").progress()}
-    assert states["a"] == ("accepted", pytest.approx(0, abs=1e-9)) and states["b"] == ("open", None)
+    assert states["a"] == ("accepted", pytest.approx(0, abs=1e-9))
+    assert states["b"] == ("open", None)
 
 
 def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
@@ -123,9 +124,8 @@ def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
         "a",
     )
     labelling.skip("b")
-    assert Labelling(root, "chair").progress()[-1].state == "skipped" and "b" not in read_labels(
-        root, "chair"
-    )
+    assert Labelling(root, "chair").progress()[-1].state == "skipped"
+    assert "b" not in read_labels(root, "chair")
     labelling.put("b", [])
     labelling.pick("b", (0, 0, 0))
     assert labelling.progress()[-1].state == "open"
@@ -214,7 +214,8 @@ def test_a_proposal_becomes_the_label_where_nothing_is_picked(root):
             label_bytes(PoseLabel(trans, name, "a")),
         )
     labelling = Labelling(root, "chair")
-    assert labelling.reference == "best" and labelling.proposal("b") is None
+    assert labelling.reference == "best"
+    assert labelling.proposal("b") is None
     assert_allclose(labelling.proposal("a").R, turn[:3, :3].T)
     refused("sequence b has 0 of 0 keypoints", labelling.accept, "b")
     labelling.accept("a")

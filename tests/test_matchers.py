@@ -46,7 +46,8 @@ def test_mutual_neighbours_are_each_others_choice_among_the_objects_patches():
     for u in range(len(sim)):
         v = int(hidden[u].argmax())
         if on1[u] and int(hidden[:, v].argmax()) == u:
-            assert partner[u] == v and score[u] == sim[u, v]
+            assert partner[u] == v
+            assert score[u] == sim[u, v]
         else:
             assert score[u] == -torch.inf
 
@@ -56,7 +57,9 @@ def test_partners_are_on_the_objects_and_nothing_is_found_without_one(name):
     sim, (on1, on2) = similarities(), masks()
     partner, score = MATCHERS[name](sim, on1, on2)
     found = score.isfinite()
-    assert found.any() and on1[found].all() and on2[partner[found]].all()
+    assert found.any()
+    assert on1[found].all()
+    assert on2[partner[found]].all()
     assert not MATCHERS[name](sim, on1, torch.zeros_like(on2))[1].isfinite().any()
 
 
@@ -65,7 +68,8 @@ def test_every_matcher_finds_an_image_in_itself(name):
     features = feature_map(3)
     for kmeans in (False, True):
         found = match(features, features, k=10, kmeans=kmeans, matcher=name)
-        assert len(found) == 10 and (found.reference == found.target).all()
+        assert len(found) == 10
+        assert (found.reference == found.target).all()
         assert found.similarity == pytest.approx(np.ones(10), abs=1e-5)
 
 

@@ -80,7 +80,8 @@ def test_the_interval_of_an_accuracy_matches_the_binomial():
     # 40 of 100 solved: the normal approximation gives 40 +- 1.96 * sqrt(.4 * .6 / 100) = 40 +- 9.6.
     errors = np.r_[np.zeros(40), np.full(60, 90.0)]
     low, high = bootstrap_ci(errors, acc30)
-    assert low == pytest.approx(30.4, abs=1.5) and high == pytest.approx(49.6, abs=1.5)
+    assert low == pytest.approx(30.4, abs=1.5)
+    assert high == pytest.approx(49.6, abs=1.5)
     drawn = default_rng(0).integers(100, size=(2000, 100))
     assert (low, high) == pytest.approx(
         tuple(np.percentile(accuracy(errors[drawn], 30), [2.5, 97.5]))
@@ -168,20 +169,18 @@ def test_a_paired_differences_interval_and_p_value_are_those_of_its_replicates()
     gains = [100 * np.average((second < 30) * 1.0 - (first < 30), weights=row) for row in weights]
     assert result["accuracy_gain_ci"] == pytest.approx(list(np.percentile(gains, [2.5, 97.5])))
     below = np.sum(np.array(gains) < 1e-9)
-    assert result["accuracy_gain"] > 0 and result["accuracy_gain_p"] == pytest.approx(
-        2 * (below + 1) / 2001
-    )
+    assert result["accuracy_gain"] > 0
+    assert result["accuracy_gain_p"] == pytest.approx(2 * (below + 1) / 2001)
 
 
 def test_a_method_does_not_differ_from_itself_and_one_pair_proves_nothing():
     result = paired_test([90.0], [10.0])
-    assert (
-        result["accuracy_gain"] == 100
-        and result["sign_test_p"] == result["permutation_test_p"] == 1
-    )
+    assert result["accuracy_gain"] == 100
+    assert result["sign_test_p"] == result["permutation_test_p"] == 1
     errors = np.linspace(0, 180, 30)
     result = paired_test(errors, errors)
     assert {result[f"{name}_p"] for name in ("accuracy_gain", "sign_test", "permutation_test")} == {
         1
     }
-    assert result["accuracy_gain"] == 0 and result["accuracy_gain_ci"] == [0, 0]
+    assert result["accuracy_gain"] == 0
+    assert result["accuracy_gain_ci"] == [0, 0]

@@ -477,8 +477,8 @@ def test_depth_in_another_unit_is_questioned(image, frames, tmp_path, unit, ques
 
 def test_the_command_prints_the_poses_and_names_its_files(loaded, ellipsoids, tmp_path, run):
     folder = ellipsoids.root / "ellipsoid"
-    options = "--targets 3 --solver both --reference-frame 2 --out".split()
-    text = run(["estimate", folder / "a", folder / "b", *options, tmp_path])
+    options = "--targets 3 --solver both --reference-frame 2"
+    text = run(f"estimate {folder}/a {folder}/b {options} --out {tmp_path}")
     assert f"{Path('ellipsoid/a')}, frame 2 (mask: given)" in text
     assert "The rotations of both solvers differ by" in text
     for name in ("report.html", "target.ply", "aligned_paper.ply", "aligned_verified.ply"):
@@ -492,8 +492,8 @@ def estimate_paper(loaded, pictures, tmp_path, monkeypatch, run) -> Callable[[st
     cup, mug, _ = pictures
     monkeypatch.setattr("zsp_lite.viz.report.write_report", lambda path, *_, **__: path)
     intrinsics = ",".join(map(str, INTRINSICS))
-    words = ["estimate", cup, mug, "--intrinsics", intrinsics, "--solver", "paper", "--out"]
-    return lambda options: run([*words, tmp_path, *options.split()])
+    line = f"estimate {cup} {mug} --intrinsics {intrinsics} --solver paper --out {tmp_path}"
+    return lambda options: run(f"{line} {options}")
 
 
 def test_the_command_prints_json_alone(estimate_paper, tmp_path):

@@ -89,13 +89,10 @@ def test_all_pairs_are_different_and_too_large_a_number_gives_all_there_are(tmp_
         write_label(tmp_path, "chair", PoseLabel(np.eye(4), name, "a"))
     total = 62  # both directions of every two sequences: 2 * (2 * 3 + 2 * 5 + 3 * 5)
     every = sample_pairs(Co3D(tmp_path), "chair", total, 2)
-    assert len({pair.key for pair in every}) == total and {
-        pair.reference_sequence for pair in every[-4:]
-    } == {"c"}
-    assert (
-        all(sample_pairs(Co3D(tmp_path), "chair", n, 2) == every[:n] for n in range(total))
-        and not caplog.text
-    )
+    assert len({pair.key for pair in every}) == total
+    assert {pair.reference_sequence for pair in every[-4:]} == {"c"}
+    assert all(sample_pairs(Co3D(tmp_path), "chair", n, 2) == every[:n] for n in range(total))
+    assert not caplog.text
     assert sample_pairs(Co3D(tmp_path), "chair", 10**9, 2) == every
     assert "category chair has 62 different pairs of 2 targets, not 1000000000" in caplog.text
 

@@ -87,9 +87,7 @@ STORED = np.where(
 )
 
 
-@pytest.mark.parametrize(
-    "name", ["d.npy", "d.npz", "d.tiff", "d.pfm", "d.geometric.png", "16.png", "16.tiff"]
-)
+@pytest.mark.parametrize("name", "d.npy d.npz d.tiff d.pfm d.geometric.png 16.png 16.tiff".split())
 def test_every_kind_of_depth_file_is_read_with_zeros_where_it_is_unknown(tmp_path, name):
     path, values = tmp_path / name, STORED if "16" in name else FLOAT
     if path.suffix == ".npy":
@@ -232,9 +230,7 @@ def test_a_capture_of_turned_photographs_keeps_its_world_and_refuses_mirrored_on
         ((9000, 0, 320, 0, 9000, 240, 0, 0, 1), "view of 4.07 degrees"),
     ],
 )
-def test_intrinsics_of_another_image_or_unit_are_questioned_with_the_corrected_numbers(
-    values, message
-):
+def test_intrinsics_of_another_image_or_unit_are_questioned_and_corrected(values, message):
     camera = camera_from_pose(np.eye(4), values, (480, 640), "a.jpg")
     if message and "view of" in message:
         refused(message, question_intrinsics, camera, "a.jpg")
@@ -264,7 +260,8 @@ def test_frames_without_a_mask_get_one_by_depth_and_are_named(tmp_path):
         )
     source = open_source(tmp_path)
     frames = source.load([0, 1])
-    assert source.mask == "given" and overlap(frames[0].mask, scenes[0][1]) > 0.95
+    assert source.mask == "given"
+    assert overlap(frames[0].mask, scenes[0][1]) > 0.95
     assert_array_equal(frames[1].mask, views[1].mask)
     missing, inverted = source.flags(source.load([0, 1, 3]))
     assert inverted.endswith(
@@ -275,7 +272,8 @@ def test_frames_without_a_mask_get_one_by_depth_and_are_named(tmp_path):
     done = import_source(
         open_source(tmp_path, masks=tmp_path / "others"), tmp_path / "some", "ball", "one"
     )
-    assert done.frames == 4 and done.flags[0] == "no mask is given for 0.jpg: found by depth"
+    assert done.frames == 4
+    assert done.flags[0] == "no mask is given for 0.jpg: found by depth"
     assert done.flags[1].startswith(
         "the masks may be wrong: those of 1 of 4 frames cover most of the border"
     )
@@ -318,7 +316,8 @@ def test_the_pose_of_a_sideways_portrait_is_that_of_the_upright_one(tmp_path, po
             "number of target views: 4, all that there are, not 9" in flag
             for flag in found.estimate.flags
         )
-    assert rotation_error(poses[0], poses[1]) < 3 and rotation_error(poses[0], poses[2]) < 15
+    assert rotation_error(poses[0], poses[1]) < 3
+    assert rotation_error(poses[0], poses[2]) < 15
     assert {path.name for path in out.iterdir()} == {
         "report.html",
         "target.ply",
@@ -328,7 +327,7 @@ def test_the_pose_of_a_sideways_portrait_is_that_of_the_upright_one(tmp_path, po
     assert [one.load([0])[0].camera.K[0, 0] for one in pair] == [190, 190, 200]
 
 
-def test_a_link_to_a_sequence_is_one_and_the_root_of_the_disk_is_no_folder_for_results(
+def test_a_link_to_a_sequence_is_one_and_the_disks_root_no_folder_for_results(
     links, tmp_path, ellipsoids
 ):
     (tmp_path / "mine").symlink_to(ellipsoids.root / "ellipsoid/a")

@@ -54,9 +54,11 @@ def test_the_true_pose_is_found_within_a_few_degrees(estimate, reference, target
     assert estimate.sim3.scale == pytest.approx(truth.scale, rel=0.1)
     centre = reference.camera.to_camera(np.zeros(3))
     assert_allclose(estimate.sim3.apply(centre), truth.apply(centre), atol=0.1)
-    assert not estimate.flags and estimate.note == ""
+    assert not estimate.flags
+    assert estimate.note == ""
     assert list(estimate.timings) == ["features", "matching", "view", "alignment"]
-    assert estimate.alternatives == () and estimate.confidence is None
+    assert estimate.alternatives == ()
+    assert estimate.confidence is None
 
 
 def test_propagation_gives_the_pose_against_every_target_view(estimate, reference, targets):
@@ -154,7 +156,8 @@ def test_the_range_of_scales_reaches_ransac(views, monkeypatch):
     free = estimate_noisy(views, trials=1000)
     monkeypatch.setattr(pipeline, "SCALE_RANGE", (1.2, 1.25))
     bounded = estimate_noisy(views, trials=1000)
-    assert free.sim3.scale < 1.2 <= bounded.sim3.scale <= 1.25 and not bounded.flags
+    assert free.sim3.scale < 1.2 <= bounded.sim3.scale <= 1.25
+    assert not bounded.flags
 
 
 def test_a_given_matcher_selector_and_solver_are_called(views):
@@ -164,7 +167,8 @@ def test_a_given_matcher_selector_and_solver_are_called(views):
     assert len(estimate_noisy(views, matcher=match_nothing).matches) == 0
     numbers = iter([1.0, 3.0, 2.0])
     estimate = estimate_noisy(views, view_selector=lambda pair: next(numbers))
-    assert estimate.view == 1 and estimate.view_scores.tolist() == [1, 3, 2]
+    assert estimate.view == 1
+    assert estimate.view_scores.tolist() == [1, 3, 2]
 
     def first_view(reference, targets, matched, *, seed, threshold):
         sim3, inliers = ransac(
@@ -229,13 +233,12 @@ def test_nothing_that_a_plug_in_overwrites_reaches_the_rest(reference, targets, 
     assert_array_equal(found.sim3.matrix, expected.sim3.matrix)
     views, others = ((one.reference_view, *one.target_views) for one in (found, expected))
     for one, other in zip(views, others, strict=True):
-        assert torch.equal(one.features.keys, other.features.keys) and torch.equal(
-            one.foreground, other.foreground
-        )
-        assert np.array_equal(one.frame.rgb, other.frame.rgb) and np.array_equal(
-            one.frame.depth, other.frame.depth
-        )
-    assert np.array_equal(reference.rgb, before[0]) and np.array_equal(targets[0].depth, before[1])
+        assert torch.equal(one.features.keys, other.features.keys)
+        assert torch.equal(one.foreground, other.foreground)
+        assert np.array_equal(one.frame.rgb, other.frame.rgb)
+        assert np.array_equal(one.frame.depth, other.frame.depth)
+    assert np.array_equal(reference.rgb, before[0])
+    assert np.array_equal(targets[0].depth, before[1])
 
 
 @pytest.mark.parametrize(
@@ -276,10 +279,8 @@ def test_seed_and_threshold_reach_the_verified_solver(views):
     verified = estimate_noisy(views, VERIFIED)
     assert scores(estimate_noisy(views, VERIFIED, seed=1)) != scores(verified)
     wide = estimate_noisy(views, VERIFIED, threshold=2.0)
-    assert (
-        wide.inliers.sum() > verified.inliers.sum()
-        and (wide.sim3.matrix == verified.sim3.matrix).all()
-    )
+    assert wide.inliers.sum() > verified.inliers.sum()
+    assert (wide.sim3.matrix == verified.sim3.matrix).all()
 
 
 def test_a_patch_is_foreground_from_a_quarter_of_its_area(reference):
@@ -302,8 +303,11 @@ class TwoPatchBackbone(CoordinateBackbone):
 
 def test_too_few_matches_fall_back_to_the_best_view_with_a_flag(reference, targets):
     estimate = ZeroShotPose(TwoPatchBackbone()).estimate(reference, targets)
-    assert estimate.flags and "best view" in estimate.note and "at least 4" in estimate.note
-    assert (estimate.sim3.R == np.eye(3)).all() and not estimate.inliers.any()
+    assert estimate.flags
+    assert "best view" in estimate.note
+    assert "at least 4" in estimate.note
+    assert (estimate.sim3.R == np.eye(3)).all()
+    assert not estimate.inliers.any()
     # The object's middle still lands on the target's middle: both crops hold the object alone.
     middle = estimate.sim3.apply(reference.camera.to_camera(np.zeros(3)))
     truth = targets[estimate.view].camera.to_camera(ELSEWHERE.t)
@@ -325,7 +329,8 @@ def test_targets_without_depth_or_foreground_are_left_out_with_a_flag(
     blank = replace(views[2], foreground=torch.zeros_like(views[2].foreground))
     estimate = method.estimate_from_views(reference, [no_depth, unknown, blank, views[4]])
     defects = ("no depth map", "no known depth", "no foreground")
-    assert estimate.view == 3 and len(estimate.view_scores) == 4
+    assert estimate.view == 3
+    assert len(estimate.view_scores) == 4
     assert estimate.flags[:3] == tuple(
         f"target {view} left out: {defect}" for view, defect in enumerate(defects)
     )

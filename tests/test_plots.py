@@ -48,13 +48,14 @@ def test_lines_join_the_centres_of_matched_patches_and_those_of_outliers_are_das
     ]
 
 
-def test_points_and_axes_are_drawn_at_their_projections_and_nothing_behind_the_camera():
+def test_points_and_axes_are_drawn_where_they_project_unless_behind_the_camera():
     _, (axis,) = plots.show_images([IMAGE])
     # With focal length 100 and principal point (40, 30), (0.1, 0, 1) is 10 pixels to the right of
     # the latter.
     plots.draw_points(axis, CAMERA, np.array([[0.1, 0, 1], [0, 0, 2], [0, 0, -1]]))
     assert_allclose(axis.collections[0].get_offsets(), [[40, 30], [50, 30]])
-    assert axis.get_xlim() == (0, 80) and axis.get_ylim() == (60, 0)
+    assert axis.get_xlim() == (0, 80)
+    assert axis.get_ylim() == (60, 0)
     plots.draw_axes(
         axis, CAMERA, np.array([0, 0, 2]), np.array([[0.2, 0, 2], [0, 0.2, 2], [0, 0, -1]]), "xyz"
     )

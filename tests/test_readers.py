@@ -19,6 +19,7 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone
 from test_importers import (
+    HALF_PIXEL,
     edited,
     hairdryer_views,
     to_world,
@@ -168,7 +169,7 @@ def write_bop(folder, frames, objects=(5,)):
             "cam_t_m2c": (1000 * frame.camera.t).tolist(),
         }
         scene[k] = [pose | {"obj_id": number} for number in objects]
-        K = frame.camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        K = frame.camera.K - HALF_PIXEL
         cameras[k] = {"cam_K": K.ravel().tolist(), "depth_scale": 0.5}
     (folder / "scene_gt.json").write_text(json.dumps(scene))
     (folder / "scene_camera.json").write_text(json.dumps(cameras))
@@ -189,7 +190,7 @@ def write_scannet(folder, frames):
 
 def write_open3d(folder, frames):
     write_files(folder, frames, "color/{}.jpg")
-    K = frames[0].camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    K = frames[0].camera.K - HALF_PIXEL
     (folder / "intrinsic.json").write_text(json.dumps({"intrinsic_matrix": K.T.ravel().tolist()}))
     with open(folder / "trajectory.log", "w") as log:
         for k, frame in enumerate(frames):
@@ -231,7 +232,8 @@ def test_each_layout_is_recognised_and_gives_the_cameras_the_depth_and_the_masks
 ):
     path, options = write(layout, tmp_path / "scan", views)
     capture = open_capture(path, **options)
-    assert recognise(path)[0] == layout and not capture.left_out
+    assert recognise(path)[0] == layout
+    assert not capture.left_out
     assert open_source(path, **options).mask == "given"
     for one, view in zip(capture.frames, views, strict=True):
         frame, known = one.load(), view.depth > 0
@@ -323,10 +325,8 @@ def test_a_frame_that_cannot_be_used_is_left_out_and_named(tmp_path, views, dama
     assert [one.image.name for one in capture.frames] == ["0001.jpg", "0002.jpg", "0003.jpg"]
     source = open_source(tmp_path)
     (flag,) = source.flags(source.load([0]))
-    assert (
-        all(re.search(message, line) for line in (*capture.left_out, flag))
-        and "frames left out: 1: " in flag
-    )
+    assert all(re.search(message, line) for line in (*capture.left_out, flag))
+    assert "frames left out: 1: " in flag
 
 
 def test_a_damaged_picture_is_left_out_and_named_unless_too_few_remain(tmp_path, views, run):
@@ -337,19 +337,12 @@ def test_a_damaged_picture_is_left_out_and_named_unless_too_few_remain(tmp_path,
     found = estimate_pose(*2 * [tmp_path / "scan"], "paper", backbone=CoordinateBackbone())
     assert len(found.targets) == 3
     assert sum("frames left out: 1: image" in flag for flag in found.estimates["paper"].flags) == 2
-    arguments = [
-        "data",
-        "import",
-        str(tmp_path / "scan"),
-        "--root",
-        str(tmp_path / "mine"),
-        "--category",
-        "teapot",
-    ]
-    text = run([*arguments, "--sequence", "one"])
-    assert "3 frames" in text and "flag: frames left out: 1: image" in text
+    line = f"data import {tmp_path}/scan --root {tmp_path}/mine --category teapot --sequence"
+    text = run(f"{line} one")
+    assert "3 frames" in text
+    assert "flag: frames left out: 1: image" in text
     images[1].write_bytes(b"")
-    assert "2 frames remain, expected 3: image" in run([*arguments, "--sequence", "two"], 2)
+    assert "2 frames remain, expected 3: image" in run(f"{line} two", 2)
 
 
 @pytest.mark.parametrize(
@@ -366,7 +359,7 @@ def test_a_path_that_leads_out_of_the_capture_is_refused(tmp_path, views, path):
 
 
 def test_masks_belong_to_images_by_relative_path_then_name_then_stem(tmp_path):
-    for name in ("a/1.png", "2.jpg.png", "2.png", "3.png", "4.png"):
+    for name in "a/1.png 2.jpg.png 2.png 3.png 4.png".split():
         write_mask(tmp_path / name, np.ones((4, 4), np.float32))
     names = ("a/1.jpg", "b/1.jpg", "a/2.jpg", "a/3.jpg", "a/4.jpg", "b/4.jpg")
     found = find_masks(tmp_path, [Path("scan/images", name) for name in names])
@@ -380,9 +373,7 @@ def test_masks_belong_to_images_by_relative_path_then_name_then_stem(tmp_path):
     ]
 
 
-def test_lists_have_names_with_signs_a_camera_for_each_image_and_images_of_several_sizes(
-    tmp_path, views
-):
+def test_lists_have_names_with_signs_cameras_for_each_image_and_several_sizes(tmp_path, views):
     upright = replace(
         views[1],
         rgb=views[1].rgb[:, :64],
@@ -408,7 +399,8 @@ def test_options_of_formats(tmp_path, views):
         "has the objects 3, 5, expected one of them as --object N", open_source, tmp_path / "bop"
     )
     source = open_source(tmp_path / "bop", object=5, depth_unit=0.01)
-    assert source.mask == "given" and source.load([0])[0].depth.max() > 15 * views[0].depth.max()
+    assert source.mask == "given"
+    assert source.load([0])[0].depth.max() > 15 * views[0].depth.max()
 
 
 @pytest.mark.parametrize(
@@ -464,7 +456,8 @@ def test_the_sharpest_frames_of_a_video_and_of_images_are_chosen(tmp_path, views
     read = []
     blank = np.zeros((8, 8), np.uint8)
     chosen = list(sharpest(range(2000), 100, lambda k: read.append(k) or blank, []))
-    assert len(chosen) == 100 and len(read) <= 1000
+    assert len(chosen) == 100
+    assert len(read) <= 1000
     blurred = [
         replace(views[0], rgb=cv2.GaussianBlur(views[0].rgb, (15, 15), 3), name=f"{k:04d}")
         for k in range(9)
@@ -500,7 +493,9 @@ def test_depth_of_middle_confidence_is_dropped_in_thin_bands_only():
     wrong = np.abs(smeared - true) > 0.01
     levels = np.where(wrong, 1, 2).astype(np.uint8)
     kept = trusted(levels)
-    assert wrong.mean() > 0.01 and not (kept & wrong).any() and kept[~wrong].all()
+    assert wrong.mean() > 0.01
+    assert not (kept & wrong).any()
+    assert kept[~wrong].all()
     # A dark surface is all of the middle level, and is kept; level 0 never is. The levels of
     # Polycam reach 255.
     dark = np.where(disc & ~wrong, 1, levels).astype(np.uint8)
@@ -515,7 +510,8 @@ def test_a_confidence_map_has_the_size_of_the_depth(tmp_path, views):
     levels = np.repeat([[0], [2]], 48, axis=0).repeat(128, axis=1).astype(np.uint8)
     cv2.imwrite(str(path / "confidence/000001.png"), levels)
     depth = open_capture(path).frames[1].load().depth
-    assert not depth[:48].any() and (depth[48:] > 0).any()
+    assert not depth[:48].any()
+    assert (depth[48:] > 0).any()
     cv2.imwrite(str(path / "confidence/000001.png"), levels[::2])
     (line,) = open_capture(path).left_out
     assert "000001.png is (48, 128) pixels, expected (H, W) = (96, 128)" in line
@@ -535,7 +531,9 @@ def test_views_are_spread_evenly_whatever_their_order(count):
     degrees = np.arange(0, 360, 10.0)
     chosen = np.sort(degrees[spread_views(circle(degrees), count)])
     gaps = np.diff(chosen, append=chosen[0] + 360)
-    assert len(chosen) == count and chosen[0] == 0 and np.abs(gaps - 360 / count).max() <= 15
+    assert len(chosen) == count
+    assert chosen[0] == 0
+    assert np.abs(gaps - 360 / count).max() <= 15
     shuffled = np.array([0, *np.random.default_rng(0).permutation(degrees[1:])])
     assert_array_equal(np.sort(shuffled[spread_views(circle(shuffled), count)]), chosen)
 

@@ -54,7 +54,7 @@ def page(results, tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def text(page) -> str:
     """The text of the report."""
-    return page.read_text(encoding="utf-8")
+    return page.read_text("utf-8")
 
 
 def test_the_demo_takes_a_pair_of_each_category_and_both_solvers(results):
@@ -137,7 +137,7 @@ def test_the_page_says_where_the_answer_is_one_of_two(results, text, tmp_path):
     assert "One of two" not in text  # the features are perfect
     estimate = results[0].estimates["verified"]
     two = replace(results[0], estimates={"verified": replace(estimate, one_of_two=True)})
-    page = write_report(tmp_path / "report.html", [two], "name").read_text(encoding="utf-8")
+    page = write_report(tmp_path / "report.html", [two], "name").read_text("utf-8")
     assert "One of two" in page
     angle = estimate.angle_to(estimate.alternatives[0])
     assert f"turned by {angle:.0f} degrees" in page
@@ -206,7 +206,7 @@ def test_all_text_of_a_pair_is_escaped(results, tmp_path):
         errors={hostile: 1.0},
     )
     path = write_report(tmp_path / "report.html", [result], hostile, hostile, hostile)
-    page = path.read_text(encoding="utf-8")
+    page = path.read_text("utf-8")
     assert hostile not in page
     # Each of them at least once, some in several places.
     assert page.count("&lt;img src=x onerror=alert(1)&gt;") >= 15

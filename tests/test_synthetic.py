@@ -66,9 +66,11 @@ def test_objects_of_a_category_have_unit_size_vary_and_differ_from_their_half_tu
 ):
     shapes = [make_shape(ALL[category], seed) for seed in range(4)]
     for shape in shapes:
-        assert shape.faces.max() < len(shape.vertices) and np.isfinite(shape.vertices).all()
+        assert shape.faces.max() < len(shape.vertices)
+        assert np.isfinite(shape.vertices).all()
         assert surface_spread(shape.vertices, shape.faces) == pytest.approx(1)
-        assert 0 <= shape.material.min() and shape.material.max() < 8
+        assert 0 <= shape.material.min()
+        assert shape.material.max() < 8
     extents = np.array([np.ptp(shape.vertices, axis=0) for shape in shapes])
     assert (extents.std(0) / extents.mean(0)).max() > 0.02
     turned = shapes[3].vertices * [-1, -1, 1]
@@ -81,7 +83,8 @@ def test_a_soft_mask_is_1_inside_0_outside_and_between_at_the_edge():
     truth = np.zeros((80, 80), bool)
     truth[20:60, 20:60] = True
     mask = soft_mask(truth, default_rng(0))
-    assert mask[30:50, 30:50].min() > 0.99 and mask[:16].max() < 0.1
+    assert mask[30:50, 30:50].min() > 0.99
+    assert mask[:16].max() < 0.1
     assert ((mask > 0.1) & (mask < 0.9)).sum() > 100
 
 
@@ -99,7 +102,8 @@ def test_depth_has_holes_and_noise_and_masks_are_accurate_to_two_pixels(chairs):
                 1 - inside, cv2.DIST_L2, 5
             )
             wrong = (frame.mask > 0.5) != view.mask
-            assert 0 < wrong.sum() and to_edge[wrong].max() <= 2.5
+            assert 0 < wrong.sum()
+            assert to_edge[wrong].max() <= 2.5
     edge_on = replace(view, mask=np.zeros_like(view.mask))  # of a flat object
     assert np.isfinite(stereo_depth(edge_on, 0.3, 0.2, default_rng(0))).all()
 
@@ -111,7 +115,8 @@ def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):
         R, t = pose[:3, :3], pose[:3, 3]
         canonical = (data.points - t) @ R / scale
         seen = np.concatenate([view.canonical[view.mask] for view in views])
-        assert (canonical > seen.min(0) - 0.3).all() and (canonical < seen.max(0) + 0.3).all()
+        assert (canonical > seen.min(0) - 0.3).all()
+        assert (canonical < seen.max(0) + 0.3).all()
         for frame, view in zip(
             data.frames, views, strict=True
         ):  # coordinates project onto their own pixels and depth

@@ -143,10 +143,8 @@ def test_matches_with_outliers_propose_the_true_pose(seed):
     points = (torch.tensor(part, dtype=torch.float32) for part in (source, target))
     found = poses_from_matches(*points, default_rng(seed))
     assert rotation_error(found.rotation[0].double().numpy(), pose.R) < 1
-    assert (
-        len(found) <= 6
-        and (rotation_angles(found.rotation, found.rotation).fill_diagonal_(180) >= 20).all()
-    )
+    assert len(found) <= 6
+    assert (rotation_angles(found.rotation, found.rotation).fill_diagonal_(180) >= 20).all()
 
 
 def test_without_enough_matches_no_pose_is_proposed():
@@ -356,7 +354,8 @@ def test_reliability_by_hand():
     assert_allclose(found.confidence, [0.3, 2.3 / 3])
     assert_allclose(found.accuracy, [1 / 3, 1])
     assert found.calibration_error == pytest.approx((1 / 3 - 0.3 + 1 - 2.3 / 3) / 2)
-    assert found.top_half_accuracy == 1 and "more confident half 100.0 %" in str(found)
+    assert found.top_half_accuracy == 1
+    assert "more confident half 100.0 %" in str(found)
     found = reliability(np.repeat([0.2, 0.9], 10), np.tile(np.arange(10) < 3, 2), bins=2)
     # Wilson's interval for 3 of 10, from a table: 10.8 % to 60.3 %.
     assert_allclose(found.interval, [[0.108] * 2, [0.603] * 2], atol=1e-3)
@@ -415,5 +414,6 @@ def test_an_answer_is_one_of_two_if_just_two_poses_far_apart_are_nearly_as_proba
     confidence = dict(zip((0, 2, 4), probabilities))
     hypotheses = [Hypothesis(Sim3.identity(), 0, 0.0, terms, confidence[m], m) for m in mode]
     flags, found = reliability_flags(hypotheses, angles)
-    assert found == one_of_two and len(flags) == bool(start)
+    assert found == one_of_two
+    assert len(flags) == bool(start)
     assert not start or flags[0].startswith(start)

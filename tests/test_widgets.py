@@ -43,7 +43,8 @@ def values_of(control) -> list:
 def test_every_control_changes_the_picture_and_going_back_restores_it(name):
     widget = examples.WIDGETS[name]()
     before, caption = widget.picture.value, widget.caption.value
-    assert before[:4] == b"\x89PNG" and caption
+    assert before[:4] == b"\x89PNG"
+    assert caption
     for control in widget.controls.values():
         start = control.value
         for value in values_of(control):
@@ -57,9 +58,9 @@ def test_every_control_changes_the_picture_and_going_back_restores_it(name):
 
 def test_no_module_imports_ipywidgets_before_a_widget_is_made():
     for path in Path(common.__file__).parent.glob("*.py"):
-        assert not re.search(
-            "^(from|import) ipywidgets", path.read_text(encoding="utf-8"), re.MULTILINE
-        ), path.name
+        assert not re.search("^(from|import) ipywidgets", path.read_text("utf-8"), re.MULTILINE), (
+            path.name
+        )
 
 
 def test_without_ipywidgets_the_error_has_the_command_that_installs_it(monkeypatch):
@@ -106,7 +107,7 @@ def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim
     assert f"{right:.0%} have" in widget.caption.value
 
 
-def test_saliency_counts_the_patches_above_the_threshold_and_an_empty_box_has_no_mask():
+def test_saliency_counts_patches_above_the_threshold_and_an_empty_box_has_none():
     view, widget = examples.sample_views()[0], examples.saliency()
     widget.controls["threshold"].value = 0.5
     assert f"{int((view.features.saliency > 0.5).sum())} of 784 patches" in widget.caption.value

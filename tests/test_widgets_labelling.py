@@ -160,13 +160,15 @@ def test_proposals_are_looked_at_one_by_one_and_accepted_without_a_click(labelli
     labelling.proposal = lambda sequence: proposal
     box = label_poses(labelling)
     box.buttons["next"].click()
-    assert "proposal is laid over" in message(box) and box.controls["overlay"].value
+    assert "proposal is laid over" in message(box)
+    assert box.controls["overlay"].value
     first = box.controls["sequence"].value
     box.buttons["accept"].click()
     assert_allclose(
         read_labels(labelling.root, labelling.category)[first].trans[:3, :3], TURN, atol=1e-9
     )
-    assert box.controls["sequence"].value != first and not box.buttons["accept"].disabled
+    assert box.controls["sequence"].value != first
+    assert not box.buttons["accept"].disabled
 
 
 def test_the_slider_chooses_a_point(labelling):

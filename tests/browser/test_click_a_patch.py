@@ -297,7 +297,7 @@ def test_settings_are_changed_by_keyboard(touched):
 
 
 def test_every_stage_fits_the_screen(touched):
-    for stage in ("saliency", "similarity", "cycle", "matches", "view", "pose"):
+    for stage in "saliency similarity cycle matches view pose".split():
         touched.check(f"[name=stage][value={stage}]")
         width = touched.evaluate("document.documentElement.scrollWidth")
         assert width <= touched.viewport_size["width"], stage

@@ -98,32 +98,15 @@ def notebooks(device: str) -> Result:
     """
     with tempfile.TemporaryDirectory() as folder:
         for path in sorted((REPOSITORY / "notebooks").glob("0[0-4]*.ipynb")):
-            text = path.read_text(encoding="utf-8")
+            text = path.read_text("utf-8")
             if "backbone.model" not in text:
                 text = text.replace(r"device=\"cpu\"", rf"device=\"{device}\"")
             Path(folder, path.name).write_text(
-                text.replace("nbval-check-output", "not-compared"), encoding="utf-8"
+                text.replace("nbval-check-output", "not-compared"), "utf-8"
             )
-        command = [
-            sys.executable,
-            "-m",
-            "pytest",
-            "-c",
-            "pyproject.toml",
-            "--rootdir",
-            folder,
-            "-q",
-            "--nbval-lax",
-        ]
-        command += [
-            "--nbval-current-env",
-            "--nbval-cell-timeout=300",
-            "-n",
-            "4",
-            "--dist",
-            "loadfile",
-            folder,
-        ]
+        words = "-m pytest -c pyproject.toml -q --nbval-lax --nbval-current-env"
+        words += " --nbval-cell-timeout=300 -n 4 --dist loadfile --rootdir"
+        command = [sys.executable, *words.split(), folder, folder]
         threads = {"OMP_NUM_THREADS": str(max(1, CORES // 4))}
         status = subprocess.run(command, cwd=REPOSITORY, env=os.environ | threads).returncode
     return [], [f"pytest of the notebooks ended with {status}"] if status else []
@@ -187,6 +170,6 @@ def main() -> int:
         lines, failed = parts[part](options.device)
         report += [*lines, f"| the part {part} | | {time.perf_counter() - start:.0f} s |"]
         failures += failed
-        (options.out / "gpu.md").write_text("\n".join([*report, ""]), encoding="utf-8")
+        (options.out / "gpu.md").write_text("\n".join([*report, ""]), "utf-8")
     print("\n".join([*report, *(f"FAILED {one}" for one in failures)]))
     return 1 if failures else 0
