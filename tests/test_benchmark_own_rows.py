@@ -293,7 +293,7 @@ def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
         assert counts[most] > 20  # or the exact pose would be chance
         assert results["exact"]["error"] < 0.1
         similarity = results["exact"]["scale"], results["exact"]["translation"]
-        assert similarity == pytest.approx((1, 0), abs=1e-3)
+        assert_allclose(similarity, (1, 0), atol=1e-3)
 
 
 def test_a_matcher_of_keypoints_gets_the_crops_at_the_resolution_of_the_frames(tmp_path):
@@ -687,7 +687,7 @@ def test_a_row_may_answer_in_few_digits(tmp_path):
     methods = run_rows(rows, tmp_path, 2)
     assert [row["failed"] for row in methods.values()] == [0] * 4
     medians = [row["median"] for row in methods.values()]
-    assert medians == pytest.approx([medians[0]] * 4, abs=0.1)
+    assert_allclose(medians, [medians[0]] * 4, atol=0.1)
 
 
 def overwrite(*frames: Frame) -> None:

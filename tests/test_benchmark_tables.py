@@ -336,7 +336,7 @@ def test_figures_have_truetype_fonts_and_the_size_that_is_asked_for(run, tmp_pat
         assert b"/Type3" not in document
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def acc30(run) -> list[float]:
     """Acc30 of ours, and the ends of its interval."""
     ours = run.summary["methods"]["ours"]

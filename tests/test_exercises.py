@@ -41,79 +41,9 @@ ASSIGNMENTS = sorted(folder.name for folder in (EXERCISES / "source").iterdir())
 MISTAKES = json.loads(Path(__file__).with_name("exercise_mistakes.json").read_text("utf-8"))
 
 # For each assignment: a statement of a marking guide, and an expression that holds for what the
-# given cells computed.
-STATEMENTS = {
-    "01_features": {
-        (
-            "the similarity of true partners falls even if every key stays the same"
-        ): "turned_similarity(lambda x: log_bin(x[None])[0].numpy(), views[0])"
-        " < 0.99 * turned_similarity(np.asarray, views[0])",
-    },
-    "02_cyclical_maps": {
-        (
-            "39 % against 37 % on the bicycles, 32 % against 32 % on the cars"
-        ): "counts.iloc[[1, 0], [1, 3]].to_numpy().tolist() == [[39, 32], [37, 32]]",
-        (
-            "up to 2 patches are the best broad rule, 48 % and 38 %, and leave more than 100"
-        ): "counts.loc['up to 2 patches'].tolist() == [105, 48, 279, 38]",
-        (
-            "48 % against 35 % without a limit, and 152 of 278 matches are left"
-        ): "limits.iloc[[2, 5], [2, 5]].to_numpy().tolist() == [[152, '48%'], [278, '35%']]",
-        (
-            "12 % against 6 %: 2 right ones of 16 and 4 of 33"
-        ): "limits.iloc[[6, 7, 11], 3:].to_numpy().tolist() == [[16, 2, '12%'], [33, 4, '12%'], "
-        "[118, 7, '6%']]",
-    },
-    "03_best_view": {
-        (
-            "turned by 171°, one of 23° was offered, and it wins clearly, -29.9 against -33.5"
-        ): "wrong == (171, 23)",
-        (
-            "the chosen one does so on three of the four pairs"
-        ): "sum((np.diff(one) > 0).any() for _, one in views.groupby('category')['chosen (°)']) "
-        "== 3"
-        " and all(one.is_monotonic_decreasing for _, one in "
-        "views.groupby('category')['nearest (°)'])",
-    },
-    "04_umeyama_ransac": {
-        (
-            "The number of inliers never falls as the threshold grows"
-        ): "all(table['inliers'].is_monotonic_increasing for table in tables.values())",
-        (
-            "the error is smallest, 5°, at 0.2 and 0.5"
-        ): "tables['chair']['error (°)'].tolist() == [30, 15, 9, 5, 5, 9, 28]",
-        (
-            "the motorcycles have 19 inliers and the chairs 18, but the error is 135° against 5°"
-        ): "[table.loc[0.5].tolist() for table in tables.values()] == [[18, 4, 5], [19, 9, 135]]",
-        (
-            "750 trials with samples of 3, 5,049 with samples of 4 and 348,471 with samples of 6"
-        ): "[trials(10, 50, size) for size in (3, 4, 6)] == [750, 5049, 348471]",
-        (
-            "8 % of the poses are more than 30° off with samples of 3, 22 % with samples of 4 "
-            "and 43 %"
-        ): "np.allclose(settings['above 30° (%)'], [8, 22, 43, 0, 0, 0], atol=1)",
-    },
-    "05_metrics": {
-        (
-            "two intervals that overlap, and p = 0.002"
-        ): "intervals['new'][0] < intervals['old'][1] and round(paired_test(old, "
-        "new)['sign_test_p'], 3) == 0.002",
-        (
-            "13 that only the new method solves against 1"
-        ): "[np.sum((a < 30) & (b >= 30)) for a, b in ((new, old), (old, new))] == [13, 1]",
-        # A gain of 3 points at a discordance of 12 %: z = 2, and z = 1.96 + 0.84 for a power of 80
-        # %.
-        (
-            "exceeded from about 530 pairs on, and a power of 80 % takes about 1,050"
-        ): "round(0.12 * (2 / 0.03) ** 2, -1) == 530 and round(0.12 * (2.8 / 0.03) ** 2, -1) == "
-        "1050",
-        (
-            "A has the smaller median and the larger Acc30, B the smaller mean and no error "
-            "above 45°"
-        ): "(figures['A'] - figures['B'] > 0).tolist() == [False, True, True] and "
-        "method_b.max() <= 45",
-    },
-}
+# given cells computed. Of the power in 05_metrics: a gain of 3 points at a discordance of 12 %, z = 2,
+# and z = 1.96 + 0.84 for a power of 80 %.
+STATEMENTS = json.loads(Path(__file__).with_name("exercise_statements.json").read_text("utf-8"))
 
 
 def turned_similarity(described: Callable[[np.ndarray], np.ndarray], view: View) -> float:

@@ -109,7 +109,7 @@ def test_colours_are_averaged_along_a_side_that_shrinks_while_the_other_grows(si
     stripes[::3] = 240  # every third row, each row of the result covers two periods
     stripes = stripes if size[0] < 24 else stripes.swapaxes(0, 1)
     resized = resize_frame(Frame(stripes, None, None, random_camera(0, (24, 24))), size)
-    assert (resized.rgb == 80).all()
+    assert_array_equal(resized.rgb, 80)
 
 
 @pytest.mark.parametrize(
@@ -372,9 +372,9 @@ def test_a_patch_without_depth_takes_the_filled_depth_at_its_centre():
     centre = camera.unproject_camera(np.array([10.5, 6.5]), inpaint_depth(depth)[6, 10])
     assert_allclose(points[1, 2], centre)
     measured, same = patch_points(depth, camera, (4, 4), inpaint=False)
-    assert (same == known).all()
-    assert (measured[known] == points[known]).all()
-    assert (measured[1, 2] == 0).all()
+    assert_array_equal(same, known)
+    assert_array_equal(measured[known], points[known])
+    assert_array_equal(measured[1, 2], 0)
 
 
 def test_patches_need_not_divide_the_image():

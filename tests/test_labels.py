@@ -60,7 +60,7 @@ def test_labels_and_pairs_are_imported_and_replace_others_only_on_request(clone,
     )
     assert contents(root) == before
     import_labels(clone, root, replace=True)
-    assert np.array_equal(read_labels(root, "chair")["b"].trans, np.eye(4))
+    assert_array_equal(read_labels(root, "chair")["b"].trans, np.eye(4))
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from co3d_folders import sequence_data
 from model_files import write_quad, write_wedge
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
 from zsp_lite import Co3D
@@ -86,9 +86,9 @@ def test_labels_map_the_front_of_the_reference_to_the_front_of_every_object(data
     dataset, _ = data
     poses = object_poses(dataset, "chair")
     label, reference = read_labels(dataset.root, "chair")[name].trans, poses["high"]
-    assert label[:3, :3] @ reference.R == pytest.approx(poses[name].R, abs=1e-6)
+    assert_allclose(label[:3, :3] @ reference.R, poses[name].R, atol=1e-6)
     middle = label[:3, :3] @ reference.t + label[:3, 3]
-    assert middle == pytest.approx(poses[name].t, abs=1e-6)
+    assert_allclose(middle, poses[name].t, atol=1e-6)
     inside = poses[name].to_box(dataset.point_cloud("chair", name)[0])
     # The box holds the cloud but for noise and a few outliers.
     assert np.quantile(inside, 0.01) > -0.1
@@ -157,4 +157,4 @@ def test_the_code_of_the_page_on_own_models_writes_labels_that_align_the_objects
     names["write_category"](tmp_path, "box", recordings)
     first, second = [Co3D(tmp_path).point_cloud("box", name)[0] for name in ("first", "second")]
     label = read_labels(tmp_path, "box")["second"].trans
-    assert first @ label[:3, :3].T + label[:3, 3] == pytest.approx(second, abs=1e-4)
+    assert_allclose(first @ label[:3, :3].T + label[:3, 3], second, atol=1e-4)

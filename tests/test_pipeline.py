@@ -51,7 +51,7 @@ def test_the_true_pose_is_found_within_a_few_degrees(estimate, reference, target
     truth = true_pose(reference.camera, AT_HOME, targets[estimate.view].camera, ELSEWHERE)
     assert rotation_error(estimate.sim3.R, truth.R) < 4
     # Matches are whole patches apart from the truth, and least squares shrinks what is noisy.
-    assert estimate.sim3.scale == pytest.approx(truth.scale, rel=0.1)
+    assert_allclose(estimate.sim3.scale, truth.scale, rtol=0.1)
     centre = reference.camera.to_camera(np.zeros(3))
     assert_allclose(estimate.sim3.apply(centre), truth.apply(centre), atol=0.1)
     assert not estimate.flags
@@ -80,7 +80,7 @@ def test_the_best_view_alone_maps_spread_and_centroid_onto_the_targets(method, r
     near = replace(reference, depth=reference.depth / 2)
     first, second = method.views([reference, near])
     sim3 = view_alignment(first, second)
-    assert sim3.scale == pytest.approx(0.5, rel=1e-4)
+    assert_allclose(sim3.scale, 0.5, rtol=1e-4)
     points, known = first.patch_points
     assert_allclose(sim3.apply(points[known]), second.patch_points[0][known], atol=1e-3)
 
@@ -235,10 +235,10 @@ def test_nothing_that_a_plug_in_overwrites_reaches_the_rest(reference, targets, 
     for one, other in zip(views, others, strict=True):
         assert torch.equal(one.features.keys, other.features.keys)
         assert torch.equal(one.foreground, other.foreground)
-        assert np.array_equal(one.frame.rgb, other.frame.rgb)
-        assert np.array_equal(one.frame.depth, other.frame.depth)
-    assert np.array_equal(reference.rgb, before[0])
-    assert np.array_equal(targets[0].depth, before[1])
+        assert_array_equal(one.frame.rgb, other.frame.rgb)
+        assert_array_equal(one.frame.depth, other.frame.depth)
+    assert_array_equal(reference.rgb, before[0])
+    assert_array_equal(targets[0].depth, before[1])
 
 
 @pytest.mark.parametrize(
@@ -280,7 +280,7 @@ def test_seed_and_threshold_reach_the_verified_solver(views):
     assert scores(estimate_noisy(views, VERIFIED, seed=1)) != scores(verified)
     wide = estimate_noisy(views, VERIFIED, threshold=2.0)
     assert wide.inliers.sum() > verified.inliers.sum()
-    assert (wide.sim3.matrix == verified.sim3.matrix).all()
+    assert_array_equal(wide.sim3.matrix, verified.sim3.matrix)
 
 
 def test_a_patch_is_foreground_from_a_quarter_of_its_area(reference):
@@ -306,7 +306,7 @@ def test_too_few_matches_fall_back_to_the_best_view_with_a_flag(reference, targe
     assert estimate.flags
     assert "best view" in estimate.note
     assert "at least 4" in estimate.note
-    assert (estimate.sim3.R == np.eye(3)).all()
+    assert_array_equal(estimate.sim3.R, np.eye(3))
     assert not estimate.inliers.any()
     # The object's middle still lands on the target's middle: both crops hold the object alone.
     middle = estimate.sim3.apply(reference.camera.to_camera(np.zeros(3)))

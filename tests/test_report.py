@@ -51,7 +51,7 @@ def page(results, tmp_path_factory) -> Path:
     return write_report(path, results, "a & b", "some/folder", "synthetic ellipsoids <script>")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def text(page) -> str:
     """The text of the report."""
     return page.read_text("utf-8")

@@ -183,7 +183,7 @@ def test_views_of_a_deformed_copy_show_the_originals_points_in_another_room():
     for drawn in (one, two):
         row, col = np.nonzero(drawn.mask)
         seen = camera.unproject(np.stack([col + 0.5, row + 0.5], 1), drawn.depth[row, col])
-        assert drawn.canonical[row, col] * factors + offset == pytest.approx(seen, abs=2e-3)
+        assert_allclose(drawn.canonical[row, col] * factors + offset, seen, atol=2e-3)
 
 
 def test_attention_on_the_mask_is_worth_more_than_attention_off_it():
@@ -207,7 +207,7 @@ def test_a_few_steps_teach_a_network_where_the_object_is(renders):
     with torch.no_grad():
         total, figures = losses(model, batch, torch.Generator().manual_seed(0), helpers=0.5)
     expected = figures["match"] + 0.5 * (figures["geometry"] + figures["attention"])
-    assert float(total) == pytest.approx(expected, rel=1e-5)
+    assert_allclose(float(total), expected, rtol=1e-5)
     with torch.no_grad():
         attention, iou = attention_loss(model(batch.images).cls_logits, batch.coverage)
     assert (float(attention), iou) == pytest.approx((figures["attention"], figures["iou"]))
