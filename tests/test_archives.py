@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from co3d_folders import contents, sequence_data
+from co3d_folders import contents, write_category, write_identities
 from loopback import Server
 
 from zsp_lite.cli.main import main
 from zsp_lite.data import archives
 from zsp_lite.data.archives import list_archives
-from zsp_lite.data.co3d import Co3D, Pair, write_co3d
-from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import write_published_pairs
 from zsp_lite.io.locks import writing
 
@@ -43,10 +43,9 @@ def source(tmp_path_factory):
     """A labelled data folder of toasters with one evaluation pair, and a file that makes a long
     archive."""
     folder = tmp_path_factory.mktemp("source")
-    write_co3d(folder, "toaster", [sequence_data(name) for name in (*SEQUENCES, UNLABELLED)])
+    write_category(folder, "toaster", (*SEQUENCES, UNLABELLED))
     (folder / "toaster" / UNLABELLED / "long").write_bytes(np.random.default_rng(0).bytes(1 << 20))
-    for name in SEQUENCES:
-        write_label(folder, "toaster", PoseLabel(np.eye(4), name, SEQUENCES[0]))
+    write_identities(folder, "toaster", SEQUENCES)
     pair = Pair("toaster", SEQUENCES[0], 1, SEQUENCES[1], (2,))
     write_published_pairs(folder / "determ_eval/1samples_1tgt/toaster.pt", [pair], Co3D(folder))
     return folder

@@ -36,7 +36,7 @@ def vit() -> VisionTransformer:
 
 
 @pytest.fixture()
-def pictures() -> list[np.ndarray]:
+def pictures():
     rng = default_rng(0)
     return [
         rng.integers(0, 256, shape, dtype=np.uint8)
@@ -51,7 +51,7 @@ def assert_same_features(first, second):
 
 
 @pytest.fixture(scope="module")
-def places(tmp_path_factory, vit) -> dict[str, str]:
+def places(tmp_path_factory, vit):
     """The embedded backbone, a checkpoint in DINO's layout, a model of each architecture of Hugging
     Face's format."""
     root = tmp_path_factory.mktemp("backbones")

@@ -145,7 +145,7 @@ def essential(first: Camera, second: Camera, matches: int) -> tuple[np.ndarray, 
 
 
 @pytest.fixture
-def cameras() -> tuple[Camera, Camera]:
+def cameras():
     """Two cameras with different intrinsics."""
     first = replace(look_at((1, 0, 0.3), size=SIZE), focal_length=np.array([300.0, 260.0]))
     second = look_at((0.9, 0.45, 0.3), size=SIZE)

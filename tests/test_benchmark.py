@@ -29,7 +29,7 @@ ROWS = ("ours", "ours-bv", "oracle-view")
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> tuple[Path, dict]:
+def run(tmp_path_factory):
     """The folder of a run and what the call returned."""
     out = tmp_path_factory.mktemp("out")
     return out, evaluate(small_folder(), BACKBONE, ROWS, 6, 5, out)

@@ -407,7 +407,7 @@ def exact_pose(dataset: Co3D, pair: Pair) -> Sim3:
 
 
 @pytest.fixture
-def answers(tmp_path) -> list[str]:
+def answers(tmp_path):
     """Files of another program that answers three of four pairs, each in the second target view.
 
     exact.csv has whole poses, rotations.csv rotations only; returns the lines of exact.csv.
@@ -565,7 +565,7 @@ def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_pat
 
 
 @pytest.fixture
-def asked(tmp_path) -> list[dict[str, str]]:
+def asked(tmp_path):
     """The lines of a file of questions about pairs of both categories."""
     dataset = Co3D(small_folder())
     path = write_questions(tmp_path / "pairs.csv", dataset, asked_pairs(dataset))

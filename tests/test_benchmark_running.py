@@ -56,7 +56,7 @@ def again(out: Path, executor=1) -> dict:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory) -> tuple[Path, dict]:
+def undisturbed(tmp_path_factory):
     """The folder of a run that nothing interrupts, and what it returned."""
     out = tmp_path_factory.mktemp("undisturbed")
     return out, again(out)

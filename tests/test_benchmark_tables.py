@@ -53,7 +53,7 @@ def by_name(found: list[Table]) -> dict[str, Table]:
 
 
 @pytest.fixture(scope="module")
-def every(run) -> dict[str, Table]:
+def every(run):
     """All tables of the run, by their names."""
     return by_name(every_table(run.summary))
 
@@ -337,7 +337,7 @@ def test_figures_have_truetype_fonts_and_the_size_that_is_asked_for(run, tmp_pat
 
 
 @pytest.fixture
-def acc30(run) -> list[float]:
+def acc30(run):
     """Acc30 of ours, and the ends of its interval."""
     ours = run.summary["methods"]["ours"]
     return [ours["acc30"], *ours["acc30_ci"]]

@@ -11,14 +11,14 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
-from co3d_folders import convert_to_v2, sequence_data
+from co3d_folders import convert_to_v2, write_category, write_identities
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite import __version__, errors
 from zsp_lite.backbones.load import BackboneConfig
 from zsp_lite.cli import demo, doctor
 from zsp_lite.cli.main import cli, main
-from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.importers import FORMATS
 from zsp_lite.importers.convert import ImportResult
@@ -313,24 +313,18 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
 @pytest.fixture
 def chairs(tmp_path) -> Path:
     """A data folder of two sequences without labels."""
-    write_co3d(tmp_path / "data", "chair", [sequence_data("a"), sequence_data("b")])
+    write_category(tmp_path / "data", "chair", "ab")
     return tmp_path / "data"
 
 
-def write_labels(folder: Path) -> None:
-    """Write a label of each sequence."""
-    for name in "ab":
-        write_label(folder, "chair", PoseLabel(np.eye(4), name, "a"))
-
-
 def test_labels_are_imported(chairs, tmp_path, run):
-    write_labels(tmp_path / "clone/data")
+    write_identities(tmp_path / "clone/data", "chair", "ab")
     text = run(f"data labels {tmp_path}/clone --root {chairs}")
     assert "2 labels, 0 files of pairs" in text
 
 
 def test_labels_are_transferred(chairs, tmp_path, run):
-    write_labels(chairs)
+    write_identities(chairs, "chair", "ab")
     shutil.copytree(chairs / "chair", tmp_path / "v2/chair")
     convert_to_v2(tmp_path / "v2/chair")
     write_label(tmp_path / "v2", "chair", PoseLabel(np.diag([-1.0, -1, 1, 1]), "b", "a"))

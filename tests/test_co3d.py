@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from co3d_folders import convert_to_v2, edit_json, sequence_data
+from co3d_folders import convert_to_v2, edit_json, sequence_data, write_category
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
 from zsp_lite.data.annotations import FrameAnnotation
-from zsp_lite.data.co3d import Co3D, Pair, SequenceData, write_co3d
+from zsp_lite.data.co3d import Co3D, Pair, write_co3d
 from zsp_lite.data.frames import write_depth, write_image, write_mask
 
 
@@ -41,7 +41,7 @@ def test_a_pair_is_loaded_as_its_reference_frame_and_its_target_frames_in_order(
 
 
 @pytest.fixture(params=[1, 2], ids="CO3D v{}".format)
-def read_back(root, request) -> tuple[SequenceData, Co3D]:
+def read_back(root, request):
     """A sequence that was written, and the data set that has it, in a version of CO3D."""
     written = sequence_data("b_2", depth_scale_adjustment=1.7)
     write_co3d(root, "chair", [written])
@@ -226,7 +226,7 @@ def test_selection_takes_the_best_clouds_above_both_bounds(tmp_path):
         "blurred": (1.25, 2),
         "sparse": (3, 0.3),
     }
-    write_co3d(tmp_path, "chair", [sequence_data(name, frames=1) for name in scores])
+    write_category(tmp_path, "chair", scores, frames=1)
 
     def score(items):
         for item in items:

@@ -3,20 +3,19 @@
 import cv2
 import numpy as np
 import pytest
-from co3d_folders import convert_to_v2, edit_json, sequence_data
+from co3d_folders import convert_to_v2, edit_json, write_category, write_identities
 from refusals import refused
 
 from zsp_lite.data.check import check_folder
-from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, write_label
 from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 
 
 @pytest.fixture
 def root(tmp_path):
-    write_co3d(tmp_path, "chair", [sequence_data("a"), sequence_data("b")])
-    for name in "ab":
-        write_label(tmp_path, "chair", PoseLabel(np.eye(4), name, "a"))
+    write_category(tmp_path, "chair", "ab")
+    write_identities(tmp_path, "chair", "ab")
     return tmp_path
 
 
@@ -29,7 +28,7 @@ def test_a_complete_folder_has_no_problems(root):
     write_published_pairs(
         pairs_path(root, "chair", 3, 2), sample_pairs(dataset, "chair", 3, 2), dataset
     )
-    write_co3d(root, "stool", [sequence_data("c")])
+    write_category(root, "stool", "c")
     convert_to_v2(root / "stool")
     check, stool = check_folder(root, deep=True)
     assert not check.problems
@@ -83,7 +82,7 @@ def test_sequences_without_a_point_cloud_are_counted(root, run):
     """A cloud that the annotations lack is no problem, a file that is missing is one."""
     annotations = root / "chair/sequence_annotations.jgz"
     edit_json(annotations, lambda sequences: sequences[0].update(point_cloud=None))
-    write_co3d(root, "stool", [sequence_data("c")])
+    write_category(root, "stool", "c")
     check, stool = check_folder(root)
     assert (check.cloudless, check.problems, check.complete, stool.cloudless) == (1, [], 2, 0)
     assert "No problems" in run(f"data check {root}")
@@ -116,7 +115,7 @@ def test_labels_of_unknown_sequences_and_of_two_references_are_named(root):
 
 
 def test_annotations_that_cannot_be_read_are_a_problem_of_their_category(root, tmp_path_factory):
-    write_co3d(root, "stool", [sequence_data("c")])
+    write_category(root, "stool", "c")
     (root / "chair/frame_annotations.jgz").write_bytes(b"no gzip")
     chair, stool = check_folder(root)
     assert len(chair.problems) == 1

@@ -41,8 +41,8 @@ ASSIGNMENTS = sorted(folder.name for folder in (EXERCISES / "source").iterdir())
 MISTAKES = json.loads(Path(__file__).with_name("exercise_mistakes.json").read_text("utf-8"))
 
 # For each assignment: a statement of a marking guide, and an expression that holds for what the
-# given cells computed. Of the power in 05_metrics: a gain of 3 points at a discordance of 12 %, z = 2,
-# and z = 1.96 + 0.84 for a power of 80 %.
+# given cells computed. Of the power in 05_metrics: a gain of 3 points at a discordance of 12 %,
+# z = 2, and z = 1.96 + 0.84 for a power of 80 %.
 STATEMENTS = json.loads(Path(__file__).with_name("exercise_statements.json").read_text("utf-8"))
 
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from co3d_folders import sequence_data
+from co3d_folders import write_category
 from numpy.random import default_rng
 from numpy.testing import assert_array_equal
 from refusals import refused
@@ -22,7 +22,6 @@ from zsp_lite import Co3D, InputError
 from zsp_lite.backbones.checkpoints import read_checkpoint
 from zsp_lite.data import frames
 from zsp_lite.data.annotations import read_frame_index
-from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.frames import read_depth, read_image, read_mask
 from zsp_lite.data.pairs import read_pair_file
 from zsp_lite.io.files import GROWTH_ALLOWED, decompress, path_inside, plain_name, read_bytes
@@ -331,11 +330,11 @@ def test_a_category_has_one_writer_until_that_is_killed(tmp_path):
     assert writer.stdout.readline()
     refused(
         "cup: another process is writing to it",
-        lambda: write_co3d(tmp_path, "cup", [sequence_data("a", 2)]),
+        lambda: write_category(tmp_path, "cup", "a", frames=2),
     )
     writer.kill()
     writer.wait()
-    write_co3d(tmp_path, "cup", [sequence_data("a", 2)])
+    write_category(tmp_path, "cup", "a", frames=2)
     assert len(Co3D(tmp_path).frames("cup", "a")) == 2
     assert not list((tmp_path / "cup").glob(".*"))
 

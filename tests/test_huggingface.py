@@ -27,7 +27,7 @@ from zsp_lite.choices import FACETS
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory) -> dict[str, Path]:
+def folders(tmp_path_factory):
     return save_all(tmp_path_factory.mktemp("models"))
 
 

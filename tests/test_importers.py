@@ -19,7 +19,7 @@ from zsp_lite.course.synthetic.sequences import render_sequence
 from zsp_lite.data.check import check_folder
 from zsp_lite.data.frames import write_image, write_mask
 from zsp_lite.importers import CaptureFrame, open_capture
-from zsp_lite.importers.convert import ImportResult, fuse, import_captures, import_source
+from zsp_lite.importers.convert import fuse, import_captures, import_source
 from zsp_lite.importers.masks import masks_from_box
 
 # From pixel centres at half integers to OpenCV's at integers.
@@ -42,7 +42,7 @@ def hairdryer_views() -> list[Frame]:
 
 
 @pytest.fixture(scope="module")
-def views() -> list[Frame]:
+def views():
     """The views, rendered once."""
     return hairdryer_views()
 
@@ -109,7 +109,7 @@ def scan(tmp_path, views) -> Path:
 
 
 @pytest.fixture(scope="module")
-def imported(tmp_path_factory, views) -> tuple[Path, ImportResult]:
+def imported(tmp_path_factory, views):
     """A data folder into which a scan was imported, and what the import says of it."""
     root = tmp_path_factory.mktemp("imported")
     write_nerfstudio(root / "scan", views)

@@ -2,11 +2,10 @@
 refused."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
-from co3d_folders import sequence_data
+from co3d_folders import write_category, write_identities
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -14,27 +13,26 @@ from scipy.spatial.transform import Rotation
 from zsp_lite import Sim3
 from zsp_lite.course.labelling import Labelling, align_picks
 from zsp_lite.course.labelling.session import MAX_RESIDUAL
-from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.labels import PoseLabel, label_bytes, read_labels, write_label
 from zsp_lite.io.files import write_atomic
 
 
 @pytest.fixture
 def root(tmp_path):
-    write_co3d(
-        tmp_path,
-        "chair",
-        [sequence_data("best", quality=3.0), sequence_data("a"), sequence_data("b")],
-    )
+    """A data folder of three sequences, with the best cloud first."""
+    write_category(tmp_path, "chair", ["best"], quality=3.0)
+    write_category(tmp_path, "chair", "ab")
     return tmp_path
 
 
-def pick_all(labelling, sequence, points):
+def pick_all(labelling: Labelling, sequence: str, points: np.ndarray) -> None:
+    """Pick points one after the other."""
     for point in points:
         labelling.pick(sequence, point)
 
 
-def corners(sequence="best"):
+def corners(sequence: str = "best") -> np.ndarray:
+    """Keypoints, (5, 3), at a place that depends on the sequence."""
     return np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0.5)]) + len(sequence)
 
 
@@ -44,7 +42,7 @@ def test_residuals_are_relative_to_the_spread_of_the_keypoints():
     target = moved.apply(points)
     assert_allclose(align_picks(points, target).residuals, np.zeros(5), atol=1e-12)
     target[4] += 7 * np.array([0.3, 0, 0])
-    small, large = (align_picks(points, scale * target).residuals for scale in (1, 100))
+    small, large = [align_picks(points, scale * target).residuals for scale in (1, 100)]
     assert_allclose(small, large)
     assert small.argmax() == 4
 
@@ -96,9 +94,9 @@ def test_accepting_writes_the_published_format_and_the_references_identity(root)
     centre = labelling.cloud("best")[0].mean(axis=0)
     assert_allclose(labels["a"].trans @ [*centre, 1], [*(1.3 * turn @ centre + 2), 1])
     assert_array_equal(labels["best"].trans, np.eye(4))
-    states = {row.sequence: (row.state, row.rms) for row in Labelling(root, "chair").progress()}
-    assert states["a"] == ("accepted", pytest.approx(0, abs=1e-9))
-    assert states["b"] == ("open", None)
+    _, a, b = Labelling(root, "chair").progress()
+    assert (a.state, a.rms) == ("accepted", pytest.approx(0, abs=1e-9))
+    assert (b.state, b.rms) == ("open", None)
 
 
 def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
@@ -153,12 +151,16 @@ def test_invalid_categories_sequences_and_picks_are_refused(root):
         refused(message, call)
     assert read_labels(root, "chair") == {}
     assert_array_equal(Labelling(root, "chair").picks("a"), corners()[:3])
-    for name, message in (("a", "expected one reference sequence"), ("c", "c has no point cloud")):
-        if name == "c":
-            (root / "label_picks/chair.json").unlink()
-        write_label(root, "chair", PoseLabel(np.eye(4), name, name))
-        refused(message, Labelling, root, "chair")
-        shutil.rmtree(root / "class_labels")
+
+
+def test_a_label_of_another_reference_or_of_no_sequence_is_refused(root):
+    Labelling(root, "chair").pick("best", (0, 0, 0))
+    write_identities(root, "chair", "a")
+    refused("expected one reference sequence", Labelling, root, "chair")
+    (root / "class_labels/chair/a.json").unlink()
+    (root / "label_picks/chair.json").unlink()
+    write_identities(root, "chair", "c")
+    refused("c has no point cloud", Labelling, root, "chair")
 
 
 def test_broken_picks_are_named(root):
@@ -205,14 +207,10 @@ def test_the_reference_is_that_of_the_labels(root):
 def test_a_proposal_becomes_the_label_where_nothing_is_picked(root):
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_euler("z", 70, degrees=True).as_matrix()
-    for name, trans in (
-        ("a", np.eye(4)),
-        ("best", turn),
-    ):  # the reference of proposals may be another one
-        write_atomic(
-            root / "label_proposals/chair" / f"{name}.json",
-            label_bytes(PoseLabel(trans, name, "a")),
-        )
+    # The reference of proposals may be another one than that of the labels.
+    for name, trans in (("a", np.eye(4)), ("best", turn)):
+        proposal = label_bytes(PoseLabel(trans, name, "a"))
+        write_atomic(root / f"label_proposals/chair/{name}.json", proposal)
     labelling = Labelling(root, "chair")
     assert labelling.reference == "best"
     assert labelling.proposal("b") is None

@@ -6,7 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from co3d_folders import contents, convert_to_v2, random_camera, seeds, sequence_data
+from co3d_folders import (
+    contents,
+    convert_to_v2,
+    random_camera,
+    seeds,
+    sequence_data,
+    write_category,
+    write_identities,
+)
 from hypothesis import given
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -24,7 +32,7 @@ from zsp_lite.metrics import rotation_error
 @pytest.fixture
 def root(tmp_path):
     folder = tmp_path / "data"
-    write_co3d(folder, "chair", [sequence_data("a"), sequence_data("b")])
+    write_category(folder, "chair", "ab")
     return folder
 
 
@@ -32,8 +40,7 @@ def root(tmp_path):
 def clone(tmp_path, root):
     """A folder with the layout of the published repository."""
     folder, dataset = tmp_path / "clone", Co3D(root)
-    for name in "ab":
-        write_label(folder / "data", "chair", PoseLabel(np.eye(4), name, "a"))
+    write_identities(folder / "data", "chair", "ab")
     pairs = [Pair("chair", *names) for names in (("a", 0, "b", (1, 3)), ("b", 2, "a", (0, 2)))]
     write_published_pairs(folder / "data/determ_eval/200samples_2tgt/chair.pt", pairs, dataset)
     (folder / "README.md").write_text("code")

@@ -50,7 +50,7 @@ def lay_down(vertex: re.Match) -> str:
 
 
 @pytest.fixture(scope="module")
-def data(folder, tmp_path_factory) -> tuple[Co3D, dict[str, str]]:
+def data(folder, tmp_path_factory):
     """The data folder of the models, and the reasons of those that were left out."""
     out = tmp_path_factory.mktemp("data")
     left_out = export_models(folder, out, **SETTINGS)

@@ -3,7 +3,6 @@ command and by call."""
 
 import json
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -187,7 +186,7 @@ def test_options_that_no_source_takes_are_refused(sequence, image):
 
 
 @pytest.fixture(scope="module")
-def own(ellipsoids, tmp_path_factory) -> tuple[PairResult, Path]:
+def own(ellipsoids, tmp_path_factory):
     """Both solvers on two labelled sequences, and the folder of their files."""
     out = tmp_path_factory.mktemp("own") / "deep/out"
     settings = {"reference_frame": 2, "targets": 3, "backbone": CoordinateBackbone(), "out": out}
@@ -487,7 +486,7 @@ def test_the_command_prints_the_poses_and_names_its_files(loaded, ellipsoids, tm
 
 
 @pytest.fixture
-def estimate_paper(loaded, pictures, tmp_path, monkeypatch, run) -> Callable[[str], str]:
+def estimate_paper(loaded, pictures, tmp_path, monkeypatch, run):
     """Runs the command on the two pictures by the paper's solver, with more options."""
     cup, mug, _ = pictures
     monkeypatch.setattr("zsp_lite.viz.report.write_report", lambda path, *_, **__: path)

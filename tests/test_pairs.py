@@ -3,7 +3,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 import torch
-from co3d_folders import edit_json, sequence_data
+from co3d_folders import edit_json, sequence_data, write_category, write_identities
 from refusals import refused
 
 from zsp_lite.data.co3d import Co3D, Pair, write_co3d
@@ -24,9 +24,7 @@ NAMES = ["s3", "s1", "s2"]
 def dataset(tmp_path_factory):
     root = tmp_path_factory.mktemp("data")
     for category in ("chair", "lamp"):
-        write_co3d(
-            root, category, [sequence_data(name, frames=12) for name in [*NAMES, "unlabelled"]]
-        )
+        write_category(root, category, [*NAMES, "unlabelled"], frames=12)
         for name in NAMES:
             write_label(root, category, PoseLabel(np.eye(4), name, "s1"))
     # Frame numbers are not positions: the list is shuffled, and numbers start at 100.
@@ -85,8 +83,7 @@ def test_all_pairs_are_different_and_too_large_a_number_gives_all_there_are(tmp_
     write_co3d(
         tmp_path, "chair", [sequence_data(name, frames=length) for name, length in lengths.items()]
     )
-    for name in lengths:
-        write_label(tmp_path, "chair", PoseLabel(np.eye(4), name, "a"))
+    write_identities(tmp_path, "chair", [*lengths])
     total = 62  # both directions of every two sequences: 2 * (2 * 3 + 2 * 5 + 3 * 5)
     every = sample_pairs(Co3D(tmp_path), "chair", total, 2)
     assert len({pair.key for pair in every}) == total
@@ -106,7 +103,7 @@ def test_missing_labels_and_frames_are_refused(dataset, tmp_path):
         1,
         13,
     )
-    write_co3d(tmp_path, "chair", [sequence_data("s1")])
+    write_category(tmp_path, "chair", ["s1"])
     refused("has 0 labelled sequences", lambda: sample_pairs(Co3D(tmp_path), "chair", 1, 1))
 
 
@@ -139,7 +136,7 @@ def test_published_ids_are_positions_in_the_frame_list(dataset, tmp_path, form):
 
 
 def test_a_folders_own_pairs_are_found(tmp_path, caplog):
-    write_co3d(tmp_path, "chair", [sequence_data(name) for name in "ab"])
+    write_category(tmp_path, "chair", "ab")
     dataset = Co3D(tmp_path)
     assert shipped_pairs(dataset, "chair", 2) == []
     # the last is the first

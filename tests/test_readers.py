@@ -221,9 +221,9 @@ def write(layout, folder, frames):
     """Write a scan; returns its path, and the options by which it is read."""
     folder.mkdir()
     (fx, fy), (cx, cy) = frames[0].camera.focal_length, frames[0].camera.principal_point
-    return WRITERS[layout](folder, frames), {
-        "intrinsics": (fx, fy, cx, cy)
-    } if layout == "tum" else {}
+    # The files of TUM say nothing of the camera.
+    options = {"intrinsics": (fx, fy, cx, cy)} if layout == "tum" else {}
+    return WRITERS[layout](folder, frames), options
 
 
 @pytest.mark.parametrize("layout", WRITERS)

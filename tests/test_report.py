@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 from numpy.testing import assert_allclose, assert_array_equal
 from plotly.offline import get_plotlyjs
 from synthetic_views import CoordinateBackbone
@@ -19,7 +18,6 @@ from zsp_lite.course.demo import N_TARGETS, demo_pairs, run_demo
 from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 from zsp_lite.io.files import REPOSITORY
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pair_result import PairResult
 from zsp_lite.viz.plots import object_cloud
 from zsp_lite.viz.report import (
     _two_poses_figure,
@@ -39,7 +37,7 @@ def exact_poses(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def results(ellipsoids) -> list[PairResult]:
+def results(ellipsoids):
     """The demo on the ellipsoids: one pair, by both solvers."""
     return list(run_demo(ellipsoids, CoordinateBackbone(), SOLVERS["both"]))
 
@@ -213,7 +211,7 @@ def test_all_text_of_a_pair_is_escaped(results, tmp_path):
 
 
 @pytest.fixture
-def axes(results, exact_poses) -> list[Axes]:
+def axes(results, exact_poses):
     """The overview of the demo and of a pair with other errors, three pictures for each."""
     wrong = replace(results[0], title="$x$", errors={"paper": 30.4, "verified": 29.6})
     return overview([results[0], wrong]).axes

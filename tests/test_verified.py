@@ -8,7 +8,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic_views import ELSEWHERE, REACH, CoordinateBackbone, look_at, render, true_pose, turned
 
-from zsp_lite import Camera, FeatureMap, Frame, PoseEstimate, Sim3, ZeroShotPose
+from zsp_lite import FeatureMap, Frame, PoseEstimate, Sim3, ZeroShotPose
 from zsp_lite.metrics import rotation_error
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 from zsp_lite.views import View, extract_views, object_crop
@@ -23,7 +23,7 @@ def method() -> ZeroShotPose:
 
 
 @pytest.fixture(scope="module")
-def views(method, frames) -> list[View]:
+def views(method, frames):
     """A reference and five target views."""
     return extract_views(method.backbone, [object_crop(frame) for frame in frames])
 
@@ -189,7 +189,7 @@ ALL_AROUND = [
 
 
 @pytest.fixture(scope="module")
-def symmetric() -> tuple[PoseEstimate, Camera]:
+def symmetric():
     """An estimate for an object that a half turn about z leaves alone, and the reference's
     camera."""
     with pytest.MonkeyPatch.context() as patch:

@@ -5,7 +5,6 @@ import base64
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -201,7 +200,7 @@ def test_the_page_has_the_librarys_fit(shown):
 
 
 @pytest.fixture(scope="module")
-def address(site) -> Iterator[str]:
+def address(site):
     """The address of a server of the site."""
     handler = partial(SimpleHTTPRequestHandler, directory=site)
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:

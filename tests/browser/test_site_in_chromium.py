@@ -2,7 +2,6 @@
 presenter's notes."""
 
 import pytest
-from playwright.sync_api import Page
 
 
 def test_no_page_is_wider_than_the_screen_of_a_phone(browser, site):
@@ -19,7 +18,7 @@ def test_no_page_is_wider_than_the_screen_of_a_phone(browser, site):
 
 
 @pytest.fixture
-def windows(browser, site) -> tuple[Page, Page]:
+def windows(browser, site):
     """What the class sees of a lab's slides, and the presenter's view."""
     page = browser.new_page()
     page.goto((site / "docs/slides/lab_2.html").as_uri())

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from co3d_folders import sequence_data
+from co3d_folders import sequence_data, write_identities
 from safetensors.torch import save_file
 from test_importers import write_lists, write_nerfstudio
 
@@ -20,7 +20,7 @@ from zsp_lite.cli.main import main
 from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.exchange import read_stored_poses
 from zsp_lite.data.frames import read_depth, read_image, read_mask
-from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.data.published import import_labels
 from zsp_lite.importers import open_capture
@@ -81,8 +81,7 @@ def prepare(folder: Path) -> Path:
     """
     data = folder / "data"
     write_co3d(data, "cup", [sequence_data("a", 6), sequence_data("b", 6, seed=1)])
-    for name in ("a", "b"):
-        write_label(data, "cup", PoseLabel(np.eye(4), name, "a"))
+    write_identities(data, "cup", "ab")
     assert main(f"{BENCHMARK} --data {data} --out {folder}/out --quiet".split()) == 0
     for write in (write_lists, write_nerfstudio):
         write(folder / "capture", [replace(sequence_data("c", 1).frames[0], name="0")])
