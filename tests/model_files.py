@@ -71,11 +71,9 @@ def write_wedge(path: Path, seat: float = 0.5) -> Path:
 def painted(mesh: Mesh) -> TexturedMesh:
     """Return a textured mesh of one colour, with smooth normals except at sharp edges."""
     n, normals = len(mesh.faces), smooth_normals(mesh.vertices, mesh.faces)
-    uv, white, material = (
-        np.zeros((n, 3, 2), np.float32),
-        np.ones((n, 3, 3), np.float32),
-        np.zeros(n, int),
-    )
+    uv = np.zeros((n, 3, 2), np.float32)
+    white = np.ones((n, 3, 3), np.float32)
+    material = np.zeros(n, int)
     colour = Material(np.array((0.7, 0.4, 0.3, 1.0)))
     return TexturedMesh(mesh.vertices, mesh.faces, normals, uv, white, material, (colour,))
 

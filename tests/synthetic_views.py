@@ -70,10 +70,8 @@ def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width)))
     # of a ball that holds the object
-    middle, reach = (
-        camera.to_camera(placement.t),
-        REACH * placement.scale,
-    )
+    middle = camera.to_camera(placement.t)
+    reach = REACH * placement.scale
     near = np.linalg.norm(np.cross(rays, middle), axis=-1) < reach * np.linalg.norm(rays, axis=-1)
     start, *ends = placement.inverse().apply(
         camera.to_world(np.concatenate([np.zeros((1, 3)), rays[near]]))

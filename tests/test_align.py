@@ -155,10 +155,8 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
             return one
         best = one.hypotheses[0]
         # the half turn is that of A's world
-        turn, other = (
-            reference.frame.camera.R,
-            targets[best.view].frame.camera.R,
-        )
+        turn = reference.frame.camera.R
+        other = targets[best.view].frame.camera.R
         turned = (
             best.sim3.R @ turn @ HALF_TURN @ turn.T
             if ends[0] == A

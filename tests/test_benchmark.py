@@ -228,14 +228,14 @@ def test_the_folder_of_another_run_is_refused(run, backbone, options, message):
 @pytest.mark.parametrize(
     "root, options, message",
     [
-        (small_folder(), {"pairs": {"teapot": 1}}, "category is 'teapot', expected one of lump"),
-        (small_folder(), {"pairs": {"lump": 0}}, "pairs of lump is 0"),
-        (small_folder(), {"targets": 0}, "targets is 0"),
-        (Path("nowhere"), {}, "nowhere"),
+        (small_folder, {"pairs": {"teapot": 1}}, "category is 'teapot', expected one of lump"),
+        (small_folder, {"pairs": {"lump": 0}}, "pairs of lump is 0"),
+        (small_folder, {"targets": 0}, "targets is 0"),
+        (lambda: Path("nowhere"), {}, "nowhere"),
     ],
 )
 def test_data_and_numbers_that_are_not_there_are_refused(tmp_path, root, options, message):
-    refused(message, evaluate, root, BACKBONE, out=tmp_path / "a", **options)
+    refused(message, evaluate, root(), BACKBONE, out=tmp_path / "a", **options)
     assert not (tmp_path / "a").exists()
 
 

@@ -80,10 +80,8 @@ def all_code() -> str:
 
 @pytest.mark.parametrize("page", PAGES, **ids)
 def test_every_environment_variable_and_make_target_that_is_named_exists(page):
-    named, inline = (
-        set(re.findall(r"\bZSP_LITE_\w+", markdown(page))),
-        _INLINE_CODE.findall(markdown(page)),
-    )
+    named = set(re.findall(r"\bZSP_LITE_\w+", markdown(page)))
+    inline = _INLINE_CODE.findall(markdown(page))
     pattern = r"\$?(?!PIP_)[A-Z0-9]+(_[A-Z0-9]+)+"  # PIP_...: pip's own
     named |= {code for code in inline if re.fullmatch(pattern, code)}
     for name in named:

@@ -49,10 +49,8 @@ def by_transformers(folder: Path, kind: str, size: int):
         options["noise"] = (
             torch.arange((size // architecture.patch) ** 2).float().repeat(len(PICTURES), 1)
         )
-    (blocks,), seen = (
-        [module for module in model.modules() if isinstance(module, torch.nn.ModuleList)],
-        [],
-    )
+    (blocks,) = [module for module in model.modules() if isinstance(module, torch.nn.ModuleList)]
+    seen = []
     for block in blocks:
         block.register_forward_hook(lambda module, inputs, output: seen.append((inputs[0], output)))
     with torch.no_grad():

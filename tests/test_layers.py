@@ -59,10 +59,8 @@ def test_no_module_imports_from_a_higher_layer_or_from_another_name_of_its_own()
 
 def test_only_the_commands_import_the_course_and_only_it_imports_its_packages():
     for module, imported, line in imports():
-        room, where = (
-            module.partition(".")[0],
-            f"zsp_lite.{module}, line {line}, imports {imported}",
-        )
+        room = module.partition(".")[0]
+        where = f"zsp_lite.{module}, line {line}, imports {imported}"
         assert room == "course" or imported.partition(".")[0] not in OF_THE_COURSE, where
         assert room in ("course", "cli") or not imported.startswith("zsp_lite.course"), where
 

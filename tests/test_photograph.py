@@ -41,13 +41,11 @@ def frame():
 
 
 def test_the_mask_holds_the_seat_and_both_wheels_and_neither_the_floor_nor_the_bench(frame):
-    seat, rear_tyre, front_tyre, floor, bench = (
-        (240, 230),
-        (320, 135),
-        (370, 675),
-        (470, 300),
-        (160, 100),
-    )
+    seat = (240, 230)
+    rear_tyre = (320, 135)
+    front_tyre = (370, 675)
+    floor = (470, 300)
+    bench = (160, 100)
     assert [frame.mask[pixel] for pixel in (seat, rear_tyre, front_tyre, floor, bench)] == [
         1,
         1,

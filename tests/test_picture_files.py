@@ -295,12 +295,10 @@ def test_depth_of_another_shape_is_refused_with_what_is_allowed(tmp_path, portra
 def test_the_pose_of_a_sideways_portrait_is_that_of_the_upright_one(tmp_path, portrait):
     """A later run leaves no file of an earlier one in its folder, and a single image is a
     helper."""
-    names, given, out, poses = (
-        ("upright.png", "sideways.jpg", "third.jpg"),
-        (190, 190, 70, 90),
-        tmp_path / "out",
-        [],
-    )
+    names = ("upright.png", "sideways.jpg", "third.jpg")
+    given = (190, 190, 70, 90)
+    out = tmp_path / "out"
+    poses = []
     images = [
         write_photograph(tmp_path / name, portrait, 6 if name == "sideways.jpg" else 1)
         for name in names

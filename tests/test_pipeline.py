@@ -54,8 +54,10 @@ def test_the_true_pose_is_found_within_a_few_degrees(estimate, reference, target
     assert_allclose(estimate.sim3.scale, truth.scale, rtol=0.1)
     centre = reference.camera.to_camera(np.zeros(3))
     assert_allclose(estimate.sim3.apply(centre), truth.apply(centre), atol=0.1)
-    assert not estimate.flags
-    assert estimate.note == ""
+
+
+def test_an_estimate_by_the_papers_solver_has_times_but_no_doubts(estimate):
+    assert (estimate.flags, estimate.note) == ((), "")
     assert list(estimate.timings) == ["features", "matching", "view", "alignment"]
     assert estimate.alternatives == ()
     assert estimate.confidence is None
@@ -220,18 +222,16 @@ def nearest(similarity, *_):
     ],
 )
 def test_nothing_that_a_plug_in_overwrites_reaches_the_rest(reference, targets, settings):
-    before, backbone = (
-        deepcopy((reference.rgb, targets[0].depth)),
-        {"backbone": CoordinateBackbone()},
-    )
+    before = deepcopy((reference.rgb, targets[0].depth))
+    backbone = {"backbone": CoordinateBackbone()}
     spoiled = {
         name: one if isinstance(one, str) else spoiling(one) for name, one in settings.items()
     }
-    found, expected = (
-        ZeroShotPose(**backbone | some).estimate(reference, targets) for some in (spoiled, settings)
-    )
+    found = ZeroShotPose(**backbone | spoiled).estimate(reference, targets)
+    expected = ZeroShotPose(**backbone | settings).estimate(reference, targets)
     assert_array_equal(found.sim3.matrix, expected.sim3.matrix)
-    views, others = ((one.reference_view, *one.target_views) for one in (found, expected))
+    views = found.reference_view, *found.target_views
+    others = expected.reference_view, *expected.target_views
     for one, other in zip(views, others, strict=True):
         assert torch.equal(one.features.keys, other.features.keys)
         assert torch.equal(one.foreground, other.foreground)

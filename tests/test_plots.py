@@ -67,10 +67,8 @@ def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects(
     # Points: on the surface, far behind it, far before it, outside the silhouette, over a hole in
     # the depth.
     behind, weight = torch.tensor([0.0, 1, -1, 0, 0]), torch.tensor([1.0, 1, 1, 0, 0])
-    off, pixels = (
-        torch.tensor([0.0, 0, 0, 0.4, 0]),
-        torch.tensor([[10.0, 5], [20, 5], [30, 5], [55, 5], [20, 20]]),
-    )
+    off = torch.tensor([0.0, 0, 0, 0.4, 0])
+    pixels = torch.tensor([[10.0, 5], [20, 5], [30, 5], [55, 5], [20, 20]])
     parts = (3 + behind, torch.full((5,), 3.0), weight, off, torch.arange(5), pixels)
     touch = weight * torch.exp(-(behind**2) / (2 * SURFACE_SIGMA**2))
     front = weight * (-(behind + SURFACE_SIGMA) / MAX_VIOLATION).clamp(0, 1)

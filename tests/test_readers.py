@@ -6,6 +6,7 @@ import re
 import shutil
 import sys
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -93,11 +94,9 @@ def write_polycam(folder, frames):
     write_files(inside, frames, images="corrected_images/{}.jpg", masks="../masks/{}.png")
     write_confidence(inside / "confidence", frames)
     for k, frame in enumerate(frames):
-        pose, (fx, fy), (cx, cy) = (
-            to_world(frame) @ OPENGL,
-            frame.camera.focal_length,
-            frame.camera.principal_point,
-        )
+        pose = to_world(frame) @ OPENGL
+        (fx, fy) = frame.camera.focal_length
+        (cx, cy) = frame.camera.principal_point
         camera = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
         path = inside / f"corrected_cameras/{k:06d}.json"
         path.parent.mkdir(exist_ok=True)
@@ -244,7 +243,8 @@ def test_each_layout_is_recognised_and_gives_the_cameras_the_depth_and_the_masks
         assert np.abs(frame.rgb.astype(int) - view.rgb).mean() < 8
 
 
-def each(change):
+def each(change: Callable[[dict], object]) -> Callable[[dict], list]:
+    """Return a change of all frames of transforms.json."""
     return lambda content: [change(frame) for frame in content["frames"]]
 
 

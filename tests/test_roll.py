@@ -28,10 +28,8 @@ class UprightBackbone(CoordinateBackbone):
         found = super().features(image)
         rows, columns = np.nonzero(image.any(axis=-1))
         height = image[rows, columns, 2].astype(float) - image[rows, columns, 2].mean()
-        down, right = (
-            (height * (rows - rows.mean())).sum(),
-            (height * (columns - columns.mean())).sum(),
-        )
+        down = (height * (rows - rows.mean())).sum()
+        right = (height * (columns - columns.mean())).sum()
         if down < 0 and -down > abs(right):
             return found
         noise = torch.from_numpy(np.random.default_rng(5).normal(size=found.keys.shape)).float()

@@ -74,10 +74,8 @@ def test_surface_points_of_renders_are_coordinates_of_the_object(renders):
     assert inside.shape == (3, VIEWS, GRID, GRID)
     assert 0.05 < inside.mean() < 0.9
     for number, points in enumerate(renders.surface):
-        shape, seen = (
-            make_shape(rendering.build_random_object, [number, 1]).vertices,
-            points[inside[number]],
-        )
+        shape = make_shape(rendering.build_random_object, [number, 1]).vertices
+        seen = points[inside[number]]
         assert (seen > shape.min(0) - 0.01).all()
         assert (seen < shape.max(0) + 0.01).all()
 
@@ -245,11 +243,9 @@ def pictures() -> np.ndarray:
 
 def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_crop():
     rng = default_rng(0)
-    student, teacher, centre = (
-        rng.normal(size=(4, 3, 5)),
-        rng.normal(size=(2, 3, 5)),
-        rng.normal(size=5),
-    )
+    student = rng.normal(size=(4, 3, 5))
+    teacher = rng.normal(size=(2, 3, 5))
+    centre = rng.normal(size=5)
     terms, entropies = [], []
     for picture in range(3):
         for g in range(2):

@@ -246,10 +246,8 @@ def test_terms_equal_a_computation_point_by_point(scene, views, truth, turn):
         rotation_matrices(torch.deg2rad(torch.tensor([turn], dtype=torch.float32))) @ truth.rotation
     )
     poses = Poses(truth.scale, turned, truth.translation + 0.1)
-    found, expected = (
-        first_terms(scene, poses, EVERY),
-        by_hand(scene, views, scene.to_sim3(poses, 0, 0)),
-    )
+    found = first_terms(scene, poses, EVERY)
+    expected = by_hand(scene, views, scene.to_sim3(poses, 0, 0))
     for name, value in expected.items():
         assert found[name] == pytest.approx(value, abs=0.02), name
 
@@ -379,10 +377,8 @@ def test_probabilities_by_hand():
     calibration = Calibration(
         (0.2, 0.4, -0.5, 0.6, 1.0, 0.1), (0.3, 0.8, -0.1, 0.2, -2.0, -0.25), 0.4
     )
-    a, none = (
-        np.exp(0.2 + 0.2 + 0.3 + 0.03 + 0.2) / 2,
-        np.exp(0.3 + 0.4 + 0.1 - 0.06 - 0.5) * 4**-0.1,
-    )
+    a = np.exp(0.2 + 0.2 + 0.3 + 0.03 + 0.2) / 2
+    none = np.exp(0.3 + 0.4 + 0.1 - 0.06 - 0.5) * 4**-0.1
     odds = np.exp(-a * np.array([0.0, 0.5, 2.0, np.inf]))
     found = calibration.probabilities(np.array([0.0, 0.5, 2.0, np.inf]), known)
     assert_allclose(found, (1 - 0.4 / 4) * odds / (none + odds.sum()))

@@ -76,11 +76,9 @@ def sim():
 def test_attention_names_the_patch_with_the_largest_weight():
     backbone, widget = load_backbone("zsp-tiny", "cpu"), examples.attention()
     facets = patches.all_facets(backbone, [examples.sample_pair().reference.rgb])
-    widget.controls["layer"].value, widget.controls["head"].value, widget.controls["row"].value = (
-        4,
-        2,
-        20,
-    )
+    widget.controls["layer"].value = 4
+    widget.controls["head"].value = 2
+    widget.controls["row"].value = 20
     heads, col = backbone.model.num_heads, widget.controls["col"].value
     q, k = (facets[4, name][0].unflatten(1, (heads, -1))[:, 2] for name in ("query", "key"))
     top = divmod(int((k @ q[1 + 20 * 28 + col])[1:].argmax()), 28)
@@ -93,11 +91,9 @@ def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim
     widget = patches.patch_similarities(
         pair.reference.rgb, pair.target.rgb, kinds, pair.cells, pair.valid, "other"
     )
-    widget.controls["kind"].value, widget.controls["row"].value, widget.controls["col"].value = (
-        "one",
-        15,
-        9,
-    )
+    widget.controls["kind"].value = "one"
+    widget.controls["row"].value = 15
+    widget.controls["col"].value = 9
     row, col = cells[15 * 28 + 9]
     assert (
         f"nearest neighbour ({row}, {col}), cosine {sim[15 * 28 + 9].max():.2f}"

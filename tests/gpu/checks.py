@@ -160,10 +160,11 @@ def main() -> int:
         print("skipped: no CUDA device")
         return 0
     name = torch.cuda.get_device_name() if options.device == "cuda" else "no GPU"
-    report, failures = (
-        [f"| {name}, {CORES} cores, PyTorch {torch.__version__} | device | |", "|---|---|---:|"],
-        [],
-    )
+    report = [
+        f"| {name}, {CORES} cores, PyTorch {torch.__version__} | device | |",
+        "|---|---|---:|",
+    ]
+    failures = []
     options.out.mkdir(parents=True, exist_ok=True)
     for part in options.parts:
         start = time.perf_counter()
