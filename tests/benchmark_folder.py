@@ -49,11 +49,9 @@ def small_folder() -> Path:
             frames = tuple(
                 render(camera, placement, f"{name}/{i}") for i, camera in enumerate(cameras)
             )
-            times, cloud, colours = (
-                tuple(map(float, range(FRAMES))),
-                np.eye(3),
-                np.zeros((3, 3), np.uint8),
-            )
+            times = tuple(map(float, range(FRAMES)))
+            cloud = np.eye(3)
+            colours = np.zeros((3, 3), np.uint8)
             sequences.append(SequenceData(name, frames, times, cloud, colours))
             trans = np.eye(4)
             trans[:3, :3] = turn
