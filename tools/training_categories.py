@@ -25,19 +25,13 @@ def quadruped(a: Assembly) -> None:
     a.add(capsule((-length / 2, 0, z), (length / 2, 0, z + a.u(-0.05, 0.1)), r * a.u(0.8, 1), r), 0)
     for x in (-length / 2, length / 2 - 0.05):
         foot = (x + a.u(-0.1, 0.1), r * 0.65, 0.06)
-        a.add(
-            capsule((x, r * 0.6, z - 0.05), foot, a.u(0.08, 0.13), a.u(0.06, 0.1)), 0, mirror=True
-        )
+        a.add_pair(capsule((x, r * 0.6, z - 0.05), foot, a.u(0.08, 0.13), a.u(0.06, 0.1)), 0)
     head = np.array([length / 2 + a.u(0.1, 0.4), 0, z + a.u(0.25, 0.9)])
     a.add(capsule((length / 2, 0, z + 0.1), head, a.u(0.12, 0.2), a.u(0.1, 0.18)), 0)
     a.add(capsule(head, head + [a.u(0.2, 0.4), 0, -0.08], a.u(0.15, 0.24), a.u(0.09, 0.15)), 1)
     if a.chance(0.8):
-        a.add(
-            ellipsoid((0.05, a.u(0.06, 0.12), a.u(0.1, 0.22)), head + [-0.05, 0.15, 0.2]),
-            2,
-            mirror=True,
-        )
-    a.add(ellipsoid((0.04, 0.03, 0.04), head + [0.1, 0.15, 0.08]), 3, mirror=True)
+        a.add_pair(ellipsoid((0.05, a.u(0.06, 0.12), a.u(0.1, 0.22)), head + [-0.05, 0.15, 0.2]), 2)
+    a.add_pair(ellipsoid((0.04, 0.03, 0.04), head + [0.1, 0.15, 0.08]), 3)
     tail = (-length / 2 - r - a.u(0.1, 0.5), 0, z + a.u(-0.4, 0.4))
     a.add(capsule((-length / 2 - r * 0.6, 0, z + 0.1), tail, 0.06, 0.04), 2)
 
@@ -59,12 +53,8 @@ def fish(a: Assembly) -> None:
         [-0.5 * length, h * 0.7],
     ]
     a.add(extrusion(fin, 0.05), 1)
-    a.add(ellipsoid((0.06, 0.05, 0.06), (length * 0.72, 0.14, h * 0.2)), 3, mirror=True)
-    a.add(
-        ellipsoid((0.25, 0.04, 0.12)).rotated("z", -0.5).translated((0.15, 0.28, -0.1)),
-        2,
-        mirror=True,
-    )
+    a.add_pair(ellipsoid((0.06, 0.05, 0.06), (length * 0.72, 0.14, h * 0.2)), 3)
+    a.add_pair(ellipsoid((0.25, 0.04, 0.12)).rotated("z", -0.5).translated((0.15, 0.28, -0.1)), 2)
 
 
 def teapot(a: Assembly) -> None:
@@ -145,15 +135,15 @@ def cart(a: Assembly) -> None:
         [length / 2 + flare, z + h],
         [-length / 2 - flare * 0.3, z + h],
     ]
-    a.add(extrusion(panel, 0.05, "xz", w / 2), 0, mirror=True)
+    a.add_pair(extrusion(panel, 0.05, "xz", w / 2), 0)
     for x in (-length / 2, length / 2 + flare * 0.5):
         a.add(box((0.05, w, h), (x, 0, z + h / 2)), 1)
     grip = np.array([-length / 2 - a.u(0.2, 0.5), w * 0.45, z + h + a.u(0.1, 0.5)])
-    a.add(rod((-length / 2, w * 0.45, z + h), grip, 0.03), 2, mirror=True)
+    a.add_pair(rod((-length / 2, w * 0.45, z + h), grip, 0.03), 2)
     a.add(rod(grip, grip * [1, -1, 1], 0.04), 3)
     for x, r in ((-length * 0.35, wheel), (length * 0.35, wheel * 0.8)):
-        a.add(disc(r, 0.08, (x, w / 2, r)), 3, mirror=True)
-        a.add(disc(r * 0.5, 0.1, (x, w / 2, r)), 2, mirror=True)
+        a.add_pair(disc(r, 0.08, (x, w / 2, r)), 3)
+        a.add_pair(disc(r * 0.5, 0.1, (x, w / 2, r)), 2)
 
 
 def rocket(a: Assembly) -> None:

@@ -45,16 +45,10 @@ def helicopter(a: Assembly) -> None:
         a.add(blade, 2)
     a.add(torus(0.2, 0.025, (0, 1, 0), tail + [0, 0.08, 0.05]), 3)
     if a.chance(0.7):
-        a.add(
-            rod((-length * 0.6, r * 0.8, 0.05), (length * 0.9, r * 0.8, 0.05), 0.035),
-            3,
-            mirror=True,
-        )
+        a.add_pair(rod((-length * 0.6, r * 0.8, 0.05), (length * 0.9, r * 0.8, 0.05), 0.035), 3)
         for x in (-0.3, 0.35):
-            a.add(
-                rod((x * length, r * 0.4, z - r * 0.7), (x * length, r * 0.8, 0.05), 0.03),
-                3,
-                mirror=True,
+            a.add_pair(
+                rod((x * length, r * 0.4, z - r * 0.7), (x * length, r * 0.8, 0.05), 0.03), 3
             )
     else:
         _wheel(a, length * 0.4, r * 0.7, 0.14, 0.1)
@@ -73,15 +67,15 @@ def wheelbarrow(a: Assembly) -> None:
         [length * 0.25, z],
         [length * a.u(0.55, 0.75), z + depth],
     ]
-    a.add(extrusion(side, 0.05).translated((0, w / 2, 0)), 0, mirror=True)
+    a.add_pair(extrusion(side, 0.05).translated((0, w / 2, 0)), 0)
     a.add(box((length * 0.6, w, 0.05), (0, 0, z)), 0)
     a.add(
         rod((length * 0.3, 0, z + 0.02), (length * 0.6, 0, z + depth * 0.9), w * 0.45, w * 0.5), 0
     )
     grip = np.array([-length / 2 - a.u(0.4, 0.7), w * 0.4, z + a.u(0.1, 0.4)])
-    a.add(rod((length * 0.6, w * 0.15, wheel), grip, 0.04), 1, mirror=True)
-    a.add(capsule(grip, grip + [-0.15, 0, 0.02], 0.06), 2, mirror=True)
-    a.add(rod((-length * 0.2, w * 0.35, z), (-length * 0.35, w * 0.4, 0), 0.035), 1, mirror=True)
+    a.add_pair(rod((length * 0.6, w * 0.15, wheel), grip, 0.04), 1)
+    a.add_pair(capsule(grip, grip + [-0.15, 0, 0.02], 0.06), 2)
+    a.add_pair(rod((-length * 0.2, w * 0.35, z), (-length * 0.35, w * 0.4, 0), 0.035), 1)
     _wheel(a, length * 0.65, 0, wheel, a.u(0.08, 0.16), mirror=False)
 
 
@@ -153,11 +147,11 @@ def dinosaur(a: Assembly) -> None:
     head = chest + [a.u(0.3, 0.6), 0, a.u(0.2, 0.7)]
     a.add(rod(chest, head, r * 0.6, r * 0.35), 0)
     a.add(capsule(head, head + [a.u(0.2, 0.4), 0, -0.05], r * 0.45, r * 0.28), 1)
-    a.add(ellipsoid((0.05, 0.04, 0.05), head + [0.06, r * 0.4, 0.08]), 3, mirror=True)
-    a.add(capsule(hip + [0, r * 0.7, 0], (hip[0] + 0.05, r * 0.9, 0.08), 0.17, 0.1), 1, mirror=True)
+    a.add_pair(ellipsoid((0.05, 0.04, 0.05), head + [0.06, r * 0.4, 0.08]), 3)
+    a.add_pair(capsule(hip + [0, r * 0.7, 0], (hip[0] + 0.05, r * 0.9, 0.08), 0.17, 0.1), 1)
     upright = a.chance(0.5)
     foot = chest + [0.3, r * 0.5, -0.3] if upright else np.array([chest[0], r * 0.8, 0.08])
-    a.add(capsule(chest + [0, r * 0.5, -0.05], foot, 0.1, 0.06), 1, mirror=True)
+    a.add_pair(capsule(chest + [0, r * 0.5, -0.05], foot, 0.1, 0.06), 1)
     for k in range(5):
         x = hip[0] - 0.3 + 0.25 * k
         a.add(
@@ -191,7 +185,7 @@ def mailbox(a: Assembly) -> None:
 def excavator(a: Assembly) -> None:
     length = a.u(0.9, 1.2)
     w = a.u(0.6, 0.8)
-    a.add(capsule((-length / 2, w / 2, 0.16), (length / 2, w / 2, 0.16), 0.16), 3, mirror=True)
+    a.add_pair(capsule((-length / 2, w / 2, 0.16), (length / 2, w / 2, 0.16), 0.16), 3)
     a.add(box((length * 0.9, w * 0.9, a.u(0.25, 0.4)), (-0.08, 0, 0.5)), 0)
     side = a.u(0.1, 0.2) * (1 if a.chance(0.5) else -1)
     a.add(box((0.4, w * 0.45, a.u(0.4, 0.55)), (length * 0.15, side, 0.9)), 4)
@@ -213,18 +207,15 @@ def bed(a: Assembly) -> None:
     a.add(box((length, width, a.u(0.15, 0.3)), (0, 0, z)), 0)
     for end, height in ((1, a.u(0.65, 1.1)), (-1, a.u(0.35, 0.65))):
         a.add(box((0.08, width, height), (end * length / 2, 0, height / 2 + 0.08)), 1)
-        a.add(
+        a.add_pair(
             rod(
                 (end * length / 2, width / 2, 0), (end * length / 2, width / 2, height + 0.12), 0.05
             ),
             1,
-            mirror=True,
         )
     top = z + 0.17
     if double:
-        a.add(
-            ellipsoid((0.2, width * 0.2, 0.1), (length * 0.37, width * 0.24, top)), 2, mirror=True
-        )
+        a.add_pair(ellipsoid((0.2, width * 0.2, 0.1), (length * 0.37, width * 0.24, top)), 2)
     else:
         a.add(ellipsoid((0.2, width * 0.36, 0.1), (length * 0.37, 0, top)), 2)
     a.add(box((length * a.u(0.4, 0.65), width * 1.03, 0.12), (-length * 0.15, 0, top - 0.05)), 3)
@@ -239,12 +230,12 @@ def bathtub(a: Assembly) -> None:
     a.add(extrusion([[-rear, 0], [front, 0], [length / 2, h], [-length / 2, h]], w), 0)
     a.add(box((length * 0.88, w * 0.8, 0.03), (0, 0, h + 0.01)), 1)
     for x in (-rear, front):
-        a.add(ellipsoid((0.07, 0.07, 0.1), (x * 0.85, w * 0.38, -0.03)), 2, mirror=True)
+        a.add_pair(ellipsoid((0.07, 0.07, 0.1), (x * 0.85, w * 0.38, -0.03)), 2)
     tap = np.array([-length / 2 + 0.06, 0, h])
     rise = a.u(0.12, 0.3)
     a.add(rod(tap, tap + [0, 0, rise], 0.035), 2)
     a.add(rod(tap + [0, 0, rise], tap + [a.u(0.1, 0.25), 0, rise - 0.03], 0.03), 2)
-    a.add(ellipsoid((0.04, 0.04, 0.06), tap + [0, 0.13, 0.05]), 2, mirror=True)
+    a.add_pair(ellipsoid((0.04, 0.04, 0.06), tap + [0, 0.13, 0.05]), 2)
 
 
 def skateboard(a: Assembly) -> None:
@@ -262,7 +253,7 @@ def skateboard(a: Assembly) -> None:
         deck = deck if end == 1 else deck.rotated("z", np.pi)
         a.add(deck.translated((end * length * 0.33, 0, z)), 0)
     for x in (-0.24 * length, 0.26 * length):
-        a.add(disc(0.09, 0.1, (x, w * 0.42, 0.09)), 2, mirror=True)
+        a.add_pair(disc(0.09, 0.1, (x, w * 0.42, 0.09)), 2)
         a.add(rod((x, -w * 0.4, 0.1), (x, w * 0.4, 0.1), 0.04), 1)
         a.add(box((0.2, 0.15, 0.12), (x, 0, 0.18)), 1)
     a.add(box((length * 0.25, w * 0.98, 0.02), (length * a.u(0.05, 0.15), 0, z + 0.03)), 3)
@@ -283,15 +274,14 @@ def tram(a: Assembly) -> None:
     a.add(screen.translated((length / 2 - rake / 2 + 0.01, 0, (belt + roof) / 2)), 4)
     a.add(box((0.03, w * 0.5, h * 0.3), (-length / 2, 0, (belt + roof) / 2)), 4)
     for k in range(4):
-        a.add(
+        a.add_pair(
             box(
                 (length * 0.15, 0.03, h * 0.3), ((k - 1.6) * length * 0.2, w / 2, (belt + roof) / 2)
             ),
             4,
-            mirror=True,
         )
-    a.add(ellipsoid((0.04, 0.07, 0.06), (length / 2, w * 0.32, floor + 0.17)), 5, mirror=True)
-    a.add(box((0.04, 0.1, 0.08), (-length / 2, w * 0.35, floor + 0.2)), 6, mirror=True)
+    a.add_pair(ellipsoid((0.04, 0.07, 0.06), (length / 2, w * 0.32, floor + 0.17)), 5)
+    a.add_pair(box((0.04, 0.1, 0.08), (-length / 2, w * 0.35, floor + 0.2)), 6)
     for x in (-0.32, 0.32):
         a.add(box((length * 0.2, w * 0.8, 0.2), (x * length, 0, 0.1)), 3)
     arm = np.array([length * a.u(-0.05, 0.1), 0, roof + a.u(0.25, 0.4)])
