@@ -149,7 +149,9 @@ def block_index(layer: int | str, depth: int, name: str) -> int:
     return int(number[1]) % depth
 
 
-def prepare_images(images: Sequence[Image], size: int, first: int = 0) -> Float[Tensor, "b 3 s s"]:
+def prepare_images(
+    images: Sequence[Image], size: int = 224, first: int = 0
+) -> Float[Tensor, "b 3 s s"]:
     """Stack RGB images (H, W, 3), uint8 or float in [0, 1], to a batch of squares in [0, 1].
 
     Images are resized bilinearly with anti-aliasing. Errors count the images from `first`.
