@@ -49,11 +49,9 @@ def small_folder() -> Path:
             frames = tuple(
                 render(camera, placement, f"{name}/{i}") for i, camera in enumerate(cameras)
             )
-            times, cloud, colours = (
-                tuple(map(float, range(FRAMES))),
-                np.eye(3),
-                np.zeros((3, 3), np.uint8),
-            )
+            times = tuple(map(float, range(FRAMES)))
+            cloud = np.eye(3)
+            colours = np.zeros((3, 3), np.uint8)
             sequences.append(SequenceData(name, frames, times, cloud, colours))
             trans = np.eye(4)
             trans[:3, :3] = turn
@@ -190,8 +188,8 @@ def made_up_run(out, rows):
 def after_each_save(act: Callable[[], None]) -> Callable[..., None]:
     """Return a substitute of `execution.add_lines` that calls `act` after it has added pairs."""
 
-    def add_and_act(out, lines, kind):
-        add_lines(out, lines, kind)
+    def add_and_act(out, lines):
+        add_lines(out, lines)
         act()
 
     return add_and_act

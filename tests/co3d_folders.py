@@ -2,21 +2,24 @@
 
 import gzip
 import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.data.cameras import Camera
-from zsp_lite.data.co3d import SequenceData
-from zsp_lite.data.frames import Frame
+from zsp_lite import Camera, Frame
+from zsp_lite.data.co3d import SequenceData, write_co3d
+from zsp_lite.data.labels import PoseLabel, write_label
 
 seeds = st.integers(0, 2**32 - 1)
 
 
 def random_camera(seed: int = 0, size: tuple[int, int] | None = None) -> Camera:
     """A random camera with unequal focal lengths."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     size = size or tuple(int(side) for side in rng.integers(8, 2000, 2))
     rotation = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
     focal = rng.uniform(0.5, 3, 2) * max(size)
@@ -30,7 +33,7 @@ def sequence_data(
 ) -> SequenceData:
     """`frames` views of 24 x 32 pixels with a smooth picture, a disc for a mask and depth with a
     hole."""
-    rng = np.random.default_rng([seed, *name.encode()])
+    rng = default_rng([seed, *name.encode()])
     height, width = 24, 32
     y, x = np.mgrid[:height, :width]
     made = []
@@ -49,7 +52,18 @@ def sequence_data(
     return SequenceData(name, made, times, points, colours, None, 2.0, quality, **options)
 
 
-def contents(folder) -> dict[str, bytes]:
+def write_category(root: Path, category: str, names: Iterable[str], **options) -> None:
+    """Write small random sequences."""
+    write_co3d(root, category, [sequence_data(name, **options) for name in names])
+
+
+def write_identities(root: Path, category: str, names: Sequence[str]) -> None:
+    """Write labels that say that the worlds of sequences are that of the first one."""
+    for name in names:
+        write_label(root, category, PoseLabel(np.eye(4), name, names[0]))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
     """The files of a folder by their paths in it."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
@@ -58,14 +72,14 @@ def contents(folder) -> dict[str, bytes]:
     }
 
 
-def edit_json(path, change) -> None:
+def edit_json(path: Path, change: Callable) -> None:
     """Rewrite a gzipped JSON file with `change` applied to its content."""
     content = json.loads(gzip.decompress(path.read_bytes()))
     changed = change(content)
     path.write_bytes(gzip.compress(json.dumps(content if changed is None else changed).encode()))
 
 
-def convert_to_v2(folder) -> None:
+def convert_to_v2(folder: Path) -> None:
     """Rewrite the cameras of a category in the format of CO3D v2, with the fields that only
     v2 has."""
 

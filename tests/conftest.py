@@ -58,12 +58,12 @@ def links(tmp_path_factory):
 
 @pytest.fixture
 def run(capsys):
-    """Runs a command that ends with an exit code; returns what it printed, with stderr where it did
-    not succeed."""
+    """Runs a command line, whose words have no spaces, that ends with an exit code; returns what it
+    printed, with stderr where it did not succeed."""
     from zsp_lite.cli.main import main
 
-    def run_command(words, code=0) -> str:
-        assert main([str(word) for word in words]) == code
+    def run_command(line: str, code: int = 0) -> str:
+        assert main(line.split()) == code
         out, error = capsys.readouterr()
         return out + error if code > 1 else out
 

@@ -5,12 +5,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from zsp_lite import Camera
 from zsp_lite.course.synthetic.meshes import Material, TexturedMesh, smooth_normals
 from zsp_lite.course.synthetic.primitives import Mesh, box, joined
 from zsp_lite.course.synthetic.room import CheapCamera, Room
 from zsp_lite.course.synthetic.sequences import orbit_pose
 from zsp_lite.course.training.renders import framed_camera
-from zsp_lite.data.cameras import Camera
 
 # Two triangles in the plane z = 0 of the file, 2 x 2, seen upright from +z.
 _QUAD = """mtllib {stem}.mtl
@@ -71,11 +71,9 @@ def write_wedge(path: Path, seat: float = 0.5) -> Path:
 def painted(mesh: Mesh) -> TexturedMesh:
     """Return a textured mesh of one colour, with smooth normals except at sharp edges."""
     n, normals = len(mesh.faces), smooth_normals(mesh.vertices, mesh.faces)
-    uv, white, material = (
-        np.zeros((n, 3, 2), np.float32),
-        np.ones((n, 3, 3), np.float32),
-        np.zeros(n, int),
-    )
+    uv = np.zeros((n, 3, 2), np.float32)
+    white = np.ones((n, 3, 3), np.float32)
+    material = np.zeros(n, int)
     colour = Material(np.array((0.7, 0.4, 0.3, 1.0)))
     return TexturedMesh(mesh.vertices, mesh.faces, normals, uv, white, material, (colour,))
 

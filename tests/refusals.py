@@ -2,7 +2,7 @@
 
 import pytest
 
-from zsp_lite.errors import InputError
+from zsp_lite import InputError
 
 
 def refused(message: str, call, /, *arguments, error=InputError, **options) -> str:

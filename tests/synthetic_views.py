@@ -9,11 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.random import default_rng
 
-from zsp_lite.alignment import Sim3
-from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import Frame
-from zsp_lite.features import FeatureMap
+from zsp_lite import Camera, FeatureMap, Frame, Sim3
 from zsp_lite.matching import match, similarities
 from zsp_lite.verified.poses import Poses
 from zsp_lite.verified.scene import Scene, build_scene
@@ -72,10 +70,8 @@ def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width)))
     # of a ball that holds the object
-    middle, reach = (
-        camera.to_camera(placement.t),
-        REACH * placement.scale,
-    )
+    middle = camera.to_camera(placement.t)
+    reach = REACH * placement.scale
     near = np.linalg.norm(np.cross(rays, middle), axis=-1) < reach * np.linalg.norm(rays, axis=-1)
     start, *ends = placement.inverse().apply(
         camera.to_world(np.concatenate([np.zeros((1, 3)), rays[near]]))
@@ -129,9 +125,9 @@ class CoordinateBackbone:
             ..., None
         ]
         coordinates = (mean / 127 - 1) * REACH
-        waves = np.random.default_rng(5).normal(0, 1.6, (3, self.frequencies))
+        waves = default_rng(5).normal(0, 1.6, (3, self.frequencies))
         keys = np.concatenate([np.sin(coordinates @ waves), np.cos(coordinates @ waves)], axis=-1)
-        keys[share < 0.5] = 0.05 * np.random.default_rng(6).normal(size=keys.shape[-1])
+        keys[share < 0.5] = 0.05 * default_rng(6).normal(size=keys.shape[-1])
         keys = torch.as_tensor(keys, dtype=torch.float32)
         saliency = torch.as_tensor(np.where(share < 0.5, 0, share), dtype=torch.float32)
         return FeatureMap(keys, saliency, keys[share >= 0.5].mean(dim=0).nan_to_num())

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic_views import ELSEWHERE, look_at, render
 
-from zsp_lite.data.frames import Frame
+from zsp_lite import Frame
 from zsp_lite.importers.agreement import disagreement
 
 FLIP = np.diag([1.0, -1, -1, 1])
@@ -70,7 +70,7 @@ def farther(frame):
 
 
 @pytest.mark.parametrize(
-    ("mistake", "named"),
+    "mistake, named",
     [
         (inverted, r"agree \(\d+%\) if the poses are world to camera$"),
         (flipped, "if the poses have the other axes, OpenGL's for OpenCV's or the reverse"),

@@ -11,21 +11,19 @@ import msgspec
 import numpy as np
 import pytest
 from benchmark_folder import SEQUENCES, SlowBackbone, run_rows, small_folder
+from numpy.testing import assert_allclose
 from refusals import refused
 
-from zsp_lite import align
-from zsp_lite.align import align_category, read_hypotheses, write_labels
+from zsp_lite import Co3D, InputError, ZeroShotPose, align, align_category, estimate_pose
+from zsp_lite.align import read_hypotheses, write_labels
 from zsp_lite.benchmark.run import evaluate
 from zsp_lite.category import synchronise
 from zsp_lite.cli import main as cli
 from zsp_lite.course.labelling.session import Labelling
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import resize_frame
 from zsp_lite.data.labels import read_labels
-from zsp_lite.errors import InputError, NoPoseError
+from zsp_lite.errors import NoPoseError
 from zsp_lite.metrics import rotation_error
-from zsp_lite.own_objects import estimate_pose
-from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.viz.category_sheet import objects_figure
 
 BACKBONE = SlowBackbone(grid=8, _seconds=0)
@@ -47,15 +45,13 @@ def turns(root):
     }
 
 
-def test_objects_are_aligned_as_their_labels_say_and_the_labels_that_are_written_say_the_same(
-    run, tmp_path
-):
+def test_objects_are_aligned_as_their_labels_and_the_written_labels_say(run, tmp_path):
     _, found = run
     write_labels(found, tmp_path, "lump")
     written = turns(tmp_path)
     for pair, true in turns(small_folder()).items():
         assert rotation_error(found.between(*pair).R, true) < 15
-        np.testing.assert_allclose(written[pair], found.between(*pair).R, atol=1e-6)
+        assert_allclose(written[pair], found.between(*pair).R, atol=1e-6)
     with pytest.raises(InputError, match="would be replaced by other content"):
         write_labels(
             replace(found, objects=dict(reversed(found.objects.items()))), tmp_path, "lump"
@@ -64,7 +60,8 @@ def test_objects_are_aligned_as_their_labels_say_and_the_labels_that_are_written
 
 def test_the_row_of_the_benchmark_takes_the_pose_from_the_alignment_of_all_objects(tmp_path):
     found = run_rows(["verified", "category"], tmp_path, 2, 3)
-    assert found["category"]["n"] == 2 and found["category"]["median"] < 20
+    assert found["category"]["n"] == 2
+    assert found["category"]["median"] < 20
 
 
 def test_a_killed_run_is_continued_where_it_was_and_by_other_workers(run, tmp_path, monkeypatch):
@@ -119,21 +116,16 @@ def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     shutil.copytree(small_folder(), root)
     found = replace(run[1], disagreements={(A, C): 179.96})
     monkeypatch.setattr("zsp_lite.align.align_category", lambda *_, **__: found)
-    assert cli.main(["align", str(root), "--category", "lump", "--out", str(out), "--propose"]) == 0
+    assert cli.main(f"align {root} --category lump --out {out} --propose".split()) == 0
     text = capsys.readouterr().out
-    assert (
-        "lump: 3 objects in one frame" in text
-        and "100.0% of 6 ordered pairs are within 30°" in text
-    )
+    assert "lump: 3 objects in one frame" in text
+    assert "100.0% of 6 ordered pairs are within 30°" in text
     assert f"{A} to {C}: the best pose of the pair alone is 180° away" in text
-    assert (out / "report.html").read_bytes().count(b"<img") == 1 and (
-        out / "objects.jpg"
-    ).stat().st_size > 1000
+    assert (out / "report.html").read_bytes().count(b"<img") == 1
+    assert (out / "objects.jpg").stat().st_size > 1000
     alignment = json.loads((out / "alignment.json").read_text())
     assert alignment["disagreements"] == [{"pair": [A, C], "degrees": 179.96}]
-    np.testing.assert_allclose(
-        alignment["objects"][B]["world_to_frame"], run[1].objects[B].sim3.matrix
-    )
+    assert_allclose(alignment["objects"][B]["world_to_frame"], run[1].objects[B].sim3.matrix)
     labelling = Labelling(root, "lump")
     assert rotation_error(labelling.proposal(C).R, run[1].between(A, C).R) < 0.01
     assert cli.main(["align", str(root), "--category", "lump", "--out", str(out)]) == 0
@@ -165,10 +157,8 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
             return one
         best = one.hypotheses[0]
         # the half turn is that of A's world
-        turn, other = (
-            reference.frame.camera.R,
-            targets[best.view].frame.camera.R,
-        )
+        turn = reference.frame.camera.R
+        other = targets[best.view].frame.camera.R
         turned = (
             best.sim3.R @ turn @ HALF_TURN @ turn.T
             if ends[0] == A
@@ -188,7 +178,9 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
     assert estimate_pose(*sources[:2], **settings).errors["verified"] > 150
     found = estimate_pose(*sources[:2], helpers=sources[2:], **settings)
     one = found.estimates["verified"]
-    assert found.errors["verified"] < 15 and one.confidence > 0.5 and not one.one_of_two
+    assert found.errors["verified"] < 15
+    assert one.confidence > 0.5
+    assert not one.one_of_two
     assert found.sources[1].endswith(f"helpers: {sources[2]}")
     assert one.flags[-1].startswith("4 of 4 frames vote for another pose: frame 0 of")
     refused(

@@ -7,45 +7,45 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.alignment import Sim3, ransac, umeyama
-from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import Frame
+from zsp_lite import Camera, FeatureMap, Frame, Sim3
+from zsp_lite.alignment import ransac, umeyama
 from zsp_lite.data.labels import PoseLabel
 from zsp_lite.errors import rotation_matrix
-from zsp_lite.features import FeatureMap
 
 seeds = st.integers(0, 2**32 - 1)
 scales = st.floats(0.3, 4.0)
 
 
 def similarity(seed: int, scale: float = 1.3) -> Sim3:
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     return Sim3(scale, Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3) * 3)
 
 
 def cloud(seed: int, n: int = 20) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=(n, 3)) * (1.0, 0.7, 0.4)
+    return default_rng(seed).normal(size=(n, 3)) * (1.0, 0.7, 0.4)
 
 
 def assert_same(first: Sim3, second: Sim3, atol: float = 1e-9):
-    np.testing.assert_allclose(first.matrix, second.matrix, atol=atol)
+    assert_allclose(first.matrix, second.matrix, atol=atol)
 
 
 @given(seeds, scales)
 def test_composition_is_the_product_of_the_matrices_and_application_in_turn(seed, scale):
     a, b, points = similarity(seed, scale), similarity(seed + 7), cloud(seed)
     assert_same(a @ a.inverse(), Sim3.identity())
-    np.testing.assert_allclose((a @ b).matrix, a.matrix @ b.matrix, atol=1e-9)
-    np.testing.assert_allclose((a @ b).apply(points), a.apply(b.apply(points)), atol=1e-9)
+    assert_allclose((a @ b).matrix, a.matrix @ b.matrix, atol=1e-9)
+    assert_allclose((a @ b).apply(points), a.apply(b.apply(points)), atol=1e-9)
     homogeneous = np.c_[points, np.ones(len(points))] @ a.matrix.T
-    np.testing.assert_allclose(a.apply(points), homogeneous[:, :3], atol=1e-9)
+    assert_allclose(a.apply(points), homogeneous[:, :3], atol=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("scale", "R", "t"),
+    "scale, R, t",
     [
         (0.0, np.eye(3), np.zeros(3)),
         (np.nan, np.eye(3), np.zeros(3)),
@@ -62,7 +62,7 @@ def test_what_is_no_similarity_is_refused(scale, R, t):
 @pytest.mark.parametrize(
     "rounded", [lambda R: R.astype(np.float16), lambda R: R.round(4), lambda R: R.round(2)]
 )
-def test_a_rounded_rotation_becomes_the_nearest_one_and_another_is_refused_with_its_distance(
+def test_a_rounded_rotation_becomes_the_nearest_one_and_another_is_refused(
     rounded,
 ):
     exact = similarity(3).R
@@ -76,11 +76,9 @@ def test_a_rounded_rotation_becomes_the_nearest_one_and_another_is_refused_with_
         found.R,
         camera.R,
     ):
-        np.testing.assert_allclose(one, nearest, atol=1e-12)
-    assert found.scale == pytest.approx(2, abs=0.02)
-    np.testing.assert_array_equal(
-        Sim3(1.0, exact.astype(np.float32), np.zeros(3)).R, exact.astype(np.float32)
-    )
+        assert_allclose(one, nearest, atol=1e-12)
+    assert_allclose(found.scale, 2, atol=0.02)
+    assert_array_equal(Sim3(1.0, exact.astype(np.float32), np.zeros(3)).R, exact.astype(np.float32))
     refused(
         r"Sim3: R is .*, 0\.029 off the nearest rotation, expected",
         Sim3,
@@ -100,13 +98,12 @@ def test_records_keep_their_values_when_the_arrays_that_they_were_made_of_change
     for array in (R, t, trans, rgb, depth, keys):
         array[0] = 5
     assert_same(sim3, Sim3.identity())
-    assert np.array_equal(label.trans, np.eye(4)) and np.array_equal(camera.matrix, np.eye(4))
-    assert (
-        not frame.rgb.any()
-        and not frame.depth.any()
-        and not frame.mask.any()
-        and not features.keys.any()
-    )
+    assert_array_equal(label.trans, np.eye(4))
+    assert_array_equal(camera.matrix, np.eye(4))
+    assert not frame.rgb.any()
+    assert not frame.depth.any()
+    assert not frame.mask.any()
+    assert not features.keys.any()
 
 
 @given(seeds, scales, st.integers(4, 40))
@@ -118,10 +115,10 @@ def test_umeyama_is_the_best_rotation_by_scipy_also_for_a_mirrored_target(seed, 
     ):
         sim3 = umeyama(source, target)
         x, y = source - source.mean(axis=0), target - target.mean(axis=0)
-        np.testing.assert_allclose(sim3.R, Rotation.align_vectors(y, x)[0].as_matrix(), atol=1e-6)
+        assert_allclose(sim3.R, Rotation.align_vectors(y, x)[0].as_matrix(), atol=1e-6)
         # the least-squares scale
         assert sim3.scale == pytest.approx((x @ sim3.R.T * y).sum() / np.square(x).sum())
-        np.testing.assert_allclose(sim3.apply(source.mean(axis=0)), target.mean(axis=0), atol=1e-9)
+        assert_allclose(sim3.apply(source.mean(axis=0)), target.mean(axis=0), atol=1e-9)
 
 
 def test_without_scale_the_scale_is_one():
@@ -155,7 +152,7 @@ def test_degenerate_or_malformed_points_are_refused_in_one_line(solver, points):
 
 def contaminated(seed: int, outliers: float = 0.6):
     """Source, target, true similarity, and which points are no outliers."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     source, truth = rng.normal(size=(50, 3)), similarity(seed, 1.2)
     target = truth.apply(source) + 0.01 * rng.normal(size=(50, 3))
     wrong = rng.permutation(50) < outliers * 50
@@ -169,20 +166,18 @@ def test_ransac_recovers_the_pose_with_sixty_percent_outliers(seed):
     source, target, truth, right = contaminated(seed)
     sim3, inliers = ransac(source, target, seed=seed)
     assert inliers[right].mean() > 0.9
-    np.testing.assert_allclose(sim3.matrix, truth.matrix, atol=0.15)
+    assert_allclose(sim3.matrix, truth.matrix, atol=0.15)
 
 
 def test_the_same_seed_gives_the_same_result_and_a_generator_will_do():
     source, target, _, _ = contaminated(4, outliers=0.8)
-    first, second = (
-        ransac(source, target, seed=5),
-        ransac(source, target, seed=np.random.default_rng(5)),
-    )
+    first = ransac(source, target, seed=5)
+    second = ransac(source, target, seed=default_rng(5))
     assert_same(first[0], second[0], atol=0)
-    assert (first[1] == second[1]).all()
+    assert_array_equal(first[1], second[1])
 
 
-def test_many_trials_on_many_points_need_little_memory_and_one_that_is_better_wins_wherever_it_is(
+def test_many_trials_need_little_memory_and_a_better_one_wins_wherever_it_is(
     monkeypatch,
 ):
     source, target, truth, right = contaminated(3, outliers=0.8)
@@ -192,11 +187,12 @@ def test_many_trials_on_many_points_need_little_memory_and_one_that_is_better_wi
     tracemalloc.stop()
     assert peak < 100e6  # all residuals at once are 160 MB, their offsets 480 MB
     assert inliers.reshape(20, 50).all(axis=0)[right].mean() > 0.9
-    np.testing.assert_allclose(found.matrix, truth.matrix, atol=0.15)
+    assert_allclose(found.matrix, truth.matrix, atol=0.15)
     monkeypatch.setattr("zsp_lite.alignment._BLOCK", 50 * 64)
     in_blocks, more = ransac(source, target, trials=20_000)
-    assert more.sum() >= ransac(source, target, trials=64)[1].sum() and (more >= right).mean() > 0.9
-    np.testing.assert_allclose(in_blocks.matrix, truth.matrix, atol=0.15)
+    assert more.sum() >= ransac(source, target, trials=64)[1].sum()
+    assert (more >= right).mean() > 0.9
+    assert_allclose(in_blocks.matrix, truth.matrix, atol=0.15)
 
 
 def test_of_two_motions_with_as_many_inliers_the_closer_fit_wins():
@@ -213,7 +209,7 @@ def test_scales_out_of_range_are_not_considered():
 
 def test_the_final_fit_keeps_to_the_scale_range():
     # The inliers fit a scale below 0.2, though samples of them fit scales above.
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     source = rng.normal(size=(40, 3))
     target = 0.19 * source + 0.05 * rng.normal(size=(40, 3))
     assert ransac(source, target)[0].scale < 0.2
@@ -224,8 +220,8 @@ def test_the_final_fit_keeps_to_the_scale_range():
     # by scipy.
     x, y = source[inliers], target[inliers]
     expected, _ = Rotation.align_vectors(y - y.mean(axis=0), x - x.mean(axis=0))
-    np.testing.assert_allclose(bounded.R, expected.as_matrix(), atol=1e-9)
-    np.testing.assert_allclose(bounded.apply(x).mean(axis=0), y.mean(axis=0), atol=1e-12)
+    assert_allclose(bounded.R, expected.as_matrix(), atol=1e-9)
+    assert_allclose(bounded.apply(x).mean(axis=0), y.mean(axis=0), atol=1e-12)
 
 
 @pytest.mark.parametrize(

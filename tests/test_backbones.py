@@ -9,24 +9,24 @@ import pytest
 import torch
 import torch.nn.functional as F
 from loopback import Server
+from numpy.random import default_rng
 from refusals import refused
 from safetensors.torch import save_file
 from small_backbones import ARCHITECTURES, save_all, small_vit
 from torch import nn
+from torch.testing import assert_close
 
+from zsp_lite import Backbone, InputError, load_backbone
 from zsp_lite.backbones import load
-from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import (
     BackboneConfig,
     PretrainedWeights,
     available_backbones,
-    load_backbone,
-    obtained_by,
+    how_to_obtain,
 )
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark.identity import fingerprint
+from zsp_lite.benchmark.runs import fingerprint
 from zsp_lite.choices import FACETS
-from zsp_lite.errors import InputError
 from zsp_lite.io.download import fetch
 
 
@@ -36,8 +36,8 @@ def vit() -> VisionTransformer:
 
 
 @pytest.fixture()
-def pictures() -> list[np.ndarray]:
-    rng = np.random.default_rng(0)
+def pictures():
+    rng = default_rng(0)
     return [
         rng.integers(0, 256, shape, dtype=np.uint8)
         for shape in ((32, 32, 3), (50, 40, 3), (9, 64, 3))
@@ -47,11 +47,11 @@ def pictures() -> list[np.ndarray]:
 def assert_same_features(first, second):
     for a, b in zip(first, second, strict=True):
         for name in ("keys", "saliency", "global_feature"):
-            torch.testing.assert_close(getattr(a, name), getattr(b, name), atol=2e-5, rtol=1e-4)
+            assert_close(getattr(a, name), getattr(b, name), atol=2e-5, rtol=1e-4)
 
 
 @pytest.fixture(scope="module")
-def places(tmp_path_factory, vit) -> dict[str, str]:
+def places(tmp_path_factory, vit):
     """The embedded backbone, a checkpoint in DINO's layout, a model of each architecture of Hugging
     Face's format."""
     root = tmp_path_factory.mktemp("backbones")
@@ -74,8 +74,11 @@ def backbone(place):
 def test_keys_are_float32_per_patch_and_saliency_spans_0_to_1(backbone, pictures):
     features = backbone(pictures)
     for one in features:
-        assert one.keys.shape == (4, 4, backbone.embed_dim) and one.keys.dtype == torch.float32
-        assert one.saliency.min() == 0 and one.saliency.max() == 1 and one.saliency.std() > 0.05
+        assert one.keys.shape == (4, 4, backbone.embed_dim)
+        assert one.keys.dtype == torch.float32
+        assert one.saliency.min() == 0
+        assert one.saliency.max() == 1
+        assert one.saliency.std() > 0.05
     assert not torch.allclose(features[0].keys, features[1].keys)
 
 
@@ -117,7 +120,7 @@ def test_layer_and_facet_change_the_keys_alone_and_stand_in_the_name(place, pict
     keys, (first, *others) = [one.keys for one in found], found
     assert all(not torch.allclose(a, b) for i, a in enumerate(keys) for b in keys[:i])
     for other in others:
-        torch.testing.assert_close(
+        assert_close(
             (other.saliency, other.global_feature),
             (first.saliency, first.global_feature),
             atol=1e-5,
@@ -142,10 +145,10 @@ def test_features_are_the_models_keys_saliency_and_cls(pictures):
     mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
     with torch.no_grad():
         tokens = vit.extract((pixels - mean.view(3, 1, 1)) / std.view(3, 1, 1), 1)
-    torch.testing.assert_close(features[0].keys, tokens.keys[0].view(4, 4, 64))
-    torch.testing.assert_close(features[0].global_feature, tokens.cls[0])
+    assert_close(features[0].keys, tokens.keys[0].view(4, 4, 64))
+    assert_close(features[0].global_feature, tokens.cls[0])
     raw = tokens.attention[0, [0, 3]].mean(0).view(4, 4)
-    torch.testing.assert_close(features[0].saliency, (raw - raw.min()) / (raw.max() - raw.min()))
+    assert_close(features[0].saliency, (raw - raw.min()) / (raw.max() - raw.min()))
     assert_same_features(Backbone(vit, "small", 1, (0, 3), "cpu", batch_size=1)(pictures), features)
 
 
@@ -224,9 +227,8 @@ def test_the_embedded_backbone_is_found_by_its_name(vit, tmp_path, monkeypatch):
         "checkpoint .*zsp-tiny.safetensors cannot be read: no such file", load_backbone, "zsp-tiny"
     )
     save_file(vit.state_dict(), path, metadata={"num_heads": "1"})
-    assert (
-        load_backbone("zsp-tiny").name == "zsp-tiny" and available_backbones()["zsp-tiny"] == path
-    )
+    assert load_backbone("zsp-tiny").name == "zsp-tiny"
+    assert available_backbones()["zsp-tiny"] == path
     assert (
         load.as_backbone(path).embed_dim == load.as_backbone(str(path)).embed_dim == vit.embed_dim
     )
@@ -278,7 +280,7 @@ def test_an_unknown_name_or_device_is_refused():
 def server(monkeypatch):
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
-    content = np.random.default_rng(0).bytes(10_000)
+    content = default_rng(0).bytes(10_000)
     server = Server({"/file": content})
     server.content, server.md5 = content, hashlib.md5(content).hexdigest()[:6]
     yield server
@@ -321,10 +323,11 @@ def test_dino_models_come_from_the_server(server, vit, pictures, tmp_path, cache
     monkeypatch.setenv("ZSP_LITE_DINO_URL", f"{server.url}/dino")
     released = PretrainedWeights("some/vit.pth", hashlib.md5(content).hexdigest()[:6], len(content))
     monkeypatch.setitem(load.PRETRAINED, "dino_vits8", released)
-    assert obtained_by("dino_vits8") == "not downloaded: zsp-lite weights fetch dino_vits8"
+    assert how_to_obtain("dino_vits8") == "not downloaded: zsp-lite weights fetch dino_vits8"
     assert available_backbones()["dino_vits8"] is None
     loaded = load_backbone("dino_vits8", "cpu")
-    assert loaded.name == "dino_vits8" and available_backbones()["dino_vits8"] == cache / "vit.pth"
+    assert loaded.name == "dino_vits8"
+    assert available_backbones()["dino_vits8"] == cache / "vit.pth"
     assert_same_features(loaded(pictures), Backbone(vit, "small", device="cpu")(pictures))
 
 

@@ -2,24 +2,26 @@
 known."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from benchmark_folder import BACKBONE, own_method, run_rows, small_folder
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from synthetic_views import CoordinateBackbone
 
+from zsp_lite import Co3D, InputError
 from zsp_lite.benchmark.run import evaluate, write_reports
-from zsp_lite.benchmark.runs import add_lines, read_lines, read_run
+from zsp_lite.benchmark.runs import Run, add_lines, read_lines, read_run
 from zsp_lite.benchmark.tables import pair_figure
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import write_mask
 from zsp_lite.data.ground_truth import POSES_FILE, ObjectPose, object_poses
 from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.data.pairs import category_pairs, sample_pairs, true_poses, write_published_pairs
-from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.views import object_crop
 
@@ -28,75 +30,92 @@ ROWS = ("ours", "ours-bv", "oracle-view")
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
+    """The folder of a run and what the call returned."""
     out = tmp_path_factory.mktemp("out")
     return out, evaluate(small_folder(), BACKBONE, ROWS, 6, 5, out)
 
 
-def test_the_summary_has_the_fixed_form_and_is_what_the_call_returned(run):
+def test_the_summary_is_what_the_call_returned(run):
     out, summary = run
-    assert json.loads((out / "summary.json").read_text()) == summary == read_run(out).summary
-    # Perfect features solve nearly every pair, and the best view alone does not.
+    assert json.loads((out / "summary.json").read_text()) == summary
+    assert read_run(out).summary == summary
+
+
+def test_perfect_features_solve_nearly_every_pair_and_the_best_view_alone_does_not(run):
+    _, summary = run
     ours = summary["methods"]["ours"]
-    assert ours["acc30"] >= 90 and ours["median"] < 10 and ours["failed"] == 0
+    assert ours["acc30"] >= 90
+    assert ours["median"] < 10
+    assert ours["failed"] == 0
     assert summary["methods"]["ours-bv"]["median"] > ours["median"]
+
+
+def test_the_figures_of_a_row_are_those_of_its_errors(run):
+    out, summary = run
+    ours = summary["methods"]["ours"]
     errors = read_run(out).row("ours")["error"]
-    assert ours["median"] == np.median(errors) and ours["acc15"] == pytest.approx(
-        100 * np.mean(errors < 15)
-    )
+    assert ours["median"] == np.median(errors)
+    assert ours["acc15"] == pytest.approx(100 * np.mean(errors < 15))
+
+
+def test_the_summary_has_the_fixed_form(run):
+    _, summary = run
     assert summary["data"] == {
         "root": str(small_folder()),
         "categories": ["lump", "pebble"],
         "pairs": 12,
         "targets": 5,
     }
+    stages = {"reading", "backbone", "similarity", "matching", "view", "alignment"}
+    assert stages <= summary["timings"].keys()
     for row in summary["methods"].values():
-        assert row["n"] == 12 and row["per_category"].keys() == {"lump", "pebble"}
-        assert row["per_category"]["lump"]["n"] == 6
-        assert row["acc30_ci"][0] <= row["acc30"] <= row["acc30_ci"][1]
-    assert {"reading", "backbone", "similarity", "matching", "view", "alignment"} <= summary[
-        "timings"
-    ].keys()
-    settings = read_run(out).settings
-    (call,) = settings.calls
-    assert call.versions["numpy"] == np.__version__ and (call.rows, call.pairs) == (
-        [*ROWS],
-        {"lump": 6, "pebble": 6},
-    )
+        numbers = {name: figures["n"] for name, figures in row["per_category"].items()}
+        assert (row["n"], numbers) == (12, {"lump": 6, "pebble": 6})
+        low, high = row["acc30_ci"]
+        assert low <= row["acc30"] <= high
+
+
+def test_the_settings_have_the_call_and_the_versions(run):
+    (call,) = read_run(run[0]).settings.calls
+    assert (call.rows, call.pairs) == ([*ROWS], {"lump": 6, "pebble": 6})
+    assert call.versions["numpy"] == np.__version__
 
 
 def test_a_method_added_later_leaves_the_others_as_they_were(tmp_path):
-    alone = evaluate(small_folder(), BACKBONE, ("ours",), {"lump": 3}, 2, tmp_path / "run")
-    both = evaluate(
-        small_folder(), BACKBONE, ("ours", "rootsift"), {"lump": 3}, 2, tmp_path / "run"
-    )
-    every = evaluate(small_folder(), BACKBONE, ("ours",), 3, 2, tmp_path / "every")
-    assert (
-        every["methods"]["ours"]["per_category"]["lump"]
-        == alone["methods"]["ours"]["per_category"]["lump"]
-    )
+    alone = evaluate(small_folder(), BACKBONE, ("ours",), {"lump": 3}, 2, tmp_path)
+    both = evaluate(small_folder(), BACKBONE, ("ours", "rootsift"), {"lump": 3}, 2, tmp_path)
     assert both["methods"]["ours"] == alone["methods"]["ours"]
     assert both["timings"]["backbone"] == alone["timings"]["backbone"]
-    assert both["methods"]["rootsift"]["n"] == 3
-    assert both["against"]["rootsift"]["accuracy_gain"] == pytest.approx(
-        both["methods"]["rootsift"]["acc30"] - both["methods"]["ours"]["acc30"]
-    )
+    ours, rootsift = both["methods"].values()
+    assert rootsift["n"] == 3
+    gain = both["against"]["rootsift"]["accuracy_gain"]
+    assert gain == pytest.approx(rootsift["acc30"] - ours["acc30"])
+
+
+def test_a_category_has_the_same_figures_alone_and_among_others(tmp_path):
+    rows, figures = ("ours",), []
+    for pairs in ({"lump": 3}, 3):
+        summary = evaluate(small_folder(), BACKBONE, rows, pairs, 2, tmp_path / str(pairs))
+        figures.append(summary["methods"]["ours"]["per_category"]["lump"])
+    assert figures[0] == figures[1]
 
 
 def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(run):
-    dataset, found = Co3D(small_folder()), read_run(run[0])
+    out, summary = run
+    dataset, found = Co3D(small_folder()), read_run(out)
     for category in ("lump", "pebble"):
         labels = read_labels(small_folder(), category)
         for pair in sample_pairs(dataset, category, 6, 5):
             a, b = pair.reference_sequence, pair.target_sequence
-            frame, targets = dataset.load_pair(pair)
-            reference, cameras = frame.camera, [target.camera for target in targets]
+            reference, targets = dataset.load_pair(pair)
             # The object's axes as each camera sees them.
-            turns = [camera.R @ labels[b].trans[:3, :3] for camera in cameras]
-            angles = [rotation_error(turn, reference.R @ labels[a].trans[:3, :3]) for turn in turns]
+            seen = reference.camera.R @ labels[a].trans[:3, :3]
+            turns = [target.camera.R @ labels[b].trans[:3, :3] for target in targets]
+            angles = [rotation_error(turn, seen) for turn in turns]
             assert found.row("oracle-view")["view"][pair.key] == np.argmin(angles)
             best_view = found.row("ours-bv").loc[pair.key]
-            assert best_view["error"] == pytest.approx(angles[int(best_view["view"])], abs=1e-4)
-    assert run[1]["methods"]["oracle-view"]["acc30"] >= 90
+            assert_allclose(best_view["error"], angles[int(best_view["view"])], atol=1e-4)
+    assert summary["methods"]["oracle-view"]["acc30"] >= 90
 
 
 def test_stored_poses_give_the_errors_again(run):
@@ -105,116 +124,118 @@ def test_stored_poses_give_the_errors_again(run):
         pairs, views, rotations, positions = found.poses(name)
         truths = true_poses(small_folder(), pairs, views)
         errors = found.row(name)["error"][[pair.key for pair in pairs]]
-        np.testing.assert_allclose(rotation_error(rotations, truths[:, :3, :3]), errors, atol=2e-4)
+        # Errors are stored with four decimals, rotations with fewer digits than a double has.
+        assert_allclose(rotation_error(rotations, truths[:, :3, :3]), errors, atol=2e-4)
     solved = errors < 1  # of "oracle-view"
-    np.testing.assert_allclose(positions[solved], truths[solved, :3, 3], atol=0.1)
+    assert_allclose(positions[solved], truths[solved, :3, 3], atol=0.1)
 
 
-def test_the_picture_of_a_pair_shows_each_rows_pose_in_its_target_view(tmp_path, closed_figures):
+@pytest.fixture(scope="module")
+def pictured(tmp_path_factory) -> Run:
+    """A run of one pair, by rows that see it, turn it and fail."""
+
     def blind(problem):
         raise InputError("sees nothing")
 
-    run_rows({"ours": "ours", "turned": own_method, "blind": blind}, tmp_path)
-    found, dataset = read_run(tmp_path), Co3D(small_folder())
-    (pair,), (view,), _, _ = found.poses("ours")
-    figure = pair_figure(found, pair.key, dataset)
-    error, other = (f"{found.row(name)['error'][pair.key]:.0f}° off" for name in ("ours", "turned"))
-    assert [one.get_title() for one in figure.axes] == [
-        "reference",
-        "ours",
-        "turned",
-        "its points",
-        error,
-        other,
-    ]
+    out = tmp_path_factory.mktemp("pictured")
+    run_rows({"ours": "ours", "turned": own_method, "blind": blind}, out)
+    return read_run(out)
+
+
+def test_the_picture_of_a_pair_shows_each_rows_pose_in_its_target_view(pictured, closed_figures):
+    dataset = Co3D(small_folder())
+    (pair,), (view,), _, _ = pictured.poses("ours")
+    axes = pair_figure(pictured, pair.key, dataset).axes
+    errors = [f"{pictured.row(name)['error'][pair.key]:.0f}° off" for name in ("ours", "turned")]
+    titles = ["reference", "ours", "turned", "its points", *errors]
+    assert [axis.get_title() for axis in axes] == titles
     crop = object_crop(dataset.load_pair(pair)[1][view])
-    assert np.array_equal(figure.axes[1].get_images()[0].get_array(), crop.rgb)
-    drawn, turned = (axis.collections[0].get_offsets() for axis in figure.axes[4:])
+    assert_array_equal(axes[1].get_images()[0].get_array(), crop.rgb)
+    drawn, turned = [axis.collections[0].get_offsets() for axis in axes[4:]]
     x, y = np.floor(drawn.data).astype(int).clip(0, 223).T
     assert np.mean(crop.mask[y, x] > 0.5) > 0.9  # the pose is nearly exact
-    # a rotation alone is drawn in the middle of the object
+    # A rotation alone is drawn in the middle of the object; the crop is 224 pixels wide.
     assert np.abs(turned.mean(axis=0) - 112).max() < 40
-    refused(
-        "pair 'lump' has no pose in the run, expected a key such as lump/",
-        pair_figure,
-        found,
-        "lump",
-        dataset,
-    )
-    refused("has no pose in the run", pair_figure, found, pair.key, dataset, ["blind"])
-    refused("row 'nobody' is not in the run", pair_figure, found, pair.key, dataset, ["nobody"])
+
+
+@pytest.mark.parametrize(
+    "pair, rows, message",
+    [
+        ("lump", None, "pair 'lump' has no pose in the run, expected a key such as lump/"),
+        ("of the run", ["blind"], "has no pose in the run"),
+        ("of the run", ["nobody"], "row 'nobody' is not in the run"),
+    ],
+)
+def test_a_pair_or_a_row_without_a_pose_has_no_picture(pictured, pair, rows, message):
+    key = pictured.poses("ours")[0][0].key if pair == "of the run" else pair
+    refused(message, pair_figure, pictured, key, Co3D(small_folder()), rows)
 
 
 def test_shipped_pairs_come_first_and_only_where_there_are_enough(tmp_path):
     dataset = Co3D(shutil.copytree(small_folder(), tmp_path / "copy"))
     shipped = sample_pairs(dataset, "lump", 4, 3, seed=9)
-    write_published_pairs(
-        dataset.root / "determ_eval" / "4samples_3tgt" / "lump.pt", shipped, dataset
-    )
+    path = dataset.root / "determ_eval/4samples_3tgt/lump.pt"
+    write_published_pairs(path, shipped, dataset)
     assert category_pairs(dataset, "lump", 3, 3) == shipped[:3]
     assert category_pairs(dataset, "lump", 5, 3) == sample_pairs(dataset, "lump", 5, 3)
 
 
-def test_frames_that_cannot_be_used_count_as_failures(tmp_path):
-    class Blind(CoordinateBackbone):
-        def features(self, image):
-            found = super().features(image)
-            return replace(found, saliency=0 * found.saliency)
+class Blind(CoordinateBackbone):
+    """Finds nothing salient."""
 
+    def features(self, image):
+        found = super().features(image)
+        return replace(found, saliency=0 * found.saliency)
+
+
+def test_frames_that_cannot_be_used_count_as_failures(tmp_path):
     row = run_rows(["ours"], tmp_path, 2, 5, backbone=Blind(grid=8))["ours"]
-    assert row["failed"] == row["n"] == 2 and row["acc30"] == 0 and row["median"] == 180
-    assert (
-        read_run(tmp_path)
-        .row("ours")["failed"]
-        .str.contains("all 5 target views were left out")
-        .all()
-    )
+    expected = {"failed": 2, "n": 2, "acc30": 0, "median": 180}
+    assert {name: row[name] for name in expected} == expected
+    for reason in read_run(tmp_path).row("ours")["failed"]:
+        assert "all 5 target views were left out" in reason
 
 
 def test_a_target_view_with_an_empty_mask_is_left_out_and_the_pair_is_not_lost(tmp_path):
     dataset = Co3D(shutil.copytree(small_folder(), tmp_path / "copy"))
     (pair,) = sample_pairs(dataset, "lump", 1, 3)
-    path = (
-        dataset.root / dataset.frame("lump", pair.target_sequence, pair.target_frames[0]).mask.path
-    )
-    write_mask(path, np.zeros((90, 100), np.float32))
+    first = dataset.frame("lump", pair.target_sequence, pair.target_frames[0])
+    write_mask(dataset.root / first.mask.path, np.zeros((90, 100), np.float32))
     evaluate(dataset.root, BACKBONE, ("ours", "verified"), {"lump": 1}, 3, tmp_path / "run")
     for row in ("ours", "verified"):
-        found = read_run(tmp_path / "run").row(row).iloc[0]
-        assert (
-            found["failed"] == ""
-            and found["error"] < 30
-            and "mask" in found["note"]
-            and found["view"] > 0
-        )
+        (found,) = read_run(tmp_path / "run").row(row).to_dict("records")
+        assert found["failed"] == ""
+        assert found["error"] < 30
+        assert found["view"] > 0
+        assert "mask" in found["note"]
 
 
-def test_unknown_methods_categories_and_folders_and_the_folder_of_another_run_are_refused(
-    run, tmp_path
-):
-    class Renamed(CoordinateBackbone):
-        pass
+class Renamed(CoordinateBackbone):
+    """A backbone with the name of another class."""
 
-    new = {"out": tmp_path / "a"}
-    for root, backbone, options, told in (
-        (
-            small_folder(),
-            BACKBONE,
-            {"out": run[0], "targets": 3},
-            "a run with targets 5, this is 3",
-        ),
-        (small_folder(), Renamed(grid=8), {"out": run[0]}, "a run with backbone .*Renamed"),
-        (
-            small_folder(),
-            BACKBONE,
-            new | {"pairs": {"teapot": 1}},
-            "category is 'teapot', expected one of lump",
-        ),
-        (small_folder(), BACKBONE, new | {"pairs": {"lump": 0}}, "pairs of lump is 0"),
-        (small_folder(), BACKBONE, new | {"targets": 0}, "targets is 0"),
-        (tmp_path / "nowhere", BACKBONE, new, "nowhere"),
-    ):
-        refused(told, evaluate, root, backbone, **options)
+
+@pytest.mark.parametrize(
+    "backbone, options, message",
+    [
+        (BACKBONE, {"targets": 3}, "a run with targets 5, this is 3"),
+        (Renamed(grid=8), {}, "a run with backbone .*Renamed"),
+    ],
+)
+def test_the_folder_of_another_run_is_refused(run, backbone, options, message):
+    refused(message, evaluate, small_folder(), backbone, out=run[0], **options)
+
+
+@pytest.mark.parametrize(
+    "root, options, message",
+    [
+        (small_folder, {"pairs": {"teapot": 1}}, "category is 'teapot', expected one of lump"),
+        (small_folder, {"pairs": {"lump": 0}}, "pairs of lump is 0"),
+        (small_folder, {"targets": 0}, "targets is 0"),
+        (lambda: Path("nowhere"), {}, "nowhere"),
+    ],
+)
+def test_data_and_numbers_that_are_not_there_are_refused(tmp_path, root, options, message):
+    refused(message, evaluate, root(), BACKBONE, out=tmp_path / "a", **options)
     assert not (tmp_path / "a").exists()
 
 
@@ -223,110 +244,128 @@ def _object_pose(matrix: np.ndarray) -> dict:
     return {"trans": matrix.tolist(), "scale": 1.0, "low": [0, 0, 0], "high": [1, 1, 1]}
 
 
-def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(tmp_path, monkeypatch):
+@pytest.mark.parametrize("turns, expected", [((180,), 0), ((90,), 90), ((), 180)])
+def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(
+    tmp_path, monkeypatch, turns, expected
+):
     labels = read_labels(small_folder(), "lump")
 
     def half_turned(problem):
-        first, second = (
-            (labels[frame.name.partition("/")[0]], frame.camera) for frame in problem.frames()
-        )
-        truth = relative_pose(*first, *second)
-        return second[1].R @ np.diag([-1.0, -1, 1]) @ second[1].R.T @ truth[:3, :3]
+        reference, target = problem.frames()
+        first, second = [labels[one.name.partition("/")[0]] for one in (reference, target)]
+        truth = relative_pose(first, reference.camera, second, target.camera)
+        half_turn = target.camera.R @ np.diag([-1.0, -1, 1]) @ target.camera.R.T
+        return half_turn @ truth[:3, :3]
 
-    for turns, expected in (((180,), 0), ((90,), 90), ((), 180)):
-        pose = ObjectPose(np.eye(4)[:3].tolist(), 1.0, (0, 0, 0), (1, 1, 1), turns)
-        monkeypatch.setattr(
-            "zsp_lite.data.ground_truth.read_poses", lambda *_: dict.fromkeys(labels, pose)
-        )
-        summary = evaluate(
-            small_folder(),
-            BACKBONE,
-            {"mine": half_turned},
-            {"lump": 2},
-            1,
-            tmp_path / str(expected),
-        )
-        found = read_run(tmp_path / str(expected)).row("mine")[["symmetric_error", "error"]]
-        np.testing.assert_allclose(found, [[expected, 180]] * 2, atol=1e-5)
-        assert summary["methods"]["mine"]["symmetric_acc30"] == 100 * (expected < 30)
+    pose = ObjectPose(np.eye(4)[:3].tolist(), 1.0, (0, 0, 0), (1, 1, 1), turns)
+    poses = dict.fromkeys(labels, pose)
+    monkeypatch.setattr("zsp_lite.data.ground_truth.read_poses", lambda *_: poses)
+    mine = run_rows({"mine": half_turned}, tmp_path, pairs=2, targets=1)["mine"]
+    found = read_run(tmp_path).row("mine")[["symmetric_error", "error"]]
+    assert_allclose(found, [[expected, 180]] * 2, atol=1e-5)
+    assert mine["symmetric_acc30"] == 100 * (expected < 30)
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    "text, expected",
     [
         ('{"100_a": {"trans": [[1, 0, 0, 0]], "scale": 1}}', "Expected"),
         (json.dumps({"100_a": _object_pose(1.05 * np.eye(4))}), "100_a is"),
     ],
 )
-def test_object_poses_of_another_layout_cost_a_warning_and_the_figure_that_needs_them(
+def test_object_poses_of_another_layout_cost_a_warning_and_their_figure(
     tmp_path, caplog, text, expected
 ):
     dataset = Co3D(shutil.copytree(small_folder(), tmp_path / "copy"))
     path = dataset.root / "lump" / POSES_FILE
     path.write_text(text)
-    found = evaluate(
-        dataset.root, BACKBONE, {"mine": own_method}, {"lump": 3}, 2, tmp_path / "out"
-    )["methods"]["mine"]
-    assert found["n"] == 3 and found["failed"] == 0 and "symmetric_acc30" not in found
-    (told,) = caplog.messages
-    assert (
-        str(path) in told
-        and expected in told
-        and told.endswith(": without it there is no symmetric_acc30")
-    )
+    rows = {"mine": own_method}
+    summary = evaluate(dataset.root, BACKBONE, rows, {"lump": 3}, 2, tmp_path / "out")
+    mine = summary["methods"]["mine"]
+    assert (mine["n"], mine["failed"]) == (3, 0)
+    assert "symmetric_acc30" not in mine
+    (warning,) = caplog.messages
+    ending = ": without it there is no symmetric_acc30"
+    assert re.fullmatch(f".*{re.escape(str(path))}.*{expected}.*{ending}", warning, re.DOTALL)
     refused(POSES_FILE, object_poses, dataset, "lump")
 
 
-def test_seeds_repeat_every_pair_with_other_draws_and_tables_average_over_them(tmp_path):
-    arguments = (small_folder(), BACKBONE, ["ours", "ours-bv"], 3, 3)
-    evaluate(
-        small_folder(),
-        BACKBONE,
-        {"ours-mask": "ours-mask", "none": lambda one: None},
-        3,
-        3,
-        tmp_path / "three",
-    )
-    # and as a call with more seeds that was interrupted
-    first = read_lines(tmp_path / "three")[0].pair
-    add_lines(
-        tmp_path / "three", [{"pair": first, "repeat": 1, "results": {"ours-mask": {"error": 0.0}}}]
-    )
-    evaluate(*arguments, tmp_path / "one")
-    once = read_run(tmp_path / "one")
-    evaluate(*arguments, tmp_path / "three")
-    summary = evaluate(*arguments, tmp_path / "three", seeds=3)
-    found = read_run(tmp_path / "three")
-    repeated = found.table[found.table["row"].isin(["ours", "ours-bv"])]
+REPEATED = ["ours", "ours-bv"]
+ONCE = {"ours-mask": "ours-mask", "none": lambda problem: None}  # with the first seed only
+
+
+@pytest.fixture(scope="module")
+def once(tmp_path_factory) -> Run:
+    """A run with one seed."""
+    out = tmp_path_factory.mktemp("once")
+    evaluate(small_folder(), BACKBONE, REPEATED, 3, 3, out)
+    return read_run(out)
+
+
+@pytest.fixture(scope="module")
+def seeded(tmp_path_factory) -> Path:
+    """The folder of a run with three seeds, of which a call with more seeds was interrupted."""
+    out = tmp_path_factory.mktemp("seeded")
+    evaluate(small_folder(), BACKBONE, ONCE, 3, 3, out)
+    first = read_lines(out)[0].pair
+    add_lines(out, [{"pair": first, "repeat": 1, "results": {"ours-mask": {"error": 0.0}}}])
+    evaluate(small_folder(), BACKBONE, REPEATED, 3, 3, out)
+    evaluate(small_folder(), BACKBONE, REPEATED, 3, 3, out, seeds=3)
+    return out
+
+
+def test_the_first_seed_is_that_of_a_run_with_one(seeded, once):
+    table = read_run(seeded).table
+    repeated = table[table["row"].isin(REPEATED)]
     first = repeated[repeated["repeat"] == 0]["error"].tolist()
-    assert first == once.table["error"].tolist(), "the first seed is that of a run with one"
-    assert repeated.groupby(["row", "pair"]).size().eq(3).all()
-    assert found.table[found.table["row"] == "ours"].groupby("pair")["error"].nunique().max() > 1
-    ours, before = (one["methods"]["ours"] for one in (summary, once.summary))
-    assert ours["n"] == before["n"] and summary["data"]["pairs"] == once.summary["data"]["pairs"]
-    by_seed = [
-        100 * (errors < 30).mean() for _, errors in found.row("ours").groupby("repeat")["error"]
-    ]
-    assert (
-        ours["acc30"] == pytest.approx(np.mean(by_seed))
-        and summary["methods"]["ours-mask"]["n"] == ours["n"]
-    )
+    assert first == once.table["error"].tolist()
+    assert set(repeated.groupby(["row", "pair"]).size()) == {3}
+
+
+def test_seeds_repeat_every_pair_with_other_draws(seeded):
+    errors = read_run(seeded).row("ours").groupby("pair")["error"]
+    assert errors.nunique().max() > 1
+
+
+def test_repeated_pairs_count_once(seeded, once):
+    summary = read_run(seeded).summary
+    assert summary["data"]["pairs"] == once.summary["data"]["pairs"]
+    number = once.summary["methods"]["ours"]["n"]
+    assert {name: summary["methods"][name]["n"] for name in ("ours", "ours-mask")} == {
+        "ours": number,
+        "ours-mask": number,
+    }
+
+
+def test_tables_average_over_the_seeds(seeded):
+    found = read_run(seeded)
+    ours = found.summary["methods"]["ours"]
+    errors = found.row("ours").groupby("repeat")["error"]
+    by_seed = [100 * (of_seed < 30).mean() for _, of_seed in errors]
+    assert ours["acc30"] == pytest.approx(np.mean(by_seed))
     assert ours["acc30_sd_of_seeds"] == pytest.approx(np.std(by_seed, ddof=1))
-    write_reports(tmp_path / "three")
-    assert (
-        "by seed, Acc30 of ours has a standard deviation of"
-        in (tmp_path / "three/tables/all_rows.md").read_text()
-    )
-    summary = evaluate(
-        small_folder(), BACKBONE, {"none": lambda one: None}, 3, 3, tmp_path / "three", seeds=2
-    )
-    assert (
-        summary["methods"]["none"]["failed"] == 6
-        and "none failed on 6 of 6 pairs" in summary["note"]
-    )
+    write_reports(seeded)
+    table = (seeded / "tables/all_rows.md").read_text()
+    assert "by seed, Acc30 of ours has a standard deviation of" in table
+
+
+def test_a_row_with_the_first_seed_only_is_compared_on_it(seeded, once):
+    found = read_run(seeded)
     mask = found.row("ours-mask")["error"]
     gain = 100 * ((mask < 30).mean() - (once.row("ours")["error"] < 30).mean())
-    assert summary["against"]["ours-mask"]["accuracy_gain"] == pytest.approx(gain), (
-        "a row with the first seed only"
-    )
-    assert len(pair_figure(found, mask.index[0], Co3D(small_folder())).axes) == 8, "all but none"
+    assert found.summary["against"]["ours-mask"]["accuracy_gain"] == pytest.approx(gain)
+
+
+def test_the_picture_of_a_repeated_pair_has_all_rows_with_a_pose(seeded, closed_figures):
+    found = read_run(seeded)
+    key = found.row("ours-mask").index[0]
+    rows = len([*REPEATED, *ONCE]) - 1  # "none" has no pose
+    # In two rows: the pictures and what is drawn on them, each with one for the reference.
+    assert len(pair_figure(found, key, Co3D(small_folder())).axes) == 2 * (rows + 1)
+
+
+def test_failures_of_all_seeds_on_a_pair_are_counted_once(tmp_path):
+    row = {"none": lambda problem: None}
+    summary = evaluate(small_folder(), BACKBONE, row, 3, 3, tmp_path, seeds=2)
+    assert summary["methods"]["none"]["failed"] == 6
+    assert "none failed on 6 of 6 pairs" in summary["note"]

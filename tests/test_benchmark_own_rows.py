@@ -29,16 +29,14 @@ from benchmark_folder import (
     run_rows,
     small_folder,
 )
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone, true_pose
 
-from zsp_lite.align import align_category
-from zsp_lite.alignment import Sim3
-from zsp_lite.backbones.backbone import Backbone
+from zsp_lite import Backbone, Camera, Co3D, Frame, InputError, Sim3, ZeroShotPose, align_category
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark import identity, own
-from zsp_lite.benchmark.identity import fingerprint
+from zsp_lite.benchmark import own, runs
 from zsp_lite.benchmark.methods import (
     GROUPS,
     METHODS,
@@ -50,58 +48,87 @@ from zsp_lite.benchmark.methods import (
 from zsp_lite.benchmark.own import StoredPoses, kind_of
 from zsp_lite.benchmark.problem import Answer, FrameStore
 from zsp_lite.benchmark.run import evaluate, evaluate_pair
-from zsp_lite.benchmark.runs import LINES, read_run
+from zsp_lite.benchmark.runs import LINES, Run, fingerprint, read_run
 from zsp_lite.benchmark.tables import every_table
-from zsp_lite.data.cameras import Camera
-from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.co3d import Pair
 from zsp_lite.data.exchange import write_questions
 from zsp_lite.data.frames import mask_to_bbox
 from zsp_lite.data.labels import PoseLabel
 from zsp_lite.data.pairs import category_pairs
-from zsp_lite.errors import FatalError, InputError
-from zsp_lite.pipeline import ZeroShotPose, align_best_view
+from zsp_lite.errors import FatalError
+from zsp_lite.pipeline import align_best_view
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.views import object_crop
 
-OWN = ("own_method", "own_estimator", "own_matcher", "own_keypoints", "own_solver")
+NONE = np.zeros((0, 2)), np.zeros((0, 2)), 0.0  # no keypoints
+# What `kind_of` says of the things of `benchmark_folder`.
+OWN = {
+    "own_method": "problem",
+    "own_estimator": "estimator",
+    "own_matcher": "matcher",
+    "own_keypoints": "keypoints",
+    "own_solver": "solver",
+}
+LIBRARY = {
+    "pipeline": ZeroShotPose(BACKBONE),
+    "row": Method(settings={"matcher": own_matcher}),
+    "ours": "ours",
+}
+ENOUGH = 3  # inliers that a fit has at least: so many determine a pose
 
 
-def test_ones_own_things_of_every_kind_are_rows_by_object_and_by_name(tmp_path):
-    by_object = {name: getattr(benchmark_folder, name) for name in OWN}
-    assert [kind_of(*own) for own in by_object.items()] == [
-        "problem",
-        "estimator",
-        "matcher",
-        "keypoints",
-        "solver",
-    ]
-    more = {
-        "pipeline": ZeroShotPose(BACKBONE),
-        "row": Method(settings={"matcher": own_matcher}),
-        "ours": "ours",
-    }
-    methods, found = run_rows(by_object | more, tmp_path / "a", 3), read_run(tmp_path / "a")
-    assert list(methods) == [*OWN, *more] and all(row["failed"] == 0 for row in methods.values())
-    assert set(found.row("own_method")["view"]) == {0} and set(
-        found.row("own_estimator")["view"]
-    ) == {1}
-    assert found.row("own_matcher")["error"].equals(found.row("row")["error"])
-    assert (
-        set(found.row("own_solver")["view"]) == {0}
-        and (found.row("own_solver")["inliers"] > 3).all()
-    )
+@pytest.fixture(scope="module")
+def own_run(tmp_path_factory) -> Run:
+    """A run of a row of every kind, each given as an object."""
+    out = tmp_path_factory.mktemp("own")
+    own = {name: getattr(benchmark_folder, name) for name in OWN}
+    run_rows(own | LIBRARY, out, pairs=3)
+    return read_run(out)
+
+
+def test_the_kind_of_ones_own_things_is_recognised():
+    assert {name: kind_of(name, getattr(benchmark_folder, name)) for name in OWN} == OWN
+
+
+def test_rows_of_every_kind_answer_every_pair(own_run):
+    methods = own_run.summary["methods"]
+    assert list(methods) == [*OWN, *LIBRARY]
+    assert [row["failed"] for row in methods.values()] == [0] * len(methods)
+
+
+@pytest.mark.parametrize("name, view", [("own_method", 0), ("own_estimator", 1)])
+def test_ones_own_row_chooses_the_view(own_run, name, view):
+    assert set(own_run.row(name)["view"]) == {view}
+
+
+def test_ones_own_solver_fits_a_pose_in_the_first_view(own_run):
+    assert set(own_run.row("own_solver")["view"]) == {0}
+    assert (own_run.row("own_solver")["inliers"] > ENOUGH).all()
+
+
+def test_a_pose_is_fitted_to_ones_own_keypoints(own_run):
     # The pixels of two views are no matches: what they fit is far from the truth, but is fitted.
-    assert (found.row("own_keypoints")["inliers"] > 3).all()
-    run_rows([f"{name}=benchmark_folder:{name}" for name in OWN], tmp_path / "b", 3)
-    named = read_run(tmp_path / "b")
-    assert all(named.row(name)["error"].equals(found.row(name)["error"]) for name in OWN)
-    assert list(run_rows(["benchmark_folder:own_method"], tmp_path / "c")) == [
-        "benchmark_folder:own_method"
-    ]
+    assert (own_run.row("own_keypoints")["inliers"] > ENOUGH).all()
+
+
+def test_a_matcher_is_the_same_row_alone_and_as_a_setting(own_run):
+    assert own_run.row("own_matcher")["error"].equals(own_run.row("row")["error"])
+
+
+def test_ones_own_things_are_rows_by_name_too(own_run, tmp_path):
+    run_rows([f"{name}=benchmark_folder:{name}" for name in OWN], tmp_path, pairs=3)
+    named = read_run(tmp_path)
+    for name in OWN:
+        assert named.row(name)["error"].equals(own_run.row(name)["error"]), name
+
+
+def test_a_row_that_is_imported_without_a_name_is_called_as_it_is_imported(tmp_path):
+    imported = "benchmark_folder:own_method"
+    assert list(run_rows([imported], tmp_path)) == [imported]
 
 
 @pytest.mark.parametrize(
-    ("thing", "told"),
+    "thing, told",
     [
         (3, "'mine' is of type int, expected"),
         (ZeroShotPose, "'mine' is of type type, expected"),
@@ -125,37 +152,52 @@ def test_what_is_no_method_is_refused_by_one_line_before_anything_is_computed(
     assert not (tmp_path / "out").exists()
 
 
-def test_the_number_of_arguments_without_a_default_or_the_attribute_kind_tells_what_a_function_is():
-    class Network(torch.nn.Module):
-        def forward(self, first, second):
-            return first
+class Network(torch.nn.Module):
+    """Takes two arguments."""
 
-    problem = Network()
-    problem.kind = "problem"  # comes before the two arguments
-    found = (
-        lambda one, other=None, *, third=3: 0,
-        lambda one, two, three=3, **options: 0,
-        Network(),
-        problem,
-    )
-    assert [kind_of("mine", one) for one in found] == [
-        "problem",
-        "keypoints",
-        "keypoints",
-        "problem",
-    ]
-    solvers = align_best_view, VerifiedSolver(), lambda one, two, three, seed, threshold: 0
-    assert [kind_of("mine", one) for one in solvers] == ["solver"] * 3
-    assert kind_of("mine", lambda one, two, three, *, seed, level=0.2: 0) == "matcher"
-    refused("no methods, expected some", resolve, [])
-    for name in ("ours-n0", "ours-n99999"):
-        refused(f"{name!r} is unknown", resolve, [name])
-    views = resolve(["ours-n4", "ours-bv-n2", "far=benchmark_folder:own_method"])
-    assert [(name, row.targets) for name, row in views.items()] == [
-        ("ours-n4", 4),
-        ("ours-bv-n2", 2),
-        ("far", None),
-    ]
+    def forward(self, first, second):
+        return first
+
+
+class NetworkOfProblems(Network):
+    """Takes two arguments, but says that it takes a problem."""
+
+    kind = "problem"
+
+
+@pytest.mark.parametrize(
+    "thing, kind",
+    [
+        (lambda one, other=None, *, third=3: 0, "problem"),
+        (lambda one, two, three=3, **options: 0, "keypoints"),
+        (Network(), "keypoints"),
+        (NetworkOfProblems(), "problem"),
+        (align_best_view, "solver"),
+        (VerifiedSolver(), "solver"),
+        (lambda one, two, three, seed, threshold: 0, "solver"),
+        (lambda one, two, three, *, seed, level=0.2: 0, "matcher"),
+    ],
+)
+def test_arguments_without_a_default_or_the_attribute_kind_tell_the_kind(thing, kind):
+    assert kind_of("mine", thing) == kind
+
+
+@pytest.mark.parametrize(
+    "rows, message",
+    [
+        ([], "no methods, expected some"),
+        (["ours-n0"], "'ours-n0' is unknown"),
+        (["ours-n99999"], "'ours-n99999' is unknown"),
+    ],
+)
+def test_no_rows_and_impossible_numbers_of_views_are_refused(rows, message):
+    refused(message, resolve, rows)
+
+
+def test_a_rows_name_tells_its_number_of_target_views():
+    rows = resolve(["ours-n4", "ours-bv-n2", "far=benchmark_folder:own_method"])
+    targets = {name: row.targets for name, row in rows.items()}
+    assert targets == {"ours-n4": 4, "ours-bv-n2": 2, "far": None}
 
 
 def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path):
@@ -233,182 +275,207 @@ def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
     dataset = Co3D(small_folder())
     store = FrameStore(dataset, {"backbone": BACKBONE})
     exact = exact_keypoints(dataset, "lump")
-    rows = resolve(
-        {"exact": exact, "one score": lambda first, second: (*exact(first, second)[:2], 0.5)}
-    )
+
+    def with_one_score(first: np.ndarray, second: np.ndarray):
+        pixels, places, _ = exact(first, second)
+        return pixels, places, 0.5  # of all matches, so that the views are equally good
+
+    rows = resolve({"exact": exact, "one score": with_one_score})
     for pair in category_pairs(dataset, "lump", 4, 3):
-        found = evaluate_pair(pair, rows, rows, store)["results"]
+        results = evaluate_pair(pair, rows, rows, store)["results"]
         reference, targets = dataset.load_pair(pair)
-        reference, *targets = (object_crop(frame, None).rgb for frame in (reference, *targets))
-        counts = [len(exact(reference, target)[0]) for target in targets]
-        one = found["exact"]
-        assert one["view"] == np.argmax(counts) and one["inliers"] == max(counts) > 20
-        assert (
-            one["error"] < 0.1
-            and one["scale"] == pytest.approx(1, abs=1e-3)
-            and one["translation"] < 1e-3
-        )
-        assert found["one score"]["view"] == 0 and found["one score"]["inliers"] == counts[0]
+        crop = object_crop(reference, None).rgb
+        counts = [len(exact(crop, object_crop(target, None).rgb)[0]) for target in targets]
+        choices = {name: (row["view"], row["inliers"]) for name, row in results.items()}
+        most = int(np.argmax(counts))
+        assert choices == {"exact": (most, counts[most]), "one score": (0, counts[0])}
+        assert counts[most] > 20  # or the exact pose would be chance
+        assert results["exact"]["error"] < 0.1
+        similarity = results["exact"]["scale"], results["exact"]["translation"]
+        assert_allclose(similarity, (1, 0), atol=1e-3)
 
 
 def test_a_matcher_of_keypoints_gets_the_crops_at_the_resolution_of_the_frames(tmp_path):
-    seen, dataset = {}, Co3D(small_folder())
-    run_rows(
-        {"mine": lambda first, second: keep(seen, len(seen), NONE, first, second)}, tmp_path, 1, 1
-    )
+    crops = []
+
+    def record(first, second):
+        crops.extend((first, second))
+        return NONE
+
+    run_rows({"mine": record}, tmp_path, pairs=1, targets=1)
+    dataset = Co3D(small_folder())
     (pair,) = category_pairs(dataset, "lump", 1, 1)
     reference, (target,) = dataset.load_pair(pair)
-    for image, frame in zip(seen[0], (reference, target), strict=True):
+    for crop, frame in zip(crops, (reference, target), strict=True):
         top, left, height, width = mask_to_bbox(frame.mask)
-        np.testing.assert_array_equal(image, frame.rgb[top : top + height, left : left + width])
+        assert_array_equal(crop, frame.rgb[top : top + height, left : left + width])
 
 
-def test_a_sweep_makes_a_row_of_each_threshold_and_says_where_it_belongs(tmp_path):
-    keypoints, solver, values = (
-        benchmark_folder.own_keypoints,
-        benchmark_folder.own_solver,
-        [0.001, 0.2],
-    )
-    rows = {"mine": keypoints, "solved": solver, "verified-n2": "verified-n2"}
-    assert list(resolve(rows, values)) == [
-        f"{name}@threshold={value}" for name in rows for value in values
-    ]
-    evaluate(small_folder(), BACKBONE, rows, {"lump": 2}, 2, tmp_path, sweep=values)
-    found = read_run(tmp_path)
-    for name in ("mine", "solved"):
-        few, many = (found.row(f"{name}@threshold={value}")["inliers"] for value in values)
-        assert (few < many).all(), name
-    assert (
-        "on validation categories, never on those that are evaluated"
-        in next(iter(every_table(found.summary))).note
-    )
-    run_rows(rows, tmp_path / "default", 2)
-    for name in rows:
-        default = read_run(tmp_path / "default").row(name)["error"]
-        assert default.equals(found.row(f"{name}@threshold=0.2")["error"]), name
-    refused(
-        "'own' has no threshold, expected a matcher or a solver",
-        resolve,
-        {"own": own_method},
-        [0.1],
-    )
-    refused("threshold is -1, expected", resolve, {"mine": keypoints}, [-1])
+SWEPT = {
+    "mine": benchmark_folder.own_keypoints,
+    "solved": benchmark_folder.own_solver,
+    "verified-n2": "verified-n2",
+}
+DEFAULT = 0.2  # the threshold of rows without a sweep
+THRESHOLDS = [0.001, DEFAULT]
 
 
-def test_keypoints_that_fit_no_pose_are_noted_and_those_that_are_none_fail(tmp_path):
-    none, ones = np.zeros((0, 2)), np.ones((9, 2))
-    rows = {
-        "none": lambda first, second: (none, none, none[:, 0]),
-        "empty": lambda first, second: ([], [], []),
-        "words": lambda first, second: ("a", "b", [1]),
-        "uneven": lambda first, second: (ones, ones[1:], ones[:, 0]),
-    }
-    found = run_rows(rows, tmp_path)
-    assert [row["failed"] for row in found.values()] == [0, 0, 1, 1]
-    assert (
-        read_run(tmp_path)
-        .row("none")["note"]
-        .iloc[0]
-        .startswith("pose is the best view's, not a fit: ")
-    )
-    told = "matched points are 9 and 8, expected as many in both images"
-    assert read_run(tmp_path).row("uneven")["failed"].iloc[0] == told
-    for number in (-1.0, np.nan):
-        run_rows({f"{number}": lambda first, second, number=number: (ones, ones, number)}, tmp_path)
-        told = "scores of matches are negative or NaN, expected 0 or more"
-        assert read_run(tmp_path).row(f"{number}")["failed"].iloc[0] == told
-    run_rows({"turned": lambda first, second: (ones.T, ones.T, ones[:, 0])}, tmp_path)
-    assert (
-        read_run(tmp_path)
-        .row("turned")["failed"]
-        .str.contains("matched points has shape .2, 9., expected")
-        .all()
-    )
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory) -> Run:
+    """A run with a row of each threshold."""
+    out = tmp_path_factory.mktemp("sweep")
+    evaluate(small_folder(), BACKBONE, SWEPT, {"lump": 2}, 2, out, sweep=THRESHOLDS)
+    return read_run(out)
+
+
+def test_a_sweep_makes_a_row_of_each_threshold():
+    expected = [f"{name}@threshold={value}" for name in SWEPT for value in THRESHOLDS]
+    assert list(resolve(SWEPT, THRESHOLDS)) == expected
+
+
+@pytest.mark.parametrize("name", ["mine", "solved"])
+def test_a_larger_threshold_of_a_sweep_gives_more_inliers(sweep, name):
+    few, many = [sweep.row(f"{name}@threshold={value}")["inliers"] for value in THRESHOLDS]
+    assert (few < many).all()
+
+
+def test_the_note_of_a_sweep_says_where_it_belongs(sweep):
+    table = next(iter(every_table(sweep.summary)))
+    assert "on validation categories, never on those that are evaluated" in table.note
+
+
+def test_the_default_threshold_in_a_sweep_gives_the_row_without_a_sweep(sweep, tmp_path):
+    run_rows(SWEPT, tmp_path, pairs=2)
+    default = read_run(tmp_path)
+    for name in SWEPT:
+        swept = sweep.row(f"{name}@threshold={DEFAULT}")["error"]
+        assert default.row(name)["error"].equals(swept), name
+
+
+@pytest.mark.parametrize(
+    "row, threshold, message",
+    [
+        (own_method, 0.1, "'mine' has no threshold, expected a matcher or a solver"),
+        (benchmark_folder.own_keypoints, -1, "threshold is -1, expected"),
+    ],
+)
+def test_sweeps_that_cannot_be_are_refused(row, threshold, message):
+    refused(message, resolve, {"mine": row}, [threshold])
+
+
+ONES = np.ones((9, 2))
+
+
+def test_keypoints_that_fit_no_pose_are_noted(tmp_path):
+    rows = {"none": lambda first, second: NONE, "empty": lambda first, second: ([], [], [])}
+    methods = run_rows(rows, tmp_path)
+    assert [row["failed"] for row in methods.values()] == [0, 0]
+    (note,) = read_run(tmp_path).row("none")["note"]
+    assert note.startswith("pose is the best view's, not a fit: ")
+
+
+@pytest.mark.parametrize(
+    "keypoints, message",
+    [
+        (("a", "b", [1]), "matched points is .a., expected real numbers"),
+        ((ONES, ONES[1:], ONES[:, 0]), "matched points are 9 and 8, expected as many in both"),
+        ((ONES, ONES, -1.0), "scores of matches are negative or NaN, expected 0 or more"),
+        ((ONES, ONES, np.nan), "scores of matches are negative or NaN, expected 0 or more"),
+        ((ONES.T, ONES.T, ONES[:, 0]), "matched points has shape .2, 9., expected"),
+    ],
+)
+def test_what_is_no_keypoints_fails_with_the_reason(tmp_path, keypoints, message):
+    run_rows({"mine": lambda first, second: keypoints}, tmp_path)
+    (reason,) = read_run(tmp_path).row("mine")["failed"]
+    assert re.search(message, reason)
 
 
 COLUMNS = "pair,target_frame,rotation,translation,scale"
 
 
-def exact_pose(dataset, pair):
+def exact_pose(dataset: Co3D, pair: Pair) -> Sim3:
     """The true pose of a pair in its second target view."""
-    ends = (
-        (pair.reference_sequence, pair.reference_frame),
-        (pair.target_sequence, pair.target_frames[1]),
+    reference = dataset.frame("lump", pair.reference_sequence, pair.reference_frame)
+    target = dataset.frame("lump", pair.target_sequence, pair.target_frames[1])
+    return true_pose(
+        dataset.camera(reference),
+        placement("lump", pair.reference_sequence),
+        dataset.camera(target),
+        placement("lump", pair.target_sequence),
     )
-    known = (
-        (dataset.camera(dataset.frame("lump", *end)), placement("lump", end[0])) for end in ends
-    )
-    return true_pose(*(part for one in known for part in one))
 
 
-def test_poses_from_a_file_are_measured_like_any_others(tmp_path):
-    """As another program would: it reads the questions, and answers in any of the target views."""
-    dataset, lines = Co3D(small_folder()), [COLUMNS]
-    pairs = category_pairs(dataset, "lump", 4, 3)
-    for pair in pairs[:3]:
+@pytest.fixture
+def answers(tmp_path):
+    """Files of another program that answers three of four pairs, each in the second target view.
+
+    exact.csv has whole poses, rotations.csv rotations only; returns the lines of exact.csv.
+    """
+    dataset = Co3D(small_folder())
+    lines = [COLUMNS]
+    for pair in category_pairs(dataset, "lump", 4, 3)[:3]:
         pose = exact_pose(dataset, pair)
-        numbers = (" ".join(map(repr, part.ravel().tolist())) for part in (pose.R, pose.t))
-        lines.append(f'"{pair.key}",{pair.target_frames[1]},{",".join(numbers)},1.0')
+        rotation = " ".join(map(repr, pose.R.ravel().tolist()))
+        translation = " ".join(map(repr, pose.t.tolist()))
+        lines.append(f'"{pair.key}",{pair.target_frames[1]},{rotation},{translation},1.0')
     (tmp_path / "exact.csv").write_text("\n".join(lines))
     (tmp_path / "rotations.csv").write_text("\r\n".join(line.rsplit(",", 2)[0] for line in lines))
-    rows = {name: f"{tmp_path / name}.csv" for name in ("exact", "rotations")}
+    return lines
+
+
+@pytest.mark.parametrize(
+    "name, translation, scale", [("exact", 0, 1), ("rotations", np.nan, np.nan)]
+)
+def test_poses_from_a_file_are_measured_like_any_others(
+    answers, tmp_path, name, translation, scale
+):
+    path = tmp_path / f"{name}.csv"
+    run_rows({name: str(path)}, tmp_path / "run", 4, 3)
+    found = read_run(tmp_path / "run").row(name)
+    *answered, missing = [pair.key for pair in category_pairs(Co3D(small_folder()), "lump", 4, 3)]
+    assert (found.loc[answered, "error"] < 1e-5).all()  # degrees: equal but for rounding
+    assert set(found.loc[answered, "view"]) == {1}
+    similarity = found.loc[answered, ["translation", "scale"]].to_numpy(float)
+    assert_allclose(similarity, [[translation, scale]] * 3, atol=1e-9)
+    assert found.loc[missing, ["error", "failed"]].tolist() == [180, f"{path} has no pose"]
+
+
+def test_a_file_with_other_poses_is_another_row(answers, tmp_path):
+    rows = {"exact": str(tmp_path / "exact.csv")}
     run_rows(rows, tmp_path / "run", 4, 3)
-    for name, path in rows.items():
-        found = read_run(tmp_path / "run").row(name)
-        answered = found.loc[[pair.key for pair in pairs[:3]]]
-        assert (answered["error"] < 1e-5).all() and (answered["view"] == 1).all()
-        known = answered[["translation", "scale"]].to_numpy(float)
-        assert (
-            np.isnan(known).all() if name == "rotations" else np.allclose(known, (0, 1), atol=1e-9)
-        )
-        assert found.loc[pairs[3].key, ["error", "failed"]].tolist() == [180, f"{path} has no pose"]
-    (tmp_path / "exact.csv").write_text("\n".join(lines[:2]))  # other poses under the same name
+    (tmp_path / "exact.csv").write_text("\n".join(answers[:2]))
     refused("a run with methods of exact", run_rows, rows, tmp_path / "run", 4, 3)
-    refused(
-        "exact.csv has no pose for any of the pairs",
-        run_rows,
-        rows,
-        tmp_path / "other",
-        6,
-        2,
-        "pebble",
-    )
-    (tmp_path / "views.csv").write_text(
-        "\n".join(lines).replace(f'",{pairs[0].target_frames[1]},', '",99,', 1)
-    )
-    view = [f"view={tmp_path / 'views.csv'}"]
-    refused(
-        "views.csv, line 2: target_frame is 99, expected one of .*, ",
-        run_rows,
-        view,
-        tmp_path / "other",
-        4,
-        3,
-    )
+
+
+def test_a_file_without_a_pose_of_the_pairs_or_of_another_view_is_refused(answers, tmp_path):
+    rows, out = {"exact": str(tmp_path / "exact.csv")}, tmp_path / "run"
+    message = "exact.csv has no pose for any of the pairs"
+    refused(message, run_rows, rows, out, category="pebble")
+    answers[1] = re.sub(r'",\d+,', '",99,', answers[1])
+    (tmp_path / "exact.csv").write_text("\n".join(answers))
+    message = "exact.csv, line 2: target_frame is 99, expected one of .*, "
+    refused(message, run_rows, rows, out, 4, 3)
 
 
 def test_each_pair_has_its_own_pose_and_missing_ones_are_told(tmp_path, monkeypatch):
     """Here the pairs differ in a target frame, and both are answered in the frame that they
     share."""
-    pairs = [Pair("lump", "100_a", 0, "200_b", (3, last)) for last in (4, 5)]
-    monkeypatch.setattr(
-        "zsp_lite.benchmark.run.pairs_of_rows", lambda *_: dict.fromkeys(pairs, ["both", "one"])
-    )
-    turns = "1 0 0 0 1 0 0 0 1", "0 -1 0 1 0 0 0 0 1"
-    lines = [COLUMNS, *(f'"{pair.key}",3,{turn},,' for pair, turn in zip(pairs, turns))]
-    for name, text in (("both", lines), ("one", lines[:2])):
-        (tmp_path / f"{name}.csv").write_text("\n".join(text))
-    rows = run_rows(
-        {name: f"{tmp_path / name}.csv" for name in ("both", "one")}, tmp_path / "run", 2
-    )
+    first, second = [Pair("lump", "100_a", 0, "200_b", (3, last)) for last in (4, 5)]
+    rows_of_pairs = dict.fromkeys([first, second], ["both", "one"])
+    monkeypatch.setattr("zsp_lite.benchmark.run.pairs_of_rows", lambda *_: rows_of_pairs)
+    one = [COLUMNS, f'"{first.key}",3,1 0 0 0 1 0 0 0 1,,']
+    both = [*one, f'"{second.key}",3,0 -1 0 1 0 0 0 0 1,,']
+    (tmp_path / "one.csv").write_text("\n".join(one))
+    (tmp_path / "both.csv").write_text("\n".join(both))
+    files = {name: f"{tmp_path / name}.csv" for name in ("both", "one")}
+    rows = run_rows(files, tmp_path / "run", 2)
     found = read_run(tmp_path / "run")
     assert [(row["n"], row["failed"]) for row in rows.values()] == [(2, 0), (2, 1)]
     assert found.row("both")["error"].nunique() == 2
-    note = next(iter(every_table(found.summary))).note
-    assert re.match(
-        "one failed on 1 of 2 pairs, counted as 180°; the first: .*one.csv has no pose", note
-    )
-    assert "both" not in note
+    (failure,) = found.failures
+    reason = "one failed on 1 of 2 pairs, counted as 180°; the first: .*one.csv has no pose"
+    assert re.match(reason, failure)
+    assert failure in next(iter(every_table(found.summary))).note
 
 
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -425,29 +492,30 @@ CONVENTIONS = {
 def test_a_spreadsheets_poses_are_read_and_the_note_names_their_convention(
     tmp_path, caplog, convention
 ):
-    dataset, lines = (
-        Co3D(small_folder()),
-        [COLUMNS.replace(",", ";"), "lump/x:1/y:2;2;1 0 0 0 1 0 0 0 1;;"],
-    )
-    for pair in category_pairs(dataset, "lump", 12, 3):
-        pose = exact_pose(dataset, pair)
-        # as of a method that confuses left and right
-        mixed = pose.R.T if len(lines) < 10 else pose.R
-        other = (
-            Rotation.random(random_state=len(lines)).as_matrix() if convention == "none" else mixed
-        )
-        rotation = CONVENTIONS.get(convention, lambda R, other=other: other)(pose.R)
+    dataset = Co3D(small_folder())
+    # As spreadsheets write where numbers have commas; the first pose fits no pair.
+    lines = [COLUMNS.replace(",", ";"), "lump/x:1/y:2;2;1 0 0 0 1 0 0 0 1;;"]
+    for index, pair in enumerate(category_pairs(dataset, "lump", 12, 3)):
+        true = exact_pose(dataset, pair).R
+        if convention == "none":
+            rotation = Rotation.random(random_state=index).as_matrix()
+        elif convention in CONVENTIONS:
+            rotation = CONVENTIONS[convention](true)
+        else:  # as of a method that confuses left and right
+            rotation = true.T if index < 8 else true
         numbers = " ".join(f"{value:.4f}".replace(".", ",") for value in rotation.ravel())
         lines.append(f"{pair.key};{pair.target_frames[1]};{numbers};;")
-    (tmp_path / "mine.csv").write_text("\ufeff" + "\r\n".join(lines), encoding="utf-8")
+    (tmp_path / "mine.csv").write_text("\ufeff" + "\r\n".join(lines), "utf-8")
     run_rows({"mine": str(tmp_path / "mine.csv")}, tmp_path / "run", 12, 3)
     found = read_run(tmp_path / "run")
-    told = "mine: 1 of 13 poses fit no pair"
-    if convention in [*CONVENTIONS][1:]:
-        told += f"; rotations agree with the labels if {convention}: median 0° in place of "
     run_rows(["oracle-view"], tmp_path / "run", 12, 3)  # the note stays with the row
+    named = convention in CONVENTIONS and convention != ""
+    told = "mine: 1 of 13 poses fit no pair"
+    if named:
+        told += f"; rotations agree with the labels if {convention}: median 0° in place of "
     for note in (found.summary["note"], caplog.text, read_run(tmp_path / "run").summary["note"]):
-        assert told in note and ("agree with" in note) == ("agree with" in told)
+        assert told in note
+        assert ("agree with" in note) == named
     assert (found.row("mine")["error"].max() < 0.01) == (convention == "")
 
 
@@ -455,7 +523,7 @@ RIGHT = '"lump/a:0/b:1,5",1,1 0 0 0 1 0 0 0 1,0 0 1,1'
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    "text, told",
     [
         ("", "a CSV file"),
         ("\xff", "codec.* a CSV file"),
@@ -495,56 +563,65 @@ def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_pat
     assert resolve([f"theirs={path}"])["theirs"].solve._poses.keys() == {"lump/a:0/b:1,5"}
 
 
-def test_the_questions_have_a_line_for_each_frame_with_its_files_and_camera(tmp_path):
+@pytest.fixture
+def asked(tmp_path):
+    """The lines of a file of questions about pairs of both categories."""
     dataset = Co3D(small_folder())
-    pairs = [*category_pairs(dataset, "lump", 2, 3), *category_pairs(dataset, "pebble", 1, 3)]
-    with open(write_questions(tmp_path / "pairs.csv", dataset, pairs), newline="") as file:
-        lines = list(csv.DictReader(file))
-    asked = []
-    for pair in pairs:
-        asked += [
-            (
-                pair.key,
-                "reference",
-                pair.category,
-                pair.reference_sequence,
-                f"{pair.reference_frame}",
-            )
+    path = write_questions(tmp_path / "pairs.csv", dataset, asked_pairs(dataset))
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def asked_pairs(dataset: Co3D) -> list[Pair]:
+    """Two pairs of one category and one of the other."""
+    return [*category_pairs(dataset, "lump", 2, 3), *category_pairs(dataset, "pebble", 1, 3)]
+
+
+def test_the_questions_have_a_line_for_each_frame(asked):
+    expected = []
+    for pair in asked_pairs(Co3D(small_folder())):
+        reference = ("reference", pair.category, pair.reference_sequence, pair.reference_frame)
+        targets = [
+            ("target", pair.category, pair.target_sequence, number) for number in pair.target_frames
         ]
-        asked += [
-            (pair.key, "target", pair.category, pair.target_sequence, f"{n}")
-            for n in pair.target_frames
-        ]
-    assert [tuple(line.values())[:5] for line in lines] == asked
+        expected += [[pair.key, *map(str, frame)] for frame in (reference, *targets)]
+    columns = ("pair", "role", "category", "sequence", "frame")
+    assert [[line[name] for name in columns] for line in asked] == expected
+
+
+def test_the_questions_have_the_files_and_the_camera_of_each_frame(asked):
+    dataset = Co3D(small_folder())
     points = np.random.default_rng(0).normal(size=(20, 3))
-    for line in lines:
+    for line in asked:
         assert all((dataset.root / line[name]).is_file() for name in ("image", "depth", "mask"))
         assert float(line["depth_scale"]) > 0
-        numbers = {
-            name: np.array(line[name].split(), float) for name in ("fx", "fy", "cx", "cy", "R", "t")
-        }
-        focal, middle = (
-            np.array([*numbers["fx"], *numbers["fy"]]),
-            np.array([*numbers["cx"], *numbers["cy"]]),
-        )
+        rotation = np.array(line["R"].split(), float).reshape(3, 3)
+        translation = np.array(line["t"].split(), float)
+        focal = np.array([line["fx"], line["fy"]], float)
+        middle = np.array([line["cx"], line["cy"]], float)
         frame = dataset.load(dataset.frame(line["category"], line["sequence"], int(line["frame"])))
-        camera = Camera(numbers["R"].reshape(3, 3), numbers["t"], focal, middle, frame.camera.size)
-        np.testing.assert_allclose(
-            camera.project(points)[0], frame.camera.project(points)[0], atol=1e-9
-        )
+        camera = Camera(rotation, translation, focal, middle, frame.camera.size)
+        expected, _ = frame.camera.project(points)
+        assert_allclose(camera.project(points)[0], expected, atol=1e-9)
 
 
 def test_a_row_is_remembered_by_its_settings_and_the_names_of_its_functions():
-    assert description(METHODS["ours-k30"]) == "backbone; pose; k=30"
-    (views,) = resolve(["verified-mask-n3"]).values()
-    assert description(views) == "backbone; pose; foreground=mask, solver=verified; 3 views"
-    rows = resolve(
-        {"own": own_method, "matcher": own_matcher, "object": ZeroShotPose(BACKBONE, k=7)}
-    )
-    own, matcher, estimator = map(description, rows.values())
-    assert own == "backbone; pose; benchmark_folder:own_method"
-    assert matcher == "backbone; pose; matcher=benchmark_folder:own_matcher"
-    assert "zsp_lite.pipeline:ZeroShotPose" in estimator and "k=7" in estimator
+    rows = resolve({"own": own_method, "matcher": own_matcher})
+    rows |= resolve(["ours-k30", "verified-mask-n3"])
+    assert {name: description(row) for name, row in rows.items()} == {
+        "own": "backbone; pose; benchmark_folder:own_method",
+        "matcher": "backbone; pose; matcher=benchmark_folder:own_matcher",
+        "ours-k30": "backbone; pose; k=30",
+        "verified-mask-n3": "backbone; pose; foreground=mask, solver=verified; 3 views",
+    }
+
+
+def test_a_row_of_an_estimator_is_remembered_by_its_class_and_settings():
+    (estimator,) = resolve({"object": ZeroShotPose(BACKBONE, k=7)}).values()
+    assert re.search(r"zsp_lite\.pipeline:ZeroShotPose.*k=7", description(estimator))
+
+
+def test_no_two_rows_of_the_library_have_one_description():
     assert len(set(map(description, METHODS.values()))) == len(METHODS)
 
 
@@ -565,34 +642,37 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
     assert Path.cwd() == tmp_path
 
 
-def test_an_answer_is_a_rotation_in_a_view_or_the_pair_fails_and_its_numbers_can_be_stored(
-    tmp_path, caplog
-):
-    rows = {
-        "large": lambda problem: Answer(2 * np.eye(3)),
-        "words": lambda problem: "north",
-        "mirror": lambda problem: np.diag([1.0, 1.0, -1.0]),
-        "far view": lambda problem: (np.eye(3), 2),
-        "nowhere": lambda problem: Answer(np.eye(3), translation=np.full(3, np.nan)),
-    }
-    assert all(
-        row["failed"] == 1 and row["median"] == 180 for row in run_rows(rows, tmp_path).values()
-    )
+@pytest.mark.parametrize(
+    "row",
+    [
+        lambda problem: "north",
+        lambda problem: np.diag([1.0, 1.0, -1.0]),  # a mirror
+        lambda problem: (np.eye(3), 2),  # there are two views, 0 and 1
+        lambda problem: Answer(np.eye(3), translation=np.full(3, np.nan)),
+        lambda problem: Answer(np.eye(3), inliers="many"),
+        lambda problem: Answer(np.eye(3), confidence=2.0),
+        lambda problem: Answer(np.eye(3), note="\udcff"),
+        lambda problem: Answer(np.eye(3), view=0.5),
+    ],
+)
+def test_an_answer_is_a_rotation_in_a_view_or_the_pair_fails(tmp_path, row):
+    figures = run_rows({"mine": row}, tmp_path)["mine"]
+    assert (figures["failed"], figures["median"]) == (1, 180)
+
+
+def test_the_reason_of_a_failure_is_logged_and_noted(tmp_path, caplog):
+    row = run_rows({"large": lambda problem: Answer(2 * np.eye(3))}, tmp_path)["large"]
+    assert (row["failed"], row["median"]) == (1, 180)
     told = "large failed on 1 of 1 pairs, counted as 180°; the first: Sim3: R is [[2.0, 0.0, 0.0], "
-    assert told in caplog.text and told in next(iter(every_table(read_run(tmp_path).summary))).note
-    run_rows(
-        {"sure": lambda problem: Answer(np.eye(3), note="x" * 10**6, inliers=4, confidence=1 / 3)},
-        tmp_path,
-    )
-    found = read_run(tmp_path).row("sure")
-    assert (
-        found[["inliers", "confidence"]].to_numpy().tolist() == [[4, 0.3333]]
-        and len(found["note"].iloc[0]) == 1000
-    )
-    for wrong in ({"inliers": "many"}, {"confidence": 2.0}, {"note": "\udcff"}, {"view": 0.5}):
-        (name,) = wrong
-        run_rows({name: lambda problem, wrong=wrong: Answer(np.eye(3), **wrong)}, tmp_path)
-        assert read_run(tmp_path).row(name)["failed"].str.contains("Error: ").all()
+    assert told in caplog.text
+    assert told in next(iter(every_table(read_run(tmp_path).summary))).note
+
+
+def test_what_an_answer_says_besides_is_stored_rounded_and_cut(tmp_path):
+    answer = Answer(np.eye(3), note="x" * 10**6, inliers=4, confidence=1 / 3)
+    run_rows({"sure": lambda problem: answer}, tmp_path)
+    (found,) = read_run(tmp_path).row("sure")[["inliers", "confidence", "note"]].to_numpy()
+    assert found.tolist() == [4, 0.3333, "x" * 1000]
 
 
 def test_a_row_may_answer_in_few_digits(tmp_path):
@@ -603,43 +683,52 @@ def test_a_row_may_answer_in_few_digits(tmp_path):
         "decimals": lambda problem: Answer(exact.round(4)),
         "sim3": lambda problem: Sim3(1.0, exact.round(3), np.ones(3)),
     }
-    found = run_rows(rows, tmp_path, 2)
-    assert [row["failed"] for row in found.values()] == [0] * 4
-    assert [row["median"] for row in found.values()] == pytest.approx(
-        [found["exact"]["median"]] * 4, abs=0.1
-    )
+    methods = run_rows(rows, tmp_path, 2)
+    assert [row["failed"] for row in methods.values()] == [0] * 4
+    medians = [row["median"] for row in methods.values()]
+    assert_allclose(medians, [medians[0]] * 4, atol=0.1)
 
 
-def overwrite(*frames):
+def overwrite(*frames: Frame) -> None:
+    """Overwrite the arrays of frames."""
     for frame in frames:
-        frame.rgb[:], frame.depth[:], frame.mask[:] = 0, 1, 1
+        frame.rgb[:] = 0
+        frame.depth[:] = 1
+        frame.mask[:] = 1
 
 
 class Vandal:
     """Rows of every kind that overwrite all that they get."""
 
     def problem(self, problem):
-        found = problem.estimate(settings={"solver": "verified"})
-        found.matches.reference[:], found.sim3.R[:] = 0, np.eye(3)
+        estimate = problem.estimate(settings={"solver": "verified"})
+        estimate.matches.reference[:] = 0
+        estimate.sim3.R[:] = np.eye(3)
         for view in (*problem.views(), *problem.estimate().target_views):
-            view.features.keys[:], view.features.saliency[:], view.foreground[:] = 0, 0, False
+            view.features.keys[:] = 0
+            view.features.saliency[:] = 0
+            view.foreground[:] = False
         overwrite(*problem.frames())
         return np.eye(3)
 
     def matcher(self, similarity, first, second):
-        similarity[:], first[:], second[:] = 0, False, False
+        similarity[:] = 0
+        first[:] = False
+        second[:] = False
         return torch.zeros(len(first), dtype=torch.long), torch.zeros(len(first))
 
     def keypoints(self, first, second):
-        first[:], second[:] = 0, 0
-        return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
+        first[:] = 0
+        second[:] = 0
+        return NONE
 
     def estimate(self, reference, targets):
         overwrite(reference, *targets)
         return np.eye(3)
 
 
-def test_rows_do_not_reach_each_other_in_any_order(tmp_path):
+@pytest.mark.parametrize("order", ["own first", "own last"])
+def test_rows_do_not_reach_each_other_in_any_order(tmp_path, library_alone, order):
     vandal = Vandal()
     own = {
         "problem": vandal.problem,
@@ -647,15 +736,23 @@ def test_rows_do_not_reach_each_other_in_any_order(tmp_path):
         "keypoints": vandal.keypoints,
         "estimator": vandal,
     }
-    library = {name: name for name in ("ours", "verified", "sift", "ours-mask", "icp", "scans-2")}
-    for name, rows in (("alone", library), ("last", own | library), ("first", library | own)):
-        run_rows(rows, tmp_path / name, 2)
-    alone, *others = (read_run(tmp_path / name) for name in ("alone", "last", "first"))
-    times = ["seconds", "milliseconds"]
-    for name in library:
-        for run in others:
-            found, expected = run.row(name), alone.row(name)
-            assert found.drop(columns=times).equals(expected.drop(columns=times)), name
+    library = dict(zip(UNREACHED, UNREACHED))
+    run_rows(own | library if order == "own first" else library | own, tmp_path, 2)
+    for name in UNREACHED:
+        results, expected = [run.row(name) for run in (read_run(tmp_path), library_alone)]
+        times = ["seconds", "milliseconds"]
+        assert results.drop(columns=times).equals(expected.drop(columns=times)), name
+
+
+UNREACHED = ("ours", "verified", "sift", "ours-mask", "icp", "scans-2")
+
+
+@pytest.fixture(scope="module")
+def library_alone(tmp_path_factory) -> Run:
+    """A run without rows of one's own."""
+    out = tmp_path_factory.mktemp("alone")
+    run_rows(UNREACHED, out, 2)
+    return read_run(out)
 
 
 @pytest.mark.slow
@@ -691,8 +788,8 @@ def never_ends(problem):
         pass
 
 
-def keep(handed, name, answer, *things):
-    """A row that keeps what it gets."""
+def keep(handed: dict[str, tuple], name: str, answer, *things):
+    """Store what the row `name` was handed, and give the row's answer."""
     handed.setdefault(name, things)
     return answer
 
@@ -732,21 +829,23 @@ def test_a_row_that_fails_does_not_stop_the_others(workers, tmp_path, monkeypatc
     )["methods"]
     assert found.pop("ours") == run_rows(["ours"], tmp_path / "alone", 2)["ours"]
     for name, (_, told) in rows.items():
-        assert (
-            re.match(told, read_run("run").row(name)["failed"].iloc[0])
-            and found[name]["median"] == 180
-        )
+        assert re.match(told, read_run("run").row(name)["failed"].iloc[0])
+        assert found[name]["median"] == 180
         assert f"{name} failed on 2 of 2 pairs" in caplog.text
 
 
 def test_a_row_that_ends_at_its_time_limit_leaves_nothing_behind():
     threads = threading.active_count()
-    for delay in np.linspace(0.998, 1.002, 7):
+    for delay in np.linspace(0.998, 1.002, 7):  # seconds, just before and after the limit
         with suppress(InputError), own.fails_alone(1):
             time.sleep(delay)
-    assert threading.active_count() == threads and sum(range(100_000))
-    # Python 3.11 never enters a function under a profiler or debugger while it waits for what was
-    # raised from outside.
+    assert threading.active_count() == threads
+    sum(range(100_000))  # long enough for an exception that comes too late
+
+
+def test_the_time_limit_is_not_entered_by_a_profiler():
+    """Python 3.11 never enters a function under a profiler or debugger while it waits for what was
+    raised from outside."""
     profiled = "import sys; sys.setprofile(lambda *_: None); (lambda: None)()"
     watched = (
         f"from zsp_lite.benchmark.own import fails_alone\nwith fails_alone(1): pass\n{profiled}"
@@ -779,65 +878,86 @@ def reached(thing) -> list:
         if id(thing) in seen or isinstance(thing, ENDS):
             continue
         seen[id(thing)] = thing
-        if not isinstance(thing, FunctionType) or "site-packages" not in thing.__code__.co_filename:
-            names = *INNER, *getattr(thing, "__slots__", ())
-            todo += [getattr(thing, name) for name in names if hasattr(thing, name)]
-            todo += [*thing.keys(), *thing.values()] if isinstance(thing, Mapping) else []
-            todo += thing if isinstance(thing, list | tuple | set) else []
+        if isinstance(thing, FunctionType) and "site-packages" in thing.__code__.co_filename:
+            continue
+        names = *INNER, *getattr(thing, "__slots__", ())
+        todo += [getattr(thing, name) for name in names if hasattr(thing, name)]
+        if isinstance(thing, Mapping):
+            todo += [*thing.keys(), *thing.values()]
+        if isinstance(thing, list | tuple | set):
+            todo += thing
     return list(seen.values())
 
 
-NONE = np.zeros((0, 2)), np.zeros((0, 2)), 0.0  # no keypoints
-
-
 def test_nothing_that_a_row_of_ones_own_gets_leads_to_a_label(tmp_path):
-    handed, solve = {}, benchmark_folder.own_solver
+    handed = {}
+
+    def problem(one):
+        things = one, one.frames(), one.views(), one.estimate()
+        return keep(handed, "problem", np.eye(3), *things)
+
+    def matcher(*arguments):
+        return keep(handed, "matcher", own_matcher(*arguments), *arguments)
+
+    def solver(*arguments, seed, threshold):
+        return keep(handed, "solver", benchmark_folder.own_solver(*arguments), *arguments)
+
+    matcher.kind, solver.kind = "matcher", "solver"
     rows = {
-        "problem": lambda one: keep(
-            handed, "problem", np.eye(3), one, one.frames(), one.views(), one.estimate()
-        ),
+        "problem": problem,
         "method": Method(solve=lambda one: keep(handed, "method", np.eye(3), one)),
         "posing": Method(solve=Posing("", handed, "")),
         "estimator": SimpleNamespace(
             estimate=lambda *frames: keep(handed, "estimator", np.eye(3), frames)
         ),
-        "keypoints": lambda one, two: keep(handed, "keypoints", NONE, one, two),
-        "matcher": lambda one, two, three: keep(
-            handed, "matcher", own_matcher(one, two, three), one, two, three
-        ),
-        "solver": lambda a, b, c, seed, threshold: keep(handed, "solver", solve(a, b, c), a, b, c),
+        "keypoints": lambda *images: keep(handed, "keypoints", NONE, *images),
+        "matcher": matcher,
+        "solver": solver,
     }
-    found = run_rows({"icp": "icp", "scans-2": "scans-2"} | rows, tmp_path)
-    assert not any(row["failed"] for row in found.values()) and handed.keys() == rows.keys()
+    rows["keypoints"].kind = "keypoints"
+    methods = run_rows({"icp": "icp", "scans-2": "scans-2"} | rows, tmp_path)
+    assert {row["failed"] for row in methods.values()} == {0}
+    assert handed.keys() == rows.keys()
     for thing in reached(handed):
         assert not isinstance(thing, Co3D | Path | PoseLabel | Pair), thing
         assert not (isinstance(thing, str) and str(small_folder()) in thing), thing
 
 
 def test_the_pairs_seed_goes_to_every_row_that_takes_one(tmp_path):
-    seeds, solve, (pair,) = (
-        {},
-        benchmark_folder.own_solver,
-        category_pairs(Co3D(small_folder()), "lump", 1, 2),
-    )
+    seeds = {}
+
+    class Estimator:
+        def estimate(self, reference, targets, seed=0):
+            return keep(seeds, "estimator", np.eye(3), seed)
+
+    def problem(problem, seed):
+        assert seed == problem.seed
+        return keep(seeds, "problem", np.eye(3), seed)
+
+    def keypoints(first, second, *, seed):
+        return keep(seeds, "keypoints", NONE, seed)
+
+    def matcher(similarity, first, second, seed=0):
+        return keep(seeds, "matcher", own_matcher(similarity, first, second), seed)
+
+    def solver(reference, targets, matched, *, seed, threshold):
+        answer = benchmark_folder.own_solver(reference, targets, matched)
+        return keep(seeds, "solver", answer, seed)
+
     rows = {
-        "problem": lambda problem, seed: (
-            keep(seeds, "problem", np.eye(3), seed) if seed == problem.seed else None
-        ),
-        "estimator": SimpleNamespace(
-            estimate=lambda one, others, seed=0: keep(seeds, "estimator", np.eye(3), seed)
-        ),
-        "keypoints": lambda first, second, *, seed: keep(seeds, "keypoints", NONE, seed),
-        "matcher": lambda one, two, three, seed=0: keep(
-            seeds, "matcher", own_matcher(one, two, three), seed
-        ),
-        "solver": lambda a, b, c, *, seed, threshold: keep(seeds, "solver", solve(a, b, c), seed),
+        "problem": problem,
+        "estimator": Estimator(),
+        "keypoints": keypoints,
+        "matcher": matcher,
+        "solver": solver,
     }
-    run_rows(rows | {"pipeline": ZeroShotPose(BACKBONE), "ours": "ours"}, tmp_path)
+    run_rows(rows, tmp_path)
+    (pair,) = category_pairs(Co3D(small_folder()), "lump", 1, 2)
     assert seeds == dict.fromkeys(rows, (pair.seed,))
-    assert (
-        read_run(tmp_path).row("pipeline")["error"].equals(read_run(tmp_path).row("ours")["error"])
-    )
+
+
+def test_a_pipeline_as_a_row_draws_with_the_pairs_seed(own_run):
+    assert own_run.row("pipeline")["error"].equals(own_run.row("ours")["error"])
 
 
 class Broken(CoordinateBackbone):
@@ -850,7 +970,7 @@ class Broken(CoordinateBackbone):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    "wrong, told",
     [
         (
             lambda maps: [replace(one, keys=one.keys * float("nan")) for one in maps],
@@ -931,29 +1051,38 @@ def test_a_fingerprint_tells_apart_whatever_changes_the_features():
     assert of() != plain
 
 
-def test_a_backbone_of_ones_own_is_known_by_its_name_and_its_weights():
+def test_a_backbone_that_is_a_function_is_known_by_its_name():
     def grey(images):
         return BACKBONE([image // 2 for image in images])
 
-    def weighed(value):
+    assert fingerprint(grey) == f"{__name__}:{grey.__qualname__}"
+
+
+def test_a_backbone_of_ones_own_is_known_by_its_name_and_its_weights():
+    def weighed(value: float):
         return SimpleNamespace(name="weighed", state_dict=lambda: {"value": torch.tensor(value)})
 
-    assert fingerprint(grey).endswith(
-        ":test_a_backbone_of_ones_own_is_known_by_its_name_and_its_weights.<locals>.grey"
-    )
-    first, again, other = (fingerprint(weighed(value)) for value in (1.0, 1.0, 2.0))
-    assert first == again != other and first.startswith("weighed ")
+    first = fingerprint(weighed(1.0))
+    assert first.startswith("weighed ")
+    assert first == fingerprint(weighed(1.0))
+    assert first != fingerprint(weighed(2.0))
 
 
 def test_the_library_is_known_by_version_and_commit(tmp_path, monkeypatch):
-    monkeypatch.setattr(identity, "REPOSITORY", tmp_path)
-    version, found = identity.library_version.__wrapped__, []
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=b"]
+    monkeypatch.setattr(runs, "REPOSITORY", tmp_path)
+    version = runs.library_version.__wrapped__  # without its cache
+
+    def git(*words: str) -> None:
+        user = ["-c", "user.name=a", "-c", "user.email=b"]
+        subprocess.run(["git", "-C", tmp_path, *user, *words], check=True, capture_output=True)
+
     (tmp_path / "__init__.py").touch()
-    for step in (["init"], ["add", "."], ["commit", "-m", "x"]):
-        found.append(version()["commit"])
-        subprocess.run([*git, *step], check=True, capture_output=True)
+    assert version()["commit"] is None  # no repository
+    git("init")
+    git("add", ".")
+    assert version()["commit"] is None  # no commit
+    git("commit", "-m", "x")
     commit = version()["commit"]
-    assert found[:2] == [None, None] and len(commit) == 40
+    assert len(commit) == 40
     (tmp_path / "__init__.py").write_text("x = 1")
     assert version()["commit"] == f"{commit}-dirty"

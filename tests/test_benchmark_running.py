@@ -26,18 +26,23 @@ from refusals import refused
 from synthetic_views import CoordinateBackbone
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from zsp_lite.backbones.backbone import Backbone
+from zsp_lite import Backbone, Co3D, InputError
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.execution import make_chunks, open_workers
-from zsp_lite.benchmark.identity import library_version
 from zsp_lite.benchmark.methods import resolve
 from zsp_lite.benchmark.run import evaluate, pair_evaluator, pairs_of_rows, write_reports
-from zsp_lite.benchmark.runs import LINES, SETTINGS, add_lines, read_lines, read_run
+from zsp_lite.benchmark.runs import (
+    LINES,
+    SETTINGS,
+    add_lines,
+    library_version,
+    read_lines,
+    read_run,
+)
 from zsp_lite.benchmark.tables import compare
 from zsp_lite.cli.main import main
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels, write_label
-from zsp_lite.errors import FatalError, InputError
+from zsp_lite.errors import FatalError
 from zsp_lite.threads import one_thread
 
 pytestmark = pytest.mark.slow
@@ -51,81 +56,99 @@ TESTS = Path(__file__).parent
 PATHS = os.environ | {"PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)])}
 
 
-def again(out, executor=1):
+def again(out: Path, executor=1) -> dict:
     """The run of `benchmark_folder`'s main, in this process."""
     return evaluate(small_folder(), QUICK, ROWS, 6, 3, out, executor)
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
+    """The folder of a run that nothing interrupts, and what it returned."""
     out = tmp_path_factory.mktemp("undisturbed")
     return out, again(out)
 
 
-def pairs_in(out) -> list[str]:
+PAIRS = 12  # of both categories
+
+
+def pairs_in(out: Path) -> list[str]:
     """The evaluations of pairs in a run's folder."""
     return [line.pair for line in read_lines(out)]
 
 
 def _children(pid: int) -> set[int]:
-    return {
-        int(child)
-        for child in subprocess.run(["pgrep", "-P", str(pid)], capture_output=True).stdout.split()
-    }
+    """The processes that a process has started."""
+    found = subprocess.run(["pgrep", "-P", str(pid)], capture_output=True).stdout
+    return set(map(int, found.split()))
+
+
+def kill_after(saves: int, out: Path, workers: int) -> set[int]:
+    """Start a run and kill it after it has saved pairs so often; returns its workers."""
+    words = [TESTS / "benchmark_folder.py", small_folder(), out, workers]
+    command = [sys.executable, *map(str, words)]
+    with subprocess.Popen(command, env=PATHS, stdout=subprocess.PIPE, text=True) as process:
+        for _ in range(saves):
+            assert process.stdout.readline()  # a line for each time that pairs are saved
+        process.send_signal(signal.SIGSTOP)  # it must not finish before it is killed
+        children = _children(process.pid)
+        process.kill()
+    return children
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory) -> Path:
+    """The folder of a run that was killed twice, first with two workers, then with one."""
+    out = tmp_path_factory.mktemp("killed")
+    children = kill_after(1, out, 2)
+    stored = len(pairs_in(out))
+    assert stored >= 1
+    children |= kill_after(3, out, 1)
+    assert len(pairs_in(out)) >= stored + 3
+    deadline = time.monotonic() + 20
+    for pid in children:  # a killed run's workers end by themselves
+        status = Path(f"/proc/{pid}/stat")
+        # The state stands behind the name in brackets; Z is a process that has ended.
+        while status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z":
+            assert time.monotonic() < deadline, f"{status}: a worker outlives its run"
+            time.sleep(0.05)
+    return out
+
+
+@needs_signals
+def test_an_interrupted_run_has_tables_figures_and_comparisons_of_what_is_finished(
+    undisturbed, killed, tmp_path
+):
+    stored = len(pairs_in(killed))
+    assert 4 <= stored < PAIRS
+    assert main(f"tables {killed} --out {tmp_path}".split()) == 0
+    assert (tmp_path / "tables/all_rows.csv").is_file()
+    assert (tmp_path / "figures/error_curves.pdf").is_file()
+    assert read_run(killed).summary["methods"]["ours"]["n"] == stored
+    compared = compare(read_run(killed), read_run(undisturbed[0])).cells
+    assert {one.value for one in compared["pairs"]} == {stored}
 
 
 @needs_signals
 def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_twice(
-    undisturbed, tmp_path
+    undisturbed, killed, tmp_path
 ):
-    stored = 0
-    for workers, more in ((2, 1), (1, 3)):
-        command = [
-            sys.executable,
-            str(TESTS / "benchmark_folder.py"),
-            str(small_folder()),
-            str(tmp_path),
-            str(workers),
-        ]
-        with subprocess.Popen(command, env=PATHS, stdout=subprocess.PIPE, text=True) as process:
-            for _ in range(more):
-                assert process.stdout.readline()  # a line for each time that pairs are saved
-            process.send_signal(signal.SIGSTOP)  # it must not finish before it is killed
-            children = _children(process.pid)
-            process.kill()
-        assert len(pairs_in(tmp_path)) >= stored + more
-        stored = len(pairs_in(tmp_path))
-        deadline = time.monotonic() + 20
-        for status in (
-            Path(f"/proc/{pid}/stat") for pid in children
-        ):  # a killed run's workers end by themselves
-            while status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z":
-                assert time.monotonic() < deadline, f"{status}: a worker outlives its run"
-                time.sleep(0.05)
-    assert 4 <= stored < 12
-    # An interrupted run has tables, figures and comparisons of what is finished.
-    assert main(["tables", str(tmp_path)]) == 0
-    assert read_run(tmp_path).summary["methods"]["ours"]["n"] == stored
-    assert (tmp_path / "tables" / "all_rows.csv").is_file() and (
-        tmp_path / "figures" / "error_curves.pdf"
-    ).is_file()
-    compared = compare(read_run(tmp_path), read_run(undisturbed[0])).cells
-    assert {one.value for one in compared["pairs"]} == {stored}
-    assert again(tmp_path)["methods"] == undisturbed[1]["methods"]
-    assert (
-        sorted(pairs_in(tmp_path)) == sorted(pairs_in(undisturbed[0]))
-        and len(set(pairs_in(tmp_path))) == 12
-    )
+    out, summary = undisturbed
+    run = shutil.copytree(killed, tmp_path / "run")
+    assert again(run)["methods"] == summary["methods"]
+    assert len(set(pairs_in(run))) == PAIRS
+    assert sorted(pairs_in(run)) == sorted(pairs_in(out))
 
 
 def test_a_line_cut_off_by_a_kill_is_neither_read_nor_continued(undisturbed, tmp_path):
     run = shutil.copytree(undisturbed[0], tmp_path / "run")
     before, path = read_run(run), run / LINES
     whole = path.read_bytes()
-    path.write_bytes(whole + whole[: len(whole) // 2].rpartition(b"\n")[2])
+    cut_off = whole[: len(whole) // 2].rpartition(b"\n")[2]
+    path.write_bytes(whole + cut_off)
     assert read_run(run).table.equals(before.table)
     again(run)
-    assert read_run(run).table.equals(before.table) and path.read_bytes() == whole
+    assert read_run(run).table.equals(before.table)
+    assert path.read_bytes() == whole
 
 
 def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monkeypatch):
@@ -134,38 +157,33 @@ def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monke
     refused("no pair that all its rows have finished", read_run, tmp_path)
     packed = tmp_path / f"{LINES}.gz"
     packed.write_bytes(gzip.compress((out / LINES).read_bytes()))
-    assert (
-        read_run(tmp_path).table.equals(read_run(out).table)
-        and read_run(tmp_path).summary == summary
-    )
+    assert read_run(tmp_path).table.equals(read_run(out).table)
     with monkeypatch.context() as context:
         context.setattr("zsp_lite.benchmark.run.evaluate_pair", None)  # nothing is left to compute
         assert again(tmp_path) == summary
-    assert not packed.exists() and (tmp_path / LINES).read_bytes() == (out / LINES).read_bytes()
+    assert not packed.exists()
+    assert (tmp_path / LINES).read_bytes() == (out / LINES).read_bytes()
 
 
 @needs_signals
 def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tables(
     undisturbed, tmp_path, monkeypatch
 ):
-    seen, before = [], _children(os.getpid())
+    stored, before = [], _children(os.getpid())  # the numbers of pairs after each save
 
     def kill_a_worker() -> None:
-        if not seen:
+        if not stored:
             os.kill(max(_children(os.getpid()) - before), signal.SIGKILL)
-        seen.append(len(pairs_in(tmp_path)))
+        stored.append(len(pairs_in(tmp_path)))
 
     monkeypatch.setattr("zsp_lite.benchmark.execution.add_lines", after_each_save(kill_a_worker))
     arguments = (small_folder(), SlowBackbone(grid=8), ROWS, 6, 3, tmp_path)
-    refused(
-        "finished pairs are stored: run again to continue, with fewer workers",
-        evaluate,
-        *arguments,
-        executor=2,
-    )
-    assert seen[-1] == len(pairs_in(tmp_path)) < 12
+    message = "finished pairs are stored: run again to continue, with fewer workers"
+    refused(message, evaluate, *arguments, executor=2)
+    assert stored[-1] == len(pairs_in(tmp_path)) < PAIRS
     assert evaluate(*arguments)["methods"] == undisturbed[1]["methods"]
-    assert seen[-1] == len(pairs_in(tmp_path)) == len(set(pairs_in(tmp_path))) == 12
+    assert stored[-1] == PAIRS
+    assert sorted(pairs_in(tmp_path)) == sorted(pairs_in(undisturbed[0]))
 
 
 # With two workers, a chunk of 24 pairs has three: each worker finishes its first one, and no other.
@@ -187,8 +205,8 @@ def row(problem):
 def test_an_interrupt_ends_a_run_and_its_workers_with_one_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "waiting_rows.py").write_text(WAITS)
-    words = ["benchmark", "--data", str(small_folder()), "--pairs", "12", "--out", "run"]
-    words += ["--methods", "waits=waiting_rows:row"]
+    options = "--pairs 12 --out run --methods waits=waiting_rows:row"
+    words = f"benchmark --data {small_folder()} {options}".split()
     command = [sys.executable, "-m", "zsp_lite", *words, "--workers", "2"]
     with subprocess.Popen(
         command, env=PATHS, stderr=subprocess.PIPE, text=True, start_new_session=True
@@ -205,49 +223,38 @@ def test_an_interrupt_ends_a_run_and_its_workers_with_one_line(tmp_path, monkeyp
     assert pairs_in(tmp_path / "run")[: len(stored)] == stored
 
 
-def test_modules_of_the_current_folder_travel_to_workers_and_what_they_lack_is_one_line(
-    tmp_path, monkeypatch
-):
+LOCK = "import threading\nlock = threading.Lock()\ndef half(problem):\n    return lock and None"
+MODULES = {
+    "turns_of_mine": "import numpy as np\nHALF = np.diag([1.0, -1.0, -1.0])",
+    "rows_of_mine": "import turns_of_mine\ndef half(problem):\n    return turns_of_mine.HALF",
+    "installed/package_of_mine": "def half(problem):\n    return None",
+    "lock_of_mine": LOCK,
+    "other_lock": LOCK,
+}
+
+
+def test_modules_of_the_current_folder_travel_to_workers(tmp_path, monkeypatch):
     from distributed import Client, LocalCluster
 
-    lock = "import threading\nlock = threading.Lock()\ndef half(problem):\n    return lock and None"
-    for name, text in {
-        "turns_of_mine": "import numpy as np\nHALF = np.diag([1.0, -1.0, -1.0])",
-        "rows_of_mine": "import turns_of_mine\ndef half(problem):\n    return turns_of_mine.HALF",
-        "installed/package_of_mine": "def half(problem):\n    return None",
-        "lock_of_mine": lock,
-        "other_lock": lock,
-    }.items():
+    for name, text in MODULES.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / f"{name}.py").write_text(text)
-    with (
-        LocalCluster(
-            n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50
-        ) as cluster,
-        Client(cluster) as client,
-    ):
+    options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
+    with LocalCluster(**options, silence_logs=50) as cluster, Client(cluster) as client:
         monkeypatch.chdir(tmp_path)  # after the worker has its path
         monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "installed")])
 
-        def run(module: str, executor=client.get_executor(pure=False)) -> int:
+        def failures(module: str, executor=client.get_executor(pure=False)) -> int:
             rows = [f"mine={module}:half"]
-            return evaluate(small_folder(), QUICK, rows, {"lump": 2}, 2, module, executor)[
-                "methods"
-            ]["mine"]["failed"]
+            summary = evaluate(small_folder(), QUICK, rows, {"lump": 2}, 2, module, executor)
+            return summary["methods"]["mine"]["failed"]
 
-        assert run("rows_of_mine") == 0
-        refused(
-            "a worker cannot import the rows: No module named 'package_of_mine', expected",
-            run,
-            "package_of_mine",
-        )
-        refused(
-            "sending the rows to workers failed: .*cannot pickle",
-            run,
-            "lock_of_mine",
-            error=FatalError,
-        )
-        assert run("other_lock", executor=2) == 2  # processes of this machine import the module
+        assert failures("rows_of_mine") == 0
+        lacks = "a worker cannot import the rows: No module named 'package_of_mine', expected"
+        refused(lacks, failures, "package_of_mine")
+        unsent = "sending the rows to workers failed: .*cannot pickle"
+        refused(unsent, failures, "lock_of_mine", error=FatalError)
+        assert failures("other_lock", executor=2) == 2  # processes of this machine import it
 
 
 def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch):
@@ -256,7 +263,7 @@ def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch
     def look() -> None:
         seen.append(read_run(tmp_path).summary["methods"]["ours-bv"]["n"])
         if len(seen) == 3:
-            assert main(["tables", str(tmp_path), "--out", str(tmp_path / "reports")]) == 0
+            assert main(f"tables {tmp_path} --out {tmp_path}/reports".split()) == 0
             refused("another process is writing", evaluate, *arguments)
 
     arguments = (small_folder(), QUICK, ["ours-bv"], 2, 3, tmp_path)
@@ -267,46 +274,47 @@ def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch
 
 
 def test_any_executor_will_do_and_gets_the_backbone_once(undisturbed, tmp_path):
+    sizes = []
+
     class Counting(ThreadPoolExecutor):
         def submit(self, function, *arguments):
             sizes.append(len(cloudpickle.dumps(arguments)))
             return super().submit(function, *arguments)
 
-    sizes, heavy = [], replace(QUICK, _weights=np.zeros(1_000_000))
+    heavy = replace(QUICK, _weights=np.zeros(1_000_000))
     with Counting(2) as executor:
         found = evaluate(small_folder(), heavy, ROWS, 6, 3, tmp_path, executor)
     assert found["methods"] == undisturbed[1]["methods"]
-    assert len(sizes) > 2 and max(sizes) < 10_000
-    assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith(".rows")) == []
+    assert len(sizes) > 2
+    assert max(sizes) < 10_000  # bytes: far less than the weights
+    assert list(tmp_path.glob(".rows*")) == []
+
+
+def thread_counts() -> list[int]:
+    """The numbers of threads of OpenCV and of the linear algebra."""
+    return [cv2.getNumThreads(), *(one["num_threads"] for one in threadpool_info())]
 
 
 def test_numbers_of_threads_are_restored_after_blocks_that_overlap():
-    def counts():
-        return cv2.getNumThreads(), {
-            one["filepath"]: one["num_threads"] for one in threadpool_info()
-        }
+    started, go, ended = threading.Barrier(2), threading.Event(), threading.Event()
 
-    def block(waits_for, then):
+    def block(waits_for: threading.Event, then: threading.Event) -> set[int]:
         with one_thread():
             started.wait()
             waits_for.wait()
-            inside = counts()
+            inside = set(thread_counts())
         then.set()
         return inside
 
-    started, go, ended = threading.Barrier(2), threading.Event(), threading.Event()
     go.set()
     with threadpool_limits(2, "blas"):
-        before = counts()
-        # the first block to start may be the first or the last to end
+        before = thread_counts()
+        assert 2 in before[1:]
+        # The first block to start may be the first or the last to end.
         with ThreadPoolExecutor(2) as executor:
-            inside = [
-                one.result()
-                for one in (executor.submit(block, go, ended), executor.submit(block, ended, go))
-            ]
-        assert [one[0] for one in inside] == [1, 1]
-        assert all(set(numbers.values()) == {1} for _, numbers in inside)
-        assert counts() == before and 2 in before[1].values()
+            blocks = executor.submit(block, go, ended), executor.submit(block, ended, go)
+        assert [one.result() for one in blocks] == [{1}, {1}]
+        assert thread_counts() == before
 
 
 @pytest.mark.parametrize("executor", ["nowhere:Pool", 0, 10**11, 1.5, True, None])
@@ -315,7 +323,8 @@ def test_unusable_executors_are_refused(executor):
         pass
 
 
-def pairs_to_evaluate(rows, pairs: int, targets: int) -> dict:
+def pairs_to_evaluate(rows: list[str], pairs: int, targets: int) -> dict:
+    """The pairs of a run on one category, with the rows that evaluate each."""
     return pairs_of_rows(Co3D(small_folder()), resolve(rows), {"lump": pairs}, targets)
 
 
@@ -324,13 +333,12 @@ def test_a_vision_transformers_features_do_not_depend_on_threads():
         torch.manual_seed(0)
         backbone = Backbone(VisionTransformer(32, 8, 24, 2, 3), "small", layer=1, device="cpu")
     (chunk,) = make_chunks(pairs_to_evaluate(["ours"], 2, 2))
-    errors = []
-    for threads in (1, 2):
+
+    def errors(threads: int) -> list[float]:
         evaluate_one = pair_evaluator(str(small_folder()), resolve(["ours"]), backbone, threads)
-        errors.append(
-            [evaluate_one(pair, names)["results"]["ours"]["error"] for pair, names in chunk]
-        )
-    assert errors[0] == errors[1]
+        return [evaluate_one(pair, names)["results"]["ours"]["error"] for pair, names in chunk]
+
+    assert errors(1) == errors(2)
 
 
 def test_the_note_of_a_run_says_that_several_versions_of_the_library_evaluated_it(
@@ -341,7 +349,7 @@ def test_the_note_of_a_run_says_that_several_versions_of_the_library_evaluated_i
     )
     run(["ours-bv"])
     first, other = library_version(), {"version": "1", "commit": "0123abc"}
-    monkeypatch.setattr("zsp_lite.benchmark.identity.library_version", lambda: other)
+    monkeypatch.setattr("zsp_lite.benchmark.runs.library_version", lambda: other)
     assert "note" not in read_run(tmp_path).summary
     run(["ours"])
     assert json.loads((tmp_path / SETTINGS).read_text())["library"] == [first, other]
@@ -368,21 +376,21 @@ def test_a_full_disk_is_one_error(tmp_path):
 
 
 def test_features_are_computed_once_for_all_rows(tmp_path):
-    calls, rows = [], ["ours", "ours-k30", "ours-n1", "ours-globalsim", "ours-n6"]
+    batches = []
 
     class Counting(CoordinateBackbone):
         def __call__(self, images):
-            calls.append(len(images))
+            batches.append(len(images))
             return super().__call__(images)
 
+    rows = "ours ours-k30 ours-n1 ours-globalsim ours-n6".split()
     run_rows(rows, tmp_path, 4, 3, backbone=Counting(grid=8))
     frames = set()
     for pair in pairs_to_evaluate(rows, 4, 3):
         frames |= {(pair.target_sequence, number) for number in pair.target_frames}
         frames.add((pair.reference_sequence, pair.reference_frame))
-    assert sum(calls) == len(frames)
-    # a frame's features do not depend, in their last bits, on the rest of a batch
-    assert set(calls) == {1}
+    # One by one: a frame's features do not depend, in their last bits, on the rest of a batch.
+    assert batches == [1] * len(frames)
 
 
 def test_the_same_data_by_another_path_continue_a_run_and_other_data_do_not(
@@ -396,58 +404,57 @@ def test_the_same_data_by_another_path_continue_a_run_and_other_data_do_not(
         return evaluate(data, BACKBONE, [row], {"lump": 1}, 2, tmp_path / "run")["data"]["root"]
 
     monkeypatch.chdir(tmp_path)
-    assert run("data", "icp") == "data" and run(tmp_path / "data", "ours-bv") == str(
-        tmp_path / "data"
-    )
+    assert run("data", "icp") == "data"
+    assert run(tmp_path / "data", "ours-bv") == str(tmp_path / "data")
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert run("../link", "ours") == "../link"
-    refused(
-        "a run with data .*data, this is .*elsewhere/data; choose another folder",
-        run,
-        "data",
-        "ours",
-    )
-    assert len(read_run(tmp_path / "run").settings.methods) == 3
+    message = "a run with data .*data, this is .*elsewhere/data; choose another folder"
+    refused(message, run, "data", "ours")
+    assert list(read_run(tmp_path / "run").settings.methods) == ["icp", "ours-bv", "ours"]
 
 
 def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
     root = shutil.copytree(small_folder(), tmp_path / "data")
     run = functools.partial(evaluate, root, BACKBONE, ["ours-bv"], {"lump": 2}, 2)
     run(tmp_path / "run")
-    labels = read_labels(root, "lump")
-    name = next(name for name, label in labels.items() if name != label.reference_seq)
-    write_label(
-        root,
-        "lump",
-        replace(labels[name], trans=labels[name].trans @ np.diag([-1.0, -1.0, 1.0, 1.0])),
-    )
+    label = next(one for one in read_labels(root, "lump").values() if one.seq != one.reference_seq)
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    write_label(root, "lump", replace(label, trans=label.trans @ half_turn))
     refused("a run with labels of lump", run, tmp_path / "run")
     run(tmp_path / "other")
 
 
-def test_the_tables_of_an_unfinished_run_say_so(tmp_path, monkeypatch):
-    def stop() -> None:
-        raise KeyboardInterrupt
+def stop() -> None:
+    """Interrupt a run."""
+    raise KeyboardInterrupt
 
+
+@pytest.fixture
+def unfinished(tmp_path, monkeypatch) -> Path:
+    """The folder of a run that was interrupted after one of three pairs, with its tables."""
     with monkeypatch.context() as context, pytest.raises(KeyboardInterrupt):
         context.setattr("zsp_lite.benchmark.execution.add_lines", after_each_save(stop))
         run_rows(["ours", "ours-bv"], tmp_path, 3)
     write_reports(tmp_path)
+    return tmp_path
+
+
+def test_the_tables_of_an_unfinished_run_say_so(unfinished):
     for name in ("all_rows", "table_a_depth", "categories_acc30"):
-        assert "Not finished: 1 of 3 pairs." in (tmp_path / f"tables/{name}.md").read_text()
-        assert "1 pairs of an unfinished run" in (tmp_path / f"tables/{name}.tex").read_text()
-    run_rows(["ours"], tmp_path, 3)
-    (tmp_path / "tables" / "mine.csv").touch()
-    write_reports(tmp_path)
-    # Tables that the last call has no rows for are removed, and nothing else.
-    assert (
-        not list((tmp_path / "tables").glob("table_a_depth*"))
-        and (tmp_path / "tables" / "mine.csv").exists()
-    )
-    assert "Not finished" not in (tmp_path / "tables" / "all_rows.md").read_text()
-    run_rows(["category"], tmp_path, 4)
-    write_reports(tmp_path)
-    assert (
-        not list((tmp_path / "tables").glob("all_rows*"))
-        and (tmp_path / "tables" / "with_others.md").exists()
-    )
+        table = unfinished / "tables" / name
+        assert "Not finished: 1 of 3 pairs." in table.with_suffix(".md").read_text()
+        assert "1 pairs of an unfinished run" in table.with_suffix(".tex").read_text()
+
+
+def test_tables_that_the_last_call_has_no_rows_for_are_removed_and_nothing_else(unfinished):
+    tables = unfinished / "tables"
+    run_rows(["ours"], unfinished, 3)
+    (tables / "mine.csv").touch()
+    write_reports(unfinished)
+    assert not list(tables.glob("table_a_depth*"))
+    assert (tables / "mine.csv").exists()
+    assert "Not finished" not in (tables / "all_rows.md").read_text()
+    run_rows(["category"], unfinished, 4)
+    write_reports(unfinished)
+    assert not list(tables.glob("all_rows*"))
+    assert (tables / "with_others.md").exists()

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from zsp_lite import FeatureMap, Matches
 from zsp_lite.best_view import correspondence_score, cyclical_iou, global_score, mask_iou
-from zsp_lite.features import FeatureMap
-from zsp_lite.matching import Matches
 
 
 def matches(similarities) -> Matches:
@@ -67,4 +66,5 @@ def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
     # view.
     shifted = torch.eye(6).roll(1, 0)
     first, last = everything & (torch.arange(6) == 0), everything & (torch.arange(6) == 5)
-    assert cyclical_iou(shifted, first, last) == 1 and cyclical_iou(shifted, last, first) == 0
+    assert cyclical_iou(shifted, first, last) == 1
+    assert cyclical_iou(shifted, last, first) == 0

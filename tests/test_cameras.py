@@ -1,8 +1,11 @@
+"""Cameras: projection, crops, formats of others."""
+
 import numpy as np
 import pytest
 from co3d_folders import random_camera, seeds
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from synthetic_views import level_camera
 
@@ -22,7 +25,7 @@ def test_conversion_to_pytorch3d_and_back_changes_nothing(seed, intrinsics_forma
     camera = random_camera(seed)
     back = Camera.from_pytorch3d(**camera.to_pytorch3d(intrinsics_format), size=camera.size)
     for name in ("R", "t", "focal_length", "principal_point"):
-        np.testing.assert_allclose(getattr(back, name), getattr(camera, name), rtol=1e-9, atol=1e-9)
+        assert_allclose(getattr(back, name), getattr(camera, name), rtol=1e-9, atol=1e-9)
     assert back.size == camera.size
 
 
@@ -37,10 +40,8 @@ def test_projection_agrees_with_pytorch3ds_own_row_vector_formula(seed, intrinsi
         np.array([width, height]) / 2 if intrinsics_format == FORMATS[0] else min(height, width) / 2
     )
     pixels, depth = camera.project(points)
-    np.testing.assert_allclose(
-        pixels, np.array([width, height]) / 2 - ndc * per_ndc, rtol=1e-9, atol=1e-7
-    )
-    np.testing.assert_allclose(depth, row[:, 2], rtol=1e-9)
+    assert_allclose(pixels, np.array([width, height]) / 2 - ndc * per_ndc, rtol=1e-9, atol=1e-7)
+    assert_allclose(depth, row[:, 2], rtol=1e-9)
 
 
 @given(seeds, st.integers(0, 50), st.integers(0, 50), st.integers(1, 300), st.integers(1, 300))
@@ -49,14 +50,14 @@ def test_cropping_shifts_pixels_and_resizing_scales_them(seed, top, left, height
     pixels, depth = camera.project(points)
     cropped, resized = camera.crop((top, left, height, width)), camera.resize((height, width))
     assert cropped.size == resized.size == (height, width)
-    np.testing.assert_allclose(cropped.project(points)[0] + (left, top), pixels, rtol=1e-9)
+    assert_allclose(cropped.project(points)[0] + (left, top), pixels, rtol=1e-9)
     scale = np.array([width / camera.size[1], height / camera.size[0]])
-    np.testing.assert_allclose(resized.project(points)[0], pixels * scale, rtol=1e-9)
-    np.testing.assert_array_equal(resized.project(points)[1], depth)
+    assert_allclose(resized.project(points)[0], pixels * scale, rtol=1e-9)
+    assert_array_equal(resized.project(points)[1], depth)
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes, message",
     [
         ({"R": np.eye(2)}, r"R has shape \(2, 2\)"),
         ({"R": 2 * np.eye(3)}, "expected a rotation"),

@@ -9,7 +9,6 @@ import pytest
 from tools.models import LICENCES, attribution, read_catalogue
 from tools.training_categories import TRAINING
 from tools.validation_categories import VALIDATION
-from zsp_lite.backbones.load import WEIGHTS
 from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.io.files import REPOSITORY
 
@@ -19,13 +18,13 @@ TRAINED, CHOSEN_BY = TOOLS / "training.json", TOOLS / "validation.json"
 CATALOGUES = {
     path.stem: read_catalogue(path).models for path in (ARTISTS, SAMPLES, TRAINED, CHOSEN_BY)
 }
-ATTRIBUTION = WEIGHTS / "ATTRIBUTION.md"
+ATTRIBUTION = REPOSITORY / "zsp_lite/weights/ATTRIBUTION.md"
 
 CC = {"CC0 1.0", "CC BY 3.0", "CC BY 3.0 US"}
 
 
 @pytest.mark.parametrize(
-    ("path", "categories", "count", "licences"),
+    "path, categories, count, licences",
     [
         (ARTISTS, 8, 59, CC | {"Public Domain Mark 1.0", "GPL-2+"}),
         (SAMPLES, 4, 16, CC),
@@ -38,7 +37,8 @@ def test_every_model_of_a_catalogue_has_a_free_licence_and_names_its_author(
 ):
     catalogue = read_catalogue(path)
     entries = [entry for models in catalogue.models.values() for entry in models.values()]
-    assert len(catalogue.models) == categories and len(entries) == count
+    assert len(catalogue.models) == categories
+    assert len(entries) == count
     assert len({entry.sha256 for entry in entries}) == count  # no file twice
     assert {entry.package for entry in entries} == set(catalogue.packages)
     assert {entry.licence for entry in entries} <= licences
@@ -56,7 +56,7 @@ def test_no_file_is_in_two_catalogues_and_the_sample_data_show_those_of_theirs()
             for one in entries.values()
         ]
         assert len(set(files)) == len(files)
-    records = json.loads((REPOSITORY / "data_samples" / "rendered_models.json").read_text())
+    records = json.loads((REPOSITORY / "data_samples/rendered_models.json").read_text())
     shown = {
         record["sha256"] for models in records["sequences"].values() for record in models.values()
     }
@@ -66,13 +66,11 @@ def test_no_file_is_in_two_catalogues_and_the_sample_data_show_those_of_theirs()
 
 
 def test_the_weights_name_every_model_that_they_were_trained_on():
-    page = ATTRIBUTION.read_text(encoding="utf-8")
+    page = ATTRIBUTION.read_text("utf-8")
     text = " ".join(page.split())
     for name, work in [one for models in CATALOGUES["training"].values() for one in models.items()]:
-        assert (
-            f"**{work.author}**: " in text
-            and " ".join((work.title or name.replace("_", " ")).split()) in text
-        )
+        assert f"**{work.author}**: " in text
+        assert " ".join((work.title or name.replace("_", " ")).split()) in text
         assert f"### {work.licence} <{LICENCES[work.licence]}>" in text
     assert f"]({ATTRIBUTION.name})" in (ATTRIBUTION.parent / "MODEL_CARD.md").read_text(
         encoding="utf-8"
@@ -85,7 +83,8 @@ SIDE_OF = {row["name"]: row["side"] for row in ROWS}
 
 
 def test_no_name_is_listed_twice_and_no_concept_is_on_two_sides():
-    assert len(SIDE_OF) == len(ROWS) and all(row["name"] and row["concept"] for row in ROWS)
+    assert len(SIDE_OF) == len(ROWS)
+    assert all(row["name"] and row["concept"] for row in ROWS)
     assert set(SIDE_OF.values()) == {"training", "validation", "evaluation"}
     side_of_concept = {row["concept"]: row["side"] for row in ROWS}
     assert [row for row in ROWS if row["side"] != side_of_concept[row["concept"]]] == []

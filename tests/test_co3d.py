@@ -2,86 +2,91 @@
 
 import gzip
 import json
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
-from co3d_folders import convert_to_v2, edit_json, sequence_data
+from co3d_folders import convert_to_v2, edit_json, sequence_data, write_category
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
+from zsp_lite.data.annotations import FrameAnnotation
 from zsp_lite.data.co3d import Co3D, Pair, write_co3d
 from zsp_lite.data.frames import write_depth, write_image, write_mask
 
 
 @pytest.fixture
-def root(tmp_path):
+def root(tmp_path) -> Path:
+    """A data folder of two sequences."""
     write_co3d(tmp_path, "chair", [sequence_data("b_2"), sequence_data("a_1", quality=0.5)])
     return tmp_path
 
 
-def edit_first(root, change) -> None:
+def edit_first(root: Path, change: Callable[[dict], object]) -> None:
     """Change the entry of the frame that `first` returns."""
     edit_json(root / "chair/frame_annotations.jgz", lambda frames: change(frames[0]) and None)
 
 
-def first(root):
+def first(root: Path) -> FrameAnnotation:
+    """The first frame in the file."""
     return Co3D(root).frame("chair", "b_2", 0)
 
 
 def test_a_pair_is_loaded_as_its_reference_frame_and_its_target_frames_in_order(root):
     reference, targets = Co3D(root).load_pair(Pair("chair", "a_1", 2, "b_2", (3, 0)))
-    assert reference.name == "a_1/2" and [target.name for target in targets] == ["b_2/3", "b_2/0"]
-    refused(
-        "chair/b_2 has no frame number 9",
-        lambda: Co3D(root).load_pair(Pair("chair", "a_1", 2, "b_2", (9,))),
-    )
+    assert [frame.name for frame in (reference, *targets)] == ["a_1/2", "b_2/3", "b_2/0"]
+    lost = Pair("chair", "a_1", 2, "b_2", (9,))
+    refused("chair/b_2 has no frame number 9", Co3D(root).load_pair, lost)
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_written_data_is_read_back(root, version):
+@pytest.fixture(params=[1, 2], ids="CO3D v{}".format)
+def read_back(root, request):
+    """A sequence that was written, and the data set that has it, in a version of CO3D."""
     written = sequence_data("b_2", depth_scale_adjustment=1.7)
     write_co3d(root, "chair", [written])
-    if version == 2:
+    if request.param == 2:
         convert_to_v2(root / "chair")
-    dataset = Co3D(root)
+    return written, Co3D(root)
+
+
+def test_written_annotations_are_read_back(read_back):
+    written, dataset = read_back
     assert dataset.categories() == ["chair"]
     annotations = dataset.frames("chair", "b_2")
     assert [annotation.frame_number for annotation in annotations] == [0, 1, 2, 3]
     assert [annotation.frame_timestamp for annotation in annotations] == written.timestamps
-    for annotation, expected in zip(annotations, written.frames, strict=True):
+
+
+def test_written_frames_are_read_back(read_back):
+    written, dataset = read_back
+    for annotation, expected in zip(dataset.frames("chair", "b_2"), written.frames, strict=True):
         frame = dataset.load(annotation)
         for name in ("R", "t", "focal_length", "principal_point"):
-            np.testing.assert_allclose(
-                getattr(frame.camera, name), getattr(expected.camera, name), atol=1e-9
-            )
-        np.testing.assert_array_equal(frame.mask, expected.mask)
-        np.testing.assert_allclose(frame.depth, expected.depth, rtol=2**-11)
+            assert_allclose(getattr(frame.camera, name), getattr(expected.camera, name), atol=1e-9)
+        assert_array_equal(frame.mask, expected.mask)
+        assert_allclose(frame.depth, expected.depth, rtol=2**-11)  # a float16
         # JPEG, colours at half resolution
         assert np.abs(frame.rgb.astype(int) - expected.rgb).mean() < 8
+
+
+def test_a_written_point_cloud_is_read_back(read_back):
+    written, dataset = read_back
     points, colours = dataset.point_cloud("chair", "b_2")
-    np.testing.assert_allclose(points, written.points, rtol=1e-6)
-    np.testing.assert_array_equal(colours, written.colours)
+    assert_allclose(points, written.points, rtol=1e-6)
+    assert_array_equal(colours, written.colours)
 
 
 def test_written_files_have_the_layout_of_co3d(root):
     names = {path.name for path in (root / "chair").iterdir()}
     assert names == {"a_1", "b_2", "frame_annotations.jgz", "sequence_annotations.jgz"}
-    for part in (
-        "images/?.jpg",
-        "masks/?.png",
-        "depths/?.jpg.geometric.png",
-        "depth_masks/?.png",
-        "pointcloud.ply",
-    ):
-        assert (root / "chair/a_1" / part.replace("?", "frame000001")).is_file()
+    parts = "images/?.jpg masks/?.png depths/?.jpg.geometric.png depth_masks/?.png pointcloud.ply"
+    for part in parts.replace("?", "frame000001").split():
+        assert (root / "chair/a_1" / part).is_file()
     entry = json.loads(gzip.decompress((root / "chair/frame_annotations.jgz").read_bytes()))[0]
     assert entry["image"] == {"path": "chair/b_2/images/frame000001.jpg", "size": [24, 32]}
     # v1 has no format
-    assert set(entry["viewpoint"]) == {
-        "R",
-        "T",
-        "focal_length",
-        "principal_point",
-    }
+    assert set(entry["viewpoint"]) == {"R", "T", "focal_length", "principal_point"}
 
 
 def test_a_sequence_written_again_replaces_itself_and_nothing_else(root):
@@ -104,7 +109,8 @@ def test_the_frame_list_keeps_file_order_and_frames_are_sorted_by_number(root):
 def test_optional_fields_may_be_null_and_unknown_ones_are_ignored(root):
     edit_first(root, lambda frame: frame.update(depth=None, mask=None, novelty={"deep": [1, 2]}))
     frame = Co3D(root).load(first(root))
-    assert frame.depth is None and frame.mask is None
+    assert frame.depth is None
+    assert frame.mask is None
     nothing = dict.fromkeys(("video", "point_cloud", "viewpoint_quality_score"))
     edit_json(root / "chair/sequence_annotations.jgz", lambda items: items[0].update(nothing))
     dataset = Co3D(root)
@@ -113,7 +119,7 @@ def test_optional_fields_may_be_null_and_unknown_ones_are_ignored(root):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change, message",
     [
         (
             lambda frame: frame.pop("sequence_name"),
@@ -153,27 +159,35 @@ def test_an_invalid_frame_fails_by_name_and_field(root, change, message):
         assert len(Co3D(root).frames("chair", "a_1")) == 4
 
 
-def test_unknown_folders_categories_sequences_and_frames_are_named(root):
-    dataset = Co3D(root)
-    for call, message in (
-        (lambda: Co3D(root / "nowhere"), "nowhere does not exist"),
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda root: Co3D(root / "nowhere"), "nowhere does not exist"),
         (
-            lambda: Co3D(root / "chair/frame_annotations.jgz"),
+            lambda root: Co3D(root / "chair/frame_annotations.jgz"),
             "frame_annotations.jgz is not a folder",
         ),
-        (lambda: dataset.frame_list("sofa"), "category is 'sofa', expected one of chair"),
-        (lambda: dataset.frame_list("../chair"), "category is '../chair', expected one of chair"),
-        (lambda: write_co3d(root, "../chair", []), "category name is '../chair', expected"),
-        (lambda: dataset.frames("chair", "c_3"), "no frames of 'c_3'"),
-    ):
-        refused(message, call)
+        (lambda root: Co3D(root).frame_list("sofa"), "category is 'sofa', expected one of chair"),
+        (
+            lambda root: Co3D(root).frame_list("../chair"),
+            "category is '../chair', expected one of chair",
+        ),
+        (
+            lambda root: write_co3d(root, "../chair", []),
+            "category name is '../chair', expected",
+        ),
+        (lambda root: Co3D(root).frames("chair", "c_3"), "no frames of 'c_3'"),
+    ],
+)
+def test_unknown_folders_categories_sequences_and_frames_are_named(root, call, message):
+    refused(message, call, root)
 
 
 def test_paths_that_leave_the_folder_are_refused(root):
     for part in ("image", "depth", "mask"):
         edit_first(root, lambda frame, part=part: frame[part].update(path="chair/../../secret.jpg"))
         refused("leads out of the data folder", lambda: Co3D(root).load(first(root)))
-    items = root / "chair" / "sequence_annotations.jgz"
+    items = root / "chair/sequence_annotations.jgz"
     edit_json(items, lambda items: items[0]["point_cloud"].update(path="../secret.ply"))
     refused("leads out of the data folder", lambda: Co3D(root).point_cloud("chair", "b_2"))
 
@@ -184,13 +198,13 @@ def test_the_depth_mask_makes_depth_unknown(root):
     allowed = np.arange(32) < np.full((24, 1), 16)
     write_mask(root / annotation.depth.mask_path, allowed)
     after = Co3D(root).load(annotation).depth
-    np.testing.assert_array_equal(after, np.where(allowed, before, 0))
+    assert_array_equal(after, np.where(allowed, before, 0))
     edit_first(root, lambda frame: frame["depth"].update(scale_adjustment=2.0, mask_path=None))
-    np.testing.assert_array_equal(Co3D(root).load(first(root)).depth, 2 * before)
+    assert_array_equal(Co3D(root).load(first(root)).depth, 2 * before)
 
 
 @pytest.mark.parametrize(
-    ("part", "write"), [("image", write_image), ("depth", write_depth), ("mask", write_mask)]
+    "part, write", [("image", write_image), ("depth", write_depth), ("mask", write_mask)]
 )
 def test_missing_files_and_files_of_another_size_are_refused(root, part, write):
     annotation = first(root)
@@ -204,6 +218,7 @@ def test_missing_files_and_files_of_another_size_are_refused(root, part, write):
 
 
 def test_selection_takes_the_best_clouds_above_both_bounds(tmp_path):
+    # Of the views and of the clouds; the bounds are 1.25 and 0.3, and a score at one is too low.
     scores = {
         "good": (2.0, 0.9),
         "best": (1.3, 1.5),
@@ -211,19 +226,16 @@ def test_selection_takes_the_best_clouds_above_both_bounds(tmp_path):
         "blurred": (1.25, 2),
         "sparse": (3, 0.3),
     }
-    write_co3d(tmp_path, "chair", [sequence_data(name, frames=1) for name in scores])
+    write_category(tmp_path, "chair", scores, frames=1)
 
     def score(items):
         for item in items:
-            item["viewpoint_quality_score"], item["point_cloud"]["quality_score"] = scores[
-                item["sequence_name"]
-            ]
+            of_views, of_cloud = scores[item["sequence_name"]]
+            item["viewpoint_quality_score"] = of_views
+            item["point_cloud"]["quality_score"] = of_cloud
 
-    edit_json(tmp_path / "chair" / "sequence_annotations.jgz", score)
+    edit_json(tmp_path / "chair/sequence_annotations.jgz", score)
     dataset = Co3D(tmp_path)
-    assert [sequence.sequence_name for sequence in dataset.select("chair")] == [
-        "best",
-        "good",
-        "fair",
-    ]
-    assert [sequence.sequence_name for sequence in dataset.select("chair", top=1)] == ["best"]
+    names = [sequence.sequence_name for sequence in dataset.select("chair")]
+    assert names == ["best", "good", "fair"]
+    assert [sequence.sequence_name for sequence in dataset.select("chair", top=1)] == names[:1]

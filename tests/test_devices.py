@@ -6,12 +6,11 @@ import pytest
 import torch
 from synthetic_views import CoordinateBackbone
 
+from zsp_lite import FeatureMap, ZeroShotPose
 from zsp_lite.choices import SOLVERS
 from zsp_lite.course.widgets import cycles
-from zsp_lite.features import FeatureMap
 from zsp_lite.matchers import MATCHERS
 from zsp_lite.matching import similarity
-from zsp_lite.pipeline import ZeroShotPose
 
 
 class Elsewhere(torch.Tensor):
@@ -59,4 +58,5 @@ def test_a_matcher_does_not_ask_another_device_for_float64(name):
     expected, found = (
         MATCHERS[name](*some) for some in (arguments, [x.as_subclass(Elsewhere) for x in arguments])
     )
-    assert torch.equal(found[0], expected[0]) and torch.equal(found[1], expected[1])
+    assert torch.equal(found[0], expected[0])
+    assert torch.equal(found[1], expected[1])

@@ -28,9 +28,9 @@ PAGES = [
     REPOSITORY / "README.md",
     *sorted((REPOSITORY / "docs").rglob("*.md")),
     *sorted((REPOSITORY / "notebooks").rglob("README.md")),
-    REPOSITORY / "zsp_lite" / "weights" / "MODEL_CARD.md",
+    REPOSITORY / "zsp_lite/weights/MODEL_CARD.md",
     *NOTEBOOKS,
-    *sorted((REPOSITORY / "notebooks" / "exercises" / "source").glob("*/*.ipynb")),
+    *sorted((REPOSITORY / "notebooks/exercises/source").glob("*/*.ipynb")),
 ]
 ids = {"ids": [str(page.relative_to(REPOSITORY)) for page in PAGES]}
 
@@ -41,7 +41,7 @@ _INLINE_CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 def markdown(page: Path) -> str:
     """The text of a Markdown file, or of a notebook's Markdown cells."""
     if page.suffix != ".ipynb":
-        return page.read_text(encoding="utf-8")
+        return page.read_text("utf-8")
     cells = json.loads(page.read_bytes())["cells"]
     return "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
 
@@ -75,15 +75,13 @@ def test_every_module_and_file_of_the_package_that_is_named_exists(page):
 def all_code() -> str:
     folders = REPOSITORY / "zsp_lite", REPOSITORY / "notebooks"
     paths = (path for folder in folders for path in folder.rglob("*") if path.suffix in CODE)
-    return "\n".join(path.read_text(encoding="utf-8") for path in paths)
+    return "\n".join(path.read_text("utf-8") for path in paths)
 
 
 @pytest.mark.parametrize("page", PAGES, **ids)
 def test_every_environment_variable_and_make_target_that_is_named_exists(page):
-    named, inline = (
-        set(re.findall(r"\bZSP_LITE_\w+", markdown(page))),
-        _INLINE_CODE.findall(markdown(page)),
-    )
+    named = set(re.findall(r"\bZSP_LITE_\w+", markdown(page)))
+    inline = _INLINE_CODE.findall(markdown(page))
     pattern = r"\$?(?!PIP_)[A-Z0-9]+(_[A-Z0-9]+)+"  # PIP_...: pip's own
     named |= {code for code in inline if re.fullmatch(pattern, code)}
     for name in named:
@@ -176,13 +174,13 @@ def test_python_code_compiles_and_imports_what_exists(page, xfeat):
 def test_the_examples_of_methods_of_ones_own_run_as_they_stand(
     tmp_path, monkeypatch, capsys, links, xfeat
 ):
-    page = REPOSITORY / "docs" / "benchmark_your_own.md"
+    page = REPOSITORY / "docs/benchmark_your_own.md"
     (tmp_path / "data_samples").symlink_to(REPOSITORY / "data_samples")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     names = re.findall(r"`(\w+\.py)`:?\n", markdown(page))
     for name, block in zip(names, python_blocks(page), strict=True):
-        Path(name).write_text(block, encoding="utf-8")
+        Path(name).write_text(block, "utf-8")
     few = "--categories bicycle --pairs 1 --targets 2".split()
     rows = {}
     for line in command_blocks(page):
@@ -194,20 +192,11 @@ def test_the_examples_of_methods_of_ones_own_run_as_they_stand(
         elif program == "python":
             runpy.run_path(words[0])
     swept = [f"xfeat@threshold={value}" for value in (0.1, 0.2)]
-    assert list(rows) == [
-        "ours",
-        "ratio",
-        "rootsift",
-        "xfeat",
-        *swept,
-        "most",
-        "ours-mask",
-        "theirs",
-    ]
-    assert float(capsys.readouterr().out.splitlines()[-1]) == pytest.approx(
-        rows["ratio"]["median"], abs=1e-3
-    )
-    assert all(row["n"] == 1 and row["failed"] == 0 for row in rows.values())
+    first, last = "ours ratio rootsift xfeat".split(), "most ours-mask theirs".split()
+    assert list(rows) == [*first, *swept, *last]
+    assert {(row["n"], row["failed"]) for row in rows.values()} == {(1, 0)}
+    printed = float(capsys.readouterr().out.splitlines()[-1])
+    assert printed == pytest.approx(rows["ratio"]["median"], abs=1e-3)
 
 
 @pytest.mark.slow
@@ -216,11 +205,12 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(REPOSITORY)
     names: dict = {}
     exec(first, names)
-    assert not names["estimate"].flags and capsys.readouterr().out
+    assert not names["estimate"].flags
+    assert capsys.readouterr().out
 
     # The second block gets frames of a camera, and reads the scan of another object: here sample
     # sequences.
-    from test_importers import write_lists
+    from test_importers import HALF_PIXEL, write_lists
 
     dataset, scans = names["dataset"], []
     for name in ("scooter", "scooter2"):
@@ -228,14 +218,15 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
         scans.append([replace(dataset.load(frame), name=str(k)) for k, frame in enumerate(frames)])
     (tmp_path / "scans/other_cup/pictures").mkdir(parents=True)
     write_lists(tmp_path / "scans/other_cup", scans[1])
-    names["K"] = scans[0][0].camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    names["K"] = scans[0][0].camera.K - HALF_PIXEL
     names["camera"] = [
         (one.rgb, np.rint(1000 * one.depth).astype(np.uint16), np.linalg.inv(one.camera.matrix))
         for one in scans[0]
     ]
     monkeypatch.chdir(tmp_path)
     exec(second, names)
-    assert names["pose"].confidence > 0.5 and len(names["cups"].votes) == 8
+    assert names["pose"].confidence > 0.5
+    assert len(names["cups"].votes) == 8
     labels = read_labels(REPOSITORY / "data_samples", "motorcycle")
     between = labels["scooter2"].trans @ np.linalg.inv(labels["scooter"].trans)
     assert rotation_error(names["cups"].world_sim3.R, between[:3, :3]) < 15
@@ -245,8 +236,8 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
 def test_the_stored_drawings_are_those_of_the_script():
     assert {path.stem for path in drawings.FOLDER.iterdir()} == set(drawings.DRAWINGS)
     for name, draw in drawings.DRAWINGS.items():
-        assert (drawings.FOLDER / f"{name}.svg").read_text(encoding="utf-8") == draw(), name
-    assert drawings.ROOMS_FILE.read_text(encoding="utf-8") == drawings.draw_rooms(), (
+        assert (drawings.FOLDER / f"{name}.svg").read_text("utf-8") == draw(), name
+    assert drawings.ROOMS_FILE.read_text("utf-8") == drawings.draw_rooms(), (
         "run python -m tools.drawings"
     )
 
@@ -256,7 +247,7 @@ def test_the_readme_says_how_many_lines_the_library_has_without_the_course():
         r"the library has about ([\d,]+) lines", markdown(REPOSITORY / "README.md")
     )
     library = set((REPOSITORY / "zsp_lite").rglob("*.py"))
-    course = set((REPOSITORY / "zsp_lite" / "course").rglob("*.py"))
+    course = set((REPOSITORY / "zsp_lite/course").rglob("*.py"))
     counted = sum(len(path.read_text("utf-8").splitlines()) for path in library - course)
     assert abs(int(claimed.replace(",", "")) - counted) <= 500
 
@@ -277,15 +268,7 @@ def test_cells_of_code_are_short_and_at_most_a_third_of_a_cell_draws(path):
         "\n".join(c.source for c in cells),
     )
     drawers = "|".join(
-        [
-            "plt",
-            "axes",
-            "axis",
-            "ax",
-            "figure",
-            "fig",
-            *re.findall(r"\w+(?=,|$)", ",".join(imports)),
-        ]
+        ["plt|axes|axis|ax|figure|fig", *re.findall(r"\w+(?=,|$)", ",".join(imports))]
     )
     assert len(code_lines(cells[0])) <= 6, "the first cell of code is longer than 6 lines"
     for cell in cells:

@@ -8,127 +8,65 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable
 from copy import deepcopy
 from datetime import datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import nbformat
 import numpy as np
 import pytest
+from nbformat import NotebookNode
 from nbgrader.api import Gradebook
 from nbgrader.apps import ZipCollectApp
 from nbgrader.coursedir import CourseDirectory
 from nbgrader.preprocessors import ClearHiddenTests, ClearMarkScheme, ClearSolutions
 from nbgrader.tests import run_nbgrader
-from traitlets.config import PyFileConfigLoader
+from traitlets.config import Config, PyFileConfigLoader
 
-pytestmark = pytest.mark.slow
+from zsp_lite.views import View
 
-EXERCISES = Path(__file__).parents[1] / "notebooks" / "exercises"
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::sqlalchemy.exc.SAWarning"),
+]
+
+EXERCISES = Path(__file__).parents[1] / "notebooks/exercises"
 ASSIGNMENTS = sorted(folder.name for folder in (EXERCISES / "source").iterdir())
 
 # For each assignment and task: the name of a mistake, the part of the solution to replace, and its
 # replacement.
-MISTAKES = json.loads(
-    Path(__file__).with_name("exercise_mistakes.json").read_text(encoding="utf-8")
-)
+MISTAKES = json.loads(Path(__file__).with_name("exercise_mistakes.json").read_text("utf-8"))
 
 # For each assignment: a statement of a marking guide, and an expression that holds for what the
-# given cells computed.
-STATEMENTS = {
-    "01_features": {
-        (
-            "the similarity of true partners falls even if every key stays the same"
-        ): "turned_similarity(lambda x: log_bin(x[None])[0].numpy(), views[0])"
-        " < 0.99 * turned_similarity(np.asarray, views[0])",
-    },
-    "02_cyclical_maps": {
-        (
-            "39 % against 37 % on the bicycles, 32 % against 32 % on the cars"
-        ): "counts.iloc[[1, 0], [1, 3]].to_numpy().tolist() == [[39, 32], [37, 32]]",
-        (
-            "up to 2 patches are the best broad rule, 48 % and 38 %, and leave more than 100"
-        ): "counts.loc['up to 2 patches'].tolist() == [105, 48, 279, 38]",
-        (
-            "48 % against 35 % without a limit, and 152 of 278 matches are left"
-        ): "limits.iloc[[2, 5], [2, 5]].to_numpy().tolist() == [[152, '48%'], [278, '35%']]",
-        (
-            "12 % against 6 %: 2 right ones of 16 and 4 of 33"
-        ): "limits.iloc[[6, 7, 11], 3:].to_numpy().tolist() == [[16, 2, '12%'], [33, 4, '12%'], "
-        "[118, 7, '6%']]",
-    },
-    "03_best_view": {
-        (
-            "turned by 171°, one of 23° was offered, and it wins clearly, -29.9 against -33.5"
-        ): "wrong == (171, 23)",
-        (
-            "the chosen one does so on three of the four pairs"
-        ): "sum((np.diff(one) > 0).any() for _, one in views.groupby('category')['chosen (°)']) "
-        "== 3"
-        " and all(one.is_monotonic_decreasing for _, one in "
-        "views.groupby('category')['nearest (°)'])",
-    },
-    "04_umeyama_ransac": {
-        (
-            "The number of inliers never falls as the threshold grows"
-        ): "all(table['inliers'].is_monotonic_increasing for table in tables.values())",
-        (
-            "the error is smallest, 5°, at 0.2 and 0.5"
-        ): "tables['chair']['error (°)'].tolist() == [30, 15, 9, 5, 5, 9, 28]",
-        (
-            "the motorcycles have 19 inliers and the chairs 18, but the error is 135° against 5°"
-        ): "[table.loc[0.5].tolist() for table in tables.values()] == [[18, 4, 5], [19, 9, 135]]",
-        (
-            "750 trials with samples of 3, 5,049 with samples of 4 and 348,471 with samples of 6"
-        ): "[trials(10, 50, size) for size in (3, 4, 6)] == [750, 5049, 348471]",
-        (
-            "8 % of the poses are more than 30° off with samples of 3, 22 % with samples of 4 "
-            "and 43 %"
-        ): "np.allclose(settings['above 30° (%)'], [8, 22, 43, 0, 0, 0], atol=1)",
-    },
-    "05_metrics": {
-        (
-            "two intervals that overlap, and p = 0.002"
-        ): "intervals['new'][0] < intervals['old'][1] and round(paired_test(old, "
-        "new)['sign_test_p'], 3) == 0.002",
-        (
-            "13 that only the new method solves against 1"
-        ): "[np.sum((a < 30) & (b >= 30)) for a, b in ((new, old), (old, new))] == [13, 1]",
-        # A gain of 3 points at a discordance of 12 %: z = 2, and z = 1.96 + 0.84 for a power of 80
-        # %.
-        (
-            "exceeded from about 530 pairs on, and a power of 80 % takes about 1,050"
-        ): "round(0.12 * (2 / 0.03) ** 2, -1) == 530 and round(0.12 * (2.8 / 0.03) ** 2, -1) == "
-        "1050",
-        (
-            "A has the smaller median and the larger Acc30, B the smaller mean and no error "
-            "above 45°"
-        ): "(figures['A'] - figures['B'] > 0).tolist() == [False, True, True] and "
-        "method_b.max() <= 45",
-    },
-}
+# given cells computed. Of the power in 05_metrics: a gain of 3 points at a discordance of 12 %,
+# z = 2, and z = 1.96 + 0.84 for a power of 80 %.
+STATEMENTS = json.loads(Path(__file__).with_name("exercise_statements.json").read_text("utf-8"))
 
 
-def turned_similarity(described, view):
+def turned_similarity(described: Callable[[np.ndarray], np.ndarray], view: View) -> float:
     """Mean cosine of a grid's descriptors with those of the same grid, turned by 90 degrees and
     back again."""
     keys = view.features.keys.numpy()
-    pair = described(keys), np.rot90(described(np.rot90(keys).copy()), -1)
-    a, b = (x / np.linalg.norm(x, axis=-1, keepdims=True) for x in pair)
+    turned = np.rot90(described(np.rot90(keys).copy()), -1)
+    a, b = [x / np.linalg.norm(x, axis=-1, keepdims=True) for x in (described(keys), turned)]
     return (a * b).sum(axis=-1).mean()
 
 
 @pytest.fixture(scope="module")
-def config():
+def config() -> Config:
+    """The course's settings of nbgrader."""
     return PyFileConfigLoader("nbgrader_config.py", path=str(EXERCISES)).load_config()
 
 
-def source(assignment):
+def source(assignment: str) -> NotebookNode:
+    """The notebook with solutions."""
     return nbformat.read(EXERCISES / "source" / assignment / f"{assignment}.ipynb", as_version=4)
 
 
-def graded(notebook, **kind):
+def graded(notebook: NotebookNode, **kind) -> dict[str, NotebookNode]:
     """Cells by grade id whose nbgrader metadata have these values: solution=True,
     grade=False, ..."""
     return {
@@ -138,7 +76,12 @@ def graded(notebook, **kind):
     }
 
 
-def students_version(assignment, config):
+def code(notebook: NotebookNode, **kind) -> str:
+    """The source of such cells."""
+    return "\n".join(cell.source for cell in graded(notebook, **kind).values())
+
+
+def students_version(assignment: str, config: Config) -> NotebookNode:
     """The source without solutions, hidden tests and guides for marking, as `nbgrader
     generate_assignment` makes it."""
     notebook = source(assignment)
@@ -162,11 +105,10 @@ def prepared():
     return prepare
 
 
-def failing_tests(namespace, answers, tests):
+def failing_tests(namespace: dict, answers: NotebookNode, tests: NotebookNode) -> set[str]:
     """Names of the test cells of notebook `tests` that fail for the functions defined in notebook
     `answers`."""
-    for cell in graded(answers, solution=True, grade=False).values():
-        exec(cell.source, namespace)
+    exec(code(answers, solution=True, grade=False), namespace)
     failing = set()
     for name, cell in graded(tests, grade=True, solution=False).items():
         try:
@@ -183,90 +125,74 @@ def failing_tests(namespace, answers, tests):
     return failing
 
 
-def tasks(notebook):
-    """The cells of each task, by the heading of its first cell."""
-    found = {}
+def tasks(notebook: NotebookNode) -> list[list[NotebookNode]]:
+    """The cells of each task, which begins with a heading."""
+    found = []
     for cell in notebook.cells:
         if cell.cell_type == "markdown" and cell.source.startswith("## Task"):
-            found[cell.source.splitlines()[0]] = under = []
+            found.append([])
         if found:
-            under.append(cell)
+            found[-1].append(cell)
     return found
 
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_the_given_cells_of_the_handed_out_notebook_run_and_agree_with_the_marking_guides(
+def test_the_given_cells_of_the_handed_out_notebook_run_and_agree_with_the_guides(
     prepared, config, assignment
 ):
     """No given cell needs more than the first cell of the notebook and the function of its own
     task."""
-    handed_out, solutions = (
-        students_version(assignment, config),
-        graded(source(assignment), solution=True),
-    )
-    computed, given = {}, 0
-    for cells in tasks(handed_out).values():
+    handed_out = students_version(assignment, config)
+    solutions = graded(source(assignment), solution=True)
+    computed, given = {"turned_similarity": turned_similarity}, 0
+    for cells in tasks(handed_out):
         namespace = prepared(assignment)
-        for cell in graded(handed_out, solution=True, grade=False).values():
-            exec(cell.source, namespace)
-        for cell in cells:
-            if cell.cell_type == "code" and "nbgrader" not in cell.metadata:
+        exec(code(handed_out, solution=True, grade=False), namespace)
+        for cell in [one for one in cells if one.cell_type == "code"]:
+            if "nbgrader" not in cell.metadata:
                 exec(cell.source, namespace)
                 given += 1
-            elif (
-                "nbgrader" in cell.metadata
-                and cell.cell_type == "code"
-                and cell.metadata.nbgrader.solution
-            ):
+            elif cell.metadata.nbgrader.solution:
                 exec(solutions[cell.metadata.nbgrader.grade_id].source, namespace)
         computed |= namespace
     plt.close("all")
     assert given == len(tasks(handed_out))
-    exec(
-        "\n".join(
-            cell.source for cell in graded(source(assignment), solution=True, grade=False).values()
-        ),
-        computed,
-    )
-    guides = " ".join(
-        cell.source for cell in graded(source(assignment), solution=True, grade=True).values()
-    )
-    for statement, holds in STATEMENTS[assignment].items():
-        assert statement in " ".join(guides.split()), statement
-        assert eval(holds, computed | {"turned_similarity": turned_similarity}), statement
+    exec(code(source(assignment), solution=True, grade=False), computed)
+    guides = " ".join(code(source(assignment), solution=True, grade=True).split())
+    for statement, expression in STATEMENTS[assignment].items():
+        assert statement in guides
+        assert eval(expression, computed), statement
 
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
 def test_the_solutions_pass_every_test_and_the_students_version_none(prepared, config, assignment):
     notebook, handed_out = source(assignment), students_version(assignment, config)
     text = "\n".join(cell.source for cell in handed_out.cells)
-    assert "SOLUTION" not in text and "HIDDEN" not in text and "Guide for marking" not in text
+    assert not re.search("SOLUTION|HIDDEN|Guide for marking", text)
     assert failing_tests(prepared(assignment), notebook, notebook) == set()
-    assert failing_tests(prepared(assignment), handed_out, notebook) == set(
-        graded(notebook, grade=True, locked=True)
-    )
+    every = set(graded(notebook, grade=True, locked=True))
+    assert failing_tests(prepared(assignment), handed_out, notebook) == every
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # some mistakes divide by zero or overflow
 @pytest.mark.parametrize(
-    ("assignment", "task", "mistake"),
+    "assignment, task, mistake",
     [
-        (a, task, mistake)
-        for a, tasks in MISTAKES.items()
-        for task, mistakes in tasks.items()
+        (assignment, task, mistake)
+        for assignment, of_tasks in MISTAKES.items()
+        for task, mistakes in of_tasks.items()
         for mistake in mistakes
     ],
 )
 def test_each_mistake_fails_its_own_task_and_no_other(prepared, assignment, task, mistake):
     notebook = source(assignment)
-    cell, (right, wrong) = (
-        graded(notebook, solution=True)[task],
-        MISTAKES[assignment][task][mistake],
-    )
+    cell = graded(notebook, solution=True)[task]
+    right, wrong = MISTAKES[assignment][task][mistake]
     assert right in cell.source, f"the solution does not contain {right!r}"
     cell.source = cell.source.replace(right, wrong)
     failing = failing_tests(prepared(assignment), notebook, notebook)
-    assert failing and {name.removeprefix("test_")[:-2] for name in failing} == {task}
+    # The tests of a task are called test_TASK_1 and test_TASK_2.
+    assert {name.removeprefix("test_")[:-2] for name in failing} == {task}
 
 
 CALLS_THE_LIBRARY = """
@@ -282,13 +208,12 @@ def test_a_function_that_calls_the_library_fails_all_tests_of_its_task(prepared,
     for task in MISTAKES[assignment]:
         notebook = source(assignment)
         graded(notebook, solution=True)[task].source += CALLS_THE_LIBRARY.format(task)
-        assert failing_tests(prepared(assignment), notebook, notebook) == {
-            f"test_{task}_1",
-            f"test_{task}_2",
-        }
+        failing = failing_tests(prepared(assignment), notebook, notebook)
+        assert failing == {f"test_{task}_1", f"test_{task}_2"}
 
 
-def turn_into_text(cell):
+def turn_into_text(cell: NotebookNode) -> None:
+    """Make a text cell of a code cell."""
     cell.cell_type = "markdown"
     del cell["outputs"], cell["execution_count"]
 
@@ -304,114 +229,183 @@ DAMAGES = {
 }
 
 
-@pytest.mark.filterwarnings("ignore::sqlalchemy.exc.SAWarning")
-def test_the_commands_of_a_lecturer_lose_no_hand_in_and_git_sees_none(tmp_path, monkeypatch):
+METRICS = "05_metrics"
+RIGHT, CALLS, _ = MISTAKES[METRICS]  # the task that Ada has right, and where she calls the library
+
+
+class Collected(NamedTuple):
+    """What the commands of a lecturer make of the hand-ins of an assignment."""
+
+    folder: Path  # of the exercises
+    log: str  # of `autograde`
+    exported: str  # the output of `export` before the answers are graded by hand
+    points: dict[str, float]  # of the tests of Ada's notebook
+    unignored: str  # what git would add
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory) -> Collected:
     """Ada has one task right and calls the library in another; Bob's file is damaged, Eve's a PDF,
     Dan has two."""
-    name, folder = "05_metrics", tmp_path / "notebooks" / "exercises"
-    shutil.copytree(EXERCISES / "source" / name, folder / "source" / name)
+    root = tmp_path_factory.mktemp("course")
+    folder = copy_course(root)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("MPLBACKEND", raising=False)  # the kernel draws as it does for students
+        # nbgrader starts the program `alembic`, which is installed beside the interpreter.
+        patch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
+        patch.setenv("PYTHONPATH", str(EXERCISES.parents[1]))
+        patch.setattr(os, "environ", os.environ)  # run_nbgrader replaces it
+        patch.setattr(sys, "path", [*sys.path])
+        patch.chdir(folder)
+        git(root, "init")
+        git(root, "add", ".")
+        run_nbgrader(["generate_assignment", METRICS])
+        download(folder, answered(folder))
+        for _ in range(2):  # a second time, after another download
+            run_nbgrader(["zip_collect", METRICS])
+        log = run_nbgrader(["autograde", METRICS], retcode=1)  # as one is damaged
+        exported = run_nbgrader(["export"])
+        points = grade_by_hand(folder)
+        run_nbgrader(["export"])
+        run_nbgrader(["generate_feedback", METRICS, "--force"])
+    unignored = git(root, "ls-files", "--others", "--exclude-standard")
+    return Collected(folder, log, exported, points, unignored)
+
+
+def git(root: Path, *words: str) -> str:
+    """Run git on a folder; returns what it printed."""
+    return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True).stdout
+
+
+def copy_course(root: Path) -> Path:
+    """Copy what a lecturer needs of the repository; returns the folder of the exercises."""
+    folder = root / "notebooks/exercises"
+    shutil.copytree(EXERCISES / "source" / METRICS, folder / "source" / METRICS)
     shutil.copy(EXERCISES / "nbgrader_config.py", folder)
-    shutil.copy(EXERCISES.parents[1] / ".gitignore", tmp_path)
-    monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel draws as it does for students
-    # nbgrader starts the program `alembic`, which is installed beside the interpreter.
-    monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
-    monkeypatch.setenv("PYTHONPATH", str(EXERCISES.parents[1]))
-    monkeypatch.setattr(os, "environ", os.environ)  # run_nbgrader replaces it
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.chdir(folder)
+    shutil.copy(EXERCISES.parents[1] / ".gitignore", root)
+    return folder
 
-    def git(*words):
-        return subprocess.run(["git", *words, tmp_path], capture_output=True, text=True).stdout
 
-    git("init"), git("add")
-    run_nbgrader(["generate_assignment", name])
-    handed_in = nbformat.read(folder / "release" / name / f"{name}.ipynb", as_version=4)
-    solutions, answers = graded(source(name), solution=True), graded(handed_in, solution=True)
-    first, second, _ = MISTAKES[name]
-    answers[first].source = solutions[first].source
-    answers[second].source = solutions[second].source + CALLS_THE_LIBRARY.format(second)
+def answered(folder: Path) -> NotebookNode:
+    """Ada's notebook."""
+    notebook = nbformat.read(folder / "release" / METRICS / f"{METRICS}.ipynb", as_version=4)
+    solutions, answers = graded(source(METRICS), solution=True), graded(notebook, solution=True)
+    answers[RIGHT].source = solutions[RIGHT].source
+    answers[CALLS].source = solutions[CALLS].source + CALLS_THE_LIBRARY.format(CALLS)
     answers["better"].source = "See my remark: [Comment](#mine), $\\lambda R$ and $\\broken{$"
-    downloads = folder / "downloaded" / name
+    return notebook
+
+
+def download(folder: Path, notebook: NotebookNode) -> None:
+    """Write the hand-ins as a learning platform packs them, with its list of participants."""
+    downloads = folder / "downloaded" / METRICS
     (downloads / "archive").mkdir(parents=True)
-    with zipfile.ZipFile(downloads / "archive" / "all.zip", "w") as archive:
-        for number, damage in enumerate(DAMAGES.values(), 110):
-            notebook = deepcopy(handed_in)
-            damage(graded(notebook)[first], notebook.cells)
-            archive.writestr(
-                f"A_{number}_assignsubmission_file_{name}.ipynb", nbformat.writes(notebook)
-            )
-        # nbgrader puts them back
-        text, test, stripped, *_ = graded(handed_in, grade=True, locked=True).values()
-        (
-            turn_into_text(text),
-            handed_in.cells.insert(1, deepcopy(test)),
-            stripped.metadata.pop("nbgrader"),
-        )
-        archive.writestr(
-            f"Ada Lovelace_123_assignsubmission_file_{name} (1).ipynb", nbformat.writes(handed_in)
-        )
-        archive.writestr(f"Bob_124_assignsubmission_file_{name}.ipynb", "{")
-        archive.writestr("Eve_125_assignsubmission_file_homework.pdf", "")
-        for end in ("", " (1)"):
-            archive.writestr(
-                f"Dan_126_assignsubmission_file_{name}{end}.ipynb", nbformat.writes(handed_in)
-            )
+    files = {}
+    for number, damage in enumerate(DAMAGES.values(), 110):
+        damaged = deepcopy(notebook)
+        damage(graded(damaged)[RIGHT], damaged.cells)
+        files[f"A_{number}_assignsubmission_file_{METRICS}.ipynb"] = nbformat.writes(damaged)
+    # Changes of given cells, which nbgrader puts back.
+    text, test, stripped, *_ = graded(notebook, grade=True, locked=True).values()
+    turn_into_text(text)
+    notebook.cells.insert(1, deepcopy(test))
+    stripped.metadata.pop("nbgrader")
+    whole = nbformat.writes(notebook)
+    files |= {
+        f"Ada Lovelace_123_assignsubmission_file_{METRICS} (1).ipynb": whole,
+        f"Bob_124_assignsubmission_file_{METRICS}.ipynb": "{",
+        "Eve_125_assignsubmission_file_homework.pdf": "",
+        f"Dan_126_assignsubmission_file_{METRICS}.ipynb": whole,
+        f"Dan_126_assignsubmission_file_{METRICS} (1).ipynb": whole,
+    }
+    with zipfile.ZipFile(downloads / "archive/all.zip", "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
     lines = "".join(f"\nParticipant {number}," for number in range(123, 127))
     (downloads / "worksheet.csv").write_text(f"\ufeffIdentifier,Grade{lines}")
 
-    for _ in range(2):  # a second time, after another download
-        run_nbgrader(["zip_collect", name])
-    log = run_nbgrader(["autograde", name], retcode=1)  # as one is damaged
-    assert "123: answers to be graded by hand" in run_nbgrader(["export"])
+
+def grade_by_hand(folder: Path) -> dict[str, float]:
+    """Give Ada 1.5 points for each answer; returns those of the tests."""
     with Gradebook(f"sqlite:///{folder / 'gradebook.db'}", "zsp-lite") as gradebook:
-        grades = gradebook.find_submission(name, "123").notebooks[0].grades
+        grades = gradebook.find_submission(METRICS, "123").notebooks[0].grades
         points = {
             grade.name: grade.auto_score for grade in grades if grade.cell.cell_type == "code"
         }
         for grade in grades:
             if grade.needs_manual_grade:
-                grade.manual_score, grade.needs_manual_grade = 1.5, False
+                grade.manual_score = 1.5
+                grade.needs_manual_grade = False
         gradebook.db.commit()
-    assert points == {
-        f"test_{task}_{i}": 2 * (task == first) for task in MISTAKES[name] for i in (1, 2)
-    }
-    assert set(re.findall("(?:'checksum' for|Missing grade) cell (\\w+)", log)) == set(points)
-    run_nbgrader(["export"])
-    states = [
-        line.removeprefix(name + ",")
-        for line in (folder / "grades.csv").read_text().splitlines()[1:]
-    ]
-    not_graded = "{0},,20,not graded: submitted/{0}/05_metrics/05_metrics.ipynb: {1}".format
-    assert states[:4] == [
-        not_graded(i, f"{cause}: {first}") for i, cause in enumerate(DAMAGES, 110)
-    ]
-    assert states[4:6] == ["123,5.5,20,graded", not_graded(124, "damaged file")]
-    assert states[6] == "125,,20,not collected: all/Eve_125_assignsubmission_file_homework.pdf"
-    assert states[7].startswith('126,,20,"not collected: 2 files, all/Dan_126') and len(states) == 8
-    assert all(state.removeprefix(f"{i},,20,") in log for i, state in enumerate(states[:4], 110))
-    filled = (downloads / "worksheet_filled.csv").read_text().splitlines()
-    assert filled[1:] == [
-        "Participant 123,5.5",
-        "Participant 124,",
-        "Participant 125,",
-        "Participant 126,",
-    ]
+    return points
 
-    run_nbgrader(["generate_feedback", name, "--force"])
-    page = (folder / "feedback" / "123" / name / f"{name}.html").read_text(encoding="utf-8")
-    scores = re.findall(r'<li><a href="#\w+">(.*?)</a> \(Score: ([\d.]+) / ([\d.]+)\)</li>', page)
-    assert (
-        scores[0] == ("Task 1 · Symmetric objects: An n-fold symmetry", "2.0", "2.0")
-        and "HIDDEN TESTS" in page
+
+def test_each_test_of_a_task_that_is_right_gives_two_points_and_the_others_none(collected):
+    assert collected.points == {
+        f"test_{task}_{i}": 2 * (task == RIGHT) for task in MISTAKES[METRICS] for i in (1, 2)
+    }
+
+
+def test_tests_that_students_changed_are_put_back(collected):
+    changed = re.findall("(?:'checksum' for|Missing grade) cell (\\w+)", collected.log)
+    assert set(changed) == set(collected.points)
+
+
+def test_the_export_names_who_has_answers_to_be_graded_by_hand(collected):
+    assert "123: answers to be graded by hand" in collected.exported
+
+
+def test_every_hand_in_is_graded_or_named_with_the_reason(collected):
+    _, *lines = (collected.folder / "grades.csv").read_text().splitlines()
+    states = [line.removeprefix(f"{METRICS},") for line in lines]
+    not_graded = "{0},,20,not graded: submitted/{0}/05_metrics/05_metrics.ipynb: {1}".format
+    damaged = [not_graded(i, f"{cause}: {RIGHT}") for i, cause in enumerate(DAMAGES, 110)]
+    *graded_or_damaged, dan = states
+    assert graded_or_damaged == [
+        *damaged,
+        "123,5.5,20,graded",
+        not_graded(124, "damaged file"),
+        "125,,20,not collected: all/Eve_125_assignsubmission_file_homework.pdf",
+    ]
+    assert dan.startswith('126,,20,"not collected: 2 files, all/Dan_126')
+    for state in damaged:
+        assert state.rpartition(",")[2] in collected.log
+
+
+def test_the_worksheet_of_the_platform_is_filled(collected):
+    path = collected.folder / "downloaded" / METRICS / "worksheet_filled.csv"
+    _, *lines = path.read_text().splitlines()
+    assert lines == [f"Participant {end}" for end in ("123,5.5", "124,", "125,", "126,")]
+
+
+def test_git_sees_no_hand_in(collected):
+    assert collected.unignored == ""
+
+
+@pytest.fixture
+def feedback(collected) -> str:
+    """The page for Ada."""
+    path = collected.folder / "feedback/123" / METRICS / f"{METRICS}.html"
+    return path.read_text("utf-8")
+
+
+def test_the_feedback_has_a_score_for_each_task_and_answer_and_the_hidden_tests(feedback):
+    scores = re.findall(
+        r'<li><a href="#\w+">(.*?)</a> \(Score: ([\d.]+) / ([\d.]+)\)</li>', feedback
     )
-    assert len(scores) == 8 and "Test cell" not in page
-    # the student's own link, and no other
-    assert re.findall(r'href="([^"]*)">Comment</a>', page) == ["#mine"]
-    assert "<math" in page and "<code>\\broken{</code>" in page
-    assert "<script" not in page and not re.search(
-        r"""(src|href)=["'](?!#|data:)|url\(["']?http""", page
-    )
-    assert git("ls-files", "--others", "--exclude-standard") == ""
+    assert scores[0] == ("Task 1 · Symmetric objects: An n-fold symmetry", "2.0", "2.0")
+    assert len(scores) == len(MISTAKES[METRICS]) * 2 + 2  # two tests of each task, two answers
+    assert "HIDDEN TESTS" in feedback
+    assert "Test cell" not in feedback
+
+
+def test_the_feedback_shows_formulas_and_loads_nothing(feedback):
+    # The student's own link, and no other.
+    assert re.findall(r'href="([^"]*)">Comment</a>', feedback) == ["#mine"]
+    assert "<math" in feedback
+    assert "<code>\\broken{</code>" in feedback
+    loads = r"""<script|(src|href)=["'](?!#|data:)|url\(["']?http"""
+    assert not re.search(loads, feedback)
 
 
 def test_a_second_collection_renews_only_files_that_changed(config, tmp_path, monkeypatch):
@@ -419,51 +413,58 @@ def test_a_second_collection_renews_only_files_that_changed(config, tmp_path, mo
     hand."""
     plugin = config.ZipCollectApp.collector_plugin
     monkeypatch.setitem(plugin.collect.__globals__, "HERE", tmp_path)
-    course = CourseDirectory(root=str(tmp_path), assignment_id="05_metrics")
-    kept, extracted = datetime(2026, 1, 2), tmp_path / "downloaded" / "05_metrics" / "extracted"
+    course = CourseDirectory(root=str(tmp_path), assignment_id=METRICS)
+    first_time = datetime(2026, 1, 2)
+    extracted = tmp_path / "downloaded" / METRICS / "extracted"
     extracted.mkdir(parents=True)
     for student, text in (("123", "answers"), ("124", "other answers"), ("125", "answers")):
-        submitted = tmp_path / "submitted" / student / "05_metrics"
+        submitted = tmp_path / "submitted" / student / METRICS
         submitted.mkdir(parents=True)
-        (submitted / "05_metrics.ipynb").write_text("answers")
+        (submitted / f"{METRICS}.ipynb").write_text("answers")
         if student != "125":  # copied by hand
-            (submitted / "timestamp.txt").write_text(f"{kept}")
-        (extracted / f"A_{student}_12_05_metrics.ipynb").write_text(text)
+            (submitted / "timestamp.txt").write_text(f"{first_time}")
+        (extracted / f"A_{student}_12_{METRICS}.ipynb").write_text(text)
     collector = plugin(parent=ZipCollectApp(config=config, coursedir=course))
     times = [collector.collect(str(file))["timestamp"] for file in sorted(extracted.iterdir())]
-    assert [time == kept for time in times] == [True, False, False] and min(times) == kept
+    assert [time == first_time for time in times] == [True, False, False]
+    assert min(times) == first_time
 
 
-def test_nbgrader_recognises_the_files_of_learning_platforms(config):
-    for name in (
+@pytest.mark.parametrize(
+    "name",
+    [
         "Ada Lovelace_123_assignsubmission_file_05_metrics.ipynb",
         "Ada Lovelace_123_assignsubmission_file_/05_metrics.ipynb",
         "Ada Lovelace_123_assignsubmission_file_05_metrics (1).ipynb",
         "lovelaceada_LATE_123_67890_05_metrics-2.ipynb",
         "lovelaceada_123_67890_05_metrics-Copy1.ipynb",
-    ):
-        found = re.match(
-            config.FileNameCollectorPlugin.named_regexp,
-            f"downloaded/05_metrics/extracted/all/{name}",
-        )
-        assert found.groupdict() == {"student_id": "123", "file_id": "05_metrics"}
+    ],
+)
+def test_nbgrader_recognises_the_files_of_learning_platforms(config, name):
+    path = f"downloaded/{METRICS}/extracted/all/{name}"
+    found = re.match(config.FileNameCollectorPlugin.named_regexp, path)
+    assert found.groupdict() == {"student_id": "123", "file_id": METRICS}
 
 
-def test_the_five_exercises_have_100_points_and_no_test_decides_more_than_two():
-    readme = (EXERCISES / "README.md").read_text(encoding="utf-8")
-    for assignment in ASSIGNMENTS:
-        notebook = source(assignment)
-        points = {
-            name: cell.metadata.nbgrader.points
-            for name, cell in graded(notebook, grade=True).items()
-        }
-        tests = [name for name in points if name.startswith("test_")]
-        assert tests == [f"test_{task}_{i}" for task in MISTAKES[assignment] for i in (1, 2)]
-        assert [*points.values()] == [2] * 6 + [
-            4
-        ] * 2 and "20 points: 12 by tests, 8 by" in notebook.cells[0].source
-        titles = [re.match(r"## Task \d · (.*) \(4 points", cell.source) for cell in notebook.cells]
-        assert (
-            all(title[1].lower() in readme.lower() for title in titles if title)
-            and sum(map(bool, titles)) == 5
-        )
+@pytest.mark.parametrize("assignment", ASSIGNMENTS)
+def test_an_exercise_has_20_points_and_no_test_decides_more_than_two(assignment):
+    notebook = source(assignment)
+    cells = graded(notebook, grade=True)
+    points = {name: cell.metadata.nbgrader.points for name, cell in cells.items()}
+    tests = [f"test_{task}_{i}" for task in MISTAKES[assignment] for i in (1, 2)]
+    assert [name for name in points if name.startswith("test_")] == tests
+    assert [*points.values()] == [2] * 6 + [4] * 2  # six tests, two answers
+    assert "20 points: 12 by tests, 8 by" in notebook.cells[0].source
+
+
+def test_there_are_five_exercises():
+    assert len(ASSIGNMENTS) == 5
+
+
+@pytest.mark.parametrize("assignment", ASSIGNMENTS)
+def test_the_readme_lists_the_five_tasks_of_an_exercise(assignment):
+    readme = (EXERCISES / "README.md").read_text("utf-8").lower()
+    text = "\n".join(cell.source for cell in source(assignment).cells)
+    titles = re.findall(r"^## Task \d · (.*) \(4 points", text, re.MULTILINE)
+    assert len(titles) == 5
+    assert [title for title in titles if title.lower() not in readme] == []

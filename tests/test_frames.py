@@ -9,9 +9,11 @@ import pytest
 from co3d_folders import random_camera, seeds, sequence_data
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
-from zsp_lite.data.cameras import Camera
+from zsp_lite import Camera, Frame
 from zsp_lite.data.depth import (
     decode_depth,
     encode_depth,
@@ -20,7 +22,6 @@ from zsp_lite.data.depth import (
     unproject_depth,
 )
 from zsp_lite.data.frames import (
-    Frame,
     crop_to_object,
     frame_defect,
     mask_to_bbox,
@@ -45,7 +46,7 @@ SIZE = (24, 32)
 
 
 @pytest.mark.parametrize(
-    ("parts", "padding", "box"),
+    "parts, padding, box",
     [
         ([(20, 40, 40, 60, 1.0)], 0.1, (18, 37, 44, 66)),  # a tenth, half of it on each side
         ([(0, 0, 100, 200, 1.0)], 0.1, (0, 0, 100, 200)),  # in the image
@@ -83,9 +84,9 @@ def test_cropping_keeps_every_pixels_world_point():
         == cropped.mask.shape
         == (height, width)
     )
-    np.testing.assert_array_equal(cropped.rgb, whole.rgb[top : top + height, left : left + width])
+    assert_array_equal(cropped.rgb, whole.rgb[top : top + height, left : left + width])
     pixel = np.array([3.5, 2.5])
-    np.testing.assert_allclose(
+    assert_allclose(
         cropped.camera.unproject(pixel, 2.0),
         whole.camera.unproject(pixel + (left, top), 2.0),
         atol=1e-12,
@@ -98,7 +99,7 @@ def test_resized_depth_is_the_depth_under_the_new_pixels_centre(seed, height, wi
     small = resize_frame(whole, (height, width))
     rows = np.floor((np.arange(height) + 0.5) * SIZE[0] / height).astype(int)
     cols = np.floor((np.arange(width) + 0.5) * SIZE[1] / width).astype(int)
-    np.testing.assert_array_equal(small.depth, whole.depth[rows][:, cols])
+    assert_array_equal(small.depth, whole.depth[rows][:, cols])
     assert small.camera.size == small.rgb.shape[:2] == small.mask.shape == (height, width)
 
 
@@ -108,11 +109,11 @@ def test_colours_are_averaged_along_a_side_that_shrinks_while_the_other_grows(si
     stripes[::3] = 240  # every third row, each row of the result covers two periods
     stripes = stripes if size[0] < 24 else stripes.swapaxes(0, 1)
     resized = resize_frame(Frame(stripes, None, None, random_camera(0, (24, 24))), size)
-    assert (resized.rgb == 80).all()
+    assert_array_equal(resized.rgb, 80)
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes, message",
     [
         ({"rgb": np.zeros((*SIZE, 3))}, "rgb is float64"),
         ({"rgb": np.zeros((5, 5, 3), np.uint8)}, r"rgb is uint8 \(5, 5, 3\)"),
@@ -140,17 +141,25 @@ def arrays(**changes):
 
 
 def test_arrays_of_a_camera_become_a_frame_with_half_integer_pixel_centres():
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = random_camera(np.random.default_rng(0)).R, (1, 2, 3)
-    frame = Frame.from_arrays(**arrays(pose=pose, name="cup"))
-    camera = frame.camera
-    assert frame.name == "cup" and frame.mask is None and camera.size == SIZE
-    np.testing.assert_allclose([camera.focal_length, camera.principal_point], [[40, 41], [16, 12]])
-    np.testing.assert_allclose(camera.to_world(np.eye(3)), np.eye(3) @ pose[:3, :3].T + (1, 2, 3))
-    np.testing.assert_array_equal(frame.depth[:2, :8], 0)
-    np.testing.assert_array_equal(frame.depth[2:], np.float32(2))
+    frame = Frame.from_arrays(**arrays(name="cup"))
+    assert (frame.name, frame.mask, frame.camera.size) == ("cup", None, SIZE)
+    assert_allclose(frame.camera.K, [[40, 0, 16], [0, 41, 12], [0, 0, 1]])
     four = Frame.from_arrays(**arrays(K=(40, 41, 15.5, 11.5)))
-    np.testing.assert_array_equal(four.camera.K, camera.K)
+    assert_array_equal(four.camera.K, frame.camera.K)
+
+
+def test_the_pose_of_arrays_is_that_of_the_camera_in_the_world():
+    pose = np.eye(4)
+    pose[:3, :3] = random_camera(default_rng(0)).R
+    pose[:3, 3] = 1, 2, 3
+    camera = Frame.from_arrays(**arrays(pose=pose)).camera
+    assert_allclose(camera.to_world(np.eye(3)), pose[:3, :3].T + (1, 2, 3))
+
+
+def test_smaller_depth_of_arrays_is_enlarged_and_zero_where_it_is_unknown():
+    depth = Frame.from_arrays(**arrays()).depth
+    assert_array_equal(depth[:2, :8], 0)
+    assert_array_equal(depth[2:], np.float32(2))
 
 
 @pytest.mark.parametrize(
@@ -162,9 +171,7 @@ def test_arrays_of_a_camera_become_a_frame_with_half_integer_pixel_centres():
     ],
 )
 def test_grey_images_alpha_and_floats_are_colours(rgb):
-    np.testing.assert_array_equal(
-        Frame.from_arrays(**arrays(rgb=rgb)).rgb, np.full((*SIZE, 3), 128)
-    )
+    assert_array_equal(Frame.from_arrays(**arrays(rgb=rgb)).rgb, np.full((*SIZE, 3), 128))
 
 
 def test_a_mask_holds_booleans_zeros_and_ones_or_up_to_255():
@@ -176,11 +183,11 @@ def test_a_mask_holds_booleans_zeros_and_ones_or_up_to_255():
         inside.astype(np.float32),
         255 * inside.astype(np.uint8),
     ):
-        np.testing.assert_array_equal(Frame.from_arrays(**arrays(mask=mask)).mask > 0.5, inside)
+        assert_array_equal(Frame.from_arrays(**arrays(mask=mask)).mask > 0.5, inside)
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes, message",
     [
         (
             {"rgb": np.zeros((3, *SIZE), np.uint8)},
@@ -208,21 +215,21 @@ def test_arrays_that_cannot_be_a_frame_are_refused_by_one_line(changes, message)
 
 
 def test_depth_and_masks_survive_their_files(tmp_path):
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     depth = np.where(rng.random(SIZE) < 0.5, rng.uniform(1, 9, SIZE), 0).astype(np.float32)
     write_depth(tmp_path / "depth.png", depth, 2.0)
-    np.testing.assert_allclose(read_depth(tmp_path / "depth.png", 2.0), depth, rtol=2**-11)
+    assert_allclose(read_depth(tmp_path / "depth.png", 2.0), depth, rtol=2**-11)
     mask = rng.integers(0, 256, SIZE).astype(np.float32) / 255
     write_mask(tmp_path / "mask.png", mask)
-    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), mask)
+    assert_array_equal(read_mask(tmp_path / "mask.png"), mask)
     write_mask(tmp_path / "known.png", depth > 0)
-    np.testing.assert_array_equal(read_mask(tmp_path / "known.png"), depth > 0)
+    assert_array_equal(read_mask(tmp_path / "known.png"), depth > 0)
     # bit depth in the PNG's header: a mask of booleans
     assert (tmp_path / "known.png").read_bytes()[24] == 1
 
 
 @pytest.mark.parametrize(
-    ("extension", "options"),
+    "extension, options",
     [
         (".png", ()),
         (".jpg", ()),
@@ -231,7 +238,7 @@ def test_depth_and_masks_survive_their_files(tmp_path):
     ],
 )
 def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension, options):
-    pixels = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
+    pixels = default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
     data, path = cv2.imencode(extension, pixels, options)[1].tobytes(), tmp_path / "image"
     if extension == ".jpg":  # a thumbnail in a segment of its own
         thumbnail = cv2.imencode(".jpg", pixels[::4, ::4])[1].tobytes()
@@ -246,7 +253,7 @@ def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension, opti
         b"IDAT IEND IDAT",
     ):
         path.write_bytes(data + behind)
-        np.testing.assert_array_equal(read_image(path), decoded)
+        assert_array_equal(read_image(path), decoded)
     for end in (*range(0, len(data), 37), len(data) - 2, len(data) - 1):
         path.write_bytes(data[:end])
         refused("cannot be decoded", read_image, path)
@@ -255,12 +262,10 @@ def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension, opti
 def test_a_mask_file_of_zeros_and_ones_is_an_empty_mask_for_all(tmp_path):
     assert cv2.imwrite(str(tmp_path / "mask.png"), np.eye(*SIZE, dtype=np.uint8))
     frame = replace(sequence_data("one").frames[0], mask=read_mask(tmp_path / "mask.png"))
-    assert (
-        frame.mask.any()
-        and frame_defect(frame) == "empty object mask"
-        and not len(world_cloud([frame])[0])
-    )
-    np.testing.assert_array_equal(object_crop(frame, 8).rgb, resize_frame(frame, (8, 8)).rgb)
+    assert frame.mask.any()
+    assert frame_defect(frame) == "empty object mask"
+    assert not len(world_cloud([frame])[0])
+    assert_array_equal(object_crop(frame, 8).rgb, resize_frame(frame, (8, 8)).rgb)
 
 
 def test_an_interrupted_write_leaves_the_old_file_alone(tmp_path, monkeypatch):
@@ -276,7 +281,7 @@ def test_an_interrupted_write_leaves_the_old_file_alone(tmp_path, monkeypatch):
     assert (tmp_path / "file").read_bytes() == b"old"
 
 
-def test_a_pixel_is_on_the_object_if_that_is_more_probable_than_not_and_its_depth_is_known():
+def test_a_pixel_is_on_the_object_if_probably_so_and_of_known_depth():
     mask = np.array([[0.0, 0.5, 0.55, 0.85, 1.0, 1.0]], np.float32)
     depth = np.array([[2.0, 2.0, 2.0, 2.0, 2.0, 0.0]], np.float32)
     frame = Frame(np.zeros((1, 6, 3), np.uint8), depth, mask, random_camera(0, (1, 6)))
@@ -297,7 +302,7 @@ def frontal(size):
     return Camera(np.eye(3), np.zeros(3), np.array([50.0, 60.0]), centre, size)
 
 
-def test_the_bits_are_those_of_a_float16_and_values_that_are_not_positive_and_finite_are_unknown():
+def test_the_bits_are_those_of_a_float16_and_only_positive_finite_values_known():
     assert encode_depth(np.array([[1.0, 0.0]])).tolist() == [[0x3C00, 0]]
     assert decode_depth(np.array([[0x4000]], np.uint16), 3.0).tolist() == [[6.0]]
     infinite, nan, negative = 0x7C00, 0x7E00, 0xBC00
@@ -310,28 +315,29 @@ def test_a_hole_in_a_plane_is_filled_with_the_plane():
     holed = plane.copy()
     holed[10:20, 12:25] = 0
     filled = inpaint_depth(holed)
-    np.testing.assert_allclose(filled, plane, atol=0.05)  # the hole spans a range of 0.27
-    np.testing.assert_array_equal(filled[holed > 0], plane[holed > 0])
+    assert_allclose(filled, plane, atol=0.05)  # the hole spans a range of 0.27
+    assert_array_equal(filled[holed > 0], plane[holed > 0])
 
 
 @given(seeds)
 def test_filled_depth_stays_between_the_known_depths(seed):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     depth = np.where(rng.random((20, 24)) < 0.3, rng.uniform(1, 5, (20, 24)), 0).astype(np.float32)
     depth[3, 4] = 2.0
     filled = inpaint_depth(depth)
-    assert filled.min() >= depth[depth > 0].min() and filled.max() <= depth.max()
-    np.testing.assert_array_equal(inpaint_depth(filled), filled)  # complete depth needs no filling
+    assert filled.min() >= depth[depth > 0].min()
+    assert filled.max() <= depth.max()
+    assert_array_equal(inpaint_depth(filled), filled)  # complete depth needs no filling
     refused("no known pixel", inpaint_depth, 0 * depth)
 
 
 def test_unprojected_depth_projects_onto_its_own_pixels():
     camera = random_camera(3, (7, 9))
-    depth = np.random.default_rng(0).uniform(1, 2, (7, 9))
+    depth = default_rng(0).uniform(1, 2, (7, 9))
     pixels, back = camera.project(camera.to_world(unproject_depth(depth, camera)))
-    np.testing.assert_allclose(pixels[2, 5], [5.5, 2.5])  # pixel centres lie at half-integers
-    np.testing.assert_allclose(pixels[6, 0], [0.5, 6.5])
-    np.testing.assert_allclose(back, depth)
+    assert_allclose(pixels[2, 5], [5.5, 2.5])  # pixel centres lie at half-integers
+    assert_allclose(pixels[6, 0], [0.5, 6.5])
+    assert_allclose(back, depth)
 
 
 def patch_depths_one_by_one(depth, grid):
@@ -346,7 +352,7 @@ def patch_depths_one_by_one(depth, grid):
 
 @given(seeds)
 def test_a_patchs_point_has_the_lower_quartile_of_its_known_depths(seed):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     depth = np.where(rng.random((24, 32)) < 0.2, rng.uniform(1, 5, (24, 32)), 0).astype(np.float32)
     depth[0, 0] = 3
     camera = frontal((24, 32))
@@ -356,7 +362,8 @@ def test_a_patchs_point_has_the_lower_quartile_of_its_known_depths(seed):
     for row, col, expected in patch_depths_one_by_one(depth, (6, 8)):
         assert known[row, col] == (expected is not None)
         # the pixel is one of the patch
-        assert rows[row, col] // 4 == row and cols[row, col] // 4 == col
+        assert rows[row, col] // 4 == row
+        assert cols[row, col] // 4 == col
         if expected is not None:
             assert points[row, col, 2] == expected == depth[rows[row, col], cols[row, col]]
 
@@ -366,19 +373,19 @@ def test_a_patch_without_depth_takes_the_filled_depth_at_its_centre():
     depth[4:8, 8:12] = 0
     camera = frontal((16, 16))
     points, known = patch_points(depth, camera, (4, 4))
-    assert not known[1, 2] and known.sum() == 15
+    assert not known[1, 2]
+    assert known.sum() == 15
     centre = camera.unproject_camera(np.array([10.5, 6.5]), inpaint_depth(depth)[6, 10])
-    np.testing.assert_allclose(points[1, 2], centre)
+    assert_allclose(points[1, 2], centre)
     measured, same = patch_points(depth, camera, (4, 4), inpaint=False)
-    assert (
-        (same == known).all()
-        and (measured[known] == points[known]).all()
-        and (measured[1, 2] == 0).all()
-    )
+    assert_array_equal(same, known)
+    assert_array_equal(measured[known], points[known])
+    assert_array_equal(measured[1, 2], 0)
 
 
 def test_patches_need_not_divide_the_image():
     depth = np.arange(1, 36, dtype=np.float32).reshape(5, 7)
     points, known = patch_points(depth, frontal((5, 7)), (2, 3))
-    assert points.shape == (2, 3, 3) and known.all()
+    assert points.shape == (2, 3, 3)
+    assert known.all()
     assert points[1, 2, 2] == np.sort(depth[2:, 4:].ravel())[2]

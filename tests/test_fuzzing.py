@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.hostile.harness import READERS_OF, prepare, read_capture
+from zsp_lite import InputError
 from zsp_lite.benchmark.runs import read_run
 from zsp_lite.data.frames import read_image
-from zsp_lite.errors import InputError
 
 pytestmark = pytest.mark.slow
 

@@ -16,17 +16,18 @@ import transformers
 from refusals import refused
 from safetensors.torch import load, load_file, save_file
 from small_backbones import ARCHITECTURES, DEPTH, DIM, HEADS, configuration, save_all, save_model
+from torch.testing import assert_close
 from transformers import AutoModel
 
 from zsp_lite import load_backbone
 from zsp_lite.backbones.backbone import prepare_images
 from zsp_lite.backbones.load import download
-from zsp_lite.benchmark.identity import fingerprint
+from zsp_lite.benchmark.runs import fingerprint
 from zsp_lite.choices import FACETS
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory) -> dict[str, Path]:
+def folders(tmp_path_factory):
     return save_all(tmp_path_factory.mktemp("models"))
 
 
@@ -48,10 +49,8 @@ def by_transformers(folder: Path, kind: str, size: int):
         options["noise"] = (
             torch.arange((size // architecture.patch) ** 2).float().repeat(len(PICTURES), 1)
         )
-    (blocks,), seen = (
-        [module for module in model.modules() if isinstance(module, torch.nn.ModuleList)],
-        [],
-    )
+    (blocks,) = [module for module in model.modules() if isinstance(module, torch.nn.ModuleList)]
+    seen = []
     for block in blocks:
         block.register_forward_hook(lambda module, inputs, output: seen.append((inputs[0], output)))
     with torch.no_grad():
@@ -71,7 +70,7 @@ def projection(architecture, block, x, facet: str):
 
 @pytest.mark.parametrize("kind", ARCHITECTURES)
 @pytest.mark.parametrize("facet", FACETS)
-def test_facets_are_the_projections_of_the_normalised_input_of_the_block_and_its_output(
+def test_facets_are_the_projections_of_the_blocks_normalised_input_and_its_output(
     kind, folders, facet
 ):
     architecture = ARCHITECTURES[kind]
@@ -88,7 +87,7 @@ def test_facets_are_the_projections_of_the_normalised_input_of_the_block_and_its
         for features, values in zip(
             backbone(PICTURES), expected[:, architecture.special :], strict=True
         ):
-            torch.testing.assert_close(features.keys, values.view(4, 4, DIM), atol=2e-5, rtol=1e-4)
+            assert_close(features.keys, values.view(4, 4, DIM), atol=2e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ARCHITECTURES)
@@ -111,8 +110,8 @@ def test_saliency_is_the_last_cls_attention_and_the_global_feature_the_cls_outpu
     expected = (expected / expected.amax(1, keepdim=True)).view(-1, 4, 4)
     features = load_backbone(f"hf:{folders[kind]}", "cpu", image_size=size)(PICTURES)
     for one, saliency, cls in zip(features, expected, output.last_hidden_state[:, 0], strict=True):
-        torch.testing.assert_close(one.saliency, saliency, atol=2e-5, rtol=1e-4)
-        torch.testing.assert_close(one.global_feature, cls, atol=2e-5, rtol=1e-4)
+        assert_close(one.saliency, saliency, atol=2e-5, rtol=1e-4)
+        assert_close(one.global_feature, cls, atol=2e-5, rtol=1e-4)
 
 
 def test_a_model_that_nobody_thought_of_is_read_by_the_names_of_its_parts(tmp_path):
@@ -229,7 +228,7 @@ def offline(tmp_path, monkeypatch) -> Path:
 def test_what_is_in_the_cache_needs_no_hub(offline):
     repository = offline / "models--someone--small"
     (repository / "refs").mkdir(parents=True)
-    (repository / "refs" / "main").write_text("0" * 40)
+    (repository / "refs/main").write_text("0" * 40)
     folder = save_model(repository / "snapshots" / ("0" * 40), configuration("vit"))
     backbone = load_backbone("hf:someone/small", "cpu")
     assert backbone.name == "hf:someone/small"

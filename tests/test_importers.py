@@ -4,28 +4,30 @@ and imported."""
 import json
 import weakref
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from refusals import refused
 from scipy.spatial import cKDTree
 
+from zsp_lite import Co3D, Frame, open_source
 from zsp_lite.course.synthetic.export import make_object
 from zsp_lite.course.synthetic.sequences import render_sequence
 from zsp_lite.data.check import check_folder
-from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.frames import Frame, write_image, write_mask
-from zsp_lite.errors import InputError
+from zsp_lite.data.frames import write_image, write_mask
 from zsp_lite.importers import CaptureFrame, open_capture
 from zsp_lite.importers.convert import fuse, import_captures, import_source
 from zsp_lite.importers.masks import masks_from_box
-from zsp_lite.importers.sources import open_source
 
+# From pixel centres at half integers to OpenCV's at integers.
+HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 METRES = 0.13  # per unit of the rendered world: the object is about 30 cm wide
 
 
-def hairdryer_views():
+def hairdryer_views() -> list[Frame]:
     """Eight views around a hairdryer, in metres."""
     shape = make_object("hairdryer", 0, 4)
     exact, _ = render_sequence(shape, np.random.default_rng(2), 8, 96)
@@ -41,25 +43,25 @@ def hairdryer_views():
 
 @pytest.fixture(scope="module")
 def views():
+    """The views, rendered once."""
     return hairdryer_views()
 
 
-def to_world(frame):
+def to_world(frame: Frame) -> np.ndarray:
+    """The pose of a frame's camera, camera-to-world (4, 4)."""
     return np.linalg.inv(frame.camera.matrix)
 
 
-def write_depth16(path, depth):
-    """Write millimetres."""
+def write_depth16(path: Path, depth: np.ndarray) -> None:
+    """Write a depth map in metres as millimetres in 16 bits."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), np.rint(1000 * depth).astype(np.uint16))
 
 
-def write_nerfstudio(folder, frames):
-    (fx, fy), (cx, cy), (h, w) = (
-        frames[0].camera.focal_length,
-        frames[0].camera.principal_point,
-        frames[0].camera.size,
-    )
+def write_nerfstudio(folder: Path, frames: list[Frame]) -> None:
+    """Write a capture of nerfstudio."""
+    camera = frames[0].camera
+    (fx, fy), (cx, cy), (h, w) = camera.focal_length, camera.principal_point, camera.size
     listed = []
     for frame in frames:
         write_image(folder / f"images/{frame.name}.jpg", frame.rgb, 95)
@@ -74,20 +76,12 @@ def write_nerfstudio(folder, frames):
                 "transform_matrix": pose.tolist(),
             }
         )
-    content = {
-        "camera_model": "OPENCV",
-        "fl_x": fx,
-        "fl_y": fy,
-        "cx": cx,
-        "cy": cy,
-        "w": w,
-        "h": h,
-        "frames": listed,
-    }
+    content = dict(camera_model="OPENCV", fl_x=fx, fl_y=fy, cx=cx, cy=cy, w=w, h=h, frames=listed)
     (folder / "transforms.json").write_text(json.dumps(content))
 
 
-def write_lists(folder, frames, masks=False):
+def write_lists(folder: Path, frames: list[Frame], masks: bool = False) -> Path:
+    """Write a capture as lists of images, depth maps and poses; returns its folder."""
     names, depths, poses = [], [], []
     for frame in frames:
         names.append(f"pictures/{frame.name}.jpg")
@@ -108,28 +102,49 @@ WRITERS = {"nerfstudio": write_nerfstudio, "lists": write_lists}
 
 
 @pytest.fixture
-def scan(tmp_path, views):
+def scan(tmp_path, views) -> Path:
+    """A capture of nerfstudio."""
     write_nerfstudio(tmp_path / "scan", views)
     return tmp_path / "scan"
 
 
-def test_an_import_reads_as_a_data_folder_of_unit_scale(tmp_path, scan, views):
-    done = import_source(open_source(scan), tmp_path / "data", "teapot", "mine")
-    dataset = Co3D(tmp_path / "data")
-    (check,) = check_folder(tmp_path / "data", deep=True)
-    assert not check.problems and check.complete == 1
-    points, _ = dataset.point_cloud("teapot", "mine")
-    assert done.frames == 8 and done.points == len(points) > 500
-    assert points.std(axis=0).mean() == pytest.approx(1, rel=1e-3)
-    for annotation, view in zip(dataset.frames("teapot", "mine"), views, strict=True):
-        frame = dataset.load(annotation)
-        inside = (frame.mask > 0.9) & (frame.depth > 0)
-        np.testing.assert_allclose(frame.depth[inside], done.scale * view.depth[inside], rtol=5e-3)
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory, views):
+    """A data folder into which a scan was imported, and what the import says of it."""
+    root = tmp_path_factory.mktemp("imported")
+    write_nerfstudio(root / "scan", views)
+    return root / "data", import_source(open_source(root / "scan"), root / "data", "teapot", "mine")
+
+
+def test_an_import_is_a_complete_data_folder(imported):
+    root, done = imported
+    (check,) = check_folder(root, deep=True)
+    assert (check.problems, check.complete) == ([], 1)
+    assert done.frames == 8
+
+
+def test_an_import_has_a_cloud_of_unit_scale_on_the_object(imported):
+    root, done = imported
+    points, _ = Co3D(root).point_cloud("teapot", "mine")
+    assert done.points == len(points) > 500
+    assert_allclose(points.std(axis=0).mean(), 1, rtol=1e-3)
+    for annotation in Co3D(root).frames("teapot", "mine"):
         # The cloud projects into the mask of every view.
-        pixels, depth = frame.camera.project(points)
-        column, row = np.floor(pixels).astype(int).clip(0, np.array(frame.camera.size[::-1]) - 1).T
-        assert (cv2.dilate(frame.mask, np.ones((5, 5)))[row, column] > 0.5).mean() > 0.97
-        np.testing.assert_allclose(frame.camera.t, done.scale * view.camera.t, rtol=1e-5)
+        frame = Co3D(root).load(annotation)
+        pixels, _ = frame.camera.project(points)
+        height, width = frame.camera.size
+        column, row = np.floor(pixels).astype(int).clip(0, (width - 1, height - 1)).T
+        near_object = cv2.dilate(frame.mask, np.ones((5, 5))) > 0.5
+        assert near_object[row, column].mean() > 0.97
+
+
+def test_an_import_has_the_depth_and_cameras_in_its_scale(imported, views):
+    root, done = imported
+    for annotation, view in zip(Co3D(root).frames("teapot", "mine"), views, strict=True):
+        frame = Co3D(root).load(annotation)
+        inside = (frame.mask > 0.9) & (frame.depth > 0)
+        assert_allclose(frame.depth[inside], done.scale * view.depth[inside], rtol=5e-3)
+        assert_allclose(frame.camera.t, done.scale * view.camera.t, rtol=1e-5)
 
 
 @pytest.mark.parametrize("box", [None, (20, 30, 60, 70)])
@@ -152,21 +167,22 @@ def test_an_import_holds_a_few_frames_at_once(tmp_path, scan, monkeypatch, box):
 def test_distortion_is_corrected(tmp_path, views, model):
     folder = tmp_path / "scan"
     write_nerfstudio(folder, views[:1])
-    names, coefficients = (
-        ("k1", "k2", "p1", "p2", "k3"),
-        np.array([0.12, -0.03, 0.002, -0.001, 2.0]),
-    )
+    distortion = {"k1": 0.12, "k2": -0.03}
     if model == "OPENCV_FISHEYE":
-        names, coefficients = ("k1", "k2", "k3", "k4"), np.array([0.12, -0.03, 0.02, -0.01])
-    edited(lambda content: content.update(zip(names, coefficients), camera_model=model))(folder)
+        distortion |= {"k3": 0.02, "k4": -0.01}
+    else:
+        distortion |= {"p1": 0.002, "p2": -0.001, "k3": 2.0}
+    edited(lambda content: content.update(distortion, camera_model=model))(folder)
     # A distorted image of a grid of dots, projected by OpenCV.
     view, camera = views[0], views[0].camera
     height, width = camera.size
     wanted = np.mgrid[20 : width - 20 : 12, 20 : height - 20 : 12].reshape(2, -1).T + 0.5
     rays = camera.unproject_camera(wanted, np.ones(len(wanted)))
-    matrix = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    matrix = camera.K - HALF_PIXEL
     project = cv2.projectPoints if model == "OPENCV" else cv2.fisheye.projectPoints
-    stored, _ = project(rays[:, None], np.zeros(3), np.zeros(3), matrix, coefficients)
+    stored, _ = project(
+        rays[:, None], np.zeros(3), np.zeros(3), matrix, np.array([*distortion.values()])
+    )
     picture = np.zeros((height, width, 3), np.float32)
     for x, y in stored.reshape(-1, 2):
         grid_y, grid_x = np.mgrid[:height, :width]
@@ -177,28 +193,21 @@ def test_distortion_is_corrected(tmp_path, views, model):
         top, left = int(y) - 4, int(x) - 4
         patch = loaded[top : top + 9, left : left + 9]
         rows, columns = np.mgrid[top : top + 9, left : left + 9] + 0.5
-        assert (
-            np.hypot(
-                (patch * columns).sum() / patch.sum() - x, (patch * rows).sum() / patch.sum() - y
-            )
-            < 0.35
-        )
+        middle = np.average([columns, rows], axis=(1, 2), weights=[patch, patch])
+        assert np.hypot(*middle - (x, y)) < 0.35  # pixels
 
 
 def test_the_fused_cloud_lies_on_the_surface(views):
     points, colours, normals = fuse(views)
-    seen = np.concatenate(
-        [
-            view.camera.unproject(
-                np.argwhere(view.mask > 0)[:, ::-1] + 0.5, view.depth[view.mask > 0]
-            )
-            for view in views
-        ]
-    )
+    seen = []
+    for view in views:
+        pixels = np.argwhere(view.mask > 0)[:, ::-1] + 0.5
+        seen.append(view.camera.unproject(pixels, view.depth[view.mask > 0]))
+    seen = np.concatenate(seen)
     spread = seen.std(axis=0).mean()
     assert np.percentile(cKDTree(seen).query(points)[0], 90) < 0.1 * spread
     assert np.percentile(cKDTree(points).query(seen)[0], 90) < 0.2 * spread
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-3)
+    assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-3)
     assert colours.shape == points.shape
 
 
@@ -221,7 +230,7 @@ def edited(*changes, encoding="utf-8", name="transforms.json"):
 
 
 @pytest.mark.parametrize(
-    ("kind", "damage", "message"),
+    "kind, damage, message",
     [
         (
             "nerfstudio",
@@ -277,37 +286,31 @@ def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(
 def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
     write_nerfstudio(tmp_path, views[:1])
     height, width = views[0].camera.size
-    plane = np.repeat(np.arange(500, 500 + height // 2), width // 2).reshape(
-        height // 2, width // 2
-    )
+    plane = np.arange(500, 500 + height // 2)[:, None].repeat(width // 2, axis=1)
     write_depth16(tmp_path / f"depths/{views[0].name}.png", plane / 1000)
     frame = open_capture(tmp_path, "nerfstudio").frames[0].load()
-    np.testing.assert_allclose(frame.depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
+    assert_allclose(frame.depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
 
 
-def test_a_single_frame_is_fused_and_a_surface_that_one_of_many_frames_saw_is_left_out(views):
+def test_a_single_frame_is_fused_and_what_one_of_many_frames_saw_is_left_out(views):
     assert len(fuse(views[:1])[0]) > 200
-    ghost = replace(
-        views[0], depth=np.where(views[0].mask > 0.5, 0.5 * views[0].depth, 0).astype(np.float32)
-    )
-    _, depth = views[0].camera.project(fuse([*views, ghost])[0])
-    assert depth.min() > 0.7 * views[0].depth[views[0].mask > 0.5].min()
+    view = views[0]
+    on_object = view.mask > 0.5
+    near = np.where(on_object, 0.5 * view.depth, 0).astype(np.float32)
+    points, *_ = fuse([*views, replace(view, depth=near)])
+    _, depth = view.camera.project(points)
+    assert depth.min() > 0.7 * view.depth[on_object].min()
 
 
 def test_bad_boxes_empty_depth_and_frames_without_overlap_are_refused(views):
     refused("expected one inside", masks_from_box, views, (0, 0, 5, 9999))
-    refused(
-        "no known depth on the object",
-        fuse,
-        [replace(view, depth=np.zeros_like(view.depth)) for view in views],
-    )
-    with pytest.raises(InputError, match="expected overlapping depth maps"):
-        fuse(
-            [
-                replace(v, camera=replace(v.camera, t=v.camera.t + 100 * i))
-                for i, v in enumerate(views[:3])
-            ]
-        )
+    blind = [replace(view, depth=np.zeros_like(view.depth)) for view in views]
+    refused("no known depth on the object", fuse, blind)
+    apart = [
+        replace(view, camera=replace(view.camera, t=view.camera.t + 100 * i))
+        for i, view in enumerate(views[:3])
+    ]
+    refused("expected overlapping depth maps", fuse, apart)
 
 
 def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(tmp_path, views):
@@ -317,22 +320,14 @@ def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(t
     done = import_source(source, tmp_path / "data", "teapot", "mine")
     assert (done.frames, done.empty) == (5, 1)
     assert len(Co3D(tmp_path / "data").frames("teapot", "mine")) == 5
-    refused(
-        "mine exists already, expected another",
-        import_source,
-        source,
-        tmp_path / "data",
-        "teapot",
-        "mine",
-    )
+    message = "mine exists already, expected another"
+    refused(message, import_source, source, tmp_path / "data", "teapot", "mine")
 
 
 def test_every_capture_in_a_folder_is_imported_once(tmp_path, views):
     for name in ("one", "two"):
         write_lists(tmp_path / "scans" / name, views, masks=True)
     done = dict(import_captures(tmp_path / "scans", tmp_path / "data", "teapot"))
-    assert [(name, one.frames) for name, one in done.items()] == [
-        ("one", len(views)),
-        ("two", len(views)),
-    ]
+    numbers = {name: one.frames for name, one in done.items()}
+    assert numbers == {"one": len(views), "two": len(views)}
     assert not list(import_captures(tmp_path / "scans", tmp_path / "data", "teapot"))

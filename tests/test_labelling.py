@@ -2,38 +2,37 @@
 refused."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
-from co3d_folders import sequence_data
+from co3d_folders import write_category, write_identities
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.alignment import Sim3
+from zsp_lite import Sim3
 from zsp_lite.course.labelling import Labelling, align_picks
 from zsp_lite.course.labelling.session import MAX_RESIDUAL
-from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.labels import PoseLabel, label_bytes, read_labels, write_label
 from zsp_lite.io.files import write_atomic
 
 
 @pytest.fixture
 def root(tmp_path):
-    write_co3d(
-        tmp_path,
-        "chair",
-        [sequence_data("best", quality=3.0), sequence_data("a"), sequence_data("b")],
-    )
+    """A data folder of three sequences, with the best cloud first."""
+    write_category(tmp_path, "chair", ["best"], quality=3.0)
+    write_category(tmp_path, "chair", "ab")
     return tmp_path
 
 
-def pick_all(labelling, sequence, points):
+def pick_all(labelling: Labelling, sequence: str, points: np.ndarray) -> None:
+    """Pick points one after the other."""
     for point in points:
         labelling.pick(sequence, point)
 
 
-def corners(sequence="best"):
+def corners(sequence: str = "best") -> np.ndarray:
+    """Keypoints, (5, 3), at a place that depends on the sequence."""
     return np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0.5)]) + len(sequence)
 
 
@@ -41,15 +40,15 @@ def test_residuals_are_relative_to_the_spread_of_the_keypoints():
     moved = Sim3(7.0, Rotation.random(random_state=1).as_matrix(), np.ones(3))
     points = corners().astype(float)
     target = moved.apply(points)
-    assert align_picks(points, target).residuals == pytest.approx(np.zeros(5), abs=1e-12)
+    assert_allclose(align_picks(points, target).residuals, np.zeros(5), atol=1e-12)
     target[4] += 7 * np.array([0.3, 0, 0])
-    small, large = (align_picks(points, scale * target).residuals for scale in (1, 100))
-    np.testing.assert_allclose(small, large)
+    small, large = [align_picks(points, scale * target).residuals for scale in (1, 100)]
+    assert_allclose(small, large)
     assert small.argmax() == 4
 
 
 @pytest.mark.parametrize(
-    ("reference", "picks", "message"),
+    "reference, picks, message",
     [
         (
             corners()[:3],
@@ -73,7 +72,7 @@ def test_the_reference_is_the_best_cloud_and_a_restart_loses_nothing(root):
     pick_all(labelling, "a", corners()[:2])
     again = Labelling(root, "chair")
     assert again.names == ("left arm", "keypoint 2", "keypoint 3", "keypoint 4", "keypoint 5")
-    np.testing.assert_array_equal(again.picks("a"), corners()[:2])
+    assert_array_equal(again.picks("a"), corners()[:2])
     assert [(row.sequence, row.state, row.picks) for row in again.progress()] == [
         ("best", "reference", 5),
         ("a", "open", 2),
@@ -90,13 +89,14 @@ def test_accepting_writes_the_published_format_and_the_references_identity(root)
     path = labelling.accept("a")
     assert json.loads(path.read_text()).keys() == {"trans", "seq", "reference_seq"}
     labels = read_labels(root, "chair")
-    np.testing.assert_allclose(labels["a"].trans[:3, :3], turn, atol=1e-9)
+    assert_allclose(labels["a"].trans[:3, :3], turn, atol=1e-9)
     # of the object, which the label maps to its centre
     centre = labelling.cloud("best")[0].mean(axis=0)
-    np.testing.assert_allclose(labels["a"].trans @ [*centre, 1], [*(1.3 * turn @ centre + 2), 1])
-    np.testing.assert_array_equal(labels["best"].trans, np.eye(4))
-    states = {row.sequence: (row.state, row.rms) for row in Labelling(root, "chair").progress()}
-    assert states["a"] == ("accepted", pytest.approx(0, abs=1e-9)) and states["b"] == ("open", None)
+    assert_allclose(labels["a"].trans @ [*centre, 1], [*(1.3 * turn @ centre + 2), 1])
+    assert_array_equal(labels["best"].trans, np.eye(4))
+    _, a, b = Labelling(root, "chair").progress()
+    assert (a.state, a.rms) == ("accepted", pytest.approx(0, abs=1e-9))
+    assert (b.state, b.rms) == ("open", None)
 
 
 def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
@@ -122,9 +122,8 @@ def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
         "a",
     )
     labelling.skip("b")
-    assert Labelling(root, "chair").progress()[-1].state == "skipped" and "b" not in read_labels(
-        root, "chair"
-    )
+    assert Labelling(root, "chair").progress()[-1].state == "skipped"
+    assert "b" not in read_labels(root, "chair")
     labelling.put("b", [])
     labelling.pick("b", (0, 0, 0))
     assert labelling.progress()[-1].state == "open"
@@ -151,13 +150,17 @@ def test_invalid_categories_sequences_and_picks_are_refused(root):
     ):
         refused(message, call)
     assert read_labels(root, "chair") == {}
-    np.testing.assert_array_equal(Labelling(root, "chair").picks("a"), corners()[:3])
-    for name, message in (("a", "expected one reference sequence"), ("c", "c has no point cloud")):
-        if name == "c":
-            (root / "label_picks/chair.json").unlink()
-        write_label(root, "chair", PoseLabel(np.eye(4), name, name))
-        refused(message, Labelling, root, "chair")
-        shutil.rmtree(root / "class_labels")
+    assert_array_equal(Labelling(root, "chair").picks("a"), corners()[:3])
+
+
+def test_a_label_of_another_reference_or_of_no_sequence_is_refused(root):
+    Labelling(root, "chair").pick("best", (0, 0, 0))
+    write_identities(root, "chair", "a")
+    refused("expected one reference sequence", Labelling, root, "chair")
+    (root / "class_labels/chair/a.json").unlink()
+    (root / "label_picks/chair.json").unlink()
+    write_identities(root, "chair", "c")
+    refused("c has no point cloud", Labelling, root, "chair")
 
 
 def test_broken_picks_are_named(root):
@@ -204,21 +207,16 @@ def test_the_reference_is_that_of_the_labels(root):
 def test_a_proposal_becomes_the_label_where_nothing_is_picked(root):
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_euler("z", 70, degrees=True).as_matrix()
-    for name, trans in (
-        ("a", np.eye(4)),
-        ("best", turn),
-    ):  # the reference of proposals may be another one
-        write_atomic(
-            root / "label_proposals" / "chair" / f"{name}.json",
-            label_bytes(PoseLabel(trans, name, "a")),
-        )
+    # The reference of proposals may be another one than that of the labels.
+    for name, trans in (("a", np.eye(4)), ("best", turn)):
+        proposal = label_bytes(PoseLabel(trans, name, "a"))
+        write_atomic(root / f"label_proposals/chair/{name}.json", proposal)
     labelling = Labelling(root, "chair")
-    assert labelling.reference == "best" and labelling.proposal("b") is None
-    np.testing.assert_allclose(labelling.proposal("a").R, turn[:3, :3].T)
+    assert labelling.reference == "best"
+    assert labelling.proposal("b") is None
+    assert_allclose(labelling.proposal("a").R, turn[:3, :3].T)
     refused("sequence b has 0 of 0 keypoints", labelling.accept, "b")
     labelling.accept("a")
-    np.testing.assert_allclose(
-        read_labels(root, "chair")["a"].trans[:3, :3], turn[:3, :3].T, atol=1e-12
-    )
-    write_atomic(root / "label_proposals" / "chair" / "b.json", b"{}")
+    assert_allclose(read_labels(root, "chair")["a"].trans[:3, :3], turn[:3, :3].T, atol=1e-12)
+    write_atomic(root / "label_proposals/chair/b.json", b"{}")
     refused("proposal .*b.json|label .*b.json", Labelling, root, "chair")

@@ -6,13 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from co3d_folders import contents, convert_to_v2, random_camera, seeds, sequence_data
+from co3d_folders import (
+    contents,
+    convert_to_v2,
+    random_camera,
+    seeds,
+    sequence_data,
+    write_category,
+    write_identities,
+)
 from hypothesis import given
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.alignment import Sim3
-from zsp_lite.data.co3d import Co3D, Pair, write_co3d
+from zsp_lite import Co3D, Sim3
+from zsp_lite.data.co3d import Pair, write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose, write_label
 from zsp_lite.data.pairs import shipped_pairs, write_published_pairs
 from zsp_lite.data.published import align_worlds, import_labels, transfer_labels
@@ -22,7 +32,7 @@ from zsp_lite.metrics import rotation_error
 @pytest.fixture
 def root(tmp_path):
     folder = tmp_path / "data"
-    write_co3d(folder, "chair", [sequence_data("a"), sequence_data("b")])
+    write_category(folder, "chair", "ab")
     return folder
 
 
@@ -30,8 +40,7 @@ def root(tmp_path):
 def clone(tmp_path, root):
     """A folder with the layout of the published repository."""
     folder, dataset = tmp_path / "clone", Co3D(root)
-    for name in "ab":
-        write_label(folder / "data", "chair", PoseLabel(np.eye(4), name, "a"))
+    write_identities(folder / "data", "chair", "ab")
     pairs = [Pair("chair", *names) for names in (("a", 0, "b", (1, 3)), ("b", 2, "a", (0, 2)))]
     write_published_pairs(folder / "data/determ_eval/200samples_2tgt/chair.pt", pairs, dataset)
     (folder / "README.md").write_text("code")
@@ -58,11 +67,11 @@ def test_labels_and_pairs_are_imported_and_replace_others_only_on_request(clone,
     )
     assert contents(root) == before
     import_labels(clone, root, replace=True)
-    assert np.array_equal(read_labels(root, "chair")["b"].trans, np.eye(4))
+    assert_array_equal(read_labels(root, "chair")["b"].trans, np.eye(4))
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "message"),
+    "file, content, message",
     [
         ("clone/data/class_labels/chair/b.json", b"{", "Input data was truncated"),
         (
@@ -100,7 +109,7 @@ def test_sources_without_labels_are_refused(root, tmp_path):
 
 def moved(sequence, world: Sim3, noise: float = 0.0):
     """The same sequence in another world."""
-    rng, frames = np.random.default_rng(0), []
+    rng, frames = default_rng(0), []
     for frame in sequence.frames:
         rotation = frame.camera.R @ world.R.T
         centre = world.apply(frame.camera.centre) + noise * rng.normal(size=3)
@@ -138,13 +147,13 @@ def test_labels_are_transferred_between_worlds(tmp_path):
     residuals = transfer_labels(tmp_path / "v1", tmp_path / "v2", "chair")
     assert max(residuals.values()) < 1e-6
     labels = read_labels(tmp_path / "v2", "chair")
-    np.testing.assert_array_equal(labels["a"].trans, np.eye(4))
+    assert_array_equal(labels["a"].trans, np.eye(4))
     expected = worlds["b"].R @ trans[:3, :3] @ worlds["a"].R.T
     assert rotation_error(labels["b"].trans[:3, :3], expected) < 0.01
     # Both labels map the centre of the reference cloud to the same point of the other object.
     centre = Co3D(tmp_path / "v2").point_cloud("chair", "a")[0].mean(axis=0)
     landed = labels["b"].trans[:3, :3] @ centre + labels["b"].trans[:3, 3]
-    np.testing.assert_allclose(
+    assert_allclose(
         landed, worlds["b"].apply(trans[:3, :3] @ worlds["a"].inverse().apply(centre)), atol=1e-3
     )
 
@@ -166,7 +175,7 @@ def test_the_residual_is_reported_and_a_large_one_refused(tmp_path):
 def random_label(seed, name="a"):
     trans = np.eye(4)
     trans[:3, :3] = Rotation.random(random_state=seed % 2**31).as_matrix()
-    trans[:3, 3] = np.random.default_rng(seed).normal(size=3)
+    trans[:3, 3] = default_rng(seed).normal(size=3)
     return PoseLabel(trans, name, "zero")
 
 
@@ -175,12 +184,12 @@ def test_the_relative_pose_takes_what_one_camera_sees_to_what_the_other_sees(see
     label_a, label_b = random_label(seed), random_label(seed + 1, "b")
     camera_a, camera_b = random_camera(seed), random_camera(seed + 1)
     # points of the reference sequence's cloud
-    canonical = np.random.default_rng(seed).normal(size=(6, 3))
+    canonical = default_rng(seed).normal(size=(6, 3))
     seen_a = camera_a.to_camera(Sim3.from_matrix(label_a.trans).apply(canonical))
     seen_b = camera_b.to_camera(Sim3.from_matrix(label_b.trans).apply(canonical))
     pose = relative_pose(label_a, camera_a, label_b, camera_b)
-    np.testing.assert_allclose(Sim3.from_matrix(pose).apply(seen_a), seen_b, atol=1e-9)
-    np.testing.assert_allclose(
+    assert_allclose(Sim3.from_matrix(pose).apply(seen_a), seen_b, atol=1e-9)
+    assert_allclose(
         pose @ relative_pose(label_b, camera_b, label_a, camera_a), np.eye(4), atol=1e-9
     )
 
@@ -198,12 +207,12 @@ def test_labels_are_read_back_from_files_in_the_published_format(tmp_path):
     read = read_labels(tmp_path, "chair")
     assert list(read) == ["a", "b"]
     for name, label in read.items():
-        np.testing.assert_array_equal(label.trans, written[name].trans)
+        assert_array_equal(label.trans, written[name].trans)
         assert (label.seq, label.reference_seq) == (name, "zero")
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change, message",
     [
         (
             {"trans": np.diag([2.0, 2, 2, 1]).tolist()},

@@ -57,12 +57,10 @@ def test_no_module_imports_from_a_higher_layer_or_from_another_name_of_its_own()
             )
 
 
-def test_only_the_commands_import_the_course_and_only_the_course_imports_its_packages():
+def test_only_the_commands_import_the_course_and_only_it_imports_its_packages():
     for module, imported, line in imports():
-        room, where = (
-            module.partition(".")[0],
-            f"zsp_lite.{module}, line {line}, imports {imported}",
-        )
+        room = module.partition(".")[0]
+        where = f"zsp_lite.{module}, line {line}, imports {imported}"
         assert room == "course" or imported.partition(".")[0] not in OF_THE_COURSE, where
         assert room in ("course", "cli") or not imported.startswith("zsp_lite.course"), where
 
@@ -81,4 +79,5 @@ def test_every_room_is_within_its_limit():
 def test_every_file_of_the_library_is_in_one_room():
     code = [room for room in size.rooms() if room.name.startswith("zsp_lite")]
     parts, whole = [room.size for room in code if room.name != "zsp_lite in all"], code[-1]
-    assert whole.name == "zsp_lite in all" and sum(parts) == whole.size
+    assert whole.name == "zsp_lite in all"
+    assert sum(parts) == whole.size

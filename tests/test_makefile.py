@@ -69,7 +69,7 @@ def test_the_users_package_index_reaches_pip(folder):
     assert install.endswith("[https://mine/simple] [https://cpu/whl]")
 
 
-@pytest.mark.parametrize(("user", "is_root"), [("0", True), ("1000", False)])
+@pytest.mark.parametrize("user, is_root", [("0", True), ("1000", False)])
 def test_lab_opens_a_copy_of_the_notebooks_and_says_why_it_allows_root(folder, user, is_root):
     text, calls = make(folder, "lab", USER_ID=user)
     assert ("--allow-root" in calls[-1]) == ("You are root" in text) == is_root
@@ -83,9 +83,8 @@ def test_lab_opens_a_copy_of_the_notebooks_and_says_why_it_allows_root(folder, u
     (folder / "my_notebooks/00.ipynb").write_text("changed")
     text, _ = make(folder, "lab", USER_ID=user)
     assert (folder / "notebooks/00.ipynb").read_text() == "original"
-    assert (
-        folder / "my_notebooks/00.ipynb"
-    ).read_text() == "changed" and "move that folder away" in text
+    assert (folder / "my_notebooks/00.ipynb").read_text() == "changed"
+    assert "move that folder away" in text
 
 
 def test_the_version_is_the_same_everywhere():

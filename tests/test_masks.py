@@ -9,9 +9,8 @@ import pytest
 from refusals import refused
 from synthetic_views import look_at
 
+from zsp_lite import Frame, InputError
 from zsp_lite.course.motorcycle import load_photograph
-from zsp_lite.data.frames import Frame
-from zsp_lite.errors import InputError
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth, separate_colours
 
@@ -50,7 +49,7 @@ def overlap(mask, truth):
     return (found & truth).sum() / (found | truth).sum()
 
 
-@pytest.mark.parametrize(("count", "unit"), [(1, 1), (4, 1), (1, 1000)])
+@pytest.mark.parametrize("count, unit", [(1, 1), (4, 1), (1, 1000)])
 def test_the_object_on_a_floor_is_found_without_a_box_in_any_unit_of_length(count, unit):
     scenes = [ball_on_floor(direction) for direction in DIRECTIONS[:count]]
     masked = masks_from_depth([scale_frame(frame, unit) for frame, _ in scenes])
@@ -58,7 +57,7 @@ def test_the_object_on_a_floor_is_found_without_a_box_in_any_unit_of_length(coun
     assert mask_flags(masked) == ()
 
 
-def test_depth_without_an_object_is_refused_and_a_frame_without_depth_gets_an_empty_mask():
+def test_depth_without_an_object_is_refused_and_no_depth_gives_an_empty_mask():
     frame, truth = ball_on_floor(DIRECTIONS[0])
     blind = replace(frame, depth=np.zeros_like(frame.depth))
     refused("no depth is known", masks_from_depth, [blind])
@@ -67,7 +66,8 @@ def test_depth_without_an_object_is_refused_and_a_frame_without_depth_gets_an_em
     ):
         masks_from_depth([replace(frame, depth=np.full_like(frame.depth, 2))])
     empty, found = masks_from_depth([blind, frame])
-    assert not empty.mask.any() and overlap(found.mask, truth) > 0.95
+    assert not empty.mask.any()
+    assert overlap(found.mask, truth) > 0.95
     assert mask_flags([empty]) == mask_flags([empty, found]) == ()
 
 
@@ -100,7 +100,7 @@ def on_the_floor_too(mask):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "sign"),
+    "spoil, sign",
     [
         (in_the_corner, "several borders of the image are touched"),
         (in_two_parts, "several separate parts"),
@@ -108,14 +108,15 @@ def on_the_floor_too(mask):
         (on_the_floor_too, "much of it lies in the plane around it"),
     ],
 )
-def test_a_mask_that_may_be_wrong_is_flagged_with_the_reason_and_the_number_of_frames(spoil, sign):
+def test_masks_that_may_be_wrong_are_flagged_with_reason_and_number(spoil, sign):
     (first, truth), (second, _) = (ball_on_floor(direction) for direction in DIRECTIONS[:2])
     good = masks_from_depth([first, second])
     assert mask_flags(good) == ()
     spoilt = truth.copy()
     spoil(spoilt)
     (flag,) = mask_flags([replace(first, mask=spoilt.astype(np.float32)), good[1]])
-    assert flag.startswith("the masks may be wrong: ") and f"{sign} (1 of 2 frames)" in flag
+    assert flag.startswith("the masks may be wrong: ")
+    assert f"{sign} (1 of 2 frames)" in flag
 
 
 def test_an_object_without_a_floor_is_found():
@@ -135,8 +136,10 @@ def test_a_box_finds_the_object_and_stays_empty_where_it_is_not_seen():
     away = replace(second, camera=replace(away, t=away.t - (0, 0, 9)))  # behind the camera
     black = replace(second, rgb=np.zeros_like(second.rgb))
     masked = list(masks_from_box([first, away, black, second], box))
-    assert overlap(masked[0].mask, truth) > 0.9 and overlap(masked[3].mask, other) > 0.9
-    assert not masked[1].mask.any() and not masked[2].mask.any()
+    assert overlap(masked[0].mask, truth) > 0.9
+    assert overlap(masked[3].mask, other) > 0.9
+    assert not masked[1].mask.any()
+    assert not masked[2].mask.any()
 
 
 def test_the_photographed_motorcycle_is_found():

@@ -7,6 +7,7 @@ import numpy as np
 import ot
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from test_matching import feature_map
 
 from zsp_lite.matchers import MATCHERS, dual_softmax, sinkhorn
@@ -34,8 +35,8 @@ def test_the_dual_softmax_is_the_product_of_two_softmaxes():
     sim = similarities()
     product = (sim / 0.1).softmax(0) * (sim / 0.1).softmax(1)
     partner, score = dual_softmax(sim)
-    assert (partner == product.argmax(1)).all()
-    assert score.exp().numpy() == pytest.approx(product.max(1).values.numpy(), rel=1e-4)
+    assert_array_equal(partner, product.argmax(1))
+    assert_allclose(score.exp().numpy(), product.max(1).values.numpy(), rtol=1e-4)
 
 
 def test_mutual_neighbours_are_each_others_choice_among_the_objects_patches():
@@ -46,7 +47,8 @@ def test_mutual_neighbours_are_each_others_choice_among_the_objects_patches():
     for u in range(len(sim)):
         v = int(hidden[u].argmax())
         if on1[u] and int(hidden[:, v].argmax()) == u:
-            assert partner[u] == v and score[u] == sim[u, v]
+            assert partner[u] == v
+            assert score[u] == sim[u, v]
         else:
             assert score[u] == -torch.inf
 
@@ -56,7 +58,9 @@ def test_partners_are_on_the_objects_and_nothing_is_found_without_one(name):
     sim, (on1, on2) = similarities(), masks()
     partner, score = MATCHERS[name](sim, on1, on2)
     found = score.isfinite()
-    assert found.any() and on1[found].all() and on2[partner[found]].all()
+    assert found.any()
+    assert on1[found].all()
+    assert on2[partner[found]].all()
     assert not MATCHERS[name](sim, on1, torch.zeros_like(on2))[1].isfinite().any()
 
 
@@ -65,14 +69,13 @@ def test_every_matcher_finds_an_image_in_itself(name):
     features = feature_map(3)
     for kmeans in (False, True):
         found = match(features, features, k=10, kmeans=kmeans, matcher=name)
-        assert len(found) == 10 and (found.reference == found.target).all()
-        assert found.similarity == pytest.approx(np.ones(10), abs=1e-5)
+        assert len(found) == 10
+        assert_array_equal(found.reference, found.target)
+        assert_allclose(found.similarity, np.ones(10), atol=1e-5)
 
 
 def test_plain_similarity_is_the_cosine_of_the_keys():
     first, second = feature_map(5), feature_map(6)
     (found,) = key_similarities(first, [second])
     u, v = first.keys[2, 3], second.keys[4, 5]
-    assert found[2 * 9 + 3, 4 * 9 + 5] == pytest.approx(
-        float(u @ v / u.norm() / v.norm()), abs=1e-6
-    )
+    assert_allclose(found[2 * 9 + 3, 4 * 9 + 5], float(u @ v / u.norm() / v.norm()), atol=1e-6)

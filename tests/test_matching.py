@@ -8,7 +8,10 @@ import torch
 import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from threadpoolctl import threadpool_info
+from torch.testing import assert_close
 
 from zsp_lite import matching
 from zsp_lite.features import FeatureMap, log_bin
@@ -50,22 +53,22 @@ def test_similarity_is_the_cosine_of_materialised_descriptors(h1, w1, h2, w2, se
     ref = torch.randn(h1, w1, 5, generator=generator) + 0.5
     target = torch.randn(h2, w2, 5, generator=generator)
     expected = descriptors(ref.double()) @ descriptors(target.double()).T
-    torch.testing.assert_close(similarity(ref, target).double(), expected, atol=1e-5, rtol=0)
+    assert_close(similarity(ref, target).double(), expected, atol=1e-5, rtol=0)
 
 
 def test_similarity_holds_at_the_size_of_the_paper_and_with_one_dominant_patch():
     ref, target = feature_map(0, (28, 28), 384).keys, feature_map(1, (28, 28), 384).keys
     ref[13, 4] *= 1000
     expected = descriptors(ref.double()) @ descriptors(target.double()).T
-    torch.testing.assert_close(similarity(ref, target).double(), expected, atol=1e-5, rtol=0)
+    assert_close(similarity(ref, target).double(), expected, atol=1e-5, rtol=0)
 
 
 def test_similarity_takes_maps_tensors_and_arrays_and_is_symmetric():
     ref, target = feature_map(0, (4, 6)), feature_map(1, (5, 3))
     sim = similarity(ref, target)
     assert sim.shape == (24, 15)
-    torch.testing.assert_close(similarity(ref.keys.numpy().astype(np.float64), target.keys), sim)
-    torch.testing.assert_close(similarity(target, ref).T, sim)
+    assert_close(similarity(ref.keys.numpy().astype(np.float64), target.keys), sim)
+    assert_close(similarity(target, ref).T, sim)
     for many, target in zip(similarities(ref, [target, ref]), (target, ref)):
         assert torch.equal(many, similarity(ref, target))
 
@@ -77,12 +80,12 @@ def test_descriptors_without_length_are_similar_to_nothing():
 @settings(max_examples=40)
 @given(sides, sides, sides, sides, seeds)
 def test_cyclical_distances_follow_equation_2(h1, w1, h2, w2, seed):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     sim = rng.normal(size=(h1 * w1, h2 * w2))
     fg1, fg2 = rng.random((h1, w1)) < 0.7, rng.random((h2, w2)) < 0.7
     expected = cycles_by_loops(sim, (h1, w1), (h2, w2), fg1, fg2)
     cyclical = cyclical_distances(sim, (h1, w1), (h2, w2), fg1, fg2)
-    np.testing.assert_allclose(cyclical.numpy(), expected, rtol=1e-6)
+    assert_allclose(cyclical.numpy(), expected, rtol=1e-6)
 
 
 def test_matches_are_cycles_with_their_similarity_and_distance():
@@ -111,7 +114,7 @@ def test_without_binning_bare_keys_are_matched_and_clustered():
         match(ref, target, k=20, binning=binning, sim=some).reference
         for binning, some in ((False, sim), (True, sim), (False, None))
     )
-    np.testing.assert_array_equal(computed, bare)
+    assert_array_equal(computed, bare)
     assert not np.array_equal(bare, binned)
 
 
@@ -120,9 +123,7 @@ def test_without_kmeans_the_k_best_cycles_are_taken_ties_by_similarity():
     everything = match(ref, target, k=81, kmeans=False)
     keys = list(zip(everything.distance, -everything.similarity))
     assert keys == sorted(keys)
-    np.testing.assert_array_equal(
-        match(ref, target, k=7, kmeans=False).reference, everything.reference[:7]
-    )
+    assert_array_equal(match(ref, target, k=7, kmeans=False).reference, everything.reference[:7])
 
 
 def test_kmeans_keeps_the_most_salient_patch_of_each_group_of_like_patches():
@@ -136,8 +137,8 @@ def test_kmeans_keeps_the_most_salient_patch_of_each_group_of_like_patches():
     six = saliency > 0.2
     matches = match(features, features, k=3, ref_foreground=six, target_foreground=six)
     assert sorted(matches.reference.tolist()) == [[4, 4], [13, 0], [22, 5]]
-    np.testing.assert_array_equal(matches.target, matches.reference)
-    np.testing.assert_array_equal(matches.distance, 0)
+    assert_array_equal(matches.target, matches.reference)
+    assert_array_equal(matches.distance, 0)
 
 
 @pytest.mark.parametrize("kmeans", [True, False])
@@ -164,9 +165,9 @@ def test_cycles_from_the_target_are_the_published_cycles_of_the_swapped_pair():
     ends = (target.grid, ref.grid, on_target.numpy(), on_ref.numpy())
     cycles = cycles_by_loops(sim.T.numpy(), *ends, published=True)
     assert len(matches) == np.isfinite(cycles).sum() > 0
-    np.testing.assert_allclose(-matches.distance, cycles[tuple(matches.target.T)])
+    assert_allclose(-matches.distance, cycles[tuple(matches.target.T)])
     forth = sim.argmax(0).numpy()
-    np.testing.assert_array_equal(matches.reference @ (9, 1), forth[matches.target @ (10, 1)])
+    assert_array_equal(matches.reference @ (9, 1), forth[matches.target @ (10, 1)])
 
 
 def test_clusters_are_computed_by_one_thread(monkeypatch):
@@ -179,5 +180,5 @@ def test_clusters_are_computed_by_one_thread(monkeypatch):
 
     threads = set()
     monkeypatch.setattr(matching, "KMeans", Observed)
-    matching._cluster(np.eye(8), 4, np.random.default_rng(0))
+    matching._cluster(np.eye(8), 4, default_rng(0))
     assert threads == {1}

@@ -3,7 +3,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 import torch
-from co3d_folders import edit_json, sequence_data
+from co3d_folders import edit_json, sequence_data, write_category, write_identities
 from refusals import refused
 
 from zsp_lite.data.co3d import Co3D, Pair, write_co3d
@@ -24,13 +24,11 @@ NAMES = ["s3", "s1", "s2"]
 def dataset(tmp_path_factory):
     root = tmp_path_factory.mktemp("data")
     for category in ("chair", "lamp"):
-        write_co3d(
-            root, category, [sequence_data(name, frames=12) for name in [*NAMES, "unlabelled"]]
-        )
+        write_category(root, category, [*NAMES, "unlabelled"], frames=12)
         for name in NAMES:
             write_label(root, category, PoseLabel(np.eye(4), name, "s1"))
     # Frame numbers are not positions: the list is shuffled, and numbers start at 100.
-    path = root / "chair" / "frame_annotations.jgz"
+    path = root / "chair/frame_annotations.jgz"
 
     def shuffle(frames):
         for frame in frames:
@@ -85,17 +83,13 @@ def test_all_pairs_are_different_and_too_large_a_number_gives_all_there_are(tmp_
     write_co3d(
         tmp_path, "chair", [sequence_data(name, frames=length) for name, length in lengths.items()]
     )
-    for name in lengths:
-        write_label(tmp_path, "chair", PoseLabel(np.eye(4), name, "a"))
+    write_identities(tmp_path, "chair", [*lengths])
     total = 62  # both directions of every two sequences: 2 * (2 * 3 + 2 * 5 + 3 * 5)
     every = sample_pairs(Co3D(tmp_path), "chair", total, 2)
-    assert len({pair.key for pair in every}) == total and {
-        pair.reference_sequence for pair in every[-4:]
-    } == {"c"}
-    assert (
-        all(sample_pairs(Co3D(tmp_path), "chair", n, 2) == every[:n] for n in range(total))
-        and not caplog.text
-    )
+    assert len({pair.key for pair in every}) == total
+    assert {pair.reference_sequence for pair in every[-4:]} == {"c"}
+    assert all(sample_pairs(Co3D(tmp_path), "chair", n, 2) == every[:n] for n in range(total))
+    assert not caplog.text
     assert sample_pairs(Co3D(tmp_path), "chair", 10**9, 2) == every
     assert "category chair has 62 different pairs of 2 targets, not 1000000000" in caplog.text
 
@@ -109,7 +103,7 @@ def test_missing_labels_and_frames_are_refused(dataset, tmp_path):
         1,
         13,
     )
-    write_co3d(tmp_path, "chair", [sequence_data("s1")])
+    write_category(tmp_path, "chair", ["s1"])
     refused("has 0 labelled sequences", lambda: sample_pairs(Co3D(tmp_path), "chair", 1, 1))
 
 
@@ -121,7 +115,7 @@ def test_a_pairs_seed_is_a_function_of_its_key():
 def test_pairs_are_read_back_from_the_published_format(dataset, tmp_path):
     pairs = sample_pairs(dataset, "chair", 10, 5)
     path = pairs_path(tmp_path, "chair", 10, 5)
-    assert path == tmp_path / "determ_eval" / "10samples_5tgt" / "chair.pt"
+    assert path == tmp_path / "determ_eval/10samples_5tgt/chair.pt"
     write_published_pairs(path, pairs, dataset)
     assert read_published_pairs(path, dataset) == pairs
     before = path.read_bytes()
@@ -142,7 +136,7 @@ def test_published_ids_are_positions_in_the_frame_list(dataset, tmp_path, form):
 
 
 def test_a_folders_own_pairs_are_found(tmp_path, caplog):
-    write_co3d(tmp_path, "chair", [sequence_data(name) for name in "ab"])
+    write_category(tmp_path, "chair", "ab")
     dataset = Co3D(tmp_path)
     assert shipped_pairs(dataset, "chair", 2) == []
     # the last is the first
@@ -151,19 +145,15 @@ def test_a_folders_own_pairs_are_found(tmp_path, caplog):
         write_published_pairs(pairs_path(tmp_path, "chair", n, 2), pairs[:n], dataset)
     assert shipped_pairs(dataset, "chair", 2) == pairs[:3]
     assert shipped_pairs(dataset, "chair", 2, at_least=4) == pairs[:4]
-    assert (
-        shipped_pairs(dataset, "chair", 2, at_least=5)
-        == pairs[:4]
-        == category_pairs(dataset, "chair", 5, 2)
-    )
+    assert shipped_pairs(dataset, "chair", 2, at_least=5) == pairs[:4]
+    assert category_pairs(dataset, "chair", 5, 2) == pairs[:4]
     assert "category chair: 4 of 5 stored pairs are different" in caplog.text
-    assert (
-        shipped_pairs(dataset, "chair", 2, at_least=6) == shipped_pairs(dataset, "chair", 1) == []
-    )
+    assert shipped_pairs(dataset, "chair", 2, at_least=6) == []
+    assert shipped_pairs(dataset, "chair", 1) == []
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes, message",
     [
         (
             {"reference_frame_id": 48},

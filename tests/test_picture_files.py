@@ -7,15 +7,16 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageOps
 from refusals import refused
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, look_at, render
 from test_importers import write_lists, write_nerfstudio
 from test_masks import DIRECTIONS, ball_on_floor, overlap
 
+from zsp_lite import InputError, estimate_pose, open_source
 from zsp_lite.data.cameras import camera_from_pose
 from zsp_lite.data.frames import encode_depth, write_mask
-from zsp_lite.errors import InputError
 from zsp_lite.importers import open_capture
 from zsp_lite.importers.convert import import_source
 from zsp_lite.importers.files import (
@@ -25,9 +26,8 @@ from zsp_lite.importers.files import (
     read_mask_file,
     read_picture,
 )
-from zsp_lite.importers.sources import open_pair, open_source
+from zsp_lite.importers.sources import open_pair
 from zsp_lite.metrics import rotation_error
-from zsp_lite.own_objects import estimate_pose
 
 DISC = np.hypot(*np.mgrid[-16:16, -20:20]) < 9  # the object, at (32, 40) pixels
 RING = (np.hypot(*np.mgrid[-16:16, -20:20]) < 11) & ~DISC
@@ -87,9 +87,7 @@ STORED = np.where(
 )
 
 
-@pytest.mark.parametrize(
-    "name", ["d.npy", "d.npz", "d.tiff", "d.pfm", "d.geometric.png", "16.png", "16.tiff"]
-)
+@pytest.mark.parametrize("name", "d.npy d.npz d.tiff d.pfm d.geometric.png 16.png 16.tiff".split())
 def test_every_kind_of_depth_file_is_read_with_zeros_where_it_is_unknown(tmp_path, name):
     path, values = tmp_path / name, STORED if "16" in name else FLOAT
     if path.suffix == ".npy":
@@ -99,9 +97,7 @@ def test_every_kind_of_depth_file_is_read_with_zeros_where_it_is_unknown(tmp_pat
     else:
         cv2.imwrite(str(path), encode_depth(values) if "geometric" in name else values)
     expected = np.where(COUNT < 4, 0, values)
-    np.testing.assert_allclose(
-        read_depth_file(path), expected, rtol=1e-3 if "geometric" in name else 0
-    )
+    assert_allclose(read_depth_file(path), expected, rtol=1e-3 if "geometric" in name else 0)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     refused("cannot be decoded .* expected a complete", read_depth_file, path)
 
@@ -183,12 +179,10 @@ def test_a_photograph_is_upright_with_its_depth_mask_and_camera_in_either_form(
                 lambda: open_source(path, given).load([0]),
             )
         (frame,) = open_source(path, given, orientation=form if ambiguous else None).load([0])
-        np.testing.assert_allclose(frame.depth, portrait.depth, atol=6e-4)
-        np.testing.assert_array_equal(frame.mask, portrait.mask)
-        np.testing.assert_allclose(
-            frame.camera.K, [[190, 0, 74], [0, 190, 99], [0, 0, 1]], atol=1.01
-        )
-        np.testing.assert_allclose(frame.camera.R, np.eye(3), atol=1e-12)
+        assert_allclose(frame.depth, portrait.depth, atol=6e-4)
+        assert_array_equal(frame.mask, portrait.mask)
+        assert_allclose(frame.camera.K, [[190, 0, 74], [0, 190, 99], [0, 0, 1]], atol=1.01)
+        assert_allclose(frame.camera.R, np.eye(3), atol=1e-12)
         assert np.abs(frame.rgb.astype(int) - portrait.rgb).mean() < 3
 
 
@@ -204,14 +198,12 @@ def test_a_capture_of_turned_photographs_keeps_its_world_and_refuses_mirrored_on
     y, x = np.argwhere(frame.mask > 0)[::97].T
     points = frame.camera.unproject(np.stack([x, y], -1) + 0.5, frame.depth[y, x])
     assert frame.depth.shape == (180, 140)
-    np.testing.assert_allclose(
-        views[0].camera.project(points)[0], np.stack([y, 139 - x], -1) + 0.5, atol=0.01
-    )
+    assert_allclose(views[0].camera.project(points)[0], np.stack([y, 139 - x], -1) + 0.5, atol=0.01)
     assert "0001.jpg is mirrored by its EXIF orientation 5" in line
 
 
 @pytest.mark.parametrize(
-    ("values", "message"),
+    "values, message",
     [
         ((600, 600, 320, 240), None),
         ((600, 600, 280, 260), None),
@@ -238,9 +230,7 @@ def test_a_capture_of_turned_photographs_keeps_its_world_and_refuses_mirrored_on
         ((9000, 0, 320, 0, 9000, 240, 0, 0, 1), "view of 4.07 degrees"),
     ],
 )
-def test_intrinsics_of_another_image_or_unit_are_questioned_with_the_corrected_numbers(
-    values, message
-):
+def test_intrinsics_of_another_image_or_unit_are_questioned_and_corrected(values, message):
     camera = camera_from_pose(np.eye(4), values, (480, 640), "a.jpg")
     if message and "view of" in message:
         refused(message, question_intrinsics, camera, "a.jpg")
@@ -270,8 +260,9 @@ def test_frames_without_a_mask_get_one_by_depth_and_are_named(tmp_path):
         )
     source = open_source(tmp_path)
     frames = source.load([0, 1])
-    assert source.mask == "given" and overlap(frames[0].mask, scenes[0][1]) > 0.95
-    np.testing.assert_array_equal(frames[1].mask, views[1].mask)
+    assert source.mask == "given"
+    assert overlap(frames[0].mask, scenes[0][1]) > 0.95
+    assert_array_equal(frames[1].mask, views[1].mask)
     missing, inverted = source.flags(source.load([0, 1, 3]))
     assert inverted.endswith(
         "the masks may be wrong: those of 1 of 3 frames cover most of the border: inverted?"
@@ -281,7 +272,8 @@ def test_frames_without_a_mask_get_one_by_depth_and_are_named(tmp_path):
     done = import_source(
         open_source(tmp_path, masks=tmp_path / "others"), tmp_path / "some", "ball", "one"
     )
-    assert done.frames == 4 and done.flags[0] == "no mask is given for 0.jpg: found by depth"
+    assert done.frames == 4
+    assert done.flags[0] == "no mask is given for 0.jpg: found by depth"
     assert done.flags[1].startswith(
         "the masks may be wrong: those of 1 of 4 frames cover most of the border"
     )
@@ -303,12 +295,10 @@ def test_depth_of_another_shape_is_refused_with_what_is_allowed(tmp_path, portra
 def test_the_pose_of_a_sideways_portrait_is_that_of_the_upright_one(tmp_path, portrait):
     """A later run leaves no file of an earlier one in its folder, and a single image is a
     helper."""
-    names, given, out, poses = (
-        ("upright.png", "sideways.jpg", "third.jpg"),
-        (190, 190, 70, 90),
-        tmp_path / "out",
-        [],
-    )
+    names = ("upright.png", "sideways.jpg", "third.jpg")
+    given = (190, 190, 70, 90)
+    out = tmp_path / "out"
+    poses = []
     images = [
         write_photograph(tmp_path / name, portrait, 6 if name == "sideways.jpg" else 1)
         for name in names
@@ -324,7 +314,8 @@ def test_the_pose_of_a_sideways_portrait_is_that_of_the_upright_one(tmp_path, po
             "number of target views: 4, all that there are, not 9" in flag
             for flag in found.estimate.flags
         )
-    assert rotation_error(poses[0], poses[1]) < 3 and rotation_error(poses[0], poses[2]) < 15
+    assert rotation_error(poses[0], poses[1]) < 3
+    assert rotation_error(poses[0], poses[2]) < 15
     assert {path.name for path in out.iterdir()} == {
         "report.html",
         "target.ply",
@@ -334,7 +325,7 @@ def test_the_pose_of_a_sideways_portrait_is_that_of_the_upright_one(tmp_path, po
     assert [one.load([0])[0].camera.K[0, 0] for one in pair] == [190, 190, 200]
 
 
-def test_a_link_to_a_sequence_is_one_and_the_root_of_the_disk_is_no_folder_for_results(
+def test_a_link_to_a_sequence_is_one_and_the_disks_root_no_folder_for_results(
     links, tmp_path, ellipsoids
 ):
     (tmp_path / "mine").symlink_to(ellipsoids.root / "ellipsoid/a")

@@ -4,8 +4,9 @@ counts and intervals."""
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 
-from zsp_lite.data.cameras import Camera
+from zsp_lite import Camera
 from zsp_lite.verified.scene import Projection
 from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, PointTerms
 from zsp_lite.viz import plots, point_classes
@@ -17,7 +18,7 @@ CAMERA = Camera(np.eye(3), np.zeros(3), np.array([100.0, 100.0]), np.array([40.0
 
 def test_patches_are_marked_at_their_centres_in_pixels_x_y():
     centres = plots.patch_centres(np.array([[0, 0], [2, 3]]), (3, 4), (60, 80))
-    np.testing.assert_allclose(centres, [[10, 10], [70, 50]])
+    assert_allclose(centres, [[10, 10], [70, 50]])
     similar = np.zeros((3, 4))
     similar[2, 1] = 0.9
     maps, circles = {"this patch": None, "key": similar}, [(0, 0), (2, 1)]
@@ -47,13 +48,14 @@ def test_lines_join_the_centres_of_matched_patches_and_those_of_outliers_are_das
     ]
 
 
-def test_points_and_axes_are_drawn_at_their_projections_and_nothing_behind_the_camera():
+def test_points_and_axes_are_drawn_where_they_project_unless_behind_the_camera():
     _, (axis,) = plots.show_images([IMAGE])
     # With focal length 100 and principal point (40, 30), (0.1, 0, 1) is 10 pixels to the right of
     # the latter.
     plots.draw_points(axis, CAMERA, np.array([[0.1, 0, 1], [0, 0, 2], [0, 0, -1]]))
-    np.testing.assert_allclose(axis.collections[0].get_offsets(), [[40, 30], [50, 30]])
-    assert axis.get_xlim() == (0, 80) and axis.get_ylim() == (60, 0)
+    assert_allclose(axis.collections[0].get_offsets(), [[40, 30], [50, 30]])
+    assert axis.get_xlim() == (0, 80)
+    assert axis.get_ylim() == (60, 0)
     plots.draw_axes(
         axis, CAMERA, np.array([0, 0, 2]), np.array([[0.2, 0, 2], [0, 0.2, 2], [0, 0, -1]]), "xyz"
     )
@@ -65,10 +67,8 @@ def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects(
     # Points: on the surface, far behind it, far before it, outside the silhouette, over a hole in
     # the depth.
     behind, weight = torch.tensor([0.0, 1, -1, 0, 0]), torch.tensor([1.0, 1, 1, 0, 0])
-    off, pixels = (
-        torch.tensor([0.0, 0, 0, 0.4, 0]),
-        torch.tensor([[10.0, 5], [20, 5], [30, 5], [55, 5], [20, 20]]),
-    )
+    off = torch.tensor([0.0, 0, 0, 0.4, 0])
+    pixels = torch.tensor([[10.0, 5], [20, 5], [30, 5], [55, 5], [20, 20]])
     parts = (3 + behind, torch.full((5,), 3.0), weight, off, torch.arange(5), pixels)
     touch = weight * torch.exp(-(behind**2) / (2 * SURFACE_SIGMA**2))
     front = weight * (-(behind + SURFACE_SIGMA) / MAX_VIOLATION).clamp(0, 1)
@@ -83,6 +83,4 @@ def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects(
     )
     drawn = np.concatenate([collection.get_offsets() for collection in figure.axes[0].collections])
     # The point beyond the border (110) stands at it (80).
-    np.testing.assert_allclose(
-        sorted(map(tuple, drawn)), [(20, 10), (40, 10), (40, 40), (60, 10), (80, 10)]
-    )
+    assert_allclose(sorted(map(tuple, drawn)), [(20, 10), (40, 10), (40, 40), (60, 10), (80, 10)])

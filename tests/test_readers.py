@@ -6,6 +6,7 @@ import re
 import shutil
 import sys
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,10 +15,12 @@ import cv2
 import lzfse
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone
 from test_importers import (
+    HALF_PIXEL,
     edited,
     hairdryer_views,
     to_world,
@@ -26,12 +29,11 @@ from test_importers import (
     write_nerfstudio,
 )
 
-from zsp_lite.data.cameras import Camera
+from zsp_lite import Camera, estimate_pose, open_source
 from zsp_lite.data.frames import write_image, write_mask
 from zsp_lite.importers import open_capture, recognise
 from zsp_lite.importers.capture import find_masks, sharpest, trusted
-from zsp_lite.importers.sources import open_source, spread_views
-from zsp_lite.own_objects import estimate_pose
+from zsp_lite.importers.sources import spread_views
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 
@@ -92,11 +94,9 @@ def write_polycam(folder, frames):
     write_files(inside, frames, images="corrected_images/{}.jpg", masks="../masks/{}.png")
     write_confidence(inside / "confidence", frames)
     for k, frame in enumerate(frames):
-        pose, (fx, fy), (cx, cy) = (
-            to_world(frame) @ OPENGL,
-            frame.camera.focal_length,
-            frame.camera.principal_point,
-        )
+        pose = to_world(frame) @ OPENGL
+        (fx, fy) = frame.camera.focal_length
+        (cx, cy) = frame.camera.principal_point
         camera = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
         path = inside / f"corrected_cameras/{k:06d}.json"
         path.parent.mkdir(exist_ok=True)
@@ -168,7 +168,7 @@ def write_bop(folder, frames, objects=(5,)):
             "cam_t_m2c": (1000 * frame.camera.t).tolist(),
         }
         scene[k] = [pose | {"obj_id": number} for number in objects]
-        K = frame.camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        K = frame.camera.K - HALF_PIXEL
         cameras[k] = {"cam_K": K.ravel().tolist(), "depth_scale": 0.5}
     (folder / "scene_gt.json").write_text(json.dumps(scene))
     (folder / "scene_camera.json").write_text(json.dumps(cameras))
@@ -189,7 +189,7 @@ def write_scannet(folder, frames):
 
 def write_open3d(folder, frames):
     write_files(folder, frames, "color/{}.jpg")
-    K = frames[0].camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    K = frames[0].camera.K - HALF_PIXEL
     (folder / "intrinsic.json").write_text(json.dumps({"intrinsic_matrix": K.T.ravel().tolist()}))
     with open(folder / "trajectory.log", "w") as log:
         for k, frame in enumerate(frames):
@@ -220,9 +220,9 @@ def write(layout, folder, frames):
     """Write a scan; returns its path, and the options by which it is read."""
     folder.mkdir()
     (fx, fy), (cx, cy) = frames[0].camera.focal_length, frames[0].camera.principal_point
-    return WRITERS[layout](folder, frames), {
-        "intrinsics": (fx, fy, cx, cy)
-    } if layout == "tum" else {}
+    # The files of TUM say nothing of the camera.
+    options = {"intrinsics": (fx, fy, cx, cy)} if layout == "tum" else {}
+    return WRITERS[layout](folder, frames), options
 
 
 @pytest.mark.parametrize("layout", WRITERS)
@@ -231,18 +231,20 @@ def test_each_layout_is_recognised_and_gives_the_cameras_the_depth_and_the_masks
 ):
     path, options = write(layout, tmp_path / "scan", views)
     capture = open_capture(path, **options)
-    assert recognise(path)[0] == layout and not capture.left_out
+    assert recognise(path)[0] == layout
+    assert not capture.left_out
     assert open_source(path, **options).mask == "given"
     for one, view in zip(capture.frames, views, strict=True):
         frame, known = one.load(), view.depth > 0
-        np.testing.assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
-        np.testing.assert_allclose(frame.camera.K, view.camera.K, atol=1e-6)
-        np.testing.assert_allclose(frame.depth[known], view.depth[known], atol=6e-4)
-        np.testing.assert_array_equal(frame.mask > 0.5, view.mask > 0.5)
+        assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
+        assert_allclose(frame.camera.K, view.camera.K, atol=1e-6)
+        assert_allclose(frame.depth[known], view.depth[known], atol=6e-4)
+        assert_array_equal(frame.mask > 0.5, view.mask > 0.5)
         assert np.abs(frame.rgb.astype(int) - view.rgb).mean() < 8
 
 
-def each(change):
+def each(change: Callable[[dict], object]) -> Callable[[dict], list]:
+    """Return a change of all frames of transforms.json."""
     return lambda content: [change(frame) for frame in content["frames"]]
 
 
@@ -284,10 +286,10 @@ def test_relatives_of_nerfstudio_are_read(tmp_path, views, kind, links):
     capture = open_capture(RELATIVES[kind](tmp_path / "scan"))
     for one, view in zip(capture.frames, views, strict=True):
         frame = one.load()
-        np.testing.assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
+        assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
         # 0.6 pixels off the middle
-        np.testing.assert_allclose(frame.camera.K, view.camera.K, rtol=0.02)
-        np.testing.assert_allclose(frame.depth[view.mask > 0], view.depth[view.mask > 0], atol=6e-4)
+        assert_allclose(frame.camera.K, view.camera.K, rtol=0.02)
+        assert_allclose(frame.depth[view.mask > 0], view.depth[view.mask > 0], atol=6e-4)
 
 
 def first(change):
@@ -295,7 +297,7 @@ def first(change):
 
 
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    "damage, message",
     [
         (
             first(lambda f: f["transform_matrix"][0].__setitem__(0, float("nan"))),
@@ -323,10 +325,8 @@ def test_a_frame_that_cannot_be_used_is_left_out_and_named(tmp_path, views, dama
     assert [one.image.name for one in capture.frames] == ["0001.jpg", "0002.jpg", "0003.jpg"]
     source = open_source(tmp_path)
     (flag,) = source.flags(source.load([0]))
-    assert (
-        all(re.search(message, line) for line in (*capture.left_out, flag))
-        and "frames left out: 1: " in flag
-    )
+    assert all(re.search(message, line) for line in (*capture.left_out, flag))
+    assert "frames left out: 1: " in flag
 
 
 def test_a_damaged_picture_is_left_out_and_named_unless_too_few_remain(tmp_path, views, run):
@@ -337,19 +337,12 @@ def test_a_damaged_picture_is_left_out_and_named_unless_too_few_remain(tmp_path,
     found = estimate_pose(*2 * [tmp_path / "scan"], "paper", backbone=CoordinateBackbone())
     assert len(found.targets) == 3
     assert sum("frames left out: 1: image" in flag for flag in found.estimates["paper"].flags) == 2
-    arguments = [
-        "data",
-        "import",
-        str(tmp_path / "scan"),
-        "--root",
-        str(tmp_path / "mine"),
-        "--category",
-        "teapot",
-    ]
-    text = run([*arguments, "--sequence", "one"])
-    assert "3 frames" in text and "flag: frames left out: 1: image" in text
+    line = f"data import {tmp_path}/scan --root {tmp_path}/mine --category teapot --sequence"
+    text = run(f"{line} one")
+    assert "3 frames" in text
+    assert "flag: frames left out: 1: image" in text
     images[1].write_bytes(b"")
-    assert "2 frames remain, expected 3: image" in run([*arguments, "--sequence", "two"], 2)
+    assert "2 frames remain, expected 3: image" in run(f"{line} two", 2)
 
 
 @pytest.mark.parametrize(
@@ -366,7 +359,7 @@ def test_a_path_that_leads_out_of_the_capture_is_refused(tmp_path, views, path):
 
 
 def test_masks_belong_to_images_by_relative_path_then_name_then_stem(tmp_path):
-    for name in ("a/1.png", "2.jpg.png", "2.png", "3.png", "4.png"):
+    for name in "a/1.png 2.jpg.png 2.png 3.png 4.png".split():
         write_mask(tmp_path / name, np.ones((4, 4), np.float32))
     names = ("a/1.jpg", "b/1.jpg", "a/2.jpg", "a/3.jpg", "a/4.jpg", "b/4.jpg")
     found = find_masks(tmp_path, [Path("scan/images", name) for name in names])
@@ -380,9 +373,7 @@ def test_masks_belong_to_images_by_relative_path_then_name_then_stem(tmp_path):
     ]
 
 
-def test_lists_have_names_with_signs_a_camera_for_each_image_and_images_of_several_sizes(
-    tmp_path, views
-):
+def test_lists_have_names_with_signs_cameras_for_each_image_and_several_sizes(tmp_path, views):
     upright = replace(
         views[1],
         rgb=views[1].rgb[:, :64],
@@ -408,11 +399,12 @@ def test_options_of_formats(tmp_path, views):
         "has the objects 3, 5, expected one of them as --object N", open_source, tmp_path / "bop"
     )
     source = open_source(tmp_path / "bop", object=5, depth_unit=0.01)
-    assert source.mask == "given" and source.load([0])[0].depth.max() > 15 * views[0].depth.max()
+    assert source.mask == "given"
+    assert source.load([0])[0].depth.max() > 15 * views[0].depth.max()
 
 
 @pytest.mark.parametrize(
-    ("files", "message"),
+    "files, message",
     [
         (
             ["sparse/0/images.bin"],
@@ -445,7 +437,7 @@ def zipped(path, name="rgb.txt", data=b"", flag=0):
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    "make, message",
     [
         (lambda path: path.write_bytes(b"PK\3\4" + bytes(99)), "File is not a zip file"),
         (lambda path: zipped(path, "../../climbs"), "path ../../climbs leads out of"),
@@ -464,7 +456,8 @@ def test_the_sharpest_frames_of_a_video_and_of_images_are_chosen(tmp_path, views
     read = []
     blank = np.zeros((8, 8), np.uint8)
     chosen = list(sharpest(range(2000), 100, lambda k: read.append(k) or blank, []))
-    assert len(chosen) == 100 and len(read) <= 1000
+    assert len(chosen) == 100
+    assert len(read) <= 1000
     blurred = [
         replace(views[0], rgb=cv2.GaussianBlur(views[0].rgb, (15, 15), 3), name=f"{k:04d}")
         for k in range(9)
@@ -500,12 +493,14 @@ def test_depth_of_middle_confidence_is_dropped_in_thin_bands_only():
     wrong = np.abs(smeared - true) > 0.01
     levels = np.where(wrong, 1, 2).astype(np.uint8)
     kept = trusted(levels)
-    assert wrong.mean() > 0.01 and not (kept & wrong).any() and kept[~wrong].all()
+    assert wrong.mean() > 0.01
+    assert not (kept & wrong).any()
+    assert kept[~wrong].all()
     # A dark surface is all of the middle level, and is kept; level 0 never is. The levels of
     # Polycam reach 255.
     dark = np.where(disc & ~wrong, 1, levels).astype(np.uint8)
     assert trusted(dark)[disc & ~wrong].mean() > 0.95
-    np.testing.assert_array_equal(trusted(dark * np.uint8(127) + (dark == 2)), trusted(dark))
+    assert_array_equal(trusted(dark * np.uint8(127) + (dark == 2)), trusted(dark))
     dark[:20] = 0
     assert not trusted(dark)[:20].any()
 
@@ -515,7 +510,8 @@ def test_a_confidence_map_has_the_size_of_the_depth(tmp_path, views):
     levels = np.repeat([[0], [2]], 48, axis=0).repeat(128, axis=1).astype(np.uint8)
     cv2.imwrite(str(path / "confidence/000001.png"), levels)
     depth = open_capture(path).frames[1].load().depth
-    assert not depth[:48].any() and (depth[48:] > 0).any()
+    assert not depth[:48].any()
+    assert (depth[48:] > 0).any()
     cv2.imwrite(str(path / "confidence/000001.png"), levels[::2])
     (line,) = open_capture(path).left_out
     assert "000001.png is (48, 128) pixels, expected (H, W) = (96, 128)" in line
@@ -535,9 +531,11 @@ def test_views_are_spread_evenly_whatever_their_order(count):
     degrees = np.arange(0, 360, 10.0)
     chosen = np.sort(degrees[spread_views(circle(degrees), count)])
     gaps = np.diff(chosen, append=chosen[0] + 360)
-    assert len(chosen) == count and chosen[0] == 0 and np.abs(gaps - 360 / count).max() <= 15
+    assert len(chosen) == count
+    assert chosen[0] == 0
+    assert np.abs(gaps - 360 / count).max() <= 15
     shuffled = np.array([0, *np.random.default_rng(0).permutation(degrees[1:])])
-    np.testing.assert_array_equal(np.sort(shuffled[spread_views(circle(shuffled), count)]), chosen)
+    assert_array_equal(np.sort(shuffled[spread_views(circle(shuffled), count)]), chosen)
 
 
 def test_an_object_that_is_twice_in_an_image_of_bop_leaves_it_out(tmp_path, views):

@@ -6,13 +6,12 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, true_pose
 
-from zsp_lite.cli import main as cli
+from zsp_lite import FeatureMap, estimate_pose
 from zsp_lite.data.frames import turn_frame
-from zsp_lite.features import FeatureMap
 from zsp_lite.metrics import rotation_error
-from zsp_lite.own_objects import estimate_pose
 
 
 class UprightBackbone(CoordinateBackbone):
@@ -29,10 +28,8 @@ class UprightBackbone(CoordinateBackbone):
         found = super().features(image)
         rows, columns = np.nonzero(image.any(axis=-1))
         height = image[rows, columns, 2].astype(float) - image[rows, columns, 2].mean()
-        down, right = (
-            (height * (rows - rows.mean())).sum(),
-            (height * (columns - columns.mean())).sum(),
-        )
+        down = (height * (rows - rows.mean())).sum()
+        right = (height * (columns - columns.mean())).sum()
         if down < 0 and -down > abs(right):
             return found
         noise = torch.from_numpy(np.random.default_rng(5).normal(size=found.keys.shape)).float()
@@ -47,16 +44,16 @@ def test_a_turned_frame_shows_every_world_point_with_the_same_colour_and_depth(f
     points = frame.camera.unproject(np.stack([column, row], -1) + 0.5, frame.depth[row, column])
     pixels, depth = turned_frame.camera.project(points)
     there = tuple(np.floor(pixels).astype(int).T[::-1])
-    np.testing.assert_allclose(pixels % 1, 0.5, atol=1e-6)
-    np.testing.assert_array_equal(turned_frame.rgb[there], frame.rgb[row, column])
-    np.testing.assert_array_equal(turned_frame.depth[there], frame.depth[row, column])
-    np.testing.assert_allclose(depth, frame.depth[row, column], rtol=1e-6)
+    assert_allclose(pixels % 1, 0.5, atol=1e-6)
+    assert_array_equal(turned_frame.rgb[there], frame.rgb[row, column])
+    assert_array_equal(turned_frame.depth[there], frame.depth[row, column])
+    assert_allclose(depth, frame.depth[row, column], rtol=1e-6)
     assert turned_frame.camera.size == turned_frame.rgb.shape[:2]
-    np.testing.assert_array_equal(turned_frame.rgb, np.rot90(frame.rgb, quarters))
+    assert_array_equal(turned_frame.rgb, np.rot90(frame.rgb, quarters))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("solver", "quarters"), [("paper", 1), ("paper", 2), ("verified", 3)])
+@pytest.mark.parametrize("solver, quarters", [("paper", 1), ("paper", 2), ("verified", 3)])
 def test_a_turned_reference_stands_up_and_the_pose_is_that_of_the_turned_image(
     frames, solver, quarters
 ):
@@ -70,9 +67,10 @@ def test_a_turned_reference_stands_up_and_the_pose_is_that_of_the_turned_image(
         f"the reference is turned by {360 - 90 * quarters}° counterclockwise: the pose is that of "
         "the turned image"
     )
-    assert rotation_error(one.sim3.R, truth.R) < 10 and flag in one.flags
-    np.testing.assert_array_equal(found.reference.rgb, frames[0].rgb)
-    np.testing.assert_allclose(found.reference.camera.matrix, frames[0].camera.matrix, atol=1e-9)
+    assert rotation_error(one.sim3.R, truth.R) < 10
+    assert flag in one.flags
+    assert_array_equal(found.reference.rgb, frames[0].rgb)
+    assert_allclose(found.reference.camera.matrix, frames[0].camera.matrix, atol=1e-9)
     lying = estimate_pose(rolled, frames[1:4], solver, backbone=backbone, references=1)
     # the features are noise
     assert solver == "verified" or rotation_error(lying.estimate.sim3.R, truth.R) > 20
@@ -88,17 +86,12 @@ def test_a_turn_that_gives_no_pose_is_passed_over(frames, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_command_tries_the_turns_on_demand(monkeypatch, ellipsoids, tmp_path):
+def test_the_command_tries_the_turns_on_demand(monkeypatch, ellipsoids, tmp_path, run):
     monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda choice: UprightBackbone())
     monkeypatch.setattr("zsp_lite.own_objects.write_pair", lambda *_: [])
-    words = [
-        "estimate",
-        *(str(ellipsoids.root / "ellipsoid" / name) for name in "ab"),
-        "--targets",
-        "2",
-    ]
-    words += ["--solver", "paper", "--out", str(tmp_path)]
-    for options, images in (([], 3), (["--not-upright"], 8)):
+    folder = ellipsoids.root / "ellipsoid"
+    line = f"estimate {folder}/a {folder}/b --targets 2 --solver paper --out {tmp_path}"
+    for option, images in (("", 3), ("--not-upright", 8)):
         UprightBackbone.images = 0
-        assert cli.main([*words, *options]) == 0
+        run(f"{line} {option}")
         assert UprightBackbone.images == images

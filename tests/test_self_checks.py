@@ -18,20 +18,31 @@ FILES = sorted(QUESTIONS.glob("*.json"))
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_every_question_has_right_and_wrong_answers_with_feedback_to_each(path):
-    checks = json.loads(path.read_text(encoding="utf-8"))
-    assert re.fullmatch(r"\d\d", path.stem) and [
-        2 <= len(questions) <= 4 for questions in checks
-    ] == [True, True]
-    for question in sum(checks, []):
-        kind, answers = question["type"], question["answers"]
+    for question in sum(json.loads(path.read_text("utf-8")), []):
+        answers = question["answers"]
         right = sum(answer.get("correct", False) for answer in answers)
-        assert 0 < right < len(answers) and (kind != "multiple_choice" or right == 1)
-        # for what no value and no range covers
-        assert (kind == "numeric") == (answers[-1].get("type") == "default")
-        assert all(
-            low < high for low, high in (answer["range"] for answer in answers if "range" in answer)
-        )
+        assert 0 < right < len(answers)
+        if question["type"] == "multiple_choice":
+            assert right == 1
         assert len({answer["feedback"] for answer in answers}) == len(answers)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_numeric_questions_have_ranges_and_an_answer_to_all_else(path):
+    for question in sum(json.loads(path.read_text("utf-8")), []):
+        answers = question["answers"]
+        has_default = answers[-1].get("type") == "default"
+        assert has_default == (question["type"] == "numeric")
+        for low, high in [answer["range"] for answer in answers if "range" in answer]:
+            assert low < high
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_notebook_has_two_checks_of_two_to_four_questions(path):
+    assert re.fullmatch(r"\d\d", path.stem)
+    first, second = json.loads(path.read_text("utf-8"))
+    assert 2 <= len(first) <= 4
+    assert 2 <= len(second) <= 4
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -43,7 +54,8 @@ def test_the_questions_are_in_the_output_itself(number):
     form, script = (output.data for output in captured.outputs)
     embedded = re.search(r"var questions\w+=(.*);\n", script["application/javascript"])[1]
     assert json.loads(embedded) == read_questions("00")[number - 1]
-    assert "fetch(" not in script["application/javascript"] and "http" not in form["text/html"]
+    assert "fetch(" not in script["application/javascript"]
+    assert "http" not in form["text/html"]
 
 
 def test_an_unknown_self_check_is_named():

@@ -22,7 +22,7 @@ def runs():
 
 
 def page(name: str) -> str:
-    return (REPOSITORY / name).read_text(encoding="utf-8").replace("−", "-")
+    return (REPOSITORY / name).read_text("utf-8").replace("−", "-")
 
 
 def numbers(text: str) -> list[float]:
@@ -74,10 +74,11 @@ def test_the_table_of_artist_made_models_has_the_figures(runs):
 
 def test_the_marked_tables_are_those_of_the_runs(runs, monkeypatch):
     monkeypatch.setattr(results_page, "read_run", lambda path: runs[path.name])
-    text = results_page.PAGE.read_text(encoding="utf-8")
+    text = results_page.PAGE.read_text("utf-8")
     assert results_page.updated(text) == text, "run python -m tools.results_page"
     old = re.sub(r"^\| Ours \(K=50\).*\n", "", text, flags=re.MULTILINE)
-    assert old != text and results_page.updated(old) == text
+    assert old != text
+    assert results_page.updated(old) == text
 
 
 def test_the_page_on_solvers_has_the_confidences(runs):

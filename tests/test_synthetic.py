@@ -8,9 +8,12 @@ import cv2
 import numpy as np
 import pytest
 from co3d_folders import contents
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from refusals import refused
 
 from tools.synthetic import SPLITS
+from zsp_lite import Co3D
 from zsp_lite.course.synthetic import export
 from zsp_lite.course.synthetic.assembly import make_shape
 from zsp_lite.course.synthetic.categories import CATEGORIES
@@ -27,7 +30,6 @@ from zsp_lite.course.synthetic.sequences import (
     soft_mask,
     stereo_depth,
 )
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.io.files import stable_hash
 
@@ -52,7 +54,7 @@ def chairs():
     def recorded(index):
         name, key = sequence_name(SEED, "chair", index), stable_hash(f"{SEED}/chair/{index}")
         mesh = make_object("chair", index, SEED)
-        views, _ = render_sequence(mesh, np.random.default_rng([key, 1]), FRAMES, SIZE)
+        views, _ = render_sequence(mesh, default_rng([key, 1]), FRAMES, SIZE)
         return *record_sequence(mesh, name, key, FRAMES, SIZE), views
 
     return [recorded(0), recorded(1)]
@@ -64,9 +66,11 @@ def test_objects_of_a_category_have_unit_size_vary_and_differ_from_their_half_tu
 ):
     shapes = [make_shape(ALL[category], seed) for seed in range(4)]
     for shape in shapes:
-        assert shape.faces.max() < len(shape.vertices) and np.isfinite(shape.vertices).all()
+        assert shape.faces.max() < len(shape.vertices)
+        assert np.isfinite(shape.vertices).all()
         assert surface_spread(shape.vertices, shape.faces) == pytest.approx(1)
-        assert 0 <= shape.material.min() and shape.material.max() < 8
+        assert 0 <= shape.material.min()
+        assert shape.material.max() < 8
     extents = np.array([np.ptp(shape.vertices, axis=0) for shape in shapes])
     assert (extents.std(0) / extents.mean(0)).max() > 0.02
     turned = shapes[3].vertices * [-1, -1, 1]
@@ -78,8 +82,9 @@ def test_objects_of_a_category_have_unit_size_vary_and_differ_from_their_half_tu
 def test_a_soft_mask_is_1_inside_0_outside_and_between_at_the_edge():
     truth = np.zeros((80, 80), bool)
     truth[20:60, 20:60] = True
-    mask = soft_mask(truth, np.random.default_rng(0))
-    assert mask[30:50, 30:50].min() > 0.99 and mask[:16].max() < 0.1
+    mask = soft_mask(truth, default_rng(0))
+    assert mask[30:50, 30:50].min() > 0.99
+    assert mask[:16].max() < 0.1
     assert ((mask > 0.1) & (mask < 0.9)).sum() > 100
 
 
@@ -97,19 +102,21 @@ def test_depth_has_holes_and_noise_and_masks_are_accurate_to_two_pixels(chairs):
                 1 - inside, cv2.DIST_L2, 5
             )
             wrong = (frame.mask > 0.5) != view.mask
-            assert 0 < wrong.sum() and to_edge[wrong].max() <= 2.5
+            assert 0 < wrong.sum()
+            assert to_edge[wrong].max() <= 2.5
     edge_on = replace(view, mask=np.zeros_like(view.mask))  # of a flat object
-    assert np.isfinite(stereo_depth(edge_on, 0.3, 0.2, np.random.default_rng(0))).all()
+    assert np.isfinite(stereo_depth(edge_on, 0.3, 0.2, default_rng(0))).all()
 
 
 def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):
     for data, pose, scale, views in chairs:
         assert data.points.std(0).mean() == pytest.approx(1)
-        np.testing.assert_allclose(np.linalg.norm(data.normals, axis=1), 1, atol=1e-4)
+        assert_allclose(np.linalg.norm(data.normals, axis=1), 1, atol=1e-4)
         R, t = pose[:3, :3], pose[:3, 3]
         canonical = (data.points - t) @ R / scale
         seen = np.concatenate([view.canonical[view.mask] for view in views])
-        assert (canonical > seen.min(0) - 0.3).all() and (canonical < seen.max(0) + 0.3).all()
+        assert (canonical > seen.min(0) - 0.3).all()
+        assert (canonical < seen.max(0) + 0.3).all()
         for frame, view in zip(
             data.frames, views, strict=True
         ):  # coordinates project onto their own pixels and depth
@@ -118,7 +125,7 @@ def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):
                 scale * view.canonical[row, col].astype(float) @ R.T + t
             )
             assert np.abs(pixels - np.stack([col + 0.5, row + 0.5], 1)).max() < 0.02
-            np.testing.assert_allclose(depth, scale * view.depth[row, col], rtol=1e-4)
+            assert_allclose(depth, scale * view.depth[row, col], rtol=1e-4)
 
 
 def test_an_export_reads_back(folder, chairs):
@@ -127,11 +134,9 @@ def test_an_export_reads_back(folder, chairs):
     assert len(dataset.select("toytruck")) == 2
     assert list(read_labels(folder, "chair")) == [data.name for data, *_ in chairs]
     for data, *_ in chairs:
-        np.testing.assert_allclose(
-            dataset.point_cloud("chair", data.name)[0], data.points, atol=1e-4
-        )
+        assert_allclose(dataset.point_cloud("chair", data.name)[0], data.points, atol=1e-4)
         for annotation, wanted in zip(dataset.frames("chair", data.name), data.frames, strict=True):
-            np.testing.assert_allclose(dataset.load(annotation).depth, wanted.depth, rtol=1e-3)
+            assert_allclose(dataset.load(annotation).depth, wanted.depth, rtol=1e-3)
 
 
 def test_an_interrupted_export_is_completed_and_complete_sequences_stay(tmp_path, monkeypatch):

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from small_backbones import small_vit
 
 from zsp_lite.course.synthetic.assembly import make_shape, random_materials
@@ -63,42 +65,44 @@ def test_a_number_stands_for_one_rendered_object(renders):
     for array, rows in zip(
         render_object(1), (renders.rgb, renders.surface, renders.geometry), strict=True
     ):
-        np.testing.assert_array_equal(array, rows[1])
+        assert_array_equal(array, rows[1])
 
 
 def test_surface_points_of_renders_are_coordinates_of_the_object(renders):
     inside = ~np.isnan(renders.surface[..., 0])
-    assert renders.rgb.shape == (3, VIEWS, SIZE, SIZE, 3) and inside.shape == (3, VIEWS, GRID, GRID)
+    assert renders.rgb.shape == (3, VIEWS, SIZE, SIZE, 3)
+    assert inside.shape == (3, VIEWS, GRID, GRID)
     assert 0.05 < inside.mean() < 0.9
     for number, points in enumerate(renders.surface):
-        shape, seen = (
-            make_shape(rendering.build_random_object, [number, 1]).vertices,
-            points[inside[number]],
-        )
-        assert (seen > shape.min(0) - 0.01).all() and (seen < shape.max(0) + 0.01).all()
+        shape = make_shape(rendering.build_random_object, [number, 1]).vertices
+        seen = points[inside[number]]
+        assert (seen > shape.min(0) - 0.01).all()
+        assert (seen < shape.max(0) + 0.01).all()
 
 
 def test_renders_hold_unit_normals_and_centred_depth_on_the_object(renders):
     inside = ~np.isnan(renders.surface[..., 0])
     normals = np.linalg.norm(renders.geometry[..., :3].astype(np.float64), axis=-1)
-    np.testing.assert_allclose(normals[inside], 1, atol=5e-3)
-    np.testing.assert_array_equal(renders.geometry[~inside], 0)
+    assert_allclose(normals[inside], 1, atol=5e-3)
+    assert_array_equal(renders.geometry[~inside], 0)
     # Visible surfaces face the camera, which looks along +z, up to the slant of the rays.
     assert np.mean(renders.geometry[..., 2][inside] < 0.2) > 0.99
     depth = renders.geometry[..., 3].astype(np.float64)
     for values, on in zip(
         depth.reshape(-1, GRID, GRID), inside.reshape(-1, GRID, GRID), strict=True
     ):
-        assert abs(values[on].mean()) < 0.01 and abs(values[on].std() - 1) < 0.01
+        assert abs(values[on].mean()) < 0.01
+        assert abs(values[on].std() - 1) < 0.01
 
 
 def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
     """A patch's surface point must be one that the uncropped view shows."""
     batch = sample_batch(
-        renders, np.random.default_rng(0), 3, VIEWS, 96, (0.4, 1.0), members=np.array([0, 1, 2])
+        renders, default_rng(0), 3, VIEWS, 96, (0.4, 1.0), members=np.array([0, 1, 2])
     )
     crops = 3 * VIEWS
-    assert batch.images.shape == (crops, 3, 96, 96) and batch.surface.shape == (crops, 144, 3)
+    assert batch.images.shape == (crops, 3, 96, 96)
+    assert batch.surface.shape == (crops, 144, 3)
     for crop in range(crops):
         points = batch.surface[crop][~batch.surface[crop, :, 0].isnan()].numpy()
         view = renders.surface[crop // VIEWS, crop % VIEWS].reshape(-1, 3).astype(np.float32)
@@ -110,10 +114,8 @@ def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
 
 
 def test_normals_turn_and_flip_with_the_crop(renders):
-    grid, turn = crop_grids(np.random.default_rng(3), 3 * VIEWS, VIEWS, 96, (0.5, 1.0))
-    batch = sample_batch(
-        renders, np.random.default_rng(3), 3, VIEWS, 96, (0.5, 1.0), members=np.arange(3)
-    )
+    grid, turn = crop_grids(default_rng(3), 3 * VIEWS, VIEWS, 96, (0.5, 1.0))
+    batch = sample_batch(renders, default_rng(3), 3, VIEWS, 96, (0.5, 1.0), members=np.arange(3))
     assert set(torch.linalg.det(turn).round().tolist()) == {-1.0, 1.0}
     for crop in range(3 * VIEWS):
         right, down = grid[crop, 4, 5] - grid[crop, 4, 4], grid[crop, 5, 4] - grid[crop, 4, 4]
@@ -160,25 +162,26 @@ def test_losses_of_crops_without_an_object_are_zero_not_nan():
         attention_loss(keys[:, None, :, 0], torch.zeros(8, 8)),
     ]
     for loss, share in found:
-        assert loss == 0 and share == 0
+        assert loss == 0
+        assert share == 0
         loss.backward()
     assert keys.grad.isfinite().all()
 
 
-def test_views_of_a_deformed_copy_show_points_of_the_original_and_differ_in_room_and_materials():
+def test_views_of_a_deformed_copy_show_the_originals_points_in_another_room():
     shape, factors, offset = make_shape(CATEGORIES["chair"], 3), [1.3, 0.8, 1.1], [0.4, 0, 0.2]
     copy = shape.vertices * factors + offset
     camera = rendering.framed_camera(copy, *orbit_pose(0.5, 0.4, 0, 7, np.zeros(3)), 96)
     meshes = (replace(shape, vertices=copy, materials=random_materials(seed)) for seed in (0, 1))
     one, two = (
-        rendering.render_instance(0, mesh, shape.vertices, camera, np.random.default_rng(seed))
+        rendering.render_instance(0, mesh, shape.vertices, camera, default_rng(seed))
         for seed, mesh in enumerate(meshes)
     )
     assert np.abs(one.rgb.astype(int) - two.rgb).mean() > 20
     for drawn in (one, two):
         row, col = np.nonzero(drawn.mask)
         seen = camera.unproject(np.stack([col + 0.5, row + 0.5], 1), drawn.depth[row, col])
-        assert drawn.canonical[row, col] * factors + offset == pytest.approx(seen, abs=2e-3)
+        assert_allclose(drawn.canonical[row, col] * factors + offset, seen, atol=2e-3)
 
 
 def test_attention_on_the_mask_is_worth_more_than_attention_off_it():
@@ -188,7 +191,8 @@ def test_attention_on_the_mask_is_worth_more_than_attention_off_it():
     logits[:, :, 5:10] = 0.0  # column 0 is the CLS token itself
     on, iou = attention_loss(logits, coverage)
     off, missed = attention_loss(-logits, coverage)
-    assert iou == 1 and missed == 0
+    assert iou == 1
+    assert missed == 0
     assert on < 0.6 < 5 < off
 
 
@@ -197,11 +201,11 @@ def test_a_few_steps_teach_a_network_where_the_object_is(renders):
     functions."""
     torch.manual_seed(0)
     model = Trainee(initial_backbone(renders, 24, 2, 2), 1)
-    batch = sample_batch(renders, np.random.default_rng(5), 2, VIEWS, 48, (0.8, 1.0))
+    batch = sample_batch(renders, default_rng(5), 2, VIEWS, 48, (0.8, 1.0))
     with torch.no_grad():
         total, figures = losses(model, batch, torch.Generator().manual_seed(0), helpers=0.5)
     expected = figures["match"] + 0.5 * (figures["geometry"] + figures["attention"])
-    assert float(total) == pytest.approx(expected, rel=1e-5)
+    assert_allclose(float(total), expected, rtol=1e-5)
     with torch.no_grad():
         attention, iou = attention_loss(model(batch.images).cls_logits, batch.coverage)
     assert (float(attention), iou) == pytest.approx((figures["attention"], figures["iou"]))
@@ -211,7 +215,8 @@ def test_a_few_steps_teach_a_network_where_the_object_is(renders):
         loss, last = losses(model, batch, torch.Generator().manual_seed(0), helpers=0.5)
         loss.backward()
         optimiser.step()
-    assert last["attention"] < 0.9 * figures["attention"] and last["loss"] < 0.9 * figures["loss"]
+    assert last["attention"] < 0.9 * figures["attention"]
+    assert last["loss"] < 0.9 * figures["loss"]
 
 
 # Self-distillation
@@ -225,7 +230,7 @@ TINY = DistillationConfig(
 def pictures() -> np.ndarray:
     """Eight objects, two views each, (8, 2, 48, 48, 3): stripes of each object's own colour and
     direction."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     y, x = np.mgrid[:48, :48]
     rgb = np.empty((8, 2, 48, 48, 3), np.uint8)
     for k in range(8):
@@ -237,12 +242,10 @@ def pictures() -> np.ndarray:
 
 
 def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_crop():
-    rng = np.random.default_rng(0)
-    student, teacher, centre = (
-        rng.normal(size=(4, 3, 5)),
-        rng.normal(size=(2, 3, 5)),
-        rng.normal(size=5),
-    )
+    rng = default_rng(0)
+    student = rng.normal(size=(4, 3, 5))
+    teacher = rng.normal(size=(2, 3, 5))
+    centre = rng.normal(size=5)
     terms, entropies = [], []
     for picture in range(3):
         for g in range(2):
@@ -255,7 +258,8 @@ def test_the_loss_is_the_cross_entropy_of_every_global_crop_with_every_other_cro
                     terms.append(-sum(p * np.log(q / q.sum())))
     arrays = (torch.from_numpy(x) for x in (student, teacher, centre))
     loss, figures = distillation_loss(*arrays, student_temperature=0.8, teacher_temperature=0.5)
-    assert len(terms) == 18 and float(loss) == pytest.approx(np.mean(terms))
+    assert len(terms) == 18
+    assert float(loss) == pytest.approx(np.mean(terms))
     assert figures["teacher_entropy"] == pytest.approx(np.mean(entropies))
     assert figures["kl"] == pytest.approx(np.mean(terms) - np.mean(entropies))
 

@@ -4,7 +4,8 @@ refuse other splits."""
 from dataclasses import astuple, replace
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from refusals import refused
 
 from tools import tuning
@@ -37,8 +38,8 @@ def sample_outcomes(n: int, rng: np.random.Generator) -> list[Outcome]:
 
 
 def test_the_weights_of_the_sampling_distribution_are_recovered():
-    fitted = fit_weights(sample_outcomes(1200, np.random.default_rng(0)), ridge=0)
-    np.testing.assert_allclose(astuple(fitted), astuple(TRUE_WEIGHTS), atol=1)
+    fitted = fit_weights(sample_outcomes(1200, default_rng(0)), ridge=0)
+    assert_allclose(astuple(fitted), astuple(TRUE_WEIGHTS), atol=1)
 
 
 def sample_ranked(n: int, true: Calibration, rng: np.random.Generator) -> list[Outcome]:
@@ -73,20 +74,20 @@ TRUE_CALIBRATION = Calibration(
 
 
 def test_the_coefficients_of_the_calibration_are_recovered():
-    outcomes = sample_ranked(6000, TRUE_CALIBRATION, np.random.default_rng(0))
+    outcomes = sample_ranked(6000, TRUE_CALIBRATION, default_rng(0))
     found = fit_calibration(outcomes, FIRST_TERMS, ridge=0)
     for name in ("scale", "none"):
         true, measured = (np.delete(getattr(one, name), 4) for one in (TRUE_CALIBRATION, found))
-        np.testing.assert_allclose(measured, true, atol=0.6)
+        assert_allclose(measured, true, atol=0.6)
         # of view_std
-        assert getattr(found, name)[4] == pytest.approx(getattr(TRUE_CALIBRATION, name)[4], abs=2)
-    assert found.unseen == pytest.approx(0.2, abs=0.1)
+        assert_allclose(getattr(found, name)[4], getattr(TRUE_CALIBRATION, name)[4], atol=2)
+    assert_allclose(found.unseen, 0.2, atol=0.1)
     right = [one for one in outcomes if one.errors.min() < 30]
     refused("all have a right pose or none has", fit_calibration, right, FIRST_TERMS)
 
 
 def test_no_fit_sees_the_category_it_is_evaluated_on():
-    outcomes = sample_outcomes(12, np.random.default_rng(4))
+    outcomes = sample_outcomes(12, default_rng(4))
     seen = leave_out(outcomes, lambda some: {one.category for one in some})
     assert all(
         one.category not in others and len(others) == 3 for one, others in zip(outcomes, seen)

@@ -5,6 +5,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from torch import nn
+from torch.testing import assert_close
 
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.choices import FACETS
@@ -63,7 +64,7 @@ def oracle(vit: VisionTransformer, images: torch.Tensor):
 @pytest.mark.parametrize("gradients", [False, True])
 def test_forward_equals_an_independent_transformer(model, images, gradients):
     with torch.set_grad_enabled(gradients):  # both implementations of attention
-        torch.testing.assert_close(model(images), oracle(model, images)[0], atol=2e-5, rtol=1e-4)
+        assert_close(model(images), oracle(model, images)[0], atol=2e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("facet", FACETS)
@@ -72,9 +73,9 @@ def test_extract_gives_the_facet_cls_attention_and_cls_output(model, images, lay
     with torch.no_grad():
         tokens = model.extract(images, layer, facet)
         output, facets, attentions = oracle(model, images)
-    torch.testing.assert_close(tokens.keys, facets[layer][facet][:, 1:], atol=2e-5, rtol=1e-4)
-    torch.testing.assert_close(tokens.attention, attentions[-1][:, :, 0, 1:], atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(tokens.cls, output[:, 0], atol=2e-5, rtol=1e-4)
+    assert_close(tokens.keys, facets[layer][facet][:, 1:], atol=2e-5, rtol=1e-4)
+    assert_close(tokens.attention, attentions[-1][:, :, 0, 1:], atol=1e-5, rtol=1e-4)
+    assert_close(tokens.cls, output[:, 0], atol=2e-5, rtol=1e-4)
     assert tokens.grid == (4, 4)
 
 
@@ -83,13 +84,13 @@ def test_training_forward_agrees_with_inference_and_reaches_every_weight(model, 
     training = model.forward_training(images, layer)
     with torch.no_grad():
         tokens, output = model.extract(images, layer), model(images)
-    torch.testing.assert_close(training.tokens, output, atol=2e-5, rtol=1e-4)
-    torch.testing.assert_close(training.keys, tokens.keys, atol=2e-5, rtol=1e-4)
+    assert_close(training.tokens, output, atol=2e-5, rtol=1e-4)
+    assert_close(training.keys, tokens.keys, atol=2e-5, rtol=1e-4)
     attention = training.cls_logits.softmax(-1)[:, :, 1:]
-    torch.testing.assert_close(attention, tokens.attention, atol=1e-5, rtol=1e-4)
+    assert_close(attention, tokens.attention, atol=1e-5, rtol=1e-4)
     weight, bias = (x.chunk(3)[1] for x in model.blocks[layer].attn.qkv.parameters())
     keys = F.linear(training.key_input, weight, bias)
-    torch.testing.assert_close(keys, training.keys, atol=2e-5, rtol=1e-4)
+    assert_close(keys, training.keys, atol=2e-5, rtol=1e-4)
     loss = training.tokens.square().sum() + training.keys.sum() + training.cls_logits.square().sum()
     gradients = torch.autograd.grad(loss, list(model.parameters()))
     assert all(bool(gradient.isfinite().all()) and bool(gradient.any()) for gradient in gradients)
@@ -118,12 +119,12 @@ def test_position_embedding_is_itself_on_its_own_grid_and_interpolated_on_others
     assert model.position_embedding((4, 4)) is model.pos_embed
     resized = model.position_embedding((3, 6))
     assert resized.shape == (1, 19, DIM)
-    torch.testing.assert_close(resized[:, 0], model.pos_embed[:, 0])
+    assert_close(resized[:, 0], model.pos_embed[:, 0])
     # DINO's own expression for an image of 24 x 48 pixels.
     stored = model.pos_embed[:, 1:].reshape(1, 4, 4, DIM).permute(0, 3, 1, 2)
     expected = F.interpolate(
         stored, scale_factor=((24 // 8 + 0.1) / 4, (48 // 8 + 0.1) / 4), mode="bicubic"
     )
-    torch.testing.assert_close(resized[:, 1:], expected.permute(0, 2, 3, 1).reshape(1, -1, DIM))
+    assert_close(resized[:, 1:], expected.permute(0, 2, 3, 1).reshape(1, -1, DIM))
     with torch.no_grad():
         assert model.extract(torch.zeros(1, 3, 24, 48), 0).grid == (3, 6)

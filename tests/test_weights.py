@@ -7,10 +7,10 @@ import pytest
 from safetensors import safe_open
 
 from tools.training_categories import TRAINING
-from zsp_lite.backbones.load import TINY, load_backbone
+from zsp_lite import Co3D, load_backbone
+from zsp_lite.backbones.load import TINY
 from zsp_lite.course.demo import demo_pairs
 from zsp_lite.course.samples import sample_data
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.views import object_crop, patch_mask
 
 

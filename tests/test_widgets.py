@@ -8,10 +8,11 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from refusals import refused
 
-from zsp_lite.alignment import Sim3, ransac, umeyama
-from zsp_lite.backbones.load import load_backbone
+from zsp_lite import Sim3, load_backbone
+from zsp_lite.alignment import ransac, umeyama
 from zsp_lite.course.true_matches import correct_matches
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.metrics import rotation_error
@@ -42,7 +43,8 @@ def values_of(control) -> list:
 def test_every_control_changes_the_picture_and_going_back_restores_it(name):
     widget = examples.WIDGETS[name]()
     before, caption = widget.picture.value, widget.caption.value
-    assert before[:4] == b"\x89PNG" and caption
+    assert before[:4] == b"\x89PNG"
+    assert caption
     for control in widget.controls.values():
         start = control.value
         for value in values_of(control):
@@ -56,9 +58,9 @@ def test_every_control_changes_the_picture_and_going_back_restores_it(name):
 
 def test_no_module_imports_ipywidgets_before_a_widget_is_made():
     for path in Path(common.__file__).parent.glob("*.py"):
-        assert not re.search(
-            "^(from|import) ipywidgets", path.read_text(encoding="utf-8"), re.MULTILINE
-        ), path.name
+        assert not re.search("^(from|import) ipywidgets", path.read_text("utf-8"), re.MULTILINE), (
+            path.name
+        )
 
 
 def test_without_ipywidgets_the_error_has_the_command_that_installs_it(monkeypatch):
@@ -74,11 +76,9 @@ def sim():
 def test_attention_names_the_patch_with_the_largest_weight():
     backbone, widget = load_backbone("zsp-tiny", "cpu"), examples.attention()
     facets = patches.all_facets(backbone, [examples.sample_pair().reference.rgb])
-    widget.controls["layer"].value, widget.controls["head"].value, widget.controls["row"].value = (
-        4,
-        2,
-        20,
-    )
+    widget.controls["layer"].value = 4
+    widget.controls["head"].value = 2
+    widget.controls["row"].value = 20
     heads, col = backbone.model.num_heads, widget.controls["col"].value
     q, k = (facets[4, name][0].unflatten(1, (heads, -1))[:, 2] for name in ("query", "key"))
     top = divmod(int((k @ q[1 + 20 * 28 + col])[1:].argmax()), 28)
@@ -91,11 +91,9 @@ def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim
     widget = patches.patch_similarities(
         pair.reference.rgb, pair.target.rgb, kinds, pair.cells, pair.valid, "other"
     )
-    widget.controls["kind"].value, widget.controls["row"].value, widget.controls["col"].value = (
-        "one",
-        15,
-        9,
-    )
+    widget.controls["kind"].value = "one"
+    widget.controls["row"].value = 15
+    widget.controls["col"].value = 9
     row, col = cells[15 * 28 + 9]
     assert (
         f"nearest neighbour ({row}, {col}), cosine {sim[15 * 28 + 9].max():.2f}"
@@ -105,7 +103,7 @@ def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim
     assert f"{right:.0%} have" in widget.caption.value
 
 
-def test_saliency_counts_the_patches_above_the_threshold_and_an_empty_box_has_no_mask():
+def test_saliency_counts_patches_above_the_threshold_and_an_empty_box_has_none():
     view, widget = examples.sample_views()[0], examples.saliency()
     widget.controls["threshold"].value = 0.5
     assert f"{int((view.features.saliency > 0.5).sum())} of 784 patches" in widget.caption.value
@@ -130,7 +128,7 @@ def test_the_cycle_has_the_cyclical_distance_and_names_the_background(sim):
 
 
 def test_the_caption_agrees_with_ransac():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     source = rng.normal(size=(40, 3))
     target = Sim3(1.3, TURN, np.ones(3)).apply(source) + 0.03 * rng.normal(size=(40, 3))
     target[:10] = 2 * rng.normal(size=(10, 3))
@@ -151,7 +149,7 @@ def test_the_caption_agrees_with_ransac():
 
 
 def test_the_caption_agrees_with_least_squares():
-    source = np.random.default_rng(2).normal(size=(9, 3))
+    source = default_rng(2).normal(size=(9, 3))
     widget = outliers.one_outlier(source, source)
     widget.controls["distance"].value = 3.0
     fit = umeyama(source, source + np.outer(np.arange(9) == 8, [3.0, 0, 0]))

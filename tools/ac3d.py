@@ -14,6 +14,9 @@ from PIL import Image
 
 from zsp_lite.errors import InputError
 
+Material = dict[str, list[float]]  # numbers by keyword
+Corners = list[tuple[int, float, float]]  # vertex, u, v
+
 
 @dataclass
 class Ac3dObject:
@@ -21,18 +24,16 @@ class Ac3dObject:
 
     vertices: np.ndarray  # (v, 3)
     texture: str | None  # its name
-    # Polygons: index of the material, (vertex, u, v) of corners
-    faces: list[tuple[int, list[tuple[int, float, float]]]]
+    faces: list[tuple[int, Corners]]  # polygons: index of the material, corners
 
 
-def read_ac3d(path: Path) -> tuple[list[dict[str, list[float]]], list[Ac3dObject]]:
-    """Return the materials (each a dict of numbers by keyword) and the objects of an AC3D file."""
-    lines = iter(
-        [line for line in path.read_bytes().decode("latin-1").splitlines() if line.strip()]
-    )
+def read_ac3d(path: Path) -> tuple[list[Material], list[Ac3dObject]]:
+    """Return the materials and the objects of an AC3D file."""
+    text = path.read_bytes().decode("latin-1")
+    lines = iter([line for line in text.splitlines() if line.strip()])
     if not next(lines, "").startswith("AC3D"):
         raise InputError(f"{path} does not begin with AC3D")
-    materials: list[dict[str, list[float]]] = []
+    materials: list[Material] = []
     objects: list[Ac3dObject] = []
     try:
         for line in lines:
@@ -51,62 +52,75 @@ def convert(path: Path, out: Path, texture_folders: Sequence[Path] = ()) -> None
     `texture_folders`."""
     materials, objects = read_ac3d(path)
     out.parent.mkdir(parents=True, exist_ok=True)
-    obj, used, start, corner = [f"mtllib {out.stem}.mtl"], {}, 1, 1
+
+    # Vertices, texture coordinates and faces. OBJ counts vertices and corners from 1 in the file.
+    obj = [f"mtllib {out.stem}.mtl"]
+    names = {}  # of the materials of the OBJ file, by material and texture of the model
+    vertex_start = 1
+    corner_start = 1
     for part in objects:
         obj += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in part.vertices.tolist()]
         for material, corners in part.faces:
-            name = used.setdefault((material, part.texture), f"m{len(used)}")
+            name = names.setdefault((material, part.texture), f"m{len(names)}")
             obj += [f"vt {u:.6f} {v:.6f}" for _, u, v in corners]
-            face = " ".join(
-                f"{start + vertex}/{corner + k}" for k, (vertex, _, _) in enumerate(corners)
-            )
-            obj += [f"usemtl {name}", f"f {face}"]
-            corner += len(corners)
-        start += len(part.vertices)
+            face = "f"
+            for corner, (vertex, _, _) in enumerate(corners, corner_start):
+                face += f" {vertex_start + vertex}/{corner}"
+            obj += [f"usemtl {name}", face]
+            corner_start += len(corners)
+        vertex_start += len(part.vertices)
+
+    # Materials, with white and a broad highlight where the model says nothing.
     mtl = []
-    for (index, texture), name in used.items():
-        given = materials[index]
-        numbers = {key: " ".join(map(str, given.get(key, [1, 1, 1]))) for key in ("rgb", "spec")}
+    for (index, texture), name in names.items():
+        material = materials[index]
+        diffuse = " ".join(map(str, material.get("rgb", [1, 1, 1])))
+        specular = " ".join(map(str, material.get("spec", [1, 1, 1])))
         mtl += [
             f"newmtl {name}",
-            f"Kd {numbers['rgb']}",
-            f"Ks {numbers['spec']}",
-            f"Ns {given.get('shi', [10])[0]}",
+            f"Kd {diffuse}",
+            f"Ks {specular}",
+            f"Ns {material.get('shi', [10])[0]}",
+            f"d {1 - material.get('trans', [0])[0]}",
         ]
-        mtl.append(f"d {1 - given.get('trans', [0])[0]}")
         if texture:
             mtl.append(f"map_Kd {_write_texture(texture, path, out.parent, texture_folders)}")
     out.with_suffix(".mtl").write_text("\n".join(mtl) + "\n")
     out.write_text("\n".join(obj) + "\n")
 
 
-def _material(words: list[str]) -> dict[str, list[float]]:
+def _material(words: list[str]) -> Material:
     """Return the numbers after each keyword of a MATERIAL line."""
-    found: dict[str, list[float]] = {}
+    material: Material = {}
     for word in words:
         if word.isalpha():
-            found[word] = numbers = []
+            keyword = word
+            material[keyword] = []
         else:
-            numbers.append(float(word))
-    return found
+            material[keyword].append(float(word))
+    return material
 
 
 def _read_object(
     lines: Iterator[str], rotation: np.ndarray, shift: np.ndarray, objects: list[Ac3dObject]
 ) -> None:
     """Read one object and its children, which move with it."""
-    turn, offset, vertices = np.eye(3), np.zeros(3), np.zeros((0, 3))
-    texture, repeat, displacement = None, (1, 1), (0, 0)
-    faces: list[tuple[int, list[tuple[int, float, float]]]] = []
+    turn = np.eye(3)
+    offset = np.zeros(3)
+    vertices = np.zeros((0, 3))
+    texture = None
+    repeat = (1, 1)
+    displacement = (0, 0)
+    faces: list[tuple[int, Corners]] = []
     for line in lines:
         words = shlex.split(line) if '"' in line else line.split()
-        keyword, rest = words[0], words[1:]
+        keyword, *rest = words
         if keyword == "loc":
             offset = np.array(rest, float)
         elif keyword == "rot":
             # rows of the file are the images of the axes
             turn = np.array(rest, float).reshape(3, 3).T
-        elif keyword == "data":
+        elif keyword == "data":  # so many characters of text, with the ends of lines
             left = int(rest[0])
             while left > 0:
                 left -= len(next(lines)) + 1
@@ -117,24 +131,12 @@ def _read_object(
         elif keyword == "texoff":
             displacement = float(rest[0]), float(rest[1])
         elif keyword == "numvert":
-            vertices = np.array(
-                [next(lines).split()[:3] for _ in range(int(rest[0]))], float
-            ).reshape(-1, 3)
+            rows = [next(lines).split()[:3] for _ in range(int(rest[0]))]
+            vertices = np.array(rows, float).reshape(-1, 3)
         elif keyword == "SURF":
-            is_polygon, material, corners = int(rest[0], 16) & 0xF == 0, 0, []
-            for line_ in lines:
-                key, *values = line_.split()
-                if key == "mat":
-                    material = int(values[0])
-                elif key == "refs":
-                    for _ in range(int(values[0])):
-                        vertex, u, v = next(lines).split()[:3]
-                        u, v = (
-                            float(u) * repeat[0] + displacement[0],
-                            float(v) * repeat[1] + displacement[1],
-                        )
-                        corners.append((int(vertex), u, v))
-                    break
+            # The low four bits are the kind of the surface: 0 is a polygon, others are lines.
+            is_polygon = int(rest[0], 16) & 0xF == 0
+            material, corners = _read_surface(lines, repeat, displacement)
             if is_polygon and len(corners) >= 3:
                 faces.append((material, corners))
         elif keyword == "kids":
@@ -151,6 +153,26 @@ def _read_object(
                 _read_object(lines, rotation, shift, objects)
             return
     raise ValueError("the file ends inside an object")
+
+
+def _read_surface(
+    lines: Iterator[str], repeat: tuple[float, float], displacement: tuple[float, float]
+) -> tuple[int, Corners]:
+    """Read the index of the material and the corners (vertex, u, v) of a surface."""
+    material = 0
+    corners = []
+    for line in lines:
+        keyword, *values = line.split()
+        if keyword == "mat":
+            material = int(values[0])
+        elif keyword == "refs":
+            for _ in range(int(values[0])):
+                vertex, u, v = next(lines).split()[:3]
+                u = float(u) * repeat[0] + displacement[0]
+                v = float(v) * repeat[1] + displacement[1]
+                corners.append((int(vertex), u, v))
+            break
+    return material, corners
 
 
 def _write_texture(texture: str, model: Path, out: Path, folders: Sequence[Path]) -> str:

@@ -11,7 +11,7 @@ calibration on categories left out.
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 from itertools import combinations, permutations, product
 
 import numpy as np
@@ -26,15 +26,18 @@ from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_angle
 from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.views import View
 
 
 def collect(
     data: Co3D, category: str, names: list[str], method: ZeroShotPose
 ) -> Iterator[PairHypotheses]:
     """Solve all pairs of objects of a category."""
-    view = lru_cache(None)(
-        lambda name, k: method.views([data.load(data.frame(category, name, k))])[0]
-    )
+
+    @cache
+    def view(name: str, number: int) -> View:
+        return method.views([data.load(data.frame(category, name, number))])[0]
+
     for pair in object_pairs(data, category, names, None, 5):
         reference = view(pair.reference_sequence, pair.reference_frame)
         targets = [view(pair.target_sequence, number) for number in pair.target_frames]
@@ -45,39 +48,36 @@ def collect(
 def examples(
     pairs: list[PairHypotheses], labels: dict[str, Float[np.ndarray, "3 3"]]
 ) -> list[tuple]:
-    """Return number of objects, share of pairs, margin, agreeing share; 0, 1 or 2: pose,
-    alternative, neither right."""
-    rng, rows = np.random.default_rng(0), []
-    for some, share in product(
-        (some for size in (3, 4, 5) for some in combinations(labels, size)), (1.0, 1 / 3)
-    ):
-        ends = rng.permutation(list(permutations(some, 2)))[
-            : round(share * len(some) * (len(some) - 1))
-        ].tolist()
+    """Return for each object of each set: number of objects, share of pairs, margin, agreeing
+    share, and 0, 1 or 2 if its pose, its alternative or neither is right."""
+    rng = np.random.default_rng(0)
+    rows = []
+    sets = [names for size in (3, 4, 5) for names in combinations(labels, size)]
+    for names, share in product(sets, (1.0, 1 / 3)):
+        ends = rng.permutation(list(permutations(names, 2)))
+        ends = ends[: round(share * len(ends))].tolist()
+        solved = [pair for pair in pairs if [pair.reference, pair.target] in ends]
         try:
-            objects = synchronise(
-                [pair for pair in pairs if [pair.reference, pair.target] in ends]
-            ).objects
+            objects = synchronise(solved).objects
         except InputError:  # they do not connect all objects
             continue
-        frames = np.stack([one.sim3.R @ labels[name] for name, one in objects.items()])
-        common = frames[
-            (rotation_angle(frames[:, None], frames) < module.SAME_ANGLE).sum(axis=1).argmax()
-        ]
-        for name, one in objects.items():
-            poses = (one.sim3, one.alternative or one.sim3)
-            right = [
-                rotation_angle(pose.R @ labels[name], common) < module.SAME_ANGLE for pose in poses
-            ]
-            odds = (
-                np.array([other := one.alternative_probability, 1 - one.probability - other])
-                / one.probability
-            )
-            terms = (np.log(odds + 1e-30) - (0, module.NONE)) / (
-                -module.MARGIN,
-                module.NONE_AGREEING,
-            )
-            rows.append((len(objects), share, *terms, [*right, True].index(True)))
+
+        # Rotations from the frame of the labels to that of the alignment, which should be one: the
+        # true one is that which most objects agree with.
+        frames = np.stack([pose.sim3.R @ labels[name] for name, pose in objects.items()])
+        agreeing = (rotation_angle(frames[:, None], frames) < module.SAME_ANGLE).sum(axis=1)
+        common = frames[agreeing.argmax()]
+        for name, pose in objects.items():
+            other = pose.alternative or pose.sim3
+            turns = rotation_angle(np.stack([pose.sim3.R, other.R]) @ labels[name], common)
+            right = [*(turns < module.SAME_ANGLE), True].index(True)
+            # The terms of the logit, from the probabilities that it gave with present constants.
+            other_probability = pose.alternative_probability
+            neither = 1 - pose.probability - other_probability
+            odds = np.array([other_probability, neither]) / pose.probability
+            margin, none = np.log(odds + 1e-30)
+            terms = (margin / -module.MARGIN, (none - module.NONE) / module.NONE_AGREEING)
+            rows.append((len(objects), share, *terms, right))
     return rows
 
 
@@ -86,43 +86,46 @@ def probabilities(
 ) -> Float[np.ndarray, "n 3"]:
     """Return the probabilities of pose, alternative and neither: a conditional logit."""
     margin, none, agreeing = coefficients
-    odds = np.exp(
-        np.stack([0 * terms[:, 0], -margin * terms[:, 0], none + agreeing * terms[:, 1]], axis=1)
-    )
+    scores = [0 * terms[:, 0], -margin * terms[:, 0], none + agreeing * terms[:, 1]]
+    odds = np.exp(np.stack(scores, axis=1))
     return odds / odds.sum(axis=1, keepdims=True)
 
 
 def fit(terms: Float[np.ndarray, "n 2"], right: Int[np.ndarray, " n"]) -> Float[np.ndarray, "3"]:
     """Fit the coefficients by maximum likelihood, with a ridge."""
     chosen = np.eye(3, dtype=bool)[right]
-    return minimize(
-        lambda x: 1e-3 * x @ x - np.log(probabilities(terms, x)[chosen]).mean(), (1.0, -1.0, -1.0)
-    ).x
+
+    def loss(x: np.ndarray) -> float:
+        return 1e-3 * x @ x - np.log(probabilities(terms, x)[chosen]).mean()
+
+    return minimize(loss, (1.0, -1.0, -1.0)).x
 
 
 def main(root: str) -> None:
     """Fit to the examples of all categories, and print."""
-    data, method, rows = Co3D(root), ZeroShotPose(load_backbone(), solver="verified"), []
+    data = Co3D(root)
+    method = ZeroShotPose(load_backbone(), solver="verified")
+    rows = []
     for k, category in enumerate(data.categories()):
-        labels = {
-            name: one.trans[:3, :3] for name, one in list(read_labels(root, category).items())[:5]
-        }
-        rows += [
-            (k, *row)
-            for row in examples(list(collect(data, category, list(labels), method)), labels)
-        ]
-    terms, right, p = (
-        (table := np.array(rows))[:, 3:5],
-        table[:, 5].astype(int),
-        np.empty(len(table)),
-    )
+        labels = {name: one.trans[:3, :3] for name, one in read_labels(root, category).items()}
+        labels = dict(list(labels.items())[:5])
+        pairs = list(collect(data, category, list(labels), method))
+        rows += [(k, *row) for row in examples(pairs, labels)]
+    table = np.array(rows)  # category, and the columns of `examples`
+    terms = table[:, 3:5]
+    right = table[:, 5].astype(int)
     print("MARGIN, NONE, NONE_AGREEING:", fit(terms, right))
-    for mine in (table[:, 0] == k for k in set(table[:, 0])):
+
+    # Calibration: the probability of each pose by a fit that has not seen its category.
+    p = np.empty(len(table))
+    for k in set(table[:, 0]):
+        mine = table[:, 0] == k
         p[mine] = probabilities(terms[mine], fit(terms[~mine], right[~mine]))[:, 0]
     for size, share in np.unique(table[:, 1:3], axis=0):
-        some = np.flatnonzero((table[:, 1:3] == (size, share)).all(axis=1))
-        quarters = np.array_split(some[np.argsort(p[some])], 4)
-        error = 100 * sum(abs((p[one] - (right[one] == 0)).sum()) for one in quarters) / len(some)
+        members = np.flatnonzero((table[:, 1:3] == (size, share)).all(axis=1))
+        quarters = np.array_split(members[np.argsort(p[members])], 4)
+        errors = [abs((p[part] - (right[part] == 0)).sum()) for part in quarters]
+        error = 100 * sum(errors) / len(members)
         print(f"{size:.0f} objects, {share:.2f} of the pairs: calibration error {error:.1f} points")
 
 

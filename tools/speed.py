@@ -41,35 +41,38 @@ def one_estimate() -> None:
     one."""
     dataset = Co3D(sample_data())
     ZeroShotPose(load_backbone(device="cpu")).estimate(*dataset.load_pair(example_pair(dataset)))
-    print(
-        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        * (1 if sys.platform == "darwin" else 1024)
-    )
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    print(peak if sys.platform == "darwin" else 1024 * peak)  # Linux counts in KiB
 
 
 def main() -> None:
+    """Measure and print everything."""
+
     def report(name: str, value: float, unit: str = "ms") -> None:
         print(f"{name:62} {value:9.4g} {unit}", flush=True)
 
     report("threads", torch.get_num_threads(), "")
-    tiny, dataset = load_backbone(device="cpu"), Co3D(sample_data())
+    dataset = Co3D(sample_data())
     pair = example_pair(dataset)
     reference, targets = dataset.load_pair(pair)
-    images, large = (
-        [one.rgb for one in (reference, *targets)],
-        Backbone(VisionTransformer(), "DINO", device="cpu"),
-    )
+    images = [frame.rgb for frame in (reference, *targets)]
+
+    # The networks.
+    tiny = load_backbone(device="cpu")
+    large = Backbone(VisionTransformer(), "DINO", device="cpu")
     report(
         "forward pass of DINO ViT-S/8 with random weights, six images",
         1000 * seconds(lambda: large(images)),
     )
     report(f"the same with {tiny.name}", 1000 * seconds(lambda: tiny(images)))
+
+    # The stages of an estimate; the first run is not counted.
     for solver in ("paper", "verified"):
         method = ZeroShotPose(tiny, solver=solver)
         runs = [method.estimate(reference, targets).timings for _ in range(REPEATS + 1)][1:]
         stages = {stage: 1000 * float(np.median([run[stage] for run in runs])) for stage in runs[0]}
-        for stage in stages:
-            report(f"{solver} solver: {stage}", stages[stage])
+        for stage, duration in stages.items():
+            report(f"{solver} solver: {stage}", duration)
         report(f"{solver} solver: all but features", sum(stages.values()) - stages["features"])
     frame = dataset.frame(pair.category, pair.target_sequence, pair.target_frames[0])
     report(
@@ -78,8 +81,10 @@ def main() -> None:
     )
 
     keys = [torch.randn(28, 28, 384, generator=torch.Generator().manual_seed(i)) for i in range(6)]
-    fast = seconds(lambda: similarities(keys[0], keys[1:]))
-    report("similarity of log-binned descriptors, 5 targets", 1000 * fast)
+    report(
+        "similarity of log-binned descriptors, 5 targets",
+        1000 * seconds(lambda: similarities(keys[0], keys[1:])),
+    )
 
     command = [sys.executable, "-c", "from tools.speed import one_estimate; one_estimate()"]
     peak = subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -24,7 +24,7 @@ import csv
 import os
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass, replace
@@ -39,7 +39,13 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.category import _build_nodes, compare_two, synchronise, world_hypotheses
+from zsp_lite.category import (
+    PairHypotheses,
+    _build_nodes,
+    compare_two,
+    synchronise,
+    world_hypotheses,
+)
 from zsp_lite.data.cameras import view_span
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
@@ -59,7 +65,8 @@ CONCEPTS = Path(__file__).with_name("concepts.csv")  # the side of every name of
 CORRECT_ANGLE = 30.0  # degrees
 # A hypothesis counts as correct to the degree exp(-(error / 12 degrees)^2); pairs without one above
 # 0.3 are not used.
-_SOFT_ANGLE, _MIN_CORRECTNESS = 12.0, 0.3
+_SOFT_ANGLE = 12.0
+_MIN_CORRECTNESS = 0.3
 _WEIGHT_RIDGE = 1e-2
 _CALIBRATION_RIDGE = 1e-3
 _SURE = 0.8  # confidences above this are reported by themselves
@@ -82,8 +89,12 @@ _SETTINGS = {
         ((100.0, 5), (360.0, 5)),
     ),
 }
-_FRAMES = 1, 2, 4, 8  # reference frames of each object
+_FRAMES = (1, 2, 4, 8)  # reference frames of each object
+_OBJECTS = 8  # of a category, in pairs of scans
 _Fit = TypeVar("_Fit")
+# Of the different poses of a pair, best first: by how many nats each is below the best, and its
+# error in degrees.
+Poses = tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +117,11 @@ class Outcome:
         """How correct each hypothesis is, in [0, 1]."""
         return np.exp(-np.square(self.errors / _SOFT_ANGLE))
 
-    def ranked(
-        self, weights: ScoreCoefficients
-    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """Return by how many nats each different pose is below the best under the weights, and its
-        error."""
+    def ranked(self, weights: ScoreCoefficients) -> Poses:
+        """Return the different poses under the weights."""
         scores = self.terms @ np.array(astuple(weights))
         order = np.argsort(-scores, kind="stable")
+        # `modes` names for each hypothesis the best one of the same pose: keep those themselves.
         different = order[modes(self.angles[np.ix_(order, order)]) == np.arange(len(order))]
         return scores[order[0]] - scores[different], self.errors[different]
 
@@ -128,14 +137,11 @@ def collect_outcomes(
 ) -> list[Outcome]:
     """Run the verified solver on `pairs` pairs of a category in each setting; features are
     extracted once per image."""
-    torch.set_num_threads(1)
-    dataset, backbone, outcomes = Co3D(root), load_backbone(device="cpu"), []
-    # folders may share names of categories
-    labels, name = (
-        read_labels(root, category),
-        f"{root.name}/{category}",
-    )
-    method = ZeroShotPose(backbone, solver="verified")
+    torch.set_num_threads(1)  # every category has a process
+    dataset = Co3D(root)
+    method = ZeroShotPose(load_backbone(device="cpu"), solver="verified")
+    labels = read_labels(root, category)
+    name = f"{root.name}/{category}"  # folders may share names of categories
     numbers: dict[str, list[int]] = {}
     for frame in dataset.frame_list(category):
         numbers.setdefault(frame.sequence_name, []).append(frame.frame_number)
@@ -144,27 +150,22 @@ def collect_outcomes(
     def view(sequence: str, number: int) -> View:
         return method.views([dataset.load(dataset.frame(category, sequence, number))])[0]
 
+    outcomes = []
     for n_targets, arc in settings:
-        setting = (
-            f"{n_targets} views all around"
-            if arc == ALL_AROUND
-            else f"views within {arc:.0f} degrees"
-        )
+        setting = f"{n_targets} views all around"
+        if arc < ALL_AROUND:
+            setting = f"views within {arc:.0f} degrees"
         for pair in sample_pairs(dataset, category, pairs, n_targets, seed):
-            targets = [view(pair.target_sequence, number) for number in pair.target_frames]
+            shown = pair.target_frames
             if arc < ALL_AROUND:
-                around = [
-                    view(pair.target_sequence, number)
-                    for number in sorted(numbers[pair.target_sequence])
-                ]
-                targets = views_within(around, arc, np.random.default_rng(pair.seed))
+                shown = sorted(numbers[pair.target_sequence])
+            targets = [view(pair.target_sequence, number) for number in shown]
+            if arc < ALL_AROUND:
+                targets = views_within(targets, arc, np.random.default_rng(pair.seed))
             reference = view(pair.reference_sequence, pair.reference_frame)
-            ends = labels[pair.reference_sequence], labels[pair.target_sequence]
-            outcomes.append(
-                solve_views(
-                    replace(method, seed=pair.seed), (name, setting), reference, targets, ends
-                )
-            )
+            ends = (labels[pair.reference_sequence], labels[pair.target_sequence])
+            seeded = replace(method, seed=pair.seed)
+            outcomes.append(solve_views(seeded, (name, setting), reference, targets, ends))
     return outcomes
 
 
@@ -176,12 +177,10 @@ class ScanOutcome:
     category: str
     setting: str
     frames: int
-    poses: tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]  # see `Outcome.ranked`
+    poses: Poses
     known: Float[np.ndarray, "5"]
 
-    def ranked(
-        self, weights: ScoreCoefficients | None
-    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    def ranked(self, weights: ScoreCoefficients | None) -> Poses:
         return self.poses
 
     def evidence(self, weights: ScoreCoefficients | None) -> Float[np.ndarray, "5"]:
@@ -193,62 +192,80 @@ def collect_scans(
 ) -> list[ScanOutcome]:
     """Find the poses between `pairs` pairs of objects of a category from several frames of both, in
     each setting."""
-    torch.set_num_threads(1)
-    dataset, labels, outcomes = Co3D(root), read_labels(root, category), []
+    torch.set_num_threads(1)  # every category has a process
+    dataset = Co3D(root)
     method = ZeroShotPose(load_backbone(device="cpu"), solver="verified")
-    view = cache(lambda name, k: method.views([dataset.load(dataset.frames(category, name)[k])])[0])
-    every = list(combinations(list(labels)[:8], 2))
-    chosen = np.random.default_rng(stable_hash(category) >> 1).permutation(len(every))[:pairs]
-    for ends, setting in product([every[k] for k in chosen], settings):
-        rng, frames, targets = np.random.default_rng(stable_hash(f"{ends}{setting}") >> 1), {}, {}
+    labels = read_labels(root, category)
+
+    @cache
+    def view(name: str, index: int) -> View:
+        return method.views([dataset.load(dataset.frames(category, name)[index])])[0]
+
+    every = list(combinations(list(labels)[:_OBJECTS], 2))
+    # A seed is 63 bits of a hash.
+    order = np.random.default_rng(stable_hash(category) >> 1).permutation(len(every))
+    outcomes = []
+    for ends, setting in product([every[k] for k in order[:pairs]], settings):
+        # The frames of each object within its arc, as references and as target views.
+        rng = np.random.default_rng(stable_hash(f"{ends}{setting}") >> 1)
+        references = {}
+        targets = {}
         for name, (arc, views) in zip(ends, setting):
             count = len(dataset.frames(category, name))
-            some = (
-                rng.integers(count) + np.arange(max(1, round(count * arc / ALL_AROUND)))
-            ) % count
-            frames[name] = [int(some[k]) for k in spread(_FRAMES[-1], len(some))]
-            targets[name] = [view(name, int(some[k])) for k in spread(views, len(some))]
-        found = []
+            length = max(1, round(count * arc / ALL_AROUND))
+            within = (rng.integers(count) + np.arange(length)) % count
+            references[name] = [int(within[k]) for k in spread(_FRAMES[-1], length)]
+            targets[name] = [view(name, int(within[k])) for k in spread(views, length)]
+
+        # Hypotheses of every reference frame, in both directions, with the rank of the frame.
+        ranked = []
         for first, second in (ends, ends[::-1]):
-            for rank, k in enumerate(frames[first]):
+            for rank, k in enumerate(references[first]):
                 with suppress(NoPoseError):
                     estimate = method.estimate_from_views(view(first, k), targets[second])
-                    found.append((rank, world_hypotheses(first, second, estimate)))
-        names = sorted(ends)
-        true = labels[names[1]].trans[:3, :3] @ labels[names[0]].trans[:3, :3].T
+                    ranked.append((rank, world_hypotheses(first, second, estimate)))
+
+        # The pose from fewer and fewer of the frames.
+        place = " and ".join(f"{views} views within {arc:.0f}°" for arc, views in setting)
         for count in _FRAMES:
-            some = [one for rank, one in found if rank % (_FRAMES[-1] // count) == 0]
-            objects = synchronise(some).objects
-            rotations = np.stack([objects[name].sim3.R for name in names])
-            sides = np.array(
-                [[names.index(one.reference), names.index(one.target)] for one in some]
-            )
-            spans = np.array([one.span for one in some])
-            margin, other, known = compare_two(_build_nodes(some, sides)[1], rotations, 1, spans)
-            poses = [rotations[1]] if other is None else [rotations[1], other]
-            errors = rotation_error(np.stack([one.T @ rotations[0] for one in poses]), true)
-            seen = " and ".join(f"{views} views within {arc:.0f}°" for arc, views in setting)
-            deficit = np.array([0.0, margin])[: len(poses)]
-            outcomes.append(
-                ScanOutcome(f"{root.name}/{category}", seen, count, (deficit, errors), known)
-            )
+            step = _FRAMES[-1] // count
+            chosen = [hypotheses for rank, hypotheses in ranked if rank % step == 0]
+            poses, known = pose_of_two(chosen, labels)
+            outcomes.append(ScanOutcome(f"{root.name}/{category}", place, count, poses, known))
     return outcomes
+
+
+def pose_of_two(
+    pairs: Sequence[PairHypotheses], labels: Mapping[str, PoseLabel]
+) -> tuple[Poses, Float[np.ndarray, "5"]]:
+    """Align two objects by the hypotheses of their frames; return `ScanOutcome.poses` and
+    `known`."""
+    objects = synchronise(pairs).objects
+    names = sorted(objects)
+    rotations = np.stack([objects[name].sim3.R for name in names])
+    ends = np.array([[names.index(pair.reference), names.index(pair.target)] for pair in pairs])
+    spans = np.array([pair.span for pair in pairs])
+    margin, other, known = compare_two(_build_nodes(pairs, ends)[1], rotations, 1, spans)
+    poses = [rotations[1]] if other is None else [rotations[1], other]
+    true = labels[names[1]].trans[:3, :3] @ labels[names[0]].trans[:3, :3].T
+    errors = rotation_error(np.stack([pose.T @ rotations[0] for pose in poses]), true)
+    deficit = np.array([0.0, margin])[: len(poses)]
+    return (deficit, errors), known
 
 
 def views_within(around: Sequence[View], arc: float, rng: np.random.Generator) -> list[View]:
     """Draw two to ten views from a random arc of the views that go once around an object, in their
     order."""
     points = [
-        one.frame.camera.to_world(one.measured_points[0][one.known_foreground]) for one in around
+        view.frame.camera.to_world(view.measured_points[0][view.known_foreground])
+        for view in around
     ]
     centre = np.median(np.concatenate(points), axis=0)
     first = int(rng.integers(len(around)))
     turned = [*around[first:], *around[:first]]
+    cameras = [view.frame.camera for view in turned]
     count = 1
-    while (
-        count < len(turned)
-        and view_span([one.frame.camera for one in turned[: count + 1]], centre) <= arc
-    ):
+    while count < len(turned) and view_span(cameras[: count + 1], centre) <= arc:
         count += 1
     wanted = min(int(rng.choice([2, 3, 5, 10])), count)
     return [turned[k] for k in np.linspace(0, count - 1, wanted).round().astype(int)]
@@ -299,23 +316,29 @@ def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> Sc
         InputError: No pair has a correct hypothesis among several.
     """
     used = [
-        one for one in outcomes if len(one.errors) > 1 and one.correctness.max() > _MIN_CORRECTNESS
+        outcome
+        for outcome in outcomes
+        if len(outcome.errors) > 1 and outcome.correctness.max() > _MIN_CORRECTNESS
     ]
     if not used:
         raise InputError(
             f"{len(outcomes)} pairs, none with a correct hypothesis among several, expected some"
         )
-    std = np.concatenate([one.terms - one.terms.mean(axis=0) for one in used]).std(axis=0) + 1e-9
+    centred = [outcome.terms - outcome.terms.mean(axis=0) for outcome in used]
+    std = np.concatenate(centred).std(axis=0) + 1e-9
+
     # One row per pair, padded to the longest list with hypotheses of probability 0.
-    shape = len(used), max(len(one.errors) for one in used)
+    shape = (len(used), max(len(outcome.errors) for outcome in used))
     x = torch.zeros(*shape, len(std), dtype=torch.float64)
     log_correctness = torch.full(shape, -torch.inf, dtype=torch.float64)
     padding = torch.full(shape, -torch.inf, dtype=torch.float64)
-    for row, one in enumerate(used):
-        number, columns = len(one.errors), one.terms / std
+    for row, outcome in enumerate(used):
+        number = len(outcome.errors)
+        columns = outcome.terms / std
         x[row, :number] = torch.from_numpy(columns - columns.mean(axis=0))
-        log_correctness[row, :number] = torch.from_numpy(np.log(one.correctness.clip(1e-12)))
+        log_correctness[row, :number] = torch.from_numpy(np.log(outcome.correctness.clip(1e-12)))
         padding[row, :number] = 0
+
     w = torch.zeros(x.shape[2], dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.LBFGS([w], max_iter=200, line_search_fn="strong_wolfe")
 
@@ -341,23 +364,29 @@ def fit_calibration(
     The `ridge` is on coefficients per standard deviation of the evidence. InputError if all
     estimates are right, or none is.
     """
-    ranked = [one.ranked(weights) for one in outcomes]
-    right = [np.flatnonzero(error < CORRECT_ANGLE) for _, error in ranked]
+    ranked = [outcome.ranked(weights) for outcome in outcomes]
+    right = [np.flatnonzero(errors < CORRECT_ANGLE) for _, errors in ranked]
     if min(map(len, right)) > 0 or max(map(len, right)) == 0:
         raise InputError(
             f"{len(outcomes)} pairs: all have a right pose or none has, expected both kinds"
         )
+
+    # Poses, a row per outcome, padded with a deficit whose probability is 0; the class behind the
+    # last is "none is right".
     most = max(len(deficit) for deficit, _ in ranked)
     deficits = torch.full((len(outcomes), most), 1e3, dtype=torch.float64)
     for row, (deficit, _) in zip(deficits, ranked):
         row[: len(deficit)] = torch.from_numpy(deficit)
-    target = torch.tensor([int(found[0]) if len(found) else most for found in right])
-    count = Counter(one.category for one in outcomes)
+    target = torch.tensor([int(indices[0]) if len(indices) else most for indices in right])
+    count = Counter(outcome.category for outcome in outcomes)
     importance = torch.tensor(
-        [1 / (count[one.category] * len(count)) for one in outcomes], dtype=torch.float64
+        [1 / (count[outcome.category] * len(count)) for outcome in outcomes], dtype=torch.float64
     )
-    known = np.array([one.evidence(weights) for one in outcomes])[:, 1:]
-    mean, std = known.mean(axis=0), known.std(axis=0) + 1e-9
+
+    # The evidence without its constant, standardised.
+    known = np.array([outcome.evidence(weights) for outcome in outcomes])[:, 1:]
+    mean = known.mean(axis=0)
+    std = known.std(axis=0) + 1e-9
     x = torch.from_numpy(np.column_stack([np.ones(len(known)), (known - mean) / std]))
     hidden = torch.from_numpy(hidden_share(known[:, 0]))
     theta = torch.zeros(2, x.shape[1], dtype=torch.float64, requires_grad=True)  # alpha and beta
@@ -378,36 +407,37 @@ def fit_calibration(
 
     with torch.enable_grad():
         optimiser.step(loss)
-    constant, slopes = theta.detach().numpy()[:, 0], theta.detach().numpy()[:, 1:] / std
-    scale, none = np.column_stack([constant - slopes @ mean, slopes]).tolist()
+    # Back from standardised evidence.
+    fitted = theta.detach().numpy()
+    slopes = fitted[:, 1:] / std
+    scale, none = np.column_stack([fitted[:, 0] - slopes @ mean, slopes]).tolist()
     return Calibration(tuple(scale), tuple(none), unseen.sigmoid().item())
 
 
 def leave_out(outcomes: Sequence[Outcome], fit: Callable[[Sequence[Outcome]], _Fit]) -> list[_Fit]:
     """Return for each outcome a fit that has not seen its category."""
-    categories = {one.category for one in outcomes}
-    fitted = {name: fit([one for one in outcomes if one.category != name]) for name in categories}
-    return [fitted[one.category] for one in outcomes]
+    fitted = {}
+    for category in {outcome.category for outcome in outcomes}:
+        fitted[category] = fit([one for one in outcomes if one.category != category])
+    return [fitted[outcome.category] for outcome in outcomes]
 
 
 def report_weights(outcomes: Sequence[Outcome], present: ScoreCoefficients) -> list[str]:
     """Format the fit of the weights and its accuracy on categories that the fit has not seen."""
-    fitted = fit_weights(outcomes)
+    lines = [f"{len(outcomes)} pairs of {len({one.category for one in outcomes})} categories"]
     held_out = leave_out(outcomes, fit_weights)
-    rows = (
-        ("present weights", [one.ranked(present)[1][0] for one in outcomes]),
-        (
-            "fitted weights, held-out category",
-            [one.ranked(w)[1][0] for one, w in zip(outcomes, held_out)],
-        ),
-        ("most accurate hypothesis", [one.errors.min() for one in outcomes]),
-    )
-    return [
-        f"{len(outcomes)} pairs of {len({one.category for one in outcomes})} categories",
-        *(f"{name:35s}{_accuracy(np.array(errors))}" for name, errors in rows),
-        "fitted weights: "
-        + ", ".join(f"{name} {value:.1f}" for name, value in asdict(fitted).items()),
-    ]
+    rows = {
+        "present weights": [one.ranked(present)[1][0] for one in outcomes],
+        "fitted weights, held-out category": [
+            one.ranked(weights)[1][0] for one, weights in zip(outcomes, held_out)
+        ],
+        "most accurate hypothesis": [one.errors.min() for one in outcomes],
+    }
+    for name, errors in rows.items():
+        lines.append(f"{name:35s}{_accuracy(np.array(errors))}")
+    weights = asdict(fit_weights(outcomes)).items()
+    lines.append(f"fitted weights: {', '.join(f'{name} {value:.1f}' for name, value in weights)}")
+    return lines
 
 
 def report_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) -> list[str]:
@@ -415,15 +445,17 @@ def report_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) 
     seen."""
     fitted = fit_calibration(outcomes, weights)
     held_out = leave_out(outcomes, lambda some: fit_calibration(some, weights))
-    first, others = [], []
-    for one, calibration in zip(outcomes, held_out):
-        deficit, error = one.ranked(weights)
-        pairs = list(
-            zip(calibration.probabilities(deficit, one.evidence(weights)), error < CORRECT_ANGLE)
-        )
-        first.append(pairs[0])
-        others += pairs[1:]
-    confidence, right = map(np.array, zip(*first))
+
+    # Probability and correctness of the best pose of each outcome, and of all other poses.
+    best = []
+    others = []
+    for outcome, calibration in zip(outcomes, held_out):
+        deficit, errors = outcome.ranked(weights)
+        probabilities = calibration.probabilities(deficit, outcome.evidence(weights))
+        first, *rest = zip(probabilities, errors < CORRECT_ANGLE)
+        best.append(first)
+        others += rest
+    confidence, right = map(np.array, zip(*best))
     lines = [
         f"{len(outcomes)} outcomes of {len({one.category for one in outcomes})} categories",
         f"scale: {_numbers(fitted.scale)}; none: {_numbers(fitted.none)}; unseen: "
@@ -431,13 +463,14 @@ def report_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) 
         "confidence, held-out category:",
         str(reliability(confidence, right, min(10, len(right)))),
     ]
+
+    # The same for each setting.
     settings = np.array([one.setting for one in outcomes])
     for setting in dict.fromkeys(settings.tolist()):
         chosen = settings == setting
         sure = chosen & (confidence > _SURE)
-        error = reliability(
-            confidence[chosen], right[chosen], min(5, int(chosen.sum()))
-        ).calibration_error
+        bins = min(5, int(chosen.sum()))
+        error = reliability(confidence[chosen], right[chosen], bins).calibration_error
         lines.append(
             f"  {setting}: {chosen.sum()} outcomes, mean confidence "
             f"{100 * confidence[chosen].mean():.0f} %, right "
@@ -476,7 +509,9 @@ def check_sides(folders: Iterable[str | Path], side: str) -> None:
         sides = {row["name"]: row["side"] for row in csv.DictReader(file)}
     for folder in folders:
         for category in Co3D(folder).categories():
-            if (found := sides.get(category.partition("-")[0], "no side")) != side:
+            # A concept is the part of a name before its hyphen.
+            found = sides.get(category.partition("-")[0], "no side")
+            if found != side:
                 raise InputError(f"{folder}: category {category} is for {found}, expected {side}")
 
 
@@ -489,20 +524,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("data", nargs="+", type=folder_and_pairs, metavar="FOLDER:PAIRS")
     given = parser.parse_args(arguments)
     fit = given.constants
+    side = "training" if fit == "weights" else "validation"
+    collect = collect_scans if fit == "scans" else collect_outcomes
+    report = report_weights if fit == "weights" else report_calibration
     try:
-        check_sides(
-            [folder for folder, _ in given.data], "training" if fit == "weights" else "validation"
-        )
+        check_sides([folder for folder, _ in given.data], side)
         jobs = [
             (root, category, pairs)
             for root, pairs in given.data
             for category in Co3D(root).categories()
         ]
         with ProcessPoolExecutor(os.cpu_count()) as pool:
-            collect = collect_scans if fit == "scans" else collect_outcomes
             parts = pool.map(collect, *zip(*jobs), [_SETTINGS[fit]] * len(jobs))
             outcomes = [one for part in tqdm(parts, "categories", len(jobs)) for one in part]
-        report = report_weights if fit == "weights" else report_calibration
         print("\n".join(report(outcomes, ScoreCoefficients())))
         if fit == "scans":
             by_frames = [

@@ -43,23 +43,25 @@ def sample_views() -> tuple[View, View]:
 
 def attention() -> Widget:
     """`patches.attention` on a sample object."""
-    image, backbone = sample_pair().reference.rgb, _backbone()
+    image = sample_pair().reference.rgb
+    backbone = _backbone()
     facets = patches.all_facets(backbone, [image])
-    queries, keys = (
-        torch.cat([facets[layer, facet] for layer in range(backbone.model.depth)])
-        for facet in ("query", "key")
-    )
+    layers = range(backbone.model.depth)
+    queries = torch.cat([facets[layer, "query"] for layer in layers])
+    keys = torch.cat([facets[layer, "key"] for layer in layers])
     return patches.attention(image, queries, keys, GRID, backbone.model.num_heads)
 
 
 def patch_similarities() -> Widget:
     """`patches.patch_similarities` on a sample pair: the keys of two layers, and those of the last
     with context."""
-    pair, (first, second) = sample_pair(), sample_views()
+    pair = sample_pair()
+    first, second = sample_views()
     tokens = patches.all_facets(_backbone(), [pair.reference.rgb, pair.target.rgb])
-    sims = {
-        f"layer {n}, key": similarity(*tokens[n, "key"][:, 1:].unflatten(1, GRID)) for n in (3, 11)
-    }
+    sims = {}
+    for layer in (3, 11):
+        keys = tokens[layer, "key"][:, 1:].unflatten(1, GRID)  # without CLS: (2, rows, cols, d)
+        sims[f"layer {layer}, key"] = similarity(*keys)
     sims["bare key"] = key_similarities(first.features.keys, [second.features.keys])[0]
     return patches.patch_similarities(
         pair.reference.rgb, pair.target.rgb, sims, pair.cells, pair.valid
@@ -73,16 +75,18 @@ def saliency() -> Widget:
 
 def cycle() -> Widget:
     """`cycles.cycle` on a sample pair."""
-    return cycles.cycle(*sample_views(), similarity(*(view.features for view in sample_views())))
+    reference, target = sample_views()
+    return cycles.cycle(reference, target, similarity(reference.features, target.features))
 
 
 def ransac_settings() -> Widget:
     """`outliers.ransac_settings` on a sample pair."""
-    pair = sample_views()
-    found = match(pair[0].features, pair[1].features)
-    images = tuple(view.frame.rgb for view in pair)
+    reference, target = sample_views()
+    matches = match(reference.features, target.features)
     return outliers.ransac_settings(
-        images, tuple(match_pixels(pair, found)), match_points(*pair, found)
+        (reference.frame.rgb, target.frame.rgb),
+        tuple(match_pixels(sample_views(), matches)),
+        match_points(reference, target, matches),
     )
 
 
@@ -96,7 +100,8 @@ def box_to_mask() -> Widget:
     """`mask_box.box_to_mask` on a sample frame."""
     dataset = Co3D(sample_data())
     category = dataset.categories()[0]
-    frame = dataset.load(dataset.frames(category, dataset.sequences(category)[0].sequence_name)[0])
+    sequence = dataset.sequences(category)[0].sequence_name
+    frame = dataset.load(dataset.frames(category, sequence)[0])
     return mask_box.box_to_mask(frame, mask_to_bbox(frame.mask))
 
 

@@ -18,9 +18,8 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.benchmark.baseline_rows import hypotheses
 from zsp_lite.benchmark.execution import Evaluate, evaluate_pairs, open_workers
-from zsp_lite.benchmark.identity import run_settings
 from zsp_lite.benchmark.problem import FrameStore, PairProblem
-from zsp_lite.benchmark.runs import open_run, read_lines
+from zsp_lite.benchmark.runs import open_run, read_lines, run_settings
 from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
@@ -118,7 +117,8 @@ def align_category(
     if not found:
         raise InputError(f"category {category}: none of {len(chosen)} pairs determines a pose")
     posed = {name for one in found for name in (one.reference, one.target)}
-    for name in sorted({pair.reference_sequence for pair in chosen.values()} - posed):
+    asked = {pair.reference_sequence for pair in chosen.values()}
+    for name in sorted(asked - posed):
         logger.warning("%s/%s is left out: none of its pairs determines a pose", category, name)
     return synchronise(found)
 
@@ -130,23 +130,30 @@ def alignment_errors(
     pair alone."""
     turns = {name: labels[name].trans[:3, :3] for name in found.objects if name in labels}
     true = {(a, b): turns[b] @ turns[a].T for a, b in permutations(turns, 2)}
-    together = [float(rotation_error(found.between(*pair).R, true[pair])) for pair in true]
-    alone = [((one.reference, one.target), one.sim3s[0].R) for one in found.pairs]
-    return together, [
-        float(rotation_error(rotation, true[pair])) for pair, rotation in alone if pair in true
-    ]
+    together = [float(rotation_error(found.between(*ends).R, true[ends])) for ends in true]
+    alone = []
+    for pair in found.pairs:
+        ends = pair.reference, pair.target
+        if ends in true:
+            alone.append(float(rotation_error(pair.sim3s[0].R, true[ends])))
+    return together, alone
 
 
 def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
     """Read the hypotheses that a run of `align_category` keeps, by the key of the pair of frames,
     for `synchronise`."""
     found = {}
-    for line in (line for line in read_lines(out, _Line) if line.matrices):
-        names = [part.rpartition(":")[0] for part in line.pair.split("/")[1:]]
-        sim3s = tuple(map(Sim3.from_matrix, np.array(line.matrices)))
-        found[line.pair] = PairHypotheses(
-            *names, sim3s, np.array(line.probabilities), np.array(line.centre), line.span
-        )
+    for line in read_lines(out, _Line):
+        if line.matrices:
+            pair = Pair.from_key(line.pair)
+            found[line.pair] = PairHypotheses(
+                pair.reference_sequence,
+                pair.target_sequence,
+                tuple(map(Sim3.from_matrix, np.array(line.matrices))),
+                np.array(line.probabilities),
+                np.array(line.centre),
+                line.span,
+            )
     return found
 
 
@@ -183,13 +190,12 @@ def write_labels(
     The first object is the reference. Without `replace`, InputError if one exists with other
     content.
     """
-    reference, folder = next(iter(found.objects)), Path(root) / kind / category
+    folder = Path(root) / kind / category
+    reference = next(iter(found.objects))
     centre = found.objects[reference].centre
-    labels = {
-        name: rigid_label(found.between(reference, name), centre, name, reference)
-        for name in found.objects
-    }
-    write_all(
-        {folder / f"{name}.json": label_bytes(label) for name, label in labels.items()}, replace
-    )
+    files = {}
+    for name in found.objects:
+        label = rigid_label(found.between(reference, name), centre, name, reference)
+        files[folder / f"{name}.json"] = label_bytes(label)
+    write_all(files, replace)
     return folder

@@ -153,13 +153,12 @@ def umeyama_batch(
     covariance, 0 for collinear points.
     """
     source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
-    centred_source, centred_target = source - source_mean[:, None], target - target_mean[:, None]
-    rotation, singular, sign = nearest_rotation(centred_target.swapaxes(1, 2) @ centred_source)
-    variance = np.square(centred_source).sum(axis=(1, 2))
-    scale = (singular[:, 0] + singular[:, 1] + sign * singular[:, 2]) / np.where(
-        variance > 0, variance, 1
-    )
-    scale = scale.clip(*scale_range)
+    centred = source - source_mean[:, None]
+    covariance = (target - target_mean[:, None]).swapaxes(1, 2) @ centred  # (b, 3, 3), times n
+    rotation, singular, sign = nearest_rotation(covariance)
+    variance = np.square(centred).sum(axis=(1, 2))  # times n, too
+    trace = singular[:, 0] + singular[:, 1] + sign * singular[:, 2]
+    scale = (trace / np.where(variance > 0, variance, 1)).clip(*scale_range)
     translation = target_mean - scale[:, None] * (rotation @ source_mean[:, :, None])[:, :, 0]
     conditioning = singular[:, 1] / np.where(singular[:, 0] > 0, singular[:, 0], 1)
     return scale, rotation, translation, conditioning
@@ -209,19 +208,18 @@ def ransac(
             f"ransac: scale_range is {scale_range}, expected (smallest, largest), both not negative"
         )
     source, target = _point_pairs(source, target, minimum=sample_size)
-    rng, block = np.random.default_rng(seed), max(_BLOCK // len(source), 1)
+    rng = np.random.default_rng(seed)
+    block = max(_BLOCK // len(source), 1)
     winner = None
     for first in range(0, trials, block):
         samples = _draw_samples(len(source), sample_size, min(block, trials - first), rng)
         found = _best_trial(source, target, samples, threshold, scale_range)
-        if found and (
-            winner is None or (-found[1].sum(), found[2]) < (-winner[1].sum(), winner[2])
-        ):
+        if found and (winner is None or found[0] < winner[0]):
             winner = found
     if winner is None:
         found = f"no usable sample in {trials} trials over {len(source)} points"
         raise InputError(f"ransac: {found}: all collinear, or scale outside {scale_range}")
-    sim3, chosen, _ = winner
+    _, sim3, chosen = winner
 
     if chosen.sum() >= 3:
         *fit, conditioning = umeyama_batch(source[None, chosen], target[None, chosen], scale_range)
@@ -236,13 +234,12 @@ def _best_trial(
     samples: Int[np.ndarray, "trials size"],
     threshold: float,
     scale_range: tuple[float, float],
-) -> tuple[Sim3, Bool[np.ndarray, " n"], float] | None:
-    """Return the fit to the best sample, its inliers and the sum of their residuals; None if no
-    sample is usable."""
+) -> tuple[tuple[int, float], Sim3, Bool[np.ndarray, " n"]] | None:
+    """Return the rank of the best sample, lower is better, its fit and inliers; None if no sample
+    is usable."""
     scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
-    usable = (
-        (conditioning > _COLLINEAR_SAMPLE) & (scale >= scale_range[0]) & (scale <= scale_range[1])
-    )
+    in_range = (scale >= scale_range[0]) & (scale <= scale_range[1])
+    usable = in_range & (conditioning > _COLLINEAR_SAMPLE)
     if not usable.any():
         return None
     scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
@@ -254,7 +251,9 @@ def _best_trial(
     leaders = np.flatnonzero(counts == counts.max())
     sums = np.where(inlier[leaders], residual[leaders], 0).sum(axis=1)
     best = leaders[sums.argmin()]
-    return Sim3(scale[best], rotation[best], translation[best]), inlier[best], float(sums.min())
+    # More inliers, then the smaller sum of their residuals.
+    rank = (-int(counts.max()), float(sums.min()))
+    return rank, Sim3(scale[best], rotation[best], translation[best]), inlier[best]
 
 
 def _draw_samples(

@@ -40,18 +40,30 @@ from zsp_lite.io.files import stable_hash
 from zsp_lite.metrics import rotation_angle
 from zsp_lite.verified.confidence import Calibration, hidden_share
 
-KAPPA, FLOOR = 16.0, 0.1  # \kappa, with which a hypothesis 20 degrees off counts 1/e, and \epsilon
-SAME_ANGLE = 30.0  # degrees; rotations further apart disagree
-ALL_PAIRS_BELOW, PAIRS_PER_OBJECT = 12, 6  # see `object_pairs`
-_REFERENCES, _REFERENCES_OF_ONE = 3, 16  # see `references_per_pair`
-_CHAINS = 48
-_TEMPERATURES = (*np.geomspace(1, 0.3, 12), *[0.0] * 4)  # of each sweep: at 0, coordinate ascent
-_PROPOSERS, _AVERAGING_SWEEPS, _REWEIGHTINGS = 8, 6, 10
+# \kappa of the objective: a hypothesis 20 degrees off counts 1/e of one that agrees.
+KAPPA = 16.0
+# \epsilon of the objective, where a sure hypothesis that agrees counts 1.
+FLOOR = 0.1
+SAME_ANGLE = 30.0  # degrees, as in Acc30; rotations further apart disagree
+# All pairs of a category are solved below this number of objects, since pairs grow as its square;
+# from it on, each object is the reference of a few.
+ALL_PAIRS_BELOW = 12
+PAIRS_PER_OBJECT = 6
+_REFERENCES = 3  # frames of the first object of a pair, at least
+_REFERENCES_OF_ONE = 16  # divided by the number of objects: two alone have eight
+_CHAINS = 48  # of the search; the best one is kept
+# Temperature of each sweep over all objects: a slow fall, then coordinate ascent.
+_TEMPERATURES = (*np.geomspace(1, 0.3, 12), 0.0, 0.0, 0.0, 0.0)
+_PROPOSERS = 8  # pairs of an object that propose rotations in a step, which bounds its time
+_AVERAGING_SWEEPS = 6  # over all objects
+_REWEIGHTINGS = 10  # of the least absolute deviations
 # Weight of hypotheses that disagree, so that every object gets a scale and a translation.
 _WEAK = 1e-3
 # Coefficients of `_judge`, fitted by tools/category_fit.py on validation categories to sets of
 # three to five objects.
-MARGIN, NONE, NONE_AGREEING = 1.57, -3.07, -2.37
+MARGIN = 1.57
+NONE = -3.07
+NONE_AGREEING = -2.37
 # Probabilities of two objects, whose evidence `compare_two` returns (fit: `tools/tuning.py`).
 OF_TWO = Calibration((-1.08, -0.02, -0.65, 1.57, 0.35), (2.62, 0.27, 0.54, -6.18, -2.27), 0.112)
 _LEAST_WEIGHT = 0.05  # of a pair whose target was seen from one place
@@ -119,22 +131,25 @@ def object_pairs(
     """Choose the pairs of frames that a category is aligned by (see `align_category`)."""
     numbers = dataset.frame_numbers(category)
     names = sorted(numbers if sequences is None else set(sequences))
-    if (n := len(names)) < 2:
+    n = len(names)
+    if n < 2:
         raise InputError(f"category {category}: {n} sequences to align, expected at least 2")
+    least = max(targets, _REFERENCES)
     for name in names:
-        if (length := len(numbers.get(name, ()))) < (least := max(targets, _REFERENCES)):
+        length = len(numbers.get(name, ()))
+        if length < least:
             raise InputError(
                 f"sequence {category}/{name} has {length} frames, expected at least {least}"
             )
     if per_object is None:
         per_object = n - 1 if n < ALL_PAIRS_BELOW else PAIRS_PER_OBJECT
+    # The objects stand in a random circle; each has pairs with those some steps further.
     rng = np.random.default_rng(0)
-    circle = rng.permutation(n).tolist()
+    circle = [names[k] for k in rng.permutation(n)]
     steps = [1, *(2 + rng.permutation(n - 2)).tolist()]  # the first connects all objects
-    steps = steps[:per_object]
+    ends = [(circle[k], circle[(k + step) % n]) for k in range(n) for step in steps[:per_object]]
     pairs = []
-    for a, b in sorted((circle[k], circle[(k + step) % n]) for k in range(n) for step in steps):
-        reference, target = names[a], names[b]
+    for reference, target in sorted(ends):
         rng = np.random.default_rng([0, stable_hash(f"{category}/{reference}/{target}") >> 1])
         # Frames that are evenly spaced over a sequence show several sides; the random starts depend
         # on the names only.
@@ -160,19 +175,19 @@ def scan_pairs(dataset: Co3D, pair: Pair, references: int) -> list[Pair]:
     first.
     """
     numbers = dataset.frame_numbers(pair.category)
-    ends, count = (pair.reference_sequence, pair.target_sequence), len(pair.target_frames)
 
     def around(name: str, start: int, count: int) -> tuple[int, ...]:
         frames = numbers[name]
         first, count = frames.index(start), min(count, len(frames))
         return tuple(frames[(first + k * len(frames) // count) % len(frames)] for k in range(count))
 
-    starts = dict(zip(ends, (pair.reference_frame, pair.target_frames[0])))
-    views = dict(zip(ends, (around(ends[0], pair.reference_frame, count), pair.target_frames)))
+    a, b = pair.reference_sequence, pair.target_sequence
+    views = around(a, pair.reference_frame, len(pair.target_frames))
+    forward = around(a, pair.reference_frame, references)
+    backward = around(b, pair.target_frames[0], references)
     return [
-        Pair(pair.category, a, frame, b, views[b])
-        for a, b in (ends, ends[::-1])
-        for frame in around(a, starts[a], references)
+        *(Pair(pair.category, a, frame, b, pair.target_frames) for frame in forward),
+        *(Pair(pair.category, b, frame, a, views) for frame in backward),
     ]
 
 
@@ -181,7 +196,8 @@ def world_hypotheses(reference: str, target: str, estimate: PoseEstimate) -> Pai
     objects, by name."""
     sim3s = tuple(estimate.between_worlds(one.sim3, one.view) for one in estimate.hypotheses)
     probabilities = np.array([one.confidence for one in estimate.hypotheses])
-    view, used = estimate.reference_view, np.flatnonzero(np.isfinite(estimate.view_scores))
+    view = estimate.reference_view
+    used = np.flatnonzero(np.isfinite(estimate.view_scores))
     centre = view.frame.camera.to_world(
         np.median(view.measured_points[0][view.known_foreground], axis=0)
     )
@@ -200,25 +216,18 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
     pairs = sorted(pairs, key=lambda pair: (pair.reference, pair.target, pair.centre.tolist()))
     names = sorted({name for pair in pairs for name in (pair.reference, pair.target)})
     ends = np.array([[names.index(pair.reference), names.index(pair.target)] for pair in pairs])
-    links = coo_array((np.ones(len(ends)), ends.T), (len(names), len(names)))
-    order = breadth_first_order(links.tocsr(), 0, directed=False, return_predecessors=False)
-    if len(order) < len(names):
-        raise InputError(
-            f"pairs connect {len(order)} of {len(names)} objects with {names[0]}, expected all"
-        )
+    order = _connected(names, ends)
 
+    # The three steps of the module's docstring.
     nodes = _build_nodes(pairs, ends)
     rotations = _search(nodes, order, np.random.default_rng(0))
     scales, translations, centres = _scales_and_translations(pairs, ends, rotations)
-    off = np.array(
-        [
-            rotation_angle(rotations[a], rotations[b] @ one.sim3s[0].R)
-            for (a, b), one in zip(ends, pairs)
-        ]
-    )
 
-    objects = {}
+    # How sure each object's rotation is, and its best alternative.
+    best = np.stack([pair.sim3s[0].R for pair in pairs])
+    off = rotation_angle(rotations[ends[:, 0]], rotations[ends[:, 1]] @ best)
     spans = np.array([pair.span for pair in pairs])
+    objects = {}
     for i, name in enumerate(names):
         sim3 = Sim3(scales[i], rotations[i], translations[i])
         if len(names) > 2:
@@ -229,11 +238,21 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
             probability, other = OF_TWO.probabilities(np.array([0.0, margin]), known).tolist()
         alternative = None
         if turned is not None:  # about the object's centre
-            alternative = Sim3(
-                scales[i], turned, sim3.apply(centres[i]) - scales[i] * turned @ centres[i]
-            )
+            shift = sim3.apply(centres[i]) - scales[i] * turned @ centres[i]
+            alternative = Sim3(scales[i], turned, shift)
         objects[name] = AlignedObject(sim3, centres[i], probability, alternative, other)
     return CategoryAlignment(objects, tuple(pairs), _disagreements(names, ends, off))
+
+
+def _connected(names: Sequence[str], ends: Int[np.ndarray, "e 2"]) -> Int[np.ndarray, " n"]:
+    """Order the objects so that each has a pair with an earlier one; InputError if none does."""
+    links = coo_array((np.ones(len(ends)), ends.T), [len(names)] * 2)
+    order = breadth_first_order(links.tocsr(), 0, directed=False, return_predecessors=False)
+    if len(order) < len(names):
+        raise InputError(
+            f"pairs connect {len(order)} of {len(names)} objects with {names[0]}, expected all"
+        )
+    return order
 
 
 def _disagreements(
@@ -302,7 +321,7 @@ def _search(
     nodes: list[_Node], order: Int[np.ndarray, " n"], rng: np.random.Generator
 ) -> Float[np.ndarray, "n 3 3"]:
     """Return the rotations that maximise the objective, relative to the first object's."""
-    rotations = np.tile(np.eye(3, dtype=np.float32), (_CHAINS, len(nodes), 1, 1))
+    rotations = np.tile(np.eye(3, dtype=np.float32), (_CHAINS, len(nodes), 1, 1))  # (t, n, 3, 3)
     # In this order, each object has a pair with an earlier one.
     for k, i in enumerate(order[1:], 1):
         earlier = np.isin(nodes[i].neighbour, order[:k])
@@ -326,11 +345,11 @@ def _sample(
 ) -> None:
     """Set the rotation of object i, in place, to its present one or one that a hypothesis of a few
     pairs proposes."""
-    t, some = len(rotations), rng.permutation(len(node.neighbour))[:_PROPOSERS]
+    t = len(rotations)
+    proposers = rng.permutation(len(node.neighbour))[:_PROPOSERS]
     proposals = node.proposals(rotations)
-    candidates = np.concatenate(
-        [rotations[:, i, None], proposals[:, some].reshape(t, -1, 3, 3)], axis=1
-    )
+    proposed = proposals[:, proposers].reshape(t, -1, 3, 3)
+    candidates = np.concatenate([rotations[:, i, None], proposed], axis=1)
     score = node.score(candidates, proposals)
     # The largest is then a sample of the softmax.
     score += temperature * rng.gumbel(size=score.shape)
@@ -347,7 +366,8 @@ def _judge(
     # conditional logit; that none is right is less probable if more of the object's pairs agree.
     other = np.exp(-MARGIN * margin / np.sqrt(len(node.neighbour)))
     none = np.exp(NONE + NONE_AGREEING * agreeing)
-    return float(1 / (1 + other + none)), best, float(other / (1 + other + none))
+    total = 1 + other + none
+    return float(1 / total), best, float(other / total)
 
 
 def compare_two(
@@ -362,8 +382,10 @@ def compare_two(
     """
     margin, best = _margin(node, rotations, i)
     near = rotation_angle(node.proposals(rotations[None])[0], rotations[i]) < SAME_ANGLE
-    votes, weight = (node.weight * near).max(axis=1), 1 + _LEAST_WEIGHT - hidden_share(spans / 360)
-    mean, number = np.average(votes, weights=weight), weight.sum() / weight.max()
+    votes = (node.weight * near).max(axis=1)
+    weight = 1 + _LEAST_WEIGHT - hidden_share(spans / 360)
+    mean = np.average(votes, weights=weight)
+    number = weight.sum() / weight.max()
     return margin, best, np.array([1.0, spans.max() / 360, np.log(number), votes.max(), mean])
 
 
@@ -375,10 +397,11 @@ def _margin(
     proposals = node.proposals(rotations[None])
     others = proposals.reshape(-1, 3, 3)
     others = others[rotation_angle(others, rotations[i]) > SAME_ANGLE]
-    present, *scores = node.score(np.concatenate([rotations[None, i], others])[None], proposals)[
-        0
-    ].tolist()
-    return (present - max(scores), others[np.argmax(scores)]) if scores else (np.inf, None)
+    if not len(others):
+        return np.inf, None
+    candidates = np.concatenate([rotations[None, i], others])
+    present, *scores = node.score(candidates[None], proposals)[0].tolist()
+    return present - max(scores), others[np.argmax(scores)]
 
 
 def _scales_and_translations(
@@ -388,25 +411,27 @@ def _scales_and_translations(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Fit scales and translations to the hypotheses that agree with the rotations; return the
     objects' centres too."""
+    # A row for each hypothesis (lambda, H, tau) of each pair (a, b), k in all.
     a, b = np.repeat(ends, [len(pair.sim3s) for pair in pairs], axis=0).T
     sim3s = [one for pair in pairs for one in pair.sim3s]
-    c = np.stack([pair.centre for pair in pairs for _ in pair.sim3s])
-    y = np.stack([one.apply(centre) for one, centre in zip(sim3s, c)])
-    angle = np.radians(
-        rotation_angle(rotations[a], rotations[b] @ np.stack([one.R for one in sim3s]))
-    )
+    turns = np.stack([one.R for one in sim3s])
+    angle = np.radians(rotation_angle(rotations[a], rotations[b] @ turns))
     probability = np.concatenate([pair.probabilities for pair in pairs])
     weight = probability * (np.exp(KAPPA * (np.cos(angle) - 1)) + _WEAK)
-    # Hypothesis (lambda, H, tau) demands log s_a - log s_b = log(lambda), and t_a - t_b = s_b Q_b y
-    # - s_a Q_a c with y = lambda H c + tau, the place in the world of b of the centre c of a.
-    incidence = np.eye(len(rotations))[a] - np.eye(len(rotations))[b]
+    # The centre c of a, and y = lambda H c + tau, its place in the world of b.
+    c = np.stack([pair.centre for pair in pairs for _ in pair.sim3s])
+    y = np.stack([one.apply(centre) for one, centre in zip(sim3s, c)])
+
+    # Each demands log s_a - log s_b = log(lambda), and t_a - t_b = s_b Q_b y - s_a Q_a c.
+    of_a, of_b = np.eye(len(rotations))[a], np.eye(len(rotations))[b]  # (k, n)
     log_ratios = np.log([[one.scale] for one in sim3s])
-    scales = np.exp(_least_absolute(incidence, log_ratios, weight))[:, 0]
+    scales = np.exp(_least_absolute(of_a - of_b, log_ratios, weight))[:, 0]
     linear = scales[:, None, None] * rotations
     shift = np.einsum("kij,kj->ki", linear[b], y) - np.einsum("kij,kj->ki", linear[a], c)
-    t = _least_absolute(incidence, shift, weight)
-    seen = np.concatenate([np.eye(len(rotations))[a], np.eye(len(rotations))[b]])
-    seen *= np.r_[weight, weight][:, None]
+    t = _least_absolute(of_a - of_b, shift, weight)
+
+    # An object's centre is the weighted mean of where its pairs see it, in its own world.
+    seen = np.concatenate([of_a, of_b]) * np.r_[weight, weight][:, None]  # (2 k, n)
     return scales, t - t[0], (seen / seen.sum(axis=0)).T @ np.r_[c, y]
 
 

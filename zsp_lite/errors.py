@@ -30,9 +30,9 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str):
-        super().__init__(
-            message if len(message) <= _LONGEST else f"{message[:600]} ... {message[-300:]}"
-        )
+        if len(message) > _LONGEST:
+            message = f"{message[:600]} ... {message[-300:]}"
+        super().__init__(message)
 
 
 class NoPoseError(InputError):
@@ -106,10 +106,10 @@ def check_magnitude(name: str, values: object) -> None:
 
 def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
     """Raise InputError if a value is none of those allowed."""
-    if value not in (allowed := list(allowed)):
-        raise InputError(
-            f"{name} is {value!r}, expected one of {', '.join(map(str, allowed)) or '(none)'}"
-        )
+    allowed = list(allowed)
+    if value not in allowed:
+        names = ", ".join(map(str, allowed))
+        raise InputError(f"{name} is {value!r}, expected one of {names or '(none)'}")
 
 
 def real_array(

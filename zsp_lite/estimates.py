@@ -94,8 +94,8 @@ class PoseEstimate:
     def world_rotation(self, pose: Hypothesis | None = None) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from the reference camera's frame to the world of the target
         views."""
-        sim3, view = (self.sim3, self.view) if pose is None else (pose.sim3, pose.view)
-        return self.target_views[view].frame.camera.R.T @ sim3.R
+        found = self if pose is None else pose
+        return self.target_views[found.view].frame.camera.R.T @ found.sim3.R
 
     def angle_to(self, pose: Hypothesis) -> float:
         """Return the angle in degrees between the rotation of the estimate and that of another

@@ -48,9 +48,8 @@ class FeatureMap:
                 f"FeatureMap: keys and saliency have shapes {keys}, {saliency}, expected (H, "
                 "W, D), (H, W)"
             )
-        if not all(
-            bool(x.isfinite().all()) for x in (self.keys, self.saliency, self.global_feature)
-        ):
+        parts = (self.keys, self.saliency, self.global_feature)
+        if not all(part.isfinite().all() for part in parts):
             raise InputError(
                 "FeatureMap: keys, saliency or global feature hold values that are not finite"
             )

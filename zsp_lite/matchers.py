@@ -116,9 +116,8 @@ def on_foreground(
     similarities; on the CPU."""
 
     def matcher(similarity, foreground1, foreground2):
-        similarity, foreground1, foreground2 = (
-            one.cpu() for one in (similarity, foreground1, foreground2)
-        )
+        similarity = similarity.cpu()
+        foreground1, foreground2 = foreground1.cpu(), foreground2.cpu()
         partner = torch.zeros(len(foreground1), dtype=torch.long)
         score = torch.full((len(foreground1),), -torch.inf, dtype=torch.float64)
         if foreground1.any() and foreground2.any():

@@ -69,19 +69,20 @@ def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]
     keys1 = _keys(ref)
     inverse_norm1 = _inverse_norm(keys1)
     results = []
-    for keys2 in map(_keys, targets):
-        products = keys1.flatten(0, 1) @ keys2.flatten(0, 1).T
+    for target in targets:
+        keys2 = _keys(target)
+        products = keys1.flatten(0, 1) @ keys2.flatten(0, 1).T  # (H1 W1, H2 W2)
         summed = _bin_products(products.view(*keys1.shape[:2], *keys2.shape[:2]))
-        results.append(
-            summed.view(products.shape).mul_(inverse_norm1[:, None]).mul_(_inverse_norm(keys2))
-        )
+        # In place: the matrices are the largest arrays of the method.
+        cosines = summed.view(products.shape).mul_(inverse_norm1[:, None])
+        results.append(cosines.mul_(_inverse_norm(keys2)))
     return results
 
 
 def key_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
     """Compute the cosine similarities of the keys themselves, without log-binning (see
     `similarities`)."""
-    first, *others = (F.normalize(_keys(one).flatten(0, 1), dim=1) for one in (ref, *targets))
+    first, *others = [F.normalize(_keys(one).flatten(0, 1), dim=1) for one in (ref, *targets)]
     return [first @ other.T for other in others]
 
 
@@ -157,17 +158,21 @@ def match(
         binning: Compare and cluster log-binned descriptors; False takes the keys themselves.
     """
     if sim is None:
-        (sim,) = (similarities if binning else key_similarities)(ref, [target])
-    on_ref = ref.foreground() if ref_foreground is None else ref_foreground
-    on_target = target.foreground() if target_foreground is None else target_foreground
-    on_ref, on_target = torch.as_tensor(on_ref), torch.as_tensor(on_target)
+        compare = similarities if binning else key_similarities
+        (sim,) = compare(ref, [target])
+    if ref_foreground is None:
+        ref_foreground = ref.foreground()
+    if target_foreground is None:
+        target_foreground = target.foreground()
+    on_start, on_end = torch.as_tensor(ref_foreground), torch.as_tensor(target_foreground)
 
     # Both stages are about the image in which cycles start.
     forward = cycle_from == "reference"
-    if forward:
-        start, end, on_start, on_end = ref, target, on_ref, on_target
-    else:
-        start, end, on_start, on_end, sim = target, ref, on_target, on_ref, sim.T
+    start, end = ref, target
+    if not forward:
+        start, end = target, ref
+        on_start, on_end = on_end, on_start
+        sim = sim.T
     ranked = _rank(sim, on_start, on_end, matcher, published=not forward)
     chosen = _select(ranked, start, k, kmeans, seed, binning)
 
@@ -200,7 +205,7 @@ def _rank(
         # Copies, since a matcher may overwrite what it gets, such as the similarities of the
         # background.
         answer = ask(sim.clone(), on_start.flatten().clone(), on_end.flatten().clone())
-        partner, score = (torch.as_tensor(one).cpu() for one in answer)
+        partner, score = [torch.as_tensor(one).cpu() for one in answer]
         if not len(partner) == len(score) == len(sim):
             found = f"{len(partner)} partners and {len(score)} scores"
             raise InputError(
@@ -221,9 +226,10 @@ def _select(
     """Select at most k patches, best first: those of the highest scores, or of twice as many the
     most salient of each cluster."""
     order = np.lexsort((-ranked.similarity, -ranked.score))
-    order = order[np.isfinite(ranked.score[order])][: 2 * k if kmeans else k]
+    order = order[np.isfinite(ranked.score[order])]
     if not kmeans or len(order) <= k:
-        return order
+        return order[:k]
+    order = order[: 2 * k]
     clusters = _cluster(_gram(features, order, binning), k, np.random.default_rng(seed))
     saliency = features.saliency.flatten().numpy()[order]
     by_cluster = np.lexsort((-saliency, clusters))  # the most salient of each cluster first
@@ -242,22 +248,20 @@ def _cycles(
 
     Only the foreground's neighbours, and of the patches of image 2 only theirs, are searched for.
     """
-    columns, on1, on2 = on1.shape[1], on1.flatten(), on2.flatten()
+    columns = on1.shape[1]
+    on1, on2 = on1.flatten(), on2.flatten()
+    # Patches by their index: u on the foreground, its neighbour v (`forth`), and v's u' (`back`).
     u = on1.nonzero()[:, 0]
     forth = sim[u].argmax(dim=1)
     reached, position = forth.unique(return_inverse=True)
     back = sim[:, reached].argmax(dim=0)[position]
     row, column = back // columns, back % columns
-    distance = (
-        torch.stack([u // columns - row, u % columns - column])
-        .to(torch.float32)
-        .square()
-        .sum(0)
-        .sqrt()
-    )
+    offset = torch.stack([u // columns - row, u % columns - column])
+    distance = offset.to(torch.float32).square().sum(0).sqrt()
     # The published code does not check that u' is foreground, and discards every u' in row 0 or
     # column 0: it marks "no cycle" by index 0, and looks for the mark in each coordinate.
-    valid = on2[forth] & ((row > 0) & (column > 0) if published else on1[back])
+    returned = (row > 0) & (column > 0) if published else on1[back]
+    valid = on2[forth] & returned
     score = torch.full((len(sim),), -torch.inf, device=sim.device)
     score[u] = torch.where(valid, -distance, -torch.inf)
     neighbour = torch.zeros(len(sim), dtype=torch.long, device=sim.device)
@@ -267,9 +271,8 @@ def _cycles(
 
 def _keys(features: Keys) -> Float[Tensor, "h w d"]:
     """Get the keys as a float32 tensor."""
-    return torch.as_tensor(features.keys if isinstance(features, FeatureMap) else features).to(
-        torch.float32
-    )
+    keys = features.keys if isinstance(features, FeatureMap) else features
+    return torch.as_tensor(keys).to(torch.float32)
 
 
 def _bin_products(products: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w1 h2 w2"]:
@@ -304,7 +307,8 @@ def _joint_shifts(x: Float[Tensor, "a b c d"], step: int) -> Float[Tensor, "a b 
 def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
     """Compute 1 / length of each patch's log-binned descriptor."""
     index = bin_indices(tuple(keys.shape[:2])).to(keys.device)
-    raw, pooled = (x.square().sum(-1).flatten() for x in (keys, average_pool(keys, (0, 1))))
+    raw = keys.square().sum(-1).flatten()
+    pooled = average_pool(keys, (0, 1)).square().sum(-1).flatten()
     squared = raw[index[:9]].sum(0) + pooled[index[9:]].sum(0)
     return squared.clamp_min(torch.finfo(squared.dtype).tiny).rsqrt()
 
@@ -318,8 +322,9 @@ def _gram(
     index = torch.from_numpy(index)
     descriptors = keys.flatten(0, 1)[index]
     if binning:
-        bins, pooled = bin_indices(features.grid)[:, index], average_pool(keys, (0, 1))
-        near, far = keys.flatten(0, 1)[bins[:9]], pooled.flatten(0, 1)[bins[9:]]
+        bins = bin_indices(features.grid)[:, index]  # (17, m)
+        near = keys.flatten(0, 1)[bins[:9]]
+        far = average_pool(keys, (0, 1)).flatten(0, 1)[bins[9:]]
         descriptors = torch.cat([near, far]).transpose(0, 1).flatten(1)  # (m, 17 D)
     descriptors = F.normalize(descriptors, dim=1)
     # Rounded, because greedy k-means++ has exact ties (of two points that are each other's nearest,

@@ -163,9 +163,10 @@ def _solve(
     pose becomes the one that most of them agree on, and these vote."""
     position = scans[0].references[0]
     reference, targets = scans[0].views[position], scans[1].target_views
-    solved = {}
-    for name in SOLVERS[solver]:
-        solved[name] = replace(method, solver=name).estimate_from_views(reference, targets)
+    solved = {
+        name: replace(method, solver=name).estimate_from_views(reference, targets)
+        for name in SOLVERS[solver]
+    }
     if not several:
         return solved, ()
 
@@ -221,17 +222,12 @@ def _solve_others(
         with suppress(NoPoseError):
             return method.estimate_from_views(scans[a].views[position], scans[b].target_views)
 
+    others = ends[1:]
     with ThreadPoolExecutor(workers) as pool:
-        solved = list(
-            tqdm(
-                pool.map(solve, *zip(*ends[1:])),
-                total=len(ends) - 1,
-                unit="frame",
-                delay=1,
-                disable=None,
-            )
-        )
-    return {end: one for end, one in zip(ends[1:], solved, strict=True) if one}
+        solved = pool.map(solve, *zip(*others))
+        # `disable=None`: shown in a terminal only.
+        shown = [*tqdm(solved, total=len(others), unit="frame", delay=1, disable=None)]
+    return {end: one for end, one in zip(others, shown, strict=True) if one}
 
 
 def _agreed_pose(
@@ -243,26 +239,23 @@ def _agreed_pose(
     agreement = synchronise(
         [world_hypotheses(names[a], names[b], one) for (a, b, _), one in found.items()]
     )
-    one, other = (agreement.objects[name] for name in names[:2])
+    one, other = agreement.objects[names[0]], agreement.objects[names[1]]
     answers = [(agreement.between(*names[:2]), min(one.probability, other.probability))]
     if other.alternative and other.alternative_probability > _LEAST_PROBABLE:
         answers.append((other.alternative.inverse() @ one.sim3, other.alternative_probability))
     votes = []
     for (a, b, position), estimate in found.items():
-        if max(a, b) < 2:
+        if max(a, b) < 2:  # of the two objects, not of helpers
             name = f"frame {scans[a].source.numbers[position]} of {scans[a].source.name}"
-            degrees = float(
-                rotation_error(estimate.world_sim3.R, agreement.between(names[a], names[b]).R)
-            )
-            votes.append(
-                Vote(name, _in_units(estimate, scans[a].scale, scans[b].scale, ()), degrees, a > b)
-            )
+            agreed = agreement.between(names[a], names[b])
+            degrees = float(rotation_error(estimate.world_sim3.R, agreed.R))
+            own = _in_units(estimate, scans[a].scale, scans[b].scale, ())
+            votes.append(Vote(name, own, degrees, a > b))
     against = [vote.name for vote in votes if vote.degrees > SAME_ANGLE]
-    flags = (
-        [f"{len(against)} of {len(votes)} frames vote for another pose: {', '.join(against)}"]
-        if against
-        else []
-    )
+    flags = []
+    if against:
+        named = ", ".join(against)
+        flags.append(f"{len(against)} of {len(votes)} frames vote for another pose: {named}")
     return _answer(next(iter(found.values())), method, answers, flags), tuple(votes)
 
 
@@ -275,15 +268,17 @@ def _answer(
     """Replace the hypotheses of an estimate by similarities between the worlds, each with its
     probability."""
     reference, targets = estimate.reference_view, estimate.target_views
-    to_reference, *to_targets = (
+    to_reference, *to_targets = [
         Sim3(1.0, one.frame.camera.R, one.frame.camera.t) for one in (reference, *targets)
-    )
-    hypotheses, left_out = [], np.where(np.isfinite(estimate.view_scores), 0.0, np.inf)
+    ]
+    left_out = np.where(np.isfinite(estimate.view_scores), 0.0, np.inf)
+    hypotheses = []
+    # The best last, whose `view`, `poses` and `angles` stay.
     for mode, (sim3, probability) in reversed([*enumerate(answers)]):
         poses = [camera @ sim3 @ to_reference.inverse() for camera in to_targets]
         angles = rotation_angle(np.stack([pose.R for pose in poses]), np.eye(3)) + left_out
         view = int(angles.argmin())
-        score = float(np.log(max(probability, 1e-9)))
+        score = float(np.log(max(probability, 1e-9)))  # finite for a probability of 0
         hypotheses.insert(0, Hypothesis(poses[view], view, score, {}, probability, mode))
     (matched,) = method.match_views(reference, [targets[view]])
     turns = np.stack([sim3.R for sim3, _ in answers])
@@ -329,11 +324,8 @@ def write_pair(result: PairResult, out: str | Path) -> list[Path]:
         poses = [estimate, *estimate.alternatives[:1]] if estimate.one_of_two else [estimate]
         for name, pose in zip((f"aligned_{solver}.ply", f"aligned_{solver}_2.ply"), poses):
             paths.append(out / name)
-            write_ply(
-                paths[-1],
-                result.targets[pose.view].camera.to_world(pose.sim3.apply(points)),
-                colours,
-            )
+            moved = pose.sim3.apply(points)
+            write_ply(paths[-1], result.targets[pose.view].camera.to_world(moved), colours)
     return [write_pair_report(out / "report.html", result), *paths]
 
 

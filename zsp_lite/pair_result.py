@@ -62,7 +62,7 @@ class PairResult:
         """Angle in degrees between the rotations of two solvers; None if only one ran."""
         if len(self.estimates) < 2:
             return None
-        first, second = (one.world_rotation() for one in self.estimates.values())
+        first, second = [one.world_rotation() for one in self.estimates.values()]
         return float(rotation_error(first, second))
 
     def __repr__(self) -> str:
@@ -127,13 +127,13 @@ def _alternatives(estimate: PoseEstimate) -> list[dict[str, Any]]:
 def label_errors(found: PairResult, category: Path, sequences: Sequence[str]) -> dict[str, float]:
     """Compute rotation errors in degrees; {} unless both sequences of the folder of a category have
     labels."""
-    labels, errors = read_labels(category.parent, category.name), {}
+    labels = read_labels(category.parent, category.name)
     if not set(sequences) <= set(labels):
-        return errors
-    first, second = (labels[name] for name in sequences)
+        return {}
+    first, second = map(labels.get, sequences)
+    errors = {}
     for name, estimate in found.estimates.items():
-        truth = relative_pose(
-            first, found.reference.camera, second, found.targets[estimate.view].camera
-        )
+        camera = found.targets[estimate.view].camera
+        truth = relative_pose(first, found.reference.camera, second, camera)
         errors[name] = float(rotation_error(estimate.sim3.R, truth[:3, :3]))
     return errors

@@ -33,22 +33,30 @@ _FEW = 10  # fewer points do not give a standard deviation
 class ZeroShotPose:
     """Zero-shot category-level pose estimation; the defaults are the paper's.
 
-    Attributes: backbone: Computes the features of images; any `FeatureExtractor`. k: Number of
-        matches. kmeans: Select the matches by clustering the 2k best candidates (sec. 4.1); False
-        takes the k best. None uses the solver's setting (see `estimates.Solver`): True for the
-        paper's, False for the verified one. view_selector: "correspond", as in the paper, another
-        name in `best_view.VIEW_SELECTORS`, or a `ViewSelector`. trials: Number of RANSAC trials.
+    Attributes:
+        backbone: Computes the features of images; any `FeatureExtractor`.
+        k: Number of matches.
+        kmeans: Select the matches by clustering the 2k best candidates (sec. 4.1); False takes the
+            k best. None uses the solver's setting (see `estimates.Solver`): True for the paper's,
+            False for the verified one.
+        view_selector: "correspond", as in the paper, another name in `best_view.VIEW_SELECTORS`, or
+            a `ViewSelector`.
+        trials: Number of RANSAC trials.
         threshold: Largest residual of a RANSAC inlier in scene units. (The scenes of CO3D are
-        scaled to unit standard deviation.) sample_size: Points per RANSAC trial. foreground:
-        "saliency", as in the paper, or "mask" for the frame's own object mask. Backbones without
-        saliency need "mask". cycle_from: View in which cycles start: "reference", as in the paper,
-        or "target", as in the cycle step of the published code (see `matching.match`;
-        docs/published_code.md lists all its differences). matcher: "cyclical", as in the paper,
-        another name in `matchers.MATCHERS`, or a `Matcher`. binning: Compare log-binned
-        descriptors, as in the paper; False compares the keys themselves. solver: "paper" selects
-        the best view and aligns with it by RANSAC; or a name in `SOLVER_CLASSES`, such as
-        "verified", or a `Solver`. The settings view_selector, trials and sample_size are for
-        "paper" only. seed: Seed of k-means and of the solver.
+            scaled to unit standard deviation.)
+        sample_size: Points per RANSAC trial.
+        foreground: "saliency", as in the paper, or "mask" for the frame's own object mask.
+            Backbones without saliency need "mask".
+        cycle_from: View in which cycles start: "reference", as in the paper, or "target", as in the
+            cycle step of the published code (see `matching.match`; docs/published_code.md lists all
+            its differences).
+        matcher: "cyclical", as in the paper, another name in `matchers.MATCHERS`, or a `Matcher`.
+        binning: Compare log-binned descriptors, as in the paper; False compares the keys
+            themselves.
+        solver: "paper" selects the best view and aligns with it by RANSAC; or a name in
+            `SOLVER_CLASSES`, such as "verified", or a `Solver`. The settings view_selector, trials
+            and sample_size are for "paper" only.
+        seed: Seed of k-means and of the solver.
 
     Raises:
         InputError: A setting is out of range.
@@ -69,20 +77,22 @@ class ZeroShotPose:
     seed: int = 0
 
     def __post_init__(self):
-        stages = {"matcher": ("cyclical", *MATCHERS), "view_selector": VIEW_SELECTORS}
-        stages["solver"] = ("paper", *SOLVER_CLASSES)
-        options = {"foreground": ("saliency", "mask"), "cycle_from": ("reference", "target")}
-        for name, allowed in (stages | options | {"kmeans": (None, True, False)}).items():
-            value = getattr(self, name)
-            if name not in stages or not callable(value):  # else a plug-in
-                check_choice(name, value, allowed)
-        for name, *limits in (
-            ("k", 1),
-            ("trials", 1, MOST_TRIALS),
-            ("sample_size", 3),
-            ("seed", 0),
-        ):
-            check_integer(name, getattr(self, name), *limits)
+        stages = {
+            "matcher": ("cyclical", *MATCHERS),
+            "view_selector": VIEW_SELECTORS,
+            "solver": ("paper", *SOLVER_CLASSES),
+        }
+        for name, allowed in stages.items():
+            stage = getattr(self, name)
+            if not callable(stage):  # else a plug-in
+                check_choice(name, stage, allowed)
+        check_choice("foreground", self.foreground, ("saliency", "mask"))
+        check_choice("cycle_from", self.cycle_from, ("reference", "target"))
+        check_choice("kmeans", self.kmeans, (None, True, False))
+        check_integer("k", self.k, 1)
+        check_integer("trials", self.trials, 1, MOST_TRIALS)
+        check_integer("sample_size", self.sample_size, 3)
+        check_integer("seed", self.seed, 0)
         if not callable(self.backbone):
             raise InputError(
                 f"backbone is {self.backbone!r}, expected what `load_backbone` returns"
@@ -119,9 +129,8 @@ class ZeroShotPose:
     def views(self, frames: Iterable[Frame]) -> list[View]:
         """Crop frames to their objects and extract features and foregrounds, all in one batch."""
         size = getattr(self.backbone, "image_size", IMAGE_SIZE)
-        return extract_views(
-            self.backbone, [object_crop(frame, size) for frame in frames], self.foreground
-        )
+        crops = [object_crop(frame, size) for frame in frames]
+        return extract_views(self.backbone, crops, self.foreground)
 
     def match_views(
         self,
@@ -137,7 +146,9 @@ class ZeroShotPose:
         if similarities is None:
             compare = cosine_similarities if self.binning else key_similarities
             similarities = compare(reference.features, [target.features for target in targets])
-        kmeans = getattr(self._solver(), "kmeans", True) if self.kmeans is None else self.kmeans
+        kmeans = self.kmeans
+        if kmeans is None:
+            kmeans = getattr(self._solver(), "kmeans", True)
         matched = []
         for target, similarity in zip(targets, similarities, strict=True):
             matches = match(
@@ -165,17 +176,19 @@ class ZeroShotPose:
         """
         if not targets:
             raise InputError("no target views, expected at least one")
-        if defect := frame_defect(reference.frame):
+        defect = frame_defect(reference.frame)
+        if defect:
             raise NoPoseError(f"reference {reference.frame.name or 'view'}: {defect}")
         timings: dict[str, float] = {}
         if matched is None:
             with timed(timings, "matching"):
                 matched = self.match_views(reference, targets)
         usable, flags = usable_targets(targets)
-        seen = reference, [targets[i] for i in usable], [matched[i] for i in usable]
+        seen = (reference, [targets[i] for i in usable], [matched[i] for i in usable])
         if not isinstance(self.solver, str):  # a plug-in may overwrite what it gets
             seen = deepcopy(seen)
         found = self._solver()(*seen, seed=self.seed, threshold=self.threshold)
+        # The solver's views are the usable ones: back to the numbers of all.
         scores = np.full(len(targets), -np.inf)
         scores[usable] = np.reshape(found.view_scores, len(usable))
         return replace(
@@ -191,12 +204,12 @@ class ZeroShotPose:
 
     def _solver(self) -> Solver:
         if self.solver == "paper":
-            settings = {
-                "view_selector": self.view_selector,
-                "trials": self.trials,
-                "sample_size": self.sample_size,
-            }
-            return partial(align_best_view, **settings)
+            return partial(
+                align_best_view,
+                view_selector=self.view_selector,
+                trials=self.trials,
+                sample_size=self.sample_size,
+            )
         if isinstance(self.solver, str):
             return pkgutil.resolve_name(SOLVER_CLASSES[self.solver])()
         return self.solver
@@ -211,16 +224,11 @@ def solve_pair(
     """Estimate the pose of a pair by each of several solvers, by name, or by the method's own, with
     shared features."""
     first, *others = method.views([reference, *targets])
+    methods = {name: replace(method, solver=name) for name in solvers or ()}
     if solvers is None:
-        name = (
-            method.solver
-            if isinstance(method.solver, str)
-            else getattr(method.solver, "__name__", "solver")
-        )
-        return {name: method.estimate_from_views(first, others)}
-    return {
-        name: replace(method, solver=name).estimate_from_views(first, others) for name in solvers
-    }
+        own = method.solver
+        methods[own if isinstance(own, str) else getattr(own, "__name__", "solver")] = method
+    return {name: one.estimate_from_views(first, others) for name, one in methods.items()}
 
 
 def align_best_view(
@@ -242,10 +250,10 @@ def align_best_view(
     timings: dict[str, float] = {}
     with timed(timings, "view"):
         if isinstance(view_selector, str):
-            scores = [VIEW_SELECTORS[view_selector](one) for one in matched]
+            scored = [VIEW_SELECTORS[view_selector](one) for one in matched]
         else:  # a plug-in may overwrite what it gets
-            scores = [view_selector(deepcopy(one)) for one in matched]
-        scores = np.array(scores, dtype=np.float64)
+            scored = [view_selector(deepcopy(one)) for one in matched]
+        scores = np.array(scored, dtype=np.float64)
         best = int(scores.argmax())
         matches = matched[best].matches
     with timed(timings, "alignment"):
@@ -260,7 +268,8 @@ def align_best_view(
                 seed=seed,
                 scale_range=SCALE_RANGE,
             )
-            if (agreeing := int(inliers.sum())) < sample_size:
+            agreeing = int(inliers.sum())
+            if agreeing < sample_size:
                 flags = (f"only {agreeing} of {len(inliers)} matches agree with the pose",)
         except InputError as error:
             sim3 = view_alignment(reference, targets[best])
@@ -279,8 +288,8 @@ def view_alignment(reference: View, target: View) -> Sim3:
     of the reference's foreground points onto those of the target's.
     """
     first, second = _foreground_points(reference), _foreground_points(target)
-    spreads = standard_deviation(first), standard_deviation(second)
-    scale = spreads[1] / spreads[0] if min(spreads) > 0 else 1.0
+    spread, target_spread = standard_deviation(first), standard_deviation(second)
+    scale = target_spread / spread if min(spread, target_spread) > 0 else 1.0
     return Sim3(scale, np.eye(3), second.mean(axis=0) - scale * first.mean(axis=0))
 
 

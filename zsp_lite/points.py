@@ -66,11 +66,15 @@ def world_cloud(
 ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
     """Gather the world points and colours of the object in the usable frames, without each frame's
     outliers."""
-    clouds, colours = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
+    clouds = [np.zeros((0, 3))]
+    colours = [np.zeros((0, 3), np.uint8)]
     for frame in frames:
-        if not frame_defect(frame) and (inside := object_pixels(frame)).any():
+        if frame_defect(frame):
+            continue
+        inside = object_pixels(frame)
+        if inside.any():
             points = world_points(frame, inside)
-            kept = near_median(points, _FAR)
-            clouds.append(points[kept])
-            colours.append(frame.rgb[inside][kept])
+            near = near_median(points, _FAR)
+            clouds.append(points[near])
+            colours.append(frame.rgb[inside][near])
     return np.concatenate(clouds), np.concatenate(colours)

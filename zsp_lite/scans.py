@@ -1,6 +1,6 @@
 """The frames of one's own objects that an estimate uses: loaded, scaled, turned, and doubted."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -72,33 +72,33 @@ class Scan:
 def stood_up(scan: Scan, target: Scan, method: ZeroShotPose) -> tuple[Scan, int]:
     """Turn the frames of a scan by the quarter turns that suit its first reference frame best;
     return the degrees."""
-    scores, position = {}, scan.references[0]
+
+    def views_of(positions: Iterable[int], quarters: int) -> list[View]:
+        frames = [scale_frame(scan.frames[position], scan.scale) for position in positions]
+        return method.views([turn_frame(frame, quarters) for frame in frames])
+
+    scores = {}
     for quarters in range(4):
-        (view,) = method.views(
-            [turn_frame(scale_frame(scan.frames[position], scan.scale), quarters)]
-        )
+        (view,) = views_of(scan.references[:1], quarters)
         with suppress(NoPoseError):
-            one = method.estimate_from_views(view, target.target_views)
-            scores[quarters] = (
-                one.hypotheses[0].score if one.hypotheses else one.view_scores[one.view]
-            )
-    quarters = max(scores, key=scores.get, default=0)
-    frames = {key: turn_frame(frame, quarters) for key, frame in scan.frames.items()}
-    views = method.views([scale_frame(frames[key], scan.scale) for key in scan.views])
-    return replace(
-        scan, frames=frames, views=dict(zip(scan.views, views, strict=True))
-    ), 90 * quarters
+            estimate = method.estimate_from_views(view, target.target_views)
+            scores[quarters] = estimate.view_scores.max()
+            if estimate.hypotheses:
+                scores[quarters] = estimate.hypotheses[0].score
+    best = max(scores, key=scores.get, default=0)
+    frames = {position: turn_frame(frame, best) for position, frame in scan.frames.items()}
+    views = dict(zip(scan.views, views_of(scan.views, best), strict=True))
+    return replace(scan, frames=frames, views=views), 90 * best
 
 
 def scan_flags(scans: Sequence[Scan]) -> tuple[str, ...]:
     """Name two categories, and what is doubtful about the frames in use and the sides that they
     show."""
-    kinds = sorted(
-        {one.source.path.resolve().parent.name for one in scans if one.source.format == "sequence"}
-    )
-    flags = (
-        [f"the objects are of different categories: {', '.join(kinds)}"] if len(kinds) > 1 else []
-    )
+    flags = []
+    sources = [scan.source for scan in scans if scan.source.format == "sequence"]
+    categories = sorted({source.path.resolve().parent.name for source in sources})
+    if len(categories) > 1:
+        flags.append(f"the objects are of different categories: {', '.join(categories)}")
     for scan in scans:
         found = scan.source.flags([scan.frames[position] for position in scan.views])
         flags += [f"{scan.source.path}: {flag}" for flag in found]
@@ -106,9 +106,9 @@ def scan_flags(scans: Sequence[Scan]) -> tuple[str, ...]:
     count, span = max(seen, key=lambda one: (one[1], one[0]))
     if count < 3 or span < _ALL_SIDES:
         sides = "two sides" if span >= _ALL_SIDES else "one side"
-        what, other = (
-            ("the target was", "the reference") if len(seen) < 2 else ("each object was", "one")
-        )
+        what, other = "each object was", "one"
+        if len(seen) < 2:
+            what, other = "the target was", "the reference"
         seen_from = f"seen from {sides} only ({span:.0f} degrees)"
         flags.append(
             f"{what} {seen_from}: if {other} was taken from another side, this pose is wrong"

@@ -9,7 +9,9 @@ from functools import lru_cache
 import cv2
 from threadpoolctl import OpenBLASController, ThreadpoolController
 
-_lock, _blocks, _of_process = threading.Lock(), 0, ExitStack()
+_lock = threading.Lock()
+_blocks = 0  # that are open now, in all threads
+_of_process = ExitStack()  # restores the numbers of the process
 # From threadpoolctl 3.8 on, only the thread that set the number for OpenBLAS first may set it,
 # unless this is called.
 _let_this_thread_set = getattr(OpenBLASController, "clear_controlling_thread", lambda force: None)

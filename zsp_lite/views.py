@@ -82,9 +82,9 @@ def feature_maps(backbone: FeatureExtractor, crops: Sequence[Frame]) -> list[Fea
         maps = list(backbone([crop.rgb.copy() for crop in crops]))
     if len(maps) != len(crops) or not all(isinstance(one, FeatureMap) for one in maps):
         kinds = ", ".join(sorted({type(one).__name__ for one in maps})) or "nothing"
-        expected = f"expected {len(crops)} of FeatureMap"
         raise FatalError(
-            f"backbone {name} returned {len(maps)} of {kinds} for {len(crops)} images, {expected}"
+            f"backbone {name} returned {len(maps)} of {kinds} for {len(crops)} images, "
+            f"expected {len(crops)} of FeatureMap"
         )
     return maps
 

@@ -33,19 +33,23 @@ from zsp_lite.views import View
 PAIRS = {"bicycle": (0, 1), "car": (0, 6), "chair": (0, 4), "motorcycle": (0, 1)}
 # Steps of the stored numbers, 16-bit integers. Cosines of descriptors are off by at most 5e-4, of
 # bare keys by 2e-3.
-KEY_STEP, POINT_STEP = 1 / 64, 1 / 1024
-GRID, NUMBER = (28, 28), (28, 1)  # patches, and factors of row and column in the number of a patch
+KEY_STEP = 1 / 64
+POINT_STEP = 1 / 1024
+GRID = (28, 28)  # patches
+NUMBER = (28, 1)  # factors of row and column in the number of a patch
 RUNTIME = "onnxruntime-web-1.30.0.tgz"
 RUNTIME_SHA256 = "d2228df7e4616bc3348bf504ee888f3bec43789a273f0a63f3e68d203ce3bf71"
 _TYPES = {"float32": 1, "int64": 7, "float16": 10}  # in ONNX files, as in onnx.proto
 _ATTRIBUTES = {float: (2, 1), int: (3, 2), str: (4, 3), list: (8, 7)}  # field and type
-_FROM_SECOND = np.array([0, 1]), np.array([1, 1 << 30])  # starts and ends of a slice: [:1, 1:]
+_FROM_SECOND = (np.array([0, 1]), np.array([1, 1 << 30]))  # starts and ends of a slice: [:1, 1:]
 
 
 def stored_pairs(dataset: Co3D) -> list[Pair]:
     """List the pairs of the page."""
     return [
-        shipped_pairs(dataset, name, 5)[index] for name, both in PAIRS.items() for index in both
+        shipped_pairs(dataset, category, 5)[index]
+        for category, indices in PAIRS.items()
+        for index in indices
     ]
 
 
@@ -53,44 +57,50 @@ def pair_data(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> tuple[list[dic
     """Compute the data of each view, the reference first; of targets also truth and matches; and
     the error."""
     reference, targets = dataset.load_pair(pair)
-    first, *others = views = method.views([reference, *targets])
+    views = method.views([reference, *targets])
+    first, *others = views
+
+    # Keys (views, patches, d) on their principal axes, of which few matter, and rounded.
     keys = np.stack([view.features.keys.flatten(0, 1).numpy() for view in views])
-    # principal: few of them matter
     axes = np.linalg.svd(keys.reshape(-1, keys.shape[-1]), full_matrices=False)[2]
     rounded = np.round(keys @ axes.T / KEY_STEP).astype("<i2").swapaxes(1, 2)
-    data = [_view_data(view, one) for view, one in zip(views, rounded[:, rounded.any(axis=(0, 2))])]
-    matched, names = (
-        method.match_views(first, others),
-        (pair.reference_sequence, pair.target_sequence),
-    )
-    labels = [read_labels(dataset.root, pair.category)[name] for name in names]
-    poses = [object_poses(dataset, pair.category)[name] for name in names]
-    seen = patch_coordinates(first.frame, poses[0], GRID)
+    rounded = rounded[:, rounded.any(axis=(0, 2))]  # without axes that are 0 everywhere
+    data = [_view_data(view, own) for view, own in zip(views, rounded)]
+
+    # True matches, true rotation and the method's matches of each target.
+    labels = read_labels(dataset.root, pair.category)
+    poses = object_poses(dataset, pair.category)
+    seen = patch_coordinates(first.frame, poses[pair.reference_sequence], GRID)
+    matched = method.match_views(first, others)
     for target, one in zip(data[1:], matched):
-        frame, found = one.target.frame, one.matches
-        cells, valid = ground_truth_matches(seen, patch_coordinates(frame, poses[1], GRID))
+        frame = one.target.frame
+        cells, valid = ground_truth_matches(
+            seen, patch_coordinates(frame, poses[pair.target_sequence], GRID)
+        )
+        true = relative_pose(
+            labels[pair.reference_sequence],
+            first.frame.camera,
+            labels[pair.target_sequence],
+            frame.camera,
+        )
+        chosen = [one.matches.reference @ NUMBER, one.matches.target @ NUMBER]
         target["truth"] = _packed(np.where(valid, cells @ NUMBER, -1).astype("<i2"))
-        target["rotation"] = relative_pose(labels[0], first.frame.camera, labels[1], frame.camera)[
-            :3, :3
-        ].tolist()
-        target["chosen"] = np.stack(
-            [found.reference @ NUMBER, found.target @ NUMBER], axis=1
-        ).tolist()
+        target["rotation"] = true[:3, :3].tolist()
+        target["chosen"] = np.stack(chosen, axis=1).tolist()
     estimate = method.estimate_from_views(first, others, matched)
     return data, rotation_error(estimate.sim3.R, data[1 + estimate.view]["rotation"])
 
 
 def _packed(array: np.ndarray) -> str:
+    """Compress the bytes of an array, as text."""
     return b64encode(zlib.compress(array.tobytes())).decode()
 
 
 def write_page_data(folder: Path) -> None:
     """Write the pairs, one script each, the network, and a script that lists them."""
-    dataset, method, titles = (
-        Co3D(sample_data()),
-        ZeroShotPose(load_backbone("zsp-tiny", "cpu")),
-        [],
-    )
+    dataset = Co3D(sample_data())
+    method = ZeroShotPose(load_backbone("zsp-tiny", "cpu"))
+    titles = []
     folder.mkdir(parents=True, exist_ok=True)
     for index, pair in enumerate(stored_pairs(dataset)):
         views, error = pair_data(dataset, pair, method)
@@ -103,12 +113,12 @@ def write_page_data(folder: Path) -> None:
             f"STORED[{index}] = {json.dumps(views, separators=(',', ':'))};\n"
         )
     (folder / "zsp-tiny.onnx").write_bytes(onnx_model(method.backbone))
-    # of RANSAC
-    draws = _packed(np.random.default_rng(method.seed).bit_generator.random_raw(5000).astype("<u8"))
+    # The random numbers of RANSAC.
+    draws = np.random.default_rng(method.seed).bit_generator.random_raw(5000)
     content = {
         "titles": titles,
         "steps": (KEY_STEP, POINT_STEP),
-        "draws": draws,
+        "draws": _packed(draws.astype("<u8")),
         "runtime": fetch_runtime(folder),
     }
     (folder / "data.js").write_text(f"const STORED = [], DATA = {json.dumps(content)};\n")
@@ -137,7 +147,10 @@ def fetch_runtime(folder: Path) -> bool:
 
 
 def _view_data(view: View, keys: np.ndarray) -> dict:
-    points, camera, solid = view.patch_points[0], view.frame.camera, view.known_foreground
+    """Compute the data of one view."""
+    points, _ = view.patch_points
+    camera = view.frame.camera
+    solid = view.known_foreground
     solid[solid] = near_median(points[solid], 2.5)  # to draw in 3D
     jpeg = cv2.imencode(".jpg", view.frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
     return {
@@ -158,9 +171,14 @@ def _view_data(view: View, keys: np.ndarray) -> dict:
 def onnx_model(backbone: Backbone) -> bytes:
     """Encode the graph from "image" (1, 3, side, side), RGB in [0, 1], to "keys" (1, n, d),
     "saliency" (1, 1, 1, n)."""
-    graph, model, side = _Graph(), backbone.model, backbone.image_size
-    add, linear = graph.add, graph.linear
-    mean, std = (np.float32(values).reshape(1, 3, 1, 1) for values in (backbone.mean, backbone.std))
+    graph = _Graph()
+    add = graph.add
+    linear = graph.linear
+    model = backbone.model
+
+    # From the image to tokens: standardised colours, patches, positions.
+    mean = np.float32(backbone.mean).reshape(1, 3, 1, 1)
+    std = np.float32(backbone.std).reshape(1, 3, 1, 1)
     image = add("Div", add("Sub", "image", mean), std)
     patches = add(
         "Conv", image, *model.patch_embed.proj.parameters(), strides=[model.patch_size] * 2
@@ -169,18 +187,21 @@ def onnx_model(backbone: Backbone) -> bytes:
         "Transpose", add("Reshape", patches, np.array([1, model.embed_dim, -1])), perm=[0, 2, 1]
     )
     tokens = add("Add", add("Concat", model.cls_token, patches, axis=1), model.pos_embed)
-    joined, split = np.array([1, -1, model.embed_dim]), np.array([1, 0, model.num_heads, -1])
+
+    # The blocks: (1, tokens, d) and, by heads, (1, tokens, heads, d / heads).
+    joined = np.array([1, -1, model.embed_dim])
+    split = np.array([1, 0, model.num_heads, -1])
     for index, block in enumerate(model.blocks):
         normed = add(
             "LayerNormalization", tokens, *block.norm1.parameters(), epsilon=block.norm1.eps
         )
-        query, key, value = (
-            linear(normed, *part)
-            for part in zip(*(p.chunk(3) for p in block.attn.qkv.parameters()))
-        )
+        weights, biases = [p.chunk(3) for p in block.attn.qkv.parameters()]
+        query, key, value = [linear(normed, *both) for both in zip(weights, biases)]
         if index == backbone.layer:
             add("Slice", key, *_FROM_SECOND, np.array([0, 1]), name="keys")
-        query, key, value = (add("Reshape", part, split) for part in (query, key, value))
+        query = add("Reshape", query, split)
+        key = add("Reshape", key, split)
+        value = add("Reshape", value, split)
         products = add("Einsum", query, key, equation="bihd,bjhd->bhij")
         attention = add("Softmax", add("Mul", products, np.float32(block.attn.scale)), axis=-1)
         if block is model.blocks[-1]:
@@ -192,12 +213,16 @@ def onnx_model(backbone: Backbone) -> bytes:
         )
         hidden = add("Gelu", linear(normed, *block.mlp.fc1.parameters()))
         tokens = add("Add", tokens, linear(hidden, *block.mlp.fc2.parameters()))
-    chosen = add("Gather", attention, np.array(backbone.saliency_heads), axis=1)
+
+    # Saliency: the attention of CLS to patches, averaged over heads, scaled to [0, 1].
+    heads = add("Gather", attention, np.array(backbone.saliency_heads), axis=1)
     saliency = add(
-        "ReduceMean", add("Slice", chosen, *_FROM_SECOND, np.array([2, 3])), np.array([1])
+        "ReduceMean", add("Slice", heads, *_FROM_SECOND, np.array([2, 3])), np.array([1])
     )
-    low, high = add("ReduceMin", saliency), add("ReduceMax", saliency)
+    low = add("ReduceMin", saliency)
+    high = add("ReduceMax", saliency)
     add("Div", add("Sub", saliency, low), add("Sub", high, low), name="saliency")
+    side = backbone.image_size
     return graph.encode((11, "image", (1, 3, side, side)), (12, "keys", ()), (12, "saliency", ()))
 
 
@@ -217,31 +242,38 @@ class _Graph:
         fields = [(1, one if isinstance(one, str) else self._store(one)) for one in inputs]
         name = name or f"{operator}{len(self.fields)}"
         for attribute, value in attributes.items():
-            (field, kind), values = _ATTRIBUTES[type(value)], np.atleast_1d(value).tolist()
-            fields.append(
-                (5, _message((1, attribute), *((field, one) for one in values), (20, kind)))
-            )
+            field, kind = _ATTRIBUTES[type(value)]
+            values = [(field, one) for one in np.atleast_1d(value).tolist()]
+            fields.append((5, _message((1, attribute), *values, (20, kind))))
         self.fields.append((1, _message(*fields, (2, name), (4, operator))))
         return name
 
     def linear(self, x: str, weight: torch.Tensor, bias: torch.Tensor) -> str:
+        """Add a linear layer and return the name of its output."""
         return self.add("Add", self.add("MatMul", x, weight.T), bias)
 
     def _store(self, values: np.ndarray | torch.Tensor) -> str:
-        is_weight, name = torch.is_tensor(values), f"tensor{len(self.fields)}"
-        array = (
-            values.detach().cpu().numpy().astype(np.float16) if is_weight else np.asarray(values)
-        )
-        content = (2, _TYPES[array.dtype.name]), (8, name), (9, array.tobytes())
-        self.fields.append((5, _message(*((1, n) for n in array.shape), *content)))
+        """Store a tensor and return the name of its values in float32, or of an array as it is."""
+        name = f"tensor{len(self.fields)}"
+        is_weight = torch.is_tensor(values)
+        if is_weight:
+            array = values.detach().cpu().numpy().astype(np.float16)
+        else:
+            array = np.asarray(values)
+        shape = [(1, n) for n in array.shape]
+        content = ((2, _TYPES[array.dtype.name]), (8, name), (9, array.tobytes()))
+        self.fields.append((5, _message(*shape, *content)))
         return self.add("Cast", name, to=_TYPES["float32"]) if is_weight else name
 
     def encode(self, *ends: tuple[int, str, tuple[int, ...]]) -> bytes:
         """Encode the model with float32 inputs (field 11) and outputs (12); an output needs no
         shape."""
         for field, name, shape in ends:
-            sizes = [(2, _message(*((1, _message((1, n))) for n in shape)))] if shape else []
-            kind = _message((1, _message((1, _TYPES["float32"]), *sizes)))
+            content = [(1, _TYPES["float32"])]
+            if shape:
+                sizes = [(1, _message((1, n))) for n in shape]
+                content.append((2, _message(*sizes)))
+            kind = _message((1, _message(*content)))
             self.fields.append((field, _message((1, name), (2, kind))))
         return _message((1, 9), (7, _message(*self.fields)), (8, _message((1, ""), (2, 20))))
 
@@ -261,6 +293,7 @@ def _message(*fields: tuple[int, int | float | str | bytes]) -> bytes:
 
 
 def _varint(value: int) -> bytes:
+    """Encode an integer in groups of seven bits, the lowest first."""
     rest, last = divmod(value & (1 << 64) - 1, 128)  # negative numbers in two's complement
     return bytes([last | 128]) + _varint(rest) if rest else bytes([last])
 

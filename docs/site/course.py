@@ -36,7 +36,8 @@ WIDGET = "application/vnd.jupyter.widget-view+json"
 PLOTLY = "application/vnd.plotly.v1+json"
 BRANCH = "gh-pages"  # where the workflow publishes the site, and so the notebooks that Colab opens
 
-WIDE = 7, 80  # columns, and characters of a row, from which on a table uses the margin
+WIDE_COLUMNS = 7  # from which on, and
+WIDE_ROW = 80  # characters of a row, a table uses the margin
 INTERVAL = re.compile(r"\[[-−]?[\d.]+, [-−]?[\d.]+\]")
 
 # The pages below a page, which the sidebar leaves out.
@@ -139,12 +140,15 @@ def static_outputs(output: NotebookNode, widgets: dict) -> list[NotebookNode]:
 
 
 def html_output(html: str) -> NotebookNode:
+    """Make an output of a cell."""
     return nbformat.v4.new_output("display_data", {"text/html": html})
 
 
 def widget_outputs(models: dict, identifier: str) -> list[NotebookNode]:
     """The stored picture of a widget, its caption, and the names and values of its controls."""
-    pictures, captions, controls = [], [], []
+    pictures = []
+    captions = []
+    controls = []
 
     def visit(identifier: str) -> None:
         model = models[identifier]
@@ -157,14 +161,11 @@ def widget_outputs(models: dict, identifier: str) -> list[NotebookNode]:
                 re.sub("<style>.*?</style>|<[^>]*>", "", state["value"], flags=re.DOTALL).strip()
             )
         elif state.get("description"):
-            value = (
-                state["_options_labels"][state["index"]]
-                if "index" in state
-                else state.get("value", "")
-            )
-            controls.append(
-                f"{state['description']} = {value}" if value != "" else state["description"]
-            )
+            value = state.get("value", "")
+            if "index" in state:
+                value = state["_options_labels"][state["index"]]
+            text = state["description"]
+            controls.append(text if value == "" else f"{text} = {value}")
         for child in state.get("children", []):
             visit(child.removeprefix("IPY_MODEL_"))
 
@@ -174,12 +175,12 @@ def widget_outputs(models: dict, identifier: str) -> list[NotebookNode]:
     )
     if not pictures:
         return [note]
-    alt, caption = " ".join(captions).removeprefix("Picture: "), captions[-1]
+    alt = " ".join(captions).removeprefix("Picture: ")
     (picture,) = pictures
     metadata = {form: {"alt": unescape(alt)} for form in picture}
     return [
         nbformat.v4.new_output("display_data", picture, metadata=metadata),
-        html_output(f'<p class="widget">{caption}</p>'),
+        html_output(f'<p class="widget">{captions[-1]}</p>'),
         note,
     ]
 
@@ -195,16 +196,15 @@ def describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
 def keep_intervals(app: Sphinx, doctree: nodes.document) -> None:
     """Join the ends of intervals in text, and in the HTML tables of outputs, by a no-break space
     (`doctree-read`)."""
+
+    def join(interval: re.Match[str]) -> str:
+        return interval[0].replace(" ", "\N{NO-BREAK SPACE}")
+
+    verbatim = nodes.raw | nodes.literal | nodes.literal_block | nodes.math | nodes.math_block
     for text in list(doctree.findall(nodes.Text)):
-        part = text.parent
-        table = isinstance(part, nodes.raw) and "<table" in text
-        if table or not isinstance(
-            part, nodes.raw | nodes.literal | nodes.literal_block | nodes.math | nodes.math_block
-        ):
-            joined = INTERVAL.sub(
-                lambda interval: interval[0].replace(" ", "\N{NO-BREAK SPACE}"), text
-            )
-            part.replace(text, nodes.Text(joined))
+        table = isinstance(text.parent, nodes.raw) and "<table" in text
+        if table or not isinstance(text.parent, verbatim):
+            text.parent.replace(text, nodes.Text(INTERVAL.sub(join, text)))
 
 
 def widen_tables(app: Sphinx, doctree: nodes.document) -> None:
@@ -212,7 +212,8 @@ def widen_tables(app: Sphinx, doctree: nodes.document) -> None:
     for table in list(doctree.findall(nodes.table)):
         rows = [[cell.astext() for cell in row] for row in table.findall(nodes.row)]
         if is_wide(rows):
-            table.replace_self(box := nodes.container(classes=["full-width"]))
+            box = nodes.container(classes=["full-width"])
+            table.replace_self(box)
             box += table
     for part in doctree.findall(nodes.raw):
         rows = [
@@ -227,7 +228,8 @@ def widen_tables(app: Sphinx, doctree: nodes.document) -> None:
 
 
 def is_wide(rows: list[list[str]]) -> bool:
-    return any(len(row) >= WIDE[0] and len("".join(row)) >= WIDE[1] for row in rows)
+    """Whether a table has a row of many cells and characters."""
+    return any(len(row) >= WIDE_COLUMNS and len("".join(row)) >= WIDE_ROW for row in rows)
 
 
 def mark_place(app: Sphinx, doctree: nodes.document) -> None:
@@ -237,26 +239,27 @@ def mark_place(app: Sphinx, doctree: nodes.document) -> None:
         if "/here_" in image["uri"]:
             strip = (app.srcdir / image["uri"]).read_text(encoding="utf-8")
             box = re.search('<rect x="([^"]*)"[^>]*? width="([^"]*)"[^>]*stroke="#0072B2"', strip)
-            middle = (float(box[1]) + float(box[2]) / 2) / float(
-                re.search('width="(.*?)"', strip)[1]
-            )
-            image["classes"].append(f"here-{100 * middle:.0f}")
+            middle = float(box[1]) + float(box[2]) / 2
+            width = float(re.search('width="(.*?)"', strip)[1])  # of the whole strip
+            image["classes"].append(f"here-{100 * (middle / width):.0f}")
 
 
 def fold_members(app: Sphinx, doctree: nodes.document) -> None:
     """Fold what a module of the reference defines, below links to all of it (`doctree-read`)."""
+    if not app.env.docname.startswith("docs/api/"):
+        return
     for section in list(doctree.findall(nodes.section)):
         members = [node for node in section.children if isinstance(node, addnodes.desc)]
-        if members and app.env.docname.startswith("docs/api/"):
-            marks = [
-                (member[0]["ids"][0], member[0]["fullname"])
-                for member in members
-                if member[0]["ids"]
-            ]
-            links = ", ".join(f'<a href="#{mark}"><code>{name}</code></a>' for mark, name in marks)
+        if members:
+            links = []
+            for member in members:
+                signature = member[0]
+                if signature["ids"]:
+                    name = f"<code>{signature['fullname']}</code>"
+                    links.append(f'<a href="#{signature["ids"][0]}">{name}</a>')
             start = (
-                f'<p class="members">{links}</p><details class="members"><summary>Signatures and '
-                "arguments</summary>"
+                f'<p class="members">{", ".join(links)}</p><details class="members"><summary>'
+                "Signatures and arguments</summary>"
             )
             section.insert(section.index(members[0]), nodes.raw("", start, format="html"))
             section += nodes.raw("", "</details>", format="html")
@@ -287,11 +290,8 @@ def run_links(docname: str, repository: str) -> str:
             ),
             (f"https://codespaces.new/{name}", "Open in a dev container"),
         ]
-    return (
-        '<p class="run">'
-        + " ".join(f'<a href="{escape(link)}">{text}</a>' for link, text in links)
-        + "</p>"
-    )
+    shown = " ".join(f'<a href="{escape(link)}">{text}</a>' for link, text in links)
+    return f'<p class="run">{shown}</p>'
 
 
 def runnable(notebook: NotebookNode, repository: str) -> NotebookNode:
@@ -342,14 +342,11 @@ def skip_imported(
 ) -> bool | None:
     """Leave out what a module imports from other packages, before autodoc analyses them
     (`autodoc-skip-member`)."""
-    foreign = isinstance(member, ModuleType) or not getattr(member, "__module__", "").startswith(
-        "zsp_lite"
-    )
-    return (
-        True
-        if what == "module" and foreign and isinstance(member, ModuleType | type | FunctionType)
-        else None
-    )
+    if what != "module" or not isinstance(member, ModuleType | type | FunctionType):
+        return None
+    home = getattr(member, "__module__", "")
+    foreign = isinstance(member, ModuleType) or not home.startswith("zsp_lite")
+    return True if foreign else None
 
 
 def mark_examples(
@@ -357,7 +354,8 @@ def mark_examples(
 ) -> None:
     """Mark indented blocks of a docstring as literal, and link pages (`autodoc-process-docstring`,
     before napoleon)."""
-    text, literal = [], False
+    text = []
+    literal = False
     for line in lines:
         indented = line.startswith("    ")
         if not literal and indented and text and not text[-1] and not text[-2].startswith(" "):
@@ -370,6 +368,7 @@ def mark_examples(
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
+    """Connect the functions to Sphinx's events."""
     app.add_config_value("course_repository", "", "env", str)
     app.connect("source-read", read_source)
     app.connect("doctree-read", describe_pictures)

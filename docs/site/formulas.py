@@ -38,18 +38,19 @@ CHARACTERS += [(0x27E6, 0x27EB), (0x1D400, 0x1D503), (0x1D6A4, 0x1D7FF)]
 @cache
 def math_font() -> bytes:
     """Return the font of formulas in the format WOFF, or nothing where ziamath is not installed."""
-    if (package := find_spec("ziamath")) is None:
+    package = find_spec("ziamath")
+    if package is None:
         return b""
     font = TTFont(Path(package.origin).parent / "fonts" / "STIXTwoMath-Regular.ttf")
     features = ["ssty", "dtls", "flac", "kern", "mark"]
-    # with its licence
+    # All names, since the licence is one of them.
     subsetter = Subsetter(Options(hinting=False, layout_features=features, name_IDs=["*"]))
-    subsetter.populate(
-        unicodes=[code for first, last in CHARACTERS for code in range(first, last + 1)]
-    )
+    codes = [code for first, last in CHARACTERS for code in range(first, last + 1)]
+    subsetter.populate(unicodes=codes)
     subsetter.subset(font)
     font.flavor = "woff"
-    font.save(file := io.BytesIO())
+    file = io.BytesIO()
+    font.save(file)
     return file.getvalue()
 
 
@@ -72,6 +73,7 @@ def mathml(latex: str, display: str = "inline") -> str:
 
 
 def _letter(found: re.Match[str]) -> str:
+    """Return the character of a letter in a style."""
     style = found[1].upper().replace("-", " ")
     name = re.sub("LATIN |GREEK |LETTER ", "", unicodedata.name(unescape(found[2])))
     try:
@@ -81,16 +83,19 @@ def _letter(found: re.Match[str]) -> str:
 
 
 def visit_math(translator: HTML5Translator, node: nodes.math) -> None:
+    """Write a formula in a line."""
     translator.body.append(mathml(node.astext()))
     raise nodes.SkipNode
 
 
 def visit_displayed_math(translator: HTML5Translator, node: nodes.math_block) -> None:
+    """Write a formula in a paragraph of its own."""
     translator.body.append(f'<div class="formula">{mathml(node.astext(), "block")}</div>')
     raise nodes.SkipNode
 
 
 def write_font(app: Sphinx, error: Exception | None) -> None:
+    """Write the font beside the pages (Sphinx's event `build-finished`)."""
     if not error and app.builder.format == "html" and math_font():
         (app.outdir / "_static" / "math.woff").write_bytes(math_font())
 

@@ -44,7 +44,8 @@ class Picture(SphinxDirective):
             raise self.error(f"no file {self.arguments[0]}")
         self.env.note_dependency(str(path))
         if path.suffix == ".svg":
-            form, data = "image/svg+xml", base64.b64encode(path.read_bytes()).decode()
+            form = "image/svg+xml"
+            data = base64.b64encode(path.read_bytes()).decode()
             alt = unescape(re.search("<desc[^>]*>(.*?)</desc>", path.read_text("utf-8"))[1])
         else:
             heading = self.options["heading"]
@@ -79,34 +80,38 @@ def pictures_below(notebook: NotebookNode, heading: str) -> list[tuple[str, str,
         from the cell with the heading to the next cell with a heading of the same or a higher
         level. Empty without such a heading.
     """
-    found, level = [], 0
+    pictures = []
+    level = 0  # of the heading; 0 before it
     for cell in notebook.cells:
-        if cell.cell_type == "markdown":
-            if level and re.search(rf"^#{{1,{level}}} ", cell.source, re.MULTILINE):
+        if cell.cell_type == "markdown" and level:
+            if re.search(rf"^#{{1,{level}}} ", cell.source, re.MULTILINE):
                 break
-            if not level and (
-                mark := re.search(rf"^(#+) .*{re.escape(heading)}", cell.source, re.MULTILINE)
-            ):
-                level = len(mark[1])
+        elif cell.cell_type == "markdown":
+            mark = re.search(rf"^(#+) .*{re.escape(heading)}", cell.source, re.MULTILINE)
+            level = len(mark[1]) if mark else 0
         elif level:
             for output in cell.get("outputs", []):
                 for form in {"image/png", "image/jpeg"} & set(output.get("data", {})):
                     data = output.data[form].replace("\n", "")
-                    found.append((form, data, output.metadata.get(form, {}).get("alt", "")))
-    return found
+                    pictures.append((form, data, output.metadata.get(form, {}).get("alt", "")))
+    return pictures
 
 
 def arranged(data: str, columns: int, rows: int, count: int, new_columns: int) -> str:
     """Cut a picture in base64 into equal tiles, and lay the first of them out in another number of
     columns."""
     picture = Image.open(io.BytesIO(base64.b64decode(data)))
-    width, height = picture.width // columns, picture.height // rows
-    result = Image.new("RGB", (new_columns * width, -(-count // new_columns) * height), "white")
+    width = picture.width // columns
+    height = picture.height // rows
+    new_rows = -(-count // new_columns)  # rounded up
+    result = Image.new("RGB", (new_columns * width, new_rows * height), "white")
     for tile in range(count):
-        left, top = tile % columns * width, tile // columns * height
+        left = tile % columns * width
+        top = tile // columns * height
         part = picture.crop((left, top, left + width, top + height))
         result.paste(part, (tile % new_columns * width, tile // new_columns * height))
-    result.save(file := io.BytesIO(), picture.format, quality=95)
+    file = io.BytesIO()
+    result.save(file, picture.format, quality=95)
     return base64.b64encode(file.getvalue()).decode()
 
 

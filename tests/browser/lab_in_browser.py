@@ -13,6 +13,7 @@ import urllib.error
 import urllib.request
 from contextlib import contextmanager
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 
 import pytest
@@ -51,18 +52,9 @@ def running_chromium():
                 "no Chromium here: `apt install chromium` or `python -m playwright install "
                 "chromium` brings one"
             )
-        options = [
-            "--no-sandbox",
-            "--disable-gpu",
-            "--enable-unsafe-swiftshader",
-            "--use-gl=swiftshader",
-        ]
-        options += [
-            "--no-first-run",
-            "--disable-background-networking",
-            "--disable-component-update",
-        ]
-        running = playwright.chromium.launch(executable_path=program, args=options)
+        options = "--no-sandbox --disable-gpu --enable-unsafe-swiftshader --use-gl=swiftshader"
+        options += " --no-first-run --disable-background-networking --disable-component-update"
+        running = playwright.chromium.launch(executable_path=program, args=options.split())
         yield running
         running.close()
 
@@ -116,12 +108,7 @@ def serve(folder: Path, state: Path, data: Path):
     lab = Lab(f"http://127.0.0.1:{port}", secrets.token_hex(16))
     command = [
         sys.executable,
-        "-m",
-        "jupyter",
-        "lab",
-        "--no-browser",
-        "--allow-root",
-        "--ServerApp.ip=127.0.0.1",
+        *"-m jupyter lab --no-browser --allow-root --ServerApp.ip=127.0.0.1".split(),
         f"--ServerApp.port={port}",
         "--ServerApp.port_retries=0",
         f"--IdentityProvider.token={lab.token}",
@@ -282,10 +269,8 @@ def label_by_clicks(page) -> None:
     box.locator("button.zsp-next").click()
     _pick_outermost(page, "sequence")
     accept = box.locator("button.zsp-accept:enabled")
-    accepted, asked = (
-        box.locator(".zsp-progress td", has_text="accepted"),
-        box.get_by_text("press accept again"),
-    )
+    accepted = box.locator(".zsp-progress td", has_text="accepted")
+    asked = box.get_by_text("press accept again")
     accept.click()
     accepted.or_(asked).first.wait_for()
     if asked.first.is_visible():
@@ -304,13 +289,7 @@ def _pick_outermost(page, cloud: str, first: int = 0) -> None:
     places = canvas.evaluate(
         "c => [...Array(+c.dataset.points).keys()].map(i => c.pointOnCanvas(i))"
     )
-    across, down = (lambda place: place[0]), (lambda place: place[1])
-    ends = [
-        min(places, key=across),
-        max(places, key=across),
-        min(places, key=down),
-        max(places, key=down),
-    ]
+    ends = [end(places, key=itemgetter(axis)) for axis in (0, 1) for end in (min, max)]
     for number, (x, y) in list(enumerate(ends, 1))[first:]:
         canvas.click(position={"x": x, "y": y})
         _await_marks(page, cloud, number)

@@ -7,12 +7,17 @@ import sys
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import pytest
 import torch
 from lab_in_browser import REPOSITORY
+from numpy.testing import assert_allclose, assert_array_equal
+from playwright.sync_api import Browser, Page
+from torch.testing import assert_close
 
 from docs.playground.build import stored_pairs, write_page_data
 from zsp_lite import Co3D, FeatureMap, ZeroShotPose, load_backbone
@@ -22,6 +27,8 @@ from zsp_lite.course.demo import run_pair
 from zsp_lite.course.samples import sample_data
 from zsp_lite.matching import cyclical_distances, key_similarities, match, similarity
 from zsp_lite.metrics import rotation_error
+from zsp_lite.pair_result import PairResult
+from zsp_lite.views import View
 
 DEFAULTS = {
     "saliency": 0.05,
@@ -51,41 +58,32 @@ PACK = """(array) => {
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory):
+def site(tmp_path_factory) -> Path:
     """Folder of a site with this one page."""
     folder = tmp_path_factory.mktemp("site")
-    only = ["-D", "include_patterns=docs/playground.md", "-D", "root_doc=docs/playground"]
-    command = [
-        sys.executable,
-        "-m",
-        "sphinx",
-        "-q",
-        "-c",
-        "docs/site",
-        "-d",
-        folder / "doctrees",
-        *only,
-        ".",
-        folder,
-    ]
+    only = "-D include_patterns=docs/playground.md -D root_doc=docs/playground".split()
+    options = ["-q", "-c", "docs/site", "-d", folder / "doctrees", *only]
+    command = [sys.executable, "-m", "sphinx", *options, ".", folder]
     # links to other pages are missing
     subprocess.run(command, cwd=REPOSITORY, check=True, stderr=subprocess.DEVNULL)
-    write_page_data(folder / "docs" / "playground")
+    write_page_data(folder / "docs/playground")
     return folder
 
 
 @pytest.fixture(scope="module")
-def method():
+def method() -> ZeroShotPose:
+    """The library's method with the page's backbone."""
     return ZeroShotPose(load_backbone("zsp-tiny", "cpu"))
 
 
 @pytest.fixture(scope="module")
-def stored(browser, site):
+def stored(browser, site) -> Page:
     """The page opened as a file."""
     return open_page(browser, site.as_uri())
 
 
-def open_page(browser, address, **options):
+def open_page(browser: Browser, address: str, **options) -> Page:
+    """Open the page and wait until its pictures are drawn; `broken` collects its errors."""
     page = browser.new_context(**options).new_page()
     page.set_default_timeout(180_000)  # milliseconds, for a busy machine
     page.broken = []
@@ -97,151 +95,209 @@ def open_page(browser, address, **options):
     return page
 
 
-def array(page, expression, kind=np.float32):
+def array(page: Page, expression: str, kind: type = np.float32) -> np.ndarray:
     """A typed array of the page."""
     return np.frombuffer(base64.b64decode(page.evaluate(f"({PACK})({expression})")), kind).copy()
 
 
-def nearest(sim, on1, on2):
+def nearest(sim: torch.Tensor, on1: torch.Tensor, on2: torch.Tensor):
     """Rank patches by the similarity to their nearest neighbour, a `Matcher`."""
     best, partner = sim.max(dim=1)
     return partner, best.masked_fill(~(on1 & on2[partner]), -torch.inf)
 
 
-@pytest.mark.parametrize("index", range(8))
-def test_the_page_computes_what_the_library_computes(stored, method, index):
+class Shown(NamedTuple):
+    """A stored pair that the page shows, and the library's result."""
+
+    page: Page
+    result: PairResult
+    views: list[View]  # the library's: the reference, and the targets
+    stored: list[FeatureMap]  # of the views, with the rounded keys that the page stores
+    solved: dict[bool, dict]  # the page's, by whether matches are cyclical
+
+    def compared(self, target: int, binned: bool) -> torch.Tensor:
+        """The page's similarities of the patches of the reference and a target, (784, 784)."""
+        name = f"state.views[{target + 1}].compared[{int(binned)}].sim"
+        return torch.from_numpy(array(self.page, name).reshape(784, 784))
+
+
+GRID = (28, 28)
+
+
+@pytest.fixture(scope="module", params=range(8))
+def shown(stored, method, request) -> Shown:
+    """Each stored pair in turn."""
     dataset = Co3D(sample_data())
-    result = run_pair(dataset, stored_pairs(dataset)[index], method)
-    expected, views = (
-        result.estimate,
-        [result.estimate.reference_view, *result.estimate.target_views],
-    )
-    stored.evaluate("index => openStored(index)", index)
-    default = stored.evaluate(SOLVE, DEFAULTS)
-    assert default["best"] == expected.view
-    np.testing.assert_allclose(
-        [one["score"] for one in default["targets"]], expected.view_scores, atol=0.05
-    )
-    assert rotation_error(np.array(default["pose"]["R"]), expected.sim3.R) < 1
-    assert default["error"] == pytest.approx(result.error, abs=1)
-
-    solved = {
-        cycle: stored.evaluate(SOLVE, DEFAULTS | {"kmeans": False, "cycle": cycle})
-        for cycle in (True, False)
-    }
-    kept = []  # features with the rounded keys that the page stores
+    result = run_pair(dataset, stored_pairs(dataset)[request.param], method)
+    stored.evaluate("index => openStored(index)", request.param)
+    views = [result.estimate.reference_view, *result.estimate.target_views]
+    maps = []
     for i, view in enumerate(views):
-        on = stored.evaluate(f"Array.from(state.views[{i}].saliency, (value) => value > 0.05)")
-        assert on == view.foreground.flatten().tolist()
-        keys = torch.from_numpy(array(stored, f"state.views[{i}].keys").reshape(28, 28, -1))
-        kept.append(FeatureMap(keys, view.features.saliency, view.features.global_feature))
-    for i, view in enumerate(views[1:]):
-        compared = (array(stored, f"state.views[{i + 1}].compared[{one}].sim") for one in (0, 1))
-        bare, sim = (torch.from_numpy(one.reshape(784, 784)) for one in compared)
-        torch.testing.assert_close(
-            sim, similarity(views[0].features, view.features), atol=1e-3, rtol=0
-        )
-        torch.testing.assert_close(sim, similarity(kept[0], kept[i + 1]), atol=1e-5, rtol=0)
-        (plain,) = key_similarities(views[0].features, [view.features])
-        torch.testing.assert_close(bare, plain, atol=3e-3, rtol=0)
-        closed = -cyclical_distances(sim, (28, 28), (28, 28), views[0].foreground, view.foreground)
-        np.testing.assert_allclose(
-            solved[True]["targets"][i]["distances"], closed.flatten(), atol=1e-6
-        )
-        for cycle, matcher in ((True, "cyclical"), (False, nearest)):
-            matches = match(kept[0], kept[i + 1], kmeans=False, sim=sim, matcher=matcher)
-            found = solved[cycle]["targets"][i]
-            pairs = np.stack([matches.reference @ (28, 1), matches.target @ (28, 1)], axis=1)
-            np.testing.assert_array_equal(found["matches"], pairs)
-            assert found["score"] == pytest.approx(correspondence_score(matches, 50), abs=1e-3)
-    best, pose = solved[True]["best"], solved[True]["pose"]
-    u, v = np.transpose(solved[True]["targets"][best]["matches"])
-    x, y = (np.array(stored.evaluate(f"state.views[{i}].points")) for i in (0, best + 1))
+        keys = torch.from_numpy(array(stored, f"state.views[{i}].keys").reshape(*GRID, -1))
+        maps.append(FeatureMap(keys, view.features.saliency, view.features.global_feature))
+    # Without k-means, whose draws are the page's own.
+    settings = DEFAULTS | {"kmeans": False}
+    solved = {cycle: stored.evaluate(SOLVE, settings | {"cycle": cycle}) for cycle in (True, False)}
+    return Shown(stored, result, views, maps, solved)
+
+
+def test_the_page_has_the_librarys_pose_by_default(shown):
+    expected = shown.result.estimate
+    found = shown.page.evaluate(SOLVE, DEFAULTS)
+    assert found["best"] == expected.view
+    scores = [one["score"] for one in found["targets"]]
+    assert_allclose(scores, expected.view_scores, atol=0.05)
+    assert rotation_error(np.array(found["pose"]["R"]), expected.sim3.R) < 1
+    assert_allclose(found["error"], shown.result.error, atol=1)
+    assert not shown.page.broken
+
+
+def test_the_page_has_the_librarys_foreground(shown):
+    for i, view in enumerate(shown.views):
+        salient = f"Array.from(state.views[{i}].saliency, (value) => value > 0.05)"
+        assert shown.page.evaluate(salient) == view.foreground.flatten().tolist()
+
+
+def test_the_page_has_the_librarys_similarities(shown):
+    reference, *targets = shown.views
+    first, *maps = shown.stored
+    for i, (view, rounded) in enumerate(zip(targets, maps)):
+        sim = shown.compared(i, binned=True)
+        assert_close(sim, similarity(reference.features, view.features), atol=1e-3, rtol=0)
+        assert_close(sim, similarity(first, rounded), atol=1e-5, rtol=0)
+        (plain,) = key_similarities(reference.features, [view.features])
+        assert_close(shown.compared(i, binned=False), plain, atol=3e-3, rtol=0)
+
+
+@pytest.mark.parametrize("cycle, matcher", [(True, "cyclical"), (False, nearest)])
+def test_the_page_has_the_librarys_matches(shown, cycle, matcher):
+    first, *maps = shown.stored
+    for i, (found, rounded) in enumerate(zip(shown.solved[cycle]["targets"], maps, strict=True)):
+        sim = shown.compared(i, binned=True)
+        matches = match(first, rounded, kmeans=False, sim=sim, matcher=matcher)
+        pairs = np.stack([matches.reference @ (28, 1), matches.target @ (28, 1)], axis=1)
+        assert_array_equal(found["matches"], pairs)
+        assert_allclose(found["score"], correspondence_score(matches, 50), atol=1e-3)
+
+
+def test_the_page_has_the_librarys_cyclical_distances(shown):
+    reference, *targets = shown.views
+    for i, view in enumerate(targets):
+        sim = shown.compared(i, binned=True)
+        closed = cyclical_distances(sim, GRID, GRID, reference.foreground, view.foreground)
+        found = shown.solved[True]["targets"][i]["distances"]
+        assert_allclose(found, -closed.flatten(), atol=1e-6)
+
+
+def test_the_page_has_the_librarys_fit(shown):
+    found = shown.solved[True]
+    best, pose = found["best"], found["pose"]
+    u, v = np.transpose(found["targets"][best]["matches"])
+    x, y = [np.array(shown.page.evaluate(f"state.views[{i}].points")) for i in (0, best + 1)]
     fitted, inliers = ransac(x[u], y[v], scale_range=(0.2, 5))
-    assert (
-        rotation_error(np.array(pose["R"]), fitted.R) < 1e-3 and pose["inliers"] == inliers.tolist()
-    )
-    assert not stored.broken
+    assert rotation_error(np.array(pose["R"]), fitted.R) < 1e-3
+    assert pose["inliers"] == inliers.tolist()
 
 
-def test_photographs_get_the_features_of_the_library_and_no_pose(browser, site, method, tmp_path):
+@pytest.fixture(scope="module")
+def address(site):
+    """The address of a server of the site."""
+    handler = partial(SimpleHTTPRequestHandler, directory=site)
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+def wait_for_notice(page: Page, pattern: str) -> None:
+    """Wait until the page says what matches a pattern."""
+    page.wait_for_function(f"/{pattern}/.test(document.getElementById('notice').textContent)")
+
+
+def test_photographs_get_the_features_of_the_library_and_no_pose(
+    browser, address, method, tmp_path
+):
     dataset = Co3D(sample_data())
     reference, targets = dataset.load_pair(stored_pairs(dataset)[-1])
     views = method.views([reference, targets[0]])
     files = [tmp_path / "a.png", tmp_path / "b.png"]
     for file, view in zip(files, views):
         cv2.imwrite(str(file), view.frame.rgb[..., ::-1])
-    server = ThreadingHTTPServer(
-        ("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=site)
-    )
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    address, asked = f"http://127.0.0.1:{server.server_port}", []
-    page = open_page(browser, address)
+    page, requests = open_page(browser, address), []
     if not page.evaluate("DATA.runtime"):
         pytest.skip("onnxruntime-web could not be fetched")
-    page.on("request", lambda request: asked.append((request.method, request.url)))
+    page.on("request", lambda request: requests.append((request.method, request.url)))
     page.set_input_files("#files", files)
-    page.wait_for_function("/not left|cannot/.test(document.getElementById('notice').textContent)")
-    assert "not left this computer" in page.inner_text("#notice") and "No pose" in page.inner_text(
-        "#stages"
-    )
+    wait_for_notice(page, "not left|cannot")
+    assert "not left this computer" in page.inner_text("#notice")
+    assert "No pose" in page.inner_text("#stages")
     for i, view in enumerate(views):
-        keys, saliency = (array(page, f"state.views[{i}].{name}") for name in ("keys", "saliency"))
-        np.testing.assert_allclose(keys, view.features.keys.flatten(), atol=1e-3)
-        np.testing.assert_allclose(saliency, view.features.saliency.flatten(), atol=1e-3)
+        for name in ("keys", "saliency"):
+            found = array(page, f"state.views[{i}].{name}")
+            assert_allclose(found, getattr(view.features, name).flatten(), atol=1e-3)
     page.select_option("#pair", "3")  # the pair shown before
-    page.wait_for_function("/3D models/.test(document.getElementById('notice').textContent)")
-    assert page.evaluate("state.views.length") == 6 and "No pose" not in page.inner_text("#stages")
-    assert asked and all(
-        how == "GET" and url.startswith((address, "data:", "blob:")) for how, url in asked
-    )
-    server.shutdown()
+    wait_for_notice(page, "3D models")
+    assert page.evaluate("state.views.length") == 6
+    assert "No pose" not in page.inner_text("#stages")
+    assert {how for how, _ in requests} == {"GET"}
+    assert all(url.startswith((address, "data:", "blob:")) for _, url in requests)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 390])
-def test_a_person_uses_the_page_with_keyboard_and_touch(browser, site, width, scheme):
-    options = {
-        "viewport": {"width": width, "height": 900},
-        "color_scheme": scheme,
-        "has_touch": True,
-    }
-    page = open_page(browser, site.as_uri(), **options)
+SCREENS = [(width, scheme) for width in (1280, 390) for scheme in ("light", "dark")]
 
-    def tab_to(name):
-        for _ in range(60):
-            if page.evaluate("document.activeElement.id") == name:
-                return
-            page.keyboard.press("Tab")
-        pytest.fail(f"{name} is not reached by the keyboard")
 
-    tab_to("reference")
-    text, picture = page.inner_text("#patch"), array(page, FIRST_TARGET, np.uint8)
-    page.keyboard.press("ArrowLeft")
-    page.keyboard.press("Enter")
-    assert text != page.inner_text("#patch") and page.inner_text("#patch").endswith("held")
-    assert (picture != array(page, FIRST_TARGET, np.uint8)).any() and picture.std() > 20
-    box = page.locator("#reference").bounding_box()
-    page.touchscreen.tap(box["x"] + 60, box["y"] + 60)
-    assert page.inner_text("#patch").endswith("click to hold") and "row 14" not in page.inner_text(
-        "#patch"
-    )
+@pytest.fixture(params=SCREENS, ids=str)
+def touched(browser, site, request) -> Page:
+    """The page on a screen of a width, in a scheme of colours."""
+    width, scheme = request.param
+    viewport = {"width": width, "height": 900}
+    options = {"viewport": viewport, "color_scheme": scheme, "has_touch": True}
+    return open_page(browser, site.as_uri(), **options)
+
+
+def tab_to(page: Page, name: str) -> None:
+    """Press Tab until an element has the focus."""
+    for _ in range(60):  # more than there are elements
+        if page.evaluate("document.activeElement.id") == name:
+            return
+        page.keyboard.press("Tab")
+    pytest.fail(f"{name} is not reached by the keyboard")
+
+
+def test_a_patch_is_held_by_keyboard_and_touch(touched):
+    tab_to(touched, "reference")
+    text, picture = touched.inner_text("#patch"), array(touched, FIRST_TARGET, np.uint8)
+    assert picture.std() > 20  # a picture is shown
+    touched.keyboard.press("ArrowLeft")
+    touched.keyboard.press("Enter")
+    held = touched.inner_text("#patch")
+    assert held != text
+    assert held.endswith("held")
+    assert (picture != array(touched, FIRST_TARGET, np.uint8)).any()
+    box = touched.locator("#reference").bounding_box()
+    touched.touchscreen.tap(box["x"] + 60, box["y"] + 60)
+    released = touched.inner_text("#patch")
+    assert released.endswith("click to hold")
+    assert "row 14" not in released  # the middle row, where the keyboard began
+
+
+def test_settings_are_changed_by_keyboard(touched):
+    tab_to(touched, "cloud")
+    cloud = touched.evaluate("element('cloud').toDataURL()")
+    touched.keyboard.press("ArrowUp")
+    assert touched.evaluate("element('cloud').toDataURL()") != cloud
     right, left = "ArrowRight", "ArrowLeft"
-    keys = {
-        "cloud": "ArrowUp",
-        "saliency": right,
-        "cycle": " ",
-        "k": left,
-        "kmeans": " ",
-        "trials": "Home",
-    }
+    keys = {"saliency": right, "cycle": " ", "k": left, "kmeans": " ", "trials": "Home"}
     for name, key in keys.items():
-        before = page.inner_text("#stages"), page.evaluate("element('cloud').toDataURL()")
-        tab_to(name)
-        page.keyboard.press(key)
-        after = page.inner_text("#stages"), page.evaluate("element('cloud').toDataURL()")
-        assert before[name == "cloud"] != after[name == "cloud"], name
-    for stage in ("saliency", "similarity", "cycle", "matches", "view", "pose"):
-        page.check(f"[name=stage][value={stage}]")
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-    assert not page.broken
+        before = touched.inner_text("#stages")
+        tab_to(touched, name)
+        touched.keyboard.press(key)
+        assert touched.inner_text("#stages") != before, name
+
+
+def test_every_stage_fits_the_screen(touched):
+    for stage in "saliency similarity cycle matches view pose".split():
+        touched.check(f"[name=stage][value={stage}]")
+        width = touched.evaluate("document.documentElement.scrollWidth")
+        assert width <= touched.viewport_size["width"], stage
+    assert not touched.broken

@@ -13,7 +13,7 @@ import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 NOTEBOOKS = sorted(path.name for path in (reader.REPOSITORY / "notebooks").glob("*.ipynb"))
-PICTURES = reader.REPOSITORY / "outputs" / "browser"
+PICTURES = reader.REPOSITORY / "outputs/browser"
 LABELLING = {"08_label_poses.ipynb"}  # have a 3D view that a click labels
 WIDGET = "application/vnd.jupyter.widget-view+json"
 MINUTES = 20  # a notebook may take on a busy machine
@@ -37,7 +37,7 @@ def lab(browser, tmp_path_factory):
     asking = new_notebook(
         cells=[new_markdown_cell("A formula, for MathJax: $x^2$"), check], metadata=python
     )
-    nbformat.write(asking, folder / "notebooks" / "asking.ipynb")
+    nbformat.write(asking, folder / "notebooks/asking.ipynb")
     with reader.serve(folder / "notebooks", folder, folder / "data_samples") as running:
         yield running
 
@@ -65,7 +65,8 @@ def test_a_self_check_gives_feedback_without_a_network(page, lab):
         assert feedback.inner_text().startswith(words)
     page.wait_for_timeout(2000)  # jupyterquiz looks for MathJax after half a second
     assert page.evaluate("typeof MathJax") == "object"
-    assert asked and not [
+    assert asked
+    assert not [
         url for url in asked if not url.startswith((lab.url, "ws://127.0.0.1", "data:", "blob:"))
     ]
 

@@ -1,38 +1,47 @@
 """The course site in Chromium: pages fit a phone, fields can be read, the class does not see the
 presenter's notes."""
 
+import pytest
+
 
 def test_no_page_is_wider_than_the_screen_of_a_phone(browser, site):
-    page, wide = browser.new_page(viewport={"width": 390, "height": 800}), {}
+    screen = 390  # pixels
+    page, wide = browser.new_page(viewport={"width": screen, "height": 800}), {}
     for path in sorted(site.rglob("*.html")):
         name = str(path.relative_to(site))
         if "_static" not in path.parts and name != "index.html":  # which leads on to the start page
             page.goto(path.as_uri())
-            if (width := page.evaluate("document.documentElement.scrollWidth")) > 390:
+            width = page.evaluate("document.documentElement.scrollWidth")
+            if width > screen:
                 wide[name] = width
-    assert not wide
+    assert wide == {}
 
 
-def test_notes_are_shown_in_the_presenters_view_alone(browser, site):
+@pytest.fixture
+def windows(browser, site):
+    """What the class sees of a lab's slides, and the presenter's view."""
     page = browser.new_page()
-    page.goto((site / "docs" / "slides" / "lab_2.html").as_uri())
+    page.goto((site / "docs/slides/lab_2.html").as_uri())
     with page.expect_popup() as opened:
         page.keyboard.press("n")
-    presenter = opened.value
+    return page, opened.value
+
+
+def test_the_keys_of_both_windows_turn_the_slides_of_both(windows):
+    page, presenter = windows
     assert "questions on exercise 02, 10 min" in presenter.inner_text("article")
-    for key, window in (("ArrowRight", page), ("ArrowRight", presenter)):
-        window.keyboard.press(key)
-    assert page.inner_text("#place") == presenter.inner_text("header b") and page.inner_text(
-        "#place"
-    ).startswith("3 /")
-    assert presenter.locator("article img").count() == 1
-    assert "comes close" in presenter.inner_text(
-        "article"
-    ) and "comes close" not in page.inner_text("main")
     page.keyboard.press("ArrowRight")
-    assert "equation 3" in presenter.inner_text(
-        "article"
-    ) and "Taken literally" in presenter.inner_text("article")
-    assert "equation 3" not in page.inner_text("main") and "Taken literally" not in page.inner_text(
-        "main"
-    )
+    presenter.keyboard.press("ArrowRight")
+    assert page.inner_text("#place").startswith("3 /")
+    assert presenter.inner_text("header b") == page.inner_text("#place")
+    assert presenter.locator("article img").count() == 1
+
+
+def test_notes_are_shown_in_the_presenters_view_alone(windows):
+    page, presenter = windows
+    page.keyboard.press("ArrowRight")
+    for notes in (["comes close"], ["equation 3", "Taken literally"]):  # of the slides 3 and 4
+        page.keyboard.press("ArrowRight")
+        for note in notes:
+            assert note in presenter.inner_text("article")
+            assert note not in page.inner_text("main")

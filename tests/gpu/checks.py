@@ -21,17 +21,14 @@ import numpy as np
 import torch
 
 from tools.speed import seconds
-from zsp_lite.backbones.backbone import Backbone
-from zsp_lite.backbones.load import load_backbone
+from zsp_lite import Backbone, Co3D, ZeroShotPose, load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.choices import SOLVERS
 from zsp_lite.course.demo import example_pair
 from zsp_lite.course.samples import sample_data
-from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.pairs import labelled_categories, shipped_pairs
 from zsp_lite.io.files import REPOSITORY
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import extract_views, object_crop
 
 CORES, LARGEST_ANGLE = os.cpu_count(), 1.0  # degrees between the poses of two devices
@@ -101,32 +98,15 @@ def notebooks(device: str) -> Result:
     """
     with tempfile.TemporaryDirectory() as folder:
         for path in sorted((REPOSITORY / "notebooks").glob("0[0-4]*.ipynb")):
-            text = path.read_text(encoding="utf-8")
+            text = path.read_text("utf-8")
             if "backbone.model" not in text:
                 text = text.replace(r"device=\"cpu\"", rf"device=\"{device}\"")
             Path(folder, path.name).write_text(
-                text.replace("nbval-check-output", "not-compared"), encoding="utf-8"
+                text.replace("nbval-check-output", "not-compared"), "utf-8"
             )
-        command = [
-            sys.executable,
-            "-m",
-            "pytest",
-            "-c",
-            "pyproject.toml",
-            "--rootdir",
-            folder,
-            "-q",
-            "--nbval-lax",
-        ]
-        command += [
-            "--nbval-current-env",
-            "--nbval-cell-timeout=300",
-            "-n",
-            "4",
-            "--dist",
-            "loadfile",
-            folder,
-        ]
+        words = "-m pytest -c pyproject.toml -q --nbval-lax --nbval-current-env"
+        words += " --nbval-cell-timeout=300 -n 4 --dist loadfile --rootdir"
+        command = [sys.executable, *words.split(), folder, folder]
         threads = {"OMP_NUM_THREADS": str(max(1, CORES // 4))}
         status = subprocess.run(command, cwd=REPOSITORY, env=os.environ | threads).returncode
     return [], [f"pytest of the notebooks ended with {status}"] if status else []
@@ -174,22 +154,23 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.gpu")
     parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts))
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
-    parser.add_argument("--out", type=Path, default=REPOSITORY / "outputs" / "gpu")
+    parser.add_argument("--out", type=Path, default=REPOSITORY / "outputs/gpu")
     options = parser.parse_args()
     if options.device == "cuda" and not torch.cuda.is_available():
         print("skipped: no CUDA device")
         return 0
     name = torch.cuda.get_device_name() if options.device == "cuda" else "no GPU"
-    report, failures = (
-        [f"| {name}, {CORES} cores, PyTorch {torch.__version__} | device | |", "|---|---|---:|"],
-        [],
-    )
+    report = [
+        f"| {name}, {CORES} cores, PyTorch {torch.__version__} | device | |",
+        "|---|---|---:|",
+    ]
+    failures = []
     options.out.mkdir(parents=True, exist_ok=True)
     for part in options.parts:
         start = time.perf_counter()
         lines, failed = parts[part](options.device)
         report += [*lines, f"| the part {part} | | {time.perf_counter() - start:.0f} s |"]
         failures += failed
-        (options.out / "gpu.md").write_text("\n".join([*report, ""]), encoding="utf-8")
+        (options.out / "gpu.md").write_text("\n".join([*report, ""]), "utf-8")
     print("\n".join([*report, *(f"FAILED {one}" for one in failures)]))
     return 1 if failures else 0

@@ -49,10 +49,8 @@ def attempt(case, folder: Path, answers) -> None:
     try:
         kind, message = case.call(folder)
     except InputError as error:
-        kind, message = (
-            "wrong" if "\n" in str(error) or len(str(error)) > 1500 else "refused",
-            str(error),
-        )
+        kind = "wrong" if "\n" in str(error) or len(str(error)) > 1500 else "refused"
+        message = str(error)
     except BaseException as error:
         lines = traceback.format_exc().strip().splitlines()
         kind, message = "traceback", f"{type(error).__name__}: {error} | {' '.join(lines[-3:-1])}"

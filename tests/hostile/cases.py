@@ -9,8 +9,10 @@ import sys
 import warnings
 import zipfile
 import zlib
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -28,6 +30,7 @@ from tests.hostile.harness import (
     RESULTS,
     STRANGE,
     Case,
+    both,
     case,
     command,
     gzip_bomb,
@@ -35,31 +38,35 @@ from tests.hostile.harness import (
     strange,
     written,
 )
+from zsp_lite import Frame
 from zsp_lite.importers import open_capture
 from zsp_lite.importers.files import read_depth_file, read_mask_file, read_picture
 
+CONTINUED = f"{BENCHMARK} --data ROOT/data --out ROOT/out"
+# Every command, with a file that it reads.
 COMMANDS_OF = {
     "picture": (
         "a.png",
-        ("estimate", "ROOT/a.png", "ROOT/b.png", "--intrinsics", "60,60,32,32", "--out", "ROOT/e"),
+        "estimate ROOT/a.png ROOT/b.png --intrinsics 60,60,32,32 --out ROOT/e",
     ),
-    "results": (RESULTS, ("tables", "ROOT/out")),
-    "packed results": (f"{RESULTS}.gz", ("tables", "ROOT/out")),
-    "run to continue": ("out/run.jsonl", (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/out")),
-    "settings of a run": ("out/run.json", (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/out")),
-    "checked annotations": (FRAMES, ("data", "check", "ROOT/data")),
-    "weights": ("x.safetensors", ("demo", "--backbone", "ROOT/x.safetensors", "--out", "ROOT/d")),
+    "results": (RESULTS, "tables ROOT/out"),
+    "packed results": (f"{RESULTS}.gz", "tables ROOT/out"),
+    "run to continue": ("out/run.jsonl", CONTINUED),
+    "settings of a run": ("out/run.json", CONTINUED),
+    "checked annotations": (FRAMES, "data check ROOT/data"),
+    "weights": ("x.safetensors", "demo --backbone ROOT/x.safetensors --out ROOT/d"),
 }
 for kind in STRANGE:
     for what, (name, read) in READERS_OF.items():
         case("file", f"{what}: {kind}", read, strange(name, kind))
-    for what, (name, argv) in COMMANDS_OF.items():
-        codes = (1,) if what == "checked annotations" else (2,)
-        command("file", f"{what}: {kind}", *argv, change=strange(name, kind), codes=codes)
+    for what, (name, line) in COMMANDS_OF.items():
+        code = 1 if what == "checked annotations" else 2
+        command("file", f"{what}: {kind}", line, strange(name, kind), code)
 
 
 # oversized
 def png(width: int, height: int) -> bytes:
+    """A picture that says to be of a size, and has a megabyte of zeros."""
     chunks = (
         (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)),
         (b"IDAT", zlib.compress(bytes(1 << 20), 9)),
@@ -72,15 +79,22 @@ def png(width: int, height: int) -> bytes:
 
 
 def safetensors(header: dict | bytes, data: bytes = b"") -> bytes:
+    """Weights with a header of one's own."""
     encoded = header if isinstance(header, bytes) else json.dumps(header).encode()
     return struct.pack("<Q", len(encoded)) + encoded + data
 
 
-def _npy(shape, descr="<f8", data=b"") -> bytes:
+def _npy(shape: tuple[int, ...], descr: str = "<f8", data: bytes = b"") -> bytes:
+    """An array file that says to be of a shape and type."""
     header = (
         str({"descr": descr, "fortran_order": False, "shape": shape}).encode().ljust(117) + b"\n"
     )
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + data
+
+
+def depth_map(content: bytes) -> Callable[[Path], None]:
+    """Return a function that gives the capture a depth map."""
+    return both(written("capture/z/0.npy", content), written("capture/depth.txt", "z/0.npy\n"))
 
 
 DEEP = b"[" * 100_000
@@ -111,72 +125,69 @@ for number, (what, data) in enumerate(OVERSIZED):
 command(
     "oversized",
     "results that are a gzip bomb",
-    "tables",
-    "ROOT/out",
-    change=written(f"{RESULTS}.gz", gzip_bomb),
+    "tables ROOT/out",
+    written(f"{RESULTS}.gz", gzip_bomb),
 )
 case(
     "oversized",
     "depth map of 10^15 numbers",
     read_capture("lists"),
-    lambda folder: (
-        written("capture/z/0.npy", _npy((10**15,)))(folder),
-        written("capture/depth.txt", "z/0.npy\n")(folder),
-    ),
+    depth_map(_npy((10**15,))),
 )
 
 
 # malicious: links that lead out of a folder, code in files and as values of options
-def _link(name, target):
-    return lambda folder: (
-        (folder / name).unlink(missing_ok=True),
-        (folder / name).symlink_to(target),
-    )
+def link(name: str, target: str) -> Callable[[Path], None]:
+    """Return a function that replaces a file of the folder by a link."""
+
+    def replace_by_link(folder: Path) -> None:
+        (folder / name).unlink(missing_ok=True)
+        (folder / name).symlink_to(target)
+
+    return replace_by_link
 
 
 case(
     "malicious",
     "depth map of objects",
     read_capture("lists"),
-    lambda folder: (
-        written("capture/z/0.npy", _npy((1,), "|O", b"cos\nsystem\n(S'touch executed'\ntR."))(
-            folder
-        ),
-        written("capture/depth.txt", "z/0.npy\n")(folder),
-    ),
+    depth_map(_npy((1,), "|O", b"cos\nsystem\n(S'touch executed'\ntR.")),
 )
 for target in ("capture/pictures/0.jpg", "capture/rgb.txt"):
     case(
         "malicious",
         f"{target} is a link out of the folder",
         read_capture("lists"),
-        _link(target, "/etc/passwd"),
+        link(target, "/etc/passwd"),
     )
 
 
-def scan(layout: str, change):
-    """Write one frame in a layout of `test_readers`, and change the folder."""
+def scan(layout: str, change: Callable[[Path], object]) -> Callable[[Path], None]:
+    """Return a function that writes one frame in a layout of `test_readers`, and changes it."""
 
-    def write(folder):
-        path, _ = write_scan(
-            layout, folder / "scan", [replace(sequence_data("c", 1).frames[0], name="0")]
-        )
+    def write(folder: Path) -> None:
+        frame = replace(sequence_data("c", 1).frames[0], name="0")
+        path, _ = write_scan(layout, folder / "scan", [frame])
         change(path)
         (folder / "path").write_text(str(path))
 
     return write
 
 
-def read_scan(folder):
+def read_scan(folder: Path) -> list[Frame]:
+    """Read the frames of the scan."""
     return [frame.load() for frame in open_capture((folder / "path").read_text()).frames]
 
 
-def rewritten(name: str, change):
+def rewritten(name: str, change: Callable[[bytes], bytes]) -> Callable[[Path], object]:
+    """Return a function that changes the content of a file."""
     return lambda path: (path / name).write_bytes(change((path / name).read_bytes()))
 
 
-def zip_of(name: str, size: int):
-    def write(path):
+def zip_of(name: str, size: int) -> Callable[[Path], None]:
+    """Return a function that writes a zip with one file of zeros."""
+
+    def write(path: Path) -> None:
         with (
             zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as zipped,
             zipped.open(name, "w", force_zip64=True) as file,
@@ -187,7 +198,8 @@ def zip_of(name: str, size: int):
     return write
 
 
-def without_lzfse(path):
+def without_lzfse(path: Path) -> None:
+    """Give a scan of Record3D a depth map that is not compressed."""
     with zipfile.ZipFile(path, "a") as zipped, warnings.catch_warnings(action="ignore"):
         zipped.writestr("rgbd/0.depth", bytes(range(256)))  # the last of equal names is unpacked
 
@@ -201,27 +213,17 @@ def ten_hours(data: bytes) -> bytes:
     return data
 
 
+CLIMBING = """{"fl_x": 1, "frames": [{
+    "file_path": "../../../../../etc/passwd", "depth_path": "/dev/zero",
+    "transform_matrix": [[1, 0, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]]
+}]}"""
 for name, layout, change in (
     ("zip that unpacks to 3 GB", "nerfstudio", zip_of("transforms.json", 3 << 30)),
     ("zip with a path that climbs", "nerfstudio", zip_of("../../executed", 1 << 20)),
     (
         "transforms.json with a path that climbs",
         "polycam",
-        lambda path: written(
-            "transforms.json",
-            json.dumps(
-                {
-                    "fl_x": 1,
-                    "frames": [
-                        {
-                            "file_path": "../../../../../etc/passwd",
-                            "depth_path": "/dev/zero",
-                            "transform_matrix": [[1, 0, 0, 0]] * 3,
-                        }
-                    ],
-                }
-            ),
-        )(path),
+        written("transforms.json", CLIMBING),
     ),
     (
         "quaternion of zeros",
@@ -231,22 +233,22 @@ for name, layout, change in (
     (
         "frames without end",
         "stray",
-        lambda path: (
+        both(
             written(
                 "odometry.csv",
                 "timestamp, frame\n"
                 + "".join(f"0, {k}, 0, 0, 0, 0, 0, 0, 1\n" for k in (1e9, 1e18, -5, "nan")),
-            )(path),
-            written("depth/1000000000.png", "")(path),
+            ),
+            written("depth/1000000000.png", ""),
         ),
     ),
     (
         "video of 10 hours",
         "stray",
-        lambda path: (
-            rewritten("rgb.mp4", ten_hours)(path),
-            rewritten("odometry.csv", lambda data: data.replace(b", 0.0", b", 9e5"))(path),
-            written("depth/900000.png", "")(path),
+        both(
+            rewritten("rgb.mp4", ten_hours),
+            rewritten("odometry.csv", lambda data: data.replace(b", 0.0", b", 9e5")),
+            written("depth/900000.png", ""),
         ),
     ),
     (
@@ -306,6 +308,7 @@ for name, change in (
 
 # pictures, depth maps and masks of other kinds
 def encoded(values: np.ndarray, kind: str, palette: bool = False, **options) -> bytes:
+    """A picture in a format of Pillow."""
     image, file = Image.fromarray(values), io.BytesIO()
     if palette:
         image.putpalette(range(256))
@@ -314,7 +317,9 @@ def encoded(values: np.ndarray, kind: str, palette: bool = False, **options) -> 
 
 
 def npz(*members: np.ndarray) -> bytes:
-    np.savez_compressed(file := io.BytesIO(), *members)
+    """An archive of arrays."""
+    file = io.BytesIO()
+    np.savez_compressed(file, *members)
     return file.getvalue()
 
 
@@ -328,10 +333,8 @@ def exif(kind: int, count: int, value: bytes) -> bytes:
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(directory) + 2) + directory + jpeg[2:]
 
 
-TIFF, LABELS = (
-    encoded(np.ones((32, 32), np.float32), "TIFF"),
-    np.arange(4096, dtype=np.uint16).reshape(64, 64) % 300,
-)
+TIFF = encoded(np.ones((32, 32), np.float32), "TIFF")
+LABELS = np.arange(4096, dtype=np.uint16).reshape(64, 64) % 300
 for name, read, data in (
     ("cut.webp", read_picture, encoded(np.zeros((32, 32, 3), np.uint8), "WEBP")[:-9]),
     ("cut.tiff", read_depth_file, TIFF[:2000]),
@@ -361,7 +364,20 @@ case(
     lambda folder: zip_of("a.npy", 3 << 30)(folder / "z.npz"),
 )
 MASK_OF_300_LABELS = written("a_mask.png", encoded(LABELS, "PNG"))
-command("picture", "mask of 300 labels", *COMMANDS_OF["picture"][1], change=MASK_OF_300_LABELS)
+command("picture", "mask of 300 labels", COMMANDS_OF["picture"][1], MASK_OF_300_LABELS)
+
+
+def read_without_orientation(*tag: int | bytes) -> Callable[[Path], tuple[str, str]]:
+    """Return the call of a case: a picture is read as if it had no EXIF orientation."""
+
+    def call(folder: Path) -> tuple[str, str]:
+        written("e.jpg", exif(*tag))(folder)
+        _, orientation = read_picture(folder / "e.jpg")
+        return "right" if orientation == 1 else "wrong", ""
+
+    return call
+
+
 for tag in (
     (3, 1, b"\x60\xea\0\0"),
     (2, 4, b"abc\0"),
@@ -369,59 +385,35 @@ for tag in (
     (3, 1 << 31, bytes(4)),
     (99, 1, bytes(4)),
 ):
-    CASES.append(
-        Case(
-            "picture",
-            f"EXIF orientation {tag}",
-            lambda folder, tag=tag: (
-                written("e.jpg", exif(*tag))(folder),
-                ("right" if read_picture(folder / "e.jpg")[1] == 1 else "wrong", ""),
-            )[1],
-        )
-    )
+    CASES.append(Case("picture", f"EXIF orientation {tag}", read_without_orientation(*tag)))
 
-ON_DATA = (*BENCHMARK, "--data", "ROOT/data", "--out", "ROOT/new")
-for option, value in (
-    ("--methods", "raises:now"),
-    ("--methods", "a=/dev/zero/x.csv"),
-    ("--categories", "../.."),
-    ("--list-pairs", "/dev/null/x"),
+ON_DATA = f"{BENCHMARK} --data ROOT/data --out ROOT/new"
+
+
+def module_that_exits(folder: Path) -> None:
+    """Write a module of methods that ends the program."""
+    sys.path.insert(0, str(folder))
+    written("raises.py", "raise SystemExit(3)")(folder)
+
+
+for option in (
+    "--methods raises:now",
+    "--methods a=/dev/zero/x.csv",
+    "--categories ../..",
+    "--list-pairs /dev/null/x",
 ):
-    command(
-        "malicious",
-        f"benchmark {option} {value!r}",
-        *ON_DATA,
-        option,
-        value,
-        change=lambda folder: (
-            sys.path.insert(0, str(folder)),
-            written("raises.py", "raise SystemExit(3)")(folder),
-        ),
-    )
+    command("malicious", f"benchmark {option}", f"{ON_DATA} {option}", module_that_exits)
 
 # options that reach beyond their folder, or ask for more than there is
-for argv in (
-    (*ON_DATA, "--pairs", "100000000"),
-    (*ON_DATA, "--workers", "100000000000"),
-    (*ON_DATA, "--image-size", "1000000"),
-    (*BENCHMARK, "--data", "ROOT/data", "--out", "/dev/null/x"),
-    ("compare", "ROOT", "\udcff"),
-    ("demo", "--data", "\udcff"),
-    ("data", "labels", "file:///etc", "--root", "ROOT/data"),
-    ("data", "transfer", "ROOT/data", "ROOT/data", "../cup"),
-    (
-        "data",
-        "import",
-        "lists",
-        "ROOT/capture",
-        "--root",
-        "ROOT/data",
-        "--category",
-        "c",
-        "--sequence",
-        "..",
-        "--box",
-        "2,2,20,20",
-    ),
+for line in (
+    f"{ON_DATA} --pairs 100000000",
+    f"{ON_DATA} --workers 100000000000",
+    f"{ON_DATA} --image-size 1000000",
+    f"{BENCHMARK} --data ROOT/data --out /dev/null/x",
+    "compare ROOT \udcff",
+    "demo --data \udcff",
+    "data labels file:///etc --root ROOT/data",
+    "data transfer ROOT/data ROOT/data ../cup",
+    "data import lists ROOT/capture --root ROOT/data --category c --sequence .. --box 2,2,20,20",
 ):
-    command("options", " ".join(argv).replace(" ".join(ON_DATA), "benchmark")[:60], *argv)
+    command("options", line.replace(ON_DATA, "benchmark")[:60], line)

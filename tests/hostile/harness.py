@@ -10,18 +10,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from co3d_folders import sequence_data
+from co3d_folders import sequence_data, write_identities
 from safetensors.torch import save_file
 from test_importers import write_lists, write_nerfstudio
 from uco3d_folders import write_uco3d
 
-from zsp_lite.backbones.load import load_backbone
+from zsp_lite import Co3D, Frame, load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.cli.main import main
-from zsp_lite.data.co3d import Co3D, write_co3d
+from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.exchange import read_stored_poses
 from zsp_lite.data.frames import read_depth, read_image, read_mask
-from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.data.published import import_labels
 from zsp_lite.importers import open_capture
@@ -45,32 +45,30 @@ def case(
     group: str, name: str, read: Callable[[Path], object], change: Callable[[Path], object]
 ) -> None:
     """Register a reader that must raise InputError after a change of the folder."""
-    CASES.append(
-        Case(group, name, lambda folder: (change(folder), ("wrong", repr(read(folder))))[1])
-    )
+
+    def call(folder: Path) -> tuple[str, str]:
+        change(folder)
+        return "wrong", repr(read(folder))
+
+    CASES.append(Case(group, name, call))
 
 
 def command(
-    group: str, name: str, *argv: str, change: Callable[[Path], object] | None = None, codes=(2,)
+    group: str, name: str, line: str, change: Callable[[Path], object] | None = None, code: int = 2
 ) -> None:
-    """Register a command line that must end with one of the exit codes: with 2, one line on
-    stderr."""
+    """Register a command line that must end with an exit code: with 2, one line on stderr."""
 
-    def call(folder: Path):
+    def call(folder: Path) -> tuple[str, str]:
         if change is not None:
             change(folder)
         stderr = io.TextIOWrapper(io.BytesIO(), "utf-8", errors="backslashreplace")
         with redirect_stderr(stderr):
-            code = main([text.replace("ROOT", str(folder)) for text in argv])
+            found = main(line.replace("ROOT", str(folder)).split())
         stderr.flush()
         text = stderr.buffer.getvalue().decode()
-        if (
-            code not in codes
-            or "Traceback" in text
-            or code == 2
-            and len(text.strip().splitlines()) != 1
-        ):
-            return "wrong", f"exit code {code}, expected {codes}, and one line on stderr: {text}"
+        one_line = len(text.strip().splitlines()) == 1
+        if found != code or "Traceback" in text or (code == 2 and not one_line):
+            return "wrong", f"exit code {found}, expected {code}, and one line on stderr: {text}"
         return "refused" if code == 2 else "right", text
 
     CASES.append(Case(group, name, call))
@@ -85,23 +83,19 @@ def prepare(folder: Path) -> Path:
     """
     data = folder / "data"
     write_co3d(data, "cup", [sequence_data("a", 6), sequence_data("b", 6, seed=1)])
-    for name in ("a", "b"):
-        write_label(data, "cup", PoseLabel(np.eye(4), name, "a"))
+    write_identities(data, "cup", "ab")
     write_uco3d(folder / "uco3d", Co3D(data), "cup", ["a"])
-    assert main([*BENCHMARK, "--data", str(data), "--out", str(folder / "out"), "--quiet"]) == 0
+    assert main(f"{BENCHMARK} --data {data} --out {folder}/out --quiet".split()) == 0
     for write in (write_lists, write_nerfstudio):
         write(folder / "capture", [replace(sequence_data("c", 1).frames[0], name="0")])
     y, x = np.mgrid[:64, :64]
     disc = (y - 32) ** 2 + (x - 32) ** 2 < 24**2
     depth = np.where(disc, 1000 + 4 * x + 2 * y, 0).astype(np.uint16)
+    picture = np.stack([4 * x, 4 * y, 2 * (x + y)], axis=-1).astype(np.uint8)
     for name in ("a", "b"):
-        picture = np.stack([4 * x, 4 * y, 2 * (x + y)], axis=-1).astype(np.uint8)
-        for end, image in (
-            ("", picture),
-            ("_depth", depth),
-            ("_mask", 255 * disc.astype(np.uint8)),
-        ):
-            cv2.imwrite(str(folder / f"{name}{end}.png"), image)
+        cv2.imwrite(str(folder / f"{name}.png"), picture)
+        cv2.imwrite(str(folder / f"{name}_depth.png"), depth)
+        cv2.imwrite(str(folder / f"{name}_mask.png"), 255 * disc.astype(np.uint8))
     (folder / "poses.csv").write_text(POSES)
     save_file(
         VisionTransformer(32, 8, 64, 2, 1).state_dict(),
@@ -111,28 +105,28 @@ def prepare(folder: Path) -> Path:
     return folder
 
 
-def read_frames(folder: Path):
+def read_frames(folder: Path) -> list[Frame]:
+    """Read the frames of a sequence."""
     data = Co3D(folder / "data")
     return [data.load(frame) for frame in data.frames("cup", "a")]
 
 
-def read_capture(layout: str) -> Callable[[Path], object]:
-    return lambda folder: [
-        frame.load() for frame in open_capture(folder / "capture", layout).frames
-    ]
+def read_capture(layout: str) -> Callable[[Path], list[Frame]]:
+    """Return a function that reads the frames of the capture in a layout."""
+    return lambda folder: [one.load() for one in open_capture(folder / "capture", layout).frames]
 
 
-def read_uco3d(folder: Path):
+def read_uco3d(folder: Path) -> list:
+    """Import the sequences of a small uCO3D."""
     return list(import_uco3d(folder / "uco3d", folder / "imported", "cup"))
 
 
 OF_UCO3D = "uco3d/things/cup/a"
-FRAMES, SEQUENCES = "data/cup/frame_annotations.jgz", "data/cup/sequence_annotations.jgz"
-PAIRS, LABEL, RESULTS = (
-    "data/determ_eval/1samples_2tgt/cup.pt",
-    "data/class_labels/cup/b.json",
-    "out/run.jsonl",
-)
+FRAMES = "data/cup/frame_annotations.jgz"
+SEQUENCES = "data/cup/sequence_annotations.jgz"
+PAIRS = "data/determ_eval/1samples_2tgt/cup.pt"
+LABEL = "data/class_labels/cup/b.json"
+RESULTS = "out/run.jsonl"
 # Every reader, with the file that it reads.
 READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
     "image": ("a.png", lambda folder: read_image(folder / "a.png")),
@@ -161,7 +155,7 @@ READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
     "uCO3D's depth": (f"{OF_UCO3D}/depth_maps.h5", read_uco3d),
     "poses": ("poses.csv", lambda folder: read_stored_poses(folder / "poses.csv")),
 }
-BENCHMARK = ("benchmark", "--pairs", "2", "--targets", "2", "--methods", "icp")
+BENCHMARK = "benchmark --pairs 2 --targets 2 --methods icp"
 POSES = """pair,target_frame,rotation,translation,scale
 "cup/a:0/b:1,4",1,1 0 0 0 1 0 0 0 1,0 0 1,1.5
 """
@@ -178,12 +172,23 @@ def written(name: str, data: bytes | str | Callable[[], bytes]) -> Callable[[Pat
     return write
 
 
+def both(*changes: Callable[[Path], object]) -> Callable[[Path], None]:
+    """Return a function that makes several changes of the folder."""
+
+    def change(folder: Path) -> None:
+        for one in changes:
+            one(folder)
+
+    return change
+
+
 def gzip_bomb() -> bytes:
     """8 GB of spaces, compressed."""
     return gzip.compress(b" " * (1 << 26)) * 128
 
 
 def _sparse(path: Path) -> None:
+    """Write a file of zeros that takes no room on the disk."""
     with open(path, "wb") as file:
         file.truncate(20 << 30)
 

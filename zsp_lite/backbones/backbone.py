@@ -64,6 +64,10 @@ class Backbone:
         if saliency_heads is None:
             dino_small = (model.embed_dim, model.num_heads, model.depth) == (384, 6, 12)
             saliency_heads = (0, 2, 4, 5) if dino_small else heads
+        if layer is None:
+            layer = min(9, model.depth - 1)
+        if image_size is None:
+            image_size = model.image_size
         if not saliency_heads or not set(saliency_heads) <= set(heads):
             raise InputError(
                 f"{name}: saliency_heads are {tuple(saliency_heads)}, expected some of 0 to "
@@ -73,17 +77,13 @@ class Backbone:
         self.name = name
         self.facet = facet
         self.saliency_heads = tuple(saliency_heads)
-        self.layer = block_index(
-            min(9, model.depth - 1) if layer is None else layer, model.depth, name
-        )
+        self.layer = block_index(layer, model.depth, name)
         self.mean = tuple(mean)
         self.std = tuple(std)
         self.batch_size = batch_size
         self.patch_size = model.patch_size
         self.embed_dim = model.embed_dim
-        self.image_size = nearest_multiple(
-            model.image_size if image_size is None else image_size, model.patch_size
-        )
+        self.image_size = nearest_multiple(image_size, model.patch_size)
         self.device = choose_device(device)
         self.model = model.to(self.device).eval().requires_grad_(False)
 
@@ -109,46 +109,50 @@ class Backbone:
         return features
 
     def _extract(self, batch: Float[Tensor, "b 3 s s"]) -> list[FeatureMap]:
-        # The patches' convolution in float32, too: by default, a GPU computes it in TensorFloat-32.
-        cudnn = torch.backends.cudnn
-        flags = cudnn.flags(
-            cudnn.enabled, cudnn.benchmark, deterministic=cudnn.deterministic, allow_tf32=False
-        )
-        with torch.inference_mode(), flags if self.device.type == "cuda" else nullcontext():
+        """Compute the features of a batch of prepared images."""
+        # By default, a GPU computes convolutions in TensorFloat-32: ask for float32. Flags that are
+        # not given would be reset.
+        precision = nullcontext()
+        if self.device.type == "cuda":
+            cudnn = torch.backends.cudnn
+            precision = cudnn.flags(
+                cudnn.enabled, cudnn.benchmark, deterministic=cudnn.deterministic, allow_tf32=False
+            )
+        with torch.inference_mode(), precision:
             tokens = self.model.extract(
                 normalize(batch, self.mean, self.std), self.layer, self.facet
             )
+            # (b, heads, n) -> (b, n), from 0 to 1 in each image
             saliency = tokens.attention[:, list(self.saliency_heads)].float().mean(1)
             low = saliency.amin(1, keepdim=True)
             high = saliency.amax(1, keepdim=True)
             saliency = (saliency - low) / (high - low).clamp_min(1e-12)
-            parts = (
-                tokens.keys.unflatten(1, tokens.grid),
-                saliency.unflatten(1, tokens.grid),
-                tokens.cls,
-            )
-        return [FeatureMap(*one) for one in zip(*(values.cpu() for values in parts), strict=True)]
+        # One map per image: (rows, columns, dim), (rows, columns) and (dim,).
+        keys = tokens.keys.unflatten(1, tokens.grid).cpu()
+        saliency = saliency.unflatten(1, tokens.grid).cpu()
+        return [FeatureMap(*maps) for maps in zip(keys, saliency, tokens.cls.cpu())]
 
 
-def block_index(layer: int | str, depth: int, name: str = "backbone") -> int:
-    """Return the index from 0 of a block given as "last", "block9" or an integer; negative ones
-    count from the end."""
-    found = re.fullmatch(
-        r"(?:block(?=\d))?(-?\d+)", "-1" if layer == "last" else str(layer).strip()
-    )
-    if not found or not -depth <= int(found[1]) < depth:
+def block_index(layer: int | str, depth: int, name: str) -> int:
+    """Return the index from 0 of a block given as "last", "block9" or an integer.
+
+    Negative integers count from the end.
+    """
+    text = "-1" if layer == "last" else str(layer).strip()
+    # An integer, or "block" with a digit behind it: there is no "block-1".
+    number = re.fullmatch(r"(?:block(?=\d))?(-?\d+)", text)
+    if not number or not -depth <= int(number[1]) < depth:
         raise InputError(
             f"{name}: layer is {layer!r}, expected 'last', 'block0' to 'block{depth - 1}', or "
             f"a number from {-depth} to {depth - 1}"
         )
-    return int(found[1]) % depth
+    return int(number[1]) % depth
 
 
 def prepare_images(
     images: Sequence[Image], size: int = 224, first: int = 0
 ) -> Float[Tensor, "b 3 s s"]:
-    """Stack RGB images (H, W, 3), uint8 or float in [0, 1], into a batch of squares with values in
-    [0, 1].
+    """Stack RGB images (H, W, 3), uint8 or float in [0, 1], to a batch of squares in [0, 1].
 
     Images are resized bilinearly with anti-aliasing. Errors count the images from `first`.
     """
@@ -165,7 +169,7 @@ def prepare_images(
                 f"image {index} is {found}, expected uint8 or floats in [0, 1] of shape (H, W, 3)"
             )
         image = image.to(torch.float32) / (255 if is_bytes else 1)
-        image = image.permute(2, 0, 1)[None]
+        image = image.permute(2, 0, 1)[None]  # (1, 3, H, W)
         if image.shape[2:] != (size, size):
             image = F.interpolate(
                 image, (size, size), mode="bilinear", align_corners=False, antialias=True
@@ -176,8 +180,8 @@ def prepare_images(
 
 def normalize(
     images: Float[Tensor, "b 3 h w"],
-    mean: Sequence[float] = IMAGENET_MEAN,
-    std: Sequence[float] = IMAGENET_STD,
+    mean: Sequence[float],
+    std: Sequence[float],
 ) -> Float[Tensor, "b 3 h w"]:
     """Subtract the mean and divide by the standard deviation, per channel."""
     mean = images.new_tensor(mean).view(3, 1, 1)
@@ -192,5 +196,5 @@ def choose_device(device: str | torch.device | None) -> torch.device:
     try:
         return torch.empty(0, device=device).device
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0][:120]
+        reason = str(error).splitlines()[0][:120]  # torch adds a long advice for developers
         raise InputError(f"device {str(device)!r} cannot be used: {reason}") from error

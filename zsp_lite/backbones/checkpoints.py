@@ -13,8 +13,7 @@ from zsp_lite.io.files import MAX_WEIGHTS, file_size, load_torch
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read weights with DINO's state-dict keys, and metadata, from a .safetensors file or a torch
-    file of tensors only.
+    """Read weights with DINO's state-dict keys, and metadata, from a .safetensors or a torch file.
 
     No code from the file is executed. A torch file has no metadata. InputError if there is anything
     but tensors.
@@ -24,16 +23,17 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
         file_size(path, "checkpoint", MAX_WEIGHTS)
         try:
             with safe_open(path, framework="pt") as file:
-                return {key: file.get_tensor(key) for key in file.keys()}, dict(
-                    file.metadata() or {}
-                )
+                weights = {key: file.get_tensor(key) for key in file.keys()}
+                return weights, dict(file.metadata() or {})
         except Exception as error:  # a damaged file can raise almost any exception
+            # The first line of the message, or the type where there is no message.
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(
                 f"checkpoint {path}: damaged, or contains more than tensors ({reason[:120]})"
             ) from error
+
     content = load_torch(path, "checkpoint")
-    # DINO's training checkpoints contain teacher and student.
+    # DINO's training checkpoints contain teacher and student; other programs nest the weights, too.
     for nested in ("teacher", "state_dict", "model"):
         if isinstance(content, dict) and isinstance(content.get(nested), dict):
             content = content[nested]
@@ -46,16 +46,21 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
         raise InputError(
             f"checkpoint {path}: expected a state dict of tensors, got {type(content).__name__}"
         )
-    plain = {
-        str(key).removeprefix("module.").removeprefix("backbone."): x for key, x in content.items()
-    }
-    return {key: x for key, x in plain.items() if not key.startswith("head.")}, {}
+    # Names as in the plain transformer, without the wrappers and the head of the training.
+    weights = {}
+    for key, values in content.items():
+        key = str(key).removeprefix("module.").removeprefix("backbone.")
+        if not key.startswith("head."):
+            weights[key] = values
+    return weights, {}
 
 
 def metadata_integers(metadata: dict[str, str], key: str, path: Path) -> list[int] | None:
     """Parse integers separated by commas; None if the metadata does not contain `key`."""
+    if key not in metadata:
+        return None
     try:
-        return [int(word) for word in metadata[key].split(",")] if key in metadata else None
+        return [int(word) for word in metadata[key].split(",")]
     except ValueError as error:
         raise InputError(
             f"checkpoint {path}: metadata {key} is {metadata[key]!r}, expected integers"
@@ -66,10 +71,12 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> 
     """Build a transformer from weights in the DINO layout, whose shapes give its sizes."""
     try:
         dim, _, patch_size, _ = weights["patch_embed.proj.weight"].shape
+        # The position embedding has one token for CLS, and side * side for the patches.
         side = math.isqrt(weights["pos_embed"].shape[1] - 1)
         depth = len({key.split(".")[1] for key in weights if key.startswith("blocks.")})
         if num_heads is None:
-            num_heads = dim // 64 if dim % 64 == 0 else 0  # the transformer refuses 0 heads
+            # Heads of 64 channels are usual. The transformer refuses 0 heads.
+            num_heads = dim // 64 if dim % 64 == 0 else 0
         # The checkpoint replaces the initial values: do not compute them.
         with torch.device("meta"):
             model = VisionTransformer(side * patch_size, patch_size, dim, depth, num_heads)

@@ -11,6 +11,7 @@ import inspect
 import os
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -22,46 +23,52 @@ from zsp_lite.errors import InputError
 
 PREFIX = "hf:"
 IMAGE_SIZE = 224  # pixels, the paper's
-CONFIG, PROCESSORS = "config.json", ("preprocessor_config.json", "processor_config.json")
-WEIGHTS = "model.safetensors", "model.safetensors.index.json"
-# The only files that are downloaded or read: weights in safetensors format, no pickle files, no
-# code.
+CONFIG = "config.json"
+PROCESSORS = ("preprocessor_config.json", "processor_config.json")
+WEIGHTS = ("model.safetensors", "model.safetensors.index.json")
+# The only files that are downloaded or read: safetensors, no pickle files, no code.
 FILES = (CONFIG, *PROCESSORS, *WEIGHTS, "model*.safetensors")
-_PROJECTIONS = {  # of a facet, by the names that architectures give them
+# Of each facet: the names that architectures give to its linear layer.
+_PROJECTIONS = {
     "query": ("q_proj", "query"),
     "key": ("k_proj", "key"),
     "value": ("v_proj", "value"),
 }
-_CLS = {"cls_token", "class_token", "class_embedding"}  # parameters
+# Parameters: the CLS token by its names, and all tokens that come before the patches.
+_CLS = {"cls_token", "class_token", "class_embedding"}
 _BEFORE_PATCHES = (*_CLS, "register_tokens", "distillation_token")
+
+# Mean and standard deviation that normalise RGB values in [0, 1]; None if unknown.
+Normalisation = tuple[list[float], list[float]] | None
 
 
 class HuggingFaceViT(nn.Module):
-    """Adapter of a Hugging Face model with the attributes and the `extract` of
-    `vit.VisionTransformer`.
+    """A Hugging Face model with the attributes and the `extract` of `vit.VisionTransformer`.
 
     The model must compute attention eagerly, so that it returns it. InputError if it has no CLS
     token or no query, key and value projections in every block, or does not run on images of
     `image_size`.
     """
 
-    def __init__(self, model: nn.Module, config, image_size: int, name: str):
+    def __init__(self, model: nn.Module, config: Any, image_size: int, name: str):
         super().__init__()
         self.vit = model
-        patch, self.num_heads, self.depth = (
-            getattr(config, key, None)
-            for key in ("patch_size", "num_attention_heads", "num_hidden_layers")
-        )
-        self.patch_size = (
-            patch[0] if isinstance(patch, (list, tuple)) and len(set(patch)) == 1 else patch
-        )
-        sizes_known = all(
-            isinstance(size, int) for size in (self.patch_size, self.num_heads, self.depth)
-        )
+        self.num_heads = getattr(config, "num_attention_heads", None)
+        self.depth = getattr(config, "num_hidden_layers", None)
+        self.patch_size = getattr(config, "patch_size", None)
+        # Some architectures give both sides of a patch.
+        if isinstance(self.patch_size, (list, tuple)) and len(set(self.patch_size)) == 1:
+            self.patch_size = self.patch_size[0]
+        sizes = (self.patch_size, self.num_heads, self.depth)
         # In a plain list, so that the modules are not registered a second time.
         self._projections = list(filter(None, map(_projections, model.modules())))
+        # Parameters by the last part of their names.
         special = {key.rpartition(".")[2]: x for key, x in model.named_parameters()}
-        if not sizes_known or len(self._projections) != self.depth or not _CLS & special.keys():
+        if (
+            not all(isinstance(size, int) for size in sizes)
+            or len(self._projections) != self.depth
+            or not _CLS & special.keys()
+        ):
             raise InputError(
                 f"{name}: a {config.model_type} model, expected a vision transformer with one "
                 "square patch_size, num_attention_heads, a CLS token, and in each of "
@@ -74,36 +81,33 @@ class HuggingFaceViT(nn.Module):
         self._prefix = sum(
             special[key].numel() // self.embed_dim for key in _BEFORE_PATCHES if key in special
         )
-        self._arguments = inspect.signature(model.forward).parameters.keys()
+        self._arguments = inspect.signature(model.forward).parameters
         self._try(name)
 
     def extract(
         self, images: Float[Tensor, "batch 3 height width"], layer: int, facet: Facet = "key"
     ) -> Tokens:
-        """Compute the descriptors of one block (counted from 0), the CLS attention and the CLS
-        output token.
+        """Compute block `layer`'s descriptors, the CLS attention and the CLS output.
 
         Register and distillation tokens are removed. Keys and queries are taken before any rotary
         position embedding, so that they do not depend on the position.
         """
-        grid = images.shape[2] // self.patch_size, images.shape[3] // self.patch_size
+        grid = (images.shape[2] // self.patch_size, images.shape[3] // self.patch_size)
+        options = {}
         # Models without this option always interpolate.
-        options = (
-            {"interpolate_pos_encoding": True}
-            if "interpolate_pos_encoding" in self._arguments
-            else {}
-        )
-        # a masked autoencoder orders the patches by it: keep their order
+        if "interpolate_pos_encoding" in self._arguments:
+            options["interpolate_pos_encoding"] = True
+        # A masked autoencoder sorts the patches by their noise: it rises, to keep their order.
         if "noise" in self._arguments:
-            options["noise"] = (
-                torch.arange(grid[0] * grid[1], device=images.device)
-                .float()
-                .expand(len(images), -1)
-            )
+            noise = torch.arange(grid[0] * grid[1], device=images.device).float()
+            options["noise"] = noise.expand(len(images), -1)
+
+        # The layer of a facet records its output; "token" needs no layer, and any will do.
         projected: list[Tensor] = []
-        hook = self._projections[layer][
-            "query" if facet == "token" else facet
-        ].register_forward_hook(lambda module, inputs, output: projected.append(output))
+        layer_of_facet = self._projections[layer].get(facet, nn.Identity())
+        hook = layer_of_facet.register_forward_hook(
+            lambda module, inputs, output: projected.append(output)
+        )
         try:
             output = self.vit(
                 pixel_values=images, output_attentions=True, output_hidden_states=True, **options
@@ -111,10 +115,12 @@ class HuggingFaceViT(nn.Module):
         finally:
             hook.remove()
         descriptors = output.hidden_states[layer + 1] if facet == "token" else projected[0]
-        attention = output.attentions[-1][:, :, 0]
-        patches = slice(self._prefix, None)
+        attention = output.attentions[-1][:, :, 0]  # from CLS: (batch, heads, tokens)
         return Tokens(
-            descriptors[:, patches], attention[..., patches], output.last_hidden_state[:, 0], grid
+            descriptors[:, self._prefix :],
+            attention[..., self._prefix :],
+            output.last_hidden_state[:, 0],
+            grid,
         )
 
     def _try(self, name: str) -> None:
@@ -135,15 +141,9 @@ class HuggingFaceViT(nn.Module):
             ) from error
 
 
-def load_huggingface(
-    name: str, image_size: int | None
-) -> tuple[HuggingFaceViT, tuple[list[float], list[float]] | None]:
-    """Load the model of "hf:NAME": a folder in Hugging Face's format or the name of a model on the
-    hub.
-
-    The second result is the mean and standard deviation that normalise RGB values in [0, 1], None
-    if unknown.
-    """
+def load_huggingface(name: str, image_size: int | None) -> tuple[HuggingFaceViT, Normalisation]:
+    """Load the model of "hf:NAME": a folder in Hugging Face's format, or a model of the hub."""
+    # Imported after `model_folder`, which says in one line that the package is missing.
     folder = model_folder(name)
     from transformers import AutoConfig, AutoModel
 
@@ -188,8 +188,7 @@ def load_huggingface(
 
 
 def model_folder(name: str) -> Path:
-    """Return the folder of "hf:NAME": NAME if it is a folder, else the hub's cache folder of the
-    model NAME.
+    """Return the folder of "hf:NAME": NAME itself, or the hub's cache folder of the model NAME.
 
     Only files that are not in the cache are downloaded, so that a model used before works without a
     network.
@@ -228,24 +227,23 @@ def model_folder(name: str) -> Path:
 
 
 def _has_weights(folder: Path) -> bool:
+    """Tell whether a folder has weights in safetensors format."""
     return any((folder / file).is_file() for file in WEIGHTS)
 
 
 def _projections(attention: nn.Module) -> dict[str, nn.Linear]:
-    """Return the linear layer of each facet if the module itself has all three, else an
-    empty dict."""
-    found = {
-        facet: layer
-        for facet, names in _PROJECTIONS.items()
-        for key in names
-        if isinstance(layer := getattr(attention, key, None), nn.Linear)
-    }
-    return found if len(found) == len(_PROJECTIONS) else {}
+    """Return a module's own linear layer of each facet; {} unless it has all three."""
+    layers = {}
+    for facet, names in _PROJECTIONS.items():
+        for name in names:
+            layer = getattr(attention, name, None)
+            if isinstance(layer, nn.Linear):
+                layers[facet] = layer
+    return layers if len(layers) == len(_PROJECTIONS) else {}
 
 
-def _normalisation(folder: Path) -> tuple[list[float], list[float]] | None:
-    """Return mean and standard deviation from the settings of the image processor, None if they are
-    not there."""
+def _normalisation(folder: Path) -> Normalisation:
+    """Return the image processor's mean and standard deviation, None if it has none."""
     from transformers import ImageProcessingMixin
 
     if not any((folder / file).is_file() for file in PROCESSORS):
@@ -253,7 +251,8 @@ def _normalisation(folder: Path) -> tuple[list[float], list[float]] | None:
     settings, _ = ImageProcessingMixin.get_image_processor_dict(folder, local_files_only=True)
     if settings.get("do_normalize") is False:
         return [0.0] * 3, [1.0] * 3
-    mean, std = settings.get("image_mean"), settings.get("image_std")
+    mean = settings.get("image_mean")
+    std = settings.get("image_std")
     if mean is None or std is None:
         return None
     if not len(mean) == len(std) == 3 or not min(std) > 0:
@@ -269,7 +268,8 @@ def _quiet():
     """Hide transformers' progress bars and its report of unused weights."""
     from transformers.utils import logging
 
-    verbosity, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    verbosity = logging.get_verbosity()
+    bars = logging.is_progress_bar_enabled()
     logging.set_verbosity_error()
     logging.disable_progress_bar()
     try:
@@ -281,4 +281,5 @@ def _quiet():
 
 
 def _one_line(error: Exception) -> str:
+    """Return the beginning of an error's message in one line, or its type if it has none."""
     return " ".join(str(error).split())[:200] or type(error).__name__

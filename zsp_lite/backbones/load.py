@@ -19,13 +19,13 @@ from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash
 from zsp_lite.io.modules import import_object
 
-# the environment variable ZSP_LITE_DINO_URL overrides it
+# The environment variable ZSP_LITE_DINO_URL overrides it.
 DINO_URL = "https://dl.fbaipublicfiles.com/dino/"
-# of a released file: a ViT-B, the largest, has 86 million weights of 4 bytes
+# Of a released file. A ViT-B, the largest, has 86 million weights of 4 bytes: 344 MB.
 MOST_BYTES = 400_000_000
-WEIGHTS = Path(__file__).parents[1] / "weights"
+# The backbone that is part of the package: its name and its file.
 DEFAULT = "zsp-tiny"
-TINY = WEIGHTS / "zsp-tiny.safetensors"
+TINY = Path(__file__).parents[1] / "weights/zsp-tiny.safetensors"
 
 
 @dataclass(frozen=True)
@@ -33,15 +33,18 @@ class PretrainedWeights:
     """A released checkpoint."""
 
     file: str  # path below the DINO URL
-    md5_prefix: str  # no more digits of a digest were published
-    size: int | None = None  # bytes
+    # First digits of the file's MD5 digest in hexadecimal; only these were published.
+    md5_prefix: str
+    size: int | None = None  # bytes, None where it is not known
 
     @property
     def url(self) -> str:
+        """Address of the file."""
         return os.environ.get("ZSP_LITE_DINO_URL", DINO_URL).rstrip("/") + "/" + self.file
 
     @property
     def path(self) -> Path:
+        """Path of the downloaded file."""
         return cache_folder() / Path(self.file).name
 
 
@@ -57,6 +60,7 @@ PRETRAINED = {
         "dino_vitbase16_pretrain/dino_vitbase16_pretrain.pth", "552daf"
     ),
 }
+_IMPORT_PATH = r"[\w.]+:[\w.]+"  # module:name
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,7 @@ class BackboneConfig:
     image_size: int | None = None
 
 
-# a backbone, or what `load_backbone` takes
+# A backbone, or what `load_backbone` takes.
 BackboneLike = FeatureExtractor | str | Path | BackboneConfig
 
 
@@ -116,66 +120,73 @@ def load_backbone(
     config = name_or_path
     if not isinstance(config, BackboneConfig):
         config = BackboneConfig(str(name_or_path), **options)
-    elif options != {"layer": None, "facet": "key", "image_size": None}:
+    elif BackboneConfig("", **options) != BackboneConfig(""):  # not all are the defaults
         raise InputError(f"got {options} beside {config}, expected them in the config only")
+
     load = _load_huggingface if config.name.startswith(PREFIX) else _load_checkpoint
     backbone = load(config, device)
-    # The options are part of the name, because benchmark runs are distinguished by it.
-    parts = [] if config.layer is None else [f"block{backbone.layer}"]
-    parts += [] if config.facet == "key" else [config.facet]
-    parts += [] if config.image_size is None else [f"{config.image_size} px"]
+
+    # Options other than the defaults are part of the name: benchmark runs are distinguished by it.
+    parts = []
+    if config.layer is not None:
+        parts.append(f"block{backbone.layer}")
+    if config.facet != "key":
+        parts.append(config.facet)
+    if config.image_size is not None:
+        parts.append(f"{config.image_size} px")
     if parts:
-        backbone.name = f"{backbone.name} ({', '.join(parts)})"
+        backbone.name += f" ({', '.join(parts)})"
     return backbone
 
 
 def as_backbone(backbone: BackboneLike) -> FeatureExtractor:
-    """Return a backbone as it is, and load one that is given by name, by the path of its file or by
-    its config."""
-    return (
-        load_backbone(backbone) if isinstance(backbone, str | Path | BackboneConfig) else backbone
-    )
+    """Return a backbone as it is; load one that is given by name, file or config."""
+    if isinstance(backbone, str | Path | BackboneConfig):
+        return load_backbone(backbone)
+    return backbone
 
 
 def named_backbone(
     name: str, layer: str | None, facet: Facet, image_size: int | None
 ) -> BackboneLike:
-    """Return what `as_backbone` takes for a name with options; it may be "module:thing", of a
-    backbone of one's own."""
+    """Return what `as_backbone` takes for a name with options.
+
+    "module:thing" is imported: a backbone of the user's own.
+    """
     config = BackboneConfig(name, layer, facet, image_size)
-    plain = config == BackboneConfig(name)
-    if name.startswith(PREFIX) or os.path.isfile(name) or not re.fullmatch(r"[\w.]+:[\w.]+", name):
-        return name if plain else config
-    found = import_object(name)
-    if isinstance(found, type) or not callable(found):
+    has_options = config != BackboneConfig(name)
+    if name.startswith(PREFIX) or os.path.isfile(name) or not re.fullmatch(_IMPORT_PATH, name):
+        return config if has_options else name
+    extractor = import_object(name)
+    if isinstance(extractor, type) or not callable(extractor):
         raise InputError(
-            f"backbone {name!r} is of type {type(found).__name__}, expected a function of images"
+            f"backbone {name!r} is of type {type(extractor).__name__}, "
+            "expected a function of images"
         )
-    if not plain:
+    if has_options:
         raise InputError(
             f"backbone {name!r} is your own, expected no layer, facet or image size beside it"
         )
-    return found
+    return extractor
 
 
 def available_backbones() -> dict[str, Path | None]:
     """Return the names of all backbones with their file, or None if it is not downloaded."""
-    paths = {DEFAULT: TINY} | {name: weights.path for name, weights in PRETRAINED.items()}
+    paths = {DEFAULT: TINY}
+    for name, weights in PRETRAINED.items():
+        paths[name] = weights.path
     return {name: path if path.is_file() else None for name, path in paths.items()}
 
 
-def obtained_by(name: str) -> str:
-    """Return what is to be done for a backbone whose file `available_backbones` does not have."""
-    return (
-        "missing: reinstall zsp-lite"
-        if name == DEFAULT
-        else f"not downloaded: zsp-lite weights fetch {name}"
-    )
+def how_to_obtain(name: str) -> str:
+    """Say how to get the file of a backbone for which `available_backbones` has None."""
+    if name == DEFAULT:
+        return "missing: reinstall zsp-lite"
+    return f"not downloaded: zsp-lite weights fetch {name}"
 
 
 def download(name: str) -> Path:
-    """Return the file of a backbone of this name, or the folder of "hf:NAME", downloaded if it is
-    not there yet.
+    """Return the file of a named backbone, or the folder of "hf:NAME"; download it if missing.
 
     InputError if the file is not the released one.
     """
@@ -192,6 +203,7 @@ def download(name: str) -> Path:
             f"{name}: {error}; download that file on another machine and copy it to "
             f"{weights.path}, or use {DEFAULT}"
         ) from error
+    # `fetch` checks what it downloads, but not a file that exists already.
     if not has_size_and_hash(path, weights.size, weights.md5_prefix):
         raise InputError(
             f"{name}: {path} is not the released file, expected "
@@ -202,10 +214,13 @@ def download(name: str) -> Path:
 
 
 def _load_huggingface(config: BackboneConfig, device: str | torch.device | None) -> Backbone:
+    """Load the backbone of "hf:NAME"."""
     model, normalisation = load_huggingface(config.name, config.image_size)
     mean, std = normalisation or (IMAGENET_MEAN, IMAGENET_STD)
+    # A folder is named without its parents, so that results do not depend on where it lies.
     folder = Path(config.name.removeprefix(PREFIX)).expanduser()
     label = PREFIX + folder.resolve().name if os.path.isdir(folder) else config.name
+    # Three quarters of the depth: as block 9 of DINO's 12.
     layer = 3 * model.depth // 4 if config.layer is None else config.layer
     # One image at a time, because transformers returns the attention of all blocks.
     return Backbone(
@@ -222,9 +237,12 @@ def _load_huggingface(config: BackboneConfig, device: str | torch.device | None)
 
 
 def _load_checkpoint(config: BackboneConfig, device: str | torch.device | None) -> Backbone:
-    name, path = config.name, Path(config.name).expanduser()
+    """Load a backbone from a checkpoint in the DINO layout."""
+    name = config.name
+    path = Path(name).expanduser()
     if name in available_backbones():
-        path, label = download(name), name
+        path = download(name)
+        label = name
     elif os.path.isfile(path):  # False for a name that is too long, where Path.is_file raises
         label = path.stem
     else:
@@ -233,10 +251,10 @@ def _load_checkpoint(config: BackboneConfig, device: str | torch.device | None) 
             f"{', '.join(available_backbones())}, nor {PREFIX}NAME"
         )
     weights, metadata = read_checkpoint(path)
-    num_heads, key_block, saliency_heads = (
-        metadata_integers(metadata, key, path)
-        for key in ("num_heads", "key_block", "saliency_heads")
-    )
+    # Lists of integers, of which the first two have one; None where the file does not say.
+    num_heads = metadata_integers(metadata, "num_heads", path)
+    key_block = metadata_integers(metadata, "key_block", path)
+    saliency_heads = metadata_integers(metadata, "saliency_heads", path)
     model = build_vit(weights, num_heads[0] if num_heads else None, path)
     layer = key_block[0] if config.layer is None and key_block else config.layer
     return Backbone(

@@ -17,13 +17,12 @@ from torch import Tensor, nn
 from zsp_lite.choices import Facet
 from zsp_lite.errors import InputError, check_integer
 
-# Pixels of an image's side; the time of attention grows with the fourth power of the side.
+# Largest side of an image, pixels: the time of attention grows with its fourth power.
 MOST_INPUT = 2048
 
 
 def nearest_multiple(size: int, patch_size: int) -> int:
-    """Round an image size to a positive multiple of `patch_size`; InputError for one below 1 or
-    above `MOST_INPUT`."""
+    """Round an image size, 1 to `MOST_INPUT`, to a positive multiple of `patch_size`."""
     check_integer("image_size", size, 1, MOST_INPUT)
     return max(1, round(size / patch_size)) * patch_size
 
@@ -32,9 +31,9 @@ def nearest_multiple(size: int, patch_size: int) -> int:
 class Tokens:
     """Outputs of a forward pass that the method uses; the n patches are in row-major order."""
 
-    # descriptors: the keys (or another facet) of one block, heads concatenated
+    # Descriptors: the keys (or another facet) of one block, heads concatenated.
     keys: Float[Tensor, "batch n dim"]
-    # of the last block, from CLS to the patches; softmax over 1 + n tokens
+    # Of the last block, from CLS to the patches; softmax over 1 + n tokens.
     attention: Float[Tensor, "batch heads n"]
     cls: Float[Tensor, "batch dim"]  # CLS output token after the final normalisation
     grid: tuple[int, int]  # rows and columns of patches; their product is n
@@ -44,12 +43,12 @@ class Tokens:
 class TrainingTokens:
     """Outputs of a forward pass that training losses use, with gradients."""
 
-    # all output tokens after the final normalisation, CLS first
+    # All output tokens after the final normalisation, CLS first.
     tokens: Float[Tensor, "batch tokens dim"]
     keys: Float[Tensor, "batch n dim"]  # keys of the patches in one block, heads concatenated
-    # normalised patch tokens of that block: the keys are linear in them
+    # Normalised patch tokens of that block: the keys are linear in them.
     key_input: Float[Tensor, "batch n dim"]
-    # scaled attention logits of the last block from CLS to all tokens
+    # Scaled attention logits of the last block from CLS to all tokens.
     cls_logits: Float[Tensor, "batch heads tokens"]
 
 
@@ -58,7 +57,7 @@ class BlockActivations:
     """Intermediate results of one transformer block, CLS first."""
 
     normed: Float[Tensor, "batch tokens dim"]  # input after the first normalisation
-    # like key and value a linear function of `normed`, heads concatenated
+    # Like key and value a linear function of `normed`, heads concatenated.
     query: Float[Tensor, "batch outputs dim"]
     key: Float[Tensor, "batch tokens dim"]
     value: Float[Tensor, "batch tokens dim"]
@@ -78,6 +77,7 @@ class Attention(nn.Module):
     def split_heads(
         self, x: Float[Tensor, "batch n dim"]
     ) -> Float[Tensor, "batch heads n head_dim"]:
+        """Split the last axis, along which the heads are concatenated."""
         return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)
 
     def forward(
@@ -86,16 +86,19 @@ class Attention(nn.Module):
         k: Float[Tensor, "batch n dim"],
         v: Float[Tensor, "batch n dim"],
     ) -> Float[Tensor, "batch m dim"]:
-        """Attend from each query to all keys and apply the output projection; heads are slices of
-        the last axis."""
-        q, k, v = self.split_heads(q), self.split_heads(k), self.split_heads(v)
-        return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+        """Attend from each query to all keys, and apply the output projection."""
+        heads = F.scaled_dot_product_attention(
+            self.split_heads(q), self.split_heads(k), self.split_heads(v)
+        )
+        # (batch, heads, m, head_dim) -> (batch, m, dim)
+        return self.proj(heads.transpose(1, 2).flatten(2))
 
     def cls_logits(
         self, q: Float[Tensor, "batch m dim"], k: Float[Tensor, "batch n dim"]
     ) -> Float[Tensor, "batch heads n"]:
         """Return the scaled attention logits of the first query (the CLS token) for all keys."""
-        q, k = self.split_heads(q[:, :1]), self.split_heads(k)
+        q = self.split_heads(q[:, :1])
+        k = self.split_heads(k)
         return ((q * self.scale) @ k.transpose(-1, -2))[:, :, 0]
 
 
@@ -113,15 +116,19 @@ class Block(nn.Module):
     def forward(
         self, x: Float[Tensor, "batch n dim"], outputs: int | None = None
     ) -> BlockActivations:
-        """Compute the activations; queries and output, which take most of the time, of the first
-        `outputs` tokens."""
+        """Compute the activations, of which queries and output are for `outputs` tokens only.
+
+        By default they are for all tokens; they take most of the time.
+        """
         normed = self.norm1(x)
         if outputs is None:
             q, k, v = self.attn.qkv(normed).chunk(3, dim=-1)
         else:
-            dim, weight, bias = x.shape[-1], self.attn.qkv.weight, self.attn.qkv.bias
-            q = F.linear(normed[:, :outputs], weight[:dim], bias[:dim])
-            k, v = F.linear(normed, weight[dim:], bias[dim:]).chunk(2, dim=-1)
+            # One matrix holds the rows of the queries, the keys and the values, `dim` of each.
+            dim = x.shape[-1]
+            qkv = self.attn.qkv
+            q = F.linear(normed[:, :outputs], qkv.weight[:dim], qkv.bias[:dim])
+            k, v = F.linear(normed, qkv.weight[dim:], qkv.bias[dim:]).chunk(2, dim=-1)
         attended = x[:, :outputs] + self.attn(q, k, v)
         return BlockActivations(normed, q, k, v, attended + self.mlp(self.norm2(attended)))
 
@@ -140,10 +147,9 @@ class PatchEmbed(nn.Module):
         # The windows of the convolution do not overlap: it is one matrix product, which is faster
         # on a CPU.
         p = self.patch_size
-        patches = images.unflatten(3, (-1, p)).unflatten(2, (-1, p)).permute(0, 2, 4, 1, 3, 5)
-        return F.linear(
-            patches.flatten(3).flatten(1, 2), self.proj.weight.flatten(1), self.proj.bias
-        )
+        windows = images.unflatten(3, (-1, p)).unflatten(2, (-1, p))  # (b, 3, rows, p, columns, p)
+        patches = windows.permute(0, 2, 4, 1, 3, 5).flatten(3).flatten(1, 2)  # (b, n, 3 p p)
+        return F.linear(patches, self.proj.weight.flatten(1), self.proj.bias)
 
 
 class VisionTransformer(nn.Module):
@@ -193,6 +199,7 @@ class VisionTransformer(nn.Module):
         side = math.isqrt(self.pos_embed.shape[1] - 1)
         if grid == (side, side):
             return self.pos_embed
+        # Without CLS, as an image: (1, dim, side, side).
         stored = self.pos_embed[:, 1:].unflatten(1, (side, side)).permute(0, 3, 1, 2)
         # As in DINO's code, 0.1 is added against rounding, and interpolate() samples with that
         # scale instead of the exact ratio.
@@ -203,14 +210,11 @@ class VisionTransformer(nn.Module):
     def embed(
         self, images: Float[Tensor, "batch 3 height width"]
     ) -> tuple[Tensor, tuple[int, int]]:
-        """Return the input of the first block (batch, 1 + n, dim) and the patch grid (rows,
-        columns)."""
+        """Return the first block's input (batch, 1 + n, dim) and the patch grid (rows, columns)."""
         grid = (images.shape[2] // self.patch_size, images.shape[3] // self.patch_size)
         patches = self.patch_embed(images)
-        x = torch.cat(
-            [self.cls_token.expand(len(images), -1, -1).to(patches.dtype), patches], dim=1
-        )
-        return x + self.position_embedding(grid), grid
+        cls = self.cls_token.expand(len(images), -1, -1).to(patches.dtype)
+        return torch.cat([cls, patches], dim=1) + self.position_embedding(grid), grid
 
     def forward(
         self, images: Float[Tensor, "batch 3 height width"]
@@ -224,17 +228,17 @@ class VisionTransformer(nn.Module):
     def extract(
         self, images: Float[Tensor, "batch 3 height width"], layer: int = 9, facet: Facet = "key"
     ) -> Tokens:
-        """Compute the descriptors of one block (counted from 0), CLS attention and CLS output of
-        normalised images."""
+        """Compute block `layer`'s descriptors, the CLS attention and the CLS output."""
         x, grid = self.embed(images)
         for index, block in enumerate(self.blocks):
             # In the last block the method needs the keys of all tokens, but the query and the
             # output of CLS only.
-            activations = block(x, 1 if index == self.depth - 1 and facet == "key" else None)
+            cls_only = index == self.depth - 1 and facet == "key"
+            activations = block(x, outputs=1 if cls_only else None)
             x = activations.token
             if index == layer:
                 descriptors = getattr(activations, facet)
-        logits = block.attn.cls_logits(activations.query, activations.key)
+        logits = block.attn.cls_logits(activations.query, activations.key)  # of the last block
         return Tokens(
             descriptors[:, 1:], logits.softmax(-1)[:, :, 1:], self.norm(x[:, :1])[:, 0], grid
         )
@@ -242,8 +246,7 @@ class VisionTransformer(nn.Module):
     def forward_training(
         self, images: Float[Tensor, "batch 3 height width"], layer: int
     ) -> TrainingTokens:
-        """Compute all output tokens, the keys of block `layer` and the CLS attention logits, with
-        gradients."""
+        """Compute what the losses of the training use, with the keys of block `layer`."""
         x, _ = self.embed(images)
         activations = []
         for block in self.blocks:

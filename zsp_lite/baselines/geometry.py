@@ -23,13 +23,11 @@ _MAX_DISTANCE = 1e6
 def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> Sim3:
     """Align point clouds by Open3D's point-to-point ICP with scale, starting from the identity."""
     open3d = load_open3d()
-    clouds = [
-        open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-        for points in (source, target)
-    ]
+    vectors = open3d.utility.Vector3dVector
     registration = open3d.pipelines.registration
     result = registration.registration_icp(
-        *clouds,
+        open3d.geometry.PointCloud(vectors(source)),
+        open3d.geometry.PointCloud(vectors(target)),
         _MAX_DISTANCE,
         np.eye(4),
         registration.TransformationEstimationPointToPoint(with_scaling=True),
@@ -38,6 +36,7 @@ def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> S
         ),
     )
     matrix = np.asarray(result.transformation)
+    # The cube of the scale.
     determinant = np.linalg.det(matrix[:3, :3]) if np.isfinite(matrix).all() else 0.0
     if not determinant > 1e-12:
         raise InputError("icp: the result is not a similarity, because the scale converged to 0")
@@ -47,8 +46,7 @@ def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> S
 def align(
     reference: Frame, targets: Sequence[Frame], view: int, firsts: tuple[Camera, Camera], seed: int
 ) -> Sim3:
-    """Estimate the pose of a reference frame in target `view` by ICP, from camera points to camera
-    points."""
+    """Estimate the pose of a reference frame in target `view` by ICP, between camera frames."""
     rng = np.random.default_rng(seed)
     camera = targets[view].camera
     source = _subsample(object_points(reference), rng)
@@ -66,33 +64,35 @@ def align(
 def _subsample(
     points: Float[np.ndarray, "n 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "m 3"]:
+    """Choose at most `POINTS` points at random; InputError if there are too few."""
     if len(points) < _MIN_POINTS:
         raise InputError(
             f"object has {len(points)} points of known depth, expected at least {_MIN_POINTS}"
         )
-    return (
-        points if len(points) <= POINTS else points[rng.choice(len(points), POINTS, replace=False)]
-    )
+    if len(points) <= POINTS:
+        return points
+    return points[rng.choice(len(points), POINTS, replace=False)]
 
 
 def essential_rotation(
     reference: Frame, target: Frame, matches: Matches, grid: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "3 3"], int, str]:
-    """Return the rotation from the reference's camera to the target's, how many matches agree with
-    it, and a note."""
-    # Directions, since every crop has a camera of its own.
+    """Return the rotation between the cameras, the number of its inliers, and a note for users."""
+    # Points at depth 1 in place of pixels, since every crop has a camera of its own.
     first = _directions(reference.camera, matches.reference, grid)
     second = _directions(target.camera, matches.target, grid)
     focal = np.concatenate([reference.camera.focal_length, target.camera.focal_length]).mean()
-    # Matches are patch centres: a patch is as far as one is off.
+    # The width of a patch at depth 1: matches are patch centres.
     threshold = reference.camera.size[0] / grid[0] / focal
     poses = []
     if len(matches) >= 5:  # five-point RANSAC; OpenCV's draws are always the same
         found, mask = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.999, threshold)
-        # OpenCV stacks several solutions of one sample; which is meant shows in how many points lie
-        # in front.
-        for matrix in () if found is None else np.split(found, len(found) // 3):
-            poses.append(cv2.recoverPose(matrix, first, second, np.eye(3), mask=mask.copy())[:2])
+        # OpenCV stacks the solutions of one sample, (3 s, 3). The right one has the most points in
+        # front of both cameras.
+        if found is not None:
+            for matrix in np.split(found, len(found) // 3):
+                pose = cv2.recoverPose(matrix, first, second, np.eye(3), mask=mask.copy())
+                poses.append(pose[:2])  # number of such points, rotation
     inliers, rotation = max(poses, key=lambda pose: pose[0], default=(0, None))
     if inliers and np.isfinite(rotation).all():
         return rotation, int(inliers), ""
@@ -104,8 +104,7 @@ def _directions(
 ) -> Float[np.ndarray, "k 2"]:
     """Return where patch centres lie on the plane at depth 1 of the camera."""
     height, width = camera.size
-    pixels = (np.asarray(patches, dtype=np.float64)[:, ::-1] + 0.5) * (
-        width / grid[1],
-        height / grid[0],
-    )
+    # From (row, column) of a patch to (x, y) of its centre.
+    patch_size = (width / grid[1], height / grid[0])
+    pixels = (np.asarray(patches, dtype=np.float64)[:, ::-1] + 0.5) * patch_size
     return np.ascontiguousarray(camera.unproject_camera(pixels, np.ones(len(pixels)))[:, :2])

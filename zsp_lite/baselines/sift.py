@@ -19,11 +19,10 @@ KEYPOINT_SIZE = 24.0  # of RootSIFT, pixels
 _CELLS = 4  # along each side of a descriptor
 _BINS = 8  # orientations per cell
 _CELL = 1.5  # side of a cell, in keypoint sizes
-# OpenCV's constants: blur of the first octave (the image is assumed to have a blur of 0.5),
-# clipping, scale.
+# OpenCV's constants. The first octave has a blur of 1.6 pixels, of which the image has 0.5 already.
 _BLUR = (1.6**2 - 0.5**2) ** 0.5
-_CLIP = 0.2
-_SCALE = 512.0
+_CLIP = 0.2  # largest entry of a descriptor, relative to its length
+_SCALE = 512.0  # length of a descriptor before it is rounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,55 +34,51 @@ class Keypoints:
 
 
 class Sift:
-    """Detector and descriptor of keypoints in the mask or, without a mask, in the whole image:
-
-    OpenCV's defaults.
-    """
+    """OpenCV's SIFT with its defaults, in the mask or, without one, in the whole image."""
 
     name = "sift"
 
     def describe(self, frames: Sequence[Frame]) -> list[Keypoints]:
         """Detect the keypoints of object crops."""
-        found = []
+        keypoints = []
         for frame in frames:
             grey = cv2.cvtColor(np.ascontiguousarray(frame.rgb), cv2.COLOR_RGB2GRAY)
             mask = None if frame.mask is None else (frame.mask > ON_OBJECT).astype(np.uint8)
             points, descriptors = cv2.SIFT_create().detectAndCompute(grey, mask)
-            descriptors = np.empty((0, 128), np.float32) if descriptors is None else descriptors
+            if descriptors is None:
+                descriptors = np.empty((0, 128), np.float32)
             # OpenCV measures from the centre of pixel 0 (half a pixel) in an upsampled image,
             # shifted by -1/4 pixel.
             pixels = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.25
             length = np.linalg.norm(descriptors, axis=1, keepdims=True)
-            found.append(Keypoints(pixels, descriptors / np.maximum(length, 1e-12)))
-        return found
+            keypoints.append(Keypoints(pixels, descriptors / np.maximum(length, 1e-12)))
+        return keypoints
 
 
 def mutual_matches(
     first: Keypoints, second: Keypoints, k: int = 50
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return indices in both images, and cosines, of the k most similar mutual nearest neighbours,
-    best first."""
+    """Match mutual nearest neighbours: indices in both images and cosines of the best k."""
     similarity = torch.from_numpy(
         first.descriptors.astype(np.float64) @ second.descriptors.T.astype(np.float64)
     )
     if not similarity.numel():  # an image without keypoints
         return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+    # Of each keypoint of the first image: its neighbour in the second; -inf if it is not mutual.
     partner, score = mutual_nearest_neighbours(similarity)
     best = score.argsort(descending=True, stable=True)[: min(k, int(score.isfinite().sum()))]
     return best.numpy(), partner[best].numpy(), score[best].numpy()
 
 
 def unproject_pixels(frame: Frame, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Compute the points of pixels in camera coordinates, with in-painted depth where it is
-    unknown."""
+    """Compute the points of pixels in camera coordinates; unknown depth is in-painted."""
     height, width = frame.camera.size
     columns, rows = np.floor(pixels).astype(np.int64).clip(0, (width - 1, height - 1)).T
     return frame.camera.unproject_camera(pixels, inpaint_depth(frame.depth)[rows, columns])
 
 
 class RootSift:
-    """Feature extractor without saliency: the keys (28, 28, 128) are upright SIFT descriptors at
-    the patch centres.
+    """Feature extractor whose keys (28, 28, 128) are upright SIFT descriptors at patch centres.
 
     As RootSIFT (Arandjelovic and Zisserman 2012), they are square roots of L1-normalised
     histograms, whose dot products are Hellinger kernels. The global feature is their normalised
@@ -118,20 +113,21 @@ class RootSift:
 def dense_sift(
     grey: UInt8[np.ndarray, "n n"], centres: Float[np.ndarray, " side"], size: float
 ) -> Float[np.ndarray, "side side 128"]:
-    """Compute the descriptors of upright keypoints on a grid: integers from 0 to 255, OpenCV's up
-    to rounding."""
-    n, side = len(grey), len(centres)
+    """Compute OpenCV's descriptors of upright keypoints on a grid: integers from 0 to 255."""
+    side = len(centres)
     blurred = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _BLUR)
-    right, up = np.zeros_like(blurred), np.zeros_like(blurred)  # gradients are 0 at the border
+    # Gradients, 0 at the border.
+    right = np.zeros_like(blurred)
+    up = np.zeros_like(blurred)
     right[1:-1, 1:-1] = blurred[1:-1, 2:] - blurred[1:-1, :-2]
     up[1:-1, 1:-1] = blurred[:-2, 1:-1] - blurred[2:, 1:-1]
     length, angle = cv2.cartToPolar(right, up, angleInDegrees=True)
-    # Each gradient contributes to the two nearest orientations, with linear weights.
+    # Each gradient contributes to the two nearest orientations, with linear weights: (bins, n, n).
     distance = np.abs(angle * (_BINS / 360) - np.arange(_BINS, dtype=np.float32)[:, None, None])
     oriented = length * np.maximum(1 - np.minimum(distance, _BINS - distance), 0)
     # The weights are separable in rows and columns: two small products do it in a hundredth of
     # OpenCV's time.
-    weights = _weights(n, centres, _CELL * size)
+    weights = _weights(len(grey), centres, _CELL * size)
     cells = (weights @ oriented @ weights.T).reshape(_BINS, side, _CELLS, side, _CELLS)
     histograms = cells.transpose(1, 3, 2, 4, 0).reshape(side, side, -1)
     histograms = np.minimum(histograms, _CLIP * np.linalg.norm(histograms, axis=-1, keepdims=True))
@@ -142,12 +138,12 @@ def dense_sift(
 def _weights(
     n: int, centres: Float[np.ndarray, " side"], cell: float
 ) -> Float[np.ndarray, "rows n"]:
-    """Compute the weight of each of n pixels along one axis in each cell of each keypoint
-    (keypoints x cells, n)."""
-    offset = np.arange(n) - np.round(centres)[:, None]
+    """Compute the weights of n pixels along one axis in each cell of each keypoint."""
+    offset = np.arange(n) - np.round(centres)[:, None]  # (keypoints, n), pixels
     in_cells = offset / cell
-    window = np.exp(-(in_cells**2) / (_CELLS**2 / 2)) * (
-        np.abs(offset) <= round(cell * 2**0.5 * (_CELLS + 1) / 2)
-    )
+    # A Gaussian window, which ends where OpenCV's does.
+    inside = np.abs(offset) <= round(cell * 2**0.5 * (_CELLS + 1) / 2)
+    window = np.exp(-(in_cells**2) / (_CELLS**2 / 2)) * inside
+    # To the centre of each cell, (keypoints, cells, n); the weight falls linearly to the next one.
     distance = np.abs(in_cells[:, None] + _CELLS / 2 - 0.5 - np.arange(_CELLS)[:, None])
     return (window[:, None] * np.maximum(1 - distance, 0)).reshape(-1, n).astype(np.float32)

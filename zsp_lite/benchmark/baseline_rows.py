@@ -49,15 +49,12 @@ def icp_best_view(problem: PairProblem) -> Answer:
 def sift(problem: PairProblem) -> Answer:
     """Run "SIFT": select the view by the similarity of its mutual nearest neighbours, and fit the
     pose by RANSAC."""
-    first: Keypoints
-    first, *others = (crop.described["sift"] for crop in problem.crops)
-    found = [mutual_matches(first, other, _K) for other in others]
-    view = int(
-        np.argmax(
-            [score_from_cosines(torch.from_numpy(similarity), _K) for *_, similarity in found]
-        )
-    )
-    one, two, _ = found[view]
+    keypoints: list[Keypoints] = [crop.described["sift"] for crop in problem.crops]
+    first, *others = keypoints
+    matches = [mutual_matches(first, other, _K) for other in others]
+    scores = [score_from_cosines(torch.from_numpy(cosines), _K) for *_, cosines in matches]
+    view = int(np.argmax(scores))
+    one, two, _ = matches[view]
     return fit_keypoints(problem, view, first.pixels[one], others[view].pixels[two])
 
 
@@ -84,23 +81,24 @@ class Scans:
 def _agreed(problem: PairProblem, pairs: Sequence[Pair]) -> Answer:
     """Return the pose that the hypotheses of pairs of frames agree on, those of the problem's own
     pair among them."""
-    own, kept = hypotheses(problem), problem.store.kept
-    others = [
-        pair
-        for pair in (replace(one, repeat=problem.pair.repeat) for one in pairs)
-        if pair != problem.pair
-    ]
-    for key in ((hypotheses, pair) for pair in others):
-        if key not in kept:  # for other rows, and for other pairs of the same objects
+    own = hypotheses(problem)
+    kept = problem.store.kept  # for other rows, and for other pairs of the same objects
+    found = [own]
+    for pair in (replace(pair, repeat=problem.pair.repeat) for pair in pairs):
+        if pair == problem.pair:
+            continue
+        key = hypotheses, pair
+        if key not in kept:
             kept[key] = None
             with suppress(NoPoseError):
-                kept[key] = hypotheses(PairProblem(key[1], problem.store))
-    alignment = synchronise([own, *filter(None, (kept[hypotheses, pair] for pair in others))])
-    reference, target = (Sim3(1.0, one.camera.R, one.camera.t) for one in problem.frames()[:2])
+                kept[key] = hypotheses(PairProblem(pair, problem.store))
+        if kept[key] is not None:
+            found.append(kept[key])
+    alignment = synchronise(found)
+    reference, target = [Sim3(1.0, one.camera.R, one.camera.t) for one in problem.frames()[:2]]
     sim3 = target @ alignment.between(own.reference, own.target) @ reference.inverse()
-    return Answer(
-        sim3.R, 0, sim3.t, sim3.scale, confidence=alignment.objects[own.target].probability
-    )
+    probability = alignment.objects[own.target].probability
+    return Answer(sim3.R, 0, sim3.t, sim3.scale, confidence=probability)
 
 
 def hypotheses(problem: PairProblem) -> PairHypotheses:

@@ -70,9 +70,9 @@ def evaluate_pairs(
         executor: Where to evaluate, with its number of workers; None for this process.
         kind: Type of the lines.
     """
-    known = {
-        (row, line.pair, line.repeat) for line in read_lines(out, kind) for row in line.results
-    }
+    known = set()
+    for line in read_lines(out, kind):
+        known |= {(row, line.pair, line.repeat) for row in line.results}
     todo = {}
     for pair, names in work.items():
         new = [name for name in names if (name, pair.key, pair.repeat) not in known]
@@ -81,13 +81,14 @@ def evaluate_pairs(
     if not todo:
         return
     make = partial(make, max(1, get_num_threads() // workers))
+    # At least four chunks for each worker, so that all end at about the same time.
     chunks = make_chunks(todo, max(1, min(CHUNK_SIZE, len(todo) // (4 * workers))))
     hidden = None if logger.isEnabledFor(logging.INFO) else True  # None: outside a terminal
     done = len(work) - len(todo)
     with tqdm(total=len(work), initial=done, unit="pair", delay=1, disable=hidden) as bar:
 
         def store(lines: list[dict[str, Any]]) -> None:
-            add_lines(out, lines, kind)
+            add_lines(out, lines)
             bar.update(len(lines))
 
         if executor is None:
@@ -97,7 +98,7 @@ def evaluate_pairs(
                     store([evaluate(pair, rows)])
             return
         with _rows_for_workers(make, executor, out) as (path, checksum):
-            futures = [executor.submit(_evaluate_chunk, path, checksum, one) for one in chunks]
+            futures = [executor.submit(_evaluate_chunk, path, checksum, chunk) for chunk in chunks]
             try:
                 for future in as_completed(futures):
                     store(future.result())
@@ -143,7 +144,7 @@ def _pickle(make: Callable[[], Any], executor: Executor) -> bytes:
     see it."""
     # Processes of this machine import what this one can import.
     if not isinstance(executor, ProcessPoolExecutor):
-        found = {name for _, name, _ in pkgutil.iter_modules([os.getcwd()])} - {"zsp_lite"}
+        found = {module.name for module in pkgutil.iter_modules([os.getcwd()])} - {"zsp_lite"}
         for name in found & sys.modules.keys():
             cloudpickle.register_pickle_by_value(sys.modules[name])
     with ends_the_run("sending the rows to workers"):
@@ -153,16 +154,16 @@ def _pickle(make: Callable[[], Any], executor: Executor) -> bytes:
 _worker = threading.local()  # an executor's workers may be threads
 
 
-def _evaluate_chunk(shared: str, digest_of_it: str, chunk: Chunk) -> list[dict[str, Any]]:
-    """Evaluate a chunk in a worker, which keeps what evaluates it for the next one of the same
-    call."""
-    if getattr(_worker, "shared", None) != shared:
-        pickled = read_bytes(shared, "rows of the run")
-        if digest(pickled) != digest_of_it:  # never unpickle what somebody else has written
+def _evaluate_chunk(path: str, checksum: str, chunk: Chunk) -> list[dict[str, Any]]:
+    """Evaluate a chunk in a worker, which keeps what evaluates it for the next one of the call."""
+    if getattr(_worker, "path", None) != path:
+        pickled = read_bytes(path, "rows of the run")
+        if digest(pickled) != checksum:  # never unpickle what somebody else has written
             raise InputError(
-                f"rows of the run {shared} have changed, expected the file that this run wrote"
+                f"rows of the run {path} have changed, expected the file that this run wrote"
             )
-        _worker.evaluate, _worker.shared = cloudpickle.loads(pickled)(), shared
+        _worker.evaluate = cloudpickle.loads(pickled)()
+        _worker.path = path
     with one_thread():
         return [_worker.evaluate(pair, rows) for pair, rows in chunk]
 
@@ -175,11 +176,8 @@ def open_workers(executor: Executor | int = 1) -> Iterator[tuple[Executor | None
     It is a number of processes, 1 for this one, or an Executor, which stays open.
     """
     if isinstance(executor, Executor):
-        yield (
-            executor,
-            getattr(executor, "_max_workers", None)
-            or getattr(executor, "num_workers", _UNKNOWN_WORKERS),
-        )
+        known = getattr(executor, "_max_workers", None)
+        yield executor, known or getattr(executor, "num_workers", _UNKNOWN_WORKERS)
         return
     check_integer("workers", executor, 1, 4096)
     if executor == 1:

@@ -12,8 +12,8 @@ from typing import Any, Literal
 
 from zsp_lite.baselines.sift import RootSift, Sift
 from zsp_lite.benchmark import baseline_rows
-from zsp_lite.benchmark.identity import described
 from zsp_lite.benchmark.own import Estimator, KeypointMatcher, StoredPoses, kind_of
+from zsp_lite.benchmark.runs import described
 from zsp_lite.data.exchange import read_stored_poses
 from zsp_lite.errors import InputError, check_number
 from zsp_lite.features import FeatureExtractor
@@ -36,7 +36,6 @@ class Method:
     # Function of a `Problem` that replaces the paper's method; `features` is then the extractor
     # that it uses.
     solve: Callable[[Any], Any] | None = None
-    seconds: int = field(default=60, compare=False)  # limit of a row of one's own for a pair
 
 
 _MASK = {"foreground": "mask"}
@@ -117,9 +116,9 @@ GROUPS: dict[str, list[str]] = {
 
 def _members(name: str) -> list[str]:
     """The rows of a group, or the name of a row itself."""
-    return (
-        [row for member in GROUPS[name] for row in _members(member)] if name in GROUPS else [name]
-    )
+    if name not in GROUPS:
+        return [name]
+    return [row for member in GROUPS[name] for row in _members(member)]
 
 
 def resolve(
@@ -135,19 +134,22 @@ def resolve(
     """
     if not isinstance(methods, Mapping):
         names = [methods] if isinstance(methods, str) else methods
-        parts = (row.partition("=") for name in names for row in _members(name))
-        meanings = {(name.strip(), meant or name): None for name, _, meant in parts}
-        if len(methods := dict(meanings.keys())) < len(meanings):
-            raise InputError(
-                f"methods {', '.join(names)} are two of one name, expected one of each"
-            )
+        meanings = {}
+        for row in dict.fromkeys(row for name in names for row in _members(name)):
+            name, _, meant = row.partition("=")
+            if meanings.setdefault(name.strip(), meant or name) != (meant or name):
+                raise InputError(
+                    f"methods {', '.join(names)} are two of one name, expected one of each"
+                )
+        methods = meanings
     if not methods:
         raise InputError("no methods, expected some; `zsp-lite benchmark --list` lists them")
     labels = [line["label"] for table in read_paper_tables() for line in table["rows"]]
     # "alignment" is the row that `align` stores.
-    taken = {*map(str.casefold, [*METHODS, *GROUPS, *labels, "alignment"])}
+    taken = {name.casefold() for name in (*METHODS, *GROUPS, *labels, "alignment")}
     for name, meant in methods.items():
-        plain, text = str(name).strip().casefold(), meant if isinstance(meant, str) else ""
+        plain = str(name).strip().casefold()
+        text = meant if isinstance(meant, str) else ""
         if text != name and taken & {plain, base_name(plain), base_name(text)}:
             raise InputError(
                 f"method {name!r} gives a library row another name, or a name of its or the "
@@ -168,17 +170,19 @@ def _method(name: str, meant: Any) -> Method:
         if ":" not in meant:
             raise InputError(
                 f"method {meant!r} is unknown; `zsp-lite benchmark --list` lists all, "
-                "NAME=module:thing and "
-                "NAME=poses.csv are your own"
+                "NAME=module:thing and NAME=poses.csv are your own"
             )
         meant = import_object(meant)
     elif isinstance(meant, Method):
         return meant
     kind = kind_of(name, meant)
-    if kind in ("matcher", "solver"):
-        return Method(settings={kind: meant})
-    wrap = {"estimator": Estimator, "keypoints": KeypointMatcher}.get(kind)
-    return Method("none", solve=wrap(meant)) if wrap else Method(solve=meant)
+    if kind == "estimator":
+        return Method("none", solve=Estimator(meant))
+    if kind == "keypoints":
+        return Method("none", solve=KeypointMatcher(meant))
+    if kind == "problem":
+        return Method(solve=meant)
+    return Method(settings={kind: meant})  # a matcher or a solver
 
 
 def base_name(name: str) -> str:

@@ -20,13 +20,8 @@ from zsp_lite.errors import InputError, describe_failure, ends_the_run, real_arr
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import object_crop
 
-# functions of one, two and three arguments, and a solver
-KINDS = (
-    "problem",
-    "keypoints",
-    "matcher",
-    "solver",
-)
+# Functions of one, two and three arguments, and a solver.
+KINDS = ("problem", "keypoints", "matcher", "solver")
 
 
 def kind_of(name: str, thing: Any) -> str:
@@ -40,24 +35,27 @@ def kind_of(name: str, thing: Any) -> str:
     if not isinstance(thing, type):
         if callable(getattr(thing, "estimate", None)):
             return "estimator"
-        if (kind := getattr(thing, "kind", None)) in KINDS:
-            return kind
+        if getattr(thing, "kind", None) in KINDS:
+            return thing.kind
         known = parameters(thing)
-        others = [one for name, one in known.items() if name not in ("seed", "threshold")]
         needed = [
-            one for one in others if one.default is one.empty and one.kind is not one.VAR_KEYWORD
+            one
+            for key, one in known.items()
+            if key not in ("seed", "threshold")
+            and one.default is one.empty
+            and one.kind is not one.VAR_KEYWORD
         ]
         positional = all(
             one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed
         )
+        if positional and len(needed) == 3 and known.keys() >= {"seed", "threshold"}:
+            return "solver"
         if positional and len(needed) in (1, 2, 3):
-            solves = len(needed) == 3 and known.keys() >= {"seed", "threshold"}
-            return "solver" if solves else KINDS[len(needed) - 1]
+            return KINDS[len(needed) - 1]
     raise InputError(
-        f"method {name!r} is of type {type(thing).__name__}, expected a function of one "
-        "argument (problem), two (two "
-        "images) or three (similarities, two foregrounds), a solver, or an object with "
-        "estimate(reference, targets)"
+        f"method {name!r} is of type {type(thing).__name__}, expected a function of one argument "
+        "(problem), two (two images) or three (similarities, two foregrounds), a solver, or an "
+        "object with estimate(reference, targets)"
     )
 
 
@@ -69,10 +67,11 @@ class OutOfTime(BaseException):
 def fails_alone(seconds: int) -> Iterator[None]:
     """Turn an error of the block, or that it takes too long between two calls of compiled code,
     into an InputError."""
-    thread, ended = ctypes.c_ulong(threading.get_ident()), threading.Lock()
+    thread = ctypes.c_ulong(threading.get_ident())
+    ended = threading.Lock()
 
     def watch() -> None:
-        wait: float = seconds
+        wait = seconds
         while not ended.acquire(timeout=wait):
             ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(OutOfTime))
             wait = 1  # and again, for a block that goes on
@@ -89,11 +88,10 @@ def fails_alone(seconds: int) -> Iterator[None]:
             watcher.join()  # what it has raised comes here at the latest
     except (InputError, KeyboardInterrupt):
         raise
+    except OutOfTime as error:
+        raise InputError(f"takes more than {seconds} s") from error
     except BaseException as error:
-        late = f"takes more than {seconds} s"
-        raise InputError(
-            late if isinstance(error, OutOfTime) else describe_failure(error)
-        ) from error
+        raise InputError(describe_failure(error)) from error
 
 
 def given(method: Any, problem: PairProblem) -> Any:
@@ -117,9 +115,9 @@ class Estimator:
 
     def __call__(self, problem: Problem) -> Any:
         reference, *targets = problem.frames()
-        own = (
-            replace(self.own, seed=problem.seed) if isinstance(self.own, ZeroShotPose) else self.own
-        )
+        own = self.own
+        if isinstance(own, ZeroShotPose):
+            own = replace(own, seed=problem.seed)
         return seeded(own.estimate, problem.seed)(reference, targets)
 
 
@@ -149,10 +147,8 @@ def fit_keypoints(
     (sec. 4.3)."""
     reference, *targets = problem.frames(depth=True)
     empty = np.zeros((0, 2))
-    first, second = (
-        real_array("matched points", one if len(one) else empty, (None, 2))
-        for one in (first, second)
-    )
+    first = real_array("matched points", first if len(first) else empty, (None, 2))
+    second = real_array("matched points", second if len(second) else empty, (None, 2))
     if len(first) != len(second):
         raise InputError(
             f"matched points are {len(first)} and {len(second)}, expected as many in both images"
@@ -178,7 +174,8 @@ class StoredPoses:
     digest: str  # of the file
 
     def __call__(self, problem: PairProblem) -> Answer:
-        if (pose := self._poses.get(problem.pair.key)) is None:
+        pose = self._poses.get(problem.pair.key)
+        if pose is None:
             raise InputError(f"{self.path} has no pose")
         view = problem.pair.target_frames.index(pose.target_frame)
         return Answer(pose.rotation, view, pose.translation, pose.scale)

@@ -2,8 +2,8 @@
 
 import inspect
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from typing import Any, Protocol
@@ -71,16 +71,20 @@ def as_answer(found: Any) -> Answer:
         sim3, inliers = found.sim3, int(found.inliers.sum())
         return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, inliers, found.confidence)
     if isinstance(found, Answer):
-        move, scale = found.translation, 1.0 if found.scale is None else found.scale
         # Sim3 refuses what is no pose.
-        exact = Sim3(scale, found.rotation, np.zeros(3) if move is None else move)
-        return replace(found, rotation=exact.R, translation=None if move is None else exact.t)
+        scale = 1.0 if found.scale is None else found.scale
+        move = np.zeros(3) if found.translation is None else found.translation
+        exact = Sim3(scale, found.rotation, move)
+        return replace(
+            found,
+            rotation=exact.R,
+            translation=None if found.translation is None else exact.t,
+        )
     pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
     if isinstance(pose, Sim3):
         return Answer(pose.R, int(view), pose.t, pose.scale)
-    return Answer(
-        rotation_matrix("pose of the row", real_array("pose of the row", pose, (3, 3))), int(view)
-    )
+    what = "pose of the row"
+    return Answer(rotation_matrix(what, real_array(what, pose, (3, 3))), int(view))
 
 
 def parameters(plugin: Any) -> Mapping[str, inspect.Parameter]:
@@ -96,14 +100,12 @@ def seeded(plugin: Any, seed: int) -> Any:
     return partial(plugin, seed=seed) if "seed" in parameters(plugin) else plugin
 
 
-def _timed(
-    timings: dict[str, list[float]], stage: str, function: Callable[..., Any], *arguments: Any
-) -> Any:
-    """Call a function, and add the time that it takes to the timings of a stage."""
+@contextmanager
+def _timed(timings: dict[str, list[float]], stage: str) -> Iterator[None]:
+    """Add the time that the block takes to the timings of a stage."""
     start = time.perf_counter()
-    found = function(*arguments)
+    yield
     timings.setdefault(stage, []).append(time.perf_counter() - start)
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,26 +144,25 @@ class FrameStore:
         size = getattr(self.extractors.get("backbone"), "image_size", IMAGE_SIZE)
         with ends_the_run(f"reading frame {sequence}/{number}"):
             annotation = self.dataset.frame(category, sequence, number)
-            return Crop(
-                _timed(
-                    self.timings,
-                    "reading",
-                    lambda: object_crop(self.dataset.load(annotation), size),
-                )
-            )
+            with _timed(self.timings, "reading"):
+                return Crop(object_crop(self.dataset.load(annotation), size))
 
     def crop(self, category: str, sequence: str, number: int, features: Iterable[str] = ()) -> Crop:
         """Return a frame's crop with what some extractors compute from it, each once."""
         crop = self._read(category, sequence, number)
         for name in features:
-            if name not in crop.described:
-                extract = getattr(
-                    self.extractors[name], "describe", partial(feature_maps, self.extractors[name])
-                )
+            if name in crop.described:
+                continue
+            extractor = self.extractors[name]
+            extract = getattr(extractor, "describe", partial(feature_maps, extractor))
+            with (
+                threadpool_limits(self.threads),
+                ends_the_run(f"features {name!r}"),
+                _timed(self.timings, name),
+            ):
                 # One frame at a time: the last bits of a frame's features must not depend on the
                 # rest of a batch.
-                with threadpool_limits(self.threads), ends_the_run(f"features {name!r}"):
-                    crop.described[name] = _timed(self.timings, name, extract, [crop.frame])[0]
+                crop.described[name] = extract([crop.frame])[0]
         return crop
 
 
@@ -181,7 +182,8 @@ class Problem:
     ):
         self.seed, self.crops = seed, crops  # the reference's crop first
         self._extractors, self._timings = extractors, timings
-        self._found: dict[tuple, Any] = {}  # estimates and similarities
+        self._estimates: dict[tuple, PoseEstimate] = {}  # by arguments of `estimate`
+        self._similarities: dict[tuple, Any] = {}  # by two feature maps and `binning`
 
     def frames(self, depth: bool = False) -> list[Frame]:
         """Return the object crops, the reference's first, resized to the backbone's input.
@@ -189,7 +191,8 @@ class Problem:
         With `depth`, InputError, which fails the pair, if one has no depth map.
         """
         frames = [crop.frame for crop in self.crops]
-        if depth and (missing := [frame.name for frame in frames if frame.depth is None]):
+        missing = [frame.name for frame in frames if frame.depth is None]
+        if depth and missing:
             raise InputError(f"no depth map: {', '.join(missing)}")
         return frames
 
@@ -207,30 +210,31 @@ class Problem:
         """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the
         one with an index."""
         settings = settings or {}
-        name = (features, target, *sorted(settings.items()))
-        if name not in self._found:
-            plugins = {
-                key: seeded(value, self.seed) for key, value in settings.items() if key != "solver"
-            }
-            method = ZeroShotPose(
-                self._extractors[features], **{**settings, **plugins}, seed=self.seed
-            )
-            crops = self.crops if target is None else (self.crops[0], self.crops[1 + target])
-            reference, *targets = (crop.view(features, method.foreground) for crop in crops)
-            matched = [self._match(method, reference, view) for view in targets]
-            self._found[name] = method.estimate_from_views(reference, targets, matched)
-            for stage, seconds in self._found[name].timings.items():
-                self._timings.setdefault(stage, []).append(seconds)
-        return self._found[name]
+        key = (features, target, *sorted(settings.items()))
+        if key in self._estimates:
+            return self._estimates[key]
+        own = {}
+        for name, value in settings.items():  # a solver gets the seed when it is called
+            own[name] = value if name == "solver" else seeded(value, self.seed)
+        method = ZeroShotPose(self._extractors[features], **own, seed=self.seed)
+        crops = self.crops if target is None else [self.crops[0], self.crops[1 + target]]
+        reference, *targets = [crop.view(features, method.foreground) for crop in crops]
+        matched = [self._match(method, reference, view) for view in targets]
+        estimate = method.estimate_from_views(reference, targets, matched)
+        for stage, seconds in estimate.timings.items():
+            self._timings.setdefault(stage, []).append(seconds)
+        self._estimates[key] = estimate
+        return estimate
 
     def _match(self, method: ZeroShotPose, reference: View, target: View) -> ViewMatch:
-        key = first, second, _ = reference.features, target.features, method.binning
-        if key not in self._found:
+        """Match two views; rows with other settings share the similarities."""
+        key = reference.features, target.features, method.binning
+        if key not in self._similarities:
             compare = similarities if method.binning else key_similarities
-            self._found[key] = _timed(self._timings, "similarity", compare, first, [second])
-        return _timed(
-            self._timings, "matching", method.match_views, reference, [target], self._found[key]
-        )[0]
+            with _timed(self._timings, "similarity"):
+                self._similarities[key] = compare(reference.features, [target.features])
+        with _timed(self._timings, "matching"):
+            return method.match_views(reference, [target], self._similarities[key])[0]
 
 
 class PairProblem(Problem):

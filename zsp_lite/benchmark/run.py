@@ -1,8 +1,8 @@
 """Run the benchmark: rotation errors of rows over many pairs of a CO3D-format folder (sec. 5).
 
 The way of a pair: `evaluate` samples it, `execution.evaluate_pairs` hands it to this process or a
-worker, `evaluate_pair` reads frames and features, `_evaluate_row` asks each row and measures its
-answer; `write_reports` makes tables of what is stored.
+worker, `evaluate_pair` reads frames and features, asks each row (`_ask`) and measures its answer;
+`write_reports` makes tables of what is stored.
 """
 
 import json
@@ -23,7 +23,6 @@ from jaxtyping import Float
 from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.baselines.geometry import essential_rotation
 from zsp_lite.benchmark import execution
-from zsp_lite.benchmark.identity import run_settings
 from zsp_lite.benchmark.methods import (
     GROUPS,
     Method,
@@ -34,13 +33,15 @@ from zsp_lite.benchmark.methods import (
     resolve,
 )
 from zsp_lite.benchmark.own import StoredPoses, fails_alone, given
-from zsp_lite.benchmark.problem import Answer, FrameStore, PairProblem, as_answer, seeded
-from zsp_lite.benchmark.runs import (
-    ResultLine,
-    Run,
-    open_run,
-    read_run,
+from zsp_lite.benchmark.problem import (
+    Answer,
+    FrameStore,
+    PairProblem,
+    Problem,
+    as_answer,
+    seeded,
 )
+from zsp_lite.benchmark.runs import Result, Run, open_run, read_run, run_settings
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.ground_truth import common_turns
@@ -96,10 +97,9 @@ def evaluate(
     check_integer("targets", targets, 1)
     check_integer("row_seconds", row_seconds, 1, 1_000_000)
     check_integer("seeds", seeds, 1, 1000)
-    # The rows, and the pairs that each is evaluated on.
-    rows = {
-        name: replace(row, seconds=row_seconds) for name, row in resolve(methods, sweep).items()
-    }
+
+    # Rows, pairs, and the rows of each pair, by seed.
+    rows = resolve(methods, sweep)
     dataset = Co3D(data)
     numbers = pairs
     if not isinstance(pairs, Mapping):
@@ -111,6 +111,7 @@ def evaluate(
         replace(pair, repeat=k): names for k in range(seeds) for pair, names in work.items()
     }
 
+    # Lines of the run, pair by pair (see `evaluate_pair`).
     with execution.open_workers(executor) as (pool, workers):
         settings = run_settings(
             data,
@@ -125,10 +126,13 @@ def evaluate(
         )
         # Workers load a named backbone themselves; an object travels to them.
         travels = backbone if pool else loaded
-        make = partial(pair_evaluator, str(Path(data).resolve()), rows, travels)
+        make = partial(
+            pair_evaluator, str(Path(data).resolve()), rows, travels, row_seconds=row_seconds
+        )
         with open_run(out, settings):
             execution.evaluate_pairs(out, make, repeated, pool, workers)
 
+    # The lines as one table, and its summary.
     found = read_run(out)
     for remark in filter(None, [*remarks.values(), *found.failures]):
         logger.warning("%s", remark)
@@ -149,6 +153,7 @@ def _check_rows(
         elif isinstance(row.solve, StoredPoses):
             asked = [pair for pair, names in work.items() if name in names]
             remark = row.solve.remark(dataset, asked)
+            # Empty, too: it replaces that of an earlier call.
             remarks[name] = f"{name}: {remark}." if remark else ""
     return remarks
 
@@ -170,7 +175,8 @@ def write_reports(
     """
     from zsp_lite.benchmark import tables  # workers need no matplotlib
 
-    found, out = read_run(run), Path(out or run)
+    found = read_run(run)
+    out = Path(out or run)
     shown = tables.choose(found, rows) if rows else found.summary
     for name in ("all_rows", *tables.SEE_MORE, *(spec["name"] for spec in read_paper_tables())):
         for path in (out / "tables").glob(f"{name}.*"):
@@ -196,84 +202,98 @@ def pairs_of_rows(
         names = [name for name, row in rows.items() if (row.targets or targets) == n_targets]
         for category, n in numbers.items():
             check_integer(f"pairs of {category}", n, 1)
-            work |= dict.fromkeys(category_pairs(dataset, category, n, n_targets), names)
+            for pair in category_pairs(dataset, category, n, n_targets):
+                work[pair] = names
     return work
 
 
 def _labels(dataset: Co3D, category: str) -> str:
     """Hash of the pose labels of a category."""
-    labels = read_labels(dataset.root, category).items()
-    return digest(
-        *(
-            part
-            for name, label in labels
-            for part in (name, label.trans.tobytes(), label.reference_seq)
-        )
-    )
+    parts: list[str | bytes] = []
+    for name, label in read_labels(dataset.root, category).items():
+        parts += [name, label.trans.tobytes(), label.reference_seq]
+    return digest(*parts)
 
 
 def pair_evaluator(
-    root: str, methods: Mapping[str, Method], backbone: Any, threads: int
+    root: str, methods: Mapping[str, Method], backbone: Any, threads: int, row_seconds: int = 60
 ) -> execution.Evaluate:
     """Make what evaluates pairs in one process; frames, and features by some `threads`, are kept
     from pair to pair."""
     store = FrameStore(Co3D(root), make_extractors(as_backbone(backbone), methods), threads)
-    return partial(evaluate_pair, methods=methods, store=store)
+    return partial(evaluate_pair, methods=methods, store=store, row_seconds=row_seconds)
 
 
 def evaluate_pair(
-    pair: Pair, names: Iterable[str], methods: Mapping[str, Method], store: FrameStore
+    pair: Pair,
+    names: Iterable[str],
+    methods: Mapping[str, Method],
+    store: FrameStore,
+    row_seconds: int = 60,
 ) -> dict[str, Any]:
     """Evaluate the named rows on a pair: a line of the run's results (see `runs.ResultLine`)."""
     store.timings.clear()
     problem = PairProblem(pair, store, {methods[name].features for name in names} - {"none"})
     for sequence in (pair.reference_sequence, pair.target_sequence):
         store.extent(pair.category, sequence)  # an unreadable point cloud is no failure of a row
-    labels = store.labels(pair.category)
     # Ground truth from the reference's camera to each target's.
-    truths = np.stack(
-        [true_pose(store.dataset, labels, pair, view) for view in range(len(pair.target_frames))]
-    )
-    results = {name: _evaluate_row(name, methods[name], problem, truths) for name in names}
+    labels = store.labels(pair.category)
+    views = range(len(pair.target_frames))
+    truths = np.stack([true_pose(store.dataset, labels, pair, view) for view in views])
+
+    results = {}
+    for name in names:
+        method = methods[name]
+        own = is_own(name) and type(method.solve) is not StoredPoses
+        seen = given(method.solve, problem) if own and method.solve else problem
+        try:
+            with fails_alone(row_seconds) if own else nullcontext():
+                start = time.perf_counter()
+                answer = _ask(method, seen, truths)
+                seconds = time.perf_counter() - start
+                results[name] = _measure(answer, problem, truths, seconds)
+        except InputError as error:
+            # 180 degrees: without these pairs, methods that fail often would look better.
+            reason = str(error).encode(errors="replace").decode()
+            results[name] = {"error": 180.0, "failed": reason}
     timings = {
         stage: round(float(np.median(seconds)), 5) for stage, seconds in store.timings.items()
     }
     return {"pair": pair.key, "results": results, "repeat": pair.repeat, "timings": timings}
 
 
-def _evaluate_row(
-    name: str, method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]
-) -> dict[str, Any]:
-    """Ask a row for its pose of a pair, and measure it; a failure is a result, too."""
-    own = is_own(name) and type(method.solve) is not StoredPoses
-    seen = given(method.solve, problem) if own and method.solve else problem
-    start = time.perf_counter()
-    try:
-        with fails_alone(method.seconds) if own else nullcontext():
-            solve = seeded(method.solve, problem.seed)
-            answer = as_answer(solve(seen)) if solve else _paper_answer(method, problem, truths)
-            if not 0 <= answer.view < len(truths):
-                expected = f"expected 0 to {len(truths) - 1}"
-                raise InputError(f"answer is for view {answer.view}, {expected}")
-            seconds = time.perf_counter() - start
-            result = {"seconds": seconds} | _measure(answer, problem, truths[answer.view])
-            # Refuses what could not be stored.
-            line = {"pair": problem.pair.key, "results": {name: result}}
-            msgspec.json.encode(msgspec.convert(line, ResultLine))
-    except InputError as error:
-        # 180 degrees: without these pairs, methods that fail often would look better.
-        return {"error": 180.0, "failed": str(error).encode(errors="replace").decode()}
-    return {
-        name: round(value, 4) if isinstance(value, float) else value
-        for name, value in result.items()
-    }
+def _ask(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:
+    """Ask a row for its pose of a pair."""
+    if method.solve is not None:
+        return as_answer(seeded(method.solve, problem.seed)(problem))
+    nearest = None
+    if method.answer == "true view":
+        nearest = int(rotation_error(np.eye(3), truths[:, :3, :3]).argmin())
+    estimate = problem.estimate(method.features, method.settings, nearest)
+    answer = as_answer(estimate)
+    reference, target = estimate.reference_view, estimate.target_views[estimate.view]
+    if method.answer == "true view":  # the only view of this estimate
+        return replace(answer, view=nearest)
+    if method.answer == "best view":
+        sim3 = view_alignment(reference, target)
+        return replace(answer, rotation=sim3.R, translation=sim3.t, scale=sim3.scale, note="")
+    if method.answer == "essential matrix":
+        rotation, inliers, note = essential_rotation(
+            reference.frame, target.frame, estimate.matches, reference.features.grid
+        )
+        return Answer(rotation, answer.view, note=note, inliers=inliers)
+    return answer
 
 
 def _measure(
-    answer: Answer, problem: PairProblem, truth: Float[np.ndarray, "4 4"]
+    answer: Answer, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"], seconds: float
 ) -> dict[str, Any]:
-    """Measure an answer: "error", and what is known of the other members of a stored result."""
+    """Measure an answer: the members of a stored result that are known, "error" among them."""
+    if not 0 <= answer.view < len(truths):
+        raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
+    truth = truths[answer.view]
     known = {
+        "seconds": seconds,
         "view": answer.view,
         "note": answer.note[:1000],
         "scale": answer.scale,
@@ -282,20 +302,19 @@ def _measure(
         "error": rotation_error(answer.rotation, truth[:3, :3]),
         "rotation": answer.rotation.ravel().round(6).tolist(),
     }
-    reference, *targets = (frame.camera for frame in problem.frames())
-    names = problem.pair.reference_sequence, problem.pair.target_sequence
+    pair, store = problem.pair, problem.store
+    reference, *targets = [frame.camera for frame in problem.frames()]
+    names = pair.reference_sequence, pair.target_sequence
 
     # Turns of the target object that look the same are no errors of its symmetric error.
-    turns = common_turns(problem.store.dataset.root, problem.pair.category, *names)
+    turns = common_turns(store.dataset.root, pair.category, *names)
     if turns is not None:
         to_camera = targets[answer.view].R
         turned = to_camera @ turns @ to_camera.T @ truth[:3, :3]
         known["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
 
     # Where the reference object's centre comes to lie, in diameters of the target object.
-    category = problem.pair.category
-    reference_extent = problem.store.extent(category, problem.pair.reference_sequence)
-    target_extent = problem.store.extent(category, problem.pair.target_sequence)
+    reference_extent, target_extent = [store.extent(pair.category, name) for name in names]
     if answer.translation is not None:
         known["position"] = answer.translation.round(6).tolist()
         if reference_extent and target_extent:
@@ -305,30 +324,15 @@ def _measure(
             distance = np.linalg.norm(found - truth[:3, :3] @ centre - truth[:3, 3])
             known["translation"] = distance / target_extent[1]
 
-    plain = {
-        name: value.item() if isinstance(value, np.generic) else value
-        for name, value in known.items()
+    result = {}
+    for name, value in known.items():
+        if isinstance(value, np.generic):
+            value = value.item()
+        if value is not None:
+            result[name] = value
+    # Refuses what could not be stored.
+    msgspec.json.encode(msgspec.convert(result, Result))
+    return {
+        name: round(value, 4) if isinstance(value, float) else value
+        for name, value in result.items()
     }
-    return {name: value for name, value in plain.items() if value is not None}
-
-
-def _paper_answer(
-    method: Method, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"]
-) -> Answer:
-    """Answer of a row that is the paper's method with other settings."""
-    if method.answer == "true view":
-        nearest = int(rotation_error(np.eye(3), truths[:, :3, :3]).argmin())
-        return replace(
-            as_answer(problem.estimate(method.features, method.settings, nearest)), view=nearest
-        )
-    estimate = problem.estimate(method.features, method.settings)
-    answer = as_answer(estimate)
-    reference, target = estimate.reference_view, estimate.target_views[estimate.view]
-    if method.answer == "best view":
-        sim3 = view_alignment(reference, target)
-        return replace(answer, rotation=sim3.R, translation=sim3.t, scale=sim3.scale, note="")
-    if method.answer == "essential matrix":
-        frames, grid = (reference.frame, target.frame), reference.features.grid
-        rotation, inliers, note = essential_rotation(*frames, estimate.matches, grid)
-        return Answer(rotation, answer.view, note=note, inliers=inliers)
-    return answer

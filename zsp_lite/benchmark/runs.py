@@ -5,23 +5,41 @@ run.jsonl.gz, is what `evaluate_pair` returned for a pair. One process writes to
 can read it meanwhile.
 """
 
+import dataclasses
+import functools
 import os
+import platform
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cached_property
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
+import cv2
 import msgspec
 import numpy as np
 import pandas as pd
+import scipy
+import torch
 from jaxtyping import Float, Int
 
+from zsp_lite import __version__
+from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.benchmark.statistics import summarise
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import decode_json, decompress, read_bytes, read_json, write_atomic
+from zsp_lite.io.files import (
+    REPOSITORY,
+    decode_json,
+    decompress,
+    digest,
+    read_bytes,
+    read_json,
+    write_atomic,
+)
 from zsp_lite.io.locks import writing
 
 SETTINGS, LINES = "run.json", "run.jsonl"
@@ -57,7 +75,7 @@ class Settings(msgspec.Struct):
     folder: str = ""  # absolute path of the data, without links
 
 
-class _Result(msgspec.Struct):
+class Result(msgspec.Struct):
     """What a row found for a pair (see `evaluate_pair`); other members are not part of the
     table."""
 
@@ -79,9 +97,86 @@ class _Result(msgspec.Struct):
 
 class ResultLine(msgspec.Struct):
     pair: Annotated[str, msgspec.Meta(pattern=_KEY)]
-    results: dict[str, _Result]
+    results: dict[str, Result]
     repeat: int = 0
     timings: dict[str, float] = {}
+
+
+def described(value: Any) -> str:
+    """Describe a setting as text: an object by "module:name", whatever its code; a dataclass with
+    its public fields."""
+    if value is None or isinstance(value, bool | int | float | str | list | tuple):
+        return str(value)
+    named = value if hasattr(value, "__qualname__") else type(value)
+    name = f"{named.__module__}:{named.__qualname__}"
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        names = [one.name for one in dataclasses.fields(value) if not one.name.startswith("_")]
+        fields = ", ".join(f"{one}={described(getattr(value, one))}" for one in names)
+        return f"{name}({fields})"
+    return name
+
+
+def fingerprint(extractor: Any) -> str:
+    """Return the name of an extractor (by default "module:name"), and a hash of its `state_dict`
+    and settings."""
+    name = getattr(extractor, "name", None) or described(extractor)
+    network, settings = extractor, ""
+    if isinstance(extractor, Backbone):
+        network = extractor.model
+        fields = ("layer", "facet", "saliency_heads", "image_size", "mean", "std")
+        settings = repr(tuple(getattr(extractor, one) for one in fields))
+    if not callable(getattr(network, "state_dict", None)):
+        return name
+    parts: list[str | bytes] = []
+    for key, weight in sorted(network.state_dict().items()):
+        content = weight.detach().cpu().contiguous().reshape(-1).view(torch.uint8)
+        parts += [key, content.numpy().tobytes()]
+    return f"{name} {digest(settings, *parts)}" if parts else name
+
+
+@functools.cache
+def library_version() -> dict[str, str | None]:
+    """Return the version of zsp_lite, and the commit of its checkout, "-dirty" if files differ;
+    None if installed."""
+    commit = None
+    # An installed copy may lie inside the repository of another project, whose commit says nothing.
+    if (REPOSITORY / ".git").exists():
+        words = "describe --always --abbrev=40 --dirty --exclude *".split()
+        describe = ["git", "-C", str(REPOSITORY), *words]
+        with suppress(OSError):  # git is not installed
+            commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip() or None
+    return {"version": __version__, "commit": commit}
+
+
+def run_settings(
+    data: str | Path,
+    backbone: Any,
+    targets: int,
+    methods: dict[str, str],
+    labels: dict[str, str],
+    **call: Any,
+) -> Settings:
+    """Describe a run, and this call of it: time, command, and versions of what computes."""
+    words = [Path(sys.argv[0]).name.replace("__main__.py", "zsp-lite"), *sys.argv[1:]]
+    versions = {one.__name__: str(one.__version__) for one in (torch, np, scipy, cv2)}
+    versions["python"] = platform.python_version()
+    versions["machine"] = platform.platform()
+    this_call = Call(
+        time=datetime.now(UTC).isoformat(timespec="seconds"),
+        command=[text.encode(errors="replace").decode() for text in words],
+        versions=versions,
+        rows=list(methods),
+        **call,
+    )
+    return Settings(
+        data=str(data).encode(errors="replace").decode(),
+        backbone=fingerprint(backbone),
+        targets=targets,
+        library=[library_version()],
+        labels=labels,
+        methods=methods,
+        calls=[this_call],
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,40 +187,37 @@ class Run:
     settings: Settings
     # A line for each row, pair and seed, in this order: "row", "category", "pair" (its key),
     # "repeat" (of the seed), "problem" (the key without target frames), "reference" and "target"
-    # (the objects, CATEGORY/SEQUENCE), the members of `_Result`, and "milliseconds".
+    # (the objects, CATEGORY/SEQUENCE), the members of `Result`, and "milliseconds".
     table: pd.DataFrame
-    timings: Mapping[str, float]  # median seconds by stage
+    timings: dict[str, float]  # median seconds by stage
     note: str = ""  # what is missing
 
-    @cached_property
+    @functools.cached_property
     def summary(self) -> dict[str, Any]:
         """The content of summary.json."""
         # A backbone's fingerprint is its name and a hash.
         backbone = self.settings.backbone.rpartition(" ")[0] or self.settings.backbone
-        data = {"root": self.settings.data, "categories": list(self.table["category"].unique())}
-        data |= {
+        data = {
+            "root": self.settings.data,
+            "categories": list(self.table["category"].unique()),
             "pairs": int(self.table.groupby("row")["pair"].nunique().max()),
             "targets": self.settings.targets,
         }
+        summary = {"data": data, "backbone": backbone}
         notes = " ".join(filter(None, [self.note, *self.failures]))
-        note = {"note": notes} if notes else {}
-        return (
-            {"data": data, "backbone": backbone}
-            | note
-            | summarise(self.table)
-            | {"timings": dict(self.timings)}
-        )
+        if notes:
+            summary["note"] = notes
+        return summary | summarise(self.table) | {"timings": self.timings}
 
-    @cached_property
+    @functools.cached_property
     def failures(self) -> list[str]:
         """Of each row that failed on pairs: on how many, and the reason of the first."""
         failed = self.table[self.table["failed"] != ""].groupby("row", sort=False)
-        counts, pairs = failed["pair"].nunique(), self.table.groupby("row")["pair"].nunique()
+        counts = failed["pair"].nunique()
+        pairs = self.table.groupby("row")["pair"].nunique()
         return [
-            (
-                f"{name} failed on {counts[name]} of {pairs[name]} pairs, counted as 180°; the "
-                f"first: {reason}."
-            )
+            f"{name} failed on {counts[name]} of {pairs[name]} pairs, counted as 180°; the first: "
+            f"{reason}."
             for name, reason in failed["failed"].first().items()
         ]
 
@@ -149,14 +241,10 @@ class Run:
         found = self.row(name).dropna(subset=["rotation", "view"])
         if found.empty:
             raise InputError(f"row {name!r} has no poses in the run")
+        pairs = [Pair.from_key(key) for key in found.index]
         rotations = np.array(found["rotation"].tolist()).reshape(-1, 3, 3)
         positions = np.array([position or [np.nan] * 3 for position in found["position"]])
-        return (
-            [Pair.from_key(key) for key in found.index],
-            found["view"].to_numpy(int),
-            rotations,
-            positions,
-        )
+        return pairs, found["view"].to_numpy(int), rotations, positions
 
 
 @contextmanager
@@ -164,7 +252,8 @@ def open_run(out: str | Path, settings: Settings) -> Iterator[None]:
     """Be the only writer of a run's folder, which is new or holds a run with these settings; then
     `add_lines` adds."""
     with writing(out):
-        out, packed = Path(out), Path(out) / f"{LINES}.gz"
+        out = Path(out)
+        packed = out / f"{LINES}.gz"
         settings.folder = os.path.realpath(settings.data).encode(errors="replace").decode()
         if any(path.exists() for path in (out / SETTINGS, out / LINES, packed)):
             settings = _continued(out, settings)
@@ -185,43 +274,45 @@ def _continued(out: Path, now: Settings) -> Settings:
     """Merge settings with those of the run that a folder holds; InputError if they do not go
     together."""
     before = read_json(out / SETTINGS, Settings, "settings of a run")
-    held, asked = _compared(before), _compared(now)
+    held, asked = _decisive(before), _decisive(now)
     for name in asked:
         if held.get(name, asked[name]) != asked[name]:
             raise InputError(
                 f"{out} holds a run with {name} {held[name]}, this is {asked[name]}; choose "
                 "another folder"
             )
-    merged = {name: getattr(before, name) | getattr(now, name) for name in ("methods", "labels")}
-    library = [*(one for one in before.library if one != now.library[0]), *now.library]
-    return msgspec.structs.replace(now, library=library, calls=before.calls + now.calls, **merged)
+    return msgspec.structs.replace(
+        now,
+        library=[one for one in before.library if one not in now.library] + now.library,
+        methods=before.methods | now.methods,
+        labels=before.labels | now.labels,
+        calls=before.calls + now.calls,
+    )
 
 
-def _compared(settings: Settings) -> dict[str, Any]:
+def _decisive(settings: Settings) -> dict[str, Any]:
     """What has to be equal in two calls that add to one run, where both have it, by its name."""
-    groups = {name: getattr(settings, name) for name in ("methods", "labels")}
-    parts = {
-        f"{name} of {key}": value for name, group in groups.items() for key, value in group.items()
+    parts: dict[str, Any] = {
+        "command": "align" if "alignment" in settings.methods else "benchmark",
+        "backbone": settings.backbone,
+        "targets": settings.targets,
+        "data": settings.folder or os.path.realpath(settings.data),
     }
-    whole = {name: getattr(settings, name) for name in ("backbone", "targets")}
-    whole["data"] = settings.folder or os.path.realpath(settings.data)
-    command = "align" if "alignment" in settings.methods else "benchmark"
-    return {"command": command} | whole | parts
+    for row, description in settings.methods.items():
+        parts[f"methods of {row}"] = description
+    for category, code in settings.labels.items():
+        parts[f"labels of {category}"] = code
+    return parts
 
 
-def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]], kind: type = ResultLine) -> None:
-    """Add the results of pairs to run.jsonl; InputError if they could not be read again."""
-    lines = list(lines)
+def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]]) -> None:
+    """Add the results of pairs to run.jsonl; InputError if they cannot be written."""
+    path = Path(out) / LINES
     try:
-        msgspec.convert(lines, list[kind])
-        with open(Path(out) / LINES, "ab") as file:
+        with path.open("ab") as file:
             file.write(msgspec.json.Encoder().encode_lines(lines))
-    except (
-        OSError,
-        ValueError,
-        msgspec.ValidationError,
-    ) as error:  # ValueError: a text that is not Unicode
-        raise InputError(f"{Path(out) / LINES} cannot be written: {error}") from error
+    except (OSError, ValueError) as error:  # ValueError: a text that is not Unicode
+        raise InputError(f"{path} cannot be written: {error}") from error
 
 
 def read_lines(out: str | Path, kind: type = ResultLine) -> list[Any]:
@@ -250,39 +341,38 @@ def read_run(out: str | Path) -> Run:
     that have these pairs. Pairs of different numbers of target views are the same if they are the
     same "problem".
     """
-    settings, lines = (
-        read_json(Path(out) / SETTINGS, Settings, "settings of a run"),
-        read_lines(out),
-    )
-    table, last = _finished(_table(lines, settings), settings), settings.calls[-1]
+    settings = read_json(Path(out) / SETTINGS, Settings, "settings of a run")
+    lines = read_lines(out)
+    last = settings.calls[-1]
+    table = _finished(_table(lines, settings), settings)
     if table.empty:
         raise InputError(f"{out}: the run has no pair that all its rows have finished")
     timings = pd.DataFrame([line.timings for line in lines]).median().to_dict()
-    notes, rows = [], table["row"].unique()
+    rows = table["row"].unique()
+    notes = []
     if not last.finished:
         most = table.groupby("row")["pair"].nunique().max()
         notes.append(f"Not finished: {most} of {sum(last.pairs.values())} pairs.")
     if len(settings.library) > 1:
         notes.append("Evaluated by several versions of zsp-lite (run.json lists them).")
-    if hidden := [name for name in settings.methods if name not in rows]:
+    hidden = [name for name in settings.methods if name not in rows]
+    if hidden:
         notes.append(f"Without {', '.join(hidden)}, which lack pairs of the last call.")
-    remarks = {
-        name: remark
-        for call in settings.calls
-        for name, remark in call.remarks.items()
-        if name in rows
-    }
-    return Run(settings, table, timings, " ".join(filter(None, [*notes, *remarks.values()])))
+    remarks: dict[str, str] = {}
+    for call in settings.calls:
+        remarks |= call.remarks
+    notes += [remark for name, remark in remarks.items() if name in rows]
+    return Run(settings, table, timings, " ".join(filter(None, notes)))
 
 
 def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
     """Tabulate the results in the categories of the last call, by row, category and pair."""
-    results = [
-        {"row": row, "pair": line.pair, "repeat": line.repeat} | msgspec.structs.asdict(one)
-        for line in lines
-        for row, one in line.results.items()
-    ]
-    table = pd.DataFrame(results, columns=["row", "pair", "repeat", *_Result.__struct_fields__])
+    results = []
+    for line in lines:
+        for row, found in line.results.items():
+            names = {"row": row, "pair": line.pair, "repeat": line.repeat}
+            results.append(names | msgspec.structs.asdict(found))
+    table = pd.DataFrame(results, columns=["row", "pair", "repeat", *Result.__struct_fields__])
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
     table["milliseconds"] = 1000 * table["seconds"].astype(float)
     table["target"] = table["category"] + "/" + table["target"]
@@ -297,17 +387,19 @@ def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
 def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
     """Keep the pairs that all rows of the last call have finished, and the rows, by seed, that have
     all of these."""
+    last = settings.calls[-1]
     views = table["pair"].str.count(",")  # one less than the target views
     finished = {}  # by number of views
-    for number, found in table[table["row"].isin(settings.calls[-1].rows)].groupby(views):
+    for number, found in table[table["row"].isin(last.rows)].groupby(views):
         cases_of_pair = found.groupby("pair").size()
-        wanted = found["row"].nunique() * settings.calls[-1].seeds
+        wanted = found["row"].nunique() * last.seeds
         finished[number] = set(cases_of_pair.index[cases_of_pair == wanted])
     problems = set(table["problem"][table["pair"].isin(set().union(*finished.values()))])
     kept = [table[:0]]
     for _, found in table.groupby(["row", "repeat"]):
-        number = views[found.index[0]]
-        column, wanted = ("pair", finished[number]) if number in finished else ("problem", problems)
+        column, wanted = "pair", finished.get(views[found.index[0]])
+        if wanted is None:  # the last call has no row of as many views
+            column, wanted = "problem", problems
         found = found[found[column].isin(wanted)]
         if wanted <= set(found[column]):
             kept.append(found)

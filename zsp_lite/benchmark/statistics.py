@@ -6,6 +6,7 @@ each pair.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,41 +32,42 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
     objects.
     """
     rows = {str(name): row for name, row in table.groupby("row", sort=False)}
-    methods, against, ours = {}, {}, rows.get("ours")
+    ours = rows.get("ours")
+    methods, against = {}, {}
     for name, row in rows.items():
-        errors, drawn, categories = (
-            row["error"].to_numpy(),
-            draws_of(row),
-            row["category"].to_numpy(str),
-        )
-        seeds = row["repeat"].nunique()
-        methods[name] = figures_of(errors, drawn, categories) | {
-            "failed": row.loc[row["failed"] != "", "pair"].nunique(),
-            "per_category": {
-                category: figures_of(errors[members], drawn[:, members])
-                for category in dict.fromkeys(categories)
-                for members in [categories == category]
-            },
-        }
-        for found in (methods[name], *methods[name]["per_category"].values()):
-            found["n"] //= seeds
-        if seeds > 1:
-            by_seed = row.groupby("repeat")["error"].apply(
-                lambda errors: 100 * (errors < 30).mean()
-            )
-            methods[name]["acc30_sd_of_seeds"] = float(by_seed.std())
-        methods[name] |= row[["translation", "scale"]].astype(float).median().dropna().to_dict()
-        if row["symmetric_error"].notna().any():
-            known = row["symmetric_error"].fillna(row["error"]).to_numpy(np.float64)
-            methods[name]["symmetric_acc30"] = float(accuracy(known, 30))
-        if ours is not None and name != "ours":
-            common = ours[ours["repeat"].isin(row["repeat"])]
-            if row["problem"].tolist() == common["problem"].tolist():
-                against[name] = paired_difference(common["error"], errors, weights=drawn)
+        drawn = draws_of(row)
+        methods[name] = _summarise_row(row, drawn)
+        if ours is None or name == "ours":
+            continue
+        common = ours[ours["repeat"].isin(row["repeat"])]
+        if row["problem"].tolist() == common["problem"].tolist():
+            against[name] = paired_difference(common["error"], row["error"], weights=drawn)
     times = table.groupby("row", sort=False)["milliseconds"].median().dropna().to_dict()
-    return {"methods": methods, "milliseconds": times} | (
-        {} if ours is None else {"against": against}
-    )
+    summary = {"methods": methods, "milliseconds": times}
+    return summary if ours is None else summary | {"against": against}
+
+
+def _summarise_row(row: pd.DataFrame, drawn: Draws) -> dict[str, Any]:
+    """Summarise the results of one row of the tables."""
+    errors, categories = row["error"].to_numpy(), row["category"].to_numpy(str)
+    per_category = {}
+    for category in dict.fromkeys(categories):
+        members = categories == category
+        per_category[category] = figures_of(errors[members], drawn[:, members])
+    summary = figures_of(errors, drawn, categories)
+    summary["failed"] = row.loc[row["failed"] != "", "pair"].nunique()
+    summary["per_category"] = per_category
+    seeds = row["repeat"].nunique()
+    for figures in (summary, *per_category.values()):
+        figures["n"] //= seeds
+    if seeds > 1:
+        by_seed = (row["error"] < 30).groupby(row["repeat"]).mean()
+        summary["acc30_sd_of_seeds"] = float((100 * by_seed).std())
+    summary |= row[["translation", "scale"]].astype(float).median().dropna().to_dict()
+    if row["symmetric_error"].notna().any():
+        known = row["symmetric_error"].fillna(row["error"]).to_numpy(np.float64)
+        summary["symmetric_acc30"] = float(accuracy(known, 30))
+    return summary
 
 
 def draws_of(row: pd.DataFrame) -> Draws:
@@ -75,10 +77,8 @@ def draws_of(row: pd.DataFrame) -> Draws:
     seeds, repeat = np.unique(row["repeat"], return_inverse=True)
     if len(seeds) == 1:
         return drawn
-    return (
-        drawn
-        * _multiplicities(len(seeds), RESAMPLES, np.random.default_rng([0, len(seeds)]))[:, repeat]
-    )
+    of_seeds = _multiplicities(len(seeds), RESAMPLES, np.random.default_rng([0, len(seeds)]))
+    return drawn * of_seeds[:, repeat]
 
 
 def object_draws(
@@ -94,9 +94,9 @@ def object_draws(
     total weight. Pairs of fewer than three objects are resampled themselves.
     """
     objects = np.asarray(objects, dtype=str)
-    categories = (
-        np.full(len(objects), "") if categories is None else np.asarray(categories, dtype=str)
-    )
+    if categories is None:
+        categories = np.full(len(objects), "")
+    categories = np.asarray(categories, dtype=str)
     weights = np.empty((resamples, len(objects)))
     for category in np.unique(categories):
         rng = np.random.default_rng([0, stable_hash(category)])
@@ -105,12 +105,14 @@ def object_draws(
         first, second = sides.reshape(-1, 2).T
         drawn = np.zeros((resamples, len(members)))
         # A draw without both objects of any pair has no weight at all and is repeated.
-        while len(empty := np.nonzero(drawn.sum(axis=1) == 0)[0]):
+        empty = np.arange(resamples)
+        while len(empty):
             if len(names) < _FEWEST_OBJECTS:
                 drawn[empty] = _multiplicities(len(members), len(empty), rng)
             else:
                 counts = _multiplicities(len(names), len(empty), rng)
                 drawn[empty] = counts[:, first] * counts[:, second]
+            empty = np.flatnonzero(drawn.sum(axis=1) == 0)
         weights[:, members] = drawn * (len(members) / drawn.sum(axis=1, keepdims=True))
     return weights
 
@@ -144,31 +146,36 @@ def figures_of(
     percent; "mean_category_median", if categories (n,) are given, the paper's average of medians.
     """
     errors = np.asarray(errors, np.float64)
+    figures = dict(_FIGURES)
+    if categories is not None:
+        figures["mean_category_median"] = partial(_mean_category_median, categories=categories)
+    found: dict[str, Any] = {"n": int(errors.size)}
+    for name, figure in figures.items():
+        found[name] = float(figure(errors, None))
+    for name, figure in figures.items():
+        found[f"{name}_ci"] = bootstrap_ci(errors, figure, weights)
+    return found
 
-    def mean_category_median(
-        errors: np.ndarray, weights: Draws | None = None
-    ) -> np.ndarray | float:
-        members = [categories == category for category in np.unique(categories)]
-        medians = [
-            median(errors[one], None if weights is None else weights[:, one]) for one in members
-        ]
-        return np.mean(medians, axis=0)
 
-    figures = {
-        "median": median,
-        "acc30": lambda errors, weights=None: accuracy(errors, 30, weights),
-        "acc15": lambda errors, weights=None: accuracy(errors, 15, weights),
-        "above150": lambda errors, weights=None: 100 * weighted_mean(errors > 150, weights),
-        "auc30": lambda errors, weights=None: (
-            100 * weighted_mean(np.clip(1 - errors / 30, 0, None), weights)
-        ),
-    } | ({} if categories is None else {"mean_category_median": mean_category_median})
-    found = {"n": int(errors.size)} | {
-        name: float(figure(errors)) for name, figure in figures.items()
-    }
-    return found | {
-        f"{name}_ci": bootstrap_ci(errors, figure, weights) for name, figure in figures.items()
-    }
+def _mean_category_median(
+    errors: Float[np.ndarray, " n"], weights: Draws | None, categories: np.ndarray
+) -> np.ndarray | float:
+    medians = []
+    for category in np.unique(categories):
+        members = categories == category
+        drawn = None if weights is None else weights[:, members]
+        medians.append(median(errors[members], drawn))
+    return np.mean(medians, axis=0)
+
+
+# Statistics of errors (n,) with weights (resamples, n) or None.
+_FIGURES: dict[str, Callable[..., Any]] = {
+    "median": median,
+    "acc30": lambda errors, weights: accuracy(errors, 30, weights),
+    "acc15": lambda errors, weights: accuracy(errors, 15, weights),
+    "above150": lambda errors, weights: 100 * weighted_mean(errors > 150, weights),
+    "auc30": lambda errors, weights: 100 * weighted_mean((1 - errors / 30).clip(0), weights),
+}
 
 
 def paired_difference(
@@ -211,9 +218,9 @@ def paired_test(
     sign = binomtest((change > 0).sum(), np.count_nonzero(change)).pvalue if change.any() else 1.0
     how = {"permutation_type": "samples", "n_resamples": 10_000, "batch": 500, "vectorized": True}
     # scipy refuses one pair, whose difference has the same size with both signs.
-    flips = (
-        permutation_test((first - second,), np.mean, rng=0, **how).pvalue if len(first) > 1 else 1.0
-    )
+    flips = 1.0
+    if len(first) > 1:
+        flips = permutation_test((first - second,), np.mean, rng=0, **how).pvalue
     tests = {"sign_test_p": float(sign), "permutation_test_p": float(flips)}
     return paired_difference(first, second, threshold, weights) | tests
 

@@ -48,11 +48,17 @@ SEE_MORE = {
     "with_scans": ("With several frames of the reference object", GROUPS["scans"]),
     "with_others": ("With other unlabelled objects of the category", ["category"]),
 }
-_LOWEST_IS_BEST = ("mean_category_median", "median", "above150", "translation", "milliseconds")
-_SYMBOLS = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-_SYMBOLS |= {"°": r"$^\circ$", "−": "$-$"}
-_SYMBOLS |= {one: f"\\{one}" for one in "%_&#${}"} | {one: f"${one}$" for one in "<>|"}
-_escape = methodcaller("translate", str.maketrans(_SYMBOLS))
+# Characters that LaTeX reads as commands or does not have in text mode.
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "°": r"$^\circ$",
+    "−": "$-$",
+    **{symbol: f"\\{symbol}" for symbol in "%_&#${}"},
+    **{symbol: f"${symbol}$" for symbol in "<>|"},
+}
+_escape = methodcaller("translate", str.maketrans(_LATEX))
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,6 @@ class Cell:
     low: float | None = None
     high: float | None = None
     decimals: int = 1
-    metric: str = ""  # of `METRICS`
 
     def __str__(self) -> str:
         if self.decimals == 3 and self.value < 0.001:  # a p value
@@ -82,7 +87,6 @@ class Table:
     cells: pd.DataFrame  # of `Cell`, or None
     note: str = ""  # how to read it
     data: str = ""  # what was evaluated
-    across: bool = False  # the columns are methods, not the rows
 
     @property
     def text(self) -> pd.DataFrame:
@@ -109,9 +113,12 @@ def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHO
         name: row | {"milliseconds": times.get(name)} for name, row in summary["methods"].items()
     }
     summary = {**summary, "methods": methods}
-    first = (all_rows(summary, metrics, name) for name in ("all_rows", *SEE_MORE))
-    shown = *PAPER, *(metric for metric in metrics if metric == "milliseconds")
-    tables = *first, *paper_tables(summary, shown), *(by_category(summary, one) for one in PAPER)
+    of_paper = [*PAPER, "milliseconds"] if "milliseconds" in metrics else PAPER
+    tables = [
+        *(all_rows(summary, metrics, name) for name in ("all_rows", *SEE_MORE)),
+        *paper_tables(summary, of_paper),
+        *(by_category(summary, metric) for metric in PAPER),
+    ]
     return [table for table in tables if table.cells.size]
 
 
@@ -120,20 +127,21 @@ def all_rows(
 ) -> Table:
     """Return every row that sees the pair only, or those of a table of `SEE_MORE` below "verified",
     which does, too."""
-    title, members = SEE_MORE.get(table, ("All rows", []))
-    names = [
-        name
-        for name in summary["methods"]
-        if base_name(name) in members or not members and not _sees_more(name)
-    ]
-    if members and names:  # what they add to
-        names = [*(name for name in summary["methods"] if name == "verified"), *names]
+    methods = summary["methods"]
+    if table in SEE_MORE:
+        title, members = SEE_MORE[table]
+        names = [name for name in methods if base_name(name) in members]
+        if names and "verified" in methods:  # what they add to
+            names.insert(0, "verified")
+    else:
+        title = "All rows"
+        names = [name for name in methods if not _sees_more(name)]
     rows = {}
     for name in names:
-        row = summary["methods"][name]
-        pairs, failed = (Cell(row[count], decimals=0) for count in ("n", "failed"))
+        row = methods[name]
+        figures = [_cell(row, metric) for metric in metrics]
         difference = _difference(summary.get("against", {}).get(name))
-        rows[name] = [pairs, *(_cell(row, metric) for metric in metrics), failed, *difference]
+        rows[name] = [_count(row["n"]), *figures, _count(row["failed"]), *difference]
     titles = ["pairs", *(METRICS[name] for name in metrics), "failed", "Acc30 − ours", "p"]
     gain = (
         'Acc30 − ours: difference to "ours" on the same pairs, in points, and its p value by the '
@@ -154,45 +162,43 @@ def _paper_table(
 ) -> Table:
     """A table with the run's rows, the published figures, and in Table 1, rows of one's own below
     the paper's."""
-    categories, methods, views = (
-        summary["data"]["categories"],
-        summary["methods"],
-        f"-n{summary['data']['targets']}",
-    )
-    lines = [
-        (one["row"] if one["row"] in methods else one["row"].removesuffix(views), one)
-        for one in spec["rows"]
-    ]
+    categories, methods = summary["data"]["categories"], summary["methods"]
+    # A row at the run's own number of target views goes by either name.
+    views = f"-n{summary['data']['targets']}"
+    lines = []  # the row of the run, and the line of the table
+    for line in spec["rows"]:
+        name = line["row"]
+        lines.append((name if name in methods else name.removesuffix(views), line))
     if spec["name"] == "table_1":
         lines += [(name, {"label": name, "published": []}) for name in own_rows(summary)]
-    if chosen := summary.get("chosen"):
-        lines = sorted(
-            (line for line in lines if line[0] in chosen), key=lambda line: chosen.index(line[0])
-        )
+    if "chosen" in summary:
+        order = summary["chosen"]
+        lines = [line for line in lines if line[0] in order]
+        lines.sort(key=lambda line: order.index(line[0]))
+
     # Of the single categories with a published Acc30, those of the run are shown.
-    names = [title.removesuffix(" Acc30") for title in spec["published"]]
-    kept = [
-        k
-        for k, (name, title) in enumerate(zip(names, spec["published"]))
-        if name in (title, *categories)
-    ]
-    featured = [names[k] for k in kept if names[k] in categories]
-    titles = [
-        *(METRICS[metric] for metric in metrics),
-        *(f"{category} Acc30" for category in featured),
-    ]
+    featured, shown = [], []
+    for k, title in enumerate(spec["published"]):
+        category = title.removesuffix(" Acc30")
+        if category in categories:
+            featured.append(category)
+        if category in (title, *categories):
+            shown.append(k)
+
     rows = {}
     for name, line in lines:
         row = methods.get(name)
         cells = [_cell(row, metric) for metric in metrics]
-        cells += [
-            _cell(row and row["per_category"].get(category), "acc30") for category in featured
-        ]
-        rows[line["label"]] = cells + [
-            Cell(line["published"][k]) if line["published"] else None for k in kept
-        ]
-    titles += [f"{PUBLISHED}: {spec['published'][k]}" for k in kept]
-    notes = _PUBLISHED_NOTE if kept else "", spec.get("note", "")
+        for category in featured:
+            cells.append(_cell(row and row["per_category"].get(category), "acc30"))
+        published = line["published"]
+        rows[line["label"]] = cells + [Cell(published[k]) if published else None for k in shown]
+    titles = [
+        *(METRICS[metric] for metric in metrics),
+        *(f"{category} Acc30" for category in featured),
+        *(f"{PUBLISHED}: {spec['published'][k]}" for k in shown),
+    ]
+    notes = [_PUBLISHED_NOTE if shown else "", spec.get("note", "")]
     return _table(summary, spec["name"], spec["title"], rows, titles, metrics, *notes)
 
 
@@ -208,7 +214,7 @@ def by_category(
     }
     rows["all"] = [_cell(row, metric) for row in methods.values()]
     name, title = f"categories_{metric.rpartition('_')[2]}", f"By category: {METRICS[metric]}"
-    return _table(summary, name, title, rows, list(methods), [metric], across=True)
+    return _table(summary, name, title, rows, list(methods), [metric])
 
 
 def compare(
@@ -220,42 +226,55 @@ def compare(
     Rows are texts "A:B", for row A of the first and B of the second run, or "A"; `names` are those
     of the runs. InputError if a row or a common pair is missing.
     """
-    of_first, of_second = (run.table["row"].unique() for run in (first, second))
-    rows, cells = [name for name in of_first if name in of_second] if rows is None else rows, {}
+    of_first, of_second = first.table["row"].unique(), second.table["row"].unique()
+    if rows is None:
+        rows = [name for name in of_first if name in of_second]
     if not len(rows):
         raise InputError(
             f"runs have no row in common: {', '.join(of_first)} and {', '.join(of_second)}"
         )
+    cells = {}
     for text in rows:
         one, _, other = (text, "", text) if text in of_first else text.partition(":")
-        lines = (
-            run.row(name).set_index("repeat", append=True, drop=False)
-            for run, name in ((first, one), (second, other))
-        )
-        both = next(lines).join(next(lines)["error"].rename("other"), how="inner").sort_index()
+        errors_b = _by_seed(second, other)["error"].rename("error_b")
+        both = _by_seed(first, one).join(errors_b, how="inner").sort_index()
         if both.empty:
             raise InputError(
                 f"rows {one} and {other} have no pair in common: other data or number of views"
             )
-        errors = both[["error", "other"]].to_numpy().T
-        figures = [Cell(len(both), decimals=0), *map(Cell, accuracy(errors, 30))]
-        difference = _difference(paired_difference(*errors, weights=draws_of(both)))
-        cells[text] = [*figures, *difference, *map(Cell, median(errors))]
-    medians = (f"{run}: {METRICS['median']}" for run in "AB")
-    titles = ["pairs", "Acc30 of A (%)", "Acc30 of B (%)", "B − A", "p", *medians]
-    note = "On the common pairs. Intervals (95 %) and p: bootstrap over objects. "
-    note += "Of twenty rows without a difference, one has p < 0.05 by chance."
+        errors = both[["error", "error_b"]].to_numpy().T
+        gain = paired_difference(*errors, weights=draws_of(both))
+        cells[text] = [
+            _count(len(both)),
+            *map(Cell, accuracy(errors, 30)),
+            *_difference(gain),
+            *map(Cell, median(errors)),
+        ]
+    titles = ["pairs", "Acc30 of A (%)", "Acc30 of B (%)", "B − A", "p"]
+    titles += [f"{run}: {METRICS['median']}" for run in "AB"]
+    note = (
+        "On the common pairs. Intervals (95 %) and p: bootstrap over objects. "
+        "Of twenty rows without a difference, one has p < 0.05 by chance."
+    )
     title = "A = {}, B = {}".format(*names)
     return Table("compare", title, pd.DataFrame.from_dict(cells, "index", object, titles), note)
 
 
-def _difference(test: Mapping[str, Any] | None) -> tuple[Cell | None, Cell | None]:
+def _by_seed(run: Run, row: str) -> pd.DataFrame:
+    """A row's lines by pair and seed."""
+    return run.row(row).set_index("repeat", append=True, drop=False)
+
+
+def _difference(test: Mapping[str, Any] | None) -> list[Cell | None]:
     """The gain and the p value of a `paired_difference`."""
     if test is None:
-        return None, None
-    return Cell(test["accuracy_gain"], *test["accuracy_gain_ci"]), Cell(
-        test["accuracy_gain_p"], decimals=3
-    )
+        return [None, None]
+    gain = Cell(test["accuracy_gain"], *test["accuracy_gain_ci"])
+    return [gain, Cell(test["accuracy_gain_p"], decimals=3)]
+
+
+def _count(number: int) -> Cell:
+    return Cell(number, decimals=0)
 
 
 def own_rows(summary: Mapping[str, Any]) -> list[str]:
@@ -282,12 +301,15 @@ def _sees_more(name: str) -> bool:
 
 def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:
     """A figure of a row, or of a category, which has no mean of categories."""
-    if row is not None and metric not in row and metric == "mean_category_median":
-        metric = "median"
-    if row is None or row.get(metric) is None:
+    if row is None:
+        return None
+    found = metric
+    if metric == "mean_category_median" and metric not in row:
+        found = "median"
+    if row.get(found) is None:
         return None
     decimals = 2 if metric in ("scale", "translation") else 1
-    return Cell(row[metric], *row.get(f"{metric}_ci", (None, None)), decimals, metric)
+    return Cell(row[found], *row.get(f"{found}_ci", ()), decimals=decimals)
 
 
 def _table(
@@ -298,10 +320,10 @@ def _table(
     titles: Sequence[str],
     metrics: Sequence[str],
     *more: str,
-    across: bool = False,
 ) -> Table:
     """Make a table of a run, with notes on how to read it, and with what the run has evaluated."""
-    data, notes = summary["data"], [summary.get("note", "")]
+    data = summary["data"]
+    notes = [summary.get("note", "")]
     if "mean_category_median" in metrics:
         notes.append("Med. err.: mean of the categories' medians.")
     if {"translation", "scale"} & set(metrics):
@@ -316,109 +338,65 @@ def _table(
             "ms per pair: median; what rows share, such as features, counts for the first "
             "that needs it."
         )
-    notes += ["Intervals: 95 %, bootstrap over objects.", *_note_on_seeds(summary), *more]
-    pairs = f"{data['pairs']} pairs" + (
-        " of an unfinished run" if "Not finished" in notes[0] else ""
-    )
+    notes.append("Intervals: 95 %, bootstrap over objects.")
+    for row, figures in {"ours": {}, **summary["methods"]}.items():
+        if "acc30_sd_of_seeds" in figures:
+            notes.append(
+                f"Means over seeds, which the intervals hold; by seed, Acc30 of {row} has a "
+                f"standard deviation of {figures['acc30_sd_of_seeds']:.1f} points."
+            )
+            break
+    notes += more
+    unfinished = " of an unfinished run" if "Not finished" in notes[0] else ""
     what = (
-        f"{Path(data['root']).name}, {pairs}, {data['targets']} target views, backbone "
-        f"{summary['backbone']}"
+        f"{Path(data['root']).name}, {data['pairs']} pairs{unfinished}, {data['targets']} target "
+        f"views, backbone {summary['backbone']}"
     )
     cells = pd.DataFrame.from_dict(rows, "index", object, titles)
-    return Table(name, title, cells, " ".join(filter(None, notes)), what, across)
-
-
-def _note_on_seeds(summary: Mapping[str, Any]) -> list[str]:
-    """Say how much the draws of k-means and RANSAC alone change Acc30, if there are several of each
-    pair."""
-    spread = {
-        name: row["acc30_sd_of_seeds"]
-        for name, row in summary["methods"].items()
-        if "acc30_sd_of_seeds" in row
-    }
-    if not spread:
-        return []
-    name = "ours" if "ours" in spread else next(iter(spread))
-    return [
-        f"Means over seeds, which the intervals hold; by seed, Acc30 of {name} has a standard "
-        "deviation of "
-        f"{spread[name]:.1f} points."
-    ]
+    return Table(name, title, cells, " ".join(filter(None, notes)), what)
 
 
 def as_csv(table: Table) -> str:
     """Format as plain numbers, an interval in two columns of its own."""
-    columns = {
-        f"{title} {part}".removesuffix(" value"): [getattr(cell, part, None) for cell in cells]
-        for title, cells in table.cells.items()
-        for part in ("value", "low", "high")
-    }
+    columns = {}
+    for title, cells in table.cells.items():
+        for part in ("value", "low", "high"):
+            column = title if part == "value" else f"{title} {part}"
+            columns[column] = [getattr(cell, part, None) for cell in cells]
     numbers = pd.DataFrame(columns, table.cells.index).dropna(axis="columns", how="all")
     return numbers.to_csv(index_label="row", float_format="%.6g")
 
 
 def as_markdown(table: Table) -> str:
     """Format as a pipe table under its title."""
-    text = table.text.rename(
-        **dict.fromkeys(("index", "columns"), lambda name: name.replace("|", "\\|"))
-    )
-    lines = text.to_markdown(
-        disable_numparse=True, colalign=("left", *["right"] * len(text.columns))
-    )
+
+    def escape(name: str) -> str:
+        return name.replace("|", "\\|")
+
+    text = table.text.rename(index=escape, columns=escape)
+    alignment = ["left", *["right"] * len(text.columns)]
+    lines = text.to_markdown(disable_numparse=True, colalign=alignment)
     return "\n\n".join(filter(None, [f"**{table.title}**", lines, table.note])) + "\n"
 
 
 def as_latex(table: Table, intervals: bool = False) -> str:
-    """Format three columns and the time as a booktabs table, the best value of a metric in bold.
-
-    The paper's figures of these columns follow in lines of their own.
-    """
+    """Format three columns and the time as a booktabs table."""
     time = METRICS["milliseconds"]
-    titles = [title for title in table.cells if title not in ("pairs", time)][:3] + [time] * (
-        time in table.cells
-    )
-    shown = table.cells[titles].dropna(how="all")
-    texts, best = (
-        shown.map(_number, interval=intervals),
-        shown.apply(_are_best, axis=int(table.across)),
-    )
-    published = table.cells.reindex(columns=[f"{PUBLISHED}: {title}" for title in titles]).dropna(
-        how="all"
-    )
-    published = published.set_axis(titles, axis="columns").rename(
-        lambda label: f"{PUBLISHED}: {label}"
-    )
-    lines = pd.concat([texts.mask(best, r"\textbf{" + texts + "}"), published.map(_number)])
-    lines = lines.rename(index=_escape, columns=_escape)
+    titles = [title for title in table.cells if title not in ("pairs", time)][:3]
+    if time in table.cells:
+        titles.append(time)
+    shown = table.cells[titles].dropna(how="all").map(_number, interval=intervals)
     # LaTeX counts tables itself
     title = re.sub(r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title)
-    caption = _escape(
-        ". ".join(filter(None, (title, table.data, _PUBLISHED_NOTE if len(published) else "")))
+    return shown.rename(index=_escape, columns=_escape).to_latex(
+        position="tb",
+        label=f"tab:{table.name}",
+        caption=_escape(". ".join(filter(None, [title, table.data]))),
+        column_format="l" + "r" * len(titles),
     )
-    alignment = "l" + "r" * len(titles)
-    return lines.to_latex(
-        position="tb", label=f"tab:{table.name}", caption=caption, column_format=alignment
-    )
 
 
-def _are_best(cells: pd.Series) -> pd.Series:
-    """Tell which cells of one metric are the best, if there are rivals; a row that is told the true
-    view is none."""
-    rivals = {
-        name: cell
-        for name, cell in cells.items()
-        if cell and cell.metric and "oracle-view" not in name
-    }
-    values = pd.Series(
-        {name: round(cell.value, cell.decimals) for name, cell in rivals.items()},
-        cells.index,
-        float,
-    )
-    lowest = any(cell.metric in _LOWEST_IS_BEST for cell in rivals.values())
-    return (values == (values.min() if lowest else values.max())) & (len(rivals) > 1)
-
-
-def _number(cell: Any, interval: bool = False) -> str:
+def _number(cell: Any, interval: bool) -> str:
     if not isinstance(cell, Cell):
         return "--"
     text = str(cell) if interval else str(replace(cell, low=None))
@@ -444,12 +422,8 @@ def error_distribution(run: Run, row: str = "ours") -> Figure:
     A second cluster near 180 degrees consists of confusions of front and back.
     """
     groups = {str(name): errors for name, errors in run.row(row).groupby("category")["error"]}
-    labels = {
-        "xlabel": f"rotation error of {row} (degrees)",
-        "xlim": (-3, 183),
-        "xticks": range(0, 181, 30),
-    }
-    return show_dots({row: groups}, **labels)
+    label = f"rotation error of {row} (degrees)"
+    return show_dots({row: groups}, xlabel=label, xlim=(-3, 183), xticks=range(0, 181, 30))
 
 
 def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
@@ -459,14 +433,17 @@ def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
     for name in rows or important_rows(run.summary)[: len(COLOURS)]:
         errors = np.sort(run.row(name)["error"])
         shares = 100 * np.arange(len(errors) + 1) / len(errors)
-        # a step at every error
-        curves[name] = (
-            np.repeat([0, *errors], 2)[1:],
-            np.repeat(shares, 2)[:-1],
-        )
-    labels = {"xlabel": "rotation error (degrees)", "ylabel": "pairs with at most this error (%)"}
-    labels |= {"xlim": (0, 180), "ylim": (0, 100), "xticks": (0, 15, 30, 60, 90, 120, 150, 180)}
-    return show_panels({"": curves}, size=(6.5, 4), **labels)
+        # A step at every error: to the right at the old share, then up.
+        curves[name] = (np.repeat([0, *errors], 2)[1:], np.repeat(shares, 2)[:-1])
+    return show_panels(
+        {"": curves},
+        size=(6.5, 4),
+        xlabel="rotation error (degrees)",
+        ylabel="pairs with at most this error (%)",
+        xlim=(0, 180),
+        ylim=(0, 100),
+        xticks=(0, 15, 30, 60, 90, 120, 150, 180),
+    )
 
 
 def pair_figure(run: Run, key: str, dataset: Co3D, rows: Sequence[str] | None = None) -> Figure:
@@ -476,41 +453,36 @@ def pair_figure(run: Run, key: str, dataset: Co3D, rows: Sequence[str] | None = 
     Without a translation, they are moved to the middle of the target's points. InputError if no row
     has a pose.
     """
-    stored = {
-        name: run.row(name).dropna(subset=["rotation", "view"])
-        for name in rows or run.table["row"].unique()
-    }
-    # of the first seed
-    found = {name: row.loc[[key]].iloc[0] for name, row in stored.items() if key in row.index}
+    found = {}
+    for name in rows or run.table["row"].unique():
+        poses = run.row(name).dropna(subset=["rotation", "view"])
+        if key in poses.index:
+            found[name] = poses.loc[[key]].iloc[0]  # of the first seed
     if not found:
         raise InputError(
             f"pair {key!r} has no pose in the run, expected a key such as "
             f"{run.table['pair'].iloc[0]}"
         )
     reference, targets = dataset.load_pair(Pair.from_key(key))
-    crops = [
-        object_crop(reference),
-        *(object_crop(targets[int(result["view"])]) for result in found.values()),
-    ]
-    cloud, images = frame_cloud(crops[0]), [crop.rgb for crop in crops]
-    poses = [
-        Sim3.identity(),
-        *(_pose(result, cloud, crop) for result, crop in zip(found.values(), crops[1:])),
-    ]
-    titles = [
-        "reference",
-        *found,
-        "its points",
-        *(f"{result['error']:.0f}° off" for result in found.values()),
-    ]
+    crops = [object_crop(reference)]
+    cloud = frame_cloud(crops[0])
+    poses = [Sim3.identity()]
+    errors = []
+    for result in found.values():
+        crops.append(object_crop(targets[int(result["view"])]))
+        poses.append(_pose(result, cloud, crops[-1]))
+        errors.append(f"{result['error']:.0f}° off")
+    images = [crop.rgb for crop in crops]
+    titles = ["reference", *found, "its points", *errors]
     figure, axes = show_images([*images, *map(pale, images)], titles, len(crops))
     draw_moved_cloud(axes[len(crops) :], [crop.camera for crop in crops], cloud, poses)
     return figure
 
 
 def _pose(result: pd.Series, cloud: np.ndarray, target: Frame) -> Sim3:
-    scale, position = 1.0 if pd.isna(result["scale"]) else result["scale"], result["position"]
+    scale = 1.0 if pd.isna(result["scale"]) else result["scale"]
     rotation = np.reshape(result["rotation"], (3, 3))
+    position = result["position"]
     if position is None:
         position = frame_cloud(target).mean(axis=0) - scale * rotation @ cloud.mean(axis=0)
     return Sim3(scale, rotation, np.array(position))

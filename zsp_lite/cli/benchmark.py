@@ -175,10 +175,9 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
     from zsp_lite.benchmark import tables
     from zsp_lite.cli.terminal import print_table
 
-    found = [
-        one for one in tables.every_table(summary, metrics) if not one.name.startswith("categories")
-    ]
-    for table in (*found, tables.by_category(summary, most=_ROWS_SHOWN)):
+    shown = tables.every_table(summary, metrics)
+    shown = [table for table in shown if not table.name.startswith("categories")]
+    for table in (*shown, tables.by_category(summary, most=_ROWS_SHOWN)):
         if with_paper or table.name in ("all_rows", *tables.SEE_MORE, "categories_acc30"):
             print_table(table)
 
@@ -210,16 +209,14 @@ def tables(run, out, metrics, rows, latex, size, pair, data) -> None:
 
     if pair:
         found = read_run(run)
-        figure = pair_figure(
-            found, pair, Co3D(data or found.settings.folder or found.settings.data), rows
-        )
+        dataset = Co3D(data or found.settings.folder or found.settings.data)
+        figure = pair_figure(found, pair, dataset, rows)
         print(f"Written: {save_figure(figure, (out or run) / 'figures', f'pair_{pair}', size)}")
         return
     if "time" in latex and "milliseconds" not in metrics:
         metrics = [*metrics, "milliseconds"]
-    _print_summary(
-        write_reports(run, out, metrics, rows, "intervals" in latex, size), metrics, with_paper=True
-    )
+    summary = write_reports(run, out, metrics, rows, "intervals" in latex, size)
+    _print_summary(summary, metrics, with_paper=True)
 
 
 @click.command(

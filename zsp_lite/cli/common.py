@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from functools import partial, reduce, wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
@@ -110,11 +110,6 @@ def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return with_backbone
 
 
-def _options(*options: Callable[..., Any]) -> Callable[..., Any]:
-    """Combine options to one decorator of commands."""
-    return lambda command: reduce(lambda one, option: option(one), reversed(options), command)
-
-
 workers_option = click.option("--workers", type=COUNT, default=1, help="Worker processes.")
 
 
@@ -122,7 +117,7 @@ def source_options(multiple: bool) -> Callable[..., Any]:
     """Add the options of `open_source` that images and captures have, once or for each of several
     objects."""
     option = partial(click.option, multiple=multiple)
-    return _options(
+    options = [
         option(
             "--mask",
             type=click.Choice(MASKS),
@@ -150,4 +145,11 @@ def source_options(multiple: bool) -> Callable[..., Any]:
             help="Metres per stored depth value: 0.001 for millimetres.",
         ),
         option("--object", type=INDEX, help="Number of the object in a scene of BOP."),
-    )
+    ]
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        for one in reversed(options):
+            command = one(command)
+        return command
+
+    return decorate

@@ -88,7 +88,8 @@ def _print_checks(root: Path, checks: Sequence[Any]) -> int:
         ]
         found = [f"{count:,} of {every:,} {what}" for count, every, what in counted if count > 0]
         found += check.problems[:_PROBLEMS_SHOWN]
-        if (more := len(check.problems) - _PROBLEMS_SHOWN) > 0:
+        more = len(check.problems) - _PROBLEMS_SHOWN
+        if more > 0:
             found.append(f"and {more} more")
         lines += [f"{check.category}: {line}" for line in found]
     size = decimal(sum(check.size for check in checks))
@@ -348,10 +349,10 @@ def uco3d(root, category, sequences, best, count, out) -> None:
 
 def _print_import(folder: Path, done: Any) -> None:
     """Print the numbers of an `ImportResult`."""
+    left_out = f"; {done.empty} frames without the object left out" if done.empty else ""
     print(
         f"Written: {folder}: {done.frames} frames, {done.points:,} points, "
-        f"scaled by {done.scale:.4g}"
-        + (f"; {done.empty} frames without the object left out" if done.empty else "")
+        f"scaled by {done.scale:.4g}{left_out}"
     )
     for flag in done.flags:
         print(f"flag: {flag}")

@@ -40,7 +40,7 @@ def run_checks() -> Iterator[tuple[str, str, str, str]]:
     try:
         import torch
 
-        from zsp_lite.backbones.load import DEFAULT, available_backbones, obtained_by
+        from zsp_lite.backbones.load import DEFAULT, available_backbones, how_to_obtain
         from zsp_lite.io.download import cache_folder
     except (ImportError, OSError) as error:
         yield (
@@ -57,7 +57,7 @@ def run_checks() -> Iterator[tuple[str, str, str, str]]:
     )
     yield "torch", "ok", f"{torch.__version__}, {torch.get_num_threads()} threads, {cuda}", ""
     path = available_backbones()[DEFAULT]
-    state, fix = ("ok", "") if path else ("bad", obtained_by(DEFAULT))
+    state, fix = ("ok", "") if path else ("bad", how_to_obtain(DEFAULT))
     yield f"weights {DEFAULT}", state, f"{path or 'no file'} (all: zsp-lite weights list)", fix
     folder = cache_folder()
     existing = next(one for one in (folder, *folder.parents) if one.exists())

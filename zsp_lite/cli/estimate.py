@@ -107,17 +107,17 @@ def estimate(
     with writing(out):
         given = {name: settings.pop(name) for name in _ONCE_PER_OBJECT}
         sources = open_pair(reference, target, given, (*helpers, *others))
-        settings |= {"backbone": backbone, "upright": not not_upright, "helpers": sources[2:]}
-        found = estimate_pose(*sources[:2], **settings)
+        found = estimate_pose(
+            *sources[:2],
+            backbone=backbone,
+            upright=not not_upright,
+            helpers=sources[2:],
+            **settings,
+        )
         files = write_pair(found, out)
     if as_json:
-        print(
-            json.dumps(
-                found.as_json() | {"files": [str(path) for path in files]},
-                indent=1,
-                allow_nan=False,
-            )
-        )
+        printed = {**found.as_json(), "files": [str(path) for path in files]}
+        print(json.dumps(printed, indent=1, allow_nan=False))
     else:
         _print_tables(found)
         for path in files:

@@ -84,10 +84,10 @@ def weights() -> None:
 @weights.command("list", epilog=examples("weights list"))
 def list_weights() -> None:
     """List every backbone with its file, or where to get it."""
-    from zsp_lite.backbones.load import available_backbones, obtained_by
+    from zsp_lite.backbones.load import available_backbones, how_to_obtain
 
     for name, path in available_backbones().items():
-        print(f"{name:19} {path or obtained_by(name)}")
+        print(f"{name:19} {path or how_to_obtain(name)}")
 
 
 @weights.command(

@@ -28,12 +28,11 @@ def example_pair(dataset: Co3D) -> Pair:
     The pair of scooters is chosen by its result: a turn of 41 degrees, and both solvers are less
     than 10 off.
     """
-    chosen = Pair("motorcycle", "scooter", 10, "scooter2", (2, 6, 11, 16, 21))
-    folders = (
-        dataset.root / chosen.category / name
-        for name in (chosen.reference_sequence, chosen.target_sequence)
-    )
-    return chosen if all(folder.is_dir() for folder in folders) else demo_pairs(dataset)[0]
+    scooters = Pair("motorcycle", "scooter", 10, "scooter2", (2, 6, 11, 16, 21))
+    for sequence in (scooters.reference_sequence, scooters.target_sequence):
+        if not (dataset.root / scooters.category / sequence).is_dir():
+            return demo_pairs(dataset)[0]
+    return scooters
 
 
 def run_demo(
@@ -57,11 +56,10 @@ def run_pair(
         f"sequence {pair.reference_sequence}, frame {pair.reference_frame}",
         f"sequence {pair.target_sequence}, frames {', '.join(map(str, pair.target_frames))}",
     )
-    name, sequences = (
-        getattr(method.backbone, "name", ""),
-        (pair.reference_sequence, pair.target_sequence),
-    )
-    found = PairResult(
+    name = getattr(method.backbone, "name", "")
+    result = PairResult(
         pair.category, sources, reference, tuple(targets), estimates, {}, pair, backbone=name
     )
-    return replace(found, errors=label_errors(found, dataset.root / pair.category, sequences))
+    sequences = (pair.reference_sequence, pair.target_sequence)
+    errors = label_errors(result, dataset.root / pair.category, sequences)
+    return replace(result, errors=errors)

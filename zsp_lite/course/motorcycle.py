@@ -9,7 +9,9 @@ from zsp_lite.data.cameras import Camera
 from zsp_lite.data.depth import fit_plane, unproject_depth
 from zsp_lite.data.frames import Frame, largest_region
 
-CATEGORY, TARGET = "motorcycle", "scooter"  # the synthetic object that tells the directions
+# The synthetic object whose directions are known.
+CATEGORY = "motorcycle"
+TARGET = "scooter"
 # Directions of the photographed motorcycle in camera coordinates. There is no measured ground
 # truth. The front was judged by eye from the rear wheel, since the front wheel is turned, and may
 # be wrong by 10 degrees. Up is the normal of the floor; the motorcycle leans on its side stand by a
@@ -17,16 +19,13 @@ CATEGORY, TARGET = "motorcycle", "scooter"  # the synthetic object that tells th
 FRONT = (0.97, 0.06, -0.24)
 UP = (0.01, -0.97, -0.26)
 
-# Calibration at the size in scikit-image, from its documentation: focal length, principal point and
-# difference of the two principal points in pixels, baseline in metres. The values are those of the
-# original photograph divided by 4. They therefore count from the corner of the image, as `Camera`
-# does, to within 1/8 pixel.
-_FOCAL_LENGTH, _PRINCIPAL_POINT, _PRINCIPAL_DIFFERENCE, _BASELINE = (
-    994.978,
-    (311.193, 254.877),
-    31.086,
-    0.193001,
-)
+# Calibration at the size in scikit-image, from its documentation. The values in pixels are those of
+# the original photograph divided by 4. They therefore count from the corner of the image, as
+# `Camera` does, to within 1/8 pixel.
+_FOCAL_LENGTH = 994.978  # pixels
+_PRINCIPAL_POINT = (311.193, 254.877)  # pixels
+_PRINCIPAL_DIFFERENCE = 31.086  # pixels between the principal points of both cameras, along x
+_BASELINE = 0.193001  # metres between both cameras
 _FLOOR_ROWS = slice(300, None)  # lower part of the photograph, mostly floor
 _FLOOR_DISTANCE = 0.01  # metres; largest distance of a floor point from the plane
 _CLEARANCE = 0.02  # metres; smallest height of an object point above the floor
@@ -46,7 +45,8 @@ def load_photograph() -> Frame:
     rgb, _, disparity = skimage.data.stereo_motorcycle()
     frame = motorcycle_frame(rgb, disparity)
     points = unproject_depth(frame.depth, frame.camera)[(frame.mask > 0) & (frame.depth > 0)]
-    return replace(frame, depth=frame.depth / np.float32(points.std(axis=0).mean()))
+    unit = np.float32(points.std(axis=0).mean())  # metres
+    return replace(frame, depth=frame.depth / unit)
 
 
 def motorcycle_frame(
@@ -61,7 +61,8 @@ def motorcycle_frame(
         np.eye(3), np.zeros(3), np.full(2, _FOCAL_LENGTH), np.array(_PRINCIPAL_POINT), depth.shape
     )
     points = unproject_depth(depth, camera)
-    normal, offset = fit_plane(points[_FLOOR_ROWS][known[_FLOOR_ROWS]], _FLOOR_DISTANCE)
+    floor = points[_FLOOR_ROWS][known[_FLOOR_ROWS]]
+    normal, offset = fit_plane(floor, _FLOOR_DISTANCE)
     height = (points @ normal - offset) * -np.sign(normal[1])  # +y is down
     # Thin parts, such as the brake cables and a mirror, are missing, and so are the lowest 2 cm of
     # the tyres.

@@ -69,19 +69,30 @@ def run_photograph(dataset: Co3D, backbone: FeatureExtractor) -> Iterator[Photog
     sequence = motorcycle.TARGET if motorcycle.TARGET in poses else min(poses)
     frames = dataset.frames(motorcycle.CATEGORY, sequence)
     targets = [dataset.load(frames[k * len(frames) // N_TARGETS]) for k in range(N_TARGETS)]
-    photograph, pose = motorcycle.load_photograph(), poses[sequence]
+    pose = poses[sequence]
     points, _ = dataset.point_cloud(motorcycle.CATEGORY, sequence)
+    along = pose.to_box(points)[:, 0]
+    photograph = motorcycle.load_photograph()
     for foreground in _FOREGROUNDS:
         method = ZeroShotPose(backbone, foreground=foreground)
         reference, *views = method.views([photograph, *targets])
         for solver in _SOLVERS:
             estimate = replace(method, solver=solver).estimate_from_views(reference, views)
-            camera, to_photograph = estimate.target_camera, estimate.sim3.inverse()
+            # From the target's camera to the photograph's: the photograph is the reference.
+            camera = estimate.target_camera
+            to_photograph = estimate.sim3.inverse()
             axes = to_photograph.R @ camera.R @ pose.R
-            cloud, along = to_photograph.apply(camera.to_camera(points)), pose.to_box(points)[:, 0]
-            errors = _angle(axes[:, 0], motorcycle.FRONT), _angle(axes[:, 2], motorcycle.UP)
             yield PhotographResult(
-                photograph, sequence, foreground, solver, estimate, axes, cloud, along, *errors
+                photograph,
+                sequence,
+                foreground,
+                solver,
+                estimate,
+                axes,
+                cloud=to_photograph.apply(camera.to_camera(points)),
+                along=along,
+                front_error=_angle(axes[:, 0], motorcycle.FRONT),
+                up_error=_angle(axes[:, 2], motorcycle.UP),
             )
 
 
@@ -89,14 +100,17 @@ def photograph_section(results: Sequence[PhotographResult]) -> PhotographSection
     """Return what the report of the demo shows of the results."""
     rows = []
     for result in results:
-        confidence = (
-            "–" if result.estimate.confidence is None else f"{result.estimate.confidence:.2f}"
+        confidence = result.estimate.confidence
+        row = (
+            _FOREGROUNDS[result.foreground],
+            result.solver,
+            f"{result.front_error:.0f}°",
+            f"{result.up_error:.0f}°",
+            "–" if confidence is None else f"{confidence:.2f}",
         )
-        errors = f"{result.front_error:.0f}°", f"{result.up_error:.0f}°"
-        rows.append((_FOREGROUNDS[result.foreground], result.solver, *errors, confidence))
-    return PhotographSection(
-        results[0].sequence, _COLUMNS, rows, partial(photograph_figure, results)
-    )
+        rows.append(row)
+    figure = partial(photograph_figure, results)
+    return PhotographSection(results[0].sequence, _COLUMNS, rows, figure)
 
 
 def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
@@ -105,11 +119,15 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
 
     The left column shows a view of the synthetic motorcycle, and the directions judged by eye.
     """
-    photograph, estimate = results[0].photograph, results[0].estimate
-    view, (height, width) = estimate.target_views[estimate.view].frame.rgb, photograph.camera.size
-    # to the aspect of the photograph
+    # A view of the synthetic motorcycle, with white margins to the aspect of the photograph.
+    photograph = results[0].photograph
+    height, width = photograph.camera.size
+    estimate = results[0].estimate
+    view = estimate.target_views[estimate.view].frame.rgb
     margin = round((view.shape[0] * width / height - view.shape[1]) / 2)
     view = np.pad(view, ((0, 0), (margin, margin), (0, 0)), constant_values=255)
+
+    # A row for each foreground: a panel at the left, then one for each solver.
     titles = [
         f"{_FOREGROUNDS[result.foreground]}, {result.solver} solver\n"
         f"front {result.front_error:.0f}°, up {result.up_error:.0f}° off"
@@ -119,11 +137,12 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
     titles.insert(0, f"a view of the synthetic motorcycle,\n{results[0].sequence}")
     images = [view, *[photograph.rgb] * (len(titles) - 1)]
     figure, (_, *axes) = plots.show_images(images, titles, columns=1 + len(_SOLVERS), size=3.6)
-    up, front = np.array(motorcycle.UP), np.array(motorcycle.FRONT)
-    centre, directions = (
-        np.median(object_points(photograph), axis=0),
-        np.stack([front, np.cross(up, front), up]),
-    )
+
+    # The directions judged by eye, and those of the results.
+    up = np.array(motorcycle.UP)
+    front = np.array(motorcycle.FRONT)
+    directions = np.stack([front, np.cross(up, front), up])  # rows: front, left, up
+    centre = np.median(object_points(photograph), axis=0)
     _draw_directions(axes.pop(len(_SOLVERS)), photograph, centre, directions)
     for axis, result in zip(axes, results):
         chosen = np.linspace(0, len(result.cloud) - 1, min(_POINTS, len(result.cloud))).astype(int)
@@ -134,6 +153,7 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
 
 
 def _draw_directions(axis: Axes, frame: Frame, origin: np.ndarray, directions: np.ndarray) -> None:
+    """Draw arrows from an origin to front, left and up (rows) over a frame."""
     plots.draw_axes(
         axis, frame.camera, origin, origin + _LENGTH * directions, ("front", "left", "up")
     )

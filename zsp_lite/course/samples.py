@@ -20,21 +20,21 @@ def sample_data() -> Path:
     about 15 s (the preset "demo" of `zsp-lite synth`). An interrupted call is completed by the next
     one.
     """
-    folders = Path("data_samples"), REPOSITORY / "data_samples", cache_folder() / "samples"
-    for folder in folders:
+    made = cache_folder() / "samples"
+    for folder in (Path("data_samples"), REPOSITORY / "data_samples", made):
         if folder.is_dir():
             return folder
     from zsp_lite.course.synthetic.export import export_preset
 
     # A warning, because a program without logging settings shows nothing else.
-    logger.warning("No data_samples/ here: making synthetic samples in %s, once", folder)
-    part = folder.with_name(folder.name + ".part")
+    logger.warning("No data_samples/ here: making synthetic samples in %s, once", made)
+    part = made.with_name(made.name + ".part")
     try:
         with writing(part):
             export_preset("demo", part)
-        part.rename(folder)
+        part.rename(made)
     except (OSError, InputError) as error:
-        if not folder.is_dir():  # otherwise another process has made them meanwhile
+        if not made.is_dir():  # otherwise another process has made them meanwhile
             cure = "set ZSP_LITE_CACHE to a folder that can be written"
-            raise InputError(f"samples cannot be made in {folder} ({error}); {cure}") from error
-    return folder
+            raise InputError(f"samples cannot be made in {made} ({error}); {cure}") from error
+    return made

@@ -62,8 +62,10 @@ def ground_truth_matches(
     `reference` and `target` are results of `patch_coordinates`. Returns the target patch (row, col)
     of each reference patch, (0, 0) without a match, and the reference patches that have one.
     """
-    (points, known), (target_points, target_known) = reference, target
-    cells, valid = np.zeros((*known.shape, 2), int), np.zeros_like(known)
+    points, known = reference
+    target_points, target_known = target
+    cells = np.zeros((*known.shape, 2), int)
+    valid = np.zeros_like(known)
     if known.any() and target_known.any():
         search = NearestNeighbors(n_neighbors=1).fit(target_points[target_known])
         distance, index = search.kneighbors(points[known])
@@ -89,7 +91,8 @@ def ground_truth_pair(dataset: Co3D, pair: Pair) -> GroundTruthPair:
     grid = (28, 28)
     poses = object_poses(dataset, pair.category)
     reference, targets = dataset.load_pair(pair)
-    reference, targets = object_crop(reference), [object_crop(target) for target in targets]
+    reference = object_crop(reference)
+    targets = [object_crop(target) for target in targets]
     coordinates = patch_coordinates(reference, poses[pair.reference_sequence], grid)
     target_pose = poses[pair.target_sequence]
     matches = [

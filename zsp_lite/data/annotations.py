@@ -17,7 +17,8 @@ from zsp_lite.data.cameras import NDC_NORM_IMAGE_BOUNDS
 from zsp_lite.errors import MAX_LENGTH, InputError
 from zsp_lite.io.files import decode_json, decompress, read_bytes, without_nan
 
-FRAMES_FILE, SEQUENCES_FILE = "frame_annotations.jgz", "sequence_annotations.jgz"
+FRAMES_FILE = "frame_annotations.jgz"
+SEQUENCES_FILE = "sequence_annotations.jgz"
 Row = tuple[float, float, float]
 
 
@@ -28,7 +29,7 @@ class ImageAnnotation(msgspec.Struct, frozen=True, gc=False):
 
 class DepthAnnotation(msgspec.Struct, frozen=True, gc=False):
     path: str
-    # Factor from stored depth to depth
+    # Factor from stored depth to depth.
     scale_adjustment: Annotated[float, msgspec.Meta(gt=0, le=MAX_LENGTH)]
     mask_path: str | None = None
 
@@ -88,19 +89,17 @@ class FrameIndex:
     path: Path
     entries: list[msgspec.Raw]  # JSON of each frame
     keys: list[FrameKey]
-    # Of each sequence, the positions in `entries` by frame number, sorted
+    # Of each sequence, the positions in `entries` by frame number, sorted.
     by_sequence: dict[str, dict[int, int]]
 
     def positions(self, sequence: str) -> dict[int, int]:
-        """Return the positions of a sequence's frames by frame number; InputError if the sequence
-        is unknown."""
+        """Return the positions of a sequence's frames by frame number."""
         if sequence not in self.by_sequence:
             raise InputError(f"frame annotations {self.path} have no frames of {sequence!r}")
         return self.by_sequence[sequence]
 
     def frame(self, position: int) -> FrameAnnotation:
-        """Decode the entry at a position; InputError, which names file, frame and field, if a field
-        is invalid."""
+        """Decode the entry at a position; an InputError names file, frame and field."""
         key = self.keys[position]
         what = (
             f"frame annotations {self.path} (entry {position}: frame {key.frame_number} of "
@@ -110,15 +109,16 @@ class FrameIndex:
 
 
 def read_frame_index(path: Path) -> FrameIndex:
-    """Read the frame annotations of a category; InputError if they are damaged, or have a frame
-    twice."""
+    """Read the frame annotations of a category; InputError if a frame is there twice."""
     data = read_annotations(path)
     # Two passes that each skip most of the bytes are faster than one that builds every frame.
     keys = decode_json(data, list[FrameKey], f"frame annotations {path}")
     entries = msgspec.json.decode(data, type=list[msgspec.Raw])  # views into `data`, not copies
     by_sequence: dict[str, dict[int, int]] = {}
-    for position, key in sorted(enumerate(keys), key=lambda one: one[1].frame_number):
-        first = by_sequence.setdefault(key.sequence_name, {}).setdefault(key.frame_number, position)
+    for position in sorted(range(len(keys)), key=lambda position: keys[position].frame_number):
+        key = keys[position]
+        positions = by_sequence.setdefault(key.sequence_name, {})
+        first = positions.setdefault(key.frame_number, position)
         if first != position:
             raise InputError(
                 f"frame annotations {path}: entries {first} and {position} are both frame "
@@ -140,8 +140,8 @@ def read_annotations(path: Path) -> bytes:
 
 
 def compress(data: bytes) -> bytes:
-    """Compress with gzip, without name and time in the header, so that equal data give
-    equal bytes."""
+    """Compress with gzip; equal data give equal bytes."""
+    # Without name and time in the header.
     buffer = io.BytesIO()  # gzip.compress would write the platform into the header
     with gzip.GzipFile(filename="", mode="wb", fileobj=buffer, mtime=0) as file:
         file.write(data)

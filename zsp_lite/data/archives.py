@@ -55,9 +55,12 @@ class _Unpacked(msgspec.Struct):
 def list_archives(
     dataset: str, category: str, single_sequence: bool = False, chunks: int | None = None
 ) -> list[Archive]:
-    """List the first archives of a category of "co3d" (v2) or "co3d-v1"; the very first holds the
-    annotations."""
-    subset, suffix = ("single-sequence", "_singlesequence") if single_sequence else ("full", "")
+    """List the first archives of a category of "co3d" (v2) or "co3d-v1".
+
+    The very first holds the annotations.
+    """
+    subset = "single-sequence" if single_sequence else "full"
+    suffix = "_singlesequence" if single_sequence else ""
     catalogue = msgspec.json.decode(CATALOGUE.read_bytes())[dataset]
     origin = f"{dataset} ({subset})"
     digests = catalogue.get(subset, {})
@@ -71,25 +74,22 @@ def list_archives(
 
 
 def missing_archives(root: Path, archives: Sequence[Archive]) -> list[Archive]:
-    """Return what is not unpacked yet of archives; InputError if the folder has a category from
-    elsewhere."""
-    record, missing = _read_record(root), []
+    """Return what is not unpacked yet of archives; InputError for a category from elsewhere."""
+    record = _read_record(root)
+    missing = []
     for archive in archives:
-        place, found = root / archive.category, record.get(archive.category)
-        origin = (
-            found.origin
-            if found
-            else "elsewhere"
-            if place.is_dir() and any(place.iterdir())
-            else archive.origin
-        )
+        folder = root / archive.category
+        unpacked = record.get(archive.category, _Unpacked(archive.origin))
+        origin = unpacked.origin
+        if archive.category not in record and folder.is_dir() and any(folder.iterdir()):
+            origin = "elsewhere"
         if origin != archive.origin:
             raise InputError(
-                f"{place} is from {origin}, expected another folder (--root) for {archive.origin}"
+                f"{folder} is from {origin}, expected another folder (--root) for {archive.origin}"
             )
-        done = found.done if found else []
-        sequences = tuple(name for name in archive.sequences if name not in done)
-        if archive.name not in done and (sequences or not archive.sequences):
+        sequences = tuple(name for name in archive.sequences if name not in unpacked.done)
+        # Missing are whole archives, and those of which some sequences are.
+        if archive.name not in unpacked.done and (sequences or not archive.sequences):
             missing.append(replace(archive, sequences=sequences))
     return missing
 
@@ -103,19 +103,24 @@ def download_size(archive: Archive) -> int | None:
 
 
 def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | None]) -> int:
-    """Return the number of bytes that missing archives of these sizes need on the disk; InputError
-    if it has less."""
+    """Return the bytes that missing archives of these sizes need; InputError if the disk has less.
+
+    An unknown size counts 0.
+    """
     # Unpacked archives are about as large as the archives. Of whole archives, one at a time is
     # there, too.
     whole = [size or 0 for archive, size in zip(missing, sizes) if not archive.sequences]
+    # What an interrupted download has left.
     present = [
         path.stat().st_size
         for archive in missing
         for path in (root / _WORK).glob(f"{archive.name}*")
     ]
     needed = sum(size or 0 for size in sizes) + max(whole, default=0) - sum(present)
+    # The disk of the nearest folder that exists.
     existing = next(path for path in (root.absolute(), *root.absolute().parents) if path.exists())
-    if needed > (free := shutil.disk_usage(existing).free):
+    free = shutil.disk_usage(existing).free
+    if needed > free:
         raise InputError(
             f"disk of {root} has {free / 1e9:.1f} GB free, expected at least "
             f"{needed / 1e9:.1f} GB; choose another folder, or fewer chunks"
@@ -124,20 +129,22 @@ def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | Non
 
 
 def download_archives(root: Path, archives: Sequence[Archive]) -> None:
-    """Download archives, verify them, and unpack them, or sequences of them; continues an
-    interrupted download."""
+    """Download, verify and unpack archives, or sequences of them.
+
+    An interrupted download is continued.
+    """
     with writing(root / _WORK):
         # The first archive has the annotations: it comes last.
         for archive in reversed(missing_archives(root, archives)):
             path = root / _WORK / archive.name
             if not archive.sequences and not path.exists():
                 fetch(archive.url, path, remote_size(archive.url), digest=archive.sha256)
+            # The origin is recorded before the folder has files, for an interrupted run.
             record = _read_record(root)
             category = record.setdefault(archive.category, _Unpacked(archive.origin))
             write_atomic(root / _RECORD, msgspec.json.encode(record))
-            with _zip(
-                RemoteFile(archive.url) if archive.sequences else io.FileIO(path), archive.url
-            ) as zipped:
+            file = RemoteFile(archive.url) if archive.sequences else io.FileIO(path)
+            with _zip(file, archive.url) as zipped:
                 _unpack(zipped, root, _members(zipped, archive))
             category.done += archive.sequences or [archive.name]
             write_atomic(root / _RECORD, msgspec.json.encode(record))
@@ -145,33 +152,37 @@ def download_archives(root: Path, archives: Sequence[Archive]) -> None:
 
 
 def _unpack(zipped: zipfile.ZipFile, root: Path, members: Sequence[zipfile.ZipInfo]) -> None:
-    """Unpack members of a zip archive, annotations last, so that a category is read only if it is
-    complete."""
+    """Unpack members of a zip archive, annotations last: a category with them is complete."""
     # All paths are checked before the first file is written.
-    targets = {one: path_inside(root, one.filename) for one in members}
-    members = sorted(members, key=lambda one: (_is_annotation(one), one.header_offset))
-    for one in tqdm(members, "unpacking", disable=None):
-        path = targets[one]
-        if _is_annotation(one) or not path.is_file() or path.stat().st_size != one.file_size:
-            write_atomic(path, zipped.read(one))
+    targets = {member: path_inside(root, member.filename) for member in members}
+    members = sorted(members, key=lambda member: (_is_annotation(member), member.header_offset))
+    for member in tqdm(members, "unpacking", disable=None):
+        path = targets[member]
+        # Other files that are there in full size are left by an interrupted run.
+        if _is_annotation(member) or not path.is_file() or path.stat().st_size != member.file_size:
+            write_atomic(path, zipped.read(member))
 
 
 def _members(zipped: zipfile.ZipFile, archive: Archive) -> list[zipfile.ZipInfo]:
-    """List the files of the category in an archive, or its annotations and the files of the
-    archive's `sequences`."""
+    """List the files of an archive's category, or the annotations and its `sequences` only."""
     members = [
-        one
-        for one in zipped.infolist()
-        if one.filename.startswith(f"{archive.category}/") and not one.is_dir()
+        member
+        for member in zipped.infolist()
+        if member.filename.startswith(f"{archive.category}/") and not member.is_dir()
     ]
     if not archive.sequences:
         return members
-    folder_of = {one: one.filename.split("/")[1] for one in members}
-    if absent := sorted(set(archive.sequences) - set(folder_of.values())):
+    folder_of = {member: member.filename.split("/")[1] for member in members}
+    absent = sorted(set(archive.sequences) - set(folder_of.values()))
+    if absent:
         raise InputError(
             f"archive {archive.name} has no sequence {absent[0]!r}, expected all that are labelled"
         )
-    return [one for one in members if _is_annotation(one) or folder_of[one] in archive.sequences]
+    return [
+        member
+        for member in members
+        if _is_annotation(member) or folder_of[member] in archive.sequences
+    ]
 
 
 @contextmanager
@@ -185,9 +196,11 @@ def _zip(file: io.RawIOBase, where: str) -> Iterator[zipfile.ZipFile]:
 
 
 def _is_annotation(member: zipfile.ZipInfo) -> bool:
+    """Tell the annotations, in the category's folder itself, from the files of sequences."""
     return member.filename.count("/") == 1
 
 
 def _read_record(root: Path) -> dict[str, _Unpacked]:
+    """Read what is unpacked, by category."""
     path = root / _RECORD
     return read_json(path, dict[str, _Unpacked], "list") if path.is_file() else {}

@@ -24,27 +24,30 @@ from zsp_lite.errors import (
 
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
 Values = Real[np.ndarray, "..."] | Sequence
+Depths = Real[np.ndarray, "*batch"] | float | np.floating
 
 # CO3D v1, and the default if the format is not given
 NDC_NORM_IMAGE_BOUNDS = "ndc_norm_image_bounds"
 NDC_ISOTROPIC = "ndc_isotropic"  # CO3D v2
 
-# Rotation of camera coordinates if the image is turned by 90 degrees counterclockwise: right
-# becomes up.
+# Rotation of camera coordinates if the image is turned by 90 degrees counterclockwise: its right
+# becomes its top.
 _QUARTER_TURN = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 # PyTorch3D's camera axes (+x left, +y up, +z forward) are OpenCV's rotated by 180 degrees about z.
 _AXES = np.array([-1.0, -1.0, 1.0])
 MOST_PIXELS = 1_000_000  # of a side
-# a camera looks along the vertical if the sine of its angle to the vertical is at most this
+# A camera looks along the vertical if the sine of its angle to the vertical is at most this.
 _STEEP = 0.4
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Pinhole camera without distortion; InputError for a value out of range, or an `R` that is no
-    rotation."""
+    """Pinhole camera without distortion.
 
-    # (3, 3) rotation, world to camera; the nearest rotation of what is given
+    InputError for a value out of range, or an `R` that is no rotation.
+    """
+
+    # (3, 3) rotation, world to camera; the nearest rotation of what is given.
     R: Float[np.ndarray, "3 3"]
     t: Float[np.ndarray, "3"]  # (3,) translation, world to camera, in units of the world
     focal_length: Float[np.ndarray, "2"]  # (2,) along x and y, pixels
@@ -78,26 +81,23 @@ class Camera:
         intrinsics_format: str,
         size: Sequence[int],
     ) -> "Camera":
-        """Convert a PyTorch3D camera, such as a CO3D viewpoint, of an image of `size` (height,
-        width) in pixels.
+        """Convert a PyTorch3D camera, such as a CO3D viewpoint, of an image of (height, width).
 
         `X_cam = X_world @ R + T` with row vectors, +x left, +y up. Each side of the image covers
         [-1, 1] in the format "ndc_norm_image_bounds", the shorter side in "ndc_isotropic".
         """
-        R, T, focal_length, principal_point = map(np.asarray, (R, T, focal_length, principal_point))
         scale, centre = _ndc(size, intrinsics_format)
         # NDC axes point left and up, pixel axes right and down: hence the minus.
         return cls(
-            _AXES[:, None] * R.T,
+            _AXES[:, None] * np.transpose(R),
             _AXES * T,
-            focal_length * scale,
-            centre - principal_point * scale,
+            np.multiply(focal_length, scale),
+            centre - np.multiply(principal_point, scale),
             size,
         )
 
     def to_pytorch3d(self, intrinsics_format: str = NDC_NORM_IMAGE_BOUNDS) -> dict:
-        """Convert to the arguments of `from_pytorch3d` by name, without `size`; arrays are
-        float64."""
+        """Convert to the arguments of `from_pytorch3d` by name, without `size`."""
         scale, centre = _ndc(self.size, intrinsics_format)
         return {
             "R": (_AXES[:, None] * self.R).T,
@@ -110,7 +110,8 @@ class Camera:
     @property
     def K(self) -> Float[np.ndarray, "3 3"]:
         """Intrinsic matrix, pixels: `pixel ~ K @ x_cam`."""
-        (fx, fy), (cx, cy) = self.focal_length, self.principal_point
+        fx, fy = self.focal_length
+        cx, cy = self.principal_point
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     @property
@@ -148,12 +149,9 @@ class Camera:
         return pixels, depth
 
     def unproject_camera(
-        self,
-        pixels: Real[np.ndarray, "*batch 2"],
-        depth: Real[np.ndarray, "*batch"] | float | np.floating,
+        self, pixels: Real[np.ndarray, "*batch 2"], depth: Depths
     ) -> Float[np.ndarray, "*batch 3"]:
-        """Compute the points (..., 3) in camera coordinates at given pixels (x, y) and depths along
-        +z."""
+        """Compute camera points (..., 3) at given pixels (x, y) and depths along +z."""
         depth = np.asarray(depth, dtype=np.float64)[..., None]
         rays = (np.asarray(pixels, dtype=np.float64) - self.principal_point) / self.focal_length
         return np.concatenate(
@@ -161,25 +159,20 @@ class Camera:
         )
 
     def unproject(
-        self,
-        pixels: Real[np.ndarray, "*batch 2"],
-        depth: Real[np.ndarray, "*batch"] | float | np.floating,
+        self, pixels: Real[np.ndarray, "*batch 2"], depth: Depths
     ) -> Float[np.ndarray, "*batch 3"]:
-        """Compute the points (..., 3) in world coordinates at given pixels and depths; the inverse
-        of `project`."""
+        """Compute world points (..., 3) at given pixels and depths; the inverse of `project`."""
         return self.to_world(self.unproject_camera(pixels, depth))
 
     def crop(self, box: Box) -> "Camera":
-        """Return the camera of the image cropped to `box` (top, left, height, width): the principal
-        point moves."""
+        """Return the camera of the image cropped to `box` (top, left, height, width)."""
         top, left, height, width = box
         return replace(
             self, principal_point=self.principal_point - (left, top), size=(height, width)
         )
 
     def resize(self, size: Sequence[int]) -> "Camera":
-        """Return the camera of the image resized to (height, width): the intrinsics are scaled per
-        axis."""
+        """Return the camera of the image resized to (height, width), whatever the aspect ratio."""
         scale = np.array([size[1] / self.size[1], size[0] / self.size[0]])
         return replace(
             self,
@@ -189,35 +182,36 @@ class Camera:
         )
 
     def turn(self, quarters: int) -> "Camera":
-        """Return the camera of the image turned as in `numpy.rot90`: the camera turns about its
-        optical axis."""
+        """Return the camera of the image turned as in `numpy.rot90`, about its optical axis."""
         camera = self
         for _ in range(quarters % 4):
             x, y = camera.principal_point
-            centre = np.array([y, camera.size[1] - x])
-            R, t = _QUARTER_TURN @ camera.R, _QUARTER_TURN @ camera.t
-            camera = Camera(R, t, camera.focal_length[::-1], centre, camera.size[::-1])
+            camera = Camera(
+                _QUARTER_TURN @ camera.R,
+                _QUARTER_TURN @ camera.t,
+                camera.focal_length[::-1],
+                np.array([y, camera.size[1] - x]),
+                camera.size[::-1],
+            )
         return camera
 
 
 def split_intrinsics(name: str, values: Values) -> Float[np.ndarray, "4"]:
-    """Return fx, fy, cx, cy, which may be given as a matrix (3, 3) or its 9 numbers; InputError for
-    anything else."""
-    matrix = real_array(name, values)
-    if matrix.shape in ((3, 3), (9,)):
-        fx, skew, cx, *zeros, one = matrix.ravel().tolist()
-        zero, fy, cy, *zeros = zeros
-        if any((skew, zero, *zeros)) or one != 1:
+    """Return fx, fy, cx, cy, which may be given as a matrix (3, 3) or its 9 numbers."""
+    numbers = real_array(name, values)
+    if numbers.shape in ((3, 3), (9,)):
+        entries = numbers.ravel().tolist()
+        fx, _, cx, _, fy, cy, *_ = entries
+        if entries != [fx, 0, cx, 0, fy, cy, 0, 0, 1]:
             raise InputError(
-                f"{name} is {matrix.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels"
+                f"{name} is {numbers.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels"
             )
-        matrix = np.array([fx, fy, cx, cy])
-    return real_array(name, matrix, (4,))
+        numbers = np.array([fx, fy, cx, cy])
+    return real_array(name, numbers, (4,))
 
 
 def camera_from_pose(pose: Values, intrinsics: Values, size: tuple[int, int], where: str) -> Camera:
-    """Create a camera from its intrinsics and its camera-to-world pose in OpenCV's axes; errors
-    begin with `where`."""
+    """Create a camera of its intrinsics and its camera-to-world pose; errors begin with `where`."""
     pose = rigid_matrix(f"{where}: camera-to-world pose", pose)
     rotation = pose[:3, :3]
     values = split_intrinsics(f"{where}: intrinsics", intrinsics)
@@ -236,19 +230,18 @@ def _ndc(size: Sequence[int], intrinsics_format: str) -> tuple[np.ndarray, np.nd
 
 
 def ground_axes(cameras: Sequence[Camera]) -> Float[np.ndarray, "2 3"]:
-    """Return the axes of the world to the right and up in a drawing of the scene from above, normal
-    to the vertical."""
-    # The vertical is the image axis that the cameras agree on better, since images may be turned by
-    # 90 degrees.
+    """Return the world's axes to the right and up in a drawing of the scene from above."""
+    # The vertical is the image axis that the cameras agree on better, by the length of its mean:
+    # images may be turned by 90 degrees. Of two that are equal after rounding, it is y.
     axes = np.mean([camera.R[[1, 0]] for camera in cameras], axis=0)
     down = axes[np.linalg.norm(axes, axis=1).round(6).argmax()]
+    # The right singular vectors of (1, 3) after the first are normal to it.
     right, up = np.linalg.svd(down[None])[2][1:]
     return np.stack([right, up if np.cross(right, up) @ down < 0 else -up])
 
 
 def azimuths(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
-    """Return the directions of cameras around a point in degrees, seen from above; NaN for those
-    along the vertical."""
+    """Return the directions in degrees of cameras around a point; NaN for vertical ones."""
     directions = np.stack([camera.centre for camera in cameras]) - centre
     x, y = ground_axes(cameras) @ directions.T
     steep = np.hypot(x, y) <= _STEEP * np.linalg.norm(directions, axis=1)
@@ -256,8 +249,7 @@ def azimuths(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float
 
 
 def view_span(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> float:
-    """Return the angle in degrees that cameras span around a point: 360 minus the largest gap; 0
-    for one camera."""
+    """Return the angle in degrees that cameras span around a point: 360 minus the largest gap."""
     angles = azimuths(cameras, centre)
     angles = np.sort(angles[~np.isnan(angles)])
     if len(angles) > 1:

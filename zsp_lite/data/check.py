@@ -41,8 +41,7 @@ class CategoryCheck:
     problems: list[str] = field(default_factory=list)  # messages, one line each
 
     def attempt(self, function: Callable, *values: object) -> Any:
-        """Call a function; if it raises InputError, its message becomes a problem, and the result
-        is None."""
+        """Call a function; return None, and list the message as a problem, for an InputError."""
         try:
             return function(*values)
         except InputError as error:
@@ -75,18 +74,20 @@ def check_folder(
 
 
 def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> CategoryCheck:
+    """Check one category (see `check_folder`)."""
     check = CategoryCheck(category)
     keys = check.attempt(dataset.frame_list, category)
     sequences = check.attempt(dataset.sequences, category)
     if keys is None or sequences is None:
         return check
-    clouds = {one.sequence_name: one.point_cloud for one in sequences}
+    clouds = {sequence.sequence_name: sequence.point_cloud for sequence in sequences}
     names = list(dict.fromkeys(key.sequence_name for key in keys))
-    check.sequences, check.frames = len(names), len(keys)
-    check.problems += [
-        f"sequence {name} has no frames in the annotations"
-        for name in sorted(set(clouds) - set(names))
-    ]
+    check.sequences = len(names)
+    check.frames = len(keys)
+    for name in sorted(set(clouds) - set(names)):
+        check.problems.append(f"sequence {name} has no frames in the annotations")
+
+    # The files of each sequence.
     usable = set()
     for name in names:
         if partial and not (dataset.root / category / name).exists():
@@ -107,40 +108,50 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
             check.cloudless += 1
         elif deep:
             check.attempt(dataset.point_cloud, category, name)
-        check.complete += len(check.problems) == before
+        if len(check.problems) == before:
+            check.complete += 1
+
+    # Labels and evaluation pairs.
     labels = check.attempt(read_labels, dataset.root, category) or {}
-    check.labelled, check.usable = len(labels), len(set(labels) & usable)
+    check.labelled = len(labels)
+    check.usable = len(set(labels) & usable)
     for name in sorted(set(labels) - set(names)):
         check.problems.append(f"label of {name} is of a sequence that is not in the annotations")
     for path in pair_files(dataset, category):
-        check.pairs += check.attempt(read_published_pairs, path, dataset) is not None
+        if check.attempt(read_published_pairs, path, dataset) is not None:
+            check.pairs += 1
     return check
 
 
 def _check_frame(
     dataset: Co3D, annotation: FrameAnnotation, deep: bool, check: CategoryCheck
 ) -> bool:
-    """Check the files and the camera of a frame, and count its defect; True if a pose can be
-    estimated in it."""
-    depth, mask = annotation.depth, annotation.mask
-    paths = [
-        annotation.image.path,
-        mask and mask.path,
-        depth and depth.path,
-        depth and depth.mask_path,
-    ]
+    """Check the files and the camera of a frame; return whether a pose can be estimated in it."""
+    depth = annotation.depth
+    mask = annotation.mask
+    paths = [annotation.image.path]
+    if mask:
+        paths.append(mask.path)
+    if depth:
+        paths += [depth.path, depth.mask_path]
     are_there = [_check_file(dataset, path, check) for path in paths if path]
     if annotation.viewpoint is None or not all(are_there):
         return False
     opened = check.attempt(dataset.load if deep else dataset.camera, annotation)
-    if defect := frame_defect(opened) if deep and opened is not None else "":
-        check.defects[defect] += 1
-    return opened is not None and not defect and depth is not None and mask is not None
+    if opened is None:
+        return False
+    if deep:
+        defect = frame_defect(opened)
+        if defect:
+            check.defects[defect] += 1
+            return False
+    return depth is not None and mask is not None
 
 
 def _check_file(dataset: Co3D, relative: str, check: CategoryCheck) -> bool:
     """Check that a file exists and is not empty, and add its size to `check`."""
-    if (path := check.attempt(path_inside, dataset.root, relative)) is None:
+    path = check.attempt(path_inside, dataset.root, relative)
+    if path is None:
         return False
     size = path.stat().st_size if path.is_file() else 0
     check.size += size

@@ -3,29 +3,53 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 from jaxtyping import Float64, Real, UInt8
 
-from zsp_lite.data import annotations as records
-from zsp_lite.data import frames as images
+from zsp_lite.data.annotations import (
+    FRAMES_FILE,
+    SEQUENCES_FILE,
+    DepthAnnotation,
+    FrameAnnotation,
+    FrameIndex,
+    FrameKey,
+    ImageAnnotation,
+    MaskAnnotation,
+    PointCloudAnnotation,
+    SequenceAnnotation,
+    Viewpoint,
+    compress,
+    read_frame_index,
+    read_sequences,
+)
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import Frame
+from zsp_lite.data.frames import (
+    Frame,
+    check_pixels,
+    read_depth,
+    read_image,
+    read_mask,
+    write_depth,
+    write_image,
+    write_mask,
+)
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import path_inside, plain_name, stable_hash, write_atomic
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import read_ply, write_ply
 
-# Of sequences that are worth labelling: the supplement, "Choice of evaluation categories &
-# sequences".
-_MIN_VIEW_QUALITY, _MIN_CLOUD_QUALITY = 1.25, 0.3
+# Of sequences that are worth labelling: "Choice of evaluation categories & sequences" of the
+# supplement.
+_MIN_VIEW_QUALITY = 1.25
+_MIN_CLOUD_QUALITY = 0.3
 
 
 @dataclass(frozen=True)
 class Pair:
-    """A reference frame of one sequence and the target frames, by their numbers, of another
-    sequence of a category."""
+    """A reference frame of one sequence and target frames of another, by their numbers."""
 
     category: str
     reference_sequence: str
@@ -52,7 +76,8 @@ class Pair:
     @property
     def seed(self) -> int:
         """Seed of all random draws for this pair; it depends on the key and the repeat only."""
-        return stable_hash(f"{self.key} {self.repeat}" if self.repeat else self.key) >> 1
+        name = f"{self.key} {self.repeat}" if self.repeat else self.key
+        return stable_hash(name) >> 1  # 63 bits, for int64
 
 
 class Co3D:
@@ -70,88 +95,90 @@ class Co3D:
         if not self.root.is_dir():
             state = "is not a folder" if self.root.exists() else "does not exist"
             raise InputError(
-                f"data folder {root} {state}, expected a folder with CATEGORY/{records.FRAMES_FILE}"
+                f"data folder {root} {state}, expected a folder with CATEGORY/{FRAMES_FILE}"
             )
-        self._index: tuple[str, records.FrameIndex] | None = None
-        self._sequences: dict[str, list[records.SequenceAnnotation]] = {}
+        self._index: tuple[str, FrameIndex] | None = None
+        self._sequences: dict[str, list[SequenceAnnotation]] = {}
 
     def categories(self) -> list[str]:
         """List the folders that have frame annotations, sorted by name."""
-        return sorted(path.parent.name for path in self.root.glob(f"*/{records.FRAMES_FILE}"))
+        return sorted(path.parent.name for path in self.root.glob(f"*/{FRAMES_FILE}"))
 
-    def sequences(self, category: str) -> list[records.SequenceAnnotation]:
+    def sequences(self, category: str) -> list[SequenceAnnotation]:
         """Read the sequence annotations of a category, in file order."""
         if category not in self._sequences:
-            self._sequences[category] = records.read_sequences(
-                self._category_folder(category) / records.SEQUENCES_FILE
+            self._sequences[category] = read_sequences(
+                self._category_folder(category) / SEQUENCES_FILE
             )
         return list(self._sequences[category])
 
-    def select(self, category: str, top: int = 10) -> list[records.SequenceAnnotation]:
+    def select(self, category: str, top: int = 10) -> list[SequenceAnnotation]:
         """Select at most `top` sequences for labelling, those with the best point clouds first."""
         selected = []
         for sequence in self.sequences(category):
             cloud = sequence.point_cloud.quality_score if sequence.point_cloud else None
-            views = sequence.viewpoint_quality_score
-            if (cloud or 0) > _MIN_CLOUD_QUALITY and (views or 0) > _MIN_VIEW_QUALITY:
+            views = sequence.viewpoint_quality_score or 0
+            if (cloud or 0) > _MIN_CLOUD_QUALITY and views > _MIN_VIEW_QUALITY:
                 selected.append(sequence)
         return sorted(
-            selected, key=lambda one: (-one.point_cloud.quality_score, one.sequence_name)
+            selected,
+            key=lambda sequence: (-sequence.point_cloud.quality_score, sequence.sequence_name),
         )[:top]
 
-    def frame_list(self, category: str) -> list[records.FrameKey]:
-        """List the frames in the order of the annotation file, to which the ids of published pairs
-        refer."""
+    def frame_list(self, category: str) -> list[FrameKey]:
+        """List the frames in the file's order, to which the ids of published pairs refer."""
         return self._frame_index(category).keys
 
     def frame_numbers(self, category: str) -> dict[str, list[int]]:
         """List the numbers of the frames of every sequence of a category, in ascending order."""
-        return {
-            name: list(found) for name, found in self._frame_index(category).by_sequence.items()
-        }
+        by_sequence = self._frame_index(category).by_sequence
+        return {name: list(positions) for name, positions in by_sequence.items()}
 
-    def frames(self, category: str, sequence: str) -> list[records.FrameAnnotation]:
+    def frames(self, category: str, sequence: str) -> list[FrameAnnotation]:
         """Read the frame annotations of a sequence, sorted by frame number."""
         index = self._frame_index(category)
         return [index.frame(position) for position in index.positions(sequence).values()]
 
-    def frame(self, category: str, sequence: str, frame_number: int) -> records.FrameAnnotation:
-        """Read the annotation of one frame; its number differs from its position in `frames` if
-        frames are missing."""
+    def frame(self, category: str, sequence: str, frame_number: int) -> FrameAnnotation:
+        """Read the annotation of the frame with a number, which need not be its position."""
         index = self._frame_index(category)
-        if (position := index.positions(sequence).get(frame_number)) is None:
+        position = index.positions(sequence).get(frame_number)
+        if position is None:
             raise InputError(f"sequence {category}/{sequence} has no frame number {frame_number}")
         return index.frame(position)
 
-    def camera(self, annotation: records.FrameAnnotation) -> Camera:
+    def camera(self, annotation: FrameAnnotation) -> Camera:
         """Convert the viewpoint of a frame to a camera."""
         name = f"{annotation.sequence_name}/{annotation.frame_number}"
-        if (view := annotation.viewpoint) is None:
+        view = annotation.viewpoint
+        if view is None:
             raise InputError(f"frame {name} has no viewpoint, expected a camera")
         try:
             return Camera.from_pytorch3d(**msgspec.structs.asdict(view), size=annotation.image.size)
         except InputError as error:
             raise InputError(f"frame {name}: {error}") from error
 
-    def load(self, annotation: records.FrameAnnotation) -> Frame:
+    def load(self, annotation: FrameAnnotation) -> Frame:
         """Load the image and camera of a frame, and its depth and mask if annotated.
 
         Depth is 0 (unknown) where its file is 0 or the depth mask is 0. No path may lead out of the
         data folder.
         """
-        camera, size = self.camera(annotation), annotation.image.size
-        name = f"{annotation.sequence_name}/{annotation.frame_number}"
-        rgb = self._read(images.read_image, annotation.image.path, size)
-        mask = depth = None
+        camera = self.camera(annotation)
+        size = annotation.image.size
+        rgb = self._read(read_image, annotation.image.path, size)
+        mask = None
         if annotation.mask is not None:
-            mask = self._read(images.read_mask, annotation.mask.path, size)
+            mask = self._read(read_mask, annotation.mask.path, size)
+        depth = None
         if annotation.depth is not None:
             depth = self._read(
-                images.read_depth, annotation.depth.path, size, annotation.depth.scale_adjustment
+                read_depth, annotation.depth.path, size, annotation.depth.scale_adjustment
             )
             if annotation.depth.mask_path is not None:
-                valid = self._read(images.read_mask, annotation.depth.mask_path, size) > 0
+                valid = self._read(read_mask, annotation.depth.mask_path, size) > 0
                 depth = np.where(valid, depth, np.float32(0))
+        name = f"{annotation.sequence_name}/{annotation.frame_number}"
         return Frame(rgb, depth, mask, camera, name)
 
     def load_pair(self, pair: Pair) -> tuple[Frame, list[Frame]]:
@@ -168,47 +195,51 @@ class Co3D:
     def point_cloud(
         self, category: str, sequence: str
     ) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
-        """Read the point cloud of a sequence: points (n, 3) in world coordinates, and RGB colours
-        (n, 3) or None."""
-        clouds = {one.sequence_name: one.point_cloud for one in self.sequences(category)}
-        if (cloud := clouds.get(sequence)) is None:
+        """Read a sequence's point cloud: world points (n, 3), and RGB colours (n, 3) or None."""
+        path = self._cloud_path(category, sequence)
+        if path is None:
             raise InputError(f"sequence {category}/{sequence} has no point cloud")
-        return read_ply(path_inside(self.root, cloud.path))
+        return read_ply(path)
 
     def extent(self, category: str, sequence: str) -> tuple[Float64[np.ndarray, "3"], float] | None:
-        """Return the centre and the diameter of a sequence's object in its world; None without a
-        point cloud.
+        """Return the centre and the diameter of a sequence's object in its world.
 
         They are those of the box of the cloud's points, without the outermost 2 % on each side.
+        None without a point cloud.
         """
-        clouds = {one.sequence_name: one.point_cloud for one in self.sequences(category)}
-        if (cloud := clouds.get(sequence)) is None or not path_inside(
-            self.root, cloud.path
-        ).is_file():
+        path = self._cloud_path(category, sequence)
+        if path is None or not path.is_file():
             return None
-        points, _ = self.point_cloud(category, sequence)
+        points, _ = read_ply(path)
         low, high = np.quantile(points, (0.02, 0.98), axis=0)
         return (low + high) / 2, float(np.linalg.norm(high - low))
 
+    def _cloud_path(self, category: str, sequence: str) -> Path | None:
+        """Return the path of a sequence's point cloud, None if the annotations have none."""
+        clouds = {entry.sequence_name: entry.point_cloud for entry in self.sequences(category)}
+        cloud = clouds.get(sequence)
+        return None if cloud is None else path_inside(self.root, cloud.path)
+
     def _read(
-        self, reader: Callable[..., np.ndarray], relative: str, size: tuple[int, int], *options
+        self, reader: Callable[..., np.ndarray], relative: str, size: tuple[int, int], *options: Any
     ) -> np.ndarray:
+        """Read an image of the folder by a function of its path and options, and check its size."""
         path = path_inside(self.root, relative)
         image = reader(path, *options)
-        images.check_pixels(path, image, size)
+        check_pixels(path, image, size)
         return image
 
     def _category_folder(self, category: str) -> Path:
+        """Return the folder of a category; InputError for an unknown one."""
         check_choice(f"data folder {self.root}: category", category, self.categories())
         return self.root / category
 
-    def _frame_index(self, category: str) -> records.FrameIndex:
+    def _frame_index(self, category: str) -> FrameIndex:
+        """Return the frame annotations of a category, which stay in memory until the next one."""
         if self._index is None or self._index[0] != category:
             self._index = None  # frees the previous category's JSON before the next one is read
-            self._index = (
-                category,
-                records.read_frame_index(self._category_folder(category) / records.FRAMES_FILE),
-            )
+            path = self._category_folder(category) / FRAMES_FILE
+            self._index = (category, read_frame_index(path))
         return self._index[1]
 
 
@@ -230,73 +261,73 @@ class SequenceData:
 def write_co3d(
     root: str | Path, category: str, sequences: Iterable[SequenceData], quality: int = 92
 ) -> None:
-    """Write sequences into `root / category` in the layout of CO3D v1; the same input gives the
-    same bytes.
+    """Write sequences to ROOT/CATEGORY in CO3D v1's layout; equal input gives equal bytes.
 
     Other sequences in the folder are kept; those of the same names are replaced. The annotations
     are updated atomically after each sequence, so the folder stays readable if the run is
     interrupted. Only one process can write to a category at a time. `quality` is that of JPEG, 0 to
     100.
     """
-    root, folder = Path(root), Path(root) / plain_name(category, "category")
-    frames_path, sequences_path = folder / records.FRAMES_FILE, folder / records.SEQUENCES_FILE
+    root = Path(root)
+    folder = root / plain_name(category, "category")
+    frames_path = folder / FRAMES_FILE
+    sequences_path = folder / SEQUENCES_FILE
     with writing(folder):
-        frames, listed = [], []  # the name of the sequence, and the entry in the file
+        # The entries of both files in their order, each as (name of the sequence, entry).
+        frames = []
+        listed = []
         if frames_path.is_file():
-            index = records.read_frame_index(frames_path)
+            index = read_frame_index(frames_path)
             frames = [(key.sequence_name, entry) for key, entry in zip(index.keys, index.entries)]
         if sequences_path.is_file():
-            listed = [(one.sequence_name, one) for one in records.read_sequences(sequences_path)]
+            listed = [(entry.sequence_name, entry) for entry in read_sequences(sequences_path)]
 
         for sequence in sequences:
             annotations, annotation = _write_sequence(root, category, sequence, quality)
-            frames = [one for one in frames if one[0] != sequence.name] + [
-                (sequence.name, one) for one in annotations
-            ]
-            listed = [one for one in listed if one[0] != sequence.name] + [
-                (sequence.name, annotation)
-            ]
+            frames = [entry for entry in frames if entry[0] != sequence.name]
+            frames += [(sequence.name, frame) for frame in annotations]
+            listed = [entry for entry in listed if entry[0] != sequence.name]
+            listed.append((sequence.name, annotation))
             for path, entries in ((frames_path, frames), (sequences_path, listed)):
                 content = msgspec.json.encode(
                     [entry for _, entry in entries], enc_hook=np.ndarray.tolist
                 )
-                write_atomic(path, records.compress(content))
+                write_atomic(path, compress(content))
 
 
 def _write_sequence(
     root: Path, category: str, sequence: SequenceData, quality: int
-) -> tuple[list[records.FrameAnnotation], records.SequenceAnnotation]:
+) -> tuple[list[FrameAnnotation], SequenceAnnotation]:
+    """Write the files of a sequence, and return the annotations of its frames and its own."""
     base = f"{category}/{plain_name(sequence.name, 'sequence')}"
     annotations = []
     for number, (frame, timestamp) in enumerate(
         zip(sequence.frames, sequence.timestamps, strict=True)
     ):
         stem = f"frame{number + 1:06d}"
-        image = records.ImageAnnotation(f"{base}/images/{stem}.jpg", frame.camera.size)
-        images.write_image(root / image.path, frame.rgb, quality)
+        image = ImageAnnotation(f"{base}/images/{stem}.jpg", frame.camera.size)
+        write_image(root / image.path, frame.rgb, quality)
         depth = mask = None
         if frame.depth is not None:
             path = f"{base}/depths/{stem}.jpg.geometric.png"
             mask_path = f"{base}/depth_masks/{stem}.png"
-            depth = records.DepthAnnotation(path, float(sequence.depth_scale_adjustment), mask_path)
-            images.write_depth(root / path, frame.depth, sequence.depth_scale_adjustment)
-            images.write_mask(root / mask_path, frame.depth > 0)
+            depth = DepthAnnotation(path, float(sequence.depth_scale_adjustment), mask_path)
+            write_depth(root / path, frame.depth, sequence.depth_scale_adjustment)
+            write_mask(root / mask_path, frame.depth > 0)
         if frame.mask is not None:
             # The stored 8-bit values are summed, because a sum of integers is the same on every
             # machine.
             mass = int(np.rint(frame.mask.astype(np.float64) * 255).astype(np.int64).sum()) / 255
-            mask = records.MaskAnnotation(f"{base}/masks/{stem}.png", mass)
-            images.write_mask(root / mask.path, frame.mask)
-        view = records.Viewpoint(**frame.camera.to_pytorch3d())  # its arrays are written as lists
+            mask = MaskAnnotation(f"{base}/masks/{stem}.png", mass)
+            write_mask(root / mask.path, frame.mask)
+        view = Viewpoint(**frame.camera.to_pytorch3d())  # its arrays are written as lists
         annotations.append(
-            records.FrameAnnotation(
-                sequence.name, number, image, float(timestamp), depth, mask, view
-            )
+            FrameAnnotation(sequence.name, number, image, float(timestamp), depth, mask, view)
         )
-    cloud = records.PointCloudAnnotation(
+    cloud = PointCloudAnnotation(
         f"{base}/pointcloud.ply", sequence.point_cloud_quality, len(sequence.points)
     )
     write_ply(root / cloud.path, sequence.points, sequence.colours, sequence.normals)
-    return annotations, records.SequenceAnnotation(
+    return annotations, SequenceAnnotation(
         sequence.name, category, None, cloud, sequence.viewpoint_quality
     )

@@ -1,5 +1,4 @@
-"""Depth maps: CO3D's 16-bit encoding, in-painting, the 3D point of each pixel or patch, and planes
-through points.
+"""Depth maps: CO3D's 16-bit encoding, in-painting, points of pixels and patches, and planes.
 
 A depth map is (H, W), along +z in units of the world; 0 means unknown.
 """
@@ -18,20 +17,17 @@ _PLANE_POINTS = 4000  # at most that a plane is fitted to
 def decode_depth(
     bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0
 ) -> Float[np.ndarray, "h w"]:
-    """Decode CO3D's depth, bits of float16 times `scale_adjustment`; 0 where that is not finite or
-    not positive."""
+    """Decode CO3D's depth, bits of float16 times `scale_adjustment`; 0 where it is not positive."""
     with np.errstate(invalid="ignore", over="ignore"):  # bits of NaN or infinity
-        depth = np.ascontiguousarray(bits).view(np.float16).astype(np.float32) * np.float32(
-            scale_adjustment
-        )
+        depth = np.ascontiguousarray(bits).view(np.float16).astype(np.float32)
+        depth = depth * np.float32(scale_adjustment)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
 def encode_depth(
     depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0
 ) -> UInt16[np.ndarray, "h w"]:
-    """Encode depth (0 where unknown) as the bits of float16 values; the inverse of
-    `decode_depth`."""
+    """Encode depth as the bits of float16 values; the inverse of `decode_depth`."""
     depth = np.asarray(depth, dtype=np.float64) / scale_adjustment
     # A value beyond float16's range (65504) would become infinite; it is stored as unknown.
     usable = np.isfinite(depth) & (depth > 0) & (depth <= float(np.finfo(np.float16).max))
@@ -39,8 +35,7 @@ def encode_depth(
 
 
 def inpaint_depth(depth: Real[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Fill the unknown pixels by OpenCV's Navier-Stokes in-painting; InputError if no pixel is
-    known.
+    """Fill unknown pixels by OpenCV's Navier-Stokes in-painting; InputError if none is known.
 
     Known pixels are unchanged; filled ones are clipped to the range of the known depths.
     """
@@ -50,7 +45,8 @@ def inpaint_depth(depth: Real[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
         raise InputError(
             f"depth map of shape {depth.shape} has no known pixel, expected at least one above 0"
         )
-    low, high = depth[known].min(), depth[known].max()
+    low = depth[known].min()
+    high = depth[known].max()
     filled = cv2.inpaint(
         np.where(known, depth, 0), (~known).astype(np.uint8), inpaintRadius=3, flags=cv2.INPAINT_NS
     )
@@ -59,8 +55,7 @@ def inpaint_depth(depth: Real[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 
 def unproject_depth(depth: Real[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray, "h w 3"]:
-    """Compute the point (H, W, 3) of each pixel in camera coordinates; unknown depth (0) gives the
-    origin."""
+    """Compute each pixel's point (H, W, 3) in camera coordinates, the origin for unknown depth."""
     depth = np.asarray(depth, dtype=np.float64)
     height, width = depth.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -80,18 +75,21 @@ def patch_points(
     # The paper does not say which of a patch's pixels it takes. At a silhouette the nearer surface
     # is the object, and a percentile is robust to single outliers.
     depth = np.asarray(depth, dtype=np.float32)
-    rows, row_valid, row_middle = _split(depth.shape[0], grid[0])
-    cols, col_valid, col_middle = _split(depth.shape[1], grid[1])
+    height, width = depth.shape
+    rows, row_valid, row_middle = _split(height, grid[0])
+    cols, col_valid, col_middle = _split(width, grid[1])
 
     # Pixel indices and depths of every patch, (rows, cols, pixels per patch); infinity where
     # unknown.
     shape = (len(rows), len(cols), rows.shape[1], cols.shape[1])
-    pixel = np.broadcast_to(rows[:, None, :, None] * depth.shape[1] + cols[None, :, None, :], shape)
+    pixel = np.broadcast_to(rows[:, None, :, None] * width + cols[None, :, None, :], shape)
     pixel = pixel.reshape(*shape[:2], -1)
     valid = (row_valid[:, None, :, None] & col_valid[None, :, None, :]).reshape(pixel.shape)
     values = depth.ravel()[pixel]
     values = np.where(valid & np.isfinite(values) & (values > 0), values, np.inf)
 
+    # The pixel whose depth has the rank of the 25th percentile, (rows, cols); without known depth,
+    # the central pixel.
     n_known = np.isfinite(values).sum(axis=-1)
     known = n_known > 0
     rank = np.maximum(n_known - 1, 0) // 4
@@ -99,9 +97,9 @@ def patch_points(
         np.argsort(values, axis=-1, kind="stable"), rank[..., None], axis=-1
     )
     nearer = np.take_along_axis(pixel, chosen, axis=-1)[..., 0]
-    index = np.where(known, nearer, row_middle[:, None] * depth.shape[1] + col_middle)
+    index = np.where(known, nearer, row_middle[:, None] * width + col_middle)
     filled = inpaint_depth(depth) if inpaint and not known.all() else depth
-    y, x = np.divmod(index, depth.shape[1])
+    y, x = np.divmod(index, width)
     depths = filled.ravel()[index] if inpaint else np.where(known, filled.ravel()[index], 0)
     return camera.unproject_camera(np.stack([x + 0.5, y + 0.5], axis=-1), depths), known
 
@@ -109,9 +107,9 @@ def patch_points(
 def fit_plane(
     points: Float[np.ndarray, "n 3"], threshold: float
 ) -> tuple[Float[np.ndarray, "3"], float]:
-    """Fit a plane `normal @ x = offset` to points with outliers by RANSAC; the sign of the unit
-    normal is arbitrary."""
-    points = points[:: -(-len(points) // _PLANE_POINTS)]
+    """Fit a plane `normal @ x = offset` to points with outliers by RANSAC, up to its sign."""
+    points = points[:: -(-len(points) // _PLANE_POINTS)]  # a step rounded up
+    # A plane through three points in each trial: normals (trials, 3), distances (trials, n).
     corners = points[np.random.default_rng(0).integers(len(points), size=(_PLANE_TRIALS, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -119,6 +117,7 @@ def fit_plane(
     distances = np.abs(normals @ points.T - (normals * corners[:, 0]).sum(axis=1, keepdims=True))
     # Collinear points span no plane: such a sample counts 0.
     counts = (distances < threshold).sum(axis=1) * (lengths[:, 0] > 0)
+    # The least-squares plane of the inliers: their direction of least variance is its normal.
     inliers = points[distances[counts.argmax()] < threshold]
     centre = inliers.mean(axis=0)
     normal = np.linalg.svd(inliers - centre, full_matrices=False)[2][2]
@@ -126,8 +125,7 @@ def fit_plane(
 
 
 def _split(length: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split pixels into bands: their indices padded to the widest, which of these are in the band,
-    and its centre."""
+    """Split pixels into bands: indices (bands, widest), whether they are in the band, centres."""
     edges = np.arange(count + 1) * length // count
     index = edges[:-1, None] + np.arange(np.diff(edges).max())
     valid = index < edges[1:, None]

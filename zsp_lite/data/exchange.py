@@ -1,5 +1,7 @@
-"""CSV files exchanged with another program, pairs and poses; docs/benchmark_your_own.md has the
-columns of both."""
+"""CSV files exchanged with another program: pairs and poses.
+
+docs/benchmark_your_own.md has the columns of both.
+"""
 
 import csv
 import io
@@ -46,9 +48,12 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
         views = [("reference", pair.reference_sequence, pair.reference_frame)]
         views += [("target", pair.target_sequence, frame) for frame in pair.target_frames]
         for role, sequence, frame in views:
-            found = dataset.frame(pair.category, sequence, frame)
-            camera, depth, mask = dataset.camera(found), found.depth, found.mask
-            (fx, fy), (cx, cy) = camera.focal_length.tolist(), camera.principal_point.tolist()
+            annotation = dataset.frame(pair.category, sequence, frame)
+            depth = annotation.depth
+            mask = annotation.mask
+            camera = dataset.camera(annotation)
+            fx, fy = camera.focal_length.tolist()
+            cx, cy = camera.principal_point.tolist()
             lines.append(
                 {
                     "pair": pair.key,
@@ -56,7 +61,7 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
                     "category": pair.category,
                     "sequence": sequence,
                     "frame": frame,
-                    "image": found.image.path,
+                    "image": annotation.image.path,
                     "depth": depth and depth.path,
                     "depth_scale": depth and depth.scale_adjustment,
                     "mask": mask and mask.path,
@@ -74,10 +79,12 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
 
 def read_stored_poses(path: str | Path) -> tuple[dict[str, StoredPose], str]:
     """Read poses by the key of their pair, and the hash of the file."""
-    data, poses = read_bytes(path, "poses"), {}
+    data = read_bytes(path, "poses")
+    poses = {}
     for number, line in _read_lines(path, data):
         try:
-            key, pose = line["pair"].strip(), _read_pose(number, line)
+            key = line["pair"].strip()
+            pose = _read_pose(number, line)
             if key in poses:
                 raise ValueError(f"second pose of the pair of line {poses[key].line}")
         except ValueError as error:  # an InputError is one, too
@@ -91,7 +98,9 @@ def _read_lines(path: str | Path, data: bytes) -> list[tuple[int, dict]]:
     try:
         # A redirection in PowerShell writes UTF-16 with its byte-order mark.
         text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
-        mark = next((mark for mark in ";\t" if mark in text.partition("\n")[0]), ",")
+        # A spreadsheet may separate fields by semicolons or tabulators.
+        header = text.partition("\n")[0]
+        mark = next((mark for mark in ";\t" if mark in header), ",")
         reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=mark, restval="")
         reader.fieldnames = ["_".join(name.lower().split()) for name in reader.fieldnames or ()]
         # The reader's own number of a line is wrong after a blank one; a spreadsheet's blank lines
@@ -99,7 +108,8 @@ def _read_lines(path: str | Path, data: bytes) -> list[tuple[int, dict]]:
         lines = [(reader.reader.line_num, line) for line in reader if any(line.values())]
     except (ValueError, csv.Error) as error:
         raise InputError(f"poses {path}: {error}, expected a CSV file") from error
-    if wrong := [name for name in _REQUIRED if reader.fieldnames.count(name) != 1]:
+    wrong = [name for name in _REQUIRED if reader.fieldnames.count(name) != 1]
+    if wrong:
         raise InputError(
             f"poses {path}: no or two columns {', '.join(wrong)}, expected a CSV file with "
             "one of each"
@@ -109,11 +119,13 @@ def _read_lines(path: str | Path, data: bytes) -> list[tuple[int, dict]]:
 
 def _read_pose(number: int, line: dict) -> StoredPose:
     """Read the pose of a line; ValueError for a wrong field."""
+    # The reader gives surplus fields the name None.
     if any(line.pop(None, ())):
         raise ValueError("more fields than the header; a pair has commas and needs quotes")
     rotation = rotation_matrix("rotation", _numbers("rotation", line["rotation"], 9).reshape(3, 3))
-    translation, scale = line.get("translation", "").strip(), line.get("scale", "").strip()
+    translation = line.get("translation", "").strip()
     translation = _numbers("translation", translation, 3) if translation else None
+    scale = line.get("scale", "").strip()
     scale = float(_numbers("scale", scale, 1)[0]) if scale else None
     if scale is not None:
         check_number("scale", scale, above=0)
@@ -141,11 +153,10 @@ def check_poses(
         check_choice(
             f"poses {path}, line {pose.line}: target_frame", pose.target_frame, pair.target_frames
         )
+    remarks = [other_convention(dataset, found)]
     surplus = len(poses) - len(found)
-    remarks = (
-        f"{surplus} of {len(poses)} poses fit no pair" if surplus else "",
-        other_convention(dataset, found),
-    )
+    if surplus:
+        remarks.insert(0, f"{surplus} of {len(poses)} poses fit no pair")
     return "; ".join(filter(None, remarks))
 
 
@@ -158,11 +169,12 @@ def other_convention(dataset: Co3D, poses: Mapping[Pair, StoredPose]) -> str:
     views = [pair.target_frames.index(pose.target_frame) for pair, pose in poses.items()]
     truths = true_poses(dataset.root, list(poses), np.array(views))[:, :3, :3]
     given = np.stack([pose.rotation for pose in poses.values()])
+    # The rotations, (n, 3, 3), as each convention reads them; "" is the right one.
     readings = {"": given}
     for signs in ((1, -1, -1), (-1, -1, 1)):
         readings[f"conjugated by diag{signs}"] = given * np.outer(signs, signs)
-    for name, one in list(readings.items()):
-        readings[f"inverted and {name}".removesuffix(" and ")] = one.swapaxes(1, 2)
+    for name, rotations in list(readings.items()):
+        readings[f"inverted and {name}".removesuffix(" and ")] = rotations.swapaxes(1, 2)
     errors = {name: rotation_error(rotations, truths) for name, rotations in readings.items()}
     medians = {name: float(np.median(error)) for name, error in errors.items()}
     best = min(medians, key=medians.get)

@@ -1,5 +1,4 @@
-"""RGB-D frames with object masks: cropping, resizing, and reading and writing of image files of
-data folders."""
+"""RGB-D frames with object masks: cropping, resizing, and the image files of data folders."""
 
 import io
 from collections.abc import Callable
@@ -20,7 +19,7 @@ from zsp_lite.io.files import read_bytes, write_atomic
 
 MAX_PIXELS = 1 << 26  # of an image file
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
-# largest relative difference of the aspect ratios of an image and its smaller depth map
+# Largest relative difference of the aspect ratios of an image and its smaller depth map.
 _SAME_ASPECT = 0.01
 _BLACK = 10  # an image without a colour of this value is black, as CO3D's hidden frames are
 
@@ -33,36 +32,38 @@ class Frame:
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]  # (H, W, 3) colours, uint8
-    # (H, W) along +z in units of the camera's world, 0 where unknown
+    # (H, W) along +z in units of the camera's world, 0 where unknown.
     depth: Float32[np.ndarray, "h w"] | None
-    # (H, W) probability that a pixel is on the object, in [0, 1]
+    # (H, W) probability that a pixel is on the object, in [0, 1].
     mask: Float32[np.ndarray, "h w"] | None
     camera: Camera
     name: str = ""  # for error messages
 
     def __post_init__(self):
-        label, size, rgb = f"frame {self.name}".rstrip(), self.camera.size, np.array(self.rgb)
+        label = f"frame {self.name}".rstrip()
+        size = self.camera.size
+        rgb = np.array(self.rgb)
         if rgb.dtype != np.uint8 or rgb.shape != (*size, 3):
             raise InputError(
                 f"{label} rgb is {rgb.dtype} {rgb.shape}, expected uint8 {(*size, 3)} as the camera"
             )
         object.__setattr__(self, "rgb", rgb)
         for name, top in (("depth", MAX_LENGTH), ("mask", 1.0)):
-            if (values := getattr(self, name)) is None:
+            values = getattr(self, name)
+            if values is None:
                 continue
             if getattr(values, "dtype", None) == np.float32:
                 values = np.array(values)
             else:
                 values = real_array(f"{label} {name}", values).astype(np.float32)
-            # `not` of the valid range, so that NaN is refused, too.
-            if values.shape != size or not (values.min() >= 0 and values.max() <= top):
-                found = (
-                    f"shape {values.shape}"
-                    if values.shape != size
-                    else f"{values.min()} to {values.max()}"
-                )
+            problem = ""
+            if values.shape != size:
+                problem = f"shape {values.shape}"
+            elif not (values.min() >= 0 and values.max() <= top):  # NaN is not in the range
+                problem = f"{values.min()} to {values.max()}"
+            if problem:
                 raise InputError(
-                    f"{label} {name} has {found}, expected shape {size} and values from 0 to "
+                    f"{label} {name} has {problem}, expected shape {size} and values from 0 to "
                     f"{top:g}"
                 )
             object.__setattr__(self, name, values)
@@ -98,31 +99,43 @@ class Frame:
         Raises:
             InputError: Arrays that are none of these, or do not fit together.
         """
-        label, image = f"frame {name}".rstrip(), np.asarray(rgb)
+        label = f"frame {name}".rstrip()
+
+        # Colours (H, W, 3), uint8; other values are refused by the frame.
+        image = np.asarray(rgb)
         if image.ndim == 2:
             image = np.repeat(image[..., None], 3, axis=2)
         if image.ndim != 3 or image.shape[2] not in (3, 4):
             raise InputError(
                 f"{label} rgb has shape {image.shape}, expected (H, W), (H, W, 3) or (H, W, 4)"
             )
-        image, size = image[..., :3], image.shape[:2]
+        image = image[..., :3]
+        size = image.shape[:2]
+        # From pixel centres at integers to ones at half-integers.
         intrinsics = split_intrinsics(f"{label} K", K) + (0, 0, 0.5, 0.5)
         camera = camera_from_pose(np.eye(4) if pose is None else pose, intrinsics, size, label)
         if image.dtype.kind == "f" and 0 <= image.min() and image.max() <= 1:
             image = np.rint(255 * image).astype(np.uint8)
+
+        # Depth in units of the world, 0 where unknown.
         check_number("depth_unit", depth_unit, above=0)
         depth = np.asarray(depth)
-        depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
-        values = real_array(f"{label} depth", depth, (None, None)) * depth_unit
-        values = np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+        if depth.ndim == 3 and depth.shape[2] == 1:
+            depth = depth[..., 0]
+        depth = real_array(f"{label} depth", depth, (None, None)) * depth_unit
+        depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+
+        # Mask from 0 to 1.
         if mask is not None:
             mask = real_array(f"{label} mask", mask).astype(np.float32)
-            if 1 < (most := mask.max()) <= ON_OBJECT * 255:
+            most = mask.max()
+            if 1 < most <= ON_OBJECT * 255:
                 raise InputError(
                     f"{label} mask has {most:g} at most, expected booleans, 0 and 1, or 0 to 255"
                 )
-            mask = mask / np.float32(255) if most > 1 else mask
-        return cls(image, enlarge_depth(values, size), mask, camera, name)
+            if most > 1:
+                mask = mask / np.float32(255)
+        return cls(image, enlarge_depth(depth, size), mask, camera, name)
 
     @property
     def shows_object(self) -> bool:
@@ -131,25 +144,24 @@ class Frame:
 
     def __repr__(self) -> str:
         height, width = self.camera.size
-        depth = (
-            "no depth"
-            if self.depth is None
-            else f"depth known at {(self.depth > 0).mean():.0%} of the pixels"
-        )
-        mask = (
-            "no mask"
-            if self.mask is None
-            else f"mask above {ON_OBJECT} at {(self.mask > ON_OBJECT).mean():.0%}"
-        )
+        depth = "no depth"
+        if self.depth is not None:
+            depth = f"depth known at {(self.depth > 0).mean():.0%} of the pixels"
+        mask = "no mask"
+        if self.mask is not None:
+            mask = f"mask above {ON_OBJECT} at {(self.mask > ON_OBJECT).mean():.0%}"
         return f"Frame({self.name!r}, {height} x {width} pixels, {depth}, {mask})"
 
 
 def enlarge_depth(
     depth: Float32[np.ndarray, "h w"], size: tuple[int, int]
 ) -> Float32[np.ndarray, "..."]:
-    """Enlarge a smaller depth map of the same aspect ratio to an image's size (H, W); others stay
-    as they are."""
-    (rows, columns), (height, width) = depth.shape, size
+    """Enlarge a smaller depth map of the same aspect ratio to an image's size (H, W).
+
+    Others stay as they are.
+    """
+    rows, columns = depth.shape
+    height, width = size
     if rows >= height or abs(rows * width / (columns * height) - 1) > _SAME_ASPECT:
         return depth
     # The nearest values, because means of two surfaces lie on neither.
@@ -157,8 +169,7 @@ def enlarge_depth(
 
 
 def frame_defect(frame: Frame) -> str:
-    """Say why a frame cannot be used for pose estimation, such as "black image"; "" for a usable
-    frame."""
+    """Say why a frame cannot be used, such as "black image"; "" for a usable frame."""
     if frame.rgb.max() < _BLACK:
         return "black image"
     if not frame.shows_object:
@@ -171,8 +182,7 @@ def frame_defect(frame: Frame) -> str:
 def mask_to_bbox(
     mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1
 ) -> Box:
-    """Compute the bounding box (top, left, height, width) of the mask above a threshold, padded and
-    clipped.
+    """Compute the padded bounding box (top, left, height, width) of the mask above a threshold.
 
     If no pixel is above the threshold, it is lowered in steps of 0.05, down to 0. Height and width
     grow by the fraction `padding`, half of it on each side, as in CO3D's loader. InputError if the
@@ -180,16 +190,16 @@ def mask_to_bbox(
     """
     if not (mask > 0).any():
         raise InputError(f"object mask of shape {mask.shape} is empty, expected a pixel above 0")
-    while not (inside := mask > max(threshold, 0.0)).any():
+    while not (mask > max(threshold, 0.0)).any():
         threshold -= 0.05
+    inside = mask > max(threshold, 0.0)
     top, bottom = _span(inside.any(axis=1), padding)
     left, right = _span(inside.any(axis=0), padding)
     return top, left, bottom - top, right - left
 
 
 def largest_region(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Remove parts thinner than 3 pixels and return the largest connected region, empty if there is
-    none."""
+    """Return the largest connected region without parts thinner than 3 pixels, empty if none."""
     opened = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, regions, statistics, _ = cv2.connectedComponentsWithStats(opened)
     areas = statistics[1:, cv2.CC_STAT_AREA]  # the first region is the outside
@@ -198,14 +208,14 @@ def largest_region(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 def crop_to_object(frame: Frame) -> Frame:
     """Crop a frame and its camera to the bounding box of its object mask (see `mask_to_bbox`)."""
-    box = top, left, height, width = mask_to_bbox(frame.mask)
+    top, left, height, width = mask_to_bbox(frame.mask)
     inside = np.s_[top : top + height, left : left + width]
-    return _changed(frame, frame.camera.crop(box), lambda image: image[inside])
+    camera = frame.camera.crop((top, left, height, width))
+    return _changed(frame, camera, lambda image: image[inside])
 
 
 def turn_frame(frame: Frame, quarters: int) -> Frame:
-    """Turn a frame and its camera by quarter turns as in `numpy.rot90`; depths and world points
-    stay the same."""
+    """Turn a frame and its camera by quarter turns as in `numpy.rot90`; world points stay."""
     if quarters % 4 == 0:
         return frame
     turned = frame.camera.turn(quarters)
@@ -213,18 +223,20 @@ def turn_frame(frame: Frame, quarters: int) -> Frame:
 
 
 def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
-    """Resize a frame without keeping its aspect ratio; colours are averaged along a side that
-    shrinks."""
+    """Resize a frame to (height, width); colours are averaged along a side that shrinks."""
     camera = frame.camera.resize(size)
-    (height, width), (old_height, old_width) = camera.size, frame.camera.size
+    height, width = camera.size
+    old_height, old_width = frame.camera.size
     # INTER_AREA averages only if neither side grows: first shrink, then enlarge the sides that
     # grow.
     rgb = cv2.resize(
         frame.rgb, (min(width, old_width), min(height, old_height)), interpolation=cv2.INTER_AREA
     )
     rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR)
-    depth, mask = frame.depth, frame.mask
-    # By the nearest pixel: values interpolated at an edge or hole lie on no surface.
+    depth = frame.depth
+    mask = frame.mask
+    # By the nearest pixel: values interpolated at an edge or hole lie on no surface. The centre of
+    # pixel i is at the fraction (2 i + 1) / (2 height) of the side.
     if depth is not None:
         rows = (2 * np.arange(height) + 1) * old_height // (2 * height)
         cols = (2 * np.arange(width) + 1) * old_width // (2 * width)
@@ -244,14 +256,12 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def read_mask(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """Read an 8-bit or 1-bit mask file as probabilities (H, W) in [0, 1]; InputError if it is
-    damaged."""
+    """Read an 8-bit or 1-bit mask file as probabilities (H, W) in [0, 1]."""
     return decode_image(path, "mask", cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
 
 
 def read_depth(path: str | Path, scale_adjustment: float = 1.0) -> Float32[np.ndarray, "h w"]:
-    """Read a CO3D depth file (see `decode_depth`) as (H, W), 0 where unknown; InputError if it is
-    no such file."""
+    """Read a CO3D depth file (see `decode_depth`) as (H, W), 0 where unknown."""
     bits = decode_image(path, "depth", cv2.IMREAD_UNCHANGED)
     if bits.dtype != np.uint16 or bits.ndim != 2:
         raise InputError(
@@ -273,8 +283,7 @@ def write_image(path: str | Path, rgb: UInt8[np.ndarray, "h w 3"], quality: int 
 
 
 def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"] | Bool[np.ndarray, "h w"]) -> None:
-    """Write probabilities (H, W) in [0, 1] as an 8-bit PNG, or a boolean mask as a 1-bit one, with
-    values 255 and 0."""
+    """Write probabilities (H, W) in [0, 1] as an 8-bit PNG, or a boolean mask as a 1-bit one."""
     options = [cv2.IMWRITE_PNG_BILEVEL, 1] if mask.dtype == bool else []
     _encode(path, ".png", np.rint(mask.astype(np.float64) * 255).astype(np.uint8), options)
 
@@ -282,32 +291,30 @@ def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"] | Bool[np.ndarray
 def write_depth(
     path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0
 ) -> None:
-    """Write depth (H, W) as a 16-bit PNG that holds the float16 bits of `depth /
-    scale_adjustment`."""
+    """Write depth (H, W) as a 16-bit PNG in CO3D's encoding (see `encode_depth`)."""
     _encode(path, ".png", encode_depth(depth, scale_adjustment), [])
 
 
 def _changed(frame: Frame, camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Frame:
     """Return a frame with another camera and `change` applied to its colours, depth and mask."""
     images = {"rgb": frame.rgb, "depth": frame.depth, "mask": frame.mask}
-    changed = {name: change(one) for name, one in images.items() if one is not None}
+    changed = {name: change(image) for name, image in images.items() if image is not None}
     return replace(frame, camera=camera, **changed)
 
 
 def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
-    """Return the padded, clipped range [first, end) of the true values of a one-dimensional
-    array."""
+    """Return the range [first, end) of the true values of an array, padded within its length."""
     first, last = np.flatnonzero(inside)[[0, -1]]
     margin = (last + 1 - first) * padding / 2
     return max(0, int(np.floor(first - margin))), min(len(inside), int(np.ceil(last + 1 + margin)))
 
 
 def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
-    """Decode a JPEG or PNG file by OpenCV with its flags; InputError if it is damaged or
-    too large."""
+    """Decode a JPEG or PNG file by OpenCV with its flags; InputError if it is damaged."""
     data = read_bytes(path, what)
     is_jpeg = data[:2] == b"\xff\xd8"
-    image, expected = None, "a complete JPEG or PNG"
+    image = None
+    expected = "a complete JPEG or PNG"
     # What Pillow and OpenCV raise for another format or a damaged header.
     with suppress(OSError, SyntaxError, ValueError, cv2.error):
         # This reads the header only.
@@ -317,7 +324,10 @@ def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
             expected = f"at most {MAX_PIXELS} pixels, not {height} x {width}"
         else:
             # OpenCV would fill missing parts of an image with grey.
-            (opened.load if is_jpeg else opened.verify)()
+            if is_jpeg:
+                opened.load()
+            else:
+                opened.verify()
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         raise InputError(
@@ -327,4 +337,5 @@ def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
 
 
 def _encode(path: str | Path, extension: str, image: np.ndarray, options: list[int]) -> None:
+    """Write an image file by OpenCV with its options."""
     write_atomic(path, cv2.imencode(extension, image, options)[1].tobytes())

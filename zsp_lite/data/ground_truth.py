@@ -14,34 +14,34 @@ from zsp_lite.errors import InputError, rigid_matrix
 from zsp_lite.io.files import read_json
 
 _warn_once = functools.cache(logging.getLogger(__name__).warning)
-# in each category folder: the pose of each sequence's object in its world
+# In each category folder: the pose of each sequence's object in its world.
 POSES_FILE = "object_poses.json"
 _Vector = tuple[float, float, float]
 _Row = tuple[float, float, float, float]
 
 
 class ObjectPose(msgspec.Struct):
-    """Pose of an object in its world, `world = scale * R @ object + t`, and its bounding box in
-    object coordinates."""
+    """Pose of an object, `world = scale * R @ object + t`, and its box in object coordinates."""
 
     trans: tuple[_Row, _Row, _Row, _Row]  # the matrix [R t]
     scale: float
     low: _Vector  # corners of the box
     high: _Vector
-    # About the up axis, in degrees, after which the shape is the same; 0 is not among them
+    # Turns about the up axis, in degrees, after which the shape is the same; 0 is not among them.
     turns: tuple[int, ...] = ()
 
     @property
     def R(self) -> Float[np.ndarray, "3 3"]:
+        """Rotation from object to world."""
         return np.array(self.trans)[:3, :3]
 
     @property
     def t(self) -> Float[np.ndarray, "3"]:
+        """Translation from object to world."""
         return np.array(self.trans)[:3, 3]
 
     def to_object(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Map world points to object coordinates (front +x, left +y, up +z, surface of unit
-        standard deviation)."""
+        """Map world points to object coordinates: front +x, left +y, up +z, unit deviation."""
         return (np.asarray(world, np.float64) - self.t) @ self.R / self.scale
 
     def to_box(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
@@ -51,23 +51,21 @@ class ObjectPose(msgspec.Struct):
 
 def read_poses(out: Path, category: str) -> dict[str, ObjectPose]:
     """Return the object pose of every sequence of a category; none without the file."""
-    if not (path := out / category / POSES_FILE).is_file():
+    path = out / category / POSES_FILE
+    if not path.is_file():
         return {}
     poses = read_json(path, dict[str, ObjectPose], "object poses")
-    exact = {
-        name: rigid_matrix(f"object poses {path}: {name}", one.trans).tolist()
-        for name, one in poses.items()
-    }
-    return {name: msgspec.structs.replace(one, trans=exact[name]) for name, one in poses.items()}
+    for name, pose in poses.items():
+        pose.trans = rigid_matrix(f"object poses {path}: {name}", pose.trans).tolist()
+    return poses
 
 
 def common_turns(
     out: Path, category: str, first: str, second: str
 ) -> Float[np.ndarray, "s 3 3"] | None:
-    """Return the turns in the world of the second object after which both look the same; None where
-    nothing is known.
+    """Return the turns in the second object's world after which both look the same.
 
-    The first is the identity.
+    The first is the identity. None where nothing is known.
     """
     try:
         poses = read_poses(out, category)
@@ -76,15 +74,17 @@ def common_turns(
         return None
     if not {first, second} <= poses.keys():
         return None
-    angles = [[0.0], *([turn] for turn in poses[first].turns if turn in poses[second].turns)]
+    common = [turn for turn in poses[first].turns if turn in poses[second].turns]
+    angles = [[turn] for turn in (0, *common)]
+    # From object to world coordinates: the turn is about the object's axis.
     world = poses[second].R
     return world @ Rotation.from_euler("z", angles, degrees=True).as_matrix() @ world.T
 
 
 def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:
-    """Read the object pose of every sequence of a category; InputError if the folder is not a
-    synthetic export."""
-    if not (poses := read_poses(dataset.root, category)):
+    """Read the object poses of a category; InputError if the folder is not a synthetic export."""
+    poses = read_poses(dataset.root, category)
+    if not poses:
         path = dataset.root / category / POSES_FILE
         raise InputError(
             f"{path} is missing, expected a synthetic export: other data has no exact object poses"

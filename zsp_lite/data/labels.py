@@ -31,8 +31,7 @@ class _LabelFile(msgspec.Struct):
 
 @dataclass(frozen=True, eq=False)
 class PoseLabel:
-    """Pose label of the sequence `seq`: the rigid transform from the world of `reference_seq` to
-    its world."""
+    """Rigid transform from the world of the sequence `reference_seq` to that of `seq`."""
 
     trans: Float[np.ndarray, "4 4"]
     seq: str
@@ -48,14 +47,15 @@ def label_folder(root: str | Path, category: str) -> Path:
 
 
 def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
-    """Read the labels of a category by sequence, sorted by name; InputError if they have several
-    references."""
+    """Read the labels of a category by sequence, sorted by name."""
     return read_label_folder(label_folder(root, category))
 
 
 def read_label_folder(folder: Path, added: Mapping[str, PoseLabel] = {}) -> dict[str, PoseLabel]:
-    """Read the labels of one category in a folder by sequence, together with labels that will be
-    added to it."""
+    """Read the labels in a folder by sequence, with labels that will be added to it.
+
+    InputError if they have several references.
+    """
     labels = {path.stem: read_label(path) for path in sorted(folder.glob("*.json"))} | added
     references = sorted({label.reference_seq for label in labels.values()})
     if len(references) > 1:
@@ -76,8 +76,7 @@ def read_label(path: Path) -> PoseLabel:
 
 
 def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:
-    """Write a label atomically, replacing an earlier one of the same sequence, and return
-    the path."""
+    """Write a label, in place of an earlier one of the same sequence, and return the path."""
     path = label_folder(root, category) / f"{plain_name(label.seq, 'sequence')}.json"
     write_atomic(path, label_bytes(label))
     return path
@@ -89,8 +88,7 @@ def label_bytes(label: PoseLabel) -> bytes:
 
 
 def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> PoseLabel:
-    """Convert a similarity from the reference's world to a label with the same rotation and image
-    of `centre`."""
+    """Convert a similarity to a label with the same rotation and the same image of `centre`."""
     # A label has no scale: with the similarity's translation, an object off the origin would be
     # displaced.
     centre = np.asarray(centre, dtype=np.float64)
@@ -103,8 +101,7 @@ def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> 
 def relative_pose(
     label_a: PoseLabel, camera_a: Camera, label_b: PoseLabel, camera_b: Camera
 ) -> Float[np.ndarray, "4 4"]:
-    """Compute the ground-truth pose between two frames: `T_ab = Tcam_b @ T0b @ inv(T0a) @
-    inv(Tcam_a)`.
+    """Compute the true pose between two frames: `T_ab = Tcam_b @ T0b @ inv(T0a) @ inv(Tcam_a)`.
 
     This is the composition in "Labelling pose for evaluation" of the supplement, which writes it
     from left to right. It leads from the coordinates of the reference frame's camera a to those of

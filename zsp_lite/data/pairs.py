@@ -1,5 +1,4 @@
-"""Evaluation pairs (section 5.1 of the paper): sampled, or read from the evaluation sets of the
-published code.
+"""Evaluation pairs (section 5.1 of the paper): sampled, or the published code's evaluation sets.
 
 These sets are torch files that refer to frames by their positions in the category's frame list.
 """
@@ -34,33 +33,20 @@ class _PublishedPair(msgspec.Struct):
 
 
 def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int = 0) -> list[Pair]:
-    """Sample `n` different evaluation pairs of a category, or all if there are fewer, each with
-    `n_targets` frames.
+    """Sample `n` different pairs of a category with `n_targets` frames, or all if there are fewer.
 
     Reference sequences take turns; the target sequence is a random other one. The reference frame
     is random; the target frames are evenly spaced from a random start. The pairs of a smaller `n`
     are the first ones of a larger.
     """
     rng = np.random.default_rng([seed, stable_hash(category) >> 1])
-    sequences = sorted(read_labels(dataset.root, category))
-    frames = dataset.frame_numbers(category)
-    numbers = {name: frames.get(name, []) for name in sequences}
-    if len(sequences) < 2:
-        raise InputError(
-            f"category {category} has {len(sequences)} labelled sequences, expected at least 2"
-        )
-    shortest = min(sequences, key=lambda name: len(numbers[name]))
-    if (found := len(numbers[shortest])) < n_targets:
-        raise InputError(
-            f"labelled sequence {category}/{shortest} has {found} frames, expected at least "
-            f"{n_targets}"
-        )
-
-    # All frames; each is the start of one choice of target frames.
-    every = sum(map(len, numbers.values()))
-    # Pairs of each reference sequence that are not sampled yet.
-    left = {name: len(own) * (every - len(own)) for name, own in numbers.items()}
-    if (total := sum(left.values())) < n:
+    numbers = _labelled_frames(dataset, category, n_targets)
+    # Pairs of each reference sequence that are not sampled yet: each frame of the other sequences
+    # is the start of one choice of target frames.
+    n_frames = sum(map(len, numbers.values()))
+    left = {name: len(own) * (n_frames - len(own)) for name, own in numbers.items()}
+    total = sum(left.values())
+    if total < n:
         logger.warning(
             "category %s has %d different pairs of %d targets, not %d",
             category,
@@ -68,46 +54,66 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
             n_targets,
             n,
         )
-    pairs: dict[Pair, None] = {}
-    for reference in itertools.cycle(sequences):
+
+    pairs: dict[Pair, None] = {}  # a set that keeps the order
+    for reference in itertools.cycle(numbers):
         if len(pairs) == min(n, total):
             return list(pairs)
-        found = len(pairs)
-        while left[reference] and len(pairs) == found:  # drawn again if it is there already
-            others = [name for name in sequences if name != reference]
+        before = len(pairs)
+        while left[reference] and len(pairs) == before:  # drawn again if it is there already
+            others = [name for name in numbers if name != reference]
             target = others[rng.integers(len(others))]
             frame = numbers[reference][rng.integers(len(numbers[reference]))]
             length = len(numbers[target])
             positions = (rng.integers(length) + np.arange(n_targets) * length // n_targets) % length
             targets = tuple(numbers[target][position] for position in positions)
             pairs[Pair(category, reference, frame, target, targets)] = None
-        left[reference] -= len(pairs) - found
+        left[reference] -= len(pairs) - before
+
+
+def _labelled_frames(dataset: Co3D, category: str, least: int) -> dict[str, list[int]]:
+    """List the frame numbers of labelled sequences; InputError for too few of either."""
+    frames = dataset.frame_numbers(category)
+    labels = sorted(read_labels(dataset.root, category))
+    numbers = {name: frames.get(name, []) for name in labels}
+    if len(numbers) < 2:
+        raise InputError(
+            f"category {category} has {len(numbers)} labelled sequences, expected at least 2"
+        )
+    shortest = min(numbers, key=lambda name: len(numbers[name]))
+    count = len(numbers[shortest])
+    if count < least:
+        raise InputError(
+            f"labelled sequence {category}/{shortest} has {count} frames, expected at least {least}"
+        )
+    return numbers
 
 
 def labelled_categories(dataset: Co3D) -> list[str]:
     """List the categories with at least two labelled sequences; InputError if there is none."""
     categories = dataset.categories()
-    if found := [
+    labelled = [
         category for category in categories if len(read_labels(dataset.root, category)) >= 2
-    ]:
-        return found
-    raise InputError(
-        f"{dataset.root}: none of {len(categories)} categories has pose labels of two "
-        "sequences, expected them in "
-        "class_labels/CATEGORY/SEQUENCE.json; `zsp-lite data labels` imports published labels"
-    )
+    ]
+    if not labelled:
+        raise InputError(
+            f"{dataset.root}: none of {len(categories)} categories has pose labels of two "
+            "sequences, expected them in class_labels/CATEGORY/SEQUENCE.json; "
+            "`zsp-lite data labels` imports published labels"
+        )
+    return labelled
 
 
 def true_poses(
     root: str | Path, pairs: Sequence[Pair], views: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Compute the labelled pose of each pair, from its reference's camera to that of the target
-    view with an index."""
-    dataset, labels = Co3D(root), cache(partial(read_labels, root))
+    """Compute the labelled pose of each pair for one of its target views, given by its index."""
+    dataset = Co3D(root)
+    labels = cache(partial(read_labels, root))
     return np.stack(
         [
             true_pose(dataset, labels(pair.category), pair, int(view))
-            for pair, view in zip(pairs, views, strict=True)
+            for pair, view in zip(pairs, views)
         ]
     )
 
@@ -115,30 +121,32 @@ def true_poses(
 def true_pose(
     dataset: Co3D, labels: Mapping[str, PoseLabel], pair: Pair, view: int
 ) -> Float[np.ndarray, "4 4"]:
-    """Compute the labelled pose of a pair from its reference's camera to that of a target view, by
-    its index."""
-    first, second = pair.reference_sequence, pair.target_sequence
-    reference = dataset.camera(dataset.frame(pair.category, first, pair.reference_frame))
-    target = dataset.camera(dataset.frame(pair.category, second, pair.target_frames[view]))
-    return relative_pose(labels[first], reference, labels[second], target)
+    """Compute the labelled pose of a pair: from the reference's camera to that of a target view."""
+    reference = dataset.frame(pair.category, pair.reference_sequence, pair.reference_frame)
+    target = dataset.frame(pair.category, pair.target_sequence, pair.target_frames[view])
+    return relative_pose(
+        labels[pair.reference_sequence],
+        dataset.camera(reference),
+        labels[pair.target_sequence],
+        dataset.camera(target),
+    )
 
 
 def pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:
-    """Return the path of an evaluation set of `n` pairs:
-
-    ROOT/determ_eval/{n}samples_{n_targets}tgt/CATEGORY.pt.
-    """
-    return (
-        Path(root)
-        / "determ_eval"
-        / f"{n}samples_{n_targets}tgt"
-        / f"{plain_name(category, 'category')}.pt"
+    """Return ROOT/determ_eval/{n}samples_{n_targets}tgt/CATEGORY.pt."""
+    return Path(
+        root,
+        "determ_eval",
+        f"{n}samples_{n_targets}tgt",
+        f"{plain_name(category, 'category')}.pt",
     )
 
 
 def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 1) -> list[Pair]:
-    """Read the first evaluation set of the folder with at least so many pairs, without repetitions;
-    [] without one."""
+    """Read the folder's first evaluation set of at least so many pairs, without repetitions.
+
+    [] if there is none.
+    """
     sets = (
         read_published_pairs(path, dataset)
         for path in pair_files(dataset, category, f"*samples_{n_targets}tgt")
@@ -153,8 +161,7 @@ def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 
 
 
 def category_pairs(dataset: Co3D, category: str, n: int, n_targets: int) -> list[Pair]:
-    """Return n pairs: the first of the folder's own evaluation set if it has so many, else sampled
-    ones."""
+    """Return n pairs: the first of the folder's evaluation set if it has so many, else sampled."""
     shipped = shipped_pairs(dataset, category, n_targets, at_least=n)
     return shipped[:n] or sample_pairs(dataset, category, n, n_targets)
 
@@ -165,11 +172,11 @@ def pair_files(dataset: Co3D, category: str, folders: str = "*") -> list[Path]:
 
 
 def read_published_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
-    """Read an evaluation set of the published code; InputError if it is damaged or does not fit the
-    data set."""
+    """Read an evaluation set of the published code; InputError if it does not fit the data set."""
     pairs = []
     for number, item in enumerate(read_pair_file(Path(path))):
         frames = dataset.frame_list(item.category)
+        # (sequence, position in the list) of the reference and of each target.
         chosen = [(item.reference_seq_name, item.reference_frame_id)]
         chosen += [(item.target_seq_name, position) for position in item.all_target_id]
         for sequence, position in chosen:
@@ -192,12 +199,12 @@ def read_published_pairs(path: str | Path, dataset: Co3D) -> list[Pair]:
 
 
 def read_pair_file(path: Path) -> list[_PublishedPair]:
-    """Read an evaluation set without its data set; InputError if it is damaged or has another
-    structure."""
+    """Read an evaluation set without its data set; InputError if it has another structure."""
     content = load_torch(path, "evaluation pairs")
     try:
+        # Numbers may be stored as tensors. Anything else becomes text, which is refused.
         plain = msgspec.to_builtins(
-            content, enc_hook=lambda one: one.tolist() if torch.is_tensor(one) else str(one)
+            content, enc_hook=lambda value: value.tolist() if torch.is_tensor(value) else str(value)
         )
         return msgspec.convert(plain, list[_PublishedPair])
     except (msgspec.ValidationError, RecursionError) as error:

@@ -1,10 +1,10 @@
-"""Labels from elsewhere: those of the published code, and their transfer from CO3D v1 to the worlds
-of v2."""
+"""Labels from elsewhere: the published code's, and their transfer from CO3D v1 to v2's worlds."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3, umeyama
 from zsp_lite.data.co3d import Co3D
@@ -27,18 +27,17 @@ _MIN_CAMERAS = 4
 def import_labels(
     source: Path, root: Path, replace: bool = False, categories: Sequence[str] | None = None
 ) -> dict[str, int]:
-    """Import labels and evaluation pairs from a clone of the published repository, and return their
-    numbers by kind.
+    """Import labels and evaluation pairs from a clone of the published repository.
 
-    Without `replace`, existing files of other content are an InputError. Nothing is written if a
-    file is damaged.
+    Returns the numbers of files by kind. Without `replace`, existing files of other content are an
+    InputError. Nothing is written if a file is damaged.
     """
     Co3D(root)  # raises InputError if there is no such folder
-    sources = {}
+    sources = {}  # by the path where a file is written: that where it is read
     for category, labels in _published_labels(source, categories).items():
         folder = label_folder(root, category)
         # This checks that they fit together.
-        read_label_folder(folder, added={one.seq: one for one in labels.values()})
+        read_label_folder(folder, added={label.seq: label for label in labels.values()})
         for path in labels:
             sources[folder / path.name] = path
     for path in sorted(source.glob("**/determ_eval/*/*.pt")):
@@ -53,30 +52,26 @@ def import_labels(
 
 
 def published_sequences(source: Path, categories: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """List the labelled sequences of each category in a clone; InputError if a category has
-    none."""
+    """List the labelled sequences of each category in a clone; InputError if one has none."""
     labels = _published_labels(source, categories)
     for category in categories:
         if category not in labels:
             raise _no_labels(source, category)
-    return {
-        category: tuple(
-            sorted({name for label in found.values() for name in (label.seq, label.reference_seq)})
-        )
-        for category, found in labels.items()
-    }
+    sequences = {}
+    for category, by_path in labels.items():
+        names = {label.seq for label in by_path.values()}
+        names.update(label.reference_seq for label in by_path.values())
+        sequences[category] = tuple(sorted(names))
+    return sequences
 
 
 def write_all(files: dict[Path, bytes], replace: bool) -> None:
-    """Write all files; without `replace`, InputError and none is written if one exists with other
-    content."""
-    conflicts = [
-        path for path, data in files.items() if path.exists() and read_bytes(path, "file") != data
-    ]
-    if conflicts and not replace:
-        raise InputError(
-            f"{conflicts[0]} would be replaced by other content, expected --replace to do so"
-        )
+    """Write all files; without `replace`, none if one exists with other content (InputError)."""
+    for path, data in files.items():
+        if path.exists() and read_bytes(path, "file") != data and not replace:
+            raise InputError(
+                f"{path} would be replaced by other content, expected --replace to do so"
+            )
     for path, data in files.items():
         write_atomic(path, data)
 
@@ -94,6 +89,7 @@ def _published_labels(
 
 
 def _no_labels(source: Path, category: str) -> InputError:
+    """Make the error for a clone without labels."""
     return InputError(
         f"{source} holds no class_labels/{category}/SEQ.json, expected a clone of the "
         "published code"
@@ -103,20 +99,25 @@ def _no_labels(source: Path, category: str) -> InputError:
 def transfer_labels(
     source: str | Path, target: str | Path, category: str, replace: bool = False
 ) -> dict[str, float]:
-    """Transfer the labels of a category from CO3D v1 to v2, whose worlds are others; return each
-    sequence's residual.
+    """Transfer the labels of a category from CO3D v1 to v2; return each sequence's residual.
 
-    The camera centres in both are aligned by Umeyama's method with scale; the residual is their RMS
-    distance over their RMS distance from their mean. Nothing is written if one is above 0.05.
+    The worlds of v2 are others. The camera centres in both are aligned by Umeyama's method with
+    scale; the residual is their RMS distance over their RMS distance from their mean. Nothing is
+    written if one is above 0.05.
     """
-    labels, old, new = read_label_folder(label_folder(source, category)), Co3D(source), Co3D(target)
+    labels = read_label_folder(label_folder(source, category))
+    old = Co3D(source)
+    new = Co3D(target)
     if not labels:
         raise InputError(
             f"{source} has no labels of category {category}, expected "
             f"class_labels/{category}/SEQ.json"
         )
+
+    # From the world of v1 to that of v2, for each sequence.
     reference = next(iter(labels.values())).reference_seq
-    worlds, residuals = {}, {}
+    worlds = {}
+    residuals = {}
     for name in dict.fromkeys([reference, *labels]):
         worlds[name], residuals[name] = align_worlds(old, new, category, name)
         if residuals[name] > _MAX_RESIDUAL:
@@ -124,7 +125,10 @@ def transfer_labels(
                 f"sequence {category}/{name}: camera centres differ by {residuals[name]:.3f} "
                 f"of their spread after alignment, expected at most {_MAX_RESIDUAL:g}"
             )
-    centre = new.point_cloud(category, reference)[0].mean(axis=0)
+
+    # From the reference's world in v2 to v1, by the label to the sequence's, and back to v2.
+    points, _ = new.point_cloud(category, reference)
+    centre = points.mean(axis=0)
     transferred = {}
     for name, label in labels.items():
         similarity = (
@@ -132,8 +136,10 @@ def transfer_labels(
             @ Sim3(1.0, label.trans[:3, :3], label.trans[:3, 3])
             @ worlds[reference].inverse()
         )
-        moved = rigid_label(similarity, centre, name, reference)
-        transferred[name] = PoseLabel(np.eye(4), name, reference) if name == reference else moved
+        transferred[name] = rigid_label(similarity, centre, name, reference)
+        if name == reference:  # exactly, without rounding
+            transferred[name] = PoseLabel(np.eye(4), name, reference)
+
     folder = label_folder(target, category)
     read_label_folder(folder, added=transferred)  # checks that they fit together
     write_all(
@@ -144,24 +150,29 @@ def transfer_labels(
 
 
 def align_worlds(old: Co3D, new: Co3D, category: str, sequence: str) -> tuple[Sim3, float]:
-    """Compute the similarity from a sequence's world in `old` to that in `new`, and its
-    residual."""
-    centres = [
-        {
-            one.frame_number: data.camera(one).centre
-            for one in data.frames(category, sequence)
-            if one.viewpoint
-        }
-        for data in (old, new)
-    ]
-    common = sorted(centres[0].keys() & centres[1].keys())
+    """Compute the similarity between a sequence's worlds in `old` and `new`, and its residual."""
+    old_centres = _camera_centres(old, category, sequence)
+    new_centres = _camera_centres(new, category, sequence)
+    common = sorted(old_centres.keys() & new_centres.keys())
     if len(common) < _MIN_CAMERAS:
         raise InputError(
             f"sequence {category}/{sequence}: {len(common)} frames have cameras in both data sets, "
             f"expected at least {_MIN_CAMERAS}"
         )
-    first, second = np.array([[one[number] for number in common] for one in centres])
+    first = np.array([old_centres[number] for number in common])
+    second = np.array([new_centres[number] for number in common])
     sim3 = umeyama(first, second)
     distance = np.square(sim3.apply(first) - second).sum(axis=1).mean()
     spread = np.square(second - second.mean(axis=0)).sum(axis=1).mean()
     return sim3, float(np.sqrt(distance / spread))
+
+
+def _camera_centres(
+    dataset: Co3D, category: str, sequence: str
+) -> dict[int, Float[np.ndarray, "3"]]:
+    """Return the centres of a sequence's known cameras by frame number."""
+    return {
+        frame.frame_number: dataset.camera(frame).centre
+        for frame in dataset.frames(category, sequence)
+        if frame.viewpoint
+    }

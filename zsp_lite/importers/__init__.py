@@ -1,8 +1,6 @@
-"""Import of RGB-D captures: the formats that are read, object masks, and sequences in CO3D's
-layout."""
+"""Import of RGB-D captures: formats, object masks, and sequences in CO3D's layout."""
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -84,30 +82,32 @@ _INCOMPLETE = {
 
 
 def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
-    """Return the format of a capture, a name in `FORMATS`, and the folder or file that its reader
-    takes.
+    """Return a capture's format, a name in `FORMATS`, and the folder or file that its reader takes.
 
     A capture is a folder, the zip or .r3d file of an app, or a transforms.json. InputError for
     anything else; it says what is missing, or what is expected, and `also`.
     """
-    path, folder = Path(path), Path(path)
+    path = Path(path)
+    folder = path
     if path.is_file() and path.suffix.lower() in (".zip", ".r3d"):
         folder = unpack(path.resolve())
     if path.is_file() and path.match("transforms*.json"):
         return "nerfstudio", path
-    files = [one for one in folder.glob("*") if not one.name.startswith((".", "__MACOSX"))]
+    files = [file for file in folder.glob("*") if not file.name.startswith((".", "__MACOSX"))]
     places = [folder]
     if len(files) == 1:  # an app may put a folder into its zip
         places += files
     for place in places:
-        for name, one in FORMATS.items():
-            if all(any(place.glob(sign)) for sign in one.signs):
+        for name, layout in FORMATS.items():
+            if all(any(place.glob(sign)) for sign in layout.signs):
                 return name, place
+
+    # No format: say why, if it is near to one.
     for signs, problem in _INCOMPLETE.items():
         if any(file.name in signs or file.suffix.lower() in signs for file in (path, *files)):
             raise InputError(f"{path} {problem}, {_HOW}")
     found = "has another format" if path.exists() else "does not exist"
-    known = "; ".join(f"{one.what} ({', '.join(one.signs)})" for one in FORMATS.values())
+    known = "; ".join(f"{layout.what} ({', '.join(layout.signs)})" for layout in FORMATS.values())
     raise InputError(f"{path} {found}, expected {also}a folder or zip with the files of {known}")
 
 
@@ -119,36 +119,43 @@ def open_capture(
     files: Mapping[str, Any] = {},
     **options: Any,
 ) -> Capture:
-    """Read the frames of a capture, with the masks of its folder masks/, if it has one (see
-    `open_source`).
+    """Read a capture's frames (see `open_source`), with the masks of its folder masks/, if any.
 
     `files` replaces members of each `CaptureFrame`. InputError if the capture cannot be read, or no
     frame can be used.
     """
-    source = path = Path(path)
-    with suppress(InputError if layout else ()):
+    path = Path(path)
+    folder = path
+    try:
         found, place = recognise(path)
         layout = layout or found
-        path = place if found == layout else path
+        if found == layout:
+            folder = place
+    except InputError:
+        if not layout:
+            raise
     if layout == "stray":  # its reader keeps the sharp frames of a video only
         options["count"] = count
-    frames, left_out = collect(FORMATS[layout].read(path, **options))
+    frames, left_out = collect(FORMATS[layout].read(folder, **options))
+
+    # A frame's own mask, or that of the folder; a folder that is named has precedence.
     images = [frame.image for frame in frames]
-    found = find_masks(masks or (path if path.is_dir() else path.parent) / "masks", images)
+    if folder.is_file():
+        folder = folder.parent
+    found = find_masks(masks or folder / "masks", images)
     if masks is not None and not any(found):
         raise InputError(
             f"--masks {masks} has no mask that is named like an image, such as {images[0].stem}.png"
         )
-    own = [None if masks else frame.mask for frame in frames]
-    frames = [
-        replace(frame, mask=one or mask, **files) for frame, one, mask in zip(frames, own, found)
-    ]
-    frames = [
-        frame for frame, _ in sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
-    ]
+    if not masks:
+        found = [frame.mask or mask for frame, mask in zip(frames, found)]
+    frames = [replace(frame, mask=mask, **files) for frame, mask in zip(frames, found)]
+
+    sharp = sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
+    frames = [frame for frame, _ in sharp]
     if not frames:
-        found = "no frame, expected some"
+        problem = "no frame, expected some"
         if left_out:
-            found = f"none of {len(left_out)} frames can be used: {left_out[0]}"
-        raise InputError(f"capture {source}: {found}")
+            problem = f"none of {len(left_out)} frames can be used: {left_out[0]}"
+        raise InputError(f"capture {path}: {problem}")
     return Capture(frames, left_out)

@@ -1,5 +1,4 @@
-"""Check that the depth of a few frames agrees by their poses, and name the usual mistake that
-explains if it does not.
+"""Check that the depth of a few frames agrees by their poses, or name the usual mistake.
 
 Points of the object in one frame are moved into another. The share of them that lies on its surface
 is high if units and poses are right, also with noise and holes: about 0.9 for cameras 15 degrees
@@ -23,14 +22,19 @@ from zsp_lite.metrics import rotation_angle
 from zsp_lite.points import object_pixels, world_points
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-# Points of a frame, at most and at least, and pairs of frames
-_POINTS, _LEAST_POINTS, _PAIRS = 500, 50, 8
-_NEAREST, _BEST, _FARTHEST = 4.0, 20.0, 50.0  # angle between two cameras that are compared, degrees
+_POINTS = 500  # of a frame, at most
+_LEAST_POINTS = 50
+_PAIRS = 8  # of frames, at most
+# Angles between two cameras that are compared, degrees.
+_NEAREST = 4.0
+_BEST = 20.0
+_FARTHEST = 50.0
 _TOLERANCE = 0.05  # of depth, relative to that of the object
 _AGREEING = 0.6  # share of points above which frames agree without doubt
-_FITTING, _GAIN = 0.5, 0.25  # least share of points by the right correction, and its least gain
+_FITTING = 0.5  # least share of points by the right correction
+_GAIN = 0.25  # by which that share must be above the given one
 _ALIKE = 0.03  # difference of shares below which the likelier correction is named
-# least ratio of the share if depth is along the ray, which changes little near the axis
+# Least ratio of the share if depth is along the ray, which changes little near the axis.
 _RAY_GAIN = 1.2
 _CONTRADICTING = 0.4  # share of points below which frames contradict each other
 _UNITS = {1.0: "metres", 0.001: "millimetres", 0.0002: "1/5000 m"}
@@ -59,14 +63,15 @@ class _Surface:
         points = frame.camera.to_camera(
             world_points(frame, pixels, int(pixels.sum()) // _POINTS + 1)
         )
+        # Wider by two pixels, because masks and poses are not exact.
         depth = np.where(cv2.dilate(mask, np.ones((5, 5))) > ON_OBJECT, frame.depth, np.inf)
-        return cls(
-            points, depth, frame.camera, float(np.median(points[:, 2])) if len(points) else 0.0
-        )
+        distance = float(np.median(points[:, 2])) if len(points) else 0.0
+        return cls(points, depth, frame.camera, distance)
 
     def share(self, other: "_Surface", motion: _Pose, along_ray: bool) -> float:
         """Return the share of points that a motion between cameras takes onto another surface."""
-        camera, points = replace(other.camera, R=motion[:3, :3], t=motion[:3, 3]), self.points
+        camera = replace(other.camera, R=motion[:3, :3], t=motion[:3, 3])
+        points = self.points
         if along_ray:
             points = points * points[:, 2:] / np.linalg.norm(points, axis=1, keepdims=True)
         pixels, depth = camera.project(points)
@@ -77,6 +82,7 @@ class _Surface:
         columns, rows = pixels[inside].astype(int).T
         surface = other.depth[rows, columns]
         agreeing = np.abs(stored[inside] - surface) < _TOLERANCE * other.distance
+        # Of all points, but for those on pixels of unknown depth.
         return agreeing.sum() / max(1, len(inside) - (surface == 0).sum())
 
 
@@ -84,13 +90,14 @@ _Pair = tuple[_Surface, _Surface]
 
 
 def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
-    """Say that frames of one object do not agree, and which usual mistake explains it; "" if they
-    do, or none overlap.
+    """Say that frames of one object do not agree, and which usual mistake explains it.
 
-    Masks are found where there are none. `unit` is the world units per stored depth value, if it
-    can be changed.
+    "" if they agree, or none overlap. Masks are found where there are none. `unit` is the world
+    units per stored depth value, if it can be changed.
     """
-    objects, scenes = [], []
+    # The object, and all that is seen, in each frame.
+    objects = []
+    scenes = []
     for frame in frames:
         if frame_defect(frame):
             continue
@@ -99,24 +106,28 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
             with suppress(InputError):
                 (frame,) = masks_from_depth([frame])
         objects.append(_Surface.of(frame))
-    pairs, whole = _pairs(objects), _pairs(scenes)
+    pairs = _pairs(objects)
+    whole = _pairs(scenes)
     if not pairs:
         return ""
-    given, everywhere = _share(pairs), _share(whole)
+    given = _share(pairs)
+    everywhere = _share(whole)
     found = f"depth and poses of the frames do not agree ({given:.0%} of the object's points do)"
-    along_ray = [_share(some, along_ray=True) for some in (whole, pairs)]
-    if (
-        along_ray[0] > _RAY_GAIN * everywhere
-        and min(along_ray) > _FITTING
-        and along_ray[1] > _AGREEING
-    ):
-        mistake = "depth is the distance along the ray of a pixel, not along the optical axis"
+
+    # This mistake changes little on the object alone, which is near the optical axis.
+    by_ray = _share(pairs, along_ray=True)
+    everywhere_by_ray = _share(whole, along_ray=True)
+    gains = everywhere_by_ray > max(_RAY_GAIN * everywhere, _FITTING)
+    if gains and by_ray > _AGREEING:
         return (
-            f"{found}; all that is seen agrees better ({along_ray[0]:.0%}, not {everywhere:.0%}) "
-            f"if {mistake}"
+            f"{found}; all that is seen agrees better ({everywhere_by_ray:.0%}, not "
+            f"{everywhere:.0%}) if depth is the distance along the ray of a pixel, not along the "
+            "optical axis"
         )
     if given > _AGREEING:
         return ""
+
+    # Mistakes in poses and units.
     for share, text in _explanations(pairs, unit):
         if share > max(_FITTING, given + _GAIN):
             return f"{found}; they agree ({share:.0%}) if {text}"
@@ -125,22 +136,22 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
 
 
 def neighbours(count: int) -> list[int]:
-    """Choose up to six positions among `count` frames that go once around an object: three and
-    those beside them."""
+    """Choose up to six positions among frames around an object: three, and those beside them."""
     thirds = [k * count // 3 for k in range(3)]
-    steps = 0, max(1, count // 18)  # 20 degrees of a turn around the object
+    steps = (0, max(1, count // 18))  # 20 degrees of a turn around the object
     return sorted({(third + step) % count for third in thirds for step in steps})
 
 
 def _pairs(surfaces: Sequence[_Surface]) -> list[_Pair]:
-    """Pair each surface with that of a camera turned by about `_BEST` degrees, an angle that no
-    mistake changes."""
-    pairs, surfaces = [], [one for one in surfaces if len(one.points) >= _LEAST_POINTS]
-    for one in surfaces:
-        angles = np.array([rotation_angle(one.camera.R, other.camera.R) for other in surfaces])
+    """Pair each surface with that of a camera turned by about `_BEST` degrees."""
+    # No mistake changes the angle between two cameras.
+    surfaces = [surface for surface in surfaces if len(surface.points) >= _LEAST_POINTS]
+    pairs = []
+    for surface in surfaces:
+        angles = np.array([rotation_angle(surface.camera.R, other.camera.R) for other in surfaces])
         angles[(angles < _NEAREST) | (angles > _FARTHEST)] = np.inf
         if np.isfinite(angles).any():
-            pairs.append((one, surfaces[int(np.abs(angles - _BEST).argmin())]))
+            pairs.append((surface, surfaces[int(np.abs(angles - _BEST).argmin())]))
     return pairs[:: len(pairs) // _PAIRS + 1]
 
 
@@ -152,35 +163,37 @@ def _share(
 ) -> float:
     """Return the median share of agreeing points, by corrected poses and with scaled depth."""
     shares = []
-    for one, other in pairs:
-        motion = corrected(other.camera.matrix) @ np.linalg.inv(corrected(one.camera.matrix))
+    for surface, other in pairs:
+        # From the camera of the surface to the other one; depth is scaled by its inverse.
+        motion = corrected(other.camera.matrix) @ np.linalg.inv(corrected(surface.camera.matrix))
         motion[:3, 3] /= scale
-        shares.append(one.share(other, motion, along_ray))
+        shares.append(surface.share(other, motion, along_ray))
     return float(np.median(shares))
 
 
 def _explanations(pairs: Sequence[_Pair], unit: float | None) -> Iterator[tuple[float, str]]:
-    """Give the best correction of poses, by a common factor and by any factor, and the share of
-    points that agree."""
+    """Yield the best correction of poses, by a common factor and by any factor, with its share."""
     shares = np.array([_share(pairs, correct) for _, correct in _CORRECTIONS])
     likeliest = int(np.argmax(shares > shares.max() - _ALIKE))
     yield shares[likeliest], f"the poses {_CORRECTIONS[likeliest][0]}"
-    distance = float(np.median([one.distance for one, _ in pairs]))
+    distance = float(np.median([surface.distance for surface, _ in pairs]))
     for factors in (_FACTORS, _SCALES):
+        # The middle one of the factors that are about as good as the best.
         shares = np.array([_share(pairs, scale=factor) for factor in factors])
         alike = np.flatnonzero(shares > shares.max() - _ALIKE)
         yield shares.max(), _scaled(factors[alike[len(alike) // 2]], distance, unit)
 
 
 def _scaled(factor: float, distance: float, unit: float | None) -> str:
-    """Say that the depth, or the positions of the cameras, are to be scaled: what leaves the
-    distance plausible."""
+    """Say that the depth, or else the cameras' positions, are to be multiplied by a factor."""
+    # Not the depth, if that would make a plausible distance of the object implausible.
     nearest, farthest = PLAUSIBLE
     if unit and nearest <= distance <= farthest and not nearest <= factor * distance <= farthest:
         return f"the positions of the cameras are multiplied by {1 / factor:.3g}"
     new = float(f"{factor * (unit or 0):.3g}")
     what = f"taken in {_UNITS[new]}" if new in _UNITS else f"multiplied by {factor:.3g}"
-    return f"the depth is {what}" + (f": --depth-unit {new:g}" if new else "")
+    option = f": --depth-unit {new:g}" if new else ""
+    return f"the depth is {what}{option}"
 
 
 def _reorder(pose: _Pose) -> _Pose:
@@ -195,8 +208,7 @@ _OTHER_AXES = (
     "have the other axes, OpenGL's for OpenCV's or the reverse: negate the columns y and z"
 )
 _INVERSE = "are world to camera"
-# From wrong to right matrices. Those of a file may be in OpenGL's axes; the choice of the world's
-# axes does not matter.
+# From wrong to right matrices, which may be in OpenGL's axes. The world's axes do not matter.
 _CORRECTIONS: list[tuple[str, _Correction]] = [
     (_INVERSE, np.linalg.inv),
     (_INVERSE, lambda pose: _FLIP @ np.linalg.inv(pose)),

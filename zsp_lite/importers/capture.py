@@ -1,5 +1,4 @@
-"""RGB-D captures: the files and camera of a frame, how they become a `Frame`, and what the readers
-of formats share."""
+"""RGB-D captures: the files and camera of a frame, and what the readers of formats share."""
 
 import re
 from collections import Counter
@@ -20,8 +19,7 @@ from zsp_lite.errors import InputError, real_array
 from zsp_lite.importers import files
 from zsp_lite.io.files import OutsideError, find_inside, read_bytes
 
-# OpenCV's and Open3D's pixel centres are at integers: subtract this from an intrinsic matrix with
-# half-integer centres.
+# OpenCV's and Open3D's pixel centres are at integers: their intrinsic matrices are smaller by this.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # +y up, looking along -z
 _FARTHEST = 1e4  # greatest known depth, in units of the world
@@ -38,35 +36,40 @@ class CaptureFrame:
     depth: Path  # of the image's aspect ratio; phones store it smaller than the image
     camera: Camera
     depth_unit: float = 0.001  # world units per stored depth value
-    # OpenCV's k1, k2, p1, p2, k3; image, depth and mask are undistorted
+    # OpenCV's k1, k2, p1, p2, k3. Image, depth and mask become undistorted.
     distortion: tuple[float, ...] = ()
     mask: Path | None = None
-    # whether the distortion is that of OpenCV's fisheye cameras, k1, k2, k3, k4
+    # Whether the distortion is that of OpenCV's fisheye cameras: k1, k2, k3, k4.
     fisheye: bool = False
     confidence: Path | None = None  # of each pixel of the depth map, see `trusted`
     label: int | None = None  # of the object, where masks have the labels of several
-    # "stored" or "displayed": how camera, depth and mask refer to a turned photograph
+    # "stored" or "displayed": how camera, depth and mask refer to a turned photograph.
     orientation: str | None = None
     posed: bool = True  # False for a single image, whose world is its camera's frame
 
     def load(self) -> Frame:
-        """Load the frame as viewers display it; InputError if a file is missing, damaged or of
-        another size."""
+        """Load the frame as viewers display it; InputError if a file cannot be used."""
         rgb, turn = files.read_picture(self.image)
+        # Tells by the size of an image whether it lies as the stored pixels.
         lies_stored = partial(files.lies_as_stored, rgb.shape, turn, self.orientation, self.image)
 
         def displayed(image: np.ndarray) -> np.ndarray:
+            """Turn an image to the form that viewers display."""
             return files.display_image(image, turn) if lies_stored(image.shape) else image
 
         camera = self.camera
         if lies_stored(camera.size):
             camera = files.display_camera(camera, turn, self.image.name, self.posed)
-        rgb, depth, mask = files.display_image(rgb, turn), displayed(self._read_depth()), None
+        rgb = files.display_image(rgb, turn)
+        depth = displayed(self._read_depth())
         check_pixels(self.image, rgb, camera.size)
         enlarged = enlarge_depth(depth, camera.size)
         if enlarged.shape != camera.size:
-            expected = f"(H, W) = {camera.size} as the image, or smaller with its aspect ratio"
-            raise InputError(f"depth {self.depth} is {depth.shape} pixels, expected {expected}")
+            raise InputError(
+                f"depth {self.depth} is {depth.shape} pixels, expected (H, W) = {camera.size} as "
+                "the image, or smaller with its aspect ratio"
+            )
+        mask = None
         if self.mask is not None:
             mask = displayed(files.read_mask_file(self.mask, self.label))
             check_pixels(self.mask, mask, camera.size)
@@ -74,7 +77,8 @@ class CaptureFrame:
             maps = self._undistortion(camera)
             rgb = cv2.remap(rgb, *maps, cv2.INTER_LINEAR)
             enlarged = cv2.remap(enlarged, *maps, cv2.INTER_NEAREST)
-            mask = None if mask is None else cv2.remap(mask, *maps, cv2.INTER_LINEAR)
+            if mask is not None:
+                mask = cv2.remap(mask, *maps, cv2.INTER_LINEAR)
         return Frame(rgb, enlarged, mask, camera, self.image.name)
 
     def _read_depth(self) -> Float32[np.ndarray, "h w"]:
@@ -88,9 +92,9 @@ class CaptureFrame:
         return np.where(known, depth, np.float32(0))
 
     def _undistortion(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return OpenCV's maps that undistort the image, of which `camera` is the camera after
-        turning."""
-        matrix, coefficients = camera.K - HALF_PIXEL, np.array(self.distortion)
+        """Return OpenCV's maps that undistort the displayed image, whose camera is given."""
+        matrix = camera.K - HALF_PIXEL
+        coefficients = np.array(self.distortion)
         if self.fisheye:
             undistortion = cv2.fisheye.initUndistortRectifyMap
         else:
@@ -111,7 +115,7 @@ class Capture(NamedTuple):
     left_out: list[str]  # what is wrong with each frame that is left out
 
 
-# What a reader returns; a frame that cannot be used raises InputError
+# What a reader returns: functions that make a frame, or raise InputError if it cannot be used.
 Makers = Iterator[Callable[[], CaptureFrame]]
 
 
@@ -128,17 +132,18 @@ def make_frame(
     confidence: str | Path | None = None,
     **others: Any,
 ) -> CaptureFrame:
-    """Make a frame of what the files in the folder of a capture say; InputError if its files or
-    numbers are no frame.
+    """Make a frame of files and numbers of a capture; InputError if they are no frame.
 
     The pose, camera to world, is a matrix of 12 or 16 numbers, or a position and a quaternion x, y,
     z, w, in OpenCV's axes after multiplication by `axes`. Intrinsics are fx, fy, cx, cy or a
     matrix. Mask and confidence may be missing.
     """
-    names = image, depth, mask, confidence
+    names = (image, depth, mask, confidence)
     paths = [find_inside(folder, name) if isinstance(name, str) else name for name in names]
-    if None in paths[:2]:
+    if None in paths[:2]:  # the first that is missing
         raise InputError(f"{where}: {names[paths.index(None)]} is missing in {folder}")
+
+    # The pose as a matrix (4, 4).
     pose = real_array(f"{where}: pose", pose)
     if pose.size not in (7, 12, 16):
         raise InputError(f"{where}: the pose has {pose.size} numbers, expected 7, 12 or 16")
@@ -153,6 +158,7 @@ def make_frame(
         pose = np.vstack([pose.reshape(3, 4), (0, 0, 0, 1)])
     with np.errstate(invalid="ignore"):  # what is not finite is refused below
         pose = pose.reshape(-1, 4) @ axes
+
     camera = camera_from_pose(pose, intrinsics, size or files.picture_size(paths[0]), where)
     return CaptureFrame(paths[0], paths[1], camera, mask=paths[2], confidence=paths[3], **others)
 
@@ -163,9 +169,9 @@ def refuse(problem: str) -> CaptureFrame:
 
 
 def collect(makers: Iterable[Callable[[], CaptureFrame]]) -> tuple[list[CaptureFrame], list[str]]:
-    """Return the frames that can be made, in the natural order of their images, and what is wrong
-    with the others."""
-    frames, left_out = [], []
+    """Return the frames in the natural order of their images, and what is wrong with others."""
+    frames = []
+    left_out = []
     for make in makers:
         try:
             frames.append(make())
@@ -179,32 +185,36 @@ def collect(makers: Iterable[Callable[[], CaptureFrame]]) -> tuple[list[CaptureF
 def _natural_order(path: Path) -> tuple[list[str | int], str]:
     """Order paths such that frame 10 follows frame 9."""
     text = path.as_posix()
-    return [int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", text))], text
+    parts = re.split(r"(\d+)", text)  # every second one is a number
+    return [int(part) if k % 2 else part for k, part in enumerate(parts)], text
 
 
 def sharpest(
     items: Sequence[Any], count: int, read: Callable[[Any], np.ndarray], left_out: list[str]
 ) -> Iterator[tuple[Any, np.ndarray]]:
-    """Split the items into `count` stretches, and yield the sharpest candidate of each with its
-    image.
+    """Split items into `count` stretches, and yield the sharpest of each with its image.
 
     What is wrong with unreadable ones is added to `left_out`. The first item is chosen, because a
     box may be for it.
     """
-    parts = [[position] for position in range(len(items))]
+    stretches = [[position] for position in range(len(items))]
     if len(items) > count:
         later = np.array_split(np.arange(1, len(items)), max(count - 1, 1))
-        parts = [[0], *(part[:: -(-len(part) // _CANDIDATES)].tolist() for part in later)][:count]
-    for part in parts:
-        best, chosen = -1.0, None
-        for position in part:
+        # Some candidates of each, by a step that is rounded up.
+        stretches = [[0], *(part[:: -(-len(part) // _CANDIDATES)].tolist() for part in later)]
+    for stretch in stretches[:count]:
+        best = -1.0
+        chosen = None
+        for position in stretch:
             try:
                 image = read(items[position])
             except InputError as error:
                 left_out.append(str(error))
                 continue
-            if (sharpness := _sharpness(image)) > best:
-                best, chosen = sharpness, (items[position], image)
+            sharpness = _sharpness(image)
+            if sharpness > best:
+                best = sharpness
+                chosen = (items[position], image)
         if chosen:
             yield chosen
 
@@ -217,7 +227,7 @@ def _sharpness(image: UInt8[np.ndarray, "..."]) -> float:
 
 
 def trusted(levels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Tell measured depth from smeared depth by levels of confidence: 0, 1, 2, or 0 to 255.
+    """Tell measured from smeared depth by levels of confidence: 0, 1, 2, or 0 to 255.
 
     The lowest level is unknown, and the middle one is kept where it is wide, as on dark surfaces,
     but not in thin bands, as along silhouettes, where the depth is a mean of object and background.
@@ -228,42 +238,38 @@ def trusted(levels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
-    """Find the mask of each image in a folder: by its relative path or its name, with its extension
-    or without.
+    """Find the mask of each image in a folder, by the end of its path or by its name.
 
-    The longest path that both share decides. Images of one name in several folders do not share a
-    mask.
+    Its extension may be part of the mask's name. The longest path that both share decides. Images
+    of one name in several folders do not share a mask.
     """
-    every = [
-        path for path in sorted(Path(folder).rglob("*.*")) if path.suffix.lower() in files.MASKS
-    ]
-    named = {path.relative_to(folder).with_suffix("").as_posix(): path for path in every}
+    named = {}
+    for path in sorted(Path(folder).rglob("*.*")):
+        if path.suffix.lower() in files.MASKS:
+            named[path.relative_to(folder).with_suffix("").as_posix()] = path
 
     def tails(image: Path) -> list[str]:
-        return [
-            "/".join(image.with_suffix("").parts[-count:])
-            for count in range(len(image.parts), 0, -1)
-        ]
+        """List the ends of a path without its extension, the longest first."""
+        parts = image.with_suffix("").parts
+        return ["/".join(parts[-count:]) for count in range(len(parts), 0, -1)]
 
     shared = Counter(tail for image in images for tail in tails(image))
-    found = []
+    masks = []
     for image in images:
-        own = [
-            name
-            for tail in tails(image)
-            if shared[tail] == 1
-            for name in (tail + image.suffix, tail)
-        ]
-        found.append(next((named[name] for name in own if name in named), None))
-    return found
+        names = []
+        for tail in tails(image):
+            if shared[tail] == 1:
+                names += [tail + image.suffix, tail]
+        masks.append(next((named[name] for name in names if name in named), None))
+    return masks
 
 
 def read_text_lines(path: Path) -> list[str]:
     """Read the lines of a text file but for empty ones and those that begin with #."""
     text = read_bytes(path, "list").decode("utf-8-sig", "replace")
-    if not (
-        lines := [line for part in text.splitlines() if (line := part.strip()) and line[0] != "#"]
-    ):
+    lines = [line.strip() for line in text.splitlines()]
+    lines = [line for line in lines if line and line[0] != "#"]
+    if not lines:
         raise InputError(f"{path} is empty, expected at least 1 line")
     return lines
 
@@ -271,8 +277,7 @@ def read_text_lines(path: Path) -> list[str]:
 def read_numbers(
     path: Path, columns: tuple[int, ...], **options: Any
 ) -> Float[np.ndarray, "rows columns"]:
-    """Read a text file of numbers by `numpy.loadtxt` with its options, as many in each line as one
-    of `columns`."""
+    """Read a text file of numbers by `numpy.loadtxt`; one of `columns` is their number per line."""
     lines = read_text_lines(path)
     try:
         values = np.loadtxt(lines, ndmin=2, **options)

@@ -1,5 +1,4 @@
-"""Conversion of a source to a sequence of a data folder in CO3D's layout, with a fused point cloud
-(Open3D)."""
+"""Conversion of a source to a sequence of a data folder, with a fused point cloud (Open3D)."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,11 +17,11 @@ from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import load_open3d
 from zsp_lite.points import axis_deviation, object_pixels, sampling_step, world_points
 
-# voxels per three standard deviations of the object; finer than the noise of depth cameras
+# Voxels per three standard deviations of the object; finer than the noise of depth cameras.
 _VOXELS = 96
 _MAX_POINTS = 50_000
 _LEAST_STEP = 7  # between the pixels by which the size of the object is estimated
-# file in the folder of a sequence whose import goes on, or was interrupted
+# File in the folder of a sequence whose import goes on, or was interrupted.
 _UNFINISHED = ".unfinished"
 MIN_VIEWS = 3  # number of frames that must see a surface, if there are that many frames
 
@@ -39,8 +38,7 @@ class ImportResult:
 
 
 def import_source(source: Source, root: str | Path, category: str, sequence: str) -> ImportResult:
-    """Write the frames of a source as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused
-    point cloud.
+    """Write a source as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused point cloud.
 
     Lengths are scaled so that the point cloud has unit standard deviation, averaged over the axes,
     as in CO3D. Frames whose mask is empty are left out. An interrupted import can be repeated.
@@ -55,8 +53,10 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
         raise InputError(
             f"{source.path}: {count} frames remain, expected {MIN_VIEWS}: {source.left_out[0]}"
         )
-    if line := source.contradiction():
-        raise InputError(f"{source.path}: {line}")
+    problem = source.contradiction()
+    if problem:
+        raise InputError(f"{source.path}: {problem}")
+
     source = source.segmented()
     seen = [position for position in range(count) if source.read(position).shows_object]
     if not seen:
@@ -92,8 +92,7 @@ def write_sequence(root: str | Path, category: str, data: SequenceData) -> None:
 def import_captures(
     folder: str | Path, root: str | Path, category: str
 ) -> Iterator[tuple[str, ImportResult]]:
-    """Import each capture in a folder as a sequence of its name, but for those that are there; give
-    what was done."""
+    """Import each capture in a folder that is not there yet; yield its name and what was done."""
     for path in sorted(Path(folder).iterdir()):
         name = path.stem if path.is_file() else path.name
         if not path.name.startswith(".") and not is_imported(Path(root) / category / name):
@@ -101,11 +100,11 @@ def import_captures(
 
 
 class LazyFrames(Sequence[Frame]):
-    """Frames that are loaded at each access, because those of a capture do not fit into memory
-    together."""
+    """Frames that are loaded at each access: those of a capture do not fit into memory together."""
 
     def __init__(self, load: Callable[[int], Frame], indices: Sequence[int]):
-        self._load, self._indices = load, indices
+        self._load = load
+        self._indices = indices
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -117,14 +116,16 @@ class LazyFrames(Sequence[Frame]):
 def fuse(
     frames: Collection[Frame],
 ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Fuse the depth inside the masks by TSDF (Curless and Levoy 1996) to world points, RGB colours
-    and normals."""
+    """Fuse the depth inside the masks (Curless and Levoy 1996) to points, colours and normals."""
     o3d = load_open3d()
     voxel = 3 * _spread(frames) / _VOXELS
-    types, shapes = (o3d.core.float32,) * 3, ((1,), (1,), (3,))
+    # Three values per voxel, in blocks of 16 x 16 x 16; at first, there is space for 2000 blocks.
+    types = (o3d.core.float32,) * 3
     volume = o3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight", "color"), types, shapes, voxel, 16, 2000
+        ("tsdf", "weight", "color"), types, ((1,), (1,), (3,)), voxel, 16, 2000
     )
+
+    # The distance to the measured surface, averaged over the frames.
     for frame in frames:
         depth = np.where(object_pixels(frame), frame.depth, 0).astype(np.float32)
         if not depth.any():
@@ -140,6 +141,8 @@ def fuse(
         colour = o3d.t.geometry.Image(frame.rgb.astype(np.float32) / 255)
         blocks = volume.compute_unique_block_coordinates(depth, intrinsic, extrinsic, **options)
         volume.integrate(blocks, depth, colour, intrinsic, intrinsic, extrinsic, **options)
+
+    # The points where it is 0, without outliers.
     weight = min(MIN_VIEWS, len(frames)) - 0.5  # Open3D keeps voxels of a greater weight
     cloud = volume.extract_point_cloud(weight_threshold=weight).to_legacy()
     cloud, _ = cloud.remove_statistical_outlier(nb_neighbors=20, std_ratio=2.5)
@@ -161,8 +164,7 @@ def scale_frame(frame: Frame, scale: float) -> Frame:
 
 
 def _spread(frames: Collection[Frame]) -> float:
-    """Estimate the object's standard deviation, averaged over the axes, by the median absolute
-    deviation."""
+    """Estimate the object's mean standard deviation by the median absolute deviation."""
     clouds = []
     for frame in frames:
         step = max(_LEAST_STEP, sampling_step(frame, len(frames)))

@@ -1,5 +1,4 @@
-"""Pictures, depth maps and masks as cameras, apps and labelling tools write them, and what speaks
-against intrinsics.
+"""Pictures, depth maps and masks of cameras, apps and labelling tools; doubts about intrinsics.
 
 A photograph's EXIF orientation says how viewers turn and mirror the stored pixels. Its depth, its
 mask and its camera may refer to the pixels as stored or as displayed.
@@ -43,13 +42,16 @@ _DAMAGED = (
     cv2.error,
     Image.DecompressionBombError,
 )
-# By EXIF orientation: the number of quarter turns, as in `numpy.rot90`, before an image is mirrored
-# left to right.
-_QUARTERS = dict(enumerate((0, 0, 2, 2, 3, 3, 1, 1), 1))
+# By EXIF orientation, 1 to 8: the number of quarter turns, as in `numpy.rot90`, and whether the
+# image is mirrored left to right after that.
+_QUARTERS = {1: 0, 2: 0, 3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
 _MIRRORED = (2, 4, 5, 7)
 _LOSSY = (".jpg", ".jpeg", ".webp")
-_MOST_LABELS, _LARGEST_LABEL, _VOID = 32, 50, 255
-_LEAST_VIEW, _LARGEST_VIEW = 10.0, 120.0  # field of view of a camera, degrees
+_MOST_LABELS = 32  # a mask with more values has probabilities
+_LARGEST_LABEL = 50  # so has one with a greater value
+_VOID = 255  # label of pixels that belong to nothing, as in PASCAL VOC
+_LEAST_VIEW = 10.0  # field of view of a camera, degrees
+_LARGEST_VIEW = 120.0
 _LARGEST_SENSOR = 60  # millimetres
 _UNEQUAL = 1.3  # ratio of the focal lengths
 _OFF_MIDDLE = 0.3  # distance of the principal point from the middle, relative to half of the side
@@ -74,8 +76,10 @@ def picture_size(path: str | Path) -> tuple[int, int]:
 
 
 def read_depth_file(path: str | Path) -> Float32[np.ndarray, "h w"]:
-    """Read the stored values of a depth map, 0 where unknown: not finite, not positive, or 65535 in
-    16 bits."""
+    """Read the stored values of a depth map, 0 where unknown.
+
+    Unknown is what is not finite, not positive, or 65535 in 16 bits.
+    """
     path = Path(path)
     if path.name.endswith(CO3D_DEPTH):
         return read_depth(path)
@@ -110,26 +114,25 @@ def read_mask_file(path: str | Path, label: int | None = None) -> Float32[np.nda
     Other values are probabilities, above half of the largest for JPEG and WebP, which blur two
     values to many.
     """
-    values, indexed = _mask_values(Path(path))
-    found, integers = np.unique(values), values.dtype.kind in "iu"
+    values, has_labels = _mask_values(Path(path))
+    levels = np.unique(values)  # sorted
+    integers = values.dtype.kind in "iu"
     lossy = Path(path).suffix.lower() in _LOSSY
-    labels = found[(found > 0) & (found != _VOID)]
-    few = (
-        integers
-        and not lossy
-        and len(found) <= _MOST_LABELS
-        and max(labels, default=0) <= _LARGEST_LABEL
-    )
+    labels = levels[(levels > 0) & (levels != _VOID)]
+    if integers and len(levels) <= _MOST_LABELS and max(labels, default=0) <= _LARGEST_LABEL:
+        has_labels = True
+
     if label is not None:
         mask = values == label
-    elif len(found) <= 2:
-        mask = (values == found[-1]) & (values > 0)
+    elif len(levels) <= 2:
+        mask = (values == levels[-1]) & (values > 0)
     elif lossy:
-        mask = values > found[-1] / 2
-    elif not (indexed or few):
-        mask = values / (
-            max(1.0, found[-1]) if not integers else 65535 if values.dtype == np.uint16 else 255
-        )
+        mask = values > levels[-1] / 2
+    elif not has_labels:
+        certain = max(1.0, levels[-1])  # the value for a probability of 1
+        if integers:
+            certain = 65535 if values.dtype == np.uint16 else 255
+        mask = values / certain
     elif len(labels) == 1:
         mask = values == labels[0]
     else:
@@ -141,8 +144,7 @@ def read_mask_file(path: str | Path, label: int | None = None) -> Float32[np.nda
 
 
 def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
-    """Read the values of a mask file, and whether they are numbers of colours: of a palette, or of
-    a few colours."""
+    """Read the values of a mask file, and whether they are numbers of colours."""
     values = _read_values(path, "mask")
     if path.suffix.lower() == ".png":
         with _decoding("mask", path):
@@ -150,13 +152,14 @@ def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
             if file.mode == "P" and np.ptp(np.array(file.convert("RGB")), axis=2).any():
                 return np.array(file), True
     if values.ndim == 3 and values.shape[2] in (1, 3, 4):
-        colours, alpha = values[..., :3], values[..., 3:]
-        if alpha.size and np.ptp(alpha):
+        colours = values[..., :3]
+        alpha = values[..., 3:]
+        if alpha.size and np.ptp(alpha):  # a picture that is cut out
             return alpha[..., 0], False
         if path.suffix.lower() not in _LOSSY and (colours != colours[..., :1]).any():
-            kinds, numbers = np.unique(
-                colours @ np.array([1 << 32, 1 << 16, 1]), return_inverse=True
-            )
+            # Three channels of up to 16 bits as one number.
+            codes = colours @ np.array([1 << 32, 1 << 16, 1])
+            kinds, numbers = np.unique(codes, return_inverse=True)
             if len(kinds) <= _MOST_LABELS:
                 return numbers.reshape(colours.shape[:2]), True
         values = colours.max(axis=2)
@@ -170,7 +173,8 @@ def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
 
 def _read_values(path: Path, what: str) -> Shaped[np.ndarray, "..."]:
     """Read the values of an array or image file as stored."""
-    suffix, data = path.suffix.lower(), read_bytes(path, what)
+    suffix = path.suffix.lower()
+    data = read_bytes(path, what)
     with _decoding(what, path):
         if suffix in (".npy", ".npz"):
             values = np.load(io.BytesIO(data), allow_pickle=False)
@@ -181,9 +185,8 @@ def _read_values(path: Path, what: str) -> Shaped[np.ndarray, "..."]:
                     )
                 (member,) = values.zip.infolist()
                 values = values[values.files[0]] if member.file_size <= MAX_FILE else None
-        elif (
-            suffix == ".exr"
-        ):  # None, or an error where the variable OPENCV_IO_ENABLE_OPENEXR is not set
+        elif suffix == ".exr":
+            # None, or an error where the variable OPENCV_IO_ENABLE_OPENEXR is not set.
             values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         elif suffix in (".tif", ".tiff", ".pfm", ".webp"):
             values = np.array(_open(path, what, ("TIFF", "PPM", "WEBP")))
@@ -224,8 +227,10 @@ def _decoding(what: str, path: str | Path) -> Iterator[None]:
 def lies_as_stored(
     stored: Sequence[int], orientation: int, form: str | None, path: Path, size: Sequence[int]
 ) -> bool:
-    """Tell by its size whether an image of a photograph lies as the stored pixels, or as displayed;
-    else by `form`."""
+    """Tell whether an image lies as a photograph's stored pixels, or as displayed.
+
+    Its size tells where the orientation exchanges the sides, and `form` otherwise.
+    """
     if orientation == 1:
         return True
     if orientation > 4 and stored[0] != stored[1]:
@@ -246,8 +251,10 @@ def display_image(image: Shaped[np.ndarray, "..."], orientation: int) -> Shaped[
 
 
 def display_camera(camera: Camera, orientation: int, where: str, posed: bool) -> Camera:
-    """Turn the camera of a stored image with it; one without a pose stays upright, and may be
-    mirrored."""
+    """Turn the camera of a stored image with it.
+
+    One without a pose stays upright, and may be mirrored.
+    """
     turned = camera.turn(_QUARTERS[orientation])
     if posed and orientation in _MIRRORED:
         raise InputError(
@@ -261,46 +268,54 @@ def display_camera(camera: Camera, orientation: int, where: str, posed: bool) ->
 
 
 def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
-    """Say what speaks against the intrinsics of an image; InputError for a field of view that no
-    camera has.
+    """Say what speaks against the intrinsics of an image.
 
-    The principal point of an image is near its middle, unless it is a crop of a larger one.
+    InputError for a field of view that no camera has.
     """
     side = np.array(camera.size[::-1], float)
     values = np.concatenate([camera.focal_length, camera.principal_point])
-    focal, centre = values[:2], values[2:]
-    ratios = 2 * centre / side  # of the image that the intrinsics fit to this one
-    doubts = [f"the intrinsics {_listed(values)}"]
-    if max(*centre, *focal / 5) <= 1:
-        doubts.append(
-            f"look normalised: for this image they would be {_listed(values * np.tile(side, 2))}"
-        )
-    elif (
-        min(ratios) > 0
-        and np.ptp(ratios) < 0.05 * ratios.mean()
-        and abs(ratios.mean() - 1) > _OFF_MIDDLE
-    ):
-        fitted_to = "an image" if max(2 * centre) > _LARGEST_SENSOR else "a sensor in millimetres"
-        wide, high = 2 * centre
-        fitted = (
-            f"fit {fitted_to} of {wide:.4g} x {high:.4g}, not {side[0]:.0f} x {side[1]:.0f} pixels"
-        )
-        doubts.append(f"{fitted}: for this image they would be {_listed(values / ratios.mean())}")
-    elif np.abs(ratios - 1).max() > _OFF_MIDDLE:
-        doubts.append("have their principal point far from the middle, as those of a crop")
-    elif focal.max() > _UNEQUAL * focal.min():
-        doubts.append("have unequal focal lengths")
-    # Size of the smallest image around this one with its centre there.
+    focal = camera.focal_length
+    centre = camera.principal_point
+    subject = f"the intrinsics {_listed(values)}"
+    doubt = _doubt(values, side)
+    # The field of view of the smallest image around this one with its centre at that point.
     whole = 2 * np.maximum(centre, side - centre)
     view = np.degrees(2 * np.arctan(whole / focal / 2)).max()
     if not _LEAST_VIEW <= view <= _LARGEST_VIEW:
-        found = (
-            f"have a field of view of {view:.3g} degrees, expected {_LEAST_VIEW:g} to "
-            f"{_LARGEST_VIEW:g}"
+        also = f"{doubt}; they " if doubt else ""
+        raise InputError(
+            f"{where}: {subject} {also}have a field of view of {view:.3g} degrees, expected "
+            f"{_LEAST_VIEW:g} to {_LARGEST_VIEW:g}"
         )
-        raise InputError(f"{where}: {' '.join(doubts)}{'; they' if doubts[1:] else ''} {found}")
-    return (" ".join(doubts),) if len(doubts) > 1 else ()
+    return (f"{subject} {doubt}",) if doubt else ()
+
+
+def _doubt(values: Float[np.ndarray, "4"], side: Float[np.ndarray, "2"]) -> str:
+    """Say what is unusual about intrinsics of an image of (width, height) pixels, or return ""."""
+    focal = values[:2]
+    centre = values[2:]
+    # Focal lengths below 5 and a principal point below 1 are no pixels.
+    if max(*centre, *focal / 5) <= 1:
+        return f"look normalised: for this image they would be {_listed(values * np.tile(side, 2))}"
+    # The principal point is near the middle of the image that the intrinsics fit, unless that is a
+    # crop of a larger one: the ratios of its sides to this image's.
+    ratios = 2 * centre / side
+    ratio = ratios.mean()
+    alike = min(ratios) > 0 and np.ptp(ratios) < 0.05 * ratio
+    if alike and abs(ratio - 1) > _OFF_MIDDLE:
+        fitted_to = "an image" if max(2 * centre) > _LARGEST_SENSOR else "a sensor in millimetres"
+        wide, high = 2 * centre
+        return (
+            f"fit {fitted_to} of {wide:.4g} x {high:.4g}, not {side[0]:.0f} x {side[1]:.0f} pixels:"
+            f" for this image they would be {_listed(values / ratio)}"
+        )
+    if np.abs(ratios - 1).max() > _OFF_MIDDLE:
+        return "have their principal point far from the middle, as those of a crop"
+    if focal.max() > _UNEQUAL * focal.min():
+        return "have unequal focal lengths"
+    return ""
 
 
 def _listed(values: Float[np.ndarray, " n"]) -> str:
+    """Write numbers as an option of the command line."""
     return ",".join(f"{value:.4g}" for value in values)

@@ -9,15 +9,14 @@ from scipy.spatial import cKDTree
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import Makers, make_frame, read_numbers, read_text_lines
 
-# The benchmark's default, with pixel centres at half-integers
+# The benchmark's default, with pixel centres at half-integers.
 _TUM_INTRINSICS = (525.0, 525.0, 320.0, 240.0)
-# Metres per stored depth value; seconds between an image and its depth
-_TUM_UNIT, _TUM_TOLERANCE = 1 / 5000, 0.02
+_TUM_UNIT = 1 / 5000  # metres per stored depth value
+_TUM_TOLERANCE = 0.02  # seconds between an image and its depth
 
 
 def read_lists(folder: Path) -> Makers:
-    """Read a capture given as plain text lists, of which line n describes frame n (see `zsp-lite
-    data import -h`)."""
+    """Read text lists, of which line n describes frame n (see `zsp-lite data import -h`)."""
     images = read_text_lines(folder / "rgb.txt")
     depths = read_text_lines(folder / "depth.txt")
     poses = read_numbers(folder / "poses.txt", (12, 16))
@@ -41,10 +40,10 @@ def read_lists(folder: Path) -> Makers:
 def read_tum(
     folder: Path, intrinsics: tuple[float, float, float, float] = _TUM_INTRINSICS
 ) -> Makers:
-    """Read a sequence of TUM's RGB-D benchmark: image, depth and pose of the nearest times are a
-    frame."""
+    """Read a sequence of TUM's RGB-D benchmark; what has the nearest times is a frame."""
     poses = read_numbers(folder / "groundtruth.txt", (8,))
-    image_list, depth_list = folder / "rgb.txt", folder / "depth.txt"
+    image_list = folder / "rgb.txt"
+    depth_list = folder / "depth.txt"
     times = read_numbers(image_list, (1,), usecols=0)[:, 0]
     depth_times = read_numbers(depth_list, (1,), usecols=0)[:, 0]
     images = [line.split(maxsplit=1)[-1] for line in read_text_lines(image_list)]
@@ -53,17 +52,23 @@ def read_tum(
         times, images, _nearest(depth_times, times), _nearest(poses[:, 0], times)
     ):
         if min(depth, pose) >= 0:
-            files, where = (image, depths[depth]), f"{folder}, time {time:.6f}"
             yield partial(
-                make_frame, folder, *files, poses[pose, 1:], intrinsics, where, depth_unit=_TUM_UNIT
+                make_frame,
+                folder,
+                image,
+                depths[depth],
+                poses[pose, 1:],
+                intrinsics,
+                f"{folder}, time {time:.6f}",
+                depth_unit=_TUM_UNIT,
             )
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> list[int]:
-    """Return the position of the time that is nearest to each wanted one, -1 if none is within the
-    tolerance."""
+    """Return the position of the time nearest to each wanted one, -1 beyond the tolerance."""
+    # Times that are no numbers are near to none: -1 and -9 seconds.
     tree = cKDTree(np.nan_to_num(times, nan=-1)[:, None])
-    gaps, found = tree.query(
+    gaps, nearest = tree.query(
         np.nan_to_num(wanted, nan=-9)[:, None], distance_upper_bound=_TUM_TOLERANCE
     )
-    return np.where(np.isfinite(gaps), found, -1).tolist()
+    return np.where(np.isfinite(gaps), nearest, -1).tolist()

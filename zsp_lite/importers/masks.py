@@ -1,5 +1,4 @@
-"""Object masks of a capture: by colours from one bounding box (GrabCut), or by depth; and flags of
-doubtful masks.
+"""Object masks of a capture: by colours from a box (GrabCut), or by depth; flags of doubtful ones.
 
 By depth, the plane of the table or floor is fitted to the points of all frames. What is above it
 falls into connected parts; the object is the part at the point that the optical axes approach.
@@ -9,7 +8,6 @@ Where depth is unknown, colours decide.
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import chain
 
 import cv2
@@ -28,11 +26,10 @@ _ITERATIONS = 4  # of GrabCut
 _LONGEST_SIDE = 320  # pixels of an image in GrabCut, whose time is proportional to the area
 _PADDING = 0.1  # of the projected bounding box, relative to its longer side
 _SMALLEST_BOX = 4  # pixels
-# distance of the ball's centre behind the visible surface, relative to its radius
+# Distance of the ball's centre behind the visible surface, relative to its radius.
 _BALL_OFFSET = 0.6
-_POINTS = 4000
-# By depth: all lengths are relative to the distance of the cameras from the point that they look
-# at.
+_POINTS = 4000  # on the object that are projected
+# By depth. All lengths are relative to the distance of the cameras from the point they look at.
 _REACH = 0.7  # points farther from that point are not part of the object
 _PLANE_DISTANCE = 0.01  # largest distance of a point of the plane
 _CLEARANCE = 0.02  # smallest height of a point of the object above the plane
@@ -40,18 +37,23 @@ _VOXEL = 0.07  # parts that are farther apart than this are separate
 _PLANES = 3  # planes to try: the largest may be a wall or a side of the object
 _MAX_BELOW = 0.05  # share of the points that may lie below the supporting plane
 _MIN_ON_PLANE = 0.05  # share of the points that must lie on it
-# least deviation of the points on it, relative to that of the others: sides of objects are smaller
+# Least deviation of the points on it, relative to that of the others: sides of objects are smaller.
 _MIN_SPREAD = 0.7
 # Two objects are alike if the ratios of their points, which count less far from the focus, and of
-# their extents exceed these values. Gaps between them may be smaller than `_VOXEL` by this factor,
-# if there are so many views: an object that hides parts of itself has gaps in a few views.
-_COMPARABLE, _ALIKE, _FINER, _MANY = 0.5, 0.7, 4, 8
-_CLOUD_POINTS = 20_000
-_MIN_PIXELS = 100
+# their extents exceed these values.
+_COMPARABLE = 0.5
+_ALIKE = 0.7
+# With so many views, gaps between them may be smaller than `_VOXEL` by this factor: in fewer views,
+# an object that hides parts of itself has gaps.
+_MANY = 8
+_FINER = 4
+_CLOUD_POINTS = 20_000  # at most that a plane is fitted to
+_MIN_PIXELS = 100  # of a mask, and points of a plane
 # The bounding box of the object in known depth grows by these shares of its sides, half of it on
 # each side: pixels of unknown depth inside the first box may be on the object, and the colours of
 # the background are those in the second.
-_UNKNOWN_PADDING, _CONTEXT_PADDING = 0.1, 0.8
+_UNKNOWN_PADDING = 0.1
+_CONTEXT_PADDING = 0.8
 # A mask is flagged beyond these values, which were chosen on renderings.
 _BORDERS = 2  # number of the image's borders that a mask may not touch at once
 _MOST = 0.5  # share of the image
@@ -59,20 +61,20 @@ _PARTS = 0.25  # share of the mask outside its largest region
 _COLOUR_IOU = 0.5  # least overlap with the mask that GrabCut finds in the padded bounding box
 _LEAST_SIGNS = 0.5  # per frame, below which masks are not flagged
 _LYING = 0.5  # share of the object's points that may lie in the plane around it
-# Shares of the object's points in and above one plane, such as a table's
-_CARRYING, _CARRIED = 0.4, 0.05
+# Shares of the object's points in and above one plane, such as a table's.
+_CARRYING = 0.4
+_CARRIED = 0.05
 
-PLAUSIBLE = 0.05, 20.0  # distance of an object, metres
+PLAUSIBLE = (0.05, 20.0)  # distance of an object, metres
 _LEAST_KNOWN = 0.4  # share of the pixels on the object
 DOUBTFUL = "the masks may be wrong"
 
-# Unit normal, to the side of the cameras, and offset: normal @ x = offset
+# Unit normal, to the side of the cameras, and offset: normal @ x = offset.
 Plane = tuple[Float[np.ndarray, "3"], float]
 
 
 def masks_from_box(frames: Iterable[Frame], box: Box) -> Iterator[Frame]:
-    """Segment the object in the frames of a capture, given its box (top, left, height, width) in
-    the first one.
+    """Segment the object in frames, given its box (top, left, height, width) in the first one.
 
     OpenCV's GrabCut (Rother, Kolmogorov and Blake 2004) separates the colours inside and outside of
     a box. The box of a further frame is the projection of the object points of the frames before it
@@ -89,6 +91,7 @@ def masks_from_box(frames: Iterable[Frame], box: Box) -> Iterator[Frame]:
         raise InputError(
             f"box (top, left, height, width) is {tuple(box)}, expected one inside {(height, width)}"
         )
+
     first = replace(first, mask=grab_cut(first.rgb, box))
     points = _inner_points(first)
     if not len(points):
@@ -96,6 +99,8 @@ def masks_from_box(frames: Iterable[Frame], box: Box) -> Iterator[Frame]:
             f"frame {first.name}: no object with known depth in the box {tuple(box)}, "
             "expected another"
         )
+
+    # Points of a ball behind the visible surface, as wide as the box.
     depth = float(np.median(first.depth[object_pixels(first)]))
     radius = depth * (np.array([box_width, box_height]) / first.camera.focal_length).max() / 2
     middle = np.array([left + box_width / 2, top + box_height / 2])
@@ -108,21 +113,21 @@ def masks_from_box(frames: Iterable[Frame], box: Box) -> Iterator[Frame]:
 def _masks_from_points(
     frames: Iterator[Frame], points: Float[np.ndarray, "n 3"], ball: Float[np.ndarray, "m 3"]
 ) -> Iterator[Frame]:
-    """Segment the object in frames, given world points on it and those of a ball that stands for
-    the rest."""
+    """Segment the object in frames, given world points on it and on the ball."""
     for frame in frames:
-        found = _project_box(frame, np.concatenate([points, ball]))
-        seen = min(found[2:]) >= _SMALLEST_BOX and not frame_defect(replace(frame, mask=None))
-        mask = grab_cut(frame.rgb, found) if seen else np.zeros(frame.camera.size, np.float32)
+        box = _project_box(frame, np.concatenate([points, ball]))
+        mask = np.zeros(frame.camera.size, np.float32)
+        if min(box[2:]) >= _SMALLEST_BOX and not frame_defect(replace(frame, mask=None)):
+            mask = grab_cut(frame.rgb, box)
         masked = replace(frame, mask=mask)
+        # Evenly spaced ones of all points that are known, at most `_POINTS`.
         points = np.concatenate([points, _inner_points(masked)])
         points = points[np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(int)]
         yield masked
 
 
 def grab_cut(rgb: UInt8[np.ndarray, "h w 3"], box: Box) -> Float[np.ndarray, "h w"]:
-    """Return the mask of the largest region in a box (top, left, height, width) with other colours
-    than around it."""
+    """Return the mask of the largest region in a box that has other colours than around it."""
     top, left, height, width = box
     inside = np.zeros(rgb.shape[:2], bool)
     inside[top : top + height, left : left + width] = True
@@ -134,37 +139,35 @@ def separate_colours(
     possible: Bool[np.ndarray, "h w"],
     certain: Bool[np.ndarray, "h w"] | bool = False,
 ) -> Bool[np.ndarray, "h w"]:
-    """Select the foreground by GrabCut on the image or a smaller copy:
-
-    `certain` pixels, and some `possible` ones.
-    """
+    """Select the foreground, `certain` pixels and some `possible` ones, by GrabCut."""
     height, width = possible.shape
-    labels = np.where(certain, cv2.GC_FGD, np.where(possible, cv2.GC_PR_FGD, cv2.GC_BGD)).astype(
-        np.uint8
-    )
+    labels = np.where(possible, cv2.GC_PR_FGD, cv2.GC_BGD)
+    labels = np.where(certain, cv2.GC_FGD, labels).astype(np.uint8)
+    # On a smaller copy of a large image.
     shrink = max(1, max(height, width) / _LONGEST_SIDE)
-    size = max(1, round(width / shrink)), max(1, round(height / shrink))
+    size = (max(1, round(width / shrink)), max(1, round(height / shrink)))
     bgr = cv2.resize(rgb[..., ::-1], size, interpolation=cv2.INTER_AREA)
     small = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT)
     foreground = (cv2.GC_FGD, cv2.GC_PR_FGD)
     if 0 < np.isin(small, foreground).mean() < 1:  # GrabCut needs pixels of both kinds
         cv2.setRNGSeed(0)  # GrabCut initialises its clusters at random
-        models = np.zeros((1, 65)), np.zeros((1, 65))
-        cv2.grabCut(bgr, small, None, *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
-    found = np.isin(small, foreground).astype(np.float32)
-    return cv2.resize(found, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+        # Five Gaussians of 13 numbers each, for GrabCut's use.
+        background_model = np.zeros((1, 65))
+        model = np.zeros((1, 65))
+        cv2.grabCut(bgr, small, None, background_model, model, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    selected = np.isin(small, foreground).astype(np.float32)
+    return cv2.resize(selected, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
 
 
 def _inner_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
-    """World points inside the mask, without its border, where depth may be that of the
-    background."""
+    """Return world points inside the mask, without its border."""
+    # At the border, depth may be that of the background.
     inner = replace(frame, mask=cv2.erode(frame.mask, np.ones((5, 5), np.uint8)))
     return world_points(inner, object_pixels(inner))
 
 
 def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box:
-    """Compute the padded bounding box of projected world points, of size 0 if they are not in the
-    image."""
+    """Compute the padded bounding box of projected world points, of size 0 if none is in front."""
     height, width = frame.camera.size
     pixels, depth = frame.camera.project(points)
     pixels = pixels[depth > 0]
@@ -178,25 +181,34 @@ def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box:
 
 
 def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
-    """Segment the object in frames of one world; InputError if nothing, or two alike, stand where
-    the cameras look."""
+    """Segment the object in frames of one world, where the cameras look.
+
+    InputError if nothing stands there, or two alike.
+    """
     if not any((frame.depth > 0).any() for frame in frames):
         raise InputError(
             f"no depth is known in any of {len(frames)} frames, expected some to find the object"
         )
+
+    # The pixels of known depth near the focus, of each frame, and some of their points.
     focus, distance = _focus(frames)
-    pixels, sample = [], []
+    pixels = []
+    sample = []
     for frame in frames:
         near = frame.depth > 0
         near[near] = _within(world_points(frame, near), focus, distance)
         pixels.append(near)
         sample.append(world_points(frame, near, sampling_step(frame, len(frames))))
-    plane = _supporting_plane(
-        [frame.camera.centre for frame in frames], np.concatenate(sample), distance
-    )
+
+    # Of these, the ones above the plane that the object stands on.
+    centres = [frame.camera.centre for frame in frames]
+    plane = _supporting_plane(centres, np.concatenate(sample), distance)
     if plane is not None:
+        normal, offset = plane
         for frame, near in zip(frames, pixels, strict=True):
-            near[near] = world_points(frame, near) @ plane[0] - plane[1] > _CLEARANCE * distance
+            near[near] = world_points(frame, near) @ normal - offset > _CLEARANCE * distance
+
+    # Of these, the ones that are connected where the cameras look.
     parts = _part_at(focus, frames, pixels, _VOXEL * distance)
     if len(frames) >= _MANY:
         # This refuses a part that is two objects close together.
@@ -214,66 +226,75 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
 
 
 def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
-    """Say in one line what speaks against the masks of frames of one world; frames with a defect do
-    not count."""
+    """Say in one line what speaks against the masks of frames of one world.
+
+    Frames with a defect do not count.
+    """
     plane, distance = _plane_around(frames)
-    usable, found = 0, Counter()
+    usable = 0
+    counts = Counter()
     for frame in frames:
         if not frame_defect(frame):
             usable += 1
-            found.update(_signs(frame, plane, distance))
-    if found.total() < _LEAST_SIGNS * usable:
+            counts.update(_signs(frame, plane, distance))
+    if counts.total() < _LEAST_SIGNS * usable:
         return ()
-    signs = [f"{sign} ({count} of {usable} frames)" for sign, count in found.items()]
-    # Alone it is no reason: many objects fill the image, or stand on a dark turntable
+    signs = [f"{sign} ({count} of {usable} frames)" for sign, count in counts.items()]
+    # Alone it is no reason: many objects fill the image, or stand on a dark turntable.
     if signs and plane is None:
         signs.append("no plane is found that the object stands on")
     return (f"{DOUBTFUL}: {', '.join(signs)}",) if signs else ()
 
 
 def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
-    """Question the object's distance, if lengths are metres, and whether most of it has known
-    depth."""
-    distances, seen, known = [], 0, 0
+    """Question the object's distance, if lengths are `metric`, and how much of it has depth."""
+    distances = []
+    seen = 0  # pixels
+    known = 0
     for frame in frames:
         depth = frame.depth[object_pixels(frame)]
-        seen, known = seen + (frame.mask > ON_OBJECT).sum(), known + len(depth)
+        seen += (frame.mask > ON_OBJECT).sum()
+        known += len(depth)
         distances.append(np.quantile(depth, 0.25) if len(depth) else np.nan)
     distance = float(np.nanmedian(distances)) if known else PLAUSIBLE[0]
     if metric and not PLAUSIBLE[0] <= distance <= PLAUSIBLE[1]:
-        cure = "the unit of its depth is given by --depth-unit (0.001: millimetres, 1: metres)"
         yield (
             f"the object is {distance:.3g} m from the camera, expected {PLAUSIBLE[0]:g} to "
-            f"{PLAUSIBLE[1]:g} m; {cure}"
+            f"{PLAUSIBLE[1]:g} m; the unit of its depth is given by --depth-unit (0.001: "
+            "millimetres, 1: metres)"
         )
     if known < _LEAST_KNOWN * seen:
         yield f"depth is known on {known / seen:.0%} of the object only"
 
 
 def given_mask_flags(frames: Collection[Frame], missing: Collection[str]) -> tuple[str, ...]:
-    """Name the frames whose masks were made, and question masks that cover most of the image's
-    border."""
-    flags = [f"no mask is given for {', '.join(missing)}: found by depth"] if missing else []
-    masks = (frame.mask > ON_OBJECT for frame in frames)
-    borders = [
-        np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean() for mask in masks
-    ]
-    if count := sum(share > _MOST for share in borders):
+    """Name the frames whose masks were made, and question masks that cover most of a border."""
+    flags = []
+    if missing:
+        flags.append(f"no mask is given for {', '.join(missing)}: found by depth")
+    count = 0
+    for frame in frames:
+        mask = frame.mask > ON_OBJECT
+        border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+        count += border.mean() > _MOST
+    if count:
         flags.append(
-            f"{DOUBTFUL}: those of {count} of {len(borders)} frames cover most of the border: "
+            f"{DOUBTFUL}: those of {count} of {len(frames)} frames cover most of the border: "
             "inverted?"
         )
     return tuple(flags)
 
 
 def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:
-    """Fit the plane that an object stands on to points outside of its masks; return also the
-    cameras' distance."""
-    on_object, around, centres = [], [], []
+    """Fit the plane that an object stands on, outside of its masks; also return the distance."""
+    on_object = []
+    around = []
+    centres = []
     for frame in frames:
         if frame_defect(frame):
             continue
-        known, mask = frame.depth > 0, frame.mask > ON_OBJECT
+        known = frame.depth > 0
+        mask = frame.mask > ON_OBJECT
         widened = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         step = sampling_step(frame, len(frames))
         on_object.append(world_points(frame, known & mask, step))
@@ -281,9 +302,11 @@ def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:
         centres.append(frame.camera.centre)
     if not centres:
         return None, 0.0
-    centre, cloud = np.median(np.concatenate(on_object), axis=0), np.concatenate(around)
+    centre = np.median(np.concatenate(on_object), axis=0)
     distance = float(np.linalg.norm(centres - centre, axis=1).mean())
-    return _supporting_plane(centres, cloud[_within(cloud, centre, distance)], distance), distance
+    cloud = np.concatenate(around)
+    cloud = cloud[_within(cloud, centre, distance)]
+    return _supporting_plane(centres, cloud, distance), distance
 
 
 def _within(
@@ -296,18 +319,21 @@ def _within(
 def _supporting_plane(
     centres: Sequence[Float[np.ndarray, "3"]], cloud: Float[np.ndarray, "n 3"], distance: float
 ) -> Plane | None:
-    """Fit the plane that an object stands on to the points around it, below the cameras; None if
-    there is none."""
-    cloud = cloud[:: max(1, -(-len(cloud) // _CLOUD_POINTS))]
+    """Fit the plane that an object stands on to the points around it; None if there is none."""
+    cloud = cloud[:: max(1, -(-len(cloud) // _CLOUD_POINTS))]  # a step rounded up
+    tolerance = _PLANE_DISTANCE * distance
     rest = cloud
     for _ in range(_PLANES):
         if len(rest) < _MIN_PIXELS:
             break
-        normal, offset = fit_plane(rest, _PLANE_DISTANCE * distance)
+        normal, offset = fit_plane(rest, tolerance)
+        # The cameras are above it.
         if np.median(np.stack(centres) @ normal - offset) < 0:
             normal, offset = -normal, -offset
+
+        # It is wide, has many points, and nearly none below.
         height = cloud @ normal - offset
-        on = np.abs(height) < _PLANE_DISTANCE * distance
+        on = np.abs(height) < tolerance
         below = (height < -3 * _PLANE_DISTANCE * distance).mean()
         spread = standard_deviation(cloud[on]) if on.any() else 0.0
         other_spread = 0.0 if on.all() else standard_deviation(cloud[~on])
@@ -317,15 +343,16 @@ def _supporting_plane(
             and below <= _MAX_BELOW
         ):
             return normal, offset
-        rest = rest[np.abs(rest @ normal - offset) >= _PLANE_DISTANCE * distance]
+        rest = rest[np.abs(rest @ normal - offset) >= tolerance]
     return None
 
 
 def _focus(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"], float]:
-    """Return the point nearest to the optical axes of the cameras, and their mean distance
-    from it."""
+    """Return the point nearest to the cameras' optical axes, and their mean distance from it."""
     centres = np.stack([frame.camera.centre for frame in frames])
     axes = np.stack([frame.camera.R[2] for frame in frames])
+    # Projections across the axes, (n, 3, 3): the sum of P (x - c) over the cameras is 0 for the
+    # point x.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     system = across.sum(axis=0) / len(frames)
     if np.linalg.eigvalsh(system)[0] > 0.01:  # the axes differ by several degrees
@@ -335,11 +362,13 @@ def _focus(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"], float]:
     # One camera, or parallel axes: the median of the nearest quarter of the points in the central
     # part of an image.
     first = next(k for k, frame in enumerate(frames) if (frame.depth > 0).any())
-    known, (height, width) = frames[first].depth > 0, frames[first].camera.size
+    known = frames[first].depth > 0
+    height, width = known.shape
     middle = np.zeros_like(known)
     middle[height // 3 : height - height // 3, width // 3 : width - width // 3] = True
     chosen = known & middle if (known & middle).any() else known
-    points, depth = world_points(frames[first], chosen), frames[first].depth[chosen]
+    points = world_points(frames[first], chosen)
+    depth = frames[first].depth[chosen]
     focus = np.median(points[depth <= np.quantile(depth, 0.25)], axis=0)
     return focus, float(np.linalg.norm(focus - centres[first]))
 
@@ -350,27 +379,29 @@ def _part_at(
     pixels: Sequence[np.ndarray],
     voxel: float,
 ) -> list[Bool[np.ndarray, "_ _"]]:
-    """Select the pixels in the connected part with the most points, which count less far from the
-    focus.
+    """Select the pixels in the connected part with the most points.
 
-    InputError if a second part is alike.
+    Points far from the focus count less. InputError if a second part is alike.
     """
-    # Clouds are large: they are computed twice, and not kept.
-    clouds = [partial(world_points, *one) for one in zip(frames, pixels, strict=True)]
+    # The box of all points. Clouds are large: they are computed twice, and not kept.
     corners = []
-    for make in clouds:
-        points = make()
+    for frame, selected in zip(frames, pixels, strict=True):
+        points = world_points(frame, selected)
         if len(points):
             corners += [points.min(axis=0), points.max(axis=0)]
     if not corners:
         return list(pixels)
-    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    low = np.min(corners, axis=0)
+    high = np.max(corners, axis=0)
 
     # Voxels with points, weighed by these, and the voxel of each pixel.
     shape = np.floor((high - low) / voxel).astype(int) + 1
-    weight, cells = np.zeros(shape.prod()), []
-    for points in (make() for make in clouds):
+    weight = np.zeros(shape.prod())
+    cells = []
+    for frame, selected in zip(frames, pixels):
+        points = world_points(frame, selected)
         indices = np.floor((points - low) / voxel).astype(int)
+        # The index of the voxel in the flattened grid.
         cells.append(np.ravel_multi_index(indices.T, shape).astype(np.int32))
         near = np.exp(-np.square(np.linalg.norm(points - focus, axis=1) / (8 * voxel)))
         weight += np.bincount(cells[-1], near, len(weight))
@@ -382,7 +413,7 @@ def _part_at(
     large = np.flatnonzero(sizes > _COMPARABLE * sizes[first])
     # Only a part of like extent may be the object, too: a far larger one is a table or a wall.
     extents = np.array(
-        [np.argwhere((part == one).reshape(shape)).std(axis=0).mean() for one in large]
+        [np.argwhere((part == number).reshape(shape)).std(axis=0).mean() for number in large]
     )
     likeness = extents / extents[large == first]
     if ((likeness > _ALIKE) & (likeness < 1 / _ALIKE)).sum() > 1:
@@ -391,16 +422,16 @@ def _part_at(
             "looks, expected --box TOP,LEFT,HEIGHT,WIDTH around one of them"
         )
 
+    # Of the selected pixels, those whose voxel is in it.
     chosen = part == first
-    selected = [some.copy() for some in pixels]
-    for mask, cell in zip(selected, cells, strict=True):
+    masks = [selected.copy() for selected in pixels]
+    for mask, cell in zip(masks, cells, strict=True):
         mask[mask] = chosen[cell]
-    return selected
+    return masks
 
 
 def _with_unknown(frame: Frame, mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Remove single pixels of a mask, and add the pixels of unknown depth around it that have the
-    object's colours."""
+    """Remove single pixels of a mask, and add those of unknown depth that have its colours."""
     mask = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     if mask.any():
         mask |= _colours_around(frame, mask > 0, certain=True) & (frame.depth == 0)
@@ -410,36 +441,37 @@ def _with_unknown(frame: Frame, mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarr
 def _colours_around(
     frame: Frame, mask: Bool[np.ndarray, "h w"], certain: bool
 ) -> Bool[np.ndarray, "h w"]:
-    """Separate the colours in the box of a mask by GrabCut; around a `certain` mask only pixels of
-    unknown depth."""
+    """Separate the colours in the box of a mask by GrabCut.
+
+    Around a `certain` mask, only pixels of unknown depth are possible.
+    """
     windows = []
     for padding in (_UNKNOWN_PADDING, _CONTEXT_PADDING):
         top, left, height, width = mask_to_bbox(mask.astype(np.uint8), padding=padding)
         windows.append(np.s_[top : top + height, left : left + width])
     inner, context = windows
-    possible, found = np.zeros_like(mask), np.zeros_like(mask)
-    possible[inner] = (frame.depth[inner] == 0) | (not certain)
-    found[context] = separate_colours(
+    possible = np.zeros_like(mask)
+    possible[inner] = frame.depth[inner] == 0 if certain else True
+    separated = np.zeros_like(mask)
+    separated[context] = separate_colours(
         frame.rgb[context], possible[context], mask[context] & certain
     )
-    return found
+    return separated
 
 
 def _signs(frame: Frame, plane: Plane | None, distance: float) -> Iterator[str]:
     """Name what speaks against the mask of a frame."""
     mask = frame.mask > ON_OBJECT
     width = max(mask.shape) // 100 + 1  # of the border, pixels
-    if (
-        sum(edge.any() for edge in (mask[:width], mask[-width:], mask[:, :width], mask[:, -width:]))
-        >= _BORDERS
-    ):
+    borders = (mask[:width], mask[-width:], mask[:, :width], mask[:, -width:])
+    if sum(border.any() for border in borders) >= _BORDERS:
         yield "several borders of the image are touched"
     if mask.mean() > _MOST:
         yield "most of the image is covered"
     if largest_region(mask).sum() < (1 - _PARTS) * mask.sum():
         yield "several separate parts"
-    found = largest_region(_colours_around(frame, mask, certain=False))
-    if (found & mask).sum() / (found | mask).sum() < _COLOUR_IOU:
+    by_colours = largest_region(_colours_around(frame, mask, certain=False))
+    if (by_colours & mask).sum() / (by_colours | mask).sum() < _COLOUR_IOU:
         yield "colours disagree"
     points = world_points(frame, mask & (frame.depth > 0))
     if plane is not None:
@@ -448,6 +480,7 @@ def _signs(frame: Frame, plane: Plane | None, distance: float) -> Iterator[str]:
             yield "much of it lies in the plane around it"
     own_plane = _supporting_plane([frame.camera.centre], points, distance)
     if own_plane is not None:
+        # In units of the tolerance of a plane.
         height = (points @ own_plane[0] - own_plane[1]) / (_PLANE_DISTANCE * distance)
         if (np.abs(height) < 1).mean() > _CARRYING and (height > 3).mean() > _CARRIED:
             yield "part of it is a surface that the rest stands on"

@@ -1,7 +1,4 @@
-"""nerfstudio's transforms.json and its relatives:
-
-Blender's synthetic scenes, NeRFCapture, instant-ngp.
-"""
+"""nerfstudio's transforms.json and its relatives: Blender's scenes, NeRFCapture, instant-ngp."""
 
 import math
 from functools import partial
@@ -85,23 +82,26 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
         found = f"{frame.camera_model!r} with k4 = {frame.k4:g}"
         expected = f"one of {', '.join(_MODELS)} with k4 = 0, or {_FISHEYE}"
         raise InputError(f"{where}: camera_model is {found}, expected {expected}")
+
+    # The size that the file gives, or that of the picture, which is read where it is there.
     image = find_inside(folder, frame.file_path) or folder / frame.file_path
-    found = picture_size(image) if image.is_file() or not (frame.h and frame.w) else None
-    height, width = (int(frame.h), int(frame.w)) if frame.h and frame.w else found
-    if not (frame.fl_x or frame.camera_angle_x):
-        raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
-    fx = frame.fl_x or width / 2 / math.tan(frame.camera_angle_x / 2)
-    fy = frame.fl_y or (
-        height / 2 / math.tan(frame.camera_angle_y / 2) if frame.camera_angle_y else fx
-    )
-    cx = width / 2 if frame.cx is None else frame.cx
-    cy = height / 2 if frame.cy is None else frame.cy
-    if found not in (None, (height, width)) and math.isclose(
-        height * found[1], width * found[0], rel_tol=0.01
+    size = None
+    if frame.h and frame.w:
+        size = (int(frame.h), int(frame.w))
+    own_size = picture_size(image) if image.is_file() or size is None else size
+    height, width = size or own_size
+    intrinsics = _intrinsics(frame, height, width, where)
+    # A smaller or larger copy of the picture whose camera the file gives.
+    own_height, own_width = own_size
+    if own_size != (height, width) and math.isclose(
+        height * own_width, width * own_height, rel_tol=0.01
     ):
-        fitted = ", ".join(f"{value * found[1] / width:.4g}" for value in (fx, fy, cx, cy))
-        expected = f"its own size {found[1]} x {found[0]} with the intrinsics {fitted}"
-        raise InputError(f"{where}: w and h of {image} are {width} x {height}, expected {expected}")
+        fitted = ", ".join(f"{value * own_width / width:.4g}" for value in intrinsics)
+        raise InputError(
+            f"{where}: w and h of {image} are {width} x {height}, expected its own size "
+            f"{own_width} x {own_height} with the intrinsics {fitted}"
+        )
+
     # OpenCV's order of the coefficients; its model has no r^8 term, k4.
     last = (frame.k3, frame.k4) if fisheye else (frame.p1, frame.p2, frame.k3)
     return make_frame(
@@ -109,7 +109,7 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
         frame.file_path,
         frame.depth_file_path or frame.depth_path,
         frame.transform_matrix,
-        (fx, fy, cx, cy),
+        intrinsics,
         where,
         FROM_OPENGL,
         (height, width),
@@ -118,3 +118,18 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
         depth_unit=frame.integer_depth_scale or frame.depth_unit_scale_factor,
         distortion=(frame.k1, frame.k2, *last),
     )
+
+
+def _intrinsics(frame: _Frame, height: int, width: int, where: str) -> list[float]:
+    """Return fx, fy, cx, cy of a frame; by default both focal lengths are equal."""
+    fx = frame.fl_x
+    fy = frame.fl_y
+    if not fx and not frame.camera_angle_x:
+        raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
+    if not fx:
+        fx = width / 2 / math.tan(frame.camera_angle_x / 2)
+    if not fy and frame.camera_angle_y:
+        fy = height / 2 / math.tan(frame.camera_angle_y / 2)
+    cx = width / 2 if frame.cx is None else frame.cx
+    cy = height / 2 if frame.cy is None else frame.cy
+    return [fx, fy or fx, cx, cy]

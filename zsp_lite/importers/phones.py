@@ -1,7 +1,4 @@
-"""Scans of phones as their apps export them, after the apps' documents:
-
-Stray Scanner, Polycam, Record3D.
-"""
+"""Scans of phones as apps export them, after their documents: Stray Scanner, Polycam, Record3D."""
 
 from functools import partial
 from pathlib import Path
@@ -31,14 +28,22 @@ def read_stray(folder: Path, count: int) -> Makers:
     rows = read_numbers(folder / "odometry.csv", (9,), delimiter=",", skiprows=1)
     K = read_numbers(folder / "camera_matrix.csv", (3,), delimiter=",")
     rows[:, 1] = np.nan_to_num(rows[:, 1], nan=-1)  # numbers of the video's frames
-    pictures, video, left_out = new_folder(), Video(folder / "rgb.mp4"), []
+    pictures = new_folder()
+    video = Video(folder / "rgb.mp4")
+    left_out = []
     for row, image in sharpest(list(rows), count, lambda row: video.frame(int(row[1])), left_out):
-        name, where = f"{row[1]:06.0f}.png", f"{folder}/odometry.csv, frame {row[1]:.0f}"
-        picture = (pictures / name).with_suffix(".jpg")
+        name = f"{row[1]:06.0f}"
+        picture = pictures / f"{name}.jpg"
         write_image(picture, image, 95)
-        files = picture, f"depth/{name}"
         yield partial(
-            make_frame, folder, *files, row[2:], K, where, confidence=f"confidence/{name}"
+            make_frame,
+            folder,
+            picture,
+            f"depth/{name}.png",
+            row[2:],
+            K,
+            f"{folder}/odometry.csv, frame {row[1]:.0f}",
+            confidence=f"confidence/{name}.png",
         )
     for problem in left_out:
         yield partial(refuse, problem)
@@ -47,23 +52,27 @@ def read_stray(folder: Path, count: int) -> Makers:
 def read_polycam(folder: Path) -> Makers:
     """Read Polycam's raw data: its corrected images and cameras, if they are there."""
     folder = folder / "keyframes"
-    prefix = (
-        "corrected_"
-        if all((folder / f"corrected_{one}").is_dir() for one in ("cameras", "images"))
-        else ""
-    )
+    prefix = ""
+    if (folder / "corrected_cameras").is_dir() and (folder / "corrected_images").is_dir():
+        prefix = "corrected_"
     for path in sorted((folder / f"{prefix}cameras").glob("*.json")):
         yield partial(_make_polycam, folder, path, f"{prefix}images/{path.stem}")
 
 
 def _make_polycam(folder: Path, path: Path, image: str) -> CaptureFrame:
+    """Make a frame of the file of its camera."""
     camera = read_json(path, dict[str, Any], "capture")
     pose = [camera.get(f"t_{row}{column}") for row in range(3) for column in range(4)]
     intrinsics = [camera.get(name) for name in ("fx", "fy", "cx", "cy")]
-    files = image, f"depth/{path.stem}"
-    confidence = f"confidence/{path.stem}"
     return make_frame(
-        folder, *files, pose, intrinsics, f"{path}", FROM_OPENGL, confidence=confidence
+        folder,
+        image,
+        f"depth/{path.stem}",
+        pose,
+        intrinsics,
+        f"{path}",
+        FROM_OPENGL,
+        confidence=f"confidence/{path.stem}",
     )
 
 
@@ -82,10 +91,12 @@ class _Record3D(msgspec.Struct):
 
 def read_record3d(folder: Path) -> Makers:
     """Read a scan of Record3D; its depth is decompressed to a temporary folder."""
-    scan, unpacked = read_json(folder / "metadata", _Record3D, "capture"), new_folder()
+    scan = read_json(folder / "metadata", _Record3D, "capture")
+    unpacked = new_folder()
     if not any(map(any, scan.poses)):
         found = f"all {len(scan.poses)} poses are zero: the tracking failed"
         raise InputError(f"{folder}/metadata: {found}, expected another scan")
+    # fx, fy, cx, cy of each frame, or of all.
     every = scan.perFrameIntrinsicCoeffs or [[scan.K[k] for k in (0, 4, 6, 7)]] * len(scan.poses)
     for number in range(len(scan.poses)):
         intrinsics = every[number] if number < len(every) else []
@@ -96,8 +107,10 @@ def _make_record3d(
     folder: Path, unpacked: Path, scan: _Record3D, intrinsics: list[float | None]
 ) -> CaptureFrame:
     """Decompress depth and confidence of a frame to files `unpacked`.npy and .png."""
-    name, pose = f"rgbd/{unpacked.name}", scan.poses[int(unpacked.name)]
-    depth, confidence = unpacked.with_suffix(".npy"), unpacked.with_suffix(".png")
+    name = f"rgbd/{unpacked.name}"
+    pose = scan.poses[int(unpacked.name)]
+    depth = unpacked.with_suffix(".npy")
+    confidence = unpacked.with_suffix(".png")
     np.save(depth, _decompressed(folder / f"{name}.depth", np.float32, scan))
     if (folder / f"{name}.conf").is_file():
         cv2.imwrite(str(confidence), _decompressed(folder / f"{name}.conf", np.uint8, scan))

@@ -27,7 +27,8 @@ def read_bop(folder: Path, object: int | None = None) -> Makers:
     """Read a scene in BOP's format, in the frame of one of its objects."""
     scene = read_json(folder / "scene_gt.json", dict[str, list[_Annotation]], "capture")
     cameras = read_json(folder / "scene_camera.json", dict[str, dict[str, Any]], "capture")
-    numbers = {image: [one.obj_id for one in placed] for image, placed in scene.items()}
+    # The objects of each image by their numbers.
+    numbers = {image: [pose.obj_id for pose in poses] for image, poses in scene.items()}
     known = sorted(set().union(*numbers.values()))
     if object is None and len(known) == 1:
         object = known[0]
@@ -36,33 +37,38 @@ def read_bop(folder: Path, object: int | None = None) -> Makers:
             f"{folder} has the objects {', '.join(map(str, known))}, expected one of them as "
             "--object N"
         )
-    for image, some in numbers.items():
-        if object in some and image in cameras:
+    for image, objects in numbers.items():
+        if object in objects and image in cameras:
             yield partial(_make_bop, folder, image, object, scene[image], cameras[image])
 
 
 def _make_bop(
     folder: Path, image: str, object: int, scene: list[_Annotation], camera: dict[str, Any]
 ) -> CaptureFrame:
-    """Make a frame of an object and a camera; pixel centres are at integers, lengths in
-    millimetres."""
-    where, name = f"{folder}, image {image}", f"{image:0>6}"
-    indices = [index for index, one in enumerate(scene) if one.obj_id == object]
+    """Make a frame of an object and a camera: pixel centres at integers, lengths in millimetres."""
+    where = f"{folder}, image {image}"
+    indices = [index for index, pose in enumerate(scene) if pose.obj_id == object]
     if len(indices) > 1:
         raise InputError(f"{where} shows object {object} {len(indices)} times, expected once")
-    index, placed = indices[0], scene[indices[0]]
+    placed = scene[indices[0]]
     R = real_array(f"{where}: cam_R_m2c", placed.cam_R_m2c, (9,))
     t = real_array(f"{where}: cam_t_m2c", placed.cam_t_m2c, (3,))
     K = real_array(f"{where}: cam_K", camera.get("cam_K"), (9,))
+    # Camera to object, the inverse of the file's.
     pose = np.column_stack([R.reshape(3, 3).T, -_MILLIMETRES * R.reshape(3, 3).T @ t])
-    unit = _MILLIMETRES * float(
-        real_array(f"{where}: depth_scale", camera.get("depth_scale", 1), ())
-    )
+    scale = real_array(f"{where}: depth_scale", camera.get("depth_scale", 1), ())
+    unit = _MILLIMETRES * float(scale)
     check_number(f"{where}: depth_scale", unit, above=0)
-    mask = f"mask_visib/{name}_{index:06d}"
-    files = f"rgb/{name}", f"depth/{name}"
+    name = f"{image:0>6}"
     return make_frame(
-        folder, *files, pose, K.reshape(3, 3) + HALF_PIXEL, where, mask=mask, depth_unit=unit
+        folder,
+        f"rgb/{name}",
+        f"depth/{name}",
+        pose,
+        K.reshape(3, 3) + HALF_PIXEL,
+        where,
+        mask=f"mask_visib/{name}_{indices[0]:06d}",
+        depth_unit=unit,
     )
 
 
@@ -74,6 +80,7 @@ def read_scannet(folder: Path) -> Makers:
 
 
 def _make_scannet(folder: Path, path: Path, K: Float[np.ndarray, "3 3"]) -> CaptureFrame:
+    """Make a frame of the file of its pose."""
     return make_frame(
         folder, f"color/{path.stem}", f"depth/{path.stem}", read_numbers(path, (4,)), K, str(path)
     )
@@ -81,20 +88,16 @@ def _make_scannet(folder: Path, path: Path, K: Float[np.ndarray, "3 3"]) -> Capt
 
 def read_open3d(folder: Path) -> Makers:
     """Read frames of Open3D's recorder, with the trajectory that its reconstruction writes."""
-    log = next(
-        (
-            one
-            for one in (folder / "trajectory.log", folder / "scene/trajectory.log")
-            if one.is_file()
-        ),
-        None,
-    )
-    if log is None:
+    log = folder / "trajectory.log"
+    if not log.is_file():
+        log = folder / "scene/trajectory.log"
+    if not log.is_file():
         raise InputError(
             f"{folder} has no trajectory.log, expected poses: run Open3D's reconstruction "
             "system on it"
         )
     camera = read_json(folder / "intrinsic.json", dict[str, Any], "capture")
+    # In column-major order.
     K = real_array(
         f"{folder}/intrinsic.json: intrinsic_matrix", camera.get("intrinsic_matrix"), (9,)
     )
@@ -103,18 +106,19 @@ def read_open3d(folder: Path) -> Makers:
         for path in (folder / "color").glob("*")
         if path.suffix.lower() in (".jpg", ".png")
     )
-    # Three frame numbers, and four lines of a matrix
+    # Of each image, a line of three frame numbers, of which the last is read twice, and four lines
+    # of a matrix.
     lines = read_numbers(log, (4,), usecols=(0, 1, 2, -1))
     if len(lines) != 5 * len(images):
         raise InputError(
             f"{log} has {len(lines)} lines, expected 5 for each of {len(images)} images"
         )
     for image, pose in zip(images, lines.reshape(-1, 5, 4)[:, 1:]):
-        files = f"color/{image}", f"depth/{image}"
         yield partial(
             make_frame,
             folder,
-            *files,
+            f"color/{image}",
+            f"depth/{image}",
             pose,
             K.reshape(3, 3).T + HALF_PIXEL,
             f"{log}, frame {image}",

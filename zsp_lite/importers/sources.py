@@ -1,5 +1,4 @@
-"""Sources of frames of one object: sequences of data folders, captures, images with depth, and
-frames in memory."""
+"""Sources of frames of one object: sequences of data folders, captures, images, and frames."""
 
 import os
 import reprlib
@@ -7,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,12 +37,13 @@ from zsp_lite.importers.masks import (
 # Options that each format takes; "open" is a source that is open already.
 _MASKED = ("mask", "box")
 _FILES = ("label", "orientation", "depth_unit")  # values of `CaptureFrame`
+_CAPTURE = (*_MASKED, *_FILES, "masks", "count")
 _TAKEN = {
     "open": (),
     "image": (*_MASKED, *_FILES, "intrinsics", "depth"),
     "sequence": _MASKED,
     "frames": _MASKED,
-    **{name: (*_MASKED, *_FILES, "masks", "count", *one.options) for name, one in FORMATS.items()},
+    **{name: (*_CAPTURE, *layout.options) for name, layout in FORMATS.items()},
 }
 _SWEEPS = 20  # over the chosen views, which mostly stay after ten
 _CONTEXT = 8  # frames of a source that are segmented together, or tried as the reference
@@ -54,25 +55,24 @@ class Source:
 
     path: Path  # the sequence, the capture or the image; a name for frames in memory
     format: str  # "sequence", "image", "frames", or the format of a capture
-    # Number of each frame: that of the annotations, or its position in the capture
+    # Number of each frame: that of the annotations, or its position in the capture.
     numbers: tuple[int, ...]
-    # Reads the frame at a position of `numbers`, with the mask that comes with it, if any
+    # Reads the frame at a position of `numbers`, with the mask that comes with it, if any.
     read: Callable[[int], Frame]
-    # where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours)
-    mask: str
+    # Where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours).
+    mask: str = "given"
     box: Box | None = None  # bounding box of the object in the first frame, for "box"
-    # Of the frames, where these are chosen by their directions, not by their order
+    # Of the frames, where these are chosen by their directions, not by their order.
     cameras: tuple[Camera, ...] = ()
     left_out: Sequence[str] = ()  # what is wrong with each frame that cannot be used
-    # Positions and names of frames without a given mask
+    # Positions and names of frames without a given mask.
     missing: Mapping[int, str] = field(default_factory=dict)
-    doubts: tuple[str, ...] = ()  # what speaks against the intrinsics
+    doubts: Sequence[str] = ()  # what speaks against the intrinsics
     depth_unit: float | None = None  # world units per stored depth value, of an image or a capture
 
     @property
     def name(self) -> str:
-        """Name of the sequence, the capture or the image; that of the folder itself where the path
-        is "."."""
+        """Name of the sequence, the capture or the image, also where the path is "."."""
         return Path(os.path.abspath(self.path)).name
 
     def describe(self, positions: Sequence[int]) -> str:
@@ -84,49 +84,44 @@ class Source:
         return f"{kind} {self.path}, frame{'s' if len(positions) > 1 else ''} {frames}"
 
     def load(self, positions: Sequence[int], context: int = _CONTEXT) -> list[Frame]:
-        """Load frames with masks of the object; those that have to be made use up to `context`
-        frames together.
+        """Load frames with masks of the object.
 
-        InputError if a file cannot be read, or no frame shows the object.
+        Masks that have to be made use up to `context` frames together. InputError if a file cannot
+        be read, or no frame shows the object.
         """
-        others = {
-            "given": [],
-            "box": [0],
-            "auto": np.linspace(0, len(self.numbers) - 1, context).round(),
-        }[self.mask]
-        frames = {
-            position: self.read(position) for position in sorted({*positions, *map(int, others)})
-        }
-        some = list(frames.values())
+        needed = set(positions)
+        if self.mask == "box":
+            needed.add(0)
+        elif self.mask == "auto":
+            needed.update(map(int, np.linspace(0, len(self.numbers) - 1, context).round()))
+        frames = {position: self.read(position) for position in sorted(needed)}
+        loaded = list(frames.values())
         if self.mask != "given":
             try:
-                masked = list(
-                    masks_from_box(some, self.box) if self.box else masks_from_depth(some)
-                )
+                masks = masks_from_box(loaded, self.box) if self.box else masks_from_depth(loaded)
+                frames = dict(zip(frames, masks, strict=True))
             except InputError as error:
-                raise InputError(
-                    "; ".join(filter(None, (str(error), self.contradiction())))
-                ) from error
-            frames = dict(zip(frames, masked, strict=True))
-        elif any(frame.mask is None for frame in some):
-            made = replace(self, mask="auto").load(list(frames), context)
-            frames = {
-                k: one if frames[k].mask is None else frames[k]
-                for k, one in zip(frames, made, strict=True)
-            }
+                reasons = (str(error), self.contradiction())
+                raise InputError("; ".join(filter(None, reasons))) from error
+        elif any(frame.mask is None for frame in loaded):
+            masked = replace(self, mask="auto").load(list(frames), context)
+            for position, frame in zip(list(frames), masked, strict=True):
+                if frames[position].mask is None:
+                    frames[position] = frame
         return [frames[position] for position in positions]
 
     def segmented(self) -> "Source":
-        """Make the masks of all frames that lack one; only their bits are kept, since all frames
-        need much memory."""
+        """Make the masks of all frames that lack one."""
         every = range(len(self.numbers))
         if self.box:
-            found = zip(every, masks_from_box(map(self.read, every), self.box))
+            masked = zip(every, masks_from_box(map(self.read, every), self.box))
         else:
-            found = self._by_depth(every if self.mask == "auto" else list(self.missing))
-        bits = {position: np.packbits(frame.mask > ON_OBJECT) for position, frame in found}
+            masked = self._by_depth(every if self.mask == "auto" else list(self.missing))
+        # Only the bits of the masks are kept: all frames would need much memory.
+        bits = {position: np.packbits(frame.mask > ON_OBJECT) for position, frame in masked}
 
         def read(position: int) -> Frame:
+            """Read a frame with its mask."""
             frame = self.read(position)
             if position not in bits:
                 return frame
@@ -137,7 +132,7 @@ class Source:
 
     def _by_depth(self, positions: Sequence[int]) -> Iterator[tuple[int, Frame]]:
         """Segment frames by depth, in groups all around the object."""
-        groups = -(-len(positions) // _CONTEXT)
+        groups = -(-len(positions) // _CONTEXT)  # rounded up
         for first in range(groups):
             group = positions[first::groups]
             yield from zip(
@@ -145,27 +140,27 @@ class Source:
             )
 
     def flags(self, frames: Sequence[Frame]) -> list[str]:
-        """Question depth and poses of some frames, the intrinsics, and masks and depth of given
-        frames."""
-        metric = self.format not in ("sequence", "frames")
-        found = (
-            given_mask_flags(frames, self.missing.values())
-            if self.mask == "given"
-            else mask_flags(frames)
-        )
-        found = [*depth_flags(frames, metric), *self.doubts, *found, self.contradiction()]
+        """Question masks and depth of these frames, and the intrinsics and poses of the source."""
+        flags = []
         if self.left_out:
             more = f"; and {len(self.left_out) - 3} more" if len(self.left_out) > 3 else ""
-            found.insert(
-                0, f"frames left out: {len(self.left_out)}: {'; '.join(self.left_out[:3])}{more}"
+            flags.append(
+                f"frames left out: {len(self.left_out)}: {'; '.join(self.left_out[:3])}{more}"
             )
-        return list(filter(None, found))
+        flags += depth_flags(frames, metric=self.format not in ("sequence", "frames"))
+        flags += self.doubts
+        if self.mask == "given":
+            flags += given_mask_flags(frames, self.missing.values())
+        else:
+            flags += mask_flags(frames)
+        flags.append(self.contradiction())
+        return list(filter(None, flags))
 
     def contradiction(self) -> str:
         """Say how depth and poses of a few frames contradict each other (see `disagreement`)."""
-        return disagreement(self._some(), self.depth_unit)
+        return disagreement(self._few(), self.depth_unit)
 
-    def _some(self) -> Iterator[Frame]:
+    def _few(self) -> Iterator[Frame]:
         """Read a few frames once around the object, without masks that follow from the poses."""
         for position in neighbours(len(self.numbers)):
             with suppress(InputError):  # a damaged file that the estimate does not use
@@ -175,8 +170,7 @@ class Source:
     def select(
         self, references: int, targets: int, first: int | None = None
     ) -> tuple[list[int], list[int], dict[int, Frame]]:
-        """Load frames from all sides; return the positions of reference frames and of target views,
-        and the frames.
+        """Load frames from all sides; return positions of references and of targets, and frames.
 
         Frames with a defect are no references. The first reference frame is that with the number
         `first`.
@@ -184,12 +178,14 @@ class Source:
         if first not in (None, *self.numbers):
             known = f"{len(self.numbers)} from {min(self.numbers)} to {max(self.numbers)}"
             raise InputError(f"{self.path} has no frame {first}, expected one of {known}")
+
+        # More candidates than references, because some may have a defect.
         start = 0 if first is None else self.numbers.index(first)
         tried = max(references, _CONTEXT) if references and first is None else references
         every = range(len(self.numbers))
         candidates = self._spread(tried, [*every[start:], *every[:start]])
         views = self._spread(targets, every)
-        needed = list(dict.fromkeys([*candidates, *views]))
+        needed = list(dict.fromkeys([*candidates, *views]))  # each once
         frames = dict(zip(needed, self.load(needed), strict=True))
         defects = {position: frame_defect(frames[position]) for position in candidates}
         usable = [position for position in candidates if not defects[position]]
@@ -201,15 +197,14 @@ class Source:
         return self._spread(references, usable), views, frames
 
     def _spread(self, count: int, positions: Sequence[int]) -> list[int]:
-        """Choose at most `count` positions with the first, evenly by the directions of the cameras,
-        or by the order."""
+        """Choose at most `count` positions with the first, evenly by directions or by the order."""
         if not self.cameras or count == 0:
             return [positions[k] for k in spread(count, len(positions))]
         cameras = [self.cameras[position] for position in positions]
         return [positions[k] for k in spread_views(cameras, count)]
 
 
-# A path, frames, or what `open_source` returns
+# A path, frames, or what `open_source` returns.
 SourceLike = str | Path | Frame | Sequence[Frame] | Source
 
 
@@ -227,8 +222,7 @@ def open_source(
     count: int | None = None,
     layout: str | None = None,
 ) -> Source:
-    """Open a sequence of a data folder, a folder with a capture, an image, or frames of one object
-    in one world.
+    """Open a sequence, a capture, an image, or frames of one object in one world.
 
     Args:
         path: ROOT/CATEGORY/SEQUENCE of a data folder; the folder or zip of a capture (see
@@ -266,7 +260,7 @@ def open_source(
         "orientation": orientation,
     }
     options = {name: value for name, value in options.items() if value is not None}
-    layout, unit = layout or _format(path), None
+    layout = layout or _format(path)
 
     # Refuse options that do not fit the format, or each other.
     if layout == "frames":
@@ -286,46 +280,85 @@ def open_source(
         expected = "--mask given, --mask auto, or --mask box with --box TOP,LEFT,HEIGHT,WIDTH"
         raise InputError(f"{path}: mask is {mask!r} and box is {box}, expected {expected}")
 
-    # Each format gives the numbers of its frames, a function that reads one, and which have a mask.
-    cameras, left_out, doubts = (), (), ()
+    # The frames with the masks that come with them.
     if layout == "frames":
-        read, masked = frames.__getitem__, [frame.mask is not None for frame in frames]
-        names = numbers = range(len(frames))
-        doubts = question_intrinsics(frames[0].camera, str(path))
+        source = _from_frames(frames, path)
     elif layout == "sequence":
-        folder = _sequence_folder(path)
-        dataset = Co3D(folder.parents[1])
-        every = dataset.frames(folder.parent.name, folder.name)
-        frames = [one for one in every if one.viewpoint is not None and one.depth is not None]
-        if not frames:
-            raise InputError(f"{path}: no frame has a camera and depth, expected some")
-        read, masked = (lambda k: dataset.load(frames[k])), [one.mask is not None for one in frames]
-        names = numbers = [one.frame_number for one in frames]
+        source = _from_sequence(path)
     else:
-        files = {name: options.pop(name) for name in _FILES if name in options}
-        if layout == "image":
-            capture = [replace(_open_image(path, **options), **files)]
-        else:
-            capture, left_out = open_capture(path, layout, files=files, **options)
-        _check_poses([frame.camera for frame in capture], path)
-        read, masked = (lambda k: capture[k].load()), [frame.mask is not None for frame in capture]
-        names, numbers = [frame.image.name for frame in capture], range(len(capture))
-        cameras, unit = tuple(frame.camera for frame in capture), capture[0].depth_unit
-        different = {camera.K.tobytes(): camera for camera in reversed(cameras)}.values()
-        doubts = tuple(line for one in different for line in question_intrinsics(one, str(path)))
+        source = _from_capture(path, layout, options)
+
+    # Where masks come from.
+    some_masked = len(source.missing) < len(source.numbers)
     if mask is None and box is not None:
         mask = "box"
     elif mask is None:
-        mask = "given" if any(masked) else "auto"
-    if mask == "given" and not any(masked):
+        mask = "given" if some_masked else "auto"
+    if mask == "given" and not some_masked:
         raise InputError(
             f"{path}: no mask, expected masks named like the images, --mask auto or --box "
             "TOP,LEFT,HEIGHT,WIDTH"
         )
+    return replace(source, mask=mask, box=box)
 
-    missing = {k: str(name) for k, name in enumerate(names) if not masked[k]}
+
+def _from_frames(frames: Sequence[Frame], path: Path) -> Source:
+    """Make the source of frames in memory."""
+    missing = {k: str(k) for k, frame in enumerate(frames) if frame.mask is None}
     return Source(
-        path, layout, tuple(numbers), read, mask, box, cameras, left_out, missing, doubts, unit
+        path,
+        "frames",
+        tuple(range(len(frames))),
+        frames.__getitem__,
+        missing=missing,
+        doubts=question_intrinsics(frames[0].camera, str(path)),
+    )
+
+
+def _from_sequence(path: Path) -> Source:
+    """Make the source of a sequence of a data folder: its frames with camera and depth."""
+    folder = _sequence_folder(path)
+    dataset = Co3D(folder.parents[1])
+    every = dataset.frames(folder.parent.name, folder.name)
+    frames = [frame for frame in every if frame.viewpoint is not None and frame.depth is not None]
+    if not frames:
+        raise InputError(f"{path}: no frame has a camera and depth, expected some")
+    return Source(
+        path,
+        "sequence",
+        tuple(frame.frame_number for frame in frames),
+        lambda k: dataset.load(frames[k]),
+        missing={
+            k: str(frame.frame_number) for k, frame in enumerate(frames) if frame.mask is None
+        },
+    )
+
+
+def _from_capture(path: Path, layout: str, options: dict[str, Any]) -> Source:
+    """Make the source of a capture or an image."""
+    left_out = ()
+    files = {name: options.pop(name) for name in _FILES if name in options}
+    if layout == "image":
+        frames = [replace(_open_image(path, **options), **files)]
+    else:
+        frames, left_out = open_capture(path, layout, files=files, **options)
+    cameras = tuple(frame.camera for frame in frames)
+    _check_poses(cameras, path)
+    # The first camera with each intrinsic matrix.
+    different = {camera.K.tobytes(): camera for camera in reversed(cameras)}
+    doubts = []
+    for camera in different.values():
+        doubts += question_intrinsics(camera, str(path))
+    return Source(
+        path,
+        layout,
+        tuple(range(len(frames))),
+        lambda k: frames[k].load(),
+        cameras=cameras,
+        left_out=left_out,
+        missing={k: frame.image.name for k, frame in enumerate(frames) if frame.mask is None},
+        doubts=doubts,
+        depth_unit=frames[0].depth_unit,
     )
 
 
@@ -335,25 +368,28 @@ def open_pair(
     options: Mapping[str, Sequence],
     helpers: Sequence[SourceLike] = (),
 ) -> list[Source]:
-    """Open two sources and helpers with the options of a command line, by the names of arguments of
-    `open_source`.
+    """Open two sources and helpers with the options of a command line.
 
-    An option has one value for each path that takes it (`depth`: each image), or one for all of
-    them. There may be fewer values, for the reference and the target alone. A single `box` is for
-    the first path whose `mask` is "box", if any, or the first of all. An open source takes none.
+    Options have the names of arguments of `open_source`. Each has one value for each path that
+    takes it (`depth`: each image), or one for all of them. There may be fewer values, for the
+    reference and the target alone. A single `box` is for the first path whose `mask` is "box", if
+    any, or the first of all. An open source takes none.
     """
-    sides = reference, target, *helpers
+    sides = (reference, target, *helpers)
     formats = [_format(side) for side in sides]
     given: list[dict] = [{} for _ in sides]
     for name, values in options.items():
-        takers = [k for k, one in enumerate(formats) if name in _TAKEN[one]]
+        takers = [k for k, layout in enumerate(formats) if name in _TAKEN[layout]]
+        # All that take it, or the reference and the target, which are the first two.
         counts = {len(takers), sum(k < 2 for k in takers)}
         if takers and name != "depth":  # each image has its own depth
             counts.add(1)
         if values and len(values) not in counts:
-            option, expected = f"--{name.replace('_', '-')}", " or ".join(map(str, sorted(counts)))
+            option = name.replace("_", "-")
+            expected = " or ".join(map(str, sorted(counts)))
             raise InputError(
-                f"{option}: {len(values)} values with {' and '.join(formats)}, expected {expected}"
+                f"--{option}: {len(values)} values with {' and '.join(formats)}, expected "
+                f"{expected}"
             )
         if len(values) == 1 and name == "box":
             boxed = [
@@ -365,8 +401,8 @@ def open_pair(
         for k, value in zip(takers, values):
             given[k][name] = value
     return [
-        side if isinstance(side, Source) else open_source(side, **some)
-        for side, some in zip(sides, given)
+        side if isinstance(side, Source) else open_source(side, **chosen)
+        for side, chosen in zip(sides, given)
     ]
 
 
@@ -393,8 +429,7 @@ def _check_poses(cameras: Sequence[Camera], where: str | Path) -> None:
 
 
 def _format(side: SourceLike) -> str:
-    """Tell a "sequence" from an "image", from "frames", and from a capture, of which the format is
-    returned."""
+    """Tell "open", "frames", "image" or "sequence", or return the format of a capture."""
     if not isinstance(side, str | Path):
         return "open" if isinstance(side, Source) else "frames"
     path = Path(side)
@@ -408,13 +443,12 @@ def _format(side: SourceLike) -> str:
 
 
 def _sequence_folder(path: Path) -> Path | None:
-    """Return the folder of a sequence in its data folder, also where the path is a link to it; None
-    if it is none."""
-    # Both are absolute, so that "." and "mine/cup/.." have names.
-    folders = (Path(os.path.abspath(path)), path.resolve())
-    return next(
-        (one for one in folders if one.is_dir() and (one.parent / FRAMES_FILE).is_file()), None
-    )
+    """Return the folder of a sequence, None if the path is no sequence of a data folder."""
+    # By the path, or behind links. Both are absolute, so that "." and "mine/cup/.." have names.
+    for folder in (Path(os.path.abspath(path)), path.resolve()):
+        if folder.is_dir() and (folder.parent / FRAMES_FILE).is_file():
+            return folder
+    return None
 
 
 def _open_image(
@@ -434,9 +468,9 @@ def _open_image(
     depth_unit = 1.0 if depth.name.endswith(CO3D_DEPTH) else 0.001
     rgb, orientation = read_picture(path)
     camera = camera_from_pose(np.eye(4), intrinsics, rgb.shape[:2], f"image {path}")
+    # The sides are exchanged if the principal point is nearer to the middle of the displayed form.
     stored = np.linalg.norm(2 * camera.principal_point - camera.size[::-1])
     displayed = np.linalg.norm(2 * camera.principal_point - camera.size)
-    # The principal point is nearer to the middle of the displayed form
     if orientation > 4 and displayed < stored:
         camera = replace(camera, size=camera.size[::-1])
     return CaptureFrame(
@@ -451,22 +485,20 @@ def _beside(path: Path, kind: str, suffixes: Sequence[str]) -> Path | None:
 
 
 def spread(count: int, length: int) -> list[int]:
-    """Return at most `count` evenly spaced positions among `length`, which go once around an
-    object."""
+    """Return at most `count` evenly spaced positions among `length` around an object."""
     return sorted({k * length // count for k in range(count)})
 
 
 def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
-    """Return the positions of at most `count` cameras, spread evenly over the directions from which
-    they see an object.
+    """Return positions of at most `count` cameras with evenly spread directions to an object.
 
     They are the first camera and others that lie as charges which repel each other.
     """
     if len(cameras) <= count:
         return list(range(len(cameras)))
-    centres = np.stack([one.centre for one in cameras])
-    axes = np.stack([one.R[2] for one in cameras])
-    # The object is at the point that is nearest to all optical axes.
+    # The object is at the point that is nearest to all optical axes (see `masks`).
+    centres = np.stack([camera.centre for camera in cameras])
+    axes = np.stack([camera.R[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None]
     point = np.linalg.lstsq(
         across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None
@@ -475,12 +507,15 @@ def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True).clip(1e-9)
     # Sorted, so that the choice is the same for every order of the other cameras.
     order = [0, *(1 + np.lexsort(directions[1:].T.round(6)))]
+    # The energy of each pair of charges, (n, n).
     gaps = directions[order][:, None] - directions[order]
     energy = 1 / (np.sum(gaps**2, axis=-1) + 1e-9)
     np.fill_diagonal(energy, np.inf)  # no camera is chosen twice
+    # Each in turn moves to where its energy with the others is least.
     chosen = [0]
     for _ in range(_SWEEPS):
-        for k in range(1, count):  # in the first sweep, they are added
+        for k in range(1, count):
             others = chosen[:k] + chosen[k + 1 :]
+            # In the first sweep, it is added at the end.
             chosen[k : k + 1] = [int(energy[others].sum(axis=0).argmin())]
     return sorted(int(order[k]) for k in chosen)

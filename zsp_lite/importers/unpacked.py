@@ -19,8 +19,11 @@ from zsp_lite.data.frames import MAX_PIXELS
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import file_size, path_inside
 
-# Bytes of an unpacked zip; above the second at most 200 times those of the zip
-_MOST, _LARGE, _RATIO = 20e9, 1e9, 200
+# Limits of an unpacked zip: bytes; bytes above which it may have at most so many times those of the
+# zip.
+_MOST = 20e9
+_LARGE = 1e9
+_RATIO = 200
 _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
@@ -44,16 +47,16 @@ def new_folder() -> Path:
 
 @cache
 def unpack(path: Path) -> Path:
-    """Unpack a zip to a temporary folder; InputError if it is damaged, encrypted, too large, or has
-    paths out of it."""
-    size, folder = file_size(path, "zip"), new_folder()
+    """Unpack a zip to a temporary folder; InputError if it is damaged, encrypted or too large."""
+    size = file_size(path, "zip")
+    folder = new_folder()
     try:
         with zipfile.ZipFile(path) as zipped:
-            total = sum(one.file_size for one in zipped.infolist())
+            total = sum(member.file_size for member in zipped.infolist())
             if total > min(_MOST, max(_LARGE, _RATIO * size)):
                 raise InputError(f"{size:,} bytes unpack to {total:,}")
-            for one in zipped.infolist():
-                path_inside(folder, one.filename)
+            for member in zipped.infolist():
+                path_inside(folder, member.filename)
             zipped.extractall(folder)  # makes no links
     except _DAMAGE as error:
         raise InputError(
@@ -73,7 +76,7 @@ class Video:
         file_size(path, "video")
         with open(path, "rb") as file:
             header = file.read(8)
-        # Other files may name addresses, which are not to be opened
+        # Other files may name addresses, which are not to be opened.
         is_video = header[4:] == b"ftyp" or header.startswith(_MATROSKA)
         video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG) if is_video else cv2.VideoCapture()
         pixels = video.get(cv2.CAP_PROP_FRAME_WIDTH) * video.get(cv2.CAP_PROP_FRAME_HEIGHT)
@@ -83,13 +86,17 @@ class Video:
                 f"{MAX_PIXELS} pixels"
             )
         video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(displayed))
-        self.path, self._video, self._position = path, video, -1
+        self.path = path
+        self._video = video
+        self._position = -1  # of the frame that was decoded last
 
     def frame(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
         """Decode the frame with a number, from 0 on; the numbers may not decrease."""
         while self._position < number and self._video.grab():
             self._position += 1
-        decoded, image = self._video.retrieve() if self._position == number else (False, None)
+        decoded = False
+        if self._position == number:
+            decoded, image = self._video.retrieve()
         if not decoded:
             raise InputError(f"video {self.path} ends before frame {number}")
         return image[..., ::-1]

@@ -1,5 +1,7 @@
-"""Files on a server: download with resume, checksum and a limit on the size (pooch cannot resume),
-parts of a file."""
+"""Files on a server: download with resume, checksum and a limit on the size; parts of a file.
+
+The package pooch cannot resume.
+"""
 
 import hashlib
 import http.client
@@ -18,8 +20,7 @@ from zsp_lite.io.files import sha256
 CHUNK = 1 << 18  # bytes
 TIMEOUT = 30  # of a connection, s
 ATTEMPTS = 3
-# What urllib raises if a server cannot be reached, sends no file, or is given by an invalid
-# address.
+# What urllib raises if a server cannot be reached, sends no file, or has an invalid address.
 NETWORK_ERRORS = (OSError, http.client.HTTPException, ValueError)
 
 
@@ -36,8 +37,7 @@ def fetch(
     digest: str = "",
     most: float = math.inf,
 ) -> Path:
-    """Download a file unless it exists; it has `size` bytes, or at most `most`, and the given
-    checksums.
+    """Download a file of `size` bytes, or at most `most`, unless it exists.
 
     Data is written to `path`.part, which is renamed after its size, the first digits of its MD5
     digest and its SHA-256 `digest` were verified. An interrupted download is resumed, in up to
@@ -45,7 +45,9 @@ def fetch(
     """
     if path.exists():
         return path
-    part, most = path.with_name(path.name + ".part"), most if size is None else size
+    part = path.with_name(path.name + ".part")
+    if size is not None:
+        most = size
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         complete = any(_fetch_rest(url, part, most) for _ in range(ATTEMPTS))
@@ -59,12 +61,10 @@ def fetch(
     matches = has_size_and_hash(part, size, md5_prefix) and digest in ("", sha256(part, "download"))
     if received > most or not matches:
         part.unlink()  # resuming from wrong data would never succeed
-        expected = (
-            f"{'at most ' * (size is None)}{most} bytes with the checksum "
-            f"{digest or md5_prefix or '(any)'}"
-        )
+        limit = f"at most {most}" if size is None else most
         raise InputError(
-            f"download of {url} is another file of {received} bytes, expected {expected}; removed"
+            f"download of {url} is another file of {received} bytes, expected {limit} bytes with "
+            f"the checksum {digest or md5_prefix or '(any)'}; removed"
         )
     os.replace(part, path)
     return path
@@ -72,18 +72,17 @@ def fetch(
 
 def has_size_and_hash(path: Path, size: int | None = None, md5_prefix: str = "") -> bool:
     """Check the size of a file (bytes, if given) and the first digits of its MD5 digest."""
+    digest = ""
     with open(path, "rb") as file:
-        digest = (
-            hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
-            if md5_prefix
-            else ""
-        )
+        if md5_prefix:
+            # MD5 finds errors of the transfer, not attacks; systems that forbid it allow that.
+            md5 = hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False))
+            digest = md5.hexdigest()
     return size in (None, path.stat().st_size) and digest.startswith(md5_prefix)
 
 
 def remote_size(url: str) -> int | None:
-    """Ask a server for the size of a file in bytes, None if it does not tell; InputError if it has
-    no such file."""
+    """Ask a server for the size of a file in bytes; None if it does not tell."""
     try:
         request = urllib.request.Request(url, method="HEAD")
         with urllib.request.urlopen(request, timeout=TIMEOUT) as response:
@@ -94,12 +93,13 @@ def remote_size(url: str) -> int | None:
 
 
 class RemoteFile(io.RawIOBase):
-    """A file on a server, of which only the parts that are read are transferred (HTTP range
-    requests)."""
+    """A file on a server, of which only what is read is transferred (HTTP range requests)."""
 
     def __init__(self, url: str):
         super().__init__()
-        self.url, self.size, self._position = url, remote_size(url) or 0, 0
+        self.url = url
+        self.size = remote_size(url) or 0
+        self._position = 0
 
     def readable(self) -> bool:
         return True
@@ -107,24 +107,25 @@ class RemoteFile(io.RawIOBase):
     seekable = readable
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        self._position = max(
-            0,
-            offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence],
-        )
+        """Move to an offset from the start, the position or the end, as in `io.IOBase.seek`."""
+        origins = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}
+        self._position = max(0, origins[whence] + offset)
         return self._position
 
     def readinto(self, buffer: bytearray | memoryview) -> int:
-        """Read up to `len(buffer)` bytes; InputError if the server cannot be reached or does not
-        send parts."""
-        count, problem = min(len(buffer), self.size - self._position), "the connection was closed"
+        """Read up to `len(buffer)` bytes; InputError if the server does not send them."""
+        count = min(len(buffer), self.size - self._position)
         if count <= 0:
             return 0
+        problem = "the connection was closed"
         for _ in range(ATTEMPTS):
             try:
                 with _request(self.url, self._position, self._position + count) as response:
                     if not _is_part(response, self._position):
                         problem = "the server does not send parts of files, expected range requests"
-                    elif received := response.readinto(memoryview(buffer)[:count]):
+                        continue
+                    received = response.readinto(memoryview(buffer)[:count])
+                    if received:
                         self._position += received
                         return received
             except NETWORK_ERRORS as error:
@@ -134,7 +135,9 @@ class RemoteFile(io.RawIOBase):
 
 def _request(url: str, start: int, end: int | None = None) -> http.client.HTTPResponse:
     """Request the bytes of a file from `start` to before `end`."""
-    headers = {"Range": f"bytes={start}-{'' if end is None else end - 1}"} if start or end else {}
+    headers = {}
+    if start or end:
+        headers["Range"] = f"bytes={start}-{'' if end is None else end - 1}"
     return urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=TIMEOUT)
 
 
@@ -156,6 +159,7 @@ def _fetch_rest(url: str, part: Path, most: float) -> bool:
         part.unlink()  # the file was complete, or it has changed on the server
         return False
     with response:
+        # A server that does not resume sends the whole file.
         start = start if _is_part(response, start) else 0
         length = response.headers.get("Content-Length")
         total = None if length is None else start + int(length)

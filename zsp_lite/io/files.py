@@ -23,7 +23,8 @@ MAX_FILE = 1 << 30  # bytes of a file that is read at once, and of what is decom
 MAX_WEIGHTS = 4 << 30  # bytes of a file of weights
 # Compressed data may grow to this many bytes, or by this factor if that is more. Annotations grow
 # by 10.
-GROWTH_ALLOWED, _GROWTH_FACTOR = 1 << 26, 32
+GROWTH_ALLOWED = 1 << 26
+_GROWTH_FACTOR = 32
 _LONGEST_NAME = 255  # bytes, on most file systems
 
 
@@ -32,8 +33,7 @@ class OutsideError(InputError):
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:
-    """Write a file, and missing folders above it, so that a reader sees the old or the new content,
-    never a part."""
+    """Write a file and missing folders above it; readers see the old or all of the new content."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
@@ -45,33 +45,27 @@ def write_atomic(path: str | Path, data: bytes) -> None:
 
 
 def read_bytes(path: str | Path, what: str) -> bytes:
-    """Read a file of at most `MAX_FILE` bytes; InputError, which names its kind `what`, if it
-    cannot be read."""
+    """Read a file of at most `MAX_FILE` bytes; `what` is its kind, for messages."""
     file_size(path, what, MAX_FILE)
     return Path(path).read_bytes()
 
 
 def read_json(path: str | Path, kind: Any, what: str) -> Any:
-    """Read a JSON file as a type of msgspec; InputError, which names its kind `what`, its path and
-    the field."""
-    return decode_json(
-        without_nan(read_bytes(path, what)).removeprefix(codecs.BOM_UTF8), kind, f"{what} {path}"
-    )
+    """Read a JSON file as a type of msgspec; `what` is the kind of file, for messages."""
+    data = without_nan(read_bytes(path, what)).removeprefix(codecs.BOM_UTF8)
+    return decode_json(data, kind, f"{what} {path}")
 
 
 def without_nan(data: bytes) -> bytes:
-    """Replace NaN and Infinity, which Python's json writes but which are not valid JSON, by
-    null."""
-    # Null is then accepted by optional fields, and refused by the others with the name of the
-    # field.
+    """Replace NaN and Infinity, which Python's json writes although they are no JSON, by null."""
+    # Optional fields accept null, and the others refuse it with the name of the field.
     if b"NaN" in data or b"Infinity" in data:
         data = re.sub(rb"(?<=[:,\[\s])-?(?:NaN|Infinity)(?=[,\]}\s])", b"null", data)
     return data
 
 
 def decode_json(data: bytes | msgspec.Raw, kind: Any, what: str) -> Any:
-    """Decode JSON as a type of msgspec; InputError, which begins with `what`, if it is damaged or
-    lacks a field."""
+    """Decode JSON as a type of msgspec; an InputError begins with `what` and names the field."""
     try:
         return msgspec.json.decode(data, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -79,16 +73,13 @@ def decode_json(data: bytes | msgspec.Raw, kind: Any, what: str) -> Any:
 
 
 def file_size(path: str | Path, what: str, most: float = math.inf) -> int:
-    """Return the size of a file in bytes; InputError if it is longer than `most`, no file, or
-    cannot be read."""
+    """Return the size of a file in bytes; InputError if it exceeds `most` or cannot be read."""
     try:
         status = os.stat(path)
-        if not stat.S_ISREG(status.st_mode):  # a pipe or a device may never end
-            problem = (
-                "is a directory"
-                if stat.S_ISDIR(status.st_mode)
-                else "a pipe or a device, expected a file"
-            )
+        if stat.S_ISDIR(status.st_mode):
+            problem = "is a directory"
+        elif not stat.S_ISREG(status.st_mode):  # it may never end
+            problem = "a pipe or a device, expected a file"
         elif status.st_size > most:
             problem = f"{status.st_size} bytes, expected at most {most}"
         elif os.access(path, os.R_OK):
@@ -101,8 +92,7 @@ def file_size(path: str | Path, what: str, most: float = math.inf) -> int:
 
 
 def load_torch(path: str | Path, what: str) -> Any:
-    """Read a torch file without executing code in it; InputError if it is damaged, or has more than
-    plain data."""
+    """Read a torch file of plain data, without executing code in it."""
     import torch  # takes seconds, and most callers of this module do not need it
 
     file_size(path, what, MAX_WEIGHTS)
@@ -116,8 +106,7 @@ def load_torch(path: str | Path, what: str) -> Any:
 
 
 def sha256(path: str | Path, what: str) -> str:
-    """Return the SHA-256 digest of a file in hexadecimal digits; InputError if it cannot be
-    read."""
+    """Return the SHA-256 digest of a file in hexadecimal digits."""
     file_size(path, what)
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -125,10 +114,10 @@ def sha256(path: str | Path, what: str) -> str:
 
 def digest(*parts: str | bytes) -> str:
     """Return a hash of texts and bytes, 16 hexadecimal digits."""
-    found = hashlib.sha256()
+    hasher = hashlib.sha256()
     for part in parts:
-        found.update(part.encode() if isinstance(part, str) else part)
-    return found.hexdigest()[:16]
+        hasher.update(part.encode() if isinstance(part, str) else part)
+    return hasher.hexdigest()[:16]
 
 
 def stable_hash(text: str) -> int:
@@ -151,8 +140,7 @@ def decompress(data: bytes, what: str) -> bytes:
 
 
 def path_inside(root: str | Path, relative: str) -> Path:
-    """Resolve a path relative to a folder; InputError if it leads out of it (by "..", absolute, or
-    by a link)."""
+    """Resolve a path relative to a folder; InputError if it, or a link on it, leads out."""
     root = Path(root).resolve()
     try:
         resolved = (root / relative).resolve()
@@ -168,14 +156,18 @@ def path_inside(root: str | Path, relative: str) -> Path:
 
 
 def find_inside(root: str | Path, text: str) -> Path | None:
-    """Find a file, or an image without its extension, by a path that a file of the folder gives,
-    relative or absolute.
+    """Find a file by a path that another file gives: relative or absolute.
+
+    The path of an image may lack its extension.
 
     Links inside the folder, which its owner made, may lead anywhere. OutsideError if the text
     itself leads out of it.
     """
-    root, text = os.path.abspath(root), text.replace("\\", "/")
+    root = os.path.abspath(root)
+    text = text.replace("\\", "/")
+    # A path with a drive is absolute, also on systems that have no drives.
     path = os.path.normpath(text if PureWindowsPath(text).drive else os.path.join(root, text))
+    # The folder may be given by its own path or by that behind links.
     if text and not path.startswith(
         (os.path.join(root, ""), os.path.join(os.path.realpath(root), ""))
     ):
@@ -183,15 +175,14 @@ def find_inside(root: str | Path, text: str) -> Path | None:
         raise OutsideError(
             f"path {_shown(text)} leads out of the folder {root}, expected {expected}"
         )
-    return next(
-        (Path(path + end) for end in ("", ".png", ".jpg", ".jpeg") if os.path.isfile(path + end)),
-        None,
-    )
+    for ending in ("", ".png", ".jpg", ".jpeg"):
+        if os.path.isfile(path + ending):
+            return Path(path + ending)
+    return None
 
 
 def plain_name(name: str, what: str) -> str:
-    """Return `name` if it is a valid name of a single file or folder; InputError, which begins with
-    `what`, if not."""
+    """Return the name of a file or folder; InputError, which begins with `what`, for no name."""
     separated = not name or name.startswith(".") or any(character in "/\\:\0" for character in name)
     if separated or len(os.fsencode(name)) > _LONGEST_NAME:
         raise InputError(

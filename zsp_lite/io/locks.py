@@ -12,27 +12,23 @@ from zsp_lite.errors import InputError
 
 @contextmanager
 def writing(folder: str | Path) -> Iterator[None]:
-    """Be the only writer of a folder until this process ends; InputError if another process writes
-    to it.
+    """Be the only writer of a folder; InputError if another process writes to it.
 
-    The folder is made if it does not exist, and is removed if it was made and nothing was written
-    into it.
+    The folder is made if it does not exist. If nothing was written into it, it is removed again.
     """
     folder = Path(folder)
-    made = [one for one in (folder, *folder.parents) if not os.path.exists(one)]
+    missing = [place for place in (folder, *folder.parents) if not os.path.exists(place)]
     path = folder / ".writing.lock"
     lock = FileLock(path, timeout=0)
-    if folder.resolve() == Path(folder.resolve().anchor):
+    if folder.resolve() == folder.resolve().parent:
         raise InputError(f"{folder} is the root of the disk, expected a folder for what is written")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except OSError as error:  # a Timeout of the lock is one, too
-        problem = (
-            "another process is writing to it"
-            if isinstance(error, Timeout)
-            else f"cannot be written ({error})"
-        )
+        problem = f"cannot be written ({error})"
+        if isinstance(error, Timeout):
+            problem = "another process is writing to it"
         raise InputError(
             f"{folder}: {problem}, expected a folder for this process alone"
         ) from error
@@ -43,5 +39,5 @@ def writing(folder: str | Path) -> Iterator[None]:
             path.unlink()
         lock.release()
         with suppress(OSError):  # not empty
-            for one in made:
-                one.rmdir()
+            for place in missing:
+                place.rmdir()

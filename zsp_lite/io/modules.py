@@ -10,8 +10,7 @@ from zsp_lite.errors import InputError, describe_failure
 
 
 def import_object(path: str) -> Any:
-    """Import the object "module:name" from an installed module or a module in the current
-    folder."""
+    """Import "module:name", of an installed module or one in the current folder."""
     if "" not in sys.path and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # the path of a console script lacks the current folder
     try:

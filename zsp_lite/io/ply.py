@@ -1,7 +1,4 @@
-"""Point clouds:
-
-PLY files, and the import of Open3D, for which all other modules call `load_open3d`.
-"""
+"""Point clouds: PLY files, and the import of Open3D, for which all modules call `load_open3d`."""
 
 import ctypes
 import functools
@@ -17,7 +14,12 @@ from zsp_lite.io.files import read_bytes, write_atomic
 
 _VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])
 _PROPERTIES = [
-    *(f"float {one}" for one in "x y z nx ny nz".split()),
+    "float x",
+    "float y",
+    "float z",
+    "float nx",
+    "float ny",
+    "float nz",
     "uchar red",
     "uchar green",
     "uchar blue",
@@ -41,14 +43,17 @@ def write_ply(
     colours: UInt8[np.ndarray, "n 3"],
     normals: Real[np.ndarray, "n 3"] | None = None,
 ) -> None:
-    """Write a point cloud in CO3D's form: binary, float32 positions and normals (or zeros), 8-bit
-    colours."""
+    """Write a point cloud as CO3D does: binary, float32 positions and normals, 8-bit colours.
+
+    Normals that are not given are zeros.
+    """
     check_magnitude(f"point cloud {path}", points)
     vertices = np.zeros(len(points), dtype=_VERTEX)
-    vertices["position"], vertices["colour"] = points, colours
+    vertices["position"] = points
+    vertices["colour"] = colours
     if normals is not None:
         vertices["normal"] = normals
-    properties = "".join(f"property {one}\n" for one in _PROPERTIES)
+    properties = "".join(f"property {name}\n" for name in _PROPERTIES)
     header = (
         "ply\nformat binary_little_endian 1.0\nelement vertex "
         f"{len(vertices)}\n{properties}end_header\n"
@@ -59,8 +64,7 @@ def write_ply(
 def read_ply(
     path: str | Path,
 ) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
-    """Read the positions and 8-bit colours (None if there are none) of a PLY file; InputError if it
-    is damaged."""
+    """Read the positions and 8-bit colours (None if there are none) of a PLY file."""
     data = read_bytes(path, "point cloud")
     try:
         columns = _vertex_columns(data)
@@ -77,11 +81,15 @@ def read_ply(
 def _vertex_columns(data: bytes) -> dict[str, np.ndarray]:
     """Return the properties of the vertices, which must be the first element of a PLY file.
 
-    ValueError and others.
+    A malformed file raises ValueError, KeyError, TypeError or another error.
     """
     header, _, rest = data.partition(b"end_header")
     body = rest[rest.index(b"\n") + 1 :]
-    encoding, elements, types = "", [], {}
+
+    # The header: names and numbers of all elements, and types of the properties of the first.
+    encoding = ""
+    elements = []
+    types = {}
     for line in header.decode("latin-1").splitlines():
         match line.split():
             case ["format", encoding, _]:
@@ -95,6 +103,8 @@ def _vertex_columns(data: bytes) -> dict[str, np.ndarray]:
     (name, count), *others = elements
     if name != "vertex" or count < 1:
         raise ValueError(f"{count} x {name!r} first, expected vertices")
+
+    # The body: one column per property, as text or as packed records.
     if encoding == "ascii":
         table = np.array(body.split()[: count * len(types)], np.float64).reshape(count, len(types))
         return {name: column.astype(kind) for (name, kind), column in zip(types.items(), table.T)}
@@ -107,8 +117,7 @@ def _vertex_columns(data: bytes) -> dict[str, np.ndarray]:
 
 
 def _colours(columns: dict[str, np.ndarray]) -> UInt8[np.ndarray, "n 3"] | None:
-    """Return the colours of vertices, integers of 8 bits or numbers from 0 to 1; None if they have
-    none."""
+    """Return 8-bit colours, which may be stored as numbers from 0 to 1; None if there are none."""
     if not {"red", "green", "blue"} <= columns.keys():
         return None
     colours = np.stack([columns[name] for name in ("red", "green", "blue")], axis=-1)

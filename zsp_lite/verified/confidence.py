@@ -28,24 +28,26 @@ from zsp_lite.verified.verification import VIEWPOINT_SIGMA
 # Hypotheses whose rotations differ by more than this many degrees are distinct: the paper's wider
 # error threshold.
 MODE_ANGLE = 30.0
-# Of the best pose's probability: above it, another pose is nearly as probable.
+# A pose with more than this share of the best pose's probability is nearly as probable.
 TIE_RATIO = float(np.exp(-1))
-# Fraction of points on an observed surface; with less in both directions, a pose is flagged.
+# Share of the points on an observed surface. With less in both directions, a pose is flagged.
 _MIN_OVERLAP = 0.05
-# The same of the similarity term. Correct and wrong poses have 0.06 and more, views that share no
-# side 0.01.
+# Likewise of the similarity term. Poses, right or wrong, have 0.06 and more; views that share no
+# side have 0.01.
 _MIN_SIMILARITY = 0.02
 
 
 def evidence(
-    # angle in degrees that the target views span around the target (see `cameras.view_span`)
+    # Angle in degrees that the target views span around the target (see `cameras.view_span`).
     span: float,
     n_views: int,
-    # angle in degrees from the reference's camera to the nearest target view's under the best pose
+    # Angle in degrees from the reference's camera to the nearest target view's, under the best
+    # pose.
     nearest: float,
-    # of the target views' similarity to the reference; small if the features distinguish no sides
+    # Standard deviation of the target views' similarity to the reference; small if the features
+    # distinguish no sides.
     view_std: float,
-    # part of the best score from overlap, silhouettes and free space; small if shapes do not fit
+    # Part of the best score from overlap, silhouettes and free space; small if shapes do not fit.
     shape_fit: float,
 ) -> Float[np.ndarray, "6"]:
     """Return a constant and what probabilities depend on beside the scores of the poses."""
@@ -71,29 +73,33 @@ class Calibration:
 
 def hidden_share(span: float | Float[np.ndarray, " n"]) -> float | Float[np.ndarray, " n"]:
     """Return h of the probabilities for a share of the circle that the views span."""
+    # A single view leaves 240 degrees of the circle hidden, and a span leaves less by its angle:
+    # h = (240 - 360 * span) / 240.
     return np.maximum(0.0, 1 - 1.5 * span)
 
 
 def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
     """Say whose pose each hypothesis has: its own or the nearest better one's within 30 degrees."""
-    found: list[int] = []
+    mode_of: list[int] = []
     for i, row in enumerate(angle):
-        near = [j for j in range(i) if found[j] == j and row[j] < MODE_ANGLE]
-        found.append(min(near, key=row.__getitem__, default=i))
-    return np.array(found)
+        # The better hypotheses nearby that stand for themselves.
+        near = [j for j in range(i) if mode_of[j] == j and row[j] < MODE_ANGLE]
+        mode_of.append(min(near, key=row.__getitem__, default=i))
+    return np.array(mode_of)
 
 
 def reliability_flags(
     hypotheses: Sequence[Hypothesis], angle: Float[np.ndarray, "m m"]
 ) -> tuple[tuple[str, ...], bool]:
     """Say why the best hypothesis may be wrong, a line per reason, and whether it is one of two."""
-    terms = hypotheses[0].terms
     flags = []
-    probability = np.array([one.confidence for one in hypotheses])
+
+    # Different poses that are about as probable as the best one, which is the first of them.
+    probability = np.array([hypothesis.confidence for hypothesis in hypotheses])
     tied = [
         k
-        for k, one in enumerate(hypotheses)
-        if one.mode == k and probability[k] > TIE_RATIO * probability[0]
+        for k, hypothesis in enumerate(hypotheses)
+        if hypothesis.mode == k and probability[k] > TIE_RATIO * probability[0]
     ]
     # Together more probable than not; more than 60 degrees apart, no rotation is within 30 degrees
     # of both.
@@ -104,17 +110,20 @@ def reliability_flags(
     )
     if len(tied) > 1:
         shown = " and ".join(f"{probability[i]:.2f}" for i in tied)
-        start = (
-            f"one of two: poses {angle[tied[0], tied[1]]:.0f}"
-            if one_of_two
-            else f"{len(tied)} poses more than 30"
-        )
+        start = f"{len(tied)} poses more than 30"
+        if one_of_two:
+            start = f"one of two: poses {angle[tied[0], tied[1]]:.0f}"
         flags.append(
             f"{start} degrees apart explain the views about equally well "
             f"(probabilities {shown}): the object may be symmetric"
         )
-    if terms and max(terms["forward_overlap"], terms["reverse_overlap"]) < _MIN_OVERLAP:
-        flags.append("no view confirms the pose: nearly no point lies on an observed surface")
-    if terms and max(terms["forward_similarity"], terms["reverse_similarity"]) < _MIN_SIMILARITY:
-        flags.append("no view confirms the pose: features of points that coincide are not similar")
+
+    terms = hypotheses[0].terms
+    if terms:  # a pose that is made of several estimates has none
+        if max(terms["forward_overlap"], terms["reverse_overlap"]) < _MIN_OVERLAP:
+            flags.append("no view confirms the pose: nearly no point lies on an observed surface")
+        if max(terms["forward_similarity"], terms["reverse_similarity"]) < _MIN_SIMILARITY:
+            flags.append(
+                "no view confirms the pose: features of points that coincide are not similar"
+            )
     return tuple(flags), one_of_two

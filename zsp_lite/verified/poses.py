@@ -49,8 +49,11 @@ class Poses:
 
 def concatenate(batches: Sequence[Poses]) -> Poses:
     """Concatenate batches of poses."""
-    parts = [(one.scale, one.rotation, one.translation) for one in batches]
-    return Poses(*map(torch.cat, zip(*parts)))
+    return Poses(
+        torch.cat([batch.scale for batch in batches]),
+        torch.cat([batch.rotation for batch in batches]),
+        torch.cat([batch.translation for batch in batches]),
+    )
 
 
 def float_tensor(values) -> Tensor:
@@ -74,6 +77,7 @@ def rotation_matrices(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
     """Convert rotation vectors (axis times angle in radians) by Rodrigues' formula, in float32."""
     angle = vectors.norm(dim=-1, keepdim=True)
     x, y, z = (vectors / angle.clamp_min(1e-12)).unbind(-1)
+    # (n, 3, 3): `cross @ v` is the cross product of the axis and v.
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(-1, 3, 3)
     sine = angle.sin()[..., None]
@@ -86,9 +90,10 @@ def non_maximum_suppression(
 ) -> Int[Tensor, " kept"]:
     """Select the best-scored poses whose rotations differ."""
     order = torch.argsort(score, descending=True, stable=True)
+    # (m, m), rows and columns in the order of the scores.
     near = (rotation_angles(rotation[order], rotation[order]) < min_angle).numpy()
-    kept: list[int] = []
+    selected: list[int] = []
     for candidate in range(len(order)):
-        if len(kept) < max_count and not near[candidate, kept].any():
-            kept.append(candidate)
-    return order[torch.tensor(kept, dtype=torch.long)]
+        if len(selected) < max_count and not near[candidate, selected].any():
+            selected.append(candidate)
+    return order[torch.tensor(selected, dtype=torch.long)]

@@ -40,19 +40,21 @@ def poses_from_matches(
         return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
     # The three smallest of random numbers are a sample without repetition: (trials, 3).
     sample = np.argpartition(rng.random((_TRIALS, len(source))), (0, 1, 2), axis=1)[:, :3]
-    fitted = umeyama_batch(*(points.double().numpy()[sample] for points in (source, target)))[:3]
-    poses = Poses(*map(float_tensor, fitted))
+    fitted = umeyama_batch(source.double().numpy()[sample], target.double().numpy()[sample])
+    poses = Poses(*map(float_tensor, fitted[:3]))  # scales, rotations, translations
     poses = poses[poses.scale == poses.scale.clamp(*SCALE_RANGE)]
-    squared_residual = (poses.apply(source) - target).square_().sum(dim=2)
+
+    squared_residual = (poses.apply(source) - target).square_().sum(dim=2)  # (trials, k)
     # As in MSAC (Torr and Zisserman 2000), sum_i max(0, 1 - (|T x_i - y_i| / 0.3)^2).
     score = (1 - squared_residual / _INLIER_DISTANCE**2).clamp_min_(0).sum(dim=1)
     best = torch.argsort(score, descending=True, stable=True)[:_POOL]
-    kept = non_maximum_suppression(poses.rotation[best], score[best], _MIN_ANGLE, _PER_VIEW)
-    return poses[best[kept]]
+    different = non_maximum_suppression(poses.rotation[best], score[best], _MIN_ANGLE, _PER_VIEW)
+    return poses[best[different]]
 
 
 def poses_from_views(scene: Scene) -> Poses:
     """Return poses with the target views' viewpoints, and the first turned about the vertical."""
+    # A pose with the inverse of a view's rotation turns the reference's camera as that view's.
     views = scene.target_maps.rotation.transpose(1, 2)
     # The mean of the directions that are up in the target images.
     vertical = F.normalize(-scene.target_maps.rotation[:, 1].mean(dim=0), dim=0)

@@ -27,9 +27,10 @@ from zsp_lite.verified.verification import WEIGHTS, score_terms
 MAX_HYPOTHESES = 6  # kept from search to search
 MIN_ANGLE = 15.0  # degrees between them
 _MAX_POLISHED = 3  # of these, the best that are polished
-# About this many points of the reference and of the targets are scored during the search.
+# About this many points of the reference and of the targets are scored, in the searches and in the
+# polish.
 _SEARCH_POINTS = (150, 375)
-_POLISH_POINTS = (450, 2000)  # the same during the polish
+_POLISH_POINTS = (450, 2000)
 # Steps of a round that are recombined into one candidate of the next round (mu in CMA-ES).
 _PARENTS = 6
 
@@ -58,7 +59,9 @@ def refine_coarse_to_fine(scene: Scene, poses: Poses, rng: np.random.Generator) 
     """Refine poses in three searches of decreasing width, on some of the points."""
 
     def score(poses: Poses, points: tuple[int, int] = _SEARCH_POINTS) -> Float[Tensor, " m"]:
-        totals = len(scene.reference_points), len(scene.target_points)
+        """Score poses on about so many points of the reference and of the targets."""
+        totals = (len(scene.reference_points), len(scene.target_points))
+        # Every so many points are scored, of the reference and of the targets.
         stride = tuple(max(round(total / count), 1) for total, count in zip(totals, points))
         return WEIGHTS.score(score_terms(scene, poses, stride))
 
@@ -83,23 +86,25 @@ def refine(
     # (Hansen 2016).
     weights = np.log(_PARENTS + 0.5) - np.log(np.arange(1, _PARENTS + 1))
     weights = torch.tensor(weights / weights.sum(), dtype=torch.float32)[:, None]
-    recombined = None
+    recombined = None  # (m, 7), one step of the next round for each pose
     for turn in range(schedule.rounds):
         # All poses get the same steps: the result for one pose does not depend on the number of
         # others.
         draws = rng.standard_normal((schedule.samples, 7)).astype(np.float32) * schedule.decay**turn
-        steps = torch.from_numpy(draws).repeat(m, 1, 1)
+        steps = torch.from_numpy(draws).repeat(m, 1, 1)  # (m, samples, 7)
         if recombined is not None:
             steps[:, 0] = recombined
 
+        # The best steps of each pose, best first: (m, parents).
         candidates = _perturb(poses, steps, schedule)
         top_score, top = score(candidates).view(m, -1).topk(_PARENTS, dim=1)
-        index = rows * schedule.samples + top[:, 0]
+        index = rows * schedule.samples + top[:, 0]  # of the best step, among all candidates
         improved = top_score[:, 0] > best_score
 
         mean = (steps[rows[:, None], top] * weights).sum(dim=1)
         # Relative to the pose from which the next round starts.
         recombined = mean - torch.where(improved[:, None], steps[rows, top[:, 0]], 0)
+        # The candidates stand behind the m poses.
         poses = concatenate([poses, candidates])[torch.where(improved, m + index, rows)]
         best_score = torch.maximum(best_score, top_score[:, 0])
     return poses, best_score

@@ -24,7 +24,7 @@ from zsp_lite.data.cameras import Camera, view_span
 from zsp_lite.errors import NoPoseError
 from zsp_lite.matching import Matches
 from zsp_lite.points import near_median, standard_deviation
-from zsp_lite.verified.poses import Poses, exp_, float_tensor
+from zsp_lite.verified.poses import Poses, exp_, float_tensor, rotation_angles
 from zsp_lite.views import View
 
 # Points farther from the median point than this many median distances are outliers: patches at a
@@ -99,16 +99,19 @@ class Scene:
     view_similarity_std: float  # standard deviation of that similarity over the target views
     view_span: float  # angle in degrees that the target views span around the target
 
+    def view_angles(self, poses: Poses) -> Float[Tensor, "m v"]:
+        """Compute the angle in degrees from the reference's camera to each target view's."""
+        return rotation_angles(poses.rotation, self.target_maps.rotation.transpose(1, 2))
+
     def to_sim3(self, poses: Poses, index: int, view: int) -> Sim3:
-        """Convert a pose from working units to one from the reference camera to a view's camera."""
-        # Orthogonal again in float64.
+        """Convert a pose in working units to one from the reference's camera to a view's camera."""
+        # The nearest orthogonal matrix: the float32 one is not orthogonal in float64.
         left, _, right = np.linalg.svd(poses.rotation[index].double().numpy())
         pose = Sim3(
             float(poses.scale[index]), left @ right, poses.translation[index].double().numpy()
         )
-        rotation, translation = _relative_pose(self.target_cameras[0], self.target_cameras[view])
         return (
-            Sim3(1.0, rotation, translation)
+            Sim3(1.0, *_relative_pose(self.target_cameras[0], self.target_cameras[view]))
             @ self.target_to_working.inverse()
             @ pose
             @ self.reference_to_working
@@ -124,6 +127,8 @@ def build_scene(
     """Prepare the scene of a reference view and its target views."""
     cameras = tuple(target.frame.camera for target in targets)
     to_camera = [_relative_pose(cameras[0], camera) for camera in cameras]
+
+    # Points of all patches, (patches, 3) each: the targets' with the axes of the first camera.
     source = reference.measured_points[0].reshape(-1, 3)
     clouds = [
         (view.measured_points[0].reshape(-1, 3) - t) @ R for view, (R, t) in zip(targets, to_camera)
@@ -140,7 +145,8 @@ def build_scene(
     source = reference_to_working.apply(source)
     cloud = target_to_working.apply(cloud)
 
-    # Similarities of the foreground patches.
+    # Similarities of the foreground patches: a row for each of the reference's, and a column for
+    # each of all targets'.
     foregrounds = [target.foreground.ravel() for target in targets]
     column = _number(np.concatenate(foregrounds))
     reference_foreground = reference.foreground.ravel()
@@ -150,30 +156,36 @@ def build_scene(
     ]
     # Of each view: each foreground patch's highest similarity in the other view, averaged in both
     # directions.
-    best = [(one.amax(dim=1).mean() + one.amax(dim=0).mean()) / 2 for one in between_foregrounds]
-    view_similarity = torch.stack(best) - torch.stack(best).mean()
+    best = torch.stack(
+        [(block.amax(dim=1).mean() + block.amax(dim=0).mean()) / 2 for block in between_foregrounds]
+    )
+    view_similarity = best - best.mean()
     valid_rows = torch.from_numpy(source_valid)[reference_foreground]
 
     # Points of the matches with measured depth on both sides.
-    starts = np.cumsum([len(one) for one in clouds])[:-1]  # of each target but the first
+    starts = np.cumsum([len(points) for points in clouds])[:-1]  # of each target but the first
     matched = []
     for target, points, match in zip(targets, np.split(cloud, starts), matches):
+        # Patches as indices of the flattened grids.
         u = np.ravel_multi_index(tuple(match.reference.T), reference.features.grid)
         v = np.ravel_multi_index(tuple(match.target.T), target.features.grid)
         both = reference.measured_points[1].ravel()[u] & target.measured_points[1].ravel()[v]
         matched.append((float_tensor(source[u[both]]), float_tensor(points[v[both]])))
 
-    still = [(np.eye(3), np.zeros(3))]  # the reference's points are in its camera's frame
     return Scene(
         reference_points=float_tensor(source[source_valid]),
         target_points=float_tensor(cloud[valid]),
         target_column=torch.from_numpy(column[valid]),
         target_weight=surface_weights(float_tensor(cloud[valid])),
         similarity=torch.cat(
-            [double_centre(one[valid_rows]) for one in between_foregrounds], dim=1
+            [double_centre(block[valid_rows]) for block in between_foregrounds], dim=1
         ).contiguous(),
+        # The world of the reference's points is its camera's frame.
         reference_maps=build_maps(
-            [reference], still, reference_to_working, [_number(source_valid)]
+            [reference],
+            [(np.eye(3), np.zeros(3))],
+            reference_to_working,
+            [_number(source_valid)],
         ),
         target_maps=build_maps(targets, to_camera, target_to_working, np.split(column, starts)),
         reference_to_working=reference_to_working,
@@ -193,17 +205,20 @@ def build_maps(
     columns: Sequence[Int[np.ndarray, " _"]],
 ) -> ViewMaps:
     """Build the maps of views that share a world frame."""
-    cameras, tables = zip(
-        *(_table(*one, to_working.scale) for one in zip(views, columns, strict=True))
-    )
+    maps = [
+        _table(view, column, to_working.scale) for view, column in zip(views, columns, strict=True)
+    ]
+    cameras, tables = zip(*maps)
     sizes = np.array([camera.size[::-1] for camera in cameras])
+    pixels = [0, *(table.shape[1] for table in tables[:-1])]  # of the views before each
     return ViewMaps(
         float_tensor([R for R, _ in world_to_camera]),
+        # From x_cam = R @ x + t, with x_working = scale * x + to_working.t.
         float_tensor([to_working.scale * t - R @ to_working.t for R, t in world_to_camera]),
         float_tensor([np.sqrt(camera.focal_length.prod()) for camera in cameras]),
         float_tensor([camera.principal_point for camera in cameras]),
         float_tensor(sizes),
-        torch.from_numpy(np.cumsum([0, *(table.shape[1] for table in tables[:-1])])),
+        torch.from_numpy(np.cumsum(pixels)),
         torch.from_numpy(np.concatenate(tables, axis=1)).T,
         float_tensor([view.frame.camera.size[::-1] for view in views] / sizes),
     )
@@ -216,16 +231,17 @@ def project_points(
     points: Float[Tensor, "n 3"],
 ) -> Projection:
     """Project the points `linear @ x + translation` into every view and read the maps."""
-    m = len(linear)
-    v = len(maps.size)
+    # The points in all cameras, (m, v, 3, n), by one product of (m * v * 3, 3) and (3, n).
     camera_linear = (maps.rotation @ linear[:, None]).reshape(-1, 3)
     camera_translation = (maps.rotation @ translation[:, None, :, None])[..., 0] + maps.translation
-    in_camera = (camera_linear @ points.T).view(m, v, 3, -1).add_(camera_translation[..., None])
+    in_camera = (camera_linear @ points.T).view(len(linear), len(maps.size), 3, -1)
+    in_camera = in_camera.add_(camera_translation[..., None])
     depth = in_camera[:, :, 2]
     pixels_per_unit = maps.focal_length[:, None] / depth.clamp_min(_MIN_DEPTH)
     pixels = (
         in_camera[:, :, :2].mul_(pixels_per_unit[:, :, None]).add_(maps.principal_point[..., None])
     )
+    # The greatest coordinates within the image: its size is beyond it.
     last = torch.nextafter(maps.size, torch.zeros(()))[..., None]
     # A point beyond the border reads the nearest border pixel, and its silhouette distance is
     # larger by the distance to it; but where the silhouette reaches the border, the object is cut
@@ -239,6 +255,7 @@ def project_points(
     ]
     surface_depth, weight, distance, patch = read
     beyond = torch.sub(pixels, nearest).abs_().sum(2)  # 0 within the image
+    # The sign is 0 where the border pixel is inside the silhouette.
     distance = distance.addcmul_(beyond, distance.sign()).div_(pixels_per_unit)
     return Projection(depth, surface_depth, weight, distance, patch.int(), pixels.transpose(2, 3))
 
@@ -249,23 +266,28 @@ def _table(
     """Resize the camera to about _MAP_PIXELS pixels, with equal focal lengths; fill its table."""
     camera = view.frame.camera
     grid = view.features.grid
+    # Height by width of the field of view, in tangents of angles.
     aspect = (camera.size[0] / camera.focal_length[1]) / (camera.size[1] / camera.focal_length[0])
     height = max(round(float(np.sqrt(_MAP_PIXELS * aspect))), 1)
     width = max(round(_MAP_PIXELS / height), 1)
+    size = (height, width)
+
     mask = cv2.resize(view.soft_mask, (width, height), interpolation=cv2.INTER_LINEAR)
-    depth = view.frame.depth[_at_centres((height, width), camera.size)]
-    outside = [(mask < threshold).astype(np.uint8) for threshold in _MASK_THRESHOLDS]
-    distance = [
-        cv2.distanceTransform(one, cv2.DIST_L2, 5).clip(max=_NO_SILHOUETTE) for one in outside
-    ]
-    column = columns.reshape(grid)[_at_centres((height, width), grid)]
-    table = depth * scale, np.where(depth > 0, mask, 0), np.mean(distance, axis=0), column
+    depth = view.frame.depth[_at_centres(size, camera.size)]
+    distances = []
+    for threshold in _MASK_THRESHOLDS:
+        outside = (mask < threshold).astype(np.uint8)
+        distance = cv2.distanceTransform(outside, cv2.DIST_L2, 5)  # by OpenCV's 5 x 5 window
+        distances.append(distance.clip(max=_NO_SILHOUETTE))
+    column = columns.reshape(grid)[_at_centres(size, grid)]
+    table = [depth * scale, np.where(depth > 0, mask, 0), np.mean(distances, axis=0), column]
     stacked = np.stack([values.astype(np.float32) for values in table])
-    return camera.resize((height, width)), stacked.reshape(4, -1)
+    return camera.resize(size), stacked.reshape(4, -1)
 
 
 def _at_centres(size: tuple[int, int], grid: tuple[int, int]) -> tuple[Int[np.ndarray, "_ _"], ...]:
     """Index a grid over an image of (height, width) pixels by the cell at each pixel's centre."""
+    # The centre of pixel i is at the fraction (2 i + 1) / (2 n) of the side.
     return np.ix_(*((2 * np.arange(n) + 1) * cells // (2 * n) for n, cells in zip(size, grid)))
 
 
@@ -282,13 +304,13 @@ def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
     # What three views show has three times the points.
     points = points / _DENSITY_SIGMA
     square = points.square().sum(dim=1, keepdim=True)
+    # -|x - y|^2 / 2 = -|y|^2 / 2 + (x, |x|^2) . (y, -1/2), for few x at a time, so that the product
+    # stays in the processor's cache.
     left = torch.cat([points, square], dim=1)
     right = torch.cat([points, torch.full_like(square, -0.5)], dim=1)
-    # |x - y|^2 / 2 is a product of few rows at a time with all, so that it stays in the processor's
-    # cache.
     products = (torch.addmm(-square.T / 2, part, right.T) for part in left.split(_DENSITY_ROWS))
-    density = torch.cat([exp_(product).sum(dim=1) for product in products])
-    return (1 / density) / (1 / density).sum()
+    weight = 1 / torch.cat([exp_(product).sum(dim=1) for product in products])
+    return weight / weight.sum()
 
 
 def _relative_pose(first: Camera, second: Camera) -> _Rigid:
@@ -311,8 +333,8 @@ def _normalisation(
         raise NoPoseError(
             f"{name}: {n} foreground patches of known depth, expected at least {MIN_POINTS}"
         )
-    kept = valid.copy()
-    kept[valid] = near_median(points[valid], _OUTLIER_DISTANCE)
-    mean = points[kept].mean(axis=0)
-    spread = standard_deviation(points[kept])
-    return Sim3(1 / spread, np.eye(3), -mean / spread), kept
+    inliers = valid.copy()
+    inliers[valid] = near_median(points[valid], _OUTLIER_DISTANCE)
+    mean = points[inliers].mean(axis=0)
+    spread = standard_deviation(points[inliers])
+    return Sim3(1 / spread, np.eye(3), -mean / spread), inliers

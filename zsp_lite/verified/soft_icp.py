@@ -14,6 +14,8 @@ fit of the pose: a point without a target point that is near and similar has nea
 
 import numpy as np
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from zsp_lite.alignment import nearest_rotation
 from zsp_lite.verified.poses import SCALE_RANGE, Poses, exp_, float_tensor
@@ -21,18 +23,16 @@ from zsp_lite.verified.scene import Scene
 
 _ITERATIONS = 6
 _FEATURE_WEIGHT = 8.0  # lambda
-_MAX_POINTS = 100, 300  # of the reference, of the targets
-_SIGMAS = 0.5, 0.15  # first and last, working units
+_MAX_POINTS = (100, 300)  # of the reference, of the targets
+_SIGMAS = (0.5, 0.15)  # first and last, working units
 _OUTLIER_AFFINITY = 0.01  # a_0 divided by the number of target points
 
 
 def soft_icp(scene: Scene, poses: Poses) -> Poses:
     """Align every pose to the local optimum, independently of the others."""
     # Evenly spaced points of both sides.
-    totals = len(scene.reference_points), len(scene.target_points)
-    rows, columns = [
-        torch.arange(min(n, most)) * n // min(n, most) for n, most in zip(totals, _MAX_POINTS)
-    ]
+    rows = _evenly_spaced(len(scene.reference_points), _MAX_POINTS[0])
+    columns = _evenly_spaced(len(scene.target_points), _MAX_POINTS[1])
     source = scene.reference_points[rows]
     target = scene.target_points[columns]
     feature_term = _FEATURE_WEIGHT * scene.similarity[rows][:, scene.target_column[columns]]
@@ -67,3 +67,9 @@ def soft_icp(scene: Scene, poses: Poses) -> Poses:
         rotated_mean = (rotation @ source_mean[..., None])[..., 0]
         poses = Poses(scale, rotation, partner_mean - scale[:, None] * rotated_mean)
     return poses
+
+
+def _evenly_spaced(total: int, most: int) -> Int[Tensor, " n"]:
+    """Return at most so many evenly spaced indices below a total."""
+    count = min(total, most)
+    return torch.arange(count) * total // count

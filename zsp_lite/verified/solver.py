@@ -82,46 +82,45 @@ class VerifiedSolver:
             one_of_two,
         )
 
+    @torch.no_grad()
     def solve(
         self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], seed: int = 0
     ) -> Solution:
         """Run all stages on usable target views, in any order and any world, and their matches."""
         rng = np.random.default_rng(seed)
         timings = {}
-        with torch.no_grad():
-            with timed(timings, "scene"):
-                order = _content_order(targets)
-                targets = [targets[k] for k in order]
-                matched = [matched[k] for k in order]
-                similarities = [one.similarity for one in matched]
-                matches = [one.matches for one in matched]
-                scene = build_scene(reference, targets, similarities, matches)
+        with timed(timings, "scene"):
+            order = _content_order(targets)
+            scene = build_scene(
+                reference,
+                [targets[k] for k in order],
+                [matched[k].similarity for k in order],
+                [matched[k].matches for k in order],
+            )
 
-            with timed(timings, "proposals"):
-                by_view = [poses_from_matches(*points, rng) for points in scene.matches]
-                poses = concatenate([*by_view, poses_from_views(scene)])
+        with timed(timings, "proposals"):
+            by_view = [poses_from_matches(*points, rng) for points in scene.matches]
+            poses = concatenate([*by_view, poses_from_views(scene)])
 
-            with timed(timings, "alignment"):
-                poses = soft_icp(scene, poses)
+        with timed(timings, "alignment"):
+            poses = soft_icp(scene, poses)
 
-            with timed(timings, "verification"):
-                score = WEIGHTS.score(score_terms(scene, poses))
-                kept = non_maximum_suppression(
-                    poses.rotation, score, _MIN_ANGLE_REFINED, _MAX_REFINED
-                )
-                poses = poses[kept]
+        with timed(timings, "verification"):
+            score = WEIGHTS.score(score_terms(scene, poses))
+            poses = poses[
+                non_maximum_suppression(poses.rotation, score, _MIN_ANGLE_REFINED, _MAX_REFINED)
+            ]
 
-            with timed(timings, "refinement"):
-                poses = refine_coarse_to_fine(scene, poses, rng)
+        with timed(timings, "refinement"):
+            poses = refine_coarse_to_fine(scene, poses, rng)
 
-            with timed(timings, "ranking"):
-                terms = score_terms(scene, poses)
-                score = WEIGHTS.score(terms)
-                best = non_maximum_suppression(poses.rotation, score, MIN_ANGLE, MAX_HYPOTHESES)
-                poses = poses[best]
-                views = scene.target_maps.rotation.transpose(1, 2)
-                angles = rotation_angles(poses.rotation, views).numpy()  # (poses, views)
-                hypotheses = _hypotheses(scene, poses, terms[best], angles, order)
+        with timed(timings, "ranking"):
+            terms = score_terms(scene, poses)
+            score = WEIGHTS.score(terms)
+            best = non_maximum_suppression(poses.rotation, score, MIN_ANGLE, MAX_HYPOTHESES)
+            poses = poses[best]
+            angles = scene.view_angles(poses).numpy()
+            hypotheses = _hypotheses(scene, poses, terms[best], angles, order)
         # From the scene's order of the views back to the caller's.
         view_angles = angles[0][np.argsort(order)].astype(np.float64)
         return Solution(hypotheses, view_angles, timings, scene, order, poses)
@@ -133,6 +132,7 @@ def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
     for target in targets:
         content = target.frame.rgb.tobytes() + target.foreground.numpy().tobytes()
         digests.append(hashlib.blake2b(content, digest_size=16).digest())
+    # The positions of the views, sorted by the digests.
     return tuple(sorted(range(len(targets)), key=digests.__getitem__))
 
 
@@ -146,17 +146,29 @@ def _hypotheses(
     # Poses of one mode share a probability: only its best pose enters, the others' odds are 0.
     mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
     deficit = np.where(mode == np.arange(len(mode)), score[0] - score, np.inf)
-    facts = float(angles[0].min()), scene.view_similarity_std, float(shape_fit[0])
-    known = evidence(scene.view_span, len(order), *facts)
+    known = evidence(
+        scene.view_span,
+        len(order),
+        float(angles[0].min()),
+        scene.view_similarity_std,
+        float(shape_fit[0]),
+    )
     confidence = Calibration().probabilities(deficit, known)[mode]
 
+    hypotheses = []
     # The scene's view that is closest under each pose.
-    nearest = angles.argmin(axis=1).tolist()
-    sim3s = [scene.to_sim3(poses, i, view) for i, view in enumerate(nearest)]
-    named = [dict(zip(TERM_NAMES, row)) for row in terms.tolist()]
-    views = [order[view] for view in nearest]
-    parts = sim3s, views, score.tolist(), named, confidence.tolist(), mode.tolist()
-    return tuple(Hypothesis(*one) for one in zip(*parts))
+    for i, view in enumerate(angles.argmin(axis=1).tolist()):
+        hypotheses.append(
+            Hypothesis(
+                scene.to_sim3(poses, i, view),
+                order[view],
+                float(score[i]),
+                dict(zip(TERM_NAMES, terms[i].tolist())),
+                float(confidence[i]),
+                int(mode[i]),
+            )
+        )
+    return tuple(hypotheses)
 
 
 def measured_inliers(

@@ -45,14 +45,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from zsp_lite.verified.poses import Poses, exp_, rotation_angles
+from zsp_lite.verified.poses import Poses, exp_
 from zsp_lite.verified.scene import Projection, Scene, project_points
 
 SURFACE_SIGMA = 0.25  # sigma, working units
 MAX_VIOLATION = 0.5  # rho, working units: distance at which b and c reach 1
 VIEWPOINT_SIGMA = 45.0  # degrees
 _SIMILARITY_PRIOR = 0.5  # kappa
-# projected points at a time, so that intermediate results stay in the processor's cache
+# Projected points at a time, so that intermediate results stay in the processor's cache.
 _CHUNK = 250_000
 
 
@@ -134,14 +134,14 @@ def score_terms(
     size = max(_CHUNK // per_pose, 1)
     chunks = []
     for first in range(0, len(poses), size):
-        some = poses[first : first + size]
-        forward = forward_terms(scene, some, stride[0])
-        reverse = reverse_terms(scene, some, stride[1])
-        chunks.append((*forward.averages(reference_weights), *reverse.averages(target_weights)))
+        chunk = poses[first : first + size]
+        forward = forward_terms(scene, chunk, stride[0]).averages(reference_weights)
+        reverse = reverse_terms(scene, chunk, stride[1]).averages(target_weights)
+        chunks.append(torch.stack([*forward, *reverse], dim=1))
     # The angle includes rotation about the line of sight, with which features change.
-    angle = rotation_angles(poses.rotation, scene.target_maps.rotation.transpose(1, 2))
+    angle = scene.view_angles(poses)
     viewpoint = torch.exp(-((angle / VIEWPOINT_SIGMA) ** 2)) @ scene.view_similarity
-    return torch.stack([*(torch.cat(term) for term in zip(*chunks)), viewpoint], dim=1)
+    return torch.cat([torch.cat(chunks), viewpoint[:, None]], dim=1)
 
 
 def _point_terms(

@@ -16,6 +16,10 @@ from zsp_lite.viz.plots import VERMILLION
 COLUMNS = ("object", "right (%)", "else turned by", "that (%)")
 _DOUBTFUL = 0.8  # an object with a lower probability should be looked at
 MOST = 10  # objects of a figure
+# Width and height that the figure has for one picture with its texts, and its border, in inches.
+_WIDTH = 1.25
+_HEIGHT = 1.35
+_BORDER = 0.3
 
 
 def objects_figure(
@@ -29,56 +33,70 @@ def objects_figure(
     """
     names = list(names or alignment.objects)[:MOST]
     objects = alignment.objects
-    look = doubtful(alignment)
-    surest, first = max(objects.items(), key=lambda item: item[1].probability)
+    flagged = doubtful(alignment)
+
+    # Each row shows an object by the frame that is nearest to a rotation from its world to the
+    # camera.
+    surest = max(objects, key=lambda name: objects[name].probability)
     camera = dataset.camera(_frames(dataset, category, surest)[0]).R
-    common = camera @ first.sim3.R.T
-    rows = {"as scanned": dict.fromkeys(names, camera)}
-    rows["aligned"] = {name: common @ objects[name].sim3.R for name in names}
-    others = {name: objects[name].alternative for name in names if name in look}
-    turned = {name: common @ other.R for name, other in others.items() if other}
+    common = camera @ objects[surest].sim3.R.T  # from the common frame to the camera
+    rows = {
+        "as scanned": dict.fromkeys(names, camera),
+        "aligned": {name: common @ objects[name].sim3.R for name in names},
+    }
+    turned = {}
+    for name in names:
+        alternative = objects[name].alternative
+        if name in flagged and alternative:
+            turned[name] = common @ alternative.R
     if turned:
         rows["or turned"] = turned
-    size = 1.25 * len(names) + 0.3, 1.35 * len(rows) + 0.3
+
+    # The pictures.
+    size = (_WIDTH * len(names) + _BORDER, _HEIGHT * len(rows) + _BORDER)
     figure, axes = plt.subplots(
         len(rows), len(names), figsize=size, layout="constrained", squeeze=False
     )
-    for line, (title, cameras) in zip(axes, rows.items(), strict=True):
-        line[names.index(next(iter(cameras)))].set_ylabel(title)
+    for line, (title, rotations) in zip(axes, rows.items(), strict=True):
+        first = names.index(next(iter(rotations)))  # the last row has pictures of some names only
+        line[first].set_ylabel(title)
         for axis, name in zip(line, names, strict=True):
             axis.set(xticks=[], yticks=[], frame_on=False)
-            if name in cameras:
+            if name in rotations:
                 frames = _frames(dataset, category, name)
-                angles = rotation_angle(
-                    np.stack([dataset.camera(one).R for one in frames]), cameras[name]
-                )
-                axis.imshow(object_crop(dataset.load(frames[int(np.argmin(angles))])).rgb)
+                seen_from = np.stack([dataset.camera(frame).R for frame in frames])
+                nearest = int(np.argmin(rotation_angle(seen_from, rotations[name])))
+                axis.imshow(object_crop(dataset.load(frames[nearest])).rgb)
+
+    # Names and probabilities below the row "aligned".
     for axis, name in zip(axes[1], names, strict=True):
         text = f"{name[:16]}\n{100 * objects[name].probability:.0f} %"
-        colour = VERMILLION if name in look else "black"
+        colour = VERMILLION if name in flagged else "black"
         axis.set_xlabel(text, fontsize=8, color=colour, parse_math=False)
     return figure
 
 
 def doubtful(alignment: CategoryAlignment) -> list[str]:
     """Return the names of the objects whose pose should be looked at."""
-    return [name for name, one in alignment.objects.items() if one.probability < _DOUBTFUL]
+    return [name for name, pose in alignment.objects.items() if pose.probability < _DOUBTFUL]
 
 
 def object_rows(alignment: CategoryAlignment) -> list[tuple[str, ...]]:
     """Return the table of objects: name, probability, next best turn and its probability."""
     rows = []
-    for name, one in alignment.objects.items():
-        other = "", ""
-        if one.alternative:
-            turn = rotation_angle(one.sim3.R, one.alternative.R)
-            other = f"{turn:.0f}°", f"{100 * one.alternative_probability:.0f}"
+    for name, pose in alignment.objects.items():
+        turn = ""
+        probability = ""
+        if pose.alternative:
+            turn = f"{rotation_angle(pose.sim3.R, pose.alternative.R):.0f}°"
+            probability = f"{100 * pose.alternative_probability:.0f}"
         flag = " (look)" if name in doubtful(alignment) else ""
-        rows.append((f"{name}{flag}", f"{100 * one.probability:.0f}", *other))
+        rows.append((f"{name}{flag}", f"{100 * pose.probability:.0f}", turn, probability))
     return rows
 
 
 def _frames(dataset: Co3D, category: str, name: str) -> list[FrameAnnotation]:
-    """Read the frames of an object with a camera, and those with a mask only if there are some."""
-    frames = [one for one in dataset.frames(category, name) if one.viewpoint is not None]
-    return [one for one in frames if one.mask is not None] or frames
+    """Read the frames of an object with a camera and a mask; if none has a mask, those with a
+    camera."""
+    frames = [frame for frame in dataset.frames(category, name) if frame.viewpoint is not None]
+    return [frame for frame in frames if frame.mask is not None] or frames

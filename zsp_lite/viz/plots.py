@@ -37,17 +37,23 @@ from zsp_lite.views import View
 Cell = Sequence[int] | np.ndarray  # (row, col)
 
 # The palette of Okabe and Ito: distinguishable with the common colour-vision deficiencies.
-BLUE, ORANGE, GREEN, VERMILLION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
+BLUE = "#0072B2"
+ORANGE = "#E69F00"
+GREEN = "#009E73"
+VERMILLION = "#D55E00"
 CHOSEN = ORANGE
 # Of several curves or groups of points in one figure, in this order and then again.
-COLOURS = BLUE, ORANGE, GREEN, VERMILLION, "#56B4E9", "#CC79A7", "#000000"
-_LINES = "-", "--", "-.", ":"
+COLOURS = (BLUE, ORANGE, GREEN, VERMILLION, "#56B4E9", "#CC79A7", "#000000")
+_LINES = ("-", "--", "-.", ":")
 _MARKERS = "os^DvP*X"
 _CLOUD_MARKERS = "oxs^"  # crosses let discs below them be seen
-_AXIS_COLOURS = VERMILLION, GREEN, BLUE
-_FONT = 10
+_AXIS_COLOURS = (VERMILLION, GREEN, BLUE)
+_FONT = 10  # points
+_TITLE_LINE = 0.2  # height of a line of a title at this font, in inches
 _MARKED = 20  # points of a curve; more have no markers
 _JOINED = 15  # matches with a line
+_INSIDE = 0.9  # a mask above this leaves out the border of the object
+_OUTLIER = 2.5  # median distances; points farther out are background (see `near_median`)
 _OUTLINE = [Stroke(linewidth=3, foreground="white"), Normal()]  # for lines and texts on dark images
 BORDER = [Stroke(linewidth=4, foreground="black"), Normal()]  # for white lines on light images
 _WHITE_BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
@@ -66,9 +72,8 @@ def show_images(
     Pixel (x, y) of an image is at (x, y) of its axes, [0, W] x [0, H].
     """
     aspect = max(np.shape(image)[0] / np.shape(image)[1] for image in images)
-    figure, axes = _panels(
-        len(images), columns, size, size * aspect + 0.1 + 0.2 * _lines_of(titles)
-    )
+    height = size * aspect + 0.1 + _TITLE_LINE * _lines_of(titles)  # 0.1: space between the rows
+    figure, axes = _panels(len(images), columns, size, height)
     for axis, image in zip(axes, images):
         axis.set_axis_off()
         draw_image(axis, image, cmap)
@@ -104,9 +109,14 @@ def overlay_map(
     `set_data` fills it anew.
     """
     low, high = limits or (None, None)
-    style = {"cmap": cmap, "alpha": alpha, "interpolation": "nearest", "vmin": low, "vmax": high}
     drawn = axis.imshow(
-        np.asarray(values, np.float64), extent=(*axis.get_xlim(), *axis.get_ylim()), **style
+        np.asarray(values, np.float64),
+        cmap=cmap,
+        alpha=alpha,
+        interpolation="nearest",
+        vmin=low,
+        vmax=high,
+        extent=(*axis.get_xlim(), *axis.get_ylim()),
     )
     if label is not None:
         bar = axis.figure.colorbar(drawn, ax=axis, location="bottom", shrink=0.85, pad=0.02)
@@ -118,10 +128,23 @@ def overlay_map(
 def mark(axis: Axes, text: str, colour: str = CHOSEN, size: float = _FONT) -> None:
     """Draw a coloured frame around the image of an axis and write `text` in its corner, `size`
     points high."""
-    frame = {"transform": axis.transAxes, "fill": False, "edgecolor": colour, "linewidth": 5}
-    axis.add_patch(Rectangle((0, 0), 1, 1, zorder=10, **frame))
-    font = {"fontsize": size, "weight": "bold", "va": "top", "parse_math": False}
-    axis.text(0.04, 0.95, text, transform=axis.transAxes, bbox=_WHITE_BOX, zorder=11, **font)
+    whole = axis.transAxes  # from fractions of the width and height of the axis
+    frame = Rectangle(
+        (0, 0), 1, 1, fill=False, edgecolor=colour, linewidth=5, transform=whole, zorder=10
+    )
+    axis.add_patch(frame)
+    axis.text(
+        0.04,
+        0.95,
+        text,
+        fontsize=size,
+        weight="bold",
+        va="top",
+        parse_math=False,
+        bbox=_WHITE_BOX,
+        transform=whole,
+        zorder=11,
+    )
 
 
 def patch_centres(
@@ -129,29 +152,26 @@ def patch_centres(
 ) -> Float[np.ndarray, "n 2"]:
     """Return the pixels (x, y) of the centres of patches (row, col) of a grid over an image of
     `size` (H, W)."""
-    scale = np.array([size[1] / grid[1], size[0] / grid[0]])
+    scale = np.array([size[1] / grid[1], size[0] / grid[0]])  # pixels per patch in x and y
     return (np.asarray(cells)[:, ::-1] + 0.5) * scale
 
 
 def match_pixels(views: Sequence[View], matches: Matches) -> list[Float[np.ndarray, "n 2"]]:
     """Return the pixels (x, y) of matched patches in the images of the reference and of the
     target."""
-    cells = matches.reference, matches.target
     return [
-        patch_centres(own, view.features.grid, view.frame.rgb.shape[:2])
-        for own, view in zip(cells, views)
+        patch_centres(cells, view.features.grid, view.frame.rgb.shape[:2])
+        for cells, view in zip((matches.reference, matches.target), views)
     ]
 
 
 def circle_patch(axis: Axes, cell: Cell, grid: tuple[int, int], marker: str = "o") -> list[Artist]:
     """Mark a patch of the image of an axis by a white circle, or by an orange star
     (`marker` "*")."""
-    style = (
-        {"color": ORANGE, "markersize": 18}
-        if marker == "*"
-        else {"color": "white", "markersize": 7}
-    )
-    centre = patch_centres(np.array([cell]), grid, _size(axis)).T
+    style = {"color": "white", "markersize": 7}
+    if marker == "*":
+        style = {"color": ORANGE, "markersize": 18}
+    centre = patch_centres(np.array([cell]), grid, _size(axis))[0]
     return axis.plot(*centre, marker, markeredgecolor="black", zorder=8, **style)
 
 
@@ -169,15 +189,17 @@ def outline_patch(
 
     The block is cut at the border of the image.
     """
+    # First and last corner (row, col) of the block, and the same in pixels (x, y).
     corners = np.clip([np.subtract(cell, reach), np.add(cell, reach + 1)], 0, grid)
     (left, top), (right, bottom) = corners[:, ::-1] * np.divide(_size(axis), grid)[::-1]
     box = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=colour, **style)
-    at, side = (right, "left") if cell[1] < 0.8 * grid[1] else (left, "right")
+    # The label is at the right of the block, but near the right border at its left.
+    near_border = cell[1] >= 0.8 * grid[1]
     name = axis.text(
-        at,
+        left if near_border else right,
         (top + bottom) / 2,
         f" {label} ",
-        ha=side,
+        ha="right" if near_border else "left",
         va="center",
         weight="bold",
         path_effects=_OUTLINE,
@@ -195,20 +217,20 @@ def draw_cycle(
     """Draw a cycle between the images of two axes: a solid arrow from u to v, a dashed one from v
     back to u'."""
     if names and tuple(cells[0]) == tuple(cells[2]):
-        names = f"{names[0]} = {names[2]}", names[1], ""
-    ends = axes[0], axes[1], axes[0]
-    places = [
-        patch_centres(np.array([cell]), grid, _size(axis))[0] for cell, axis in zip(cells, ends)
+        names = (f"{names[0]} = {names[2]}", names[1], "")
+    stops = (axes[0], axes[1], axes[0])  # the axes of u, v and u'
+    pixels = [
+        patch_centres(np.array([cell]), grid, _size(axis))[0] for cell, axis in zip(cells, stops)
     ]
-    drawn = axes[0].plot(*places[0], "o", color=colour, markeredgecolor="black", markersize=8)
-    for start, line in ((0, "-"), (1, "--")):
+    drawn = axes[0].plot(*pixels[0], "o", color=colour, markeredgecolor="black", markersize=8)
+    for start, line in enumerate(("-", "--")):
         arrow = ConnectionPatch(
-            places[start],
-            places[start + 1],
+            pixels[start],
+            pixels[start + 1],
             "data",
             "data",
-            axesA=ends[start],
-            axesB=ends[start + 1],
+            axesA=stops[start],
+            axesB=stops[start + 1],
             arrowstyle="-|>",
             mutation_scale=14,
             connectionstyle="arc3,rad=-0.1",
@@ -218,18 +240,12 @@ def draw_cycle(
             path_effects=BORDER,
         )
         drawn.append(axes[0].figure.add_artist(arrow))
-    for axis, place, name, side in zip(ends, places, names, ("left", "left", "right")):
-        drawn.append(
-            axis.text(
-                *place,
-                name,
-                fontsize=11,
-                weight="bold",
-                va="bottom",
-                ha=side,
-                path_effects=_OUTLINE,
-            )
+    # The name of u' is at its left: u, which is often near, has its own at its right.
+    for axis, pixel, name, side in zip(stops, pixels, names, ("left", "left", "right")):
+        text = axis.text(
+            *pixel, name, fontsize=11, weight="bold", va="bottom", ha=side, path_effects=_OUTLINE
         )
+        drawn.append(text)
     return drawn
 
 
@@ -243,11 +259,8 @@ def show_matches(
 ) -> Figure:
     """Show two images and matches of their patches (row, col), as `draw_matches` draws them."""
     figure, axes = show_images(images, titles, size=size)
-    draw_matches(
-        axes,
-        [patch_centres(own, grid, image.shape[:2]) for own, image in zip(cells, images)],
-        inliers,
-    )
+    pixels = [patch_centres(own, grid, image.shape[:2]) for own, image in zip(cells, images)]
+    draw_matches(axes, pixels, inliers)
     return figure
 
 
@@ -261,25 +274,32 @@ def draw_matches(
 
     Of more than 15 matches, 15 have a line, with the same share of inliers.
     """
-    inliers = np.ones(len(pixels[0]), bool) if inliers is None else inliers
-    joined = np.argsort(inliers, kind="stable")  # inliers last, above
-    joined = joined[np.linspace(0, len(joined) - 1, min(len(joined), _JOINED)).astype(int)]
+    count = len(pixels[0])
+    inliers = np.ones(count, bool) if inliers is None else inliers
+    order = np.argsort(inliers, kind="stable")  # inliers last, above
     drawn = []
-    for a, b, good in zip(*(part[joined] for part in (*pixels, inliers))):
+    for index in order[np.linspace(0, count - 1, min(count, _JOINED)).astype(int)]:
         style = {"color": VERMILLION, "linewidth": 1.2, "linestyle": (0, (4, 2))}
-        if good:  # with a white outline, to be visible on dark images
+        if inliers[index]:  # with a white outline, to be visible on dark images
             style = {"color": BLUE, "linewidth": 1.8, "path_effects": _OUTLINE}
         line = ConnectionPatch(
-            a, b, "data", "data", axesA=axes[0], axesB=axes[1], zorder=5, **style
+            pixels[0][index],
+            pixels[1][index],
+            "data",
+            "data",
+            axesA=axes[0],
+            axesB=axes[1],
+            zorder=5,
+            **style,
         )
         drawn.append(axes[0].figure.add_artist(line))
-    for axis, at in zip(axes, pixels):
-        drawn.append(
-            axis.scatter(*at[~inliers].T, 25, VERMILLION, marker="x", linewidths=1.2, zorder=6)
-        )
-        drawn.append(
-            axis.scatter(*at[inliers].T, 25, BLUE, edgecolors="white", linewidths=0.7, zorder=6)
-        )
+    for axis, places in zip(axes, pixels):
+        wrong = places[~inliers].T  # (2, m)
+        right = places[inliers].T
+        drawn += [
+            axis.scatter(*wrong, 25, VERMILLION, marker="x", linewidths=1.2, zorder=6),
+            axis.scatter(*right, 25, BLUE, edgecolors="white", linewidths=0.7, zorder=6),
+        ]
     return drawn
 
 
@@ -306,9 +326,9 @@ def show_panels(
     for axis, (title, curves) in zip(axes, panels.items()):
         styles = zip(curves.items(), cycle(COLOURS), cycle(_LINES), cycle(_MARKERS))
         for (name, (x, y)), colour, line, marker in styles:
-            style = {"marker": marker if len(x) <= _MARKED else None, "markersize": 5}
             if joined:
-                axis.plot(x, y, line, color=colour, label=name, **style)
+                marker = marker if len(x) <= _MARKED else None
+                axis.plot(x, y, line, color=colour, label=name, marker=marker, markersize=5)
             else:
                 axis.scatter(
                     x, y, 50, colour, marker, edgecolors="black", linewidths=0.4, label=name
@@ -332,22 +352,23 @@ def show_points(
     All panels have the same extent, around the first set of each; points far off it are cut. The y
     axis points `down` as in images. `labels` is what `Axes.set` takes.
     """
+    # The range of each panel's first set, without outliers: (panels, low and high, x and y).
     firsts = [next(iter(sets.values()))[:, :2] for sets in panels.values()]
     ranges = np.array([np.percentile(points, [1, 99], axis=0) for points in firsts])
     extent = (ranges[:, 1] - ranges[:, 0]).max(axis=0)
     half = extent / 2 + 0.2 * extent.max()
-    height = size * half[1] / half[0] + 0.6 + 0.2 * _lines_of(panels)
+    height = size * half[1] / half[0] + 0.6 + _TITLE_LINE * _lines_of(panels)  # 0.6: the legend
     figure, axes = _panels(len(panels), columns, size, height)
-    for axis, (title, sets), (x, y) in zip(axes, panels.items(), ranges.mean(axis=1)):
+    for axis, (title, sets), centre in zip(axes, panels.items(), ranges.mean(axis=1)):
         for (name, points), colour, marker in zip(sets.items(), colours, _CLOUD_MARKERS):
-            area = np.clip(6000 / max(len(points), 1), 3, 40)
-            style = {"marker": marker, "linewidths": 0.3 + 0.03 * area, "label": name}
-            axis.scatter(*points.T[:2], area, colour, **style)
+            area = np.clip(6000 / max(len(points), 1), 3, 40)  # of a mark: less for more points
+            thick = 0.3 + 0.03 * area
+            axis.scatter(*points.T[:2], area, colour, marker, linewidths=thick, label=name)
         axis.set_title(title, fontsize=_FONT, parse_math=False)
-        y_limits = (y + half[1], y - half[1]) if down else (y - half[1], y + half[1])
-        axis.set(
-            **{"xlim": (x - half[0], x + half[0]), "ylim": y_limits, "aspect": "equal"} | labels
-        )
+        left, bottom = centre - half
+        right, top = centre + half
+        y_limits = (top, bottom) if down else (bottom, top)
+        axis.set(**{"xlim": (left, right), "ylim": y_limits, "aspect": "equal"} | labels)
     for handle in _legend(figure, axes[0], "outside lower center").legend_handles:
         handle.set(sizes=[40], linewidths=[1.5])  # small marks would be pale
     return figure
@@ -365,28 +386,26 @@ def show_dots(
     rows = list(next(iter(groups.values())))
     figure, axis = plt.subplots(figsize=(8, 1.1 + 0.42 * len(rows)), layout="constrained")
     rng = np.random.default_rng(0)
-    width = 0.5 / len(groups)
-    for index, ((group, values), colour, marker) in enumerate(
-        zip(groups.items(), cycle(COLOURS), cycle(_MARKERS))
-    ):
+    width = 0.5 / len(groups)  # of the band of a group; rows are 1 apart
+    styles = zip(groups.items(), cycle(COLOURS), cycle(_MARKERS))
+    for index, ((group, values), colour, marker) in enumerate(styles):
         for row, name in enumerate(rows):
             middle = row + width * (index - (len(groups) - 1) / 2)
+            # Dots are scattered over the band, so that equal values can be told apart.
             height = middle + width * rng.uniform(-0.4, 0.4, len(values[name]))
-            style = {
-                "marker": marker,
-                "edgecolors": "white",
-                "linewidths": 0.4,
-                "label": "" if row else group,
-            }
-            axis.scatter(values[name], height, 40, colour, **style)
+            axis.scatter(
+                values[name],
+                height,
+                40,
+                colour,
+                marker,
+                edgecolors="white",
+                linewidths=0.4,
+                label="" if row else group,
+            )
             if median and len(values[name]):
-                axis.vlines(
-                    np.median(values[name]),
-                    middle - 0.4,
-                    middle + 0.4,
-                    color=VERMILLION,
-                    linewidth=2.5,
-                )
+                centre = np.median(values[name])
+                axis.vlines(centre, middle - 0.4, middle + 0.4, color=VERMILLION, linewidth=2.5)
     axis.set_yticks(range(len(rows)), rows)
     axis.set(ylim=(len(rows) - 0.4, -0.6), **labels)
     if len(groups) > 1:
@@ -407,14 +426,15 @@ def show_intervals(
     """
     figure, axis = plt.subplots(figsize=(7, 3.8), layout="constrained")
     styles = zip(intervals.items(), COLOURS, _LINES, _MARKERS)
-    for place, ((name, (values, low, high)), colour, line, marker) in enumerate(styles):
-        beside = offset_copy(
-            axis.transData, figure, x=5 * (place - (len(intervals) - 1) / 2), units="points"
-        )
+    for index, ((name, (values, low, high)), colour, line, marker) in enumerate(styles):
         line = line if joined else "none"
         (row,) = axis.plot(x, values, linestyle=line, marker=marker, color=colour, label=name)
-        for artist in (row, axis.vlines(x, low, high, color=colour, alpha=0.5, linewidth=3)):
-            artist.set_transform(beside)  # after the limits of the axis are known
+        bars = axis.vlines(x, low, high, color=colour, alpha=0.5, linewidth=3)
+        # Rows are 5 points apart. They are moved here, since the axis has got its limits from them.
+        shift = 5 * (index - (len(intervals) - 1) / 2)
+        beside = offset_copy(axis.transData, figure, x=shift, units="points")
+        row.set_transform(beside)
+        bars.set_transform(beside)
     axis.set(**labels)
     axis.minorticks_off()
     _legend(figure, axis)
@@ -456,16 +476,19 @@ def pca_colours(
     fitted to the `foreground` patches; others are white. Each map gives an RGB image in [0, 1],
     with one pixel per patch.
     """
-    features = [np.asarray(one, dtype=np.float64) for one in maps]
-    on = [
-        np.asarray(one, bool) for one in foreground or (np.ones(one.shape[:2]) for one in features)
-    ]
-    inside = np.concatenate([one[where] for one, where in zip(features, on)])
-    centred = inside - inside.mean(axis=0)
+    features = [np.asarray(values, dtype=np.float64) for values in maps]
+    foreground = foreground or [np.ones(values.shape[:2]) for values in features]
+    inside = [np.asarray(mask, bool) for mask in foreground]
+    fitted = np.concatenate([values[mask] for values, mask in zip(features, inside)])
+    centred = fitted - fitted.mean(axis=0)
+    # The last three eigenvectors (d, 3), those of the largest eigenvalues, in falling order.
     axes = np.linalg.eigh(centred.T @ centred)[1][:, :-4:-1]
-    low, high = np.percentile(inside @ axes, [2, 98], axis=0)
-    colours = [((one @ axes - low) / np.maximum(high - low, 1e-12)).clip(0, 1) for one in features]
-    return [np.where(where[..., None], own, 1.0) for own, where in zip(colours, on)]
+    low, high = np.percentile(fitted @ axes, [2, 98], axis=0)
+    colours = []
+    for values, mask in zip(features, inside):
+        scaled = (values @ axes - low) / np.maximum(high - low, 1e-12)
+        colours.append(np.where(mask[..., None], scaled.clip(0, 1), 1.0))
+    return colours
 
 
 def draw_points(
@@ -478,7 +501,7 @@ def draw_points(
     """Draw points of a camera's frame in its image, far ones first; those behind the camera are
     left out."""
     points = np.asarray(points, dtype=np.float64)
-    order = np.argsort(-points[:, 2])
+    order = np.argsort(-points[:, 2])  # far points first
     order = order[points[order, 2] > 0]
     pixels, _ = camera.project(camera.to_world(points[order]))
     colours = colours if isinstance(colours, str) else np.asarray(colours)[order]
@@ -498,31 +521,25 @@ def draw_axes(
     Arrows with an end behind the camera are left out; names stay inside the image.
     """
     pixels, depth = camera.project(camera.to_world(np.vstack([origin, ends])))
-    inside = np.array(camera.size[::-1])
-    for name, colour, end, near in zip(names, _AXIS_COLOURS, pixels[1:], depth[1:]):
-        if min(near, depth[0]) > 0:
-            arrow = {
-                "arrowstyle": "-|>",
-                "color": colour,
-                "linewidth": 2,
-                "shrinkA": 0,
-                "shrinkB": 0,
-            }
-            drawn = axis.annotate(
-                "", end, pixels[0], zorder=6, annotation_clip=False, arrowprops=arrow
-            )
-            drawn.set_in_layout(False)
-            drawn.arrow_patch.set_clip_path(axis.patch)
-            style = {
-                "fontsize": _FONT,
-                "weight": "bold",
-                "ha": "center",
-                "va": "center",
-                "path_effects": _OUTLINE,
-            }
-            axis.text(
-                *np.clip(end, 0.08 * inside, 0.92 * inside), name, color=colour, zorder=7, **style
-            )
+    size = np.array(camera.size[::-1])  # (W, H)
+    for name, colour, end, end_depth in zip(names, _AXIS_COLOURS, pixels[1:], depth[1:]):
+        if min(end_depth, depth[0]) <= 0:
+            continue
+        style = {"arrowstyle": "-|>", "color": colour, "linewidth": 2, "shrinkA": 0, "shrinkB": 0}
+        arrow = axis.annotate("", end, pixels[0], zorder=6, annotation_clip=False, arrowprops=style)
+        arrow.set_in_layout(False)
+        arrow.arrow_patch.set_clip_path(axis.patch)
+        axis.text(
+            *np.clip(end, 0.08 * size, 0.92 * size),
+            name,
+            color=colour,
+            zorder=7,
+            fontsize=_FONT,
+            weight="bold",
+            ha="center",
+            va="center",
+            path_effects=_OUTLINE,
+        )
 
 
 def draw_moved_cloud(
@@ -541,7 +558,7 @@ def draw_moved_cloud(
     """
     colours = coordinate_colours(cloud)
     middle = cloud.mean(axis=0)
-    ends = middle + 2 * axis_deviation(cloud) * np.eye(3)
+    ends = middle + 2 * axis_deviation(cloud) * np.eye(3)  # arrows of two standard deviations
     for axis, camera, pose in zip(axes, cameras, poses):
         draw_points(axis, camera, pose.apply(cloud), colours, size)
         if names is not None:
@@ -563,7 +580,8 @@ def moved_points(
 def chosen_views(estimates: Collection[PoseEstimate]) -> list[View]:
     """Return the reference of estimates, and for each its target view."""
     first, *_ = estimates
-    return [first.reference_view, *(one.target_views[one.view] for one in estimates)]
+    targets = [estimate.target_views[estimate.view] for estimate in estimates]
+    return [first.reference_view, *targets]
 
 
 def draw_estimates(
@@ -587,8 +605,10 @@ def coordinate_colours(points: Real[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 
     """Colour points by their position along the cloud's first principal axis."""
     points = np.asarray(points, dtype=np.float64)
     centred = points - points.mean(axis=0)
-    along = centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1]
-    return plt.get_cmap("viridis")((along - along.min()) / max(np.ptp(along), 1e-12))[:, :3]
+    axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]  # of the largest eigenvalue
+    along = centred @ axis
+    shares = (along - along.min()) / max(np.ptp(along), 1e-12)
+    return plt.get_cmap("viridis")(shares)[:, :3]
 
 
 def object_cloud(view: View, most: int = 2000) -> Float[np.ndarray, "n 3"]:
@@ -607,14 +627,15 @@ def frame_cloud(
     pixels `inside`."""
     if frame.depth is None:
         raise InputError(f"{frame.name or 'frame'}: no depth map")
-    inside = inside if frame.mask is None else frame.mask > 0.9
+    inside = inside if frame.mask is None else frame.mask > _INSIDE
     points = unproject_depth(frame.depth, frame.camera)[inside & (frame.depth > 0)]
     if len(points) == 0:
         raise InputError(f"{frame.name or 'frame'}: no pixel of the object has a known depth")
-    kept = np.flatnonzero(near_median(points, 2.5))
-    if len(kept) > most:
-        kept = kept[np.sort(np.random.default_rng(0).choice(len(kept), most, replace=False))]
-    return points[kept]
+    points = points[near_median(points, _OUTLIER)]
+    if len(points) > most:
+        chosen = np.random.default_rng(0).choice(len(points), most, replace=False)
+        points = points[np.sort(chosen)]
+    return points
 
 
 def _panels(
@@ -622,8 +643,8 @@ def _panels(
 ) -> tuple[Figure, list[Axes]]:
     """Return panels of a size in inches in a grid, by default in one row."""
     columns = min(columns or number, number)
-    rows = -(-number // columns)
-    size = columns * width, rows * height
+    rows = -(-number // columns)  # rounded up
+    size = (columns * width, rows * height)
     figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
     for axis in axes.flat[number:]:
         axis.remove()
@@ -631,12 +652,13 @@ def _panels(
 
 
 def _legend(figure: Figure, axis: Axes, place: str = "outside upper center") -> Legend:
+    """Add a legend to a figure, with the names of one axis, in up to four columns."""
     handles, names = axis.get_legend_handles_labels()
     return figure.legend(handles, names, ncols=min(len(names), 4), fontsize=9, loc=place)
 
 
 def _lines_of(titles: Iterable[str]) -> int:
-    """Return the most lines of a title."""
+    """Return the number of lines of the highest title."""
     return max((title.count("\n") + 1 for title in titles), default=0)
 
 

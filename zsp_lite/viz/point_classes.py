@@ -18,7 +18,7 @@ POINT_CLASSES: dict[str, tuple[str, str]] = {
     "outside the silhouette": (VERMILLION, "X"),
     "depth unknown": ("white", "s"),
 }
-_DRAWN = 1, 4, 0, 2, 3  # contradictions last, so that no other point covers them
+_DRAWN = (1, 4, 0, 2, 3)  # contradictions last, so that no other point covers them
 
 
 def classify_points(terms: PointTerms, pose: int = 0) -> Int[np.ndarray, "v n"]:
@@ -27,14 +27,13 @@ def classify_points(terms: PointTerms, pose: int = 0) -> Int[np.ndarray, "v n"]:
     A point is on the surface if its surface weight is at least half of what it would be exactly on
     the surface. The points that are left are behind it: occluded.
     """
-    projection = terms.projection
-    distance = projection.silhouette_distance[pose].numpy()
-    weight = projection.weight[pose].numpy()
+    distance = terms.projection.silhouette_distance[pose].numpy()
+    weight = terms.projection.weight[pose].numpy()
     surface = terms.surface[pose].numpy()
     free_space = terms.free_space[pose].numpy()
-    return np.select(
-        [distance > 0, weight <= 0, surface >= weight / 2, free_space > 0], [3, 4, 0, 2], 1
-    )
+    # The first condition that holds decides; where none does, the point is occluded (1).
+    conditions = [distance > 0, weight <= 0, surface >= weight / 2, free_space > 0]
+    return np.select(conditions, [3, 4, 0, 2], 1)
 
 
 def show_point_classes(
@@ -48,13 +47,20 @@ def show_point_classes(
     """Show points at pixels (x, y) of each image by their class; those outside are drawn at the
     border."""
     figure, axes = show_images(images, titles, columns, size)
-    for axis, image, places, found in zip(axes, images, pixels, classes):
+    for axis, image, places, point_classes in zip(axes, images, pixels, classes):
         places = np.clip(places, 0, image.shape[1::-1])
         for index in _DRAWN:
-            name, (colour, marker) = list(POINT_CLASSES.items())[index]
-            style = {"marker": marker, "edgecolors": "black", "linewidths": 0.4, "label": name}
+            name = list(POINT_CLASSES)[index]
+            colour, marker = POINT_CLASSES[name]
+            area = 6 if name == "depth unknown" else 14  # those say nothing, and are many
             axis.scatter(
-                *places[found == index].T, 6 if name == "depth unknown" else 14, colour, **style
+                *places[point_classes == index].T,
+                area,
+                colour,
+                marker,
+                edgecolors="black",
+                linewidths=0.4,
+                label=name,
             )
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(

@@ -46,21 +46,27 @@ def coverage(
     around an object."""
     numbers = list(cameras)
     cameras = list(cameras.values())
-    places = np.stack([*(camera.centre for camera in cameras), reference])
-    directions = (places - centre) / np.linalg.norm(places - centre, axis=1, keepdims=True)
+    # Unit vectors (n + 1, 3) from the object to the cameras, the reference's last.
+    offsets = np.stack([*(camera.centre for camera in cameras), reference]) - centre
+    directions = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+
+    # The axes of the ground, turned so that the reference camera is below.
     axes = ground_axes(cameras)
     x, y = axes @ directions[-1]
     turn = -np.pi / 2 - np.arctan2(y, x)
     axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ axes
+    *targets, seen_reference = directions @ axes.T
+
+    # The widest gap between neighbours on the circle, of the cameras that are not right above.
     around = azimuths(cameras, centre)
     around = np.sort(around[~np.isnan(around)] + np.degrees(turn))
     gap = (0.0, 360.0)
     if len(around):
-        ends = np.append(around[1:], around[0] + 360)
-        widest = int((ends - around).argmax())
-        gap = float(around[widest]), float(ends[widest])
+        following = np.append(around[1:], around[0] + 360)
+        widest = int((following - around).argmax())
+        gap = (float(around[widest]), float(following[widest]))
+
     angles = np.degrees(np.arccos((directions[:-1] @ directions[-1]).clip(-1, 1)))
-    *targets, seen_reference = directions @ axes.T
     nearest = numbers[int(angles.argmin())]
     return Coverage(
         dict(zip(numbers, targets)), seen_reference, gap, nearest, float(angles.min()), centre, axes
@@ -87,18 +93,15 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
     if solver == "paper":
         names = [f"{name}, score {score:.1f}" for name, score in zip(names, estimate.view_scores)]
     titles = ["reference", f"target {names[chosen]}", f"reference in view {chosen + 1}"]
-    titles += [f"in {names[view]}" for view in shown[1:]] + ["seen from above"]
-    images = [
-        reference.frame.rgb,
-        frames[chosen].rgb,
-        *(plots.pale(frames[view].rgb) for view in shown),
-    ]
-    figure, axes = plots.show_images(
-        [*images, np.full_like(images[0], 255)], titles, columns=4, size=2.5
-    )
+    titles += [f"in {names[view]}" for view in shown[1:]]
+    titles.append("seen from above")
+    images = [reference.frame.rgb, frames[chosen].rgb]
+    images += [plots.pale(frames[view].rgb) for view in shown]
+    images.append(np.full_like(images[0], 255))  # white ground for the drawing from above
+    figure, axes = plots.show_images(images, titles, columns=4, size=2.5)
     figure.set_figheight(figure.get_figheight() + 0.4)  # space for the legend
 
-    # The mask, and the reference's points moved into each view.
+    # The outline of the mask at the centres of pixels, and the reference's points in each view.
     mask = frames[chosen].mask
     if mask is not None:
         rows = np.arange(mask.shape[0]) + 0.5
@@ -115,22 +118,14 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
         raise InputError(
             "no depth is known on the target object, expected some for a picture of the pose"
         )
+    target_cameras = {int(view) + 1: frames[view].camera for view in used}
     # The reference camera is the origin of its own frame.
-    place = estimate.target_camera.to_world(estimate.sim3.t)
-    seen = coverage(
-        {int(view) + 1: frames[view].camera for view in used},
-        place,
-        np.median(target_cloud, axis=0),
-    )
-    _draw_from_above(
-        axes[-1], seen, target_cloud, estimate.target_camera.to_world(estimate.sim3.apply(cloud))
-    )
-    draw_cameras(
-        axes[-1],
-        seen,
-        chosen + 1,
-        f"reference under this pose, {seen.angle:.0f}° from view {seen.nearest}",
-    )
+    reference_place = estimate.target_camera.to_world(estimate.sim3.t)
+    seen = coverage(target_cameras, reference_place, np.median(target_cloud, axis=0))
+    moved_cloud = estimate.target_camera.to_world(estimate.sim3.apply(cloud))
+    _draw_from_above(axes[-1], seen, target_cloud, moved_cloud)
+    label = f"reference under this pose, {seen.angle:.0f}° from view {seen.nearest}"
+    draw_cameras(axes[-1], seen, chosen + 1, label)
     figure.legend(
         *axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
     )
@@ -142,17 +137,17 @@ def draw_cameras(axis: Axes, seen: Coverage, chosen: int, reference: str = "refe
     object."""
     axis.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal")
     for number, place in seen.targets.items():
-        style = {"color": plots.CHOSEN if number == chosen else plots.BLUE}
-        axis.plot(*place, "o", markersize=11, markeredgecolor="white", **style)
+        colour = plots.CHOSEN if number == chosen else plots.BLUE
+        axis.plot(*place, "o", color=colour, markersize=11, markeredgecolor="white")
         axis.text(
-            *(1.23 * place),
+            *(1.23 * place),  # beyond its mark
             str(number),
+            color=colour,
             ha="center",
             va="center",
             fontsize=11,
             weight="bold",
             zorder=4,
-            **style,
         )
     axis.plot(
         *seen.reference,
@@ -175,11 +170,11 @@ def _draw_from_above(axis: Axes, seen: Coverage, target: np.ndarray, reference: 
     spanned = f"the target views span {360 - end + begin:.0f}°"
     axis.plot([], [], "s", color="0.5", alpha=0.25, markersize=14, label=empty)
     axis.plot([], [], color=plots.BLUE, linewidth=4, label=spanned)
-    flat = [
-        (points - seen.centre) @ seen.axes.T
-        for points in (target[:: -(-len(target) // _POINTS)], reference)
-    ]
+    step = -(-len(target) // _POINTS)  # rounded up
+    flat = [(points - seen.centre) @ seen.axes.T for points in (target[::step], reference)]
+    # Nine tenths of the target's points are within `_OBJECT`.
     scale = _OBJECT / np.quantile(np.linalg.norm(flat[0], axis=1), 0.9)
     for points, colours in zip(flat, ("0.6", plots.coordinate_colours(reference))):
+        # Points near the circle of the cameras would cover their marks.
         inside = np.linalg.norm(scale * points, axis=1, keepdims=True) < 0.9
         axis.scatter(*np.where(inside, scale * points, np.nan).T, s=4, c=colours, linewidths=0)

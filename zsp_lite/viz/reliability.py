@@ -53,7 +53,8 @@ def reliability(
     interval = np.transpose([test.proportion_ci(method="wilson") for test in tests])
     error = float((count * np.abs(mean - accuracy)).sum() / count.sum())
     upper = float(correct[order[len(order) // 2 :]].mean())
-    right, wrong = confidence[correct], confidence[~correct]
-    pairs = len(right) * len(wrong)
+    right = confidence[correct]
+    wrong = confidence[~correct]
+    pairs = len(right) * len(wrong)  # for which Mann and Whitney's U counts the right order
     auroc = float(mannwhitneyu(right, wrong).statistic / pairs) if pairs else float("nan")
     return Reliability(auroc, error, upper, count, mean, accuracy, interval)

@@ -44,12 +44,11 @@ _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark gr
 _TEMPLATES = Environment(
     loader=PackageLoader("zsp_lite.viz"), autoescape=True, undefined=StrictUndefined
 )
-_COLOURED = "text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"
+_COLOURED = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")
 
 
 class PhotographSection(NamedTuple):
-    """What the page of the demo shows of a photographed motorcycle, whose directions a synthetic
-    one tells."""
+    """What the page of the demo shows of the photographed motorcycle."""
 
     sequence: str  # of the synthetic motorcycle
     columns: Sequence[str]
@@ -74,14 +73,11 @@ def write_category_report(
     """Write a page with contact sheets and the table of all objects, and the first sheet as
     objects.jpg beside it."""
     names = list(alignment.objects)
-    parts = [
-        names[start : start + category_sheet.MOST]
-        for start in range(0, len(names), category_sheet.MOST)
-    ]
-    figures = [category_sheet.objects_figure(dataset, category, alignment, part) for part in parts]
-    sheets = [
-        _encode(figure, dpi=150, format="jpg", pil_kwargs={"quality": 90}) for figure in figures
-    ]
+    sheets = []
+    for start in range(0, len(names), category_sheet.MOST):
+        part = names[start : start + category_sheet.MOST]
+        figure = category_sheet.objects_figure(dataset, category, alignment, part)
+        sheets.append(_encode(figure, dpi=150, format="jpg", pil_kwargs={"quality": 90}))
     text = _TEMPLATES.get_template("category.html").render(
         category=category,
         columns=category_sheet.COLUMNS,
@@ -125,29 +121,30 @@ def write_report(
 
 def _pair_parts(result: PairResult, scene_id: str) -> dict[str, Any]:
     """Make the rows and the pictures of a pair for the template."""
-    estimates = result.estimates
+    pictures = {}
+    both = {}
+    for solver, estimate in result.estimates.items():
+        pictures[solver] = _data_uri(pose_picture(result, solver))
+        if estimate.one_of_two:
+            both[solver] = _data_uri(_two_poses_figure(estimate))
     votes = [votes_figure(result.votes), ring_figure(result)] if result.votes else []
     return {
         "result": result,
         "rows": table_rows(result),
-        "pictures": {solver: _data_uri(pose_picture(result, solver)) for solver in estimates},
-        "both": {
-            solver: _data_uri(_two_poses_figure(one))
-            for solver, one in estimates.items()
-            if one.one_of_two
-        },
+        "pictures": pictures,
+        "both": both,
         "votes": [_data_uri(figure) for figure in votes],
         "stages": _stages(result, scene_id),
     }
 
 
 def _notebook_link(name: str, folder: Path) -> Markup:
-    """Link to a notebook of the clone; its number alone if there is none, or on another drive."""
+    """Link to a notebook of the clone, or give its number alone where no link can lead to it."""
     label = Markup("notebook {}").format(name[:2])
     local = REPOSITORY / "notebooks" / f"{name}.ipynb"
     try:
         address = Path(os.path.relpath(local, folder)).as_posix()
-    except ValueError:
+    except ValueError:  # on another drive
         return label
     return Markup('<a href="{}">{}</a>').format(address, label) if local.is_file() else label
 
@@ -172,10 +169,8 @@ def legend(columns: Sequence[str] = COLUMNS) -> str:
 
 def write_overview(path: Path, results: Sequence[PairResult]) -> None:
     """Write the picture of `overview` as a JPEG."""
-    write_atomic(
-        path,
-        _encode(overview(results), format="jpeg", bbox_inches="tight", pil_kwargs={"quality": 88}),
-    )
+    style = {"format": "jpeg", "bbox_inches": "tight", "pil_kwargs": {"quality": 88}}
+    write_atomic(path, _encode(overview(results), **style))
 
 
 def overview(results: Sequence[PairResult]) -> Figure:
@@ -199,7 +194,9 @@ def overview(results: Sequence[PairResult]) -> Figure:
         plots.draw_estimates(panels, result.estimates.values())
         plots.mark(panels[0], result.title, "none", 14)
         for axis, error in zip(panels[1:], result.errors.values()):
-            word, colour = ("right", plots.BLUE) if error < _RIGHT else ("wrong", plots.VERMILLION)
+            right = error < _RIGHT
+            word = "right" if right else "wrong"
+            colour = plots.BLUE if right else plots.VERMILLION
             plots.mark(axis, f"{word}: {error:.0f}° off", colour, 14)
     return figure
 
@@ -207,53 +204,60 @@ def overview(results: Sequence[PairResult]) -> Figure:
 def _stages(result: PairResult, scene_id: str) -> dict[str, str]:
     """Draw the stages for the first solver's chosen view; `scene_id` is unique on the page."""
     views = plots.chosen_views([result.estimate])
-    names = "reference", "chosen target"
+    names = ("reference", "chosen target")
     images = [view.frame.rgb for view in views]
-    saliency = dict(zip(names, (view.features.saliency.numpy() for view in views)))
+    saliency = {name: view.features.saliency.numpy() for name, view in zip(names, views)}
+
+    # Cycles of the reference's patches by way of the target, and of the target's by the reference.
     sim = similarity(views[0].features, views[1].features)
     cycles = {}
-    for name, start, end, table in ((names[0], *views, sim), (names[1], *views[::-1], sim.T)):
+    for name, start, end, table in zip(names, views, views[::-1], (sim, sim.T)):
         distances = cyclical_distances(
             table, start.features.grid, end.features.grid, start.foreground, end.foreground
         )
         cycles[name] = distances.numpy()
-    style = {"limits": (-10, 0), "cmap": "cividis", "label": "− distance (patches)"}
-    figure, axes = plots.show_images(images, names, size=2.7)
-    plots.draw_matches(
-        axes, plots.match_pixels(views, result.estimate.matches), result.estimate.inliers
-    )
-    return {
-        "saliency": _data_uri(
-            plots.show_maps(images, saliency, size=2.7, limits=(0, 1), label="saliency")
+
+    matches, axes = plots.show_images(images, names, size=2.7)
+    pixels = plots.match_pixels(views, result.estimate.matches)
+    plots.draw_matches(axes, pixels, result.estimate.inliers)
+    figures = {
+        "saliency": plots.show_maps(images, saliency, size=2.7, limits=(0, 1), label="saliency"),
+        "cycles": plots.show_maps(
+            images, cycles, size=2.7, limits=(-10, 0), cmap="cividis", label="− distance (patches)"
         ),
-        "cycles": _data_uri(plots.show_maps(images, cycles, size=2.7, **style)),
-        "matches": _data_uri(figure),
-        "scene": _scene_html(result, scene_id),
+        "matches": matches,
     }
+    stages = {name: _data_uri(figure) for name, figure in figures.items()}
+    stages["scene"] = _scene_html(result, scene_id)
+    return stages
 
 
 def _scene_html(result: PairResult, scene_id: str) -> Markup:
     """Draw both clouds, with a menu of all poses that the page's script serves."""
-    first, second = plots.chosen_views([result.estimate])
-    cloud = plots.object_cloud(first)
+    reference, target = plots.chosen_views([result.estimate])
+    cloud = plots.object_cloud(reference)
     poses = {}
     for solver, estimate in result.estimates.items():
         poses[f"{solver} solver"] = estimate
-        for rank, one in enumerate(estimate.alternatives, 2):
+        for rank, other in enumerate(estimate.alternatives, 2):
             poses[f"{solver} solver, hypothesis {rank}"] = replace(
-                estimate, sim3=one.sim3, view=one.view
+                estimate, sim3=other.sim3, view=other.view
             )
-    moves = [one.propagate([second.frame.camera])[0] for one in poses.values()]
-    scene = aligned_clouds(moves[0].apply(cloud), plots.object_cloud(second))
+    # Similarities from the reference camera to that of the target.
+    moves = [pose.propagate([target.frame.camera])[0] for pose in poses.values()]
+
+    scene = aligned_clouds(moves[0].apply(cloud), plots.object_cloud(target))
     # The clouds fill the scene. The eye is above the target camera, to its right.
     camera = {"eye": {"x": 0.75, "y": -0.5, "z": -1.2}, "center": {"x": 0, "y": 0, "z": 0}}
-    ground = {
-        "paper_bgcolor": "rgba(0,0,0,0)",
-        "font_color": _GREY,
-        "legend_bgcolor": "rgba(0,0,0,0)",
-    }
-    hidden = {f"scene_{axis}axis_visible": False for axis in "xyz"}
-    scene.update_layout(height=400, scene_camera=camera, **ground, **hidden)
+    scene.update_layout(
+        height=400,
+        scene_camera=camera,
+        paper_bgcolor="rgba(0,0,0,0)",
+        font_color=_GREY,
+        legend_bgcolor="rgba(0,0,0,0)",
+        **{f"scene_{axis}axis_visible": False for axis in "xyz"},
+    )
+
     config = {
         "displaylogo": False,
         "responsive": True,
@@ -275,13 +279,13 @@ def _scene_html(result: PairResult, scene_id: str) -> Markup:
 def _two_poses_figure(estimate: PoseEstimate) -> Figure:
     """Draw the estimate and its first alternative in the same target view."""
     second = estimate.alternatives[0]
-    (moved,) = replace(estimate, sim3=second.sim3, view=second.view).propagate(
-        [estimate.target_camera]
-    )
+    alternative = replace(estimate, sim3=second.sim3, view=second.view)
+    # The same pose, from the reference to the view of the estimate.
+    (sim3,) = alternative.propagate([estimate.target_camera])
     title = f"turned by {estimate.angle_to(second):.0f}°, probability {second.confidence:.2f}"
     poses = {
         f"probability {estimate.confidence:.2f}": estimate,
-        title: replace(estimate, sim3=moved),
+        title: replace(estimate, sim3=sim3),
     }
     return plots.moved_points(poses)
 

@@ -32,7 +32,8 @@ def aligned_clouds(
 
     # Ranges of equal length, from percentiles, which are robust to outliers.
     low, high = np.percentile(np.concatenate([reference, target]), [1, 99], axis=0)
-    middle, half = (low + high) / 2, 0.6 * float((high - low).max())
+    middle = (low + high) / 2
+    half = 0.6 * float((high - low).max())  # a fifth more than the clouds need
     axes = {
         f"{label[0]}axis": {
             "title": {"text": label},

@@ -21,20 +21,21 @@ def votes_figure(votes: Sequence[Vote]) -> Figure:
 
     The colour of a point is its position along the frame's object, in both pictures.
     """
-    shown = votes[:: -(-len(votes) // _SHOWN)]
-    views = [view for vote in shown for view in plots.chosen_views([vote.estimate])]
+    step = -(-len(votes) // _SHOWN)  # rounded up
+    shown = votes[::step]
+    images = []
     titles = []
     for vote in shown:
+        reference, target = plots.chosen_views([vote.estimate])
+        images += [plots.pale(reference.frame.rgb), plots.pale(target.frame.rgb)]
         confidence = f"prob. {vote.estimate.confidence:.2f}"
         titles += [vote.name.replace(" of ", "\nof "), f"{vote.degrees:.0f}° off,\n{confidence}"]
-    figure, axes = plots.show_images(
-        [plots.pale(view.frame.rgb) for view in views], titles, columns=8, size=1.45
-    )
+    figure, axes = plots.show_images(images, titles, columns=8, size=1.45)
     for k, vote in enumerate(shown):
-        plots.draw_estimates(axes[2 * k : 2 * k + 2], [vote.estimate], most=1500, size=2)
-        axes[2 * k + 1].title.set_color(
-            plots.VERMILLION if vote.degrees > SAME_ANGLE else plots.BLUE
-        )
+        pair = axes[2 * k : 2 * k + 2]
+        plots.draw_estimates(pair, [vote.estimate], most=1500, size=2)
+        colour = plots.VERMILLION if vote.degrees > SAME_ANGLE else plots.BLUE
+        pair[1].title.set_color(colour)
     return figure
 
 
@@ -48,29 +49,32 @@ def ring_figure(result: PairResult) -> Figure:
     )
 
     def turn(rotation: np.ndarray) -> float:
+        """Return the angle in radians of the part of a rotation that is about the vertical."""
         x, y, z, w = Rotation.from_matrix(rotation @ answer.world_sim3.R.T).as_quat()
         return 2 * np.arctan2(up @ (x, y, z), w)
 
+    # Dots on the outer circle, their areas by confidence.
     for vote in result.votes:
-        for one in vote.estimate.hypotheses:
-            world = vote.estimate.between_worlds(one.sim3, one.view)
+        for pose in vote.estimate.hypotheses:
+            world = vote.estimate.between_worlds(pose.sim3, pose.view)
             angle = turn(world.inverse().R if vote.backward else world.R)
-            near = np.cos(angle) > np.cos(np.radians(SAME_ANGLE))
-            axis.scatter(
-                angle, 1, 260 * one.confidence, plots.BLUE if near else plots.VERMILLION, alpha=0.45
-            )
-    for one in (answer.hypotheses[0], *answer.alternatives):
-        angle = turn(answer.between_worlds(one.sim3, one.view).R)
+            agrees = np.cos(angle) > np.cos(np.radians(SAME_ANGLE))
+            colour = plots.BLUE if agrees else plots.VERMILLION
+            axis.scatter(angle, 1, 260 * pose.confidence, colour, alpha=0.45)
+
+    # Stars inside, each with its confidence below.
+    for pose in (answer.hypotheses[0], *answer.alternatives):
+        angle = turn(answer.between_worlds(pose.sim3, pose.view).R)
         axis.scatter(
             angle,
             0.5,
-            400 * one.confidence,
+            400 * pose.confidence,
             plots.ORANGE,
             marker="*",
             edgecolors="black",
             linewidths=0.5,
         )
-        axis.text(angle, 0.24, f"{one.confidence:.2f}", ha="center", va="center", fontsize=9)
+        axis.text(angle, 0.24, f"{pose.confidence:.2f}", ha="center", va="center", fontsize=9)
     axis.set(
         theta_zero_location="N", ylim=(0, 1.15), yticks=[], xticks=np.radians([0, 90, 180, 270])
     )

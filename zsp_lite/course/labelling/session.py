@@ -40,7 +40,11 @@ MIN_KEYPOINTS = 4
 # only: usually two keypoints are confused. The size is the longest side of the point cloud without
 # outliers.
 MAX_RESIDUAL = 0.15
-OPEN, ACCEPTED, SKIPPED, REFERENCE = "open", "accepted", "skipped", "reference"
+# States of a sequence.
+OPEN = "open"
+ACCEPTED = "accepted"
+SKIPPED = "skipped"
+REFERENCE = "reference"
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +70,8 @@ def align_picks(reference: ArrayLike, picks: ArrayLike) -> Alignment:
     InputError if the numbers differ or are below 4, a keypoint is not finite, or all are equal or
     collinear.
     """
-    reference, picks = (np.asarray(points, dtype=np.float64) for points in (reference, picks))
+    reference = np.asarray(reference, dtype=np.float64)
+    picks = np.asarray(picks, dtype=np.float64)
     if len(reference) != len(picks) or len(picks) < MIN_KEYPOINTS:
         found = f"{len(picks)} keypoints picked and {len(reference)} on the reference"
         raise InputError(f"{found}, expected equally many, at least {MIN_KEYPOINTS}")
@@ -76,6 +81,8 @@ def align_picks(reference: ArrayLike, picks: ArrayLike) -> Alignment:
 
 
 class _Picks(msgspec.Struct):
+    """Content of ROOT/label_picks/CATEGORY.json."""
+
     reference_seq: str
     names: list[str]
     picks: dict[str, list[Row]]
@@ -109,29 +116,34 @@ class Labelling:
         or else the best point cloud. InputError if the category is unknown, fewer than two
         sequences have point clouds, or the references differ.
         """
-        self.root, self.category, self.dataset = (
-            Path(root),
-            plain_name(category, "category"),
-            Co3D(root),
-        )
+        self.root = Path(root)
+        self.category = plain_name(category, "category")
+        self.dataset = Co3D(root)
         known = {one.sequence_name: one for one in self.dataset.sequences(category)}
         with_cloud = [name for name, one in known.items() if one.point_cloud is not None]
+
+        # The stored picks, and the reference that they and the labels name.
         self.path = self.root / "label_picks" / f"{self.category}.json"
         stored = read_json(self.path, _Picks, "picks") if self.path.is_file() else None
-        if stored and len(stored.names) != (
-            found := len(stored.picks.get(stored.reference_seq, []))
-        ):
-            raise InputError(
-                f"picks {self.path}: {len(stored.names)} names, but {found} picks on the reference"
-            )
-        references = {label.reference_seq for label in read_labels(root, category).values()}
-        references |= {stored.reference_seq} if stored else set()
+        references = set()
+        if stored:
+            names = len(stored.names)
+            picks = len(stored.picks.get(stored.reference_seq, []))
+            if names != picks:
+                raise InputError(
+                    f"picks {self.path}: {names} names, but {picks} picks on the reference"
+                )
+            references.add(stored.reference_seq)
+        references.update(label.reference_seq for label in read_labels(root, category).values())
         if len(references) > 1:
             found = f"reference, stored picks and labels name {', '.join(sorted(references))}"
             raise InputError(f"category {category}: {found}, expected one reference sequence")
+
+        # The sequences to label.
         chosen = [one.sequence_name for one in self.dataset.select(category)] or with_cloud
-        chosen = list(dict.fromkeys([*references, *chosen]))
-        if missing := [name for name in chosen if name not in with_cloud]:
+        chosen = list(dict.fromkeys([*references, *chosen]))  # each once
+        missing = [name for name in chosen if name not in with_cloud]
+        if missing:
             allowed = ", ".join(with_cloud) or "none"
             raise InputError(
                 f"sequence {category}/{missing[0]} has no point cloud, expected some of {allowed}"
@@ -142,7 +154,7 @@ class Labelling:
             )
         best = max(chosen, key=lambda name: known[name].point_cloud.quality_score or -np.inf)
         self.reference = next(iter(references), best)
-        self.sequences = sorted(chosen, key=lambda name: name != self.reference)
+        self.sequences = sorted(chosen, key=lambda name: name != self.reference)  # it comes first
         self._stored = stored or _Picks(self.reference, [], {}, [])
         proposals = read_label_folder(self.root / "label_proposals" / self.category)
         self._proposals = {name: label.trans for name, label in proposals.items()}
@@ -155,9 +167,8 @@ class Labelling:
 
     def picks(self, sequence: str) -> Float[np.ndarray, "n 3"]:
         """Return the picks (n, 3) on a sequence, in its world coordinates."""
-        return np.array(
-            self._stored.picks.get(self._known(sequence), []), dtype=np.float64
-        ).reshape(-1, 3)
+        picks = self._stored.picks.get(self._known(sequence), [])
+        return np.array(picks, dtype=np.float64).reshape(-1, 3)
 
     def cloud(self, sequence: str) -> tuple[np.ndarray, np.ndarray]:
         """Return points (n, 3) and colours (n, 3), uint8, of a sequence's point cloud; grey if it
@@ -172,11 +183,10 @@ class Labelling:
     def first_view(self, sequence: str) -> Float[np.ndarray, "3 3"]:
         """Return the rotation (3, 3) from world to first camera of a sequence; the identity without
         cameras."""
-        frames = self.dataset.frames(self.category, self._known(sequence))
-        return next(
-            (self.dataset.camera(frame).R for frame in frames if frame.viewpoint is not None),
-            np.eye(3),
-        )
+        for frame in self.dataset.frames(self.category, self._known(sequence)):
+            if frame.viewpoint is not None:
+                return self.dataset.camera(frame).R
+        return np.eye(3)
 
     def pick(self, sequence: str, point: Point, name: str = "") -> None:
         """Add the next keypoint (3,) of a sequence, in its world coordinates; on the reference, a
@@ -194,7 +204,8 @@ class Labelling:
 
     def undo(self, sequence: str) -> None:
         """Remove the last pick of a sequence, if there is one."""
-        if len(picks := self.picks(sequence)):
+        picks = self.picks(sequence)
+        if len(picks):
             self.put(sequence, picks[:-1], self.names[:-1])
 
     def proposal(self, sequence: str) -> Sim3 | None:
@@ -216,20 +227,19 @@ class Labelling:
         A sequence that was skipped is open again. An accepted label is kept until another one is
         accepted.
         """
-        points = real_array(
-            f"picks on {sequence}", points if len(points) else np.zeros((0, 3)), (None, 3)
-        )
+        points = points if len(points) else np.zeros((0, 3))
+        points = real_array(f"picks on {sequence}", points, (None, 3))
         check_magnitude(f"picks on {sequence}", points)
+        stored = self._stored
         if self._known(sequence) == self.reference:
-            if others := [
-                name for name, picks in self._stored.picks.items() if name != sequence and picks
-            ]:
-                in_use = f"in use on {', '.join(others)}"
+            others = [name for name, picks in stored.picks.items() if name != sequence and picks]
+            if others:
                 raise InputError(
-                    f"keypoints of the reference {sequence} are {in_use}; clear those first"
+                    f"keypoints of the reference {sequence} are in use on {', '.join(others)}; "
+                    "clear those first"
                 )
-            self._stored.names[:] = names
-        self._stored.picks[sequence] = points.tolist()
+            stored.names[:] = names
+        stored.picks[sequence] = points.tolist()
         self._save(sequence)
 
     def alignment(self, sequence: str) -> Alignment | None:
@@ -243,12 +253,14 @@ class Labelling:
     def doubt(self, sequence: str) -> str:
         """Say in a line why a label should be checked: its RMS residual is above `MAX_RESIDUAL`; ""
         otherwise."""
-        if (alignment := self.alignment(sequence)) is None:
+        alignment = self.alignment(sequence)
+        if alignment is None:
             return ""
         # From fractions of the spread of the picks to fractions of the object's size.
         low, high = np.percentile(self.cloud(sequence)[0], [1, 99], axis=0)
         scale = np.sqrt(self.picks(sequence).var(axis=0).mean()) / max((high - low).max(), 1e-12)
-        residuals, rms = scale * alignment.residuals, scale * alignment.rms
+        residuals = scale * alignment.residuals
+        rms = scale * alignment.rms
         if rms <= MAX_RESIDUAL:
             return ""
         worst = int(residuals.argmax())
@@ -266,20 +278,29 @@ class Labelling:
         sequence. InputError if keypoints are missing, the sequence is the reference, or the label
         is in doubt and not confirmed.
         """
-        alignment, picked = self.alignment(sequence), len(self.picks(sequence))
-        sim3 = alignment.sim3 if alignment else None if picked else self.proposal(sequence)
-        if sequence == self.reference:
-            problem = "is the reference: its label is the identity and comes by itself"
-        elif sim3 is None:
-            problem = (
-                f"has {picked} of {len(self.names)} keypoints, expected all, at least "
-                f"{MIN_KEYPOINTS}"
-            )
+        alignment = self.alignment(sequence)
+        picked = len(self.picks(sequence))
+        if alignment:
+            sim3 = alignment.sim3
         else:
-            problem = "" if confirmed else self.doubt(sequence)
-            problem = problem and f"has a {problem}; expected a smaller one, or confirmed=True"
-        if problem:
-            raise InputError(f"sequence {sequence} {problem}")
+            sim3 = None if picked else self.proposal(sequence)
+
+        if sequence == self.reference:
+            raise InputError(
+                f"sequence {sequence} is the reference: its label is the identity and comes by "
+                "itself"
+            )
+        if sim3 is None:
+            raise InputError(
+                f"sequence {sequence} has {picked} of {len(self.names)} keypoints, expected all, "
+                f"at least {MIN_KEYPOINTS}"
+            )
+        doubt = "" if confirmed else self.doubt(sequence)
+        if doubt:
+            raise InputError(
+                f"sequence {sequence} has a {doubt}; expected a smaller one, or confirmed=True"
+            )
+
         # A label has no scale: it moves the centre of the reference as the alignment does.
         centre = self.cloud(self.reference)[0].mean(axis=0)
         label = rigid_label(sim3, centre, sequence, self.reference)
@@ -293,12 +314,12 @@ class Labelling:
         its picks."""
         path = label_folder(self.root, self.category) / f"{self._known(sequence)}.json"
         # Labels do not say where they come from: one with all its picks was made of them.
-        imported = path.is_file() and not 0 < len(self.names) == len(self.picks(sequence))
-        if imported or sequence == self.reference:
-            reason = (
-                f"has a label not made of picks; remove {path}" if imported else "is the reference"
-            )
-            raise InputError(f"sequence {sequence} cannot be skipped: it {reason}")
+        all_picked = len(self.picks(sequence)) == len(self.names) > 0
+        refusal = f"sequence {sequence} cannot be skipped: it"
+        if path.is_file() and not all_picked:
+            raise InputError(f"{refusal} has a label not made of picks; remove {path}")
+        if sequence == self.reference:
+            raise InputError(f"{refusal} is the reference")
         path.unlink(missing_ok=True)
         if sequence not in self._stored.skipped:
             self._stored.skipped.append(sequence)
@@ -309,19 +330,25 @@ class Labelling:
         labels = read_labels(self.root, self.category)
         rows = []
         for name in self.sequences:
-            state = REFERENCE if name == self.reference else ACCEPTED if name in labels else OPEN
-            state = SKIPPED if name in self._stored.skipped else state
-            alignment, problem = None, ""
-            try:
-                alignment = None if name == self.reference else self.alignment(name)
-            except InputError as error:
-                problem = str(error)
-            rows.append(
-                Progress(name, state, len(self.picks(name)), alignment and alignment.rms, problem)
-            )
+            if name in self._stored.skipped:
+                state = SKIPPED
+            elif name == self.reference:
+                state = REFERENCE
+            else:
+                state = ACCEPTED if name in labels else OPEN
+            alignment = None
+            problem = ""
+            if name != self.reference:
+                try:
+                    alignment = self.alignment(name)
+                except InputError as error:
+                    problem = str(error)
+            rms = alignment.rms if alignment else None
+            rows.append(Progress(name, state, len(self.picks(name)), rms, problem))
         return rows
 
     def _known(self, sequence: str) -> str:
+        """Return the name of a sequence of the session; refuse others."""
         check_choice("sequence", sequence, self.sequences)
         return sequence
 

@@ -1,16 +1,24 @@
-"""Procedural objects: primitives composed to a mesh of unit size, parts of several, and their
-random materials."""
+"""Procedural objects: meshes composed of primitives, parts of several, and random materials."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.course.synthetic.meshes import Material, TexturedMesh, smooth_normals
-from zsp_lite.course.synthetic.primitives import Mesh, cylinder, extrusion, joined, surface_spread
-from zsp_lite.course.synthetic.textures import hsv
+from zsp_lite.course.synthetic.primitives import (
+    Coordinates,
+    Mesh,
+    cylinder,
+    extrusion,
+    joined,
+    surface_spread,
+)
+from zsp_lite.course.synthetic.textures import random_colour
 
+# Axes.
+X = (1.0, 0.0, 0.0)
 Y = (0.0, 1.0, 0.0)
 
 
@@ -41,13 +49,20 @@ class Assembly:
         """Draw uniformly from 0 .. n - 1."""
         return int(self.rng.integers(n))
 
+    def pick(self, *options: Any) -> Any:
+        """Draw one of the options."""
+        return options[self.choice(len(options))]
+
     def add(self, mesh: Mesh, material: int, mirror: bool = False) -> None:
-        """Add a part of material 0 .. 7; with `mirror`, also its mirror image in the plane
-        y = 0."""
+        """Add a part of material 0 .. 7; with `mirror`, also its image in the plane y = 0."""
         self.meshes.append(mesh)
         self.materials.append(material)
         if mirror:
             self.add(mesh.mirrored(), material)
+
+    def add_pair(self, mesh: Mesh, material: int) -> None:
+        """Add a part and its mirror image in the plane y = 0."""
+        self.add(mesh, material, mirror=True)
 
 
 Builder = Callable[[Assembly], None]  # adds the parts of one random object of a category
@@ -56,8 +71,7 @@ Builder = Callable[[Assembly], None]  # adds the parts of one random object of a
 def make_shape(
     build: Builder, seed: int | list[int], variation: np.random.Generator | None = None
 ) -> TexturedMesh:
-    """Return the object that `build` composes, centred, of unit `surface_spread`, without
-    materials."""
+    """Return what `build` composes, centred, of unit `surface_spread`, without materials."""
     assembly = Assembly(np.random.default_rng(seed), variation)
     build(assembly)
     vertices, faces = joined(assembly.meshes)
@@ -65,80 +79,126 @@ def make_shape(
     # a small random scale along each axis
     vertices = vertices * np.exp(assembly.rng.normal(0, 0.08, 3))
     vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
-    vertices, n = vertices / surface_spread(vertices, faces), len(faces)
-    uv, white = np.zeros((n, 3, 2), np.float32), np.ones((n, 3, 3), np.float32)
+    vertices = vertices / surface_spread(vertices, faces)
+    n = len(faces)
+    uv = np.zeros((n, 3, 2), np.float32)
+    white = np.ones((n, 3, 3), np.float32)
     return TexturedMesh(vertices, faces, smooth_normals(vertices, faces), uv, white, material)
 
 
-def rounded_box(size, centre=(0, 0, 0), squareness: float = 5.0) -> Mesh:
-    """Return a superellipsoid of the given size (3,): an ellipsoid at squareness 2, nearly a box at
-    10."""
-    n = 11  # points along a side of a cube, denser at the edges, where the curvature is largest
+def rounded_box(
+    size: Coordinates, centre: Coordinates = (0, 0, 0), squareness: float = 5.0
+) -> Mesh:
+    """Return a superellipsoid of the given size (3,).
+
+    Squareness 2 gives an ellipsoid, 10 nearly a box.
+    """
+    # The surface of the cube from -1 to 1, as a grid of n x n points on each of its sides; they are
+    # denser at the edges, where the curvature is largest.
+    n = 11
     line = np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
-    u, v = (grid.ravel() for grid in np.meshgrid(line, line, indexing="ij"))
-    # of each cell, the one with the lowest index
-    corner = np.arange(n * n).reshape(n, n)[:-1, :-1].ravel()
-    cells = np.concatenate([corner[:, None] + [0, n, n + 1], corner[:, None] + [0, n + 1, 1]])
-    sides = [np.stack([np.full(n * n, sign), sign * u, v], 1) for sign in (-1.0, 1.0)]
-    vertices = np.concatenate([np.roll(side, axis, axis=1) for axis in range(3) for side in sides])
+    u, v = np.meshgrid(line, line, indexing="ij")
+    sides = [np.dstack([np.full_like(u, sign), sign * u, v]) for sign in (-1.0, 1.0)]
+    vertices = np.stack([np.roll(side, axis, axis=2) for axis in range(3) for side in sides])
+    vertices = vertices.reshape(-1, 3)
+    # Two triangles fill each cell of a grid; `corner` is its vertex of the lowest index.
+    corner = np.arange(n * n).reshape(n, n)[:-1, :-1].reshape(-1, 1)
+    cells = np.concatenate([corner + [0, n, n + 1], corner + [0, n + 1, 1]])
     faces = np.concatenate([cells + side * n * n for side in range(6)])
+    # The points move along their rays to where |x|^p + |y|^p + |z|^p = 1, p the squareness.
     vertices /= (np.abs(vertices) ** squareness).sum(1, keepdims=True) ** (1 / squareness)
     return Mesh(vertices, faces).scaled(np.asarray(size) / 2).translated(centre)
 
 
 def tapered(mesh: Mesh, low: float, high: float, factor: float) -> Mesh:
-    """Scale the width (y) of a mesh by 1 at height `low`, linearly to `factor` at height `high`."""
+    """Scale the width (y) of a mesh: by 1 up to height `low`, by `factor` from height `high` on."""
     share = np.clip((mesh.vertices[:, 2] - low) / (high - low), 0, 1)
     vertices = mesh.vertices.copy()
     vertices[:, 1] *= 1 + (factor - 1) * share
     return Mesh(vertices, mesh.faces)
 
 
-def pane(start, end, width: float, thickness: float = 0.04) -> Mesh:
-    """Return a slab between two points (x, z) of width `width` along y, for example a
-    windscreen."""
-    start, end = np.asarray(start, float), np.asarray(end, float)
+def pane(start: Coordinates, end: Coordinates, width: float, thickness: float = 0.04) -> Mesh:
+    """Return a slab between two points (x, z), for example a windscreen; the width is along y."""
+    start = np.asarray(start, float)
+    end = np.asarray(end, float)
     along = (end - start) / np.linalg.norm(end - start)
+    # half the thickness, perpendicular to the line from start to end
     across = thickness / 2 * np.array([-along[1], along[0]])
     return extrusion([start - across, end - across, end + across, start + across], width)
 
 
-def disc(radius: float, thickness: float, centre) -> Mesh:
+def disc(radius: float, thickness: float, centre: Coordinates) -> Mesh:
     """Return a disc at `centre` whose axis is y, for example a wheel."""
     return cylinder(radius, radius, thickness, 22).rotated("x", np.pi / 2).translated(centre)
 
 
 def add_wheels(a: Assembly, x: float, y: float, radius: float, width: float) -> None:
     """Add the two wheels of an axle at x, standing on the ground at y and -y."""
-    a.add(disc(radius, width, (x, y, radius)), 3, mirror=True)
-    a.add(disc(radius * 0.6, width * 1.2, (x, y, radius)), 2, mirror=True)
+    a.add_pair(disc(radius, width, (x, y, radius)), 3)
+    a.add_pair(disc(radius * 0.6, width * 1.2, (x, y, radius)), 2)
 
 
 class _Kind(NamedTuple):
+    """A kind of material; pairs are ranges to draw from."""
+
     share: float  # of all materials
     hue: tuple[float, float]  # degrees
     saturation: tuple[float, float]
     value: tuple[float, float]
     roughness: tuple[float, float]
     specular: float = 0.04
-    # numbers of waves of the pattern: 1 for stripes, 2 for checks, more for patches
+    # numbers of waves of the pattern to choose from: 1 for stripes, 2 for checks, more for patches
     waves: tuple[int, ...] = (5,)
     frequency: tuple[float, float] = (2, 8)  # of the pattern, in radians per unit
     contrast: tuple[float, float] = (0.05, 0.2)  # of the pattern
 
 
 _ANY = (0, 360)
+# Each with its share, hue, saturation, value and roughness.
 _KINDS = (
-    _Kind(0.22, _ANY, (0, 0.8), (0.25, 0.95), (0.35, 0.75)),  # paint
+    # paint
+    _Kind(0.22, _ANY, (0, 0.8), (0.25, 0.95), (0.35, 0.75)),
     # printed paint
-    _Kind(0.13, _ANY, (0, 0.8), (0.25, 0.95), (0.35, 0.75), 0.04, (1, 2, 5), (3, 14), (0.3, 1)),
-    _Kind(0.23, _ANY, (0, 0.9), (0.25, 0.95), (0.15, 0.4), 0.05),  # plastic
+    _Kind(
+        0.13,
+        _ANY,
+        (0, 0.8),
+        (0.25, 0.95),
+        (0.35, 0.75),
+        waves=(1, 2, 5),
+        frequency=(3, 14),
+        contrast=(0.3, 1),
+    ),
+    # plastic
+    _Kind(0.23, _ANY, (0, 0.9), (0.25, 0.95), (0.15, 0.4), specular=0.05),
     # wood
-    _Kind(0.12, (18, 38), (0.3, 0.65), (0.4, 0.85), (0.4, 0.8), 0.04, (1,), (10, 24), (0.2, 0.4)),
+    _Kind(
+        0.12,
+        (18, 38),
+        (0.3, 0.65),
+        (0.4, 0.85),
+        (0.4, 0.8),
+        waves=(1,),
+        frequency=(10, 24),
+        contrast=(0.2, 0.4),
+    ),
     # cloth
-    _Kind(0.14, _ANY, (0, 0.8), (0.25, 0.95), (0.95, 0.95), 0.02, (3,), (28, 40), (0.15, 0.4)),
-    _Kind(0.08, (20, 60), (0, 0.3), (0.65, 0.95), (0.2, 0.55), 0.4),  # metal
-    _Kind(0.08, _ANY, (0, 0), (0.08, 0.3), (0.7, 0.95)),  # rubber
+    _Kind(
+        0.14,
+        _ANY,
+        (0, 0.8),
+        (0.25, 0.95),
+        (0.95, 0.95),
+        specular=0.02,
+        waves=(3,),
+        frequency=(28, 40),
+        contrast=(0.15, 0.4),
+    ),
+    # metal
+    _Kind(0.08, (20, 60), (0, 0.3), (0.65, 0.95), (0.2, 0.55), specular=0.4),
+    # rubber
+    _Kind(0.08, _ANY, (0, 0), (0.08, 0.3), (0.7, 0.95)),
 )
 
 
@@ -150,15 +210,18 @@ def random_materials(seed: int | list[int] | np.random.Generator) -> tuple[Mater
 
 
 def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
-    """Draw two sRGB colours and sine waves through the object that mix them: stripes, grain, checks
-    or patches."""
-    ranges = (kind.hue, kind.saturation, kind.value)
-    colour, other = (hsv(*(rng.uniform(*limits) for limits in ranges)) for _ in range(2))
-    darker = len(kind.waves) == 1  # a printed pattern has a second colour
-    other = colour + rng.uniform(*kind.contrast) * ((0 if darker else other) - colour)
+    """Draw two sRGB colours, and sine waves through the object that mix them."""
+    colour = random_colour(rng, kind.hue, kind.saturation, kind.value)
+    other = random_colour(rng, kind.hue, kind.saturation, kind.value)
+    # Only print, the kind with a choice of waves, has a second colour; else it is darker.
+    if len(kind.waves) == 1:
+        other = 0
+    other = colour + rng.uniform(*kind.contrast) * (other - colour)
+    # Wave vectors (k, 3) of one length.
     waves = rng.normal(size=(rng.choice(kind.waves), 3))
     waves *= rng.uniform(*kind.frequency) / np.linalg.norm(waves, axis=1, keepdims=True)
-    phases, warp = rng.uniform(0, 2 * np.pi, len(waves)), rng.normal(0, 2, 3)
+    phases = rng.uniform(0, 2 * np.pi, len(waves))
+    warp = rng.normal(0, 2, 3)
     sharpness = float(rng.choice([1.0, 2.0, 6.0]))  # 1 for a sine, more for clear edges
 
     def pattern(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

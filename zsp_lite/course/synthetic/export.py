@@ -1,5 +1,4 @@
-"""Export of procedural categories or of a folder of models: a data folder in CO3D's layout, with
-labels and pairs."""
+"""Export of procedural categories, or of models, to a data folder with labels and pairs."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,10 +27,8 @@ SETTINGS_FILE = "synthetic.json"
 # in that of models: the settings, and the model of each sequence
 RENDERED_FILE = "rendered_models.json"
 # pairs per category of models, for each of these numbers of target views
-_MODEL_PAIRS, _MODEL_TARGETS = (
-    20,
-    (1, 3, 5),
-)
+_MODEL_PAIRS = 20
+_MODEL_TARGETS = (1, 3, 5)
 
 
 @dataclass(frozen=True)
@@ -79,31 +76,40 @@ def export_categories(
     """Write sequences of procedural categories to a folder, with pose labels.
 
     A sequence depends only on the seed, its category and its index. An incomplete export is
-    completed; complete sequences are not rendered again. The first sequence of a category is the
-    reference of its labels. `image_size` is the shorter image side in pixels, `heights` the range
-    of the mean elevation of a sequence's cameras in degrees. InputError if a category is unknown,
-    or if the folder was written with other settings.
+    completed; complete sequences are not rendered again.
+
+    Args:
+        categories: names among those of `builders`.
+        out: the data folder.
+        sequences: number of them per category; the first is the reference of the labels.
+        frames: number of them per sequence.
+        seed: of everything random.
+        image_size: shorter image side in pixels.
+        builders: functions that build an object, by category.
+        heights: range of the mean elevation of a sequence's cameras in degrees.
+
+    Raises:
+        InputError: if a category is unknown, or the folder was written with other settings.
     """
     for category in categories:
         check_choice("category", category, builders)
-    out, settings = Path(out), {"seed": seed, "frames": frames, "image_size": image_size}
+    out = Path(out)
+    settings = {"seed": seed, "frames": frames, "image_size": image_size}
     if (out / SETTINGS_FILE).is_file():
-        _check_same_settings(
-            out, read_json(out / SETTINGS_FILE, dict[str, int], "settings"), settings
-        )
+        written = read_json(out / SETTINGS_FILE, dict[str, int], "settings")
+        _check_same_settings(out, written, settings)
     write_atomic(out / SETTINGS_FILE, json.dumps(settings).encode())
     jobs = [(category, index) for category in categories for index in range(sequences)]
     for category, index in tqdm(jobs, "rendering", disable=None):
-        name, key = sequence_name(seed, category, index), _key(seed, category, index)
+        name = sequence_name(seed, category, index)
+        key = _key(seed, category, index)
         if name not in read_poses(out, category):
             mesh = make_object(category, index, seed, builders)
-            write_sequence(
-                out, category, mesh, record_sequence(mesh, name, key, frames, image_size, heights)
-            )
+            recorded = record_sequence(mesh, name, key, frames, image_size, heights)
+            write_sequence(out, category, mesh, recorded)
     for category in categories:
-        write_true_labels(
-            out, category, [sequence_name(seed, category, index) for index in range(sequences)]
-        )
+        names = [sequence_name(seed, category, index) for index in range(sequences)]
+        write_true_labels(out, category, names)
 
 
 def make_object(
@@ -115,15 +121,16 @@ def make_object(
 
 
 def sequence_name(seed: int, category: str, index: int) -> str:
-    """Return a name like CO3D's, three groups of digits; names sort in the order of their indices,
-    up to 900."""
+    """Return a name like CO3D's, three groups of digits; up to 900, names sort like indices."""
     digits = _key(seed, category, index)
     return f"{100 + index}_{1000 + digits % 9000}_{1000 + digits // 9000 % 9000}"
 
 
 class _Rendered(msgspec.Struct):
+    """Content of `RENDERED_FILE`."""
+
     settings: dict[str, int | str]
-    # the origin of each rendered sequence, by category and name
+    # the model of each rendered sequence, by category and name: file, rotation and licence
     sequences: dict[str, dict[str, dict]]
 
 
@@ -136,17 +143,26 @@ def export_models(
     front: str | None = None,
     up: str | None = None,
 ) -> dict[str, str]:
-    """Render every model of a folder into a sequence of a data folder, with pose labels and
-    evaluation pairs.
+    """Render every model of a folder into a data folder, with pose labels and evaluation pairs.
 
     An incomplete export is completed; complete sequences are not rendered again, unless the model
-    or its orientation changed. The other arguments are as of `export_categories` and `list_models`.
-    Returns the models that were left out ("CATEGORY/NAME"), with the reason. InputError if no model
-    is usable, or if `out` holds other data.
+    or its orientation changed.
+
+    Args:
+        folder: of the models, see `list_models`, also for `front` and `up`.
+        out: the data folder; frames, seed and image_size are as of `export_categories`.
+
+    Returns:
+        The reason for each model ("CATEGORY/NAME") that was left out.
+
+    Raises:
+        InputError: if no model is usable, or if `out` holds other data.
     """
-    models, out = list_models(folder, front, up), Path(out)
+    models = list_models(folder, front, up)
+    out = Path(out)
     settings = {"seed": seed, "frames": frames, "image_size": image_size}
-    rendered, left_out = _Rendered(settings, {}), {}
+    rendered = _Rendered(settings, {})
+    left_out = {}
     if (out / RENDERED_FILE).is_file():
         rendered = read_json(out / RENDERED_FILE, _Rendered, "records")
         _check_same_settings(out, rendered.settings, settings)
@@ -160,10 +176,10 @@ def export_models(
             "file": model.path.relative_to(folder).as_posix(),
             "sha256": sha256(model.path, "model"),
             "rotation": np.round(rotation, 9).ravel().tolist(),
-            **{
-                name: getattr(model.info, name)
-                for name in ("author", "licence", "source", "changes")
-            },
+            "author": model.info.author,
+            "licence": model.info.licence,
+            "source": model.info.source,
+            "changes": model.info.changes,
         }
         known = rendered.sequences.get(model.category, {}).get(model.name) == record
         if known and model.name in read_poses(out, model.category):
@@ -174,23 +190,20 @@ def export_models(
             left_out[f"{model.category}/{model.name}"] = str(error)
             continue
         key = _key(seed, model.category, model.name)
-        write_sequence(
-            out, model.category, mesh, record_sequence(mesh, model.name, key, frames, image_size)
-        )
+        recorded = record_sequence(mesh, model.name, key, frames, image_size)
+        write_sequence(out, model.category, mesh, recorded)
         # The record is written last; a sequence with a record is complete.
         rendered.sequences.setdefault(model.category, {})[model.name] = record
-        write_atomic(
-            out / RENDERED_FILE, msgspec.json.format(msgspec.json.encode(rendered), indent=1)
-        )
+        text = msgspec.json.format(msgspec.json.encode(rendered), indent=1)
+        write_atomic(out / RENDERED_FILE, text)
     if not rendered.sequences:
         key, reason = next(iter(left_out.items()))
         raise InputError(f"{folder} holds no usable model; {key}: {reason}")
     for category, sequences in rendered.sequences.items():
         write_true_labels(out, category, sorted(sequences))
         if len(sequences) > 1:
-            write_pairs(
-                out, category, _MODEL_PAIRS, [n for n in _MODEL_TARGETS if n <= frames], seed
-            )
+            targets = [n for n in _MODEL_TARGETS if n <= frames]
+            write_pairs(out, category, _MODEL_PAIRS, targets, seed)
     return left_out
 
 
@@ -199,11 +212,11 @@ def _key(seed: int, category: str, sequence: int | str) -> int:
     return stable_hash(f"{seed}/{category}/{sequence}")
 
 
-def _check_same_settings(out: Path, found: Mapping, settings: Mapping) -> None:
+def _check_same_settings(out: Path, written: Mapping, settings: Mapping) -> None:
     """Raise InputError if a folder was written with other settings."""
-    if found != settings:
+    if written != settings:
         raise InputError(
-            f"folder {out} was written with {found}, expected {settings} or another folder"
+            f"folder {out} was written with {written}, expected {settings} or another folder"
         )
 
 
@@ -213,44 +226,45 @@ def write_sequence(
     mesh: TexturedMesh,
     recorded: tuple[SequenceData, Float[np.ndarray, "4 4"], float],
 ) -> None:
-    """Add a recorded sequence to a data folder; its pose is written last, so that a sequence with
-    one is complete."""
+    """Add a result of `record_sequence` to a data folder, with the pose of its object."""
     data, pose, scale = recorded
     write_co3d(out, category, [data], quality=88)
-    low, high = mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()
+    low = mesh.vertices.min(0).tolist()
+    high = mesh.vertices.max(0).tolist()
+    # The pose is written last; a sequence with a pose is complete.
     poses = read_poses(out, category)
     poses[data.name] = ObjectPose(pose.tolist(), scale, low, high, shape_turns(mesh.vertices))
-    write_atomic(
-        out / category / POSES_FILE, json.dumps(msgspec.to_builtins(poses), indent=1).encode()
-    )
+    text = json.dumps(msgspec.to_builtins(poses), indent=1)
+    write_atomic(out / category / POSES_FILE, text.encode())
 
 
 def shape_turns(vertices: Float[np.ndarray, "v 3"]) -> tuple[int, ...]:
-    """Return the quarter turns about the up axis, in degrees, after which the vertices are the same
-    within 3 %."""
+    """Return the quarter turns about z, in degrees, that map the vertices to themselves."""
     points = vertices - (vertices.min(0) + vertices.max(0)) / 2
+    tree = KDTree(points)
+    limit = 0.03 * np.ptp(points)
     x, y, z = points.T
-    turned = {90: (-y, x, z), 180: (-x, -y, z), 270: (y, -x, z)}
-    distance = {
-        turn: KDTree(points).query(np.stack(one, 1))[0].max() for turn, one in turned.items()
-    }
-    return tuple(turn for turn, farthest in distance.items() if farthest < 0.03 * np.ptp(points))
+    turns = []
+    for degrees, turned in {90: (-y, x, z), 180: (-x, -y, z), 270: (y, -x, z)}.items():
+        distances, _ = tree.query(np.stack(turned, 1))
+        if distances.max() < limit:
+            turns.append(degrees)
+    return tuple(turns)
 
 
 def write_true_labels(out: Path, category: str, names: Sequence[str]) -> None:
-    """Write the pose labels of sequences from their object poses; the first name is the
-    reference."""
+    """Write pose labels of sequences from their object poses; the first is the reference."""
     poses = {name: np.array(pose.trans) for name, pose in read_poses(out, category).items()}
+    from_reference = np.linalg.inv(poses[names[0]])
     for name in names:
         # Rounded, to be equal on all processors, and without negative zeros; of the reference,
         # exactly the identity.
-        trans = np.round(poses[name] @ np.linalg.inv(poses[names[0]]), 12) + 0.0
+        trans = np.round(poses[name] @ from_reference, 12) + 0.0
         write_label(out, category, PoseLabel(trans, name, names[0]))
 
 
 def write_pairs(out: Path, category: str, pairs: int, targets: Iterable[int], seed: int) -> None:
-    """Sample evaluation pairs, a file per number of target views, in the format of the published
-    evaluation."""
+    """Sample evaluation pairs, and write a file of them per number of target views."""
     dataset = Co3D(out)
     for n_targets in targets:
         sampled = sample_pairs(dataset, category, pairs, n_targets, seed)

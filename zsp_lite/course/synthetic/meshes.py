@@ -1,7 +1,8 @@
-"""Folders of models, `FOLDER/CATEGORY/NAME.obj` or `FOLDER/CATEGORY/NAME/FILE.obj`, as textured
-meshes.
+"""Folders of models as textured meshes.
 
-The optional file `models.json` gives the orientation and the origin of each model, see `ModelInfo`.
+A model is a file `FOLDER/CATEGORY/NAME.obj` or `FOLDER/CATEGORY/NAME/FILE.obj`, or of another
+format. The optional file `models.json` gives the orientation and the origin of each model, see
+`ModelInfo`.
 """
 
 from collections.abc import Callable
@@ -14,7 +15,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from zsp_lite.course.synthetic.primitives import Mesh, joined, surface_spread, unit
+from zsp_lite.course.synthetic.primitives import Mesh, area_normals, joined, surface_spread, unit
 from zsp_lite.course.synthetic.textures import linear_to_srgb
 from zsp_lite.errors import InputError, check_magnitude, rotation_matrix
 from zsp_lite.io.files import file_size, plain_name, read_bytes, read_json
@@ -33,14 +34,13 @@ _Direction = Literal["+x", "-x", "+y", "-y", "+z", "-z"] | tuple[float, float, f
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Surface of a part of a mesh; its colour is the product of `colour`, `texture` and `pattern`,
-    all sRGB."""
+    """Surface of a part of a mesh, with the product of three colours: own, texture's, pattern's."""
 
-    # with opacity, in [0, 1]; an opacity below 1 lets the room shine through
+    # sRGB with opacity, in [0, 1]; an opacity below 1 lets the room shine through
     colour: Float[np.ndarray, "4"]
     # rows from top to bottom; opacity below 128 means a hole
     texture: UInt8[np.ndarray, "h w 4"] | None = None
-    # colours (n, 3) of points (n, 3) in object coordinates
+    # sRGB colours (n, 3) of points (n, 3) in object coordinates
     pattern: Callable[[np.ndarray], np.ndarray] | None = None
     specular: float = 0.04  # reflectance at normal incidence
     roughness: float = 0.7  # as in glTF: 0 for a mirror, 1 for a matte surface
@@ -72,16 +72,22 @@ class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
     changes: str = ""  # with respect to the source
 
     def axes(self, extension: str) -> Float[np.ndarray, "3 3"]:
-        """Return the rotation from the axes of the file to the canonical frame (front +x, left +y,
-        up +z)."""
-        # What the list of models does not name is as usual in STL, or as in glTF.
+        """Return the rotation from the file's axes to the canonical: front +x, left +y, up +z."""
+        # What `models.json` does not name is as usual in STL, or as in glTF.
         front, up = ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")
-        front, up = self.front or front, self.up or up
-        given = [_AXES[one] if isinstance(one, str) else np.array(one) for one in (front, up)]
-        x, z = (vector / max(np.linalg.norm(vector), 1e-6) for vector in given)
+        front = self.front or front
+        up = self.up or up
+        x = _unit_vector(front)
+        z = _unit_vector(up)
         return rotation_matrix(
             f"front {front} and up {up}: the axes", np.stack([x, np.cross(z, x), z])
         )
+
+
+def _unit_vector(direction: _Direction) -> Float[np.ndarray, "3"]:
+    """Return a direction in the axes of a file as a vector."""
+    vector = _AXES[direction] if isinstance(direction, str) else np.array(direction)
+    return vector / max(np.linalg.norm(vector), 1e-6)
 
 
 @dataclass(frozen=True)
@@ -95,10 +101,20 @@ class Model:
 
 
 def list_models(folder: str | Path, front: str | None = None, up: str | None = None) -> list[Model]:
-    """Return the models of a folder by category and name; `front` and `up` where `models.json` does
-    not give them."""
+    """Return the models of a folder, sorted by category and name.
+
+    Args:
+        folder: with a folder per category.
+        front: axis such as "+z" that points to the front of the models that `models.json` gives
+            none for; by default that of their format.
+        up: likewise.
+
+    Raises:
+        InputError: if there is no model, two files of one model, or an entry without a file.
+    """
     folder = Path(folder)
-    infos, models = read_infos(folder), {}
+    infos = read_infos(folder)
+    models = {}
     files = [(path.parent.name, path.stem, path) for path in folder.glob("*/*")]
     files += [(path.parts[-3], path.parts[-2], path) for path in folder.glob("*/*/*")]
     for category, name, path in sorted(files):
@@ -113,13 +129,12 @@ def list_models(folder: str | Path, front: str | None = None, up: str | None = N
         info = msgspec.structs.replace(info, front=info.front or front, up=info.up or up)
         models[key] = Model(plain_name(category, "category"), plain_name(name, "model"), path, info)
     if not models:
-        kinds = (
-            f"CATEGORY/NAME.EXT or CATEGORY/NAME/FILE.EXT with EXT one of {', '.join(EXTENSIONS)}"
-        )
+        problem = "holds no model" if folder.is_dir() else "does not exist"
         raise InputError(
-            f"{folder} {'holds no model' if folder.is_dir() else 'does not exist'}, expected "
-            f"{kinds}"
+            f"{folder} {problem}, expected CATEGORY/NAME.EXT or CATEGORY/NAME/FILE.EXT with EXT "
+            f"one of {', '.join(EXTENSIONS)}"
         )
+    # The entries of the models that were found are taken out above.
     if infos:
         raise InputError(
             f"{folder / MODELS_FILE} names {min(infos)!r}, which has no file in {folder}"
@@ -134,49 +149,65 @@ def read_infos(folder: str | Path) -> dict[str, ModelInfo]:
 
 
 def read_mesh(path: str | Path) -> TexturedMesh:
-    """Read a mesh file with its textures, in the axes and the unit of the file; InputError if it is
-    unusable."""
+    """Read a mesh file with its textures, in the axes and the unit of the file.
+
+    Args:
+        path: of a file with one of `EXTENSIONS`.
+
+    Returns:
+        Its visible faces.
+
+    Raises:
+        InputError: if the file is too large, damaged, or has no visible face.
+    """
     import trimesh  # slow to import
 
     path = Path(path)
     file_size(path, "model", MAX_BYTES)
-    if missing := _missing(path):
+    missing = _missing(path)
+    if missing:
         raise InputError(f"model {path} lacks {missing}")
+    parts = []
     try:
         scene = trimesh.load_scene(path, process=False)
-        # transforms and names of geometries
-        placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
-        parts = [
-            _part(scene.geometry[name], transform)
-            for transform, name in placed
-            if len(getattr(scene.geometry[name], "faces", ()))
-        ]
+        for node in scene.graph.nodes_geometry:
+            transform, name = scene.graph[node]
+            geometry = scene.geometry[name]
+            # points and lines have no faces
+            if len(getattr(geometry, "faces", ())):
+                parts.append(_part(geometry, transform))
     except Exception as error:  # trimesh raises many types of exceptions for damaged files
         raise InputError(f"model {path} cannot be read: {type(error).__name__}: {error}") from error
     n_faces = [len(mesh.faces) for mesh, *_ in parts]
     if not 0 < sum(n_faces) <= MAX_FACES:
         raise InputError(f"model {path} has {sum(n_faces):,} faces, expected 1 to {MAX_FACES:,}")
     meshes, uv, colours, materials = zip(*parts, strict=True)
-    (vertices, faces), material = joined(meshes), np.repeat(np.arange(len(parts)), n_faces)
+    vertices, faces = joined(meshes)
+    material = np.repeat(np.arange(len(parts)), n_faces)
     check_magnitude(f"model {path}: vertices", vertices)
-    a, b, c = np.moveaxis(vertices[faces] / _size(vertices), 1, 0)
-    opacity = np.array([one.colour[3] for one in materials])
-    visible = (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12) & (
-        opacity[material] >= _INVISIBLE
-    )
+
+    # Faces without an area or nearly transparent are left out, and vertices without a face.
+    area = np.linalg.norm(area_normals(vertices / _size(vertices), faces), axis=1)
+    opacity = np.array([part_material.colour[3] for part_material in materials])
+    visible = (area > 1e-12) & (opacity[material] >= _INVISIBLE)
     if not visible.any():
         raise InputError(f"model {path} has no visible face with an area")
     used, faces = np.unique(faces[visible], return_inverse=True)
-    vertices, faces = vertices[used], faces.reshape(-1, 3)
-    uv, colours = (np.concatenate(corners)[visible] for corners in (uv, colours))
+    vertices = vertices[used]
+    faces = faces.reshape(-1, 3)
     return TexturedMesh(
-        vertices, faces, smooth_normals(vertices, faces), uv, colours, material[visible], materials
+        vertices,
+        faces,
+        smooth_normals(vertices, faces),
+        np.concatenate(uv)[visible],
+        np.concatenate(colours)[visible],
+        material[visible],
+        materials,
     )
 
 
 def canonical_mesh(mesh: TexturedMesh, rotation: Float[np.ndarray, "3 3"]) -> TexturedMesh:
-    """Rotate a mesh to front +x, left +y, up +z, centre its bounding box, and scale its surface to
-    unit spread."""
+    """Rotate a mesh, centre its bounding box, and scale its surface to unit spread."""
     vertices = mesh.vertices @ rotation.T
     vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
     spread = surface_spread(vertices, mesh.faces)
@@ -186,11 +217,12 @@ def canonical_mesh(mesh: TexturedMesh, rotation: Float[np.ndarray, "3 3"]) -> Te
 
 
 def _missing(path: Path) -> str:
-    """Name what a file of this type needs and trimesh would not report: a package, or a file that
-    it refers to."""
+    """Name the package or the file that is missing to read a model; trimesh would skip it."""
     if path.suffix.lower() == ".dae" and not find_spec("collada"):
         return "the package pycollada: pip install pycollada"
-    for name in _values(path, b"mtllib") if path.suffix.lower() == ".obj" else ():
+    if path.suffix.lower() != ".obj":
+        return ""
+    for name in _values(path, b"mtllib"):
         library = path.parent / name
         if not library.is_file():
             return f"its material file {name!r}"
@@ -202,24 +234,21 @@ def _missing(path: Path) -> str:
 
 def _values(path: Path, key: bytes) -> list[str]:
     """Return the values of the lines that begin with a keyword."""
-    found = (
-        line.strip().split(maxsplit=1)
-        for line in read_bytes(path, "model").splitlines()
-        if key in line.lower()
-    )
-    return [
-        words[1].decode(errors="replace").strip()
-        for words in found
-        if len(words) == 2 and words[0].lower() == key
-    ]
+    values = []
+    for line in read_bytes(path, "model").splitlines():
+        words = line.split(maxsplit=1)
+        if len(words) == 2 and words[0].lower() == key:
+            values.append(words[1].decode(errors="replace").strip())
+    return values
 
 
 def _part(mesh, transform: np.ndarray) -> tuple[Mesh, np.ndarray, np.ndarray, Material]:
-    """Return one geometry of a trimesh scene, its texture coordinates and colours (f, 3, ...), and
-    its material."""
-    faces, visual = np.asarray(mesh.faces, np.int64), mesh.visual
+    """Return a geometry of trimesh, its corners' texture coordinates and colours, its material."""
+    faces = np.asarray(mesh.faces, np.int64)
+    visual = mesh.visual
     vertices = np.asarray(mesh.vertices, float) @ transform[:3, :3].T + transform[:3, 3]
-    uv, colours = np.zeros((len(faces), 3, 2), np.float32), np.ones((len(faces), 3, 3), np.float32)
+    uv = np.zeros((len(faces), 3, 2), np.float32)
+    colours = np.ones((len(faces), 3, 3), np.float32)
     material = Material(np.ones(4))
     if visual.kind == "texture":
         if visual.uv is not None and len(visual.uv) == len(vertices):
@@ -236,12 +265,17 @@ def _material(given) -> Material:
     """Convert a material of trimesh: Phong's of an OBJ or COLLADA file, or glTF's."""
     if hasattr(given, "baseColorFactor"):
         return _gltf_material(given)
-    colour, texture = _rgba(given.diffuse), _image(given.image)
+    colour = _rgba(given.diffuse)
+    texture = _image(given.image)
     if texture is not None and colour[:3].max() < 0.02:
         colour[:3] = 1  # some exporters write black beside a texture, and mean white
-    keys = given.kwargs  # of the material file
-    opacity = keys["d"][-1] if "d" in keys else 1 - float(keys["tr"][-1]) if "tr" in keys else 1.0
-    colour[3] = np.clip(float(opacity), 0, 1)
+    keys = given.kwargs  # of the material file: "d" is the opacity, "tr" the transparency
+    opacity = 1.0
+    if "d" in keys:
+        opacity = float(keys["d"][-1])
+    elif "tr" in keys:
+        opacity = 1 - float(keys["tr"][-1])
+    colour[3] = np.clip(opacity, 0, 1)
     specular = _rgba(given.specular)[:3].mean() if "ks" in keys else 0.2
     # Phong's exponent n as roughness: n = 2 / roughness^4 - 2.
     roughness = (2 / (max(float(given.glossiness), 1) + 2)) ** 0.25
@@ -249,6 +283,7 @@ def _material(given) -> Material:
 
 
 def _gltf_material(given) -> Material:
+    """Convert a material of glTF; factors that it does not give are 1."""
     colour = np.ones(4) if given.baseColorFactor is None else _rgba(given.baseColorFactor)
     colour[:3] = linear_to_srgb(colour[:3])
     texture = _image(given.baseColorTexture)
@@ -256,11 +291,13 @@ def _gltf_material(given) -> Material:
         colour[3] = 1
         if texture is not None:
             texture[..., 3] = 255
-    factors = given.metallicFactor, given.roughnessFactor
-    metallic, roughness = (1.0 if factor is None else float(factor) for factor in factors)
+    metallic = 1.0 if given.metallicFactor is None else float(given.metallicFactor)
+    roughness = 1.0 if given.roughnessFactor is None else float(given.roughnessFactor)
     if given.metallicRoughnessTexture is not None:
+        # its green channel is the roughness, its blue one the metallic share
         mean = _image(given.metallicRoughnessTexture).mean((0, 1)) / 255
-        metallic, roughness = metallic * float(mean[2]), roughness * float(mean[1])
+        roughness *= float(mean[1])
+        metallic *= float(mean[2])
     return Material(colour, texture, specular=0.04 + 0.36 * metallic, roughness=roughness)
 
 
@@ -272,8 +309,7 @@ def _rgba(colour) -> Float[np.ndarray, "4"]:
 
 
 def _image(image) -> UInt8[np.ndarray, "h w 4"] | None:
-    """Return a PIL image as RGBA bytes, reduced to at most `_TEXTURE_SIZE` pixels along its longer
-    side."""
+    """Return a PIL image as RGBA bytes, of at most `_TEXTURE_SIZE` pixels along its longer side."""
     if image is None:
         return None
     image = image.convert("RGBA")
@@ -287,29 +323,28 @@ def _size(vertices: np.ndarray) -> float:
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
-    """Return corner normals: the mean normal of the faces around the corner that meet at less than
-    40 degrees."""
-    size = _size(vertices)
-    a, b, c = np.moveaxis(vertices[faces] / size, 1, 0)
-    weighted = np.cross(b - a, c - a)  # by area
+    """Return for each corner the mean normal of the faces that meet there below 40 degrees."""
+    unit_size = vertices / _size(vertices)
+    weighted = area_normals(unit_size, faces)
     normal = unit(weighted)
-    # Corners in the order of their points, and in `first` the position of the first corner of the
-    # same point.
-    _, point = np.unique(np.round(vertices / size, 6), axis=0, return_inverse=True)
+    # Faces that share no vertex meet where vertices have the same point. Corner 3 f + k is that of
+    # face f; `corner` lists them point by point, so that those of point p are `count[p]` corners
+    # from position `first[p]` on, and `of[i]` is the point of the corner at position i.
+    _, point = np.unique(np.round(unit_size, 6), axis=0, return_inverse=True)
     point = point.ravel()[faces.ravel()]
     corner = np.argsort(point, kind="stable")
-    _, first, of, counts = np.unique(
+    _, first, of, count = np.unique(
         point[corner], return_index=True, return_inverse=True, return_counts=True
     )
     face = corner // 3
     total = np.zeros((len(corner), 3))
-    several = np.arange(len(corner))
-    for step in range(
-        min(int(counts.max()), _FACES_PER_POINT)
-    ):  # every corner with the step-th corner of its point
-        several = several[counts[of[several]] > step]
-        other = face[first[of[several]] + step]
-        close = np.einsum("nd,nd->n", normal[face[several]], normal[other]) > _CREASE
-        total[corner[several[close]]] += weighted[other[close]]
+    # In each step, every corner meets the step-th corner of its point, if there is one.
+    position = np.arange(len(corner))
+    for step in range(min(int(count.max()), _FACES_PER_POINT)):
+        position = position[count[of[position]] > step]
+        other = face[first[of[position]] + step]
+        smooth = np.einsum("nd,nd->n", normal[face[position]], normal[other]) > _CREASE
+        total[corner[position[smooth]]] += weighted[other[smooth]]
+    # beyond _FACES_PER_POINT, a corner may not even have met its own face
     normals = unit(np.where(total.any(1, keepdims=True), total, np.repeat(normal, 3, axis=0)))
     return normals.reshape(-1, 3, 3).astype(np.float32)

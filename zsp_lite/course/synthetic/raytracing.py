@@ -10,18 +10,26 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from zsp_lite.course.synthetic.meshes import TexturedMesh
-from zsp_lite.course.synthetic.primitives import unit
-from zsp_lite.course.synthetic.room import FLOOR_REACH, Room
-from zsp_lite.course.synthetic.textures import pyramid, sample_image, sample_pyramid, srgb_to_linear
+from zsp_lite.course.synthetic.primitives import area_normals, unit
+from zsp_lite.course.synthetic.room import FLOOR_REACH, Room, Values, Vectors
+from zsp_lite.course.synthetic.textures import (
+    Image,
+    pyramid,
+    sample_image,
+    sample_pyramid,
+    srgb_to_linear,
+)
 from zsp_lite.data.cameras import Camera
 from zsp_lite.io.ply import load_open3d
 
 _LAYERS = 4  # surfaces with holes that a ray passes through
+_HOLE = 128  # opacity of a texture, 0 to 255, below which it has a hole
 _OFFSET = 2e-3  # of the start of a ray from the surface that it leaves, in units
 _RAYS = 4  # per sample towards the room, and per point of the floor towards the key light
+_LEAST_FACING = 0.02  # cosine of the largest angle between a visible point's normal and its ray
 # light from parts of the object that block the room, relative to the light of the room
 _BLOCKED = 0.25
 _SHADOW_CELLS = 96  # along each side of the grid on which the shadow on the floor is known
@@ -35,299 +43,325 @@ class Rendering:
     # z in the camera frame, 0 where the ray hits neither the object nor the floor
     depth: Float[np.ndarray, "h w"]
     mask: Bool[np.ndarray, "h w"]  # pixels of the object
-    canonical: Float[np.ndarray, "h w 3"]  # object coordinates of each object pixel, NaN elsewhere
+    canonical: Image  # object coordinates of each object pixel, NaN elsewhere
     # unit normals of the object pixels in the camera frame, 0 elsewhere
-    normals: Float[np.ndarray, "h w 3"]
+    normals: Image
     camera: Camera
 
 
 class _Hits(NamedTuple):
-    """Surface points of rays: indices of the rays that hit, distances in ray parameters, faces and
-    corner weights."""
+    """Surface points where rays hit the mesh; a ray hits once or not at all."""
 
-    ray: np.ndarray
-    distance: np.ndarray
-    face: np.ndarray
-    weights: np.ndarray
+    ray: Int[np.ndarray, " n"]  # index of the ray
+    distance: Values  # the ray's parameter at the point
+    face: Int[np.ndarray, " n"]
+    weights: Vectors  # of the face's corners, with sum 1
 
 
 class MeshScene:
-    """A mesh on the floor of a room, for rendering from cameras in the coordinates of the mesh."""
+    """A mesh on the floor of a room, for rendering from cameras in the coordinates of the mesh.
+
+    Args:
+        mesh: the object.
+        room: around it, with the origin below the middle of the object.
+        seed: of shadows, exposure and noise.
+        coordinates: object coordinates of the vertices; by default the vertices themselves.
+        samples: of the picture per pixel, along each axis.
+    """
 
     def __init__(
         self,
         mesh: TexturedMesh,
         room: Room,
         seed: int | np.random.Generator,
-        coordinates: Float[np.ndarray, "v 3"]
-        | None = None,  # of the object that the mesh is a deformed copy of
-        samples: int = 2,  # per pixel, along each axis
+        coordinates: Float[np.ndarray, "v 3"] | None = None,
+        samples: int = 2,
     ):
         o3d = load_open3d()
-        self.mesh, self.room = mesh, room
-        self._rng, self._samples = np.random.default_rng(seed), samples
+        self.mesh = mesh
+        self.room = room
+        self._rng = np.random.default_rng(seed)
+        self._samples = samples
         self._tensor = o3d.core.Tensor
-        self._rays = o3d.t.geometry.RaycastingScene(nthreads=1)
-        triangles = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
-        self._rays.add_triangles(*map(self._tensor, triangles))
-        low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+        self._raycaster = o3d.t.geometry.RaycastingScene(nthreads=1)
+        vertices = mesh.vertices.astype(np.float32)
+        self._raycaster.add_triangles(
+            self._tensor(vertices), self._tensor(mesh.faces.astype(np.uint32))
+        )
+        low = mesh.vertices.min(0)
+        high = mesh.vertices.max(0)
         self.origin = np.array([*(low + high)[:2] / 2, low[2]], np.float32)  # of the room
-        first, second, third = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float32), 1, 0)
-        # normal, with twice the area of the face as its length
-        cross = np.cross(second - first, third - first)
-        self._flat = unit(cross)
-        self._coordinates = (mesh.vertices if coordinates is None else coordinates)[
-            mesh.faces
-        ].astype(np.float32)
+
+        # Of each face: its normal, twice its area, and the object coordinates of its corners.
+        normals = area_normals(vertices, mesh.faces)
+        self._flat = unit(normals)
+        area = np.linalg.norm(normals, axis=1)
+        if coordinates is None:
+            coordinates = mesh.vertices
+        self._coordinates = coordinates[mesh.faces].astype(np.float32)
+        # sides of the texture per unit of length
+        uv_area = np.abs(np.linalg.det(mesh.uv[:, 1:] - mesh.uv[:, :1]))
+        self._texture_scale = np.sqrt(uv_area / np.maximum(area, 1e-12))
+
+        # Of each material.
         self._textures = [None if m.texture is None else pyramid(m.texture) for m in mesh.materials]
         self._has_holes = [
-            m.texture is not None and bool(m.texture[..., 3].min() < 128) for m in mesh.materials
+            m.texture is not None and bool(m.texture[..., 3].min() < _HOLE) for m in mesh.materials
         ]
         self._properties = np.array(
             [[m.specular, m.roughness, m.colour[3]] for m in mesh.materials], np.float32
         )
-        uv_area = np.abs(np.linalg.det(mesh.uv[:, 1:] - mesh.uv[:, :1]))
-        # Lengths of the texture per unit, by face.
-        self._texture_scale = np.sqrt(uv_area / np.maximum(np.linalg.norm(cross, axis=1), 1e-12))
         self._shadow, self._shadow_width = self._shadow_on_the_floor()
-        self._gain: float | None = None
+        self._gain: float | None = None  # of the exposure, from the first view on
 
     def render(self, camera: Camera) -> Rendering:
-        """Render one view; the exposure is measured on the first view and varies little
-        after it."""
+        """Render one view; the exposure is measured on the first view and varies little after."""
+        # Exact geometry, along one ray per pixel.
         rays = _pixel_rays(camera, 1)
         radiance, depth = self._background(camera, rays)
         hits = self._cast(camera.centre, rays)
         pixel = np.unravel_index(hits.ray, camera.size)
-        mask, normals = np.zeros(camera.size, bool), np.zeros((*camera.size, 3), np.float32)
+        mask = np.zeros(camera.size, bool)
+        normals = np.zeros((*camera.size, 3), np.float32)
         canonical = np.full_like(normals, np.nan)
-        mask[pixel], depth[pixel] = True, hits.distance  # rays have unit z in the camera frame
+        mask[pixel] = True
+        depth[pixel] = hits.distance  # rays have unit z in the camera frame
         canonical[pixel] = _interpolated(hits.weights, self._coordinates[hits.face])
-        normals[pixel] = _towards(
-            self._flat[hits.face], rays.reshape(-1, 3)[hits.ray]
-        ) @ camera.R.T.astype(np.float32)
+        flat = _towards(self._flat[hits.face], rays.reshape(-1, 3)[hits.ray])
+        normals[pixel] = flat @ camera.R.T.astype(np.float32)
+
+        # The picture: the mean of the samples in a pixel, over the room behind the object.
         if self._samples > 1:
             rays = _pixel_rays(camera, self._samples)
             hits = self._cast(camera.centre, rays)
-        shaded = cv2.resize(
-            self._shade(camera, rays, hits), camera.size[::-1], interpolation=cv2.INTER_AREA
-        )
+        shaded = self._shade(camera, rays, hits)
+        shaded = cv2.resize(shaded, camera.size[::-1], interpolation=cv2.INTER_AREA)
         radiance = shaded[..., :3] + (1 - shaded[..., 3:]) * radiance
         if self._gain is None:
             self._gain = self.room.camera.exposure_gain(radiance)
-        rgb = self.room.camera.develop(
-            radiance, self._gain * np.exp(self._rng.normal(0, 0.025)), self._rng
-        )
+        # Automatic exposure varies by 2.5 % from view to view.
+        gain = self._gain * np.exp(self._rng.normal(0, 0.025))
+        rgb = self.room.camera.develop(radiance, gain, self._rng)
         return Rendering(rgb, depth, mask, canonical, normals, camera)
 
     def _cast(self, origin: Float[np.ndarray, "#*n 3"], rays: Float[np.ndarray, "*n 3"]) -> _Hits:
-        """Return the first point that each ray meets; a ray passes through the holes of
-        textures."""
+        """Return the first point that each ray meets; it passes through the holes of textures."""
         origin = np.broadcast_to(origin.astype(np.float32), rays.shape).reshape(-1, 3)
         rays = rays.reshape(-1, 3)
-        start, active, found = np.zeros(len(rays), np.float32), np.arange(len(rays)), []
+        start = np.zeros(len(rays), np.float32)  # the parameter from which each ray is followed
+        active = np.arange(len(rays))  # indices of the rays that are still followed
+        layers = []
         for _ in range(_LAYERS):
             points = origin[active] + start[active, None] * rays[active]
-            result = self._rays.cast_rays(self._tensor(np.concatenate([points, rays[active]], 1)))
+            result = self._raycaster.cast_rays(self._tensor(np.hstack([points, rays[active]])))
             reach = result["t_hit"].numpy()
-            on = np.flatnonzero(np.isfinite(reach))
-            uv = result["primitive_uvs"].numpy()[on]
-            face, weights = (
-                result["primitive_ids"].numpy()[on].astype(np.int64),
-                np.column_stack([1 - uv.sum(1), uv]),
-            )
-            ray = active[on]
-            distance = start[ray] + reach[on]
+            hit = np.flatnonzero(np.isfinite(reach))
+            # Open3D gives the weights of the second and the third corner.
+            uv = result["primitive_uvs"].numpy()[hit]
+            weights = np.column_stack([1 - uv.sum(1), uv])
+            face = result["primitive_ids"].numpy()[hit].astype(np.int64)
+            ray = active[hit]
+            distance = start[ray] + reach[hit]
             hole = self._is_hole(face, weights)
-            found.append(_Hits(ray[~hole], distance[~hole], face[~hole], weights[~hole]))
+            layers.append(_Hits(ray[~hole], distance[~hole], face[~hole], weights[~hole]))
+            # The rays that met a hole go on behind it.
             active = ray[hole]
             start[active] = distance[hole] + _OFFSET
             if not len(active):
                 break
-        return _Hits(*map(np.concatenate, zip(*found, strict=True)))
+        return _Hits(*map(np.concatenate, zip(*layers, strict=True)))
 
-    def _is_hole(self, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return at which surface points (n,) the texture has a hole."""
+    def _is_hole(self, face: Int[np.ndarray, " n"], weights: Vectors) -> Bool[np.ndarray, " n"]:
+        """Return at which surface points the texture has a hole."""
         hole = np.zeros(len(face), bool)
         for index in np.flatnonzero(self._has_holes):
             on = np.flatnonzero(self.mesh.material[face] == index)
             u, v = _interpolated(weights[on], self.mesh.uv[face[on]]).T
-            hole[on] = sample_image(self._textures[index][0], u, 1 - v, cv2.BORDER_WRAP)[:, 3] < 128
+            rgba = sample_image(self._textures[index][0], u, 1 - v, cv2.BORDER_WRAP)
+            hole[on] = rgba[:, 3] < _HOLE
         return hole
 
-    def _visible_share(
-        self, point: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n k 3"]
-    ) -> np.ndarray:
-        """Return the share (n,) of the directions from each point that the object does not
-        block."""
-        n, count = directions.shape[:2]
-        blocked = np.bincount(self._cast(point[:, None], directions).ray // count, minlength=n)
-        return 1 - blocked.astype(np.float32) / np.float32(count)
+    def _visible_share(self, point: Vectors, directions: Float[np.ndarray, "n k 3"]) -> Values:
+        """Return the share of the k directions from each point that the object does not block."""
+        n, k = directions.shape[:2]
+        # ray i * k + j starts at point i
+        blocked = np.bincount(self._cast(point[:, None], directions).ray // k, minlength=n)
+        return 1 - blocked.astype(np.float32) / np.float32(k)
 
-    def _shade(
-        self, camera: Camera, rays: Float[np.ndarray, "h w 3"], hits: _Hits
-    ) -> Float[np.ndarray, "h w 4"]:
-        """Return the radiance of the object along rays, multiplied by its opacity, and the
-        opacity."""
+    def _shade(self, camera: Camera, rays: Image, hits: _Hits) -> Float[np.ndarray, "h w 4"]:
+        """Return the object's radiance along rays, multiplied by its opacity; and the opacity."""
         size = rays.shape[:2]
-        rays, material = rays.reshape(-1, 3)[hits.ray], self.mesh.material[hits.face]
-        # width of a sample, in units
-        footprint = hits.distance / (camera.focal_length.mean() * self._samples)
-        albedo = self._albedo(hits, footprint)
-        view, flat = unit(rays), _towards(self._flat[hits.face], rays)
-        normal = _interpolated(hits.weights, self.mesh.normals[hits.face])
-        normal *= np.where(_dot(normal, flat) < 0, np.float32(-1), np.float32(1))[:, None]
-        # Visible points do not face away, though their interpolated normals may.
-        normal = unit(normal)
-        normal = unit(normal - np.maximum(_dot(normal, view) + 0.02, 0)[:, None] * view)
-        facing = np.maximum(-_dot(normal, view), 0.02)
+        rays = rays.reshape(-1, 3)[hits.ray]
+        view = unit(rays)
+        flat = _towards(self._flat[hits.face], rays)
+        normal = self._shading_normals(hits, view, flat)
+        facing = np.maximum(-_dot(normal, view), _LEAST_FACING)
         point = camera.centre.astype(np.float32) + hits.distance[:, None] * rays + _OFFSET * flat
 
-        light, light_colour = (
-            self.room.light.astype(np.float32),
-            self.room.light_colour.astype(np.float32),
-        )
+        # Light that arrives: from the key light if both normals face it, and from the room.
+        light = self.room.light.astype(np.float32)
+        light_colour = self.room.light_colour.astype(np.float32)
         key = np.maximum(normal @ light, 0) * (flat @ light > 0)
-        lit, of_light = np.flatnonzero(key), np.ones(len(key), np.float32)
-        of_light[lit] = self._lit_share(point[lit], 1)
-        # Directions with a density of the cosine about the normal.
-        towards_room = unit(
-            normal[:, None] + 0.99 * _spread_directions(self._rng, len(point), _RAYS)
-        )
-        of_room = self._visible_share(point, towards_room)
-        # Few rays per sample are noisy: each sample takes the mean of its neighbours on the object.
-        shares = np.zeros((*size, 3), np.float32)
-        shares.reshape(-1, 3)[hits.ray] = np.column_stack([of_light, of_room, np.ones(len(key))])
-        of_light, of_room, neighbours = cv2.blur(shares, (3, 3)).reshape(-1, 3)[hits.ray].T
-        key, visible = key * of_light / neighbours, of_room / neighbours
+        key, visible = self._unblocked(key, point, normal, hits.ray, size)
         around = self.room.irradiance(normal) * (_BLOCKED + (1 - _BLOCKED) * visible)[:, None]
-        diffuse = (key[:, None] * light_colour + around) * albedo
 
-        specular, roughness, opacity = self._properties[material].T
-        # Reflectance by Schlick's approximation, the highlight by Blinn and Phong with its
-        # normalisation.
-        reflectance = (specular + np.maximum(1 - roughness - specular, 0) * (1 - facing) ** 5)[
-            :, None
-        ]
+        # Light that is scattered in all directions.
+        footprint = hits.distance / (camera.focal_length.mean() * self._samples)
+        diffuse = (key[:, None] * light_colour + around) * self._albedo(hits, footprint)
+
+        # Light that is reflected: Schlick's approximation of the reflectance, the room in the
+        # direction of the mirrored ray, and a normalised Blinn-Phong highlight of the key light.
+        specular, roughness, opacity = self._properties[self.mesh.material[hits.face]].T
+        reflectance = specular + np.maximum(1 - roughness - specular, 0) * (1 - facing) ** 5
+        reflectance = reflectance[:, None]
+        mirrored = self.room.reflection(view + 2 * facing[:, None] * normal, roughness)
+        mirrored *= visible[:, None]
+        # No highlight is narrower than that of roughness 0.25.
         exponent = 2 / np.maximum(roughness, 0.25) ** 4 - 2
         cosine = np.maximum(_dot(normal, unit(light - view)), 0)
         highlight = key * (exponent + 8) / 8 * cosine**exponent
-        mirrored = (
-            self.room.reflection(view + 2 * facing[:, None] * normal, roughness) * visible[:, None]
-        )
-        colour = diffuse * (1 - reflectance) + reflectance * (
-            mirrored + highlight[:, None] * light_colour
-        )
+        reflected = mirrored + highlight[:, None] * light_colour
+        radiance = diffuse * (1 - reflectance) + reflectance * reflected
 
         shaded = np.zeros((*size, 4), np.float32)
-        shaded.reshape(-1, 4)[hits.ray] = opacity[:, None] * np.column_stack(
-            [colour, np.ones(len(colour))]
-        )
+        layer = opacity[:, None] * np.column_stack([radiance, np.ones(len(radiance))])
+        shaded.reshape(-1, 4)[hits.ray] = layer
         return shaded
 
-    def _albedo(self, hits: _Hits, footprint: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-        """Return the linear colours of surface points; `footprint` is the width of a sample, in
-        units."""
-        face, weights, material = hits.face, hits.weights, self.mesh.material[hits.face]
+    def _shading_normals(self, hits: _Hits, view: Vectors, flat: Vectors) -> Vectors:
+        """Return interpolated normals, turned so that no visible point faces away."""
+        normal = _interpolated(hits.weights, self.mesh.normals[hits.face])
+        # on the same side of the surface as the flat normal
+        normal *= np.where(_dot(normal, flat) < 0, np.float32(-1), np.float32(1))[:, None]
+        normal = unit(normal)
+        # Visible points do not face away, though their interpolated normals may.
+        excess = np.maximum(_dot(normal, view) + _LEAST_FACING, 0)
+        return unit(normal - excess[:, None] * view)
+
+    def _unblocked(
+        self,
+        key: Values,
+        point: Vectors,
+        normal: Vectors,
+        ray: Int[np.ndarray, " n"],
+        size: tuple[int, int],
+    ) -> tuple[Values, Values]:
+        """Return the key light that reaches each point, and the share of the room that it sees."""
+        of_light = np.ones(len(key), np.float32)
+        lit = np.flatnonzero(key)
+        of_light[lit] = self._lit_share(point[lit], 1)
+        of_room = self._room_share(point, normal)
+        # Few rays per sample are noisy: each sample takes the mean of its neighbours on the object.
+        # The blur divides by all nine neighbours, the third channel is the share on the object.
+        shares = np.zeros((*size, 3), np.float32)
+        shares.reshape(-1, 3)[ray] = np.column_stack([of_light, of_room, np.ones(len(key))])
+        of_light, of_room, on_object = cv2.blur(shares, (3, 3)).reshape(-1, 3)[ray].T
+        return key * of_light / on_object, of_room / on_object
+
+    def _albedo(self, hits: _Hits, footprint: Values) -> Vectors:
+        """Return the linear colours of surface points; `footprint` is a sample's width in units."""
+        face = hits.face
+        weights = hits.weights
+        material = self.mesh.material[face]
         albedo = srgb_to_linear(_interpolated(weights, self.mesh.colours[face]))
         for index in np.unique(material):
             on = np.flatnonzero(material == index)
-            look, texture = self.mesh.materials[index], self._textures[index]
+            look = self.mesh.materials[index]
+            texture = self._textures[index]
             albedo[on] *= srgb_to_linear(look.colour[:3])
             if look.pattern:
                 points = _interpolated(weights[on], self._coordinates[face[on]])
                 albedo[on] *= srgb_to_linear(look.pattern(points))
             if texture:
                 u, v = _interpolated(weights[on], self.mesh.uv[face[on]]).T
-                texels = (
-                    footprint[on]
-                    * self._texture_scale[face[on]]
-                    * np.sqrt(np.prod(texture[0].shape[:2]))
-                )
-                sample = sample_pyramid(texture, u, 1 - v, texels, cv2.BORDER_WRAP)
-                albedo[on] *= srgb_to_linear(sample[:, :3] / 255)
+                pixels = footprint[on] * self._texture_scale[face[on]]
+                pixels *= np.sqrt(np.prod(texture[0].shape[:2]))
+                rgba = sample_pyramid(texture, u, 1 - v, pixels, cv2.BORDER_WRAP)
+                albedo[on] *= srgb_to_linear(rgba[:, :3] / 255)
         # Artists use pure black and fully saturated colours; real surfaces reflect a few percent of
         # all colours.
         return 0.015 + 0.8 * albedo
 
-    def _lit_share(self, point: Float[np.ndarray, "n 3"], count: int) -> np.ndarray:
-        """Return the share (n,) of the key light that the object does not block, by `count` rays
-        from each point."""
-        offset = np.float32(np.tan(self.room.light_radius)) * _spread_directions(
-            self._rng, len(point), count
-        )
+    def _lit_share(self, point: Vectors, count: int) -> Values:
+        """Return the share of the key light that each point sees, by `count` rays towards it."""
+        radius = np.float32(np.tan(self.room.light_radius))
+        offset = radius * _spread_directions(self._rng, len(point), count)
         return self._visible_share(point, unit(self.room.light.astype(np.float32) + offset))
 
+    def _room_share(self, point: Vectors, normal: Float[np.ndarray, "#n 3"]) -> Values:
+        """Return the share of the room above its surface that each point sees."""
+        # A unit vector plus a random one has the density of the cosine; 0.99 avoids the sum zero.
+        offset = 0.99 * _spread_directions(self._rng, len(point), _RAYS)
+        return self._visible_share(point, unit(normal[:, None] + offset))
+
     def _shadow_on_the_floor(self) -> tuple[Float[np.ndarray, "n n 2"], float]:
-        """Return the visible shares of the key light and of the room on a grid below the object,
-        and its width."""
-        extent, light = np.ptp(self.mesh.vertices, axis=0), self.room.light
+        """Return the visible shares of key light and room on a grid on the floor, and its width."""
+        # The grid is as wide as the object with its shadow, of limited length, on either side.
+        extent = np.ptp(self.mesh.vertices, axis=0)
+        light = self.room.light
         length = extent[2] * max(float(np.linalg.norm(light[:2]) / max(light[2], 0.3)), 0.8)
-        n, width = _SHADOW_CELLS, float(extent[:2].max()) + 2 * min(length, 5.0)
+        width = float(extent[:2].max()) + 2 * min(length, 5.0)
+        n = _SHADOW_CELLS
         line = ((np.arange(n, dtype=np.float32) + 0.5) / n - 0.5) * width
         x, y = np.meshgrid(line, line)
         point = np.stack([x, y, np.full_like(x, _OFFSET)], -1).reshape(-1, 3) + self.origin
         key = self._lit_share(point, _RAYS).reshape(n, n)
-        towards_room = unit(
-            np.float32([0, 0, 1]) + 0.99 * _spread_directions(self._rng, len(point), _RAYS)
-        )
-        around = self._visible_share(point, towards_room).reshape(n, n)
-        return np.dstack(
-            [cv2.GaussianBlur(key, (0, 0), 0.8), cv2.GaussianBlur(around, (0, 0), 2.0)]
-        ), width
+        around = self._room_share(point, np.float32([[0, 0, 1]])).reshape(n, n)
+        # A blur hides the noise of few rays.
+        key = cv2.GaussianBlur(key, (0, 0), 0.8)
+        around = cv2.GaussianBlur(around, (0, 0), 2.0)
+        return np.dstack([key, around]), width
 
-    def _background(
-        self, camera: Camera, rays: Float[np.ndarray, "h w 3"]
-    ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-        """Return the radiance of the room with the shadow of the object, and the depth of the
-        floor."""
-        eye, flat_rays = camera.centre - self.origin, rays.reshape(-1, 3)
+    def _background(self, camera: Camera, rays: Image) -> tuple[Image, Float[np.ndarray, "h w"]]:
+        """Return the room's radiance with the shadow of the object, and the depth of the floor."""
+        eye = camera.centre - self.origin
+        flat_rays = rays.reshape(-1, 3)
         radiance, reach = self.room.radiance(eye, flat_rays, 1 / camera.focal_length.mean())
         floor = np.flatnonzero(reach)
-        u, v = ((eye + reach[floor, None] * flat_rays[floor])[:, :2] / self._shadow_width + 0.5).T
+        point = eye + reach[floor, None] * flat_rays[floor]
+        u, v = (point[:, :2] / self._shadow_width + 0.5).T
         shares = sample_image(self._shadow, u, v, cv2.BORDER_CONSTANT)
         radiance[floor] *= self.room.on_the_floor(*shares.T)
         depth = np.where(reach < FLOOR_REACH, reach, 0).astype(np.float32)
         return radiance.reshape(rays.shape), depth.reshape(rays.shape[:2])
 
 
-def _pixel_rays(camera: Camera, n: int) -> Float[np.ndarray, "h w 3"]:
+def _pixel_rays(camera: Camera, n: int) -> Image:
     """Return rays of unit z in the camera frame through n x n points of each pixel."""
     height, width = camera.size
     x = ((np.arange(width * n) + 0.5) / n - camera.principal_point[0]) / camera.focal_length[0]
     y = ((np.arange(height * n) + 0.5) / n - camera.principal_point[1]) / camera.focal_length[1]
-    return (x[None, :, None] * camera.R[0] + (y[:, None, None] * camera.R[1] + camera.R[2])).astype(
-        np.float32
-    )
+    # x R[0] + y R[1] + R[2] is the world direction of (x, y, 1); the shapes make it (h, w, 3)
+    rays = x[None, :, None] * camera.R[0] + (y[:, None, None] * camera.R[1] + camera.R[2])
+    return rays.astype(np.float32)
 
 
 def _interpolated(
-    weights: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "n 3 c"]
+    weights: Vectors, corners: Float[np.ndarray, "n 3 c"]
 ) -> Float[np.ndarray, "n c"]:
     """Return values at surface points from those at the corners of their faces."""
     return np.einsum("nk,nkc->nc", weights, corners)
 
 
-def _towards(
-    normal: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
+def _towards(normal: Vectors, rays: Vectors) -> Vectors:
     """Return normals that point towards the eye of rays."""
     return normal * -np.sign(_dot(normal, rays))[:, None]
 
 
-def _dot(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+def _dot(a: Vectors, b: Vectors) -> Values:
     """Return the scalar products of the rows."""
-    return np.einsum("nd,nd->n", one, other)
+    return np.einsum("nd,nd->n", a, b)
 
 
 def _spread_directions(
     rng: np.random.Generator, n: int, count: int
 ) -> Float[np.ndarray, "n {count} 3"]:
-    """Return n sets of `count` unit vectors that are spread evenly over the sphere, each set turned
-    at random."""
+    """Return n sets of `count` unit vectors, each spread evenly over the sphere at random."""
+    # A Fibonacci spiral: equal steps of z have equal areas, and the golden ratio of a turn between
+    # neighbours avoids rows.
     index = np.arange(count, dtype=np.float32)
     z = 1 - 2 * (index + rng.random((n, 1), np.float32)) / count
-    # golden ratio
-    angle = np.float32(2 * np.pi) * (index * np.float32(0.618034) + rng.random((n, 1), np.float32))
+    turns = index * np.float32(0.618034) + rng.random((n, 1), np.float32)
+    angle = np.float32(2 * np.pi) * turns
     radius = np.sqrt(np.maximum(1 - z**2, 0))
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], -1)

@@ -1,5 +1,4 @@
-"""A random room around an object: a textured floor, furnished walls, its light, and a cheap camera
-in it.
+"""A random room around an object: floor, furnished walls, light, and a cheap camera in it.
 
 All colours are linear unless a name says sRGB. Lengths are in units of the object, whose surface
 has unit spread.
@@ -11,19 +10,29 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from zsp_lite.course.synthetic.primitives import direction
 from zsp_lite.course.synthetic.textures import (
+    Colour,
+    Image,
     blur,
-    hsv,
     linear_to_srgb,
     pyramid,
+    random_colour,
     sample_pyramid,
     srgb_to_linear,
-    surface,
+    surface_albedo,
 )
 
+Vector = Float[np.ndarray, "3"]
+# A row per point or ray.
+Vectors = Float[np.ndarray, "n 3"]
+Values = Float[np.ndarray, " n"]
+
 FLOOR_REACH = 25.0  # distance in units up to which the floor has depth
-_FLOOR, _CEILING = 4, 5  # among the faces of a room
-_MIDDLE = np.array([0, 0, 1.5])  # about the middle of an object
+# indices among the faces of a room; those below 4 are the walls
+_FLOOR = 4
+_CEILING = 5
+_MIDDLE = np.array([0, 0, 1.5])  # about that of an object of unit spread
 _FLOOR_PIXELS = 1024  # along each side of the floor's image
 _WALL_DENSITY = 20  # pixels per unit
 
@@ -34,60 +43,55 @@ class CheapCamera:
 
     exposure: float = 0.2  # mean luminance after automatic exposure, with 1 for white
     # error of automatic balance, a factor per channel
-    white_balance: tuple[float, float, float] = (
-        1.0,
-        1.0,
-        1.0,
-    )
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     noise: float = 0.01  # standard deviation at mid-grey, relative to white
     vignetting: float = 0.1  # loss of light in the corners, as a fraction
 
-    def exposure_gain(self, radiance: Float[np.ndarray, "h w 3"]) -> float:
-        """Return the factor of automatic exposure, from mean and median, which limits the effect of
-        bright windows."""
-        luminance = radiance @ np.float32([0.2126, 0.7152, 0.0722])
+    def exposure_gain(self, radiance: Image) -> float:
+        """Return the factor of automatic exposure, which bright windows affect little."""
+        luminance = radiance @ np.float32([0.2126, 0.7152, 0.0722])  # weights of ITU-R BT.709
         median = np.median(luminance)
-        return float(
-            2 * self.exposure / max(median + np.minimum(luminance, 4 * median).mean(), 1e-6)
-        )
+        mean = np.minimum(luminance, 4 * median).mean()
+        return float(2 * self.exposure / max(median + mean, 1e-6))
 
     def develop(
-        self, radiance: Float[np.ndarray, "h w 3"], gain: float, rng: np.random.Generator
+        self, radiance: Image, gain: float, rng: np.random.Generator
     ) -> UInt8[np.ndarray, "h w 3"]:
         """Return the 8-bit picture of linear radiance; `gain` is that of `exposure_gain`."""
         height, width = radiance.shape[:2]
         pixel = min(height, width) / 256  # blurs are those of a picture of 256 pixels
-        y, x = np.linspace(-1, 1, height)[:, None], np.linspace(-1, 1, width)
+        y = np.linspace(-1, 1, height)[:, None]
+        x = np.linspace(-1, 1, width)
         falloff = 1 - self.vignetting * (x**2 + y**2) / 2
         image = (radiance * (gain * falloff)[..., None] * self.white_balance).astype(np.float32)
         image = blur(image, 0.4 * pixel)  # of the lens
-        # smoothed by demosaicing
+        # Noise that demosaicing smooths; 1.6 makes up for the variance that the blur takes away.
+        # The variance of photon noise grows with the light, that of read noise is constant.
         noise = blur(rng.standard_normal((height, width, 3), np.float32), 0.5 * pixel)
         image = np.maximum(image + 1.6 * self.noise * noise * np.sqrt(0.16 * image + 0.006), 0)
         # A filmic tone curve, Narkowicz's fit to ACES.
-        image = linear_to_srgb(
-            np.clip(image * (2.26 * image + 0.03) / (image * (2.19 * image + 0.59) + 0.16), 0, 1)
-        )
+        filmic = image * (2.26 * image + 0.03) / (image * (2.19 * image + 0.59) + 0.16)
+        image = linear_to_srgb(np.clip(filmic, 0, 1))
         image += 0.35 * (image - blur(image, 0.9 * pixel))  # sharpening by the camera
         return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 @dataclass(eq=False)
 class Room:
-    """A box around objects, and the light on them; the origin of all points is on the floor below
-    the object.
+    """A box around objects, and the light on them.
 
-    `images` are those of the faces -x, +x, -y, +y, floor, ceiling: an albedo of the floor, else
-    radiances. The rows of a wall run down, those of floor and ceiling along y; the columns run
-    along y on the first two walls, else along x.
+    The origin of all points is on the floor below the object. `images` are those of the faces -x,
+    +x, -y, +y, floor, ceiling: an albedo of the floor, else radiances. The rows of a wall run down,
+    those of floor and ceiling along y; the columns run along y on the first two walls, else along
+    x.
     """
 
-    low: Float[np.ndarray, "3"]  # corners of the box; low[2] is 0
-    high: Float[np.ndarray, "3"]
+    low: Vector  # corners of the box; low[2] is 0
+    high: Vector
     images: tuple[np.ndarray, ...]
-    light: Float[np.ndarray, "3"]  # unit vector towards the key light
+    light: Vector  # unit vector towards the key light
     light_radius: float  # angular radius of the key light in radians
-    light_colour: Float[np.ndarray, "3"]  # irradiance of the key light on a surface that faces it
+    light_colour: Colour  # irradiance of the key light on a surface that faces it
     camera: CheapCamera
 
     def __post_init__(self):
@@ -96,59 +100,66 @@ class Room:
         # Irradiance of a surface that faces one of the six faces: half of it from there, half from
         # the four beside it.
         self._ambient = (faces[_CEILING] + faces[:_FLOOR].mean(0)) / 2
-        faces[_FLOOR] *= self.on_the_floor(*np.ones((2, 1), np.float32))[0]
+        # The albedo of the floor becomes its radiance in full light.
+        unblocked = np.ones(1, np.float32)
+        faces[_FLOOR] *= self.on_the_floor(unblocked, unblocked)[0]
+        # the faces come in pairs, with three channels each
         opposite = faces.reshape(3, 2, 3)[:, ::-1].reshape(6, 3)
         self._irradiance = (faces + (faces.sum(0) - faces - opposite) / 4) / 2
 
-    def irradiance(self, normal: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return the irradiance of the room, without its key light, at unblocked points with these
-        normals."""
+    def irradiance(self, normal: Vectors) -> Vectors:
+        """Return the irradiance from the room, without its key light, where nothing blocks it."""
+        # the face that the normal points to along each axis; the squares of a unit vector sum to 1
         face = 2 * np.arange(3) + (normal > 0)
         return np.einsum("nf,nfc->nc", normal**2, self._irradiance[face])
 
-    def reflection(
-        self, direction: Float[np.ndarray, "n 3"], roughness: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, "n 3"]:
-        """Return the radiance that an object receives from these directions, blurred by the
-        roughness."""
-        radiance, reach = self.radiance(_MIDDLE, direction, roughness)
+    def reflection(self, rays: Vectors, roughness: Values) -> Vectors:
+        """Return the radiance that an object receives from rays, blurred by its roughness."""
+        radiance, reach = self.radiance(_MIDDLE, rays, roughness)
         floor = np.flatnonzero(reach)
-        radiance[floor] *= self.on_the_floor(*np.ones((2, len(floor)), np.float32))
+        unblocked = np.ones(len(floor), np.float32)
+        radiance[floor] *= self.on_the_floor(unblocked, unblocked)
         return radiance
 
     def radiance(
         self,
-        eye: Float[np.ndarray, "3"],
-        rays: Float[np.ndarray, "n 3"],
-        blur: float | Float[np.ndarray, " n"],
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-        """Return the radiance of walls and ceiling and the albedo of the floor along rays, and the
-        reach of the floor.
+        eye: Vector,
+        rays: Vectors,
+        blur: float | Values,
+    ) -> tuple[Vectors, Values]:
+        """Return the room's radiance along rays, of the floor its albedo; and the floor's reach.
 
         Each ray covers the angle `blur`, in radians; the reach is its parameter on the floor, 0
         where it misses it.
         """
-        low, high = (corner[:, None].astype(np.float32) for corner in (self.low, self.high))
+        # Vectors are columns here: corners (3, 1), rays (3, n).
+        low = self.low[:, None].astype(np.float32)
+        high = self.high[:, None].astype(np.float32)
+        size = high - low
         eye = np.clip(eye[:, None], low + 0.05, high - 0.05).astype(np.float32)
+        # The rays are divided by, so that none of their coordinates may be zero.
         rays = np.ascontiguousarray(np.where(np.abs(rays) < 1e-9, np.float32(1e-9), rays).T)
+
+        # From inside a box, a ray leaves through the nearest of the three planes ahead of it.
         reach = (np.where(rays > 0, high, low) - eye) / rays
-        nearest, axis = reach.min(0), reach.argmin(0)
+        nearest = reach.min(0)
+        axis = reach.argmin(0)
         face = 2 * axis + (np.take_along_axis(rays, axis[None], 0)[0] > 0)
-        x, y, z = (eye + nearest * rays - low) / (high - low)
-        texels = nearest * np.sqrt((rays**2).sum(0)) * blur
+        x, y, z = (eye + nearest * rays - low) / size  # in [0, 1]
+        width = nearest * np.sqrt((rays**2).sum(0)) * blur  # of each ray at its end, in units
+
         radiance = np.empty((len(nearest), 3), np.float32)
         for index, image in enumerate(self._pyramids):
             on = np.flatnonzero(face == index)
-            u, v = (y if index < 2 else x)[on], (1 - z if index < _FLOOR else y)[on]
-            density = image[0].shape[1] / float((high - low)[1 if index < 2 else 0, 0])
-            radiance[on] = sample_pyramid(image, u, v, texels[on] * density, cv2.BORDER_REPLICATE)
+            columns = 1 if index < 2 else 0  # the axis along which the image's columns run
+            u = (y if columns else x)[on]
+            v = (1 - z if index < _FLOOR else y)[on]
+            density = image[0].shape[1] / float(size[columns, 0])  # pixels per unit
+            radiance[on] = sample_pyramid(image, u, v, width[on] * density, cv2.BORDER_REPLICATE)
         return radiance, np.where(face == _FLOOR, nearest, 0)
 
-    def on_the_floor(
-        self, key: Float[np.ndarray, " n"], around: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, "n 3"]:
-        """Return the irradiance of the floor, from the visible shares of the key light and of the
-        room."""
+    def on_the_floor(self, key: Values, around: Values) -> Vectors:
+        """Return the irradiance of the floor from the visible shares of key light and room."""
         direct = max(float(self.light[2]), 0) * self.light_colour.astype(np.float32)
         return key[:, None] * direct + around[:, None] * self._ambient
 
@@ -157,33 +168,18 @@ def random_room(seed: int | np.random.Generator) -> Room:
     """Draw a room, independent of the object."""
     rng = np.random.default_rng(seed)
     sides = rng.uniform(11.5, 17, 4)
-    low, high = (
-        np.array([-sides[0], -sides[1], 0]),
-        np.array([sides[2], sides[3], rng.uniform(12, 14)]),
-    )
+    low = np.array([-sides[0], -sides[1], 0])
+    high = np.array([sides[2], sides[3], rng.uniform(12, 14)])
     width, depth, height = high - low
-    azimuth, elevation = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 1.4)
-    light = np.array(
-        [
-            np.cos(azimuth) * np.cos(elevation),
-            np.sin(azimuth) * np.cos(elevation),
-            np.sin(elevation),
-        ]
-    )
-    warmth, temperature = rng.uniform(-0.08, 0.2), rng.normal(0, 0.045)
+    light = direction(azimuth=rng.uniform(0, 2 * np.pi), elevation=rng.uniform(0.5, 1.4))
+    warmth = rng.uniform(-0.08, 0.2)  # of the key light
+    temperature = rng.normal(0, 0.045)  # error of the camera's white balance
 
-    floor_colour = hsv(rng.uniform(15, 60), rng.uniform(0.02, 0.6), rng.uniform(0.3, 0.8))
-    floor = surface(
-        rng, (_FLOOR_PIXELS, _FLOOR_PIXELS), floor_colour, 1.0, laid=rng.random() < 0.75
-    )
-    if rng.random() < 0.3:  # a rug
-        sides_of_rug = _FLOOR_PIXELS * (0.5 + [-1, -1, 1, 1] * rng.uniform(0.09, 0.22, 4))
-        top, left, bottom, right = sides_of_rug.astype(int).tolist()
-        colour = hsv(rng.uniform(0, 360), rng.uniform(0.02, 0.4), rng.uniform(0.25, 0.7))
-        floor[top:bottom, left:right] = surface(rng, (bottom - top, right - left), colour, 1.0)
-    pale = rng.random() < 0.75
-    hue, saturation = (rng.uniform(25, 60), 0.14) if pale else (rng.uniform(0, 360), 0.4)
-    wall_colour = hsv(hue, rng.uniform(0, saturation), rng.uniform(0.6, 0.92))
+    floor = _floor(rng)
+    if rng.random() < 0.75:  # pale walls
+        wall_colour = random_colour(rng, (25, 60), (0, 0.14), (0.6, 0.92))
+    else:
+        wall_colour = random_colour(rng, (0, 360), (0, 0.4), (0.6, 0.92))
     walls = [_wall(rng, side, height, wall_colour) for side in (depth, depth, width, width)]
     ceiling = np.full((8, 8, 3), 0.7, np.float32)
     return Room(
@@ -202,36 +198,52 @@ def random_room(seed: int | np.random.Generator) -> Room:
     )
 
 
-def _wall(
-    rng: np.random.Generator, width: float, height: float, colour: Float[np.ndarray, "3"]
-) -> np.ndarray:
-    """Return the radiance of a wall, with furniture, pictures and windows as rectangles that are
-    divided into cells."""
-    rows, cols = round(height * _WALL_DENSITY), round(width * _WALL_DENSITY)
-    image = surface(rng, (rows, cols), colour, 0.2)
+def _floor(rng: np.random.Generator) -> Float[np.ndarray, "n n 3"]:
+    """Return the albedo of a floor of boards or tiles or plain, and sometimes with a rug."""
+    colour = random_colour(rng, (15, 60), (0.02, 0.6), (0.3, 0.8))
+    tiled = rng.random() < 0.75
+    floor = surface_albedo(rng, (_FLOOR_PIXELS, _FLOOR_PIXELS), colour, 1.0, tiled)
+    if rng.random() < 0.3:
+        # The middle of the floor, below the object, is on the rug.
+        edges = _FLOOR_PIXELS * (0.5 + [-1, -1, 1, 1] * rng.uniform(0.09, 0.22, 4))
+        top, left, bottom, right = edges.astype(int).tolist()
+        colour = random_colour(rng, (0, 360), (0.02, 0.4), (0.25, 0.7))
+        rug = surface_albedo(rng, (bottom - top, right - left), colour, 1.0)
+        floor[top:bottom, left:right] = rug
+    return floor
+
+
+def _wall(rng: np.random.Generator, width: float, height: float, colour: Colour) -> Image:
+    """Return the radiance of a wall with rectangles: furniture, pictures, windows."""
+    rows = round(height * _WALL_DENSITY)
+    cols = round(width * _WALL_DENSITY)
+    image = surface_albedo(rng, (rows, cols), colour, 0.2)
     image[-8:] *= 0.4  # skirting board
     left = rng.uniform(0.3, 2)
     while left < width - 2:
-        wide, tall = rng.uniform(1, 4), rng.uniform(1.2, 5)
+        wide = rng.uniform(1, 4)
+        tall = rng.uniform(1.2, 5)
         hangs = rng.random() < 0.5
-        # of a window, or of anything else
+        # Two in five things that hang are windows, the others pictures.
         brightness = 3.0 if hangs and rng.random() < 0.4 else 1.0
-        # a row of twelve is one of books
-        cells = (
-            int(rng.integers(1, 5)),
-            int(rng.choice([1, 2, 12])),
-        )
-        colours = hsv(rng.uniform(0, 360), rng.uniform(0, 0.4), rng.uniform(0.2, 0.9)) + np.zeros(
-            (*cells, 3)
-        )
-        colours += rng.normal(0, 0.12, (*cells, 1)) + rng.normal(0, 0.05, (*cells, 3))
+        cells = _cell_colours(rng)
         bottom = rows - round(rng.uniform(2.5, 4) * _WALL_DENSITY if hangs else 0)
-        size = (round(wide * _WALL_DENSITY), round(tall * _WALL_DENSITY))
-        block = cv2.resize(
-            srgb_to_linear(np.clip(colours, 0.05, 0.95)), size, interpolation=cv2.INTER_NEAREST
-        )
-        area = image[max(bottom - size[1], 0) : bottom, round(left * _WALL_DENSITY) :][:, : size[0]]
-        area[:] = 0.3 * block.mean((0, 1))  # the frame
+        block_width = round(wide * _WALL_DENSITY)
+        block_height = round(tall * _WALL_DENSITY)
+        block = cv2.resize(cells, (block_width, block_height), interpolation=cv2.INTER_NEAREST)
+        # The part of the block that is on the wall has a dark frame of three pixels.
+        start = round(left * _WALL_DENSITY)
+        area = image[max(bottom - block_height, 0) : bottom, start : start + block_width]
+        area[:] = 0.3 * block.mean((0, 1))
         area[3:-3, 3:-3] = (brightness * block)[3 : area.shape[0] - 3, 3 : area.shape[1] - 3]
         left += wide + rng.uniform(0.3, 4)
     return image
+
+
+def _cell_colours(rng: np.random.Generator) -> Float[np.ndarray, "rows cols 3"]:
+    """Draw the linear colours of the cells that a rectangle on a wall is divided into."""
+    rows = int(rng.integers(1, 5))
+    cols = int(rng.choice([1, 2, 12]))  # twelve look like books
+    colour = random_colour(rng, (0, 360), (0, 0.4), (0.2, 0.9))
+    variation = rng.normal(0, 0.12, (rows, cols, 1)) + rng.normal(0, 0.05, (rows, cols, 3))
+    return srgb_to_linear(np.clip(colour + variation, 0.05, 0.95))

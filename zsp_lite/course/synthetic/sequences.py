@@ -1,5 +1,4 @@
-"""Simulated recordings: a hand-held camera moves once around an object, and its depth and masks
-have CO3D's errors.
+"""Simulated recordings of a hand-held camera, whose depth and masks have the errors of CO3D's.
 
 CO3D's depth comes from multi-view stereo (COLMAP), which finds no match without texture, at depth
 edges and at grazing angles. Its masks come from a segmentation network (PointRend), accurate to one
@@ -14,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from zsp_lite.course.synthetic.meshes import TexturedMesh
-from zsp_lite.course.synthetic.primitives import TAU
+from zsp_lite.course.synthetic.primitives import TAU, Coordinates, direction, rotation
 from zsp_lite.course.synthetic.raytracing import MeshScene, Rendering
 from zsp_lite.course.synthetic.room import random_room
 from zsp_lite.course.synthetic.textures import blur, smooth_noise
@@ -25,38 +24,30 @@ from zsp_lite.points import axis_deviation
 
 _ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
 # lowest and highest mean elevation of a sequence's cameras above the object, degrees
-HEIGHTS = (
-    19.0,
-    30.0,
-)
+HEIGHTS = (19.0, 30.0)
 _FRAME_MARGIN = 0.03  # free border at each image side, as a fraction of that side
 _DEPTH_NOISE = 0.005  # standard deviation relative to the depth, at the object
 # Range of the fraction of pixels without depth, drawn per sequence. The wall has no depth at all.
-_OBJECT_HOLES, _FLOOR_HOLES = (0.28, 0.46), (0.1, 0.3)
-# Ranges of CO3D's viewpoint quality and point cloud quality in the sequences that the paper labels,
-# and of CO3D's factor from stored depth to depth.
+_OBJECT_HOLES = (0.28, 0.46)
+_FLOOR_HOLES = (0.1, 0.3)
+# Ranges of the last fields of `SequenceData` in the sequences that the paper labels: viewpoint
+# quality, point cloud quality, and the factor from stored depth to depth.
 _SCORES = (1.3, 3.0), (0.35, 1.0), (0.4, 2.5)
 
 
 def orbit_pose(
-    azimuth: float, elevation: float, roll: float, distance: float, target
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotation and translation, world to camera, of a camera that looks at `target` (3,);
-    angles in radians."""
-    away = np.array(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ]
-    )
+    azimuth: float, elevation: float, roll: float, distance: float, target: Coordinates
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """Return R and t, world to camera, of a camera that looks at `target` (3,); angles in radians.
+
+    The camera is `distance` from the target in the direction of azimuth and elevation.
+    """
+    away = direction(azimuth, elevation)
     forward = -away
     right = np.cross(forward, [0, 0, 1.0])
     right /= np.linalg.norm(right)
-    c, s = np.cos(roll), np.sin(roll)
-    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.stack(
-        [right, np.cross(forward, right), forward]
-    )
+    # the rows are the camera's axes: right, down and forward
+    R = rotation("z", roll) @ np.stack([right, np.cross(forward, right), forward])
     return R, -R @ (np.asarray(target, float) + away * distance)
 
 
@@ -67,42 +58,55 @@ def handheld_sweep(
     size: tuple[int, int],
     heights: tuple[float, float] = HEIGHTS,
 ) -> list[Camera]:
-    """Draw the cameras, in object coordinates, of a hand-held camera that moves once around the
-    object."""
+    """Draw cameras, in object coordinates, of a hand that moves once around the object.
+
+    Args:
+        vertices: of the object, with unit spread.
+        rng: source of the random numbers.
+        frames: number of cameras.
+        size: height and width of their images in pixels.
+        heights: range of their mean elevation in degrees.
+
+    Returns:
+        Cameras of one focal length; the whole object is inside all their images.
+    """
+    # Every quantity swings slowly (waves) and trembles from frame to frame (normal numbers).
     progress = (np.arange(frames) + rng.normal(0, 0.12, frames)) / frames
     phase = rng.uniform(0, TAU, 4)
 
-    def wave(k: int, turns: float) -> np.ndarray:
+    def wave(k: int, turns: float) -> Float[np.ndarray, " frames"]:
         return np.sin(turns * TAU * progress + phase[k])
 
     azimuth = rng.uniform(0, TAU) + rng.choice([-1, 1]) * TAU * progress + 0.06 * wave(0, 2)
     elevation = rng.uniform(*heights) + rng.uniform(3, 9) * wave(1, float(rng.choice([1, 2])))
-    elevation = np.radians(
-        (elevation + rng.normal(0, 1, frames)).clip(heights[0] - 9, heights[1] + 5)
-    )
+    elevation += rng.normal(0, 1, frames)
+    elevation = np.radians(elevation.clip(heights[0] - 9, heights[1] + 5))
     distance = rng.uniform(6, 9) * (1 + 0.08 * wave(2, 1) + rng.normal(0, 0.01, frames))
     roll = np.radians(3 * wave(3, 1.5) + rng.normal(0, 2, frames))
-    aim = (
-        (vertices.max(0) + vertices.min(0)) / 2
-        + rng.normal(0, 0.1, 3)
-        + rng.normal(0, 0.05, (frames, 3))
-    )
-    poses = [
-        orbit_pose(*view) for view in zip(azimuth, elevation, roll, distance, aim, strict=True)
-    ]
+    middle = (vertices.max(0) + vertices.min(0)) / 2
+    aim = middle + rng.normal(0, 0.1, 3) + rng.normal(0, 0.05, (frames, 3))
+    poses = list(map(orbit_pose, azimuth, elevation, roll, distance, aim))
 
-    # Bounding box of the object's image at focal length 1, relative to the optical axis.
-    plane = [(v := vertices @ R.T + t)[:, :2] / v[:, 2:] for R, t in poses]
-    low, high = np.array([p.min(0) for p in plane]), np.array([p.max(0) for p in plane])
-    sides = np.array(size[::-1], float)
+    # Bounding boxes of the object's images at focal length 1, relative to the optical axis.
+    low, high = np.moveaxis([image_box(vertices, R, t) for R, t in poses], 1, 0)
+    sides = np.array(size[::-1], float)  # width and height, as image points are (x, y)
     principal_point = np.round(sides / 2 + rng.normal(0, 0.004, 2) * sides, 6)
     room = np.minimum(principal_point, sides - principal_point) - _FRAME_MARGIN * sides
-    # The object fills 55 to 75 % of the shorter side in the median view, and is inside the image in
-    # all views.
+    # The object fills 55 to 75 % of the shorter side in the median view, if it is then inside the
+    # image in all views.
     wanted = rng.uniform(0.55, 0.75) * sides.min() / np.median((high - low).max(1))
     allowed = (room / np.maximum(-low, high).max(0)).min()
     focal_length = np.full(2, round(min(wanted, allowed), 6))
     return [Camera(R, t, focal_length, principal_point, size) for R, t in poses]
+
+
+def image_box(
+    vertices: Float[np.ndarray, "v 3"], R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Return the lower and upper corner (x, y) of the vertices' image at focal length 1."""
+    in_camera = vertices @ R.T + t
+    plane = in_camera[:, :2] / in_camera[:, 2:]
+    return plane.min(0), plane.max(0)
 
 
 def render_sequence(
@@ -112,15 +116,25 @@ def render_sequence(
     image_size: int,
     heights: tuple[float, float] = HEIGHTS,
 ) -> tuple[list[Rendering], Float[np.ndarray, "4 4"]]:
-    """Render exact views around an object in a random room; `image_size` is the shorter image side.
+    """Render exact views around an object in a random room.
 
-    Their cameras map from the world of the sequence, the second result from the object to it.
+    Args:
+        mesh: the object, with unit spread.
+        rng: source of the random numbers.
+        frames: number of views.
+        image_size: shorter image side in pixels.
+        heights: range of the mean elevation of the cameras in degrees.
+
+    Returns:
+        The views, whose cameras map from the world of the sequence; and the pose [R t] of the
+        object in that world.
     """
-    tall, wide = _ASPECTS[rng.integers(len(_ASPECTS))]
-    size = round(tall / min(tall, wide) * image_size), round(wide / min(tall, wide) * image_size)
-    cameras = handheld_sweep(mesh.vertices, rng, frames, size, heights)
+    aspect = np.array(_ASPECTS[rng.integers(len(_ASPECTS))])
+    height, width = np.rint(aspect / aspect.min() * image_size).astype(int).tolist()
+    cameras = handheld_sweep(mesh.vertices, rng, frames, (height, width), heights)
     scene = MeshScene(mesh, random_room(rng), rng)
-    # its frame is the world, so that the object's pose does not depend on the category
+    # The frame of the first camera is the world, so that the object's pose does not depend on the
+    # category.
     first = cameras[0].matrix
     to_object = np.linalg.inv(first)
     # The last digits of sines and products depend on the processor; rounding makes the files equal
@@ -136,55 +150,64 @@ def render_sequence(
 def stereo_depth(
     view: Rendering, object_holes: float, floor_holes: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "h w"]:
-    """Simulate the depth map of multi-view stereo; the holes are fractions of the object's and the
-    floor's pixels."""
+    """Simulate the depth map of multi-view stereo, 0 where it is unknown.
+
+    The holes are fractions of the pixels of the object and of the floor.
+    """
+    # The pixels of least confidence in each region have no depth.
     confidence = _stereo_confidence(view, rng)
     known = np.zeros(view.mask.shape, bool)
-    for region, holes in ((view.mask, object_holes), (~view.mask & (view.depth > 0), floor_holes)):
+    floor = ~view.mask & (view.depth > 0)
+    for region, holes in ((view.mask, object_holes), (floor, floor_holes)):
         if region.any():
             known |= region & (confidence >= np.quantile(confidence[region], holes))
-    # a flat object may be seen edge-on
+    # a flat object that is seen edge-on may have no pixel
     near = np.median(view.depth[view.mask]) if view.mask.any() else np.inf
     # The noise, mostly correlated between pixels, grows with the square of the depth.
-    noise = 0.95 * smooth_noise(rng, view.mask.shape, 2.0) + 0.3 * rng.standard_normal(
-        view.mask.shape
-    )
-    noise *= _DEPTH_NOISE * np.minimum(view.depth / near, 3)
+    correlated = 0.95 * smooth_noise(rng, view.mask.shape, 2.0)
+    independent = 0.3 * rng.standard_normal(view.mask.shape)
+    noise = (correlated + independent) * (_DEPTH_NOISE * np.minimum(view.depth / near, 3))
     return np.where(known, view.depth * np.maximum(1 + noise, 0.5), 0).astype(np.float32)
 
 
 def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
     """Return how well stereo would match each pixel: badly at depth edges and grazing angles."""
-    scale = min(view.mask.shape) / 100
-    grey = blur(
-        view.rgb.astype(np.float32) @ np.float32([0.299, 0.587, 0.114]), max(0.6 * scale, 0.3)
-    )
+    h, w = view.mask.shape
+    scale = min(h, w) / 100  # pixels per percent of the shorter side
+
+    # Texture: the logarithm of the mean gradient around a pixel, standardised over the image.
+    grey = view.rgb.astype(np.float32) @ np.float32([0.299, 0.587, 0.114])  # weights of BT.601
+    grey = blur(grey, max(0.6 * scale, 0.3))
     energy = cv2.Sobel(grey, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(grey, cv2.CV_32F, 0, 1) ** 2
     texture = np.log(np.sqrt(blur(energy, 2.5 * scale)) + 1)
     texture = (texture - texture.mean()) / (texture.std() + 1e-6)
+
+    # Edges: steps of the depth of more than 3 % between neighbours. The wall counts as far away.
     far = np.where(view.depth > 0, view.depth, view.depth.max())
     jump = cv2.dilate(far, np.ones((3, 3))) / cv2.erode(far, np.ones((3, 3))) - 1
     edge = np.minimum(blur((jump > 0.03).astype(np.float32), max(0.5 * scale, 0.3)) * 2, 1)
-    h, w = view.mask.shape
+
+    # Grazing angles: 0 up to 60 degrees between ray and normal, 1 at 90.
     x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
     ray = view.camera.unproject_camera(np.stack([x, y], -1), np.ones((h, w)))
     facing = np.abs((view.normals * ray).sum(-1)) / np.linalg.norm(ray, axis=-1)
     grazing = np.where(view.mask, np.clip(1 - facing / 0.5, 0, 1), 0)
-    noise = 0.7 * smooth_noise(rng, (h, w), 5 * scale) + 0.4 * smooth_noise(
-        rng, (h, w), 1.5 * scale
-    )
+
+    noise = 0.7 * smooth_noise(rng, (h, w), 5 * scale)
+    noise += 0.4 * smooth_noise(rng, (h, w), 1.5 * scale)
     return texture + noise - 1.5 * edge - 1.5 * grazing
 
 
 def soft_mask(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
-    """Simulate the probability map (float32) of a segmentation network: a soft edge, displaced by
-    up to two pixels."""
+    """Simulate the probabilities (float32) of a segmentation network: a soft, displaced edge."""
+    # Distance from the edge in pixels, positive inside. OpenCV measures from the centre of a pixel
+    # to that of the nearest one of the other kind; the edge is half a pixel before that.
     inside = mask.astype(np.uint8)
-    distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(
-        1 - inside, cv2.DIST_L2, 5
-    )
+    distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
+    distance -= cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
     distance -= np.where(mask, 0.5, -0.5)
     wander = np.clip(0.8 * smooth_noise(rng, mask.shape, 0.04 * min(mask.shape)), -1.5, 1.5)
+    # A logistic function, 0.7 pixels wide; beyond 14 pixels it is 0 or 1.
     return (1 / (1 + np.exp(-np.clip(distance + wander, -14, 14) / 0.7))).astype(np.float32)
 
 
@@ -194,14 +217,14 @@ def fused_cloud(
     n_points: int,
     rng: np.random.Generator,
 ) -> list[np.ndarray]:
-    """Sample points of the object from the depth maps of all views: world points, unit normals,
-    8-bit colours."""
-    parts = []
+    """Sample world points of the object from all depth maps, with normals and 8-bit colours."""
+    clouds = []
     for view, depth in zip(views, depths, strict=True):
         row, col = np.nonzero((depth > 0) & view.mask)
         points = view.camera.unproject(np.stack([col + 0.5, row + 0.5], -1), depth[row, col])
-        parts.append((points, view.normals[row, col] @ view.camera.R, view.rgb[row, col]))
-    cloud = [np.concatenate(values) for values in zip(*parts, strict=True)]
+        # the normals are in the camera frame
+        clouds.append((points, view.normals[row, col] @ view.camera.R, view.rgb[row, col]))
+    cloud = [np.concatenate(values) for values in zip(*clouds, strict=True)]
     chosen = np.sort(rng.choice(len(cloud[0]), min(n_points, len(cloud[0])), replace=False))
     return [values[chosen] for values in cloud]
 
@@ -214,22 +237,35 @@ def record_sequence(
     image_size: int,
     heights: tuple[float, float] = HEIGHTS,
 ) -> tuple[SequenceData, Float[np.ndarray, "4 4"], float]:
-    """Return a sequence with the errors of CO3D's data, whose point cloud has CO3D's unit spread.
+    """Return a sequence with the errors of CO3D's data.
 
-    The other results are the object's exact pose [R t] and scale in it: `world = R @ (scale *
-    canonical) + t`.
+    Args:
+        mesh: the object, with unit spread.
+        name: of the sequence.
+        key: seed of everything random about it.
+        frames: number of its frames.
+        image_size: shorter image side in pixels.
+        heights: range of the mean elevation of the cameras in degrees.
+
+    Returns:
+        The sequence, whose point cloud has unit spread as in CO3D; and the exact pose [R t] and
+        scale of the object in it: `world = R @ (scale * canonical) + t`.
     """
     rng = np.random.default_rng([key, 1])
     views, pose = render_sequence(mesh, rng, frames, image_size, heights)
     seconds = np.round(np.arange(frames) * rng.uniform(0.4, 0.9), 3).tolist()
+
+    # The holes vary from view to view about those of the sequence.
     rng = np.random.default_rng([key, 2])
-    object_holes, floor_holes = rng.uniform(*_OBJECT_HOLES), rng.uniform(*_FLOOR_HOLES)
+    holes = np.array([rng.uniform(*_OBJECT_HOLES), rng.uniform(*_FLOOR_HOLES)])
     depths, masks = [], []
     for view in views:
-        shares = np.clip(np.array([object_holes, floor_holes]) + rng.normal(0, 0.03, 2), 0.05, 0.9)
-        depths.append(stereo_depth(view, *shares, rng))
+        object_holes, floor_holes = np.clip(holes + rng.normal(0, 0.03, 2), 0.05, 0.9)
+        depths.append(stereo_depth(view, object_holes, floor_holes, rng))
         masks.append(soft_mask(view.mask, rng))
     points, normals, colours = fused_cloud(views, depths, int(rng.integers(5000, 8001)), rng)
+
+    # The unit of length becomes the spread of the point cloud.
     factor = round(1 / axis_deviation(points), 9)
     pose[:3, 3] *= factor
     recorded = [
@@ -242,8 +278,5 @@ def record_sequence(
         for view, depth, mask in zip(views, depths, masks, strict=True)
     ]
     scores = [round(rng.uniform(*limits), 4) for limits in _SCORES]
-    return (
-        SequenceData(name, recorded, seconds, points * factor, colours, normals, *scores),
-        pose,
-        factor,
-    )
+    data = SequenceData(name, recorded, seconds, points * factor, colours, normals, *scores)
+    return data, pose, factor

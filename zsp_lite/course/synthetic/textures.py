@@ -1,5 +1,4 @@
-"""Images: colours, smooth noise, the picture of a floor or of a wall, and sampling between
-pixels."""
+"""Colours, smooth noise, the albedo of floors and walls, and sampling between pixels."""
 
 from collections.abc import Sequence
 
@@ -7,10 +6,18 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+Colour = Float[np.ndarray, "3"]
+# A colour, vector or point per pixel.
+Image = Float[np.ndarray, "h w 3"]
+
 _FOLD = 4096  # points per row of OpenCV's maps, whose sides are limited to 32,767
+_JOINT = 3  # pixels between boards or tiles
+# Layers of grain, fine to cloudy: width in pixels and amount.
+_GRAIN = ((1.0, 0.1), (6.0, 0.06), (60.0, 0.05))
 
 
-def srgb_to_linear(colour) -> np.ndarray:
+# Both conversions have the constants of the sRGB standard, IEC 61966-2-1.
+def srgb_to_linear(colour: np.ndarray) -> np.ndarray:
     """Convert sRGB colours in [0, 1] to linear ones."""
     colour = np.asarray(colour, np.float32)
     return np.where(
@@ -18,7 +25,7 @@ def srgb_to_linear(colour) -> np.ndarray:
     )
 
 
-def linear_to_srgb(colour) -> np.ndarray:
+def linear_to_srgb(colour: np.ndarray) -> np.ndarray:
     """Convert linear colours in [0, 1] to sRGB; the inverse of `srgb_to_linear`."""
     colour = np.asarray(colour, np.float32)
     return np.where(
@@ -26,10 +33,22 @@ def linear_to_srgb(colour) -> np.ndarray:
     )
 
 
-def hsv(hue: float, saturation: float, value: float) -> Float[np.ndarray, "3"]:
+def hsv(hue: float, saturation: float, value: float) -> Colour:
     """Return an sRGB colour from its hue in degrees, its saturation and its value."""
-    k = (np.array([5, 3, 1]) + hue / 60) % 6
-    return value - value * saturation * np.clip(np.minimum(k, 4 - k), 0, 1)
+    # Each channel has a cycle of six: lowest from 1 to 3, full from 4 to 6, linear in between.
+    # The offsets put 5, the middle of the full part, at 0 degrees (red), 120 (green), 240 (blue).
+    phase = (np.array([5, 3, 1]) + hue / 60) % 6
+    return value - value * saturation * np.clip(np.minimum(phase, 4 - phase), 0, 1)
+
+
+def random_colour(
+    rng: np.random.Generator,
+    hue: tuple[float, float],
+    saturation: tuple[float, float],
+    value: tuple[float, float],
+) -> Colour:
+    """Draw an sRGB colour from ranges of the arguments of `hsv`."""
+    return hsv(rng.uniform(*hue), rng.uniform(*saturation), rng.uniform(*value))
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:
@@ -40,8 +59,10 @@ def blur(image: np.ndarray, sigma: float) -> np.ndarray:
 def smooth_noise(
     rng: np.random.Generator, size: tuple[int, int], sigma: float, stretch: float = 1.0
 ) -> Float[np.ndarray, "h w"]:
-    """Return Gaussian noise of unit variance, smoothed over `sigma` pixels, and `stretch` times as
-    many along rows."""
+    """Return smooth Gaussian noise of unit variance.
+
+    It is smoothed over `sigma` pixels down the columns and `sigma * stretch` along the rows.
+    """
     smoothing = np.array([sigma, sigma * stretch])
     step = np.maximum(smoothing / 2, 1)  # broad noise is drawn on a coarser grid
     height, width = (np.ceil(np.array(size) / step) + 2).astype(int).tolist()
@@ -54,59 +75,66 @@ def smooth_noise(
     return noise / (noise.std() + 1e-6)
 
 
-def surface(
+def surface_albedo(
     rng: np.random.Generator,
     size: tuple[int, int],
-    colour: Float[np.ndarray, "3"],
+    colour: Colour,
     grain: float,
-    laid: bool = False,
-) -> Float[np.ndarray, "h w 3"]:
-    """Return the linear colours of a surface around an sRGB colour, with grain, and with boards or
-    tiles if `laid`."""
-    height, width = size
+    tiled: bool = False,
+) -> Image:
+    """Return the albedo of a surface of an sRGB colour with grain; `tiled` for boards or tiles."""
     stretch = 1.0
-    value = np.ones(size, np.float32)
-    if laid:
-        tile = rng.integers(40, 160)  # pixels
+    brightness = np.ones(size, np.float32)
+    if tiled:
+        tile = int(rng.integers(40, 160))  # pixels
         board = int(tile * rng.choice([1, 4, 10]))
-        stretch = 1.0 if board == tile else 12.0  # boards have the grain of wood
-        row = np.arange(height)[:, None]
-        # each row begins elsewhere
-        column = np.arange(width) + row // tile * rng.integers(1, board)
-        of_board = rng.normal(
-            1, rng.uniform(0.02, 0.1), (height // tile + 1, column.max() // board + 1)
-        )
-        joint = (row % tile < 3) | (column % board < 3)
-        value = np.where(
-            joint, rng.uniform(0.5, 0.8), of_board[row // tile, column // board]
-        ).astype(np.float32)
-    for sigma, amount in ((1.0, 0.1), (6.0, 0.06), (60.0, 0.05)):
-        value += grain * rng.uniform(0.3, 1) * amount * smooth_noise(rng, size, sigma, stretch)
-    return srgb_to_linear(np.clip(value[..., None] * colour.astype(np.float32), 0, 0.92))
+        # boards have the grain of wood, along the rows
+        stretch = 1.0 if board == tile else 12.0
+        brightness = _tiles(rng, size, tile, board)
+    for sigma, amount in _GRAIN:
+        brightness += grain * rng.uniform(0.3, 1) * amount * smooth_noise(rng, size, sigma, stretch)
+    # No surface of a room is whiter than 0.92.
+    return srgb_to_linear(np.clip(brightness[..., None] * colour.astype(np.float32), 0, 0.92))
+
+
+def _tiles(
+    rng: np.random.Generator, size: tuple[int, int], height: int, width: int
+) -> Float[np.ndarray, "h w"]:
+    """Return the brightness of tiles of random brightness with dark joints, about 1."""
+    row = np.arange(size[0])[:, None]
+    # each row of tiles begins elsewhere
+    column = np.arange(size[1]) + row // height * rng.integers(1, width)
+    shape = (size[0] // height + 1, column.max() // width + 1)
+    of_tile = rng.normal(1, rng.uniform(0.02, 0.1), shape)
+    joint = (row % height < _JOINT) | (column % width < _JOINT)
+    of_joint = rng.uniform(0.5, 0.8)
+    return np.where(joint, of_joint, of_tile[row // height, column // width]).astype(np.float32)
 
 
 def pyramid(image: np.ndarray) -> list[np.ndarray]:
     """Return an image and its halvings down to 4 pixels."""
     levels = [image]
-    while min(levels[-1].shape[:2]) >= 8:
-        height, width = levels[-1].shape[:2]
-        levels.append(
-            cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-        )
+    while min(image.shape[:2]) >= 8:
+        height, width = image.shape[:2]
+        image = cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+        levels.append(image)
     return levels
 
 
 def sample_pyramid(
-    levels: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray, texels: np.ndarray, border: int
+    levels: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray, footprint: np.ndarray, border: int
 ) -> Float[np.ndarray, "n c"]:
-    """Sample each point (u, v) at the level that fits `texels`, the texels of the finest level that
-    it covers."""
-    level = np.clip(np.rint(np.log2(np.maximum(texels, 1))), 0, len(levels) - 1).astype(np.int8)
-    result = np.empty((len(u), levels[0].shape[2]), np.float32)
+    """Interpolate each point in the level whose pixels are about as wide as its footprint.
+
+    The footprint (n,) is given in pixels of the finest level; the other arguments are as of
+    `sample_image`.
+    """
+    level = np.clip(np.rint(np.log2(np.maximum(footprint, 1))), 0, len(levels) - 1).astype(np.int8)
+    samples = np.empty((len(u), levels[0].shape[2]), np.float32)
     for index in np.unique(level):
         on = np.flatnonzero(level == index)
-        result[on] = sample_image(levels[index], u[on], v[on], border)
-    return result
+        samples[on] = sample_image(levels[index], u[on], v[on], border)
+    return samples
 
 
 def sample_image(
@@ -118,15 +146,19 @@ def sample_image(
     """
     if border == cv2.BORDER_WRAP:
         u, v = u % 1, v % 1
-    height, width = image.shape[:2]
-    padding = -len(u) % _FOLD
-    x, y = (
-        np.pad(where * side - 0.5, (0, padding)).astype(np.float32).reshape(-1, _FOLD)
-        for where, side in ((u, width), (v, height))
-    )
-    if not len(x):
-        return np.empty((0, image.shape[2]), np.float32)
-    found = cv2.remap(
+    height, width, channels = image.shape
+    if not len(u):
+        return np.empty((0, channels), np.float32)
+    # pixel coordinates, with the centre of the first pixel at 0 as in OpenCV
+    x = _folded(u * width - 0.5)
+    y = _folded(v * height - 0.5)
+    samples = cv2.remap(
         image, x, y, cv2.INTER_LINEAR, borderMode=border, borderValue=(1.0, 1.0, 1.0, 1.0)
     )
-    return found.reshape(-1, image.shape[2])[: len(u)].astype(np.float32, copy=False)
+    return samples.reshape(-1, channels)[: len(u)].astype(np.float32, copy=False)
+
+
+def _folded(coordinates: np.ndarray) -> Float[np.ndarray, "rows n"]:
+    """Return coordinates (n,) in rows of `_FOLD`, padded by zeros."""
+    padding = -len(coordinates) % _FOLD
+    return np.pad(coordinates, (0, padding)).astype(np.float32).reshape(-1, _FOLD)

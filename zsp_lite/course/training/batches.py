@@ -1,5 +1,4 @@
-"""Training batches: random crops, flips and colours of rendered views, with the geometry that goes
-with them."""
+"""Training batches: random crops, flips and colours of views, with their geometry."""
 
 from dataclasses import dataclass
 
@@ -12,13 +11,17 @@ from torch import Tensor
 from zsp_lite.course.training.renders import VIEWS, RenderSet
 
 PATCH_SIZE = 8  # pixels
-MEAN, STD = 0.45, 0.25  # normalisation of RGB values in [0, 1] during training
+# normalisation of RGB values in [0, 1] during training
+MEAN = 0.45
+STD = 0.25
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Crops of several objects, the views of an object one after the other; n patches per crop, row
-    by row."""
+    """Crops of several objects, the views of an object one after the other.
+
+    Every crop has n patches, row by row.
+    """
 
     images: Float[Tensor, "crops 3 side side"]  # normalised RGB
     # object coordinates at the centre of each patch, NaN on the background
@@ -32,42 +35,57 @@ class Batch:
 def crop_grids(
     rng: np.random.Generator, n: int, per_object: int, side: int, scale: tuple[float, float]
 ) -> tuple[Float[Tensor, "n side side 2"], Float[Tensor, "n 2 2"]]:
-    """Draw slightly rotated crops as grids for `grid_sample`, and the map of directions in the
-    image to the crop's."""
+    """Draw slightly rotated crops.
+
+    Args:
+        rng: source of the random numbers.
+        n: number of crops.
+        per_object: number of consecutive crops that are mirrored together or not.
+        side: of the crops in pixels.
+        scale: range of their widths, as a fraction of the image's.
+
+    Returns:
+        Grids for `grid_sample`, and the maps of directions in the image to those in the crop.
+    """
     size = rng.uniform(*scale, n)
+    # The sides differ by a factor of up to exp(0.5), 1.65.
     ratio = np.exp(rng.uniform(-0.25, 0.25, n))
-    width, height = np.minimum(size * ratio, 1), np.minimum(size / ratio, 1)
+    width = np.minimum(size * ratio, 1)
+    height = np.minimum(size / ratio, 1)
     angle = rng.normal(0, 0.12, n)
-    x, y = (rng.uniform(-1, 1, n) * (1 - extent) * 0.9 for extent in (width, height))
-    # Each group is mirrored as a whole or not.
+    # The centres, with the image from -1 to 1; a rotated crop stays inside most of the time.
+    x = rng.uniform(-1, 1, n) * (1 - width) * 0.9
+    y = rng.uniform(-1, 1, n) * (1 - height) * 0.9
     flip = np.repeat(rng.choice([-1.0, 1.0], n // per_object), per_object)
     c, s = np.cos(angle), np.sin(angle)
+    # Both are (2, ..., n): points of the crop to the image, directions in the image to the crop.
     affine = np.array(
         [[width * c * flip, -width * s, x], [height * s * flip, height * c, y]], np.float32
     )
     turn = np.array([[flip * c, flip * s], [-s, c]], np.float32)
-    affine, turn = (
-        torch.from_numpy(matrix).permute(2, 0, 1).contiguous() for matrix in (affine, turn)
-    )
+    affine = torch.from_numpy(affine).permute(2, 0, 1).contiguous()
+    turn = torch.from_numpy(turn).permute(2, 0, 1).contiguous()
     return F.affine_grid(affine, (n, 1, side, side), align_corners=False), turn
 
 
 def recolour(rng: np.random.Generator, x: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
-    """Change brightness, contrast and saturation at random, blur some images, and normalise by
-    `MEAN` and `STD`."""
+    """Change colours at random, blur some images, and normalise by `MEAN` and `STD`."""
     n = len(x)
 
-    def draw(low, high):
+    def draw(low: float, high: float) -> Tensor:  # one number per image
         return torch.from_numpy(rng.uniform(low, high, (n, 1, 1, 1)).astype(np.float32))
 
+    # brightness
     x = x * draw(0.7, 1.3)
+    # contrast
     mean = x.mean((2, 3), keepdim=True)
     x = (x - mean) * draw(0.7, 1.3) + mean
+    # saturation; one image in five becomes grey
     grey = x.mean(1, keepdim=True)
-    saturation = draw(0.3, 1.4) * torch.from_numpy(
-        (rng.random((n, 1, 1, 1)) > 0.2).astype(np.float32)
-    )
-    x = grey + (x - grey) * saturation
+    saturation = draw(0.3, 1.4)
+    coloured = torch.from_numpy(rng.random((n, 1, 1, 1)) > 0.2)
+    x = grey + (x - grey) * (saturation * coloured)
+    # a blur over 3 x 3 pixels
     blurred = torch.from_numpy(rng.random(n) < 0.3)
     x[blurred] = F.avg_pool2d(F.pad(x[blurred], (1, 1, 1, 1), mode="replicate"), 3, 1)
     return ((x - MEAN) / STD).contiguous()
@@ -82,40 +100,51 @@ def sample_batch(
     scale: tuple[float, float],
     members: np.ndarray | None = None,
 ) -> Batch:
-    """Draw random crops of `side` pixels, whose widths are between the two of `scale` as a fraction
-    of the image's.
+    """Draw random crops of rendered views.
 
-    The objects are random or the `members`; of each there are 8 views (all), 4 (two pairs, a
-    quarter turn apart) or 2 (one pair).
+    Args:
+        renders: the training set.
+        rng: source of the random numbers.
+        objects: number of objects.
+        views: of each object: 8 (all), 4 (two pairs, a quarter turn apart) or 2 (one pair).
+        side: of the crops in pixels.
+        scale: range of their widths, as a fraction of the image's.
+        members: indices of the objects; by default random.
     """
     index = rng.integers(0, len(renders.rgb), objects) if members is None else members
+    # Views (objects, views): all, or as many as wanted from the first of a random pair on.
     chosen = np.arange(VIEWS)[None].repeat(objects, 0)
     if views < VIEWS:
         chosen = (2 * rng.integers(0, VIEWS // 2, (objects, 1)) + np.arange(views)) % VIEWS
-    pick = (index[:, None], chosen)
-    rgb, surface, geometry = (
-        torch.from_numpy(maps[pick]).flatten(0, 1).permute(0, 3, 1, 2).float()
-        for maps in (renders.rgb, renders.surface, renders.geometry)
-    )
+
+    def maps_of(array: np.ndarray) -> Tensor:  # (crops, channels, rows, columns)
+        maps = torch.from_numpy(array[index[:, None], chosen])
+        return maps.flatten(0, 1).permute(0, 3, 1, 2).float()
+
     grid, turn = crop_grids(rng, objects * views, views, side, scale)
-    images = F.grid_sample(rgb / 255, grid, padding_mode="reflection", align_corners=False)
+    images = F.grid_sample(
+        maps_of(renders.rgb) / 255, grid, padding_mode="reflection", align_corners=False
+    )
 
-    def at(resolution):
-        return F.interpolate(grid.permute(0, 3, 1, 2), (resolution,) * 2, mode="area").permute(
-            0, 2, 3, 1
-        )
-
-    def sample(values, where):
-        return F.grid_sample(
-            values, where, mode="nearest", padding_mode="border", align_corners=False
-        )
-
+    # Geometry is sampled at the centre of each patch, coverage at four points of it.
     patches = side // PATCH_SIZE
+    surface = maps_of(renders.surface)
     on_object = (~surface[:, :1].isnan()).float()
-    coverage = F.avg_pool2d(sample(on_object, at(2 * patches)), 2).flatten(1)
-    centres = at(patches)
-    surface = sample(surface.nan_to_num(nan=-99.0), centres).flatten(2).transpose(1, 2)
+    coverage = F.avg_pool2d(_sample_geometry(on_object, grid, 2 * patches), 2).flatten(1)
+    # NaN is sampled as a number that no coordinate of an object has.
+    surface = _sample_geometry(surface.nan_to_num(nan=-99.0), grid, patches)
+    surface = surface.flatten(2).transpose(1, 2)
     surface[surface < -50] = float("nan")
-    geometry = sample(geometry, centres).flatten(2).transpose(1, 2)
+    geometry = _sample_geometry(maps_of(renders.geometry), grid, patches)
+    geometry = geometry.flatten(2).transpose(1, 2)
+    # The x and y of the normals turn with the crop.
     geometry[..., :2] = geometry[..., :2] @ turn.transpose(1, 2)
     return Batch(recolour(rng, images), surface, geometry, coverage, objects)
+
+
+def _sample_geometry(
+    maps: Float[Tensor, "crops c h w"], grid: Float[Tensor, "crops side side 2"], n: int
+) -> Float[Tensor, "crops c n n"]:
+    """Return the nearest values of maps at n x n points of crops, evenly spaced."""
+    points = F.interpolate(grid.permute(0, 3, 1, 2), (n, n), mode="area").permute(0, 2, 3, 1)
+    return F.grid_sample(maps, points, mode="nearest", padding_mode="border", align_corners=False)

@@ -23,12 +23,11 @@ from torch import Tensor, nn
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.course.training.batches import crop_grids, recolour
 
-# widths of the crops as a fraction of the image's
-GLOBAL_SCALE, LOCAL_SCALE = (
-    (0.6, 1.0),
-    (0.25, 0.6),
-)
-HIDDEN, BOTTLENECK = 256, 64  # widths of the head's layers
+# Ranges of the crops' widths, as a fraction of the image's.
+GLOBAL_SCALE = (0.6, 1.0)
+LOCAL_SCALE = (0.25, 0.6)
+HIDDEN = 256  # width of the head's hidden layers
+BOTTLENECK = 64  # width of its last hidden layer
 STUDENT_TEMPERATURE = 0.1
 CENTRE_MOMENTUM = 0.9  # decay per step of the average of the teacher's logits
 TEACHER_MOMENTUM = 0.99, 1.0  # decay of the teacher's average at the first and the last step
@@ -38,8 +37,7 @@ MAX_GRADIENT_NORM = 3.0  # gradients with a larger norm are scaled down to it
 
 @dataclass(frozen=True)
 class DistillationConfig:
-    """Everything that determines the result of a run, except the images and the initial
-    backbone."""
+    """Everything that determines a run, except the images and the initial backbone."""
 
     seed: int = 0  # of crops and of the random head
     steps: int = 300
@@ -59,20 +57,22 @@ class Head(nn.Module):
 
     def __init__(self, dim: int, outputs: int):
         super().__init__()
-        first, middle, last = (
+        self.mlp = nn.Sequential(
             nn.Linear(dim, HIDDEN),
+            nn.GELU(),
             nn.Linear(HIDDEN, HIDDEN),
+            nn.GELU(),
             nn.Linear(HIDDEN, BOTTLENECK),
         )
-        self.mlp = nn.Sequential(first, nn.GELU(), middle, nn.GELU(), last)
         self.directions = nn.Parameter(torch.randn(outputs, BOTTLENECK))
-        for module in (first, middle, last):
-            nn.init.trunc_normal_(module.weight, std=0.02)
-            nn.init.zeros_(module.bias)
+        for linear in self.mlp[::2]:
+            nn.init.trunc_normal_(linear.weight, std=0.02)
+            nn.init.zeros_(linear.bias)
 
     def forward(self, cls: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch outputs"]:
         # DINO's weight-normalised last layer with a fixed gain of 1: all logits are in [-1, 1].
-        return F.linear(F.normalize(self.mlp(cls), dim=-1), F.normalize(self.directions, dim=-1))
+        features = F.normalize(self.mlp(cls), dim=-1)
+        return F.linear(features, F.normalize(self.directions, dim=-1))
 
 
 class Network(nn.Module):
@@ -86,7 +86,8 @@ class Network(nn.Module):
     def forward(
         self, images: Float[Tensor, "crops batch 3 side side"]
     ) -> Float[Tensor, "crops batch outputs"]:
-        return self.head(self.backbone(images.flatten(0, 1))[:, 0]).unflatten(0, images.shape[:2])
+        cls = self.backbone(images.flatten(0, 1))[:, 0]
+        return self.head(cls).unflatten(0, images.shape[:2])
 
 
 def multi_crop(
@@ -94,8 +95,7 @@ def multi_crop(
     rng: np.random.Generator,
     config: DistillationConfig,
 ) -> tuple[Float[Tensor, "2 batch 3 g g"], Float[Tensor, "k batch 3 l l"]]:
-    """Cut two global and k local crops out of each image, each rotated, mirrored and recoloured
-    independently."""
+    """Cut two global and k local crops out of each image, all with changes of their own."""
     rgb = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255
 
     def crops(count: int, side: int, scale: tuple[float, float]) -> Tensor:
@@ -116,32 +116,35 @@ def distillation_loss(
     student_temperature: float,
     teacher_temperature: float,
 ) -> tuple[Tensor, dict[str, float]]:
-    """Compute the cross-entropy between the teacher's and the student's distributions of different
-    crops (eq. 3).
+    """Compute the cross-entropy of the teacher's and student's distributions of different crops.
 
-    The arguments are logits; the first two crops of the student are the global ones. `centre`, the
-    average of the teacher's logits, is subtracted. The figures are in nats: "loss";
-    "teacher_entropy", mean entropy of the teacher's distributions; "kl", divergence of the
-    student's from them; and "information", the mutual information of output and image: 0 for both
-    trivial solutions, at most log(batch) if both crops of an image have the same distribution.
+    This is eq. 3 of DINO. The arguments are logits; the first two crops of the student are the
+    global ones. `centre`, the average of the teacher's logits, is subtracted. The figures are in
+    nats: "loss"; "teacher_entropy", mean entropy of the teacher's distributions; "kl", divergence
+    of the student's from them; and "information", the mutual information of output and image: 0 for
+    both trivial solutions, at most log(batch) if both crops of an image have the same distribution.
     """
     log_p = ((teacher.detach() - centre) / teacher_temperature).log_softmax(-1)
     p = log_p.exp()
     log_q = (student / student_temperature).log_softmax(-1)
+    # of each global crop (rows) and each crop (columns), the mean over the batch
     cross = -torch.einsum("gbk,cbk->gc", p, log_q) / p.shape[1]
-    other = ~torch.eye(*cross.shape, dtype=torch.bool)
-    loss = cross[other].mean()
+    different = ~torch.eye(*cross.shape, dtype=torch.bool)
+    loss = cross[different].mean()
     entropy = -(p * log_p).sum(-1).mean().item()
+    # Mutual information: the entropy of the mean distribution minus the mean entropy.
     mean = p.mean((0, 1))
     information = -torch.xlogy(mean, mean).sum().item() - entropy
-    return loss, dict(
-        loss=loss.item(), teacher_entropy=entropy, kl=loss.item() - entropy, information=information
-    )
+    return loss, {
+        "loss": loss.item(),
+        "teacher_entropy": entropy,
+        "kl": loss.item() - entropy,
+        "information": information,
+    }
 
 
 class Distillation:
-    """A run of DINO on images of several views of each of n objects; the teacher's backbone is its
-    result."""
+    """A run of DINO on several views of each of n objects; its result is the teacher's backbone."""
 
     def __init__(
         self,
@@ -150,19 +153,24 @@ class Distillation:
         rgb: UInt8[np.ndarray, "n views size size 3"],
     ):
         torch.manual_seed(config.seed)
-        self.config, self.rgb, self.steps_done = config, rgb, 0
+        self.config = config
+        self.rgb = rgb
+        self.steps_done = 0
         self.student = Network(copy.deepcopy(backbone), config.outputs).requires_grad_(True)
         self.teacher = copy.deepcopy(self.student).requires_grad_(False)
         self.centre = torch.zeros(config.outputs)
+        # Weights decay, biases and norms (vectors) do not.
         matrices = [p for p in self.student.parameters() if p.ndim > 1]
-        # biases and norms: no weight decay
         vectors = [p for p in self.student.parameters() if p.ndim <= 1]
         groups = [{"params": matrices}, {"params": vectors, "weight_decay": 0.0}]
         self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate)
 
     def step(self) -> dict[str, float]:
         """Take one step and return its figures (see `distillation_loss`)."""
-        config, progress = self.config, self.steps_done / self.config.steps
+        # The schedules: learning rate, weight decay, and the last layer.
+        config = self.config
+        progress = self.steps_done / config.steps
+        # The rate rises linearly in the first tenth of the run.
         rate = config.learning_rate * min(1.0, 10 * progress) * cosine((1.0, 0.01), progress)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
@@ -170,24 +178,28 @@ class Distillation:
         # DINO fixes the last layer in the first epoch
         self.student.head.directions.requires_grad_(progress >= 0.05)
 
+        # The loss on the crops of random images; the teacher sees only the global ones.
         rng = np.random.default_rng([config.seed, 3, self.steps_done])
-        objects, views = (rng.integers(count, size=config.images) for count in self.rgb.shape[:2])
+        n_objects, n_views = self.rgb.shape[:2]
+        objects = rng.integers(n_objects, size=config.images)
+        views = rng.integers(n_views, size=config.images)
         large, small = multi_crop(self.rgb[objects, views], rng, config)
         with torch.no_grad():
             teacher = self.teacher(large)
         student = torch.cat([self.student(large), self.student(small)])
         sharp = config.teacher_temperature if config.sharpening else STUDENT_TEMPERATURE
         loss, figures = distillation_loss(student, teacher, self.centre, STUDENT_TEMPERATURE, sharp)
+
+        # The student follows the gradient, the teacher and its centre follow slowly.
         self.optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.student.parameters(), MAX_GRADIENT_NORM)
         self.optimizer.step()
 
         with torch.no_grad():
-            for slow, fast in zip(
-                self.teacher.parameters(), self.student.parameters(), strict=True
-            ):
-                slow.lerp_(fast, 1 - cosine(TEACHER_MOMENTUM, progress))
+            weight = 1 - cosine(TEACHER_MOMENTUM, progress)
+            for slow, fast in zip(self.teacher.parameters(), self.student.parameters()):
+                slow.lerp_(fast, weight)
         if config.centring:
             self.centre.lerp_(teacher.mean((0, 1)), 1 - CENTRE_MOMENTUM)  # eq. 4
         self.steps_done += 1

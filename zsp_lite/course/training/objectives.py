@@ -15,6 +15,8 @@ from zsp_lite.course.training.trainee import Trainee
 RADIUS = 0.15  # standard deviation of the correspondence targets, in object units
 TEMPERATURE = 0.1  # of the correspondence loss
 QUERIES = 256  # largest number of query patches per object
+SEEN_AGAIN = 0.5  # of the Gaussian: a query has a correspondent within 1.2 standard deviations
+CUT = 0.05  # of the Gaussian, reached at 2.4 standard deviations: smaller targets are zero
 
 
 def correspondence_loss(
@@ -26,8 +28,7 @@ def correspondence_loss(
     queries: int,
     generator: torch.Generator,
 ) -> tuple[Tensor, float]:
-    """Compute InfoNCE between the views of each object, with soft targets by distance on its
-    surface.
+    """Compute InfoNCE between the views of each object, with soft targets.
 
     The target of a query patch is a distribution over the patches of the object's other views: a
     Gaussian of the distance between the surface points with standard deviation `radius` (object
@@ -45,22 +46,26 @@ def correspondence_loss(
     for k in range(objects):
         on_object = (~points[k, :, 0].isnan()).nonzero()[:, 0]
         query = on_object[torch.randperm(len(on_object), generator=generator)[:queries]]
+        # An object of few patches is small or cut off, and says little.
         if len(query) < 20:
             continue
+        # Rows are queries, columns all patches of the object; the background is far from it.
         same_view = view[query][:, None] == view[None]
         distance = torch.cdist(points[k, query], points[k].nan_to_num(nan=99.0))
         target = torch.exp(-distance.square() / (2 * radius**2)).masked_fill(same_view, 0)
-        seen_again = target.amax(1) > 0.5
+        seen_again = target.amax(1) > SEEN_AGAIN
         if seen_again.sum() < 5:
             continue
-        target, query = target[seen_again], query[seen_again]
-        target = target * (target > 0.05)
+        target = target[seen_again]
+        query = query[seen_again]
+        target = target * (target > CUT)
         target = target / target.sum(1, keepdim=True)
+        # A patch of the query's own view has practically no probability.
         logits = (z[k, query] @ z[k].T / temperature).masked_fill(same_view[seen_again], -1e4)
         losses.append(F.kl_div(logits.log_softmax(1), target, reduction="batchmean"))
         hits.append((target.gather(1, logits.argmax(1, keepdim=True)) > 0).float().mean())
     if not losses:
-        return descriptors.sum() * 0, 0.0
+        return descriptors.sum() * 0, 0.0  # zero, with a gradient
     return torch.stack(losses).mean(), torch.stack(hits).mean().item()
 
 
@@ -69,8 +74,7 @@ def geometry_loss(
     geometry: Float[Tensor, "crops n 4"],
     on_object: Bool[Tensor, "crops n"],
 ) -> Tensor:
-    """Compute the loss of predicted normals and relative depth (channels 0 to 3) and foreground
-    logit (channel 4)."""
+    """Compute the loss of predicted geometry (channels 0 to 3) and foreground logit (channel 4)."""
     inside = on_object.float()
     foreground = F.binary_cross_entropy_with_logits(prediction[..., 4], inside)
     error = F.smooth_l1_loss(prediction[..., :4], geometry, beta=0.3, reduction="none").mean(-1)
@@ -80,8 +84,7 @@ def geometry_loss(
 def attention_loss(
     cls_logits: Float[Tensor, "crops heads tokens"], coverage: Float[Tensor, "crops n"]
 ) -> tuple[Tensor, float]:
-    """Compute the loss of the CLS attention, averaged over heads, against the rendered mask; and an
-    IoU.
+    """Compute the loss of the CLS attention, averaged over heads, against the mask; and an IoU.
 
     The target is uniform on the object and zero elsewhere. The loss is the divergence between the
     normalised mask and the attention over patches, plus a cross-entropy that separates object and
@@ -90,40 +93,42 @@ def attention_loss(
     """
     attention = cls_logits.softmax(-1)[..., 1:].mean(1)
     attention = attention / attention.sum(1, keepdim=True)
-    visible = coverage.sum(1) > 2
+    visible = coverage.sum(1) > 2  # crops with more than two patches of the object
     if not visible.any():
         return cls_logits.sum() * 0, 0.0
-    attention, coverage = attention[visible].clamp_min(1e-8), coverage[visible]
+    attention = attention[visible].clamp_min(1e-8)
+    coverage = coverage[visible]
     target = coverage / coverage.sum(1, keepdim=True)
     spread = F.kl_div(attention.log(), target, reduction="batchmean")
     level = (attention * coverage).sum(1, keepdim=True) / coverage.sum(1, keepdim=True)
+    # The logit of a patch is positive where its attention exceeds 0.12 of the level.
     side = F.binary_cross_entropy_with_logits(
         attention.log() - (0.12 * level.detach()).log(), coverage
     )
     with torch.no_grad():
-        low, high = attention.amin(1, keepdim=True), attention.amax(1, keepdim=True)
-        found, truth = (attention - low) / (high - low + 1e-12) > 0.05, coverage > 0.25
-        iou = ((found & truth).sum(1) / (found | truth).sum(1).clamp_min(1)).mean().item()
+        low = attention.amin(1, keepdim=True)
+        high = attention.amax(1, keepdim=True)
+        salient = (attention - low) / (high - low + 1e-12) > 0.05
+        truth = coverage > 0.25
+        iou = ((salient & truth).sum(1) / (salient | truth).sum(1).clamp_min(1)).mean().item()
     return spread + 0.25 * side, iou
 
 
 def losses(
     model: Trainee, batch: Batch, generator: torch.Generator, helpers: float = 0.4
 ) -> tuple[Tensor, dict[str, float]]:
-    """Compute the correspondence loss plus `helpers` times the geometry and attention losses of one
-    batch.
+    """Compute the correspondence loss plus `helpers` times the geometry and attention losses.
 
     The figures are the value of each loss, the match accuracy and the IoU of the saliency. The
     model's running mean of the keys is updated.
     """
     out = model(batch.images)
     on_object = ~batch.surface[..., 0].isnan()
-    geometry = 0.5 * sum(
-        geometry_loss(head(features), batch.geometry, on_object)
-        for head, features in (
-            (model.geometry_of_tokens, out.tokens[:, 1:]),
-            (model.geometry_of_keys, out.key_input),
-        )
+    of_tokens = model.geometry_of_tokens(out.tokens[:, 1:])  # without the CLS token
+    of_keys = model.geometry_of_keys(out.key_input)
+    geometry = 0.5 * (
+        geometry_loss(of_tokens, batch.geometry, on_object)
+        + geometry_loss(of_keys, batch.geometry, on_object)
     )
     attention, iou = attention_loss(out.cls_logits, batch.coverage)
     descriptors = F.normalize(model.centred(out.keys, update_mean=True), dim=-1)
@@ -131,8 +136,11 @@ def losses(
         descriptors, batch.surface, batch.objects, RADIUS, TEMPERATURE, QUERIES, generator
     )
     total = match + helpers * (geometry + attention)
-    figures = {"loss": total, "match": match, "geometry": geometry, "attention": attention}
-    return total, {name: value.item() for name, value in figures.items()} | {
+    return total, {
+        "loss": total.item(),
+        "match": match.item(),
+        "geometry": geometry.item(),
+        "attention": attention.item(),
         "accuracy": accuracy,
         "iou": iou,
     }

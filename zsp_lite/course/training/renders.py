@@ -1,5 +1,4 @@
-"""The training set: objects of no category, with several views of one object at a time and their
-geometry.
+"""The training set: objects of no category, each with several views and their geometry.
 
 Each view shows another instance of the object, with its own proportions, materials and room: the
 differences between the instances are what the features are to ignore. Objects have their front at
@@ -18,17 +17,19 @@ from zsp_lite.course.synthetic.assembly import Assembly, make_shape, random_mate
 from zsp_lite.course.synthetic.meshes import TexturedMesh
 from zsp_lite.course.synthetic.primitives import (
     TAU,
+    Coordinates,
     Mesh,
     box,
     capsule,
     cylinder,
     ellipsoid,
     extrusion,
+    rotation,
     torus,
 )
 from zsp_lite.course.synthetic.raytracing import MeshScene, Rendering
 from zsp_lite.course.synthetic.room import Room, random_room
-from zsp_lite.course.synthetic.sequences import orbit_pose
+from zsp_lite.course.synthetic.sequences import image_box, orbit_pose
 from zsp_lite.data.cameras import Camera
 
 VIEWS = 8  # per object
@@ -37,11 +38,9 @@ GRID = 48  # points along each side of a view at which geometry is known
 # Smallest and largest difference in azimuth of the two views of a pair, about that of a reference
 # and the nearest of a few target views, and never more than that of two views of different pairs.
 PAIR_ANGLES = np.radians((5, 45))
-# so many rooms for so many consecutive objects: a room takes five times as long as a view
-ROOMS, SHARING = (
-    8,
-    100,
-)
+# So many rooms for so many consecutive objects: a room takes five times as long as a view.
+ROOMS = 8
+SHARING = 100
 
 
 @dataclass(frozen=True)
@@ -58,19 +57,26 @@ class RenderSet:
 
 def render_set(numbers: Iterable[int]) -> RenderSet:
     """Render the objects of these numbers, about half a second each."""
-    return RenderSet(*map(np.stack, zip(*map(render_object, numbers), strict=True)))
+    rows = [render_object(number) for number in numbers]
+    return RenderSet(*map(np.stack, zip(*rows, strict=True)))
 
 
 def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Render one object as four pairs of views, a quarter turn apart; returns its rows of a
-    `RenderSet`."""
+    """Render one object in four pairs of views, a quarter turn apart.
+
+    Returns its images, surface points and geometry, as of a `RenderSet`.
+    """
     rng = np.random.default_rng([number, 0])  # [number, 1] draws the object itself
     shape = make_shape(build_random_object, [number, 1])
-    start, step, views = rng.uniform(0, TAU), SIZE // GRID, []
+    start = rng.uniform(0, TAU)
+    views = []
     for view in range(VIEWS):
+        # The two views of a pair share their middle and their angle.
         if view % 2 == 0:
-            azimuth, apart = start + (view // 2) * np.pi / 2, rng.uniform(*PAIR_ANGLES)
+            azimuth = start + (view // 2) * np.pi / 2
+            apart = rng.uniform(*PAIR_ANGLES)
             elevation = rng.uniform(0, 0.9)
+        # The instance of the object in this view, and its camera.
         instance = make_shape(build_random_object, [number, 1], variation=rng)
         mesh = replace(instance, materials=random_materials(rng))
         R, t = orbit_pose(
@@ -84,13 +90,23 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             mesh.vertices, R, t, SIZE, 1.12 * np.exp(rng.normal(0, 0.06)), rng.normal(0, 0.02, 2)
         )
         image = render_instance(number, mesh, shape.vertices, camera, rng)
-        every = (slice(step // 2, None, step),) * 2
-        depth, on_object = image.depth[every], image.mask[every]
-        seen, relative = depth[on_object], np.zeros_like(depth)
-        relative[on_object] = (seen - seen.mean()) / max(float(seen.std()), 1e-6)
-        maps = image.canonical[every], np.dstack([image.normals[every], relative])
-        views.append((image.rgb, *(one.astype(np.float16) for one in maps)))
+        views.append((image.rgb, *_geometry(image)))
     return tuple(map(np.stack, zip(*views, strict=True)))
+
+
+def _geometry(image: Rendering) -> tuple[np.ndarray, np.ndarray]:
+    """Return surface (grid, grid, 3) and geometry (grid, grid, 4) of a view."""
+    step = SIZE // GRID
+    rows = slice(step // 2, None, step)
+    depth = image.depth[rows, rows]
+    on_object = image.mask[rows, rows]
+    # The distance of the object does not matter: its depth is standardised.
+    relative = np.zeros_like(depth)
+    of_object = depth[on_object]
+    spread = max(float(of_object.std()), 1e-6)
+    relative[on_object] = (of_object - of_object.mean()) / spread
+    geometry = np.dstack([image.normals[rows, rows], relative])
+    return image.canonical[rows, rows].astype(np.float16), geometry.astype(np.float16)
 
 
 def framed_camera(
@@ -99,15 +115,22 @@ def framed_camera(
     t: np.ndarray,
     size: int,
     margin: float = 1.1,
-    shift=(0, 0),
+    shift: Coordinates = (0, 0),
 ) -> Camera:
-    """Return a camera at pose R, t with a square image of `size` pixels that contains all
-    vertices."""
-    in_camera = vertices @ R.T + t
-    plane = in_camera[:, :2] / in_camera[:, 2:]
-    low, high = plane.min(0), plane.max(0)
-    width = (high - low).max() * margin  # of the image; the shift is a fraction of it
-    centre, focal_length = (low + high) / 2 + np.multiply(shift, width), size / width
+    """Return a camera whose image frames an object.
+
+    Args:
+        vertices: of the object.
+        R: rotation of the camera, world to camera.
+        t: its translation.
+        size: side of the square image in pixels.
+        margin: that side, relative to the longer side of the object's image.
+        shift: of the middle of the image (2,), as a fraction of its side.
+    """
+    low, high = image_box(vertices, R, t)
+    width = (high - low).max() * margin  # of the image, at focal length 1
+    centre = (low + high) / 2 + np.multiply(shift, width)
+    focal_length = size / width
     return Camera(R, t, np.full(2, focal_length), size / 2 - centre * focal_length, (size, size))
 
 
@@ -118,15 +141,11 @@ def render_instance(
     camera: Camera,
     rng: np.random.Generator,
 ) -> Rendering:
-    """Render an instance of object `number`, with the coordinates of that object, in a random room
-    turned at random."""
-    angle = rng.uniform(0, TAU)
-    turn = np.array(
-        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-    )
-    turned = replace(
-        mesh, vertices=mesh.vertices @ turn.T, normals=(mesh.normals @ turn.T).astype(np.float32)
-    )
+    """Render an instance of object `number`, with the object's coordinates, in a random room."""
+    # The object and the camera turn together in the room.
+    turn = rotation("z", rng.uniform(0, TAU))
+    normals = (mesh.normals @ turn.T).astype(np.float32)
+    turned = replace(mesh, vertices=mesh.vertices @ turn.T, normals=normals)
     room = _room(number // SHARING * ROOMS + int(rng.integers(ROOMS)))
     scene = MeshScene(turned, room, rng, coordinates, samples=1)
     view = scene.render(replace(camera, R=camera.R @ turn.T))
@@ -137,24 +156,28 @@ def render_instance(
 def _room(index: int) -> Room:
     """Return a room in half the resolution, to save memory."""
     room = random_room(index)
-    halves = (
+    halves = [
         cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         for image in room.images
-    )
+    ]
     return replace(room, images=tuple(halves))
 
 
 def build_random_object(a: Assembly) -> None:
-    """Build a tree of 5 to 10 random parts, left and right alike, each attached to one of those
-    before it."""
+    """Build a tree of 5 to 10 random parts, symmetric, each attached to one of those before it."""
     # centre and size of each part
-    nodes = [(np.zeros(3), np.array([a.u(0.5, 1.3), a.u(0.4, 1.0), a.u(0.4, 1.2)]))]
-    a.add(_random_solid(a, nodes[0][1]), a.choice(5))
+    body = np.array([a.u(0.5, 1.3), a.u(0.4, 1.0), a.u(0.4, 1.2)])
+    nodes = [(np.zeros(3), body)]
+    a.add(_random_solid(a, body), a.choice(5))
     for _ in range(4 + a.choice(6)):
-        parent, parent_size = nodes[a.choice(len(nodes))]
-        direction, size = a.rng.normal(size=3), a.rng.uniform(0.12, 0.8, 3) * a.u(0.5, 1.0)
+        parent, parent_size = a.pick(*nodes)
+        direction = a.rng.normal(size=3)
+        size = a.rng.uniform(0.12, 0.8, 3) * a.u(0.5, 1.0)
+        # The centre is on a box about the parent, so that the two parts overlap.
         centre = parent + direction / np.abs(direction).max() * (parent_size * 0.4 + size * 0.3)
-        mesh, mirror = _random_solid(a, size), a.chance(0.55)
+        mesh = _random_solid(a, size)
+        mirror = a.chance(0.55)
+        # A part is on the left with its mirror image on the right, or in the middle.
         centre[1] = abs(centre[1]) if mirror else 0
         if mirror and a.chance(0.5):
             mesh = mesh.rotated("z", a.u(-0.7, 0.7)).rotated("x", a.u(-0.7, 0.7))
@@ -164,6 +187,7 @@ def build_random_object(a: Assembly) -> None:
 
 def _random_solid(a: Assembly, size: np.ndarray) -> Mesh:
     """Return a solid of about the given size (3,), sometimes rotated about the axis to the left."""
+    # an irregular pentagon about the origin
     angle = np.arange(5) * TAU / 5 + a.rng.uniform(0, TAU / 5, 5)
     outline = np.stack([np.cos(angle), np.sin(angle)], 1) * a.rng.uniform(0.3, 0.6, (5, 1))
     solids = (
@@ -171,8 +195,8 @@ def _random_solid(a: Assembly, size: np.ndarray) -> Mesh:
         ellipsoid((0.55, 0.55, 0.55)),
         cylinder(0.5, 0.5 * a.u(0.3, 1), 1.0),
         capsule((-0.25, 0, 0), (0.25, 0, 0), 0.25).scaled((1, 2, 2)),
-        torus(0.36, 0.12, np.eye(3)[a.choice(3)]),
-        extrusion(outline, a.u(0.1, 0.9), ("xz", "xy", "yz")[a.choice(3)]),
+        torus(0.36, 0.12, a.pick(*np.eye(3))),
+        extrusion(outline, a.u(0.1, 0.9), a.pick("xz", "xy", "yz")),
     )
-    mesh = solids[a.choice(len(solids))].scaled(size)
+    mesh = a.pick(*solids).scaled(size)
     return mesh.rotated("y", a.u(-0.8, 0.8)) if a.chance(0.4) else mesh

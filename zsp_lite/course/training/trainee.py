@@ -14,11 +14,10 @@ from zsp_lite.course.training.renders import VIEWS, RenderSet
 
 
 class Trainee(nn.Module):
-    """A transformer whose keys of block `layer` (from 0) are trained, and the running mean of these
-    keys.
+    """A transformer whose keys of block `layer` (from 0) are trained, and their running mean.
 
     Two linear heads, which only training uses, predict geometry from the output tokens and from the
-    keys' input.
+    keys' input: a normal, the relative depth and a foreground logit.
     """
 
     def __init__(self, backbone: VisionTransformer, layer: int):
@@ -38,9 +37,10 @@ class Trainee(nn.Module):
         """Subtract the running mean of the keys."""
         if update_mean:
             mean = keys.detach().mean((0, 1))
-            self.key_mean.copy_(
-                mean if not self.key_mean.any() else 0.95 * self.key_mean + 0.05 * mean
-            )
+            # The first mean is taken as it is, later ones with a weight of 5 %.
+            if self.key_mean.any():
+                mean = 0.95 * self.key_mean + 0.05 * mean
+            self.key_mean.copy_(mean)
         return keys - self.key_mean
 
 
@@ -66,40 +66,44 @@ def initial_backbone(
     so that noise is not amplified: a random linear embedding would pass on little more than the
     mean brightness.
     """
-    backbone, dim, p = (
-        VisionTransformer(224, PATCH_SIZE, embed_dim, depth, num_heads),
-        embed_dim,
-        PATCH_SIZE,
-    )
+    p = PATCH_SIZE
+    backbone = VisionTransformer(224, p, embed_dim, depth, num_heads)
     generator = torch.Generator().manual_seed(0)
+    # Linear layers; "proj" and "fc2" end the residual branches.
     for name, module in backbone.named_modules():
         if isinstance(module, nn.Linear):
             nn.init.xavier_uniform_(module.weight, generator=generator)
             if name.endswith(("proj", "fc2")):
                 module.weight *= 1.5 * (2 * backbone.depth) ** -0.5
     nn.init.normal_(backbone.cls_token, std=0.02, generator=generator)
+    # The position of the CLS token, the first, stays zero.
     backbone.pos_embed.zero_()
-    backbone.pos_embed[0, 1:] = 0.25 * _sine_cosine_embedding(dim, backbone.image_size // p)
+    backbone.pos_embed[0, 1:] = 0.25 * _sine_cosine_embedding(embed_dim, backbone.image_size // p)
+
+    # The patches (n, 3 p p) of some crops, and their principal axes by increasing variance.
     rng = np.random.default_rng([0, 1])
-    images = torch.cat(
-        [sample_batch(renders, rng, 15, VIEWS, 96, (0.4, 1.0)).images for _ in range(4)]
-    )
+    batches = [sample_batch(renders, rng, 15, VIEWS, 96, (0.4, 1.0)) for _ in range(4)]
+    images = torch.cat([batch.images for batch in batches])
     patches = F.unfold(images, p, stride=p).transpose(1, 2).flatten(0, 1)
     patches = patches - patches.mean(0)
     variance, axes = torch.linalg.eigh(patches.T @ patches / len(patches))
-    kept = min(dim, len(variance))
-    whiten = (axes[:, -kept:] / (variance[-kept:] + 0.02).sqrt()).T
-    mixing = torch.linalg.qr(torch.randn(dim, dim, generator=generator))[0][:, :kept]
-    backbone.patch_embed.proj.weight.copy_((0.5 * mixing @ whiten).view(dim, 3, p, p))
+    # The embedding whitens the strongest axes, and mixes them by a random orthogonal matrix.
+    strongest = min(embed_dim, len(variance))
+    whiten = (axes[:, -strongest:] / (variance[-strongest:] + 0.02).sqrt()).T
+    mixing, _ = torch.linalg.qr(torch.randn(embed_dim, embed_dim, generator=generator))
+    weight = 0.5 * mixing[:, :strongest] @ whiten
+    backbone.patch_embed.proj.weight.copy_(weight.view(embed_dim, 3, p, p))
     backbone.patch_embed.proj.bias.zero_()
     return backbone
 
 
 def _sine_cosine_embedding(dim: int, side: int) -> Float[Tensor, "n dim"]:
-    """Position embedding of a grid of side x side patches, row by row."""
+    """Return the position embedding of a grid of side x side patches, row by row."""
+    # Frequencies from 1 down to nearly 1/60, for positions from 0 to 12: the fastest wave has about
+    # two periods over the image.
     centre = (torch.arange(side) + 0.5) / side * 12
-    wave = torch.exp(-math.log(60) * torch.arange(dim // 4) / (dim // 4))
+    frequency = torch.exp(-math.log(60) * torch.arange(dim // 4) / (dim // 4))
     y, x = torch.meshgrid(centre, centre, indexing="ij")
-    return torch.cat(
-        [f(p[..., None] * wave) for p in (y, x) for f in (torch.sin, torch.cos)], -1
-    ).flatten(0, 1)
+    y = y[..., None] * frequency
+    x = x[..., None] * frequency
+    return torch.cat([y.sin(), y.cos(), x.sin(), x.cos()], -1).flatten(0, 1)

@@ -36,7 +36,7 @@ def view_units(points: Real[np.ndarray, "n 3"]) -> Sim3:
     """
     low, high = np.percentile(points, [1, 99], axis=0) if len(points) else np.zeros((2, 3))
     radius = float(np.linalg.norm(high - low)) / 2
-    if not radius >= 1e-12:  # not, because of NaN
+    if not radius >= 1e-12:  # so, and not `<`, for a radius that is NaN
         raise InputError(
             f"point cloud of {len(points)} points has no extent, expected an object of finite "
             "points"
@@ -47,10 +47,10 @@ def view_units(points: Real[np.ndarray, "n 3"]) -> Sim3:
 def subsample(points: Real[np.ndarray, "n 3"], most: int = MAX_POINTS) -> Int[np.ndarray, " m"]:
     """Return the indices of at most `most` points, neighbours after each other, as the slider goes
     through them."""
-    kept = np.arange(len(points))
+    chosen = np.arange(len(points))
     if len(points) > most:
-        kept = np.random.default_rng(0).choice(len(points), most, replace=False)
-    return kept[KDTree(points[kept]).indices]  # leaf by leaf
+        chosen = np.random.default_rng(0).choice(len(points), most, replace=False)
+    return chosen[KDTree(points[chosen]).indices]  # leaf by leaf
 
 
 def point_under(
@@ -101,17 +101,21 @@ class CloudView:
         With an `overlay`, the points of a second cloud, the first is orange discs, the second blue
         crosses.
         """
-        self._cloud, self._to_view = np.asarray(points, dtype=np.float64), view_units(points)
-        kept = subsample(points, MAX_POINTS if overlay is None else MAX_POINTS // 2)
-        drawn, colours, crosses = points[kept], colours[kept], np.zeros(len(kept), np.uint8)
+        self._cloud = np.asarray(points, dtype=np.float64)
+        self._to_view = view_units(points)
+        chosen = subsample(points, MAX_POINTS if overlay is None else MAX_POINTS // 2)
+        drawn = points[chosen]
+        colours = colours[chosen]
+        crosses = np.zeros(len(drawn), np.uint8)
         if overlay is not None:
-            other = overlay[subsample(overlay, MAX_POINTS // 2)]
-            crosses = np.repeat(np.uint8([0, 1]), [len(kept), len(other)])
-            two = np.array([list(bytes.fromhex(colour[1:])) for colour in (ORANGE, BLUE)], np.uint8)
-            drawn, colours = np.concatenate([drawn, other]), two[crosses]
+            second = overlay[subsample(overlay, MAX_POINTS // 2)]
+            crosses = np.repeat(np.uint8([0, 1]), [len(drawn), len(second)])
+            colours = np.uint8([list(bytes.fromhex(name[1:])) for name in (ORANGE, BLUE)])[crosses]
+            drawn = np.concatenate([drawn, second])
         with self.widget.hold_sync():
             self.widget.points = self._to_view.apply(drawn).astype(np.float32).tobytes()
-            self.widget.colours, self.widget.crosses = colours.tobytes(), crosses.tobytes()
+            self.widget.colours = colours.tobytes()
+            self.widget.crosses = crosses.tobytes()
             self.widget.alt = alt
             if view is not None:
                 self.widget.view = np.asarray(view, dtype=np.float64).ravel().tolist()
@@ -122,7 +126,9 @@ class CloudView:
         self._to_view = None
         with self.widget.hold_sync():
             self.widget.points = self.widget.colours = self.widget.crosses = b""
-            self.widget.marks, self.widget.cursor, self.widget.alt = [], [], alt
+            self.widget.marks = []
+            self.widget.cursor = []
+            self.widget.alt = alt
 
     def mark(self, points: Real[np.ndarray, "k 3"]) -> None:
         """Draw the numbers 1, 2, ... beside world points."""
@@ -130,19 +136,23 @@ class CloudView:
 
     def point_at(self, point: Real[np.ndarray, "3"] | None) -> None:
         """Draw a cross-hair at a world point; None removes it."""
-        self.widget.cursor = (
-            [] if point is None or self._to_view is None else self._to_view.apply(point).tolist()
-        )
+        cursor = []
+        if point is not None and self._to_view is not None:
+            cursor = self._to_view.apply(point).tolist()
+        self.widget.cursor = cursor
 
-    def _clicked(self, _, content: dict, buffers: list) -> None:
+    def _clicked(self, widget: Any, content: dict, buffers: list) -> None:
+        """Find the point of a click that the browser sends, and pass it on."""
         if self._to_view is not None:
-            view, at = np.array(content["view"]).reshape(3, 3), np.array(content["at"])
-            found = point_under(self._to_view.apply(self._cloud), view, at, content["reach"])
-            self.on_pick(None if found is None else self._cloud[found])
+            view = np.array(content["view"]).reshape(3, 3)
+            points = self._to_view.apply(self._cloud)
+            index = point_under(points, view, np.array(content["at"]), content["reach"])
+            self.on_pick(None if index is None else self._cloud[index])
 
 
 @cache
 def _cloud_widget() -> type:
+    """Return the class of the canvas; anywidget is imported when the first one is made."""
     anywidget = load_package("anywidget")
     from traitlets import Bytes, Float, Int, List, Unicode
 

@@ -48,9 +48,13 @@ def slider(label: str, low: float, high: float, value: float, step: float = 1) -
     """Return a slider from `low` to `high`, with integer values if all four numbers are
     integers."""
     widgets = load_package()
-    integer = all(isinstance(x, int | np.integer) for x in (low, high, value, step))
-    kind = widgets.IntSlider if integer else widgets.FloatSlider
-    form = {} if integer else {"readout_format": f".{max(0, -int(np.floor(np.log10(step))))}f"}
+    if all(isinstance(x, int | np.integer) for x in (low, high, value, step)):
+        kind = widgets.IntSlider
+        readout = "d"
+    else:
+        kind = widgets.FloatSlider
+        # The decimals that the step needs.
+        readout = f".{max(0, -int(np.floor(np.log10(step))))}f"
     return kind(
         value,
         min=low,
@@ -59,7 +63,7 @@ def slider(label: str, low: float, high: float, value: float, step: float = 1) -
         description=label,
         style=_LABEL,
         layout={"width": "22em"},
-        **form,
+        readout_format=readout,
     )
 
 
@@ -101,7 +105,7 @@ def interactive_figure(
     )
     caption = widgets.HTML()
 
-    def redraw(change=None) -> None:
+    def redraw(change: Any = None) -> None:
         caption.value = update(**{name: control.value for name, control in controls.items()})
         canvas.draw()
         pixels = cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR)
@@ -116,7 +120,9 @@ def interactive_figure(
     figure.set_layout_engine("none")
     row = widgets.HBox(list(controls.values()), layout={"flex_flow": "row wrap"})
     box = widgets.VBox([row, described, picture, caption])
-    box.controls, box.picture, box.caption = controls, picture, caption
+    box.controls = controls
+    box.picture = picture
+    box.caption = caption
     return box
 
 
@@ -125,7 +131,7 @@ def redrawing(draw: Callable[..., list[Artist]]) -> Callable[..., None]:
     before."""
     drawn: list[Artist] = []
 
-    def redraw(*values, **named) -> None:
+    def redraw(*values: Any, **named: Any) -> None:
         while drawn:
             drawn.pop().remove()
         drawn.extend(draw(*values, **named))

@@ -14,35 +14,38 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
     """Show the cycle of a reference patch u, from its nearest neighbour v in the target back to u'
     (eq. 2)."""
     grid = reference.features.grid
-    forth, back = (x.numpy() for x in nearest_neighbours(sim))
     values = sim.numpy()
+    forth, back = nearest_neighbours(sim)
     titles = ["reference: similarity to v", "target: similarity to u"]
     figure, axes = plots.show_images([reference.frame.rgb, target.frame.rgb], titles, size=3.7)
     maps = [plots.overlay_map(axis, np.zeros(grid), 0.55, limits=(0, 1)) for axis in axes]
     draw = redrawing(plots.draw_cycle)
 
     def update(row: int, col: int) -> str:
+        # Numbers of the patches u, v and u', which is w here, and their cells.
         u = row * grid[1] + col
-        v, w = int(forth[u]), int(back[forth[u]])
+        v = int(forth[u])
+        w = int(back[v])
         maps[0].set_data(values[:, v].reshape(grid))
         maps[1].set_data(values[u].reshape(grid))
-        cells = (row, col), divmod(v, grid[1]), divmod(w, grid[1])
+        cells = ((row, col), divmod(v, grid[1]), divmod(w, grid[1]))
         draw(axes, cells, grid)
-        off = ", ".join(
-            name
-            for name, cell, view in zip(("u", "v", "u'"), cells, (reference, target, reference))
-            if not view.foreground[cell]
-        )
-        return (
+        text = (
             f"u {cells[0]} → v {cells[1]}, cosine {values[u, v]:.2f} → u' {cells[2]}, cosine "
             f"{values[w, v]:.2f}: "
             f"d(u, u') = {np.hypot(*np.subtract(cells[0], cells[2])):.1f} patches"
-            + (f"; {off} not on the foreground, so the distance is infinite." if off else ".")
         )
+        off = []
+        for name, cell, view in zip(("u", "v", "u'"), cells, (reference, target, reference)):
+            if not view.foreground[cell]:
+                off.append(name)
+        if off:
+            text += f"; {', '.join(off)} not on the foreground, so the distance is infinite"
+        return f"{text}."
 
-    start = divmod(
-        int(np.where(reference.foreground, values.max(1).reshape(grid), -2).argmax()), grid[1]
-    )
+    # The foreground patch with the most similar neighbour; -2 is below every cosine.
+    similar = np.where(reference.foreground, values.max(1).reshape(grid), -2)
+    start = divmod(int(similar.argmax()), grid[1])
     alt = (
         "A solid arrow from the patch u to its nearest neighbour v, a dashed arrow from v to the "
         "patch u'."

@@ -7,6 +7,7 @@ writes every change at once, so that the work continues after a restart.
 import html
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -74,17 +75,21 @@ class _LabellingWidget:
         self.asked: tuple[str, bytes] | None = None
         self.refreshing = False
         self.box = self._build()
-        started = any(row.picks for row in labelling.progress())
-        self.controls["sequence"].value = (
-            self._next_open(labelling.reference) if started else labelling.reference
-        )
-        self._do(lambda: "The earlier keypoints are loaded." if started else "")
+        sequence = labelling.reference
+        text = ""
+        if any(row.picks for row in labelling.progress()):
+            sequence = self._next_open(labelling.reference)
+            text = "The earlier keypoints are loaded."
+        self.controls["sequence"].value = sequence
+        self._do(lambda: text)
 
     def _build(self) -> Widget:
         """Create the parts and arrange them; CSS classes begin with `zsp-`."""
-        widgets, style, narrow = load_package(), {"description_width": "initial"}, {"width": "auto"}
+        widgets = load_package()
+        style = {"description_width": "initial"}
+        narrow = {"width": "auto"}
         reference, *others = self.labelling.sequences
-        options = [(f"{reference} (reference)", reference), *((name, name) for name in others)]
+        options = [(f"{reference} (reference)", reference), *zip(others, others)]
         self.controls = controls = {
             "sequence": widgets.Dropdown(options=options, description="sequence", style=style),
             "name": widgets.Text(
@@ -112,62 +117,79 @@ class _LabellingWidget:
         self.captions = {name: widgets.HTML() for name in self.views}
         self.tables = {name: widgets.HTML() for name in ("progress", "keypoints")}
         self.message = widgets.HTML()
-        for name, part in (controls | buttons | self.tables | {"message": self.message}).items():
+
+        # Classes and actions.
+        parts = {**controls, **buttons, **self.tables, "message": self.message}
+        for name, part in parts.items():
             part.add_class(f"zsp-{name}")
         for name in ("sequence", "overlay", "point"):
             controls[name].observe(self._changed, names="value")
         for name, button in buttons.items():
             button.on_click(lambda _, name=name: self._do(getattr(self, name)))
 
+        # The rows, from top to bottom.
         clouds = [
             widgets.VBox([self.captions[name], view.widget], layout={"margin": "0 8px 0 0"})
             for name, view in self.views.items()
         ]
-        edit, finish = (
-            [buttons[name] for name in names]
-            for names in (("undo", "redo"), ("accept", "skip", "next"))
-        )
+        actions = [
+            buttons["undo"],
+            buttons["redo"],
+            controls["overlay"],
+            buttons["accept"],
+            buttons["skip"],
+            buttons["next"],
+        ]
         wrap = {"flex_flow": "row wrap"}
-        centred = wrap | {"align_items": "center"}
+        centred = {**wrap, "align_items": "center"}
         rows = [
             widgets.HTML(_STYLE),
             widgets.HBox([controls["sequence"], controls["name"]], layout=centred),
-            widgets.HBox([*edit, controls["overlay"], *finish], layout=centred),
+            widgets.HBox(actions, layout=centred),
             self.message,
             widgets.HBox(clouds, layout=wrap),
             widgets.HTML(_HELP),
             widgets.HBox([controls["point"], buttons["pick"]], layout=centred),
-            widgets.HBox(list(self.tables.values()), layout=wrap | {"align_items": "flex-start"}),
+            widgets.HBox([*self.tables.values()], layout={**wrap, "align_items": "flex-start"}),
         ]
         box = widgets.VBox(rows)
         box.add_class("zsp-label")
-        box.controls, box.buttons, box.views = controls, buttons, self.views
-        box.message, box.tables = self.message, self.tables
+        box.controls = controls
+        box.buttons = buttons
+        box.views = self.views
+        box.message = self.message
+        box.tables = self.tables
         return box
 
     @property
     def current(self) -> str:
+        """Name of the sequence that is chosen."""
         return self.controls["sequence"].value
 
     @property
     def on_reference(self) -> bool:
+        """Whether the reference is chosen."""
         return self.current == self.labelling.reference
 
     def pick(self) -> str:
+        """Pick the point under the cross-hair."""
         return self._add(self.current, self._slider_point())
 
     def undo(self) -> str:
+        """Remove the last keypoint of the sequence."""
         self.labelling.undo(self.current)
         return f"{len(self.labelling.picks(self.current))} keypoints on {self.current}."
 
     def redo(self) -> str:
+        """Remove all keypoints of the sequence."""
         self.labelling.put(self.current, [])
         return f"All keypoints of {self.current} removed."
 
     def accept(self) -> str:
         """Write the label; one in doubt only if accept is pressed twice in a row."""
-        sequence, doubt = self.current, self.labelling.doubt(self.current)
-        asked = sequence, self.labelling.picks(sequence).tobytes()
+        sequence = self.current
+        doubt = self.labelling.doubt(sequence)
+        asked = (sequence, self.labelling.picks(sequence).tobytes())
         if doubt and self.asked != asked:
             self.asked = asked
             raise InputError(
@@ -178,26 +200,30 @@ class _LabellingWidget:
         return f"Written: {'/'.join(path.parts[-3:])}. {self.next()}"
 
     def skip(self) -> str:
+        """Leave the sequence without a label."""
         self.labelling.skip(self.current)
         return f"{self.current} is skipped. {self.next()}"
 
     def next(self) -> str:
         """Go to the next open sequence."""
         following = self._next_open(self.current)
-        if len(self.labelling.names) < MIN_KEYPOINTS and not self._proposed(following):
+        proposed = self._proposed(following)
+        if len(self.labelling.names) < MIN_KEYPOINTS and not proposed:
             self.controls["sequence"].value = self.labelling.reference
             return f"Pick at least {MIN_KEYPOINTS} keypoints on the reference first."
-        is_open = any(row.state == OPEN for row in self.labelling.progress())
         self.controls["sequence"].value = following
-        self.controls["overlay"].value |= self._proposed(following)
-        now = f"Now {following}. {_PROPOSED if self._proposed(following) else ''}".strip()
-        return now if is_open else "No sequence is open."
+        if proposed:
+            self.controls["overlay"].value = True
+        if not any(row.state == OPEN for row in self.labelling.progress()):
+            return "No sequence is open."
+        return f"Now {following}. {_PROPOSED}" if proposed else f"Now {following}."
 
     def _add(self, sequence: str, point: np.ndarray | None) -> str:
         """Add the next keypoint."""
         if point is None:
             return "There is no point of the cloud at the click."
-        labelling, picks = self.labelling, self.labelling.picks(sequence)
+        labelling = self.labelling
+        picks = labelling.picks(sequence)
         same = np.flatnonzero((picks == point).all(axis=1))
         if len(same):
             raise InputError(
@@ -216,13 +242,12 @@ class _LabellingWidget:
         return f"Keypoint {len(picks) + 1}, {labelling.names[len(picks)]}, picked on {sequence}."
 
     def _clicked(self, view: str, point: np.ndarray | None) -> None:
-        self._do(
-            lambda: self._add(
-                self.labelling.reference if view == "reference" else self.current, point
-            )
-        )
+        """Add the keypoint that is clicked in a view."""
+        sequence = self.labelling.reference if view == "reference" else self.current
+        self._do(lambda: self._add(sequence, point))
 
-    def _changed(self, change) -> None:
+    def _changed(self, change: Any) -> None:
+        """Follow a control that the user moves."""
         if self.refreshing:
             return
         if change.owner is self.controls["point"]:
@@ -232,7 +257,9 @@ class _LabellingWidget:
 
     def _do(self, action: Callable[[], str]) -> None:
         """Run an action and update the display; an InputError is shown as a message."""
-        self.refreshing, text, problem = True, "", ""
+        self.refreshing = True
+        text = ""
+        problem = ""
         try:
             for step in (action, self._refresh):
                 try:
@@ -241,11 +268,13 @@ class _LabellingWidget:
                     problem = str(error)
         finally:
             self.refreshing = False
-        kind, shown = (
-            ("problem", f"Not done: {problem}")
-            if problem
-            else ("info", text or self._instruction())
-        )
+        kind = "info"
+        shown = text
+        if problem:
+            kind = "problem"
+            shown = f"Not done: {problem}"
+        elif not text:
+            shown = self._instruction()
         # Announced by screen readers.
         self.message.value = (
             f'<p class="{kind}" role="status" aria-live="polite">{html.escape(shown)}</p>'
@@ -267,15 +296,13 @@ class _LabellingWidget:
 
     def _instruction(self) -> str:
         """Return what the user can do next."""
-        labelling, names = self.labelling, self.labelling.names
-        picked = len(labelling.picks(self.current))
+        names = self.labelling.names
+        picked = len(self.labelling.picks(self.current))
         if self.on_reference:
             missing = MIN_KEYPOINTS - len(names)
-            more = (
-                f"at least {missing} more"
-                if missing > 0
-                else "enough; add more, or go on with next"
-            )
+            more = "enough; add more, or go on with next"
+            if missing > 0:
+                more = f"at least {missing} more"
             return (
                 "Click a point of the reference that all objects of the category have: "
                 f"{len(names)} so far, {more}."
@@ -284,7 +311,8 @@ class _LabellingWidget:
             return _PROPOSED
         if picked < len(names):
             return f"Click the right cloud: keypoint {picked + 1}, {names[picked]}."
-        if (alignment := labelling.alignment(self.current)) is None:
+        alignment = self.labelling.alignment(self.current)
+        if alignment is None:
             return f"Pick at least {MIN_KEYPOINTS} keypoints on the reference first."
         rms = 100 * alignment.rms
         return (
@@ -293,12 +321,17 @@ class _LabellingWidget:
         )
 
     def _refresh(self) -> None:
-        labelling, controls = self.labelling, self.controls
+        """Show the state of the session; raise InputError if the picks give no alignment."""
+        labelling = self.labelling
+        controls = self.controls
         rows = labelling.progress()
         row = next(row for row in rows if row.sequence == self.current)
         alignment = None if self.on_reference or row.problem else labelling.alignment(self.current)
         aligned = self._aligned_reference(alignment)
-        controls["overlay"].value &= aligned is not None
+
+        # Controls and tables.
+        if aligned is None:
+            controls["overlay"].value = False
         controls["overlay"].disabled = aligned is None
         controls["name"].disabled = not self.on_reference
         waiting = not self.on_reference and self._proposed(self.current)
@@ -306,9 +339,10 @@ class _LabellingWidget:
         self.buttons["skip"].disabled = self.on_reference
         self.tables["progress"].value = _progress_table(rows, self.current)
         self.tables["keypoints"].value = _keypoint_table(labelling.names, row.picks, alignment)
-        self.captions[
-            "reference"
-        ].value = f"{_dot(BLUE)} reference {html.escape(labelling.reference)}"
+
+        # Clouds and the cross-hair.
+        caption = f"{_dot(BLUE)} reference {html.escape(labelling.reference)}"
+        self.captions["reference"].value = caption
         self._show_cloud("reference", labelling.reference, None)
         if self.on_reference:
             self.shown.pop("sequence", None)
@@ -327,8 +361,10 @@ class _LabellingWidget:
     def _aligned_reference(self, alignment: Alignment | None) -> np.ndarray | None:
         """Return the reference cloud in the world of the sequence, by its keypoints, its label, or
         a proposal."""
-        if self.on_reference or alignment is None and len(self.labelling.picks(self.current)):
+        if self.on_reference:
             return None
+        if alignment is None and len(self.labelling.picks(self.current)):
+            return None  # the picks are not complete
         label = read_labels(self.labelling.root, self.labelling.category).get(self.current)
         if alignment is not None:
             sim3 = alignment.sim3
@@ -336,21 +372,25 @@ class _LabellingWidget:
             sim3 = Sim3(1.0, label.trans[:3, :3], label.trans[:3, 3])
         else:
             sim3 = self.labelling.proposal(self.current)
-        return (
-            None if sim3 is None else sim3.apply(self.labelling.cloud(self.labelling.reference)[0])
-        )
+        if sim3 is None:
+            return None
+        points, _ = self.labelling.cloud(self.labelling.reference)
+        return sim3.apply(points)
 
     def _show_cloud(self, name: str, sequence: str, overlay: np.ndarray | None) -> None:
         """Show a cloud, unless it is on the canvas already, and the keypoints."""
         before = self.shown.get(name, (None, None))
-        key = sequence, None if overlay is None else overlay.tobytes()
+        key = (sequence, None if overlay is None else overlay.tobytes())
         if before != key:
             points, colours = self.labelling.cloud(sequence)
             alt = (
                 f"Point cloud of {sequence}. The slider named point chooses a point by keyboard, "
                 "the arrow keys rotate."
             )
-            view = self.labelling.first_view(sequence) if before[0] != sequence else None
+            # A cloud that is shown already stays as the user has turned it.
+            view = None
+            if before[0] != sequence:
+                view = self.labelling.first_view(sequence)
             try:
                 self.views[name].show(points, colours, view, alt, overlay)
             except InputError as error:
@@ -362,60 +402,58 @@ class _LabellingWidget:
 
     def _slider_point(self) -> np.ndarray:
         """Return the point of the slider, which goes through neighbours after each other."""
-        points = self.labelling.cloud(self.current)[0]
-        kept = subsample(points)
-        return points[kept[min(self.controls["point"].value, len(kept) - 1)]]
+        points, _ = self.labelling.cloud(self.current)
+        drawn = subsample(points)
+        return points[drawn[min(self.controls["point"].value, len(drawn) - 1)]]
 
     def _move_cursor(self, only_if_shown: bool = False) -> None:
         """Move the cross-hair to the point of the slider."""
-        current, other = (
-            ("reference", "sequence") if self.on_reference else ("sequence", "reference")
-        )
+        current = "sequence"
+        other = "reference"
+        if self.on_reference:
+            current, other = other, current
         self.views[other].point_at(None)
         if not only_if_shown or self.views[current].widget.cursor:
             self.views[current].point_at(self._slider_point())
 
 
 def _progress_table(rows: Sequence[Progress], current: str) -> str:
+    """Return the table of all sequences, the current one marked."""
     cells = []
     for row in rows:
-        residual = (
-            "see above" if row.problem else "" if row.rms is None else f"{100 * row.rms:.1f} %"
-        )
+        residual = ""
+        if row.problem:
+            residual = "see above"
+        elif row.rms is not None:
+            residual = f"{100 * row.rms:.1f} %"
         marker = "▸" if row.sequence == current else ""
-        cells.append(
-            (
-                marker,
-                row.sequence,
-                f"{_STATE_SYMBOLS.get(row.state, '●')} {row.state}",
-                row.picks,
-                residual,
-            )
-        )
+        state = f"{_STATE_SYMBOLS.get(row.state, '●')} {row.state}"
+        cells.append((marker, row.sequence, state, row.picks, residual))
     return _table(("", "sequence", "state", "keypoints", "residual"), cells)
 
 
 def _keypoint_table(names: Sequence[str], picked: int, alignment: Alignment | None) -> str:
     """Return the table of keypoints, of which the first `picked` are picked on the current
     sequence."""
-    residuals = (
-        [""] * len(names)
-        if alignment is None
-        else [f"{100 * x:.1f} %" for x in alignment.residuals]
-    )
+    residuals = [""] * len(names)
     if alignment is not None:
+        residuals = [f"{100 * residual:.1f} %" for residual in alignment.residuals]
         residuals[int(alignment.residuals.argmax())] += " ← largest"
-    states = [
-        "✓" if index < picked else "next" if index == picked else "" for index in range(len(names))
-    ]
-    cells = [*zip(range(1, len(names) + 1), names, states, residuals)]
+    cells = []
+    for index, (name, residual) in enumerate(zip(names, residuals)):
+        state = "✓" if index < picked else ""
+        if index == picked:
+            state = "next"
+        cells.append((index + 1, name, state, residual))
     return _table(("", "keypoint", "picked", "residual"), cells or [("", "none yet", "", "")])
 
 
 def _table(head: Sequence[str], rows: Sequence[tuple]) -> str:
+    """Format a table as HTML."""
     with pd.option_context("display.max_colwidth", None):
         return pd.DataFrame(rows, columns=head).to_html(index=False, border=0)
 
 
 def _dot(colour: str, symbol: str = "●") -> str:
+    """Format a coloured symbol as HTML."""
     return f'<b style="color:{colour}">{symbol}</b>'

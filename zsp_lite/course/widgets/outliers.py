@@ -29,7 +29,8 @@ def ransac_settings(
 ) -> Widget:
     """Show the inliers of RANSAC on matches, given by pixels (x, y) in both images and by points in
     both cameras."""
-    (source, target), n = points, len(points[0])
+    source, target = points
+    n = len(source)
     figure, (*axes, graph) = plt.subplots(
         1, 3, figsize=(9.6, 3.6), width_ratios=(1, 1, 1.3), layout="constrained"
     )
@@ -63,9 +64,9 @@ def ransac_settings(
         outside.set_offsets(positions[~inliers[order]])
         lines(axes, pixels, inliers)
         text = f"{inliers.sum()} of {n} matches are inliers; scale {sim3.scale:.2f}"
-        return text + (
-            f"; rotation error {rotation_error(sim3.R, truth):.0f}°." if truth is not None else "."
-        )
+        if truth is not None:
+            text += f"; rotation error {rotation_error(sim3.R, truth):.0f}°"
+        return f"{text}."
 
     widgets = load_package()
     controls = {
@@ -107,10 +108,9 @@ def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3
             f"{fit.scale:.2f}."
         )
 
+    controls = {"distance": slider("moved by", 0.0, _FARTHEST, 0.0, 0.1)}
     alt = (
         "Target points and source points after the least-squares fit; lines connect "
         "corresponding points"
     )
-    return interactive_figure(
-        figure, {"distance": slider("moved by", 0.0, _FARTHEST, 0.0, 0.1)}, update, alt
-    )
+    return interactive_figure(figure, controls, update, alt)

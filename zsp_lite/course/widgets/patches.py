@@ -41,14 +41,15 @@ def all_facets(
             "checkpoint file"
         )
     batch = normalize(prepare_images(images, backbone.image_size), backbone.mean, backbone.std)
-    found = {}
+    facets = {}
     with torch.no_grad():
         x, _ = model.embed(batch.to(backbone.device))
         for layer, block in enumerate(model.blocks):
             activations = block(x)
             x = activations.token
-            found |= {(layer, facet): getattr(activations, facet).cpu() for facet in FACETS}
-    return found
+            for facet in FACETS:
+                facets[layer, facet] = getattr(activations, facet).cpu()
+    return facets
 
 
 def attention(
@@ -71,16 +72,17 @@ def attention(
     def update(row: int, col: int, layer: int, head: int) -> str:
         part = slice(head * dim // heads, (head + 1) * dim // heads)
         query = queries[layer, 1 + row * grid[1] + col, part]
-        found = (keys[layer, :, part] @ query * (dim // heads) ** -0.5).softmax(0)
-        patches = found[1:].view(grid).numpy()
+        # Weights of all tokens: the softmax of q · k / √d.
+        tokens = (keys[layer, :, part] @ query * (dim // heads) ** -0.5).softmax(0)
+        patches = tokens[1:].view(grid).numpy()
         top = np.unravel_index(patches.argmax(), grid)
         weights.set_data(patches / patches.max())
         outline(axes[0], (row, col), grid, label="query", linewidth=2, path_effects=plots.BORDER)
         return (
             f"Patch ({row}, {col}), layer {layer}, head {head}: the largest weight is "
             f"{patches.max():.1%} on patch "
-            f"({top[0]}, {top[1]}); uniform attention would give {1 / len(found):.1%}. CLS "
-            f"has {found[0]:.1%}."
+            f"({top[0]}, {top[1]}); uniform attention would give {1 / len(tokens):.1%}. CLS "
+            f"has {tokens[0]:.1%}."
         )
 
     controls = {
@@ -122,11 +124,14 @@ def patch_similarities(
             axes[0], cell, grid, label="u", linewidth=2, path_effects=plots.BORDER
         )
         drawn += plots.circle_patch(axes[1], nearest, grid)
-        return drawn + (plots.circle_patch(axes[1], cells[cell], grid, "*") if valid[cell] else [])
+        if valid[cell]:
+            drawn += plots.circle_patch(axes[1], cells[cell], grid, "*")
+        return drawn
 
     @cache
     def share_correct(kind: str) -> float:
-        nearest = np.stack(np.divmod(sims[kind].argmax(1).numpy(), grid[1]), -1).reshape(*grid, 2)
+        numbers = sims[kind].argmax(1).numpy()
+        nearest = np.stack(np.divmod(numbers, grid[1]), -1).reshape(*grid, 2)
         return correct_matches(nearest, cells)[valid].mean()
 
     def update(row: int, col: int, kind: str) -> str:
@@ -146,8 +151,10 @@ def patch_similarities(
             "within one patch of it."
         )
 
+    # It begins at the patch with a true match that is nearest to the middle of all of them.
     known = np.argwhere(valid)
-    middle = tuple(known[np.abs(known - np.median(known, axis=0)).sum(axis=1).argmin()].tolist())
+    off_middle = np.abs(known - np.median(known, axis=0)).sum(axis=1)
+    middle = tuple(known[off_middle.argmin()].tolist())
     kinds = load_package().Dropdown(
         options=list(sims), value=start or next(iter(sims)), description="similarity"
     )
@@ -162,7 +169,8 @@ def patch_similarities(
 def saliency(view: View) -> Widget:
     """Show the foreground patches above a saliency threshold, and their overlap with the object
     mask."""
-    grid, values = view.features.grid, view.features.saliency.numpy()
+    grid = view.features.grid
+    values = view.features.saliency.numpy()
     truth = patch_mask(view.frame, grid)
     thresholds = np.linspace(0, 1, 101)
     overlaps = [mask_iou(torch.from_numpy(values > threshold), truth) for threshold in thresholds]
@@ -181,7 +189,8 @@ def saliency(view: View) -> Widget:
         on = values > threshold
         shown.set_data(np.where(on, values, np.nan))
         line.set_xdata([threshold, threshold])
-        wrong, missed = on & ~truth.numpy(), truth.numpy() & ~on
+        wrong = on & ~truth.numpy()
+        missed = truth.numpy() & ~on
         return (
             f"Above {threshold:.2f}: {on.sum()} of {on.size} patches are foreground. "
             f"{wrong.sum()} of them are not on "

@@ -50,12 +50,11 @@ def self_check(notebook: str, number: int) -> None:
         )
     with ipython.utils.capture.capture_output() as captured:
         jupyterquiz.display_quiz(checks[number - 1], colors=_COLOURS)
-    # the form is a <div> that jupyterquiz leaves open
-    form, script = (output.data for output in captured.outputs)
-    ipython.display.display(
-        ipython.display.HTML(form["text/html"] + f"<style>{_STYLE}</style></div>")
-    )
+    # The form is a <div> that jupyterquiz leaves open.
+    form, script = captured.outputs
+    html = f"{form.data['text/html']}<style>{_STYLE}</style></div>"
+    ipython.display.display(ipython.display.HTML(html))
     # Where a page has MathJax, jupyterquiz would replace it by one from the network: hide it from
     # the script.
-    hidden = f"{{ let MathJax;\n{script['application/javascript']}\n}}"
+    hidden = f"{{ let MathJax;\n{script.data['application/javascript']}\n}}"
     ipython.display.display(ipython.display.Javascript(hidden))

@@ -1,5 +1,4 @@
-"""The categories that methods are evaluated on: the names of the paper's twenty, each built of
-primitives.
+"""The categories that methods are evaluated on: those of the paper, each built of primitives.
 
 No backbone is trained on them, and no setting is chosen by them.
 """
