@@ -113,17 +113,18 @@ def test_chosen_frames_are_evenly_spaced_and_have_depth_that_agrees(changed, tmp
 
 
 def test_the_best_sequences_are_chosen_and_those_that_are_there_stay(changed, run, tmp_path):
-    out, words = tmp_path / "out", ["data", "import", "uco3d", changed, "--category", "car"]
+    out = tmp_path / "out"
+    words = f"data import uco3d {changed} --category car --out {out}"
     execute(changed, "UPDATE sequence_annots SET _alignment_R = NULL")
-    text = run([*words, "--best", 1, "--frames", 4, "--out", out])
+    text = run(f"{words} --best 1 --frames 4")
     assert f"{out / 'car' / SUV}: 4 frames" in text and CAR not in text
     assert not (out / "label_proposals").exists()
     before = (out / "car" / SUV / "pointcloud.ply").stat().st_mtime_ns
-    text = run([*words, "--sequences", f"{CAR},{SUV}", "--frames", 3, "--out", out])
+    text = run(f"{words} --sequences {CAR},{SUV} --frames 3")
     assert f"{out / 'car' / CAR}: 3 frames" in text and SUV not in text
     assert (out / "car" / SUV / "pointcloud.ply").stat().st_mtime_ns == before
-    assert "No problems." in run(["data", "check", out, "--deep"])
-    text = run([*words, "--sequences", CAR, "--best", 2, "--out", out], code=2)
+    assert "No problems." in run(f"data check {out} --deep")
+    text = run(f"{words} --sequences {CAR} --best 2", code=2)
     assert "--best does not go with --sequences (see: zsp-lite data import uco3d --help)" in text
 
 
