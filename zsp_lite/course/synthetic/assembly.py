@@ -21,12 +21,14 @@ from zsp_lite.course.synthetic.textures import random_colour
 X = (1.0, 0.0, 0.0)
 Y = (0.0, 1.0, 0.0)
 
+BODY = 0  # the material of the main part of most objects
+
 
 class Assembly:
     """Collects the parts of one object, and draws the random numbers that its builder asks for.
 
-    With `variation`, the proportions (`u`) are perturbed by noise from that source; the choices
-    between parts stay.
+    With `variation`, noise from that source perturbs the proportions that `uniform` draws; the
+    choices between parts stay.
     """
 
     def __init__(self, rng: np.random.Generator, variation: np.random.Generator | None = None):
@@ -34,7 +36,7 @@ class Assembly:
         self.meshes: list[Mesh] = []
         self.materials: list[int] = []  # of each mesh
 
-    def u(self, low: float, high: float) -> float:
+    def uniform(self, low: float, high: float) -> float:
         """Draw a proportion uniformly from [low, high)."""
         value = float(self.rng.uniform(low, high))
         if self._variation is not None:

@@ -51,6 +51,11 @@ class Mesh:
         return Mesh(self.vertices * [1, -1, 1], self.faces[:, ::-1])
 
 
+def point(*coordinates: float) -> Float[np.ndarray, "3"]:
+    """Return a point as an array, for arithmetic with it."""
+    return np.array(coordinates)
+
+
 def joined(meshes: Sequence[Mesh]) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """Return the vertices and the faces of several meshes as those of one."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])

@@ -166,13 +166,13 @@ def _room(index: int) -> Room:
 def build_random_object(a: Assembly) -> None:
     """Build a tree of 5 to 10 random parts, symmetric, each attached to one of those before it."""
     # centre and size of each part
-    body = np.array([a.u(0.5, 1.3), a.u(0.4, 1.0), a.u(0.4, 1.2)])
+    body = np.array([a.uniform(0.5, 1.3), a.uniform(0.4, 1.0), a.uniform(0.4, 1.2)])
     nodes = [(np.zeros(3), body)]
     a.add(_random_solid(a, body), a.choice(5))
     for _ in range(4 + a.choice(6)):
         parent, parent_size = a.pick(*nodes)
         direction = a.rng.normal(size=3)
-        size = a.rng.uniform(0.12, 0.8, 3) * a.u(0.5, 1.0)
+        size = a.rng.uniform(0.12, 0.8, 3) * a.uniform(0.5, 1.0)
         # The centre is on a box about the parent, so that the two parts overlap.
         centre = parent + direction / np.abs(direction).max() * (parent_size * 0.4 + size * 0.3)
         mesh = _random_solid(a, size)
@@ -180,7 +180,7 @@ def build_random_object(a: Assembly) -> None:
         # A part is on the left with its mirror image on the right, or in the middle.
         centre[1] = abs(centre[1]) if mirror else 0
         if mirror and a.chance(0.5):
-            mesh = mesh.rotated("z", a.u(-0.7, 0.7)).rotated("x", a.u(-0.7, 0.7))
+            mesh = mesh.rotated("z", a.uniform(-0.7, 0.7)).rotated("x", a.uniform(-0.7, 0.7))
         a.add(mesh.translated(centre), a.choice(5), mirror)
         nodes.append((centre, size))
 
@@ -193,10 +193,10 @@ def _random_solid(a: Assembly, size: np.ndarray) -> Mesh:
     solids = (
         box((1, 1, 1)),
         ellipsoid((0.55, 0.55, 0.55)),
-        cylinder(0.5, 0.5 * a.u(0.3, 1), 1.0),
+        cylinder(0.5, 0.5 * a.uniform(0.3, 1), 1.0),
         capsule((-0.25, 0, 0), (0.25, 0, 0), 0.25).scaled((1, 2, 2)),
         torus(0.36, 0.12, a.pick(*np.eye(3))),
-        extrusion(outline, a.u(0.1, 0.9), a.pick("xz", "xy", "yz")),
+        extrusion(outline, a.uniform(0.1, 0.9), a.pick("xz", "xy", "yz")),
     )
     mesh = a.pick(*solids).scaled(size)
-    return mesh.rotated("y", a.u(-0.8, 0.8)) if a.chance(0.4) else mesh
+    return mesh.rotated("y", a.uniform(-0.8, 0.8)) if a.chance(0.4) else mesh

@@ -1,11 +1,11 @@
 """Furniture and devices of a household (front +x, left +y, up +z).
 
-The number in a call of `a.add` is the part's material, 0 to 7: parts of one number look alike.
+The constants at the head of a builder name its materials, 0 to 7: parts of one material look alike.
 """
 
 import numpy as np
 
-from zsp_lite.course.synthetic.assembly import Assembly, rounded_box
+from zsp_lite.course.synthetic.assembly import BODY, Assembly, rounded_box
 from zsp_lite.course.synthetic.primitives import (
     TAU,
     Mesh,
@@ -15,6 +15,7 @@ from zsp_lite.course.synthetic.primitives import (
     ellipsoid,
     extrusion,
     lathe,
+    point,
     rod,
     torus,
 )
@@ -22,18 +23,23 @@ from zsp_lite.course.synthetic.primitives import (
 
 def chair(a: Assembly) -> None:
     """Build a chair: seat, back of one of four styles, base of one of three, optional arms."""
-    width = a.u(0.8, 1.2)
-    depth = a.u(0.8, 1.1)
-    height = a.u(0.6, 1.1)
-    thick = a.u(0.06, 0.16)
-    back = a.u(0.7, 1.3)
-    leg = a.u(0.03, 0.075)
-    lean = a.u(0, 0.3)
+    SEAT = 0
+    BACK = 1
+    FRAME = 2
+    ARM = 3
+
+    width = a.uniform(0.8, 1.2)
+    depth = a.uniform(0.8, 1.1)
+    height = a.uniform(0.6, 1.1)
+    thick = a.uniform(0.06, 0.16)
+    back = a.uniform(0.7, 1.3)
+    leg = a.uniform(0.03, 0.075)
+    lean = a.uniform(0, 0.3)
     if a.chance(0.4):
         seat = rounded_box((depth, width, thick * 1.4), squareness=6)
     else:
         seat = box((depth, width, thick))
-    a.add(seat.translated((0, 0, height)), 0)
+    a.add(seat.translated((0, 0, height)), SEAT)
 
     # The back is built upright at the origin; it leans about its lower edge.
     def add_to_back(mesh: Mesh, material: int) -> None:
@@ -42,12 +48,14 @@ def chair(a: Assembly) -> None:
 
     style = a.pick("panel", "round", "slats", "rungs")
     if style == "panel":
-        add_to_back(box((thick, width * a.u(0.8, 1), back), (0, 0, back / 2)), 1)
+        add_to_back(box((thick, width * a.uniform(0.8, 1), back), (0, 0, back / 2)), BACK)
     elif style == "round":
-        add_to_back(rounded_box((thick * 1.5, width * 0.95, back * 0.6), (0, 0, back * 0.7), 3), 1)
+        add_to_back(
+            rounded_box((thick * 1.5, width * 0.95, back * 0.6), (0, 0, back * 0.7), 3), BACK
+        )
         post = rod((0, width * 0.3, 0), (0, width * 0.3, back * 0.6), leg)
-        add_to_back(post, 2)
-        add_to_back(post.mirrored(), 2)
+        add_to_back(post, FRAME)
+        add_to_back(post.mirrored(), FRAME)
     else:
         # Slats are many posts with one rung on top.
         rungs = (0.35, 0.65, 0.95)
@@ -56,20 +64,20 @@ def chair(a: Assembly) -> None:
             rungs = (0.93,)
             n_posts = 4 + a.choice(3)
         for y in np.linspace(-0.45, 0.45, n_posts) * width:
-            add_to_back(box((thick * 0.7, 0.08, back), (0, y, back / 2)), 2)
-        rung_height = back * a.u(0.1, 0.2)
+            add_to_back(box((thick * 0.7, 0.08, back), (0, y, back / 2)), FRAME)
+        rung_height = back * a.uniform(0.1, 0.2)
         for share in rungs:
-            add_to_back(box((thick * 0.8, width, rung_height), (0, 0, back * share)), 1)
+            add_to_back(box((thick * 0.8, width, rung_height), (0, 0, back * share)), BACK)
 
     # The base; x and y are those of the front left leg.
     x = depth / 2 - 0.06
     y = width / 2 - 0.06
     base = a.pick("swivel", "cantilever", "legs", "legs")
     if base == "swivel":
-        a.add(rod((0, 0, 0.1), (0, 0, height), leg * 1.3), 2)
-        for angle in np.arange(5) * TAU / 5 + a.u(0, 1):
+        a.add(rod((0, 0, 0.1), (0, 0, height), leg * 1.3), FRAME)
+        for angle in np.arange(5) * TAU / 5 + a.uniform(0, 1):
             foot = (0.55 * np.cos(angle), 0.55 * np.sin(angle), 0.06)
-            a.add(capsule((0, 0, 0.14), foot, leg), 2)
+            a.add(capsule((0, 0, 0.14), foot, leg), FRAME)
     elif base == "cantilever":
         # One bent tube per side, open at the back.
         corners = [
@@ -79,29 +87,34 @@ def chair(a: Assembly) -> None:
             (-x, y, leg),
         ]
         for start, end in zip(corners, corners[1:]):
-            a.add_pair(capsule(start, end, leg), 2)
-        a.add(rod((-x, y, leg), (-x, -y, leg), leg), 2)
+            a.add_pair(capsule(start, end, leg), FRAME)
+        a.add(rod((-x, y, leg), (-x, -y, leg), leg), FRAME)
     else:
-        splay = a.u(0, 0.14)
+        splay = a.uniform(0, 0.14)
         for side in (-1, 1):
             foot = (side * (x + splay), y + splay, 0)
-            a.add_pair(rod((side * x, y, height), foot, leg), 2)
+            a.add_pair(rod((side * x, y, height), foot, leg), FRAME)
     # The arms.
     if a.chance(0.45):
-        rest = height + a.u(0.22, 0.4)
-        arm = rounded_box((depth * a.u(0.7, 0.95), 0.12, 0.09), (0, width / 2, rest), 5)
-        a.add_pair(arm, 3)
+        rest = height + a.uniform(0.22, 0.4)
+        arm = rounded_box((depth * a.uniform(0.7, 0.95), 0.12, 0.09), (0, width / 2, rest), 5)
+        a.add_pair(arm, ARM)
         for post_x in (depth * 0.3, -depth * 0.38):
-            a.add_pair(rod((post_x, width / 2, height), (post_x, width / 2, rest), leg), 2)
+            a.add_pair(rod((post_x, width / 2, height), (post_x, width / 2, rest), leg), FRAME)
 
 
 def toilet(a: Assembly) -> None:
     """Build a toilet: bowl, seat, open or closed lid; cistern with a button or a side lever."""
+    SEAT = 1
+    LID = 2
+    COVER = 3
+    METAL = 5
+
     # length and width are radii of the bowl
-    length = a.u(0.5, 0.66)
-    width = a.u(0.36, 0.46)
-    height = a.u(0.6, 0.8)
-    foot = a.u(0.5, 0.75)
+    length = a.uniform(0.5, 0.66)
+    width = a.uniform(0.36, 0.46)
+    height = a.uniform(0.6, 0.8)
+    foot = a.uniform(0.5, 0.75)
     bowl_x = length * 0.75
     # The bowl: profiles of unit radius, 0.001 at the axis to close it.
     outside = [
@@ -112,94 +125,114 @@ def toilet(a: Assembly) -> None:
         [1, height],
     ]
     inside = [[0.78, height], [0.55, height * 0.72], [0.001, height * 0.55]]
-    a.add(lathe(outside + inside, 28).scaled((length, width, 1)).translated((bowl_x, 0, 0)), 0)
+    a.add(lathe(outside + inside, 28).scaled((length, width, 1)).translated((bowl_x, 0, 0)), BODY)
     base = (bowl_x + 0.15, width * foot * 1.5, height * 0.95)
-    a.add(rounded_box(base, (bowl_x * 0.35, 0, height * 0.47), 6), 0)
+    a.add(rounded_box(base, (bowl_x * 0.35, 0, height * 0.47), 6), BODY)
     # Seat and lid; the lid is built closed, with its hinge at the origin.
     seat = torus(0.88, 0.14, sides=32).scaled((length, width, 0.5))
-    a.add(seat.translated((bowl_x, 0, height + 0.04)), 1)
+    a.add(seat.translated((bowl_x, 0, height + 0.04)), SEAT)
     is_open = a.chance(0.6)
     hinge = (bowl_x - length, 0, height + 0.1)
     lid = ellipsoid((length * 1.02, width * 1.02, 0.04), (length, 0, 0), sides=28)
-    lid = lid.rotated("y", -a.u(1.6, 1.85) if is_open else 0)
-    a.add(lid.translated(hinge), 1 if a.chance(0.6) else 2)
+    lid = lid.rotated("y", -a.uniform(1.6, 1.85) if is_open else 0)
+    a.add(lid.translated(hinge), SEAT if a.chance(0.6) else LID)
     # The cistern, farther behind if the lid leans on it.
-    depth = a.u(0.28, 0.38)
-    tank_width = width * a.u(1.7, 2.3)
-    tank_height = a.u(0.6, 0.9)
+    depth = a.uniform(0.28, 0.38)
+    tank_width = width * a.uniform(1.7, 2.3)
+    tank_height = a.uniform(0.6, 0.9)
     tank_x = hinge[0] - depth / 2 - (0.12 if is_open else 0)
-    tank_z = height * a.u(0.85, 1.05)
+    tank_z = height * a.uniform(0.85, 1.05)
     top = tank_z + tank_height
     tank = (depth, tank_width, tank_height)
-    a.add(rounded_box(tank, (tank_x, 0, tank_z + tank_height / 2), a.u(5, 12)), 0)
+    a.add(rounded_box(tank, (tank_x, 0, tank_z + tank_height / 2), a.uniform(5, 12)), BODY)
     cover = rounded_box((depth * 1.12, tank_width * 1.06, 0.09), (tank_x, 0, top), 8)
-    a.add(cover, 3 if a.chance(0.3) else 0)
-    a.add(box((depth * 1.2, tank_width * 0.45, tank_z), (tank_x + 0.1, 0, tank_z / 2)), 0)
+    a.add(cover, COVER if a.chance(0.3) else BODY)
+    a.add(box((depth * 1.2, tank_width * 0.45, tank_z), (tank_x + 0.1, 0, tank_z / 2)), BODY)
     if a.chance(0.5):
-        a.add(cylinder(0.08, 0.08, 0.04).translated((tank_x, 0, top + 0.06)), 5)
+        a.add(cylinder(0.08, 0.08, 0.04).translated((tank_x, 0, top + 0.06)), METAL)
     else:
-        lever = np.array(
-            [tank_x + depth / 2 + 0.03, tank_width * 0.32, tank_z + tank_height * 0.82]
-        )
-        a.add(rod(lever, lever + [0.03, -0.2, -0.02], 0.03), 5)
+        lever = point(tank_x + depth / 2 + 0.03, tank_width * 0.32, tank_z + tank_height * 0.82)
+        a.add(rod(lever, lever + [0.03, -0.2, -0.02], 0.03), METAL)
 
 
 def hairdryer(a: Assembly) -> None:
     """Build a hair dryer: barrel, nozzle or diffuser, grille at the back, handle with a switch."""
-    length = a.u(0.9, 1.3)
-    radius = a.u(0.22, 0.34)
-    mouth = radius * a.u(0.55, 0.85)
+    NOZZLE = 1
+    HANDLE = 2
+    DARK = 3  # grille, switch and cable
+
+    length = a.uniform(0.9, 1.3)
+    radius = a.uniform(0.22, 0.34)
+    mouth = radius * a.uniform(0.55, 0.85)
     rear = -length * 0.43
     front = length * 0.57
     # The barrel, from its back to its mouth.
     back = [[0.001, rear], [radius * 0.7, rear], [radius, -length * 0.3]]
-    a.add(lathe([*back, [radius, 0], [mouth, front], [0.001, front]], 24).rotated("y", TAU / 4), 0)
+    a.add(
+        lathe([*back, [radius, 0], [mouth, front], [0.001, front]], 24).rotated("y", TAU / 4),
+        BODY,
+    )
     if a.chance(0.6):
         # A nozzle becomes more or less flat towards its slot.
-        reach = a.u(0.15, 0.4)
-        high = a.u(0.25, 0.8)
-        wide = a.u(0.8, 1.5)
+        reach = a.uniform(0.15, 0.4)
+        high = a.uniform(0.25, 0.8)
+        wide = a.uniform(0.8, 1.5)
         cone = cylinder(mouth, mouth, reach, 20).translated((0, 0, reach / 2))
         share = cone.vertices[:, 2:] / reach  # of the way to the slot
-        flat = Mesh(cone.vertices * (1 + share * (np.array([high, wide, 1]) - 1)), cone.faces)
-        a.add(flat.rotated("y", TAU / 4).translated((front, 0, 0)), 1)
+        flat = Mesh(cone.vertices * (1 + share * (point(high, wide, 1) - 1)), cone.faces)
+        a.add(flat.rotated("y", TAU / 4).translated((front, 0, 0)), NOZZLE)
     else:
-        reach = a.u(0.2, 0.3)
+        reach = a.uniform(0.2, 0.3)
         bowl = [[mouth, 0], [mouth * 1.1, reach * 0.3], [radius * 1.4, reach], [0.001, reach * 0.8]]
-        a.add(lathe(bowl, 24).rotated("y", TAU / 4).translated((front, 0, 0)), 1)
+        a.add(lathe(bowl, 24).rotated("y", TAU / 4).translated((front, 0, 0)), NOZZLE)
     for y in (-0.4, 0, 0.4):
-        a.add(box((0.03, 0.05, radius * 1.1), (rear, y * radius, 0)), 3)  # a bar of the grille
+        a.add(box((0.03, 0.05, radius * 1.1), (rear, y * radius, 0)), DARK)  # a bar of the grille
     # The handle, with a switch and a cable.
-    top = np.array([-0.08, 0, -radius * 0.5])
-    bottom = np.array([-0.08 + a.u(-0.25, 0.15), 0, -a.u(0.7, 1.1)])
-    a.add(capsule(top, bottom, a.u(0.11, 0.16), a.u(0.09, 0.13)), 0 if a.chance(0.5) else 2)
-    switch = top + (bottom - top) * a.u(0.35, 0.6) + [0.13, 0, 0]
-    a.add(box((0.06, 0.1, 0.22), switch), 3)
-    a.add(capsule(bottom, bottom + [-a.u(0.1, 0.35), a.u(-0.2, 0.2), -0.38], 0.035, 0.025), 3)
+    top = point(-0.08, 0, -radius * 0.5)
+    bottom = point(-0.08 + a.uniform(-0.25, 0.15), 0, -a.uniform(0.7, 1.1))
+    a.add(
+        capsule(top, bottom, a.uniform(0.11, 0.16), a.uniform(0.09, 0.13)),
+        BODY if a.chance(0.5) else HANDLE,
+    )
+    switch = top + (bottom - top) * a.uniform(0.35, 0.6) + [0.13, 0, 0]
+    a.add(box((0.06, 0.1, 0.22), switch), DARK)
+    a.add(
+        capsule(
+            bottom, bottom + [-a.uniform(0.1, 0.35), a.uniform(-0.2, 0.2), -0.38], 0.035, 0.025
+        ),
+        DARK,
+    )
 
 
 def toaster(a: Assembly) -> None:
     """Build a toaster: one to four slots; lever, dial and buttons at the front, else symmetric."""
-    length = a.u(1.0, 1.6)
-    width = a.u(0.55, 0.85)
-    height = a.u(0.65, 0.95)
-    feet = a.u(0.03, 0.08)
+    END_PLATE = 1
+    TOP = 2
+    DARK = 3  # slots, slit, feet and cable
+    LEVER = 4
+    KNOB = 5
+    TOAST = 6
+
+    length = a.uniform(1.0, 1.6)
+    width = a.uniform(0.55, 0.85)
+    height = a.uniform(0.65, 0.95)
+    feet = a.uniform(0.03, 0.08)
     end = length / 2
     top = feet + height
     middle = feet + height / 2
     if a.chance(0.6):
-        a.add(rounded_box((length, width, height), (0, 0, middle), a.u(4, 9)), 0)
+        a.add(rounded_box((length, width, height), (0, 0, middle), a.uniform(4, 9)), BODY)
     else:
         # An arch across, the upper half of a superellipse, with end plates of another material.
         angle = np.linspace(0, np.pi, 13)
         y = width / 2 * np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** 0.6
         arch = np.stack([y, feet + height * (0.35 + 0.65 * np.sin(angle) ** 0.6)], 1)
         arch = np.concatenate([[[width / 2, feet]], arch, [[-width / 2, feet]]])
-        a.add(extrusion(arch, length * 0.84, "yz"), 0)
+        a.add(extrusion(arch, length * 0.84, "yz"), BODY)
         plate = (arch - [0, middle]) * 1.03 + [0, middle]
         for side in (-1, 1):
-            a.add(extrusion(plate, length * 0.09, "yz", side * length * 0.455), 1)
-    a.add(box((length * 0.8, width * 0.78, 0.03), (0, 0, top)), 2)
+            a.add(extrusion(plate, length * 0.09, "yz", side * length * 0.455), END_PLATE)
+    a.add(box((length * 0.8, width * 0.78, 0.03), (0, 0, top)), TOP)
     # One or two rows of slots side by side; in a long toaster, each may be divided in two.
     slot_y = width * (0.22 if a.chance(0.75) else 0)
     add_slot = a.add_pair if slot_y else a.add
@@ -210,23 +243,25 @@ def toaster(a: Assembly) -> None:
         slot = length * 0.34
     toasting = a.chance(0.3)
     for x in slots:
-        add_slot(box((slot, 0.1, 0.02), (x * length, slot_y, top + 0.016)), 3)
+        add_slot(box((slot, 0.1, 0.02), (x * length, slot_y, top + 0.016)), DARK)
         if toasting:
-            place = (x * length, slot_y, top + a.u(-0.12, 0))
-            add_slot(rounded_box((slot * 0.9, 0.07, 0.5), place, 6), 6)
+            place = (x * length, slot_y, top + a.uniform(-0.12, 0))
+            add_slot(rounded_box((slot * 0.9, 0.07, 0.5), place, 6), TOAST)
     # At the front end: the lever in its slit, a dial on the left, buttons on the right.
-    a.add(box((0.02, 0.05, height * a.u(0.25, 0.45)), (end, 0, middle + 0.05)), 3)
-    lever = (0.16, a.u(0.14, 0.3), 0.08)
-    a.add(rounded_box(lever, (end + 0.07, 0, middle + a.u(-0.1, 0.25) * height), 4), 4)
-    knob_y = a.u(0.18, 0.28) * width
+    a.add(box((0.02, 0.05, height * a.uniform(0.25, 0.45)), (end, 0, middle + 0.05)), DARK)
+    lever = (0.16, a.uniform(0.14, 0.3), 0.08)
+    a.add(rounded_box(lever, (end + 0.07, 0, middle + a.uniform(-0.1, 0.25) * height), 4), LEVER)
+    knob_y = a.uniform(0.18, 0.28) * width
     knob_z = feet + height * 0.25
-    a.add(rod((end - 0.03, knob_y, knob_z), (end + 0.07, knob_y, knob_z), a.u(0.06, 0.1)), 5)
+    a.add(
+        rod((end - 0.03, knob_y, knob_z), (end + 0.07, knob_y, knob_z), a.uniform(0.06, 0.1)), KNOB
+    )
     for z in knob_z + height * 0.14 * np.arange(1 + a.choice(3)):
-        a.add(rod((end - 0.03, -knob_y, z), (end + 0.04, -knob_y, z), 0.035), 5)
+        a.add(rod((end - 0.03, -knob_y, z), (end + 0.04, -knob_y, z), 0.035), KNOB)
     # The feet, and a cable.
     for x in (-0.36, 0.36):
         foot = cylinder(0.06, 0.07, feet * 2)
-        a.add_pair(foot.translated((x * length, width * 0.32, feet / 2)), 3)
+        a.add_pair(foot.translated((x * length, width * 0.32, feet / 2)), DARK)
     if a.chance(0.6):
-        cable_end = (-end - a.u(0.1, 0.25), a.u(-0.2, 0.2), 0.03)
-        a.add(capsule((-end, 0.1, feet + 0.1), cable_end, 0.025), 3)
+        cable_end = (-end - a.uniform(0.1, 0.25), a.uniform(-0.2, 0.2), 0.03)
+        a.add(capsule((-end, 0.1, feet + 0.1), cable_end, 0.025), DARK)

@@ -1,11 +1,12 @@
 """Vehicles and street furniture (front +x, left +y, up +z).
 
-The number in a call of `a.add` is the part's material, 0 to 7: parts of one number look alike.
+The constants at the head of a builder name its materials, 0 to 7: parts of one material look alike.
 """
 
 import numpy as np
 
 from zsp_lite.course.synthetic.assembly import (
+    BODY,
     Assembly,
     Y,
     add_wheels,
@@ -22,6 +23,7 @@ from zsp_lite.course.synthetic.primitives import (
     ellipsoid,
     extrusion,
     lathe,
+    point,
     rod,
     torus,
 )
@@ -29,130 +31,161 @@ from zsp_lite.course.synthetic.primitives import (
 
 def bicycle(a: Assembly) -> None:
     """Build a bicycle: diamond or step-through frame; flat, swept or drop bars; optional basket."""
-    wheel = a.u(0.36, 0.52)
-    tyre = a.u(0.022, 0.05)
-    tube = a.u(0.028, 0.048)
-    half_base = a.u(0.5, 0.66)
+    METAL = 2
+    RUBBER = 3
+    SADDLE = 4
+    BASKET = 5
+
+    wheel = a.uniform(0.36, 0.52)
+    tyre = a.uniform(0.022, 0.05)
+    tube = a.uniform(0.028, 0.048)
+    half_base = a.uniform(0.5, 0.66)
     # The wheels, with ten spokes each.
-    front = np.array([half_base, 0, wheel])
-    rear = np.array([-half_base, 0, wheel])
+    front = point(half_base, 0, wheel)
+    rear = point(-half_base, 0, wheel)
     for hub in (front, rear):
-        a.add(torus(wheel - tyre, tyre, Y, hub, sides=32), 3)
-        a.add(disc(0.05, 0.16, hub), 2)
+        a.add(torus(wheel - tyre, tyre, Y, hub, sides=32), RUBBER)
+        a.add(disc(0.05, 0.16, hub), METAL)
         for angle in np.arange(10) * TAU / 10:
-            rim = hub + (wheel - tyre) * np.array([np.cos(angle), 0, np.sin(angle)])
-            a.add(rod(hub, rim, 0.011, sides=5), 2)
+            rim = hub + (wheel - tyre) * point(np.cos(angle), 0, np.sin(angle))
+            a.add(rod(hub, rim, 0.011, sides=5), METAL)
     # The frame: its joints, then its tubes.
-    rise = a.u(0.5, 0.8)
-    head = front + [-a.u(0.2, 0.32), 0, rise]
-    saddle = rear + [a.u(0.22, 0.38), 0, rise * a.u(0.7, 0.98)]
-    crank = np.array([a.u(-0.12, 0.04), 0, wheel * a.u(0.6, 0.9)])
+    rise = a.uniform(0.5, 0.8)
+    head = front + [-a.uniform(0.2, 0.32), 0, rise]
+    saddle = rear + [a.uniform(0.22, 0.38), 0, rise * a.uniform(0.7, 0.98)]
+    crank = point(a.uniform(-0.12, 0.04), 0, wheel * a.uniform(0.6, 0.9))
     # low on the seat tube in a step-through frame
     top_tube_end = crank + (saddle - crank) * (0.35 if a.chance(0.35) else 0.85)
-    a.add_pair(rod(head, front + [0, 0.07, 0], tube * 0.8), 2)
+    a.add_pair(rod(head, front + [0, 0.07, 0], tube * 0.8), METAL)
     for start, end in (
         (head - [0, 0, 0.14], crank),
         (saddle, crank),
         (head - [0, 0, 0.06], top_tube_end),
     ):
-        a.add(rod(start, end, tube), 0)
+        a.add(rod(start, end, tube), BODY)
     for end in (crank, saddle - [0, 0, 0.12]):
-        a.add_pair(rod(rear + [0, 0.05, 0], end, tube * 0.6), 0)
-    a.add(ellipsoid((a.u(0.15, 0.24), a.u(0.06, 0.11), 0.05), saddle + [0, 0, 0.05]), 4)
+        a.add_pair(rod(rear + [0, 0.05, 0], end, tube * 0.6), BODY)
+    a.add(
+        ellipsoid((a.uniform(0.15, 0.24), a.uniform(0.06, 0.11), 0.05), saddle + [0, 0, 0.05]),
+        SADDLE,
+    )
 
     # The bars.
-    stem = head + [0.02, 0, a.u(0.08, 0.2)]
+    stem = head + [0.02, 0, a.uniform(0.08, 0.2)]
     bars = a.pick("flat", "swept", "drop")
-    a.add(rod(head, stem, tube), 2)
-    half_width = a.u(0.18, 0.28) if bars == "drop" else a.u(0.25, 0.4)
-    grip = stem + [0.02, half_width, a.u(0, 0.12)]
-    a.add_pair(rod(stem, grip, 0.024), 3)
+    a.add(rod(head, stem, tube), METAL)
+    half_width = a.uniform(0.18, 0.28) if bars == "drop" else a.uniform(0.25, 0.4)
+    grip = stem + [0.02, half_width, a.uniform(0, 0.12)]
+    a.add_pair(rod(stem, grip, 0.024), RUBBER)
     if bars == "swept":
-        a.add_pair(capsule(grip, grip + [-a.u(0.15, 0.28), 0.02, -0.02], 0.028), 3)
+        a.add_pair(capsule(grip, grip + [-a.uniform(0.15, 0.28), 0.02, -0.02], 0.028), RUBBER)
     elif bars == "drop":
-        a.add_pair(torus(0.09, 0.024, Y, grip - [0, 0, 0.09], 0, np.pi, sides=12), 3)
+        a.add_pair(torus(0.09, 0.024, Y, grip - [0, 0, 0.09], 0, np.pi, sides=12), RUBBER)
     # Pedals half a turn apart, and the chain ring, which is on the right side of a bicycle.
     for side in (1, -1):
-        pedal = crank + side * np.array([0.13, 0.13, -0.13])
-        a.add(rod(crank + [0, side * 0.09, 0], pedal, 0.02), 2)
-        a.add(box((0.1, 0.1, 0.025), pedal + [0, side * 0.05, 0]), 3)
-    a.add(disc(0.12, 0.02, crank - [0, 0.06, 0]), 2)
+        pedal = crank + side * point(0.13, 0.13, -0.13)
+        a.add(rod(crank + [0, side * 0.09, 0], pedal, 0.02), METAL)
+        a.add(box((0.1, 0.1, 0.025), pedal + [0, side * 0.05, 0]), RUBBER)
+    a.add(disc(0.12, 0.02, crank - [0, 0.06, 0]), METAL)
     if a.chance(0.35):
-        a.add(box((0.28, 0.34, 0.22), head + [0.2, 0, 0.05]), 5)  # the basket
+        a.add(box((0.28, 0.34, 0.22), head + [0.2, 0, 0.05]), BASKET)  # the basket
 
 
 def motorcycle(a: Assembly) -> None:
     """Build a cruiser, sport motorcycle with fairing, or scooter; the exhaust is on the right."""
-    style = a.pick("cruiser", "sport", "scooter")
-    wheel = a.u(0.26, 0.32) if style == "scooter" else a.u(0.36, 0.46)
-    tyre = a.u(0.07, 0.11)
-    half_base = a.u(0.6, 0.72) + (0.1 if style == "cruiser" else 0)
-    # The wheels with their mudguards, arcs between two angles.
-    front = np.array([half_base, 0, wheel])
-    rear = np.array([-half_base, 0, wheel])
-    for hub, start, stop in ((rear, -1.5, 0.6), (front, -0.8, 0.7)):
-        a.add(torus(wheel - tyre, tyre, Y, hub), 3)
-        a.add(disc(wheel * 0.62, 0.06, hub), 2)
-        a.add(torus(wheel + 0.04, 0.05, Y, hub, start, stop, sides=14), 0)
-    # Fork, headlamp and bars.
-    head = front + [-a.u(0.2, 0.28) - (0.15 if style == "cruiser" else 0), 0, a.u(0.55, 0.72)]
-    a.add_pair(rod(head, front + [0, 0.11, 0], 0.04), 2)
-    a.add(ellipsoid((0.1, 0.12, 0.12), head + [0.12, 0, a.u(-0.06, 0.04)]), 4)
-    grip = head + [-a.u(0.12, 0.25), a.u(0.3, 0.42), 0]
-    grip[2] += a.u(0.2, 0.4) if style == "cruiser" else a.u(0.02, 0.2)
-    a.add_pair(rod(head, grip + [0.1, -0.06, 0], 0.026), 2)
-    a.add_pair(capsule(grip + [0.1, -0.06, 0], grip, 0.035), 3)
+    ENGINE = 1
+    METAL = 2
+    RUBBER = 3
+    HEADLAMP = 4
+    GLASS = 5  # rear light and screen
+    SEAT = 6
+    EXHAUST = 7
 
-    seat_z = wheel * 2 + a.u(0, 0.12)
+    style = a.pick("cruiser", "sport", "scooter")
+    wheel = a.uniform(0.26, 0.32) if style == "scooter" else a.uniform(0.36, 0.46)
+    tyre = a.uniform(0.07, 0.11)
+    half_base = a.uniform(0.6, 0.72) + (0.1 if style == "cruiser" else 0)
+    # The wheels with their mudguards, arcs between two angles.
+    front = point(half_base, 0, wheel)
+    rear = point(-half_base, 0, wheel)
+    for hub, start, stop in ((rear, -1.5, 0.6), (front, -0.8, 0.7)):
+        a.add(torus(wheel - tyre, tyre, Y, hub), RUBBER)
+        a.add(disc(wheel * 0.62, 0.06, hub), METAL)
+        a.add(torus(wheel + 0.04, 0.05, Y, hub, start, stop, sides=14), BODY)
+    # Fork, headlamp and bars.
+    head = front + [
+        -a.uniform(0.2, 0.28) - (0.15 if style == "cruiser" else 0),
+        0,
+        a.uniform(0.55, 0.72),
+    ]
+    a.add_pair(rod(head, front + [0, 0.11, 0], 0.04), METAL)
+    a.add(ellipsoid((0.1, 0.12, 0.12), head + [0.12, 0, a.uniform(-0.06, 0.04)]), HEADLAMP)
+    grip = head + [-a.uniform(0.12, 0.25), a.uniform(0.3, 0.42), 0]
+    grip[2] += a.uniform(0.2, 0.4) if style == "cruiser" else a.uniform(0.02, 0.2)
+    a.add_pair(rod(head, grip + [0.1, -0.06, 0], 0.026), METAL)
+    a.add_pair(capsule(grip + [0.1, -0.06, 0], grip, 0.035), RUBBER)
+
+    seat_z = wheel * 2 + a.uniform(0, 0.12)
     if style == "scooter":
         # Leg shield, footboard, body, seat and rear light.
-        floor = wheel * a.u(0.75, 1.0)
-        a.add(pane((half_base - 0.3, floor), head[[0, 2]], a.u(0.4, 0.55), 0.07), 0)
-        a.add(box((half_base * 1.1, 0.36, 0.08), (0, 0, floor)), 0)
+        floor = wheel * a.uniform(0.75, 1.0)
+        a.add(pane((half_base - 0.3, floor), head[[0, 2]], a.uniform(0.4, 0.55), 0.07), BODY)
+        a.add(box((half_base * 1.1, 0.36, 0.08), (0, 0, floor)), BODY)
         body = (half_base * 1.15, 0.42, seat_z - floor + 0.1)
-        a.add(rounded_box(body, (-half_base * 0.75, 0, (seat_z + floor) / 2), 4), 0)
+        a.add(rounded_box(body, (-half_base * 0.75, 0, (seat_z + floor) / 2), 4), BODY)
         seat = (half_base * 1.05, 0.36, 0.14)
-        a.add(rounded_box(seat, (-half_base * 0.65, 0, seat_z + 0.08), 3), 6)
-        a.add(box((0.06, 0.2, 0.09), (-half_base * 1.35, 0, seat_z * 0.85)), 5)
+        a.add(rounded_box(seat, (-half_base * 0.65, 0, seat_z + 0.08), 3), SEAT)
+        a.add(box((0.06, 0.2, 0.09), (-half_base * 1.35, 0, seat_z * 0.85)), GLASS)
     else:
         # Engine, tank, the tubes between them, seat, tail and rear light.
-        engine = np.array([a.u(-0.08, 0.08), 0, wheel * a.u(0.85, 1.1)])
-        a.add(box((a.u(0.4, 0.55), 0.3, a.u(0.3, 0.42)), engine), 1)
+        engine = point(a.uniform(-0.08, 0.08), 0, wheel * a.uniform(0.85, 1.1))
+        a.add(box((a.uniform(0.4, 0.55), 0.3, a.uniform(0.3, 0.42)), engine), ENGINE)
         tank = np.array([head[0] * 0.45, 0, seat_z + 0.14])
-        a.add(ellipsoid((a.u(0.28, 0.36), a.u(0.14, 0.19), a.u(0.13, 0.18)), tank), 0)
+        a.add(
+            ellipsoid((a.uniform(0.28, 0.36), a.uniform(0.14, 0.19), a.uniform(0.13, 0.18)), tank),
+            BODY,
+        )
         for start, end in ((head, engine), (head, tank), (engine, rear)):
-            a.add_pair(rod(start + [0, 0.04, 0], end + [0, 0.06, 0], 0.032), 2)
-        a.add(rounded_box((half_base * 0.95, 0.28, 0.13), (-half_base * 0.48, 0, seat_z), 3), 6)
-        tail = np.array([-half_base * a.u(0.95, 1.25), 0, seat_z + a.u(0.08, 0.25)])
-        a.add(capsule((-half_base * 0.7, 0, seat_z), tail, 0.12, 0.06), 0)
-        a.add(box((0.05, 0.16, 0.08), tail - [0.08, 0, 0]), 5)
+            a.add_pair(rod(start + [0, 0.04, 0], end + [0, 0.06, 0], 0.032), METAL)
+        a.add(rounded_box((half_base * 0.95, 0.28, 0.13), (-half_base * 0.48, 0, seat_z), 3), SEAT)
+        tail = point(-half_base * a.uniform(0.95, 1.25), 0, seat_z + a.uniform(0.08, 0.25))
+        a.add(capsule((-half_base * 0.7, 0, seat_z), tail, 0.12, 0.06), BODY)
+        a.add(box((0.05, 0.16, 0.08), tail - [0.08, 0, 0]), GLASS)
         # A fairing with a screen.
         if style == "sport":
             upper = [[head[0] + 0.3, head[2] - 0.1], [head[0] - 0.05, head[2] + 0.12]]
             lower = [[0.05, wheel * 1.6], [0.0, wheel * 0.6], [0.35, wheel * 0.9]]
-            fairing = extrusion(upper + lower, a.u(0.34, 0.44))
-            a.add(tapered(fairing, wheel, head[2] + 0.12, 0.55), 0)
-            a.add(pane(head[[0, 2]] + [0.12, 0.08], head[[0, 2]] + [-0.08, 0.3], 0.24), 5)
-    exhaust_end = (-half_base * a.u(0.9, 1.3), -0.22, wheel * a.u(0.7, 1.3))
-    a.add(rod((0.05, -0.2, wheel * 0.6), exhaust_end, 0.05, a.u(0.06, 0.09)), 7)
+            fairing = extrusion(upper + lower, a.uniform(0.34, 0.44))
+            a.add(tapered(fairing, wheel, head[2] + 0.12, 0.55), BODY)
+            a.add(pane(head[[0, 2]] + [0.12, 0.08], head[[0, 2]] + [-0.08, 0.3], 0.24), GLASS)
+    exhaust_end = (-half_base * a.uniform(0.9, 1.3), -0.22, wheel * a.uniform(0.7, 1.3))
+    a.add(rod((0.05, -0.2, wheel * 0.6), exhaust_end, 0.05, a.uniform(0.06, 0.09)), EXHAUST)
 
 
 def car(a: Assembly) -> None:
     """Build a saloon, hatchback, pickup or van: bonnet, cabin with windows, lights, wheels."""
+    BUMPER = 2
+    GLASS = 4
+    HEADLAMP = 5
+    GRILLE = 6
+    REAR_LIGHT = 7
+
     style = a.pick("saloon", "hatchback", "pickup", "van")
-    length = a.u(2.2, 2.8)
-    width = a.u(0.95, 1.15)
-    wheel = a.u(0.2, 0.27)
+    length = a.uniform(2.2, 2.8)
+    width = a.uniform(0.95, 1.15)
+    wheel = a.uniform(0.2, 0.27)
     nose = length / 2
     tail = -nose
     # lower and upper edge of the body
-    sill = wheel * a.u(0.6, 0.9)
-    belt = wheel * a.u(2.1, 2.5)
-    roof = belt + a.u(0.3, 0.45) + (0.15 if style == "van" else 0)
-    taper = a.u(0.76, 0.88)
-    bonnet_end = nose - length * (a.u(0.11, 0.18) if style == "van" else a.u(0.24, 0.31))
+    sill = wheel * a.uniform(0.6, 0.9)
+    belt = wheel * a.uniform(2.1, 2.5)
+    roof = belt + a.uniform(0.3, 0.45) + (0.15 if style == "van" else 0)
+    taper = a.uniform(0.76, 0.88)
+    bonnet_end = nose - length * (
+        a.uniform(0.11, 0.18) if style == "van" else a.uniform(0.24, 0.31)
+    )
     boot_start = tail + length * {"saloon": 0.18, "pickup": 0.43}.get(style, 0.02)
-    nose_z = belt - (belt - sill) * a.u(0.15, 0.35)
+    nose_z = belt - (belt - sill) * a.uniform(0.15, 0.35)
     # The body, below the windows.
     front = [
         [nose, sill],
@@ -160,74 +193,87 @@ def car(a: Assembly) -> None:
         [nose - 0.04, nose_z],
         [bonnet_end, belt],
     ]
-    a.add(tapered(extrusion([[tail, sill], *front, [tail, belt]], width), sill, belt, 0.94), 0)
+    a.add(tapered(extrusion([[tail, sill], *front, [tail, belt]], width), sill, belt, 0.94), BODY)
 
     # The cabin, with a pane in front and one behind.
-    rear_slope = a.u(0.02, 0.08) if style in ("pickup", "van") else a.u(0.1, 0.3)
-    windscreen = np.array([[bonnet_end + 0.03, belt], [bonnet_end - a.u(0.2, 0.38), roof]])
+    rear_slope = a.uniform(0.02, 0.08) if style in ("pickup", "van") else a.uniform(0.1, 0.3)
+    windscreen = np.array([[bonnet_end + 0.03, belt], [bonnet_end - a.uniform(0.2, 0.38), roof]])
     rear_window = np.array([[boot_start, belt], [boot_start + rear_slope, roof]])
     cabin = np.concatenate([rear_window[:1], windscreen, rear_window[1:]])
-    a.add(tapered(extrusion(cabin, width * 0.92), belt, roof, taper), 0)
+    a.add(tapered(extrusion(cabin, width * 0.92), belt, roof, taper), BODY)
     for (low, high), out in ((windscreen, 0.015), (rear_window, -0.015)):
         # The pane leaves a margin at both edges, and is slightly outside the cabin.
         margin = (high - low) * 0.12
         glass = pane(low + margin + [out, 0], high - margin + [out, 0], width * 0.8, 0.03)
-        a.add(tapered(glass, belt, roof, taper), 4)
+        a.add(tapered(glass, belt, roof, taper), GLASS)
     # The side windows have the outline of the cabin, reduced in size, and a pillar in the middle.
     middle = cabin.mean(0)
     windows = extrusion(middle + (cabin - middle) * [0.86, 0.7], width * 0.94)
-    a.add(tapered(windows, belt, roof, taper), 4)
+    a.add(tapered(windows, belt, roof, taper), GLASS)
     pillar = pane((middle[0], belt), (middle[0], roof), width * 0.95, 0.06)
-    a.add(tapered(pillar, belt, roof, taper), 0)
+    a.add(tapered(pillar, belt, roof, taper), BODY)
     if style == "pickup":
-        wall = a.u(0.08, 0.18)
+        wall = a.uniform(0.08, 0.18)
         bed = boot_start - tail
         side = box((bed, 0.06, wall), (tail + bed / 2, width * 0.44, belt + wall / 2))
-        a.add_pair(side, 0)
-        a.add(box((0.06, width * 0.9, wall), (tail + 0.03, 0, belt + wall / 2)), 0)
+        a.add_pair(side, BODY)
+        a.add(box((0.06, width * 0.9, wall), (tail + 0.03, 0, belt + wall / 2)), BODY)
     # Headlamps, grille, rear lights, bumpers and wheels.
     light_z = sill + (nose_z - sill) * 0.72
-    lamp = ellipsoid((0.06, a.u(0.09, 0.15), a.u(0.05, 0.08)), (nose, width * 0.34, light_z))
-    a.add_pair(lamp, 5)
-    a.add(box((0.05, width * a.u(0.25, 0.4), a.u(0.07, 0.12)), (nose + 0.01, 0, light_z)), 6)
-    a.add_pair(box((0.04, 0.1, a.u(0.1, 0.2)), (tail - 0.01, width * 0.4, belt - 0.16)), 7)
+    lamp = ellipsoid(
+        (0.06, a.uniform(0.09, 0.15), a.uniform(0.05, 0.08)), (nose, width * 0.34, light_z)
+    )
+    a.add_pair(lamp, HEADLAMP)
+    a.add(
+        box((0.05, width * a.uniform(0.25, 0.4), a.uniform(0.07, 0.12)), (nose + 0.01, 0, light_z)),
+        GRILLE,
+    )
+    a.add_pair(
+        box((0.04, 0.1, a.uniform(0.1, 0.2)), (tail - 0.01, width * 0.4, belt - 0.16)), REAR_LIGHT
+    )
     for x in (nose + 0.02, tail - 0.02):
-        a.add(rounded_box((0.12, width, 0.12), (x, 0, sill + 0.06), 4), 2)
-    for x in (nose - length * a.u(0.16, 0.2), tail + length * a.u(0.17, 0.21)):
+        a.add(rounded_box((0.12, width, 0.12), (x, 0, sill + 0.06), 4), BUMPER)
+    for x in (nose - length * a.uniform(0.16, 0.2), tail + length * a.uniform(0.17, 0.21)):
         add_wheels(a, x, width / 2 - 0.05, wheel, 0.16)
 
 
 def hydrant(a: Assembly) -> None:
     """Build a hydrant: barrel, flange, bonnet; a large outlet in front, small ones at the sides."""
-    radius = a.u(0.24, 0.36)
-    height = a.u(0.9, 1.35)
-    neck = radius * a.u(0.85, 1)
+    CAP = 1
+    NUT = 2
+    RING = 3
+
+    radius = a.uniform(0.24, 0.36)
+    height = a.uniform(0.9, 1.35)
+    neck = radius * a.uniform(0.85, 1)
     rim = radius * 1.22
     cap = height * 0.82
     foot = [[0.001, 0], [radius * 1.45, 0], [radius * 1.45, 0.09], [radius, 0.11]]
     flange = [[neck, height * 0.75], [rim, height * 0.76], [rim, cap], [neck, cap + 0.01]]
-    a.add(lathe(foot + flange, 24), 0)
+    a.add(lathe(foot + flange, 24), BODY)
     # The bonnet, with the nut that opens the valve.
     t = np.linspace(0, np.pi / 2, 7)
     dome = np.stack([np.cos(t), 0.25 * np.sin(t)], 1)
     cone = [[1.05, 0], [0.9, 0.14], [0.35, 0.2], [0, 0.22]]
     bonnet = np.array(dome if a.chance(0.5) else cone) * [radius, height]
-    a.add(lathe(bonnet + [0, cap], 24), 1 if a.chance(0.6) else 0)
+    a.add(lathe(bonnet + [0, cap], 24), CAP if a.chance(0.6) else BODY)
     top = cap + bonnet[-1, 1]
-    a.add(rod((0, 0, top - 0.04), (0, 0, top + a.u(0.07, 0.14)), 0.07, sides=6), 2)
+    a.add(rod((0, 0, top - 0.04), (0, 0, top + a.uniform(0.07, 0.14)), 0.07, sides=6), NUT)
 
-    outlet = height * a.u(0.5, 0.64)
-    bore = a.u(0.15, 0.21)
-    large = (outlet, radius + a.u(0.14, 0.26), bore)  # height, reach and radius
-    small = (outlet + a.u(-0.03, 0.13), radius + a.u(0.1, 0.2), a.u(0.09, 0.13))
+    outlet = height * a.uniform(0.5, 0.64)
+    bore = a.uniform(0.15, 0.21)
+    large = (outlet, radius + a.uniform(0.14, 0.26), bore)  # height, reach and radius
+    small = (outlet + a.uniform(-0.03, 0.13), radius + a.uniform(0.1, 0.2), a.uniform(0.09, 0.13))
     # Each outlet is a pipe with a cap and a nut.
     for turn, (z, reach, pipe) in ((0, large), (TAU / 4, small), (-TAU / 4, small)):
-        a.add(rod((0, 0, z), (reach, 0, z), pipe).rotated("z", turn), 0)
-        a.add(rod((reach, 0, z), (reach + 0.1, 0, z), pipe * 1.2, sides=8).rotated("z", turn), 1)
-        a.add(rod((reach, 0, z), (reach + 0.18, 0, z), 0.05, sides=5).rotated("z", turn), 2)
+        a.add(rod((0, 0, z), (reach, 0, z), pipe).rotated("z", turn), BODY)
+        a.add(rod((reach, 0, z), (reach + 0.1, 0, z), pipe * 1.2, sides=8).rotated("z", turn), CAP)
+        a.add(rod((reach, 0, z), (reach + 0.18, 0, z), 0.05, sides=5).rotated("z", turn), NUT)
     # Eight bolts around the foot, and a ring for the chain.
     bolt = cylinder(0.035, 0.035, 0.05, 6).translated((radius * 1.27, 0, 0.11))
     for angle in np.arange(8) * TAU / 8 + 0.2:
-        a.add(bolt.rotated("z", angle), 2)
+        a.add(bolt.rotated("z", angle), NUT)
     if a.chance(0.6):
-        a.add(torus(a.u(0.1, 0.16), 0.018, Y, (radius + 0.12, 0.03, outlet - bore - 0.08)), 3)
+        a.add(
+            torus(a.uniform(0.1, 0.16), 0.018, Y, (radius + 0.12, 0.03, outlet - bore - 0.08)), RING
+        )

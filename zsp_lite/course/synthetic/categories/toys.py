@@ -1,11 +1,11 @@
 """Toys (front +x, left +y, up +z).
 
-The number in a call of `a.add` is the part's material, 0 to 7: parts of one number look alike.
+The constants at the head of a builder name its materials, 0 to 7: parts of one material look alike.
 """
 
 import numpy as np
 
-from zsp_lite.course.synthetic.assembly import Assembly, add_wheels, disc, pane, rounded_box
+from zsp_lite.course.synthetic.assembly import BODY, Assembly, add_wheels, disc, pane, rounded_box
 from zsp_lite.course.synthetic.primitives import (
     TAU,
     box,
@@ -14,137 +14,164 @@ from zsp_lite.course.synthetic.primitives import (
     ellipsoid,
     extrusion,
     lathe,
+    point,
     rod,
 )
 
 
 def teddybear(a: Assembly) -> None:
     """Build a sitting or standing teddy bear, some with a light belly or a shirt."""
-    belly = a.u(0.36, 0.55)
-    tall = a.u(0.48, 0.68)
-    skull = a.u(0.32, 0.46)
+    LIGHT_FUR = 1
+    FOOT = 2
+    DARK = 3  # nose and eyes
+    SHIRT = 4
+
+    belly = a.uniform(0.36, 0.55)
+    tall = a.uniform(0.48, 0.68)
+    skull = a.uniform(0.32, 0.46)
     standing = a.chance(0.3)
-    floor = a.u(0.35, 0.5) if standing else 0.0
-    a.add(ellipsoid((belly * 0.85, belly, tall), (0, 0, floor + tall)), 0)
+    floor = a.uniform(0.35, 0.5) if standing else 0.0
+    a.add(ellipsoid((belly * 0.85, belly, tall), (0, 0, floor + tall)), BODY)
     # The head: skull, muzzle, nose, eyes and ears.
-    head = np.array([0.05, 0, floor + tall * 1.85 + skull * 0.68])
-    a.add(ellipsoid((skull * 0.9, skull * a.u(0.95, 1.18), skull), head), 0)
-    snout = a.u(0.13, 0.26)
+    head = point(0.05, 0, floor + tall * 1.85 + skull * 0.68)
+    a.add(ellipsoid((skull * 0.9, skull * a.uniform(0.95, 1.18), skull), head), BODY)
+    snout = a.uniform(0.13, 0.26)
     face = head + [skull * 0.82, 0, 0]
-    a.add(ellipsoid((snout, a.u(0.15, 0.21), 0.15), face - [0, 0, 0.09]), 1)
-    a.add(ellipsoid((0.06, 0.075, 0.05), face + [snout * 0.92, 0, -0.04]), 3)
-    a.add_pair(ellipsoid((0.05, 0.05, 0.06), face + [0, skull * 0.36, skull * 0.22]), 3)
-    ear = a.u(0.12, 0.2)
-    ear_at = head + [0, skull * a.u(0.65, 0.85), skull * a.u(0.65, 0.85)]
-    a.add_pair(ellipsoid((0.075, ear, ear), ear_at), 1)
+    a.add(ellipsoid((snout, a.uniform(0.15, 0.21), 0.15), face - [0, 0, 0.09]), LIGHT_FUR)
+    a.add(ellipsoid((0.06, 0.075, 0.05), face + [snout * 0.92, 0, -0.04]), DARK)
+    a.add_pair(ellipsoid((0.05, 0.05, 0.06), face + [0, skull * 0.36, skull * 0.22]), DARK)
+    ear = a.uniform(0.12, 0.2)
+    ear_at = head + [0, skull * a.uniform(0.65, 0.85), skull * a.uniform(0.65, 0.85)]
+    a.add_pair(ellipsoid((0.075, ear, ear), ear_at), LIGHT_FUR)
     # Each arm has its own pose, raised or hanging.
     for side in (1, -1):
-        shoulder = np.array([0, side * belly * 0.8, floor + tall * 1.45])
-        hand = shoulder + [a.u(-0.05, 0.45), side * a.u(0.2, 0.42), a.u(-0.5, 0.45)]
-        a.add(capsule(shoulder, hand, a.u(0.12, 0.16), a.u(0.12, 0.18)), 0)
+        shoulder = point(0, side * belly * 0.8, floor + tall * 1.45)
+        hand = shoulder + [
+            a.uniform(-0.05, 0.45),
+            side * a.uniform(0.2, 0.42),
+            a.uniform(-0.5, 0.45),
+        ]
+        a.add(capsule(shoulder, hand, a.uniform(0.12, 0.16), a.uniform(0.12, 0.18)), BODY)
     # Legs and feet; those of a sitting bear show their soles.
-    leg = a.u(0.14, 0.21)
+    leg = a.uniform(0.14, 0.21)
     if standing:
-        foot = np.array([0.08, belly * 0.6, leg])
-        a.add_pair(capsule((0, belly * 0.5, floor + tall * 0.4), foot, leg), 0)
-        a.add_pair(ellipsoid((leg * 1.5, leg, leg * 0.7), foot + [0.1, 0, -leg * 0.35]), 2)
+        foot = point(0.08, belly * 0.6, leg)
+        a.add_pair(capsule((0, belly * 0.5, floor + tall * 0.4), foot, leg), BODY)
+        a.add_pair(ellipsoid((leg * 1.5, leg, leg * 0.7), foot + [0.1, 0, -leg * 0.35]), FOOT)
     else:
-        foot = np.array([a.u(0.45, 0.75), belly * a.u(0.7, 1.1), leg])
-        a.add_pair(capsule((0.1, belly * 0.55, 0.15), foot, leg), 0)
+        foot = point(a.uniform(0.45, 0.75), belly * a.uniform(0.7, 1.1), leg)
+        a.add_pair(capsule((0.1, belly * 0.55, 0.15), foot, leg), BODY)
         sole = ellipsoid((0.07, leg * 0.85, leg * 1.15), foot + [leg * 0.85, 0, 0.05])
-        a.add_pair(sole, 1)
+        a.add_pair(sole, LIGHT_FUR)
     # The tail; then a light belly, a shirt, or neither.
-    a.add(ellipsoid((0.1, 0.1, 0.1), (-belly * 0.85, 0, floor + 0.25)), 0)
+    a.add(ellipsoid((0.1, 0.1, 0.1), (-belly * 0.85, 0, floor + 0.25)), BODY)
     if a.chance(0.6):
         light = (belly * 0.3, belly * 0.65, tall * 0.65)
-        a.add(ellipsoid(light, (belly * 0.62, 0, floor + tall * 0.95)), 1)
+        a.add(ellipsoid(light, (belly * 0.62, 0, floor + tall * 0.95)), LIGHT_FUR)
     elif a.chance(0.6):
         shirt = np.array([[0.97, 0.75], [1.04, 1.0], [0.96, 1.4], [0.66, 1.78]]) * [belly, tall]
-        a.add(lathe(shirt, 24).scaled((0.87, 1, 1)).translated((0, 0, floor)), 4)
+        a.add(lathe(shirt, 24).scaled((0.87, 1, 1)).translated((0, 0, floor)), SHIRT)
 
 
 def toyplane(a: Assembly) -> None:
     """Build a propeller plane or a jet: one or two wings, tail, engines, cockpit, some wheels."""
-    length = a.u(1.6, 2.6)
-    radius = a.u(0.16, 0.32)
+    WING = 1
+    FIN = 2
+    METAL = 3
+    GLASS = 4
+    BLADE = 5
+    TYRE = 6
+
+    length = a.uniform(1.6, 2.6)
+    radius = a.uniform(0.16, 0.32)
     nose = length / 2
     tail = -nose
     jet = a.chance(0.4)
-    a.add(capsule((tail, 0, 0), (nose - radius, 0, 0), radius * a.u(0.35, 0.7), radius), 0)
+    a.add(capsule((tail, 0, 0), (nose - radius, 0, 0), radius * a.uniform(0.35, 0.7), radius), BODY)
     # The wing: its outline on the left side, from the leading to the trailing edge.
-    span = a.u(0.8, 1.5)
-    chord = a.u(0.3, 0.6)
-    wing_x = a.u(-0.1, 0.3)
-    sweep = a.u(0.25, 0.6) if jet else a.u(-0.05, 0.2)
+    span = a.uniform(0.8, 1.5)
+    chord = a.uniform(0.3, 0.6)
+    wing_x = a.uniform(-0.1, 0.3)
+    sweep = a.uniform(0.25, 0.6) if jet else a.uniform(-0.05, 0.2)
     lead = wing_x + chord / 2
     trail = wing_x - chord / 2
     wing = [
         [lead, 0],
         [lead - sweep, span],
-        [trail - sweep + chord * a.u(0.1, 0.4), span],
+        [trail - sweep + chord * a.uniform(0.1, 0.4), span],
         [trail, 0],
     ]
     biplane = not jet and a.chance(0.35)
     if biplane:
         wing_z = -radius * 0.7
     elif a.chance(0.7):
-        wing_z = a.u(-0.12, 0.1)
+        wing_z = a.uniform(-0.12, 0.1)
     else:
         wing_z = radius
-    a.add_pair(extrusion(wing, 0.06, "xy", wing_z), 1)
+    a.add_pair(extrusion(wing, 0.06, "xy", wing_z), WING)
     # A biplane has a second wing, and struts between the two.
     if biplane:
         upper = radius * 1.6
-        a.add_pair(extrusion(wing, 0.06, "xy", upper), 1)
+        a.add_pair(extrusion(wing, 0.06, "xy", upper), WING)
         for x in (lead - 0.1, trail + 0.1):
-            place = np.array([x - sweep * 0.6, span * 0.65, 0])
-            a.add_pair(rod(place + [0, 0, wing_z], place + [0, 0, upper], 0.02), 3)
+            place = point(x - sweep * 0.6, span * 0.65, 0)
+            a.add_pair(rod(place + [0, 0, wing_z], place + [0, 0, upper], 0.02), METAL)
     # The tail: a fin, and a stabiliser at its foot or at its top.
-    fin = a.u(0.3, 0.6)
-    stabiliser = a.u(0.3, 0.55)
+    fin = a.uniform(0.3, 0.6)
+    stabiliser = a.uniform(0.3, 0.55)
     outline = [[tail + 0.35, 0], [tail + 0.05, fin], [tail - 0.12, fin], [tail - 0.02, 0]]
-    a.add(extrusion(outline, 0.06), 2)
+    a.add(extrusion(outline, 0.06), FIN)
     outline = [[tail + 0.3, 0], [tail + 0.1, stabiliser], [tail - 0.1, stabiliser], [tail, 0]]
     z = 0.05 if a.chance(0.75) else fin * 0.92
-    a.add_pair(extrusion(outline, 0.05, "xy", z), 1)
+    a.add_pair(extrusion(outline, 0.05, "xy", z), WING)
     # Two jet engines, or a propeller.
     if jet:
         below_wing = (wing_x - sweep * 0.4, span * 0.4, wing_z - 0.13)
         engine = np.array(below_wing if a.chance(0.6) else (tail + 0.55, radius + 0.1, 0.08))
-        a.add_pair(rod(engine - [0.2, 0, 0], engine + [0.2, 0, 0], 0.08, a.u(0.1, 0.13)), 3)
+        a.add_pair(
+            rod(engine - [0.2, 0, 0], engine + [0.2, 0, 0], 0.08, a.uniform(0.1, 0.13)), METAL
+        )
     else:
-        a.add(ellipsoid((0.12, 0.09, 0.09), (nose + 0.05, 0, 0)), 3)
-        blade = a.u(0.3, 0.45)
-        turn = a.u(0, np.pi)
+        a.add(ellipsoid((0.12, 0.09, 0.09), (nose + 0.05, 0, 0)), METAL)
+        blade = a.uniform(0.3, 0.45)
+        turn = a.uniform(0, np.pi)
         n_blades = 2 + a.choice(3)
         for k in range(n_blades):
             upright = box((0.035, 0.1, blade), (nose + 0.08, 0, blade / 2))
-            a.add(upright.rotated("x", turn + k * TAU / n_blades), 5)
+            a.add(upright.rotated("x", turn + k * TAU / n_blades), BLADE)
     # The cockpit, and wheels on struts.
-    cockpit = (a.u(0.2, 0.35), radius * 0.7, radius * 0.7)
-    a.add(ellipsoid(cockpit, (length * a.u(0.16, 0.28), 0, radius * 0.75)), 4)
+    cockpit = (a.uniform(0.2, 0.35), radius * 0.7, radius * 0.7)
+    a.add(ellipsoid(cockpit, (length * a.uniform(0.16, 0.28), 0, radius * 0.75)), GLASS)
     if a.chance(0.6):
-        gear = np.array([wing_x + 0.1, 0.25, -radius - 0.22])
-        a.add_pair(rod(gear * [1, 0.6, 0], gear, 0.025), 3)
-        a.add_pair(disc(0.1, 0.07, gear), 6)
+        gear = point(wing_x + 0.1, 0.25, -radius - 0.22)
+        a.add_pair(rod(gear * [1, 0.6, 0], gear, 0.025), METAL)
+        a.add_pair(disc(0.1, 0.07, gear), TYRE)
 
 
 def toytruck(a: Assembly) -> None:
     """Build a truck: cab, some with a bonnet; a box, flat bed, tank, tipper or crane behind."""
-    length = a.u(1.7, 2.6)
-    width = a.u(0.7, 1.0)
-    wheel = a.u(0.16, 0.28)
+    CAB = 0
+    LOAD = 1
+    CHASSIS = 2
+    CABLE = 3
+    GLASS = 4
+    HEADLAMP = 5
+    GRILLE = 6
+
+    length = a.uniform(1.7, 2.6)
+    width = a.uniform(0.7, 1.0)
+    wheel = a.uniform(0.16, 0.28)
     nose = length / 2
     tail = -nose
     deck = wheel * 1.3
-    cab_length = a.u(0.4, 0.65)
-    cab_height = a.u(0.5, 0.85)
-    slope = a.u(0.04, 0.18)
-    a.add(box((length, width * 0.8, 0.12), (0, 0, deck)), 2)
-    bonnet = a.u(0.25, 0.45) if a.chance(0.5) else 0.0
+    cab_length = a.uniform(0.4, 0.65)
+    cab_height = a.uniform(0.5, 0.85)
+    slope = a.uniform(0.04, 0.18)
+    a.add(box((length, width * 0.8, 0.12), (0, 0, deck)), CHASSIS)
+    bonnet = a.uniform(0.25, 0.45) if a.chance(0.5) else 0.0
     if bonnet:
         size = (bonnet * 1.3, width * 0.85, cab_height * 0.55)
-        a.add(rounded_box(size, (nose - bonnet * 0.5, 0, deck + cab_height * 0.26), 6), 0)
+        a.add(rounded_box(size, (nose - bonnet * 0.5, 0, deck + cab_height * 0.26), 6), CAB)
     # The cab: its outline from the side, windows, headlamps and grille.
     front = nose - bonnet * 0.85
     roof = deck + cab_height
@@ -152,39 +179,51 @@ def toytruck(a: Assembly) -> None:
     # lower and upper edge of the windscreen
     bend = (front, deck + cab_height * 0.5)
     top = (front - slope, roof)
-    a.add(extrusion([(rear, deck + 0.04), (front, deck + 0.04), bend, top, (rear, roof)], width), 0)
+    a.add(
+        extrusion([(rear, deck + 0.04), (front, deck + 0.04), bend, top, (rear, roof)], width), CAB
+    )
     side_window = (cab_length * 0.5, width * 1.02, cab_height * 0.3)
-    a.add(box(side_window, (rear + cab_length * 0.48, 0, deck + cab_height * 0.72)), 4)
-    a.add(pane(np.add(bend, [0.01, 0.04]), np.add(top, [0.01, -0.04]), width * 0.84), 4)
+    a.add(box(side_window, (rear + cab_length * 0.48, 0, deck + cab_height * 0.72)), GLASS)
+    a.add(pane(np.add(bend, [0.01, 0.04]), np.add(top, [0.01, -0.04]), width * 0.84), GLASS)
     lamp = ellipsoid((0.05, 0.08, 0.08), (nose, width * 0.34, deck + cab_height * 0.28))
-    a.add_pair(lamp, 5)
-    a.add(box((0.06, width * 0.4, cab_height * 0.2), (nose + 0.01, 0, deck + cab_height * 0.27)), 6)
+    a.add_pair(lamp, HEADLAMP)
+    a.add(
+        box((0.06, width * 0.4, cab_height * 0.2), (nose + 0.01, 0, deck + cab_height * 0.27)),
+        GRILLE,
+    )
 
     load = rear - 0.05 - tail  # the length behind the cab
     load_x = tail + load / 2
     style = a.pick("box", "tank", "crane", "tipper", "flat bed")
     if style == "box":
-        height = a.u(0.6, 1.0)
-        a.add(box((load, width * a.u(0.95, 1.1), height), (load_x, 0, deck + 0.08 + height / 2)), 1)
+        height = a.uniform(0.6, 1.0)
+        a.add(
+            box(
+                (load, width * a.uniform(0.95, 1.1), height), (load_x, 0, deck + 0.08 + height / 2)
+            ),
+            LOAD,
+        )
     elif style == "tank":
-        radius = width * a.u(0.38, 0.5)
-        a.add(rod((tail, 0, deck + radius), (tail + load, 0, deck + radius), radius, sides=22), 1)
+        radius = width * a.uniform(0.38, 0.5)
+        a.add(
+            rod((tail, 0, deck + radius), (tail + load, 0, deck + radius), radius, sides=22), LOAD
+        )
     elif style == "crane":
-        mast = np.array([load_x, 0, deck + 0.3])
-        jib = mast + [-load * a.u(0.4, 0.7), 0, a.u(0.5, 0.9)]
-        a.add(cylinder(width * 0.35, width * 0.35, 0.2).translated((load_x, 0, deck + 0.16)), 1)
-        a.add(box((0.3, 0.3, 0.3), mast + [0, 0, 0.08]), 1)
-        a.add(rod(mast, jib, 0.07, 0.05), 1)
-        a.add(rod(jib, jib - [0, 0, 0.45], 0.02), 3)
+        mast = point(load_x, 0, deck + 0.3)
+        jib = mast + [-load * a.uniform(0.4, 0.7), 0, a.uniform(0.5, 0.9)]
+        a.add(cylinder(width * 0.35, width * 0.35, 0.2).translated((load_x, 0, deck + 0.16)), LOAD)
+        a.add(box((0.3, 0.3, 0.3), mast + [0, 0, 0.08]), LOAD)
+        a.add(rod(mast, jib, 0.07, 0.05), LOAD)
+        a.add(rod(jib, jib - [0, 0, 0.45], 0.02), CABLE)
     else:
         # A tipper is a flat bed that is tilted about its rear edge.
-        tilt = a.u(0.15, 0.6) if style == "tipper" else 0.0
-        wall = a.u(0.2, 0.45)
+        tilt = a.uniform(0.15, 0.6) if style == "tipper" else 0.0
+        wall = a.uniform(0.2, 0.45)
         bottom = box((load, width, 0.06), (load / 2, 0, 0))
         front_wall = box((0.06, width, wall), (load, 0, wall / 2))
         side_wall = box((load, 0.06, wall), (load / 2, width / 2, wall / 2))
         for mesh in (bottom, front_wall, side_wall, side_wall.mirrored()):
-            a.add(mesh.rotated("y", -tilt).translated((tail, 0, deck + 0.1)), 1)
+            a.add(mesh.rotated("y", -tilt).translated((tail, 0, deck + 0.1)), LOAD)
     # One rear axle or two, and one below the cab.
     rear_axles = [tail + 0.3] if a.chance(0.5) else [tail + 0.25, tail + 0.25 + 2.1 * wheel]
     for x in (nose - cab_length * 0.6 - 0.1, *rear_axles):
@@ -193,29 +232,37 @@ def toytruck(a: Assembly) -> None:
 
 def toybus(a: Assembly) -> None:
     """Build a city bus, double-decker or school bus with a bonnet; doors on the right."""
+    STRIPE = 1
+    GLASS = 4
+    HEADLAMP = 5
+    DOOR = 6  # and destination sign
+    REAR_LIGHT = 7
+
     style = a.pick("city bus", "double-decker", "school bus")
     n_floors = 2 if style == "double-decker" else 1
-    length = a.u(1.9, 2.9)
-    width = a.u(0.65, 0.9)
-    wheel = a.u(0.15, 0.22)
-    height = a.u(0.65, 0.85) * (1.6 if n_floors == 2 else 1)
+    length = a.uniform(1.9, 2.9)
+    width = a.uniform(0.65, 0.9)
+    wheel = a.uniform(0.15, 0.22)
+    height = a.uniform(0.65, 0.85) * (1.6 if n_floors == 2 else 1)
     nose = length / 2
     tail = -nose
     floor = wheel * 0.8
     # A bonnet, or a destination sign at the front.
-    bonnet = a.u(0.3, 0.45) if style == "school bus" else 0.0
+    bonnet = a.uniform(0.3, 0.45) if style == "school bus" else 0.0
     if bonnet:
         size = (bonnet * 1.4, width * 0.8, height * 0.5)
-        a.add(rounded_box(size, (nose - bonnet * 0.6, 0, floor + height * 0.25), 6), 0)
+        a.add(rounded_box(size, (nose - bonnet * 0.6, 0, floor + height * 0.25), 6), BODY)
     else:
-        a.add(box((0.05, width * 0.7, height * 0.1), (nose, 0, floor + height * 0.93)), 6)
+        a.add(box((0.05, width * 0.7, height * 0.1), (nose, 0, floor + height * 0.93)), DOOR)
     # The body with a stripe along it.
     front = nose - bonnet
     body = front - tail
     middle = (front + tail) / 2
-    a.add(rounded_box((body, width, height), (middle, 0, floor + height / 2), a.u(7, 14)), 0)
-    stripe = (body * 0.96, width * 1.02, height * a.u(0.04, 0.1))
-    a.add(box(stripe, (middle, 0, floor + height * 0.3)), 1)
+    a.add(
+        rounded_box((body, width, height), (middle, 0, floor + height / 2), a.uniform(7, 14)), BODY
+    )
+    stripe = (body * 0.96, width * 1.02, height * a.uniform(0.04, 0.1))
+    a.add(box(stripe, (middle, 0, floor + height * 0.3)), STRIPE)
     # The windows of each floor: at the sides, in front and behind.
     n_windows = 4 + a.choice(4)
     window_height = height * (0.2 if n_floors == 2 else 0.3)
@@ -225,68 +272,81 @@ def toybus(a: Assembly) -> None:
         z = floor + height * share
         for k in range(n_windows):
             x = tail + body * 0.05 + (k + 0.5) * pitch
-            a.add(box((pitch * 0.82, width * 1.015, window_height), (x, 0, z)), 4)
-        a.add(box((0.04, width * 0.84, window_height * 1.2), (front, 0, z)), 4)
-        a.add(box((0.04, width * 0.6, window_height * 0.8), (tail, 0, z)), 4)
+            a.add(box((pitch * 0.82, width * 1.015, window_height), (x, 0, z)), GLASS)
+        a.add(box((0.04, width * 0.84, window_height * 1.2), (front, 0, z)), GLASS)
+        a.add(box((0.04, width * 0.6, window_height * 0.8), (tail, 0, z)), GLASS)
     # The door on the right, headlamps and rear lights.
     door = height * (0.42 if n_floors == 2 else 0.72)
     place = (front - body * 0.12, -width / 2, floor + 0.06 + door / 2)
-    a.add(box((pitch * 0.9, 0.04, door), place), 6)
-    a.add_pair(ellipsoid((0.05, 0.07, 0.07), (nose, width * 0.33, floor + 0.14)), 5)
-    a.add_pair(box((0.03, 0.09, 0.14), (tail, width * 0.4, floor + 0.2)), 7)
-    for x in (nose - length * a.u(0.18, 0.24), tail + length * a.u(0.17, 0.24)):
+    a.add(box((pitch * 0.9, 0.04, door), place), DOOR)
+    a.add_pair(ellipsoid((0.05, 0.07, 0.07), (nose, width * 0.33, floor + 0.14)), HEADLAMP)
+    a.add_pair(box((0.03, 0.09, 0.14), (tail, width * 0.4, floor + 0.2)), REAR_LIGHT)
+    for x in (nose - length * a.uniform(0.18, 0.24), tail + length * a.uniform(0.17, 0.24)):
         add_wheels(a, x, width / 2 - 0.04, wheel, 0.12)
 
 
 def toytrain(a: Assembly) -> None:
     """Build a locomotive: steam engine with boiler, chimney and cab, or diesel with a long hood."""
-    length = a.u(1.6, 2.3)
-    width = a.u(0.6, 0.8)
-    wheel = a.u(0.14, 0.24)
+    ROOF = 1
+    CHASSIS = 2
+    CHIMNEY = 3
+    GLASS = 4
+    LAMP = 5
+    BOILER_DOOR = 6
+    BRASS = 7  # dome, cowcatcher and rods
+
+    length = a.uniform(1.6, 2.3)
+    width = a.uniform(0.6, 0.8)
+    wheel = a.uniform(0.14, 0.24)
     nose = length / 2
     tail = -nose
     deck = wheel * 1.5
-    a.add(box((length, width * 0.85, 0.12), (0, 0, deck)), 2)
+    a.add(box((length, width * 0.85, 0.12), (0, 0, deck)), CHASSIS)
     # The cab with windows and a roof.
-    cab_length = length * a.u(0.22, 0.34)
-    cab_height = a.u(0.65, 0.95)
+    cab_length = length * a.uniform(0.22, 0.34)
+    cab_height = a.uniform(0.65, 0.95)
     cab_x = tail + cab_length / 2 + 0.04
     floor = deck + 0.06
-    a.add(box((cab_length, width, cab_height), (cab_x, 0, floor + cab_height / 2)), 0)
+    a.add(box((cab_length, width, cab_height), (cab_x, 0, floor + cab_height / 2)), BODY)
     windows = (cab_length * 0.5, width * 1.03, cab_height * 0.3)
-    a.add(box(windows, (cab_x, 0, deck + cab_height * 0.72)), 4)
-    roof = (cab_length * 0.68, width * 0.6, a.u(0.08, 0.18))
-    a.add(ellipsoid(roof, (cab_x, 0, floor + cab_height)), 1)
+    a.add(box(windows, (cab_x, 0, deck + cab_height * 0.72)), GLASS)
+    roof = (cab_length * 0.68, width * 0.6, a.uniform(0.08, 0.18))
+    a.add(ellipsoid(roof, (cab_x, 0, floor + cab_height)), ROOF)
     # Before the cab, a boiler with chimney, dome and lamp, or a hood with lamps and exhaust.
     rear = tail + cab_length
     front = nose - 0.06
     if a.chance(0.7):
-        radius = width * a.u(0.34, 0.46)
+        radius = width * a.uniform(0.34, 0.46)
         boiler = floor + radius
         top = floor + radius * 1.9
-        a.add(rod((rear, 0, boiler), (front, 0, boiler), radius, sides=24), 0)
-        a.add(rod((front, 0, boiler), (front + 0.05, 0, boiler), radius * 0.86, sides=24), 6)
-        chimney = a.u(0.2, 0.45)
-        mouth = a.u(0.08, 0.18)
+        a.add(rod((rear, 0, boiler), (front, 0, boiler), radius, sides=24), BODY)
+        a.add(
+            rod((front, 0, boiler), (front + 0.05, 0, boiler), radius * 0.86, sides=24), BOILER_DOOR
+        )
+        chimney = a.uniform(0.2, 0.45)
+        mouth = a.uniform(0.08, 0.18)
         # Its ends are closed; the radius 0 would give triangles without an area.
         profile = [[0.001, 0], [0.09, 0], [0.09, chimney * 0.6], [mouth, chimney], [0.001, chimney]]
-        a.add(lathe(profile).translated((front - 0.2, 0, top)), 3)
-        a.add(ellipsoid((0.13, 0.13, a.u(0.12, 0.2)), (rear + (front - rear) * 0.42, 0, top)), 7)
-        a.add(rod((front, 0, boiler), (front + 0.15, 0, boiler), 0.08, 0.1), 5)
+        a.add(lathe(profile).translated((front - 0.2, 0, top)), CHIMNEY)
+        a.add(
+            ellipsoid((0.13, 0.13, a.uniform(0.12, 0.2)), (rear + (front - rear) * 0.42, 0, top)),
+            BRASS,
+        )
+        a.add(rod((front, 0, boiler), (front + 0.15, 0, boiler), 0.08, 0.1), LAMP)
     else:
-        hood_width = width * a.u(0.7, 0.95)
-        hood_height = cab_height * a.u(0.55, 0.8)
+        hood_width = width * a.uniform(0.7, 0.95)
+        hood_height = cab_height * a.uniform(0.55, 0.8)
         middle = (rear + front) / 2
         hood = (front - rear, hood_width, hood_height)
-        a.add(rounded_box(hood, (middle, 0, floor + hood_height / 2), 9), 0)
+        a.add(rounded_box(hood, (middle, 0, floor + hood_height / 2), 9), BODY)
         lamp = ellipsoid((0.05, 0.07, 0.07), (front, width * 0.22, deck + hood_height * 0.8))
-        a.add_pair(lamp, 5)
-        a.add(box((0.25, width * 0.3, 0.14), (middle, 0, deck + 0.1 + hood_height)), 3)
+        a.add_pair(lamp, LAMP)
+        a.add(box((0.25, width * 0.3, 0.14), (middle, 0, deck + 0.1 + hood_height)), CHIMNEY)
     # The cowcatcher; wheels on two to four axles, and the rods that connect them.
-    cowcatcher = [[nose, deck + 0.05], [nose + a.u(0.12, 0.25), 0.05], [nose, 0.05]]
-    a.add(extrusion(cowcatcher, width * 0.75), 7)
+    cowcatcher = [[nose, deck + 0.05], [nose + a.uniform(0.12, 0.25), 0.05], [nose, 0.05]]
+    a.add(extrusion(cowcatcher, width * 0.75), BRASS)
     axles = np.linspace(tail + wheel * 1.3, nose - wheel * 1.6, 2 + a.choice(3))
     for x in axles:
         add_wheels(a, x, width / 2 - 0.03, wheel, 0.08)
     connection = (axles[-1] - axles[0], 0.03, 0.05)
-    a.add_pair(box(connection, (axles.mean(), width / 2 + 0.06, wheel)), 7)
+    a.add_pair(box(connection, (axles.mean(), width / 2 + 0.06, wheel)), BRASS)
