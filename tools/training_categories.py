@@ -6,7 +6,7 @@ its materials, 0 to 7: parts of one material look alike.
 
 import numpy as np
 
-from zsp_lite.course.synthetic.assembly import BODY, Assembly, X, Y, disc
+from zsp_lite.course.synthetic.assembly import Assembly, X, Y, by_name, disc
 from zsp_lite.course.synthetic.primitives import (
     TAU,
     box,
@@ -33,15 +33,14 @@ def quadruped(a: Assembly) -> None:
     z = leg + radius * 0.6
     front = length / 2
     chest = (front, 0, z + a.uniform(-0.05, 0.1))
-    a.add(capsule((-front, 0, z), chest, radius * a.uniform(0.8, 1), radius), BODY)
+    a.add(capsule((-front, 0, z), chest, radius * a.uniform(0.8, 1), radius))
     for x in (-front, front - 0.05):
         foot = (x + a.uniform(-0.1, 0.1), radius * 0.65, 0.06)
         hip = (x, radius * 0.6, z - 0.05)
-        a.add_pair(capsule(hip, foot, a.uniform(0.08, 0.13), a.uniform(0.06, 0.1)), BODY)
+        a.add_pair(capsule(hip, foot, a.uniform(0.08, 0.13), a.uniform(0.06, 0.1)))
     # The neck, the snout, the ears and the eyes.
     head = point(front + a.uniform(0.1, 0.4), 0, z + a.uniform(0.25, 0.9))
-    neck = (front, 0, z + 0.1)
-    a.add(capsule(neck, head, a.uniform(0.12, 0.2), a.uniform(0.1, 0.18)), BODY)
+    a.add(capsule((front, 0, z + 0.1), head, a.uniform(0.12, 0.2), a.uniform(0.1, 0.18)))
     nose = head + [a.uniform(0.2, 0.4), 0, -0.08]
     a.add(capsule(head, nose, a.uniform(0.15, 0.24), a.uniform(0.09, 0.15)), SNOUT)
     if a.chance(0.8):
@@ -60,7 +59,7 @@ def fish(a: Assembly) -> None:
 
     length = a.uniform(0.8, 1.2)
     height = a.uniform(0.3, 0.6)
-    a.add(ellipsoid((length, a.uniform(0.15, 0.35), height)), BODY)
+    a.add(ellipsoid((length, a.uniform(0.15, 0.35), height)))
     tail = [
         [-length * 0.85, 0],
         [-length * 1.5, a.uniform(0.3, 0.55)],
@@ -89,11 +88,11 @@ def teapot(a: Assembly) -> None:
     belly = (radius, height * a.uniform(0.3, 0.7))
     neck = (radius * a.uniform(0.4, 0.7), height)
     # The radius 0 would give triangles without an area.
-    a.add(lathe([(0.001, 0), (radius * 0.7, 0), belly, neck, (0.001, height)]), BODY)
+    a.add(lathe([(0.001, 0), (radius * 0.7, 0), belly, neck, (0.001, height)]))
     a.add(ellipsoid((radius * 0.5, radius * 0.5, 0.12), (0, 0, height)), LID)
     a.add(ellipsoid((0.09, 0.09, 0.1), (0, 0, height + 0.15)), HANDLE)
     spout = (radius * 1.25, 0, height * a.uniform(0.7, 1.1))
-    a.add(rod((radius * 0.75, 0, height * 0.35), spout, 0.14, 0.06), BODY)
+    a.add(rod((radius * 0.75, 0, height * 0.35), spout, 0.14, 0.06))
     # The handle is a little less than half a ring.
     ring = height * a.uniform(0.25, 0.35)
     place = (-radius * 0.9, 0, height * 0.5)
@@ -108,9 +107,9 @@ def guitar(a: Assembly) -> None:
 
     radius = a.uniform(0.4, 0.55)
     neck = a.uniform(1.0, 1.5)
-    a.add(cylinder(radius, radius, 0.22, 24).rotated("y", TAU / 4), BODY)
-    upper = cylinder(radius * 0.75, radius * 0.75, 0.22, 24).rotated("y", TAU / 4)
-    a.add(upper.translated((0, 0, radius * 1.1)), BODY)
+    # The lower and the upper half of the body.
+    for half, z in ((radius, 0), (radius * 0.75, radius * 1.1)):
+        a.add(cylinder(half, half, 0.22, 24).rotated("y", TAU / 4).translated((0, 0, z)))
     hole = cylinder(0.14, 0.14, 0.24, 16).rotated("y", TAU / 4)
     a.add(hole.translated((0.01, 0, radius * 0.75)), HOLE)
     shoulder = radius * 1.6
@@ -129,7 +128,7 @@ def camera(a: Assembly) -> None:
     width = a.uniform(1.0, 1.5)
     height = a.uniform(0.6, 0.9)
     depth = a.uniform(0.3, 0.5)
-    a.add(box((depth, width, height)), BODY)
+    a.add(box((depth, width, height)))
     radius = a.uniform(0.2, 0.33)
     lens = a.uniform(0.2, 0.7)
     y = a.uniform(-0.15, 0.15)
@@ -145,24 +144,23 @@ def camera(a: Assembly) -> None:
 
 def lamp(a: Assembly) -> None:
     """Build a desk lamp: foot, an arm of two rods with a joint, shade and bulb."""
-    FOOT = 0
     ARM = 1
     JOINT = 2
     SHADE = 3
     BULB = 4
 
-    a.add(cylinder(a.uniform(0.3, 0.5), a.uniform(0.2, 0.4), 0.1), FOOT)
+    a.add(cylinder(a.uniform(0.3, 0.5), a.uniform(0.2, 0.4), 0.1))
     knee = point(-a.uniform(0.1, 0.5), 0, a.uniform(0.5, 0.9))
-    elbow = np.array([a.uniform(0.1, 0.6), 0, knee[2] + a.uniform(0.2, 0.6)])
+    elbow = point(a.uniform(0.1, 0.6), 0, knee[2] + a.uniform(0.2, 0.6))
     a.add(rod((0, 0, 0.05), knee, 0.04), ARM)
     a.add(rod(knee, elbow, 0.04), ARM)
-    a.add(ellipsoid((0.08, 0.08, 0.08), knee), JOINT)
+    a.add(ellipsoid(0.08, knee), JOINT)
     # The shade opens along the beam.
     beam = point(a.uniform(0.2, 0.7), 0, -a.uniform(0.1, 0.8))
     beam /= np.linalg.norm(beam)
     mouth = elbow + beam * a.uniform(0.35, 0.55)
     a.add(rod(elbow - beam * 0.1, mouth, 0.1, a.uniform(0.25, 0.4), 18), SHADE)
-    a.add(ellipsoid((0.1, 0.1, 0.1), elbow + beam * 0.35), BULB)
+    a.add(ellipsoid(0.1, elbow + beam * 0.35), BULB)
 
 
 def cart(a: Assembly) -> None:
@@ -180,9 +178,9 @@ def cart(a: Assembly) -> None:
     flare = a.uniform(0, 0.2)
     front = length / 2
     side = width / 2
-    a.add(box((length, width, 0.06), (0, 0, floor)), BODY)
+    a.add(box((length, width, 0.06), (0, 0, floor)))
     panel = [[-front, floor], [front, floor], [front + flare, top], [-front - flare * 0.3, top]]
-    a.add_pair(extrusion(panel, 0.05, "xz", side), BODY)
+    a.add_pair(extrusion(panel, 0.05, "xz", side))
     for x in (-front, front + flare * 0.5):
         a.add(box((0.05, width, height), (x, 0, floor + height / 2)), END)
     grip = point(-front - a.uniform(0.2, 0.5), width * 0.45, top + a.uniform(0.1, 0.5))
@@ -211,7 +209,7 @@ def rocket(a: Assembly) -> None:
         [radius * 0.4, height * 0.9],
         [0.001, height],
     ]
-    a.add(lathe(profile), BODY)
+    a.add(lathe(profile))
     porthole = (radius * 0.85, 0, height * 0.6)
     a.add(torus(radius * 0.45, 0.05, X, porthole), RIM)
     a.add(ellipsoid((0.06, radius * 0.4, radius * 0.4), porthole), GLASS)
@@ -224,7 +222,6 @@ def rocket(a: Assembly) -> None:
 
 def windmill(a: Assembly) -> None:
     """Build a windmill of eight walls with three to five vanes, door and window in front."""
-    WALL = 0
     ROOF = 1
     AXLE = 2
     VANE = 3
@@ -233,8 +230,7 @@ def windmill(a: Assembly) -> None:
     height = a.uniform(1.2, 1.8)
     radius = a.uniform(0.28, 0.42)
     vane = a.uniform(0.6, 0.95)
-    tower = cylinder(radius, radius * a.uniform(0.6, 0.8), height, 8)
-    a.add(tower.translated((0, 0, height / 2)), WALL)
+    a.add(rod((0, 0, 0), (0, 0, height), radius, radius * a.uniform(0.6, 0.8), 8))
     roof = cylinder(radius, 0.02, radius * 1.2, 8)
     a.add(roof.translated((0, 0, height + radius * 0.6)), ROOF)
     hub = point(radius + 0.12, 0, height * 0.92)
@@ -251,7 +247,6 @@ def windmill(a: Assembly) -> None:
 
 def shoe(a: Assembly) -> None:
     """Build a shoe or a boot with two to four laces, and mostly a heel."""
-    SOLE = 0
     UPPER = 1
     LACE = 2
     HEEL = 3
@@ -268,7 +263,7 @@ def shoe(a: Assembly) -> None:
         [toe, width * 0.15],
     ]
     outline = [[x, -y] for x, y in half] + half[::-1]
-    a.add(extrusion(outline, a.uniform(0.08, 0.16), "xy", 0.05), SOLE)
+    a.add(extrusion(outline, a.uniform(0.08, 0.16), "xy", 0.05))
     upper = (length * 0.35, width * 0.42, a.uniform(0.2, 0.3))
     a.add(ellipsoid(upper, (length * 0.15, 0, 0.15)), UPPER)
     # The shaft is open at its top.
@@ -278,11 +273,7 @@ def shoe(a: Assembly) -> None:
     for k in range(2 + a.choice(3)):
         a.add(box((0.05, width * 0.5, 0.04), (length * (0.08 * k), 0, 0.42 - 0.05 * k)), LACE)
     if a.chance(0.6):
-        heel = (0.25, width * 0.6, a.uniform(0.1, 0.3))
-        a.add(box(heel, (-length * 0.36, 0, -0.08)), HEEL)
+        a.add(box((0.25, width * 0.6, a.uniform(0.1, 0.3)), (-length * 0.36, 0, -0.08)), HEEL)
 
 
-TRAINING = {
-    build.__name__: build
-    for build in (quadruped, fish, teapot, guitar, camera, lamp, cart, rocket, windmill, shoe)
-}
+TRAINING = by_name(quadruped, fish, teapot, guitar, camera, lamp, cart, rocket, windmill, shoe)

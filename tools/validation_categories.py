@@ -6,7 +6,7 @@ its materials, 0 to 7: parts of one material look alike.
 
 import numpy as np
 
-from zsp_lite.course.synthetic.assembly import BODY, Assembly, X, Y, disc
+from zsp_lite.course.synthetic.assembly import Assembly, X, Y, by_name, disc
 from zsp_lite.course.synthetic.primitives import (
     TAU,
     box,
@@ -42,13 +42,12 @@ def helicopter(a: Assembly) -> None:
     length = a.uniform(0.6, 0.9)
     radius = a.uniform(0.35, 0.5)
     z = a.uniform(0.6, 0.8)
-    a.add(ellipsoid((length, radius, radius * a.uniform(0.9, 1.2)), (0, 0, z)), BODY)
+    a.add(ellipsoid((length, radius, radius * a.uniform(0.9, 1.2)), (0, 0, z)))
     cockpit = (length * 0.5, radius * 0.85, radius * 0.7)
     a.add(ellipsoid(cockpit, (length * 0.55, 0, z + 0.05)), GLASS)
     tail = point(-length - a.uniform(0.6, 1.0), 0, z + a.uniform(0.1, 0.3))
-    a.add(rod((-length * 0.7, 0, z + 0.05), tail, radius * 0.4, 0.07), BODY)
-    fin = extrusion([[0.1, 0], [-0.12, 0], [-0.25, 0.4], [-0.1, 0.4]], 0.05)
-    a.add(fin.translated(tail), FIN)
+    a.add(rod((-length * 0.7, 0, z + 0.05), tail, radius * 0.4, 0.07))
+    a.add(extrusion([[0.1, 0], [-0.12, 0], [-0.25, 0.4], [-0.1, 0.4]], 0.05).translated(tail), FIN)
     # The main rotor on its mast, and the tail rotor.
     n_blades = 2 + a.choice(3)
     phase = a.uniform(0, 3)
@@ -88,11 +87,11 @@ def wheelbarrow(a: Assembly) -> None:
         [length * 0.25, z],
         [length * a.uniform(0.55, 0.75), z + depth],
     ]
-    a.add_pair(extrusion(wall, 0.05).translated((0, width / 2, 0)), BODY)
-    a.add(box((length * 0.6, width, 0.05), (0, 0, z)), BODY)
+    a.add_pair(extrusion(wall, 0.05).translated((0, width / 2, 0)))
+    a.add(box((length * 0.6, width, 0.05), (0, 0, z)))
     front = length * 0.6
     nose = (front, 0, z + depth * 0.9)
-    a.add(rod((length * 0.3, 0, z + 0.02), nose, width * 0.45, width * 0.5), BODY)
+    a.add(rod((length * 0.3, 0, z + 0.02), nose, width * 0.45, width * 0.5))
     grip = point(rear - a.uniform(0.4, 0.7), width * 0.4, z + a.uniform(0.1, 0.4))
     a.add_pair(rod((front, width * 0.15, wheel), grip, 0.04), FRAME)
     a.add_pair(capsule(grip, grip + [-0.15, 0, 0.02], 0.06), GRIP)
@@ -111,10 +110,10 @@ def watering_can(a: Assembly) -> None:
     height = a.uniform(0.6, 1.0)
     rim = (radius * a.uniform(0.75, 1), height)
     # The radius 0 would give triangles without an area.
-    a.add(lathe([(0.001, 0), (radius, 0), rim, (0.001, height * 0.97)]), BODY)
+    a.add(lathe([(0.001, 0), (radius, 0), rim, (0.001, height * 0.97)]))
     spout = (radius * 0.8, 0, height * 0.2)
     tip = point(radius + a.uniform(0.5, 0.9), 0, height * a.uniform(0.95, 1.3))
-    a.add(rod(spout, tip, 0.09, 0.05), BODY)
+    a.add(rod(spout, tip, 0.09, 0.05))
     along = tip - spout
     rose = tip + 0.2 * along / np.linalg.norm(along)
     a.add(rod(tip, rose, 0.05, a.uniform(0.12, 0.2)), ROSE)
@@ -139,7 +138,7 @@ def vacuum_cleaner(a: Assembly) -> None:
     radius = a.uniform(0.28, 0.4)
     front = length * 0.6
     nose = radius * a.uniform(0.7, 0.95)
-    a.add(capsule((-length, 0, radius + 0.08), (front, 0, radius + 0.05), radius, nose), BODY)
+    a.add(capsule((-length, 0, radius + 0.08), (front, 0, radius + 0.05), radius, nose))
     top = 2 * radius
     a.add(box((length * 0.8, radius * 1.1, 0.12), (-length * 0.4, 0, top + 0.05)), LID)
     a.add(cylinder(0.12, 0.12, 0.1).translated((length * 0.1, 0, top + 0.08)), PLASTIC)
@@ -166,13 +165,13 @@ def drill(a: Assembly) -> None:
     z = a.uniform(0.8, 1.0)
     front = (length * 0.35, 0, z)
     tip = (length * 0.6, 0, z)
-    a.add(rod((-length * 0.45, 0, z), front, radius, radius * a.uniform(0.8, 1)), BODY)
+    a.add(rod((-length * 0.45, 0, z), front, radius, radius * a.uniform(0.8, 1)))
     a.add(rod(front, tip, radius * 0.7, radius * 0.45), CHUCK)
     a.add(rod(tip, tip + point(a.uniform(0.3, 0.7), 0, 0), 0.05, 0.02), BIT)
     # The grip leans; the battery is at its foot.
     lean = a.uniform(-0.25, 0.05)
     grip_x = -length * 0.15
-    a.add(capsule((grip_x, 0, z), (grip_x + lean, 0, 0.2), 0.16, 0.14), BODY)
+    a.add(capsule((grip_x, 0, z), (grip_x + lean, 0, 0.2), 0.16, 0.14))
     battery = (a.uniform(0.35, 0.5), 0.3, a.uniform(0.15, 0.25))
     a.add(box(battery, (-length * 0.12 + lean, 0, 0.1)), DARK)
     a.add(box((0.1, 0.1, 0.18), (length * 0.03, 0, z - radius - 0.08)), DARK)
@@ -195,14 +194,14 @@ def dinosaur(a: Assembly) -> None:
     z = leg + radius * 0.5
     hip = point(-length * 0.4, 0, z)
     chest = point(length * 0.5, 0, z + a.uniform(0, 0.3))
-    a.add(capsule(hip, chest, radius, radius * 0.75), BODY)
+    a.add(capsule(hip, chest, radius, radius * 0.75))
     # The tail, in two parts; then the neck, the snout and the eyes.
     bend = hip - [a.uniform(0.5, 0.8), 0, a.uniform(-0.1, 0.2)]
-    a.add(rod(hip, bend, radius * 0.8, radius * 0.4), BODY)
+    a.add(rod(hip, bend, radius * 0.8, radius * 0.4))
     tail = bend - [a.uniform(0.4, 0.7), 0, a.uniform(-0.2, 0.25)]
-    a.add(rod(bend, tail, radius * 0.4, 0.03), BODY)
+    a.add(rod(bend, tail, radius * 0.4, 0.03))
     head = chest + [a.uniform(0.3, 0.6), 0, a.uniform(0.2, 0.7)]
-    a.add(rod(chest, head, radius * 0.6, radius * 0.35), BODY)
+    a.add(rod(chest, head, radius * 0.6, radius * 0.35))
     nose = head + [a.uniform(0.2, 0.4), 0, -0.05]
     a.add(capsule(head, nose, radius * 0.45, radius * 0.28), LIMB)
     a.add_pair(ellipsoid((0.05, 0.04, 0.05), head + [0.06, radius * 0.4, 0.08]), EYE)
@@ -232,10 +231,9 @@ def mailbox(a: Assembly) -> None:
     height = a.uniform(0.7, 1.1)
     front = length / 2
     axis = height + radius  # of the round top
-    a.add(box((length, 2 * radius, radius), (0, 0, height + radius / 2)), BODY)
-    a.add(rod((-front, 0, axis), (front, 0, axis), radius, sides=18), BODY)
-    door = (0.04, radius * 1.6, radius * 1.3)
-    a.add(box(door, (front + 0.02, 0, height + radius * 0.8)), DOOR)
+    a.add(box((length, 2 * radius, radius), (0, 0, height + radius / 2)))
+    a.add(rod((-front, 0, axis), (front, 0, axis), radius, sides=18))
+    a.add(box((0.04, radius * 1.6, radius * 1.3), (front + 0.02, 0, height + radius * 0.8)), DOOR)
     a.add(box((0.08, 0.12, 0.06), (front + 0.06, 0, height + radius * 1.4)), METAL)
     a.add(rod((0, 0, 0), (a.uniform(-0.1, 0.1), 0, height), a.uniform(0.06, 0.1)), POST)
     a.add(cylinder(a.uniform(0.2, 0.4), 0.15, 0.1).translated((0, 0, 0.05)), POST)
@@ -257,15 +255,15 @@ def excavator(a: Assembly) -> None:
     front = length / 2
     side = width / 2
     a.add_pair(capsule((-front, side, 0.16), (front, side, 0.16), 0.16), DARK)
-    a.add(box((length * 0.9, width * 0.9, a.uniform(0.25, 0.4)), (-0.08, 0, 0.5)), BODY)
+    a.add(box((length * 0.9, width * 0.9, a.uniform(0.25, 0.4)), (-0.08, 0, 0.5)))
     cabin_y = a.uniform(0.1, 0.2) * (1 if a.chance(0.5) else -1)
     boom_y = -cabin_y * 0.6
     a.add(box((0.4, width * 0.45, a.uniform(0.4, 0.55)), (length * 0.15, cabin_y, 0.9)), CABIN)
     a.add(box((0.3, width * 0.8, 0.25), (-length * 0.42, 0, 0.75)), COUNTERWEIGHT)
     elbow = (length * 0.45 + a.uniform(0.3, 0.6), boom_y, a.uniform(1.1, 1.5))
     wrist = (elbow[0] + a.uniform(0.3, 0.6), boom_y, a.uniform(0.5, 0.9))
-    a.add(rod((length * 0.35, boom_y, 0.6), elbow, 0.1, 0.08), BODY)
-    a.add(rod(elbow, wrist, 0.08, 0.06), BODY)
+    a.add(rod((length * 0.35, boom_y, 0.6), elbow, 0.1, 0.08))
+    a.add(rod(elbow, wrist, 0.08, 0.06))
     outline = [[0.12, 0.05], [-0.15, -0.05], [-0.22, -0.35], [0.02, -0.4]]
     a.add(extrusion(outline, width * a.uniform(0.35, 0.55)).translated(wrist), BUCKET)
     exhaust = (-length * 0.3, width * 0.25, 0.8)
@@ -274,7 +272,6 @@ def excavator(a: Assembly) -> None:
 
 def bed(a: Assembly) -> None:
     """Build a single or double bed: mattress between two boards, pillows at the head, blanket."""
-    MATTRESS = 0
     FRAME = 1
     PILLOW = 2
     BLANKET = 3
@@ -283,7 +280,7 @@ def bed(a: Assembly) -> None:
     length = a.uniform(1.9, 2.3)
     width = a.uniform(1.35, 1.8) if double else a.uniform(0.85, 1.2)
     z = a.uniform(0.3, 0.5)
-    a.add(box((length, width, a.uniform(0.15, 0.3)), (0, 0, z)), MATTRESS)
+    a.add(box((length, width, a.uniform(0.15, 0.3)), (0, 0, z)))
     # The boards at the head (in front) and at the foot, each between two posts.
     head = length / 2
     for x, height in ((head, a.uniform(0.65, 1.1)), (-head, a.uniform(0.35, 0.65))):
@@ -308,9 +305,9 @@ def bathtub(a: Assembly) -> None:
     width = a.uniform(0.75, 0.95)
     height = a.uniform(0.5, 0.65)
     end = length / 2
-    rear = a.uniform(0.55, 0.7) * length / 2
-    front = a.uniform(0.44, 0.56) * length / 2
-    a.add(extrusion([[-rear, 0], [front, 0], [end, height], [-end, height]], width), BODY)
+    rear = a.uniform(0.55, 0.7) * end
+    front = a.uniform(0.44, 0.56) * end
+    a.add(extrusion([[-rear, 0], [front, 0], [end, height], [-end, height]], width))
     a.add(box((length * 0.88, width * 0.8, 0.03), (0, 0, height + 0.01)), WATER)
     for x in (-rear, front):
         a.add_pair(ellipsoid((0.07, 0.07, 0.1), (x * 0.85, width * 0.38, -0.03)), METAL)
@@ -331,14 +328,14 @@ def skateboard(a: Assembly) -> None:
     length = a.uniform(1.6, 2.2)
     width = a.uniform(0.4, 0.55)
     z = 0.25
-    a.add(box((length * 0.66, width, 0.05), (0, 0, z)), BODY)
+    a.add(box((length * 0.66, width, 0.05), (0, 0, z)))
     front = (length * a.uniform(0.2, 0.3), a.uniform(0.35, 0.6))
     rear = (length * a.uniform(0.14, 0.22), a.uniform(0.15, 0.35))
     for sign, (reach, rise) in ((1, front), (-1, rear)):
         end = box((reach, width * 0.92, 0.05), (reach / 2 - 0.01, 0, 0)).rotated("y", -rise)
         if sign < 0:
             end = end.rotated("z", TAU / 2)
-        a.add(end.translated((sign * length * 0.33, 0, z)), BODY)
+        a.add(end.translated((sign * length * 0.33, 0, z)))
     for x in (-0.24 * length, 0.26 * length):
         a.add_pair(disc(0.09, 0.1, (x, width * 0.42, 0.09)), WHEEL)
         a.add(rod((x, -width * 0.4, 0.1), (x, width * 0.4, 0.1), 0.04), TRUCK)
@@ -363,7 +360,7 @@ def tram(a: Assembly) -> None:
     belt = floor + height * 0.45
     roof = floor + height
     front = [[nose, floor], [nose, belt], [nose - rake, roof]]
-    a.add(extrusion([*front, [-nose, roof], [-nose, floor]], width), BODY)
+    a.add(extrusion([*front, [-nose, roof], [-nose, floor]], width))
     # The windscreen leans with the front; the windows are at its height.
     window_z = (belt + roof) / 2
     screen = box((0.03, width * 0.8, height * 0.36)).rotated("y", -np.arctan(rake / (roof - belt)))
@@ -382,21 +379,18 @@ def tram(a: Assembly) -> None:
     a.add(box((0.05, width * 0.7, 0.03), collector), DARK)
 
 
-VALIDATION = {
-    build.__name__: build
-    for build in (
-        helicopter,
-        wheelbarrow,
-        watering_can,
-        vacuum_cleaner,
-        drill,
-        dinosaur,
-        mailbox,
-        excavator,
-        # Long bodies whose ends differ only in details measure errors of half a turn.
-        bed,
-        bathtub,
-        skateboard,
-        tram,
-    )
-}
+VALIDATION = by_name(
+    helicopter,
+    wheelbarrow,
+    watering_can,
+    vacuum_cleaner,
+    drill,
+    dinosaur,
+    mailbox,
+    excavator,
+    # Long bodies whose ends differ only in details measure errors of half a turn.
+    bed,
+    bathtub,
+    skateboard,
+    tram,
+)

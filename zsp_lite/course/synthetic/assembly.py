@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from zsp_lite.course.synthetic.meshes import Material, TexturedMesh, smooth_normals
 from zsp_lite.course.synthetic.primitives import (
+    TAU,
     Coordinates,
     Mesh,
     cylinder,
@@ -55,19 +56,24 @@ class Assembly:
         """Draw one of the options."""
         return options[self.choice(len(options))]
 
-    def add(self, mesh: Mesh, material: int, mirror: bool = False) -> None:
+    def add(self, mesh: Mesh, material: int = BODY, mirror: bool = False) -> None:
         """Add a part of material 0 .. 7; with `mirror`, also its image in the plane y = 0."""
         self.meshes.append(mesh)
         self.materials.append(material)
         if mirror:
             self.add(mesh.mirrored(), material)
 
-    def add_pair(self, mesh: Mesh, material: int) -> None:
+    def add_pair(self, mesh: Mesh, material: int = BODY) -> None:
         """Add a part and its mirror image in the plane y = 0."""
         self.add(mesh, material, mirror=True)
 
 
 Builder = Callable[[Assembly], None]  # adds the parts of one random object of a category
+
+
+def by_name(*builders: Builder) -> dict[str, Builder]:
+    """Return the builders by the names of their categories, which are those of the functions."""
+    return {build.__name__: build for build in builders}
 
 
 def make_shape(
@@ -98,7 +104,7 @@ def rounded_box(
     # The surface of the cube from -1 to 1, as a grid of n x n points on each of its sides; they are
     # denser at the edges, where the curvature is largest.
     n = 11
-    line = np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
+    line = np.sin(np.linspace(-TAU / 4, TAU / 4, n))
     u, v = np.meshgrid(line, line, indexing="ij")
     sides = [np.dstack([np.full_like(u, sign), sign * u, v]) for sign in (-1.0, 1.0)]
     vertices = np.stack([np.roll(side, axis, axis=2) for axis in range(3) for side in sides])
@@ -132,7 +138,7 @@ def pane(start: Coordinates, end: Coordinates, width: float, thickness: float = 
 
 def disc(radius: float, thickness: float, centre: Coordinates) -> Mesh:
     """Return a disc at `centre` whose axis is y, for example a wheel."""
-    return cylinder(radius, radius, thickness, 22).rotated("x", np.pi / 2).translated(centre)
+    return cylinder(radius, radius, thickness, 22).rotated("x", TAU / 4).translated(centre)
 
 
 def add_wheels(a: Assembly, x: float, y: float, radius: float, width: float) -> None:
@@ -222,7 +228,7 @@ def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
     # Wave vectors (k, 3) of one length.
     waves = rng.normal(size=(rng.choice(kind.waves), 3))
     waves *= rng.uniform(*kind.frequency) / np.linalg.norm(waves, axis=1, keepdims=True)
-    phases = rng.uniform(0, 2 * np.pi, len(waves))
+    phases = rng.uniform(0, TAU, len(waves))
     warp = rng.normal(0, 2, 3)
     sharpness = float(rng.choice([1.0, 2.0, 6.0]))  # 1 for a sine, more for clear edges
 

@@ -103,8 +103,8 @@ def direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
     return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
 
 
-def box(size: Coordinates, centre: Coordinates = (0, 0, 0)) -> Mesh:
-    """Return an axis-aligned box of the given size (3,)."""
+def box(size: float | Coordinates, centre: Coordinates = (0, 0, 0)) -> Mesh:
+    """Return an axis-aligned box of the given size (3,); one number gives a cube."""
     # corner 4 i + 2 j + k is on the side i of x, j of y, k of z
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     # the corners of each side, counter-clockwise from outside
@@ -139,9 +139,9 @@ def cylinder(bottom: float, top: float, height: float, sides: int = 18) -> Mesh:
     return lathe([[_ON_AXIS, low], [bottom, low], [top, high], [_ON_AXIS, high]], sides)
 
 
-def ellipsoid(radii: Coordinates, centre: Coordinates = (0, 0, 0), sides: int = 18) -> Mesh:
-    """Return an axis-aligned ellipsoid with the given radii (3,)."""
-    t = np.linspace(-np.pi / 2, np.pi / 2, 12)  # from pole to pole, whose radius is not quite 0
+def ellipsoid(radii: float | Coordinates, centre: Coordinates = (0, 0, 0), sides: int = 18) -> Mesh:
+    """Return an axis-aligned ellipsoid with the given radii (3,); one number gives a sphere."""
+    t = np.linspace(-TAU / 4, TAU / 4, 12)  # from pole to pole, whose radius is not quite 0
     sphere = lathe(np.stack([np.cos(t) + 1e-5, np.sin(t)], 1), sides)
     return sphere.scaled(radii).translated(centre)
 
@@ -165,7 +165,7 @@ def capsule(
     """Return a rod from `start` (3,) to `end` (3,) with hemispherical ends."""
     along = np.subtract(end, start)
     half = np.linalg.norm(along) / 2
-    t = np.linspace(0, np.pi / 2, 5)  # from the rim to the pole
+    t = np.linspace(0, TAU / 4, 5)  # from the rim to the pole
     round_end = np.stack([np.cos(t) + 1e-5, np.sin(t)], 1)
     tail = round_end[::-1] * [radius, -radius]
     head = round_end * (end_radius or radius)

@@ -73,7 +73,7 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for view in range(VIEWS):
         # The two views of a pair share their middle and their angle.
         if view % 2 == 0:
-            azimuth = start + (view // 2) * np.pi / 2
+            azimuth = start + (view // 2) * TAU / 4
             apart = rng.uniform(*PAIR_ANGLES)
             elevation = rng.uniform(0, 0.9)
         # The instance of the object in this view, and its camera.
@@ -191,8 +191,8 @@ def _random_solid(a: Assembly, size: np.ndarray) -> Mesh:
     angle = np.arange(5) * TAU / 5 + a.rng.uniform(0, TAU / 5, 5)
     outline = np.stack([np.cos(angle), np.sin(angle)], 1) * a.rng.uniform(0.3, 0.6, (5, 1))
     solids = (
-        box((1, 1, 1)),
-        ellipsoid((0.55, 0.55, 0.55)),
+        box(1),
+        ellipsoid(0.55),
         cylinder(0.5, 0.5 * a.uniform(0.3, 1), 1.0),
         capsule((-0.25, 0, 0), (0.25, 0, 0), 0.25).scaled((1, 2, 2)),
         torus(0.36, 0.12, a.pick(*np.eye(3))),

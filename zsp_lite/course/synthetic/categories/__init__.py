@@ -3,7 +3,7 @@
 No backbone is trained on them, and no setting is chosen by them.
 """
 
-from zsp_lite.course.synthetic.assembly import Builder
+from zsp_lite.course.synthetic.assembly import by_name
 from zsp_lite.course.synthetic.categories.belongings import (
     backpack,
     book,
@@ -23,7 +23,7 @@ from zsp_lite.course.synthetic.categories.toys import (
     toytruck,
 )
 
-_BUILDERS = (
+CATEGORIES = by_name(
     backpack,
     bicycle,
     book,
@@ -45,4 +45,3 @@ _BUILDERS = (
     toytrain,
     toytruck,
 )
-CATEGORIES: dict[str, Builder] = {build.__name__: build for build in _BUILDERS}

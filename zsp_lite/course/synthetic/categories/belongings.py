@@ -42,7 +42,7 @@ def backpack(a: Assembly) -> None:
     back = -front
     narrowing = a.uniform(0.7, 1.0)
     body = rounded_box((depth, width, height), (0, 0, height / 2), a.uniform(3.5, 6))
-    a.add(tapered(body, height / 2, height, narrowing), BODY)
+    a.add(tapered(body, height / 2, height, narrowing))
     pocket_depth = depth * a.uniform(0.45, 0.7)
     pocket_height = height * a.uniform(0.35, 0.5)
     pocket_z = height * a.uniform(0.06, 0.12) + pocket_height / 2
@@ -85,7 +85,7 @@ def handbag(a: Assembly) -> None:
     narrowing = a.uniform(1.0, 1.2) if style == "tote" else a.uniform(0.65, 0.95)
     squareness = 8 if style == "tote" else a.uniform(3, 5)
     body = rounded_box((depth, width, height), (0, 0, height / 2), squareness)
-    a.add(tapered(body, 0, height, narrowing), BODY)
+    a.add(tapered(body, 0, height, narrowing))
     front = depth / 2
     top_width = width * narrowing
     if style == "flap bag":
@@ -163,7 +163,7 @@ def laptop(a: Assembly) -> None:
     depth = a.uniform(0.8, 1.1)
     width = a.uniform(1.2, 1.6)
     thick = a.uniform(0.05, 0.1)
-    a.add(rounded_box((depth, width, thick), (0, 0, thick / 2), 12), BODY)
+    a.add(rounded_box((depth, width, thick), (0, 0, thick / 2), 12))
     # The keys in a field of their own, and the touchpad before them.
     n_rows = 4 + a.choice(2)
     n_keys = 10 + a.choice(4)
@@ -230,7 +230,7 @@ def mouse(a: Assembly) -> None:
     vertices = shell.vertices.copy()
     slope = 1 - a.uniform(0.1, 0.4) * (vertices[:, 0] / length + 0.1)
     vertices[:, 2] = np.maximum(vertices[:, 2], 0) * slope
-    a.add(Mesh(vertices, shell.faces), BODY)
+    a.add(Mesh(vertices, shell.faces))
     a.add(shell.scaled((1.03, 1.03, 0.06)), BASE)
     # A button is the front quarter of the shell, slightly raised.
     button = vertices * [1.02, 1.0, 1.06] + [0, 0, 0.015]
@@ -305,8 +305,8 @@ def remote(a: Assembly) -> None:
     waist = a.uniform(0.8, 1.0)
     top = thick + 0.005
     # The body is built upright, and laid down.
-    body = tapered(body, length / 2, 0, waist).rotated("y", np.pi / 2)  # narrower behind
-    a.add(body.translated((-length / 2, 0, thick / 2)), BODY)
+    body = tapered(body, length / 2, 0, waist).rotated("y", TAU / 4)  # narrower behind
+    a.add(body.translated((-length / 2, 0, thick / 2)))
     a.add(
         ellipsoid((0.06, width * 0.2, thick * 0.3), (length / 2 - 0.02, 0, thick * 0.55)), EMITTER
     )

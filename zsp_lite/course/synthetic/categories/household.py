@@ -23,7 +23,6 @@ from zsp_lite.course.synthetic.primitives import (
 
 def chair(a: Assembly) -> None:
     """Build a chair: seat, back of one of four styles, base of one of three, optional arms."""
-    SEAT = 0
     BACK = 1
     FRAME = 2
     ARM = 3
@@ -39,7 +38,7 @@ def chair(a: Assembly) -> None:
         seat = rounded_box((depth, width, thick * 1.4), squareness=6)
     else:
         seat = box((depth, width, thick))
-    a.add(seat.translated((0, 0, height)), SEAT)
+    a.add(seat.translated((0, 0, height)))
 
     # The back is built upright at the origin; it leans about its lower edge.
     def add_to_back(mesh: Mesh, material: int) -> None:
@@ -125,9 +124,9 @@ def toilet(a: Assembly) -> None:
         [1, height],
     ]
     inside = [[0.78, height], [0.55, height * 0.72], [0.001, height * 0.55]]
-    a.add(lathe(outside + inside, 28).scaled((length, width, 1)).translated((bowl_x, 0, 0)), BODY)
+    a.add(lathe(outside + inside, 28).scaled((length, width, 1)).translated((bowl_x, 0, 0)))
     base = (bowl_x + 0.15, width * foot * 1.5, height * 0.95)
-    a.add(rounded_box(base, (bowl_x * 0.35, 0, height * 0.47), 6), BODY)
+    a.add(rounded_box(base, (bowl_x * 0.35, 0, height * 0.47), 6))
     # Seat and lid; the lid is built closed, with its hinge at the origin.
     seat = torus(0.88, 0.14, sides=32).scaled((length, width, 0.5))
     a.add(seat.translated((bowl_x, 0, height + 0.04)), SEAT)
@@ -144,10 +143,10 @@ def toilet(a: Assembly) -> None:
     tank_z = height * a.uniform(0.85, 1.05)
     top = tank_z + tank_height
     tank = (depth, tank_width, tank_height)
-    a.add(rounded_box(tank, (tank_x, 0, tank_z + tank_height / 2), a.uniform(5, 12)), BODY)
+    a.add(rounded_box(tank, (tank_x, 0, tank_z + tank_height / 2), a.uniform(5, 12)))
     cover = rounded_box((depth * 1.12, tank_width * 1.06, 0.09), (tank_x, 0, top), 8)
     a.add(cover, COVER if a.chance(0.3) else BODY)
-    a.add(box((depth * 1.2, tank_width * 0.45, tank_z), (tank_x + 0.1, 0, tank_z / 2)), BODY)
+    a.add(box((depth * 1.2, tank_width * 0.45, tank_z), (tank_x + 0.1, 0, tank_z / 2)))
     if a.chance(0.5):
         a.add(cylinder(0.08, 0.08, 0.04).translated((tank_x, 0, top + 0.06)), METAL)
     else:
@@ -168,10 +167,7 @@ def hairdryer(a: Assembly) -> None:
     front = length * 0.57
     # The barrel, from its back to its mouth.
     back = [[0.001, rear], [radius * 0.7, rear], [radius, -length * 0.3]]
-    a.add(
-        lathe([*back, [radius, 0], [mouth, front], [0.001, front]], 24).rotated("y", TAU / 4),
-        BODY,
-    )
+    a.add(lathe([*back, [radius, 0], [mouth, front], [0.001, front]], 24).rotated("y", TAU / 4))
     if a.chance(0.6):
         # A nozzle becomes more or less flat towards its slot.
         reach = a.uniform(0.15, 0.4)
@@ -221,14 +217,14 @@ def toaster(a: Assembly) -> None:
     top = feet + height
     middle = feet + height / 2
     if a.chance(0.6):
-        a.add(rounded_box((length, width, height), (0, 0, middle), a.uniform(4, 9)), BODY)
+        a.add(rounded_box((length, width, height), (0, 0, middle), a.uniform(4, 9)))
     else:
         # An arch across, the upper half of a superellipse, with end plates of another material.
         angle = np.linspace(0, np.pi, 13)
         y = width / 2 * np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** 0.6
         arch = np.stack([y, feet + height * (0.35 + 0.65 * np.sin(angle) ** 0.6)], 1)
         arch = np.concatenate([[[width / 2, feet]], arch, [[-width / 2, feet]]])
-        a.add(extrusion(arch, length * 0.84, "yz"), BODY)
+        a.add(extrusion(arch, length * 0.84, "yz"))
         plate = (arch - [0, middle]) * 1.03 + [0, middle]
         for side in (-1, 1):
             a.add(extrusion(plate, length * 0.09, "yz", side * length * 0.455), END_PLATE)

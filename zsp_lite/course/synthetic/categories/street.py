@@ -62,9 +62,9 @@ def bicycle(a: Assembly) -> None:
         (saddle, crank),
         (head - [0, 0, 0.06], top_tube_end),
     ):
-        a.add(rod(start, end, tube), BODY)
+        a.add(rod(start, end, tube))
     for end in (crank, saddle - [0, 0, 0.12]):
-        a.add_pair(rod(rear + [0, 0.05, 0], end, tube * 0.6), BODY)
+        a.add_pair(rod(rear + [0, 0.05, 0], end, tube * 0.6))
     a.add(
         ellipsoid((a.uniform(0.15, 0.24), a.uniform(0.06, 0.11), 0.05), saddle + [0, 0, 0.05]),
         SADDLE,
@@ -111,7 +111,7 @@ def motorcycle(a: Assembly) -> None:
     for hub, start, stop in ((rear, -1.5, 0.6), (front, -0.8, 0.7)):
         a.add(torus(wheel - tyre, tyre, Y, hub), RUBBER)
         a.add(disc(wheel * 0.62, 0.06, hub), METAL)
-        a.add(torus(wheel + 0.04, 0.05, Y, hub, start, stop, sides=14), BODY)
+        a.add(torus(wheel + 0.04, 0.05, Y, hub, start, stop, sides=14))
     # Fork, headlamp and bars.
     head = front + [
         -a.uniform(0.2, 0.28) - (0.15 if style == "cruiser" else 0),
@@ -129,10 +129,10 @@ def motorcycle(a: Assembly) -> None:
     if style == "scooter":
         # Leg shield, footboard, body, seat and rear light.
         floor = wheel * a.uniform(0.75, 1.0)
-        a.add(pane((half_base - 0.3, floor), head[[0, 2]], a.uniform(0.4, 0.55), 0.07), BODY)
-        a.add(box((half_base * 1.1, 0.36, 0.08), (0, 0, floor)), BODY)
+        a.add(pane((half_base - 0.3, floor), head[[0, 2]], a.uniform(0.4, 0.55), 0.07))
+        a.add(box((half_base * 1.1, 0.36, 0.08), (0, 0, floor)))
         body = (half_base * 1.15, 0.42, seat_z - floor + 0.1)
-        a.add(rounded_box(body, (-half_base * 0.75, 0, (seat_z + floor) / 2), 4), BODY)
+        a.add(rounded_box(body, (-half_base * 0.75, 0, (seat_z + floor) / 2), 4))
         seat = (half_base * 1.05, 0.36, 0.14)
         a.add(rounded_box(seat, (-half_base * 0.65, 0, seat_z + 0.08), 3), SEAT)
         a.add(box((0.06, 0.2, 0.09), (-half_base * 1.35, 0, seat_z * 0.85)), GLASS)
@@ -142,21 +142,20 @@ def motorcycle(a: Assembly) -> None:
         a.add(box((a.uniform(0.4, 0.55), 0.3, a.uniform(0.3, 0.42)), engine), ENGINE)
         tank = np.array([head[0] * 0.45, 0, seat_z + 0.14])
         a.add(
-            ellipsoid((a.uniform(0.28, 0.36), a.uniform(0.14, 0.19), a.uniform(0.13, 0.18)), tank),
-            BODY,
+            ellipsoid((a.uniform(0.28, 0.36), a.uniform(0.14, 0.19), a.uniform(0.13, 0.18)), tank)
         )
         for start, end in ((head, engine), (head, tank), (engine, rear)):
             a.add_pair(rod(start + [0, 0.04, 0], end + [0, 0.06, 0], 0.032), METAL)
         a.add(rounded_box((half_base * 0.95, 0.28, 0.13), (-half_base * 0.48, 0, seat_z), 3), SEAT)
         tail = point(-half_base * a.uniform(0.95, 1.25), 0, seat_z + a.uniform(0.08, 0.25))
-        a.add(capsule((-half_base * 0.7, 0, seat_z), tail, 0.12, 0.06), BODY)
+        a.add(capsule((-half_base * 0.7, 0, seat_z), tail, 0.12, 0.06))
         a.add(box((0.05, 0.16, 0.08), tail - [0.08, 0, 0]), GLASS)
         # A fairing with a screen.
         if style == "sport":
             upper = [[head[0] + 0.3, head[2] - 0.1], [head[0] - 0.05, head[2] + 0.12]]
             lower = [[0.05, wheel * 1.6], [0.0, wheel * 0.6], [0.35, wheel * 0.9]]
             fairing = extrusion(upper + lower, a.uniform(0.34, 0.44))
-            a.add(tapered(fairing, wheel, head[2] + 0.12, 0.55), BODY)
+            a.add(tapered(fairing, wheel, head[2] + 0.12, 0.55))
             a.add(pane(head[[0, 2]] + [0.12, 0.08], head[[0, 2]] + [-0.08, 0.3], 0.24), GLASS)
     exhaust_end = (-half_base * a.uniform(0.9, 1.3), -0.22, wheel * a.uniform(0.7, 1.3))
     a.add(rod((0.05, -0.2, wheel * 0.6), exhaust_end, 0.05, a.uniform(0.06, 0.09)), EXHAUST)
@@ -193,14 +192,14 @@ def car(a: Assembly) -> None:
         [nose - 0.04, nose_z],
         [bonnet_end, belt],
     ]
-    a.add(tapered(extrusion([[tail, sill], *front, [tail, belt]], width), sill, belt, 0.94), BODY)
+    a.add(tapered(extrusion([[tail, sill], *front, [tail, belt]], width), sill, belt, 0.94))
 
     # The cabin, with a pane in front and one behind.
     rear_slope = a.uniform(0.02, 0.08) if style in ("pickup", "van") else a.uniform(0.1, 0.3)
     windscreen = np.array([[bonnet_end + 0.03, belt], [bonnet_end - a.uniform(0.2, 0.38), roof]])
     rear_window = np.array([[boot_start, belt], [boot_start + rear_slope, roof]])
     cabin = np.concatenate([rear_window[:1], windscreen, rear_window[1:]])
-    a.add(tapered(extrusion(cabin, width * 0.92), belt, roof, taper), BODY)
+    a.add(tapered(extrusion(cabin, width * 0.92), belt, roof, taper))
     for (low, high), out in ((windscreen, 0.015), (rear_window, -0.015)):
         # The pane leaves a margin at both edges, and is slightly outside the cabin.
         margin = (high - low) * 0.12
@@ -211,13 +210,13 @@ def car(a: Assembly) -> None:
     windows = extrusion(middle + (cabin - middle) * [0.86, 0.7], width * 0.94)
     a.add(tapered(windows, belt, roof, taper), GLASS)
     pillar = pane((middle[0], belt), (middle[0], roof), width * 0.95, 0.06)
-    a.add(tapered(pillar, belt, roof, taper), BODY)
+    a.add(tapered(pillar, belt, roof, taper))
     if style == "pickup":
         wall = a.uniform(0.08, 0.18)
         bed = boot_start - tail
         side = box((bed, 0.06, wall), (tail + bed / 2, width * 0.44, belt + wall / 2))
-        a.add_pair(side, BODY)
-        a.add(box((0.06, width * 0.9, wall), (tail + 0.03, 0, belt + wall / 2)), BODY)
+        a.add_pair(side)
+        a.add(box((0.06, width * 0.9, wall), (tail + 0.03, 0, belt + wall / 2)))
     # Headlamps, grille, rear lights, bumpers and wheels.
     light_z = sill + (nose_z - sill) * 0.72
     lamp = ellipsoid(
@@ -250,9 +249,9 @@ def hydrant(a: Assembly) -> None:
     cap = height * 0.82
     foot = [[0.001, 0], [radius * 1.45, 0], [radius * 1.45, 0.09], [radius, 0.11]]
     flange = [[neck, height * 0.75], [rim, height * 0.76], [rim, cap], [neck, cap + 0.01]]
-    a.add(lathe(foot + flange, 24), BODY)
+    a.add(lathe(foot + flange, 24))
     # The bonnet, with the nut that opens the valve.
-    t = np.linspace(0, np.pi / 2, 7)
+    t = np.linspace(0, TAU / 4, 7)
     dome = np.stack([np.cos(t), 0.25 * np.sin(t)], 1)
     cone = [[1.05, 0], [0.9, 0.14], [0.35, 0.2], [0, 0.22]]
     bonnet = np.array(dome if a.chance(0.5) else cone) * [radius, height]
@@ -266,7 +265,7 @@ def hydrant(a: Assembly) -> None:
     small = (outlet + a.uniform(-0.03, 0.13), radius + a.uniform(0.1, 0.2), a.uniform(0.09, 0.13))
     # Each outlet is a pipe with a cap and a nut.
     for turn, (z, reach, pipe) in ((0, large), (TAU / 4, small), (-TAU / 4, small)):
-        a.add(rod((0, 0, z), (reach, 0, z), pipe).rotated("z", turn), BODY)
+        a.add(rod((0, 0, z), (reach, 0, z), pipe).rotated("z", turn))
         a.add(rod((reach, 0, z), (reach + 0.1, 0, z), pipe * 1.2, sides=8).rotated("z", turn), CAP)
         a.add(rod((reach, 0, z), (reach + 0.18, 0, z), 0.05, sides=5).rotated("z", turn), NUT)
     # Eight bolts around the foot, and a ring for the chain.

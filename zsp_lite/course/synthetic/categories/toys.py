@@ -5,7 +5,7 @@ The constants at the head of a builder name its materials, 0 to 7: parts of one 
 
 import numpy as np
 
-from zsp_lite.course.synthetic.assembly import BODY, Assembly, add_wheels, disc, pane, rounded_box
+from zsp_lite.course.synthetic.assembly import Assembly, add_wheels, disc, pane, rounded_box
 from zsp_lite.course.synthetic.primitives import (
     TAU,
     box,
@@ -31,10 +31,10 @@ def teddybear(a: Assembly) -> None:
     skull = a.uniform(0.32, 0.46)
     standing = a.chance(0.3)
     floor = a.uniform(0.35, 0.5) if standing else 0.0
-    a.add(ellipsoid((belly * 0.85, belly, tall), (0, 0, floor + tall)), BODY)
+    a.add(ellipsoid((belly * 0.85, belly, tall), (0, 0, floor + tall)))
     # The head: skull, muzzle, nose, eyes and ears.
     head = point(0.05, 0, floor + tall * 1.85 + skull * 0.68)
-    a.add(ellipsoid((skull * 0.9, skull * a.uniform(0.95, 1.18), skull), head), BODY)
+    a.add(ellipsoid((skull * 0.9, skull * a.uniform(0.95, 1.18), skull), head))
     snout = a.uniform(0.13, 0.26)
     face = head + [skull * 0.82, 0, 0]
     a.add(ellipsoid((snout, a.uniform(0.15, 0.21), 0.15), face - [0, 0, 0.09]), LIGHT_FUR)
@@ -51,20 +51,20 @@ def teddybear(a: Assembly) -> None:
             side * a.uniform(0.2, 0.42),
             a.uniform(-0.5, 0.45),
         ]
-        a.add(capsule(shoulder, hand, a.uniform(0.12, 0.16), a.uniform(0.12, 0.18)), BODY)
+        a.add(capsule(shoulder, hand, a.uniform(0.12, 0.16), a.uniform(0.12, 0.18)))
     # Legs and feet; those of a sitting bear show their soles.
     leg = a.uniform(0.14, 0.21)
     if standing:
         foot = point(0.08, belly * 0.6, leg)
-        a.add_pair(capsule((0, belly * 0.5, floor + tall * 0.4), foot, leg), BODY)
+        a.add_pair(capsule((0, belly * 0.5, floor + tall * 0.4), foot, leg))
         a.add_pair(ellipsoid((leg * 1.5, leg, leg * 0.7), foot + [0.1, 0, -leg * 0.35]), FOOT)
     else:
         foot = point(a.uniform(0.45, 0.75), belly * a.uniform(0.7, 1.1), leg)
-        a.add_pair(capsule((0.1, belly * 0.55, 0.15), foot, leg), BODY)
+        a.add_pair(capsule((0.1, belly * 0.55, 0.15), foot, leg))
         sole = ellipsoid((0.07, leg * 0.85, leg * 1.15), foot + [leg * 0.85, 0, 0.05])
         a.add_pair(sole, LIGHT_FUR)
     # The tail; then a light belly, a shirt, or neither.
-    a.add(ellipsoid((0.1, 0.1, 0.1), (-belly * 0.85, 0, floor + 0.25)), BODY)
+    a.add(ellipsoid(0.1, (-belly * 0.85, 0, floor + 0.25)))
     if a.chance(0.6):
         light = (belly * 0.3, belly * 0.65, tall * 0.65)
         a.add(ellipsoid(light, (belly * 0.62, 0, floor + tall * 0.95)), LIGHT_FUR)
@@ -87,7 +87,7 @@ def toyplane(a: Assembly) -> None:
     nose = length / 2
     tail = -nose
     jet = a.chance(0.4)
-    a.add(capsule((tail, 0, 0), (nose - radius, 0, 0), radius * a.uniform(0.35, 0.7), radius), BODY)
+    a.add(capsule((tail, 0, 0), (nose - radius, 0, 0), radius * a.uniform(0.35, 0.7), radius))
     # The wing: its outline on the left side, from the leading to the trailing edge.
     span = a.uniform(0.8, 1.5)
     chord = a.uniform(0.3, 0.6)
@@ -150,7 +150,6 @@ def toyplane(a: Assembly) -> None:
 
 def toytruck(a: Assembly) -> None:
     """Build a truck: cab, some with a bonnet; a box, flat bed, tank, tipper or crane behind."""
-    CAB = 0
     LOAD = 1
     CHASSIS = 2
     CABLE = 3
@@ -171,7 +170,7 @@ def toytruck(a: Assembly) -> None:
     bonnet = a.uniform(0.25, 0.45) if a.chance(0.5) else 0.0
     if bonnet:
         size = (bonnet * 1.3, width * 0.85, cab_height * 0.55)
-        a.add(rounded_box(size, (nose - bonnet * 0.5, 0, deck + cab_height * 0.26), 6), CAB)
+        a.add(rounded_box(size, (nose - bonnet * 0.5, 0, deck + cab_height * 0.26), 6))
     # The cab: its outline from the side, windows, headlamps and grille.
     front = nose - bonnet * 0.85
     roof = deck + cab_height
@@ -179,9 +178,7 @@ def toytruck(a: Assembly) -> None:
     # lower and upper edge of the windscreen
     bend = (front, deck + cab_height * 0.5)
     top = (front - slope, roof)
-    a.add(
-        extrusion([(rear, deck + 0.04), (front, deck + 0.04), bend, top, (rear, roof)], width), CAB
-    )
+    a.add(extrusion([(rear, deck + 0.04), (front, deck + 0.04), bend, top, (rear, roof)], width))
     side_window = (cab_length * 0.5, width * 1.02, cab_height * 0.3)
     a.add(box(side_window, (rear + cab_length * 0.48, 0, deck + cab_height * 0.72)), GLASS)
     a.add(pane(np.add(bend, [0.01, 0.04]), np.add(top, [0.01, -0.04]), width * 0.84), GLASS)
@@ -212,7 +209,7 @@ def toytruck(a: Assembly) -> None:
         mast = point(load_x, 0, deck + 0.3)
         jib = mast + [-load * a.uniform(0.4, 0.7), 0, a.uniform(0.5, 0.9)]
         a.add(cylinder(width * 0.35, width * 0.35, 0.2).translated((load_x, 0, deck + 0.16)), LOAD)
-        a.add(box((0.3, 0.3, 0.3), mast + [0, 0, 0.08]), LOAD)
+        a.add(box(0.3, mast + [0, 0, 0.08]), LOAD)
         a.add(rod(mast, jib, 0.07, 0.05), LOAD)
         a.add(rod(jib, jib - [0, 0, 0.45], 0.02), CABLE)
     else:
@@ -251,16 +248,14 @@ def toybus(a: Assembly) -> None:
     bonnet = a.uniform(0.3, 0.45) if style == "school bus" else 0.0
     if bonnet:
         size = (bonnet * 1.4, width * 0.8, height * 0.5)
-        a.add(rounded_box(size, (nose - bonnet * 0.6, 0, floor + height * 0.25), 6), BODY)
+        a.add(rounded_box(size, (nose - bonnet * 0.6, 0, floor + height * 0.25), 6))
     else:
         a.add(box((0.05, width * 0.7, height * 0.1), (nose, 0, floor + height * 0.93)), DOOR)
     # The body with a stripe along it.
     front = nose - bonnet
     body = front - tail
     middle = (front + tail) / 2
-    a.add(
-        rounded_box((body, width, height), (middle, 0, floor + height / 2), a.uniform(7, 14)), BODY
-    )
+    a.add(rounded_box((body, width, height), (middle, 0, floor + height / 2), a.uniform(7, 14)))
     stripe = (body * 0.96, width * 1.02, height * a.uniform(0.04, 0.1))
     a.add(box(stripe, (middle, 0, floor + height * 0.3)), STRIPE)
     # The windows of each floor: at the sides, in front and behind.
@@ -307,7 +302,7 @@ def toytrain(a: Assembly) -> None:
     cab_height = a.uniform(0.65, 0.95)
     cab_x = tail + cab_length / 2 + 0.04
     floor = deck + 0.06
-    a.add(box((cab_length, width, cab_height), (cab_x, 0, floor + cab_height / 2)), BODY)
+    a.add(box((cab_length, width, cab_height), (cab_x, 0, floor + cab_height / 2)))
     windows = (cab_length * 0.5, width * 1.03, cab_height * 0.3)
     a.add(box(windows, (cab_x, 0, deck + cab_height * 0.72)), GLASS)
     roof = (cab_length * 0.68, width * 0.6, a.uniform(0.08, 0.18))
@@ -319,7 +314,7 @@ def toytrain(a: Assembly) -> None:
         radius = width * a.uniform(0.34, 0.46)
         boiler = floor + radius
         top = floor + radius * 1.9
-        a.add(rod((rear, 0, boiler), (front, 0, boiler), radius, sides=24), BODY)
+        a.add(rod((rear, 0, boiler), (front, 0, boiler), radius, sides=24))
         a.add(
             rod((front, 0, boiler), (front + 0.05, 0, boiler), radius * 0.86, sides=24), BOILER_DOOR
         )
@@ -338,7 +333,7 @@ def toytrain(a: Assembly) -> None:
         hood_height = cab_height * a.uniform(0.55, 0.8)
         middle = (rear + front) / 2
         hood = (front - rear, hood_width, hood_height)
-        a.add(rounded_box(hood, (middle, 0, floor + hood_height / 2), 9), BODY)
+        a.add(rounded_box(hood, (middle, 0, floor + hood_height / 2), 9))
         lamp = ellipsoid((0.05, 0.07, 0.07), (front, width * 0.22, deck + hood_height * 0.8))
         a.add_pair(lamp, LAMP)
         a.add(box((0.25, width * 0.3, 0.14), (middle, 0, deck + 0.1 + hood_height)), CHIMNEY)
