@@ -49,14 +49,13 @@ def chair(a: Assembly) -> None:
     if style == "panel":
         add_to_back(box((thick, width * a.uniform(0.8, 1), back), (0, 0, back / 2)), BACK)
     elif style == "round":
-        add_to_back(
-            rounded_box((thick * 1.5, width * 0.95, back * 0.6), (0, 0, back * 0.7), 3), BACK
-        )
+        panel = (thick * 1.5, width * 0.95, back * 0.6)
+        add_to_back(rounded_box(panel, (0, 0, back * 0.7), 3), BACK)
         post = rod((0, width * 0.3, 0), (0, width * 0.3, back * 0.6), leg)
         add_to_back(post, FRAME)
         add_to_back(post.mirrored(), FRAME)
     else:
-        # Slats are many posts with one rung on top.
+        # Slats are many posts with one rung on top; heights are shares of the back's.
         rungs = (0.35, 0.65, 0.95)
         n_posts = 2
         if style == "slats":
@@ -90,16 +89,17 @@ def chair(a: Assembly) -> None:
         a.add(rod((-x, y, leg), (-x, -y, leg), leg), FRAME)
     else:
         splay = a.uniform(0, 0.14)
-        for side in (-1, 1):
-            foot = (side * (x + splay), y + splay, 0)
-            a.add_pair(rod((side * x, y, height), foot, leg), FRAME)
-    # The arms.
+        for end in (-1, 1):
+            foot = (end * (x + splay), y + splay, 0)
+            a.add_pair(rod((end * x, y, height), foot, leg), FRAME)
+    # The arms, each on two posts.
     if a.chance(0.45):
+        side = width / 2
         rest = height + a.uniform(0.22, 0.4)
-        arm = rounded_box((depth * a.uniform(0.7, 0.95), 0.12, 0.09), (0, width / 2, rest), 5)
+        arm = rounded_box((depth * a.uniform(0.7, 0.95), 0.12, 0.09), (0, side, rest), 5)
         a.add_pair(arm, ARM)
         for post_x in (depth * 0.3, -depth * 0.38):
-            a.add_pair(rod((post_x, width / 2, height), (post_x, width / 2, rest), leg), FRAME)
+            a.add_pair(rod((post_x, side, height), (post_x, side, rest), leg), FRAME)
 
 
 def toilet(a: Assembly) -> None:
@@ -109,7 +109,7 @@ def toilet(a: Assembly) -> None:
     COVER = 3
     METAL = 5
 
-    # length and width are radii of the bowl
+    # The length and the width are radii of the bowl.
     length = a.uniform(0.5, 0.66)
     width = a.uniform(0.36, 0.46)
     height = a.uniform(0.6, 0.8)
@@ -133,7 +133,8 @@ def toilet(a: Assembly) -> None:
     is_open = a.chance(0.6)
     hinge = (bowl_x - length, 0, height + 0.1)
     lid = ellipsoid((length * 1.02, width * 1.02, 0.04), (length, 0, 0), sides=28)
-    lid = lid.rotated("y", -a.uniform(1.6, 1.85) if is_open else 0)
+    if is_open:
+        lid = lid.rotated("y", -a.uniform(1.6, 1.85))
     a.add(lid.translated(hinge), SEAT if a.chance(0.6) else LID)
     # The cistern, farther behind if the lid leans on it.
     depth = a.uniform(0.28, 0.38)
@@ -168,6 +169,7 @@ def hairdryer(a: Assembly) -> None:
     # The barrel, from its back to its mouth.
     back = [[0.001, rear], [radius * 0.7, rear], [radius, -length * 0.3]]
     a.add(lathe([*back, [radius, 0], [mouth, front], [0.001, front]], 24).rotated("y", TAU / 4))
+    # The nozzle or the diffuser is built about z, upwards from the mouth.
     if a.chance(0.6):
         # A nozzle becomes more or less flat towards its slot.
         reach = a.uniform(0.15, 0.4)
@@ -175,29 +177,24 @@ def hairdryer(a: Assembly) -> None:
         wide = a.uniform(0.8, 1.5)
         cone = cylinder(mouth, mouth, reach, 20).translated((0, 0, reach / 2))
         share = cone.vertices[:, 2:] / reach  # of the way to the slot
-        flat = Mesh(cone.vertices * (1 + share * (point(high, wide, 1) - 1)), cone.faces)
-        a.add(flat.rotated("y", TAU / 4).translated((front, 0, 0)), NOZZLE)
+        nozzle = Mesh(cone.vertices * (1 + share * (point(high, wide, 1) - 1)), cone.faces)
     else:
         reach = a.uniform(0.2, 0.3)
         bowl = [[mouth, 0], [mouth * 1.1, reach * 0.3], [radius * 1.4, reach], [0.001, reach * 0.8]]
-        a.add(lathe(bowl, 24).rotated("y", TAU / 4).translated((front, 0, 0)), NOZZLE)
+        nozzle = lathe(bowl, 24)
+    a.add(nozzle.rotated("y", TAU / 4).translated((front, 0, 0)), NOZZLE)
+    # The bars of the grille.
     for y in (-0.4, 0, 0.4):
-        a.add(box((0.03, 0.05, radius * 1.1), (rear, y * radius, 0)), DARK)  # a bar of the grille
+        a.add(box((0.03, 0.05, radius * 1.1), (rear, y * radius, 0)), DARK)
     # The handle, with a switch and a cable.
     top = point(-0.08, 0, -radius * 0.5)
     bottom = point(-0.08 + a.uniform(-0.25, 0.15), 0, -a.uniform(0.7, 1.1))
-    a.add(
-        capsule(top, bottom, a.uniform(0.11, 0.16), a.uniform(0.09, 0.13)),
-        BODY if a.chance(0.5) else HANDLE,
-    )
+    handle = capsule(top, bottom, a.uniform(0.11, 0.16), a.uniform(0.09, 0.13))
+    a.add(handle, BODY if a.chance(0.5) else HANDLE)
     switch = top + (bottom - top) * a.uniform(0.35, 0.6) + [0.13, 0, 0]
     a.add(box((0.06, 0.1, 0.22), switch), DARK)
-    a.add(
-        capsule(
-            bottom, bottom + [-a.uniform(0.1, 0.35), a.uniform(-0.2, 0.2), -0.38], 0.035, 0.025
-        ),
-        DARK,
-    )
+    cable_end = bottom + [-a.uniform(0.1, 0.35), a.uniform(-0.2, 0.2), -0.38]
+    a.add(capsule(bottom, cable_end, 0.035, 0.025), DARK)
 
 
 def toaster(a: Assembly) -> None:
@@ -219,19 +216,23 @@ def toaster(a: Assembly) -> None:
     if a.chance(0.6):
         a.add(rounded_box((length, width, height), (0, 0, middle), a.uniform(4, 9)))
     else:
-        # An arch across, the upper half of a superellipse, with end plates of another material.
+        # An arch across, with end plates of another material: points (y, z) of the upper half of a
+        # superellipse, between the lower edges.
+        side = width / 2
         angle = np.linspace(0, np.pi, 13)
-        y = width / 2 * np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** 0.6
-        arch = np.stack([y, feet + height * (0.35 + 0.65 * np.sin(angle) ** 0.6)], 1)
-        arch = np.concatenate([[[width / 2, feet]], arch, [[-width / 2, feet]]])
+        across = np.cos(angle)
+        y = side * np.sign(across) * np.abs(across) ** 0.6
+        z = feet + height * (0.35 + 0.65 * np.sin(angle) ** 0.6)
+        arch = np.array([(side, feet), *zip(y, z), (-side, feet)])
         a.add(extrusion(arch, length * 0.84, "yz"))
         plate = (arch - [0, middle]) * 1.03 + [0, middle]
-        for side in (-1, 1):
-            a.add(extrusion(plate, length * 0.09, "yz", side * length * 0.455), END_PLATE)
+        for x in (-0.455, 0.455):
+            a.add(extrusion(plate, length * 0.09, "yz", x * length), END_PLATE)
     a.add(box((length * 0.8, width * 0.78, 0.03), (0, 0, top)), TOP)
     # One or two rows of slots side by side; in a long toaster, each may be divided in two.
-    slot_y = width * (0.22 if a.chance(0.75) else 0)
-    add_slot = a.add_pair if slot_y else a.add
+    two_rows = a.chance(0.75)
+    slot_y = width * 0.22 if two_rows else 0.0
+    add_slot = a.add_pair if two_rows else a.add
     slots = (0,)
     slot = length * 0.66
     if length > 1.35 and a.chance(0.6):
@@ -249,14 +250,13 @@ def toaster(a: Assembly) -> None:
     a.add(rounded_box(lever, (end + 0.07, 0, middle + a.uniform(-0.1, 0.25) * height), 4), LEVER)
     knob_y = a.uniform(0.18, 0.28) * width
     knob_z = feet + height * 0.25
-    a.add(
-        rod((end - 0.03, knob_y, knob_z), (end + 0.07, knob_y, knob_z), a.uniform(0.06, 0.1)), KNOB
-    )
+    dial_end = (end + 0.07, knob_y, knob_z)
+    a.add(rod((end - 0.03, knob_y, knob_z), dial_end, a.uniform(0.06, 0.1)), KNOB)
     for z in knob_z + height * 0.14 * np.arange(1 + a.choice(3)):
         a.add(rod((end - 0.03, -knob_y, z), (end + 0.04, -knob_y, z), 0.035), KNOB)
     # The feet, and a cable.
+    foot = cylinder(0.06, 0.07, feet * 2)
     for x in (-0.36, 0.36):
-        foot = cylinder(0.06, 0.07, feet * 2)
         a.add_pair(foot.translated((x * length, width * 0.32, feet / 2)), DARK)
     if a.chance(0.6):
         cable_end = (-end - a.uniform(0.1, 0.25), a.uniform(-0.2, 0.2), 0.03)

@@ -40,7 +40,7 @@ def bicycle(a: Assembly) -> None:
     tyre = a.uniform(0.022, 0.05)
     tube = a.uniform(0.028, 0.048)
     half_base = a.uniform(0.5, 0.66)
-    # The wheels, with ten spokes each.
+    # The wheels, with ten spokes each: a tyre, a hub, spokes from the hub to the rim.
     front = point(half_base, 0, wheel)
     rear = point(-half_base, 0, wheel)
     for hub in (front, rear):
@@ -54,23 +54,21 @@ def bicycle(a: Assembly) -> None:
     head = front + [-a.uniform(0.2, 0.32), 0, rise]
     saddle = rear + [a.uniform(0.22, 0.38), 0, rise * a.uniform(0.7, 0.98)]
     crank = point(a.uniform(-0.12, 0.04), 0, wheel * a.uniform(0.6, 0.9))
-    # low on the seat tube in a step-through frame
+    # The top tube ends low on the seat tube in a step-through frame.
     top_tube_end = crank + (saddle - crank) * (0.35 if a.chance(0.35) else 0.85)
+    # The fork, whose legs are on both sides of the front wheel.
     a.add_pair(rod(head, front + [0, 0.07, 0], tube * 0.8), METAL)
-    for start, end in (
-        (head - [0, 0, 0.14], crank),
-        (saddle, crank),
-        (head - [0, 0, 0.06], top_tube_end),
-    ):
-        a.add(rod(start, end, tube))
+    # The down tube, the seat tube and the top tube.
+    a.add(rod(head - [0, 0, 0.14], crank, tube))
+    a.add(rod(saddle, crank, tube))
+    a.add(rod(head - [0, 0, 0.06], top_tube_end, tube))
+    # The stays from the rear hub to the crank and to the saddle.
     for end in (crank, saddle - [0, 0, 0.12]):
         a.add_pair(rod(rear + [0, 0.05, 0], end, tube * 0.6))
-    a.add(
-        ellipsoid((a.uniform(0.15, 0.24), a.uniform(0.06, 0.11), 0.05), saddle + [0, 0, 0.05]),
-        SADDLE,
-    )
+    saddle_radii = (a.uniform(0.15, 0.24), a.uniform(0.06, 0.11), 0.05)
+    a.add(ellipsoid(saddle_radii, saddle + [0, 0, 0.05]), SADDLE)
 
-    # The bars.
+    # The bars, on a stem.
     stem = head + [0.02, 0, a.uniform(0.08, 0.2)]
     bars = a.pick("flat", "swept", "drop")
     a.add(rod(head, stem, tube), METAL)
@@ -88,7 +86,7 @@ def bicycle(a: Assembly) -> None:
         a.add(box((0.1, 0.1, 0.025), pedal + [0, side * 0.05, 0]), RUBBER)
     a.add(disc(0.12, 0.02, crank - [0, 0.06, 0]), METAL)
     if a.chance(0.35):
-        a.add(box((0.28, 0.34, 0.22), head + [0.2, 0, 0.05]), BASKET)  # the basket
+        a.add(box((0.28, 0.34, 0.22), head + [0.2, 0, 0.05]), BASKET)
 
 
 def motorcycle(a: Assembly) -> None:
@@ -105,7 +103,7 @@ def motorcycle(a: Assembly) -> None:
     wheel = a.uniform(0.26, 0.32) if style == "scooter" else a.uniform(0.36, 0.46)
     tyre = a.uniform(0.07, 0.11)
     half_base = a.uniform(0.6, 0.72) + (0.1 if style == "cruiser" else 0)
-    # The wheels with their mudguards, arcs between two angles.
+    # The wheels with their mudguards, arcs between two angles in radians.
     front = point(half_base, 0, wheel)
     rear = point(-half_base, 0, wheel)
     for hub, start, stop in ((rear, -1.5, 0.6), (front, -0.8, 0.7)):
@@ -113,23 +111,22 @@ def motorcycle(a: Assembly) -> None:
         a.add(disc(wheel * 0.62, 0.06, hub), METAL)
         a.add(torus(wheel + 0.04, 0.05, Y, hub, start, stop, sides=14))
     # Fork, headlamp and bars.
-    head = front + [
-        -a.uniform(0.2, 0.28) - (0.15 if style == "cruiser" else 0),
-        0,
-        a.uniform(0.55, 0.72),
-    ]
+    rake = a.uniform(0.2, 0.28) + (0.15 if style == "cruiser" else 0)
+    head = front + [-rake, 0, a.uniform(0.55, 0.72)]
+    head_xz = head[[0, 2]]
     a.add_pair(rod(head, front + [0, 0.11, 0], 0.04), METAL)
     a.add(ellipsoid((0.1, 0.12, 0.12), head + [0.12, 0, a.uniform(-0.06, 0.04)]), HEADLAMP)
     grip = head + [-a.uniform(0.12, 0.25), a.uniform(0.3, 0.42), 0]
     grip[2] += a.uniform(0.2, 0.4) if style == "cruiser" else a.uniform(0.02, 0.2)
-    a.add_pair(rod(head, grip + [0.1, -0.06, 0], 0.026), METAL)
-    a.add_pair(capsule(grip + [0.1, -0.06, 0], grip, 0.035), RUBBER)
+    bend = grip + [0.1, -0.06, 0]
+    a.add_pair(rod(head, bend, 0.026), METAL)
+    a.add_pair(capsule(bend, grip, 0.035), RUBBER)
 
     seat_z = wheel * 2 + a.uniform(0, 0.12)
     if style == "scooter":
         # Leg shield, footboard, body, seat and rear light.
         floor = wheel * a.uniform(0.75, 1.0)
-        a.add(pane((half_base - 0.3, floor), head[[0, 2]], a.uniform(0.4, 0.55), 0.07))
+        a.add(pane((half_base - 0.3, floor), head_xz, a.uniform(0.4, 0.55), 0.07))
         a.add(box((half_base * 1.1, 0.36, 0.08), (0, 0, floor)))
         body = (half_base * 1.15, 0.42, seat_z - floor + 0.1)
         a.add(rounded_box(body, (-half_base * 0.75, 0, (seat_z + floor) / 2), 4))
@@ -140,23 +137,22 @@ def motorcycle(a: Assembly) -> None:
         # Engine, tank, the tubes between them, seat, tail and rear light.
         engine = point(a.uniform(-0.08, 0.08), 0, wheel * a.uniform(0.85, 1.1))
         a.add(box((a.uniform(0.4, 0.55), 0.3, a.uniform(0.3, 0.42)), engine), ENGINE)
-        tank = np.array([head[0] * 0.45, 0, seat_z + 0.14])
-        a.add(
-            ellipsoid((a.uniform(0.28, 0.36), a.uniform(0.14, 0.19), a.uniform(0.13, 0.18)), tank)
-        )
+        tank = point(head[0] * 0.45, 0, seat_z + 0.14)
+        tank_radii = (a.uniform(0.28, 0.36), a.uniform(0.14, 0.19), a.uniform(0.13, 0.18))
+        a.add(ellipsoid(tank_radii, tank))
         for start, end in ((head, engine), (head, tank), (engine, rear)):
             a.add_pair(rod(start + [0, 0.04, 0], end + [0, 0.06, 0], 0.032), METAL)
         a.add(rounded_box((half_base * 0.95, 0.28, 0.13), (-half_base * 0.48, 0, seat_z), 3), SEAT)
         tail = point(-half_base * a.uniform(0.95, 1.25), 0, seat_z + a.uniform(0.08, 0.25))
         a.add(capsule((-half_base * 0.7, 0, seat_z), tail, 0.12, 0.06))
         a.add(box((0.05, 0.16, 0.08), tail - [0.08, 0, 0]), GLASS)
-        # A fairing with a screen.
+        # A fairing, narrower at its top, with a screen; both by points (x, z).
         if style == "sport":
-            upper = [[head[0] + 0.3, head[2] - 0.1], [head[0] - 0.05, head[2] + 0.12]]
+            top = head_xz + [-0.05, 0.12]
             lower = [[0.05, wheel * 1.6], [0.0, wheel * 0.6], [0.35, wheel * 0.9]]
-            fairing = extrusion(upper + lower, a.uniform(0.34, 0.44))
-            a.add(tapered(fairing, wheel, head[2] + 0.12, 0.55))
-            a.add(pane(head[[0, 2]] + [0.12, 0.08], head[[0, 2]] + [-0.08, 0.3], 0.24), GLASS)
+            fairing = extrusion([head_xz + [0.3, -0.1], top, *lower], a.uniform(0.34, 0.44))
+            a.add(tapered(fairing, wheel, top[1], 0.55))
+            a.add(pane(head_xz + [0.12, 0.08], head_xz + [-0.08, 0.3], 0.24), GLASS)
     exhaust_end = (-half_base * a.uniform(0.9, 1.3), -0.22, wheel * a.uniform(0.7, 1.3))
     a.add(rod((0.05, -0.2, wheel * 0.6), exhaust_end, 0.05, a.uniform(0.06, 0.09)), EXHAUST)
 
@@ -175,30 +171,32 @@ def car(a: Assembly) -> None:
     wheel = a.uniform(0.2, 0.27)
     nose = length / 2
     tail = -nose
-    # lower and upper edge of the body
+    # The lower and the upper edge of the body.
     sill = wheel * a.uniform(0.6, 0.9)
     belt = wheel * a.uniform(2.1, 2.5)
     roof = belt + a.uniform(0.3, 0.45) + (0.15 if style == "van" else 0)
     taper = a.uniform(0.76, 0.88)
-    bonnet_end = nose - length * (
-        a.uniform(0.11, 0.18) if style == "van" else a.uniform(0.24, 0.31)
-    )
+    bonnet = a.uniform(0.11, 0.18) if style == "van" else a.uniform(0.24, 0.31)
+    bonnet_end = nose - length * bonnet
     boot_start = tail + length * {"saloon": 0.18, "pickup": 0.43}.get(style, 0.02)
     nose_z = belt - (belt - sill) * a.uniform(0.15, 0.35)
-    # The body, below the windows.
+    # The body, below the windows: its outline (x, z) from the sill in front to the sill behind.
     front = [
         [nose, sill],
         [nose + 0.03, (sill + nose_z) / 2],
         [nose - 0.04, nose_z],
         [bonnet_end, belt],
     ]
-    a.add(tapered(extrusion([[tail, sill], *front, [tail, belt]], width), sill, belt, 0.94))
+    body = extrusion([[tail, sill], *front, [tail, belt]], width)
+    a.add(tapered(body, sill, belt, 0.94))
 
     # The cabin, with a pane in front and one behind.
     rear_slope = a.uniform(0.02, 0.08) if style in ("pickup", "van") else a.uniform(0.1, 0.3)
     windscreen = np.array([[bonnet_end + 0.03, belt], [bonnet_end - a.uniform(0.2, 0.38), roof]])
     rear_window = np.array([[boot_start, belt], [boot_start + rear_slope, roof]])
-    cabin = np.concatenate([rear_window[:1], windscreen, rear_window[1:]])
+    # The outline runs up the windscreen and down the rear window.
+    rear_foot, rear_top = rear_window
+    cabin = np.array([rear_foot, *windscreen, rear_top])
     a.add(tapered(extrusion(cabin, width * 0.92), belt, roof, taper))
     for (low, high), out in ((windscreen, 0.015), (rear_window, -0.015)):
         # The pane leaves a margin at both edges, and is slightly outside the cabin.
@@ -212,24 +210,21 @@ def car(a: Assembly) -> None:
     pillar = pane((middle[0], belt), (middle[0], roof), width * 0.95, 0.06)
     a.add(tapered(pillar, belt, roof, taper))
     if style == "pickup":
-        wall = a.uniform(0.08, 0.18)
-        bed = boot_start - tail
-        side = box((bed, 0.06, wall), (tail + bed / 2, width * 0.44, belt + wall / 2))
-        a.add_pair(side)
-        a.add(box((0.06, width * 0.9, wall), (tail + 0.03, 0, belt + wall / 2)))
+        # The walls of the bed: two at its sides, one behind.
+        wall_height = a.uniform(0.08, 0.18)
+        wall_z = belt + wall_height / 2
+        bed_length = boot_start - tail
+        place = (tail + bed_length / 2, width * 0.44, wall_z)
+        a.add_pair(box((bed_length, 0.06, wall_height), place))
+        a.add(box((0.06, width * 0.9, wall_height), (tail + 0.03, 0, wall_z)))
     # Headlamps, grille, rear lights, bumpers and wheels.
     light_z = sill + (nose_z - sill) * 0.72
-    lamp = ellipsoid(
-        (0.06, a.uniform(0.09, 0.15), a.uniform(0.05, 0.08)), (nose, width * 0.34, light_z)
-    )
-    a.add_pair(lamp, HEADLAMP)
-    a.add(
-        box((0.05, width * a.uniform(0.25, 0.4), a.uniform(0.07, 0.12)), (nose + 0.01, 0, light_z)),
-        GRILLE,
-    )
-    a.add_pair(
-        box((0.04, 0.1, a.uniform(0.1, 0.2)), (tail - 0.01, width * 0.4, belt - 0.16)), REAR_LIGHT
-    )
+    lamp_radii = (0.06, a.uniform(0.09, 0.15), a.uniform(0.05, 0.08))
+    a.add_pair(ellipsoid(lamp_radii, (nose, width * 0.34, light_z)), HEADLAMP)
+    grille_size = (0.05, width * a.uniform(0.25, 0.4), a.uniform(0.07, 0.12))
+    a.add(box(grille_size, (nose + 0.01, 0, light_z)), GRILLE)
+    rear_light = (0.04, 0.1, a.uniform(0.1, 0.2))
+    a.add_pair(box(rear_light, (tail - 0.01, width * 0.4, belt - 0.16)), REAR_LIGHT)
     for x in (nose + 0.02, tail - 0.02):
         a.add(rounded_box((0.12, width, 0.12), (x, 0, sill + 0.06), 4), BUMPER)
     for x in (nose - length * a.uniform(0.16, 0.2), tail + length * a.uniform(0.17, 0.21)):
@@ -246,33 +241,34 @@ def hydrant(a: Assembly) -> None:
     height = a.uniform(0.9, 1.35)
     neck = radius * a.uniform(0.85, 1)
     rim = radius * 1.22
-    cap = height * 0.82
+    bonnet_z = height * 0.82
     foot = [[0.001, 0], [radius * 1.45, 0], [radius * 1.45, 0.09], [radius, 0.11]]
-    flange = [[neck, height * 0.75], [rim, height * 0.76], [rim, cap], [neck, cap + 0.01]]
+    flange = [[neck, height * 0.75], [rim, height * 0.76], [rim, bonnet_z], [neck, bonnet_z + 0.01]]
     a.add(lathe(foot + flange, 24))
-    # The bonnet, with the nut that opens the valve.
-    t = np.linspace(0, TAU / 4, 7)
-    dome = np.stack([np.cos(t), 0.25 * np.sin(t)], 1)
+    # The bonnet, with the nut that opens the valve and covers its tip, where the radius is 0.
+    angle = np.linspace(0, TAU / 4, 7)
+    dome = np.stack([np.cos(angle), 0.25 * np.sin(angle)], 1)
     cone = [[1.05, 0], [0.9, 0.14], [0.35, 0.2], [0, 0.22]]
-    bonnet = np.array(dome if a.chance(0.5) else cone) * [radius, height]
-    a.add(lathe(bonnet + [0, cap], 24), CAP if a.chance(0.6) else BODY)
-    top = cap + bonnet[-1, 1]
+    bonnet = np.array(dome if a.chance(0.5) else cone) * [radius, height] + [0, bonnet_z]
+    a.add(lathe(bonnet, 24), CAP if a.chance(0.6) else BODY)
+    top = bonnet[-1, 1]
     a.add(rod((0, 0, top - 0.04), (0, 0, top + a.uniform(0.07, 0.14)), 0.07, sides=6), NUT)
 
     outlet = height * a.uniform(0.5, 0.64)
     bore = a.uniform(0.15, 0.21)
-    large = (outlet, radius + a.uniform(0.14, 0.26), bore)  # height, reach and radius
+    # Height, reach and radius of the outlets.
+    large = (outlet, radius + a.uniform(0.14, 0.26), bore)
     small = (outlet + a.uniform(-0.03, 0.13), radius + a.uniform(0.1, 0.2), a.uniform(0.09, 0.13))
     # Each outlet is a pipe with a cap and a nut.
     for turn, (z, reach, pipe) in ((0, large), (TAU / 4, small), (-TAU / 4, small)):
-        a.add(rod((0, 0, z), (reach, 0, z), pipe).rotated("z", turn))
-        a.add(rod((reach, 0, z), (reach + 0.1, 0, z), pipe * 1.2, sides=8).rotated("z", turn), CAP)
-        a.add(rod((reach, 0, z), (reach + 0.18, 0, z), 0.05, sides=5).rotated("z", turn), NUT)
+        mouth = (reach, 0, z)
+        a.add(rod((0, 0, z), mouth, pipe).rotated("z", turn))
+        a.add(rod(mouth, (reach + 0.1, 0, z), pipe * 1.2, sides=8).rotated("z", turn), CAP)
+        a.add(rod(mouth, (reach + 0.18, 0, z), 0.05, sides=5).rotated("z", turn), NUT)
     # Eight bolts around the foot, and a ring for the chain.
     bolt = cylinder(0.035, 0.035, 0.05, 6).translated((radius * 1.27, 0, 0.11))
     for angle in np.arange(8) * TAU / 8 + 0.2:
         a.add(bolt.rotated("z", angle), NUT)
     if a.chance(0.6):
-        a.add(
-            torus(a.uniform(0.1, 0.16), 0.018, Y, (radius + 0.12, 0.03, outlet - bore - 0.08)), RING
-        )
+        place = (radius + 0.12, 0.03, outlet - bore - 0.08)
+        a.add(torus(a.uniform(0.1, 0.16), 0.018, Y, place), RING)
