@@ -40,9 +40,10 @@ def backpack(a: Assembly) -> None:
     height = a.uniform(1.1, 1.5)
     front = depth / 2
     back = -front
+    middle = height / 2  # from here on, the width narrows
     narrowing = a.uniform(0.7, 1.0)
-    body = rounded_box((depth, width, height), (0, 0, height / 2), a.uniform(3.5, 6))
-    a.add(tapered(body, height / 2, height, narrowing))
+    body = rounded_box((depth, width, height), (0, 0, middle), a.uniform(3.5, 6))
+    a.add(tapered(body, middle, height, narrowing))
     pocket_depth = depth * a.uniform(0.45, 0.7)
     pocket_height = height * a.uniform(0.35, 0.5)
     pocket_z = height * a.uniform(0.06, 0.12) + pocket_height / 2
@@ -52,7 +53,7 @@ def backpack(a: Assembly) -> None:
         # A flap with two belts.
         flap_size = (depth * 1.15, width * 1.02, height * 0.3)
         flap = rounded_box(flap_size, (depth * 0.08, 0, height * 0.92), 4)
-        a.add(tapered(flap, height / 2, height, narrowing), FLAP)
+        a.add(tapered(flap, middle, height, narrowing), FLAP)
         belt = box((0.04, 0.1, height * 0.38), (depth * 0.6, width * 0.2, height * 0.66))
         a.add_pair(belt, BELT)
     else:
@@ -82,8 +83,12 @@ def handbag(a: Assembly) -> None:
     width = a.uniform(1.0, 1.5)
     height = a.uniform(0.7, 1.1)
     style = a.pick("tote", "flap bag", "bowling bag")
-    narrowing = a.uniform(1.0, 1.2) if style == "tote" else a.uniform(0.65, 0.95)
-    squareness = 8 if style == "tote" else a.uniform(3, 5)
+    if style == "tote":
+        narrowing = a.uniform(1.0, 1.2)
+        squareness = 8
+    else:
+        narrowing = a.uniform(0.65, 0.95)
+        squareness = a.uniform(3, 5)
     body = rounded_box((depth, width, height), (0, 0, height / 2), squareness)
     a.add(tapered(body, 0, height, narrowing))
     front = depth / 2
@@ -104,7 +109,7 @@ def handbag(a: Assembly) -> None:
     places = (0.0,) if a.chance(0.35) else (front * 0.7, -front * 0.7)
     for x in places:
         a.add(handle.translated((x, 0, height * 0.95)), HANDLE)
-    a.add(box((0.03, 0.12, 0.25), (front + 0.05, -loop * 1.1, height * 0.7)), TAG)  # the tag
+    a.add(box((0.03, 0.12, 0.25), (front + 0.05, -loop * 1.1, height * 0.7)), TAG)
 
 
 def book(a: Assembly) -> None:
@@ -119,38 +124,38 @@ def book(a: Assembly) -> None:
     height = a.uniform(1.3, 1.7)
     width = a.uniform(0.9, 1.25)
     thick = a.uniform(0.12, 0.4)
-    board = a.uniform(0.025, 0.05)
-    spine = width / 2
+    board = a.uniform(0.025, 0.05)  # thickness of a cover
+    spine_y = width / 2
     # The pages, the lower cover, and a round or flat spine.
     a.add(box((height * 0.96, width * 0.95, thick), (0, -width * 0.01, thick / 2)), PAPER)
     a.add(box((height, width, board)), COVER)
     if a.chance(0.5):
+        # The outline (y, z) of a round spine is half an ellipse.
         angle = np.linspace(0, np.pi, 9)
-        y = spine + 0.1 * np.sin(angle)
+        y = spine_y + 0.1 * np.sin(angle)
         z = thick / 2 + (thick + board) / 2 * np.cos(angle)
         a.add(extrusion(np.stack([y, z], 1), height, "yz"), SPINE)
     else:
-        a.add(box((height, board, thick + board), (0, spine, thick / 2)), SPINE)
+        a.add(box((height, board, thick + board), (0, spine_y, thick / 2)), SPINE)
     lift = a.uniform(0.15, 0.7) if a.chance(0.4) else 0.0
 
     def add_to_cover(mesh: Mesh, material: int) -> None:
         # The cover rotates about the upper edge of the spine.
-        lifted = mesh.translated((0, -spine, 0)).rotated("x", -lift)
-        a.add(lifted.translated((0, spine, thick)), material)
+        lifted = mesh.translated((0, -spine_y, 0)).rotated("x", -lift)
+        a.add(lifted.translated((0, spine_y, thick)), material)
 
     add_to_cover(box((height, width, board)), COVER)
+    outside = board / 2
     title_x = -height * a.uniform(0.2, 0.32)
     for line in range(1 + a.choice(3)):
         title = (0.08, width * a.uniform(0.35, 0.7), 0.02)
-        add_to_cover(box(title, (title_x + 0.13 * line, 0, board / 2)), TITLE)
+        add_to_cover(box(title, (title_x + 0.13 * line, 0, outside)), TITLE)
     if a.chance(0.6):
         picture = (height * a.uniform(0.25, 0.4), width * a.uniform(0.5, 0.8), 0.015)
-        add_to_cover(box(picture, (height * 0.15, 0, board / 2)), PICTURE)
+        add_to_cover(box(picture, (height * 0.15, 0, outside)), PICTURE)
     else:
-        add_to_cover(
-            box((height, width * a.uniform(0.08, 0.2), 0.015), (0, width * 0.32, board / 2)),
-            PICTURE,
-        )
+        band = (height, width * a.uniform(0.08, 0.2), 0.015)
+        add_to_cover(box(band, (0, width * 0.32, outside)), PICTURE)
 
 
 def laptop(a: Assembly) -> None:
@@ -181,14 +186,15 @@ def laptop(a: Assembly) -> None:
     rim = a.uniform(0.04, 0.09)
 
     def add_to_lid(mesh: Mesh, material: int) -> None:
-        # The part is given for the closed lid: the screen faces down, the hinge is at x = 0.
+        # Parts are those of a closed lid: the screen faces down, the hinge is at x = 0.
         a.add(mesh.rotated("y", -opening).translated(hinge), material)
 
-    add_to_lid(rounded_box((lid, width, thick * 0.6), (lid / 2, 0, thick * 0.3), 12), BODY)
-    add_to_lid(box((lid - 2 * rim, width - 2 * rim, 0.02), (lid / 2 + 0.01, 0, 0)), SCREEN)
-    add_to_lid(
-        cylinder(a.uniform(0.06, 0.12), 0.06, 0.02, 16).translated((lid / 2, 0, thick * 0.6)), SIGN
-    )
+    middle = lid / 2
+    back = thick * 0.6
+    add_to_lid(rounded_box((lid, width, back), (middle, 0, thick * 0.3), 12), BODY)
+    add_to_lid(box((lid - 2 * rim, width - 2 * rim, 0.02), (middle + 0.01, 0, 0)), SCREEN)
+    sign = cylinder(a.uniform(0.06, 0.12), 0.06, 0.02, 16)
+    add_to_lid(sign.translated((middle, 0, back)), SIGN)
 
 
 def _add_keys(
@@ -199,12 +205,12 @@ def _add_keys(
     cell: tuple[float, float],
     z: float,
 ) -> None:
-    """Add keys in cells of (depth, width) at height z, from the front left corner (x, y) on."""
+    """Add keys at height z in cells of (depth, width), from the front left corner (x, y) on."""
     front, left = corner
     depth, width = cell
     for row in range(n_rows):
         for key in range(n_keys):
-            # The space bar replaces all but seven keys of the front row.
+            # The space bar replaces all but seven keys of the front row, three on its left.
             if row > 0 or not 3 <= key < n_keys - 4:
                 place = (front - (row + 0.5) * depth, left - (key + 0.5) * width, z)
                 material = _EDGE_KEY if key in (0, n_keys - 1) else _KEY
@@ -237,9 +243,8 @@ def mouse(a: Assembly) -> None:
     button[:, 0] = np.maximum(button[:, 0], length * a.uniform(0.02, 0.12))
     button[:, 1] = np.maximum(button[:, 1], 0.025)
     a.add_pair(Mesh(button, shell.faces), BUTTON)
-    a.add(
-        torus(0.09, 0.045, Y, (length * a.uniform(0.25, 0.33), 0, height * 0.78), sides=16), WHEEL
-    )
+    wheel = (length * a.uniform(0.25, 0.33), 0, height * 0.78)
+    a.add(torus(0.09, 0.045, Y, wheel, sides=16), WHEEL)
     if a.chance(0.5):
         rest = (length * 0.5, 0.12, height * 0.3)
         a.add(rounded_box(rest, (0.05, width * 0.46, height * 0.55), 4), THUMB_REST)
@@ -274,13 +279,11 @@ def keyboard(a: Assembly) -> None:
     cell = (row_depth, field / n_keys)
     _add_keys(add_tilted, n_rows, n_keys, (front, width * 0.46), cell, top)
     if has_pad:
+        pad_key = box((row_depth * 0.78, width * 0.04, 0.1))
         for row in range(n_rows - 1):
-            for key in range(4):
+            for key, material in enumerate((_KEY, _KEY, _KEY, _EDGE_KEY)):
                 place = (front - (row + 0.5) * row_depth, -width * (0.275 + 0.05 * key), top)
-                add_tilted(
-                    box((row_depth * 0.78, width * 0.04, 0.1), place),
-                    _EDGE_KEY if key == 3 else _KEY,
-                )
+                add_tilted(pad_key.translated(place), material)
     if a.chance(0.4):
         rest = (a.uniform(0.2, 0.35), width * 0.94, thick * 0.7)
         add_tilted(rounded_box(rest, (depth / 2 + 0.12, 0, -0.01)), PALM_REST)
@@ -301,19 +304,17 @@ def remote(a: Assembly) -> None:
     length = a.uniform(1.4, 2.0)
     width = a.uniform(0.38, 0.58)
     thick = a.uniform(0.14, 0.26)
-    body = rounded_box((thick, width, length), (0, 0, length / 2), a.uniform(4, 9))
-    waist = a.uniform(0.8, 1.0)
+    front = length / 2
     top = thick + 0.005
-    # The body is built upright, and laid down.
-    body = tapered(body, length / 2, 0, waist).rotated("y", TAU / 4)  # narrower behind
-    a.add(body.translated((-length / 2, 0, thick / 2)))
-    a.add(
-        ellipsoid((0.06, width * 0.2, thick * 0.3), (length / 2 - 0.02, 0, thick * 0.55)), EMITTER
-    )
-    a.add(
-        cylinder(0.055, 0.05, 0.06).translated((length * 0.41, width * a.uniform(0.15, 0.28), top)),
-        BUTTON,
-    )
+    # The body is built upright, narrower at its foot, and laid down.
+    upright = rounded_box((thick, width, length), (0, 0, front), a.uniform(4, 9))
+    waist = a.uniform(0.8, 1.0)
+    body = tapered(upright, front, 0, waist).rotated("y", TAU / 4)
+    a.add(body.translated((-front, 0, thick / 2)))
+    emitter = (0.06, width * 0.2, thick * 0.3)
+    a.add(ellipsoid(emitter, (front - 0.02, 0, thick * 0.55)), EMITTER)
+    power_key = (length * 0.41, width * a.uniform(0.15, 0.28), top)
+    a.add(cylinder(0.055, 0.05, 0.06).translated(power_key), BUTTON)
     # A ring, or four keys in its place, around a button.
     ring_x = length * a.uniform(0.08, 0.22)
     ring = width * a.uniform(0.26, 0.34)
@@ -323,13 +324,12 @@ def remote(a: Assembly) -> None:
         for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
             a.add(box((0.09, 0.09, 0.06), (ring_x + ring * x, ring * y, top)), RING)
     a.add(cylinder(ring * 0.45, ring * 0.4, 0.06).translated((ring_x, 0, top)), BUTTON)
-    # Rows of three keys; those of the last row, and two before the ring, have another colour.
+    # Rows of three keys; the keys of the last row and two before the ring have another colour.
     n_rows = 3 + a.choice(3)
-    round_keys = a.chance(0.5)
     pitch = width * 0.27
+    key = cylinder(0.045, 0.04, 0.05) if a.chance(0.5) else box((0.07, pitch * 0.7, 0.05))
     for row in range(n_rows):
         for column in (-1, 0, 1):
-            key = cylinder(0.045, 0.04, 0.05) if round_keys else box((0.07, pitch * 0.7, 0.05))
             place = (ring_x - ring - 0.12 - row * length * 0.085, column * pitch * waist, top)
             a.add(key.translated(place), KEY if row < n_rows - 1 else COLOURED_KEY)
     a.add_pair(box((0.06, pitch * 0.75, 0.05), (ring_x + ring + 0.11, pitch, top)), COLOURED_KEY)
