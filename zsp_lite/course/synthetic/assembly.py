@@ -11,12 +11,14 @@ from zsp_lite.course.synthetic.primitives import (
     TAU,
     Coordinates,
     Mesh,
+    box_centre,
     cylinder,
     extrusion,
     joined,
+    point,
     surface_spread,
 )
-from zsp_lite.course.synthetic.textures import random_colour
+from zsp_lite.course.synthetic.textures import ANY_HUE, random_colour
 
 # Axes.
 X = (1.0, 0.0, 0.0)
@@ -33,7 +35,8 @@ class Assembly:
     """
 
     def __init__(self, rng: np.random.Generator, variation: np.random.Generator | None = None):
-        self.rng, self._variation = rng, variation
+        self.rng = rng
+        self._variation = variation
         self.meshes: list[Mesh] = []
         self.materials: list[int] = []  # of each mesh
 
@@ -41,7 +44,8 @@ class Assembly:
         """Draw a proportion uniformly from [low, high)."""
         value = float(self.rng.uniform(low, high))
         if self._variation is not None:
-            value = float(np.clip(value + self._variation.normal(0, 0.3) * (high - low), low, high))
+            value += self._variation.normal(0, 0.3) * (high - low)
+            value = float(np.clip(value, low, high))
         return value
 
     def chance(self, probability: float) -> bool:
@@ -84,9 +88,9 @@ def make_shape(
     build(assembly)
     vertices, faces = joined(assembly.meshes)
     material = np.repeat(assembly.materials, [len(mesh.faces) for mesh in assembly.meshes])
-    # a small random scale along each axis
+    # Each axis has a small random scale of its own.
     vertices = vertices * np.exp(assembly.rng.normal(0, 0.08, 3))
-    vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
+    vertices = vertices - box_centre(vertices)
     vertices = vertices / surface_spread(vertices, faces)
     n = len(faces)
     uv = np.zeros((n, 3, 2), np.float32)
@@ -101,7 +105,7 @@ def rounded_box(
 
     Squareness 2 gives an ellipsoid, 10 nearly a box.
     """
-    # The surface of the cube from -1 to 1, as a grid of n x n points on each of its sides; they are
+    # The surface of the cube from -1 to 1 has a grid of n x n points on each of its sides. They are
     # denser at the edges, where the curvature is largest.
     n = 11
     line = np.sin(np.linspace(-TAU / 4, TAU / 4, n))
@@ -109,7 +113,7 @@ def rounded_box(
     sides = [np.dstack([np.full_like(u, sign), sign * u, v]) for sign in (-1.0, 1.0)]
     vertices = np.stack([np.roll(side, axis, axis=2) for axis in range(3) for side in sides])
     vertices = vertices.reshape(-1, 3)
-    # Two triangles fill each cell of a grid; `corner` is its vertex of the lowest index.
+    # Two triangles fill each cell of a grid; `corner` is the cell's vertex of the lowest index.
     corner = np.arange(n * n).reshape(n, n)[:-1, :-1].reshape(-1, 1)
     cells = np.concatenate([corner + [0, n, n + 1], corner + [0, n + 1, 1]])
     faces = np.concatenate([cells + side * n * n for side in range(6)])
@@ -128,11 +132,9 @@ def tapered(mesh: Mesh, low: float, high: float, factor: float) -> Mesh:
 
 def pane(start: Coordinates, end: Coordinates, width: float, thickness: float = 0.04) -> Mesh:
     """Return a slab between two points (x, z), for example a windscreen; the width is along y."""
-    start = np.asarray(start, float)
-    end = np.asarray(end, float)
-    along = (end - start) / np.linalg.norm(end - start)
-    # half the thickness, perpendicular to the line from start to end
-    across = thickness / 2 * np.array([-along[1], along[0]])
+    x, z = np.subtract(end, start) / np.linalg.norm(np.subtract(end, start))
+    # Half the thickness, perpendicular to the line from start to end.
+    across = thickness / 2 * point(-z, x)
     return extrusion([start - across, end - across, end + across, start + across], width)
 
 
@@ -143,8 +145,11 @@ def disc(radius: float, thickness: float, centre: Coordinates) -> Mesh:
 
 def add_wheels(a: Assembly, x: float, y: float, radius: float, width: float) -> None:
     """Add the two wheels of an axle at x, standing on the ground at y and -y."""
-    a.add_pair(disc(radius, width, (x, y, radius)), 3)
-    a.add_pair(disc(radius * 0.6, width * 1.2, (x, y, radius)), 2)
+    RIM = 2
+    TYRE = 3
+
+    a.add_pair(disc(radius, width, (x, y, radius)), TYRE)
+    a.add_pair(disc(radius * 0.6, width * 1.2, (x, y, radius)), RIM)
 
 
 class _Kind(NamedTuple):
@@ -156,30 +161,31 @@ class _Kind(NamedTuple):
     value: tuple[float, float]
     roughness: tuple[float, float]
     specular: float = 0.04
-    # numbers of waves of the pattern to choose from: 1 for stripes, 2 for checks, more for patches
+    # The pattern has one of these numbers of waves: 1 for stripes, 2 for checks, more for patches.
     waves: tuple[int, ...] = (5,)
     frequency: tuple[float, float] = (2, 8)  # of the pattern, in radians per unit
     contrast: tuple[float, float] = (0.05, 0.2)  # of the pattern
 
 
-_ANY = (0, 360)
-# Each with its share, hue, saturation, value and roughness.
+_MUTED = (0, 0.8)  # saturation of painted and woven surfaces
+_NO_EXTREMES = (0.25, 0.95)  # value: neither black nor white
+# The numbers in a row are share, hue, saturation, value and roughness.
 _KINDS = (
     # paint
-    _Kind(0.22, _ANY, (0, 0.8), (0.25, 0.95), (0.35, 0.75)),
+    _Kind(0.22, ANY_HUE, _MUTED, _NO_EXTREMES, (0.35, 0.75)),
     # printed paint
     _Kind(
         0.13,
-        _ANY,
-        (0, 0.8),
-        (0.25, 0.95),
+        ANY_HUE,
+        _MUTED,
+        _NO_EXTREMES,
         (0.35, 0.75),
         waves=(1, 2, 5),
         frequency=(3, 14),
         contrast=(0.3, 1),
     ),
     # plastic
-    _Kind(0.23, _ANY, (0, 0.9), (0.25, 0.95), (0.15, 0.4), specular=0.05),
+    _Kind(0.23, ANY_HUE, (0, 0.9), _NO_EXTREMES, (0.15, 0.4), specular=0.05),
     # wood
     _Kind(
         0.12,
@@ -194,9 +200,9 @@ _KINDS = (
     # cloth
     _Kind(
         0.14,
-        _ANY,
-        (0, 0.8),
-        (0.25, 0.95),
+        ANY_HUE,
+        _MUTED,
+        _NO_EXTREMES,
         (0.95, 0.95),
         specular=0.02,
         waves=(3,),
@@ -206,7 +212,7 @@ _KINDS = (
     # metal
     _Kind(0.08, (20, 60), (0, 0.3), (0.65, 0.95), (0.2, 0.55), specular=0.4),
     # rubber
-    _Kind(0.08, _ANY, (0, 0), (0.08, 0.3), (0.7, 0.95)),
+    _Kind(0.08, ANY_HUE, (0, 0), (0.08, 0.3), (0.7, 0.95)),
 )
 
 
@@ -221,19 +227,20 @@ def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
     """Draw two sRGB colours, and sine waves through the object that mix them."""
     colour = random_colour(rng, kind.hue, kind.saturation, kind.value)
     other = random_colour(rng, kind.hue, kind.saturation, kind.value)
-    # Only print, the kind with a choice of waves, has a second colour; else it is darker.
+    # Only printed paint, the kind with a choice of waves, has a second hue; the second colour of
+    # other kinds is a darker shade of the first.
     if len(kind.waves) == 1:
         other = 0
     other = colour + rng.uniform(*kind.contrast) * (other - colour)
-    # Wave vectors (k, 3) of one length.
+    # The wave vectors (k, 3) have one length.
     waves = rng.normal(size=(rng.choice(kind.waves), 3))
     waves *= rng.uniform(*kind.frequency) / np.linalg.norm(waves, axis=1, keepdims=True)
     phases = rng.uniform(0, TAU, len(waves))
-    warp = rng.normal(0, 2, 3)
+    warp = rng.normal(0, 2, 3)  # vector of a wave that bends all others
     sharpness = float(rng.choice([1.0, 2.0, 6.0]))  # 1 for a sine, more for clear edges
 
     def pattern(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        bend = np.sin(points @ warp)[:, None]  # bends all waves
+        bend = np.sin(points @ warp)[:, None]
         value = np.sin(points @ waves.T + phases + bend).mean(1, keepdims=True)
         share = np.clip(0.5 + 0.5 * sharpness * value, 0, 1)
         return (colour + share * (other - colour)).astype(np.float32)

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from zsp_lite.course.synthetic.assembly import Builder, make_shape, random_materials
 from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.course.synthetic.meshes import TexturedMesh, canonical_mesh, list_models, read_mesh
+from zsp_lite.course.synthetic.primitives import box_centre
 from zsp_lite.course.synthetic.sequences import HEIGHTS, record_sequence
 from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
 from zsp_lite.data.ground_truth import POSES_FILE, ObjectPose, read_poses
@@ -240,7 +241,7 @@ def write_sequence(
 
 def shape_turns(vertices: Float[np.ndarray, "v 3"]) -> tuple[int, ...]:
     """Return the quarter turns about z, in degrees, that map the vertices to themselves."""
-    points = vertices - (vertices.min(0) + vertices.max(0)) / 2
+    points = vertices - box_centre(vertices)
     tree = KDTree(points)
     limit = 0.03 * np.ptp(points)
     x, y, z = points.T

@@ -15,7 +15,14 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from zsp_lite.course.synthetic.primitives import Mesh, area_normals, joined, surface_spread, unit
+from zsp_lite.course.synthetic.primitives import (
+    Mesh,
+    area_normals,
+    box_centre,
+    joined,
+    surface_spread,
+    unit,
+)
 from zsp_lite.course.synthetic.textures import linear_to_srgb
 from zsp_lite.errors import InputError, check_magnitude, rotation_matrix
 from zsp_lite.io.files import file_size, plain_name, read_bytes, read_json
@@ -209,7 +216,7 @@ def read_mesh(path: str | Path) -> TexturedMesh:
 def canonical_mesh(mesh: TexturedMesh, rotation: Float[np.ndarray, "3 3"]) -> TexturedMesh:
     """Rotate a mesh, centre its bounding box, and scale its surface to unit spread."""
     vertices = mesh.vertices @ rotation.T
-    vertices = vertices - (vertices.max(0) + vertices.min(0)) / 2
+    vertices = vertices - box_centre(vertices)
     spread = surface_spread(vertices, mesh.faces)
     return replace(
         mesh, vertices=vertices / spread, normals=(mesh.normals @ rotation.T).astype(np.float32)

@@ -10,7 +10,7 @@ TAU = 2 * np.pi
 Coordinates = Sequence | np.ndarray  # of a point (3,), or of the points of an outline (n, 2)
 # Radius where a lathe's profile meets the axis; zero would give triangles without an area.
 _ON_AXIS = 1e-4
-# axes of the outline, and that of the thickness
+# The plane of an outline: indices of the outline's two axes, and of the axis of the thickness.
 _PLANES = {
     "xz": (0, 2, 1),
     "xy": (0, 1, 2),
@@ -40,7 +40,7 @@ class Mesh:
     def pointing(self, direction: Coordinates) -> "Mesh":
         """Return the mesh rotated so that its z axis points along `direction` (3,)."""
         z = np.asarray(direction, float) / np.linalg.norm(direction)
-        # any direction that is not nearly parallel to z gives an x
+        # The x axis may be any that is perpendicular to z; y does for it unless it is nearly z.
         x = np.cross([0, 1, 0] if abs(z[1]) < 0.9 else [1, 0, 0], z)
         x /= np.linalg.norm(x)
         return Mesh(self.vertices @ np.stack([x, np.cross(z, x), z]), self.faces)
@@ -51,8 +51,8 @@ class Mesh:
         return Mesh(self.vertices * [1, -1, 1], self.faces[:, ::-1])
 
 
-def point(*coordinates: float) -> Float[np.ndarray, "3"]:
-    """Return a point as an array, for arithmetic with it."""
+def point(*coordinates: float) -> Float[np.ndarray, " d"]:
+    """Return a point or a vector as an array, to calculate with it."""
     return np.array(coordinates)
 
 
@@ -61,6 +61,11 @@ def joined(meshes: Sequence[Mesh]) -> tuple[Float[np.ndarray, "v 3"], Int[np.nda
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
     return np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces)
+
+
+def box_centre(vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "3"]:
+    """Return the centre of the vertices' bounding box."""
+    return (vertices.max(0) + vertices.min(0)) / 2
 
 
 def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
@@ -89,7 +94,8 @@ def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
 def rotation(axis: str, angle: float) -> Float[np.ndarray, "3 3"]:
     """Return the right-handed rotation about the axis "x", "y" or "z"; the angle in radians."""
     i = "xyz".index(axis)
-    j, k = (i + 1) % 3, (i + 2) % 3
+    j = (i + 1) % 3
+    k = (i + 2) % 3
     R = np.eye(3)
     R[j, j] = R[k, k] = np.cos(angle)
     R[k, j] = np.sin(angle)
@@ -105,9 +111,9 @@ def direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
 
 def box(size: float | Coordinates, centre: Coordinates = (0, 0, 0)) -> Mesh:
     """Return an axis-aligned box of the given size (3,); one number gives a cube."""
-    # corner 4 i + 2 j + k is on the side i of x, j of y, k of z
+    # Corner 4 i + 2 j + k is on side i along x, side j along y, side k along z (0 for -, 1 for +).
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    # the corners of each side, counter-clockwise from outside
+    # The four corners of each side, counter-clockwise seen from outside.
     sides = np.array(
         [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     )
@@ -122,7 +128,7 @@ def lathe(profile: Coordinates, sides: int = 20, start: float = 0.0, stop: float
     angle = np.linspace(start, stop, sides, endpoint=not closed)
     x = np.outer(profile[:, 0], np.cos(angle))
     y = np.outer(profile[:, 0], np.sin(angle))
-    # vertex i * sides + j: point i of the profile at angle j
+    # Vertex i * sides + j is point i of the profile at angle j.
     vertices = np.stack([x, y, np.repeat(profile[:, 1:], sides, 1)], -1).reshape(-1, 3)
     columns = np.arange(sides if closed else sides - 1)
     ring, j = np.meshgrid(np.arange(len(profile) - 1) * sides, columns, indexing="ij")
@@ -135,14 +141,16 @@ def lathe(profile: Coordinates, sides: int = 20, start: float = 0.0, stop: float
 
 def cylinder(bottom: float, top: float, height: float, sides: int = 18) -> Mesh:
     """Return a closed cone frustum about z, centred at the origin, of radii `bottom` and `top`."""
-    low, high = -height / 2, height / 2
+    high = height / 2
+    low = -high
     return lathe([[_ON_AXIS, low], [bottom, low], [top, high], [_ON_AXIS, high]], sides)
 
 
 def ellipsoid(radii: float | Coordinates, centre: Coordinates = (0, 0, 0), sides: int = 18) -> Mesh:
     """Return an axis-aligned ellipsoid with the given radii (3,); one number gives a sphere."""
-    t = np.linspace(-TAU / 4, TAU / 4, 12)  # from pole to pole, whose radius is not quite 0
-    sphere = lathe(np.stack([np.cos(t) + 1e-5, np.sin(t)], 1), sides)
+    angle = np.linspace(-TAU / 4, TAU / 4, 12)  # from pole to pole
+    # The radius 0 at the poles would give triangles without an area.
+    sphere = lathe(np.stack([np.cos(angle) + 1e-5, np.sin(angle)], 1), sides)
     return sphere.scaled(radii).translated(centre)
 
 
@@ -165,8 +173,8 @@ def capsule(
     """Return a rod from `start` (3,) to `end` (3,) with hemispherical ends."""
     along = np.subtract(end, start)
     half = np.linalg.norm(along) / 2
-    t = np.linspace(0, TAU / 4, 5)  # from the rim to the pole
-    round_end = np.stack([np.cos(t) + 1e-5, np.sin(t)], 1)
+    angle = np.linspace(0, TAU / 4, 5)  # from the rim to the pole
+    round_end = np.stack([np.cos(angle) + 1e-5, np.sin(angle)], 1)
     tail = round_end[::-1] * [radius, -radius]
     head = round_end * (end_radius or radius)
     mesh = lathe(np.concatenate([tail - [0, half], head + [0, half]]), sides=14)
@@ -183,8 +191,8 @@ def torus(
     sides: int = 24,
 ) -> Mesh:
     """Return a torus about `axis`, or its arc from angle `start` to `stop` in radians."""
-    t = np.linspace(-np.pi, np.pi, 11)
-    tube = np.stack([major + minor * np.cos(t), minor * np.sin(t)], 1)
+    angle = np.linspace(-np.pi, np.pi, 11)
+    tube = np.stack([major + minor * np.cos(angle), minor * np.sin(angle)], 1)
     return lathe(tube, sides, start, stop).pointing(axis).translated(centre)
 
 
@@ -213,5 +221,6 @@ def extrusion(
     ]
     vertices = np.zeros((2 * n + 2, 3))
     vertices[:, _PLANES[plane]] = np.column_stack([np.tile(flat, (2, 1)), across])
-    # The order of the faces is by edge: (n, 4, 3).
-    return Mesh(vertices, np.stack([np.stack(face, 1) for face in faces], 1).reshape(-1, 3))
+    # Each row of `faces` holds the corners (3, n) of one face per edge; the result is ordered by
+    # edge, with four faces each.
+    return Mesh(vertices, np.array(faces).transpose(2, 0, 1).reshape(-1, 3))

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from zsp_lite.course.synthetic.meshes import TexturedMesh
-from zsp_lite.course.synthetic.primitives import area_normals, unit
+from zsp_lite.course.synthetic.primitives import TAU, area_normals, unit
 from zsp_lite.course.synthetic.room import FLOOR_REACH, Room, Values, Vectors
 from zsp_lite.course.synthetic.textures import (
     Image,
@@ -175,10 +175,10 @@ class MeshScene:
         """Return at which surface points the texture has a hole."""
         hole = np.zeros(len(face), bool)
         for index in np.flatnonzero(self._has_holes):
-            on = np.flatnonzero(self.mesh.material[face] == index)
-            u, v = _interpolated(weights[on], self.mesh.uv[face[on]]).T
+            chosen = np.flatnonzero(self.mesh.material[face] == index)
+            u, v = _interpolated(weights[chosen], self.mesh.uv[face[chosen]]).T
             rgba = sample_image(self._textures[index][0], u, 1 - v, cv2.BORDER_WRAP)
-            hole[on] = rgba[:, 3] < _HOLE
+            hole[chosen] = rgba[:, 3] < _HOLE
         return hole
 
     def _visible_share(self, point: Vectors, directions: Float[np.ndarray, "n k 3"]) -> Values:
@@ -186,7 +186,7 @@ class MeshScene:
         n, k = directions.shape[:2]
         # ray i * k + j starts at point i
         blocked = np.bincount(self._cast(point[:, None], directions).ray // k, minlength=n)
-        return 1 - blocked.astype(np.float32) / np.float32(k)
+        return 1 - blocked.astype(np.float32) / k
 
     def _shade(self, camera: Camera, rays: Image, hits: _Hits) -> Float[np.ndarray, "h w 4"]:
         """Return the object's radiance along rays, multiplied by its opacity; and the opacity."""
@@ -265,19 +265,19 @@ class MeshScene:
         material = self.mesh.material[face]
         albedo = srgb_to_linear(_interpolated(weights, self.mesh.colours[face]))
         for index in np.unique(material):
-            on = np.flatnonzero(material == index)
+            chosen = np.flatnonzero(material == index)
             look = self.mesh.materials[index]
             texture = self._textures[index]
-            albedo[on] *= srgb_to_linear(look.colour[:3])
+            albedo[chosen] *= srgb_to_linear(look.colour[:3])
             if look.pattern:
-                points = _interpolated(weights[on], self._coordinates[face[on]])
-                albedo[on] *= srgb_to_linear(look.pattern(points))
+                points = _interpolated(weights[chosen], self._coordinates[face[chosen]])
+                albedo[chosen] *= srgb_to_linear(look.pattern(points))
             if texture:
-                u, v = _interpolated(weights[on], self.mesh.uv[face[on]]).T
-                pixels = footprint[on] * self._texture_scale[face[on]]
+                u, v = _interpolated(weights[chosen], self.mesh.uv[face[chosen]]).T
+                pixels = footprint[chosen] * self._texture_scale[face[chosen]]
                 pixels *= np.sqrt(np.prod(texture[0].shape[:2]))
                 rgba = sample_pyramid(texture, u, 1 - v, pixels, cv2.BORDER_WRAP)
-                albedo[on] *= srgb_to_linear(rgba[:, :3] / 255)
+                albedo[chosen] *= srgb_to_linear(rgba[:, :3] / 255)
         # Artists use pure black and fully saturated colours; real surfaces reflect a few percent of
         # all colours.
         return 0.015 + 0.8 * albedo
@@ -361,7 +361,7 @@ def _spread_directions(
     # neighbours avoids rows.
     index = np.arange(count, dtype=np.float32)
     z = 1 - 2 * (index + rng.random((n, 1), np.float32)) / count
-    turns = index * np.float32(0.618034) + rng.random((n, 1), np.float32)
-    angle = np.float32(2 * np.pi) * turns
+    turns = index * 0.618034 + rng.random((n, 1), np.float32)
+    angle = TAU * turns
     radius = np.sqrt(np.maximum(1 - z**2, 0))
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], -1)

@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 
 from zsp_lite.course.synthetic.primitives import direction
 from zsp_lite.course.synthetic.textures import (
+    ANY_HUE,
     Colour,
     Image,
     blur,
@@ -29,10 +30,10 @@ Vectors = Float[np.ndarray, "n 3"]
 Values = Float[np.ndarray, " n"]
 
 FLOOR_REACH = 25.0  # distance in units up to which the floor has depth
-# indices among the faces of a room; those below 4 are the walls
+# Indices among the faces of a room; the walls are 0 to 3.
 _FLOOR = 4
 _CEILING = 5
-_MIDDLE = np.array([0, 0, 1.5])  # about that of an object of unit spread
+_MIDDLE = np.array([0, 0, 1.5])  # about the middle of an object of unit spread on the floor
 _FLOOR_PIXELS = 1024  # along each side of the floor's image
 _WALL_DENSITY = 20  # pixels per unit
 
@@ -42,7 +43,7 @@ class CheapCamera:
     """Response of a camera: from linear radiance to 8-bit sRGB."""
 
     exposure: float = 0.2  # mean luminance after automatic exposure, with 1 for white
-    # error of automatic balance, a factor per channel
+    # factor per channel: the error of the automatic white balance
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     noise: float = 0.01  # standard deviation at mid-grey, relative to white
     vignetting: float = 0.1  # loss of light in the corners, as a fraction
@@ -50,6 +51,7 @@ class CheapCamera:
     def exposure_gain(self, radiance: Image) -> float:
         """Return the factor of automatic exposure, which bright windows affect little."""
         luminance = radiance @ np.float32([0.2126, 0.7152, 0.0722])  # weights of ITU-R BT.709
+        # The exposure follows the average of the median and of a mean that limits bright pixels.
         median = np.median(luminance)
         mean = np.minimum(luminance, 4 * median).mean()
         return float(2 * self.exposure / max(median + mean, 1e-6))
@@ -59,12 +61,12 @@ class CheapCamera:
     ) -> UInt8[np.ndarray, "h w 3"]:
         """Return the 8-bit picture of linear radiance; `gain` is that of `exposure_gain`."""
         height, width = radiance.shape[:2]
-        pixel = min(height, width) / 256  # blurs are those of a picture of 256 pixels
+        pixel = min(height, width) / 256  # all blurs are given for a picture of 256 pixels
         y = np.linspace(-1, 1, height)[:, None]
         x = np.linspace(-1, 1, width)
         falloff = 1 - self.vignetting * (x**2 + y**2) / 2
         image = (radiance * (gain * falloff)[..., None] * self.white_balance).astype(np.float32)
-        image = blur(image, 0.4 * pixel)  # of the lens
+        image = blur(image, 0.4 * pixel)  # blur of the lens
         # Noise that demosaicing smooths; 1.6 makes up for the variance that the blur takes away.
         # The variance of photon noise grows with the light, that of read noise is constant.
         noise = blur(rng.standard_normal((height, width, 3), np.float32), 0.5 * pixel)
@@ -80,10 +82,10 @@ class CheapCamera:
 class Room:
     """A box around objects, and the light on them.
 
-    The origin of all points is on the floor below the object. `images` are those of the faces -x,
-    +x, -y, +y, floor, ceiling: an albedo of the floor, else radiances. The rows of a wall run down,
-    those of floor and ceiling along y; the columns run along y on the first two walls, else along
-    x.
+    The origin of all points is on the floor below the object. `images` has one image per face, in
+    the order -x, +x, -y, +y, floor, ceiling. The image of the floor is its albedo, the other images
+    are radiances. The rows of a wall's image run down, the rows of floor and ceiling run along y.
+    The columns run along y on the first two walls, and along x on the other faces.
     """
 
     low: Vector  # corners of the box; low[2] is 0
@@ -103,13 +105,14 @@ class Room:
         # The albedo of the floor becomes its radiance in full light.
         unblocked = np.ones(1, np.float32)
         faces[_FLOOR] *= self.on_the_floor(unblocked, unblocked)[0]
-        # the faces come in pairs, with three channels each
+        # The faces come in three opposite pairs; the last axis holds the colour channels.
         opposite = faces.reshape(3, 2, 3)[:, ::-1].reshape(6, 3)
         self._irradiance = (faces + (faces.sum(0) - faces - opposite) / 4) / 2
 
     def irradiance(self, normal: Vectors) -> Vectors:
         """Return the irradiance from the room, without its key light, where nothing blocks it."""
-        # the face that the normal points to along each axis; the squares of a unit vector sum to 1
+        # Along each axis, the normal points to one face. The squares of its coordinates, which sum to
+        # 1, are the weights of these three faces.
         face = 2 * np.arange(3) + (normal > 0)
         return np.einsum("nf,nfc->nc", normal**2, self._irradiance[face])
 
@@ -127,17 +130,24 @@ class Room:
         rays: Vectors,
         blur: float | Values,
     ) -> tuple[Vectors, Values]:
-        """Return the room's radiance along rays, of the floor its albedo; and the floor's reach.
+        """Return what rays meet in the room.
 
-        Each ray covers the angle `blur`, in radians; the reach is its parameter on the floor, 0
-        where it misses it.
+        Args:
+            eye: where the rays start.
+            rays: directions of any length.
+            blur: angle in radians that each ray covers.
+
+        Returns:
+            The radiance of walls and ceiling, and the albedo of the floor; and the parameter of
+            each ray at which it meets the floor, 0 for a ray that does not.
         """
         # Vectors are columns here: corners (3, 1), rays (3, n).
         low = self.low[:, None].astype(np.float32)
         high = self.high[:, None].astype(np.float32)
         size = high - low
+        # An eye outside the room sees it from just inside its walls.
         eye = np.clip(eye[:, None], low + 0.05, high - 0.05).astype(np.float32)
-        # The rays are divided by, so that none of their coordinates may be zero.
+        # No coordinate of a ray may be zero: the distances to the planes are divided by them.
         rays = np.ascontiguousarray(np.where(np.abs(rays) < 1e-9, np.float32(1e-9), rays).T)
 
         # From inside a box, a ray leaves through the nearest of the three planes ahead of it.
@@ -150,12 +160,14 @@ class Room:
 
         radiance = np.empty((len(nearest), 3), np.float32)
         for index, image in enumerate(self._pyramids):
-            on = np.flatnonzero(face == index)
+            chosen = np.flatnonzero(face == index)
             columns = 1 if index < 2 else 0  # the axis along which the image's columns run
-            u = (y if columns else x)[on]
-            v = (1 - z if index < _FLOOR else y)[on]
+            u = (y if columns else x)[chosen]
+            v = (1 - z if index < _FLOOR else y)[chosen]
             density = image[0].shape[1] / float(size[columns, 0])  # pixels per unit
-            radiance[on] = sample_pyramid(image, u, v, width[on] * density, cv2.BORDER_REPLICATE)
+            radiance[chosen] = sample_pyramid(
+                image, u, v, width[chosen] * density, cv2.BORDER_REPLICATE
+            )
         return radiance, np.where(face == _FLOOR, nearest, 0)
 
     def on_the_floor(self, key: Values, around: Values) -> Vectors:
@@ -172,14 +184,14 @@ def random_room(seed: int | np.random.Generator) -> Room:
     high = np.array([sides[2], sides[3], rng.uniform(12, 14)])
     width, depth, height = high - low
     light = direction(azimuth=rng.uniform(0, 2 * np.pi), elevation=rng.uniform(0.5, 1.4))
-    warmth = rng.uniform(-0.08, 0.2)  # of the key light
+    warmth = rng.uniform(-0.08, 0.2)  # red minus blue of the key light, halved
     temperature = rng.normal(0, 0.045)  # error of the camera's white balance
 
     floor = _floor(rng)
     if rng.random() < 0.75:  # pale walls
         wall_colour = random_colour(rng, (25, 60), (0, 0.14), (0.6, 0.92))
     else:
-        wall_colour = random_colour(rng, (0, 360), (0, 0.4), (0.6, 0.92))
+        wall_colour = random_colour(rng, ANY_HUE, (0, 0.4), (0.6, 0.92))
     walls = [_wall(rng, side, height, wall_colour) for side in (depth, depth, width, width)]
     ceiling = np.full((8, 8, 3), 0.7, np.float32)
     return Room(
@@ -199,32 +211,34 @@ def random_room(seed: int | np.random.Generator) -> Room:
 
 
 def _floor(rng: np.random.Generator) -> Float[np.ndarray, "n n 3"]:
-    """Return the albedo of a floor of boards or tiles or plain, and sometimes with a rug."""
+    """Return the albedo of a floor: boards, tiles or one surface, sometimes with a rug."""
     colour = random_colour(rng, (15, 60), (0.02, 0.6), (0.3, 0.8))
     tiled = rng.random() < 0.75
     floor = surface_albedo(rng, (_FLOOR_PIXELS, _FLOOR_PIXELS), colour, 1.0, tiled)
     if rng.random() < 0.3:
-        # The middle of the floor, below the object, is on the rug.
+        # The edges of the rug, in pixels, on all sides of the middle of the floor, where the object
+        # stands.
         edges = _FLOOR_PIXELS * (0.5 + [-1, -1, 1, 1] * rng.uniform(0.09, 0.22, 4))
         top, left, bottom, right = edges.astype(int).tolist()
-        colour = random_colour(rng, (0, 360), (0.02, 0.4), (0.25, 0.7))
+        colour = random_colour(rng, ANY_HUE, (0.02, 0.4), (0.25, 0.7))
         rug = surface_albedo(rng, (bottom - top, right - left), colour, 1.0)
         floor[top:bottom, left:right] = rug
     return floor
 
 
 def _wall(rng: np.random.Generator, width: float, height: float, colour: Colour) -> Image:
-    """Return the radiance of a wall with rectangles: furniture, pictures, windows."""
+    """Return the radiance of a wall with rectangular blocks: furniture, pictures, windows."""
     rows = round(height * _WALL_DENSITY)
     cols = round(width * _WALL_DENSITY)
     image = surface_albedo(rng, (rows, cols), colour, 0.2)
-    image[-8:] *= 0.4  # skirting board
+    image[-8:] *= 0.4  # a dark skirting board, 0.4 units high
     left = rng.uniform(0.3, 2)
     while left < width - 2:
         wide = rng.uniform(1, 4)
         tall = rng.uniform(1.2, 5)
         hangs = rng.random() < 0.5
-        # Two in five things that hang are windows, the others pictures.
+        # A block is a picture or a window if it hangs, otherwise a piece of furniture. Two in five
+        # blocks that hang are windows; they shine.
         brightness = 3.0 if hangs and rng.random() < 0.4 else 1.0
         cells = _cell_colours(rng)
         bottom = rows - round(rng.uniform(2.5, 4) * _WALL_DENSITY if hangs else 0)
@@ -241,9 +255,9 @@ def _wall(rng: np.random.Generator, width: float, height: float, colour: Colour)
 
 
 def _cell_colours(rng: np.random.Generator) -> Float[np.ndarray, "rows cols 3"]:
-    """Draw the linear colours of the cells that a rectangle on a wall is divided into."""
+    """Draw the linear colours of the cells of a block on a wall."""
     rows = int(rng.integers(1, 5))
-    cols = int(rng.choice([1, 2, 12]))  # twelve look like books
-    colour = random_colour(rng, (0, 360), (0, 0.4), (0.2, 0.9))
+    cols = int(rng.choice([1, 2, 12]))  # twelve narrow cells look like books
+    colour = random_colour(rng, ANY_HUE, (0, 0.4), (0.2, 0.9))
     variation = rng.normal(0, 0.12, (rows, cols, 1)) + rng.normal(0, 0.05, (rows, cols, 3))
     return srgb_to_linear(np.clip(colour + variation, 0.05, 0.95))

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from zsp_lite.course.synthetic.meshes import TexturedMesh
-from zsp_lite.course.synthetic.primitives import TAU, Coordinates, direction, rotation
+from zsp_lite.course.synthetic.primitives import TAU, Coordinates, box_centre, direction, rotation
 from zsp_lite.course.synthetic.raytracing import MeshScene, Rendering
 from zsp_lite.course.synthetic.room import random_room
 from zsp_lite.course.synthetic.textures import blur, smooth_noise
@@ -83,8 +83,7 @@ def handheld_sweep(
     elevation = np.radians(elevation.clip(heights[0] - 9, heights[1] + 5))
     distance = rng.uniform(6, 9) * (1 + 0.08 * wave(2, 1) + rng.normal(0, 0.01, frames))
     roll = np.radians(3 * wave(3, 1.5) + rng.normal(0, 2, frames))
-    middle = (vertices.max(0) + vertices.min(0)) / 2
-    aim = middle + rng.normal(0, 0.1, 3) + rng.normal(0, 0.05, (frames, 3))
+    aim = box_centre(vertices) + rng.normal(0, 0.1, 3) + rng.normal(0, 0.05, (frames, 3))
     poses = list(map(orbit_pose, azimuth, elevation, roll, distance, aim))
 
     # Bounding boxes of the object's images at focal length 1, relative to the optical axis.

@@ -9,10 +9,11 @@ from jaxtyping import Float
 Colour = Float[np.ndarray, "3"]
 # A colour, vector or point per pixel.
 Image = Float[np.ndarray, "h w 3"]
+ANY_HUE = (0, 360)  # range in degrees
 
 _FOLD = 4096  # points per row of OpenCV's maps, whose sides are limited to 32,767
 _JOINT = 3  # pixels between boards or tiles
-# Layers of grain, fine to cloudy: width in pixels and amount.
+# Layers of grain from fine to cloudy, each with its width in pixels and its amount.
 _GRAIN = ((1.0, 0.1), (6.0, 0.06), (60.0, 0.05))
 
 
@@ -20,17 +21,13 @@ _GRAIN = ((1.0, 0.1), (6.0, 0.06), (60.0, 0.05))
 def srgb_to_linear(colour: np.ndarray) -> np.ndarray:
     """Convert sRGB colours in [0, 1] to linear ones."""
     colour = np.asarray(colour, np.float32)
-    return np.where(
-        colour <= 0.04045, colour / np.float32(12.92), ((colour + 0.055) / 1.055) ** np.float32(2.4)
-    )
+    return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(colour: np.ndarray) -> np.ndarray:
     """Convert linear colours in [0, 1] to sRGB; the inverse of `srgb_to_linear`."""
     colour = np.asarray(colour, np.float32)
-    return np.where(
-        colour <= 0.0031308, 12.92 * colour, 1.055 * colour ** np.float32(1 / 2.4) - 0.055
-    )
+    return np.where(colour <= 0.0031308, 12.92 * colour, 1.055 * colour ** (1 / 2.4) - 0.055)
 
 
 def hsv(hue: float, saturation: float, value: float) -> Colour:
@@ -52,7 +49,8 @@ def random_colour(
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:
-    """Blur an image by a Gaussian of at least 0.2 pixels."""
+    """Blur an image by a Gaussian of at least 0.2 pixels, which changes nothing."""
+    # From a sigma of 0, OpenCV would derive another one.
     return cv2.GaussianBlur(image, (0, 0), max(sigma, 0.2), borderType=cv2.BORDER_REFLECT)
 
 
@@ -65,6 +63,7 @@ def smooth_noise(
     """
     smoothing = np.array([sigma, sigma * stretch])
     step = np.maximum(smoothing / 2, 1)  # broad noise is drawn on a coarser grid
+    # Two more cells let even the broadest noise vary over the image.
     height, width = (np.ceil(np.array(size) / step) + 2).astype(int).tolist()
     noise = rng.standard_normal((height, width), np.float32)
     down, along = smoothing / step
@@ -82,15 +81,18 @@ def surface_albedo(
     grain: float,
     tiled: bool = False,
 ) -> Image:
-    """Return the albedo of a surface of an sRGB colour with grain; `tiled` for boards or tiles."""
+    """Return the albedo of a surface with grain about an sRGB colour.
+
+    With `tiled`, the surface consists of boards or tiles.
+    """
     stretch = 1.0
     brightness = np.ones(size, np.float32)
     if tiled:
-        tile = int(rng.integers(40, 160))  # pixels
-        board = int(tile * rng.choice([1, 4, 10]))
-        # boards have the grain of wood, along the rows
-        stretch = 1.0 if board == tile else 12.0
-        brightness = _tiles(rng, size, tile, board)
+        # Tiles are square; boards are 4 or 10 times as wide as high, with the long grain of wood.
+        height = int(rng.integers(40, 160))  # pixels
+        width = int(height * rng.choice([1, 4, 10]))
+        stretch = 1.0 if width == height else 12.0
+        brightness = _tiles(rng, size, height, width)
     for sigma, amount in _GRAIN:
         brightness += grain * rng.uniform(0.3, 1) * amount * smooth_noise(rng, size, sigma, stretch)
     # No surface of a room is whiter than 0.92.
@@ -100,9 +102,9 @@ def surface_albedo(
 def _tiles(
     rng: np.random.Generator, size: tuple[int, int], height: int, width: int
 ) -> Float[np.ndarray, "h w"]:
-    """Return the brightness of tiles of random brightness with dark joints, about 1."""
+    """Return the brightness (about 1) of tiles that differ at random, with dark joints."""
     row = np.arange(size[0])[:, None]
-    # each row of tiles begins elsewhere
+    # Each row of tiles is shifted by the same offset against the row before it.
     column = np.arange(size[1]) + row // height * rng.integers(1, width)
     shape = (size[0] // height + 1, column.max() // width + 1)
     of_tile = rng.normal(1, rng.uniform(0.02, 0.1), shape)
@@ -126,14 +128,14 @@ def sample_pyramid(
 ) -> Float[np.ndarray, "n c"]:
     """Interpolate each point in the level whose pixels are about as wide as its footprint.
 
-    The footprint (n,) is given in pixels of the finest level; the other arguments are as of
+    The footprint (n,) is given in pixels of the finest level. For the other arguments, see
     `sample_image`.
     """
     level = np.clip(np.rint(np.log2(np.maximum(footprint, 1))), 0, len(levels) - 1).astype(np.int8)
     samples = np.empty((len(u), levels[0].shape[2]), np.float32)
     for index in np.unique(level):
-        on = np.flatnonzero(level == index)
-        samples[on] = sample_image(levels[index], u[on], v[on], border)
+        chosen = np.flatnonzero(level == index)
+        samples[chosen] = sample_image(levels[index], u[chosen], v[chosen], border)
     return samples
 
 
@@ -144,12 +146,14 @@ def sample_image(
 
     Outside the image, `border` continues it as in OpenCV; with BORDER_CONSTANT, by ones.
     """
+    # OpenCV wraps only points whose pixel coordinates fit into 16 bits.
     if border == cv2.BORDER_WRAP:
-        u, v = u % 1, v % 1
+        u = u % 1
+        v = v % 1
     height, width, channels = image.shape
     if not len(u):
         return np.empty((0, channels), np.float32)
-    # pixel coordinates, with the centre of the first pixel at 0 as in OpenCV
+    # In OpenCV's pixel coordinates, the centre of the first pixel is at 0.
     x = _folded(u * width - 0.5)
     y = _folded(v * height - 0.5)
     samples = cv2.remap(

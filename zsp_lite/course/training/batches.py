@@ -26,7 +26,7 @@ class Batch:
     images: Float[Tensor, "crops 3 side side"]  # normalised RGB
     # object coordinates at the centre of each patch, NaN on the background
     surface: Float[Tensor, "crops n 3"]
-    # there: normal in the camera frame, and depth standardised over the object
+    # at the same points: normal in the camera frame, and depth standardised over the object
     geometry: Float[Tensor, "crops n 4"]
     coverage: Float[Tensor, "crops n"]  # fraction of each patch that the object covers
     objects: int  # their number
@@ -45,7 +45,8 @@ def crop_grids(
         scale: range of their widths, as a fraction of the image's.
 
     Returns:
-        Grids for `grid_sample`, and the maps of directions in the image to those in the crop.
+        Grids for `grid_sample`; and matrices that map directions in the image to directions in the
+        crop.
     """
     size = rng.uniform(*scale, n)
     # The sides differ by a factor of up to exp(0.5), 1.65.
@@ -57,8 +58,10 @@ def crop_grids(
     x = rng.uniform(-1, 1, n) * (1 - width) * 0.9
     y = rng.uniform(-1, 1, n) * (1 - height) * 0.9
     flip = np.repeat(rng.choice([-1.0, 1.0], n // per_object), per_object)
-    c, s = np.cos(angle), np.sin(angle)
-    # Both are (2, ..., n): points of the crop to the image, directions in the image to the crop.
+    c = np.cos(angle)
+    s = np.sin(angle)
+    # `affine` (2, 3, n) maps points of the crop to the image; `turn` (2, 2, n) maps directions in
+    # the image to the crop.
     affine = np.array(
         [[width * c * flip, -width * s, x], [height * s * flip, height * c, y]], np.float32
     )
@@ -106,13 +109,17 @@ def sample_batch(
         renders: the training set.
         rng: source of the random numbers.
         objects: number of objects.
-        views: of each object: 8 (all), 4 (two pairs, a quarter turn apart) or 2 (one pair).
+        views: number of views per object: 8 (all), 4 (two pairs, a quarter turn apart) or 2 (one
+            pair).
         side: of the crops in pixels.
         scale: range of their widths, as a fraction of the image's.
         members: indices of the objects; by default random.
+
+    Returns:
+        The crops, recoloured, with the geometry of their patches.
     """
     index = rng.integers(0, len(renders.rgb), objects) if members is None else members
-    # Views (objects, views): all, or as many as wanted from the first of a random pair on.
+    # Indices of views (objects, views): all, or consecutive ones from a random pair on.
     chosen = np.arange(VIEWS)[None].repeat(objects, 0)
     if views < VIEWS:
         chosen = (2 * rng.integers(0, VIEWS // 2, (objects, 1)) + np.arange(views)) % VIEWS
@@ -131,7 +138,7 @@ def sample_batch(
     surface = maps_of(renders.surface)
     on_object = (~surface[:, :1].isnan()).float()
     coverage = F.avg_pool2d(_sample_geometry(on_object, grid, 2 * patches), 2).flatten(1)
-    # NaN is sampled as a number that no coordinate of an object has.
+    # NaN is sampled as a number far below all coordinates of objects, which are of unit spread.
     surface = _sample_geometry(surface.nan_to_num(nan=-99.0), grid, patches)
     surface = surface.flatten(2).transpose(1, 2)
     surface[surface < -50] = float("nan")

@@ -32,6 +32,10 @@ STUDENT_TEMPERATURE = 0.1
 CENTRE_MOMENTUM = 0.9  # decay per step of the average of the teacher's logits
 TEACHER_MOMENTUM = 0.99, 1.0  # decay of the teacher's average at the first and the last step
 WEIGHT_DECAY = 0.04, 0.4  # AdamW's, at the first and the last step
+LEARNING_RATE_DECAY = 1.0, 0.01  # factors of the largest rate, at the first and the last step
+# Share of the run in which the last layer is fixed; DINO fixes it in the first epoch.
+FIXED_LAST_LAYER = 0.05
+_CROPS = 3  # gives the crops random numbers of their own among those of one seed
 MAX_GRADIENT_NORM = 3.0  # gradients with a larger norm are scaled down to it
 
 
@@ -95,11 +99,11 @@ def multi_crop(
     rng: np.random.Generator,
     config: DistillationConfig,
 ) -> tuple[Float[Tensor, "2 batch 3 g g"], Float[Tensor, "k batch 3 l l"]]:
-    """Cut two global and k local crops out of each image, all with changes of their own."""
+    """Cut two global and k local crops out of each image; each crop is recoloured independently."""
     rgb = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255
 
     def crops(count: int, side: int, scale: tuple[float, float]) -> Tensor:
-        grid, _ = crop_grids(rng, count * len(rgb), 1, side, scale)
+        grid, _ = crop_grids(rng, count * len(rgb), per_object=1, side=side, scale=scale)
         cut = F.grid_sample(
             rgb.repeat(count, 1, 1, 1), grid, padding_mode="reflection", align_corners=False
         )
@@ -116,18 +120,28 @@ def distillation_loss(
     student_temperature: float,
     teacher_temperature: float,
 ) -> tuple[Tensor, dict[str, float]]:
-    """Compute the cross-entropy of the teacher's and student's distributions of different crops.
+    """Compute the cross-entropy between teacher and student for different crops, eq. 3 of DINO.
 
-    This is eq. 3 of DINO. The arguments are logits; the first two crops of the student are the
-    global ones. `centre`, the average of the teacher's logits, is subtracted. The figures are in
-    nats: "loss"; "teacher_entropy", mean entropy of the teacher's distributions; "kl", divergence
-    of the student's from them; and "information", the mutual information of output and image: 0 for
-    both trivial solutions, at most log(batch) if both crops of an image have the same distribution.
+    Args:
+        student: logits of the student; the first two crops are the global ones.
+        teacher: logits of the teacher for the global crops.
+        centre: average of the teacher's logits, which is subtracted from them.
+        student_temperature: divides the student's logits.
+        teacher_temperature: divides the teacher's logits.
+
+    Returns:
+        The loss and these figures, all in nats:
+
+        - "loss": the loss;
+        - "teacher_entropy": mean entropy of the teacher's distributions;
+        - "kl": mean divergence of the student's distributions from the teacher's;
+        - "information": mutual information of output and image. It is 0 for both trivial solutions,
+          and at most log(batch) if both crops of an image have the same distribution.
     """
     log_p = ((teacher.detach() - centre) / teacher_temperature).log_softmax(-1)
     p = log_p.exp()
     log_q = (student / student_temperature).log_softmax(-1)
-    # of each global crop (rows) and each crop (columns), the mean over the batch
+    # The mean over the batch, for each global crop (rows) and each crop (columns).
     cross = -torch.einsum("gbk,cbk->gc", p, log_q) / p.shape[1]
     different = ~torch.eye(*cross.shape, dtype=torch.bool)
     loss = cross[different].mean()
@@ -159,7 +173,7 @@ class Distillation:
         self.student = Network(copy.deepcopy(backbone), config.outputs).requires_grad_(True)
         self.teacher = copy.deepcopy(self.student).requires_grad_(False)
         self.centre = torch.zeros(config.outputs)
-        # Weights decay, biases and norms (vectors) do not.
+        # Weights (matrices) decay; biases and the parameters of norms (vectors) do not.
         matrices = [p for p in self.student.parameters() if p.ndim > 1]
         vectors = [p for p in self.student.parameters() if p.ndim <= 1]
         groups = [{"params": matrices}, {"params": vectors, "weight_decay": 0.0}]
@@ -171,15 +185,17 @@ class Distillation:
         config = self.config
         progress = self.steps_done / config.steps
         # The rate rises linearly in the first tenth of the run.
-        rate = config.learning_rate * min(1.0, 10 * progress) * cosine((1.0, 0.01), progress)
+        rate = (
+            config.learning_rate * min(1.0, 10 * progress) * cosine(LEARNING_RATE_DECAY, progress)
+        )
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        self.optimizer.param_groups[0]["weight_decay"] = cosine(WEIGHT_DECAY, progress)
-        # DINO fixes the last layer in the first epoch
-        self.student.head.directions.requires_grad_(progress >= 0.05)
+        matrices, _ = self.optimizer.param_groups
+        matrices["weight_decay"] = cosine(WEIGHT_DECAY, progress)
+        self.student.head.directions.requires_grad_(progress >= FIXED_LAST_LAYER)
 
         # The loss on the crops of random images; the teacher sees only the global ones.
-        rng = np.random.default_rng([config.seed, 3, self.steps_done])
+        rng = np.random.default_rng([config.seed, _CROPS, self.steps_done])
         n_objects, n_views = self.rgb.shape[:2]
         objects = rng.integers(n_objects, size=config.images)
         views = rng.integers(n_views, size=config.images)
@@ -187,8 +203,10 @@ class Distillation:
         with torch.no_grad():
             teacher = self.teacher(large)
         student = torch.cat([self.student(large), self.student(small)])
-        sharp = config.teacher_temperature if config.sharpening else STUDENT_TEMPERATURE
-        loss, figures = distillation_loss(student, teacher, self.centre, STUDENT_TEMPERATURE, sharp)
+        temperature = config.teacher_temperature if config.sharpening else STUDENT_TEMPERATURE
+        loss, figures = distillation_loss(
+            student, teacher, self.centre, STUDENT_TEMPERATURE, temperature
+        )
 
         # The student follows the gradient, the teacher and its centre follow slowly.
         self.optimizer.zero_grad()

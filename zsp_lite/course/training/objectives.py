@@ -15,8 +15,11 @@ from zsp_lite.course.training.trainee import Trainee
 RADIUS = 0.15  # standard deviation of the correspondence targets, in object units
 TEMPERATURE = 0.1  # of the correspondence loss
 QUERIES = 256  # largest number of query patches per object
-SEEN_AGAIN = 0.5  # of the Gaussian: a query has a correspondent within 1.2 standard deviations
-CUT = 0.05  # of the Gaussian, reached at 2.4 standard deviations: smaller targets are zero
+# Values of the Gaussian. A query is used if another view shows a point within 1.2 standard
+# deviations of it, where the Gaussian is 0.5; targets beyond 2.4 standard deviations, where the
+# Gaussian is 0.05, are 0.
+SEEN_AGAIN = 0.5
+CUT = 0.05
 
 
 def correspondence_loss(
@@ -31,18 +34,28 @@ def correspondence_loss(
     """Compute InfoNCE between the views of each object, with soft targets.
 
     The target of a query patch is a distribution over the patches of the object's other views: a
-    Gaussian of the distance between the surface points with standard deviation `radius` (object
-    units), 0 beyond 2.4 of these. At most `queries` random patches of an object are queries. The
-    descriptors are unit vectors, ordered by object and view. The loss is the divergence from the
-    targets, so that 0 is its minimum; the second result is the fraction of queries whose nearest
-    descriptor has a non-zero target.
+    Gaussian of the distance between the surface points, cut off beyond 2.4 standard deviations. The
+    loss is the divergence from the targets, so that 0 is its minimum.
+
+    Args:
+        descriptors: unit vectors, ordered by object and view.
+        surface: surface points in object units, NaN on the background.
+        objects: number of objects.
+        radius: standard deviation of the Gaussian in object units.
+        temperature: divides the similarities of descriptors.
+        queries: largest number of random query patches per object.
+        generator: draws the queries.
+
+    Returns:
+        The loss, and the fraction of queries whose nearest descriptor has a non-zero target.
     """
     crops, n, dim = descriptors.shape
     views = crops // objects
     z = descriptors.reshape(objects, views * n, dim)
     points = surface.reshape(objects, views * n, 3)
     view = torch.arange(views).repeat_interleave(n)
-    losses, hits = [], []
+    losses = []
+    hits = []
     for k in range(objects):
         on_object = (~points[k, :, 0].isnan()).nonzero()[:, 0]
         query = on_object[torch.randperm(len(on_object), generator=generator)[:queries]]
@@ -54,6 +67,7 @@ def correspondence_loss(
         distance = torch.cdist(points[k, query], points[k].nan_to_num(nan=99.0))
         target = torch.exp(-distance.square() / (2 * radius**2)).masked_fill(same_view, 0)
         seen_again = target.amax(1) > SEEN_AGAIN
+        # The mean over fewer queries is too noisy.
         if seen_again.sum() < 5:
             continue
         target = target[seen_again]
@@ -86,14 +100,15 @@ def attention_loss(
 ) -> tuple[Tensor, float]:
     """Compute the loss of the CLS attention, averaged over heads, against the mask; and an IoU.
 
-    The target is uniform on the object and zero elsewhere. The loss is the divergence between the
-    normalised mask and the attention over patches, plus a cross-entropy that separates object and
-    background at 0.12 times the mean attention on the object. The mean IoU is that of the mask with
-    min-max normalised attention above 0.05.
+    The loss has two terms: the divergence of the attention over patches from a target that is
+    uniform on the object and zero elsewhere; and a cross-entropy that separates object and
+    background at 0.12 times the mean attention on the object. The IoU compares the mask with the
+    patches whose min-max normalised attention exceeds 0.05.
     """
     attention = cls_logits.softmax(-1)[..., 1:].mean(1)
     attention = attention / attention.sum(1, keepdim=True)
-    visible = coverage.sum(1) > 2  # crops with more than two patches of the object
+    # Crops that show at most two patches of the object do not count.
+    visible = coverage.sum(1) > 2
     if not visible.any():
         return cls_logits.sum() * 0, 0.0
     attention = attention[visible].clamp_min(1e-8)
@@ -109,6 +124,7 @@ def attention_loss(
         low = attention.amin(1, keepdim=True)
         high = attention.amax(1, keepdim=True)
         salient = (attention - low) / (high - low + 1e-12) > 0.05
+        # A patch is on the object if more than one of its four points of coverage is.
         truth = coverage > 0.25
         iou = ((salient & truth).sum(1) / (salient | truth).sum(1).clamp_min(1)).mean().item()
     return spread + 0.25 * side, iou
@@ -119,8 +135,8 @@ def losses(
 ) -> tuple[Tensor, dict[str, float]]:
     """Compute the correspondence loss plus `helpers` times the geometry and attention losses.
 
-    The figures are the value of each loss, the match accuracy and the IoU of the saliency. The
-    model's running mean of the keys is updated.
+    The figures are the value of each loss, the match accuracy and the IoU of the attention with the
+    mask. The model's running mean of the keys is updated.
     """
     out = model(batch.images)
     on_object = ~batch.surface[..., 0].isnan()

@@ -20,6 +20,7 @@ from zsp_lite.course.synthetic.primitives import (
     Coordinates,
     Mesh,
     box,
+    box_centre,
     capsule,
     cylinder,
     ellipsoid,
@@ -35,10 +36,10 @@ from zsp_lite.data.cameras import Camera
 VIEWS = 8  # per object
 SIZE = 192  # of a view, pixels
 GRID = 48  # points along each side of a view at which geometry is known
-# Smallest and largest difference in azimuth of the two views of a pair, about that of a reference
-# and the nearest of a few target views, and never more than that of two views of different pairs.
+# Smallest and largest difference in azimuth of the two views of a pair. A reference and the nearest
+# of a few target views differ by about as much; views of different pairs differ by more.
 PAIR_ANGLES = np.radians((5, 45))
-# So many rooms for so many consecutive objects: a room takes five times as long as a view.
+# A room takes five times as long as a view: SHARING consecutive objects share ROOMS rooms.
 ROOMS = 8
 SHARING = 100
 
@@ -48,8 +49,8 @@ class RenderSet:
     """Views of n objects, with the geometry at every fourth pixel."""
 
     rgb: UInt8[np.ndarray, "n views size size 3"]
-    # Object coordinates, NaN on the background. Two views of one object correspond where these
-    # agree; they have no meaning across objects.
+    # Object coordinates, NaN on the background. Two views of one object correspond where their
+    # coordinates agree; the coordinates of different objects have no relation.
     surface: Float[np.ndarray, "n views grid grid 3"]
     # normal in the camera frame, depth standardised over the object
     geometry: Float[np.ndarray, "n views grid grid 4"]
@@ -57,8 +58,8 @@ class RenderSet:
 
 def render_set(numbers: Iterable[int]) -> RenderSet:
     """Render the objects of these numbers, about half a second each."""
-    rows = [render_object(number) for number in numbers]
-    return RenderSet(*map(np.stack, zip(*rows, strict=True)))
+    objects = [render_object(number) for number in numbers]
+    return RenderSet(*map(np.stack, zip(*objects, strict=True)))
 
 
 def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -84,11 +85,10 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             elevation=np.clip(elevation + rng.normal(0, 0.12), 0.02, 1.1),
             roll=rng.normal(0, 0.1),
             distance=rng.uniform(5, 10),
-            target=(mesh.vertices.max(0) + mesh.vertices.min(0)) / 2,
+            target=box_centre(mesh.vertices),
         )
-        camera = framed_camera(
-            mesh.vertices, R, t, SIZE, 1.12 * np.exp(rng.normal(0, 0.06)), rng.normal(0, 0.02, 2)
-        )
+        margin = 1.12 * np.exp(rng.normal(0, 0.06))
+        camera = framed_camera(mesh.vertices, R, t, SIZE, margin, shift=rng.normal(0, 0.02, 2))
         image = render_instance(number, mesh, shape.vertices, camera, rng)
         views.append((image.rgb, *_geometry(image)))
     return tuple(map(np.stack, zip(*views, strict=True)))
@@ -97,16 +97,17 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _geometry(image: Rendering) -> tuple[np.ndarray, np.ndarray]:
     """Return surface (grid, grid, 3) and geometry (grid, grid, 4) of a view."""
     step = SIZE // GRID
-    rows = slice(step // 2, None, step)
-    depth = image.depth[rows, rows]
-    on_object = image.mask[rows, rows]
+    sampled = slice(step // 2, None, step)  # of rows and of columns
+    depth = image.depth[sampled, sampled]
+    on_object = image.mask[sampled, sampled]
     # The distance of the object does not matter: its depth is standardised.
     relative = np.zeros_like(depth)
     of_object = depth[on_object]
     spread = max(float(of_object.std()), 1e-6)
     relative[on_object] = (of_object - of_object.mean()) / spread
-    geometry = np.dstack([image.normals[rows, rows], relative])
-    return image.canonical[rows, rows].astype(np.float16), geometry.astype(np.float16)
+    geometry = np.dstack([image.normals[sampled, sampled], relative])
+    surface = image.canonical[sampled, sampled]
+    return surface.astype(np.float16), geometry.astype(np.float16)
 
 
 def framed_camera(
@@ -165,7 +166,7 @@ def _room(index: int) -> Room:
 
 def build_random_object(a: Assembly) -> None:
     """Build a tree of 5 to 10 random parts, symmetric, each attached to one of those before it."""
-    # centre and size of each part
+    # The nodes of the tree: centre and size of each part.
     body = np.array([a.uniform(0.5, 1.3), a.uniform(0.4, 1.0), a.uniform(0.4, 1.2)])
     nodes = [(np.zeros(3), body)]
     a.add(_random_solid(a, body), a.choice(5))

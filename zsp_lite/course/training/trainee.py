@@ -22,7 +22,8 @@ class Trainee(nn.Module):
 
     def __init__(self, backbone: VisionTransformer, layer: int):
         super().__init__()
-        self.backbone, self.layer = backbone, layer
+        self.backbone = backbone
+        self.layer = layer
         self.geometry_of_tokens = nn.Linear(backbone.embed_dim, 5)
         self.geometry_of_keys = nn.Linear(backbone.embed_dim, 5)
         self.register_buffer("key_mean", torch.zeros(backbone.embed_dim))
@@ -46,7 +47,10 @@ class Trainee(nn.Module):
 
 @torch.no_grad()
 def as_trainee(backbone: VisionTransformer, layer: int, renders: RenderSet, side: int) -> Trainee:
-    """Wrap a transformer with the mean key of crops of `side` pixels of at most six objects."""
+    """Wrap a transformer, with the mean of its keys on crops of `side` pixels.
+
+    The crops show at most six objects.
+    """
     trainee = Trainee(backbone, layer)
     batch = sample_batch(
         renders, np.random.default_rng(7), min(6, len(renders.rgb)), VIEWS, side, (0.85, 1.0)

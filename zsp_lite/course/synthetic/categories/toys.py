@@ -18,6 +18,11 @@ from zsp_lite.course.synthetic.primitives import (
     rod,
 )
 
+# Materials of several vehicles.
+CHASSIS = 2
+GLASS = 4
+HEADLAMP = 5
+
 
 def teddybear(a: Assembly) -> None:
     """Build a sitting or standing teddy bear, some with a light belly or a shirt."""
@@ -41,18 +46,16 @@ def teddybear(a: Assembly) -> None:
     a.add(ellipsoid((0.06, 0.075, 0.05), face + [snout * 0.92, 0, -0.04]), DARK)
     a.add_pair(ellipsoid((0.05, 0.05, 0.06), face + [0, skull * 0.36, skull * 0.22]), DARK)
     ear = a.uniform(0.12, 0.2)
-    ear_at = head + [0, skull * a.uniform(0.65, 0.85), skull * a.uniform(0.65, 0.85)]
-    a.add_pair(ellipsoid((0.075, ear, ear), ear_at), LIGHT_FUR)
+    ear_centre = head + [0, skull * a.uniform(0.65, 0.85), skull * a.uniform(0.65, 0.85)]
+    a.add_pair(ellipsoid((0.075, ear, ear), ear_centre), LIGHT_FUR)
     # Each arm has its own pose, raised or hanging.
     for side in (1, -1):
         shoulder = point(0, side * belly * 0.8, floor + tall * 1.45)
-        hand = shoulder + [
-            a.uniform(-0.05, 0.45),
-            side * a.uniform(0.2, 0.42),
-            a.uniform(-0.5, 0.45),
-        ]
+        forwards = a.uniform(-0.05, 0.45)
+        outwards = a.uniform(0.2, 0.42)
+        hand = shoulder + [forwards, side * outwards, a.uniform(-0.5, 0.45)]
         a.add(capsule(shoulder, hand, a.uniform(0.12, 0.16), a.uniform(0.12, 0.18)))
-    # Legs and feet; those of a sitting bear show their soles.
+    # Legs and feet; a sitting bear shows its soles.
     leg = a.uniform(0.14, 0.21)
     if standing:
         foot = point(0.08, belly * 0.6, leg)
@@ -66,8 +69,8 @@ def teddybear(a: Assembly) -> None:
     # The tail; then a light belly, a shirt, or neither.
     a.add(ellipsoid(0.1, (-belly * 0.85, 0, floor + 0.25)))
     if a.chance(0.6):
-        light = (belly * 0.3, belly * 0.65, tall * 0.65)
-        a.add(ellipsoid(light, (belly * 0.62, 0, floor + tall * 0.95)), LIGHT_FUR)
+        light_belly = (belly * 0.3, belly * 0.65, tall * 0.65)
+        a.add(ellipsoid(light_belly, (belly * 0.62, 0, floor + tall * 0.95)), LIGHT_FUR)
     elif a.chance(0.6):
         shirt = np.array([[0.97, 0.75], [1.04, 1.0], [0.96, 1.4], [0.66, 1.78]]) * [belly, tall]
         a.add(lathe(shirt, 24).scaled((0.87, 1, 1)).translated((0, 0, floor)), SHIRT)
@@ -78,7 +81,6 @@ def toyplane(a: Assembly) -> None:
     WING = 1
     FIN = 2
     METAL = 3
-    GLASS = 4
     BLADE = 5
     TYRE = 6
 
@@ -88,7 +90,7 @@ def toyplane(a: Assembly) -> None:
     tail = -nose
     jet = a.chance(0.4)
     a.add(capsule((tail, 0, 0), (nose - radius, 0, 0), radius * a.uniform(0.35, 0.7), radius))
-    # The wing: its outline on the left side, from the leading to the trailing edge.
+    # The outline (x, y) of the left wing, from its leading to its trailing edge.
     span = a.uniform(0.8, 1.5)
     chord = a.uniform(0.3, 0.6)
     wing_x = a.uniform(-0.1, 0.3)
@@ -113,37 +115,40 @@ def toyplane(a: Assembly) -> None:
     if biplane:
         upper = radius * 1.6
         a.add_pair(extrusion(wing, 0.06, "xy", upper), WING)
-        for x in (lead - 0.1, trail + 0.1):
-            place = point(x - sweep * 0.6, span * 0.65, 0)
-            a.add_pair(rod(place + [0, 0, wing_z], place + [0, 0, upper], 0.02), METAL)
+        for root_x in (lead - 0.1, trail + 0.1):
+            x = root_x - sweep * 0.6
+            y = span * 0.65
+            a.add_pair(rod((x, y, wing_z), (x, y, upper), 0.02), METAL)
     # The tail: a fin, and a stabiliser at its foot or at its top.
     fin = a.uniform(0.3, 0.6)
     stabiliser = a.uniform(0.3, 0.55)
-    outline = [[tail + 0.35, 0], [tail + 0.05, fin], [tail - 0.12, fin], [tail - 0.02, 0]]
-    a.add(extrusion(outline, 0.06), FIN)
-    outline = [[tail + 0.3, 0], [tail + 0.1, stabiliser], [tail - 0.1, stabiliser], [tail, 0]]
+    side_view = [[tail + 0.35, 0], [tail + 0.05, fin], [tail - 0.12, fin], [tail - 0.02, 0]]
+    a.add(extrusion(side_view, 0.06), FIN)
+    top_view = [[tail + 0.3, 0], [tail + 0.1, stabiliser], [tail - 0.1, stabiliser], [tail, 0]]
     z = 0.05 if a.chance(0.75) else fin * 0.92
-    a.add_pair(extrusion(outline, 0.05, "xy", z), WING)
-    # Two jet engines, or a propeller.
+    a.add_pair(extrusion(top_view, 0.05, "xy", z), WING)
+    # Two jet engines, or a propeller with its spinner.
     if jet:
-        below_wing = (wing_x - sweep * 0.4, span * 0.4, wing_z - 0.13)
-        engine = np.array(below_wing if a.chance(0.6) else (tail + 0.55, radius + 0.1, 0.08))
-        a.add_pair(
-            rod(engine - [0.2, 0, 0], engine + [0.2, 0, 0], 0.08, a.uniform(0.1, 0.13)), METAL
-        )
+        # The engines are below the wings, or beside the tail.
+        engine = point(wing_x - sweep * 0.4, span * 0.4, wing_z - 0.13)
+        if not a.chance(0.6):
+            engine = point(tail + 0.55, radius + 0.1, 0.08)
+        half = point(0.2, 0, 0)
+        a.add_pair(rod(engine - half, engine + half, 0.08, a.uniform(0.1, 0.13)), METAL)
     else:
         a.add(ellipsoid((0.12, 0.09, 0.09), (nose + 0.05, 0, 0)), METAL)
         blade = a.uniform(0.3, 0.45)
         turn = a.uniform(0, np.pi)
         n_blades = 2 + a.choice(3)
+        upright = box((0.035, 0.1, blade), (nose + 0.08, 0, blade / 2))
         for k in range(n_blades):
-            upright = box((0.035, 0.1, blade), (nose + 0.08, 0, blade / 2))
             a.add(upright.rotated("x", turn + k * TAU / n_blades), BLADE)
     # The cockpit, and wheels on struts.
     cockpit = (a.uniform(0.2, 0.35), radius * 0.7, radius * 0.7)
     a.add(ellipsoid(cockpit, (length * a.uniform(0.16, 0.28), 0, radius * 0.75)), GLASS)
     if a.chance(0.6):
         gear = point(wing_x + 0.1, 0.25, -radius - 0.22)
+        # The strut reaches from the middle of the hull outwards.
         a.add_pair(rod(gear * [1, 0.6, 0], gear, 0.025), METAL)
         a.add_pair(disc(0.1, 0.07, gear), TYRE)
 
@@ -151,10 +156,7 @@ def toyplane(a: Assembly) -> None:
 def toytruck(a: Assembly) -> None:
     """Build a truck: cab, some with a bonnet; a box, flat bed, tank, tipper or crane behind."""
     LOAD = 1
-    CHASSIS = 2
     CABLE = 3
-    GLASS = 4
-    HEADLAMP = 5
     GRILLE = 6
 
     length = a.uniform(1.7, 2.6)
@@ -175,40 +177,36 @@ def toytruck(a: Assembly) -> None:
     front = nose - bonnet * 0.85
     roof = deck + cab_height
     rear = front - cab_length
-    # lower and upper edge of the windscreen
-    bend = (front, deck + cab_height * 0.5)
-    top = (front - slope, roof)
-    a.add(extrusion([(rear, deck + 0.04), (front, deck + 0.04), bend, top, (rear, roof)], width))
+    # Points (x, z): the lower and the upper edge of the windscreen, then the outline from the rear.
+    bend = point(front, deck + cab_height * 0.5)
+    top = point(front - slope, roof)
+    floor = deck + 0.04
+    a.add(extrusion([(rear, floor), (front, floor), bend, top, (rear, roof)], width))
     side_window = (cab_length * 0.5, width * 1.02, cab_height * 0.3)
     a.add(box(side_window, (rear + cab_length * 0.48, 0, deck + cab_height * 0.72)), GLASS)
-    a.add(pane(np.add(bend, [0.01, 0.04]), np.add(top, [0.01, -0.04]), width * 0.84), GLASS)
+    a.add(pane(bend + [0.01, 0.04], top + [0.01, -0.04], width * 0.84), GLASS)
     lamp = ellipsoid((0.05, 0.08, 0.08), (nose, width * 0.34, deck + cab_height * 0.28))
     a.add_pair(lamp, HEADLAMP)
-    a.add(
-        box((0.06, width * 0.4, cab_height * 0.2), (nose + 0.01, 0, deck + cab_height * 0.27)),
-        GRILLE,
-    )
+    grille_size = (0.06, width * 0.4, cab_height * 0.2)
+    a.add(box(grille_size, (nose + 0.01, 0, deck + cab_height * 0.27)), GRILLE)
 
-    load = rear - 0.05 - tail  # the length behind the cab
-    load_x = tail + load / 2
+    # What the truck carries: `load_length` is the length behind the cab.
+    load_length = rear - 0.05 - tail
+    load_x = tail + load_length / 2
     style = a.pick("box", "tank", "crane", "tipper", "flat bed")
     if style == "box":
         height = a.uniform(0.6, 1.0)
-        a.add(
-            box(
-                (load, width * a.uniform(0.95, 1.1), height), (load_x, 0, deck + 0.08 + height / 2)
-            ),
-            LOAD,
-        )
+        size = (load_length, width * a.uniform(0.95, 1.1), height)
+        a.add(box(size, (load_x, 0, deck + 0.08 + height / 2)), LOAD)
     elif style == "tank":
         radius = width * a.uniform(0.38, 0.5)
-        a.add(
-            rod((tail, 0, deck + radius), (tail + load, 0, deck + radius), radius, sides=22), LOAD
-        )
+        axis_z = deck + radius
+        a.add(rod((tail, 0, axis_z), (tail + load_length, 0, axis_z), radius, sides=22), LOAD)
     elif style == "crane":
         mast = point(load_x, 0, deck + 0.3)
-        jib = mast + [-load * a.uniform(0.4, 0.7), 0, a.uniform(0.5, 0.9)]
-        a.add(cylinder(width * 0.35, width * 0.35, 0.2).translated((load_x, 0, deck + 0.16)), LOAD)
+        jib = mast + [-load_length * a.uniform(0.4, 0.7), 0, a.uniform(0.5, 0.9)]
+        base = width * 0.35
+        a.add(cylinder(base, base, 0.2).translated((load_x, 0, deck + 0.16)), LOAD)
         a.add(box(0.3, mast + [0, 0, 0.08]), LOAD)
         a.add(rod(mast, jib, 0.07, 0.05), LOAD)
         a.add(rod(jib, jib - [0, 0, 0.45], 0.02), CABLE)
@@ -216,31 +214,42 @@ def toytruck(a: Assembly) -> None:
         # A tipper is a flat bed that is tilted about its rear edge.
         tilt = a.uniform(0.15, 0.6) if style == "tipper" else 0.0
         wall = a.uniform(0.2, 0.45)
-        bottom = box((load, width, 0.06), (load / 2, 0, 0))
-        front_wall = box((0.06, width, wall), (load, 0, wall / 2))
-        side_wall = box((load, 0.06, wall), (load / 2, width / 2, wall / 2))
+        middle = load_length / 2
+        bottom = box((load_length, width, 0.06), (middle, 0, 0))
+        front_wall = box((0.06, width, wall), (load_length, 0, wall / 2))
+        side_wall = box((load_length, 0.06, wall), (middle, width / 2, wall / 2))
         for mesh in (bottom, front_wall, side_wall, side_wall.mirrored()):
             a.add(mesh.rotated("y", -tilt).translated((tail, 0, deck + 0.1)), LOAD)
     # One rear axle or two, and one below the cab.
-    rear_axles = [tail + 0.3] if a.chance(0.5) else [tail + 0.25, tail + 0.25 + 2.1 * wheel]
-    for x in (nose - cab_length * 0.6 - 0.1, *rear_axles):
+    axles = [nose - cab_length * 0.6 - 0.1]
+    if a.chance(0.5):
+        axles.append(tail + 0.3)
+    else:
+        axles += [tail + 0.25, tail + 0.25 + 2.1 * wheel]
+    for x in axles:
         add_wheels(a, x, width / 2 - 0.02, wheel, 0.16)
 
 
 def toybus(a: Assembly) -> None:
     """Build a city bus, double-decker or school bus with a bonnet; doors on the right."""
     STRIPE = 1
-    GLASS = 4
-    HEADLAMP = 5
     DOOR = 6  # and destination sign
     REAR_LIGHT = 7
 
     style = a.pick("city bus", "double-decker", "school bus")
-    n_floors = 2 if style == "double-decker" else 1
     length = a.uniform(1.9, 2.9)
     width = a.uniform(0.65, 0.9)
     wheel = a.uniform(0.15, 0.22)
-    height = a.uniform(0.65, 0.85) * (1.6 if n_floors == 2 else 1)
+    height = a.uniform(0.65, 0.85)
+    # Heights of the door, of the windows and of their middles, as shares of the bus's height.
+    door_share = 0.72
+    window_share = 0.3
+    floor_shares = [0.66]
+    if style == "double-decker":
+        height *= 1.6
+        door_share = 0.42
+        window_share = 0.2
+        floor_shares = [0.36, 0.78]
     nose = length / 2
     tail = -nose
     floor = wheel * 0.8
@@ -260,10 +269,9 @@ def toybus(a: Assembly) -> None:
     a.add(box(stripe, (middle, 0, floor + height * 0.3)), STRIPE)
     # The windows of each floor: at the sides, in front and behind.
     n_windows = 4 + a.choice(4)
-    window_height = height * (0.2 if n_floors == 2 else 0.3)
+    window_height = height * window_share
     pitch = body * 0.9 / n_windows
-    shares = (0.36, 0.78) if n_floors == 2 else (0.66,)
-    for share in shares:
+    for share in floor_shares:
         z = floor + height * share
         for k in range(n_windows):
             x = tail + body * 0.05 + (k + 0.5) * pitch
@@ -271,7 +279,7 @@ def toybus(a: Assembly) -> None:
         a.add(box((0.04, width * 0.84, window_height * 1.2), (front, 0, z)), GLASS)
         a.add(box((0.04, width * 0.6, window_height * 0.8), (tail, 0, z)), GLASS)
     # The door on the right, headlamps and rear lights.
-    door = height * (0.42 if n_floors == 2 else 0.72)
+    door = height * door_share
     place = (front - body * 0.12, -width / 2, floor + 0.06 + door / 2)
     a.add(box((pitch * 0.9, 0.04, door), place), DOOR)
     a.add_pair(ellipsoid((0.05, 0.07, 0.07), (nose, width * 0.33, floor + 0.14)), HEADLAMP)
@@ -283,10 +291,7 @@ def toybus(a: Assembly) -> None:
 def toytrain(a: Assembly) -> None:
     """Build a locomotive: steam engine with boiler, chimney and cab, or diesel with a long hood."""
     ROOF = 1
-    CHASSIS = 2
     CHIMNEY = 3
-    GLASS = 4
-    LAMP = 5
     BOILER_DOOR = 6
     BRASS = 7  # dome, cowcatcher and rods
 
@@ -312,22 +317,19 @@ def toytrain(a: Assembly) -> None:
     front = nose - 0.06
     if a.chance(0.7):
         radius = width * a.uniform(0.34, 0.46)
-        boiler = floor + radius
+        axis_z = floor + radius
+        end = (front, 0, axis_z)
         top = floor + radius * 1.9
-        a.add(rod((rear, 0, boiler), (front, 0, boiler), radius, sides=24))
-        a.add(
-            rod((front, 0, boiler), (front + 0.05, 0, boiler), radius * 0.86, sides=24), BOILER_DOOR
-        )
+        a.add(rod((rear, 0, axis_z), end, radius, sides=24))
+        a.add(rod(end, (front + 0.05, 0, axis_z), radius * 0.86, sides=24), BOILER_DOOR)
         chimney = a.uniform(0.2, 0.45)
         mouth = a.uniform(0.08, 0.18)
-        # Its ends are closed; the radius 0 would give triangles without an area.
+        # The chimney's ends are closed; the radius 0 would give triangles without an area.
         profile = [[0.001, 0], [0.09, 0], [0.09, chimney * 0.6], [mouth, chimney], [0.001, chimney]]
         a.add(lathe(profile).translated((front - 0.2, 0, top)), CHIMNEY)
-        a.add(
-            ellipsoid((0.13, 0.13, a.uniform(0.12, 0.2)), (rear + (front - rear) * 0.42, 0, top)),
-            BRASS,
-        )
-        a.add(rod((front, 0, boiler), (front + 0.15, 0, boiler), 0.08, 0.1), LAMP)
+        dome = (0.13, 0.13, a.uniform(0.12, 0.2))
+        a.add(ellipsoid(dome, (rear + (front - rear) * 0.42, 0, top)), BRASS)
+        a.add(rod(end, (front + 0.15, 0, axis_z), 0.08, 0.1), HEADLAMP)
     else:
         hood_width = width * a.uniform(0.7, 0.95)
         hood_height = cab_height * a.uniform(0.55, 0.8)
@@ -335,7 +337,7 @@ def toytrain(a: Assembly) -> None:
         hood = (front - rear, hood_width, hood_height)
         a.add(rounded_box(hood, (middle, 0, floor + hood_height / 2), 9))
         lamp = ellipsoid((0.05, 0.07, 0.07), (front, width * 0.22, deck + hood_height * 0.8))
-        a.add_pair(lamp, LAMP)
+        a.add_pair(lamp, HEADLAMP)
         a.add(box((0.25, width * 0.3, 0.14), (middle, 0, deck + 0.1 + hood_height)), CHIMNEY)
     # The cowcatcher; wheels on two to four axles, and the rods that connect them.
     cowcatcher = [[nose, deck + 0.05], [nose + a.uniform(0.12, 0.25), 0.05], [nose, 0.05]]
