@@ -23,13 +23,12 @@ from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
 
-# in the data folder of procedural objects: the settings of the export
+# File with the settings of the export, in the data folder of procedural objects.
 SETTINGS_FILE = "synthetic.json"
-# in that of models: the settings, and the model of each sequence
+# File with the settings and the model of each sequence, in the data folder of models.
 RENDERED_FILE = "rendered_models.json"
-# pairs per category of models, for each of these numbers of target views
-_MODEL_PAIRS = 20
-_MODEL_TARGETS = (1, 3, 5)
+_MODEL_PAIRS = 20  # per category of models and number of target views
+_MODEL_TARGETS = (1, 3, 5)  # numbers of target views
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class Preset:
 
 
 PRESETS = {
-    # The sample data outside the repository, made in some 15 s: the photograph of the demo needs a
+    # The sample data outside the repository, made in some 15 s. The photograph of the demo needs a
     # motorcycle.
     "demo": Preset(("bicycle", "chair", "motorcycle"), 2, 12, 176, pairs=10, targets=(1, 3, 5)),
     # The size of the paper's evaluation: twenty categories, ten sequences of about a hundred frames
@@ -80,11 +79,11 @@ def export_categories(
     completed; complete sequences are not rendered again.
 
     Args:
-        categories: names among those of `builders`.
+        categories: names of categories of `builders`.
         out: the data folder.
-        sequences: number of them per category; the first is the reference of the labels.
-        frames: number of them per sequence.
-        seed: of everything random.
+        sequences: number of sequences per category; the first is the reference of the labels.
+        frames: number of frames per sequence.
+        seed: seed of everything random.
         image_size: shorter image side in pixels.
         builders: functions that build an object, by category.
         heights: range of the mean elevation of a sequence's cameras in degrees.
@@ -122,7 +121,7 @@ def make_object(
 
 
 def sequence_name(seed: int, category: str, index: int) -> str:
-    """Return a name like CO3D's, three groups of digits; up to 900, names sort like indices."""
+    """Return a name like CO3D's, three groups of digits; below index 900, names sort by index."""
     digits = _key(seed, category, index)
     return f"{100 + index}_{1000 + digits % 9000}_{1000 + digits // 9000 % 9000}"
 
@@ -131,7 +130,7 @@ class _Rendered(msgspec.Struct):
     """Content of `RENDERED_FILE`."""
 
     settings: dict[str, int | str]
-    # the model of each rendered sequence, by category and name: file, rotation and licence
+    # by category and name of the sequence: the file of its model, its rotation, licence and more
     sequences: dict[str, dict[str, dict]]
 
 
@@ -150,8 +149,13 @@ def export_models(
     or its orientation changed.
 
     Args:
-        folder: of the models, see `list_models`, also for `front` and `up`.
-        out: the data folder; frames, seed and image_size are as of `export_categories`.
+        folder: folder of the models, see `list_models`.
+        out: the data folder.
+        frames: number of frames per sequence.
+        seed: seed of everything random.
+        image_size: shorter image side in pixels.
+        front: axis to the front of models without an entry, see `list_models`.
+        up: axis to the top of models without an entry.
 
     Returns:
         The reason for each model ("CATEGORY/NAME") that was left out.
@@ -258,8 +262,8 @@ def write_true_labels(out: Path, category: str, names: Sequence[str]) -> None:
     poses = {name: np.array(pose.trans) for name, pose in read_poses(out, category).items()}
     from_reference = np.linalg.inv(poses[names[0]])
     for name in names:
-        # Rounded, to be equal on all processors, and without negative zeros; of the reference,
-        # exactly the identity.
+        # Rounding makes labels equal on all processors, and exactly the identity for the reference;
+        # adding 0.0 turns negative zeros into zeros.
         trans = np.round(poses[name] @ from_reference, 12) + 0.0
         write_label(out, category, PoseLabel(trans, name, names[0]))
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -32,7 +32,7 @@ MAX_BYTES = 300_000_000  # of a model file
 MAX_FACES = 2_000_000
 _TEXTURE_SIZE = 1024  # longer side in pixels; larger textures are reduced
 _CREASE = np.cos(np.radians(40))  # edges sharper than this stay sharp
-_FACES_PER_POINT = 32  # that its normals take into account
+_FACES_PER_POINT = 32  # largest number of faces at a point that its normals take into account
 _INVISIBLE = 0.02  # opacity below which a face is removed
 MODELS_FILE = "models.json"
 _AXES = dict(zip(["+x", "+y", "+z", "-x", "-y", "-z"], np.vstack([np.eye(3), -np.eye(3)])))
@@ -41,7 +41,10 @@ _Direction = Literal["+x", "-x", "+y", "-y", "+z", "-z"] | tuple[float, float, f
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Surface of a part of a mesh, with the product of three colours: own, texture's, pattern's."""
+    """Surface of a part of a mesh.
+
+    Its colour is the product of three: of the material, of the texture and of the pattern.
+    """
 
     # sRGB with opacity, in [0, 1]; an opacity below 1 lets the room shine through
     colour: Float[np.ndarray, "4"]
@@ -80,7 +83,7 @@ class ModelInfo(msgspec.Struct, frozen=True, omit_defaults=True):
 
     def axes(self, extension: str) -> Float[np.ndarray, "3 3"]:
         """Return the rotation from the file's axes to the canonical: front +x, left +y, up +z."""
-        # What `models.json` does not name is as usual in STL, or as in glTF.
+        # Axes that `models.json` does not name are those of the format: STL's, or glTF's.
         front, up = ("-y", "+z") if extension.lower() == ".stl" else ("+z", "+y")
         front = self.front or front
         up = self.up or up
@@ -112,9 +115,9 @@ def list_models(folder: str | Path, front: str | None = None, up: str | None = N
 
     Args:
         folder: with a folder per category.
-        front: axis such as "+z" that points to the front of the models that `models.json` gives
-            none for; by default that of their format.
-        up: likewise.
+        front: axis such as "+z" that points to the front of models without an entry `front`; by
+            default the front axis of their format.
+        up: axis that points up, for models without an entry `up`.
 
     Raises:
         InputError: if there is no model, two files of one model, or an entry without a file.
@@ -141,7 +144,7 @@ def list_models(folder: str | Path, front: str | None = None, up: str | None = N
             f"{folder} {problem}, expected CATEGORY/NAME.EXT or CATEGORY/NAME/FILE.EXT with EXT "
             f"one of {', '.join(EXTENSIONS)}"
         )
-    # The entries of the models that were found are taken out above.
+    # The loop has removed the entries of all models that have a file.
     if infos:
         raise InputError(
             f"{folder / MODELS_FILE} names {min(infos)!r}, which has no file in {folder}"
@@ -180,7 +183,7 @@ def read_mesh(path: str | Path) -> TexturedMesh:
         for node in scene.graph.nodes_geometry:
             transform, name = scene.graph[node]
             geometry = scene.geometry[name]
-            # points and lines have no faces
+            # Geometries of points or lines have no faces.
             if len(getattr(geometry, "faces", ())):
                 parts.append(_part(geometry, transform))
     except Exception as error:  # trimesh raises many types of exceptions for damaged files
@@ -193,7 +196,7 @@ def read_mesh(path: str | Path) -> TexturedMesh:
     material = np.repeat(np.arange(len(parts)), n_faces)
     check_magnitude(f"model {path}: vertices", vertices)
 
-    # Faces without an area or nearly transparent are left out, and vertices without a face.
+    # Faces without an area and nearly transparent faces are removed, then vertices without a face.
     area = np.linalg.norm(area_normals(vertices / _size(vertices), faces), axis=1)
     opacity = np.array([part_material.colour[3] for part_material in materials])
     visible = (area > 1e-12) & (opacity[material] >= _INVISIBLE)
@@ -249,8 +252,11 @@ def _values(path: Path, key: bytes) -> list[str]:
     return values
 
 
-def _part(mesh, transform: np.ndarray) -> tuple[Mesh, np.ndarray, np.ndarray, Material]:
-    """Return a geometry of trimesh, its corners' texture coordinates and colours, its material."""
+def _part(mesh: Any, transform: np.ndarray) -> tuple[Mesh, np.ndarray, np.ndarray, Material]:
+    """Return a `trimesh.Trimesh` as mesh, texture coordinates, colours and material.
+
+    Texture coordinates and colours belong to the corners of the faces.
+    """
     faces = np.asarray(mesh.faces, np.int64)
     visual = mesh.visual
     vertices = np.asarray(mesh.vertices, float) @ transform[:3, :3].T + transform[:3, 3]
@@ -268,15 +274,16 @@ def _part(mesh, transform: np.ndarray) -> tuple[Mesh, np.ndarray, np.ndarray, Ma
     return Mesh(vertices, faces), uv, colours, material
 
 
-def _material(given) -> Material:
-    """Convert a material of trimesh: Phong's of an OBJ or COLLADA file, or glTF's."""
+def _material(given: Any) -> Material:
+    """Convert a material of trimesh: a Phong material of OBJ or COLLADA, or a material of glTF."""
     if hasattr(given, "baseColorFactor"):
         return _gltf_material(given)
     colour = _rgba(given.diffuse)
     texture = _image(given.image)
     if texture is not None and colour[:3].max() < 0.02:
         colour[:3] = 1  # some exporters write black beside a texture, and mean white
-    keys = given.kwargs  # of the material file: "d" is the opacity, "tr" the transparency
+    # Lines of the material file by keyword: "d" is the opacity, "tr" the transparency.
+    keys = given.kwargs
     opacity = 1.0
     if "d" in keys:
         opacity = float(keys["d"][-1])
@@ -289,8 +296,8 @@ def _material(given) -> Material:
     return Material(colour, texture, specular=0.02 + 0.12 * float(specular), roughness=roughness)
 
 
-def _gltf_material(given) -> Material:
-    """Convert a material of glTF; factors that it does not give are 1."""
+def _gltf_material(given: Any) -> Material:
+    """Convert a material of glTF, whose missing factors are 1."""
     colour = np.ones(4) if given.baseColorFactor is None else _rgba(given.baseColorFactor)
     colour[:3] = linear_to_srgb(colour[:3])
     texture = _image(given.baseColorTexture)
@@ -301,21 +308,21 @@ def _gltf_material(given) -> Material:
     metallic = 1.0 if given.metallicFactor is None else float(given.metallicFactor)
     roughness = 1.0 if given.roughnessFactor is None else float(given.roughnessFactor)
     if given.metallicRoughnessTexture is not None:
-        # its green channel is the roughness, its blue one the metallic share
+        # The green channel is the roughness, the blue channel the metallic share.
         mean = _image(given.metallicRoughnessTexture).mean((0, 1)) / 255
         roughness *= float(mean[1])
         metallic *= float(mean[2])
     return Material(colour, texture, specular=0.04 + 0.36 * metallic, roughness=roughness)
 
 
-def _rgba(colour) -> Float[np.ndarray, "4"]:
-    """Return a colour of three or four values in [0, 1]; bytes are divided by 255."""
+def _rgba(colour: Any) -> Float[np.ndarray, "4"]:
+    """Return a colour, given as three or four bytes or fractions, as fractions with opacity."""
     colour = np.asarray(colour)
     colour = colour / 255.0 if colour.dtype.kind in "ui" else colour.astype(float)
     return np.clip(np.append(colour, 1.0)[:4], 0, 1)
 
 
-def _image(image) -> UInt8[np.ndarray, "h w 4"] | None:
+def _image(image: Any) -> UInt8[np.ndarray, "h w 4"] | None:
     """Return a PIL image as RGBA bytes, of at most `_TEXTURE_SIZE` pixels along its longer side."""
     if image is None:
         return None
@@ -334,9 +341,9 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray,
     unit_size = vertices / _size(vertices)
     weighted = area_normals(unit_size, faces)
     normal = unit(weighted)
-    # Faces that share no vertex meet where vertices have the same point. Corner 3 f + k is that of
-    # face f; `corner` lists them point by point, so that those of point p are `count[p]` corners
-    # from position `first[p]` on, and `of[i]` is the point of the corner at position i.
+    # Faces meet where their corners are at the same point, even if they share no vertex. Corners
+    # 3 f to 3 f + 2 belong to face f. `corner` lists all corners point by point: the corners of
+    # point p are at `count[p]` positions from `first[p]` on; `of[i]` is the point at position i.
     _, point = np.unique(np.round(unit_size, 6), axis=0, return_inverse=True)
     point = point.ravel()[faces.ravel()]
     corner = np.argsort(point, kind="stable")
@@ -352,6 +359,7 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray,
         other = face[first[of[position]] + step]
         smooth = np.einsum("nd,nd->n", normal[face[position]], normal[other]) > _CREASE
         total[corner[position[smooth]]] += weighted[other[smooth]]
-    # beyond _FACES_PER_POINT, a corner may not even have met its own face
+    # At a point of more than _FACES_PER_POINT faces, a corner may have met none, not even its own
+    # face; it keeps the normal of that face.
     normals = unit(np.where(total.any(1, keepdims=True), total, np.repeat(normal, 3, axis=0)))
     return normals.reshape(-1, 3, 3).astype(np.float32)

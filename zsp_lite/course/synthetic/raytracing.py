@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from zsp_lite.course.synthetic.meshes import TexturedMesh
-from zsp_lite.course.synthetic.primitives import TAU, area_normals, unit
+from zsp_lite.course.synthetic.primitives import TAU, area_normals, box_centre, unit
 from zsp_lite.course.synthetic.room import FLOOR_REACH, Room, Values, Vectors
 from zsp_lite.course.synthetic.textures import (
     Image,
@@ -25,12 +25,16 @@ from zsp_lite.course.synthetic.textures import (
 from zsp_lite.data.cameras import Camera
 from zsp_lite.io.ply import load_open3d
 
-_LAYERS = 4  # surfaces with holes that a ray passes through
+_LAYERS = 4  # surfaces that a ray meets at most, as it passes through the holes of textures
 _HOLE = 128  # opacity of a texture, 0 to 255, below which it has a hole
-_OFFSET = 2e-3  # of the start of a ray from the surface that it leaves, in units
-_RAYS = 4  # per sample towards the room, and per point of the floor towards the key light
+# Distance in units between a surface and the start of a ray that leaves it: the ray must not meet
+# the same surface again.
+_OFFSET = 2e-3
+# Rays towards the room from each sample of the picture; and both towards the room and towards the
+# key light from each point of the floor.
+_RAYS = 4
 _LEAST_FACING = 0.02  # cosine of the largest angle between a visible point's normal and its ray
-# light from parts of the object that block the room, relative to the light of the room
+# Light from parts of the object that block the room, relative to the light of the room.
 _BLOCKED = 0.25
 _SHADOW_CELLS = 96  # along each side of the grid on which the shadow on the floor is known
 
@@ -63,10 +67,10 @@ class MeshScene:
 
     Args:
         mesh: the object.
-        room: around it, with the origin below the middle of the object.
-        seed: of shadows, exposure and noise.
+        room: the room around it; its origin is below the middle of the object.
+        seed: source of the random numbers of shadows, exposure and noise.
         coordinates: object coordinates of the vertices; by default the vertices themselves.
-        samples: of the picture per pixel, along each axis.
+        samples: number of samples of the picture along each side of a pixel.
     """
 
     def __init__(
@@ -88,22 +92,22 @@ class MeshScene:
         self._raycaster.add_triangles(
             self._tensor(vertices), self._tensor(mesh.faces.astype(np.uint32))
         )
-        low = mesh.vertices.min(0)
-        high = mesh.vertices.max(0)
-        self.origin = np.array([*(low + high)[:2] / 2, low[2]], np.float32)  # of the room
+        # The origin of the room, in the coordinates of the mesh: below the middle, on the floor.
+        self.origin = box_centre(mesh.vertices).astype(np.float32)
+        self.origin[2] = mesh.vertices[:, 2].min()
 
-        # Of each face: its normal, twice its area, and the object coordinates of its corners.
+        # Per face: its unit normal, twice its area, and the object coordinates of its corners.
         normals = area_normals(vertices, mesh.faces)
         self._flat = unit(normals)
         area = np.linalg.norm(normals, axis=1)
         if coordinates is None:
             coordinates = mesh.vertices
         self._coordinates = coordinates[mesh.faces].astype(np.float32)
-        # sides of the texture per unit of length
+        # Per face: how many sides of the texture one unit of length covers.
         uv_area = np.abs(np.linalg.det(mesh.uv[:, 1:] - mesh.uv[:, :1]))
         self._texture_scale = np.sqrt(uv_area / np.maximum(area, 1e-12))
 
-        # Of each material.
+        # Per material: the texture's pyramid, whether it has holes, and three numbers.
         self._textures = [None if m.texture is None else pyramid(m.texture) for m in mesh.materials]
         self._has_holes = [
             m.texture is not None and bool(m.texture[..., 3].min() < _HOLE) for m in mesh.materials
@@ -112,7 +116,7 @@ class MeshScene:
             [[m.specular, m.roughness, m.colour[3]] for m in mesh.materials], np.float32
         )
         self._shadow, self._shadow_width = self._shadow_on_the_floor()
-        self._gain: float | None = None  # of the exposure, from the first view on
+        self._gain: float | None = None  # of the exposure, known from the first view on
 
     def render(self, camera: Camera) -> Rendering:
         """Render one view; the exposure is measured on the first view and varies little after."""
@@ -145,7 +149,7 @@ class MeshScene:
         return Rendering(rgb, depth, mask, canonical, normals, camera)
 
     def _cast(self, origin: Float[np.ndarray, "#*n 3"], rays: Float[np.ndarray, "*n 3"]) -> _Hits:
-        """Return the first point that each ray meets; it passes through the holes of textures."""
+        """Return the first point that each ray meets; rays pass through the holes of textures."""
         origin = np.broadcast_to(origin.astype(np.float32), rays.shape).reshape(-1, 3)
         rays = rays.reshape(-1, 3)
         start = np.zeros(len(rays), np.float32)  # the parameter from which each ray is followed
@@ -164,7 +168,7 @@ class MeshScene:
             distance = start[ray] + reach[hit]
             hole = self._is_hole(face, weights)
             layers.append(_Hits(ray[~hole], distance[~hole], face[~hole], weights[~hole]))
-            # The rays that met a hole go on behind it.
+            # The rays that met a hole go on from there.
             active = ray[hole]
             start[active] = distance[hole] + _OFFSET
             if not len(active):
@@ -184,7 +188,7 @@ class MeshScene:
     def _visible_share(self, point: Vectors, directions: Float[np.ndarray, "n k 3"]) -> Values:
         """Return the share of the k directions from each point that the object does not block."""
         n, k = directions.shape[:2]
-        # ray i * k + j starts at point i
+        # Ray i * k + j starts at point i.
         blocked = np.bincount(self._cast(point[:, None], directions).ray // k, minlength=n)
         return 1 - blocked.astype(np.float32) / k
 
@@ -216,7 +220,7 @@ class MeshScene:
         reflectance = reflectance[:, None]
         mirrored = self.room.reflection(view + 2 * facing[:, None] * normal, roughness)
         mirrored *= visible[:, None]
-        # No highlight is narrower than that of roughness 0.25.
+        # Roughness counts as at least 0.25, which limits how narrow a highlight is.
         exponent = 2 / np.maximum(roughness, 0.25) ** 4 - 2
         cosine = np.maximum(_dot(normal, unit(light - view)), 0)
         highlight = key * (exponent + 8) / 8 * cosine**exponent
@@ -231,7 +235,7 @@ class MeshScene:
     def _shading_normals(self, hits: _Hits, view: Vectors, flat: Vectors) -> Vectors:
         """Return interpolated normals, turned so that no visible point faces away."""
         normal = _interpolated(hits.weights, self.mesh.normals[hits.face])
-        # on the same side of the surface as the flat normal
+        # The normal is turned to the side of the surface that the flat normal is on.
         normal *= np.where(_dot(normal, flat) < 0, np.float32(-1), np.float32(1))[:, None]
         normal = unit(normal)
         # Visible points do not face away, though their interpolated normals may.
@@ -278,8 +282,8 @@ class MeshScene:
                 pixels *= np.sqrt(np.prod(texture[0].shape[:2]))
                 rgba = sample_pyramid(texture, u, 1 - v, pixels, cv2.BORDER_WRAP)
                 albedo[chosen] *= srgb_to_linear(rgba[:, :3] / 255)
-        # Artists use pure black and fully saturated colours; real surfaces reflect a few percent of
-        # all colours.
+        # Artists use pure black, pure white and fully saturated colours. Real surfaces reflect at
+        # least a few percent of every colour, and never all light.
         return 0.015 + 0.8 * albedo
 
     def _lit_share(self, point: Vectors, count: int) -> Values:
@@ -295,8 +299,10 @@ class MeshScene:
         return self._visible_share(point, unit(normal[:, None] + offset))
 
     def _shadow_on_the_floor(self) -> tuple[Float[np.ndarray, "n n 2"], float]:
-        """Return the visible shares of key light and room on a grid on the floor, and its width."""
-        # The grid is as wide as the object with its shadow, of limited length, on either side.
+        """Return the shares of key light and room seen from a grid on the floor, and its width."""
+        # The grid is as wide as the object with its shadow on either side. A light near the horizon
+        # counts as steeper, so that the shadow is at most 5 units long. A light from above counts as
+        # lower: the object shades the floor around it from the room.
         extent = np.ptp(self.mesh.vertices, axis=0)
         light = self.room.light
         length = extent[2] * max(float(np.linalg.norm(light[:2]) / max(light[2], 0.3)), 0.8)
@@ -313,7 +319,7 @@ class MeshScene:
         return np.dstack([key, around]), width
 
     def _background(self, camera: Camera, rays: Image) -> tuple[Image, Float[np.ndarray, "h w"]]:
-        """Return the room's radiance with the shadow of the object, and the depth of the floor."""
+        """Return the room's radiance with the object's shadow, and the depth of the floor."""
         eye = camera.centre - self.origin
         flat_rays = rays.reshape(-1, 3)
         radiance, reach = self.room.radiance(eye, flat_rays, 1 / camera.focal_length.mean())
@@ -331,7 +337,7 @@ def _pixel_rays(camera: Camera, n: int) -> Image:
     height, width = camera.size
     x = ((np.arange(width * n) + 0.5) / n - camera.principal_point[0]) / camera.focal_length[0]
     y = ((np.arange(height * n) + 0.5) / n - camera.principal_point[1]) / camera.focal_length[1]
-    # x R[0] + y R[1] + R[2] is the world direction of (x, y, 1); the shapes make it (h, w, 3)
+    # The world direction of (x, y, 1) is x R[0] + y R[1] + R[2], here with the shape (h, w, 3).
     rays = x[None, :, None] * camera.R[0] + (y[:, None, None] * camera.R[1] + camera.R[2])
     return rays.astype(np.float32)
 
@@ -344,7 +350,7 @@ def _interpolated(
 
 
 def _towards(normal: Vectors, rays: Vectors) -> Vectors:
-    """Return normals that point towards the eye of rays."""
+    """Return the normals, turned so that they point against the rays."""
     return normal * -np.sign(_dot(normal, rays))[:, None]
 
 
@@ -357,8 +363,8 @@ def _spread_directions(
     rng: np.random.Generator, n: int, count: int
 ) -> Float[np.ndarray, "n {count} 3"]:
     """Return n sets of `count` unit vectors, each spread evenly over the sphere at random."""
-    # A Fibonacci spiral: equal steps of z have equal areas, and the golden ratio of a turn between
-    # neighbours avoids rows.
+    # A Fibonacci spiral: equal steps of z cover equal areas of the sphere, and a turn by the golden
+    # ratio (0.618) from point to point keeps the points out of rows.
     index = np.arange(count, dtype=np.float32)
     z = 1 - 2 * (index + rng.random((n, 1), np.float32)) / count
     turns = index * 0.618034 + rng.random((n, 1), np.float32)

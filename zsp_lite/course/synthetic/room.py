@@ -111,8 +111,8 @@ class Room:
 
     def irradiance(self, normal: Vectors) -> Vectors:
         """Return the irradiance from the room, without its key light, where nothing blocks it."""
-        # Along each axis, the normal points to one face. The squares of its coordinates, which sum to
-        # 1, are the weights of these three faces.
+        # Along each axis, the normal points to one face. The squares of its coordinates are the
+        # weights of these three faces; they sum to 1.
         face = 2 * np.arange(3) + (normal > 0)
         return np.einsum("nf,nfc->nc", normal**2, self._irradiance[face])
 
@@ -184,7 +184,7 @@ def random_room(seed: int | np.random.Generator) -> Room:
     high = np.array([sides[2], sides[3], rng.uniform(12, 14)])
     width, depth, height = high - low
     light = direction(azimuth=rng.uniform(0, 2 * np.pi), elevation=rng.uniform(0.5, 1.4))
-    warmth = rng.uniform(-0.08, 0.2)  # red minus blue of the key light, halved
+    warmth = rng.uniform(-0.08, 0.2)  # excess of red in the key light, and lack of blue
     temperature = rng.normal(0, 0.045)  # error of the camera's white balance
 
     floor = _floor(rng)

@@ -23,16 +23,19 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.points import axis_deviation
 
 _ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
-# lowest and highest mean elevation of a sequence's cameras above the object, degrees
+# Lowest and highest mean elevation of a sequence's cameras above the object, in degrees.
 HEIGHTS = (19.0, 30.0)
 _FRAME_MARGIN = 0.03  # free border at each image side, as a fraction of that side
 _DEPTH_NOISE = 0.005  # standard deviation relative to the depth, at the object
-# Range of the fraction of pixels without depth, drawn per sequence. The wall has no depth at all.
+# Ranges of the fraction of pixels without depth, which is drawn per sequence. Walls have no depth.
 _OBJECT_HOLES = (0.28, 0.46)
 _FLOOR_HOLES = (0.1, 0.3)
-# Ranges of the last fields of `SequenceData` in the sequences that the paper labels: viewpoint
-# quality, point cloud quality, and the factor from stored depth to depth.
-_SCORES = (1.3, 3.0), (0.35, 1.0), (0.4, 2.5)
+# Ranges of the last three fields of `SequenceData`, as in the sequences that the paper labels.
+_SCORES = (
+    (1.3, 3.0),  # viewpoint quality
+    (0.35, 1.0),  # point cloud quality
+    (0.4, 2.5),  # factor from stored depth to depth
+)
 
 
 def orbit_pose(
@@ -46,7 +49,7 @@ def orbit_pose(
     forward = -away
     right = np.cross(forward, [0, 0, 1.0])
     right /= np.linalg.norm(right)
-    # the rows are the camera's axes: right, down and forward
+    # The rows are the camera's axes: right, down and forward.
     R = rotation("z", roll) @ np.stack([right, np.cross(forward, right), forward])
     return R, -R @ (np.asarray(target, float) + away * distance)
 
@@ -56,7 +59,7 @@ def handheld_sweep(
     rng: np.random.Generator,
     frames: int,
     size: tuple[int, int],
-    heights: tuple[float, float] = HEIGHTS,
+    heights: tuple[float, float],
 ) -> list[Camera]:
     """Draw cameras, in object coordinates, of a hand that moves once around the object.
 
@@ -70,7 +73,8 @@ def handheld_sweep(
     Returns:
         Cameras of one focal length; the whole object is inside all their images.
     """
-    # Every quantity swings slowly (waves) and trembles from frame to frame (normal numbers).
+    # Every quantity of the motion swings slowly (waves) and trembles from frame to frame (normal
+    # numbers).
     progress = (np.arange(frames) + rng.normal(0, 0.12, frames)) / frames
     phase = rng.uniform(0, TAU, 4)
 
@@ -136,12 +140,12 @@ def render_sequence(
     # category.
     first = cameras[0].matrix
     to_object = np.linalg.inv(first)
-    # The last digits of sines and products depend on the processor; rounding makes the files equal
-    # everywhere.
+    # The last digits of sines and products depend on the processor; rounded poses are equal
+    # everywhere. Adding 0.0 turns negative zeros into zeros.
     views = []
     for camera in cameras:
         view = scene.render(camera)
-        pose = np.round(view.camera.matrix @ to_object, 9) + 0.0  # no negative zeros
+        pose = np.round(view.camera.matrix @ to_object, 9) + 0.0
         views.append(replace(view, camera=replace(view.camera, R=pose[:3, :3], t=pose[:3, 3])))
     return views, np.round(first, 9)
 
@@ -149,9 +153,13 @@ def render_sequence(
 def stereo_depth(
     view: Rendering, object_holes: float, floor_holes: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "h w"]:
-    """Simulate the depth map of multi-view stereo, 0 where it is unknown.
+    """Simulate the depth map of multi-view stereo, 0 where the depth is unknown.
 
-    The holes are fractions of the pixels of the object and of the floor.
+    Args:
+        view: the exact view.
+        object_holes: fraction of the object's pixels without depth.
+        floor_holes: fraction of the floor's pixels without depth.
+        rng: source of the random numbers.
     """
     # The pixels of least confidence in each region have no depth.
     confidence = _stereo_confidence(view, rng)
@@ -160,7 +168,7 @@ def stereo_depth(
     for region, holes in ((view.mask, object_holes), (floor, floor_holes)):
         if region.any():
             known |= region & (confidence >= np.quantile(confidence[region], holes))
-    # a flat object that is seen edge-on may have no pixel
+    # A flat object that is seen edge-on may have no pixel; then there is no noise.
     near = np.median(view.depth[view.mask]) if view.mask.any() else np.inf
     # The noise, mostly correlated between pixels, grows with the square of the depth.
     correlated = 0.95 * smooth_noise(rng, view.mask.shape, 2.0)
@@ -181,7 +189,8 @@ def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Float[np.nd
     texture = np.log(np.sqrt(blur(energy, 2.5 * scale)) + 1)
     texture = (texture - texture.mean()) / (texture.std() + 1e-6)
 
-    # Edges: steps of the depth of more than 3 % between neighbours. The wall counts as far away.
+    # Edges: steps of the depth of more than 3 % between neighbours. The wall, whose depth is 0,
+    # counts as the farthest point of the floor.
     far = np.where(view.depth > 0, view.depth, view.depth.max())
     jump = cv2.dilate(far, np.ones((3, 3))) / cv2.erode(far, np.ones((3, 3))) - 1
     edge = np.minimum(blur((jump > 0.03).astype(np.float32), max(0.5 * scale, 0.3)) * 2, 1)
@@ -200,7 +209,7 @@ def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Float[np.nd
 def soft_mask(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
     """Simulate the probabilities (float32) of a segmentation network: a soft, displaced edge."""
     # Distance from the edge in pixels, positive inside. OpenCV measures from the centre of a pixel
-    # to that of the nearest one of the other kind; the edge is half a pixel before that.
+    # to the centre of the nearest pixel of the other kind; the edge is half a pixel nearer.
     inside = mask.astype(np.uint8)
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
     distance -= cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
@@ -221,10 +230,11 @@ def fused_cloud(
     for view, depth in zip(views, depths, strict=True):
         row, col = np.nonzero((depth > 0) & view.mask)
         points = view.camera.unproject(np.stack([col + 0.5, row + 0.5], -1), depth[row, col])
-        # the normals are in the camera frame
-        clouds.append((points, view.normals[row, col] @ view.camera.R, view.rgb[row, col]))
+        normals = view.normals[row, col] @ view.camera.R  # from the camera frame to the world
+        clouds.append((points, normals, view.rgb[row, col]))
     cloud = [np.concatenate(values) for values in zip(*clouds, strict=True)]
-    chosen = np.sort(rng.choice(len(cloud[0]), min(n_points, len(cloud[0])), replace=False))
+    n = len(cloud[0])
+    chosen = np.sort(rng.choice(n, min(n_points, n), replace=False))
     return [values[chosen] for values in cloud]
 
 
@@ -240,8 +250,8 @@ def record_sequence(
 
     Args:
         mesh: the object, with unit spread.
-        name: of the sequence.
-        key: seed of everything random about it.
+        name: name of the sequence.
+        key: seed of everything random about the sequence.
         frames: number of its frames.
         image_size: shorter image side in pixels.
         heights: range of the mean elevation of the cameras in degrees.
@@ -250,14 +260,16 @@ def record_sequence(
         The sequence, whose point cloud has unit spread as in CO3D; and the exact pose [R t] and
         scale of the object in it: `world = R @ (scale * canonical) + t`.
     """
+    # Views and errors have random numbers of their own: [key, 1] and [key, 2].
     rng = np.random.default_rng([key, 1])
     views, pose = render_sequence(mesh, rng, frames, image_size, heights)
     seconds = np.round(np.arange(frames) * rng.uniform(0.4, 0.9), 3).tolist()
 
-    # The holes vary from view to view about those of the sequence.
+    # The fractions of holes vary from view to view about the fractions of the sequence.
     rng = np.random.default_rng([key, 2])
     holes = np.array([rng.uniform(*_OBJECT_HOLES), rng.uniform(*_FLOOR_HOLES)])
-    depths, masks = [], []
+    depths = []
+    masks = []
     for view in views:
         object_holes, floor_holes = np.clip(holes + rng.normal(0, 0.03, 2), 0.05, 0.9)
         depths.append(stereo_depth(view, object_holes, floor_holes, rng))

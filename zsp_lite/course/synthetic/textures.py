@@ -49,8 +49,8 @@ def random_colour(
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:
-    """Blur an image by a Gaussian of at least 0.2 pixels, which changes nothing."""
-    # From a sigma of 0, OpenCV would derive another one.
+    """Blur an image by a Gaussian; a sigma below 0.2 pixels changes nothing."""
+    # OpenCV refuses a sigma of 0.
     return cv2.GaussianBlur(image, (0, 0), max(sigma, 0.2), borderType=cv2.BORDER_REFLECT)
 
 
@@ -146,7 +146,7 @@ def sample_image(
 
     Outside the image, `border` continues it as in OpenCV; with BORDER_CONSTANT, by ones.
     """
-    # OpenCV wraps only points whose pixel coordinates fit into 16 bits.
+    # Points far outside the image would lose precision in OpenCV's pixel coordinates.
     if border == cv2.BORDER_WRAP:
         u = u % 1
         v = v % 1
