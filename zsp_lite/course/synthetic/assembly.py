@@ -224,14 +224,14 @@ def random_materials(seed: int | list[int] | np.random.Generator) -> tuple[Mater
 
 
 def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
-    """Draw two sRGB colours, and sine waves through the object that mix them."""
+    """Draw a material of a kind: two sRGB colours that sine waves through the object mix."""
     colour = random_colour(rng, kind.hue, kind.saturation, kind.value)
-    other = random_colour(rng, kind.hue, kind.saturation, kind.value)
+    second = random_colour(rng, kind.hue, kind.saturation, kind.value)
     # Only printed paint, the kind with a choice of waves, has a second hue; the second colour of
     # other kinds is a darker shade of the first.
     if len(kind.waves) == 1:
-        other = 0
-    other = colour + rng.uniform(*kind.contrast) * (other - colour)
+        second = 0  # black
+    mixed = colour + rng.uniform(*kind.contrast) * (second - colour)
     # The wave vectors (k, 3) have one length.
     waves = rng.normal(size=(rng.choice(kind.waves), 3))
     waves *= rng.uniform(*kind.frequency) / np.linalg.norm(waves, axis=1, keepdims=True)
@@ -240,10 +240,11 @@ def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
     sharpness = float(rng.choice([1.0, 2.0, 6.0]))  # 1 for a sine, more for clear edges
 
     def pattern(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        # The waves (n, k) are bent by one more wave (n, 1); their mean (n, 1) mixes the colours.
         bend = np.sin(points @ warp)[:, None]
         value = np.sin(points @ waves.T + phases + bend).mean(1, keepdims=True)
         share = np.clip(0.5 + 0.5 * sharpness * value, 0, 1)
-        return (colour + share * (other - colour)).astype(np.float32)
+        return (colour + share * (mixed - colour)).astype(np.float32)
 
     return Material(
         np.ones(4), pattern=pattern, specular=kind.specular, roughness=rng.uniform(*kind.roughness)

@@ -300,9 +300,9 @@ class MeshScene:
 
     def _shadow_on_the_floor(self) -> tuple[Float[np.ndarray, "n n 2"], float]:
         """Return the shares of key light and room seen from a grid on the floor, and its width."""
-        # The grid is as wide as the object with its shadow on either side. A light near the horizon
-        # counts as steeper, so that the shadow is at most 5 units long. A light from above counts as
-        # lower: the object shades the floor around it from the room.
+        # The grid is as wide as the object with a shadow on either side. The shadow counts as at
+        # most 5 units long, and as at least 0.8 of the object's height even below a light from
+        # above: the object also shades the floor from the room.
         extent = np.ptp(self.mesh.vertices, axis=0)
         light = self.room.light
         length = extent[2] * max(float(np.linalg.norm(light[:2]) / max(light[2], 0.3)), 0.8)

@@ -120,7 +120,7 @@ def distillation_loss(
     student_temperature: float,
     teacher_temperature: float,
 ) -> tuple[Tensor, dict[str, float]]:
-    """Compute the cross-entropy between teacher and student for different crops, eq. 3 of DINO.
+    """Compute the cross-entropy of the student with the teacher on other crops, eq. 3 of DINO.
 
     Args:
         student: logits of the student; the first two crops are the global ones.
@@ -185,9 +185,8 @@ class Distillation:
         config = self.config
         progress = self.steps_done / config.steps
         # The rate rises linearly in the first tenth of the run.
-        rate = (
-            config.learning_rate * min(1.0, 10 * progress) * cosine(LEARNING_RATE_DECAY, progress)
-        )
+        warm_up = min(1.0, 10 * progress)
+        rate = config.learning_rate * warm_up * cosine(LEARNING_RATE_DECAY, progress)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         matrices, _ = self.optimizer.param_groups
