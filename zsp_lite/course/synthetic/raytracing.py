@@ -256,7 +256,8 @@ class MeshScene:
         of_light[lit] = self._lit_share(point[lit], 1)
         of_room = self._room_share(point, normal)
         # Few rays per sample are noisy: each sample takes the mean of its neighbours on the object.
-        # The blur divides by all nine neighbours, the third channel is the share on the object.
+        # The blur divides by all nine neighbours; the third channel becomes the share of these that
+        # are on the object.
         shares = np.zeros((*size, 3), np.float32)
         shares.reshape(-1, 3)[ray] = np.column_stack([of_light, of_room, np.ones(len(key))])
         of_light, of_room, on_object = cv2.blur(shares, (3, 3)).reshape(-1, 3)[ray].T
@@ -293,8 +294,9 @@ class MeshScene:
         return self._visible_share(point, unit(self.room.light.astype(np.float32) + offset))
 
     def _room_share(self, point: Vectors, normal: Float[np.ndarray, "#n 3"]) -> Values:
-        """Return the share of the room above its surface that each point sees."""
-        # A unit vector plus a random one has the density of the cosine; 0.99 avoids the sum zero.
+        """Return the share of the room above the surface that each point sees."""
+        # The sum of the normal and a random unit vector has the density of the cosine, by which a
+        # surface receives light; 0.99 keeps the sum from being zero.
         offset = 0.99 * _spread_directions(self._rng, len(point), _RAYS)
         return self._visible_share(point, unit(normal[:, None] + offset))
 

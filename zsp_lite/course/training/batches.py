@@ -83,7 +83,7 @@ def recolour(rng: np.random.Generator, x: Float[Tensor, "n 3 h w"]) -> Float[Ten
     # contrast
     mean = x.mean((2, 3), keepdim=True)
     x = (x - mean) * draw(0.7, 1.3) + mean
-    # saturation; one image in five becomes grey
+    # saturation, where one image in five becomes grey
     grey = x.mean(1, keepdim=True)
     saturation = draw(0.3, 1.4)
     coloured = torch.from_numpy(rng.random((n, 1, 1, 1)) > 0.2)

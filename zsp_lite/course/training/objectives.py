@@ -59,10 +59,11 @@ def correspondence_loss(
     for k in range(objects):
         on_object = (~points[k, :, 0].isnan()).nonzero()[:, 0]
         query = on_object[torch.randperm(len(on_object), generator=generator)[:queries]]
-        # An object of few patches is small or cut off, and says little.
+        # An object with few patches is small or cut off, and says little.
         if len(query) < 20:
             continue
-        # Rows are queries, columns all patches of the object; the background is far from it.
+        # Rows are queries, columns all patches of the object. Patches of the background get a point
+        # that is far from the object.
         same_view = view[query][:, None] == view[None]
         distance = torch.cdist(points[k, query], points[k].nan_to_num(nan=99.0))
         target = torch.exp(-distance.square() / (2 * radius**2)).masked_fill(same_view, 0)
@@ -77,7 +78,8 @@ def correspondence_loss(
         # A patch of the query's own view has practically no probability.
         logits = (z[k, query] @ z[k].T / temperature).masked_fill(same_view[seen_again], -1e4)
         losses.append(F.kl_div(logits.log_softmax(1), target, reduction="batchmean"))
-        hits.append((target.gather(1, logits.argmax(1, keepdim=True)) > 0).float().mean())
+        nearest = logits.argmax(1, keepdim=True)
+        hits.append((target.gather(1, nearest) > 0).float().mean())
     if not losses:
         return descriptors.sum() * 0, 0.0  # zero, with a gradient
     return torch.stack(losses).mean(), torch.stack(hits).mean().item()
@@ -117,7 +119,7 @@ def attention_loss(
     spread = F.kl_div(attention.log(), target, reduction="batchmean")
     level = (attention * coverage).sum(1, keepdim=True) / coverage.sum(1, keepdim=True)
     # The logit of a patch is positive where its attention exceeds 0.12 of the level.
-    side = F.binary_cross_entropy_with_logits(
+    separation = F.binary_cross_entropy_with_logits(
         attention.log() - (0.12 * level.detach()).log(), coverage
     )
     with torch.no_grad():
@@ -127,7 +129,7 @@ def attention_loss(
         # A patch is on the object if more than one of its four points of coverage is.
         truth = coverage > 0.25
         iou = ((salient & truth).sum(1) / (salient | truth).sum(1).clamp_min(1)).mean().item()
-    return spread + 0.25 * side, iou
+    return spread + 0.25 * separation, iou
 
 
 def losses(

@@ -25,6 +25,7 @@ from zsp_lite.course.synthetic.primitives import (
     cylinder,
     ellipsoid,
     extrusion,
+    point,
     rotation,
     torus,
 )
@@ -165,9 +166,9 @@ def _room(index: int) -> Room:
 
 
 def build_random_object(a: Assembly) -> None:
-    """Build a tree of 5 to 10 random parts, symmetric, each attached to one of those before it."""
+    """Build a symmetric tree of 5 to 10 random parts, each attached to an earlier part."""
     # The nodes of the tree: centre and size of each part.
-    body = np.array([a.uniform(0.5, 1.3), a.uniform(0.4, 1.0), a.uniform(0.4, 1.2)])
+    body = point(a.uniform(0.5, 1.3), a.uniform(0.4, 1.0), a.uniform(0.4, 1.2))
     nodes = [(np.zeros(3), body)]
     a.add(_random_solid(a, body), a.choice(5))
     for _ in range(4 + a.choice(6)):
@@ -188,7 +189,7 @@ def build_random_object(a: Assembly) -> None:
 
 def _random_solid(a: Assembly, size: np.ndarray) -> Mesh:
     """Return a solid of about the given size (3,), sometimes rotated about the axis to the left."""
-    # an irregular pentagon about the origin
+    # The outline of the slab is an irregular pentagon about the origin.
     angle = np.arange(5) * TAU / 5 + a.rng.uniform(0, TAU / 5, 5)
     outline = np.stack([np.cos(angle), np.sin(angle)], 1) * a.rng.uniform(0.3, 0.6, (5, 1))
     solids = (
