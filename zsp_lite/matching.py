@@ -64,8 +64,13 @@ def similarity(ref: Keys, target: Keys) -> Float[Tensor, "n1 n2"]:
     return similarities(ref, [target])[0]
 
 
-def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
-    """Compute `similarity` of one reference with several targets."""
+def similarities(
+    ref: Keys, targets: list[Keys], binning: bool = True
+) -> list[Float[Tensor, "n1 n2"]]:
+    """Compute `similarity` of one reference with several targets, or `key_similarities` without
+    `binning`."""
+    if not binning:
+        return key_similarities(ref, targets)
     keys1 = _keys(ref)
     inverse_norm1 = _inverse_norm(keys1)
     results = []
@@ -82,8 +87,10 @@ def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]
 def key_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
     """Compute the cosine similarities of the keys themselves, without log-binning (see
     `similarities`)."""
-    first, *others = [F.normalize(_keys(one).flatten(0, 1), dim=1) for one in (ref, *targets)]
-    return [first @ other.T for other in others]
+    reference, *others = [
+        F.normalize(_keys(features).flatten(0, 1), dim=1) for features in (ref, *targets)
+    ]
+    return [reference @ other.T for other in others]
 
 
 def nearest_neighbours(
@@ -158,8 +165,7 @@ def match(
         binning: Compare and cluster log-binned descriptors; False takes the keys themselves.
     """
     if sim is None:
-        compare = similarities if binning else key_similarities
-        (sim,) = compare(ref, [target])
+        (sim,) = similarities(ref, [target], binning)
     if ref_foreground is None:
         ref_foreground = ref.foreground()
     if target_foreground is None:
@@ -201,11 +207,14 @@ def _rank(
     if matcher == "cyclical":
         score, partner = _cycles(sim, on_start, on_end, published)
     else:
-        ask = MATCHERS[matcher] if isinstance(matcher, str) else matcher
+        if isinstance(matcher, str):
+            matcher = MATCHERS[matcher]
         # Copies, since a matcher may overwrite what it gets, such as the similarities of the
         # background.
-        answer = ask(sim.clone(), on_start.flatten().clone(), on_end.flatten().clone())
-        partner, score = [torch.as_tensor(one).cpu() for one in answer]
+        partner, score = matcher(
+            sim.clone(), on_start.flatten().clone(), on_end.flatten().clone()
+        )
+        partner, score = torch.as_tensor(partner).cpu(), torch.as_tensor(score).cpu()
         if not len(partner) == len(score) == len(sim):
             found = f"{len(partner)} partners and {len(score)} scores"
             raise InputError(

@@ -94,15 +94,15 @@ def fails_alone(seconds: int) -> Iterator[None]:
         raise InputError(describe_failure(error)) from error
 
 
-def given(method: Any, problem: PairProblem) -> Any:
-    """Return what the row of a method of one's own gets: copies; nothing in them leads to the data
-    set and labels."""
-    if not isinstance(method, Estimator | KeypointMatcher):
+def problem_of_own(solve: Any, problem: PairProblem) -> Problem:
+    """Return the problem that a row of one's own gets: copies that do not lead to the data set and
+    its labels."""
+    if not isinstance(solve, Estimator | KeypointMatcher):
         return Problem(problem.seed, deepcopy(problem.crops), problem.store.extractors, {})
     with ends_the_run("reading frames"):
         reference, targets = problem.store.dataset.load_pair(problem.pair)
     frames = [reference, *targets]
-    if isinstance(method, KeypointMatcher):
+    if isinstance(solve, KeypointMatcher):
         frames = [object_crop(frame, size=None) for frame in frames]
     return Problem(problem.seed, [Crop(frame) for frame in frames], {}, {})
 

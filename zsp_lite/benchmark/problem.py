@@ -14,16 +14,17 @@ from threadpoolctl import threadpool_limits
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.best_view import ViewMatch
+from zsp_lite.category import PairHypotheses, world_hypotheses
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError, ends_the_run, real_array, rotation_matrix
 from zsp_lite.estimates import PoseEstimate
-from zsp_lite.matching import key_similarities, similarities
+from zsp_lite.matching import similarities
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import IMAGE_SIZE, View, feature_maps, frame_view, object_crop
 
-CAPACITY = 128  # frames in memory
+CAPACITY = 128  # frames in memory: those of about twenty pairs with five targets
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,19 +69,19 @@ class Row(Protocol):
 def as_answer(found: Any) -> Answer:
     """Convert what a row returns to an Answer; InputError if it is none of what `Row` allows."""
     if isinstance(found, PoseEstimate):
-        sim3, inliers = found.sim3, int(found.inliers.sum())
+        sim3 = found.sim3
+        inliers = int(found.inliers.sum())
         return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, inliers, found.confidence)
     if isinstance(found, Answer):
         # Sim3 refuses what is no pose.
         scale = 1.0 if found.scale is None else found.scale
-        move = np.zeros(3) if found.translation is None else found.translation
-        exact = Sim3(scale, found.rotation, move)
-        return replace(
-            found,
-            rotation=exact.R,
-            translation=None if found.translation is None else exact.t,
-        )
-    pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
+        if found.translation is None:
+            return replace(found, rotation=Sim3(scale, found.rotation, np.zeros(3)).R)
+        exact = Sim3(scale, found.rotation, found.translation)
+        return replace(found, rotation=exact.R, translation=exact.t)
+    pose, view = found, 0
+    if isinstance(found, tuple) and len(found) == 2:
+        pose, view = found
     if isinstance(pose, Sim3):
         return Answer(pose.R, int(view), pose.t, pose.scale)
     what = "pose of the row"
@@ -88,21 +89,21 @@ def as_answer(found: Any) -> Answer:
 
 
 def parameters(plugin: Any) -> Mapping[str, inspect.Parameter]:
-    """Return the parameters of a plug-in by name; none if it has no signature, as some of compiled
-    modules."""
+    """Return the parameters of a plug-in by name; none of a compiled function without a
+    signature."""
     with suppress(TypeError, ValueError):
         return inspect.signature(getattr(plugin, "forward", plugin)).parameters
     return {}
 
 
 def seeded(plugin: Any, seed: int) -> Any:
-    """Give a seed to a plug-in that has a parameter `seed`; others stay as they are."""
+    """Give the seed to a plug-in that has a parameter `seed`; return others as they are."""
     return partial(plugin, seed=seed) if "seed" in parameters(plugin) else plugin
 
 
 @contextmanager
-def _timed(timings: dict[str, list[float]], stage: str) -> Iterator[None]:
-    """Add the time that the block takes to the timings of a stage."""
+def _time_added(timings: dict[str, list[float]], stage: str) -> Iterator[None]:
+    """Append the run time of the block, in seconds, to those of a stage."""
     start = time.perf_counter()
     yield
     timings.setdefault(stage, []).append(time.perf_counter() - start)
@@ -126,16 +127,19 @@ class Crop:
 
 
 class FrameStore:
-    """Crops, of which the last used are kept; `timings` are the seconds of their pair by stage.
+    """The crops of frames, of which the last used are kept in memory.
 
-    `kept` is what a row keeps for all pairs. `threads` are those of feature extraction, None leaves
-    them as they are.
+    Features are extracted with a number of `threads`; None leaves it as it is.
     """
 
     def __init__(self, dataset: Co3D, extractors: Mapping[str, Any], threads: int | None = None):
-        self.dataset, self.extractors, self.threads = dataset, extractors, threads
-        self.timings: dict[str, list[float]] = {}
-        self.kept: dict[Any, Any] = {}
+        self.dataset = dataset
+        self.extractors = extractors
+        self.threads = threads
+        self.timings: dict[str, list[float]] = {}  # seconds of the stages of the present pair
+        # What rows find for one pair and need for others; None if the views determine no pose.
+        self.hypotheses_of: dict[Pair, PairHypotheses | None] = {}
+        # Methods with a memory: of crops limited, of extents and labels, which are small, not.
         self._read = lru_cache(CAPACITY)(self._crop)
         self.extent = cache(dataset.extent)
         self.labels = cache(partial(read_labels, dataset.root))
@@ -144,7 +148,7 @@ class FrameStore:
         size = getattr(self.extractors.get("backbone"), "image_size", IMAGE_SIZE)
         with ends_the_run(f"reading frame {sequence}/{number}"):
             annotation = self.dataset.frame(category, sequence, number)
-            with _timed(self.timings, "reading"):
+            with _time_added(self.timings, "reading"):
                 return Crop(object_crop(self.dataset.load(annotation), size))
 
     def crop(self, category: str, sequence: str, number: int, features: Iterable[str] = ()) -> Crop:
@@ -154,15 +158,17 @@ class FrameStore:
             if name in crop.described:
                 continue
             extractor = self.extractors[name]
-            extract = getattr(extractor, "describe", partial(feature_maps, extractor))
             with (
                 threadpool_limits(self.threads),
                 ends_the_run(f"features {name!r}"),
-                _timed(self.timings, name),
+                _time_added(self.timings, name),
             ):
                 # One frame at a time: the last bits of a frame's features must not depend on the
                 # rest of a batch.
-                crop.described[name] = extract([crop.frame])[0]
+                if hasattr(extractor, "describe"):
+                    (crop.described[name],) = extractor.describe([crop.frame])
+                else:
+                    (crop.described[name],) = feature_maps(extractor, [crop.frame])
         return crop
 
 
@@ -180,8 +186,10 @@ class Problem:
         extractors: Mapping[str, Any],
         timings: dict[str, list],
     ):
-        self.seed, self.crops = seed, crops  # the reference's crop first
-        self._extractors, self._timings = extractors, timings
+        self.seed = seed
+        self.crops = crops  # the reference's crop first
+        self._extractors = extractors
+        self._timings = timings
         self._estimates: dict[tuple, PoseEstimate] = {}  # by arguments of `estimate`
         self._similarities: dict[tuple, Any] = {}  # by two feature maps and `binning`
 
@@ -197,8 +205,8 @@ class Problem:
         return frames
 
     def views(self) -> list[View]:
-        """Return the crops with the features of the run's backbone, and the foreground that its
-        saliency finds."""
+        """Return the crops with features of the run's backbone and the foreground by their
+        saliency."""
         return [crop.view("backbone", "saliency") for crop in self.crops]
 
     def estimate(
@@ -207,16 +215,18 @@ class Problem:
         settings: Mapping[str, Any] | None = None,
         target: int | None = None,
     ) -> PoseEstimate:
-        """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the
-        one with an index."""
+        """Estimate the pose by `ZeroShotPose` with some settings, in all targets or in the one with
+        index `target`."""
         settings = settings or {}
         key = (features, target, *sorted(settings.items()))
         if key in self._estimates:
             return self._estimates[key]
-        own = {}
-        for name, value in settings.items():  # a solver gets the seed when it is called
-            own[name] = value if name == "solver" else seeded(value, self.seed)
-        method = ZeroShotPose(self._extractors[features], **own, seed=self.seed)
+        # A matcher of one's own may take a seed; a solver gets it when it is called.
+        plugged = dict(settings)
+        for name, value in settings.items():
+            if callable(value) and name != "solver":
+                plugged[name] = seeded(value, self.seed)
+        method = ZeroShotPose(self._extractors[features], **plugged, seed=self.seed)
         crops = self.crops if target is None else [self.crops[0], self.crops[1 + target]]
         reference, *targets = [crop.view(features, method.foreground) for crop in crops]
         matched = [self._match(method, reference, view) for view in targets]
@@ -230,20 +240,30 @@ class Problem:
         """Match two views; rows with other settings share the similarities."""
         key = reference.features, target.features, method.binning
         if key not in self._similarities:
-            compare = similarities if method.binning else key_similarities
-            with _timed(self._timings, "similarity"):
-                self._similarities[key] = compare(reference.features, [target.features])
-        with _timed(self._timings, "matching"):
+            with _time_added(self._timings, "similarity"):
+                self._similarities[key] = similarities(
+                    reference.features, [target.features], method.binning
+                )
+        with _time_added(self._timings, "matching"):
             return method.match_views(reference, [target], self._similarities[key])[0]
 
 
 class PairProblem(Problem):
-    """A problem with its pair and data set, for rows of the library; `features` are the extractors
-    that they use."""
+    """A problem with its pair and data set, for rows of the library; `features` names the
+    extractors that they use."""
 
     def __init__(self, pair: Pair, store: FrameStore, features: Iterable[str] = ("backbone",)):
-        self.pair, self.store = pair, store
-        frames = [(pair.target_sequence, number) for number in pair.target_frames]
-        frames.insert(0, (pair.reference_sequence, pair.reference_frame))
+        self.pair = pair
+        self.store = store
+        frames = [(pair.reference_sequence, pair.reference_frame)]
+        frames += [(pair.target_sequence, number) for number in pair.target_frames]
         crops = [store.crop(pair.category, *frame, features) for frame in frames]
         super().__init__(pair.seed, crops, store.extractors, store.timings)
+
+    def hypotheses(self) -> PairHypotheses:
+        """Find the hypotheses of the verified solver between the worlds of both objects."""
+        return world_hypotheses(
+            self.pair.reference_sequence,
+            self.pair.target_sequence,
+            self.estimate(settings={"solver": "verified"}),
+        )

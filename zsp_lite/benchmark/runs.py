@@ -1,8 +1,8 @@
 """A run: its folder, to which results are only ever added, and what it found as one table.
 
 run.json holds what decides the results, and every call of `evaluate`. A line of run.jsonl, or of
-run.jsonl.gz, is what `evaluate_pair` returned for a pair. One process writes to a folder; others
-can read it meanwhile.
+run.jsonl.gz, is what `PairEvaluator.line` returned for a pair. One process writes to a folder;
+others can read it meanwhile.
 """
 
 import dataclasses
@@ -76,7 +76,7 @@ class Settings(msgspec.Struct):
 
 
 class Result(msgspec.Struct):
-    """What a row found for a pair (see `evaluate_pair`); other members are not part of the
+    """What a row found for a pair (see `PairEvaluator`); other members are not part of the
     table."""
 
     error: _Degrees

@@ -7,7 +7,7 @@ from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.pairs import category_pairs, labelled_categories
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.pair_result import PairResult, label_errors
-from zsp_lite.pipeline import ZeroShotPose, solve_pair
+from zsp_lite.pipeline import ZeroShotPose
 
 N_TARGETS = 5
 
@@ -36,7 +36,7 @@ def example_pair(dataset: Co3D) -> Pair:
 
 
 def run_demo(
-    dataset: Co3D, backbone: FeatureExtractor, solvers: Sequence[str] = ("paper",)
+    dataset: Co3D, backbone: FeatureExtractor, solvers: Sequence[str]
 ) -> Iterator[PairResult]:
     """Estimate the poses of `demo_pairs` with the paper's settings, one at a time, by each
     solver."""
@@ -51,7 +51,12 @@ def run_pair(
     """Estimate the pose of a pair by each solver, by default the method's own, and its error if it
     has labels."""
     reference, targets = dataset.load_pair(pair)
-    estimates = solve_pair(method, reference, targets, solvers)
+    # The solvers share the features.
+    view, *target_views = method.views([reference, *targets])
+    estimates = {
+        solver: replace(method, solver=solver).estimate_from_views(view, target_views)
+        for solver in solvers or [method.solver]
+    }
     sources = (
         f"sequence {pair.reference_sequence}, frame {pair.reference_frame}",
         f"sequence {pair.target_sequence}, frames {', '.join(map(str, pair.target_frames))}",
@@ -60,6 +65,5 @@ def run_pair(
     result = PairResult(
         pair.category, sources, reference, tuple(targets), estimates, {}, pair, backbone=name
     )
-    sequences = (pair.reference_sequence, pair.target_sequence)
-    errors = label_errors(result, dataset.root / pair.category, sequences)
-    return replace(result, errors=errors)
+    ends = (pair.reference_sequence, pair.target_sequence)
+    return replace(result, errors=label_errors(result, dataset.root / pair.category, ends))
