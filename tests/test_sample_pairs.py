@@ -37,15 +37,13 @@ def solved(dataset):
     """The estimates of both solvers for each pair of `sample_poses.json`, by category, with shared
     features."""
     method = zsp_lite.ZeroShotPose(load_backbone())
-    pairs = {
-        category: shipped_pairs(dataset, category, 5)[: len(stored)]
-        for category, stored in STORED.items()
-    }
-    both = SOLVERS["both"]
-    return {
-        name: [run_pair(dataset, pair, method, both).estimates for pair in some]
-        for name, some in pairs.items()
-    }
+    estimates = {}
+    for category, stored in STORED.items():
+        estimates[category] = [
+            run_pair(dataset, pair, method, SOLVERS["both"]).estimates
+            for pair in shipped_pairs(dataset, category, 5)[: len(stored)]
+        ]
+    return estimates
 
 
 def as_crop(view) -> minimal.Crop:

@@ -211,9 +211,7 @@ def _rank(
             matcher = MATCHERS[matcher]
         # Copies, since a matcher may overwrite what it gets, such as the similarities of the
         # background.
-        partner, score = matcher(
-            sim.clone(), on_start.flatten().clone(), on_end.flatten().clone()
-        )
+        partner, score = matcher(sim.clone(), on_start.flatten().clone(), on_end.flatten().clone())
         partner, score = torch.as_tensor(partner).cpu(), torch.as_tensor(score).cpu()
         if not len(partner) == len(score) == len(sim):
             found = f"{len(partner)} partners and {len(score)} scores"

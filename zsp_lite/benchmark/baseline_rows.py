@@ -2,7 +2,6 @@
 supplement), and poses that several pairs of frames or objects agree on."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,9 +13,9 @@ from zsp_lite.baselines.sift import Keypoints, mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints
 from zsp_lite.benchmark.problem import Answer, PairProblem
 from zsp_lite.best_view import score_from_cosines
-from zsp_lite.category import PairHypotheses, object_pairs, scan_pairs, synchronise
+from zsp_lite.category import object_pairs, scan_pairs, synchronise
 from zsp_lite.data.co3d import Pair
-from zsp_lite.errors import InputError, NoPoseError
+from zsp_lite.errors import InputError
 
 _K = 50  # number of matches, as in "Ours"
 
@@ -87,7 +86,7 @@ def _agreed(problem: PairProblem, pairs: Sequence[Pair]) -> Answer:
     for pair in pairs:
         pair = replace(pair, repeat=problem.pair.repeat)
         if pair != problem.pair:
-            of_pair = _hypotheses_of(pair, problem)
+            of_pair = problem.store.hypotheses(pair)
             if of_pair is not None:
                 hypotheses.append(of_pair)
     alignment = synchronise(hypotheses)
@@ -100,13 +99,3 @@ def _agreed(problem: PairProblem, pairs: Sequence[Pair]) -> Answer:
     sim3 = to_target @ between @ to_reference.inverse()
     probability = alignment.objects[of_problem.target].probability
     return Answer(sim3.R, 0, sim3.t, sim3.scale, confidence=probability)
-
-
-def _hypotheses_of(pair: Pair, problem: PairProblem) -> PairHypotheses | None:
-    """Find the hypotheses of another pair once for all problems; None if it has no pose."""
-    known = problem.store.hypotheses_of
-    if pair not in known:
-        known[pair] = None
-        with suppress(NoPoseError):
-            known[pair] = PairProblem(pair, problem.store).hypotheses()
-    return known[pair]

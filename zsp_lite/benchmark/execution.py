@@ -11,9 +11,9 @@ import pkgutil
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import chain, groupby
 from multiprocessing import active_children, get_context, parent_process
 from operator import attrgetter
@@ -103,34 +103,30 @@ def evaluate_pairs(
     # None shows the bar in a terminal only.
     hidden = None if logger.isEnabledFor(logging.INFO) else True
     done = len(work) - len(todo)
-    with tqdm(total=len(work), initial=done, unit="pair", delay=1, disable=hidden) as bar:
-
-        def store(lines: list[dict[str, Any]]) -> None:
+    found = _lines(evaluator, threads, workers, chunks, out)
+    # Closed, so that workers get no more to do where a line cannot be stored.
+    with (
+        tqdm(total=len(work), initial=done, unit="pair", delay=1, disable=hidden) as bar,
+        closing(found),
+    ):
+        for lines in found:
             add_lines(out, lines)
             bar.update(len(lines))
 
-        if workers.executor is not None:
-            _evaluate_in_workers(evaluator, threads, workers, chunks, out, store)
-            return
+
+def _lines(
+    evaluator: Evaluator, threads: int, workers: Workers, chunks: list[Chunk], out: str | Path
+) -> Iterator[list[dict[str, Any]]]:
+    """Yield the lines of pairs when they are found: one by one in this process, else by chunk."""
+    if workers.executor is None:
         evaluator.open(threads)
         with one_thread():
             for pair, names in chain.from_iterable(chunks):
-                store([evaluator.line(pair, names)])
+                yield [evaluator.line(pair, names)]
+        return
 
-
-def _evaluate_in_workers(
-    evaluator: Evaluator,
-    threads: int,
-    workers: Workers,
-    chunks: list[Chunk],
-    out: str | Path,
-    store: Callable[[list[dict[str, Any]]], None],
-) -> None:
-    """Evaluate chunks in workers, and store the lines of each when it is finished.
-
-    A backbone has megabytes: each worker reads the evaluator once, from a file in the run's folder,
-    which all workers see.
-    """
+    # A backbone has megabytes: each worker reads the evaluator once, from a file in the run's
+    # folder, which all workers see.
     pickled = _pickle(evaluator, workers)
     checksum = digest(pickled)
     # Absolute, because a worker may have another current folder.
@@ -142,7 +138,7 @@ def _evaluate_in_workers(
             task = (_evaluate_chunk, str(path), checksum, threads, chunk)
             futures.append(workers.executor.submit(*task))
         for future in as_completed(futures):
-            store(future.result())
+            yield future.result()
     except ImportError as error:
         raise InputError(
             f"a worker cannot import the rows: {error}, expected the module there, too"

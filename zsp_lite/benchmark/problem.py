@@ -18,7 +18,7 @@ from zsp_lite.category import PairHypotheses, world_hypotheses
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
-from zsp_lite.errors import InputError, ends_the_run, real_array, rotation_matrix
+from zsp_lite.errors import InputError, NoPoseError, ends_the_run, real_array, rotation_matrix
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.matching import similarities
 from zsp_lite.pipeline import ZeroShotPose
@@ -119,11 +119,10 @@ class Crop:
 
     def view(self, features: str, foreground: str) -> View:
         """Return the crop with its features and foreground (see `views.frame_view`)."""
-        if (features, foreground) not in self._views:
-            self._views[features, foreground] = frame_view(
-                self.frame, self.described[features], foreground
-            )
-        return self._views[features, foreground]
+        key = (features, foreground)
+        if key not in self._views:
+            self._views[key] = frame_view(self.frame, self.described[features], foreground)
+        return self._views[key]
 
 
 class FrameStore:
@@ -137,10 +136,9 @@ class FrameStore:
         self.extractors = extractors
         self.threads = threads
         self.timings: dict[str, list[float]] = {}  # seconds of the stages of the present pair
-        # What rows find for one pair and need for others; None if the views determine no pose.
-        self.hypotheses_of: dict[Pair, PairHypotheses | None] = {}
-        # Methods with a memory: of crops limited, of extents and labels, which are small, not.
+        # Functions that remember what they return: crops, which are large, up to a number.
         self._read = lru_cache(CAPACITY)(self._crop)
+        self.hypotheses = cache(self._hypotheses)
         self.extent = cache(dataset.extent)
         self.labels = cache(partial(read_labels, dataset.root))
 
@@ -150,6 +148,12 @@ class FrameStore:
             annotation = self.dataset.frame(category, sequence, number)
             with _time_added(self.timings, "reading"):
                 return Crop(object_crop(self.dataset.load(annotation), size))
+
+    def _hypotheses(self, pair: Pair) -> PairHypotheses | None:
+        """Return `PairProblem.hypotheses` of a pair; None if its views determine no pose."""
+        with suppress(NoPoseError):
+            return PairProblem(pair, self).hypotheses()
+        return None
 
     def crop(self, category: str, sequence: str, number: int, features: Iterable[str] = ()) -> Crop:
         """Return a frame's crop with what some extractors compute from it, each once."""
@@ -172,6 +176,7 @@ class FrameStore:
         return crop
 
 
+@dataclass(eq=False, repr=False)
 class Problem:
     """One pair as a row sees it: images, depth, masks, cameras and features of both objects, and a
     seed.
@@ -179,19 +184,14 @@ class Problem:
     Nothing in it leads to the data set.
     """
 
-    def __init__(
-        self,
-        seed: int,
-        crops: Sequence[Crop],
-        extractors: Mapping[str, Any],
-        timings: dict[str, list],
-    ):
-        self.seed = seed
-        self.crops = crops  # the reference's crop first
-        self._extractors = extractors
-        self._timings = timings
-        self._estimates: dict[tuple, PoseEstimate] = {}  # by arguments of `estimate`
-        self._similarities: dict[tuple, Any] = {}  # by two feature maps and `binning`
+    seed: int
+    crops: Sequence[Crop]  # the reference's crop first
+    _extractors: Mapping[str, Any]
+    _timings: dict[str, list]
+    # What is computed already: estimates by the arguments of `estimate`, similarities by two
+    # feature maps and `binning`.
+    _estimates: dict[tuple, PoseEstimate] = field(default_factory=dict)
+    _similarities: dict[tuple, Any] = field(default_factory=dict)
 
     def frames(self, depth: bool = False) -> list[Frame]:
         """Return the object crops, the reference's first, resized to the backbone's input.

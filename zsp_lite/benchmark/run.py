@@ -42,7 +42,7 @@ from zsp_lite.benchmark.problem import (
     as_answer,
     seeded,
 )
-from zsp_lite.benchmark.runs import Result, open_run, read_run, run_settings
+from zsp_lite.benchmark.runs import Result, open_run, printable, read_run, run_settings
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.ground_truth import common_turns
@@ -53,8 +53,8 @@ from zsp_lite.io.files import digest, write_atomic
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, view_alignment
 
-Extent = tuple[Float[np.ndarray, "3"], float] | None  # see `Co3D.extent`
 logger = logging.getLogger(__name__)
+_LONGEST_NOTE = 1000  # characters, as of an error message
 
 
 def evaluate(
@@ -201,8 +201,9 @@ def pairs_of_rows(
     All rows of one number of target views get the same pairs.
     """
     work: dict[Pair, list[str]] = {}
-    for n_targets in {row.targets or targets for row in rows.values()}:
-        names = [name for name, row in rows.items() if (row.targets or targets) == n_targets]
+    targets_of = {name: row.targets or targets for name, row in rows.items()}
+    for n_targets in set(targets_of.values()):
+        names = [name for name in rows if targets_of[name] == n_targets]
         for category, count in pairs_per_category.items():
             check_integer(f"pairs of {category}", count, 1)
             for pair in category_pairs(dataset, category, count, n_targets):
@@ -247,33 +248,27 @@ class PairEvaluator:
         views = range(len(pair.target_frames))
         truths = np.stack([true_pose(self.store.dataset, labels, pair, view) for view in views])
 
-        results = {name: self._result(name, problem, truths, extents) for name in names}
+        # The answers of the rows, measured.
+        results = {}
+        for name in names:
+            method = self.rows[name]
+            # A class that somebody derives from StoredPoses is one's own, too.
+            own = is_own(name) and type(method.solve) is not StoredPoses
+            seen = problem_of_own(method.solve, problem) if own and method.solve else problem
+            try:
+                with fails_alone(self.row_seconds) if own else nullcontext():
+                    start = time.perf_counter()
+                    answer = _ask(method, seen, truths)
+                    seconds = time.perf_counter() - start
+                    results[name] = _measure(answer, problem, truths, extents, seconds)
+            except InputError as error:
+                # 180 degrees: without these pairs, methods that fail often would look better.
+                results[name] = {"error": 180.0, "failed": printable(error)}
+
         timings = {}
         for stage, seconds in self.store.timings.items():
             timings[stage] = round(float(np.median(seconds)), 5)
         return {"pair": pair.key, "results": results, "repeat": pair.repeat, "timings": timings}
-
-    def _result(
-        self,
-        name: str,
-        problem: PairProblem,
-        truths: Float[np.ndarray, "n 4 4"],
-        extents: Sequence[Extent],
-    ) -> dict[str, Any]:
-        """Ask one row, and measure its answer; a row without an answer is 180 degrees off."""
-        method = self.rows[name]
-        own = is_own(name) and not isinstance(method.solve, StoredPoses)
-        seen = problem_of_own(method.solve, problem) if own and method.solve else problem
-        try:
-            with fails_alone(self.row_seconds) if own else nullcontext():
-                start = time.perf_counter()
-                answer = _ask(method, seen, truths)
-                seconds = time.perf_counter() - start
-                return _measure(answer, problem, truths, extents, seconds)
-        except InputError as error:
-            # 180 degrees: without these pairs, methods that fail often would look better.
-            reason = str(error).encode(errors="replace").decode()
-            return {"error": 180.0, "failed": reason}
 
 
 def _ask(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:
@@ -303,21 +298,21 @@ def _measure(
     answer: Answer,
     problem: PairProblem,
     truths: Float[np.ndarray, "n 4 4"],
-    extents: Sequence[Extent],
+    extents: Sequence[tuple | None],
     seconds: float,
 ) -> dict[str, Any]:
     """Return the members of a stored result that are known of an answer, "error" among them."""
     if not 0 <= answer.view < len(truths):
         raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
-    truth = truths[answer.view]
+    true_rotation = truths[answer.view, :3, :3]
     known: dict[str, Any] = {
         "seconds": seconds,
         "view": answer.view,
-        "note": answer.note[:1000],
+        "note": answer.note[:_LONGEST_NOTE],
         "scale": answer.scale,
         "inliers": answer.inliers,
         "confidence": answer.confidence,
-        "error": rotation_error(answer.rotation, truth[:3, :3]),
+        "error": rotation_error(answer.rotation, true_rotation),
         "rotation": answer.rotation.ravel().round(6).tolist(),
     }
     reference, *targets = [frame.camera for frame in problem.frames()]
@@ -327,7 +322,7 @@ def _measure(
     turns = common_turns(root, pair.category, pair.reference_sequence, pair.target_sequence)
     if turns is not None:
         to_camera = targets[answer.view].R
-        turned = to_camera @ turns @ to_camera.T @ truth[:3, :3]
+        turned = to_camera @ turns @ to_camera.T @ true_rotation
         known["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
 
     # Where the reference object's centre comes to lie, in diameters of the target object.
@@ -338,7 +333,8 @@ def _measure(
             centre = reference.to_camera(reference_extent[0])
             scale = 1.0 if answer.scale is None else answer.scale
             moved = scale * answer.rotation @ centre + answer.translation
-            distance = np.linalg.norm(moved - truth[:3, :3] @ centre - truth[:3, 3])
+            true_translation = truths[answer.view, :3, 3]
+            distance = np.linalg.norm(moved - true_rotation @ centre - true_translation)
             known["translation"] = distance / target_extent[1]
 
     # In the types of JSON. The conversion refuses what could not be stored.
@@ -346,10 +342,9 @@ def _measure(
     for name, value in known.items():
         if isinstance(value, np.generic):
             value = value.item()
+        if isinstance(value, float):
+            value = round(value, 4)
         if value is not None:
             result[name] = value
     msgspec.json.encode(msgspec.convert(result, Result))
-    for name, value in result.items():
-        if isinstance(value, float):
-            result[name] = round(value, 4)
     return result

@@ -148,6 +148,11 @@ def library_version() -> dict[str, str | None]:
     return {"version": __version__, "commit": commit}
 
 
+def printable(text: object) -> str:
+    """Return a text, such as a file name of any bytes, with "?" for what is not Unicode."""
+    return str(text).encode(errors="replace").decode()
+
+
 def run_settings(
     data: str | Path,
     backbone: Any,
@@ -163,13 +168,13 @@ def run_settings(
     versions["machine"] = platform.platform()
     this_call = Call(
         time=datetime.now(UTC).isoformat(timespec="seconds"),
-        command=[text.encode(errors="replace").decode() for text in words],
+        command=[printable(word) for word in words],
         versions=versions,
         rows=list(methods),
         **call,
     )
     return Settings(
-        data=str(data).encode(errors="replace").decode(),
+        data=printable(data),
         backbone=fingerprint(backbone),
         targets=targets,
         library=[library_version()],
@@ -254,7 +259,7 @@ def open_run(out: str | Path, settings: Settings) -> Iterator[None]:
     with writing(out):
         out = Path(out)
         packed = out / f"{LINES}.gz"
-        settings.folder = os.path.realpath(settings.data).encode(errors="replace").decode()
+        settings.folder = printable(os.path.realpath(settings.data))
         if any(path.exists() for path in (out / SETTINGS, out / LINES, packed)):
             settings = _continued(out, settings)
         write_atomic(out / LINES, _finished_lines(out))

@@ -176,28 +176,29 @@ def _paper_table(
         lines = [line for line in lines if line[0] in order]
         lines.sort(key=lambda line: order.index(line[0]))
 
-    # Of the single categories with a published Acc30, those of the run are shown.
+    # Of the published figures of a single category, those of the run's categories are shown.
     featured, shown = [], []
-    for k, title in enumerate(spec["published"]):
+    for title in spec["published"]:
         category = title.removesuffix(" Acc30")
         if category in categories:
             featured.append(category)
         if category in (title, *categories):
-            shown.append(k)
+            shown.append(title)
 
+    # The run's own figures, those of single categories, and the published ones.
     rows = {}
     for name, line in lines:
         row = methods.get(name)
         cells = [_cell(row, metric) for metric in metrics]
         for category in featured:
             cells.append(_cell(row and row["per_category"].get(category), "acc30"))
-        published = line["published"]
-        rows[line["label"]] = cells + [Cell(published[k]) if published else None for k in shown]
-    titles = [
-        *(METRICS[metric] for metric in metrics),
-        *(f"{category} Acc30" for category in featured),
-        *(f"{PUBLISHED}: {spec['published'][k]}" for k in shown),
-    ]
+        published = dict(zip(spec["published"], line["published"]))
+        for title in shown:
+            cells.append(Cell(published[title]) if title in published else None)
+        rows[line["label"]] = cells
+    titles = [METRICS[metric] for metric in metrics]
+    titles += [f"{category} Acc30" for category in featured]
+    titles += [f"{PUBLISHED}: {title}" for title in shown]
     notes = [_PUBLISHED_NOTE if shown else "", spec.get("note", "")]
     return _table(summary, spec["name"], spec["title"], rows, titles, metrics, *notes)
 
@@ -287,12 +288,10 @@ def important_rows(summary: Mapping[str, Any]) -> list[str]:
     first; or the chosen."""
     if "chosen" in summary:
         return summary["chosen"]
-    first = ["ours", *own_rows(summary), "ours-bv", "verified"]
     names = [name for name in summary["methods"] if not _sees_more(name)]
-    return sorted(
-        names or summary["methods"],
-        key=lambda name: first.index(name) if name in first else len(first),
-    )
+    names = names or list(summary["methods"])
+    leading = ["ours", *own_rows(summary), "ours-bv", "verified"]
+    return list(dict.fromkeys([name for name in leading if name in names] + names))
 
 
 def _sees_more(name: str) -> bool:
@@ -300,16 +299,16 @@ def _sees_more(name: str) -> bool:
 
 
 def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:
-    """A figure of a row, or of a category, which has no mean of categories."""
+    """Return a figure of a row or of one of its categories; a category has one median only."""
     if row is None:
         return None
-    found = metric
     if metric == "mean_category_median" and metric not in row:
-        found = "median"
-    if row.get(found) is None:
+        metric = "median"
+    value = row.get(metric)
+    if value is None:
         return None
     decimals = 2 if metric in ("scale", "translation") else 1
-    return Cell(row[found], *row.get(f"{found}_ci", ()), decimals=decimals)
+    return Cell(value, *row.get(f"{metric}_ci", ()), decimals=decimals)
 
 
 def _table(

@@ -15,10 +15,8 @@ N_TARGETS = 5
 def demo_pairs(dataset: Co3D) -> list[Pair]:
     """Select, independently of results, the first stored or sampled evaluation pair of every
     labelled category."""
-    return [
-        category_pairs(dataset, category, 1, N_TARGETS)[0]
-        for category in labelled_categories(dataset)
-    ]
+    categories = labelled_categories(dataset)
+    return [category_pairs(dataset, category, 1, N_TARGETS)[0] for category in categories]
 
 
 def example_pair(dataset: Co3D) -> Pair:
@@ -29,10 +27,8 @@ def example_pair(dataset: Co3D) -> Pair:
     than 10 off.
     """
     scooters = Pair("motorcycle", "scooter", 10, "scooter2", (2, 6, 11, 16, 21))
-    for sequence in (scooters.reference_sequence, scooters.target_sequence):
-        if not (dataset.root / scooters.category / sequence).is_dir():
-            return demo_pairs(dataset)[0]
-    return scooters
+    target = dataset.root / scooters.category / scooters.target_sequence
+    return scooters if target.is_dir() else demo_pairs(dataset)[0]
 
 
 def run_demo(
