@@ -281,7 +281,7 @@ def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
 
     rows = resolve({"exact": exact, "one score": with_one_score})
     evaluator = PairEvaluator(str(dataset.root), rows, BACKBONE)
-    evaluator.open()
+    evaluator.open(1)
     for pair in category_pairs(dataset, "lump", 4, 3):
         results = evaluator.line(pair, rows)["results"]
         reference, targets = dataset.load_pair(pair)

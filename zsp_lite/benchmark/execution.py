@@ -102,11 +102,12 @@ def evaluate_pairs(
     threads = max(1, get_num_threads() // workers.count)
     # None shows the bar in a terminal only.
     hidden = None if logger.isEnabledFor(logging.INFO) else True
-    done = len(work) - len(todo)
     found = _lines(evaluator, threads, workers, chunks, out)
     # Closed, so that workers get no more to do where a line cannot be stored.
     with (
-        tqdm(total=len(work), initial=done, unit="pair", delay=1, disable=hidden) as bar,
+        tqdm(
+            total=len(work), initial=len(work) - len(todo), unit="pair", delay=1, disable=hidden
+        ) as bar,
         closing(found),
     ):
         for lines in found:

@@ -1,5 +1,5 @@
-"""Methods of one's own: which kind of method an object is, what it gets, and poses that another
-program computed."""
+"""Rows of one's own: which kind of row an object is, the problem that it gets, and poses that
+another program computed."""
 
 import ctypes
 import threading
@@ -26,12 +26,12 @@ KINDS = ("problem", "keypoints", "matcher", "solver")
 
 
 def kind_of(name: str, thing: Any) -> str:
-    """Tell what the thing of a row is: "estimator" (has `estimate`), or the function of one of
+    """Return the kind of what a row was given: "estimator", which has `estimate`, or one of
     `KINDS`.
 
-    The number of arguments without a default, but for `seed` and `threshold`, tells the kinds
-    apart, and a solver has both of these; an attribute `kind` of the thing comes before it.
-    InputError if it is none of these.
+    An attribute `kind` names the kind of a function. Otherwise the number of arguments without a
+    default tells it, `seed` and `threshold` not counted; of the functions of three arguments, a
+    solver has both. InputError for any other thing.
     """
     if not isinstance(thing, type):
         if callable(getattr(thing, "estimate", None)):
@@ -149,8 +149,8 @@ class KeypointMatcher:
 def fit_keypoints(
     problem: Problem, view: int, first: Any, second: Any, threshold: float = 0.2
 ) -> Answer:
-    """Fit the pose to matched pixels of the reference's crop and of a target's: depth, then RANSAC
-    (sec. 4.3)."""
+    """Fit the pose to matched pixels of the crops of the reference and of a target: unproject them,
+    then RANSAC (sec. 4.3)."""
     reference, *targets = problem.frames(depth=True)
     empty = np.zeros((0, 2))
     first = real_array("matched points", first if len(first) else empty, (None, 2))
@@ -187,5 +187,5 @@ class StoredPoses:
         return Answer(pose.rotation, view, pose.translation, pose.scale)
 
     def remark(self, dataset: Co3D, pairs: Sequence[Pair]) -> str:
-        """Return what is to be said of the poses of pairs (see `exchange.check_poses`)."""
+        """Remark on the poses of these pairs (see `exchange.check_poses`)."""
         return check_poses(self.path, self._poses, dataset, pairs)

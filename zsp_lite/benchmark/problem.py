@@ -153,7 +153,6 @@ class FrameStore:
         """Return `PairProblem.hypotheses` of a pair; None if its views determine no pose."""
         with suppress(NoPoseError):
             return PairProblem(pair, self).hypotheses()
-        return None
 
     def crop(self, category: str, sequence: str, number: int, features: Iterable[str] = ()) -> Crop:
         """Return a frame's crop with what some extractors compute from it, each once."""
@@ -170,9 +169,10 @@ class FrameStore:
                 # One frame at a time: the last bits of a frame's features must not depend on the
                 # rest of a batch.
                 if hasattr(extractor, "describe"):
-                    (crop.described[name],) = extractor.describe([crop.frame])
+                    described = extractor.describe([crop.frame])
                 else:
-                    (crop.described[name],) = feature_maps(extractor, [crop.frame])
+                    described = feature_maps(extractor, [crop.frame])
+                crop.described[name] = described[0]
         return crop
 
 

@@ -229,7 +229,7 @@ class PairEvaluator:
     backbone: BackboneLike
     row_seconds: int = 60  # time limit of a row of one's own for a pair
 
-    def open(self, threads: int | None = None) -> None:
+    def open(self, threads: int) -> None:
         """Load the backbone and the extractors."""
         extractors = make_extractors(as_backbone(self.backbone), self.rows)
         self.store = FrameStore(Co3D(self.root), extractors, threads)

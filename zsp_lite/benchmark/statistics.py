@@ -82,10 +82,10 @@ def draws_of(row: pd.DataFrame) -> Draws:
 
 
 def object_draws(
-    objects: ArrayLike, categories: ArrayLike | None = None, resamples: int = RESAMPLES
+    objects: ArrayLike, categories: ArrayLike = "", resamples: int = RESAMPLES
 ) -> Draws:
     """Draw bootstrap weights (resamples, n) of pairs by resampling the objects (n, 2) that the
-    pairs are made of.
+    are made of. Categories (n,) are those of the pairs, by default one.
 
     In each replicate the objects of a category are drawn with replacement, and the weight of a pair
     is the product of its two objects' multiplicities: the pigeonhole bootstrap (Owen 2007) with one
@@ -94,9 +94,7 @@ def object_draws(
     total weight. Pairs of fewer than three objects are resampled themselves.
     """
     objects = np.asarray(objects, dtype=str)
-    if categories is None:
-        categories = np.full(len(objects), "")
-    categories = np.asarray(categories, dtype=str)
+    categories = np.broadcast_to(np.asarray(categories, dtype=str), len(objects))
     weights = np.empty((resamples, len(objects)))  # a column for each pair
     for category in np.unique(categories):
         rng = np.random.default_rng([0, stable_hash(category)])
@@ -223,11 +221,11 @@ def paired_test(
 
     first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
     # McNemar's test is the sign test of the pairs that one method alone solves.
-    by_second = ((second < threshold) & (first >= threshold)).sum()
-    by_first = ((first < threshold) & (second >= threshold)).sum()
+    solved, solved_by_second = first < threshold, second < threshold
+    alone = np.count_nonzero(solved != solved_by_second)
     sign = 1.0
-    if by_first + by_second:
-        sign = binomtest(by_second, by_first + by_second).pvalue
+    if alone:
+        sign = binomtest(np.count_nonzero(solved_by_second & ~solved), alone).pvalue
     # scipy refuses one pair, whose difference has the same size with both signs.
     flips = 1.0
     if len(first) > 1:

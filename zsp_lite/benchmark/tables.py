@@ -160,8 +160,10 @@ def paper_tables(summary: Mapping[str, Any], metrics: Sequence[str] = PAPER) -> 
 def _paper_table(
     spec: Mapping[str, Any], summary: Mapping[str, Any], metrics: Sequence[str]
 ) -> Table:
-    """A table with the run's rows, the published figures, and in Table 1, rows of one's own below
-    the paper's."""
+    """Return a table of the paper with the run's rows and the published figures.
+
+    Table 1 has rows of one's own, too, below the paper's.
+    """
     categories, methods = summary["data"]["categories"], summary["methods"]
     # A row at the run's own number of target views goes by either name.
     views = f"-n{summary['data']['targets']}"
@@ -236,17 +238,19 @@ def compare(
         )
     cells = {}
     for text in rows:
-        one, _, other = (text, "", text) if text in of_first else text.partition(":")
-        errors_b = _by_seed(second, other)["error"].rename("error_b")
-        both = _by_seed(first, one).join(errors_b, how="inner").sort_index()
-        if both.empty:
+        row_a, row_b = text, text
+        if text not in of_first:
+            row_a, _, row_b = text.partition(":")
+        errors_b = _by_seed(second, row_b)["error"].rename("error_b")
+        common = _by_seed(first, row_a).join(errors_b, how="inner").sort_index()
+        if common.empty:
             raise InputError(
-                f"rows {one} and {other} have no pair in common: other data or number of views"
+                f"rows {row_a} and {row_b} have no pair in common: other data or number of views"
             )
-        errors = both[["error", "error_b"]].to_numpy().T
-        gain = paired_difference(*errors, weights=draws_of(both))
+        errors = common[["error", "error_b"]].to_numpy().T  # (2, pairs)
+        gain = paired_difference(*errors, weights=draws_of(common))
         cells[text] = [
-            _count(len(both)),
+            _count(len(common)),
             *map(Cell, accuracy(errors, 30)),
             *_difference(gain),
             *map(Cell, median(errors)),
@@ -262,12 +266,12 @@ def compare(
 
 
 def _by_seed(run: Run, row: str) -> pd.DataFrame:
-    """A row's lines by pair and seed."""
+    """Return the lines of a row by pair and seed."""
     return run.row(row).set_index("repeat", append=True, drop=False)
 
 
 def _difference(test: Mapping[str, Any] | None) -> list[Cell | None]:
-    """The gain and the p value of a `paired_difference`."""
+    """Return the cells of a `paired_difference`: the gain in accuracy and its p value."""
     if test is None:
         return [None, None]
     gain = Cell(test["accuracy_gain"], *test["accuracy_gain_ci"])
@@ -452,12 +456,12 @@ def pair_figure(run: Run, key: str, dataset: Co3D, rows: Sequence[str] | None = 
     Without a translation, they are moved to the middle of the target's points. InputError if no row
     has a pose.
     """
-    found = {}
+    results = {}
     for name in rows or run.table["row"].unique():
-        poses = run.row(name).dropna(subset=["rotation", "view"])
-        if key in poses.index:
-            found[name] = poses.loc[[key]].iloc[0]  # of the first seed
-    if not found:
+        with_pose = run.row(name).dropna(subset=["rotation", "view"])
+        if key in with_pose.index:
+            results[name] = with_pose.loc[[key]].iloc[0]  # of the first seed
+    if not results:
         raise InputError(
             f"pair {key!r} has no pose in the run, expected a key such as "
             f"{run.table['pair'].iloc[0]}"
@@ -467,18 +471,19 @@ def pair_figure(run: Run, key: str, dataset: Co3D, rows: Sequence[str] | None = 
     cloud = frame_cloud(crops[0])
     poses = [Sim3.identity()]
     errors = []
-    for result in found.values():
+    for result in results.values():
         crops.append(object_crop(targets[int(result["view"])]))
         poses.append(_pose(result, cloud, crops[-1]))
         errors.append(f"{result['error']:.0f}° off")
     images = [crop.rgb for crop in crops]
-    titles = ["reference", *found, "its points", *errors]
+    titles = ["reference", *results, "its points", *errors]
     figure, axes = show_images([*images, *map(pale, images)], titles, len(crops))
     draw_moved_cloud(axes[len(crops) :], [crop.camera for crop in crops], cloud, poses)
     return figure
 
 
 def _pose(result: pd.Series, cloud: np.ndarray, target: Frame) -> Sim3:
+    """Return the pose of a result; without a translation, the cloud's mean goes to the target's."""
     scale = 1.0 if pd.isna(result["scale"]) else result["scale"]
     rotation = np.reshape(result["rotation"], (3, 3))
     position = result["position"]

@@ -36,13 +36,12 @@ def run_demo(
 ) -> Iterator[PairResult]:
     """Estimate the poses of `demo_pairs` with the paper's settings, one at a time, by each
     solver."""
-    method = ZeroShotPose(backbone)
     for pair in demo_pairs(dataset):
-        yield run_pair(dataset, pair, method, solvers)
+        yield run_pair(dataset, pair, ZeroShotPose(backbone), solvers)
 
 
 def run_pair(
-    dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[str] | None = None
+    dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[str] = ()
 ) -> PairResult:
     """Estimate the pose of a pair by each solver, by default the method's own, and its error if it
     has labels."""
@@ -57,9 +56,15 @@ def run_pair(
         f"sequence {pair.reference_sequence}, frame {pair.reference_frame}",
         f"sequence {pair.target_sequence}, frames {', '.join(map(str, pair.target_frames))}",
     )
-    name = getattr(method.backbone, "name", "")
     result = PairResult(
-        pair.category, sources, reference, tuple(targets), estimates, {}, pair, backbone=name
+        pair.category,
+        sources,
+        reference,
+        tuple(targets),
+        estimates,
+        errors={},
+        pair=pair,
+        backbone=getattr(method.backbone, "name", ""),
     )
     ends = (pair.reference_sequence, pair.target_sequence)
     return replace(result, errors=label_errors(result, dataset.root / pair.category, ends))
