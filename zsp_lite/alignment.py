@@ -150,7 +150,8 @@ def umeyama_batch(
     rotations, translations, and the ratio of the second to the first singular value of the
     covariance, 0 for collinear points.
     """
-    source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
+    source_mean = source.mean(axis=1)
+    target_mean = target.mean(axis=1)
     centred = source - source_mean[:, None]
     covariance = (target - target_mean[:, None]).swapaxes(1, 2) @ centred  # (b, 3, 3), times n
     rotation, singular, sign = nearest_rotation(covariance)
@@ -247,7 +248,9 @@ def _best_trial(
     usable = in_range & (conditioning > _COLLINEAR_SAMPLE)
     if not usable.any():
         return None
-    scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
+    scale = scale[usable]
+    rotation = rotation[usable]
+    translation = translation[usable]
     linear = scale[:, None, None] * rotation
     offset = linear @ source.T + translation[:, :, None] - target.T  # (trials, 3, N)
     residual = np.sqrt(np.square(offset).sum(axis=1))
@@ -281,7 +284,8 @@ def _point_pairs(
     source: ArrayLike, target: ArrayLike, minimum: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Convert corresponding points to float64 arrays and check them."""
-    source, target = real_array("source", source), real_array("target", target)
+    source = real_array("source", source)
+    target = real_array("target", target)
     if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
         raise InputError(
             f"source and target have shapes {source.shape} and {target.shape}, expected equal "

@@ -153,8 +153,10 @@ def object_pairs(
         rng = np.random.default_rng([0, stable_hash(f"{category}/{reference}/{target}") >> 1])
         # Frames that are evenly spaced over a sequence show several sides; the random starts depend
         # on the names only.
-        first, around = numbers[reference], numbers[target]
-        start, target_start = rng.integers(len(first)), rng.integers(len(around))
+        first = numbers[reference]
+        around = numbers[target]
+        start = rng.integers(len(first))
+        target_start = rng.integers(len(around))
         count = min(references_per_pair(n), len(first))
         for r in range(count):
             frame = first[(start + r * len(first) // count) % len(first)]
@@ -178,10 +180,12 @@ def scan_pairs(dataset: Co3D, pair: Pair, references: int) -> list[Pair]:
 
     def around(name: str, start: int, count: int) -> tuple[int, ...]:
         frames = numbers[name]
-        first, count = frames.index(start), min(count, len(frames))
+        first = frames.index(start)
+        count = min(count, len(frames))
         return tuple(frames[(first + k * len(frames) // count) % len(frames)] for k in range(count))
 
-    a, b = pair.reference_sequence, pair.target_sequence
+    a = pair.reference_sequence
+    b = pair.target_sequence
     views = around(a, pair.reference_frame, len(pair.target_frames))
     forward = around(a, pair.reference_frame, references)
     backward = around(b, pair.target_frames[0], references)

@@ -170,13 +170,16 @@ def match(
         ref_foreground = ref.foreground()
     if target_foreground is None:
         target_foreground = target.foreground()
-    on_start, on_end = torch.as_tensor(ref_foreground), torch.as_tensor(target_foreground)
+    on_start = torch.as_tensor(ref_foreground)
+    on_end = torch.as_tensor(target_foreground)
 
     # Both stages are about the image in which cycles start.
     forward = cycle_from == "reference"
-    start, end = ref, target
+    start = ref
+    end = target
     if not forward:
-        start, end = target, ref
+        start = target
+        end = ref
         on_start, on_end = on_end, on_start
         sim = sim.T
     ranked = _rank(sim, on_start, on_end, matcher, published=not forward)
@@ -212,7 +215,8 @@ def _rank(
         # Copies, since a matcher may overwrite what it gets, such as the similarities of the
         # background.
         partner, score = matcher(sim.clone(), on_start.flatten().clone(), on_end.flatten().clone())
-        partner, score = torch.as_tensor(partner).cpu(), torch.as_tensor(score).cpu()
+        partner = torch.as_tensor(partner).cpu()
+        score = torch.as_tensor(score).cpu()
         if not len(partner) == len(score) == len(sim):
             found = f"{len(partner)} partners and {len(score)} scores"
             raise InputError(
@@ -256,13 +260,15 @@ def _cycles(
     Only the foreground's neighbours, and of the patches of image 2 only theirs, are searched for.
     """
     columns = on1.shape[1]
-    on1, on2 = on1.flatten(), on2.flatten()
+    on1 = on1.flatten()
+    on2 = on2.flatten()
     # Patches by their index: u on the foreground, its neighbour v (`forth`), and v's u' (`back`).
     u = on1.nonzero()[:, 0]
     forth = sim[u].argmax(dim=1)
     reached, position = forth.unique(return_inverse=True)
     back = sim[:, reached].argmax(dim=0)[position]
-    row, column = back // columns, back % columns
+    row = back // columns
+    column = back % columns
     offset = torch.stack([u // columns - row, u % columns - column])
     distance = offset.to(torch.float32).square().sum(0).sqrt()
     # The published code does not check that u' is foreground, and discards every u' in row 0 or

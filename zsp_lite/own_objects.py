@@ -174,7 +174,8 @@ def _solve(
     If `several` frames vote, the pose of the verified solver becomes the one that most agree on.
     """
     position = scans[0].references[0]
-    reference, targets = scans[0].views[position], scans[1].target_views
+    reference = scans[0].views[position]
+    targets = scans[1].target_views
     solved = {
         name: replace(method, solver=name).estimate_from_views(reference, targets)
         for name in solvers
@@ -214,7 +215,8 @@ def _pair_result(
         backbone=backbone,
         votes=votes,
     )
-    path, target_path = first.source.path.resolve(), second.source.path.resolve()
+    path = first.source.path.resolve()
+    target_path = second.source.path.resolve()
     sequences = first.source.format == second.source.format == "sequence"
     if sequences and path.parent == target_path.parent:
         errors = label_errors(result, path.parent, (path.name, target_path.name))
@@ -264,7 +266,8 @@ def _agreed_pose(
     agreement = synchronise(hypotheses)
 
     # The answers: the pose between the worlds of both objects, and its alternative.
-    reference, target = agreement.objects[names[0]], agreement.objects[names[1]]
+    reference = agreement.objects[names[0]]
+    target = agreement.objects[names[1]]
     probability = min(reference.probability, target.probability)
     answers = [(agreement.between(names[0], names[1]), probability)]
     if target.alternative and target.alternative_probability > _LEAST_PROBABLE:
@@ -296,7 +299,8 @@ def _answer(
 ) -> PoseEstimate:
     """Replace the hypotheses of an estimate by similarities between the worlds, each with its
     probability."""
-    reference, targets = estimate.reference_view, estimate.target_views
+    reference = estimate.reference_view
+    targets = estimate.target_views
     to_reference, *to_targets = [
         Sim3(1.0, view.frame.camera.R, view.frame.camera.t) for view in (reference, *targets)
     ]
@@ -372,7 +376,8 @@ def _in_units(
         return Sim3(sim3.scale * reference_scale / target_scale, sim3.R, sim3.t / target_scale)
 
     most = _MOST_DOUBTFUL if any(DOUBTFUL in flag for flag in flags) else 1.0
-    reference, targets = estimate.reference_view, estimate.target_views
+    reference = estimate.reference_view
+    targets = estimate.target_views
     return replace(
         estimate,
         flags=(*estimate.flags, *flags),

@@ -271,8 +271,10 @@ def view_alignment(reference: View, target: View) -> Sim3:
     The rotation is the identity. Scale and translation map the standard deviation and the centroid
     of the reference's foreground points onto those of the target's.
     """
-    first, second = _foreground_points(reference), _foreground_points(target)
-    spread, target_spread = standard_deviation(first), standard_deviation(second)
+    first = _foreground_points(reference)
+    second = _foreground_points(target)
+    spread = standard_deviation(first)
+    target_spread = standard_deviation(second)
     scale = target_spread / spread if min(spread, target_spread) > 0 else 1.0
     return Sim3(scale, np.eye(3), second.mean(axis=0) - scale * first.mean(axis=0))
 

@@ -106,9 +106,11 @@ def scan_flags(scans: Sequence[Scan]) -> tuple[str, ...]:
     count, span = max(seen, key=lambda one: (one[1], one[0]))
     if count < 3 or span < _ALL_SIDES:
         sides = "two sides" if span >= _ALL_SIDES else "one side"
-        what, other = "each object was", "one"
+        what = "each object was"
+        other = "one"
         if len(seen) < 2:
-            what, other = "the target was", "the reference"
+            what = "the target was"
+            other = "the reference"
         seen_from = f"seen from {sides} only ({span:.0f} degrees)"
         flags.append(
             f"{what} {seen_from}: if {other} was taken from another side, this pose is wrong"

@@ -24,7 +24,8 @@ def icp(problem: PairProblem, view: int = 0) -> Answer:
     """Run "ICP" in one target view."""
     reference, *targets = problem.frames(depth=True)
     # ICP starts where the first cameras of both sequences coincide.
-    dataset, pair = problem.store.dataset, problem.pair
+    dataset = problem.store.dataset
+    pair = problem.pair
     reference_frames = dataset.frames(pair.category, pair.reference_sequence)
     target_frames = dataset.frames(pair.category, pair.target_sequence)
     first_cameras = (dataset.camera(reference_frames[0]), dataset.camera(target_frames[0]))

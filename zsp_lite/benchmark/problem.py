@@ -79,7 +79,8 @@ def as_answer(found: Any) -> Answer:
             return replace(found, rotation=Sim3(scale, found.rotation, np.zeros(3)).R)
         exact = Sim3(scale, found.rotation, found.translation)
         return replace(found, rotation=exact.R, translation=exact.t)
-    pose, view = found, 0
+    pose = found
+    view = 0
     if isinstance(found, tuple) and len(found) == 2:
         pose, view = found
     if isinstance(pose, Sim3):

@@ -280,7 +280,8 @@ def _ask(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -
         nearest = int(rotation_error(np.eye(3), truths[:, :3, :3]).argmin())
     estimate = problem.estimate(method.features, method.settings, nearest)
     answer = as_answer(estimate)
-    reference, target = estimate.reference_view, estimate.target_views[estimate.view]
+    reference = estimate.reference_view
+    target = estimate.target_views[estimate.view]
     if method.answer == "true view":  # the only view of this estimate
         return replace(answer, view=nearest)
     if method.answer == "best view":
@@ -318,7 +319,8 @@ def _measure(
     reference, *targets = [frame.camera for frame in problem.frames()]
 
     # Turns of the target object that look the same are no errors of its symmetric error.
-    pair, root = problem.pair, problem.store.dataset.root
+    pair = problem.pair
+    root = problem.store.dataset.root
     turns = common_turns(root, pair.category, pair.reference_sequence, pair.target_sequence)
     if turns is not None:
         to_camera = targets[answer.view].R

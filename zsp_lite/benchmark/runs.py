@@ -125,7 +125,8 @@ def fingerprint(extractor: Any) -> str:
     """Return the name of an extractor (by default "module:name"), and a hash of its `state_dict`
     and settings."""
     name = getattr(extractor, "name", None) or described(extractor)
-    network, settings = extractor, ""
+    network = extractor
+    settings = ""
     if isinstance(extractor, Backbone):
         network = extractor.model
         fields = ("layer", "facet", "saliency_heads", "image_size", "mean", "std")
@@ -284,7 +285,8 @@ def _continued(out: Path, now: Settings) -> Settings:
     """Merge settings with those of the run that a folder holds; InputError if they do not go
     together."""
     before = read_json(out / SETTINGS, Settings, "settings of a run")
-    held, asked = _decisive(before), _decisive(now)
+    held = _decisive(before)
+    asked = _decisive(now)
     for name in asked:
         if held.get(name, asked[name]) != asked[name]:
             raise InputError(
@@ -337,7 +339,9 @@ def read_lines(out: str | Path, kind: type = ResultLine) -> list[Any]:
 def _finished_lines(out: Path) -> bytes:
     """Read run.jsonl, or run.jsonl.gz, up to its last line that was written to the end; b"" without
     these."""
-    path, packed, what = out / LINES, out / f"{LINES}.gz", "results of a run"
+    path = out / LINES
+    packed = out / f"{LINES}.gz"
+    what = "results of a run"
     data = read_bytes(path, what) if path.exists() else b""
     if packed.exists():
         data = decompress(read_bytes(packed, what), f"{what} {packed}")

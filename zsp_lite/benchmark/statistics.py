@@ -33,7 +33,8 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
     """
     rows = {str(name): row for name, row in table.groupby("row", sort=False)}
     ours = rows.get("ours")
-    methods, against = {}, {}
+    methods = {}
+    against = {}
     for name, row in rows.items():
         drawn = draws_of(row)
         methods[name] = _summarise_row(row, drawn)
@@ -49,7 +50,8 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
 
 def _summarise_row(row: pd.DataFrame, drawn: Draws) -> dict[str, Any]:
     """Summarise the results of one row, for all pairs and by category (see `summarise`)."""
-    errors, categories = row["error"].to_numpy(), row["category"].to_numpy(str)
+    errors = row["error"].to_numpy()
+    categories = row["category"].to_numpy(str)
     per_category = {}
     for category in dict.fromkeys(categories):
         members = categories == category
@@ -190,7 +192,8 @@ def paired_difference(
     "accuracy_gain" is second - first in percentage points, with its 95 % interval and its p value
     by the bootstrap.
     """
-    first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    first = np.asarray(first, np.float64)
+    second = np.asarray(second, np.float64)
     gain = 100.0 * (second < threshold) - 100.0 * (first < threshold)
     if weights is None:
         weights = pair_draws(len(gain))
@@ -219,9 +222,11 @@ def paired_test(
     """
     from scipy.stats import binomtest, permutation_test
 
-    first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    first = np.asarray(first, np.float64)
+    second = np.asarray(second, np.float64)
     # McNemar's test is the sign test of the pairs that one method alone solves.
-    solved, solved_by_second = first < threshold, second < threshold
+    solved = first < threshold
+    solved_by_second = second < threshold
     alone = np.count_nonzero(solved != solved_by_second)
     sign = 1.0
     if alone:

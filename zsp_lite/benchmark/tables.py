@@ -164,7 +164,8 @@ def _paper_table(
 
     Table 1 has rows of one's own, too, below the paper's.
     """
-    categories, methods = summary["data"]["categories"], summary["methods"]
+    categories = summary["data"]["categories"]
+    methods = summary["methods"]
     # A row at the run's own number of target views goes by either name.
     views = f"-n{summary['data']['targets']}"
     lines = []  # the row of the run, and the line of the table
@@ -179,7 +180,8 @@ def _paper_table(
         lines.sort(key=lambda line: order.index(line[0]))
 
     # Of the published figures of a single category, those of the run's categories are shown.
-    featured, shown = [], []
+    featured = []
+    shown = []
     for title in spec["published"]:
         category = title.removesuffix(" Acc30")
         if category in categories:
@@ -216,7 +218,8 @@ def by_category(
         for category in summary["data"]["categories"]
     }
     rows["all"] = [_cell(row, metric) for row in methods.values()]
-    name, title = f"categories_{metric.rpartition('_')[2]}", f"By category: {METRICS[metric]}"
+    name = f"categories_{metric.rpartition('_')[2]}"
+    title = f"By category: {METRICS[metric]}"
     return _table(summary, name, title, rows, list(methods), [metric])
 
 
@@ -229,7 +232,8 @@ def compare(
     Rows are texts "A:B", for row A of the first and B of the second run, or "A"; `names` are those
     of the runs. InputError if a row or a common pair is missing.
     """
-    of_first, of_second = first.table["row"].unique(), second.table["row"].unique()
+    of_first = first.table["row"].unique()
+    of_second = second.table["row"].unique()
     if rows is None:
         rows = [name for name in of_first if name in of_second]
     if not len(rows):
@@ -238,7 +242,8 @@ def compare(
         )
     cells = {}
     for text in rows:
-        row_a, row_b = text, text
+        row_a = text
+        row_b = text
         if text not in of_first:
             row_a, _, row_b = text.partition(":")
         errors_b = _by_seed(second, row_b)["error"].rename("error_b")

@@ -91,7 +91,8 @@ def align(
         labels = read_label_folder(dataset.root / kind / category)
         together, alone = alignment_errors(found, labels)
         if alone:
-            right, before = accuracy(together, SAME_ANGLE), accuracy(alone, SAME_ANGLE)
+            right = accuracy(together, SAME_ANGLE)
+            before = accuracy(alone, SAME_ANGLE)
             print(
                 f"By the {what}, {right:.1f}% of {len(together)} ordered pairs are within "
                 f"{SAME_ANGLE:.0f}°; of the best poses of {len(alone)} pairs of views and objects "

@@ -71,7 +71,8 @@ def _print_checks(root: Path, checks: Sequence[Any]) -> int:
 
     from zsp_lite.cli.terminal import print_rows
 
-    rows, lines = [], []
+    rows = []
+    lines = []
     for check in checks:
         counts = (f"{getattr(check, name):,}" for name in _CHECK_COLUMNS[2:-1])
         rows.append((check.category, check.layout, *counts, decimal(check.size)))

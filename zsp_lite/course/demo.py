@@ -15,8 +15,10 @@ N_TARGETS = 5
 def demo_pairs(dataset: Co3D) -> list[Pair]:
     """Select, independently of results, the first stored or sampled evaluation pair of every
     labelled category."""
-    categories = labelled_categories(dataset)
-    return [category_pairs(dataset, category, 1, N_TARGETS)[0] for category in categories]
+    return [
+        category_pairs(dataset, category, 1, N_TARGETS)[0]
+        for category in labelled_categories(dataset)
+    ]
 
 
 def example_pair(dataset: Co3D) -> Pair:
@@ -62,9 +64,11 @@ def run_pair(
         reference,
         tuple(targets),
         estimates,
-        errors={},
-        pair=pair,
+        {},
+        pair,
         backbone=getattr(method.backbone, "name", ""),
     )
-    ends = (pair.reference_sequence, pair.target_sequence)
-    return replace(result, errors=label_errors(result, dataset.root / pair.category, ends))
+    errors = label_errors(
+        result, dataset.root / pair.category, (pair.reference_sequence, pair.target_sequence)
+    )
+    return replace(result, errors=errors)
