@@ -27,7 +27,7 @@ SCALE_RANGE = (0.2, 5.0)
 _COLLINEAR_SAMPLE = 1e-6  # of a sample's covariance: a ratio of squared widths
 # Of a cloud: a ratio of widths, above the rounding of float32 coordinates on a line.
 _COLLINEAR_CLOUD = 1e-5
-MOST_TRIALS = 10_000_000  # of RANSAC; more would take hours
+MOST_TRIALS = 10_000_000  # largest number of RANSAC's trials that is accepted
 _BLOCK = 1_000_000  # residuals at a time: 24 MB of offsets
 
 

@@ -36,8 +36,8 @@ from zsp_lite.verified.solver import measured_inliers
 
 _TARGETS = 5
 _REFERENCES = 4  # frames of each object that are solved against views of the other
-_MOST_DOUBTFUL = 0.8  # largest confidence by masks that are flagged
-_LEAST_PROBABLE = 0.005  # an alternative is named above this: it shows as 1 percent
+_MOST_DOUBTFUL = 0.8  # largest confidence of a pose whose masks are flagged
+_LEAST_PROBABLE = 0.005  # an alternative is named above this, where two decimals show 0.01
 # What is solved: the numbers of two objects, and the position of a frame of the first.
 _Problem = tuple[int, int, int]
 

@@ -36,7 +36,7 @@ CHUNK_SIZE = 16  # pairs
 # Assumed of an executor that does not tell its number of workers: many, so that chunks are small
 # and each worker computes with one thread.
 _UNKNOWN_WORKERS = 256
-_MOST_WORKERS = 4096  # a larger number of processes is a slip
+_MOST_WORKERS = 4096  # largest number of processes that is accepted
 logger = logging.getLogger(__name__)
 
 

@@ -79,7 +79,8 @@ def evaluate(
         data: Folder in CO3D's layout, with pose labels.
         backbone: Backbone, or what `load_backbone` takes.
         methods: Rows of the tables, by name or of one's own (see `methods.resolve`).
-        pairs: Number of pairs per category, of all with pose labels; or by category.
+        pairs: Number of pairs of every category with pose labels, by default the paper's 100 (the
+            command's default is 30, for a first try); or the number by category.
         targets: Number of target views per pair, for rows that do not fix it.
         out: Folder of the run.
         executor: Number of processes, or any `Executor`, which gets chunks of pairs.

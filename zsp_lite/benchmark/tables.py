@@ -355,6 +355,7 @@ def _table(
             )
             break
     notes += more
+    # The first note is that of `read_run`.
     unfinished = " of an unfinished run" if "Not finished" in notes[0] else ""
     what = (
         f"{Path(data['root']).name}, {data['pairs']} pairs{unfinished}, {data['targets']} target "

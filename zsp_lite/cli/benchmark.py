@@ -64,7 +64,7 @@ metrics_option = click.option(
     help="Folder in CO3D's layout.",
 )
 @backbone_options
-@click.option("--categories", type=NAMES, show_default="all with pose labels", help="Categories.")
+@click.option("--categories", type=NAMES, show_default="all with pose labels", help="Their names.")
 @click.option("--pairs", type=COUNT, default=30, help="Pairs per category.")
 @click.option(
     "--targets",
