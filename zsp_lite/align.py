@@ -133,15 +133,15 @@ def align_category(
 
 
 def alignment_errors(
-    found: CategoryAlignment, labels: Mapping[str, PoseLabel]
+    alignment: CategoryAlignment, labels: Mapping[str, PoseLabel]
 ) -> tuple[list[float], list[float]]:
-    """Compute the rotation errors in degrees of all ordered pairs of labelled objects, and of every
-    pair alone."""
-    turns = {name: labels[name].trans[:3, :3] for name in found.objects if name in labels}
+    """Compute the rotation errors in degrees of the alignment, for all ordered pairs of labelled
+    objects, and of the best hypothesis of each pair of frames."""
+    turns = {name: labels[name].trans[:3, :3] for name in alignment.objects if name in labels}
     true = {(a, b): turns[b] @ turns[a].T for a, b in permutations(turns, 2)}
-    together = [float(rotation_error(found.between(*ends).R, true[ends])) for ends in true]
+    together = [float(rotation_error(alignment.between(*ends).R, true[ends])) for ends in true]
     alone = []
-    for pair in found.pairs:
+    for pair in alignment.pairs:
         ends = pair.reference, pair.target
         if ends in true:
             alone.append(float(rotation_error(pair.sim3s[0].R, true[ends])))
@@ -151,11 +151,11 @@ def alignment_errors(
 def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
     """Read the hypotheses that a run of `align_category` keeps, by the key of the pair of frames,
     for `synchronise`."""
-    found = {}
+    hypotheses = {}
     for line in read_lines(out, _Line):
         if line.matrices:
             pair = Pair.from_key(line.pair)
-            found[line.pair] = PairHypotheses(
+            hypotheses[line.pair] = PairHypotheses(
                 pair.reference_sequence,
                 pair.target_sequence,
                 tuple(map(Sim3.from_matrix, np.array(line.matrices))),
@@ -163,7 +163,7 @@ def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
                 np.array(line.centre),
                 line.span,
             )
-    return found
+    return hypotheses
 
 
 def write_alignment(found: CategoryAlignment, out: str | Path) -> Path:
