@@ -114,7 +114,8 @@ def test_pairs_without_a_pose_are_left_out_until_none_is_left(monkeypatch):
 def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     run, tmp_path, monkeypatch, capsys
 ):
-    root, out = tmp_path / "data", tmp_path / "out"
+    root = tmp_path / "data"
+    out = tmp_path / "out"
     shutil.copytree(small_folder(), root)
     found = replace(run[1], disagreements={(A, C): 179.96})
     monkeypatch.setattr("zsp_lite.align.align_category", lambda *_, **__: found)
