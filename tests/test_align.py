@@ -14,8 +14,9 @@ from benchmark_folder import SEQUENCES, SlowBackbone, run_rows, small_folder
 from numpy.testing import assert_allclose
 from refusals import refused
 
-from zsp_lite import Co3D, InputError, ZeroShotPose, align, align_category, estimate_pose
+from zsp_lite import Co3D, InputError, ZeroShotPose, align_category, estimate_pose
 from zsp_lite.align import read_hypotheses, write_labels
+from zsp_lite.benchmark.problem import PairProblem
 from zsp_lite.benchmark.run import evaluate
 from zsp_lite.category import synchronise
 from zsp_lite.cli import main as cli
@@ -75,7 +76,7 @@ def test_a_killed_run_is_continued_where_it_was_and_by_other_workers(run, tmp_pa
             Co3D(small_folder()), "lump", BACKBONE, targets=3, out=tmp_path, executor=executor
         )
     assert sorted((tmp_path / "run.jsonl").read_text().splitlines(keepends=True)) == sorted(lines)
-    monkeypatch.setattr(align, "hypotheses", None)  # nothing is left to compute
+    monkeypatch.setattr(PairProblem, "hypotheses", None)  # nothing is left to compute
     again = align_category(Co3D(small_folder()), "lump", BACKBONE, targets=3, out=tmp_path)
     for one in (found, again, synchronise(list(read_hypotheses(tmp_path).values()))):
         assert {name: pose.sim3.matrix.tolist() for name, pose in one.objects.items()} == {
@@ -93,8 +94,9 @@ def test_pairs_without_a_pose_are_left_out_until_none_is_left(monkeypatch):
             raise NoPoseError("no pose")
         return solve(problem)
 
-    solve, everything = align.hypotheses, False
-    monkeypatch.setattr(align, "hypotheses", fail)
+    solve = PairProblem.hypotheses
+    everything = False
+    monkeypatch.setattr(PairProblem, "hypotheses", fail)
     assert list(
         align_category(Co3D(small_folder()), "lump", BACKBONE, SEQUENCES, targets=3).objects
     ) == [A, B]
@@ -112,7 +114,8 @@ def test_pairs_without_a_pose_are_left_out_until_none_is_left(monkeypatch):
 def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     run, tmp_path, monkeypatch, capsys
 ):
-    root, out = tmp_path / "data", tmp_path / "out"
+    root = tmp_path / "data"
+    out = tmp_path / "out"
     shutil.copytree(small_folder(), root)
     found = replace(run[1], disagreements={(A, C): 179.96})
     monkeypatch.setattr("zsp_lite.align.align_category", lambda *_, **__: found)

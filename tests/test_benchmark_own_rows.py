@@ -46,8 +46,8 @@ from zsp_lite.benchmark.methods import (
     resolve,
 )
 from zsp_lite.benchmark.own import StoredPoses, kind_of
-from zsp_lite.benchmark.problem import Answer, FrameStore
-from zsp_lite.benchmark.run import evaluate, evaluate_pair
+from zsp_lite.benchmark.problem import Answer
+from zsp_lite.benchmark.run import PairEvaluator, evaluate
 from zsp_lite.benchmark.runs import LINES, Run, fingerprint, read_run
 from zsp_lite.benchmark.tables import every_table
 from zsp_lite.data.co3d import Pair
@@ -273,7 +273,6 @@ def test_of_two_methods_with_one_name_none_is_lost():
 
 def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
     dataset = Co3D(small_folder())
-    store = FrameStore(dataset, {"backbone": BACKBONE})
     exact = exact_keypoints(dataset, "lump")
 
     def with_one_score(first: np.ndarray, second: np.ndarray):
@@ -281,8 +280,10 @@ def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
         return pixels, places, 0.5  # of all matches, so that the views are equally good
 
     rows = resolve({"exact": exact, "one score": with_one_score})
+    evaluator = PairEvaluator(str(dataset.root), rows, BACKBONE)
+    evaluator.open(1)
     for pair in category_pairs(dataset, "lump", 4, 3):
-        results = evaluate_pair(pair, rows, rows, store)["results"]
+        results = evaluator.line(pair, rows)["results"]
         reference, targets = dataset.load_pair(pair)
         crop = object_crop(reference, None).rgb
         counts = [len(exact(crop, object_crop(target, None).rgb)[0]) for target in targets]

@@ -30,7 +30,7 @@ from zsp_lite import Backbone, Co3D, InputError
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.execution import make_chunks, open_workers
 from zsp_lite.benchmark.methods import resolve
-from zsp_lite.benchmark.run import evaluate, pair_evaluator, pairs_of_rows, write_reports
+from zsp_lite.benchmark.run import PairEvaluator, evaluate, pairs_of_rows, write_reports
 from zsp_lite.benchmark.runs import (
     LINES,
     SETTINGS,
@@ -159,7 +159,7 @@ def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monke
     packed.write_bytes(gzip.compress((out / LINES).read_bytes()))
     assert read_run(tmp_path).table.equals(read_run(out).table)
     with monkeypatch.context() as context:
-        context.setattr("zsp_lite.benchmark.run.evaluate_pair", None)  # nothing is left to compute
+        context.setattr(PairEvaluator, "line", None)  # nothing is left to compute
         assert again(tmp_path) == summary
     assert not packed.exists()
     assert (tmp_path / LINES).read_bytes() == (out / LINES).read_bytes()
@@ -335,8 +335,9 @@ def test_a_vision_transformers_features_do_not_depend_on_threads():
     (chunk,) = make_chunks(pairs_to_evaluate(["ours"], 2, 2))
 
     def errors(threads: int) -> list[float]:
-        evaluate_one = pair_evaluator(str(small_folder()), resolve(["ours"]), backbone, threads)
-        return [evaluate_one(pair, names)["results"]["ours"]["error"] for pair, names in chunk]
+        evaluator = PairEvaluator(str(small_folder()), resolve(["ours"]), backbone)
+        evaluator.open(threads)
+        return [evaluator.line(pair, names)["results"]["ours"]["error"] for pair, names in chunk]
 
     assert errors(1) == errors(2)
 

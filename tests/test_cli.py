@@ -288,8 +288,8 @@ def test_figures_of_impossible_sizes_are_refused(size, run):
 def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path):
     given = []
 
-    def record(*arguments):
-        given.append(arguments)
+    def record(*arguments, **options):
+        given.append((*arguments, *options.values()))
         raise errors.InputError("reached")
 
     monkeypatch.setattr("zsp_lite.benchmark.run.evaluate", record)

@@ -19,10 +19,10 @@ from refusals import refused
 import zsp_lite
 from zsp_lite import Sim3, load_backbone, minimal
 from zsp_lite.choices import SOLVERS
+from zsp_lite.course.demo import run_pair
 from zsp_lite.data.pairs import labelled_categories, shipped_pairs
 from zsp_lite.features import log_bin
 from zsp_lite.io.files import REPOSITORY
-from zsp_lite.pipeline import solve_pair
 
 STORED = json.loads(Path(__file__).with_name("sample_poses.json").read_text("utf-8"))
 
@@ -37,15 +37,13 @@ def solved(dataset):
     """The estimates of both solvers for each pair of `sample_poses.json`, by category, with shared
     features."""
     method = zsp_lite.ZeroShotPose(load_backbone())
-    pairs = {
-        category: shipped_pairs(dataset, category, 5)[: len(stored)]
-        for category, stored in STORED.items()
-    }
-    both = SOLVERS["both"]
-    return {
-        name: [solve_pair(method, *dataset.load_pair(pair), both) for pair in some]
-        for name, some in pairs.items()
-    }
+    estimates = {}
+    for category, stored in STORED.items():
+        estimates[category] = [
+            run_pair(dataset, pair, method, SOLVERS["both"]).estimates
+            for pair in shipped_pairs(dataset, category, 5)[: len(stored)]
+        ]
+    return estimates
 
 
 def as_crop(view) -> minimal.Crop:

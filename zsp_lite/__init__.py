@@ -36,12 +36,11 @@ __version__ = "0.3.0"
 # Public names, and the modules that hold them, stand in `__init__.pyi`, for editors too. They are
 # imported on first use: torch takes seconds to import, which `zsp-lite --help` does not need.
 _STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
-_HOME_OF = {
-    one.name: node.module
-    for node in _STUB.body
-    if isinstance(node, ast.ImportFrom)
-    for one in node.names
-}
+_HOME_OF = {}
+for _node in _STUB.body:
+    if isinstance(_node, ast.ImportFrom):
+        for _alias in _node.names:
+            _HOME_OF[_alias.name] = _node.module
 
 __all__ = ["__version__", *_HOME_OF]
 
@@ -50,11 +49,9 @@ def __getattr__(name: str):
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     home = importlib.import_module(_HOME_OF[name])
-    return (
-        vars(home)[name]
-        if name in vars(home)
-        else importlib.import_module(f"{home.__name__}.{name}")
-    )
+    if name in vars(home):
+        return vars(home)[name]
+    return importlib.import_module(f"{home.__name__}.{name}")
 
 
 def __dir__() -> list[str]:

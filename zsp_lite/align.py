@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext, suppress
-from functools import partial
+from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,8 +16,7 @@ import numpy as np
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
-from zsp_lite.benchmark.baseline_rows import hypotheses
-from zsp_lite.benchmark.execution import Evaluate, evaluate_pairs, open_workers
+from zsp_lite.benchmark.execution import evaluate_pairs, open_workers
 from zsp_lite.benchmark.problem import FrameStore, PairProblem
 from zsp_lite.benchmark.runs import open_run, read_lines, run_settings
 from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
@@ -43,21 +42,29 @@ class _Line(msgspec.Struct):
     span: float = 360.0
 
 
-def pair_solver(root: str, backbone: BackboneLike, threads: int) -> Evaluate:
-    """Make what finds the hypotheses of pairs; frames and features are kept from pair to pair."""
-    store = FrameStore(Co3D(root), {"backbone": as_backbone(backbone)}, threads)
+@dataclass
+class HypothesisFinder:
+    """Finds the hypotheses of pairs (see `execution.Evaluator`); frames and features are kept from
+    pair to pair."""
 
-    def solve(pair: Pair, rows: Sequence[str]) -> dict[str, Any]:
+    root: str  # the data folder
+    backbone: BackboneLike
+
+    def open(self, threads: int) -> None:
+        """Load the backbone."""
+        extractors = {"backbone": as_backbone(self.backbone)}
+        self.store = FrameStore(Co3D(self.root), extractors, threads)
+
+    def line(self, pair: Pair, names: Sequence[str]) -> dict[str, Any]:
+        """Find the hypotheses of a pair: a `_Line` of the run."""
         line: dict[str, Any] = {"pair": pair.key}
         with suppress(NoPoseError):
-            found = hypotheses(PairProblem(pair, store))
-            line["centre"] = found.centre.tolist()
-            line["matrices"] = [one.matrix.tolist() for one in found.sim3s]
-            line["probabilities"] = found.probabilities.tolist()
-            line["span"] = found.span
+            hypotheses = PairProblem(pair, self.store).hypotheses()
+            line["centre"] = hypotheses.centre.tolist()
+            line["matrices"] = [sim3.matrix.tolist() for sim3 in hypotheses.sim3s]
+            line["probabilities"] = hypotheses.probabilities.tolist()
+            line["span"] = hypotheses.span
         return line
-
-    return solve
 
 
 def align_category(
@@ -96,7 +103,7 @@ def align_category(
     loaded = as_backbone(backbone)
     with (
         tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder,
-        open_workers(executor) as (pool, workers),
+        open_workers(executor) as workers,
     ):
         settings = run_settings(
             dataset.root,
@@ -104,35 +111,37 @@ def align_category(
             targets,
             {"alignment": "hypotheses of the verified solver"},
             {},
-            workers=workers,
+            workers=workers.count,
             pairs={category: len(chosen)},
         )
         with open_run(folder, settings):
-            make = partial(pair_solver, str(dataset.root.resolve()), backbone if pool else loaded)
-            evaluate_pairs(
-                folder, make, dict.fromkeys(chosen.values(), ["alignment"]), pool, workers, _Line
-            )
-        known = read_hypotheses(folder)
-    found = [known[key] for key in chosen if key in known]
-    if not found:
+            # Workers load a named backbone themselves; an object travels to them.
+            sent = backbone if workers.executor else loaded
+            finder = HypothesisFinder(str(dataset.root.resolve()), sent)
+            work = dict.fromkeys(chosen.values(), ["alignment"])
+            evaluate_pairs(folder, finder, work, workers, _Line)
+        stored = read_hypotheses(folder)
+    hypotheses = [stored[key] for key in chosen if key in stored]
+    if not hypotheses:
         raise InputError(f"category {category}: none of {len(chosen)} pairs determines a pose")
-    posed = {name for one in found for name in (one.reference, one.target)}
-    asked = {pair.reference_sequence for pair in chosen.values()}
-    for name in sorted(asked - posed):
+    left_out = {pair.reference_sequence for pair in chosen.values()}
+    for pair in hypotheses:
+        left_out -= {pair.reference, pair.target}
+    for name in sorted(left_out):
         logger.warning("%s/%s is left out: none of its pairs determines a pose", category, name)
-    return synchronise(found)
+    return synchronise(hypotheses)
 
 
 def alignment_errors(
-    found: CategoryAlignment, labels: Mapping[str, PoseLabel]
+    alignment: CategoryAlignment, labels: Mapping[str, PoseLabel]
 ) -> tuple[list[float], list[float]]:
-    """Compute the rotation errors in degrees of all ordered pairs of labelled objects, and of every
-    pair alone."""
-    turns = {name: labels[name].trans[:3, :3] for name in found.objects if name in labels}
+    """Compute the rotation errors in degrees of the alignment, for all ordered pairs of labelled
+    objects, and of the best hypothesis of each pair of frames."""
+    turns = {name: labels[name].trans[:3, :3] for name in alignment.objects if name in labels}
     true = {(a, b): turns[b] @ turns[a].T for a, b in permutations(turns, 2)}
-    together = [float(rotation_error(found.between(*ends).R, true[ends])) for ends in true]
+    together = [float(rotation_error(alignment.between(*ends).R, true[ends])) for ends in true]
     alone = []
-    for pair in found.pairs:
+    for pair in alignment.pairs:
         ends = pair.reference, pair.target
         if ends in true:
             alone.append(float(rotation_error(pair.sim3s[0].R, true[ends])))
@@ -142,11 +151,11 @@ def alignment_errors(
 def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
     """Read the hypotheses that a run of `align_category` keeps, by the key of the pair of frames,
     for `synchronise`."""
-    found = {}
+    hypotheses = {}
     for line in read_lines(out, _Line):
         if line.matrices:
             pair = Pair.from_key(line.pair)
-            found[line.pair] = PairHypotheses(
+            hypotheses[line.pair] = PairHypotheses(
                 pair.reference_sequence,
                 pair.target_sequence,
                 tuple(map(Sim3.from_matrix, np.array(line.matrices))),
@@ -154,7 +163,7 @@ def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
                 np.array(line.centre),
                 line.span,
             )
-    return found
+    return hypotheses
 
 
 def write_alignment(found: CategoryAlignment, out: str | Path) -> Path:

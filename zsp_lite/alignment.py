@@ -23,11 +23,11 @@ from zsp_lite.errors import (
 # of the target.
 SCALE_RANGE = (0.2, 5.0)
 # Points are treated as collinear, which leaves the rotation about their line undetermined, below
-# these ratios of the second to the first singular value: of a sample's covariance, a ratio of
-# squared widths; and of a cloud, a ratio of widths, above the rounding of float32 coordinates on a
-# line.
-_COLLINEAR_SAMPLE, _COLLINEAR_CLOUD = 1e-6, 1e-5
-MOST_TRIALS = 10_000_000
+# a ratio of the second to the first singular value.
+_COLLINEAR_SAMPLE = 1e-6  # of a sample's covariance: a ratio of squared widths
+# Of a cloud: a ratio of widths, above the rounding of float32 coordinates on a line.
+_COLLINEAR_CLOUD = 1e-5
+MOST_TRIALS = 10_000_000  # largest number of RANSAC's trials that is accepted
 _BLOCK = 1_000_000  # residuals at a time: 24 MB of offsets
 
 
@@ -48,19 +48,17 @@ class Sim3:
                 f"Sim3: scale is {self.scale} and t {translation}, expected finite numbers, "
                 "scale above 0"
             )
+        rotation = rotation_matrix("Sim3: R", real_array("Sim3: R", self.R, (3, 3)))
         object.__setattr__(self, "scale", float(self.scale))
-        object.__setattr__(
-            self, "R", rotation_matrix("Sim3: R", real_array("Sim3: R", self.R, (3, 3)))
-        )
+        object.__setattr__(self, "R", rotation)
         object.__setattr__(self, "t", translation)
 
     def __repr__(self) -> str:
-        rows = (np.array2string(row, precision=4, suppress_small=True) for row in (*self.R, self.t))
-        first, second, third, translation = rows
-        return (
-            f"Sim3(scale={self.scale:.4f}, t={translation},\n     R=[{first},\n        "
-            f"{second},\n        {third}])"
-        )
+        def text(row: np.ndarray) -> str:
+            return np.array2string(row, precision=4, suppress_small=True)
+
+        rows = ",\n        ".join(map(text, self.R))
+        return f"Sim3(scale={self.scale:.4f}, t={text(self.t)},\n     R=[{rows}])"
 
     @classmethod
     def identity(cls) -> "Sim3":
@@ -152,7 +150,8 @@ def umeyama_batch(
     rotations, translations, and the ratio of the second to the first singular value of the
     covariance, 0 for collinear points.
     """
-    source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
+    source_mean = source.mean(axis=1)
+    target_mean = target.mean(axis=1)
     centred = source - source_mean[:, None]
     covariance = (target - target_mean[:, None]).swapaxes(1, 2) @ centred  # (b, 3, 3), times n
     rotation, singular, sign = nearest_rotation(covariance)
@@ -210,22 +209,27 @@ def ransac(
     source, target = _point_pairs(source, target, minimum=sample_size)
     rng = np.random.default_rng(seed)
     block = max(_BLOCK // len(source), 1)
-    winner = None
+    best = None  # trial of lowest rank: its rank, similarity and inliers
     for first in range(0, trials, block):
         samples = _draw_samples(len(source), sample_size, min(block, trials - first), rng)
-        found = _best_trial(source, target, samples, threshold, scale_range)
-        if found and (winner is None or found[0] < winner[0]):
-            winner = found
-    if winner is None:
-        found = f"no usable sample in {trials} trials over {len(source)} points"
-        raise InputError(f"ransac: {found}: all collinear, or scale outside {scale_range}")
-    _, sim3, chosen = winner
+        trial = _best_trial(source, target, samples, threshold, scale_range)
+        if trial is not None and (best is None or trial[0] < best[0]):
+            best = trial
+    if best is None:
+        raise InputError(
+            f"ransac: no usable sample in {trials} trials over {len(source)} points: all "
+            f"collinear, or scale outside {scale_range}"
+        )
+    _, sim3, inliers = best
 
-    if chosen.sum() >= 3:
-        *fit, conditioning = umeyama_batch(source[None, chosen], target[None, chosen], scale_range)
+    # The similarity of all inliers.
+    if inliers.sum() >= 3:
+        scale, rotation, translation, conditioning = umeyama_batch(
+            source[None, inliers], target[None, inliers], scale_range
+        )
         if conditioning[0] > _COLLINEAR_SAMPLE:
-            return Sim3(*(part[0] for part in fit)), chosen
-    return sim3, chosen
+            sim3 = Sim3(scale[0], rotation[0], translation[0])
+    return sim3, inliers
 
 
 def _best_trial(
@@ -235,14 +239,18 @@ def _best_trial(
     threshold: float,
     scale_range: tuple[float, float],
 ) -> tuple[tuple[int, float], Sim3, Bool[np.ndarray, " n"]] | None:
-    """Return the rank of the best sample, lower is better, its fit and inliers; None if no sample
-    is usable."""
+    """Return the rank of the best sample, lower is better, its similarity and its inliers.
+
+    None if no sample is usable.
+    """
     scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
     in_range = (scale >= scale_range[0]) & (scale <= scale_range[1])
     usable = in_range & (conditioning > _COLLINEAR_SAMPLE)
     if not usable.any():
         return None
-    scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
+    scale = scale[usable]
+    rotation = rotation[usable]
+    translation = translation[usable]
     linear = scale[:, None, None] * rotation
     offset = linear @ source.T + translation[:, :, None] - target.T  # (trials, 3, N)
     residual = np.sqrt(np.square(offset).sum(axis=1))
@@ -262,7 +270,8 @@ def _draw_samples(
     """Draw `trials` samples of `size` different indices below n, uniformly, without a loop over the
     trials."""
     samples = np.empty((trials, size), dtype=np.int64)
-    # A rank among the n - k indices left, moved up past each earlier index that is not larger.
+    # Index k of a sample is drawn as a rank among the n - k indices that are left, and moved up
+    # past each earlier index that is not larger.
     for k in range(size):
         draw = rng.integers(n - k, size=trials)
         for earlier in np.sort(samples[:, :k], axis=1).T:
@@ -275,7 +284,8 @@ def _point_pairs(
     source: ArrayLike, target: ArrayLike, minimum: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Convert corresponding points to float64 arrays and check them."""
-    source, target = real_array("source", source), real_array("target", target)
+    source = real_array("source", source)
+    target = real_array("target", target)
     if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
         raise InputError(
             f"source and target have shapes {source.shape} and {target.shape}, expected equal "
@@ -287,6 +297,8 @@ def _point_pairs(
         check_magnitude(name, points)
         longest, width, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if width <= _COLLINEAR_CLOUD * longest:
-            found = f"the {len(points)} {name} points are all equal or collinear"
-            raise InputError(f"{found}, expected points that span a plane")
+            raise InputError(
+                f"the {len(points)} {name} points are all equal or collinear, expected points that "
+                "span a plane"
+            )
     return source, target

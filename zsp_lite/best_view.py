@@ -92,11 +92,25 @@ def cyclical_iou(
     return mask_iou(distances >= -threshold, target_foreground)
 
 
+def _by_correspondences(one: ViewMatch) -> float:
+    return correspondence_score(one.matches, one.k)
+
+
+def _by_global_features(one: ViewMatch) -> float:
+    return global_score(one.reference.features, one.target.features)
+
+
+def _by_saliency(one: ViewMatch) -> float:
+    return mask_iou(one.reference.foreground, one.target.foreground)
+
+
+def _by_cycles(one: ViewMatch) -> float:
+    return cyclical_iou(one.similarity, one.reference.foreground, one.target.foreground)
+
+
 VIEW_SELECTORS: dict[str, ViewSelector] = {
-    "correspond": lambda one: correspondence_score(one.matches, one.k),
-    "global": lambda one: global_score(one.reference.features, one.target.features),
-    "saliency": lambda one: mask_iou(one.reference.foreground, one.target.foreground),
-    "cyclical": lambda one: cyclical_iou(
-        one.similarity, one.reference.foreground, one.target.foreground
-    ),
+    "correspond": _by_correspondences,
+    "global": _by_global_features,
+    "saliency": _by_saliency,
+    "cyclical": _by_cycles,
 }

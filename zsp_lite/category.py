@@ -49,14 +49,16 @@ SAME_ANGLE = 30.0  # degrees, as in Acc30; rotations further apart disagree
 # from it on, each object is the reference of a few.
 ALL_PAIRS_BELOW = 12
 PAIRS_PER_OBJECT = 6
-_REFERENCES = 3  # frames of the first object of a pair, at least
-_REFERENCES_OF_ONE = 16  # divided by the number of objects: two alone have eight
-_CHAINS = 48  # of the search; the best one is kept
+# Frames of the first object of a pair that are solved: 16 divided by the number of objects, so that
+# two objects have eight each, and at least 3.
+_REFERENCES = 3
+_REFERENCES_OF_ONE = 16
+_CHAINS = 48  # chains of the search, of which the best one is kept
 # Temperature of each sweep over all objects: a slow fall, then coordinate ascent.
 _TEMPERATURES = (*np.geomspace(1, 0.3, 12), 0.0, 0.0, 0.0, 0.0)
 _PROPOSERS = 8  # pairs of an object that propose rotations in a step, which bounds its time
-_AVERAGING_SWEEPS = 6  # over all objects
-_REWEIGHTINGS = 10  # of the least absolute deviations
+_AVERAGING_SWEEPS = 6  # sweeps over all objects
+_REWEIGHTINGS = 10  # steps of the least absolute deviations
 # Weight of hypotheses that disagree, so that every object gets a scale and a translation.
 _WEAK = 1e-3
 # Coefficients of `_judge`, fitted by tools/category_fit.py on validation categories to sets of
@@ -92,11 +94,11 @@ class AlignedObject:
 
     sim3: Sim3  # from the object's world to the common frame
     centre: Float[np.ndarray, "3"]  # of the object, in its world
-    # that its rotation is within 30 degrees of the one that most objects agree with
+    # probability that the rotation is within 30 degrees of the one that most objects agree with
     probability: float
     # next best pose, more than 30 degrees off, all other objects fixed; None without one
     alternative: Sim3 | None
-    alternative_probability: float  # that this is the right one
+    alternative_probability: float  # probability that the alternative is the right one
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +107,9 @@ class CategoryAlignment:
     zero."""
 
     objects: dict[str, AlignedObject]  # by name, sorted
-    pairs: tuple[PairHypotheses, ...]  # what it was found from
-    # median angle from the best hypothesis of the pairs (reference, target), where above 30
-    # degrees; largest first
+    pairs: tuple[PairHypotheses, ...]  # the hypotheses that were synchronised
+    # by (reference, target): median angle between the alignment and the best hypothesis of each
+    # pair of frames; only angles above 30 degrees, largest first
     disagreements: dict[tuple[str, str], float]
 
     def between(self, reference: str, target: str) -> Sim3:
@@ -116,8 +118,10 @@ class CategoryAlignment:
 
 
 def references_per_pair(objects: int) -> int:
-    """Return from how many frames of the first object a pair of objects is solved: the more, the
-    fewer objects."""
+    """Return the number of frames of the first object that are solved for a pair of objects.
+
+    The fewer objects, the more frames.
+    """
     return max(_REFERENCES, _REFERENCES_OF_ONE // objects)
 
 
@@ -153,8 +157,10 @@ def object_pairs(
         rng = np.random.default_rng([0, stable_hash(f"{category}/{reference}/{target}") >> 1])
         # Frames that are evenly spaced over a sequence show several sides; the random starts depend
         # on the names only.
-        first, around = numbers[reference], numbers[target]
-        start, target_start = rng.integers(len(first)), rng.integers(len(around))
+        first = numbers[reference]
+        around = numbers[target]
+        start = rng.integers(len(first))
+        target_start = rng.integers(len(around))
         count = min(references_per_pair(n), len(first))
         for r in range(count):
             frame = first[(start + r * len(first) // count) % len(first)]
@@ -178,10 +184,12 @@ def scan_pairs(dataset: Co3D, pair: Pair, references: int) -> list[Pair]:
 
     def around(name: str, start: int, count: int) -> tuple[int, ...]:
         frames = numbers[name]
-        first, count = frames.index(start), min(count, len(frames))
+        first = frames.index(start)
+        count = min(count, len(frames))
         return tuple(frames[(first + k * len(frames) // count) % len(frames)] for k in range(count))
 
-    a, b = pair.reference_sequence, pair.target_sequence
+    a = pair.reference_sequence
+    b = pair.target_sequence
     views = around(a, pair.reference_frame, len(pair.target_frames))
     forward = around(a, pair.reference_frame, references)
     backward = around(b, pair.target_frames[0], references)
@@ -245,7 +253,8 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
 
 
 def _connected(names: Sequence[str], ends: Int[np.ndarray, "e 2"]) -> Int[np.ndarray, " n"]:
-    """Order the objects so that each has a pair with an earlier one; InputError if none does."""
+    """Order the objects so that each has a pair with an earlier one; InputError if this is
+    impossible."""
     links = coo_array((np.ones(len(ends)), ends.T), [len(names)] * 2)
     order = breadth_first_order(links.tocsr(), 0, directed=False, return_predecessors=False)
     if len(order) < len(names):
@@ -343,15 +352,15 @@ def _search(
 def _sample(
     node: _Node, rotations: _Rotations, i: int, temperature: float, rng: np.random.Generator
 ) -> None:
-    """Set the rotation of object i, in place, to its present one or one that a hypothesis of a few
-    pairs proposes."""
+    """Draw the rotation of object i, in place, from its present one and the proposals of a few
+    pairs."""
     t = len(rotations)
     proposers = rng.permutation(len(node.neighbour))[:_PROPOSERS]
     proposals = node.proposals(rotations)
     proposed = proposals[:, proposers].reshape(t, -1, 3, 3)
     candidates = np.concatenate([rotations[:, i, None], proposed], axis=1)
     score = node.score(candidates, proposals)
-    # The largest is then a sample of the softmax.
+    # With Gumbel noise, the largest score is a sample of the softmax of the scores.
     score += temperature * rng.gumbel(size=score.shape)
     rotations[:, i] = candidates[np.arange(t), score.argmax(axis=1)]
 
@@ -362,8 +371,9 @@ def _judge(
     """Return the probability of an object's rotation, the best other one, all others fixed, and its
     probability."""
     margin, best = _margin(node, rotations, i)
-    # The pairs of an object err together, so the margin counts by the root of their number. A
-    # conditional logit; that none is right is less probable if more of the object's pairs agree.
+    # A conditional logit of three cases: this rotation is right, the other one is, or none. The
+    # pairs of an object err together, so the margin counts by the root of their number. That none
+    # is right is less probable if more of the object's pairs agree.
     other = np.exp(-MARGIN * margin / np.sqrt(len(node.neighbour)))
     none = np.exp(NONE + NONE_AGREEING * agreeing)
     total = 1 + other + none
@@ -392,8 +402,10 @@ def compare_two(
 def _margin(
     node: _Node, rotations: Float[np.ndarray, "n 3 3"], i: int
 ) -> tuple[float, Float[np.ndarray, "3 3"] | None]:
-    """Return by how much an object's rotation is better than the best other one, all others fixed,
-    and that one."""
+    """Return the best other rotation of an object, all others fixed, and how much worse it is.
+
+    The margin comes first; without another rotation it is infinite.
+    """
     proposals = node.proposals(rotations[None])
     others = proposals.reshape(-1, 3, 3)
     others = others[rotation_angle(others, rotations[i]) > SAME_ANGLE]
@@ -445,7 +457,7 @@ def _least_absolute(
     scaled = weight
     for _ in range(_REWEIGHTINGS):
         weighted = incidence.T * scaled
-        # Of least norm: mean zero.
+        # The solution of least norm has the mean zero.
         x = np.linalg.lstsq(weighted @ incidence, weighted @ difference, rcond=None)[0]
         scaled = weight / (np.linalg.norm(incidence @ x - difference, axis=1) + 1e-9)
     return x

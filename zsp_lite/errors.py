@@ -14,10 +14,11 @@ if TYPE_CHECKING:
 # Largest coordinate, in any unit of length or in pixels. Beyond 1e150 squares overflow, and LAPACK
 # may never return.
 MAX_LENGTH = 1e9
-# Largest entry of the difference between a rotation matrix from outside, a few decimals or half
-# precision, and the nearest rotation; and of |R @ R.T - I| for a rotation in float32, which is kept
-# as it is.
-ROTATION_TOLERANCE, _FLOAT32_TOLERANCE = 1e-2, 1e-6
+# Largest entry of the difference between a rotation matrix from outside, which may have a few
+# decimals or half precision, and the nearest rotation.
+ROTATION_TOLERANCE = 1e-2
+# Largest entry of |R @ R.T - I| for a rotation in float32, which is kept as it is.
+_FLOAT32_TOLERANCE = 1e-6
 _LONGEST = 1000  # characters of a message
 
 
@@ -52,14 +53,14 @@ def describe_failure(error: BaseException) -> str:
     """Describe an exception of somebody else's code in one line: where it was raised, its type and
     its message."""
     *_, last = traceback.extract_tb(error.__traceback__)
-    told = "".join(traceback.format_exception_only(error))  # also where its own str() fails
-    return " ".join(f"{last.filename}, line {last.lineno}: {told}".split())
+    # `str(error)` may fail itself.
+    message = "".join(traceback.format_exception_only(error))
+    return " ".join(f"{last.filename}, line {last.lineno}: {message}".split())
 
 
 @contextmanager
 def ends_the_run(what: str) -> Iterator[None]:
-    """Turn an error of the block, which reads data or calls a backbone, into a FatalError: it is
-    not the pair's."""
+    """Turn an error of the block, which reads data or calls a backbone, into a FatalError."""
     try:
         yield
     except FatalError:
@@ -122,21 +123,21 @@ def real_array(
     """
     import numpy as np
 
-    found, expected = None, "real numbers"
+    expected = "real numbers"
+    if shape is not None:
+        expected += f" of shape {shape}".replace("None", "n")
+    array = None
     # Errors of NumPy, for instance for rows of different lengths.
     with suppress(TypeError, ValueError, RuntimeError):
         array = np.asarray(values)
-        if array.dtype.kind in "biuf":
-            if (
-                shape is None
-                or len(shape) == array.ndim
-                and all(n in (None, m) for n, m in zip(shape, array.shape))
-            ):
-                return array.astype(np.float64, copy=False)
-            found = f"has shape {array.shape}"
+    # Kinds of real numbers: booleans, integers with and without sign, floats.
+    if array is None or array.dtype.kind not in "biuf":
+        raise InputError(f"{name} is {reprlib.repr(values)}, expected {expected}")
     if shape is not None:
-        expected += f" of shape {shape}".replace("None", "n")
-    raise InputError(f"{name} {found or f'is {reprlib.repr(values)}'}, expected {expected}")
+        lengths_fit = all(n in (None, m) for n, m in zip(shape, array.shape))
+        if len(shape) != array.ndim or not lengths_fit:
+            raise InputError(f"{name} has shape {array.shape}, expected {expected}")
+    return array.astype(np.float64, copy=False)
 
 
 def rotation_matrix(name: str, values: object) -> "np.ndarray":
@@ -161,8 +162,10 @@ def rotation_matrix(name: str, values: object) -> "np.ndarray":
     nearest = left @ right
     off = np.abs(nearest - matrix).max()
     if off > ROTATION_TOLERANCE:
-        found = f"is {reprlib.repr(matrix.tolist())}, {off:.2g} off the nearest rotation"
-        raise InputError(f"{name} {found}, expected a rotation, R @ R.T = identity and det R = 1")
+        raise InputError(
+            f"{name} is {reprlib.repr(matrix.tolist())}, {off:.2g} off the nearest rotation, "
+            "expected a rotation, R @ R.T = identity and det R = 1"
+        )
     return np.where(rounded[..., None, None], nearest, matrix)
 
 

@@ -172,7 +172,8 @@ def match_points(
     reference: View, target: View, matches: Matches
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
     """Unproject matches to 3D points, each in the frame of its own camera (sec. 4.3)."""
-    (source, _), (destination, _) = reference.patch_points, target.patch_points
+    source, _ = reference.patch_points
+    destination, _ = target.patch_points
     return source[tuple(matches.reference.T)], destination[tuple(matches.target.T)]
 
 

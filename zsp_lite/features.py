@@ -42,7 +42,8 @@ class FeatureMap:
             # `clone` outside inference mode: the copy can enter a graph with gradients.
             with torch.inference_mode(False):
                 object.__setattr__(self, name, values.to(torch.float32).clone())
-        keys, saliency = tuple(self.keys.shape), tuple(self.saliency.shape)
+        keys = tuple(self.keys.shape)
+        saliency = tuple(self.saliency.shape)
         if len(keys) != 3 or 0 in keys or saliency != keys[:2]:
             raise InputError(
                 f"FeatureMap: keys and saliency have shapes {keys}, {saliency}, expected (H, "
@@ -113,7 +114,8 @@ def bin_indices(grid: Grid) -> Int[Tensor, "17 n"]:
     far = [(3 * dy, 3 * dx) for dy, dx in near if (dy, dx) != (0, 0)]
     height, width = grid
     with torch.inference_mode(False):  # the result is cached, and later callers may need gradients
-        rows, columns = torch.arange(height)[:, None], torch.arange(width)
+        rows = torch.arange(height)[:, None]
+        columns = torch.arange(width)
         filled = [
             (rows + dy).clamp(0, height - 1) * width + (columns + dx).clamp(0, width - 1)
             for dy, dx in near + far

@@ -102,7 +102,8 @@ def sinkhorn(
     # Subtracting the minimum leaves the plan as it is and keeps the kernel from underflowing.
     kernel = torch.exp((cost.min() - cost) / regularisation)
     n1, n2 = kernel.shape
-    rows, columns = kernel.new_ones(n1), kernel.new_ones(n2)
+    rows = kernel.new_ones(n1)
+    columns = kernel.new_ones(n2)
     for _ in range(steps):
         rows = 1 / (n1 * (kernel @ columns)).clamp_min(torch.finfo(kernel.dtype).tiny)
         columns = 1 / (n2 * (rows @ kernel)).clamp_min(torch.finfo(kernel.dtype).tiny)
@@ -117,7 +118,8 @@ def on_foreground(
 
     def matcher(similarity, foreground1, foreground2):
         similarity = similarity.cpu()
-        foreground1, foreground2 = foreground1.cpu(), foreground2.cpu()
+        foreground1 = foreground1.cpu()
+        foreground2 = foreground2.cpu()
         partner = torch.zeros(len(foreground1), dtype=torch.long)
         score = torch.full((len(foreground1),), -torch.inf, dtype=torch.float64)
         if foreground1.any() and foreground2.any():

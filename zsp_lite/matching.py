@@ -64,8 +64,13 @@ def similarity(ref: Keys, target: Keys) -> Float[Tensor, "n1 n2"]:
     return similarities(ref, [target])[0]
 
 
-def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
-    """Compute `similarity` of one reference with several targets."""
+def similarities(
+    ref: Keys, targets: list[Keys], binning: bool = True
+) -> list[Float[Tensor, "n1 n2"]]:
+    """Compute `similarity` of one reference with several targets, or `key_similarities` without
+    `binning`."""
+    if not binning:
+        return key_similarities(ref, targets)
     keys1 = _keys(ref)
     inverse_norm1 = _inverse_norm(keys1)
     results = []
@@ -82,8 +87,10 @@ def similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]
 def key_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
     """Compute the cosine similarities of the keys themselves, without log-binning (see
     `similarities`)."""
-    first, *others = [F.normalize(_keys(one).flatten(0, 1), dim=1) for one in (ref, *targets)]
-    return [first @ other.T for other in others]
+    reference, *others = [
+        F.normalize(_keys(features).flatten(0, 1), dim=1) for features in (ref, *targets)
+    ]
+    return [reference @ other.T for other in others]
 
 
 def nearest_neighbours(
@@ -158,19 +165,21 @@ def match(
         binning: Compare and cluster log-binned descriptors; False takes the keys themselves.
     """
     if sim is None:
-        compare = similarities if binning else key_similarities
-        (sim,) = compare(ref, [target])
+        (sim,) = similarities(ref, [target], binning)
     if ref_foreground is None:
         ref_foreground = ref.foreground()
     if target_foreground is None:
         target_foreground = target.foreground()
-    on_start, on_end = torch.as_tensor(ref_foreground), torch.as_tensor(target_foreground)
+    on_start = torch.as_tensor(ref_foreground)
+    on_end = torch.as_tensor(target_foreground)
 
     # Both stages are about the image in which cycles start.
     forward = cycle_from == "reference"
-    start, end = ref, target
+    start = ref
+    end = target
     if not forward:
-        start, end = target, ref
+        start = target
+        end = ref
         on_start, on_end = on_end, on_start
         sim = sim.T
     ranked = _rank(sim, on_start, on_end, matcher, published=not forward)
@@ -201,11 +210,13 @@ def _rank(
     if matcher == "cyclical":
         score, partner = _cycles(sim, on_start, on_end, published)
     else:
-        ask = MATCHERS[matcher] if isinstance(matcher, str) else matcher
+        if isinstance(matcher, str):
+            matcher = MATCHERS[matcher]
         # Copies, since a matcher may overwrite what it gets, such as the similarities of the
         # background.
-        answer = ask(sim.clone(), on_start.flatten().clone(), on_end.flatten().clone())
-        partner, score = [torch.as_tensor(one).cpu() for one in answer]
+        partner, score = matcher(sim.clone(), on_start.flatten().clone(), on_end.flatten().clone())
+        partner = torch.as_tensor(partner).cpu()
+        score = torch.as_tensor(score).cpu()
         if not len(partner) == len(score) == len(sim):
             found = f"{len(partner)} partners and {len(score)} scores"
             raise InputError(
@@ -249,13 +260,15 @@ def _cycles(
     Only the foreground's neighbours, and of the patches of image 2 only theirs, are searched for.
     """
     columns = on1.shape[1]
-    on1, on2 = on1.flatten(), on2.flatten()
+    on1 = on1.flatten()
+    on2 = on2.flatten()
     # Patches by their index: u on the foreground, its neighbour v (`forth`), and v's u' (`back`).
     u = on1.nonzero()[:, 0]
     forth = sim[u].argmax(dim=1)
     reached, position = forth.unique(return_inverse=True)
     back = sim[:, reached].argmax(dim=0)[position]
-    row, column = back // columns, back % columns
+    row = back // columns
+    column = back % columns
     offset = torch.stack([u // columns - row, u % columns - column])
     distance = offset.to(torch.float32).square().sum(0).sqrt()
     # The published code does not check that u' is foreground, and discards every u' in row 0 or

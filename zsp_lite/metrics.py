@@ -66,7 +66,8 @@ def median(errors: ArrayLike, weights: ArrayLike | None = None) -> np.ndarray | 
     order = np.argsort(errors)
     cumulative = np.cumsum(np.take(weights, order, axis=-1), axis=-1)
     half = cumulative[..., -1:] / 2
-    lower, upper = (cumulative < half).sum(axis=-1), (cumulative <= half).sum(axis=-1)
+    lower = (cumulative < half).sum(axis=-1)
+    upper = (cumulative <= half).sum(axis=-1)
     ordered = errors[order]
     return ((ordered[lower] + ordered[upper]) / 2)[()]
 

@@ -36,9 +36,10 @@ from zsp_lite.verified.solver import measured_inliers
 
 _TARGETS = 5
 _REFERENCES = 4  # frames of each object that are solved against views of the other
-_MOST_DOUBTFUL = 0.8  # largest confidence by masks that are flagged
-_LEAST_PROBABLE = 0.005  # an alternative is named above this
-_Ends = tuple[int, int, int]  # numbers of two objects, and the position of a frame of the first
+_MOST_DOUBTFUL = 0.8  # largest confidence of a pose whose masks are flagged
+_LEAST_PROBABLE = 0.005  # an alternative is named above this, where two decimals show 0.01
+# What is solved: the numbers of two objects, and the position of a frame of the first.
+_Problem = tuple[int, int, int]
 
 
 def estimate_pose(
@@ -91,48 +92,53 @@ def estimate_pose(
         InputError: An input or an option is missing or wrong, or the pose cannot be estimated.
     """
     check_choice("solver", solver, SOLVERS)
-    wanted, targets = targets, _TARGETS if targets is None else targets
-    check_integer("targets", targets, 1)
+    solvers = SOLVERS[solver]
+    n_targets = _TARGETS if targets is None else targets
+    check_integer("targets", n_targets, 1)
     check_integer("workers", workers, 1)
-    if references is None:
-        alone = _REFERENCES if reference_frame is None else 1
-        references = references_per_pair(2 + len(helpers)) if helpers else alone
+    if references is None and helpers:
+        references = references_per_pair(2 + len(helpers))
+    elif references is None:
+        references = _REFERENCES if reference_frame is None else 1
     check_integer("references", references, 1)
-    several = "verified" in SOLVERS[solver] and (references > 1 or bool(helpers))
+    several = "verified" in solvers and (references > 1 or bool(helpers))
 
     # A folder that cannot be written is an error at once.
     with nullcontext() if out is None else writing(out):
         sources = _open_objects(reference, target, mask, intrinsics, helpers)
         model = as_backbone(backbone)
         foreground = "saliency" if getattr(model, "has_saliency", True) else "mask"
-        method = ZeroShotPose(model, foreground=foreground, solver="verified")
+        # Of both solvers the last is the verified one, whose frames vote.
+        method = ZeroShotPose(model, foreground=foreground, solver=solvers[-1])
 
-        counts = (references, targets) if several else (1, 0)
-        before: dict[str, float] = {}  # seconds of the stages that all solvers share
-        with timed(before, "features"):
+        # The frames of all objects. Only where frames vote, the reference also has target views,
+        # and the other objects have reference frames.
+        counts = (references, n_targets) if several else (1, 0)
+        other_counts = (references if several else 0, n_targets)
+        shared: dict[str, float] = {}  # seconds of the stages that all solvers share
+        with timed(shared, "features"):
             scans = [Scan.of(sources[0], method, *counts, reference_frame)]
-            scans += [
-                Scan.of(one, method, references if several else 0, targets) for one in sources[1:]
-            ]
+            scans += [Scan.of(source, method, *other_counts) for source in sources[1:]]
         flags = scan_flags(scans)
-        if wanted and wanted > len(scans[1].targets):
-            there = f"{len(scans[1].targets)}, all that there are, not {wanted}"
+        available = len(scans[1].targets)
+        if targets and targets > available:
+            there = f"{available}, all that there are, not {targets}"
             flags = (*flags, f"number of target views: {there}")
         if not upright:
-            with timed(before, "turns"):
-                scans[0], turn = stood_up(*scans[:2], replace(method, solver=SOLVERS[solver][-1]))
+            with timed(shared, "turns"):
+                scans[0], turn = stood_up(scans[0], scans[1], method)
             turned = f"the reference is turned by {turn}° counterclockwise"
             flags = (*flags, f"{turned}: the pose is that of the turned image")
 
-        solved, votes = _solve(scans, method, solver, several, workers)
+        # The pose, in the lengths of the sources.
+        solved, votes = _solve(scans, method, solvers, several, workers)
         estimates = {}
-        for name, one in solved.items():
-            one = replace(one, timings=before | one.timings)
-            estimates[name] = _in_units(one, scans[0].scale, scans[1].scale, flags)
-
+        for name, estimate in solved.items():
+            estimate = replace(estimate, timings=shared | estimate.timings)
+            estimates[name] = _in_units(estimate, scans[0].scale, scans[1].scale, flags)
         result = _pair_result(scans, estimates, votes, getattr(model, "name", str(backbone)))
         if out is not None:
-            write_pair(result, out)
+            result = replace(result, files=tuple(write_pair(result, out)))
     return result
 
 
@@ -150,30 +156,39 @@ def _open_objects(
     if intrinsics is not None:
         given["intrinsics"] = (intrinsics,)
     sources = open_pair(reference, target, given, helpers)
-    if helpers and len({one.path.resolve() for one in sources}) < len(sources):
-        named = ", ".join(str(one.path) for one in sources)
+    if helpers and len({source.path.resolve() for source in sources}) < len(sources):
+        named = ", ".join(str(source.path) for source in sources)
         raise InputError(f"{named}: expected different objects")
     return sources
 
 
 def _solve(
-    scans: Sequence[Scan], method: ZeroShotPose, solver: str, several: bool, workers: int
+    scans: Sequence[Scan],
+    method: ZeroShotPose,
+    solvers: Sequence[str],
+    several: bool,
+    workers: int,
 ) -> tuple[dict[str, PoseEstimate], tuple[Vote, ...]]:
-    """Solve the first reference frame by each solver; with several frames, the verified solver's
-    pose becomes the one that most of them agree on, and these vote."""
+    """Solve the first reference frame by each solver.
+
+    If `several` frames vote, the pose of the verified solver becomes the one that most agree on.
+    """
     position = scans[0].references[0]
-    reference, targets = scans[0].views[position], scans[1].target_views
+    reference = scans[0].views[position]
+    targets = scans[1].target_views
     solved = {
         name: replace(method, solver=name).estimate_from_views(reference, targets)
-        for name in SOLVERS[solver]
+        for name in solvers
     }
     if not several:
         return solved, ()
 
-    timings = dict(solved["verified"].timings)
+    first = solved["verified"]
+    timings = dict(first.timings)
     with timed(timings, "other frames"):
-        found = {(0, 1, position): solved["verified"], **_solve_others(scans, method, workers)}
-        agreed, votes = _agreed_pose(scans, method, found)
+        others = _solve_others(scans, method, workers)
+        estimates = {(0, 1, position): first, **others}
+        agreed, votes = _agreed_pose(scans, method, first, estimates)
     solved["verified"] = replace(agreed, timings=timings)
     return solved, votes
 
@@ -188,31 +203,33 @@ def _pair_result(
     first, second, *helpers = scans
     shown = second.source.describe(second.targets)
     if helpers:
-        shown += f"; helpers: {', '.join(str(one.source.path) for one in helpers)}"
+        shown += f"; helpers: {', '.join(str(helper.source.path) for helper in helpers)}"
     result = PairResult(
         f"{first.source.name} to {second.source.name}",
         (first.source.describe(first.references), shown),
         first.frames[first.references[0]],
-        tuple(second.frames[k] for k in second.targets),
+        tuple(second.frames[position] for position in second.targets),
         estimates,
         {},
         masks=(first.source.mask, second.source.mask),
         backbone=backbone,
         votes=votes,
     )
-    one, other = first.source.path.resolve(), second.source.path.resolve()
-    if first.source.format == second.source.format == "sequence" and one.parent == other.parent:
-        errors = label_errors(result, one.parent, (one.name, other.name))
+    path = first.source.path.resolve()
+    target_path = second.source.path.resolve()
+    sequences = first.source.format == second.source.format == "sequence"
+    if sequences and path.parent == target_path.parent:
+        errors = label_errors(result, path.parent, (path.name, target_path.name))
         result = replace(result, errors=errors)
     return result
 
 
 def _solve_others(
     scans: Sequence[Scan], method: ZeroShotPose, workers: int
-) -> dict[_Ends, PoseEstimate]:
-    """Solve every reference frame of each object against the views of each other one, but for the
-    first of all."""
-    ends = [
+) -> dict[_Problem, PoseEstimate]:
+    """Solve every reference frame of each object against the views of each other object, but for
+    the first of all, which is solved already."""
+    problems = [
         (a, b, position)
         for a, b in permutations(range(len(scans)), 2)
         for position in scans[a].references
@@ -222,30 +239,45 @@ def _solve_others(
         with suppress(NoPoseError):
             return method.estimate_from_views(scans[a].views[position], scans[b].target_views)
 
-    others = ends[1:]
+    others = problems[1:]
+    solved = {}
     with ThreadPoolExecutor(workers) as pool:
-        solved = pool.map(solve, *zip(*others))
-        # `disable=None`: shown in a terminal only.
-        shown = [*tqdm(solved, total=len(others), unit="frame", delay=1, disable=None)]
-    return {end: one for end, one in zip(others, shown, strict=True) if one}
+        estimates = pool.map(solve, *zip(*others))
+        # `disable=None` shows the bar in a terminal only.
+        bar = tqdm(estimates, total=len(others), unit="frame", delay=1, disable=None)
+        for problem, estimate in zip(others, bar, strict=True):
+            if estimate is not None:
+                solved[problem] = estimate
+    return solved
 
 
 def _agreed_pose(
-    scans: Sequence[Scan], method: ZeroShotPose, found: Mapping[_Ends, PoseEstimate]
+    scans: Sequence[Scan],
+    method: ZeroShotPose,
+    first: PoseEstimate,
+    estimates: Mapping[_Problem, PoseEstimate],
 ) -> tuple[PoseEstimate, tuple[Vote, ...]]:
-    """Find the pose that the hypotheses of all frames agree on, in the first frame's camera, and
-    their votes."""
+    """Find the pose that the hypotheses of all estimates agree on, in the camera of the first one,
+    and the votes of the frames."""
     names = [f"{k} {scan.source.name}" for k, scan in enumerate(scans)]
-    agreement = synchronise(
-        [world_hypotheses(names[a], names[b], one) for (a, b, _), one in found.items()]
-    )
-    one, other = agreement.objects[names[0]], agreement.objects[names[1]]
-    answers = [(agreement.between(*names[:2]), min(one.probability, other.probability))]
-    if other.alternative and other.alternative_probability > _LEAST_PROBABLE:
-        answers.append((other.alternative.inverse() @ one.sim3, other.alternative_probability))
+    hypotheses = [
+        world_hypotheses(names[a], names[b], estimate) for (a, b, _), estimate in estimates.items()
+    ]
+    agreement = synchronise(hypotheses)
+
+    # The answers: the pose between the worlds of both objects, and its alternative.
+    reference = agreement.objects[names[0]]
+    target = agreement.objects[names[1]]
+    probability = min(reference.probability, target.probability)
+    answers = [(agreement.between(names[0], names[1]), probability)]
+    if target.alternative and target.alternative_probability > _LEAST_PROBABLE:
+        alternative = target.alternative.inverse() @ reference.sim3
+        answers.append((alternative, target.alternative_probability))
+
+    # The votes of the frames of the two objects, not of helpers.
     votes = []
-    for (a, b, position), estimate in found.items():
-        if max(a, b) < 2:  # of the two objects, not of helpers
+    for (a, b, position), estimate in estimates.items():
+        if max(a, b) < 2:
             name = f"frame {scans[a].source.numbers[position]} of {scans[a].source.name}"
             agreed = agreement.between(names[a], names[b])
             degrees = float(rotation_error(estimate.world_sim3.R, agreed.R))
@@ -256,7 +288,7 @@ def _agreed_pose(
     if against:
         named = ", ".join(against)
         flags.append(f"{len(against)} of {len(votes)} frames vote for another pose: {named}")
-    return _answer(next(iter(found.values())), method, answers, flags), tuple(votes)
+    return _answer(first, method, answers, flags), tuple(votes)
 
 
 def _answer(
@@ -267,36 +299,41 @@ def _answer(
 ) -> PoseEstimate:
     """Replace the hypotheses of an estimate by similarities between the worlds, each with its
     probability."""
-    reference, targets = estimate.reference_view, estimate.target_views
+    reference = estimate.reference_view
+    targets = estimate.target_views
     to_reference, *to_targets = [
-        Sim3(1.0, one.frame.camera.R, one.frame.camera.t) for one in (reference, *targets)
+        Sim3(1.0, view.frame.camera.R, view.frame.camera.t) for view in (reference, *targets)
     ]
+    # Each answer becomes a hypothesis in the usable target view that is nearest to the reference.
     left_out = np.where(np.isfinite(estimate.view_scores), 0.0, np.inf)
     hypotheses = []
-    # The best last, whose `view`, `poses` and `angles` stay.
-    for mode, (sim3, probability) in reversed([*enumerate(answers)]):
+    view_angles = []  # of each hypothesis, in degrees by target view
+    for mode, (sim3, probability) in enumerate(answers):
         poses = [camera @ sim3 @ to_reference.inverse() for camera in to_targets]
         angles = rotation_angle(np.stack([pose.R for pose in poses]), np.eye(3)) + left_out
-        view = int(angles.argmin())
+        nearest = int(angles.argmin())
         score = float(np.log(max(probability, 1e-9)))  # finite for a probability of 0
-        hypotheses.insert(0, Hypothesis(poses[view], view, score, {}, probability, mode))
-    (matched,) = method.match_views(reference, [targets[view]])
+        hypotheses.append(Hypothesis(poses[nearest], nearest, score, {}, probability, mode))
+        view_angles.append(angles)
+
+    # The first is the pose of the estimate.
+    best = hypotheses[0]
+    target = targets[best.view]
+    (matched,) = method.match_views(reference, [target])
     turns = np.stack([sim3.R for sim3, _ in answers])
     between = rotation_angle(turns[:, None], turns)
     doubts, one_of_two = reliability_flags(hypotheses, between)
-    kept = [flag for flag in estimate.flags if "left out" in flag]
+    views_left_out = [flag for flag in estimate.flags if "left out" in flag]
     return replace(
         estimate,
-        sim3=poses[view],
-        view=view,
+        sim3=best.sim3,
+        view=best.view,
         matches=matched.matches,
-        view_scores=-angles,
-        inliers=measured_inliers(
-            reference, targets[view], matched.matches, poses[view], method.threshold
-        ),
+        view_scores=-view_angles[0],
+        inliers=measured_inliers(reference, target, matched.matches, best.sim3, method.threshold),
         hypotheses=tuple(hypotheses),
         one_of_two=one_of_two,
-        flags=(*doubts, *flags, *kept),
+        flags=(*doubts, *flags, *views_left_out),
     )
 
 
@@ -332,24 +369,29 @@ def write_pair(result: PairResult, out: str | Path) -> list[Path]:
 def _in_units(
     estimate: PoseEstimate, reference_scale: float, target_scale: float, flags: tuple[str, ...]
 ) -> PoseEstimate:
-    """Express an estimate on scaled frames in the lengths before scaling, and add flags, which
-    limit its confidence."""
+    """Express an estimate on scaled frames in the lengths before scaling, and add flags; a flag of
+    doubtful masks limits the confidence."""
 
     def unscaled(sim3: Sim3) -> Sim3:
         return Sim3(sim3.scale * reference_scale / target_scale, sim3.R, sim3.t / target_scale)
 
     most = _MOST_DOUBTFUL if any(DOUBTFUL in flag for flag in flags) else 1.0
-    reference, targets = estimate.reference_view, estimate.target_views
+    reference = estimate.reference_view
+    targets = estimate.target_views
     return replace(
         estimate,
         flags=(*estimate.flags, *flags),
         sim3=unscaled(estimate.sim3),
         hypotheses=tuple(
-            replace(one, sim3=unscaled(one.sim3), confidence=min(one.confidence, most))
-            for one in estimate.hypotheses
+            replace(
+                hypothesis,
+                sim3=unscaled(hypothesis.sim3),
+                confidence=min(hypothesis.confidence, most),
+            )
+            for hypothesis in estimate.hypotheses
         ),
         reference_view=replace(reference, frame=scale_frame(reference.frame, 1 / reference_scale)),
         target_views=tuple(
-            replace(one, frame=scale_frame(one.frame, 1 / target_scale)) for one in targets
+            replace(view, frame=scale_frame(view.frame, 1 / target_scale)) for view in targets
         ),
     )

@@ -19,9 +19,9 @@ class Vote:
     """What one frame of one object says of a pose that several frames of both determine."""
 
     name: str  # the frame, such as "frame 12 of my_cup"
-    estimate: PoseEstimate  # its own: of this frame's object in views of the other
-    degrees: float  # angle from its best rotation to that of the answer
-    backward: bool  # whether it is a frame of the target, in views of the reference
+    estimate: PoseEstimate  # of this frame alone: of its object in views of the other
+    degrees: float  # angle between the rotations of this estimate and of the answer
+    backward: bool  # whether the frame shows the target, and the views the reference
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +39,9 @@ class PairResult:
     # where the masks of the reference and of the targets come from: "given", "box" or "auto"
     masks: tuple[str, str] = ("given", "given")
     backbone: str = ""  # name of the backbone
-    # of the frames of both objects, the reference frame's first; () for one frame
+    # votes of the frames of both objects, the reference frame's first; () if one frame was solved
     votes: tuple[Vote, ...] = ()
+    files: tuple[Path, ...] = ()  # what `write_pair` has written
 
     @property
     def world_sim3(self) -> Sim3:
@@ -62,7 +63,7 @@ class PairResult:
         """Angle in degrees between the rotations of two solvers; None if only one ran."""
         if len(self.estimates) < 2:
             return None
-        first, second = [one.world_rotation() for one in self.estimates.values()]
+        first, second = [estimate.world_rotation() for estimate in self.estimates.values()]
         return float(rotation_error(first, second))
 
     def __repr__(self) -> str:
@@ -101,11 +102,11 @@ class PairResult:
             "degrees_between_solvers": self.disagreement,
             "votes": [
                 {
-                    "frame": one.name,
-                    "confidence": one.estimate.confidence,
-                    "degrees_from_answer": one.degrees,
+                    "frame": vote.name,
+                    "confidence": vote.estimate.confidence,
+                    "degrees_from_answer": vote.degrees,
                 }
-                for one in self.votes
+                for vote in self.votes
             ],
         }
 
@@ -114,13 +115,13 @@ def _alternatives(estimate: PoseEstimate) -> list[dict[str, Any]]:
     """List the alternatives of an estimate in the types of JSON."""
     return [
         {
-            "view": one.view,
-            "matrix": one.sim3.matrix.tolist(),
-            "probability": one.confidence,
-            "degrees_from_best": estimate.angle_to(one),
-            "score_below_best": estimate.hypotheses[0].score - one.score,
+            "view": other.view,
+            "matrix": other.sim3.matrix.tolist(),
+            "probability": other.confidence,
+            "degrees_from_best": estimate.angle_to(other),
+            "score_below_best": estimate.hypotheses[0].score - other.score,
         }
-        for one in estimate.alternatives
+        for other in estimate.alternatives
     ]
 
 

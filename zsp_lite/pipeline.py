@@ -19,7 +19,7 @@ from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
 from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
-from zsp_lite.matching import key_similarities, match
+from zsp_lite.matching import match
 from zsp_lite.matching import similarities as cosine_similarities
 from zsp_lite.points import standard_deviation
 from zsp_lite.views import IMAGE_SIZE, View, extract_views, object_crop, usable_targets
@@ -144,8 +144,8 @@ class ZeroShotPose:
         are known already.
         """
         if similarities is None:
-            compare = cosine_similarities if self.binning else key_similarities
-            similarities = compare(reference.features, [target.features for target in targets])
+            features = [target.features for target in targets]
+            similarities = cosine_similarities(reference.features, features, self.binning)
         kmeans = self.kmeans
         if kmeans is None:
             kmeans = getattr(self._solver(), "kmeans", True)
@@ -215,22 +215,6 @@ class ZeroShotPose:
         return self.solver
 
 
-def solve_pair(
-    method: ZeroShotPose,
-    reference: Frame,
-    targets: Sequence[Frame],
-    solvers: Sequence[str] | None = None,
-) -> dict[str, PoseEstimate]:
-    """Estimate the pose of a pair by each of several solvers, by name, or by the method's own, with
-    shared features."""
-    first, *others = method.views([reference, *targets])
-    methods = {name: replace(method, solver=name) for name in solvers or ()}
-    if solvers is None:
-        own = method.solver
-        methods[own if isinstance(own, str) else getattr(own, "__name__", "solver")] = method
-    return {name: one.estimate_from_views(first, others) for name, one in methods.items()}
-
-
 def align_best_view(
     reference: View,
     targets: Sequence[View],
@@ -287,8 +271,10 @@ def view_alignment(reference: View, target: View) -> Sim3:
     The rotation is the identity. Scale and translation map the standard deviation and the centroid
     of the reference's foreground points onto those of the target's.
     """
-    first, second = _foreground_points(reference), _foreground_points(target)
-    spread, target_spread = standard_deviation(first), standard_deviation(second)
+    first = _foreground_points(reference)
+    second = _foreground_points(target)
+    spread = standard_deviation(first)
+    target_spread = standard_deviation(second)
     scale = target_spread / spread if min(spread, target_spread) > 0 else 1.0
     return Sim3(scale, np.eye(3), second.mean(axis=0) - scale * first.mean(axis=0))
 

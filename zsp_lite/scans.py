@@ -1,8 +1,10 @@
-"""The frames of one's own objects that an estimate uses: loaded, scaled, turned, and doubted."""
+"""The frames of one's own objects that an estimate uses: load, scale and turn them, and flag what
+is doubtful about them."""
 
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +18,8 @@ from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import axis_deviation, world_cloud
 from zsp_lite.views import View
 
-_ALL_SIDES = 120.0  # target views that span less, in degrees, show one side of the object
+# Target views that span less than this angle, in degrees, show one side of the object.
+_ALL_SIDES = 120.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,15 +66,18 @@ class Scan:
     def seen(self) -> tuple[int, float]:
         """Number of usable target views, and the angle in degrees that they span around the
         object."""
-        cameras = [self.frames[k].camera for k in self.targets if not frame_defect(self.frames[k])]
+        frames = [self.frames[position] for position in self.targets]
+        cameras = [frame.camera for frame in frames if not frame_defect(frame)]
         if not len(self.cloud):
             return len(cameras), 0.0
         return len(cameras), view_span(cameras, np.median(self.cloud, axis=0))
 
 
 def stood_up(scan: Scan, target: Scan, method: ZeroShotPose) -> tuple[Scan, int]:
-    """Turn the frames of a scan by the quarter turns that suit its first reference frame best;
-    return the degrees."""
+    """Turn the frames of a scan by 0 to 3 quarters, so that its first reference frame fits best.
+
+    Returns the scan and the turn in degrees.
+    """
 
     def views_of(positions: Iterable[int], quarters: int) -> list[View]:
         frames = [scale_frame(scan.frames[position], scan.scale) for position in positions]
@@ -82,9 +88,10 @@ def stood_up(scan: Scan, target: Scan, method: ZeroShotPose) -> tuple[Scan, int]
         (view,) = views_of(scan.references[:1], quarters)
         with suppress(NoPoseError):
             estimate = method.estimate_from_views(view, target.target_views)
-            scores[quarters] = estimate.view_scores.max()
             if estimate.hypotheses:
                 scores[quarters] = estimate.hypotheses[0].score
+            else:
+                scores[quarters] = estimate.view_scores.max()
     best = max(scores, key=scores.get, default=0)
     frames = {position: turn_frame(frame, best) for position, frame in scan.frames.items()}
     views = dict(zip(scan.views, views_of(scan.views, best), strict=True))
@@ -92,23 +99,26 @@ def stood_up(scan: Scan, target: Scan, method: ZeroShotPose) -> tuple[Scan, int]
 
 
 def scan_flags(scans: Sequence[Scan]) -> tuple[str, ...]:
-    """Name two categories, and what is doubtful about the frames in use and the sides that they
-    show."""
+    """Flag objects of different categories, doubtful frames, and objects seen from one side."""
     flags = []
     sources = [scan.source for scan in scans if scan.source.format == "sequence"]
     categories = sorted({source.path.resolve().parent.name for source in sources})
     if len(categories) > 1:
         flags.append(f"the objects are of different categories: {', '.join(categories)}")
     for scan in scans:
-        found = scan.source.flags([scan.frames[position] for position in scan.views])
-        flags += [f"{scan.source.path}: {flag}" for flag in found]
+        frames = [scan.frames[position] for position in scan.views]
+        flags += [f"{scan.source.path}: {flag}" for flag in scan.source.flags(frames)]
+    # Of the two objects, the one whose views span more. Two views show two sides at most, however
+    # far they are apart.
     seen = [scan.seen for scan in scans[:2] if scan.targets]
-    count, span = max(seen, key=lambda one: (one[1], one[0]))
+    count, span = max(seen, key=itemgetter(1, 0))
     if count < 3 or span < _ALL_SIDES:
         sides = "two sides" if span >= _ALL_SIDES else "one side"
-        what, other = "each object was", "one"
+        what = "each object was"
+        other = "one"
         if len(seen) < 2:
-            what, other = "the target was", "the reference"
+            what = "the target was"
+            other = "the reference"
         seen_from = f"seen from {sides} only ({span:.0f} degrees)"
         flags.append(
             f"{what} {seen_from}: if {other} was taken from another side, this pose is wrong"

@@ -10,8 +10,8 @@ import cv2
 from threadpoolctl import OpenBLASController, ThreadpoolController
 
 _lock = threading.Lock()
-_blocks = 0  # that are open now, in all threads
-_of_process = ExitStack()  # restores the numbers of the process
+_blocks = 0  # number of blocks of `one_thread` that are open, in all threads
+_of_process = ExitStack()  # restores the process's numbers of threads
 # From threadpoolctl 3.8 on, only the thread that set the number for OpenBLAS first may set it,
 # unless this is called.
 _let_this_thread_set = getattr(OpenBLASController, "clear_controlling_thread", lambda force: None)
@@ -19,15 +19,17 @@ _let_this_thread_set = getattr(OpenBLASController, "clear_controlling_thread", l
 
 @lru_cache(1)
 def _libraries(modules: int) -> ThreadpoolController:
-    """Find the loaded libraries, which takes ten milliseconds; anew only after imports, by the
-    number of modules."""
+    """Find the loaded libraries, which takes ten milliseconds: again only after an import, which
+    changes the number of modules."""
     return ThreadpoolController()
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Restrict all libraries to one thread within a block: more are slower on small matrices, and
-    disturb workers."""
+    """Restrict all libraries to one thread within a block.
+
+    On small matrices more threads are slower, and they take processors from other workers.
+    """
     global _blocks
     libraries = _libraries(len(sys.modules))
     with _lock:

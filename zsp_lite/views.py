@@ -112,7 +112,8 @@ def usable_targets(targets: Sequence[View]) -> tuple[list[int], tuple[str, ...]]
     Returns their indices, and for each other view a flag that names it and the reason. NoPoseError
     if none is usable.
     """
-    usable, flags = [], []
+    usable = []
+    flags = []
     for index, target in enumerate(targets):
         defect = frame_defect(target.frame) or ("" if target.foreground.any() else "no foreground")
         if defect:

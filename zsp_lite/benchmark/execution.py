@@ -11,14 +11,14 @@ import pkgutil
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
-from functools import partial
-from itertools import chain
+from contextlib import closing, contextmanager
+from itertools import chain, groupby
 from multiprocessing import active_children, get_context, parent_process
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 from uuid import uuid4
 
 import cloudpickle
@@ -31,98 +31,115 @@ from zsp_lite.errors import InputError, check_integer, ends_the_run
 from zsp_lite.io.files import digest, read_bytes, write_atomic
 from zsp_lite.threads import one_thread
 
-Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, and the rows to evaluate on each
-Evaluate = Callable[[Pair, list[str]], dict[str, Any]]  # finds the line of a run for a pair
+Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, each with the names of its rows
 CHUNK_SIZE = 16  # pairs
+# Assumed of an executor that does not tell its number of workers: many, so that chunks are small
+# and each worker computes with one thread.
+_UNKNOWN_WORKERS = 256
+_MOST_WORKERS = 4096  # largest number of processes that is accepted
 logger = logging.getLogger(__name__)
-_UNKNOWN_WORKERS = 256  # of an executor that does not tell
 
 
-class _Processes(ProcessPoolExecutor):
-    """Processes that `open_workers` ends; the pool's thread would print a traceback if their
-    futures were cancelled."""
+@runtime_checkable
+class Evaluator(Protocol):
+    """Evaluates pairs; it travels to a worker as it was made, and is opened there."""
+
+    def open(self, threads: int) -> None:
+        """Load what evaluation needs; features are computed with this number of threads."""
+
+    def line(self, pair: Pair, names: Sequence[str]) -> dict[str, Any]:
+        """Evaluate the named rows on a pair; return the line of the run."""
+
+
+class Workers(NamedTuple):
+    """Where pairs are evaluated (see `open_workers`)."""
+
+    executor: Executor | None  # None for this process
+    count: int
+    own: bool = False  # processes that `open_workers` has started, and will end
 
 
 def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[Chunk]:
     """Divide pairs into chunks of one category and at most `size` pairs, which share frames."""
+    ordered = sorted(work, key=attrgetter("category", "target_sequence", "key"))
     chunks: list[Chunk] = []
-    for pair in sorted(work, key=lambda pair: (pair.category, pair.target_sequence, pair.key)):
-        if not chunks or len(chunks[-1]) == size or chunks[-1][0][0].category != pair.category:
-            chunks.append([])
-        chunks[-1].append((pair, work[pair]))
+    for _, members in groupby(ordered, key=attrgetter("category")):
+        pairs = [(pair, work[pair]) for pair in members]
+        chunks += [pairs[start : start + size] for start in range(0, len(pairs), size)]
     return chunks
 
 
 def evaluate_pairs(
     out: str | Path,
-    make: Callable[[int], Evaluate],
+    evaluator: Evaluator,
     work: Mapping[Pair, list[str]],
-    executor: Executor | None,
-    workers: int,
+    workers: Workers,
     kind: type = ResultLine,
 ) -> None:
-    """Evaluate the rows and pairs that a run lacks, and add the lines found to it at once.
+    """Evaluate the rows and pairs that a run lacks, and add each line to the run when it is found.
 
     Args:
         out: Folder of the run.
-        make: Makes what finds the line of a pair, from the number of threads that it may use.
-        work: The rows of each pair.
-        executor: Where to evaluate, with its number of workers; None for this process.
+        evaluator: Evaluates a pair.
+        work: The names of the rows of each pair.
+        workers: Where to evaluate.
         kind: Type of the lines.
     """
-    known = set()
+    # What the run lacks.
+    stored = set()
     for line in read_lines(out, kind):
-        known |= {(row, line.pair, line.repeat) for row in line.results}
+        stored.update((name, line.pair, line.repeat) for name in line.results)
     todo = {}
     for pair, names in work.items():
-        new = [name for name in names if (name, pair.key, pair.repeat) not in known]
-        if new:
-            todo[pair] = new
+        missing = [name for name in names if (name, pair.key, pair.repeat) not in stored]
+        if missing:
+            todo[pair] = missing
     if not todo:
         return
-    make = partial(make, max(1, get_num_threads() // workers))
-    # At least four chunks for each worker, so that all end at about the same time.
-    chunks = make_chunks(todo, max(1, min(CHUNK_SIZE, len(todo) // (4 * workers))))
-    hidden = None if logger.isEnabledFor(logging.INFO) else True  # None: outside a terminal
-    done = len(work) - len(todo)
-    with tqdm(total=len(work), initial=done, unit="pair", delay=1, disable=hidden) as bar:
 
-        def store(lines: list[dict[str, Any]]) -> None:
+    # At least four chunks for each worker, so that all end at about the same time.
+    chunks = make_chunks(todo, max(1, min(CHUNK_SIZE, len(todo) // (4 * workers.count))))
+    threads = max(1, get_num_threads() // workers.count)
+    # None shows the bar in a terminal only.
+    hidden = None if logger.isEnabledFor(logging.INFO) else True
+    found = _lines(evaluator, threads, workers, chunks, out)
+    # Closed, so that workers get no more to do where a line cannot be stored.
+    with (
+        tqdm(
+            total=len(work), initial=len(work) - len(todo), unit="pair", delay=1, disable=hidden
+        ) as bar,
+        closing(found),
+    ):
+        for lines in found:
             add_lines(out, lines)
             bar.update(len(lines))
 
-        if executor is None:
-            evaluate = make()
-            with one_thread():
-                for pair, rows in chain.from_iterable(chunks):
-                    store([evaluate(pair, rows)])
-            return
-        with _rows_for_workers(make, executor, out) as (path, checksum):
-            futures = [executor.submit(_evaluate_chunk, path, checksum, chunk) for chunk in chunks]
-            try:
-                for future in as_completed(futures):
-                    store(future.result())
-            finally:
-                if not isinstance(executor, _Processes):
-                    for future in futures:
-                        future.cancel()
 
+def _lines(
+    evaluator: Evaluator, threads: int, workers: Workers, chunks: list[Chunk], out: str | Path
+) -> Iterator[list[dict[str, Any]]]:
+    """Yield the lines of pairs when they are found: one by one in this process, else by chunk."""
+    if workers.executor is None:
+        evaluator.open(threads)
+        with one_thread():
+            for pair, names in chain.from_iterable(chunks):
+                yield [evaluator.line(pair, names)]
+        return
 
-@contextmanager
-def _rows_for_workers(
-    make: Callable[[], Evaluate], executor: Executor, out: str | Path
-) -> Iterator[tuple[str, str]]:
-    """Write what evaluates pairs to a file in the run's folder, which all workers see.
-
-    A backbone has megabytes, and each worker reads it once. Yields the path, absolute because a
-    worker may have another current folder, and the digest of the file. Errors of workers that are
-    no row's become one line.
-    """
+    # A backbone has megabytes: each worker reads the evaluator once, from a file in the run's
+    # folder, which all workers see.
+    pickled = _pickle(evaluator, workers)
+    checksum = digest(pickled)
+    # Absolute, because a worker may have another current folder.
     path = Path(out).resolve() / f".rows-{uuid4()}"
-    pickled = _pickle(make, executor)
+    futures = []
     try:
         write_atomic(path, pickled)
-        yield str(path), digest(pickled)
+        for chunk in chunks:
+            task = (_evaluate_chunk, str(path), checksum, threads, chunk)
+            futures.append(workers.executor.submit(*task))
+        for future in as_completed(futures):
+            yield future.result()
     except ImportError as error:
         raise InputError(
             f"a worker cannot import the rows: {error}, expected the module there, too"
@@ -136,66 +153,71 @@ def _rows_for_workers(
             "to continue, with fewer workers"
         ) from error
     finally:
+        # A pool that is about to end would print a traceback for each cancelled future.
+        if not workers.own:
+            for future in futures:
+                future.cancel()
         path.unlink(missing_ok=True)
 
 
-def _pickle(make: Callable[[], Any], executor: Executor) -> bytes:
-    """Pickle by value what a notebook, or a module in the current folder, defines: workers need not
-    see it."""
+def _pickle(evaluator: Evaluator, workers: Workers) -> bytes:
+    """Pickle an evaluator; what a notebook or a module in the current folder defines goes with it,
+    since workers need not see it."""
     # Processes of this machine import what this one can import.
-    if not isinstance(executor, ProcessPoolExecutor):
-        found = {module.name for module in pkgutil.iter_modules([os.getcwd()])} - {"zsp_lite"}
-        for name in found & sys.modules.keys():
+    if not isinstance(workers.executor, ProcessPoolExecutor):
+        local = {module.name for module in pkgutil.iter_modules([os.getcwd()])} - {"zsp_lite"}
+        for name in local & sys.modules.keys():
             cloudpickle.register_pickle_by_value(sys.modules[name])
     with ends_the_run("sending the rows to workers"):
-        return cloudpickle.dumps(make)
+        return cloudpickle.dumps(evaluator)
 
 
 _worker = threading.local()  # an executor's workers may be threads
 
 
-def _evaluate_chunk(path: str, checksum: str, chunk: Chunk) -> list[dict[str, Any]]:
-    """Evaluate a chunk in a worker, which keeps what evaluates it for the next one of the call."""
+def _evaluate_chunk(path: str, checksum: str, threads: int, chunk: Chunk) -> list[dict[str, Any]]:
+    """Evaluate a chunk in a worker, which keeps the evaluator for the next chunk of the run."""
     if getattr(_worker, "path", None) != path:
         pickled = read_bytes(path, "rows of the run")
         if digest(pickled) != checksum:  # never unpickle what somebody else has written
             raise InputError(
                 f"rows of the run {path} have changed, expected the file that this run wrote"
             )
-        _worker.evaluate = cloudpickle.loads(pickled)()
+        _worker.evaluator = cloudpickle.loads(pickled)
+        _worker.evaluator.open(threads)
         _worker.path = path
     with one_thread():
-        return [_worker.evaluate(pair, rows) for pair, rows in chunk]
+        return [_worker.evaluator.line(pair, names) for pair, names in chunk]
 
 
 @contextmanager
-def open_workers(executor: Executor | int = 1) -> Iterator[tuple[Executor | None, int]]:
-    """Open an executor (None: this process) with its number of workers, and close it after the
-    block.
-
-    It is a number of processes, 1 for this one, or an Executor, which stays open.
-    """
+def open_workers(executor: Executor | int = 1) -> Iterator[Workers]:
+    """Open a number of processes, 1 for this one, and end them after the block; an Executor stays
+    open."""
     if isinstance(executor, Executor):
-        known = getattr(executor, "_max_workers", None)
-        yield executor, known or getattr(executor, "num_workers", _UNKNOWN_WORKERS)
+        # Executors of `concurrent.futures` have `_max_workers`, mpi4py's has `num_workers`.
+        count = getattr(executor, "_max_workers", None)
+        if not count:
+            count = getattr(executor, "num_workers", _UNKNOWN_WORKERS)
+        yield Workers(executor, count)
         return
-    check_integer("workers", executor, 1, 4096)
+    check_integer("workers", executor, 1, _MOST_WORKERS)
     if executor == 1:
-        yield None, 1
+        yield Workers(None, 1)
         return
     before = set(active_children())
     # Spawned, not forked: a fork of a process whose threads have already computed may hang.
-    with _Processes(executor, get_context("spawn"), _start_worker) as pool:
+    with ProcessPoolExecutor(executor, get_context("spawn"), _start_worker) as pool:
         try:
-            yield pool, executor
-        finally:  # ends at once, without waiting for what is being evaluated or a thread of a row
+            yield Workers(pool, executor, own=True)
+        finally:
+            # Ends at once, without waiting for a pair in progress or a thread of a row.
             for child in set(active_children()) - before:
                 child.terminate()
 
 
 def _start_worker() -> None:
-    """Ignore interrupts, which the parent process handles, and end when the parent ends, even if it
-    was killed."""
+    """Leave interrupts to the parent process, and end when it ends, even if it was killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:

@@ -1,5 +1,4 @@
-"""Methods of the benchmark: the rows of its tables as plain data, groups of rows, and methods of
-one's own."""
+"""The rows of the benchmark's tables as plain data, groups of rows, and rows of one's own."""
 
 import json
 import re
@@ -73,11 +72,9 @@ METHODS: dict[str, Method] = {
     # Beyond the paper.
     "verified": Method(settings={"solver": "verified"}),
     "verified-mask": Method(settings={"solver": "verified"} | _MASK),
-    # See other frames of both objects, and other objects of the category, too, without labels:
-    # tables of their own.
-    "scans-2": Method(solve=baseline_rows.Scans(2)),
-    "scans-4": Method(solve=baseline_rows.Scans(4)),
-    "scans-8": Method(solve=baseline_rows.Scans(8)),
+    # These rows see more than the pair, without labels, and have tables of their own: scans-R sees
+    # R frames of both objects, "category" all objects of the category.
+    **{f"scans-{count}": Method(solve=baseline_rows.Scans(count)) for count in (2, 4, 8)},
     "category": Method(solve=baseline_rows.category),
 }
 
@@ -136,8 +133,10 @@ def resolve(
         names = [methods] if isinstance(methods, str) else methods
         meanings = {}
         for row in dict.fromkeys(row for name in names for row in _members(name)):
-            name, _, meant = row.partition("=")
-            if meanings.setdefault(name.strip(), meant or name) != (meant or name):
+            # "NAME=MEANING", or a name that means itself.
+            name, _, meaning = row.partition("=")
+            meaning = meaning or name
+            if meanings.setdefault(name.strip(), meaning) != meaning:
                 raise InputError(
                     f"methods {', '.join(names)} are two of one name, expected one of each"
                 )

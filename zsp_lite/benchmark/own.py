@@ -1,5 +1,5 @@
-"""Methods of one's own: which kind of method an object is, what it gets, and poses that another
-program computed."""
+"""Rows of one's own: which kind of row an object is, the problem that it gets, and poses that
+another program computed."""
 
 import ctypes
 import threading
@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import chdir, contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from inspect import Parameter
 from typing import Any
 
 import numpy as np
@@ -25,12 +26,12 @@ KINDS = ("problem", "keypoints", "matcher", "solver")
 
 
 def kind_of(name: str, thing: Any) -> str:
-    """Tell what the thing of a row is: "estimator" (has `estimate`), or the function of one of
+    """Return the kind of what a row was given: "estimator", which has `estimate`, or one of
     `KINDS`.
 
-    The number of arguments without a default, but for `seed` and `threshold`, tells the kinds
-    apart, and a solver has both of these; an attribute `kind` of the thing comes before it.
-    InputError if it is none of these.
+    An attribute `kind` names the kind of a function. Otherwise the number of arguments without a
+    default tells it, `seed` and `threshold` not counted; of the functions of three arguments, a
+    solver has both. InputError for any other thing.
     """
     if not isinstance(thing, type):
         if callable(getattr(thing, "estimate", None)):
@@ -38,16 +39,15 @@ def kind_of(name: str, thing: Any) -> str:
         if getattr(thing, "kind", None) in KINDS:
             return thing.kind
         known = parameters(thing)
+        # The kinds of the parameters that have to be given; `**options` need not be.
         needed = [
-            one
-            for key, one in known.items()
-            if key not in ("seed", "threshold")
-            and one.default is one.empty
-            and one.kind is not one.VAR_KEYWORD
+            parameter.kind
+            for name, parameter in known.items()
+            if name not in ("seed", "threshold")
+            and parameter.default is Parameter.empty
+            and parameter.kind is not Parameter.VAR_KEYWORD
         ]
-        positional = all(
-            one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in needed
-        )
+        positional = {*needed} <= {Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD}
         if positional and len(needed) == 3 and known.keys() >= {"seed", "threshold"}:
             return "solver"
         if positional and len(needed) in (1, 2, 3):
@@ -60,13 +60,15 @@ def kind_of(name: str, thing: Any) -> str:
 
 
 class OutOfTime(BaseException):
-    """Raised in a row of one's own that takes too long; no Exception, which the row might catch."""
+    """Raised in a row of one's own that takes too long; no Exception, since rows catch these."""
 
 
 @contextmanager
 def fails_alone(seconds: int) -> Iterator[None]:
-    """Turn an error of the block, or that it takes too long between two calls of compiled code,
-    into an InputError."""
+    """Turn an error of the block into an InputError, and end a block that takes too long.
+
+    Compiled code is not interrupted: the block ends when its call returns.
+    """
     thread = ctypes.c_ulong(threading.get_ident())
     ended = threading.Lock()
 
@@ -74,18 +76,19 @@ def fails_alone(seconds: int) -> Iterator[None]:
         wait = seconds
         while not ended.acquire(timeout=wait):
             ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(OutOfTime))
-            wait = 1  # and again, for a block that goes on
+            wait = 1  # second, for a block that has caught the exception and goes on
 
     ended.acquire()
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
     try:
         try:
-            with chdir("."):  # and back, wherever the block goes
+            with chdir("."):  # returns to the present folder, wherever the block goes
                 yield
         finally:
-            ended.release()  # compiled: nothing can be raised before it has ended the watch
-            watcher.join()  # what it has raised comes here at the latest
+            # Compiled: OutOfTime cannot be raised in it, only before it or after it.
+            ended.release()
+            watcher.join()  # an OutOfTime of the watcher is raised here at the latest
     except (InputError, KeyboardInterrupt):
         raise
     except OutOfTime as error:
@@ -94,15 +97,15 @@ def fails_alone(seconds: int) -> Iterator[None]:
         raise InputError(describe_failure(error)) from error
 
 
-def given(method: Any, problem: PairProblem) -> Any:
-    """Return what the row of a method of one's own gets: copies; nothing in them leads to the data
-    set and labels."""
-    if not isinstance(method, Estimator | KeypointMatcher):
+def problem_of_own(solve: Any, problem: PairProblem) -> Problem:
+    """Return the problem that a row of one's own gets: copies that do not lead to the data set and
+    its labels."""
+    if not isinstance(solve, Estimator | KeypointMatcher):
         return Problem(problem.seed, deepcopy(problem.crops), problem.store.extractors, {})
     with ends_the_run("reading frames"):
         reference, targets = problem.store.dataset.load_pair(problem.pair)
     frames = [reference, *targets]
-    if isinstance(method, KeypointMatcher):
+    if isinstance(solve, KeypointMatcher):
         frames = [object_crop(frame, size=None) for frame in frames]
     return Problem(problem.seed, [Crop(frame) for frame in frames], {}, {})
 
@@ -127,24 +130,27 @@ class KeypointMatcher:
     has its protocol."""
 
     own: Callable[[np.ndarray, np.ndarray], tuple[Any, Any, Any]]
-    threshold: float = 0.2  # of RANSAC
+    threshold: float = 0.2  # of RANSAC, the paper's
 
     def __call__(self, problem: Problem) -> Answer:
         reference, *targets = problem.frames()
         own = seeded(self.own, problem.seed)
-        found = [own(reference.rgb.copy(), target.rgb) for target in targets]
-        scores = [real_array("scores of matches", score) for _, _, score in found]
-        if not all((one >= 0).all() for one in scores):  # the view of the highest sum is chosen
-            raise InputError("scores of matches are negative or NaN, expected 0 or more")
-        view = int(np.argmax([one.sum() for one in scores]))
-        return fit_keypoints(problem, view, *found[view][:2], self.threshold)
+        matches = [own(reference.rgb.copy(), target.rgb) for target in targets]
+        sums = []
+        for _, _, scores in matches:
+            scores = real_array("scores of matches", scores)
+            if not (scores >= 0).all():
+                raise InputError("scores of matches are negative or NaN, expected 0 or more")
+            sums.append(scores.sum())
+        view = int(np.argmax(sums))
+        return fit_keypoints(problem, view, *matches[view][:2], self.threshold)
 
 
 def fit_keypoints(
     problem: Problem, view: int, first: Any, second: Any, threshold: float = 0.2
 ) -> Answer:
-    """Fit the pose to matched pixels of the reference's crop and of a target's: depth, then RANSAC
-    (sec. 4.3)."""
+    """Fit the pose to matched pixels of the crops of the reference and of a target: unproject them,
+    then RANSAC (sec. 4.3)."""
     reference, *targets = problem.frames(depth=True)
     empty = np.zeros((0, 2))
     first = real_array("matched points", first if len(first) else empty, (None, 2))
@@ -181,5 +187,5 @@ class StoredPoses:
         return Answer(pose.rotation, view, pose.translation, pose.scale)
 
     def remark(self, dataset: Co3D, pairs: Sequence[Pair]) -> str:
-        """Return what is to be said of the poses of pairs (see `exchange.check_poses`)."""
+        """Remark on the poses of these pairs (see `exchange.check_poses`)."""
         return check_poses(self.path, self._poses, dataset, pairs)

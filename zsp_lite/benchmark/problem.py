@@ -14,16 +14,17 @@ from threadpoolctl import threadpool_limits
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.best_view import ViewMatch
+from zsp_lite.category import PairHypotheses, world_hypotheses
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
-from zsp_lite.errors import InputError, ends_the_run, real_array, rotation_matrix
+from zsp_lite.errors import InputError, NoPoseError, ends_the_run, real_array, rotation_matrix
 from zsp_lite.estimates import PoseEstimate
-from zsp_lite.matching import key_similarities, similarities
+from zsp_lite.matching import similarities
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import IMAGE_SIZE, View, feature_maps, frame_view, object_crop
 
-CAPACITY = 128  # frames in memory
+CAPACITY = 128  # frames in memory: those of about twenty pairs with five targets
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,19 +69,20 @@ class Row(Protocol):
 def as_answer(found: Any) -> Answer:
     """Convert what a row returns to an Answer; InputError if it is none of what `Row` allows."""
     if isinstance(found, PoseEstimate):
-        sim3, inliers = found.sim3, int(found.inliers.sum())
+        sim3 = found.sim3
+        inliers = int(found.inliers.sum())
         return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, inliers, found.confidence)
     if isinstance(found, Answer):
         # Sim3 refuses what is no pose.
         scale = 1.0 if found.scale is None else found.scale
-        move = np.zeros(3) if found.translation is None else found.translation
-        exact = Sim3(scale, found.rotation, move)
-        return replace(
-            found,
-            rotation=exact.R,
-            translation=None if found.translation is None else exact.t,
-        )
-    pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
+        if found.translation is None:
+            return replace(found, rotation=Sim3(scale, found.rotation, np.zeros(3)).R)
+        exact = Sim3(scale, found.rotation, found.translation)
+        return replace(found, rotation=exact.R, translation=exact.t)
+    pose = found
+    view = 0
+    if isinstance(found, tuple) and len(found) == 2:
+        pose, view = found
     if isinstance(pose, Sim3):
         return Answer(pose.R, int(view), pose.t, pose.scale)
     what = "pose of the row"
@@ -88,21 +90,21 @@ def as_answer(found: Any) -> Answer:
 
 
 def parameters(plugin: Any) -> Mapping[str, inspect.Parameter]:
-    """Return the parameters of a plug-in by name; none if it has no signature, as some of compiled
-    modules."""
+    """Return the parameters of a plug-in by name; none of a compiled function without a
+    signature."""
     with suppress(TypeError, ValueError):
         return inspect.signature(getattr(plugin, "forward", plugin)).parameters
     return {}
 
 
 def seeded(plugin: Any, seed: int) -> Any:
-    """Give a seed to a plug-in that has a parameter `seed`; others stay as they are."""
+    """Give the seed to a plug-in that has a parameter `seed`; return others as they are."""
     return partial(plugin, seed=seed) if "seed" in parameters(plugin) else plugin
 
 
 @contextmanager
-def _timed(timings: dict[str, list[float]], stage: str) -> Iterator[None]:
-    """Add the time that the block takes to the timings of a stage."""
+def _time_added(timings: dict[str, list[float]], stage: str) -> Iterator[None]:
+    """Append the run time of the block, in seconds, to those of a stage."""
     start = time.perf_counter()
     yield
     timings.setdefault(stage, []).append(time.perf_counter() - start)
@@ -118,25 +120,26 @@ class Crop:
 
     def view(self, features: str, foreground: str) -> View:
         """Return the crop with its features and foreground (see `views.frame_view`)."""
-        if (features, foreground) not in self._views:
-            self._views[features, foreground] = frame_view(
-                self.frame, self.described[features], foreground
-            )
-        return self._views[features, foreground]
+        key = (features, foreground)
+        if key not in self._views:
+            self._views[key] = frame_view(self.frame, self.described[features], foreground)
+        return self._views[key]
 
 
 class FrameStore:
-    """Crops, of which the last used are kept; `timings` are the seconds of their pair by stage.
+    """The crops of frames, of which the last used are kept in memory.
 
-    `kept` is what a row keeps for all pairs. `threads` are those of feature extraction, None leaves
-    them as they are.
+    Features are extracted with a number of `threads`; None leaves it as it is.
     """
 
     def __init__(self, dataset: Co3D, extractors: Mapping[str, Any], threads: int | None = None):
-        self.dataset, self.extractors, self.threads = dataset, extractors, threads
-        self.timings: dict[str, list[float]] = {}
-        self.kept: dict[Any, Any] = {}
+        self.dataset = dataset
+        self.extractors = extractors
+        self.threads = threads
+        self.timings: dict[str, list[float]] = {}  # seconds of the stages of the present pair
+        # Functions that remember what they return: crops, which are large, up to a number.
         self._read = lru_cache(CAPACITY)(self._crop)
+        self.hypotheses = cache(self._hypotheses)
         self.extent = cache(dataset.extent)
         self.labels = cache(partial(read_labels, dataset.root))
 
@@ -144,8 +147,13 @@ class FrameStore:
         size = getattr(self.extractors.get("backbone"), "image_size", IMAGE_SIZE)
         with ends_the_run(f"reading frame {sequence}/{number}"):
             annotation = self.dataset.frame(category, sequence, number)
-            with _timed(self.timings, "reading"):
+            with _time_added(self.timings, "reading"):
                 return Crop(object_crop(self.dataset.load(annotation), size))
+
+    def _hypotheses(self, pair: Pair) -> PairHypotheses | None:
+        """Return `PairProblem.hypotheses` of a pair; None if its views determine no pose."""
+        with suppress(NoPoseError):
+            return PairProblem(pair, self).hypotheses()
 
     def crop(self, category: str, sequence: str, number: int, features: Iterable[str] = ()) -> Crop:
         """Return a frame's crop with what some extractors compute from it, each once."""
@@ -154,18 +162,22 @@ class FrameStore:
             if name in crop.described:
                 continue
             extractor = self.extractors[name]
-            extract = getattr(extractor, "describe", partial(feature_maps, extractor))
             with (
                 threadpool_limits(self.threads),
                 ends_the_run(f"features {name!r}"),
-                _timed(self.timings, name),
+                _time_added(self.timings, name),
             ):
                 # One frame at a time: the last bits of a frame's features must not depend on the
                 # rest of a batch.
-                crop.described[name] = extract([crop.frame])[0]
+                if hasattr(extractor, "describe"):
+                    described = extractor.describe([crop.frame])
+                else:
+                    described = feature_maps(extractor, [crop.frame])
+                crop.described[name] = described[0]
         return crop
 
 
+@dataclass(eq=False, repr=False)
 class Problem:
     """One pair as a row sees it: images, depth, masks, cameras and features of both objects, and a
     seed.
@@ -173,17 +185,14 @@ class Problem:
     Nothing in it leads to the data set.
     """
 
-    def __init__(
-        self,
-        seed: int,
-        crops: Sequence[Crop],
-        extractors: Mapping[str, Any],
-        timings: dict[str, list],
-    ):
-        self.seed, self.crops = seed, crops  # the reference's crop first
-        self._extractors, self._timings = extractors, timings
-        self._estimates: dict[tuple, PoseEstimate] = {}  # by arguments of `estimate`
-        self._similarities: dict[tuple, Any] = {}  # by two feature maps and `binning`
+    seed: int
+    crops: Sequence[Crop]  # the reference's crop first
+    _extractors: Mapping[str, Any]
+    _timings: dict[str, list]
+    # What is computed already: estimates by the arguments of `estimate`, similarities by two
+    # feature maps and `binning`.
+    _estimates: dict[tuple, PoseEstimate] = field(default_factory=dict)
+    _similarities: dict[tuple, Any] = field(default_factory=dict)
 
     def frames(self, depth: bool = False) -> list[Frame]:
         """Return the object crops, the reference's first, resized to the backbone's input.
@@ -197,8 +206,8 @@ class Problem:
         return frames
 
     def views(self) -> list[View]:
-        """Return the crops with the features of the run's backbone, and the foreground that its
-        saliency finds."""
+        """Return the crops with features of the run's backbone and the foreground by their
+        saliency."""
         return [crop.view("backbone", "saliency") for crop in self.crops]
 
     def estimate(
@@ -207,16 +216,18 @@ class Problem:
         settings: Mapping[str, Any] | None = None,
         target: int | None = None,
     ) -> PoseEstimate:
-        """Run the paper's method with other settings of `ZeroShotPose`, on all targets or on the
-        one with an index."""
+        """Estimate the pose by `ZeroShotPose` with some settings, in all targets or in the one with
+        index `target`."""
         settings = settings or {}
         key = (features, target, *sorted(settings.items()))
         if key in self._estimates:
             return self._estimates[key]
-        own = {}
-        for name, value in settings.items():  # a solver gets the seed when it is called
-            own[name] = value if name == "solver" else seeded(value, self.seed)
-        method = ZeroShotPose(self._extractors[features], **own, seed=self.seed)
+        # A matcher of one's own may take a seed; a solver gets it when it is called.
+        plugged = dict(settings)
+        for name, value in settings.items():
+            if callable(value) and name != "solver":
+                plugged[name] = seeded(value, self.seed)
+        method = ZeroShotPose(self._extractors[features], **plugged, seed=self.seed)
         crops = self.crops if target is None else [self.crops[0], self.crops[1 + target]]
         reference, *targets = [crop.view(features, method.foreground) for crop in crops]
         matched = [self._match(method, reference, view) for view in targets]
@@ -230,20 +241,30 @@ class Problem:
         """Match two views; rows with other settings share the similarities."""
         key = reference.features, target.features, method.binning
         if key not in self._similarities:
-            compare = similarities if method.binning else key_similarities
-            with _timed(self._timings, "similarity"):
-                self._similarities[key] = compare(reference.features, [target.features])
-        with _timed(self._timings, "matching"):
+            with _time_added(self._timings, "similarity"):
+                self._similarities[key] = similarities(
+                    reference.features, [target.features], method.binning
+                )
+        with _time_added(self._timings, "matching"):
             return method.match_views(reference, [target], self._similarities[key])[0]
 
 
 class PairProblem(Problem):
-    """A problem with its pair and data set, for rows of the library; `features` are the extractors
-    that they use."""
+    """A problem with its pair and data set, for rows of the library; `features` names the
+    extractors that they use."""
 
     def __init__(self, pair: Pair, store: FrameStore, features: Iterable[str] = ("backbone",)):
-        self.pair, self.store = pair, store
-        frames = [(pair.target_sequence, number) for number in pair.target_frames]
-        frames.insert(0, (pair.reference_sequence, pair.reference_frame))
+        self.pair = pair
+        self.store = store
+        frames = [(pair.reference_sequence, pair.reference_frame)]
+        frames += [(pair.target_sequence, number) for number in pair.target_frames]
         crops = [store.crop(pair.category, *frame, features) for frame in frames]
         super().__init__(pair.seed, crops, store.extractors, store.timings)
+
+    def hypotheses(self) -> PairHypotheses:
+        """Find the hypotheses of the verified solver between the worlds of both objects."""
+        return world_hypotheses(
+            self.pair.reference_sequence,
+            self.pair.target_sequence,
+            self.estimate(settings={"solver": "verified"}),
+        )

@@ -1,18 +1,19 @@
 """Run the benchmark: rotation errors of rows over many pairs of a CO3D-format folder (sec. 5).
 
 The way of a pair: `evaluate` samples it, `execution.evaluate_pairs` hands it to this process or a
-worker, `evaluate_pair` reads frames and features, asks each row (`_ask`) and measures its answer;
-`write_reports` makes tables of what is stored.
+worker, `PairEvaluator.line` reads frames and features, asks each row (`_ask`) and measures its
+answer; `write_reports` makes tables of what is stored.
+
+`rows` are always the `Method`s by name, `names` are names of rows.
 """
 
 import json
 import logging
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from zsp_lite.benchmark.methods import (
     read_paper_tables,
     resolve,
 )
-from zsp_lite.benchmark.own import StoredPoses, fails_alone, given
+from zsp_lite.benchmark.own import StoredPoses, fails_alone, problem_of_own
 from zsp_lite.benchmark.problem import (
     Answer,
     FrameStore,
@@ -41,7 +42,7 @@ from zsp_lite.benchmark.problem import (
     as_answer,
     seeded,
 )
-from zsp_lite.benchmark.runs import Result, Run, open_run, read_run, run_settings
+from zsp_lite.benchmark.runs import Result, open_run, printable, read_run, run_settings
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.ground_truth import common_turns
@@ -53,6 +54,7 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, view_alignment
 
 logger = logging.getLogger(__name__)
+_LONGEST_NOTE = 1000  # characters, as of an error message
 
 
 def evaluate(
@@ -77,7 +79,8 @@ def evaluate(
         data: Folder in CO3D's layout, with pose labels.
         backbone: Backbone, or what `load_backbone` takes.
         methods: Rows of the tables, by name or of one's own (see `methods.resolve`).
-        pairs: Number of pairs per category, of all with pose labels; or by category.
+        pairs: Number of pairs of every category with pose labels, by default the paper's 100 (the
+            command's default is 30, for a first try); or the number by category.
         targets: Number of target views per pair, for rows that do not fix it.
         out: Folder of the run.
         executor: Number of processes, or any `Executor`, which gets chunks of pairs.
@@ -86,8 +89,8 @@ def evaluate(
         sweep: RANSAC thresholds V; each row is evaluated with each, as NAME@threshold=V.
 
     Returns:
-        The content of OUT/summary.json (see `statistics.summarise`); `write_reports` writes tables
-        and figures.
+        The summary (see `statistics.summarise`), which `write_reports` writes, with tables and
+        figures.
 
     Raises:
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds
@@ -98,62 +101,65 @@ def evaluate(
     check_integer("row_seconds", row_seconds, 1, 1_000_000)
     check_integer("seeds", seeds, 1, 1000)
 
-    # Rows, pairs, and the rows of each pair, by seed.
+    # The rows, and the pairs with the names of the rows that are evaluated on each.
     rows = resolve(methods, sweep)
     dataset = Co3D(data)
-    numbers = pairs
+    pairs_per_category = pairs
     if not isinstance(pairs, Mapping):
-        numbers = dict.fromkeys(labelled_categories(dataset), pairs)
-    work = pairs_of_rows(dataset, rows, numbers, targets)
+        pairs_per_category = dict.fromkeys(labelled_categories(dataset), pairs)
+    work = pairs_of_rows(dataset, rows, pairs_per_category, targets)
     loaded = as_backbone(backbone)
-    remarks = _check_rows(rows, make_extractors(loaded, rows), dataset, work)
-    repeated = {
-        replace(pair, repeat=k): names for k in range(seeds) for pair, names in work.items()
-    }
+    _check_settings(rows, make_extractors(loaded, rows))
+    remarks = _remarks_on_stored_poses(rows, dataset, work)
+    repeated = {}
+    for seed in range(seeds):
+        for pair, names in work.items():
+            repeated[replace(pair, repeat=seed)] = names
 
-    # Lines of the run, pair by pair (see `evaluate_pair`).
-    with execution.open_workers(executor) as (pool, workers):
+    # The lines of the run, pair by pair.
+    with execution.open_workers(executor) as workers:
         settings = run_settings(
             data,
             loaded,
             targets,
             {name: description(row) for name, row in rows.items()},
-            {category: _labels(dataset, category) for category in numbers},
-            workers=workers,
-            pairs=dict(numbers),
+            {category: _hash_of_labels(dataset, category) for category in pairs_per_category},
+            workers=workers.count,
+            pairs=dict(pairs_per_category),
             seeds=seeds,
             remarks=remarks,
         )
         # Workers load a named backbone themselves; an object travels to them.
-        travels = backbone if pool else loaded
-        make = partial(
-            pair_evaluator, str(Path(data).resolve()), rows, travels, row_seconds=row_seconds
-        )
+        sent = backbone if workers.executor else loaded
+        evaluator = PairEvaluator(str(Path(data).resolve()), rows, sent, row_seconds)
         with open_run(out, settings):
-            execution.evaluate_pairs(out, make, repeated, pool, workers)
+            execution.evaluate_pairs(out, evaluator, repeated, workers)
 
     # The lines as one table, and its summary.
-    found = read_run(out)
-    for remark in filter(None, [*remarks.values(), *found.failures]):
-        logger.warning("%s", remark)
-    return _write_summary(found, out)
+    run = read_run(out)
+    for remark in [*remarks.values(), *run.failures]:
+        if remark:
+            logger.warning("%s", remark)
+    return run.summary
 
 
-def _check_rows(
-    rows: Mapping[str, Method],
-    extractors: Mapping[str, Any],
-    dataset: Co3D,
-    work: Mapping[Pair, list[str]],
-) -> dict[str, str]:
-    """Refuse wrong settings before anything is computed; return remarks on stored poses by row."""
-    remarks = {}
-    for name, row in rows.items():
+def _check_settings(rows: Mapping[str, Method], extractors: Mapping[str, Any]) -> None:
+    """Raise InputError for wrong settings of a row, before anything is computed."""
+    for row in rows.values():
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)
-        elif isinstance(row.solve, StoredPoses):
+
+
+def _remarks_on_stored_poses(
+    rows: Mapping[str, Method], dataset: Co3D, work: Mapping[Pair, list[str]]
+) -> dict[str, str]:
+    """Remark on the poses of rows that another program computed, by row; "" is no remark."""
+    remarks = {}
+    for name, row in rows.items():
+        if isinstance(row.solve, StoredPoses):
             asked = [pair for pair, names in work.items() if name in names]
             remark = row.solve.remark(dataset, asked)
-            # Empty, too: it replaces that of an earlier call.
+            # An empty remark replaces that of an earlier call.
             remarks[name] = f"{name}: {remark}." if remark else ""
     return remarks
 
@@ -175,91 +181,95 @@ def write_reports(
     """
     from zsp_lite.benchmark import tables  # workers need no matplotlib
 
-    found = read_run(run)
+    results = read_run(run)
     out = Path(out or run)
-    shown = tables.choose(found, rows) if rows else found.summary
-    for name in ("all_rows", *tables.SEE_MORE, *(spec["name"] for spec in read_paper_tables())):
+    shown = tables.choose(results, rows) if rows else results.summary
+    of_paper = [spec["name"] for spec in read_paper_tables()]
+    for name in ("all_rows", *tables.SEE_MORE, *of_paper):
         for path in (out / "tables").glob(f"{name}.*"):
             path.unlink()
     tables.write_tables(tables.every_table(shown, metrics), out / "tables", intervals)
-    tables.write_figures(found, out / "figures", rows, size)
-    _write_summary(found, out)
+    tables.write_figures(results, out / "figures", rows, size)
+    write_atomic(out / "summary.json", json.dumps(results.summary, indent=1).encode())
     return shown
 
 
-def _write_summary(run: Run, out: str | Path) -> dict[str, Any]:
-    write_atomic(Path(out) / "summary.json", json.dumps(run.summary, indent=1).encode())
-    return run.summary
-
-
 def pairs_of_rows(
-    dataset: Co3D, rows: Mapping[str, Method], numbers: Mapping[str, int], targets: int
+    dataset: Co3D, rows: Mapping[str, Method], pairs_per_category: Mapping[str, int], targets: int
 ) -> dict[Pair, list[str]]:
-    """Return the pairs, each with the rows that are evaluated on it: the same for all rows of as
-    many target views."""
+    """Return the pairs, each with the names of the rows that are evaluated on it.
+
+    All rows of one number of target views get the same pairs.
+    """
     work: dict[Pair, list[str]] = {}
-    for n_targets in {row.targets or targets for row in rows.values()}:
-        names = [name for name, row in rows.items() if (row.targets or targets) == n_targets]
-        for category, n in numbers.items():
-            check_integer(f"pairs of {category}", n, 1)
-            for pair in category_pairs(dataset, category, n, n_targets):
+    targets_of = {name: row.targets or targets for name, row in rows.items()}
+    for n_targets in set(targets_of.values()):
+        names = [name for name in rows if targets_of[name] == n_targets]
+        for category, count in pairs_per_category.items():
+            check_integer(f"pairs of {category}", count, 1)
+            for pair in category_pairs(dataset, category, count, n_targets):
                 work[pair] = names
     return work
 
 
-def _labels(dataset: Co3D, category: str) -> str:
-    """Hash of the pose labels of a category."""
+def _hash_of_labels(dataset: Co3D, category: str) -> str:
+    """Hash the pose labels of a category."""
     parts: list[str | bytes] = []
     for name, label in read_labels(dataset.root, category).items():
         parts += [name, label.trans.tobytes(), label.reference_seq]
     return digest(*parts)
 
 
-def pair_evaluator(
-    root: str, methods: Mapping[str, Method], backbone: Any, threads: int, row_seconds: int = 60
-) -> execution.Evaluate:
-    """Make what evaluates pairs in one process; frames, and features by some `threads`, are kept
-    from pair to pair."""
-    store = FrameStore(Co3D(root), make_extractors(as_backbone(backbone), methods), threads)
-    return partial(evaluate_pair, methods=methods, store=store, row_seconds=row_seconds)
+@dataclass
+class PairEvaluator:
+    """Evaluates rows on pairs (see `execution.Evaluator`); frames and features are kept from pair
+    to pair."""
 
+    root: str  # the data folder
+    rows: Mapping[str, Method]
+    backbone: BackboneLike
+    row_seconds: int = 60  # time limit of a row of one's own for a pair
 
-def evaluate_pair(
-    pair: Pair,
-    names: Iterable[str],
-    methods: Mapping[str, Method],
-    store: FrameStore,
-    row_seconds: int = 60,
-) -> dict[str, Any]:
-    """Evaluate the named rows on a pair: a line of the run's results (see `runs.ResultLine`)."""
-    store.timings.clear()
-    problem = PairProblem(pair, store, {methods[name].features for name in names} - {"none"})
-    for sequence in (pair.reference_sequence, pair.target_sequence):
-        store.extent(pair.category, sequence)  # an unreadable point cloud is no failure of a row
-    # Ground truth from the reference's camera to each target's.
-    labels = store.labels(pair.category)
-    views = range(len(pair.target_frames))
-    truths = np.stack([true_pose(store.dataset, labels, pair, view) for view in views])
+    def open(self, threads: int) -> None:
+        """Load the backbone and the extractors."""
+        extractors = make_extractors(as_backbone(self.backbone), self.rows)
+        self.store = FrameStore(Co3D(self.root), extractors, threads)
 
-    results = {}
-    for name in names:
-        method = methods[name]
-        own = is_own(name) and type(method.solve) is not StoredPoses
-        seen = given(method.solve, problem) if own and method.solve else problem
-        try:
-            with fails_alone(row_seconds) if own else nullcontext():
-                start = time.perf_counter()
-                answer = _ask(method, seen, truths)
-                seconds = time.perf_counter() - start
-                results[name] = _measure(answer, problem, truths, seconds)
-        except InputError as error:
-            # 180 degrees: without these pairs, methods that fail often would look better.
-            reason = str(error).encode(errors="replace").decode()
-            results[name] = {"error": 180.0, "failed": reason}
-    timings = {
-        stage: round(float(np.median(seconds)), 5) for stage, seconds in store.timings.items()
-    }
-    return {"pair": pair.key, "results": results, "repeat": pair.repeat, "timings": timings}
+    def line(self, pair: Pair, names: Collection[str]) -> dict[str, Any]:
+        """Evaluate the named rows on a pair: a line of the run's results (see
+        `runs.ResultLine`)."""
+        self.store.timings.clear()
+        features = {self.rows[name].features for name in names} - {"none"}
+        problem = PairProblem(pair, self.store, features)
+        # Read here, since an unreadable point cloud is no failure of a row.
+        objects = (pair.reference_sequence, pair.target_sequence)
+        extents = [self.store.extent(pair.category, name) for name in objects]
+        # The ground truth from the reference's camera to each target's.
+        labels = self.store.labels(pair.category)
+        views = range(len(pair.target_frames))
+        truths = np.stack([true_pose(self.store.dataset, labels, pair, view) for view in views])
+
+        # The answers of the rows, measured.
+        results = {}
+        for name in names:
+            method = self.rows[name]
+            # A class that somebody derives from StoredPoses is one's own, too.
+            own = is_own(name) and type(method.solve) is not StoredPoses
+            seen = problem_of_own(method.solve, problem) if own and method.solve else problem
+            try:
+                with fails_alone(self.row_seconds) if own else nullcontext():
+                    start = time.perf_counter()
+                    answer = _ask(method, seen, truths)
+                    seconds = time.perf_counter() - start
+                    results[name] = _measure(answer, problem, truths, extents, seconds)
+            except InputError as error:
+                # 180 degrees: without these pairs, methods that fail often would look better.
+                results[name] = {"error": 180.0, "failed": printable(error)}
+
+        timings = {}
+        for stage, seconds in self.store.timings.items():
+            timings[stage] = round(float(np.median(seconds)), 5)
+        return {"pair": pair.key, "results": results, "repeat": pair.repeat, "timings": timings}
 
 
 def _ask(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:
@@ -271,7 +281,8 @@ def _ask(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -
         nearest = int(rotation_error(np.eye(3), truths[:, :3, :3]).argmin())
     estimate = problem.estimate(method.features, method.settings, nearest)
     answer = as_answer(estimate)
-    reference, target = estimate.reference_view, estimate.target_views[estimate.view]
+    reference = estimate.reference_view
+    target = estimate.target_views[estimate.view]
     if method.answer == "true view":  # the only view of this estimate
         return replace(answer, view=nearest)
     if method.answer == "best view":
@@ -286,53 +297,57 @@ def _ask(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -
 
 
 def _measure(
-    answer: Answer, problem: PairProblem, truths: Float[np.ndarray, "n 4 4"], seconds: float
+    answer: Answer,
+    problem: PairProblem,
+    truths: Float[np.ndarray, "n 4 4"],
+    extents: Sequence[tuple | None],
+    seconds: float,
 ) -> dict[str, Any]:
-    """Measure an answer: the members of a stored result that are known, "error" among them."""
+    """Return the members of a stored result that are known of an answer, "error" among them."""
     if not 0 <= answer.view < len(truths):
         raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
-    truth = truths[answer.view]
-    known = {
+    true_rotation = truths[answer.view, :3, :3]
+    known: dict[str, Any] = {
         "seconds": seconds,
         "view": answer.view,
-        "note": answer.note[:1000],
+        "note": answer.note[:_LONGEST_NOTE],
         "scale": answer.scale,
         "inliers": answer.inliers,
         "confidence": answer.confidence,
-        "error": rotation_error(answer.rotation, truth[:3, :3]),
+        "error": rotation_error(answer.rotation, true_rotation),
         "rotation": answer.rotation.ravel().round(6).tolist(),
     }
-    pair, store = problem.pair, problem.store
     reference, *targets = [frame.camera for frame in problem.frames()]
-    names = pair.reference_sequence, pair.target_sequence
 
     # Turns of the target object that look the same are no errors of its symmetric error.
-    turns = common_turns(store.dataset.root, pair.category, *names)
+    pair = problem.pair
+    root = problem.store.dataset.root
+    turns = common_turns(root, pair.category, pair.reference_sequence, pair.target_sequence)
     if turns is not None:
         to_camera = targets[answer.view].R
-        turned = to_camera @ turns @ to_camera.T @ truth[:3, :3]
+        turned = to_camera @ turns @ to_camera.T @ true_rotation
         known["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
 
     # Where the reference object's centre comes to lie, in diameters of the target object.
-    reference_extent, target_extent = [store.extent(pair.category, name) for name in names]
+    reference_extent, target_extent = extents
     if answer.translation is not None:
         known["position"] = answer.translation.round(6).tolist()
         if reference_extent and target_extent:
             centre = reference.to_camera(reference_extent[0])
             scale = 1.0 if answer.scale is None else answer.scale
-            found = scale * answer.rotation @ centre + answer.translation
-            distance = np.linalg.norm(found - truth[:3, :3] @ centre - truth[:3, 3])
+            moved = scale * answer.rotation @ centre + answer.translation
+            true_translation = truths[answer.view, :3, 3]
+            distance = np.linalg.norm(moved - true_rotation @ centre - true_translation)
             known["translation"] = distance / target_extent[1]
 
+    # In the types of JSON. The conversion refuses what could not be stored.
     result = {}
     for name, value in known.items():
         if isinstance(value, np.generic):
             value = value.item()
+        if isinstance(value, float):
+            value = round(value, 4)
         if value is not None:
             result[name] = value
-    # Refuses what could not be stored.
     msgspec.json.encode(msgspec.convert(result, Result))
-    return {
-        name: round(value, 4) if isinstance(value, float) else value
-        for name, value in result.items()
-    }
+    return result

@@ -1,8 +1,8 @@
 """A run: its folder, to which results are only ever added, and what it found as one table.
 
 run.json holds what decides the results, and every call of `evaluate`. A line of run.jsonl, or of
-run.jsonl.gz, is what `evaluate_pair` returned for a pair. One process writes to a folder; others
-can read it meanwhile.
+run.jsonl.gz, is what `PairEvaluator.line` returned for a pair. One process writes to a folder;
+others can read it meanwhile.
 """
 
 import dataclasses
@@ -42,7 +42,10 @@ from zsp_lite.io.files import (
 )
 from zsp_lite.io.locks import writing
 
-SETTINGS, LINES = "run.json", "run.jsonl"
+SETTINGS = "run.json"
+LINES = "run.jsonl"
+# CATEGORY/SEQUENCE:FRAME/SEQUENCE:FRAME,FRAME, as of `Pair.key`; the problem is the key without
+# target frames.
 _KEY = r"^(?P<problem>(?P<reference>(?P<category>[^/]+)/[^/]+):\d+/(?P<target>[^/]+)):\d+(?:,\d+)*$"
 _Degrees = Annotated[float, msgspec.Meta(ge=0, le=180)]
 
@@ -67,8 +70,7 @@ class Settings(msgspec.Struct):
     data: str
     backbone: str  # fingerprint
     targets: int
-    # version and commit
-    library: Annotated[list[dict[str, str | None]], msgspec.Meta(min_length=1)]
+    library: list[dict[str, str | None]]  # version and commit
     methods: dict[str, str]  # description by row
     labels: dict[str, str]  # hash of the pose labels by category
     calls: Annotated[list[Call], msgspec.Meta(min_length=1)]
@@ -76,7 +78,7 @@ class Settings(msgspec.Struct):
 
 
 class Result(msgspec.Struct):
-    """What a row found for a pair (see `evaluate_pair`); other members are not part of the
+    """What a row found for a pair (see `PairEvaluator`); other members are not part of the
     table."""
 
     error: _Degrees
@@ -96,10 +98,12 @@ class Result(msgspec.Struct):
 
 
 class ResultLine(msgspec.Struct):
+    """A line of run.jsonl: what the rows found for a pair."""
+
     pair: Annotated[str, msgspec.Meta(pattern=_KEY)]
     results: dict[str, Result]
-    repeat: int = 0
-    timings: dict[str, float] = {}
+    repeat: int = 0  # number of the seed
+    timings: dict[str, float] = {}  # median seconds by stage
 
 
 def described(value: Any) -> str:
@@ -110,9 +114,10 @@ def described(value: Any) -> str:
     named = value if hasattr(value, "__qualname__") else type(value)
     name = f"{named.__module__}:{named.__qualname__}"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        names = [one.name for one in dataclasses.fields(value) if not one.name.startswith("_")]
-        fields = ", ".join(f"{one}={described(getattr(value, one))}" for one in names)
-        return f"{name}({fields})"
+        fields = [field.name for field in dataclasses.fields(value)]
+        public = [field for field in fields if not field.startswith("_")]
+        texts = [f"{field}={described(getattr(value, field))}" for field in public]
+        return f"{name}({', '.join(texts)})"
     return name
 
 
@@ -120,14 +125,15 @@ def fingerprint(extractor: Any) -> str:
     """Return the name of an extractor (by default "module:name"), and a hash of its `state_dict`
     and settings."""
     name = getattr(extractor, "name", None) or described(extractor)
-    network, settings = extractor, ""
+    network = extractor
+    settings = ""
     if isinstance(extractor, Backbone):
         network = extractor.model
         fields = ("layer", "facet", "saliency_heads", "image_size", "mean", "std")
-        settings = repr(tuple(getattr(extractor, one) for one in fields))
+        settings = repr(tuple(getattr(extractor, field) for field in fields))
     if not callable(getattr(network, "state_dict", None)):
         return name
-    parts: list[str | bytes] = []
+    parts: list[str | bytes] = []  # the name and the bytes of each weight
     for key, weight in sorted(network.state_dict().items()):
         content = weight.detach().cpu().contiguous().reshape(-1).view(torch.uint8)
         parts += [key, content.numpy().tobytes()]
@@ -148,6 +154,11 @@ def library_version() -> dict[str, str | None]:
     return {"version": __version__, "commit": commit}
 
 
+def printable(text: object) -> str:
+    """Return a text, such as a file name of any bytes, with "?" for what is not Unicode."""
+    return str(text).encode(errors="replace").decode()
+
+
 def run_settings(
     data: str | Path,
     backbone: Any,
@@ -163,13 +174,13 @@ def run_settings(
     versions["machine"] = platform.platform()
     this_call = Call(
         time=datetime.now(UTC).isoformat(timespec="seconds"),
-        command=[text.encode(errors="replace").decode() for text in words],
+        command=[printable(word) for word in words],
         versions=versions,
         rows=list(methods),
         **call,
     )
     return Settings(
-        data=str(data).encode(errors="replace").decode(),
+        data=printable(data),
         backbone=fingerprint(backbone),
         targets=targets,
         library=[library_version()],
@@ -254,7 +265,7 @@ def open_run(out: str | Path, settings: Settings) -> Iterator[None]:
     with writing(out):
         out = Path(out)
         packed = out / f"{LINES}.gz"
-        settings.folder = os.path.realpath(settings.data).encode(errors="replace").decode()
+        settings.folder = printable(os.path.realpath(settings.data))
         if any(path.exists() for path in (out / SETTINGS, out / LINES, packed)):
             settings = _continued(out, settings)
         write_atomic(out / LINES, _finished_lines(out))
@@ -274,7 +285,8 @@ def _continued(out: Path, now: Settings) -> Settings:
     """Merge settings with those of the run that a folder holds; InputError if they do not go
     together."""
     before = read_json(out / SETTINGS, Settings, "settings of a run")
-    held, asked = _decisive(before), _decisive(now)
+    held = _decisive(before)
+    asked = _decisive(now)
     for name in asked:
         if held.get(name, asked[name]) != asked[name]:
             raise InputError(
@@ -283,7 +295,7 @@ def _continued(out: Path, now: Settings) -> Settings:
             )
     return msgspec.structs.replace(
         now,
-        library=[one for one in before.library if one not in now.library] + now.library,
+        library=[old for old in before.library if old not in now.library] + now.library,
         methods=before.methods | now.methods,
         labels=before.labels | now.labels,
         calls=before.calls + now.calls,
@@ -291,7 +303,7 @@ def _continued(out: Path, now: Settings) -> Settings:
 
 
 def _decisive(settings: Settings) -> dict[str, Any]:
-    """What has to be equal in two calls that add to one run, where both have it, by its name."""
+    """Return by name what must be equal in two calls of one run, if both calls have it."""
     parts: dict[str, Any] = {
         "command": "align" if "alignment" in settings.methods else "benchmark",
         "backbone": settings.backbone,
@@ -327,7 +339,9 @@ def read_lines(out: str | Path, kind: type = ResultLine) -> list[Any]:
 def _finished_lines(out: Path) -> bytes:
     """Read run.jsonl, or run.jsonl.gz, up to its last line that was written to the end; b"" without
     these."""
-    path, packed, what = out / LINES, out / f"{LINES}.gz", "results of a run"
+    path = out / LINES
+    packed = out / f"{LINES}.gz"
+    what = "results of a run"
     data = read_bytes(path, what) if path.exists() else b""
     if packed.exists():
         data = decompress(read_bytes(packed, what), f"{what} {packed}")
@@ -369,13 +383,14 @@ def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
     """Tabulate the results in the categories of the last call, by row, category and pair."""
     results = []
     for line in lines:
-        for row, found in line.results.items():
-            names = {"row": row, "pair": line.pair, "repeat": line.repeat}
-            results.append(names | msgspec.structs.asdict(found))
+        for row, result in line.results.items():
+            ids = {"row": row, "pair": line.pair, "repeat": line.repeat}
+            results.append(ids | msgspec.structs.asdict(result))
     table = pd.DataFrame(results, columns=["row", "pair", "repeat", *Result.__struct_fields__])
     table = table.join(table["pair"].astype(str).str.extract(_KEY))
     table["milliseconds"] = 1000 * table["seconds"].astype(float)
     table["target"] = table["category"] + "/" + table["target"]
+    # Categorical columns are sorted in the order of their categories, others by name.
     orders = {"row": settings.methods, "category": settings.calls[-1].pairs}
     for column, names in orders.items():
         table = table[table[column].isin(names)].astype({column: pd.CategoricalDtype(list(names))})
@@ -386,21 +401,27 @@ def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
 
 def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
     """Keep the pairs that all rows of the last call have finished, and the rows, by seed, that have
-    all of these."""
+    all of these pairs."""
     last = settings.calls[-1]
-    views = table["pair"].str.count(",")  # one less than the target views
-    finished = {}  # by number of views
-    for number, found in table[table["row"].isin(last.rows)].groupby(views):
-        cases_of_pair = found.groupby("pair").size()
-        wanted = found["row"].nunique() * last.seeds
-        finished[number] = set(cases_of_pair.index[cases_of_pair == wanted])
+    commas = table["pair"].str.count(",")  # in the key of a pair: one less than its target views
+
+    # The finished pairs have a line for each row and seed of the last call; by number of commas.
+    finished = {}
+    for number, lines in table[table["row"].isin(last.rows)].groupby(commas):
+        lines_of_pair = lines.groupby("pair").size()
+        expected = lines["row"].nunique() * last.seeds
+        finished[number] = set(lines_of_pair.index[lines_of_pair == expected])
     problems = set(table["problem"][table["pair"].isin(set().union(*finished.values()))])
-    kept = [table[:0]]
-    for _, found in table.groupby(["row", "repeat"]):
-        column, wanted = "pair", finished.get(views[found.index[0]])
-        if wanted is None:  # the last call has no row of as many views
-            column, wanted = "problem", problems
-        found = found[found[column].isin(wanted)]
-        if wanted <= set(found[column]):
-            kept.append(found)
-    return pd.concat(kept).sort_index(ignore_index=True)
+
+    # A row at a number of target views that the last call does not have needs the same problems.
+    complete = [table[:0]]
+    for _, lines in table.groupby(["row", "repeat"]):
+        column = "pair"
+        wanted = finished.get(commas[lines.index[0]])
+        if wanted is None:
+            column = "problem"
+            wanted = problems
+        lines = lines[lines[column].isin(wanted)]
+        if wanted <= set(lines[column]):
+            complete.append(lines)
+    return pd.concat(complete).sort_index(ignore_index=True)

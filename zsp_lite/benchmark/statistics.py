@@ -19,7 +19,7 @@ from zsp_lite.metrics import accuracy, median, weighted_mean
 
 Draws = Float[np.ndarray, "resamples n"]
 RESAMPLES = 2000
-_FEWEST_OBJECTS = 3
+_FEWEST_OBJECTS = 3  # two objects have one pair in each direction: nothing to resample
 
 
 def summarise(table: pd.DataFrame) -> dict[str, Any]:
@@ -33,7 +33,8 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
     """
     rows = {str(name): row for name, row in table.groupby("row", sort=False)}
     ours = rows.get("ours")
-    methods, against = {}, {}
+    methods = {}
+    against = {}
     for name, row in rows.items():
         drawn = draws_of(row)
         methods[name] = _summarise_row(row, drawn)
@@ -48,8 +49,9 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
 
 
 def _summarise_row(row: pd.DataFrame, drawn: Draws) -> dict[str, Any]:
-    """Summarise the results of one row of the tables."""
-    errors, categories = row["error"].to_numpy(), row["category"].to_numpy(str)
+    """Summarise the results of one row, for all pairs and by category (see `summarise`)."""
+    errors = row["error"].to_numpy()
+    categories = row["category"].to_numpy(str)
     per_category = {}
     for category in dict.fromkeys(categories):
         members = categories == category
@@ -82,10 +84,10 @@ def draws_of(row: pd.DataFrame) -> Draws:
 
 
 def object_draws(
-    objects: ArrayLike, categories: ArrayLike | None = None, resamples: int = RESAMPLES
+    objects: ArrayLike, categories: ArrayLike = "", resamples: int = RESAMPLES
 ) -> Draws:
     """Draw bootstrap weights (resamples, n) of pairs by resampling the objects (n, 2) that the
-    pairs are made of.
+    are made of. Categories (n,) are those of the pairs, by default one.
 
     In each replicate the objects of a category are drawn with replacement, and the weight of a pair
     is the product of its two objects' multiplicities: the pigeonhole bootstrap (Owen 2007) with one
@@ -94,10 +96,8 @@ def object_draws(
     total weight. Pairs of fewer than three objects are resampled themselves.
     """
     objects = np.asarray(objects, dtype=str)
-    if categories is None:
-        categories = np.full(len(objects), "")
-    categories = np.asarray(categories, dtype=str)
-    weights = np.empty((resamples, len(objects)))
+    categories = np.broadcast_to(np.asarray(categories, dtype=str), len(objects))
+    weights = np.empty((resamples, len(objects)))  # a column for each pair
     for category in np.unique(categories):
         rng = np.random.default_rng([0, stable_hash(category)])
         members = np.nonzero(categories == category)[0]
@@ -131,7 +131,13 @@ def bootstrap_ci(
     `object_draws`; by default of `pair_draws(n)`, which treats pairs as independent.
     """
     errors = np.asarray(errors, np.float64)
-    replicates = statistic(errors, pair_draws(len(errors)) if weights is None else weights)
+    if weights is None:
+        weights = pair_draws(len(errors))
+    return _interval(statistic(errors, weights))
+
+
+def _interval(replicates: Float[np.ndarray, " resamples"]) -> list[float]:
+    """Return the ends of the interval that holds 95 % of the replicates."""
     return np.percentile(replicates, [2.5, 97.5]).tolist()
 
 
@@ -149,12 +155,12 @@ def figures_of(
     figures = dict(_FIGURES)
     if categories is not None:
         figures["mean_category_median"] = partial(_mean_category_median, categories=categories)
-    found: dict[str, Any] = {"n": int(errors.size)}
+    values: dict[str, Any] = {"n": int(errors.size)}
     for name, figure in figures.items():
-        found[name] = float(figure(errors, None))
+        values[name] = float(figure(errors, None))
     for name, figure in figures.items():
-        found[f"{name}_ci"] = bootstrap_ci(errors, figure, weights)
-    return found
+        values[f"{name}_ci"] = bootstrap_ci(errors, figure, weights)
+    return values
 
 
 def _mean_category_median(
@@ -186,15 +192,19 @@ def paired_difference(
     "accuracy_gain" is second - first in percentage points, with its 95 % interval and its p value
     by the bootstrap.
     """
-    first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    first = np.asarray(first, np.float64)
+    second = np.asarray(second, np.float64)
     gain = 100.0 * (second < threshold) - 100.0 * (first < threshold)
+    if weights is None:
+        weights = pair_draws(len(gain))
     # Rounding errors must not hide a difference of 0.
-    replicates = weighted_mean(gain, pair_draws(len(gain)) if weights is None else weights).round(9)
-    p = 2 * (1 + min((replicates <= 0).sum(), (replicates >= 0).sum())) / (1 + len(replicates))
-    interval = np.percentile(replicates, [2.5, 97.5]).tolist()
+    replicates = weighted_mean(gain, weights).round(9)
+    # Two-sided: twice the share of replicates on the rarer side, the data themselves counted in.
+    rarer = min((replicates <= 0).sum(), (replicates >= 0).sum())
+    p = 2 * (1 + rarer) / (1 + len(replicates))
     return {
         "accuracy_gain": float(gain.mean()),
-        "accuracy_gain_ci": interval,
+        "accuracy_gain_ci": _interval(replicates),
         "accuracy_gain_p": min(1.0, float(p)),
     }
 
@@ -212,15 +222,27 @@ def paired_test(
     """
     from scipy.stats import binomtest, permutation_test
 
-    first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
-    # 1 for a pair that the second alone solves
-    change = (second < threshold) * 1 - (first < threshold)
-    sign = binomtest((change > 0).sum(), np.count_nonzero(change)).pvalue if change.any() else 1.0
-    how = {"permutation_type": "samples", "n_resamples": 10_000, "batch": 500, "vectorized": True}
+    first = np.asarray(first, np.float64)
+    second = np.asarray(second, np.float64)
+    # McNemar's test is the sign test of the pairs that one method alone solves.
+    solved = first < threshold
+    solved_by_second = second < threshold
+    alone = np.count_nonzero(solved != solved_by_second)
+    sign = 1.0
+    if alone:
+        sign = binomtest(np.count_nonzero(solved_by_second & ~solved), alone).pvalue
     # scipy refuses one pair, whose difference has the same size with both signs.
     flips = 1.0
     if len(first) > 1:
-        flips = permutation_test((first - second,), np.mean, rng=0, **how).pvalue
+        flips = permutation_test(
+            (first - second,),
+            np.mean,
+            permutation_type="samples",
+            vectorized=True,
+            n_resamples=10_000,
+            batch=500,  # resamples in memory at a time
+            rng=0,
+        ).pvalue
     tests = {"sign_test_p": float(sign), "permutation_test_p": float(flips)}
     return paired_difference(first, second, threshold, weights) | tests
 
@@ -229,5 +251,6 @@ def _multiplicities(
     n: int, resamples: int, rng: np.random.Generator
 ) -> Int[np.ndarray, "resamples n"]:
     """Count how often each of n items is drawn if n are drawn with replacement."""
+    # The items of replicate r are counted from r * n on.
     draws = rng.integers(n, size=(resamples, n)) + n * np.arange(resamples)[:, None]
     return np.bincount(draws.ravel(), minlength=resamples * n).reshape(resamples, n)

@@ -160,9 +160,12 @@ def paper_tables(summary: Mapping[str, Any], metrics: Sequence[str] = PAPER) -> 
 def _paper_table(
     spec: Mapping[str, Any], summary: Mapping[str, Any], metrics: Sequence[str]
 ) -> Table:
-    """A table with the run's rows, the published figures, and in Table 1, rows of one's own below
-    the paper's."""
-    categories, methods = summary["data"]["categories"], summary["methods"]
+    """Return a table of the paper with the run's rows and the published figures.
+
+    Table 1 has rows of one's own, too, below the paper's.
+    """
+    categories = summary["data"]["categories"]
+    methods = summary["methods"]
     # A row at the run's own number of target views goes by either name.
     views = f"-n{summary['data']['targets']}"
     lines = []  # the row of the run, and the line of the table
@@ -176,28 +179,30 @@ def _paper_table(
         lines = [line for line in lines if line[0] in order]
         lines.sort(key=lambda line: order.index(line[0]))
 
-    # Of the single categories with a published Acc30, those of the run are shown.
-    featured, shown = [], []
-    for k, title in enumerate(spec["published"]):
+    # Of the published figures of a single category, those of the run's categories are shown.
+    featured = []
+    shown = []
+    for title in spec["published"]:
         category = title.removesuffix(" Acc30")
         if category in categories:
             featured.append(category)
         if category in (title, *categories):
-            shown.append(k)
+            shown.append(title)
 
+    # The run's own figures, those of single categories, and the published ones.
     rows = {}
     for name, line in lines:
         row = methods.get(name)
         cells = [_cell(row, metric) for metric in metrics]
         for category in featured:
             cells.append(_cell(row and row["per_category"].get(category), "acc30"))
-        published = line["published"]
-        rows[line["label"]] = cells + [Cell(published[k]) if published else None for k in shown]
-    titles = [
-        *(METRICS[metric] for metric in metrics),
-        *(f"{category} Acc30" for category in featured),
-        *(f"{PUBLISHED}: {spec['published'][k]}" for k in shown),
-    ]
+        published = dict(zip(spec["published"], line["published"]))
+        for title in shown:
+            cells.append(Cell(published[title]) if title in published else None)
+        rows[line["label"]] = cells
+    titles = [METRICS[metric] for metric in metrics]
+    titles += [f"{category} Acc30" for category in featured]
+    titles += [f"{PUBLISHED}: {title}" for title in shown]
     notes = [_PUBLISHED_NOTE if shown else "", spec.get("note", "")]
     return _table(summary, spec["name"], spec["title"], rows, titles, metrics, *notes)
 
@@ -213,7 +218,8 @@ def by_category(
         for category in summary["data"]["categories"]
     }
     rows["all"] = [_cell(row, metric) for row in methods.values()]
-    name, title = f"categories_{metric.rpartition('_')[2]}", f"By category: {METRICS[metric]}"
+    name = f"categories_{metric.rpartition('_')[2]}"
+    title = f"By category: {METRICS[metric]}"
     return _table(summary, name, title, rows, list(methods), [metric])
 
 
@@ -226,7 +232,8 @@ def compare(
     Rows are texts "A:B", for row A of the first and B of the second run, or "A"; `names` are those
     of the runs. InputError if a row or a common pair is missing.
     """
-    of_first, of_second = first.table["row"].unique(), second.table["row"].unique()
+    of_first = first.table["row"].unique()
+    of_second = second.table["row"].unique()
     if rows is None:
         rows = [name for name in of_first if name in of_second]
     if not len(rows):
@@ -235,17 +242,20 @@ def compare(
         )
     cells = {}
     for text in rows:
-        one, _, other = (text, "", text) if text in of_first else text.partition(":")
-        errors_b = _by_seed(second, other)["error"].rename("error_b")
-        both = _by_seed(first, one).join(errors_b, how="inner").sort_index()
-        if both.empty:
+        row_a = text
+        row_b = text
+        if text not in of_first:
+            row_a, _, row_b = text.partition(":")
+        errors_b = _by_seed(second, row_b)["error"].rename("error_b")
+        common = _by_seed(first, row_a).join(errors_b, how="inner").sort_index()
+        if common.empty:
             raise InputError(
-                f"rows {one} and {other} have no pair in common: other data or number of views"
+                f"rows {row_a} and {row_b} have no pair in common: other data or number of views"
             )
-        errors = both[["error", "error_b"]].to_numpy().T
-        gain = paired_difference(*errors, weights=draws_of(both))
+        errors = common[["error", "error_b"]].to_numpy().T  # (2, pairs)
+        gain = paired_difference(*errors, weights=draws_of(common))
         cells[text] = [
-            _count(len(both)),
+            _count(len(common)),
             *map(Cell, accuracy(errors, 30)),
             *_difference(gain),
             *map(Cell, median(errors)),
@@ -261,12 +271,12 @@ def compare(
 
 
 def _by_seed(run: Run, row: str) -> pd.DataFrame:
-    """A row's lines by pair and seed."""
+    """Return the lines of a row by pair and seed."""
     return run.row(row).set_index("repeat", append=True, drop=False)
 
 
 def _difference(test: Mapping[str, Any] | None) -> list[Cell | None]:
-    """The gain and the p value of a `paired_difference`."""
+    """Return the cells of a `paired_difference`: the gain in accuracy and its p value."""
     if test is None:
         return [None, None]
     gain = Cell(test["accuracy_gain"], *test["accuracy_gain_ci"])
@@ -287,12 +297,10 @@ def important_rows(summary: Mapping[str, Any]) -> list[str]:
     first; or the chosen."""
     if "chosen" in summary:
         return summary["chosen"]
-    first = ["ours", *own_rows(summary), "ours-bv", "verified"]
     names = [name for name in summary["methods"] if not _sees_more(name)]
-    return sorted(
-        names or summary["methods"],
-        key=lambda name: first.index(name) if name in first else len(first),
-    )
+    names = names or list(summary["methods"])
+    leading = ["ours", *own_rows(summary), "ours-bv", "verified"]
+    return list(dict.fromkeys([name for name in leading if name in names] + names))
 
 
 def _sees_more(name: str) -> bool:
@@ -300,16 +308,16 @@ def _sees_more(name: str) -> bool:
 
 
 def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:
-    """A figure of a row, or of a category, which has no mean of categories."""
+    """Return a figure of a row or of one of its categories; a category has one median only."""
     if row is None:
         return None
-    found = metric
     if metric == "mean_category_median" and metric not in row:
-        found = "median"
-    if row.get(found) is None:
+        metric = "median"
+    value = row.get(metric)
+    if value is None:
         return None
     decimals = 2 if metric in ("scale", "translation") else 1
-    return Cell(row[found], *row.get(f"{found}_ci", ()), decimals=decimals)
+    return Cell(value, *row.get(f"{metric}_ci", ()), decimals=decimals)
 
 
 def _table(
@@ -347,6 +355,7 @@ def _table(
             )
             break
     notes += more
+    # The first note is that of `read_run`.
     unfinished = " of an unfinished run" if "Not finished" in notes[0] else ""
     what = (
         f"{Path(data['root']).name}, {data['pairs']} pairs{unfinished}, {data['targets']} target "
@@ -453,12 +462,12 @@ def pair_figure(run: Run, key: str, dataset: Co3D, rows: Sequence[str] | None = 
     Without a translation, they are moved to the middle of the target's points. InputError if no row
     has a pose.
     """
-    found = {}
+    results = {}
     for name in rows or run.table["row"].unique():
-        poses = run.row(name).dropna(subset=["rotation", "view"])
-        if key in poses.index:
-            found[name] = poses.loc[[key]].iloc[0]  # of the first seed
-    if not found:
+        with_pose = run.row(name).dropna(subset=["rotation", "view"])
+        if key in with_pose.index:
+            results[name] = with_pose.loc[[key]].iloc[0]  # of the first seed
+    if not results:
         raise InputError(
             f"pair {key!r} has no pose in the run, expected a key such as "
             f"{run.table['pair'].iloc[0]}"
@@ -468,18 +477,19 @@ def pair_figure(run: Run, key: str, dataset: Co3D, rows: Sequence[str] | None = 
     cloud = frame_cloud(crops[0])
     poses = [Sim3.identity()]
     errors = []
-    for result in found.values():
+    for result in results.values():
         crops.append(object_crop(targets[int(result["view"])]))
         poses.append(_pose(result, cloud, crops[-1]))
         errors.append(f"{result['error']:.0f}° off")
     images = [crop.rgb for crop in crops]
-    titles = ["reference", *found, "its points", *errors]
+    titles = ["reference", *results, "its points", *errors]
     figure, axes = show_images([*images, *map(pale, images)], titles, len(crops))
     draw_moved_cloud(axes[len(crops) :], [crop.camera for crop in crops], cloud, poses)
     return figure
 
 
 def _pose(result: pd.Series, cloud: np.ndarray, target: Frame) -> Sim3:
+    """Return the pose of a result; without a translation, the cloud's mean goes to the target's."""
     scale = 1.0 if pd.isna(result["scale"]) else result["scale"]
     rotation = np.reshape(result["rotation"], (3, 3))
     position = result["position"]

@@ -79,25 +79,28 @@ def align(
                 print(f"{name}: {flag}")
         data = out / "data"
     dataset = Co3D(data)
-    found = align_category(dataset, category, backbone, sequences, pairs, targets, out, workers)
-    written = [write_alignment(found, out), write_labels(found, out, category, replace=True)]
-    written.append(write_category_report(out / "report.html", found, dataset, category))
-    print_rows(
-        f"{category}: {len(found.objects)} objects in one frame", COLUMNS, object_rows(found)
-    )
-    for (first, second), angle in found.disagreements.items():
+    alignment = align_category(dataset, category, backbone, sequences, pairs, targets, out, workers)
+    written = [
+        write_alignment(alignment, out),
+        write_labels(alignment, out, category, replace=True),
+        write_category_report(out / "report.html", alignment, dataset, category),
+    ]
+    title = f"{category}: {len(alignment.objects)} objects in one frame"
+    print_rows(title, COLUMNS, object_rows(alignment))
+    for (first, second), angle in alignment.disagreements.items():
         print(f"{first} to {second}: the best pose of the pair alone is {angle:.0f}° away")
     for kind, what in (("class_labels", "pose labels"), ("label_proposals", "proposals")):
         labels = read_label_folder(dataset.root / kind / category)
-        together, alone = alignment_errors(found, labels)
+        together, alone = alignment_errors(alignment, labels)
         if alone:
-            right, before = accuracy(together, SAME_ANGLE), accuracy(alone, SAME_ANGLE)
+            right = accuracy(together, SAME_ANGLE)
+            before = accuracy(alone, SAME_ANGLE)
             print(
                 f"By the {what}, {right:.1f}% of {len(together)} ordered pairs are within "
                 f"{SAME_ANGLE:.0f}°; of the best poses of {len(alone)} pairs of views and objects "
                 f"alone, {before:.1f}%."
             )
     if propose:
-        written.append(write_labels(found, dataset.root, category, "label_proposals", replace))
+        written.append(write_labels(alignment, dataset.root, category, "label_proposals", replace))
     for path in written:
         print(f"Written: {path}")

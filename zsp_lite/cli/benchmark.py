@@ -18,30 +18,30 @@ from zsp_lite.cli.common import (
 
 SIZE = Parsed(
     "W,H",
-    lambda text: tuple(map(float, text.split(","))),
-    lambda size: len(size) == 2 and all(1 <= side <= 100 for side in size),
-    "two numbers from 1 to 100",
+    parse=lambda text: tuple(map(float, text.split(","))),
+    valid=lambda size: len(size) == 2 and all(1 <= side <= 100 for side in size),
+    expected="two numbers from 1 to 100",
 )
+# The text may begin with the name of the setting, as the rows of a sweep are named.
 THRESHOLDS = Parsed(
     "threshold=V,V",
-    lambda text: [*map(float, text.removeprefix("threshold=").split(","))],
-    bool,
-    "threshold=V,V",
+    parse=lambda text: [float(value) for value in text.removeprefix("threshold=").split(",")],
+    expected="threshold=V,V",
 )
 LATEX = Parsed(
     "intervals,time",
-    lambda text: text.split(","),
-    {"", "intervals", "time"}.issuperset,
-    "intervals, time",
+    parse=lambda text: text.split(","),
+    valid={"", "intervals", "time"}.issuperset,  # "" is the default: neither of them
+    expected="intervals, time",
 )
 _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 metrics_option = click.option(
     "--metrics",
     type=Parsed(
         "a,b",
-        lambda text: [*dict.fromkeys(text.split(","))],
-        set(METRICS).issuperset,
-        ", ".join(METRICS),
+        parse=lambda text: list(dict.fromkeys(text.split(","))),
+        valid=set(METRICS).issuperset,
+        expected=", ".join(METRICS),
     ),
     default=",".join(METRICS_SHOWN),
     help=f"Figures in the table of all rows: {', '.join(METRICS)}.",
@@ -64,7 +64,7 @@ metrics_option = click.option(
     help="Folder in CO3D's layout.",
 )
 @backbone_options
-@click.option("--categories", type=NAMES, show_default="all with pose labels", help="Categories.")
+@click.option("--categories", type=NAMES, show_default="all with pose labels", help="Their names.")
 @click.option("--pairs", type=COUNT, default=30, help="Pairs per category.")
 @click.option(
     "--targets",
@@ -127,26 +127,27 @@ def benchmark(
     if quiet:
         logging.getLogger("zsp_lite").setLevel(logging.WARNING)
     dataset = Co3D(data or sample_data())
-    numbers = dict.fromkeys(categories or labelled_categories(dataset), pairs)
+    pairs_per_category = dict.fromkeys(categories or labelled_categories(dataset), pairs)
     if list_pairs:
-        asked = pairs_of_rows(dataset, resolve(methods), numbers, targets)
+        asked = pairs_of_rows(dataset, resolve(methods), pairs_per_category, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
     evaluate(
         dataset.root,
         backbone,
         methods,
-        numbers,
+        pairs_per_category,
         targets,
         out,
-        workers,
-        row_seconds,
-        seeds,
-        sweep or (),
+        executor=workers,
+        row_seconds=row_seconds,
+        seeds=seeds,
+        sweep=sweep or (),
     )
     summary = write_reports(out, metrics=metrics)
     if not quiet:
         print(f"{dataset.root}, backbone {summary['backbone']}, {targets} target views")
+        # More rows than the default ones are for the paper's tables.
         _print_summary(summary, metrics, with_paper=len(summary["methods"]) > 3)
         print(f"Written: {out / 'summary.json'}, tables/, figures/")
     return None
@@ -171,15 +172,18 @@ def _list_methods() -> None:
 
 
 def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
-    """Print the tables of a summary, with those of the paper or without."""
+    """Print the tables of a summary, with those of the paper or without.
+
+    The table by category has only as many rows as fit.
+    """
     from zsp_lite.benchmark import tables
     from zsp_lite.cli.terminal import print_table
 
-    shown = tables.every_table(summary, metrics)
-    shown = [table for table in shown if not table.name.startswith("categories")]
-    for table in (*shown, tables.by_category(summary, most=_ROWS_SHOWN)):
-        if with_paper or table.name in ("all_rows", *tables.SEE_MORE, "categories_acc30"):
+    for table in tables.every_table(summary, metrics):
+        by_category = table.name.startswith("categories")
+        if not by_category and (with_paper or table.name in ("all_rows", *tables.SEE_MORE)):
             print_table(table)
+    print_table(tables.by_category(summary, most=_ROWS_SHOWN))
 
 
 @click.command(
@@ -203,19 +207,21 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
 @click.option("--data", type=PATH, show_default="the run's", help="Data folder, for --pair.")
 def tables(run, out, metrics, rows, latex, size, pair, data) -> None:
     """Write tables and figures of a benchmark run, also of one that goes on."""
-    from zsp_lite.benchmark.run import read_run, write_reports
+    from zsp_lite.benchmark.run import write_reports
+    from zsp_lite.benchmark.runs import read_run
     from zsp_lite.benchmark.tables import pair_figure, save_figure
     from zsp_lite.data.co3d import Co3D
 
     if pair:
-        found = read_run(run)
-        dataset = Co3D(data or found.settings.folder or found.settings.data)
-        figure = pair_figure(found, pair, dataset, rows)
+        results = read_run(run)
+        # `folder` is absolute. A run may have none, and `data`, the path as it was given, only.
+        dataset = Co3D(data or results.settings.folder or results.settings.data)
+        figure = pair_figure(results, pair, dataset, rows)
         print(f"Written: {save_figure(figure, (out or run) / 'figures', f'pair_{pair}', size)}")
         return
     if "time" in latex and "milliseconds" not in metrics:
         metrics = [*metrics, "milliseconds"]
-    summary = write_reports(run, out, metrics, rows, "intervals" in latex, size)
+    summary = write_reports(run, out, metrics, rows, intervals="intervals" in latex, size=size)
     _print_summary(summary, metrics, with_paper=True)
 
 

@@ -13,48 +13,52 @@ from zsp_lite.choices import FACETS, MASKS
 
 
 class Parsed(click.ParamType):
-    """Type of an option:
+    """Type of an option.
 
-    `parse` converts its text, and `valid` tells whether the value can be used.
+    `parse` converts its text, `valid` tells whether the value can be used, and `expected` says in
+    an error message what can be.
     """
 
     def __init__(
-        self, metavar: str, parse: Callable[[str], Any], valid: Callable[[Any], bool], expected: str
+        self,
+        metavar: str,
+        parse: Callable[[str], Any],
+        expected: str,
+        valid: Callable[[Any], bool] = bool,
     ):
-        self.name, self.parse, self.valid, self.expected = metavar, parse, valid, expected
+        self.name = metavar
+        self.parse = parse
+        self.expected = expected
+        self.valid = valid
 
     def convert(self, value, parameter, context):
         with suppress(ValueError, OverflowError):
-            found = self.parse(value)
-            if self.valid(found):
-                return found
+            parsed = self.parse(value)
+            if self.valid(parsed):
+                return parsed
         self.fail(f"got {value!r}, expected {self.expected}", parameter, context)
 
 
-def _finite(*counts: int) -> Callable[[tuple[float, ...]], bool]:
-    return lambda values: len(values) in counts and all(map(math.isfinite, values))
-
-
-COUNT, INDEX = click.IntRange(1, 1_000_000), click.IntRange(min=0)
-PATH = Parsed("path", Path, lambda path: "\0" not in str(path), "a path")
+COUNT = click.IntRange(1, 1_000_000)
+INDEX = click.IntRange(min=0)
+PATH = Parsed("path", Path, "a path", lambda path: "\0" not in str(path))
 NAMES = Parsed(
     "a,b",
-    lambda text: [name for name in text.split(",") if name],
-    bool,
-    "names separated by commas",
+    parse=lambda text: [name for name in text.split(",") if name],
+    expected="names separated by commas",
 )
-LENGTH = Parsed("metres", float, lambda length: 0 < length < 1e9, "a positive number below 1e9")
+LENGTH = Parsed("metres", float, "a positive number below 1e9", lambda length: 0 < length < 1e9)
 BOX = Parsed(
     "top,left,height,width",
-    lambda text: tuple(map(int, text.split(","))),
-    _finite(4),
-    "four integers",
+    parse=lambda text: tuple(map(int, text.split(","))),
+    valid=lambda box: len(box) == 4,
+    expected="four integers",
 )
 INTRINSICS = Parsed(
     "fx,fy,cx,cy",
-    lambda text: tuple(map(float, text.split(","))),
-    _finite(4, 9),
-    "four numbers, or K",
+    parse=lambda text: tuple(map(float, text.split(","))),
+    valid=lambda values: len(values) in (4, 9) and all(map(math.isfinite, values)),
+    expected="four numbers, or K",
 )
 ORIENTATION = click.Choice(("stored", "displayed"))
 
@@ -65,8 +69,8 @@ def examples(*lines: str) -> str:
 
 
 def refuse_options(given: Mapping[str, Any], taken: Collection[str], by: str) -> None:
-    """Raise click.UsageError if an option was given, and `by`, which takes only some options, does
-    not take it."""
+    """Raise click.UsageError if an option was given that is not among those `taken`; `by` names
+    what takes them."""
     for name, value in given.items():
         if value and name not in taken:
             raise click.UsageError(f"--{name.replace('_', '-')} does not go with {by}")
@@ -148,8 +152,9 @@ def source_options(multiple: bool) -> Callable[..., Any]:
     ]
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        for one in reversed(options):
-            command = one(command)
+        # The last decorator is the first option of the help text.
+        for add_option in reversed(options):
+            command = add_option(command)
         return command
 
     return decorate

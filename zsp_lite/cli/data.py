@@ -65,13 +65,14 @@ def check(root, deep, partial) -> int:
 
 
 def _print_checks(root: Path, checks: Sequence[Any]) -> int:
-    """Print the results of `check_folder`, and return the exit code: 1 if there is any problem,
-    else 0."""
+    """Print the results of `check_folder`; return the exit code, which is 1 if there is a
+    problem."""
     from rich.filesize import decimal
 
     from zsp_lite.cli.terminal import print_rows
 
-    rows, lines = [], []
+    rows = []
+    lines = []
     for check in checks:
         counts = (f"{getattr(check, name):,}" for name in _CHECK_COLUMNS[2:-1])
         rows.append((check.category, check.layout, *counts, decimal(check.size)))
@@ -86,12 +87,12 @@ def _print_checks(root: Path, checks: Sequence[Any]) -> int:
             (check.cloudless, check.sequences, "sequences have no point cloud"),
             (check.defects.total(), check.frames, f"frames cannot be used ({kinds})"),
         ]
-        found = [f"{count:,} of {every:,} {what}" for count, every, what in counted if count > 0]
-        found += check.problems[:_PROBLEMS_SHOWN]
+        messages = [f"{count:,} of {total:,} {what}" for count, total, what in counted if count > 0]
+        messages += check.problems[:_PROBLEMS_SHOWN]
         more = len(check.problems) - _PROBLEMS_SHOWN
         if more > 0:
-            found.append(f"and {more} more")
-        lines += [f"{check.category}: {line}" for line in found]
+            messages.append(f"and {more} more")
+        lines += [f"{check.category}: {message}" for message in messages]
     size = decimal(sum(check.size for check in checks))
     print_rows(f"{root}: {len(checks)} categories, {size}", _CHECK_COLUMNS, rows, texts=2)
     problems = sum(len(check.problems) for check in checks)
@@ -158,16 +159,17 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
 
     root = root or Path(dataset)
     categories = tuple(dict.fromkeys(categories))
-    archives = [
-        one
-        for name in categories
-        for one in co3d.list_archives(dataset, name, single_sequence, chunks)
-    ]
+    archives = []
+    for name in categories:
+        archives += co3d.list_archives(dataset, name, single_sequence, chunks)
     if labelled_only:
         labelled = published_sequences(labels, categories)
-        archives = [dataclasses.replace(one, sequences=labelled[one.category]) for one in archives]
+        archives = [
+            dataclasses.replace(archive, sequences=labelled[archive.category])
+            for archive in archives
+        ]
     missing = co3d.missing_archives(root, archives)
-    sizes = [co3d.download_size(one) for one in missing]
+    sizes = [co3d.download_size(archive) for archive in missing]
     if not missing:
         print(f"{root}: everything is unpacked already")
     elif not _confirmed(missing, sizes, co3d.check_disk(root, missing, sizes), root, yes):
@@ -178,20 +180,22 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
     if labels:
         counts = import_labels(labels, root, categories=categories)
         print(f"Imported: {counts['class_labels']} labels, {counts['determ_eval']} files of pairs")
-    some = chunks is not None or labelled_only
-    return _print_checks(root, check_folder(root, categories=categories, partial=some))
+    partial = chunks is not None or labelled_only
+    return _print_checks(root, check_folder(root, categories=categories, partial=partial))
 
 
 def _confirmed(
     archives: Sequence[Any], sizes: Sequence[int | None], needed: int, root: Path, yes: bool
 ) -> bool:
-    """Print the sizes of the archives and of what they need on the disk, bytes, and ask whether to
-    download them."""
+    """Print the sizes of the archives and the room that they need on the disk, in bytes, and ask
+    whether to download them."""
     from zsp_lite.cli.terminal import print_rows
 
     names = [
-        f"{len(one.sequences)} sequences of {one.name}" if one.sequences else one.name
-        for one in archives
+        f"{len(archive.sequences)} sequences of {archive.name}"
+        if archive.sequences
+        else archive.name
+        for archive in archives
     ]
     rows = [
         (name, "unknown" if size is None else f"{size / 1e9:,.2f} GB")
@@ -247,7 +251,7 @@ def transfer(v1, v2, category, replace) -> None:
 
 
 class _Import(click.Command):
-    """The command `data import`; after `uco3d` follow the arguments of another command."""
+    """The command `data import`; `data import uco3d` is another command, with its own arguments."""
 
     def make_context(self, info_name, args, parent=None, **extra):
         if args[:1] == ["uco3d"]:
@@ -343,16 +347,18 @@ def uco3d(root, category, sequences, best, count, out) -> None:
     from zsp_lite.importers.uco3d import import_uco3d
 
     refuse_options({"best": sequences and best}, (), "--sequences")
-    for name, done in import_uco3d(root, out, category, sequences, best or 10, count):
-        _print_import(out / category / name, done)
+    for name, imported in import_uco3d(root, out, category, sequences, best or 10, count):
+        _print_import(out / category / name, imported)
 
 
-def _print_import(folder: Path, done: Any) -> None:
+def _print_import(folder: Path, imported: Any) -> None:
     """Print the numbers of an `ImportResult`."""
-    left_out = f"; {done.empty} frames without the object left out" if done.empty else ""
+    left_out = ""
+    if imported.empty:
+        left_out = f"; {imported.empty} frames without the object left out"
     print(
-        f"Written: {folder}: {done.frames} frames, {done.points:,} points, "
-        f"scaled by {done.scale:.4g}{left_out}"
+        f"Written: {folder}: {imported.frames} frames, {imported.points:,} points, "
+        f"scaled by {imported.scale:.4g}{left_out}"
     )
-    for flag in done.flags:
+    for flag in imported.flags:
         print(f"flag: {flag}")

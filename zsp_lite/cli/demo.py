@@ -47,7 +47,8 @@ def demo(data, solver, backbone, out) -> None:
     notes = {SETTINGS_FILE: SYNTHETIC_NOTE, RENDERED_FILE: MODELS_NOTE}
     note = next((text for file, text in notes.items() if (folder / file).is_file()), USER_NOTE)
     with writing(out), Console().status("estimating poses"):
-        dataset, model = Co3D(folder), as_backbone(backbone)
+        dataset = Co3D(folder)
+        model = as_backbone(backbone)
         found = list(run_photograph(dataset, model))
         photograph = photograph_section(found) if found else None
         results = list(run_demo(dataset, model, SOLVERS[solver]))

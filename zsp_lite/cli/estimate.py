@@ -7,17 +7,6 @@ import click
 from zsp_lite.choices import SOLVERS
 from zsp_lite.cli.common import COUNT, INDEX, PATH, backbone_options, examples, source_options
 
-_ONCE_PER_OBJECT = (
-    "mask",
-    "box",
-    "intrinsics",
-    "label",
-    "orientation",
-    "depth",
-    "depth_unit",
-    "object",
-)
-
 
 @click.command(
     epilog=examples(
@@ -68,7 +57,20 @@ _ONCE_PER_OBJECT = (
     help="Folder for the report and the point clouds.",
 )
 def estimate(
-    reference, target, others, helpers, not_upright, as_json, backbone, out, **settings
+    reference,
+    target,
+    others,
+    helpers,
+    solver,
+    reference_frame,
+    references,
+    targets,
+    workers,
+    not_upright,
+    as_json,
+    backbone,
+    out,
+    **once_per_object,
 ) -> None:
     """Estimate the pose between two objects of one category; no label is needed.
 
@@ -95,62 +97,67 @@ def estimate(
     import json
 
     from zsp_lite.importers.sources import open_pair
-    from zsp_lite.io.locks import writing
-    from zsp_lite.own_objects import estimate_pose, write_pair
+    from zsp_lite.own_objects import estimate_pose
 
-    if helpers and settings["solver"] != "verified":
+    if helpers and solver != "verified":
         raise click.UsageError("--helpers goes with --solver verified only")
     if others and not helpers:
         raise click.UsageError(
             f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers"
         )
-    with writing(out):
-        given = {name: settings.pop(name) for name in _ONCE_PER_OBJECT}
-        sources = open_pair(reference, target, given, (*helpers, *others))
-        found = estimate_pose(
-            *sources[:2],
-            backbone=backbone,
-            upright=not not_upright,
-            helpers=sources[2:],
-            **settings,
-        )
-        files = write_pair(found, out)
+    sources = open_pair(reference, target, once_per_object, (*helpers, *others))
+    result = estimate_pose(
+        sources[0],
+        sources[1],
+        solver,
+        reference_frame,
+        targets,
+        backbone=backbone,
+        out=out,
+        upright=not not_upright,
+        references=references,
+        helpers=sources[2:],
+        workers=workers,
+    )
     if as_json:
-        printed = {**found.as_json(), "files": [str(path) for path in files]}
+        printed = {**result.as_json(), "files": [str(path) for path in result.files]}
         print(json.dumps(printed, indent=1, allow_nan=False))
     else:
-        _print_tables(found)
-        for path in files:
+        _print_tables(result)
+        for path in result.files:
             print(f"Written: {path}")
 
 
-def _print_tables(found: Any) -> None:
+def _print_tables(result: Any) -> None:
     """Print the answers of a `PairResult`, the other hypotheses, the matrices and the flags."""
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.viz.report import COLUMNS, legend, table_rows
 
-    print(f"Reference: {found.sources[0]} (mask: {found.masks[0]})")
-    print(f"Target: {found.sources[1]} (masks: {found.masks[1]})")
-    rows = [row[1:] for row in table_rows(found)]
-    print_rows(f"Pose from {found.title}, backbone {found.backbone}", COLUMNS[1:], rows)
-    print(legend([name for name in COLUMNS[1:] if name != "error" or found.errors]))
-    for solver, one in found.estimates.items():
-        view = f"view {one.view + 1} ({found.targets[one.view].name})"
-        matrices = {f"camera points of {found.reference.name} to those of {view}": one.sim3}
-        matrices["world points of the reference to those of the target"] = one.world_sim3
+    print(f"Reference: {result.sources[0]} (mask: {result.masks[0]})")
+    print(f"Target: {result.sources[1]} (masks: {result.masks[1]})")
+    # Without the first column, the name of the pair, which is in the title.
+    rows = [row[1:] for row in table_rows(result)]
+    print_rows(f"Pose from {result.title}, backbone {result.backbone}", COLUMNS[1:], rows)
+    print(legend([name for name in COLUMNS[1:] if name != "error" or result.errors]))
+    for solver, pose in result.estimates.items():
+        view = f"view {pose.view + 1} ({result.targets[pose.view].name})"
+        matrices = {
+            f"camera points of {result.reference.name} to those of {view}": pose.sim3,
+            "world points of the reference to those of the target": pose.world_sim3,
+        }
         for points, sim3 in matrices.items():
             print(f"{solver}: {points}")
             for line in sim3.matrix:
                 print("  " + " ".join(f"{value:10.5f}" for value in line))
-        for rank, other in enumerate(one.alternatives, 2):
+        for rank, other in enumerate(pose.alternatives, 2):
             print(
-                f"  hypothesis {rank}: turned by {one.angle_to(other):.0f}° from the best, "
-                f"score {other.score - one.hypotheses[0].score:+.1f} nats, probability "
+                f"  hypothesis {rank}: turned by {pose.angle_to(other):.0f}° from the best, "
+                f"score {other.score - pose.hypotheses[0].score:+.1f} nats, probability "
                 f"{other.confidence:.2f}"
             )
-        for flag in one.flags:
+        for flag in pose.flags:
             print(f"  flag: {flag}")
-    if found.disagreement is not None:
-        print(f"The rotations of both solvers differ by {found.disagreement:.0f}°.")
-    if not found.errors:
+    if result.disagreement is not None:
+        print(f"The rotations of both solvers differ by {result.disagreement:.0f}°.")
+    if not result.errors:
         print("No pose labels: the rotation error is unknown.")

@@ -62,7 +62,9 @@ def synth(preset, categories, models_folder, seed, out, **given) -> None:
     from zsp_lite.course.synthetic.export import export_categories, export_models, export_preset
     from zsp_lite.io.locks import writing
 
-    sequences, frames, left_out = given["sequences"] or 4, given["frames"] or 24, {}
+    sequences = given["sequences"] or 4
+    frames = given["frames"] or 24
+    left_out = {}
     with writing(out):
         if preset:
             refuse_options(given, (), "--preset")

@@ -27,17 +27,17 @@ def print_table(table: Any) -> None:
     from zsp_lite.benchmark.tables import PUBLISHED
 
     look = {"box": SIMPLE_HEAD, "pad_edge": False, "caption_justify": "left"}
-    made = RichTable(title=table.title, caption=table.note or None, **look)
+    printed = RichTable(title=table.title, caption=table.note or None, **look)
     longest = max(map(len, table.text.index), default=0)
     # A row's name is folded, never cut off.
-    made.add_column("", justify="left", min_width=min(longest, 14), overflow="fold")
+    printed.add_column("", justify="left", min_width=min(longest, 14), overflow="fold")
     for title in table.text.columns:
         style = "dim" if title.startswith(PUBLISHED) else None
         title = title.replace(": ", "\n").replace(" (", "\n(").replace(" Acc30", "\nAcc30")
-        made.add_column(title, justify="right", style=style, header_style=style)
+        printed.add_column(title, justify="right", style=style, header_style=style)
     for label, *cells in table.text.itertuples():
-        made.add_row(label, *(cell.replace(" [", "\n[") for cell in cells))
-    _print_whole(made)
+        printed.add_row(label, *(cell.replace(" [", "\n[") for cell in cells))
+    _print_whole(printed)
 
 
 def _print_whole(table: RichTable) -> None:

@@ -7,7 +7,7 @@ from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.pairs import category_pairs, labelled_categories
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.pair_result import PairResult, label_errors
-from zsp_lite.pipeline import ZeroShotPose, solve_pair
+from zsp_lite.pipeline import ZeroShotPose
 
 N_TARGETS = 5
 
@@ -29,37 +29,46 @@ def example_pair(dataset: Co3D) -> Pair:
     than 10 off.
     """
     scooters = Pair("motorcycle", "scooter", 10, "scooter2", (2, 6, 11, 16, 21))
-    for sequence in (scooters.reference_sequence, scooters.target_sequence):
-        if not (dataset.root / scooters.category / sequence).is_dir():
-            return demo_pairs(dataset)[0]
-    return scooters
+    target = dataset.root / scooters.category / scooters.target_sequence
+    return scooters if target.is_dir() else demo_pairs(dataset)[0]
 
 
 def run_demo(
-    dataset: Co3D, backbone: FeatureExtractor, solvers: Sequence[str] = ("paper",)
+    dataset: Co3D, backbone: FeatureExtractor, solvers: Sequence[str]
 ) -> Iterator[PairResult]:
     """Estimate the poses of `demo_pairs` with the paper's settings, one at a time, by each
     solver."""
-    method = ZeroShotPose(backbone)
     for pair in demo_pairs(dataset):
-        yield run_pair(dataset, pair, method, solvers)
+        yield run_pair(dataset, pair, ZeroShotPose(backbone), solvers)
 
 
 def run_pair(
-    dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[str] | None = None
+    dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[str] = ()
 ) -> PairResult:
     """Estimate the pose of a pair by each solver, by default the method's own, and its error if it
     has labels."""
     reference, targets = dataset.load_pair(pair)
-    estimates = solve_pair(method, reference, targets, solvers)
+    # The solvers share the features.
+    view, *target_views = method.views([reference, *targets])
+    estimates = {
+        solver: replace(method, solver=solver).estimate_from_views(view, target_views)
+        for solver in solvers or [method.solver]
+    }
     sources = (
         f"sequence {pair.reference_sequence}, frame {pair.reference_frame}",
         f"sequence {pair.target_sequence}, frames {', '.join(map(str, pair.target_frames))}",
     )
-    name = getattr(method.backbone, "name", "")
     result = PairResult(
-        pair.category, sources, reference, tuple(targets), estimates, {}, pair, backbone=name
+        pair.category,
+        sources,
+        reference,
+        tuple(targets),
+        estimates,
+        {},
+        pair,
+        backbone=getattr(method.backbone, "name", ""),
     )
-    sequences = (pair.reference_sequence, pair.target_sequence)
-    errors = label_errors(result, dataset.root / pair.category, sequences)
+    errors = label_errors(
+        result, dataset.root / pair.category, (pair.reference_sequence, pair.target_sequence)
+    )
     return replace(result, errors=errors)

@@ -28,13 +28,15 @@ def sample_data() -> Path:
 
     # A warning, because a program without logging settings shows nothing else.
     logger.warning("No data_samples/ here: making synthetic samples in %s, once", made)
-    part = made.with_name(made.name + ".part")
+    part = made.with_name(f"{made.name}.part")
     try:
         with writing(part):
             export_preset("demo", part)
         part.rename(made)
     except (OSError, InputError) as error:
         if not made.is_dir():  # otherwise another process has made them meanwhile
-            cure = "set ZSP_LITE_CACHE to a folder that can be written"
-            raise InputError(f"samples cannot be made in {made} ({error}); {cure}") from error
+            raise InputError(
+                f"samples cannot be made in {made} ({error}); set ZSP_LITE_CACHE to a folder that "
+                "can be written"
+            ) from error
     return made
