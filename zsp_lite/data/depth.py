@@ -21,6 +21,11 @@ def decode_depth(
     with np.errstate(invalid="ignore", over="ignore"):  # bits of NaN or infinity
         depth = np.ascontiguousarray(bits).view(np.float16).astype(np.float32)
         depth = depth * np.float32(scale_adjustment)
+    return zero_unknown(depth)
+
+
+def zero_unknown(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Replace depth that is not finite or not positive by 0."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 

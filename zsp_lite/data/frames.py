@@ -13,7 +13,7 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
 from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose, split_intrinsics
-from zsp_lite.data.depth import decode_depth, encode_depth
+from zsp_lite.data.depth import decode_depth, encode_depth, zero_unknown
 from zsp_lite.errors import MAX_LENGTH, InputError, check_number, real_array
 from zsp_lite.io.files import read_bytes, write_atomic
 
@@ -125,7 +125,7 @@ class Frame:
         if depth.ndim == 3 and depth.shape[2] == 1:
             depth = depth[..., 0]
         depth = real_array(f"{label} depth", depth, (None, None)) * depth_unit
-        depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+        depth = zero_unknown(depth).astype(np.float32)
 
         # Mask from 0 to 1.
         if mask is not None:

@@ -87,7 +87,7 @@ def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:
     poses = read_poses(dataset.root, category)
     if not poses:
         raise InputError(
-            f"{dataset.root / category / POSES_FILE} is missing, expected a synthetic export: other "
-            "data has no exact object poses"
+            f"{dataset.root / category / POSES_FILE} is missing, expected a synthetic export: "
+            "other data has no exact object poses"
         )
     return poses
