@@ -120,10 +120,9 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
 
     # Depth along the ray changes little on the object alone, which is near the optical axis: the
     # whole image decides.
-    by_ray = _share(pairs, along_ray=True)
     everywhere_by_ray = _share(whole, along_ray=True)
     gains = everywhere_by_ray > max(_RAY_GAIN * everywhere, _FITTING)
-    if gains and by_ray > _AGREEING:
+    if gains and _share(pairs, along_ray=True) > _AGREEING:
         return (
             f"{found}; all that is seen agrees better ({everywhere_by_ray:.0%}, not "
             f"{everywhere:.0%}) if depth is the distance along the ray of a pixel, not along the "

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -105,15 +106,16 @@ def import_captures(
 class LazyFrames(Sequence[Frame]):
     """Frames that are loaded at each access, because all of a capture do not fit into memory."""
 
-    def __init__(self, load: Callable[[int], Frame], indices: Sequence[int]):
+    def __init__(self, load: Callable[[Any], Frame], items: Sequence[Any]):
+        """Make the frames that `load` returns for the items."""
         self._load = load
-        self._indices = indices
+        self._items = items
 
     def __len__(self) -> int:
-        return len(self._indices)
+        return len(self._items)
 
     def __getitem__(self, position: int) -> Frame:
-        return self._load(self._indices[position])
+        return self._load(self._items[position])
 
 
 def fuse(

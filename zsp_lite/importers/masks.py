@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
-from zsp_lite.data.cameras import Box
+from zsp_lite.data.cameras import Box, Camera
 from zsp_lite.data.depth import fit_plane
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, largest_region, mask_to_bbox
 from zsp_lite.errors import InputError
@@ -358,15 +358,12 @@ def _supporting_plane(
 def _focus(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"], float]:
     """Return the point nearest to the cameras' optical axes, and their mean distance from it."""
     centres = np.stack([frame.camera.centre for frame in frames])
-    axes = np.stack([frame.camera.R[2] for frame in frames])
-    # The matrices P, (n, 3, 3), project across the axes. For the point x nearest to the axes, the
-    # sum of P (x - c) over the cameras is 0.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    system = across.sum(axis=0) / len(frames)
+    matrix, right_side = axes_equation([frame.camera for frame in frames])
+    mean_matrix = matrix / len(frames)
     # Parallel axes have no nearest point. Above this eigenvalue, they differ by several degrees.
-    if np.linalg.eigvalsh(system)[0] > 0.01:
-        focus = np.linalg.solve(system, np.einsum("nij,nj->i", across, centres) / len(frames))
-        if (np.einsum("nj,nj->n", focus - centres, axes) > 0).all():
+    if np.linalg.eigvalsh(mean_matrix)[0] > 0.01:
+        focus = np.linalg.solve(mean_matrix, right_side / len(frames))
+        if all(frame.camera.to_camera(focus)[2] > 0 for frame in frames):
             return focus, float(np.linalg.norm(focus - centres, axis=1).mean())
     # With one camera or parallel axes, the focus is the median of the nearest quarter of the points
     # in the central part of an image.
@@ -380,6 +377,18 @@ def _focus(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"], float]:
     depth = frames[first].depth[chosen]
     focus = np.median(points[depth <= np.quantile(depth, 0.25)], axis=0)
     return focus, float(np.linalg.norm(focus - centres[first]))
+
+
+def axes_equation(
+    cameras: Sequence[Camera],
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """Return A and b of the equation A x = b of the point x nearest to the optical axes."""
+    centres = np.stack([camera.centre for camera in cameras])
+    axes = np.stack([camera.R[2] for camera in cameras])
+    # The matrices P, (n, 3, 3), project across the axes. For the point x nearest to the axes, the
+    # sum of P (x - c) over the camera centres c is 0.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    return across.sum(axis=0), np.einsum("nij,nj->i", across, centres)
 
 
 def _part_at(

@@ -27,6 +27,7 @@ from zsp_lite.importers.files import (
     read_picture,
 )
 from zsp_lite.importers.masks import (
+    axes_equation,
     depth_flags,
     given_mask_flags,
     mask_flags,
@@ -314,13 +315,12 @@ def open_source(
 
 def _from_frames(frames: Sequence[Frame], path: Path) -> Source:
     """Make the source of frames in memory."""
-    missing = {k: str(k) for k, frame in enumerate(frames) if frame.mask is None}
     return Source(
         path,
         "frames",
         tuple(range(len(frames))),
         frames.__getitem__,
-        missing=missing,
+        missing={k: str(k) for k, frame in enumerate(frames) if frame.mask is None},
         doubts=question_intrinsics(frames[0].camera, str(path)),
     )
 
@@ -329,8 +329,11 @@ def _from_sequence(path: Path) -> Source:
     """Make the source of a sequence of a data folder: its frames with camera and depth."""
     folder = _sequence_folder(path)
     dataset = Co3D(folder.parents[1])
-    every = dataset.frames(folder.parent.name, folder.name)
-    frames = [frame for frame in every if frame.viewpoint is not None and frame.depth is not None]
+    frames = [
+        frame
+        for frame in dataset.frames(folder.parent.name, folder.name)
+        if frame.viewpoint is not None and frame.depth is not None
+    ]
     if not frames:
         raise InputError(f"{path}: no frame has a camera and depth, expected some")
     return Source(
@@ -507,14 +510,10 @@ def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
     """
     if len(cameras) <= count:
         return list(range(len(cameras)))
-    # The object is at the point that is nearest to all optical axes (see `masks._focus`).
-    centres = np.stack([camera.centre for camera in cameras])
-    axes = np.stack([camera.R[2] for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None]
-    point = np.linalg.lstsq(
-        across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None
-    )[0]
-    directions = centres - point
+    # The object is at the point that is nearest to all optical axes.
+    matrix, right_side = axes_equation(cameras)
+    point = np.linalg.lstsq(matrix, right_side, rcond=None)[0]
+    directions = np.stack([camera.centre for camera in cameras]) - point
     directions /= np.linalg.norm(directions, axis=1, keepdims=True).clip(1e-9)
     # Sorted, so that the choice is the same for every order of the other cameras.
     order = [0, *(1 + np.lexsort(directions[1:].T.round(6)))]

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import cv2
 import msgspec
@@ -85,7 +85,7 @@ class _Row(msgspec.Struct, rename=_column):
     sequence_name: str
 
     @classmethod
-    def decode(cls, columns: dict[str, Any]) -> Self:
+    def decode(cls, columns: dict[str, Any]) -> "_Row":
         """Check the columns of a row; InputError if a value has another type."""
         try:
             return msgspec.convert(columns, cls)
@@ -106,7 +106,7 @@ class _Row(msgspec.Struct, rename=_column):
         return values
 
 
-class _SequenceRow(_Row, rename=_column):
+class _SequenceRow(_Row):
     """A row of `sequence_annots`; paths are relative to ROOT."""
 
     video_path: str
@@ -120,7 +120,7 @@ class _SequenceRow(_Row, rename=_column):
     alignment_T: bytes | None
 
 
-class _FrameRow(_Row, rename=_column):
+class _FrameRow(_Row):
     """A row of `frame_annots`."""
 
     frame_number: int
@@ -242,10 +242,12 @@ def _downloaded(root: Path, category: str) -> list[str]:
 def _ranked(metadata: sqlite3.Connection, names: list[str]) -> list[dict[str, Any]]:
     """Return the rows of sequences, those with the best cameras first."""
     places = ", ".join("?" * len(names))  # one place per name
-    condition = f"sequence_name IN ({places})"
-    order = "_reconstruction_quality_viewpoint DESC, sequence_name"
     return _select(
-        metadata, _SequenceRow, f"sequence_annots WHERE {condition} ORDER BY {order}", names
+        metadata,
+        _SequenceRow,
+        f"sequence_annots WHERE sequence_name IN ({places}) "
+        "ORDER BY _reconstruction_quality_viewpoint DESC, sequence_name",
+        names,
     )
 
 
@@ -317,11 +319,12 @@ class _Sequence:
         self.images = Video(path_inside(root, row.video_path), displayed=True)
         self.masks = Video(path_inside(root, row.mask_video_path), displayed=True)
         self.depths = _DepthMaps(path_inside(root, row.depth_video_path))
-        usable = "_mask_mass IS NOT 0 AND _viewpoint_R IS NOT NULL AND frame_timestamp IS NOT NULL"
+        # Frames with a mask, a camera, a time and depth.
         rows = _select(
             metadata,
             _FrameRow,
-            f"frame_annots WHERE sequence_name = ? AND {usable} "
+            "frame_annots WHERE sequence_name = ? AND _mask_mass IS NOT 0 "
+            "AND _viewpoint_R IS NOT NULL AND frame_timestamp IS NOT NULL "
             "AND _depth_scale_adjustment > 0 ORDER BY frame_number",
             [row.sequence_name],
         )
@@ -343,9 +346,7 @@ class _Sequence:
             )
         # Scale the scene.
         scale = 1 / self.deviation
-        frames = LazyFrames(
-            lambda k: scale_frame(self._load(agreeing[k]), scale), range(len(agreeing))
-        )
+        frames = LazyFrames(lambda frame: scale_frame(self._load(frame), scale), agreeing)
         # Load the last frame: InputError, before anything is written, if the video ends too early.
         frames[-1]
         label = self._label(scale)

@@ -95,10 +95,8 @@ class Video:
         """Decode the frame with a number, from 0 on; the numbers may not decrease."""
         while self._position < number and self._video.grab():
             self._position += 1
-        decoded = False
-        if self._position == number:
-            decoded, image = self._video.retrieve()
-        if not decoded:
+        decoded, image = self._video.retrieve()
+        if self._position != number or not decoded:
             raise InputError(f"video {self.path} ends before frame {number}")
         return image[..., ::-1]
 
