@@ -25,6 +25,8 @@ Image = (
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+# The block whose keys the published code uses, counted from 0.
+_DINO_BLOCK = 9
 
 
 class Backbone:
@@ -40,7 +42,7 @@ class Backbone:
             Default: heads 0, 2, 4 and 5 for the size of DINO's ViT-S (Amir et al. 2021), all heads
             for other sizes.
         batch_size: Number of images in one forward pass.
-        device, facet, image_size: As of `load_backbone`; the default size is the model's.
+        device, facet, image_size: See `load_backbone`. The default size is the model's.
         mean, std: Normalisation of RGB values in [0, 1].
 
     Raises:
@@ -62,10 +64,11 @@ class Backbone:
     ):
         heads = range(model.num_heads)
         if saliency_heads is None:
+            # The width, the heads and the depth of DINO's ViT-S.
             dino_small = (model.embed_dim, model.num_heads, model.depth) == (384, 6, 12)
             saliency_heads = (0, 2, 4, 5) if dino_small else heads
         if layer is None:
-            layer = min(9, model.depth - 1)
+            layer = min(_DINO_BLOCK, model.depth - 1)
         if image_size is None:
             image_size = model.image_size
         if not saliency_heads or not set(saliency_heads) <= set(heads):
@@ -110,8 +113,8 @@ class Backbone:
 
     def _extract(self, batch: Float[Tensor, "b 3 s s"]) -> list[FeatureMap]:
         """Compute the features of a batch of prepared images."""
-        # By default, a GPU computes convolutions in TensorFloat-32: ask for float32. Flags that are
-        # not given would be reset.
+        # By default, a GPU computes convolutions in TensorFloat-32: ask for float32. The other
+        # flags are given with their values, because they would be reset.
         precision = nullcontext()
         if self.device.type == "cuda":
             cudnn = torch.backends.cudnn
@@ -139,7 +142,7 @@ def block_index(layer: int | str, depth: int, name: str) -> int:
     Negative integers count from the end.
     """
     text = "-1" if layer == "last" else str(layer).strip()
-    # An integer, or "block" with a digit behind it: there is no "block-1".
+    # An integer, which may be negative, or "block" and a number, which may not.
     number = re.fullmatch(r"(?:block(?=\d))?(-?\d+)", text)
     if not number or not -depth <= int(number[1]) < depth:
         raise InputError(
@@ -154,19 +157,20 @@ def prepare_images(
 ) -> Float[Tensor, "b 3 s s"]:
     """Stack RGB images (H, W, 3), uint8 or float in [0, 1], to a batch of squares in [0, 1].
 
-    Images are resized bilinearly with anti-aliasing. Errors count the images from `first`.
+    Images are resized bilinearly with anti-aliasing. `first` is the number of the first image in
+    error messages.
     """
     prepared = []
     for index, image in enumerate(images, first):
-        # Copied, because torch does not accept read-only arrays and negative strides.
+        # An array is copied, because torch does not accept read-only ones and negative strides.
         image = image if torch.is_tensor(image) else torch.from_numpy(np.array(image))
         is_bytes = image.dtype == torch.uint8
-        # The comparison is false for NaN, too.
+        # NaN is not in the range: its comparisons are false.
         is_unit = image.is_floating_point() and bool(((image >= 0) & (image <= 1)).all())
         if image.shape[2:] != (3,) or not image.numel() or not (is_bytes or is_unit):
-            found = f"{image.dtype} of shape {tuple(image.shape)}"
             raise InputError(
-                f"image {index} is {found}, expected uint8 or floats in [0, 1] of shape (H, W, 3)"
+                f"image {index} is {image.dtype} of shape {tuple(image.shape)}, expected uint8 or "
+                "floats in [0, 1] of shape (H, W, 3)"
             )
         image = image.to(torch.float32) / (255 if is_bytes else 1)
         image = image.permute(2, 0, 1)[None]  # (1, 3, H, W)
@@ -196,5 +200,6 @@ def choose_device(device: str | torch.device | None) -> torch.device:
     try:
         return torch.empty(0, device=device).device
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0][:120]  # torch adds a long advice for developers
+        # After the first line, torch has advice for its developers.
+        reason = str(error).splitlines()[0][:120]
         raise InputError(f"device {str(device)!r} cannot be used: {reason}") from error

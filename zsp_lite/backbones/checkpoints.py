@@ -33,7 +33,8 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
             ) from error
 
     content = load_torch(path, "checkpoint")
-    # DINO's training checkpoints contain teacher and student; other programs nest the weights, too.
+    # DINO's training checkpoints hold a teacher and a student, and other programs nest weights,
+    # too.
     for nested in ("teacher", "state_dict", "model"):
         if isinstance(content, dict) and isinstance(content.get(nested), dict):
             content = content[nested]
@@ -46,7 +47,8 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
         raise InputError(
             f"checkpoint {path}: expected a state dict of tensors, got {type(content).__name__}"
         )
-    # Names as in the plain transformer, without the wrappers and the head of the training.
+    # Parameters are named as in the plain transformer: the prefixes are from wrappers of the
+    # training, and its head is left out.
     weights = {}
     for key, values in content.items():
         key = str(key).removeprefix("module.").removeprefix("backbone.")
@@ -75,7 +77,7 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> 
         side = math.isqrt(weights["pos_embed"].shape[1] - 1)
         depth = len({key.split(".")[1] for key in weights if key.startswith("blocks.")})
         if num_heads is None:
-            # Heads of 64 channels are usual. The transformer refuses 0 heads.
+            # Heads usually have 64 channels. For other widths, the transformer refuses 0 heads.
             num_heads = dim // 64 if dim % 64 == 0 else 0
         # The checkpoint replaces the initial values: do not compute them.
         with torch.device("meta"):

@@ -22,19 +22,19 @@ from zsp_lite.choices import Facet
 from zsp_lite.errors import InputError
 
 PREFIX = "hf:"
-IMAGE_SIZE = 224  # pixels, the paper's
+IMAGE_SIZE = 224  # default, pixels: the paper's
 CONFIG = "config.json"
 PROCESSORS = ("preprocessor_config.json", "processor_config.json")
 WEIGHTS = ("model.safetensors", "model.safetensors.index.json")
 # The only files that are downloaded or read: safetensors, no pickle files, no code.
 FILES = (CONFIG, *PROCESSORS, *WEIGHTS, "model*.safetensors")
-# Of each facet: the names that architectures give to its linear layer.
+# For each facet, the names that architectures give to its linear layer.
 _PROJECTIONS = {
     "query": ("q_proj", "query"),
     "key": ("k_proj", "key"),
     "value": ("v_proj", "value"),
 }
-# Parameters: the CLS token by its names, and all tokens that come before the patches.
+# Names of parameters: those of the CLS token, and those of all tokens that precede the patches.
 _CLS = {"cls_token", "class_token", "class_embedding"}
 _BEFORE_PATCHES = (*_CLS, "register_tokens", "distillation_token")
 
@@ -60,7 +60,7 @@ class HuggingFaceViT(nn.Module):
         if isinstance(self.patch_size, (list, tuple)) and len(set(self.patch_size)) == 1:
             self.patch_size = self.patch_size[0]
         sizes = (self.patch_size, self.num_heads, self.depth)
-        # In a plain list, so that the modules are not registered a second time.
+        # The dicts of layers are in a plain list, so that torch does not register the layers twice.
         self._projections = list(filter(None, map(_projections, model.modules())))
         # Parameters by the last part of their names.
         special = {key.rpartition(".")[2]: x for key, x in model.named_parameters()}
@@ -77,7 +77,7 @@ class HuggingFaceViT(nn.Module):
             )
         self.image_size = nearest_multiple(image_size, self.patch_size)
         self.embed_dim = self._projections[0]["query"].in_features
-        # Number of tokens before the patches.
+        # Number of tokens that precede the patches.
         self._prefix = sum(
             special[key].numel() // self.embed_dim for key in _BEFORE_PATCHES if key in special
         )
@@ -97,12 +97,13 @@ class HuggingFaceViT(nn.Module):
         # Models without this option always interpolate.
         if "interpolate_pos_encoding" in self._arguments:
             options["interpolate_pos_encoding"] = True
-        # A masked autoencoder sorts the patches by their noise: it rises, to keep their order.
+        # A masked autoencoder sorts the patches by noise. Rising noise keeps their order.
         if "noise" in self._arguments:
             noise = torch.arange(grid[0] * grid[1], device=images.device).float()
             options["noise"] = noise.expand(len(images), -1)
 
-        # The layer of a facet records its output; "token" needs no layer, and any will do.
+        # The hook records the output of the facet's layer. "token" is no layer's output: its hook
+        # is registered on a layer that is never called.
         projected: list[Tensor] = []
         layer_of_facet = self._projections[layer].get(facet, nn.Identity())
         hook = layer_of_facet.register_forward_hook(
@@ -143,14 +144,14 @@ class HuggingFaceViT(nn.Module):
 
 def load_huggingface(name: str, image_size: int | None) -> tuple[HuggingFaceViT, Normalisation]:
     """Load the model of "hf:NAME": a folder in Hugging Face's format, or a model of the hub."""
-    # Imported after `model_folder`, which says in one line that the package is missing.
+    # transformers is imported after this call, which raises InputError if the package is missing.
     folder = model_folder(name)
     from transformers import AutoConfig, AutoModel
 
     local = {"local_files_only": True, "trust_remote_code": False}
     try:
         config = AutoConfig.from_pretrained(folder, **local)
-        # Of CLIP and similar models: the image encoder.
+        # CLIP and similar models have a text encoder, too: only the image encoder is used.
         vision = getattr(config, "vision_config", config)
         if hasattr(vision, "mask_ratio"):
             vision.mask_ratio = 0.0  # a masked autoencoder must see the whole image
@@ -179,7 +180,7 @@ def load_huggingface(name: str, image_size: int | None) -> tuple[HuggingFaceViT,
         ) from error
     for key, weight in model.named_parameters():
         if key in report["missing_keys"]:
-            # random values would give the backbone another identity at every start
+            # With random values, the backbone would have another identity at every start.
             weight.data.zero_()
     model = getattr(model, "vision_model", model).eval()
     return HuggingFaceViT(
@@ -196,7 +197,7 @@ def model_folder(name: str) -> Path:
     wanted = name.removeprefix(PREFIX).strip()
     folder = Path(wanted).expanduser()
     try:
-        import transformers  # noqa: F401  an error that is understood, before a download
+        import transformers  # noqa: F401  raises ImportError before a download
         from huggingface_hub import snapshot_download
         from huggingface_hub.errors import LocalEntryNotFoundError
 
@@ -212,7 +213,7 @@ def model_folder(name: str) -> Path:
             f"{name}: needs the package transformers: pip install transformers "
             f"huggingface-hub ({_one_line(error)})"
         ) from error
-    # No such model, no permission, no network: the hub's client says which.
+    # The hub's client says what is wrong: no such model, no permission, or no network.
     except Exception as error:
         raise InputError(
             f"{name}: neither a folder nor a model OWNER/MODEL that the Hugging Face hub "
@@ -232,7 +233,7 @@ def _has_weights(folder: Path) -> bool:
 
 
 def _projections(attention: nn.Module) -> dict[str, nn.Linear]:
-    """Return a module's own linear layer of each facet; {} unless it has all three."""
+    """Return the linear layers of a module by facet; {} if it lacks one of the three."""
     layers = {}
     for facet, names in _PROJECTIONS.items():
         for name in names:

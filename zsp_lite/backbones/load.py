@@ -1,6 +1,6 @@
 """Loading of backbones, from a checkpoint file, a model in Hugging Face's format, or by name.
 
-The names are those of the embedded one, and of the DINO models released by Caron et al. (2021).
+There are names for the backbone in the package, and for the DINO models of Caron et al. (2021).
 """
 
 import os
@@ -19,9 +19,10 @@ from zsp_lite.features import FeatureExtractor
 from zsp_lite.io.download import cache_folder, fetch, has_size_and_hash
 from zsp_lite.io.modules import import_object
 
-# The environment variable ZSP_LITE_DINO_URL overrides it.
+# Address of the released files, unless the environment variable ZSP_LITE_DINO_URL gives another
+# one.
 DINO_URL = "https://dl.fbaipublicfiles.com/dino/"
-# Of a released file. A ViT-B, the largest, has 86 million weights of 4 bytes: 344 MB.
+# Limit of the size of a released file: a ViT-B, the largest, has 86 million weights of 4 bytes.
 MOST_BYTES = 400_000_000
 # The backbone that is part of the package: its name and its file.
 DEFAULT = "zsp-tiny"
@@ -120,7 +121,8 @@ def load_backbone(
     config = name_or_path
     if not isinstance(config, BackboneConfig):
         config = BackboneConfig(str(name_or_path), **options)
-    elif BackboneConfig("", **options) != BackboneConfig(""):  # not all are the defaults
+    # A config has the options already: all others must be the defaults.
+    elif BackboneConfig("", **options) != BackboneConfig(""):
         raise InputError(f"got {options} beside {config}, expected them in the config only")
 
     load = _load_huggingface if config.name.startswith(PREFIX) else _load_checkpoint
@@ -220,7 +222,7 @@ def _load_huggingface(config: BackboneConfig, device: str | torch.device | None)
     # A folder is named without its parents, so that results do not depend on where it lies.
     folder = Path(config.name.removeprefix(PREFIX)).expanduser()
     label = PREFIX + folder.resolve().name if os.path.isdir(folder) else config.name
-    # Three quarters of the depth: as block 9 of DINO's 12.
+    # Three quarters of the depth, as block 9 is of DINO's 12 blocks.
     layer = 3 * model.depth // 4 if config.layer is None else config.layer
     # One image at a time, because transformers returns the attention of all blocks.
     return Backbone(
@@ -251,7 +253,8 @@ def _load_checkpoint(config: BackboneConfig, device: str | torch.device | None) 
             f"{', '.join(available_backbones())}, nor {PREFIX}NAME"
         )
     weights, metadata = read_checkpoint(path)
-    # Lists of integers, of which the first two have one; None where the file does not say.
+    # Each is a list of integers, or None if the file has no such entry. The first two have one
+    # entry.
     num_heads = metadata_integers(metadata, "num_heads", path)
     key_block = metadata_integers(metadata, "key_block", path)
     saliency_heads = metadata_integers(metadata, "saliency_heads", path)

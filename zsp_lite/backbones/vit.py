@@ -33,7 +33,7 @@ class Tokens:
 
     # Descriptors: the keys (or another facet) of one block, heads concatenated.
     keys: Float[Tensor, "batch n dim"]
-    # Of the last block, from CLS to the patches; softmax over 1 + n tokens.
+    # Attention of the last block from CLS to the patches, by softmax over all 1 + n tokens.
     attention: Float[Tensor, "batch heads n"]
     cls: Float[Tensor, "batch dim"]  # CLS output token after the final normalisation
     grid: tuple[int, int]  # rows and columns of patches; their product is n
@@ -57,7 +57,7 @@ class BlockActivations:
     """Intermediate results of one transformer block, CLS first."""
 
     normed: Float[Tensor, "batch tokens dim"]  # input after the first normalisation
-    # Like key and value a linear function of `normed`, heads concatenated.
+    # Query, key and value are linear functions of `normed`, heads concatenated.
     query: Float[Tensor, "batch outputs dim"]
     key: Float[Tensor, "batch tokens dim"]
     value: Float[Tensor, "batch tokens dim"]
@@ -116,9 +116,9 @@ class Block(nn.Module):
     def forward(
         self, x: Float[Tensor, "batch n dim"], outputs: int | None = None
     ) -> BlockActivations:
-        """Compute the activations, of which queries and output are for `outputs` tokens only.
+        """Compute the activations; queries and output for the first `outputs` tokens only.
 
-        By default they are for all tokens; they take most of the time.
+        By default, they are computed for all tokens, which takes most of the time.
         """
         normed = self.norm1(x)
         if outputs is None:
@@ -144,8 +144,8 @@ class PatchEmbed(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch 3 height width"]
     ) -> Float[Tensor, "batch n dim"]:
-        # The windows of the convolution do not overlap: it is one matrix product, which is faster
-        # on a CPU.
+        # The windows of the convolution do not overlap: one matrix product gives the same, and is
+        # faster on a CPU.
         p = self.patch_size
         windows = images.unflatten(3, (-1, p)).unflatten(2, (-1, p))  # (b, 3, rows, p, columns, p)
         patches = windows.permute(0, 2, 4, 1, 3, 5).flatten(3).flatten(1, 2)  # (b, n, 3 p p)
@@ -199,10 +199,10 @@ class VisionTransformer(nn.Module):
         side = math.isqrt(self.pos_embed.shape[1] - 1)
         if grid == (side, side):
             return self.pos_embed
-        # Without CLS, as an image: (1, dim, side, side).
+        # The embedding of the patches as an image: (1, dim, side, side).
         stored = self.pos_embed[:, 1:].unflatten(1, (side, side)).permute(0, 3, 1, 2)
-        # As in DINO's code, 0.1 is added against rounding, and interpolate() samples with that
-        # scale instead of the exact ratio.
+        # As in DINO's code, 0.1 is added so that rounding cannot lose a row, and interpolate()
+        # samples with this scale instead of the exact ratio.
         scale = tuple((cells + 0.1) / side for cells in grid)
         resized = F.interpolate(stored, scale_factor=scale, mode="bicubic", align_corners=False)
         return torch.cat([self.pos_embed[:, :1], resized.flatten(2).transpose(1, 2)], dim=1)
@@ -231,8 +231,8 @@ class VisionTransformer(nn.Module):
         """Compute block `layer`'s descriptors, the CLS attention and the CLS output."""
         x, grid = self.embed(images)
         for index, block in enumerate(self.blocks):
-            # In the last block the method needs the keys of all tokens, but the query and the
-            # output of CLS only.
+            # In the last block, the method needs the keys of all tokens, but only the query and the
+            # output of CLS, which is the first token.
             cls_only = index == self.depth - 1 and facet == "key"
             activations = block(x, outputs=1 if cls_only else None)
             x = activations.token

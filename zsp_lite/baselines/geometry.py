@@ -15,8 +15,8 @@ from zsp_lite.matching import Matches
 from zsp_lite.points import object_points
 
 POINTS = 5000  # largest number of points per cloud
-_MIN_POINTS = 10
-# Every point has a correspondence at any distance, as in PyTorch3D's ICP, which the paper uses.
+_MIN_POINTS = 10  # fewer points do not determine a shape
+# Points correspond at any distance, as in PyTorch3D's ICP, which the paper uses.
 _MAX_DISTANCE = 1e6
 
 
@@ -36,7 +36,7 @@ def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> S
         ),
     )
     matrix = np.asarray(result.transformation)
-    # The cube of the scale.
+    # The determinant is the cube of the scale.
     determinant = np.linalg.det(matrix[:3, :3]) if np.isfinite(matrix).all() else 0.0
     if not determinant > 1e-12:
         raise InputError("icp: the result is not a similarity, because the scale converged to 0")
@@ -46,19 +46,25 @@ def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> S
 def align(
     reference: Frame, targets: Sequence[Frame], view: int, firsts: tuple[Camera, Camera], seed: int
 ) -> Sim3:
-    """Estimate the pose of a reference frame in target `view` by ICP, between camera frames."""
+    """Estimate the pose of a reference frame in target `view` by ICP, between camera frames.
+
+    `firsts` has the first cameras of the sequences of reference and targets.
+    """
     rng = np.random.default_rng(seed)
     camera = targets[view].camera
     source = _subsample(object_points(reference), rng)
-    parts = [camera.to_camera(target.camera.to_world(object_points(target))) for target in targets]
-    target = _subsample(np.concatenate(parts), rng)
-    # Both cameras start where the first camera of their sequence is (supplement), because the
-    # worlds of CO3D's sequences are nearly aligned already, which would help.
-    first, second = firsts
-    aligned = icp(first.to_world(source), second.to_world(target))
-    to_reference = Sim3(1.0, first.R, first.t)
-    to_target = Sim3(1.0, second.R, second.t)
-    return to_target @ aligned @ to_reference.inverse()
+    # The points of all targets in the frame of the target view's camera.
+    clouds = [camera.to_camera(target.camera.to_world(object_points(target))) for target in targets]
+    destination = _subsample(np.concatenate(clouds), rng)
+    # For ICP, both cameras are placed where the first camera of their sequence is (supplement):
+    # with their own places, the worlds of CO3D's sequences would be nearly aligned already.
+    first_reference, first_target = firsts
+    aligned = icp(first_reference.to_world(source), first_target.to_world(destination))
+    return (
+        Sim3(1.0, first_target.R, first_target.t)
+        @ aligned
+        @ Sim3(1.0, first_reference.R, first_reference.t).inverse()
+    )
 
 
 def _subsample(
@@ -78,21 +84,26 @@ def essential_rotation(
     reference: Frame, target: Frame, matches: Matches, grid: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "3 3"], int, str]:
     """Return the rotation between the cameras, the number of its inliers, and a note for users."""
-    # Points at depth 1 in place of pixels, since every crop has a camera of its own.
-    first = _directions(reference.camera, matches.reference, grid)
-    second = _directions(target.camera, matches.target, grid)
+    # Points at depth 1 take the place of pixels, because every crop has a camera of its own.
+    source = _directions(reference.camera, matches.reference, grid)
+    destination = _directions(target.camera, matches.target, grid)
     focal = np.concatenate([reference.camera.focal_length, target.camera.focal_length]).mean()
-    # The width of a patch at depth 1: matches are patch centres.
+    # The threshold is the width of a patch at depth 1, because matches are patch centres.
     threshold = reference.camera.size[0] / grid[0] / focal
     poses = []
-    if len(matches) >= 5:  # five-point RANSAC; OpenCV's draws are always the same
-        found, mask = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.999, threshold)
-        # OpenCV stacks the solutions of one sample, (3 s, 3). The right one has the most points in
-        # front of both cameras.
-        if found is not None:
-            for matrix in np.split(found, len(found) // 3):
-                pose = cv2.recoverPose(matrix, first, second, np.eye(3), mask=mask.copy())
-                poses.append(pose[:2])  # number of such points, rotation
+    # The five-point algorithm in RANSAC; OpenCV's random draws are always the same.
+    if len(matches) >= 5:
+        matrices, mask = cv2.findEssentialMat(
+            source, destination, np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=threshold
+        )
+        # OpenCV stacks the s solutions of one sample, (3 s, 3). The right solution has the most
+        # points in front of both cameras: `recoverPose` returns their number first, and then the
+        # rotation.
+        if matrices is not None:
+            for matrix in np.split(matrices, len(matrices) // 3):
+                poses.append(
+                    cv2.recoverPose(matrix, source, destination, np.eye(3), mask=mask.copy())[:2]
+                )
     inliers, rotation = max(poses, key=lambda pose: pose[0], default=(0, None))
     if inliers and np.isfinite(rotation).all():
         return rotation, int(inliers), ""

@@ -19,7 +19,7 @@ KEYPOINT_SIZE = 24.0  # of RootSIFT, pixels
 _CELLS = 4  # along each side of a descriptor
 _BINS = 8  # orientations per cell
 _CELL = 1.5  # side of a cell, in keypoint sizes
-# OpenCV's constants. The first octave has a blur of 1.6 pixels, of which the image has 0.5 already.
+# OpenCV's constants follow. Blur that adds to the image's own, 0.5 pixels, up to 1.6 pixels.
 _BLUR = (1.6**2 - 0.5**2) ** 0.5
 _CLIP = 0.2  # largest entry of a descriptor, relative to its length
 _SCALE = 512.0  # length of a descriptor before it is rounded
@@ -47,8 +47,8 @@ class Sift:
             points, descriptors = cv2.SIFT_create().detectAndCompute(grey, mask)
             if descriptors is None:
                 descriptors = np.empty((0, 128), np.float32)
-            # OpenCV measures from the centre of pixel 0 (half a pixel) in an upsampled image,
-            # shifted by -1/4 pixel.
+            # OpenCV's origin is the centre of pixel 0, which adds 1/2; its upsampled image is
+            # shifted, which subtracts 1/4.
             pixels = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.25
             length = np.linalg.norm(descriptors, axis=1, keepdims=True)
             keypoints.append(Keypoints(pixels, descriptors / np.maximum(length, 1e-12)))
@@ -64,7 +64,8 @@ def mutual_matches(
     )
     if not similarity.numel():  # an image without keypoints
         return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
-    # Of each keypoint of the first image: its neighbour in the second; -inf if it is not mutual.
+    # For each keypoint of the first image, its nearest neighbour in the second image, and their
+    # cosine, which is -inf if they are not mutual neighbours.
     partner, score = mutual_nearest_neighbours(similarity)
     best = score.argsort(descending=True, stable=True)[: min(k, int(score.isfinite().sum()))]
     return best.numpy(), partner[best].numpy(), score[best].numpy()
@@ -125,8 +126,8 @@ def dense_sift(
     # Each gradient contributes to the two nearest orientations, with linear weights: (bins, n, n).
     distance = np.abs(angle * (_BINS / 360) - np.arange(_BINS, dtype=np.float32)[:, None, None])
     oriented = length * np.maximum(1 - np.minimum(distance, _BINS - distance), 0)
-    # The weights are separable in rows and columns: two small products do it in a hundredth of
-    # OpenCV's time.
+    # The weight of a pixel is a product of one for its row and one for its column: two matrix
+    # products sum all cells in a hundredth of OpenCV's time.
     weights = _weights(len(grey), centres, _CELL * size)
     cells = (weights @ oriented @ weights.T).reshape(_BINS, side, _CELLS, side, _CELLS)
     histograms = cells.transpose(1, 3, 2, 4, 0).reshape(side, side, -1)
@@ -141,9 +142,10 @@ def _weights(
     """Compute the weights of n pixels along one axis in each cell of each keypoint."""
     offset = np.arange(n) - np.round(centres)[:, None]  # (keypoints, n), pixels
     in_cells = offset / cell
-    # A Gaussian window, which ends where OpenCV's does.
+    # A Gaussian window that ends where OpenCV's window ends.
     inside = np.abs(offset) <= round(cell * 2**0.5 * (_CELLS + 1) / 2)
     window = np.exp(-(in_cells**2) / (_CELLS**2 / 2)) * inside
-    # To the centre of each cell, (keypoints, cells, n); the weight falls linearly to the next one.
+    # Distances to the centre of each cell, (keypoints, cells, n). The weight falls linearly to 0 at
+    # the centre of the next cell.
     distance = np.abs(in_cells[:, None] + _CELLS / 2 - 0.5 - np.arange(_CELLS)[:, None])
     return (window[:, None] * np.maximum(1 - distance, 0)).reshape(-1, n).astype(np.float32)

@@ -89,7 +89,8 @@ class FrameIndex:
     path: Path
     entries: list[msgspec.Raw]  # JSON of each frame
     keys: list[FrameKey]
-    # Of each sequence, the positions in `entries` by frame number, sorted.
+    # For each sequence, the positions of its frames in `entries`, by frame number in ascending
+    # order.
     by_sequence: dict[str, dict[int, int]]
 
     def positions(self, sequence: str) -> dict[int, int]:
@@ -99,17 +100,18 @@ class FrameIndex:
         return self.by_sequence[sequence]
 
     def frame(self, position: int) -> FrameAnnotation:
-        """Decode the entry at a position; an InputError names file, frame and field."""
+        """Decode the entry at a position; an InputError names the file, the frame and the field."""
         key = self.keys[position]
-        what = (
+        return decode_json(
+            self.entries[position],
+            FrameAnnotation,
             f"frame annotations {self.path} (entry {position}: frame {key.frame_number} of "
-            f"{key.sequence_name})"
+            f"{key.sequence_name})",
         )
-        return decode_json(self.entries[position], FrameAnnotation, what)
 
 
 def read_frame_index(path: Path) -> FrameIndex:
-    """Read the frame annotations of a category; InputError if a frame is there twice."""
+    """Read the frame annotations of a category; InputError if a frame has two entries."""
     data = read_annotations(path)
     # Two passes that each skip most of the bytes are faster than one that builds every frame.
     keys = decode_json(data, list[FrameKey], f"frame annotations {path}")
@@ -141,8 +143,8 @@ def read_annotations(path: Path) -> bytes:
 
 def compress(data: bytes) -> bytes:
     """Compress with gzip; equal data give equal bytes."""
-    # Without name and time in the header.
-    buffer = io.BytesIO()  # gzip.compress would write the platform into the header
+    # gzip.compress would write the platform into the header. Name and time are left out of it, too.
+    buffer = io.BytesIO()
     with gzip.GzipFile(filename="", mode="wb", fileobj=buffer, mtime=0) as file:
         file.write(data)
     return buffer.getvalue()

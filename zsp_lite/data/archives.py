@@ -26,9 +26,10 @@ from zsp_lite.io.locks import writing
 CATALOGUE = Path(__file__).with_name("co3d_archives.json")  # names and SHA-256 digests
 # Environment variables with the address of a mirror, by data set. v1 is the version of the paper.
 URL_VARIABLES = {"co3d": "ZSP_LITE_CO3D_URL", "co3d-v1": "ZSP_LITE_CO3D_V1_URL"}
-_PART = 1 << 22  # bytes of a request for a part of an archive
-_WORK = ".download"  # in the data folder: archives in progress
-_RECORD = f"{_WORK}/unpacked.json"  # what is unpacked, by category
+# Bytes of one request for a part of an archive: fewer requests would read more than is needed.
+_PART = 1 << 22
+_DOWNLOADS = ".download"  # folder in the data folder that holds archives until they are unpacked
+_RECORD = f"{_DOWNLOADS}/unpacked.json"  # the list of what is unpacked, by category
 
 
 @dataclass(frozen=True)
@@ -40,13 +41,13 @@ class Archive:
     name: str
     url: str
     sha256: str
-    # What is read out of the archive on the server, with the annotations; if empty, the whole
-    # archive is downloaded.
+    # Sequences that are read out of the archive on the server, with the annotations. If there are
+    # none, the whole archive is downloaded.
     sequences: tuple[str, ...] = ()
 
 
 class _Unpacked(msgspec.Struct):
-    """What is unpacked of a category: names of archives, and of single sequences."""
+    """Names of the archives and of the single sequences of a category that are unpacked."""
 
     origin: str
     done: list[str] = []
@@ -55,9 +56,9 @@ class _Unpacked(msgspec.Struct):
 def list_archives(
     dataset: str, category: str, single_sequence: bool = False, chunks: int | None = None
 ) -> list[Archive]:
-    """List the first archives of a category of "co3d" (v2) or "co3d-v1".
+    """List the first `chunks` archives of a category of "co3d" (v2) or "co3d-v1", by default all.
 
-    The very first holds the annotations.
+    The first archive holds the annotations.
     """
     subset = "single-sequence" if single_sequence else "full"
     suffix = "_singlesequence" if single_sequence else ""
@@ -74,7 +75,10 @@ def list_archives(
 
 
 def missing_archives(root: Path, archives: Sequence[Archive]) -> list[Archive]:
-    """Return what is not unpacked yet of archives; InputError for a category from elsewhere."""
+    """Return the archives, or the sequences of them, that are not unpacked yet.
+
+    InputError if the category's folder is from another source.
+    """
     record = _read_record(root)
     missing = []
     for archive in archives:
@@ -88,7 +92,7 @@ def missing_archives(root: Path, archives: Sequence[Archive]) -> list[Archive]:
                 f"{folder} is from {origin}, expected another folder (--root) for {archive.origin}"
             )
         sequences = tuple(name for name in archive.sequences if name not in unpacked.done)
-        # Missing are whole archives, and those of which some sequences are.
+        # An archive without `sequences` is missing as a whole, others if a sequence is missing.
         if archive.name not in unpacked.done and (sequences or not archive.sequences):
             missing.append(replace(archive, sequences=sequences))
     return missing
@@ -107,17 +111,16 @@ def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | Non
 
     An unknown size counts 0.
     """
-    # Unpacked archives are about as large as the archives. Of whole archives, one at a time is
-    # there, too.
+    # Unpacked files are about as large as the archives. While a whole archive is unpacked, it is on
+    # the disk beside its files.
     whole = [size or 0 for archive, size in zip(missing, sizes) if not archive.sequences]
-    # What an interrupted download has left.
-    present = [
-        path.stat().st_size
-        for archive in missing
-        for path in (root / _WORK).glob(f"{archive.name}*")
-    ]
-    needed = sum(size or 0 for size in sizes) + max(whole, default=0) - sum(present)
-    # The disk of the nearest folder that exists.
+    # Bytes of interrupted downloads need not be downloaded again.
+    present = 0
+    for archive in missing:
+        for path in (root / _DOWNLOADS).glob(f"{archive.name}*"):
+            present += path.stat().st_size
+    needed = sum(size or 0 for size in sizes) + max(whole, default=0) - present
+    # `root` may not exist yet: its disk is that of the nearest folder above it that exists.
     existing = next(path for path in (root.absolute(), *root.absolute().parents) if path.exists())
     free = shutil.disk_usage(existing).free
     if needed > free:
@@ -133,20 +136,22 @@ def download_archives(root: Path, archives: Sequence[Archive]) -> None:
 
     An interrupted download is continued.
     """
-    with writing(root / _WORK):
-        # The first archive has the annotations: it comes last.
+    with writing(root / _DOWNLOADS):
+        # The first archive has the annotations. It comes last, so that a category with annotations
+        # is complete.
         for archive in reversed(missing_archives(root, archives)):
-            path = root / _WORK / archive.name
+            path = root / _DOWNLOADS / archive.name
             if not archive.sequences and not path.exists():
                 fetch(archive.url, path, remote_size(archive.url), digest=archive.sha256)
-            # The origin is recorded before the folder has files, for an interrupted run.
+            # The origin is recorded before files are unpacked: after an interruption, they would
+            # count as files from elsewhere.
             record = _read_record(root)
-            category = record.setdefault(archive.category, _Unpacked(archive.origin))
+            unpacked = record.setdefault(archive.category, _Unpacked(archive.origin))
             write_atomic(root / _RECORD, msgspec.json.encode(record))
             file = RemoteFile(archive.url) if archive.sequences else io.FileIO(path)
             with _zip(file, archive.url) as zipped:
                 _unpack(zipped, root, _members(zipped, archive))
-            category.done += archive.sequences or [archive.name]
+            unpacked.done += archive.sequences or [archive.name]
             write_atomic(root / _RECORD, msgspec.json.encode(record))
             path.unlink(missing_ok=True)
 
@@ -158,7 +163,7 @@ def _unpack(zipped: zipfile.ZipFile, root: Path, members: Sequence[zipfile.ZipIn
     members = sorted(members, key=lambda member: (_is_annotation(member), member.header_offset))
     for member in tqdm(members, "unpacking", disable=None):
         path = targets[member]
-        # Other files that are there in full size are left by an interrupted run.
+        # Files of full size are left by an interrupted run and need not be unpacked again.
         if _is_annotation(member) or not path.is_file() or path.stat().st_size != member.file_size:
             write_atomic(path, zipped.read(member))
 
@@ -187,7 +192,7 @@ def _members(zipped: zipfile.ZipFile, archive: Archive) -> list[zipfile.ZipInfo]
 
 @contextmanager
 def _zip(file: io.RawIOBase, where: str) -> Iterator[zipfile.ZipFile]:
-    """Open a zip archive; InputError where it turns out to be damaged or encrypted."""
+    """Open a zip archive; InputError if the block finds it damaged or encrypted."""
     try:
         with io.BufferedReader(file, _PART) as buffered, zipfile.ZipFile(buffered) as zipped:
             yield zipped
@@ -196,11 +201,11 @@ def _zip(file: io.RawIOBase, where: str) -> Iterator[zipfile.ZipFile]:
 
 
 def _is_annotation(member: zipfile.ZipInfo) -> bool:
-    """Tell the annotations, in the category's folder itself, from the files of sequences."""
+    """Whether a file lies in the category's folder itself, not in the folder of a sequence."""
     return member.filename.count("/") == 1
 
 
 def _read_record(root: Path) -> dict[str, _Unpacked]:
-    """Read what is unpacked, by category."""
+    """Read the list of what is unpacked, by category."""
     path = root / _RECORD
     return read_json(path, dict[str, _Unpacked], "list") if path.is_file() else {}

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Real
+from numpy.typing import ArrayLike
 
 from zsp_lite.errors import (
     InputError,
@@ -24,7 +25,6 @@ from zsp_lite.errors import (
 
 Box = tuple[int, int, int, int]  # (top, left, height, width), pixels
 Values = Real[np.ndarray, "..."] | Sequence
-Depths = Real[np.ndarray, "*batch"] | float | np.floating
 
 # CO3D v1, and the default if the format is not given
 NDC_NORM_IMAGE_BOUNDS = "ndc_norm_image_bounds"
@@ -35,7 +35,7 @@ NDC_ISOTROPIC = "ndc_isotropic"  # CO3D v2
 _QUARTER_TURN = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 # PyTorch3D's camera axes (+x left, +y up, +z forward) are OpenCV's rotated by 180 degrees about z.
 _AXES = np.array([-1.0, -1.0, 1.0])
-MOST_PIXELS = 1_000_000  # of a side
+MOST_PIXELS = 1_000_000  # of a side of an image
 # A camera looks along the vertical if the sine of its angle to the vertical is at most this.
 _STEEP = 0.4
 
@@ -47,7 +47,7 @@ class Camera:
     InputError for a value out of range, or an `R` that is no rotation.
     """
 
-    # (3, 3) rotation, world to camera; the nearest rotation of what is given.
+    # (3, 3) rotation, world to camera; the nearest rotation to the given matrix.
     R: Float[np.ndarray, "3 3"]
     t: Float[np.ndarray, "3"]  # (3,) translation, world to camera, in units of the world
     focal_length: Float[np.ndarray, "2"]  # (2,) along x and y, pixels
@@ -149,7 +149,7 @@ class Camera:
         return pixels, depth
 
     def unproject_camera(
-        self, pixels: Real[np.ndarray, "*batch 2"], depth: Depths
+        self, pixels: Real[np.ndarray, "*batch 2"], depth: ArrayLike
     ) -> Float[np.ndarray, "*batch 3"]:
         """Compute camera points (..., 3) at given pixels (x, y) and depths along +z."""
         depth = np.asarray(depth, dtype=np.float64)[..., None]
@@ -159,7 +159,7 @@ class Camera:
         )
 
     def unproject(
-        self, pixels: Real[np.ndarray, "*batch 2"], depth: Depths
+        self, pixels: Real[np.ndarray, "*batch 2"], depth: ArrayLike
     ) -> Float[np.ndarray, "*batch 3"]:
         """Compute world points (..., 3) at given pixels and depths; the inverse of `project`."""
         return self.to_world(self.unproject_camera(pixels, depth))
@@ -173,7 +173,7 @@ class Camera:
 
     def resize(self, size: Sequence[int]) -> "Camera":
         """Return the camera of the image resized to (height, width), whatever the aspect ratio."""
-        scale = np.array([size[1] / self.size[1], size[0] / self.size[0]])
+        scale = np.divide(size, self.size)[::-1]  # (x, y)
         return replace(
             self,
             focal_length=self.focal_length * scale,
@@ -186,6 +186,7 @@ class Camera:
         camera = self
         for _ in range(quarters % 4):
             x, y = camera.principal_point
+            # The distance from the right border becomes the distance from the top.
             camera = Camera(
                 _QUARTER_TURN @ camera.R,
                 _QUARTER_TURN @ camera.t,
@@ -197,7 +198,7 @@ class Camera:
 
 
 def split_intrinsics(name: str, values: Values) -> Float[np.ndarray, "4"]:
-    """Return fx, fy, cx, cy, which may be given as a matrix (3, 3) or its 9 numbers."""
+    """Return fx, fy, cx, cy of four numbers, of a matrix (3, 3), or of its 9 numbers."""
     numbers = real_array(name, values)
     if numbers.shape in ((3, 3), (9,)):
         entries = numbers.ravel().tolist()
@@ -211,7 +212,7 @@ def split_intrinsics(name: str, values: Values) -> Float[np.ndarray, "4"]:
 
 
 def camera_from_pose(pose: Values, intrinsics: Values, size: tuple[int, int], where: str) -> Camera:
-    """Create a camera of its intrinsics and its camera-to-world pose; errors begin with `where`."""
+    """Create a camera from intrinsics and a camera-to-world pose; errors begin with `where`."""
     pose = rigid_matrix(f"{where}: camera-to-world pose", pose)
     rotation = pose[:3, :3]
     values = split_intrinsics(f"{where}: intrinsics", intrinsics)
@@ -223,25 +224,25 @@ def camera_from_pose(pose: Values, intrinsics: Values, size: tuple[int, int], wh
 
 def _ndc(size: Sequence[int], intrinsics_format: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the pixels per NDC unit and the pixel of the NDC origin, each (2,) as (x, y)."""
-    height, width = size
-    half = np.array([width, height]) / 2
+    half = np.array(size)[::-1] / 2
     scales = {NDC_NORM_IMAGE_BOUNDS: half, NDC_ISOTROPIC: np.full(2, half.min())}
     return scales[intrinsics_format], half
 
 
 def ground_axes(cameras: Sequence[Camera]) -> Float[np.ndarray, "2 3"]:
     """Return the world's axes to the right and up in a drawing of the scene from above."""
-    # The vertical is the image axis that the cameras agree on better, by the length of its mean:
-    # images may be turned by 90 degrees. Of two that are equal after rounding, it is y.
+    # Images may be turned by 90 degrees: the vertical is the image axis, y or x, on which the
+    # cameras agree better, which is the one with the longer mean. If both are equal after rounding,
+    # it is y.
     axes = np.mean([camera.R[[1, 0]] for camera in cameras], axis=0)
     down = axes[np.linalg.norm(axes, axis=1).round(6).argmax()]
-    # The right singular vectors of (1, 3) after the first are normal to it.
+    # The second and the third right singular vector of (1, 3) are normal to the vertical.
     right, up = np.linalg.svd(down[None])[2][1:]
     return np.stack([right, up if np.cross(right, up) @ down < 0 else -up])
 
 
 def azimuths(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
-    """Return the directions in degrees of cameras around a point; NaN for vertical ones."""
+    """Return the directions in degrees of cameras around a point; NaN for those above or below."""
     directions = np.stack([camera.centre for camera in cameras]) - centre
     x, y = ground_axes(cameras) @ directions.T
     steep = np.hypot(x, y) <= _STEEP * np.linalg.norm(directions, axis=1)
@@ -254,7 +255,8 @@ def view_span(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> floa
     angles = np.sort(angles[~np.isnan(angles)])
     if len(angles) > 1:
         gaps = np.diff(angles, append=angles[0] + 360)
-    else:  # others look along the vertical: the largest angle between any two cameras
+    else:
+        # At most one camera has a direction: the span is the largest angle between two cameras.
         directions = np.stack([camera.centre for camera in cameras]) - centre
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         span = np.degrees(np.arccos((directions @ directions.T).clip(-1, 1).min()))

@@ -18,6 +18,9 @@ from zsp_lite.data.pairs import pair_files, read_published_pairs
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import path_inside
 
+# A sequence can be evaluated with two usable frames: one as a reference, one as a target.
+_LEAST_FRAMES = 2
+
 
 @dataclass
 class CategoryCheck:
@@ -28,7 +31,7 @@ class CategoryCheck:
     sequences: int = 0  # annotated ones
     frames: int = 0  # annotated ones
     complete: int = 0  # sequences without problems
-    absent: int = 0  # annotated sequences without any file, in a folder that was downloaded in part
+    absent: int = 0  # sequences without any file; counted in a `partial` folder alone
     labelled: int = 0  # sequences with a label
     # Labelled sequences that can be evaluated: at least two frames have image, mask, depth and
     # camera, and no defect.
@@ -80,11 +83,11 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
     sequences = check.attempt(dataset.sequences, category)
     if keys is None or sequences is None:
         return check
-    clouds = {sequence.sequence_name: sequence.point_cloud for sequence in sequences}
+    listed = {sequence.sequence_name: sequence for sequence in sequences}
     names = list(dict.fromkeys(key.sequence_name for key in keys))
     check.sequences = len(names)
     check.frames = len(keys)
-    for name in sorted(set(clouds) - set(names)):
+    for name in sorted(listed.keys() - names):
         check.problems.append(f"sequence {name} has no frames in the annotations")
 
     # The files of each sequence.
@@ -93,29 +96,30 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
         if partial and not (dataset.root / category / name).exists():
             check.absent += 1
             continue
-        before = len(check.problems)
-        frames = check.attempt(dataset.frames, category, name) or []
-        if sum(_check_frame(dataset, frame, deep, check) for frame in frames) >= 2:
+        problems_before = len(check.problems)
+        usable_frames = 0
+        for frame in check.attempt(dataset.frames, category, name) or []:
+            usable_frames += _check_frame(dataset, frame, deep, check)
+            if frame.viewpoint and frame.viewpoint.intrinsics_format == NDC_ISOTROPIC:
+                check.layout = "v2"
+        if usable_frames >= _LEAST_FRAMES:
             usable.add(name)
-        if any(
-            frame.viewpoint and frame.viewpoint.intrinsics_format == NDC_ISOTROPIC
-            for frame in frames
-        ):
-            check.layout = "v2"
-        if name not in clouds:
+        if name in listed:
+            cloud = listed[name].point_cloud
+            if cloud is None or not _check_file(dataset, cloud.path, check):
+                check.cloudless += 1
+            elif deep:
+                check.attempt(dataset.point_cloud, category, name)
+        else:
             check.problems.append(f"sequence {name} is not in {SEQUENCES_FILE}")
-        elif not clouds[name] or not _check_file(dataset, clouds[name].path, check):
-            check.cloudless += 1
-        elif deep:
-            check.attempt(dataset.point_cloud, category, name)
-        if len(check.problems) == before:
+        if len(check.problems) == problems_before:
             check.complete += 1
 
     # Labels and evaluation pairs.
     labels = check.attempt(read_labels, dataset.root, category) or {}
     check.labelled = len(labels)
     check.usable = len(set(labels) & usable)
-    for name in sorted(set(labels) - set(names)):
+    for name in sorted(labels.keys() - names):
         check.problems.append(f"label of {name} is of a sequence that is not in the annotations")
     for path in pair_files(dataset, category):
         if check.attempt(read_published_pairs, path, dataset) is not None:
@@ -126,30 +130,34 @@ def _check_category(dataset: Co3D, category: str, deep: bool, partial: bool) -> 
 def _check_frame(
     dataset: Co3D, annotation: FrameAnnotation, deep: bool, check: CategoryCheck
 ) -> bool:
-    """Check the files and the camera of a frame; return whether a pose can be estimated in it."""
+    """Check the files and the camera of a frame; return whether its pose can be estimated."""
     depth = annotation.depth
     mask = annotation.mask
     paths = [annotation.image.path]
     if mask:
         paths.append(mask.path)
     if depth:
-        paths += [depth.path, depth.mask_path]
-    are_there = [_check_file(dataset, path, check) for path in paths if path]
-    if annotation.viewpoint is None or not all(are_there):
+        paths.append(depth.path)
+        if depth.mask_path:
+            paths.append(depth.mask_path)
+    # A list, so that the files after a missing one are checked, too.
+    has_files = all([_check_file(dataset, path, check) for path in paths])
+    if annotation.viewpoint is None or not has_files:
         return False
-    opened = check.attempt(dataset.load if deep else dataset.camera, annotation)
-    if opened is None:
+    has_depth_and_mask = depth is not None and mask is not None
+    if not deep:
+        return check.attempt(dataset.camera, annotation) is not None and has_depth_and_mask
+    frame = check.attempt(dataset.load, annotation)
+    if frame is None:
         return False
-    if deep:
-        defect = frame_defect(opened)
-        if defect:
-            check.defects[defect] += 1
-            return False
-    return depth is not None and mask is not None
+    defect = frame_defect(frame)
+    if defect:
+        check.defects[defect] += 1
+    return not defect and has_depth_and_mask
 
 
 def _check_file(dataset: Co3D, relative: str, check: CategoryCheck) -> bool:
-    """Check that a file exists and is not empty, and add its size to `check`."""
+    """Return whether a file exists and is not empty; add its size or the problem to `check`."""
     path = check.attempt(path_inside, dataset.root, relative)
     if path is None:
         return False

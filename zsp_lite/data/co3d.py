@@ -41,8 +41,8 @@ from zsp_lite.io.files import path_inside, plain_name, stable_hash, write_atomic
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import read_ply, write_ply
 
-# Of sequences that are worth labelling: "Choice of evaluation categories & sequences" of the
-# supplement.
+# Sequences with greater qualities are worth labelling ("Choice of evaluation categories &
+# sequences" of the supplement).
 _MIN_VIEW_QUALITY = 1.25
 _MIN_CLOUD_QUALITY = 0.3
 
@@ -56,28 +56,35 @@ class Pair:
     reference_frame: int
     target_sequence: str
     target_frames: tuple[int, ...]
-    repeat: int = 0  # number of the evaluation, with random draws of its own
+    # Number of the evaluation: each repetition has other random draws.
+    repeat: int = 0
 
     @property
     def key(self) -> str:
-        """Unique identifier of the pair, used in results."""
+        """Identifier of the frames, used in results; repetitions of a pair share it."""
         targets = ",".join(map(str, self.target_frames))
         reference = f"{self.category}/{self.reference_sequence}:{self.reference_frame}"
         return f"{reference}/{self.target_sequence}:{targets}"
 
     @classmethod
     def from_key(cls, key: str) -> "Pair":
-        """Return the pair with a `key`."""
+        """Return the pair with a `key`, and the repeat 0."""
         category, reference, target = key.split("/")
-        first, _, frame = reference.rpartition(":")
-        second, _, frames = target.rpartition(":")
-        return cls(category, first, int(frame), second, tuple(map(int, frames.split(","))))
+        reference_sequence, _, reference_frame = reference.rpartition(":")
+        target_sequence, _, frames = target.rpartition(":")
+        return cls(
+            category,
+            reference_sequence,
+            int(reference_frame),
+            target_sequence,
+            tuple(map(int, frames.split(","))),
+        )
 
     @property
     def seed(self) -> int:
         """Seed of all random draws for this pair; it depends on the key and the repeat only."""
         name = f"{self.key} {self.repeat}" if self.repeat else self.key
-        return stable_hash(name) >> 1  # 63 bits, for int64
+        return stable_hash(name) >> 1  # 63 of the 64 bits, because tables hold it as int64
 
 
 class Co3D:
@@ -116,9 +123,9 @@ class Co3D:
         """Select at most `top` sequences for labelling, those with the best point clouds first."""
         selected = []
         for sequence in self.sequences(category):
-            cloud = sequence.point_cloud.quality_score if sequence.point_cloud else None
-            views = sequence.viewpoint_quality_score or 0
-            if (cloud or 0) > _MIN_CLOUD_QUALITY and views > _MIN_VIEW_QUALITY:
+            cloud_quality = sequence.point_cloud.quality_score if sequence.point_cloud else None
+            view_quality = sequence.viewpoint_quality_score or 0
+            if (cloud_quality or 0) > _MIN_CLOUD_QUALITY and view_quality > _MIN_VIEW_QUALITY:
                 selected.append(sequence)
         return sorted(
             selected,
@@ -126,12 +133,16 @@ class Co3D:
         )[:top]
 
     def frame_list(self, category: str) -> list[FrameKey]:
-        """List the frames in the file's order, to which the ids of published pairs refer."""
+        """List sequence and number of all frames, in the file's order.
+
+        The ids of published pairs are positions in this list.
+        """
         return self._frame_index(category).keys
 
     def frame_numbers(self, category: str) -> dict[str, list[int]]:
         """List the numbers of the frames of every sequence of a category, in ascending order."""
         by_sequence = self._frame_index(category).by_sequence
+        # The keys of the positions are the frame numbers.
         return {name: list(positions) for name, positions in by_sequence.items()}
 
     def frames(self, category: str, sequence: str) -> list[FrameAnnotation]:
@@ -148,7 +159,7 @@ class Co3D:
         return index.frame(position)
 
     def camera(self, annotation: FrameAnnotation) -> Camera:
-        """Convert the viewpoint of a frame to a camera."""
+        """Convert the viewpoint of a frame's annotation to a camera."""
         name = f"{annotation.sequence_name}/{annotation.frame_number}"
         view = annotation.viewpoint
         if view is None:
@@ -204,8 +215,8 @@ class Co3D:
     def extent(self, category: str, sequence: str) -> tuple[Float64[np.ndarray, "3"], float] | None:
         """Return the centre and the diameter of a sequence's object in its world.
 
-        They are those of the box of the cloud's points, without the outermost 2 % on each side.
-        None without a point cloud.
+        Both describe the box around the points of its cloud, without the outermost 2 % on each
+        side. None without a point cloud.
         """
         path = self._cloud_path(category, sequence)
         if path is None or not path.is_file():
@@ -216,7 +227,7 @@ class Co3D:
 
     def _cloud_path(self, category: str, sequence: str) -> Path | None:
         """Return the path of a sequence's point cloud, None if the annotations have none."""
-        clouds = {entry.sequence_name: entry.point_cloud for entry in self.sequences(category)}
+        clouds = {known.sequence_name: known.point_cloud for known in self.sequences(category)}
         cloud = clouds.get(sequence)
         return None if cloud is None else path_inside(self.root, cloud.path)
 
@@ -235,7 +246,7 @@ class Co3D:
         return self.root / category
 
     def _frame_index(self, category: str) -> FrameIndex:
-        """Return the frame annotations of a category, which stay in memory until the next one."""
+        """Return the frame annotations of a category, and keep them until another is asked for."""
         if self._index is None or self._index[0] != category:
             self._index = None  # frees the previous category's JSON before the next one is read
             path = self._category_folder(category) / FRAMES_FILE
@@ -255,7 +266,6 @@ class SequenceData:
     normals: Real[np.ndarray, "n 3"] | None = None
     viewpoint_quality: float | None = None
     point_cloud_quality: float | None = None
-    depth_scale_adjustment: float = 1.0  # CO3D's factor from stored depth to depth
 
 
 def write_co3d(
@@ -273,46 +283,53 @@ def write_co3d(
     frames_path = folder / FRAMES_FILE
     sequences_path = folder / SEQUENCES_FILE
     with writing(folder):
-        # The entries of both files in their order, each as (name of the sequence, entry).
+        # The annotations in each file, as (name of the sequence, annotation).
         frames = []
         listed = []
         if frames_path.is_file():
             index = read_frame_index(frames_path)
-            frames = [(key.sequence_name, entry) for key, entry in zip(index.keys, index.entries)]
+            frames = [(key.sequence_name, frame) for key, frame in zip(index.keys, index.entries)]
         if sequences_path.is_file():
-            listed = [(entry.sequence_name, entry) for entry in read_sequences(sequences_path)]
+            listed = [(known.sequence_name, known) for known in read_sequences(sequences_path)]
 
         for sequence in sequences:
-            annotations, annotation = _write_sequence(root, category, sequence, quality)
-            frames = [entry for entry in frames if entry[0] != sequence.name]
-            frames += [(sequence.name, frame) for frame in annotations]
-            listed = [entry for entry in listed if entry[0] != sequence.name]
-            listed.append((sequence.name, annotation))
-            for path, entries in ((frames_path, frames), (sequences_path, listed)):
-                content = msgspec.json.encode(
-                    [entry for _, entry in entries], enc_hook=np.ndarray.tolist
-                )
-                write_atomic(path, compress(content))
+            new_frames, new_sequence = _write_sequence(root, category, sequence, quality)
+            _update(frames_path, frames, sequence.name, new_frames)
+            _update(sequences_path, listed, sequence.name, [new_sequence])
+
+
+def _update(path: Path, named: list[tuple[str, Any]], name: str, new: Sequence) -> None:
+    """Replace a sequence's annotations in the list, whose last ones they become, and in the file.
+
+    The list holds (name of the sequence, annotation).
+    """
+    named[:] = [pair for pair in named if pair[0] != name]
+    named += [(name, annotation) for annotation in new]
+    # A viewpoint holds arrays, which become lists.
+    content = msgspec.json.encode(
+        [annotation for _, annotation in named], enc_hook=np.ndarray.tolist
+    )
+    write_atomic(path, compress(content))
 
 
 def _write_sequence(
     root: Path, category: str, sequence: SequenceData, quality: int
 ) -> tuple[list[FrameAnnotation], SequenceAnnotation]:
-    """Write the files of a sequence, and return the annotations of its frames and its own."""
+    """Write the files of a sequence; return the annotations of its frames, and of the sequence."""
     base = f"{category}/{plain_name(sequence.name, 'sequence')}"
     annotations = []
     for number, (frame, timestamp) in enumerate(
         zip(sequence.frames, sequence.timestamps, strict=True)
     ):
-        stem = f"frame{number + 1:06d}"
+        stem = f"frame{number + 1:06d}"  # CO3D numbers frames from 0, and their files from 1
         image = ImageAnnotation(f"{base}/images/{stem}.jpg", frame.camera.size)
         write_image(root / image.path, frame.rgb, quality)
         depth = mask = None
         if frame.depth is not None:
             path = f"{base}/depths/{stem}.jpg.geometric.png"
             mask_path = f"{base}/depth_masks/{stem}.png"
-            depth = DepthAnnotation(path, float(sequence.depth_scale_adjustment), mask_path)
-            write_depth(root / path, frame.depth, sequence.depth_scale_adjustment)
+            depth = DepthAnnotation(path, scale_adjustment=1.0, mask_path=mask_path)
+            write_depth(root / path, frame.depth)
             write_mask(root / mask_path, frame.depth > 0)
         if frame.mask is not None:
             # The stored 8-bit values are summed, because a sum of integers is the same on every
@@ -320,14 +337,24 @@ def _write_sequence(
             mass = int(np.rint(frame.mask.astype(np.float64) * 255).astype(np.int64).sum()) / 255
             mask = MaskAnnotation(f"{base}/masks/{stem}.png", mass)
             write_mask(root / mask.path, frame.mask)
-        view = Viewpoint(**frame.camera.to_pytorch3d())  # its arrays are written as lists
         annotations.append(
-            FrameAnnotation(sequence.name, number, image, float(timestamp), depth, mask, view)
+            FrameAnnotation(
+                sequence.name,
+                number,
+                image,
+                float(timestamp),
+                depth,
+                mask,
+                Viewpoint(**frame.camera.to_pytorch3d()),
+            )
         )
     cloud = PointCloudAnnotation(
         f"{base}/pointcloud.ply", sequence.point_cloud_quality, len(sequence.points)
     )
     write_ply(root / cloud.path, sequence.points, sequence.colours, sequence.normals)
     return annotations, SequenceAnnotation(
-        sequence.name, category, None, cloud, sequence.viewpoint_quality
+        sequence.name,
+        category,
+        point_cloud=cloud,
+        viewpoint_quality_score=sequence.viewpoint_quality,
     )

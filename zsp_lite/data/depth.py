@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Real, UInt16
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
 
-_PLANE_TRIALS = 500  # samples of three points to fit a plane to
-_PLANE_POINTS = 4000  # at most that a plane is fitted to
+_PLANE_TRIALS = 500  # number of samples of three points
+_PLANE_POINTS = 4000  # largest number of points to which a plane is fitted, for speed
 
 
 def decode_depth(
@@ -21,14 +21,17 @@ def decode_depth(
     with np.errstate(invalid="ignore", over="ignore"):  # bits of NaN or infinity
         depth = np.ascontiguousarray(bits).view(np.float16).astype(np.float32)
         depth = depth * np.float32(scale_adjustment)
+    return zero_unknown(depth)
+
+
+def zero_unknown(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Replace depth that is not finite or not positive by 0."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def encode_depth(
-    depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0
-) -> UInt16[np.ndarray, "h w"]:
+def encode_depth(depth: Real[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
     """Encode depth as the bits of float16 values; the inverse of `decode_depth`."""
-    depth = np.asarray(depth, dtype=np.float64) / scale_adjustment
+    depth = np.asarray(depth, dtype=np.float64)
     # A value beyond float16's range (65504) would become infinite; it is stored as unknown.
     usable = np.isfinite(depth) & (depth > 0) & (depth <= float(np.finfo(np.float16).max))
     return np.where(usable, depth, 0).astype(np.float16).view(np.uint16)
@@ -67,10 +70,10 @@ def patch_points(
 ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
     """Compute one point per patch in camera coordinates.
 
-    The point of a patch is that of the pixel whose depth is the 25th percentile of the patch's
-    known depths. A patch without known depth takes the in-painted depth at its central pixel, or
-    the origin without `inpaint`, which takes most of the time. Also returns whether each patch has
-    a known depth.
+    The point of a patch is the point of the pixel whose depth is the 25th percentile of the patch's
+    known depths. A patch without known depth takes the in-painted depth at its central pixel; or,
+    without `inpaint`, the origin: in-painting takes most of the time. Also returns whether each
+    patch has a known depth.
     """
     # The paper does not say which of a patch's pixels it takes. At a silhouette the nearer surface
     # is the object, and a percentile is robust to single outliers.
@@ -79,8 +82,8 @@ def patch_points(
     rows, row_valid, row_middle = _split(height, grid[0])
     cols, col_valid, col_middle = _split(width, grid[1])
 
-    # Pixel indices and depths of every patch, (rows, cols, pixels per patch); infinity where
-    # unknown.
+    # Pixel indices and depths of every patch, (rows, cols, pixels per patch). The depth is infinite
+    # where it is unknown, and where a smaller patch has no such pixel.
     shape = (len(rows), len(cols), rows.shape[1], cols.shape[1])
     pixel = np.broadcast_to(rows[:, None, :, None] * width + cols[None, :, None, :], shape)
     pixel = pixel.reshape(*shape[:2], -1)
@@ -88,8 +91,8 @@ def patch_points(
     values = depth.ravel()[pixel]
     values = np.where(valid & np.isfinite(values) & (values > 0), values, np.inf)
 
-    # The pixel whose depth has the rank of the 25th percentile, (rows, cols); without known depth,
-    # the central pixel.
+    # The pixel of each patch, (rows, cols): with known depths, the one at the 25th percentile;
+    # without any, the central pixel.
     n_known = np.isfinite(values).sum(axis=-1)
     known = n_known > 0
     rank = np.maximum(n_known - 1, 0) // 4
@@ -100,7 +103,9 @@ def patch_points(
     index = np.where(known, nearer, row_middle[:, None] * width + col_middle)
     filled = inpaint_depth(depth) if inpaint and not known.all() else depth
     y, x = np.divmod(index, width)
-    depths = filled.ravel()[index] if inpaint else np.where(known, filled.ravel()[index], 0)
+    depths = filled.ravel()[index]
+    if not inpaint:
+        depths = np.where(known, depths, 0)
     return camera.unproject_camera(np.stack([x + 0.5, y + 0.5], axis=-1), depths), known
 
 
@@ -108,7 +113,8 @@ def fit_plane(
     points: Float[np.ndarray, "n 3"], threshold: float
 ) -> tuple[Float[np.ndarray, "3"], float]:
     """Fit a plane `normal @ x = offset` to points with outliers by RANSAC, up to its sign."""
-    points = points[:: -(-len(points) // _PLANE_POINTS)]  # a step rounded up
+    # The step is rounded up.
+    points = points[:: -(-len(points) // _PLANE_POINTS)]
     # A plane through three points in each trial: normals (trials, 3), distances (trials, n).
     corners = points[np.random.default_rng(0).integers(len(points), size=(_PLANE_TRIALS, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -125,7 +131,11 @@ def fit_plane(
 
 
 def _split(length: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split pixels into bands: indices (bands, widest), whether they are in the band, centres."""
+    """Split the pixels 0 to `length` - 1 of a side into `count` bands.
+
+    Returns the pixels of each band, padded to the widest band: (bands, widest); whether each is no
+    padding; and the central pixel of each band.
+    """
     edges = np.arange(count + 1) * length // count
     index = edges[:-1, None] + np.arange(np.diff(edges).max())
     valid = index < edges[1:, None]

@@ -27,14 +27,14 @@ from zsp_lite.errors import (
 from zsp_lite.io.files import digest, read_bytes, write_atomic
 from zsp_lite.metrics import rotation_error
 
-_REQUIRED = ("pair", "target_frame", "rotation")  # columns
-_CHANCE = 0.01  # largest p value of the sign test by which another convention is named
+_REQUIRED = ("pair", "target_frame", "rotation")  # columns that a file of poses must have
+_CHANCE = 0.01  # another convention is named if the p value of a sign test is at most this
 
 
 class StoredPose(NamedTuple):
     """Pose of the reference object in the camera of a target frame."""
 
-    line: int  # of the file
+    line: int  # number of its line in the file
     target_frame: int
     rotation: Float[np.ndarray, "3 3"]
     translation: Float[np.ndarray, "3"] | None  # in the target's unit
@@ -62,9 +62,9 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
                     "sequence": sequence,
                     "frame": frame,
                     "image": annotation.image.path,
-                    "depth": depth and depth.path,
-                    "depth_scale": depth and depth.scale_adjustment,
-                    "mask": mask and mask.path,
+                    "depth": depth.path if depth else None,
+                    "depth_scale": depth.scale_adjustment if depth else None,
+                    "mask": mask.path if mask else None,
                     "fx": fx,
                     "fy": fy,
                     "cx": cx,
@@ -103,8 +103,8 @@ def _read_lines(path: str | Path, data: bytes) -> list[tuple[int, dict]]:
         mark = next((mark for mark in ";\t" if mark in header), ",")
         reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=mark, restval="")
         reader.fieldnames = ["_".join(name.lower().split()) for name in reader.fieldnames or ()]
-        # The reader's own number of a line is wrong after a blank one; a spreadsheet's blank lines
-        # have separators.
+        # The reader skips blank lines, so that their position in its output is no line number. The
+        # blank lines of a spreadsheet have separators: all their fields are empty.
         lines = [(reader.reader.line_num, line) for line in reader if any(line.values())]
     except (ValueError, csv.Error) as error:
         raise InputError(f"poses {path}: {error}, expected a CSV file") from error
@@ -133,7 +133,7 @@ def _read_pose(number: int, line: dict) -> StoredPose:
 
 
 def _numbers(name: str, text: str, size: int) -> np.ndarray:
-    """Read the numbers of a field; a comma in one is its decimal point."""
+    """Read the numbers of a field, with decimal points or decimal commas."""
     values = real_array(name, np.array(text.replace(",", ".").split(), float), (size,))
     check_magnitude(name, values)
     return values
@@ -146,30 +146,31 @@ def check_poses(
 
     InputError if no pose is of any of the pairs, or if one is in none of its pair's target frames.
     """
-    found = {pair: poses[pair.key] for pair in pairs if pair.key in poses}
-    if not found:
+    pose_of = {pair: poses[pair.key] for pair in pairs if pair.key in poses}
+    if not pose_of:
         raise InputError(f"{path} has no pose for any of the pairs of --list-pairs")
-    for pair, pose in found.items():
+    for pair, pose in pose_of.items():
         check_choice(
             f"poses {path}, line {pose.line}: target_frame", pose.target_frame, pair.target_frames
         )
-    remarks = [other_convention(dataset, found)]
-    surplus = len(poses) - len(found)
-    if surplus:
-        remarks.insert(0, f"{surplus} of {len(poses)} poses fit no pair")
+    surplus = len(poses) - len(pose_of)
+    remarks = [
+        f"{surplus} of {len(poses)} poses fit no pair" if surplus else "",
+        other_convention(dataset, pose_of),
+    ]
     return "; ".join(filter(None, remarks))
 
 
 def other_convention(dataset: Co3D, poses: Mapping[Pair, StoredPose]) -> str:
     """Name another convention by which rotations clearly agree with the labels, or return "".
 
-    Those of other programs may be inverted, or conjugated, for cameras in OpenGL's or PyTorch3D's
-    axes.
+    Other programs may write inverse rotations, or rotations between cameras with OpenGL's or
+    PyTorch3D's axes.
     """
     views = [pair.target_frames.index(pose.target_frame) for pair, pose in poses.items()]
     truths = true_poses(dataset.root, list(poses), np.array(views))[:, :3, :3]
     given = np.stack([pose.rotation for pose in poses.values()])
-    # The rotations, (n, 3, 3), as each convention reads them; "" is the right one.
+    # The rotations, (n, 3, 3), as each convention reads them; "" is the documented convention.
     readings = {"": given}
     for signs in ((1, -1, -1), (-1, -1, 1)):
         readings[f"conjugated by diag{signs}"] = given * np.outer(signs, signs)
@@ -178,8 +179,8 @@ def other_convention(dataset: Co3D, poses: Mapping[Pair, StoredPose]) -> str:
     errors = {name: rotation_error(rotations, truths) for name, rotations in readings.items()}
     medians = {name: float(np.median(error)) for name, error in errors.items()}
     best = min(medians, key=medians.get)
-    # Rows that confuse left and right, or turn little, have small errors in either reading: that of
-    # most pairs counts.
+    # The errors of a wrong reading may be small by chance, as for rotations by small angles: a sign
+    # test decides whether more pairs agree with the other reading than chance explains.
     by_chance = binom.sf((errors[best] < errors[""]).sum() - 1, len(truths), 1 / 2)
     if medians[best] > min(30, medians[""] / 2) or by_chance > _CHANCE:
         return ""

@@ -13,22 +13,24 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
 from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose, split_intrinsics
-from zsp_lite.data.depth import decode_depth, encode_depth
+from zsp_lite.data.depth import decode_depth, encode_depth, zero_unknown
 from zsp_lite.errors import MAX_LENGTH, InputError, check_number, real_array
 from zsp_lite.io.files import read_bytes, write_atomic
 
 MAX_PIXELS = 1 << 26  # of an image file
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
-# Largest relative difference of the aspect ratios of an image and its smaller depth map.
+# Largest relative difference of the aspect ratios of an image and its smaller depth map: sides are
+# rounded to whole pixels.
 _SAME_ASPECT = 0.01
-_BLACK = 10  # an image without a colour of this value is black, as CO3D's hidden frames are
+# An image whose colours are all below this value is black, as CO3D's hidden frames are.
+_BLACK = 10
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Image with its camera and, if known, its depth map and object mask: copies of what is given.
+    """Image with its camera and, if known, its depth map and object mask.
 
-    InputError if they do not fit together.
+    The arrays are copied. InputError if they do not fit together.
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]  # (H, W, 3) colours, uint8
@@ -89,19 +91,19 @@ class Frame:
                 negative.
             K: Intrinsics of the colours, (3, 3) or (fx, fy, cx, cy), pixels; the first pixel's
                 centre is (0, 0).
-            mask: The object's pixels (H, W): booleans, 0 and 1, or 0 to 255. None leaves it to
-                `estimate_pose`.
+            mask: The object's pixels (H, W): booleans, 0 and 1, or 0 to 255. By default,
+                `estimate_pose` finds the object.
             pose: Rigid transform (4, 4) from camera to world in OpenCV's axes (x right, y down, z
                 forward), in units of the world. By default, the world is the camera's frame.
             depth_unit: World units per unit of `depth`.
             name: Name for messages and reports.
 
         Raises:
-            InputError: Arrays that are none of these, or do not fit together.
+            InputError: An array has another shape or type, or the arrays do not fit together.
         """
         label = f"frame {name}".rstrip()
 
-        # Colours (H, W, 3), uint8; other values are refused by the frame.
+        # Colours (H, W, 3), uint8. What is still of another type below is refused by `__init__`.
         image = np.asarray(rgb)
         if image.ndim == 2:
             image = np.repeat(image[..., None], 3, axis=2)
@@ -123,17 +125,18 @@ class Frame:
         if depth.ndim == 3 and depth.shape[2] == 1:
             depth = depth[..., 0]
         depth = real_array(f"{label} depth", depth, (None, None)) * depth_unit
-        depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+        depth = zero_unknown(depth).astype(np.float32)
 
         # Mask from 0 to 1.
         if mask is not None:
             mask = real_array(f"{label} mask", mask).astype(np.float32)
-            most = mask.max()
-            if 1 < most <= ON_OBJECT * 255:
+            largest = mask.max()
+            # Such a mask has labels or another scale: as 0 to 255, no pixel would be on the object.
+            if 1 < largest <= ON_OBJECT * 255:
                 raise InputError(
-                    f"{label} mask has {most:g} at most, expected booleans, 0 and 1, or 0 to 255"
+                    f"{label} mask has {largest:g} at most, expected booleans, 0 and 1, or 0 to 255"
                 )
-            if most > 1:
+            if largest > 1:
                 mask = mask / np.float32(255)
         return cls(image, enlarge_depth(depth, size), mask, camera, name)
 
@@ -156,15 +159,15 @@ class Frame:
 def enlarge_depth(
     depth: Float32[np.ndarray, "h w"], size: tuple[int, int]
 ) -> Float32[np.ndarray, "..."]:
-    """Enlarge a smaller depth map of the same aspect ratio to an image's size (H, W).
+    """Enlarge a depth map of the same aspect ratio to an image's size (H, W).
 
-    Others stay as they are.
+    Depth maps of other aspect ratios, or no smaller than the image, are returned as they are.
     """
     rows, columns = depth.shape
     height, width = size
     if rows >= height or abs(rows * width / (columns * height) - 1) > _SAME_ASPECT:
         return depth
-    # The nearest values, because means of two surfaces lie on neither.
+    # Pixels take the nearest value, because the mean of two surfaces' depths lies on neither.
     return cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
 
@@ -199,7 +202,10 @@ def mask_to_bbox(
 
 
 def largest_region(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Return the largest connected region without parts thinner than 3 pixels, empty if none."""
+    """Return the largest connected region after parts thinner than 3 pixels are removed.
+
+    It is empty if there is no region.
+    """
     opened = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, regions, statistics, _ = cv2.connectedComponentsWithStats(opened)
     areas = statistics[1:, cv2.CC_STAT_AREA]  # the first region is the outside
@@ -210,16 +216,20 @@ def crop_to_object(frame: Frame) -> Frame:
     """Crop a frame and its camera to the bounding box of its object mask (see `mask_to_bbox`)."""
     top, left, height, width = mask_to_bbox(frame.mask)
     inside = np.s_[top : top + height, left : left + width]
-    camera = frame.camera.crop((top, left, height, width))
-    return _changed(frame, camera, lambda image: image[inside])
+    return _changed(
+        frame, frame.camera.crop((top, left, height, width)), lambda image: image[inside]
+    )
 
 
 def turn_frame(frame: Frame, quarters: int) -> Frame:
     """Turn a frame and its camera by quarter turns as in `numpy.rot90`; world points stay."""
     if quarters % 4 == 0:
         return frame
-    turned = frame.camera.turn(quarters)
-    return _changed(frame, turned, lambda image: np.ascontiguousarray(np.rot90(image, quarters)))
+    return _changed(
+        frame,
+        frame.camera.turn(quarters),
+        lambda image: np.ascontiguousarray(np.rot90(image, quarters)),
+    )
 
 
 def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
@@ -235,8 +245,8 @@ def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:
     rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR)
     depth = frame.depth
     mask = frame.mask
-    # By the nearest pixel: values interpolated at an edge or hole lie on no surface. The centre of
-    # pixel i is at the fraction (2 i + 1) / (2 height) of the side.
+    # Depth is that of the nearest pixel: values interpolated at an edge or hole lie on no surface.
+    # The centre of pixel i is at the fraction (2 i + 1) / (2 height) of the side.
     if depth is not None:
         rows = (2 * np.arange(height) + 1) * old_height // (2 * height)
         cols = (2 * np.arange(width) + 1) * old_width // (2 * width)
@@ -288,25 +298,24 @@ def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"] | Bool[np.ndarray
     _encode(path, ".png", np.rint(mask.astype(np.float64) * 255).astype(np.uint8), options)
 
 
-def write_depth(
-    path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0
-) -> None:
+def write_depth(path: str | Path, depth: Real[np.ndarray, "h w"]) -> None:
     """Write depth (H, W) as a 16-bit PNG in CO3D's encoding (see `encode_depth`)."""
-    _encode(path, ".png", encode_depth(depth, scale_adjustment), [])
+    _encode(path, ".png", encode_depth(depth), [])
 
 
 def _changed(frame: Frame, camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Frame:
-    """Return a frame with another camera and `change` applied to its colours, depth and mask."""
+    """Return a frame with a new camera, and with `change` applied to colours, depth and mask."""
     images = {"rgb": frame.rgb, "depth": frame.depth, "mask": frame.mask}
     changed = {name: change(image) for name, image in images.items() if image is not None}
     return replace(frame, camera=camera, **changed)
 
 
 def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
-    """Return the range [first, end) of the true values of an array, padded within its length."""
+    """Return the range [start, end) of the true values of an array, padded within its length."""
     first, last = np.flatnonzero(inside)[[0, -1]]
-    margin = (last + 1 - first) * padding / 2
-    return max(0, int(np.floor(first - margin))), min(len(inside), int(np.ceil(last + 1 + margin)))
+    end = last + 1
+    margin = (end - first) * padding / 2
+    return max(0, int(np.floor(first - margin))), min(len(inside), int(np.ceil(end + margin)))
 
 
 def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
@@ -317,13 +326,13 @@ def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
     expected = "a complete JPEG or PNG"
     # What Pillow and OpenCV raise for another format or a damaged header.
     with suppress(OSError, SyntaxError, ValueError, cv2.error):
-        # This reads the header only.
+        # This reads the header only: the number of pixels is checked before any is decoded.
         opened = (JpegImageFile if is_jpeg else PngImageFile)(io.BytesIO(data))
         width, height = opened.size
         if width * height > MAX_PIXELS:
             expected = f"at most {MAX_PIXELS} pixels, not {height} x {width}"
         else:
-            # OpenCV would fill missing parts of an image with grey.
+            # Pillow refuses incomplete files; OpenCV would fill missing parts with grey.
             if is_jpeg:
                 opened.load()
             else:

@@ -14,7 +14,7 @@ from zsp_lite.errors import InputError, rigid_matrix
 from zsp_lite.io.files import read_json
 
 _warn_once = functools.cache(logging.getLogger(__name__).warning)
-# In each category folder: the pose of each sequence's object in its world.
+# A file in each category folder: the pose of each sequence's object in the sequence's world.
 POSES_FILE = "object_poses.json"
 _Vector = tuple[float, float, float]
 _Row = tuple[float, float, float, float]
@@ -63,30 +63,31 @@ def read_poses(out: Path, category: str) -> dict[str, ObjectPose]:
 def common_turns(
     out: Path, category: str, first: str, second: str
 ) -> Float[np.ndarray, "s 3 3"] | None:
-    """Return the turns in the second object's world after which both look the same.
+    """Return the rotations in the second object's world after which both objects look the same.
 
-    The first is the identity. None where nothing is known.
+    The first of them is the identity. None if the pose of an object is not known.
     """
     try:
         poses = read_poses(out, category)
-    except InputError as error:  # a file of an older layout, for instance, costs one figure only
+    # A damaged file costs one figure of the benchmark only.
+    except InputError as error:
         _warn_once("%s", f"{error}: without it there is no symmetric_acc30")
         return None
     if not {first, second} <= poses.keys():
         return None
     common = [turn for turn in poses[first].turns if turn in poses[second].turns]
     angles = [[turn] for turn in (0, *common)]
-    # From object to world coordinates: the turn is about the object's axis.
-    world = poses[second].R
-    return world @ Rotation.from_euler("z", angles, degrees=True).as_matrix() @ world.T
+    # A turn about the object's up axis, in the coordinates of the world.
+    to_world = poses[second].R
+    return to_world @ Rotation.from_euler("z", angles, degrees=True).as_matrix() @ to_world.T
 
 
 def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:
     """Read the object poses of a category; InputError if the folder is not a synthetic export."""
     poses = read_poses(dataset.root, category)
     if not poses:
-        path = dataset.root / category / POSES_FILE
         raise InputError(
-            f"{path} is missing, expected a synthetic export: other data has no exact object poses"
+            f"{dataset.root / category / POSES_FILE} is missing, expected a synthetic export: "
+            "other data has no exact object poses"
         )
     return poses

@@ -51,22 +51,32 @@ def read_labels(root: str | Path, category: str) -> dict[str, PoseLabel]:
     return read_label_folder(label_folder(root, category))
 
 
-def read_label_folder(folder: Path, added: Mapping[str, PoseLabel] = {}) -> dict[str, PoseLabel]:
-    """Read the labels in a folder by sequence, with labels that will be added to it.
+def read_label_folder(folder: Path) -> dict[str, PoseLabel]:
+    """Read the labels in a folder by sequence; InputError if they have several references."""
+    labels = read_label_files(folder)
+    check_one_reference(folder, labels)
+    return labels
 
-    InputError if they have several references.
-    """
-    labels = {path.stem: read_label(path) for path in sorted(folder.glob("*.json"))} | added
+
+def read_label_files(folder: Path) -> dict[str, PoseLabel]:
+    """Read the labels in a folder by sequence, whatever their references."""
+    return {path.stem: read_label(path) for path in sorted(folder.glob("*.json"))}
+
+
+def check_one_reference(folder: Path, labels: Mapping[str, PoseLabel]) -> None:
+    """Raise InputError if the labels for a folder have several reference sequences."""
     references = sorted({label.reference_seq for label in labels.values()})
     if len(references) > 1:
         raise InputError(
             f"labels in {folder} have reference sequences {', '.join(references)}, expected one"
         )
-    return labels
 
 
 def read_label(path: Path) -> PoseLabel:
-    """Read a label file; InputError if it lacks a field, is not rigid, or has another name."""
+    """Read a label file; InputError if it is damaged, not rigid, or of another sequence.
+
+    The name of the file is that of the sequence.
+    """
     label = read_json(path, _LabelFile, "label")
     if label.seq != path.stem:
         raise InputError(f"label {path} has seq {label.seq!r}, expected seq as in its name")
@@ -101,11 +111,12 @@ def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> 
 def relative_pose(
     label_a: PoseLabel, camera_a: Camera, label_b: PoseLabel, camera_b: Camera
 ) -> Float[np.ndarray, "4 4"]:
-    """Compute the true pose between two frames: `T_ab = Tcam_b @ T0b @ inv(T0a) @ inv(Tcam_a)`.
+    """Compute the true pose, for column vectors, from the frame of camera a to that of camera b.
 
-    This is the composition in "Labelling pose for evaluation" of the supplement, which writes it
-    from left to right. It leads from the coordinates of the reference frame's camera a to those of
-    the target's camera b, for column vectors. Both labels have the same reference sequence.
+    It leads from camera a to the world of its sequence, by label a to the world of the category's
+    reference sequence, by label b to the world of the other sequence, and to camera b. This is the
+    composition in "Labelling pose for evaluation" of the supplement, which writes it from left to
+    right. Both labels have the same `reference_seq`.
     """
     return (
         camera_b.matrix

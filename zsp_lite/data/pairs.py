@@ -36,16 +36,16 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
     """Sample `n` different pairs of a category with `n_targets` frames, or all if there are fewer.
 
     Reference sequences take turns; the target sequence is a random other one. The reference frame
-    is random; the target frames are evenly spaced from a random start. The pairs of a smaller `n`
-    are the first ones of a larger.
+    is random; the target frames are evenly spaced from a random start. The pairs for a smaller `n`
+    are the first pairs for a larger one.
     """
     rng = np.random.default_rng([seed, stable_hash(category) >> 1])
     numbers = _labelled_frames(dataset, category, n_targets)
-    # Pairs of each reference sequence that are not sampled yet: each frame of the other sequences
-    # is the start of one choice of target frames.
+    # The number of pairs of each reference sequence that are not sampled yet. Each frame of another
+    # sequence is the start of one choice of target frames.
     n_frames = sum(map(len, numbers.values()))
-    left = {name: len(own) * (n_frames - len(own)) for name, own in numbers.items()}
-    total = sum(left.values())
+    unsampled = {name: len(frames) * (n_frames - len(frames)) for name, frames in numbers.items()}
+    total = sum(unsampled.values())
     if total < n:
         logger.warning(
             "category %s has %d different pairs of %d targets, not %d",
@@ -60,7 +60,8 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
         if len(pairs) == min(n, total):
             return list(pairs)
         before = len(pairs)
-        while left[reference] and len(pairs) == before:  # drawn again if it is there already
+        # A pair that is sampled already is drawn again.
+        while unsampled[reference] and len(pairs) == before:
             others = [name for name in numbers if name != reference]
             target = others[rng.integers(len(others))]
             frame = numbers[reference][rng.integers(len(numbers[reference]))]
@@ -68,11 +69,14 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
             positions = (rng.integers(length) + np.arange(n_targets) * length // n_targets) % length
             targets = tuple(numbers[target][position] for position in positions)
             pairs[Pair(category, reference, frame, target, targets)] = None
-        left[reference] -= len(pairs) - before
+        unsampled[reference] -= len(pairs) - before
 
 
 def _labelled_frames(dataset: Co3D, category: str, least: int) -> dict[str, list[int]]:
-    """List the frame numbers of labelled sequences; InputError for too few of either."""
+    """List the frame numbers of each labelled sequence.
+
+    InputError for fewer than two sequences, or a sequence of fewer than `least` frames.
+    """
     frames = dataset.frame_numbers(category)
     labels = sorted(read_labels(dataset.root, category))
     numbers = {name: frames.get(name, []) for name in labels}
@@ -107,7 +111,7 @@ def labelled_categories(dataset: Co3D) -> list[str]:
 def true_poses(
     root: str | Path, pairs: Sequence[Pair], views: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Compute the labelled pose of each pair for one of its target views, given by its index."""
+    """Compute the labelled pose of each pair, for the target view whose index is in `views`."""
     dataset = Co3D(root)
     labels = cache(partial(read_labels, root))
     return np.stack(
@@ -143,9 +147,9 @@ def pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:
 
 
 def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 1) -> list[Pair]:
-    """Read the folder's first evaluation set of at least so many pairs, without repetitions.
+    """Read the pairs of the folder's first evaluation set with `at_least` pairs, each pair once.
 
-    [] if there is none.
+    [] if there is no such set.
     """
     sets = (
         read_published_pairs(path, dataset)
@@ -161,7 +165,7 @@ def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 
 
 
 def category_pairs(dataset: Co3D, category: str, n: int, n_targets: int) -> list[Pair]:
-    """Return n pairs: the first of the folder's evaluation set if it has so many, else sampled."""
+    """Return the first n pairs of the folder's evaluation set; sampled ones if none is so large."""
     shipped = shipped_pairs(dataset, category, n_targets, at_least=n)
     return shipped[:n] or sample_pairs(dataset, category, n, n_targets)
 
@@ -219,10 +223,11 @@ def write_published_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D
     for pair in pairs:
         reference = position[pair.reference_sequence, pair.reference_frame]
         targets = [position[pair.target_sequence, number] for number in pair.target_frames]
-        item = _PublishedPair(
-            pair.category, pair.reference_sequence, reference, pair.target_sequence, targets
+        items.append(
+            _PublishedPair(
+                pair.category, pair.reference_sequence, reference, pair.target_sequence, targets
+            )
         )
-        items.append(msgspec.to_builtins(item))
     buffer = io.BytesIO()  # torch.save to a file would store the file's name
-    torch.save(items, buffer)
+    torch.save(msgspec.to_builtins(items), buffer)
     write_atomic(path, buffer.getvalue())

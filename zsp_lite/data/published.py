@@ -10,17 +10,21 @@ from zsp_lite.alignment import Sim3, umeyama
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import (
     PoseLabel,
+    check_one_reference,
     label_bytes,
     label_folder,
     read_label,
-    read_label_folder,
+    read_label_files,
+    read_labels,
     rigid_label,
 )
 from zsp_lite.data.pairs import read_pair_file
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
 
-_MAX_RESIDUAL = 0.05  # above it, the camera centres of v1 and v2 are not related by a similarity
+# With a larger residual, the camera centres of v1 and v2 are not related by a similarity.
+_MAX_RESIDUAL = 0.05
+# A similarity fits three centres well, whatever they are: a fourth one tests it.
 _MIN_CAMERAS = 4
 
 
@@ -33,11 +37,11 @@ def import_labels(
     InputError. Nothing is written if a file is damaged.
     """
     Co3D(root)  # raises InputError if there is no such folder
-    sources = {}  # by the path where a file is written: that where it is read
+    sources = {}  # for each path where a file is written: the path where it is read
     for category, labels in _published_labels(source, categories).items():
         folder = label_folder(root, category)
-        # This checks that they fit together.
-        read_label_folder(folder, added={label.seq: label for label in labels.values()})
+        added = {label.seq: label for label in labels.values()}
+        check_one_reference(folder, read_label_files(folder) | added)
         for path in labels:
             sources[folder / path.name] = path
     for path in sorted(source.glob("**/determ_eval/*/*.pt")):
@@ -101,11 +105,11 @@ def transfer_labels(
 ) -> dict[str, float]:
     """Transfer the labels of a category from CO3D v1 to v2; return each sequence's residual.
 
-    The worlds of v2 are others. The camera centres in both are aligned by Umeyama's method with
-    scale; the residual is their RMS distance over their RMS distance from their mean. Nothing is
-    written if one is above 0.05.
+    A sequence has another world in v2 than in v1. The camera centres in both worlds are aligned by
+    Umeyama's method with scale. The residual is the RMS distance of aligned centres, divided by the
+    RMS distance of the centres from their mean. Nothing is written if a residual is above 0.05.
     """
-    labels = read_label_folder(label_folder(source, category))
+    labels = read_labels(source, category)
     old = Co3D(source)
     new = Co3D(target)
     if not labels:
@@ -114,7 +118,7 @@ def transfer_labels(
             f"class_labels/{category}/SEQ.json"
         )
 
-    # From the world of v1 to that of v2, for each sequence.
+    # For each sequence, the similarity from its world in v1 to its world in v2.
     reference = next(iter(labels.values())).reference_seq
     worlds = {}
     residuals = {}
@@ -126,7 +130,8 @@ def transfer_labels(
                 f"of their spread after alignment, expected at most {_MAX_RESIDUAL:g}"
             )
 
-    # From the reference's world in v2 to v1, by the label to the sequence's, and back to v2.
+    # A label in v2 leads from the reference's world in v2 to its world in v1, by the label of v1 to
+    # the sequence's world in v1, and to the sequence's world in v2.
     points, _ = new.point_cloud(category, reference)
     centre = points.mean(axis=0)
     transferred = {}
@@ -137,11 +142,11 @@ def transfer_labels(
             @ worlds[reference].inverse()
         )
         transferred[name] = rigid_label(similarity, centre, name, reference)
-        if name == reference:  # exactly, without rounding
+        if name == reference:  # the exact identity, without rounding errors
             transferred[name] = PoseLabel(np.eye(4), name, reference)
 
     folder = label_folder(target, category)
-    read_label_folder(folder, added=transferred)  # checks that they fit together
+    check_one_reference(folder, read_label_files(folder) | transferred)
     write_all(
         {folder / f"{name}.json": label_bytes(label) for name, label in transferred.items()},
         replace,
@@ -159,11 +164,11 @@ def align_worlds(old: Co3D, new: Co3D, category: str, sequence: str) -> tuple[Si
             f"sequence {category}/{sequence}: {len(common)} frames have cameras in both data sets, "
             f"expected at least {_MIN_CAMERAS}"
         )
-    first = np.array([old_centres[number] for number in common])
-    second = np.array([new_centres[number] for number in common])
-    sim3 = umeyama(first, second)
-    distance = np.square(sim3.apply(first) - second).sum(axis=1).mean()
-    spread = np.square(second - second.mean(axis=0)).sum(axis=1).mean()
+    old_points = np.array([old_centres[number] for number in common])
+    new_points = np.array([new_centres[number] for number in common])
+    sim3 = umeyama(old_points, new_points)
+    distance = np.square(sim3.apply(old_points) - new_points).sum(axis=1).mean()
+    spread = np.square(new_points - new_points.mean(axis=0)).sum(axis=1).mean()
     return sim3, float(np.sqrt(distance / spread))
 
 

@@ -28,13 +28,13 @@ __all__ = ["FORMATS", "Capture", "CaptureFrame", "open_capture", "recognise"]
 class Format:
     """A format of captures."""
 
-    signs: tuple[str, ...]  # patterns of files; a folder of the format has all
-    what: str
+    signs: tuple[str, ...]  # patterns of files: a folder of the format has a match for each
+    what: str  # name of the format, for messages
     read: Callable[..., Makers]
-    options: tuple[str, ...] = ()  # of `read`, without `count`
+    options: tuple[str, ...] = ()  # options that `read` takes, without `count`
 
 
-# A folder has the first format whose signs it has.
+# The format of a folder is the first one whose signs it has.
 FORMATS = {
     "nerfstudio": Format(
         ("transforms*.json",), "nerfstudio, Blender, NeRFCapture or instant-ngp", read_nerfstudio
@@ -52,7 +52,7 @@ _HOW = (
     "expected raw data with depth and poses, as Stray Scanner, Record3D or Polycam export them "
     "from LiDAR"
 )
-# What is near to a capture, by names and extensions of its files.
+# Files, by name or extension, that show why a folder is no capture, and the reason.
 _INCOMPLETE = {
     (
         "sparse",
@@ -85,7 +85,7 @@ def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
     """Return a capture's format, a name in `FORMATS`, and the folder or file that its reader takes.
 
     A capture is a folder, the zip or .r3d file of an app, or a transforms.json. InputError for
-    anything else; it says what is missing, or what is expected, and `also`.
+    anything else. The message says what is missing, or what is expected: `also` or a capture.
     """
     path = Path(path)
     folder = path
@@ -102,13 +102,13 @@ def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
             if all(any(place.glob(sign)) for sign in layout.signs):
                 return name, place
 
-    # No format: say why, if it is near to one.
+    # The path has no format: say why, if its files show a reason.
     for signs, problem in _INCOMPLETE.items():
         if any(file.name in signs or file.suffix.lower() in signs for file in (path, *files)):
             raise InputError(f"{path} {problem}, {_HOW}")
-    found = "has another format" if path.exists() else "does not exist"
+    problem = "has another format" if path.exists() else "does not exist"
     known = "; ".join(f"{layout.what} ({', '.join(layout.signs)})" for layout in FORMATS.values())
-    raise InputError(f"{path} {found}, expected {also}a folder or zip with the files of {known}")
+    raise InputError(f"{path} {problem}, expected {also}a folder or zip with the files of {known}")
 
 
 def open_capture(
@@ -121,38 +121,40 @@ def open_capture(
 ) -> Capture:
     """Read a capture's frames (see `open_source`), with the masks of its folder masks/, if any.
 
-    `files` replaces members of each `CaptureFrame`. InputError if the capture cannot be read, or no
-    frame can be used.
+    `files` has attributes of `CaptureFrame` that replace those of every frame. InputError if the
+    capture cannot be read, or no frame can be used.
     """
     path = Path(path)
     folder = path
     try:
-        found, place = recognise(path)
-        layout = layout or found
-        if found == layout:
+        recognised, place = recognise(path)
+        layout = layout or recognised
+        # Another layout is read from the path as it is given.
+        if recognised == layout:
             folder = place
     except InputError:
         if not layout:
             raise
-    if layout == "stray":  # its reader keeps the sharp frames of a video only
+    if layout == "stray":  # the reader chooses the sharp frames, because it decodes a video
         options["count"] = count
     frames, left_out = collect(FORMATS[layout].read(folder, **options))
 
-    # A frame's own mask, or that of the folder; a folder that is named has precedence.
+    # A frame's own mask comes before the one in the capture's folder masks/. If the folder `masks`
+    # is given, all masks are from it.
     images = [frame.image for frame in frames]
     if folder.is_file():
         folder = folder.parent
-    found = find_masks(masks or folder / "masks", images)
-    if masks is not None and not any(found):
+    paths = find_masks(masks or folder / "masks", images)
+    if masks is not None and not any(paths):
         raise InputError(
             f"--masks {masks} has no mask that is named like an image, such as {images[0].stem}.png"
         )
     if not masks:
-        found = [frame.mask or mask for frame, mask in zip(frames, found)]
-    frames = [replace(frame, mask=mask, **files) for frame, mask in zip(frames, found)]
+        paths = [frame.mask or mask for frame, mask in zip(frames, paths)]
+    frames = [replace(frame, mask=mask, **files) for frame, mask in zip(frames, paths)]
 
-    sharp = sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
-    frames = [frame for frame, _ in sharp]
+    frames_and_images = sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
+    frames = [frame for frame, _ in frames_and_images]
     if not frames:
         problem = "no frame, expected some"
         if left_out:

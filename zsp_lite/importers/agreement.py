@@ -1,8 +1,8 @@
 """Check that the depth of a few frames agrees by their poses, or name the usual mistake.
 
-Points of the object in one frame are moved into another. The share of them that lies on its surface
-is high if units and poses are right, also with noise and holes: about 0.9 for cameras 15 degrees
-apart, and 0.8 for 45 degrees.
+Points of the object in one frame are moved into another frame. If units and poses are right, a high
+share of the points lies on the surface there, also with noise and holes: about 0.9 for cameras 15
+degrees apart, and 0.8 for 45 degrees.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,29 +17,32 @@ from scipy.spatial.transform import Rotation
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
 from zsp_lite.errors import InputError
+from zsp_lite.importers.files import WINDOW_5
 from zsp_lite.importers.masks import PLAUSIBLE, masks_from_depth
 from zsp_lite.metrics import rotation_angle
 from zsp_lite.points import object_pixels, world_points
 
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-_POINTS = 500  # of a frame, at most
-_LEAST_POINTS = 50
-_PAIRS = 8  # of frames, at most
-# Angles between two cameras that are compared, degrees.
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's camera axes to OpenCV's, or back
+_POINTS = 500  # largest number of points of a frame, about
+_LEAST_POINTS = 50  # with fewer points, a share says little
+_PAIRS = 8  # largest number of pairs of frames
+# Angles between the two cameras of a pair, degrees. Of nearer cameras, wrong poses agree, too;
+# cameras farther apart see other sides of the object.
 _NEAREST = 4.0
 _BEST = 20.0
 _FARTHEST = 50.0
-_TOLERANCE = 0.05  # of depth, relative to that of the object
-_AGREEING = 0.6  # share of points above which frames agree without doubt
-_FITTING = 0.5  # least share of points by the right correction
-_GAIN = 0.25  # by which that share must be above the given one
-_ALIKE = 0.03  # difference of shares below which the likelier correction is named
-# Least ratio of the share if depth is along the ray, which changes little near the axis.
+_TOLERANCE = 0.05  # largest difference of depth on a surface, relative to the object's distance
+_AGREEING = 0.6  # frames agree without doubt above this share of points
+_FITTING = 0.5  # the right correction makes at least this share of points agree
+_GAIN = 0.25  # it raises the share by at least this value
+_ALIKE = 0.03  # of corrections whose shares differ by less, the likelier is named
+# Depth along the ray raises the share in the whole image by at least this factor. The gain is
+# small, because both depths are nearly equal near the optical axis.
 _RAY_GAIN = 1.2
-_CONTRADICTING = 0.4  # share of points below which frames contradict each other
+_CONTRADICTING = 0.4  # frames contradict each other below this share of points
 _UNITS = {1.0: "metres", 0.001: "millimetres", 0.0002: "1/5000 m"}
 _FACTORS = (1000.0, 0.001, 5.0, 0.2, 10.0, 0.1)  # from one common unit to another
-# Steps of 5 %, without those near 1, which correct nothing.
+# Any factors, in steps of 5 %, without those near 1, which correct nothing.
 _SCALES = [scale for scale in np.geomspace(1e-3, 1e3, 280).tolist() if not 0.96 < scale < 1.04]
 
 _Pose = Float[np.ndarray, "4 4"]  # world to camera
@@ -50,10 +53,10 @@ _Correction = Callable[[_Pose], _Pose]
 class _Surface:
     """The object in one frame."""
 
-    points: Float[np.ndarray, "n 3"]  # some of its points in the camera's frame
+    points: Float[np.ndarray, "n 3"]  # some points of the object in the camera's frame
     depth: Float[np.ndarray, "h w"]  # 0 where unknown, infinite off the object
     camera: Camera
-    distance: float
+    distance: float  # median depth of the points; 0 without points
 
     @classmethod
     def of(cls, frame: Frame) -> "_Surface":
@@ -63,16 +66,17 @@ class _Surface:
         points = frame.camera.to_camera(
             world_points(frame, pixels, int(pixels.sum()) // _POINTS + 1)
         )
-        # Wider by two pixels, because masks and poses are not exact.
-        depth = np.where(cv2.dilate(mask, np.ones((5, 5))) > ON_OBJECT, frame.depth, np.inf)
+        # The mask is widened by two pixels, because masks and poses are not exact.
+        depth = np.where(cv2.dilate(mask, WINDOW_5) > ON_OBJECT, frame.depth, np.inf)
         distance = float(np.median(points[:, 2])) if len(points) else 0.0
         return cls(points, depth, frame.camera, distance)
 
     def share(self, other: "_Surface", motion: _Pose, along_ray: bool) -> float:
-        """Return the share of points that a motion between cameras takes onto another surface."""
+        """Return the share of points that lie on another surface after a motion between cameras."""
         camera = replace(other.camera, R=motion[:3, :3], t=motion[:3, 3])
         points = self.points
         if along_ray:
+            # The stored depth is the length of the ray: points move towards the camera.
             points = points * points[:, 2:] / np.linalg.norm(points, axis=1, keepdims=True)
         pixels, depth = camera.project(points)
         inside = (
@@ -82,7 +86,7 @@ class _Surface:
         columns, rows = pixels[inside].astype(int).T
         surface = other.depth[rows, columns]
         agreeing = np.abs(stored[inside] - surface) < _TOLERANCE * other.distance
-        # Of all points, but for those on pixels of unknown depth.
+        # Points on pixels of unknown depth do not count.
         return agreeing.sum() / max(1, len(inside) - (surface == 0).sum())
 
 
@@ -92,10 +96,10 @@ _Pair = tuple[_Surface, _Surface]
 def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     """Say that frames of one object do not agree, and which usual mistake explains it.
 
-    "" if they agree, or none overlap. Masks are found where there are none. `unit` is the world
-    units per stored depth value, if it can be changed.
+    Returns "" if the frames agree, or if none of them overlap. Frames without a mask get one by
+    depth. `unit` has the world units per stored depth value, if the user can change it.
     """
-    # The object, and all that is seen, in each frame.
+    # The surfaces of each frame: of the object, and of everything in the image.
     objects = []
     scenes = []
     for frame in frames:
@@ -114,11 +118,11 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     everywhere = _share(whole)
     found = f"depth and poses of the frames do not agree ({given:.0%} of the object's points do)"
 
-    # This mistake changes little on the object alone, which is near the optical axis.
-    by_ray = _share(pairs, along_ray=True)
+    # Depth along the ray changes little on the object alone, which is near the optical axis: the
+    # whole image decides.
     everywhere_by_ray = _share(whole, along_ray=True)
     gains = everywhere_by_ray > max(_RAY_GAIN * everywhere, _FITTING)
-    if gains and by_ray > _AGREEING:
+    if gains and _share(pairs, along_ray=True) > _AGREEING:
         return (
             f"{found}; all that is seen agrees better ({everywhere_by_ray:.0%}, not "
             f"{everywhere:.0%}) if depth is the distance along the ray of a pixel, not along the "
@@ -136,14 +140,14 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
 
 
 def neighbours(count: int) -> list[int]:
-    """Choose up to six positions among frames around an object: three, and those beside them."""
+    """Choose three positions among `count` frames around an object, and one beside each."""
     thirds = [k * count // 3 for k in range(3)]
     steps = (0, max(1, count // 18))  # 20 degrees of a turn around the object
     return sorted({(third + step) % count for third in thirds for step in steps})
 
 
 def _pairs(surfaces: Sequence[_Surface]) -> list[_Pair]:
-    """Pair each surface with that of a camera turned by about `_BEST` degrees."""
+    """Pair each surface with the one whose camera is turned by about `_BEST` degrees."""
     # No mistake changes the angle between two cameras.
     surfaces = [surface for surface in surfaces if len(surface.points) >= _LEAST_POINTS]
     pairs = []
@@ -161,10 +165,11 @@ def _share(
     scale: float = 1.0,
     along_ray: bool = False,
 ) -> float:
-    """Return the median share of agreeing points, by corrected poses and with scaled depth."""
+    """Return the median share of agreeing points, with corrected poses and with scaled depth."""
     shares = []
     for surface, other in pairs:
-        # From the camera of the surface to the other one; depth is scaled by its inverse.
+        # The motion leads from the camera of the surface to the other camera. Dividing its
+        # translation by a factor is the same as multiplying all depth by the factor.
         motion = corrected(other.camera.matrix) @ np.linalg.inv(corrected(surface.camera.matrix))
         motion[:3, 3] /= scale
         shares.append(surface.share(other, motion, along_ray))
@@ -172,21 +177,21 @@ def _share(
 
 
 def _explanations(pairs: Sequence[_Pair], unit: float | None) -> Iterator[tuple[float, str]]:
-    """Yield the best correction of poses, by a common factor and by any factor, with its share."""
+    """Yield the share and the words for the best correction of poses, common factor, any factor."""
     shares = np.array([_share(pairs, correct) for _, correct in _CORRECTIONS])
     likeliest = int(np.argmax(shares > shares.max() - _ALIKE))
     yield shares[likeliest], f"the poses {_CORRECTIONS[likeliest][0]}"
     distance = float(np.median([surface.distance for surface, _ in pairs]))
     for factors in (_FACTORS, _SCALES):
-        # The middle one of the factors that are about as good as the best.
+        # Of the factors that are about as good as the best, the middle one.
         shares = np.array([_share(pairs, scale=factor) for factor in factors])
         alike = np.flatnonzero(shares > shares.max() - _ALIKE)
         yield shares.max(), _scaled(factors[alike[len(alike) // 2]], distance, unit)
 
 
 def _scaled(factor: float, distance: float, unit: float | None) -> str:
-    """Say that the depth, or else the cameras' positions, are to be multiplied by a factor."""
-    # Not the depth, if that would make a plausible distance of the object implausible.
+    """Say that the depth, or else the cameras' positions, must be multiplied by a factor."""
+    # The depth is right if its factor would make a plausible distance of the object implausible.
     nearest, farthest = PLAUSIBLE
     if unit and nearest <= distance <= farthest and not nearest <= factor * distance <= farthest:
         return f"the positions of the cameras are multiplied by {1 / factor:.3g}"
@@ -208,7 +213,8 @@ _OTHER_AXES = (
     "have the other axes, OpenGL's for OpenCV's or the reverse: negate the columns y and z"
 )
 _INVERSE = "are world to camera"
-# From wrong to right matrices, which may be in OpenGL's axes. The world's axes do not matter.
+# Corrections from wrong to right world-to-camera matrices. An inverse may be in OpenGL's axes, too.
+# The axes of the world do not matter.
 _CORRECTIONS: list[tuple[str, _Correction]] = [
     (_INVERSE, np.linalg.inv),
     (_INVERSE, lambda pose: _FLIP @ np.linalg.inv(pose)),

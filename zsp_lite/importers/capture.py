@@ -19,13 +19,14 @@ from zsp_lite.errors import InputError, real_array
 from zsp_lite.importers import files
 from zsp_lite.io.files import OutsideError, find_inside, read_bytes
 
-# OpenCV's and Open3D's pixel centres are at integers: their intrinsic matrices are smaller by this.
+# OpenCV's and Open3D's pixel centres are at integers: their principal points are smaller by this.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # +y up, looking along -z
-_FARTHEST = 1e4  # greatest known depth, in units of the world
-MOST_FRAMES = 100  # of a capture; the sharp ones are chosen where there are more
-_CANDIDATES = 10  # frames of which the sharpest is chosen
-_SHARPNESS_SIDE = 640  # pixels of an image whose sharpness is measured
+FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's camera: +y up, looking along -z
+_FARTHEST = 1e4  # greater depth counts as unknown, in units of the world
+MOST_FRAMES = 100  # by default, so many sharp frames of a larger capture are chosen
+_CANDIDATES = 10  # largest number of frames of which the sharpest is chosen
+# Longest side in pixels of the copy of an image whose sharpness is measured.
+_SHARPNESS_SIDE = 640
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,31 +37,31 @@ class CaptureFrame:
     depth: Path  # of the image's aspect ratio; phones store it smaller than the image
     camera: Camera
     depth_unit: float = 0.001  # world units per stored depth value
-    # OpenCV's k1, k2, p1, p2, k3. Image, depth and mask become undistorted.
+    # OpenCV's k1, k2, p1, p2, k3. `load` undistorts image, depth and mask.
     distortion: tuple[float, ...] = ()
     mask: Path | None = None
     # Whether the distortion is that of OpenCV's fisheye cameras: k1, k2, k3, k4.
     fisheye: bool = False
     confidence: Path | None = None  # of each pixel of the depth map, see `trusted`
-    label: int | None = None  # of the object, where masks have the labels of several
+    label: int | None = None  # number of the object in masks that label several objects
     # "stored" or "displayed": how camera, depth and mask refer to a turned photograph.
     orientation: str | None = None
     posed: bool = True  # False for a single image, whose world is its camera's frame
 
     def load(self) -> Frame:
         """Load the frame as viewers display it; InputError if a file cannot be used."""
-        rgb, turn = files.read_picture(self.image)
-        # Tells by the size of an image whether it lies as the stored pixels.
-        lies_stored = partial(files.lies_as_stored, rgb.shape, turn, self.orientation, self.image)
+        rgb, exif = files.read_picture(self.image)
+        # A function that says whether an image of a size lies as the stored pixels.
+        lies_stored = partial(files.lies_as_stored, rgb.shape, exif, self.orientation, self.image)
 
         def displayed(image: np.ndarray) -> np.ndarray:
-            """Turn an image to the form that viewers display."""
-            return files.display_image(image, turn) if lies_stored(image.shape) else image
+            """Turn an image to the form that viewers display, if it is not in that form."""
+            return files.display_image(image, exif) if lies_stored(image.shape) else image
 
         camera = self.camera
         if lies_stored(camera.size):
-            camera = files.display_camera(camera, turn, self.image.name, self.posed)
-        rgb = files.display_image(rgb, turn)
+            camera = files.display_camera(camera, exif, self.image.name, self.posed)
+        rgb = files.display_image(rgb, exif)
         depth = displayed(self._read_depth())
         check_pixels(self.image, rgb, camera.size)
         enlarged = enlarge_depth(depth, camera.size)
@@ -92,7 +93,7 @@ class CaptureFrame:
         return np.where(known, depth, np.float32(0))
 
     def _undistortion(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return OpenCV's maps that undistort the displayed image, whose camera is given."""
+        """Return OpenCV's maps that undistort the displayed image with this camera."""
         matrix = camera.K - HALF_PIXEL
         coefficients = np.array(self.distortion)
         if self.fisheye:
@@ -100,7 +101,7 @@ class CaptureFrame:
         else:
             undistortion = cv2.initUndistortRectifyMap
             p1, p2 = coefficients[2:4]
-            # The tangential coefficients are a vector, which turns with the image.
+            # The tangential coefficients, as (p2, p1), are a vector that turns with the image.
             coefficients[[3, 2]] = (camera.R @ self.camera.R.T)[:2, :2] @ (p2, p1)
         return undistortion(
             matrix, coefficients, np.eye(3), matrix, camera.size[::-1], cv2.CV_32FC1
@@ -108,14 +109,13 @@ class CaptureFrame:
 
 
 class Capture(NamedTuple):
-    """Frames of a capture in the natural order of their image names, whatever the order in its
-    files."""
+    """Frames of a capture, sorted by the names of their images: frame 10 follows frame 9."""
 
     frames: list[CaptureFrame]
-    left_out: list[str]  # what is wrong with each frame that is left out
+    left_out: list[str]  # for each frame that is left out, what is wrong with it
 
 
-# What a reader returns: functions that make a frame, or raise InputError if it cannot be used.
+# A reader yields functions, each of which makes a frame, or raises InputError if it cannot be used.
 Makers = Iterator[Callable[[], CaptureFrame]]
 
 
@@ -132,15 +132,16 @@ def make_frame(
     confidence: str | Path | None = None,
     **others: Any,
 ) -> CaptureFrame:
-    """Make a frame of files and numbers of a capture; InputError if they are no frame.
+    """Make a frame from files and numbers of a capture; InputError if a file is missing or wrong.
 
     The pose, camera to world, is a matrix of 12 or 16 numbers, or a position and a quaternion x, y,
-    z, w, in OpenCV's axes after multiplication by `axes`. Intrinsics are fx, fy, cx, cy or a
-    matrix. Mask and confidence may be missing.
+    z, w. After multiplication by `axes`, it has OpenCV's camera axes. Intrinsics are fx, fy, cx, cy
+    or a matrix. Mask and confidence may be missing.
     """
     names = (image, depth, mask, confidence)
     paths = [find_inside(folder, name) if isinstance(name, str) else name for name in names]
-    if None in paths[:2]:  # the first that is missing
+    # The image and the depth are needed.
+    if None in paths[:2]:
         raise InputError(f"{where}: {names[paths.index(None)]} is missing in {folder}")
 
     # The pose as a matrix (4, 4).
@@ -156,7 +157,7 @@ def make_frame(
         pose = np.column_stack([Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]])
     if pose.size == 12:
         pose = np.vstack([pose.reshape(3, 4), (0, 0, 0, 1)])
-    with np.errstate(invalid="ignore"):  # what is not finite is refused below
+    with np.errstate(invalid="ignore"):  # `camera_from_pose` refuses numbers that are not finite
         pose = pose.reshape(-1, 4) @ axes
 
     camera = camera_from_pose(pose, intrinsics, size or files.picture_size(paths[0]), where)
@@ -164,43 +165,44 @@ def make_frame(
 
 
 def refuse(problem: str) -> CaptureFrame:
-    """Raise InputError, in place of a frame that cannot be made."""
+    """Raise InputError: a maker for a frame that cannot be made."""
     raise InputError(problem)
 
 
 def collect(makers: Iterable[Callable[[], CaptureFrame]]) -> tuple[list[CaptureFrame], list[str]]:
-    """Return the frames in the natural order of their images, and what is wrong with others."""
+    """Return the frames sorted by the names of their images, and what is wrong with the others."""
     frames = []
     left_out = []
     for make in makers:
         try:
             frames.append(make())
+        # A path out of the folder is no mistake of one frame: nothing of such a capture is read.
         except OutsideError:
             raise
-        except (InputError, OSError) as error:  # OSError: of a name that is too long
+        except (InputError, OSError) as error:  # OSError for a name that is too long
             left_out.append(str(error))
     return sorted(frames, key=lambda frame: _natural_order(frame.image)), left_out
 
 
 def _natural_order(path: Path) -> tuple[list[str | int], str]:
-    """Order paths such that frame 10 follows frame 9."""
+    """Return a key to sort paths: frame 10 follows frame 9."""
     text = path.as_posix()
-    parts = re.split(r"(\d+)", text)  # every second one is a number
+    parts = re.split(r"(\d+)", text)  # every second part is a number
     return [int(part) if k % 2 else part for k, part in enumerate(parts)], text
 
 
 def sharpest(
     items: Sequence[Any], count: int, read: Callable[[Any], np.ndarray], left_out: list[str]
 ) -> Iterator[tuple[Any, np.ndarray]]:
-    """Split items into `count` stretches, and yield the sharpest of each with its image.
+    """Split items into `count` stretches, and yield the sharpest item of each with its image.
 
-    What is wrong with unreadable ones is added to `left_out`. The first item is chosen, because a
-    box may be for it.
+    The problems of unreadable items are added to `left_out`. The first item is a stretch of its
+    own, because a user may have drawn a box in it.
     """
     stretches = [[position] for position in range(len(items))]
     if len(items) > count:
         later = np.array_split(np.arange(1, len(items)), max(count - 1, 1))
-        # Some candidates of each, by a step that is rounded up.
+        # Evenly spaced candidates of each stretch: the step is rounded up.
         stretches = [[0], *(part[:: -(-len(part) // _CANDIDATES)].tolist() for part in later)]
     for stretch in stretches[:count]:
         best = -1.0
@@ -227,21 +229,22 @@ def _sharpness(image: UInt8[np.ndarray, "..."]) -> float:
 
 
 def trusted(levels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Tell measured from smeared depth by levels of confidence: 0, 1, 2, or 0 to 255.
+    """Select the pixels of measured depth by levels of confidence: 0, 1, 2, or 0 to 255.
 
-    The lowest level is unknown, and the middle one is kept where it is wide, as on dark surfaces,
-    but not in thin bands, as along silhouettes, where the depth is a mean of object and background.
+    The highest level is measured, the lowest unknown. Pixels of a middle level are trusted in wide
+    regions, such as dark surfaces. They are not trusted in thin bands along silhouettes, where the
+    depth is a mean of object and background.
     """
     best = levels >= (2 if levels.max() <= 2 else 255)
     middle = ((levels > 0) & ~best).astype(np.uint8)
-    return best | (cv2.morphologyEx(middle, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0)
+    return best | (cv2.morphologyEx(middle, cv2.MORPH_OPEN, files.WINDOW_5) > 0)
 
 
 def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
-    """Find the mask of each image in a folder, by the end of its path or by its name.
+    """Find the mask of each image in a folder: its path there is an end of the image's path.
 
-    Its extension may be part of the mask's name. The longest path that both share decides. Images
-    of one name in several folders do not share a mask.
+    The extension of the image may be part of the mask's name. The longest such path counts. An end
+    that several images share is no name of a mask.
     """
     named = {}
     for path in sorted(Path(folder).rglob("*.*")):
@@ -265,7 +268,7 @@ def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
 
 
 def read_text_lines(path: Path) -> list[str]:
-    """Read the lines of a text file but for empty ones and those that begin with #."""
+    """Read the lines of a text file, without empty lines and lines that begin with #."""
     text = read_bytes(path, "list").decode("utf-8-sig", "replace")
     lines = [line.strip() for line in text.splitlines()]
     lines = [line for line in lines if line and line[0] != "#"]
@@ -277,7 +280,7 @@ def read_text_lines(path: Path) -> list[str]:
 def read_numbers(
     path: Path, columns: tuple[int, ...], **options: Any
 ) -> Float[np.ndarray, "rows columns"]:
-    """Read a text file of numbers by `numpy.loadtxt`; one of `columns` is their number per line."""
+    """Read a text file by `numpy.loadtxt`; `columns` has the possible numbers of columns."""
     lines = read_text_lines(path)
     try:
         values = np.loadtxt(lines, ndmin=2, **options)

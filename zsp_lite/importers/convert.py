@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -17,13 +18,16 @@ from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import load_open3d
 from zsp_lite.points import axis_deviation, object_pixels, sampling_step, world_points
 
-# Voxels per three standard deviations of the object; finer than the noise of depth cameras.
+# Voxels per three standard deviations of the object: they are finer than the noise of depth
+# cameras.
 _VOXELS = 96
-_MAX_POINTS = 50_000
-_LEAST_STEP = 7  # between the pixels by which the size of the object is estimated
-# File in the folder of a sequence whose import goes on, or was interrupted.
+_MAX_POINTS = 50_000  # of a fused point cloud
+# The size of the object is estimated from every seventh pixel, or fewer.
+_LEAST_STEP = 7
+# This file lies in the folder of a sequence while it is imported, and after an interruption.
 _UNFINISHED = ".unfinished"
-MIN_VIEWS = 3  # number of frames that must see a surface, if there are that many frames
+# This many frames must see a surface. With fewer frames, all must see it.
+MIN_VIEWS = 3
 
 
 @dataclass(frozen=True)
@@ -34,16 +38,16 @@ class ImportResult:
     empty: int  # frames that were left out because their masks are empty
     points: int
     scale: float  # factor from the capture's lengths to those of the sequence
-    flags: tuple[str, ...]  # what speaks against the masks and the intrinsics
+    flags: tuple[str, ...]  # reasons to doubt the masks, the depth or the intrinsics
 
 
 def import_source(source: Source, root: str | Path, category: str, sequence: str) -> ImportResult:
     """Write a source as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused point cloud.
 
     Lengths are scaled so that the point cloud has unit standard deviation, averaged over the axes,
-    as in CO3D. Frames whose mask is empty are left out. An interrupted import can be repeated.
-    InputError, and nothing is written, if the source cannot be read, segmented or fused, or the
-    sequence exists.
+    as in CO3D. Frames whose mask is empty are left out. An interrupted import can be repeated. If
+    the source cannot be read, segmented or fused, or if the sequence exists, InputError is raised
+    before anything is written.
     """
     folder = Path(root) / plain_name(category, "category") / plain_name(sequence, "sequence")
     count = len(source.numbers)
@@ -58,13 +62,13 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
         raise InputError(f"{source.path}: {problem}")
 
     source = source.segmented()
-    seen = [position for position in range(count) if source.read(position).shows_object]
+    seen = [position for position in range(count) if source.read_frame(position).shows_object]
     if not seen:
         raise InputError(f"the masks of all {count} frames are empty, expected an object")
-    frames = LazyFrames(source.read, seen)
+    frames = LazyFrames(source.read_frame, seen)
     points, colours, normals = fuse(frames)
     scale = 1 / axis_deviation(points)
-    scaled = LazyFrames(lambda position: scale_frame(source.read(position), scale), seen)
+    scaled = LazyFrames(lambda position: scale_frame(source.read_frame(position), scale), seen)
     data = SequenceData(
         sequence, scaled, [float(position) for position in seen], points * scale, colours, normals
     )
@@ -92,7 +96,7 @@ def write_sequence(root: str | Path, category: str, data: SequenceData) -> None:
 def import_captures(
     folder: str | Path, root: str | Path, category: str
 ) -> Iterator[tuple[str, ImportResult]]:
-    """Import each capture in a folder that is not there yet; yield its name and what was done."""
+    """Import the captures in a folder that are not imported yet; yield names and results."""
     for path in sorted(Path(folder).iterdir()):
         name = path.stem if path.is_file() else path.name
         if not path.name.startswith(".") and not is_imported(Path(root) / category / name):
@@ -100,17 +104,18 @@ def import_captures(
 
 
 class LazyFrames(Sequence[Frame]):
-    """Frames that are loaded at each access: those of a capture do not fit into memory together."""
+    """Frames that are loaded at each access, because all of a capture do not fit into memory."""
 
-    def __init__(self, load: Callable[[int], Frame], indices: Sequence[int]):
+    def __init__(self, load: Callable[[Any], Frame], items: Sequence[Any]):
+        """Make the frames that `load` returns for the items."""
         self._load = load
-        self._indices = indices
+        self._items = items
 
     def __len__(self) -> int:
-        return len(self._indices)
+        return len(self._items)
 
     def __getitem__(self, position: int) -> Frame:
-        return self._load(self._indices[position])
+        return self._load(self._items[position])
 
 
 def fuse(
@@ -119,13 +124,18 @@ def fuse(
     """Fuse the depth inside the masks (Curless and Levoy 1996) to points, colours and normals."""
     o3d = load_open3d()
     voxel = 3 * _spread(frames) / _VOXELS
-    # Three values per voxel, in blocks of 16 x 16 x 16; at first, there is space for 2000 blocks.
-    types = (o3d.core.float32,) * 3
+    # A voxel has a distance to the surface, a weight and a colour. The grid starts with space for
+    # 2000 blocks and grows.
     volume = o3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight", "color"), types, ((1,), (1,), (3,)), voxel, 16, 2000
+        attr_names=("tsdf", "weight", "color"),
+        attr_dtypes=(o3d.core.float32,) * 3,
+        attr_channels=((1,), (1,), (3,)),
+        voxel_size=voxel,
+        block_resolution=16,
+        block_count=2000,
     )
 
-    # The distance to the measured surface, averaged over the frames.
+    # Average the signed distance of each voxel to the measured surfaces over the frames.
     for frame in frames:
         depth = np.where(object_pixels(frame), frame.depth, 0).astype(np.float32)
         if not depth.any():
@@ -134,16 +144,18 @@ def fuse(
         extrinsic = o3d.core.Tensor(frame.camera.matrix)
         options = {
             "depth_scale": 1.0,
+            # Open3D ignores depth from this value on: the greatest depth must be below it.
             "depth_max": 1.01 * float(depth.max()),
-            "trunc_voxel_multiplier": 4.0,
+            "trunc_voxel_multiplier": 4.0,  # distances are cut off at 4 voxels
         }
         depth = o3d.t.geometry.Image(depth)
         colour = o3d.t.geometry.Image(frame.rgb.astype(np.float32) / 255)
         blocks = volume.compute_unique_block_coordinates(depth, intrinsic, extrinsic, **options)
         volume.integrate(blocks, depth, colour, intrinsic, intrinsic, extrinsic, **options)
 
-    # The points where it is 0, without outliers.
-    weight = min(MIN_VIEWS, len(frames)) - 0.5  # Open3D keeps voxels of a greater weight
+    # The surface is where the distance is 0. Open3D uses voxels of a greater weight, which is the
+    # number of frames that saw the voxel.
+    weight = min(MIN_VIEWS, len(frames)) - 0.5
     cloud = volume.extract_point_cloud(weight_threshold=weight).to_legacy()
     cloud, _ = cloud.remove_statistical_outlier(nb_neighbors=20, std_ratio=2.5)
     if len(cloud.points) > _MAX_POINTS:
@@ -158,13 +170,13 @@ def fuse(
 
 
 def scale_frame(frame: Frame, scale: float) -> Frame:
-    """Multiply all lengths of a frame, of its depth and of its camera's translation, by `scale`."""
+    """Multiply all lengths of a frame by `scale`: its depth and its camera's translation."""
     camera = replace(frame.camera, t=frame.camera.t * scale)
     return replace(frame, camera=camera, depth=(frame.depth * scale).astype(np.float32))
 
 
 def _spread(frames: Collection[Frame]) -> float:
-    """Estimate the object's mean standard deviation by the median absolute deviation."""
+    """Estimate the object's standard deviation, averaged over the axes, despite outliers."""
     clouds = []
     for frame in frames:
         step = max(_LEAST_STEP, sampling_step(frame, len(frames)))
@@ -176,5 +188,5 @@ def _spread(frames: Collection[Frame]) -> float:
             "the masks"
         )
     deviation = np.abs(points - np.median(points, axis=0))
-    # 1.48: ratio to the standard deviation for normal noise
+    # The standard deviation of a normal distribution is 1.48 times its median absolute deviation.
     return float(1.48 * np.median(deviation, axis=0).mean())

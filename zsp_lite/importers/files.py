@@ -24,11 +24,15 @@ from zsp_lite.data.frames import MAX_PIXELS, decode_image, read_depth, read_imag
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import MAX_FILE, read_bytes
 
+# Windows of OpenCV's filters of masks: 3 x 3 and 5 x 5 pixels.
+WINDOW_3 = np.ones((3, 3), np.uint8)
+WINDOW_5 = np.ones((5, 5), np.uint8)
 PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif")
 _FORMATS = ("JPEG", "PNG", "WEBP")
 DEPTHS = (".png", ".npy", ".npz", ".tiff", ".tif", ".pfm", ".exr")
 MASKS = (".png", ".jpg", ".jpeg", ".webp", ".tiff", ".tif", ".npy")
-CO3D_DEPTH = ".geometric.png"  # float16 bits
+CO3D_DEPTH = ".geometric.png"  # such a file has the bits of float16 values
+# What numpy, Pillow and OpenCV raise for damaged files.
 _DAMAGED = (
     OSError,
     SyntaxError,
@@ -42,19 +46,25 @@ _DAMAGED = (
     cv2.error,
     Image.DecompressionBombError,
 )
-# By EXIF orientation, 1 to 8: the number of quarter turns, as in `numpy.rot90`, and whether the
-# image is mirrored left to right after that.
+# For each EXIF orientation, 1 to 8, the number of quarter turns as in `numpy.rot90`; and the
+# orientations whose image is mirrored left to right after the turn.
 _QUARTERS = {1: 0, 2: 0, 3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
 _MIRRORED = (2, 4, 5, 7)
+# Compression of these files blurs two values of a mask to many.
 _LOSSY = (".jpg", ".jpeg", ".webp")
-_MOST_LABELS = 32  # a mask with more values has probabilities
-_LARGEST_LABEL = 50  # so has one with a greater value
+# A mask has labels if it has at most this many values and no greater value; otherwise it has
+# probabilities.
+_MOST_LABELS = 32
+_LARGEST_LABEL = 50
 _VOID = 255  # label of pixels that belong to nothing, as in PASCAL VOC
-_LEAST_VIEW = 10.0  # field of view of a camera, degrees
+# Range of the field of view of a camera, degrees.
+_LEAST_VIEW = 10.0
 _LARGEST_VIEW = 120.0
-_LARGEST_SENSOR = 60  # millimetres
-_UNEQUAL = 1.3  # ratio of the focal lengths
-_OFF_MIDDLE = 0.3  # distance of the principal point from the middle, relative to half of the side
+_LARGEST_SENSOR = 60  # width of the largest sensor of a camera, millimetres
+_UNEQUAL = 1.3  # ratio of the focal lengths above which they are doubtful
+# Distance of the principal point from the middle, relative to half of the side, above which it is
+# doubtful.
+_OFF_MIDDLE = 0.3
 
 
 def read_picture(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], int]:
@@ -78,13 +88,13 @@ def picture_size(path: str | Path) -> tuple[int, int]:
 def read_depth_file(path: str | Path) -> Float32[np.ndarray, "h w"]:
     """Read the stored values of a depth map, 0 where unknown.
 
-    Unknown is what is not finite, not positive, or 65535 in 16 bits.
+    A value is unknown if it is not finite, not positive, or 65535 in 16 bits.
     """
     path = Path(path)
     if path.name.endswith(CO3D_DEPTH):
         return read_depth(path)
     values = _read_values(path, "depth")
-    # Blender repeats the depth as three colours.
+    # Blender writes the depth three times, as colours of an .exr file.
     if values.ndim == 3 and (values.shape[2] == 1 or path.suffix.lower() == ".exr"):
         values = values[..., 0]
     if (
@@ -93,12 +103,9 @@ def read_depth_file(path: str | Path) -> Float32[np.ndarray, "h w"]:
         or values.dtype.itemsize < 2
         or not values.size
     ):
-        expected = (
-            "numbers (H, W): a 16-bit greyscale PNG or TIFF, .npy, .npz with one array, or float "
-            ".tiff or .pfm"
-        )
         raise InputError(
-            f"depth {path} holds {values.dtype} of shape {values.shape}, expected {expected}"
+            f"depth {path} holds {values.dtype} of shape {values.shape}, expected numbers (H, W): "
+            "a 16-bit greyscale PNG or TIFF, .npy, .npz with one array, or float .tiff or .pfm"
         )
     with np.errstate(over="ignore", invalid="ignore"):
         depth = values.astype(np.float32)
@@ -109,10 +116,10 @@ def read_depth_file(path: str | Path) -> Float32[np.ndarray, "h w"]:
 def read_mask_file(path: str | Path, label: int | None = None) -> Float32[np.ndarray, "h w"]:
     """Read a mask file as probabilities (H, W) in [0, 1].
 
-    Of two values, the larger is the object. A picture with a palette, or of at most 32 values, none
-    above 50, has labels: the object is the one that is not 0, or the given `label` of several.
-    Other values are probabilities, above half of the largest for JPEG and WebP, which blur two
-    values to many.
+    Of two values, the larger is the object. A picture with a palette, or with at most 32 values
+    from 0 to 50, has labels: the object is the only label beside 0, or the given `label`. Other
+    values are probabilities. JPEG and WebP blur two values to many: values above half of the
+    largest are the object.
     """
     values, has_labels = _mask_values(Path(path))
     levels = np.unique(values)  # sorted
@@ -144,7 +151,7 @@ def read_mask_file(path: str | Path, label: int | None = None) -> Float32[np.nda
 
 
 def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
-    """Read the values of a mask file, and whether they are numbers of colours."""
+    """Read the values of a mask file, and whether they are labels, each of one colour."""
     values = _read_values(path, "mask")
     if path.suffix.lower() == ".png":
         with _decoding("mask", path):
@@ -154,10 +161,11 @@ def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
     if values.ndim == 3 and values.shape[2] in (1, 3, 4):
         colours = values[..., :3]
         alpha = values[..., 3:]
-        if alpha.size and np.ptp(alpha):  # a picture that is cut out
+        # The transparency of a picture that is cut out is its mask.
+        if alpha.size and np.ptp(alpha):
             return alpha[..., 0], False
         if path.suffix.lower() not in _LOSSY and (colours != colours[..., :1]).any():
-            # Three channels of up to 16 bits as one number.
+            # Each colour, three channels of up to 16 bits, becomes one number.
             codes = colours @ np.array([1 << 32, 1 << 16, 1])
             kinds, numbers = np.unique(codes, return_inverse=True)
             if len(kinds) <= _MOST_LABELS:
@@ -186,7 +194,7 @@ def _read_values(path: Path, what: str) -> Shaped[np.ndarray, "..."]:
                 (member,) = values.zip.infolist()
                 values = values[values.files[0]] if member.file_size <= MAX_FILE else None
         elif suffix == ".exr":
-            # None, or an error where the variable OPENCV_IO_ENABLE_OPENEXR is not set.
+            # Without the variable OPENCV_IO_ENABLE_OPENEXR, this returns None or raises an error.
             values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         elif suffix in (".tif", ".tiff", ".pfm", ".webp"):
             values = np.array(_open(path, what, ("TIFF", "PPM", "WEBP")))
@@ -198,7 +206,7 @@ def _read_values(path: Path, what: str) -> Shaped[np.ndarray, "..."]:
 
 
 def _open(path: str | Path, what: str, formats: Sequence[str]) -> Image.Image:
-    """Open an image file of some formats without decoding its pixels."""
+    """Open an image file of one of the formats, without decoding its pixels."""
     if Path(path).suffix.lower() in (".heic", ".heif"):
         raise InputError(f"{what} {path}: HEIC is not read, expected the photograph as JPEG")
     file = Image.open(io.BytesIO(read_bytes(path, what)), formats=formats)
@@ -227,20 +235,21 @@ def _decoding(what: str, path: str | Path) -> Iterator[None]:
 def lies_as_stored(
     stored: Sequence[int], orientation: int, form: str | None, path: Path, size: Sequence[int]
 ) -> bool:
-    """Tell whether an image lies as a photograph's stored pixels, or as displayed.
+    """Tell whether an image of a size lies as a photograph's stored pixels, or as displayed.
 
-    Its size tells where the orientation exchanges the sides, and `form` otherwise.
+    The size tells it if the EXIF orientation exchanges the sides, and `form` otherwise.
     """
     if orientation == 1:
         return True
+    # Orientations above 4 exchange height and width.
     if orientation > 4 and stored[0] != stored[1]:
         return (size[0] < size[1]) == (stored[0] < stored[1])
     if form is None:
-        unclear = (
-            "turns it, and sizes do not show whether depth, mask and intrinsics are turned, too"
+        raise InputError(
+            f"{path}: EXIF orientation {orientation} turns it, and sizes do not show whether "
+            "depth, mask and intrinsics are turned, too, expected --orientation stored or "
+            "--orientation displayed"
         )
-        expected = "--orientation stored or --orientation displayed"
-        raise InputError(f"{path}: EXIF orientation {orientation} {unclear}, expected {expected}")
     return form == "stored"
 
 
@@ -251,9 +260,9 @@ def display_image(image: Shaped[np.ndarray, "..."], orientation: int) -> Shaped[
 
 
 def display_camera(camera: Camera, orientation: int, where: str, posed: bool) -> Camera:
-    """Turn the camera of a stored image with it.
+    """Return the camera of the displayed image, given the camera of the stored one.
 
-    One without a pose stays upright, and may be mirrored.
+    A camera without a pose keeps the identity as its rotation, and its image may be mirrored.
     """
     turned = camera.turn(_QUARTERS[orientation])
     if posed and orientation in _MIRRORED:
@@ -273,14 +282,14 @@ def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
     InputError for a field of view that no camera has.
     """
     side = np.array(camera.size[::-1], float)
-    values = np.concatenate([camera.focal_length, camera.principal_point])
-    focal = camera.focal_length
     centre = camera.principal_point
+    values = np.concatenate([camera.focal_length, centre])
     subject = f"the intrinsics {_listed(values)}"
     doubt = _doubt(values, side)
-    # The field of view of the smallest image around this one with its centre at that point.
+    # The field of view of the smallest image that contains this one and has the principal point in
+    # its middle.
     whole = 2 * np.maximum(centre, side - centre)
-    view = np.degrees(2 * np.arctan(whole / focal / 2)).max()
+    view = np.degrees(2 * np.arctan(whole / camera.focal_length / 2)).max()
     if not _LEAST_VIEW <= view <= _LARGEST_VIEW:
         also = f"{doubt}; they " if doubt else ""
         raise InputError(
@@ -294,11 +303,11 @@ def _doubt(values: Float[np.ndarray, "4"], side: Float[np.ndarray, "2"]) -> str:
     """Say what is unusual about intrinsics of an image of (width, height) pixels, or return ""."""
     focal = values[:2]
     centre = values[2:]
-    # Focal lengths below 5 and a principal point below 1 are no pixels.
+    # Focal lengths of at most 5 and a principal point of at most 1 are not in pixels.
     if max(*centre, *focal / 5) <= 1:
         return f"look normalised: for this image they would be {_listed(values * np.tile(side, 2))}"
-    # The principal point is near the middle of the image that the intrinsics fit, unless that is a
-    # crop of a larger one: the ratios of its sides to this image's.
+    # The principal point is near the middle of the image for which the intrinsics were measured,
+    # unless it was cropped. The ratios of that image's sides to those of this image:
     ratios = 2 * centre / side
     ratio = ratios.mean()
     alike = min(ratios) > 0 and np.ptp(ratios) < 0.05 * ratio

@@ -40,7 +40,7 @@ def read_lists(folder: Path) -> Makers:
 def read_tum(
     folder: Path, intrinsics: tuple[float, float, float, float] = _TUM_INTRINSICS
 ) -> Makers:
-    """Read a sequence of TUM's RGB-D benchmark; what has the nearest times is a frame."""
+    """Read a sequence of TUM's RGB-D benchmark: images with the nearest depth and pose in time."""
     poses = read_numbers(folder / "groundtruth.txt", (8,))
     image_list = folder / "rgb.txt"
     depth_list = folder / "depth.txt"
@@ -66,7 +66,7 @@ def read_tum(
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> list[int]:
     """Return the position of the time nearest to each wanted one, -1 beyond the tolerance."""
-    # Times that are no numbers are near to none: -1 and -9 seconds.
+    # NaN becomes -1 s or -9 s, which are far from each other and from all times.
     tree = cKDTree(np.nan_to_num(times, nan=-1)[:, None])
     gaps, nearest = tree.query(
         np.nan_to_num(wanted, nan=-9)[:, None], distance_upper_bound=_TUM_TOLERANCE

@@ -15,61 +15,65 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
-from zsp_lite.data.cameras import Box
+from zsp_lite.data.cameras import Box, Camera
 from zsp_lite.data.depth import fit_plane
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, largest_region, mask_to_bbox
 from zsp_lite.errors import InputError
+from zsp_lite.importers.files import WINDOW_3, WINDOW_5
 from zsp_lite.points import object_pixels, sampling_step, standard_deviation, world_points
 
-# By colours.
-_ITERATIONS = 4  # of GrabCut
-_LONGEST_SIDE = 320  # pixels of an image in GrabCut, whose time is proportional to the area
+# Masks by colours.
+_ITERATIONS = 4  # number of GrabCut's iterations
+# Longest side in pixels of the image for GrabCut, whose time is proportional to the area.
+_LONGEST_SIDE = 320
 _PADDING = 0.1  # of the projected bounding box, relative to its longer side
-_SMALLEST_BOX = 4  # pixels
-# Distance of the ball's centre behind the visible surface, relative to its radius.
+_SMALLEST_BOX = 4  # least side of a box, pixels
+# Distance of the ball's centre behind the visible surface, relative to the ball's radius.
 _BALL_OFFSET = 0.6
-_POINTS = 4000  # on the object that are projected
-# By depth. All lengths are relative to the distance of the cameras from the point they look at.
-_REACH = 0.7  # points farther from that point are not part of the object
+_POINTS = 4000  # largest number of the object's points that are projected into a frame
+# Masks by depth. All lengths are relative to the distance of the cameras from the point they look
+# at, the focus.
+_REACH = 0.7  # points farther from the focus are not part of the object
 _PLANE_DISTANCE = 0.01  # largest distance of a point of the plane
 _CLEARANCE = 0.02  # smallest height of a point of the object above the plane
 _VOXEL = 0.07  # parts that are farther apart than this are separate
 _PLANES = 3  # planes to try: the largest may be a wall or a side of the object
 _MAX_BELOW = 0.05  # share of the points that may lie below the supporting plane
-_MIN_ON_PLANE = 0.05  # share of the points that must lie on it
-# Least deviation of the points on it, relative to that of the others: sides of objects are smaller.
+_MIN_ON_PLANE = 0.05  # share of the points that must lie on the supporting plane
+# Least deviation of the points on the supporting plane, relative to the deviation of all others:
+# a side of an object is smaller.
 _MIN_SPREAD = 0.7
-# Two objects are alike if the ratios of their points, which count less far from the focus, and of
-# their extents exceed these values.
+# Two objects are alike if the ratio of their numbers of points exceeds the first value, and the
+# ratio of their extents the second. Points count less the farther they are from the focus.
 _COMPARABLE = 0.5
 _ALIKE = 0.7
-# With so many views, gaps between them may be smaller than `_VOXEL` by this factor: in fewer views,
-# an object that hides parts of itself has gaps.
+# From this number of views on, parts are separate if they are farther apart than `_VOXEL` divided
+# by the factor below. Fewer views of an object that hides parts of itself have gaps of this size.
 _MANY = 8
 _FINER = 4
-_CLOUD_POINTS = 20_000  # at most that a plane is fitted to
-_MIN_PIXELS = 100  # of a mask, and points of a plane
+_CLOUD_POINTS = 20_000  # largest number of points to which a plane is fitted
+_MIN_PIXELS = 100  # least number of pixels of a mask, and of points of a plane
 # The bounding box of the object in known depth grows by these shares of its sides, half of it on
-# each side: pixels of unknown depth inside the first box may be on the object, and the colours of
-# the background are those in the second.
+# each side. Pixels of unknown depth inside the first box may be on the object. The second box shows
+# the colours of the background.
 _UNKNOWN_PADDING = 0.1
 _CONTEXT_PADDING = 0.8
-# A mask is flagged beyond these values, which were chosen on renderings.
-_BORDERS = 2  # number of the image's borders that a mask may not touch at once
-_MOST = 0.5  # share of the image
-_PARTS = 0.25  # share of the mask outside its largest region
+# A mask is flagged beyond the values below, which were chosen on renderings.
+_BORDERS = 2  # a mask that touches so many borders of the image is doubtful
+_MOST = 0.5  # largest share of the image, or of its border, that a mask covers
+_PARTS = 0.25  # largest share of a mask outside its largest region
 _COLOUR_IOU = 0.5  # least overlap with the mask that GrabCut finds in the padded bounding box
-_LEAST_SIGNS = 0.5  # per frame, below which masks are not flagged
-_LYING = 0.5  # share of the object's points that may lie in the plane around it
-# Shares of the object's points in and above one plane, such as a table's.
+_LEAST_SIGNS = 0.5  # masks are flagged from this number of signs per frame on
+_LYING = 0.5  # largest share of the object's points that lies in the plane around it
+# A part of the mask is a table if these shares of the points lie in one plane and above it.
 _CARRYING = 0.4
 _CARRIED = 0.05
 
-PLAUSIBLE = (0.05, 20.0)  # distance of an object, metres
-_LEAST_KNOWN = 0.4  # share of the pixels on the object
+PLAUSIBLE = (0.05, 20.0)  # least and largest distance of an object, metres
+_LEAST_KNOWN = 0.4  # least share of the object's pixels that have depth
 DOUBTFUL = "the masks may be wrong"
 
-# Unit normal, to the side of the cameras, and offset: normal @ x = offset.
+# Unit normal, which points to the side of the cameras, and offset: normal @ x = offset.
 Plane = tuple[Float[np.ndarray, "3"], float]
 
 
@@ -77,10 +81,10 @@ def masks_from_box(frames: Iterable[Frame], box: Box) -> Iterator[Frame]:
     """Segment the object in frames, given its box (top, left, height, width) in the first one.
 
     OpenCV's GrabCut (Rother, Kolmogorov and Blake 2004) separates the colours inside and outside of
-    a box. The box of a further frame is the projection of the object points of the frames before it
-    and of a ball as wide as the first box, which stands for what is not visible there. A mask is
-    empty where a further frame does not show the object. The frames are read one by one, as their
-    masks are asked for. InputError if the box finds nothing.
+    a box. The box in a later frame is the projection of the object points of the frames before it,
+    and of a ball as wide as the first box. The ball stands for what is not visible in the first
+    frame. The mask of a later frame that does not show the object is empty. Each frame is read when
+    its mask is asked for. InputError if there is no object in the box.
     """
     frames = iter(frames)
     first = next(frames)
@@ -120,14 +124,14 @@ def _masks_from_points(
         if min(box[2:]) >= _SMALLEST_BOX and not frame_defect(replace(frame, mask=None)):
             mask = grab_cut(frame.rgb, box)
         masked = replace(frame, mask=mask)
-        # Evenly spaced ones of all points that are known, at most `_POINTS`.
+        # Of all points known so far, at most `_POINTS` evenly spaced ones are kept.
         points = np.concatenate([points, _inner_points(masked)])
         points = points[np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(int)]
         yield masked
 
 
 def grab_cut(rgb: UInt8[np.ndarray, "h w 3"], box: Box) -> Float[np.ndarray, "h w"]:
-    """Return the mask of the largest region in a box that has other colours than around it."""
+    """Return the mask of the largest region in a box whose colours differ from those around it."""
     top, left, height, width = box
     inside = np.zeros(rgb.shape[:2], bool)
     inside[top : top + height, left : left + width] = True
@@ -139,11 +143,11 @@ def separate_colours(
     possible: Bool[np.ndarray, "h w"],
     certain: Bool[np.ndarray, "h w"] | bool = False,
 ) -> Bool[np.ndarray, "h w"]:
-    """Select the foreground, `certain` pixels and some `possible` ones, by GrabCut."""
+    """Select the foreground by GrabCut: the `certain` pixels, and some of the `possible` ones."""
     height, width = possible.shape
     labels = np.where(possible, cv2.GC_PR_FGD, cv2.GC_BGD)
     labels = np.where(certain, cv2.GC_FGD, labels).astype(np.uint8)
-    # On a smaller copy of a large image.
+    # GrabCut works on a smaller copy of a large image.
     shrink = max(1, max(height, width) / _LONGEST_SIDE)
     size = (max(1, round(width / shrink)), max(1, round(height / shrink)))
     bgr = cv2.resize(rgb[..., ::-1], size, interpolation=cv2.INTER_AREA)
@@ -151,7 +155,7 @@ def separate_colours(
     foreground = (cv2.GC_FGD, cv2.GC_PR_FGD)
     if 0 < np.isin(small, foreground).mean() < 1:  # GrabCut needs pixels of both kinds
         cv2.setRNGSeed(0)  # GrabCut initialises its clusters at random
-        # Five Gaussians of 13 numbers each, for GrabCut's use.
+        # GrabCut keeps five Gaussians of 13 numbers each in these arrays.
         background_model = np.zeros((1, 65))
         model = np.zeros((1, 65))
         cv2.grabCut(bgr, small, None, background_model, model, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
@@ -162,7 +166,7 @@ def separate_colours(
 def _inner_points(frame: Frame) -> Float[np.ndarray, "n 3"]:
     """Return world points inside the mask, without its border."""
     # At the border, depth may be that of the background.
-    inner = replace(frame, mask=cv2.erode(frame.mask, np.ones((5, 5), np.uint8)))
+    inner = replace(frame, mask=cv2.erode(frame.mask, WINDOW_5))
     return world_points(inner, object_pixels(inner))
 
 
@@ -183,35 +187,36 @@ def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box:
 def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
     """Segment the object in frames of one world, where the cameras look.
 
-    InputError if nothing stands there, or two alike.
+    InputError if nothing stands there, or if two objects of like size do.
     """
     if not any((frame.depth > 0).any() for frame in frames):
         raise InputError(
             f"no depth is known in any of {len(frames)} frames, expected some to find the object"
         )
 
-    # The pixels of known depth near the focus, of each frame, and some of their points.
+    # Select the pixels of known depth near the focus in each frame; gather some of their points.
     focus, distance = _focus(frames)
-    pixels = []
-    sample = []
+    selections = []
+    cloud = []
     for frame in frames:
-        near = frame.depth > 0
-        near[near] = _within(world_points(frame, near), focus, distance)
-        pixels.append(near)
-        sample.append(world_points(frame, near, sampling_step(frame, len(frames))))
+        selected = frame.depth > 0
+        selected[selected] = _within(world_points(frame, selected), focus, distance)
+        selections.append(selected)
+        cloud.append(world_points(frame, selected, sampling_step(frame, len(frames))))
 
-    # Of these, the ones above the plane that the object stands on.
+    # Keep the pixels above the plane that the object stands on.
     centres = [frame.camera.centre for frame in frames]
-    plane = _supporting_plane(centres, np.concatenate(sample), distance)
+    plane = _supporting_plane(centres, np.concatenate(cloud), distance)
     if plane is not None:
         normal, offset = plane
-        for frame, near in zip(frames, pixels, strict=True):
-            near[near] = world_points(frame, near) @ normal - offset > _CLEARANCE * distance
+        for frame, selected in zip(frames, selections, strict=True):
+            height = world_points(frame, selected) @ normal - offset
+            selected[selected] = height > _CLEARANCE * distance
 
-    # Of these, the ones that are connected where the cameras look.
-    parts = _part_at(focus, frames, pixels, _VOXEL * distance)
+    # Keep the pixels that are connected where the cameras look.
+    parts = _part_at(focus, frames, selections, _VOXEL * distance)
     if len(frames) >= _MANY:
-        # This refuses a part that is two objects close together.
+        # This raises InputError if the part is two objects close together.
         _part_at(focus, frames, parts, _VOXEL / _FINER * distance)
     masked = [
         replace(frame, mask=_with_unknown(frame, part))
@@ -226,7 +231,7 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
 
 
 def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
-    """Say in one line what speaks against the masks of frames of one world.
+    """Say in one line why the masks of frames of one world are doubtful; () if they are not.
 
     Frames with a defect do not count.
     """
@@ -240,16 +245,17 @@ def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
     if counts.total() < _LEAST_SIGNS * usable:
         return ()
     signs = [f"{sign} ({count} of {usable} frames)" for sign, count in counts.items()]
-    # Alone it is no reason: many objects fill the image, or stand on a dark turntable.
+    # A missing plane alone is no sign: objects may fill the image, or stand on a dark turntable.
     if signs and plane is None:
         signs.append("no plane is found that the object stands on")
     return (f"{DOUBTFUL}: {', '.join(signs)}",) if signs else ()
 
 
 def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
-    """Question the object's distance, if lengths are `metric`, and how much of it has depth."""
+    """Say that the object's distance, if `metric`, or its depth's extent is doubtful."""
     distances = []
-    seen = 0  # pixels
+    # Numbers of pixels on the object: all, and those of known depth.
+    seen = 0
     known = 0
     for frame in frames:
         depth = frame.depth[object_pixels(frame)]
@@ -268,7 +274,7 @@ def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
 
 
 def given_mask_flags(frames: Collection[Frame], missing: Collection[str]) -> tuple[str, ...]:
-    """Name the frames whose masks were made, and question masks that cover most of a border."""
+    """Name the frames without a given mask, and say how many masks cover most of the border."""
     flags = []
     if missing:
         flags.append(f"no mask is given for {', '.join(missing)}: found by depth")
@@ -286,7 +292,7 @@ def given_mask_flags(frames: Collection[Frame], missing: Collection[str]) -> tup
 
 
 def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:
-    """Fit the plane that an object stands on, outside of its masks; also return the distance."""
+    """Fit the plane that an object stands on, outside its masks; also return its distance."""
     on_object = []
     around = []
     centres = []
@@ -295,7 +301,7 @@ def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:
             continue
         known = frame.depth > 0
         mask = frame.mask > ON_OBJECT
-        widened = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        widened = cv2.dilate(mask.astype(np.uint8), WINDOW_5) > 0
         step = sampling_step(frame, len(frames))
         on_object.append(world_points(frame, known & mask, step))
         around.append(world_points(frame, known & ~widened, step))
@@ -312,7 +318,7 @@ def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:
 def _within(
     points: Float[np.ndarray, "n 3"], focus: Float[np.ndarray, "3"], distance: float
 ) -> Bool[np.ndarray, " n"]:
-    """Select the points that may be part of an object at the focus of cameras at a distance."""
+    """Select the points that may be part of the object: near the focus, for cameras this far."""
     return np.linalg.norm(points - focus, axis=1) < _REACH * distance
 
 
@@ -320,18 +326,20 @@ def _supporting_plane(
     centres: Sequence[Float[np.ndarray, "3"]], cloud: Float[np.ndarray, "n 3"], distance: float
 ) -> Plane | None:
     """Fit the plane that an object stands on to the points around it; None if there is none."""
-    cloud = cloud[:: max(1, -(-len(cloud) // _CLOUD_POINTS))]  # a step rounded up
+    # The step is rounded up.
+    cloud = cloud[:: max(1, -(-len(cloud) // _CLOUD_POINTS))]
     tolerance = _PLANE_DISTANCE * distance
     rest = cloud
     for _ in range(_PLANES):
         if len(rest) < _MIN_PIXELS:
             break
         normal, offset = fit_plane(rest, tolerance)
-        # The cameras are above it.
+        # The normal points to the side of the cameras.
         if np.median(np.stack(centres) @ normal - offset) < 0:
-            normal, offset = -normal, -offset
+            normal = -normal
+            offset = -offset
 
-        # It is wide, has many points, and nearly none below.
+        # The supporting plane is wide, has many points, and nearly none below.
         height = cloud @ normal - offset
         on = np.abs(height) < tolerance
         below = (height < -3 * _PLANE_DISTANCE * distance).mean()
@@ -350,17 +358,15 @@ def _supporting_plane(
 def _focus(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"], float]:
     """Return the point nearest to the cameras' optical axes, and their mean distance from it."""
     centres = np.stack([frame.camera.centre for frame in frames])
-    axes = np.stack([frame.camera.R[2] for frame in frames])
-    # Projections across the axes, (n, 3, 3): the sum of P (x - c) over the cameras is 0 for the
-    # point x.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    system = across.sum(axis=0) / len(frames)
-    if np.linalg.eigvalsh(system)[0] > 0.01:  # the axes differ by several degrees
-        focus = np.linalg.solve(system, np.einsum("nij,nj->i", across, centres) / len(frames))
-        if (np.einsum("nj,nj->n", focus - centres, axes) > 0).all():
+    matrix, right_side = axes_equation([frame.camera for frame in frames])
+    mean_matrix = matrix / len(frames)
+    # Parallel axes have no nearest point. Above this eigenvalue, they differ by several degrees.
+    if np.linalg.eigvalsh(mean_matrix)[0] > 0.01:
+        focus = np.linalg.solve(mean_matrix, right_side / len(frames))
+        if all(frame.camera.to_camera(focus)[2] > 0 for frame in frames):
             return focus, float(np.linalg.norm(focus - centres, axis=1).mean())
-    # One camera, or parallel axes: the median of the nearest quarter of the points in the central
-    # part of an image.
+    # With one camera or parallel axes, the focus is the median of the nearest quarter of the points
+    # in the central part of an image.
     first = next(k for k, frame in enumerate(frames) if (frame.depth > 0).any())
     known = frames[first].depth > 0
     height, width = known.shape
@@ -373,17 +379,29 @@ def _focus(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"], float]:
     return focus, float(np.linalg.norm(focus - centres[first]))
 
 
+def axes_equation(
+    cameras: Sequence[Camera],
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """Return A and b of the equation A x = b of the point x nearest to the optical axes."""
+    centres = np.stack([camera.centre for camera in cameras])
+    axes = np.stack([camera.R[2] for camera in cameras])
+    # The matrices P, (n, 3, 3), project across the axes. For the point x nearest to the axes, the
+    # sum of P (x - c) over the camera centres c is 0.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    return across.sum(axis=0), np.einsum("nij,nj->i", across, centres)
+
+
 def _part_at(
     focus: Float[np.ndarray, "3"],
     frames: Sequence[Frame],
     pixels: Sequence[np.ndarray],
     voxel: float,
 ) -> list[Bool[np.ndarray, "_ _"]]:
-    """Select the pixels in the connected part with the most points.
+    """Keep the pixels in the connected part with the most points.
 
-    Points far from the focus count less. InputError if a second part is alike.
+    Points far from the focus count less. InputError if there is a second part of like size.
     """
-    # The box of all points. Clouds are large: they are computed twice, and not kept.
+    # The box of all points. Clouds are large: they are computed twice, not kept in memory.
     corners = []
     for frame, selected in zip(frames, pixels, strict=True):
         points = world_points(frame, selected)
@@ -394,24 +412,24 @@ def _part_at(
     low = np.min(corners, axis=0)
     high = np.max(corners, axis=0)
 
-    # Voxels with points, weighed by these, and the voxel of each pixel.
+    # The weight of each voxel, which is the sum over its points, and the voxel of each pixel.
     shape = np.floor((high - low) / voxel).astype(int) + 1
     weight = np.zeros(shape.prod())
     cells = []
     for frame, selected in zip(frames, pixels):
         points = world_points(frame, selected)
         indices = np.floor((points - low) / voxel).astype(int)
-        # The index of the voxel in the flattened grid.
+        # The voxel of each pixel, as an index of the flattened grid.
         cells.append(np.ravel_multi_index(indices.T, shape).astype(np.int32))
         near = np.exp(-np.square(np.linalg.norm(points - focus, axis=1) / (8 * voxel)))
         weight += np.bincount(cells[-1], near, len(weight))
 
-    # Connected parts of voxels, of which the one with the most weight is the object.
+    # Label the connected parts of voxels. The part with the most weight is the object.
     part = ndimage.label(weight.reshape(shape) > 0, np.ones((3, 3, 3)))[0].ravel()
     sizes = np.bincount(part, weight)
     first = sizes.argmax()
     large = np.flatnonzero(sizes > _COMPARABLE * sizes[first])
-    # Only a part of like extent may be the object, too: a far larger one is a table or a wall.
+    # Only a part of like extent may be the object, too: a far larger part is a table or a wall.
     extents = np.array(
         [np.argwhere((part == number).reshape(shape)).std(axis=0).mean() for number in large]
     )
@@ -422,7 +440,7 @@ def _part_at(
             "looks, expected --box TOP,LEFT,HEIGHT,WIDTH around one of them"
         )
 
-    # Of the selected pixels, those whose voxel is in it.
+    # Keep the selected pixels whose voxel is in that part.
     chosen = part == first
     masks = [selected.copy() for selected in pixels]
     for mask, cell in zip(masks, cells, strict=True):
@@ -431,19 +449,20 @@ def _part_at(
 
 
 def _with_unknown(frame: Frame, mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Remove single pixels of a mask, and add those of unknown depth that have its colours."""
-    mask = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    """Remove single pixels of a mask, and add pixels of unknown depth that have its colours."""
+    mask = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, WINDOW_3)
     if mask.any():
         mask |= _colours_around(frame, mask > 0, certain=True) & (frame.depth == 0)
-    return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).astype(np.float32)
+    return cv2.morphologyEx(mask, cv2.MORPH_OPEN, WINDOW_3).astype(np.float32)
 
 
 def _colours_around(
     frame: Frame, mask: Bool[np.ndarray, "h w"], certain: bool
 ) -> Bool[np.ndarray, "h w"]:
-    """Separate the colours in the box of a mask by GrabCut.
+    """Select the foreground in the box of a mask by GrabCut.
 
-    Around a `certain` mask, only pixels of unknown depth are possible.
+    A `certain` mask is foreground, and beside it only pixels of unknown depth can be. Otherwise,
+    each pixel of the box can be foreground.
     """
     windows = []
     for padding in (_UNKNOWN_PADDING, _CONTEXT_PADDING):
@@ -460,9 +479,9 @@ def _colours_around(
 
 
 def _signs(frame: Frame, plane: Plane | None, distance: float) -> Iterator[str]:
-    """Name what speaks against the mask of a frame."""
+    """Yield the signs that the mask of a frame is wrong."""
     mask = frame.mask > ON_OBJECT
-    width = max(mask.shape) // 100 + 1  # of the border, pixels
+    width = max(mask.shape) // 100 + 1  # width of the border: 1 % of the image, pixels
     borders = (mask[:width], mask[-width:], mask[:, :width], mask[:, -width:])
     if sum(border.any() for border in borders) >= _BORDERS:
         yield "several borders of the image are touched"
@@ -480,7 +499,7 @@ def _signs(frame: Frame, plane: Plane | None, distance: float) -> Iterator[str]:
             yield "much of it lies in the plane around it"
     own_plane = _supporting_plane([frame.camera.centre], points, distance)
     if own_plane is not None:
-        # In units of the tolerance of a plane.
+        # Heights in units of the tolerance of a plane.
         height = (points @ own_plane[0] - own_plane[1]) / (_PLANE_DISTANCE * distance)
         if (np.abs(height) < 1).mean() > _CARRYING and (height > 3).mean() > _CARRIED:
             yield "part of it is a surface that the rest stands on"

@@ -19,11 +19,12 @@ _Row = tuple[float | None, float | None, float | None, float | None]  # None: no
 _Side = Annotated[float, msgspec.Meta(multiple_of=1)]  # pixels; exporters write 640 or 640.0
 _Angle = Annotated[float, msgspec.Meta(gt=0, lt=math.pi)]  # radians
 _Unit = Annotated[float, msgspec.Meta(gt=0, le=MAX_LENGTH)]
-_Coefficient = Annotated[float, msgspec.Meta(ge=-100, le=100)]  # of the distortion
+# Coefficient of the distortion; a greater one is a mistake.
+_Coefficient = Annotated[float, msgspec.Meta(ge=-100, le=100)]
 
 
 class _Frame(msgspec.Struct):
-    """A frame, together with what the file gives for all frames."""
+    """The values of a frame, those of all frames included."""
 
     file_path: str
     transform_matrix: Annotated[list[_Row], msgspec.Meta(min_length=3, max_length=4)]
@@ -46,7 +47,7 @@ class _Frame(msgspec.Struct):
     k4: _Coefficient = 0.0
     camera_model: str = "OPENCV"
     depth_unit_scale_factor: _Unit = 0.001
-    integer_depth_scale: _Unit | None = None  # has precedence
+    integer_depth_scale: _Unit | None = None  # if given, it counts, not the factor above
 
 
 def read_nerfstudio(path: str | Path) -> Makers:
@@ -63,7 +64,9 @@ def read_nerfstudio(path: str | Path) -> Makers:
         msgspec.json.encode(common.pop("frames", None)), list[dict[str, Any]], f"{path}, frames"
     )
     with_depth = [
-        k for k, own in enumerate(listed) if own.get("depth_file_path") or own.get("depth_path")
+        k
+        for k, frame in enumerate(listed)
+        if frame.get("depth_file_path") or frame.get("depth_path")
     ]
     if not with_depth:
         raise InputError(
@@ -75,15 +78,17 @@ def read_nerfstudio(path: str | Path) -> Makers:
 
 
 def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
-    """Make a frame of its values and those of all frames."""
+    """Make a frame from its values, those of all frames included."""
     frame = decode_json(msgspec.json.encode(values), _Frame, where)
     fisheye = frame.camera_model == _FISHEYE
     if not fisheye and (frame.camera_model not in _MODELS or frame.k4):
-        found = f"{frame.camera_model!r} with k4 = {frame.k4:g}"
-        expected = f"one of {', '.join(_MODELS)} with k4 = 0, or {_FISHEYE}"
-        raise InputError(f"{where}: camera_model is {found}, expected {expected}")
+        raise InputError(
+            f"{where}: camera_model is {frame.camera_model!r} with k4 = {frame.k4:g}, expected one "
+            f"of {', '.join(_MODELS)} with k4 = 0, or {_FISHEYE}"
+        )
 
-    # The size that the file gives, or that of the picture, which is read where it is there.
+    # The size that the file gives, or else the picture's. The picture may be missing if the file
+    # gives a size.
     image = find_inside(folder, frame.file_path) or folder / frame.file_path
     size = None
     if frame.h and frame.w:
@@ -91,7 +96,8 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     own_size = picture_size(image) if image.is_file() or size is None else size
     height, width = size or own_size
     intrinsics = _intrinsics(frame, height, width, where)
-    # A smaller or larger copy of the picture whose camera the file gives.
+    # Refuse a picture that is a smaller or larger copy of the one for which the file has
+    # intrinsics.
     own_height, own_width = own_size
     if own_size != (height, width) and math.isclose(
         height * own_width, width * own_height, rel_tol=0.01

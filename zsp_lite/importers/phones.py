@@ -27,7 +27,8 @@ def read_stray(folder: Path, count: int) -> Makers:
     """Read a scan of Stray Scanner, at most `count` sharp frames of its video."""
     rows = read_numbers(folder / "odometry.csv", (9,), delimiter=",", skiprows=1)
     K = read_numbers(folder / "camera_matrix.csv", (3,), delimiter=",")
-    rows[:, 1] = np.nan_to_num(rows[:, 1], nan=-1)  # numbers of the video's frames
+    # Column 1 has the number of the video's frame: one that is no number is not in the video.
+    rows[:, 1] = np.nan_to_num(rows[:, 1], nan=-1)
     pictures = new_folder()
     video = Video(folder / "rgb.mp4")
     left_out = []
@@ -60,7 +61,7 @@ def read_polycam(folder: Path) -> Makers:
 
 
 def _make_polycam(folder: Path, path: Path, image: str) -> CaptureFrame:
-    """Make a frame of the file of its camera."""
+    """Make a frame from the file of its camera."""
     camera = read_json(path, dict[str, Any], "capture")
     pose = [camera.get(f"t_{row}{column}") for row in range(3) for column in range(4)]
     intrinsics = [camera.get(name) for name in ("fx", "fy", "cx", "cy")]
@@ -84,7 +85,7 @@ class _Record3D(msgspec.Struct):
 
     K: Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)]  # in column-major order
     poses: list[list[float | None]]  # qx, qy, qz, qw, tx, ty, tz
-    dw: _Side = 256  # of the depth maps; by default those of the LiDAR
+    dw: _Side = 256  # width and height of the depth maps; the LiDAR's by default
     dh: _Side = 192
     perFrameIntrinsicCoeffs: list[list[float | None]] | None = None
 
@@ -94,9 +95,11 @@ def read_record3d(folder: Path) -> Makers:
     scan = read_json(folder / "metadata", _Record3D, "capture")
     unpacked = new_folder()
     if not any(map(any, scan.poses)):
-        found = f"all {len(scan.poses)} poses are zero: the tracking failed"
-        raise InputError(f"{folder}/metadata: {found}, expected another scan")
-    # fx, fy, cx, cy of each frame, or of all.
+        raise InputError(
+            f"{folder}/metadata: all {len(scan.poses)} poses are zero: the tracking failed, "
+            "expected another scan"
+        )
+    # fx, fy, cx, cy of each frame. A file without them has one K for all frames.
     every = scan.perFrameIntrinsicCoeffs or [[scan.K[k] for k in (0, 4, 6, 7)]] * len(scan.poses)
     for number in range(len(scan.poses)):
         intrinsics = every[number] if number < len(every) else []
@@ -106,7 +109,7 @@ def read_record3d(folder: Path) -> Makers:
 def _make_record3d(
     folder: Path, unpacked: Path, scan: _Record3D, intrinsics: list[float | None]
 ) -> CaptureFrame:
-    """Decompress depth and confidence of a frame to files `unpacked`.npy and .png."""
+    """Make a frame; its depth and confidence are decompressed to `unpacked`.npy and .png."""
     name = f"rgbd/{unpacked.name}"
     pose = scan.poses[int(unpacked.name)]
     depth = unpacked.with_suffix(".npy")
@@ -128,7 +131,7 @@ def _make_record3d(
 
 
 def _decompressed(path: Path, kind: type, scan: _Record3D) -> np.ndarray:
-    """Decompress a map of numbers by LZFSE."""
+    """Decompress a map (dh, dw) of numbers of a type by LZFSE."""
     try:
         import lzfse
     except ImportError as error:

@@ -45,7 +45,7 @@ def read_bop(folder: Path, object: int | None = None) -> Makers:
 def _make_bop(
     folder: Path, image: str, object: int, scene: list[_Annotation], camera: dict[str, Any]
 ) -> CaptureFrame:
-    """Make a frame of an object and a camera: pixel centres at integers, lengths in millimetres."""
+    """Make a frame whose world is the object's; BOP has integer pixel centres and millimetres."""
     where = f"{folder}, image {image}"
     indices = [index for index, pose in enumerate(scene) if pose.obj_id == object]
     if len(indices) > 1:
@@ -54,7 +54,7 @@ def _make_bop(
     R = real_array(f"{where}: cam_R_m2c", placed.cam_R_m2c, (9,))
     t = real_array(f"{where}: cam_t_m2c", placed.cam_t_m2c, (3,))
     K = real_array(f"{where}: cam_K", camera.get("cam_K"), (9,))
-    # Camera to object, the inverse of the file's.
+    # From camera to object: the inverse of the file's pose.
     pose = np.column_stack([R.reshape(3, 3).T, -_MILLIMETRES * R.reshape(3, 3).T @ t])
     scale = real_array(f"{where}: depth_scale", camera.get("depth_scale", 1), ())
     unit = _MILLIMETRES * float(scale)
@@ -80,7 +80,7 @@ def read_scannet(folder: Path) -> Makers:
 
 
 def _make_scannet(folder: Path, path: Path, K: Float[np.ndarray, "3 3"]) -> CaptureFrame:
-    """Make a frame of the file of its pose."""
+    """Make a frame from the file of its pose."""
     return make_frame(
         folder, f"color/{path.stem}", f"depth/{path.stem}", read_numbers(path, (4,)), K, str(path)
     )
@@ -97,7 +97,7 @@ def read_open3d(folder: Path) -> Makers:
             "system on it"
         )
     camera = read_json(folder / "intrinsic.json", dict[str, Any], "capture")
-    # In column-major order.
+    # The file has the matrix in column-major order.
     K = real_array(
         f"{folder}/intrinsic.json: intrinsic_matrix", camera.get("intrinsic_matrix"), (9,)
     )
@@ -106,8 +106,8 @@ def read_open3d(folder: Path) -> Makers:
         for path in (folder / "color").glob("*")
         if path.suffix.lower() in (".jpg", ".png")
     )
-    # Of each image, a line of three frame numbers, of which the last is read twice, and four lines
-    # of a matrix.
+    # The log has five lines for each image: three frame numbers, and the four rows of a matrix. By
+    # these columns, the last of the three numbers is read twice.
     lines = read_numbers(log, (4,), usecols=(0, 1, 2, -1))
     if len(lines) != 5 * len(images):
         raise InputError(

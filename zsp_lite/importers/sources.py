@@ -27,6 +27,7 @@ from zsp_lite.importers.files import (
     read_picture,
 )
 from zsp_lite.importers.masks import (
+    axes_equation,
     depth_flags,
     given_mask_flags,
     mask_flags,
@@ -34,9 +35,9 @@ from zsp_lite.importers.masks import (
     masks_from_depth,
 )
 
-# Options that each format takes; "open" is a source that is open already.
+# The options that each format takes. "open" stands for a source that is open already.
 _MASKED = ("mask", "box")
-_FILES = ("label", "orientation", "depth_unit")  # values of `CaptureFrame`
+_FILES = ("label", "orientation", "depth_unit")  # attributes of `CaptureFrame`
 _CAPTURE = (*_MASKED, *_FILES, "masks", "count")
 _TAKEN = {
     "open": (),
@@ -45,8 +46,9 @@ _TAKEN = {
     "frames": _MASKED,
     **{name: (*_CAPTURE, *layout.options) for name, layout in FORMATS.items()},
 }
-_SWEEPS = 20  # over the chosen views, which mostly stay after ten
-_CONTEXT = 8  # frames of a source that are segmented together, or tried as the reference
+_SWEEPS = 20  # number of sweeps over the chosen views: most views move no more after ten
+# So many frames of a source are segmented together, or tried as the reference.
+_CONTEXT = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,19 +57,19 @@ class Source:
 
     path: Path  # the sequence, the capture or the image; a name for frames in memory
     format: str  # "sequence", "image", "frames", or the format of a capture
-    # Number of each frame: that of the annotations, or its position in the capture.
+    # Number of each frame: its number in the annotations, or its position in the capture.
     numbers: tuple[int, ...]
     # Reads the frame at a position of `numbers`, with the mask that comes with it, if any.
-    read: Callable[[int], Frame]
+    read_frame: Callable[[int], Frame]
     # Where masks come from: "given" with the frames, "box" (GrabCut) or "auto" (depth and colours).
     mask: str = "given"
     box: Box | None = None  # bounding box of the object in the first frame, for "box"
-    # Of the frames, where these are chosen by their directions, not by their order.
+    # Camera of each frame, if frames are to be chosen by directions; () if by their order.
     cameras: tuple[Camera, ...] = ()
-    left_out: Sequence[str] = ()  # what is wrong with each frame that cannot be used
-    # Positions and names of frames without a given mask.
+    left_out: Sequence[str] = ()  # for each frame that cannot be used, what is wrong with it
+    # Names of the frames that come without a mask, by position.
     missing: Mapping[int, str] = field(default_factory=dict)
-    doubts: Sequence[str] = ()  # what speaks against the intrinsics
+    doubts: Sequence[str] = ()  # reasons to doubt the intrinsics
     depth_unit: float | None = None  # world units per stored depth value, of an image or a capture
 
     @property
@@ -86,16 +88,19 @@ class Source:
     def load(self, positions: Sequence[int], context: int = _CONTEXT) -> list[Frame]:
         """Load frames with masks of the object.
 
-        Masks that have to be made use up to `context` frames together. InputError if a file cannot
-        be read, or no frame shows the object.
+        Masks by depth are made with up to `context` more frames from all around the object.
+        InputError if a file cannot be read, or no frame shows the object.
         """
+        # The frames, and those from which their masks are made.
         needed = set(positions)
         if self.mask == "box":
             needed.add(0)
         elif self.mask == "auto":
             needed.update(map(int, np.linspace(0, len(self.numbers) - 1, context).round()))
-        frames = {position: self.read(position) for position in sorted(needed)}
+        frames = {position: self.read_frame(position) for position in sorted(needed)}
         loaded = list(frames.values())
+
+        # Make all masks, or those that are missing.
         if self.mask != "given":
             try:
                 masks = masks_from_box(loaded, self.box) if self.box else masks_from_depth(loaded)
@@ -111,36 +116,36 @@ class Source:
         return [frames[position] for position in positions]
 
     def segmented(self) -> "Source":
-        """Make the masks of all frames that lack one."""
+        """Return the source with masks for all frames that lack one."""
         every = range(len(self.numbers))
         if self.box:
-            masked = zip(every, masks_from_box(map(self.read, every), self.box))
+            masked = zip(every, masks_from_box(map(self.read_frame, every), self.box))
         else:
             masked = self._by_depth(every if self.mask == "auto" else list(self.missing))
-        # Only the bits of the masks are kept: all frames would need much memory.
+        # Only the bits of the masks stay in memory: the frames would need too much.
         bits = {position: np.packbits(frame.mask > ON_OBJECT) for position, frame in masked}
 
-        def read(position: int) -> Frame:
+        def read_masked(position: int) -> Frame:
             """Read a frame with its mask."""
-            frame = self.read(position)
+            frame = self.read_frame(position)
             if position not in bits:
                 return frame
             mask = np.unpackbits(bits[position], count=frame.depth.size).reshape(frame.depth.shape)
             return replace(frame, mask=mask.astype(np.float32))
 
-        return replace(self, read=read)
+        return replace(self, read_frame=read_masked)
 
     def _by_depth(self, positions: Sequence[int]) -> Iterator[tuple[int, Frame]]:
-        """Segment frames by depth, in groups all around the object."""
+        """Segment frames by depth, in groups of frames from all around the object."""
         groups = -(-len(positions) // _CONTEXT)  # rounded up
         for first in range(groups):
             group = positions[first::groups]
-            yield from zip(
-                group, replace(self, mask="auto").load(group, _CONTEXT - len(group)), strict=True
-            )
+            # A small group is completed by other frames.
+            masked = replace(self, mask="auto").load(group, _CONTEXT - len(group))
+            yield from zip(group, masked, strict=True)
 
     def flags(self, frames: Sequence[Frame]) -> list[str]:
-        """Question masks and depth of these frames, and the intrinsics and poses of the source."""
+        """List doubts about the masks and depth of frames, and the intrinsics and poses of all."""
         flags = []
         if self.left_out:
             more = f"; and {len(self.left_out) - 3} more" if len(self.left_out) > 3 else ""
@@ -158,13 +163,14 @@ class Source:
 
     def contradiction(self) -> str:
         """Say how depth and poses of a few frames contradict each other (see `disagreement`)."""
-        return disagreement(self._few(), self.depth_unit)
+        return disagreement(self._few_frames(), self.depth_unit)
 
-    def _few(self) -> Iterator[Frame]:
-        """Read a few frames once around the object, without masks that follow from the poses."""
+    def _few_frames(self) -> Iterator[Frame]:
+        """Read a few frames around the object, with their given masks only."""
         for position in neighbours(len(self.numbers)):
-            with suppress(InputError):  # a damaged file that the estimate does not use
-                frame = self.read(position)
+            # A damaged file is no reason to fail here: the estimate may not use it.
+            with suppress(InputError):
+                frame = self.read_frame(position)
                 yield frame if self.mask == "given" else replace(frame, mask=None)
 
     def select(
@@ -172,32 +178,35 @@ class Source:
     ) -> tuple[list[int], list[int], dict[int, Frame]]:
         """Load frames from all sides; return positions of references and of targets, and frames.
 
-        Frames with a defect are no references. The first reference frame is that with the number
-        `first`.
+        Frames with a defect are no references. `first` is the number of the first reference frame.
+        The frames are by position.
         """
         if first not in (None, *self.numbers):
-            known = f"{len(self.numbers)} from {min(self.numbers)} to {max(self.numbers)}"
-            raise InputError(f"{self.path} has no frame {first}, expected one of {known}")
+            raise InputError(
+                f"{self.path} has no frame {first}, expected one of {len(self.numbers)} from "
+                f"{min(self.numbers)} to {max(self.numbers)}"
+            )
 
-        # More candidates than references, because some may have a defect.
+        # There are more candidates than references, because some may have a defect. If the user
+        # names the first reference, it must have none.
         start = 0 if first is None else self.numbers.index(first)
         tried = max(references, _CONTEXT) if references and first is None else references
         every = range(len(self.numbers))
         candidates = self._spread(tried, [*every[start:], *every[:start]])
         views = self._spread(targets, every)
-        needed = list(dict.fromkeys([*candidates, *views]))  # each once
+        needed = list(dict.fromkeys([*candidates, *views]))  # each position once
         frames = dict(zip(needed, self.load(needed), strict=True))
         defects = {position: frame_defect(frames[position]) for position in candidates}
         usable = [position for position in candidates if not defects[position]]
         if references and (not usable or first is not None and defects[start]):
-            expected = "another --reference-frame, --mask or --box"
             raise InputError(
-                f"{self.path}: no usable reference frame: {defects[start]}, expected {expected}"
+                f"{self.path}: no usable reference frame: {defects[start]}, expected another "
+                "--reference-frame, --mask or --box"
             )
         return self._spread(references, usable), views, frames
 
     def _spread(self, count: int, positions: Sequence[int]) -> list[int]:
-        """Choose at most `count` positions with the first, evenly by directions or by the order."""
+        """Choose at most `count` positions, the first among them, by directions or by the order."""
         if not self.cameras or count == 0:
             return [positions[k] for k in spread(count, len(positions))]
         cameras = [self.cameras[position] for position in positions]
@@ -277,8 +286,10 @@ def open_source(
             raise InputError(f"--{option} does not go with {path}, of the format {layout}")
     ways = ("given", "auto") if box is None else ("box",)
     if mask not in (None, *ways):
-        expected = "--mask given, --mask auto, or --mask box with --box TOP,LEFT,HEIGHT,WIDTH"
-        raise InputError(f"{path}: mask is {mask!r} and box is {box}, expected {expected}")
+        raise InputError(
+            f"{path}: mask is {mask!r} and box is {box}, expected --mask given, --mask auto, or "
+            "--mask box with --box TOP,LEFT,HEIGHT,WIDTH"
+        )
 
     # The frames with the masks that come with them.
     if layout == "frames":
@@ -304,13 +315,12 @@ def open_source(
 
 def _from_frames(frames: Sequence[Frame], path: Path) -> Source:
     """Make the source of frames in memory."""
-    missing = {k: str(k) for k, frame in enumerate(frames) if frame.mask is None}
     return Source(
         path,
         "frames",
         tuple(range(len(frames))),
         frames.__getitem__,
-        missing=missing,
+        missing={k: str(k) for k, frame in enumerate(frames) if frame.mask is None},
         doubts=question_intrinsics(frames[0].camera, str(path)),
     )
 
@@ -319,8 +329,11 @@ def _from_sequence(path: Path) -> Source:
     """Make the source of a sequence of a data folder: its frames with camera and depth."""
     folder = _sequence_folder(path)
     dataset = Co3D(folder.parents[1])
-    every = dataset.frames(folder.parent.name, folder.name)
-    frames = [frame for frame in every if frame.viewpoint is not None and frame.depth is not None]
+    frames = [
+        frame
+        for frame in dataset.frames(folder.parent.name, folder.name)
+        if frame.viewpoint is not None and frame.depth is not None
+    ]
     if not frames:
         raise InputError(f"{path}: no frame has a camera and depth, expected some")
     return Source(
@@ -344,7 +357,7 @@ def _from_capture(path: Path, layout: str, options: dict[str, Any]) -> Source:
         frames, left_out = open_capture(path, layout, files=files, **options)
     cameras = tuple(frame.camera for frame in frames)
     _check_poses(cameras, path)
-    # The first camera with each intrinsic matrix.
+    # The first camera with each intrinsic matrix, so that a doubt is said once.
     different = {camera.K.tobytes(): camera for camera in reversed(cameras)}
     doubts = []
     for camera in different.values():
@@ -377,19 +390,18 @@ def open_pair(
     """
     sides = (reference, target, *helpers)
     formats = [_format(side) for side in sides]
-    given: list[dict] = [{} for _ in sides]
+    options_of_side: list[dict] = [{} for _ in sides]
     for name, values in options.items():
         takers = [k for k, layout in enumerate(formats) if name in _TAKEN[layout]]
-        # All that take it, or the reference and the target, which are the first two.
+        # There is a value for each path that takes the option, or only for those of the reference
+        # and the target, which are the first two paths.
         counts = {len(takers), sum(k < 2 for k in takers)}
         if takers and name != "depth":  # each image has its own depth
             counts.add(1)
         if values and len(values) not in counts:
-            option = name.replace("_", "-")
-            expected = " or ".join(map(str, sorted(counts)))
             raise InputError(
-                f"--{option}: {len(values)} values with {' and '.join(formats)}, expected "
-                f"{expected}"
+                f"--{name.replace('_', '-')}: {len(values)} values with {' and '.join(formats)}, "
+                f"expected {' or '.join(map(str, sorted(counts)))}"
             )
         if len(values) == 1 and name == "box":
             boxed = [
@@ -399,15 +411,15 @@ def open_pair(
         if len(values) == 1 and name != "depth":
             values = [*values] * len(takers)
         for k, value in zip(takers, values):
-            given[k][name] = value
+            options_of_side[k][name] = value
     return [
-        side if isinstance(side, Source) else open_source(side, **chosen)
-        for side, chosen in zip(sides, given)
+        side if isinstance(side, Source) else open_source(side, **own_options)
+        for side, own_options in zip(sides, options_of_side)
     ]
 
 
 def _check_frames(frames: Sequence[Frame]) -> list[Frame]:
-    """Refuse what cannot be frames of one object in one world."""
+    """Return frames as a list; InputError if they cannot be of one object in one world."""
     if not frames or not all(isinstance(frame, Frame) for frame in frames):
         raise InputError(
             f"frames are {reprlib.repr(frames)}, expected a sequence of zsp_lite.Frame"
@@ -420,7 +432,7 @@ def _check_frames(frames: Sequence[Frame]) -> list[Frame]:
 
 
 def _check_poses(cameras: Sequence[Camera], where: str | Path) -> None:
-    """Refuse several frames with one pose, as those of a program without tracking."""
+    """Raise InputError if several frames have one pose, as from a program without tracking."""
     if len({camera.matrix.tobytes() for camera in cameras}) == 1 < len(cameras):
         raise InputError(
             f"{where}: all {len(cameras)} frames have one camera pose, expected their poses "
@@ -444,7 +456,8 @@ def _format(side: SourceLike) -> str:
 
 def _sequence_folder(path: Path) -> Path | None:
     """Return the folder of a sequence, None if the path is no sequence of a data folder."""
-    # By the path, or behind links. Both are absolute, so that "." and "mine/cup/.." have names.
+    # The path as it is given, or behind links; both absolute, so that "." and "mine/cup/.." have
+    # names.
     for folder in (Path(os.path.abspath(path)), path.resolve()):
         if folder.is_dir() and (folder.parent / FRAMES_FILE).is_file():
             return folder
@@ -454,21 +467,22 @@ def _sequence_folder(path: Path) -> Path | None:
 def _open_image(
     path: Path, intrinsics: Values | None = None, depth: str | Path | None = None
 ) -> CaptureFrame:
-    """Name the files and the camera of an image, whose world is its camera's frame."""
+    """Return the files and the camera of an image, whose world is its camera's frame."""
     if intrinsics is None:
         raise InputError(
             f"image {path}: no intrinsics, expected --intrinsics FX,FY,CX,CY in pixels"
         )
     depth = _beside(path, "depth", DEPTHS) if depth is None else Path(depth)
     if depth is None:
-        names = f"{path.stem}_depth.png or {path.stem}_depth.npy"
         raise InputError(
-            f"image {path}: no {names} beside it, expected its depth there or as --depth FILE"
+            f"image {path}: no {path.stem}_depth.png or {path.stem}_depth.npy beside it, expected "
+            "its depth there or as --depth FILE"
         )
     depth_unit = 1.0 if depth.name.endswith(CO3D_DEPTH) else 0.001
     rgb, orientation = read_picture(path)
     camera = camera_from_pose(np.eye(4), intrinsics, rgb.shape[:2], f"image {path}")
-    # The sides are exchanged if the principal point is nearer to the middle of the displayed form.
+    # If the orientation exchanges the sides, the intrinsics are for the form, stored or displayed,
+    # whose middle is nearer to the principal point.
     stored = np.linalg.norm(2 * camera.principal_point - camera.size[::-1])
     displayed = np.linalg.norm(2 * camera.principal_point - camera.size)
     if orientation > 4 and displayed < stored:
@@ -485,25 +499,21 @@ def _beside(path: Path, kind: str, suffixes: Sequence[str]) -> Path | None:
 
 
 def spread(count: int, length: int) -> list[int]:
-    """Return at most `count` evenly spaced positions among `length` around an object."""
+    """Return at most `count` evenly spaced positions below `length`, 0 among them."""
     return sorted({k * length // count for k in range(count)})
 
 
 def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
     """Return positions of at most `count` cameras with evenly spread directions to an object.
 
-    They are the first camera and others that lie as charges which repel each other.
+    The first camera is chosen, and others that spread like charges which repel each other.
     """
     if len(cameras) <= count:
         return list(range(len(cameras)))
-    # The object is at the point that is nearest to all optical axes (see `masks`).
-    centres = np.stack([camera.centre for camera in cameras])
-    axes = np.stack([camera.R[2] for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None]
-    point = np.linalg.lstsq(
-        across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None
-    )[0]
-    directions = centres - point
+    # The object is at the point that is nearest to all optical axes.
+    matrix, right_side = axes_equation(cameras)
+    point = np.linalg.lstsq(matrix, right_side, rcond=None)[0]
+    directions = np.stack([camera.centre for camera in cameras]) - point
     directions /= np.linalg.norm(directions, axis=1, keepdims=True).clip(1e-9)
     # Sorted, so that the choice is the same for every order of the other cameras.
     order = [0, *(1 + np.lexsort(directions[1:].T.round(6)))]
@@ -511,11 +521,11 @@ def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
     gaps = directions[order][:, None] - directions[order]
     energy = 1 / (np.sum(gaps**2, axis=-1) + 1e-9)
     np.fill_diagonal(energy, np.inf)  # no camera is chosen twice
-    # Each in turn moves to where its energy with the others is least.
+    # Each chosen camera but the first moves in turn to where its energy with the others is least.
     chosen = [0]
     for _ in range(_SWEEPS):
         for k in range(1, count):
             others = chosen[:k] + chosen[k + 1 :]
-            # In the first sweep, it is added at the end.
+            # In the first sweep, the camera is added at the end of the list.
             chosen[k : k + 1] = [int(energy[others].sum(axis=0).argmin())]
     return sorted(int(order[k]) for k in chosen)

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import cv2
 import msgspec
@@ -20,6 +20,7 @@ from jaxtyping import Float, Float32
 
 from zsp_lite.data.cameras import NDC_ISOTROPIC, Camera
 from zsp_lite.data.co3d import SequenceData
+from zsp_lite.data.depth import zero_unknown
 from zsp_lite.data.frames import MAX_PIXELS, Frame, check_pixels
 from zsp_lite.data.labels import PoseLabel, label_bytes
 from zsp_lite.errors import (
@@ -51,16 +52,17 @@ logger = logging.getLogger(__name__)
 _MOST_STEPS = 1_000_000
 _LONGEST_VALUE = 1 << 20  # bytes; the longest values are captions
 # A frame agrees if the median distance of its depth from the point cloud is below this multiple of
-# the object's standard deviation, so that most of its points can be inliers of RANSAC. Depth is a
-# network's, which is right in scale at best.
+# the object's standard deviation: most of its points can then be inliers of RANSAC. The depth is
+# from a network and may be wrong.
 _TOLERANCE = 0.2
-# The nearest point of the cloud in each cell is one that the camera sees. The longer side of an
-# image has 48 cells: an object then covers several hundred, and a cloud has points in all of them.
+# Number of cells along the longer side of an image. The camera sees the nearest point of the cloud
+# in each cell: an object covers several hundred cells, and a cloud has points in all of them.
 _CELLS = 48
-_GREY = 128  # of points without colours
+_GREY = 128  # colour of points without colours
 _LONGEST_VIDEO = 1e6  # seconds
+# Columns whose names begin with no underscore.
 _PLAIN_COLUMNS = ("sequence_name", "frame_number", "frame_timestamp")
-# What the proposed labels refer to: uCO3D's aligned frame, which is the world of no sequence
+# The reference of the proposed labels: uCO3D's aligned frame, which is the world of no sequence.
 _ALIGNED_FRAME = "uco3d"
 _ATTRIBUTION = """\
 # Authors and licence
@@ -78,12 +80,20 @@ def _column(field: str) -> str:
 
 
 class _Row(msgspec.Struct, rename=_column):
-    """A row of a table, in which tuples of numbers are blobs."""
+    """A row of a table, in which arrays of numbers are blobs."""
 
     sequence_name: str
 
+    @classmethod
+    def decode(cls, columns: dict[str, Any]) -> "_Row":
+        """Check the columns of a row; InputError if a value has another type."""
+        try:
+            return msgspec.convert(columns, cls)
+        except msgspec.ValidationError as error:
+            raise InputError(f"metadata.sqlite: {error}") from error
+
     def numbers(self, field: str, shape: tuple[int, ...], kind: str = "<f4") -> np.ndarray:
-        """Decode a blob: numbers of four bytes one after the other."""
+        """Decode a blob of four bytes per number to an array; `kind` is the type of its numbers."""
         blob = getattr(self, field)
         expected = 4 * int(np.prod(shape))
         if len(blob) != expected:
@@ -96,7 +106,7 @@ class _Row(msgspec.Struct, rename=_column):
         return values
 
 
-class _SequenceRow(_Row, rename=_column):
+class _SequenceRow(_Row):
     """A row of `sequence_annots`; paths are relative to ROOT."""
 
     video_path: str
@@ -104,12 +114,13 @@ class _SequenceRow(_Row, rename=_column):
     depth_video_path: str  # the HDF5 file
     segmented_point_cloud_path: str
     reconstruction_quality_viewpoint: float | None
-    # Rotation and translation of row vectors: aligned points are a multiple of `x @ R + T`.
+    # Rotation R and translation T: the aligned point of a row vector x is a multiple of `x @ R +
+    # T`.
     alignment_R: bytes | None
     alignment_T: bytes | None
 
 
-class _FrameRow(_Row, rename=_column):
+class _FrameRow(_Row):
     """A row of `frame_annots`."""
 
     frame_number: int
@@ -152,9 +163,6 @@ class _FrameRow(_Row, rename=_column):
         return replace(camera, focal_length=K[[0, 1], [0, 1]], principal_point=K[:2, 2])
 
 
-_AnyRow = TypeVar("_AnyRow", _SequenceRow, _FrameRow)
-
-
 def import_uco3d(
     root: str | Path,
     out: str | Path,
@@ -163,36 +171,37 @@ def import_uco3d(
     best: int = 10,
     count: int = 24,
 ) -> Iterator[tuple[str, ImportResult]]:
-    """Write sequences of a category as OUT/CATEGORY/SEQUENCE; give the names and what was done.
+    """Write sequences of a category as OUT/CATEGORY/SEQUENCE; yield names and results.
 
-    uCO3D's alignment of the objects becomes pose labels in OUT/label_proposals. Sequences that are
-    there already stay as they are. Those that cannot be imported are left out with a warning.
+    uCO3D's alignment of the objects becomes pose labels in OUT/label_proposals. Sequences that
+    exist in OUT stay as they are. Sequences that cannot be imported are left out with a warning.
 
     Args:
         root: uCO3D's folder, in which single categories or sequences may be missing.
         out: Data folder.
         category: Name of the category.
-        sequences: Their names; by default those with the best cameras.
-        best: Number of sequences without `sequences`.
+        sequences: Names of sequences. By default, those with the best cameras are imported.
+        best: Number of sequences that are imported by default.
         count: Number of frames per sequence, evenly spaced among those with a mask and depth.
 
     Raises:
         InputError: Category or sequence is not on the disk, the metadata are not those of uCO3D, or
             none of the sequences can be imported.
     """
-    root, out = Path(root), Path(out)
+    root = Path(root)
+    out = Path(out)
     with closing(_open_metadata(root / "metadata.sqlite")) as metadata:
         names = _downloaded(root, category)
         for name in sequences or ():
             check_choice(f"{root}: sequence of {category}", name, names)
         asked = set(sequences or names)
         rows = _ranked(metadata, sorted(asked))
-        if len(rows) < len(asked):
-            absent = len(asked) - len(rows)
+        absent = len(asked) - len(rows)
+        if absent:
             logger.warning("%d of %d sequences are not in the metadata", absent, len(asked))
         if sequences is None:
             rows = rows[:best]
-        present = 0
+        present = 0  # number of sequences in OUT
         problem = "no sequence on the disk is in the metadata"
         for row in rows:
             name = row["sequence_name"]
@@ -200,7 +209,7 @@ def import_uco3d(
                 present += 1
                 continue
             try:
-                sequence = _Sequence(root, metadata, _decoded(row, _SequenceRow))
+                sequence = _Sequence(root, metadata, _SequenceRow.decode(row))
                 result = sequence.write(out, category, count)
             except InputError as error:
                 problem = f"{name}: {error}"
@@ -213,7 +222,7 @@ def import_uco3d(
 
 
 def _open_metadata(path: Path) -> sqlite3.Connection:
-    """Open a database for reading."""
+    """Open a database for reading, with limits for each query."""
     file_size(path, "uCO3D's metadata")
     metadata = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
     metadata.row_factory = sqlite3.Row
@@ -232,34 +241,28 @@ def _downloaded(root: Path, category: str) -> list[str]:
 
 def _ranked(metadata: sqlite3.Connection, names: list[str]) -> list[dict[str, Any]]:
     """Return the rows of sequences, those with the best cameras first."""
-    places = ", ".join("?" * len(names))
-    condition = f"sequence_name IN ({places})"
-    order = "_reconstruction_quality_viewpoint DESC, sequence_name"
+    places = ", ".join("?" * len(names))  # one place per name
     return _select(
-        metadata, _SequenceRow, f"sequence_annots WHERE {condition} ORDER BY {order}", names
+        metadata,
+        _SequenceRow,
+        f"sequence_annots WHERE sequence_name IN ({places}) "
+        "ORDER BY _reconstruction_quality_viewpoint DESC, sequence_name",
+        names,
     )
 
 
 def _select(
     metadata: sqlite3.Connection, kind: type[_Row], source: str, values: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return the columns of a kind of rows."""
+    """Query the columns of a kind of rows; `source` has the table and the conditions."""
     columns = ", ".join(field.encode_name for field in msgspec.structs.fields(kind))
     try:
-        found = metadata.execute(f"SELECT {columns} FROM {source}", values)
-        return [dict(row) for row in found]
+        rows = metadata.execute(f"SELECT {columns} FROM {source}", values)
+        return [dict(row) for row in rows]
     except sqlite3.Error as error:
         raise InputError(
             f"metadata.sqlite: {error}, expected uCO3D's tables with their keys"
         ) from error
-
-
-def _decoded(row: dict[str, Any], kind: type[_AnyRow]) -> _AnyRow:
-    """Check the types of the values of a row."""
-    try:
-        return msgspec.convert(row, kind)
-    except msgspec.ValidationError as error:
-        raise InputError(f"metadata.sqlite: {error}") from error
 
 
 class _DepthMaps:
@@ -272,7 +275,7 @@ class _DepthMaps:
             self.names = set(file)
 
     def read(self, name: str) -> Float32[np.ndarray, "h w"]:
-        """Read a depth map, as it is stored."""
+        """Read the stored values of a depth map, which must be in this file itself."""
         import h5py
 
         with self._open() as file:
@@ -287,7 +290,7 @@ class _DepthMaps:
 
     @contextmanager
     def _open(self) -> Iterator[Any]:
-        """Open the file; InputError for what the block finds wrong with it."""
+        """Open the file; InputError if it is damaged, or if the block raises an error."""
         try:
             import h5py
         except ImportError as error:
@@ -305,7 +308,7 @@ class _DepthMaps:
 
 
 class _Sequence:
-    """A sequence with its open files; its frames are rows."""
+    """A sequence with its open files, and the rows of the frames that can be used."""
 
     def __init__(self, root: Path, metadata: sqlite3.Connection, row: _SequenceRow):
         self.row = row
@@ -316,19 +319,23 @@ class _Sequence:
         self.images = Video(path_inside(root, row.video_path), displayed=True)
         self.masks = Video(path_inside(root, row.mask_video_path), displayed=True)
         self.depths = _DepthMaps(path_inside(root, row.depth_video_path))
-        usable = "_mask_mass IS NOT 0 AND _viewpoint_R IS NOT NULL AND frame_timestamp IS NOT NULL"
+        # Frames with a mask, a camera, a time and depth.
         rows = _select(
             metadata,
             _FrameRow,
-            f"frame_annots WHERE sequence_name = ? AND {usable} "
+            "frame_annots WHERE sequence_name = ? AND _mask_mass IS NOT 0 "
+            "AND _viewpoint_R IS NOT NULL AND frame_timestamp IS NOT NULL "
             "AND _depth_scale_adjustment > 0 ORDER BY frame_number",
             [row.sequence_name],
         )
-        frames = [_decoded(one, _FrameRow) for one in rows]
-        self.frames = [one for one in frames if one.depth_name() in self.depths.names]
+        frames = [_FrameRow.decode(frame) for frame in rows]
+        self.frames = [frame for frame in frames if frame.depth_name() in self.depths.names]
 
     def write(self, out: Path, category: str, count: int) -> ImportResult:
-        """Write at most `count` frames, whose depth agrees with the point cloud, and the label."""
+        """Write the sequence, its licence and its label, with at most `count` frames.
+
+        Frames whose depth disagrees with the point cloud are left out.
+        """
         # Choose frames, and leave out those with wrong depth.
         chosen = [self.frames[position] for position in spread(count, len(self.frames))]
         agreeing = [frame for frame in chosen if self._agrees(frame)]
@@ -337,11 +344,10 @@ class _Sequence:
                 f"{len(agreeing)} of {len(chosen)} frames have depth that agrees with the point "
                 f"cloud, expected {MIN_VIEWS}"
             )
-        # Scale the scene; a video that ends too early is an InputError before anything is written.
+        # Scale the scene.
         scale = 1 / self.deviation
-        frames = LazyFrames(
-            lambda k: scale_frame(self._load(agreeing[k]), scale), range(len(agreeing))
-        )
+        frames = LazyFrames(lambda frame: scale_frame(self._load(frame), scale), agreeing)
+        # Load the last frame: InputError, before anything is written, if the video ends too early.
         frames[-1]
         label = self._label(scale)
         data = SequenceData(
@@ -358,14 +364,16 @@ class _Sequence:
         if label is not None:
             path = out / "label_proposals" / category / f"{label.seq}.json"
             write_atomic(path, label_bytes(label))
-        flags = []
+        flags = ()
         left_out = len(chosen) - len(agreeing)
         if left_out:
-            flags.append(
+            flags = (
                 f"{left_out} of {len(chosen)} frames left out, whose depth disagrees with the "
-                "point cloud"
+                "point cloud",
             )
-        return ImportResult(len(agreeing), 0, len(self.points), scale, tuple(flags))
+        return ImportResult(
+            len(agreeing), empty=0, points=len(self.points), scale=scale, flags=flags
+        )
 
     def _load(self, frame: _FrameRow) -> Frame:
         """Load a frame without distortion."""
@@ -385,19 +393,18 @@ class _Sequence:
             cv2.CV_32FC1,
         )
         rgb = cv2.remap(rgb, *maps, cv2.INTER_LINEAR)
-        # A video has three channels, which are equal for masks.
+        # The three channels of a video of masks are equal.
         mask = cv2.remap(mask[..., 0].astype(np.float32) / 255, *maps, cv2.INTER_LINEAR)
         depth = cv2.resize(self._depth(frame), size, interpolation=cv2.INTER_NEAREST_EXACT)
         return Frame(rgb, depth, mask, camera, f"{frame.sequence_name}/{frame.frame_number}")
 
     def _depth(self, frame: _FrameRow) -> Float32[np.ndarray, "h w"]:
-        """Read the depth of a frame, which has no distortion and a size of its own."""
+        """Read the depth of a frame: undistorted, 0 where unknown, not of the image's size."""
         stored = self.depths.read(frame.depth_name())
-        depth = stored * np.float32(frame.depth_scale_adjustment)
-        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+        return zero_unknown(stored * np.float32(frame.depth_scale_adjustment))
 
     def _agrees(self, frame: _FrameRow) -> bool:
-        """Whether the depth of a frame lies on the side of the point cloud that it shows."""
+        """Whether the depth of a frame lies on the part of the point cloud that the camera sees."""
         depth = self._depth(frame)
         height, width = depth.shape
         pixels, distances = frame.undistorted().resize(depth.shape).project(self.points)
@@ -406,7 +413,7 @@ class _Sequence:
         )
         columns, rows = pixels[inside].astype(int).T
         distances = distances[inside]
-        # With the points in the order of their distances, the first of each cell is the nearest.
+        # In the order of the distances, the first point of each cell is the nearest.
         side = max(height, width) / _CELLS
         cells = (rows // side) * _CELLS + columns // side
         order = np.argsort(distances)
@@ -418,12 +425,12 @@ class _Sequence:
         return bool(known.any() and np.median(errors) < _TOLERANCE * self.deviation)
 
     def _label(self, scale: float) -> PoseLabel | None:
-        """Propose the label that leads from uCO3D's aligned frame to the scaled world."""
+        """Return the label from uCO3D's aligned frame to the scaled world, None if not aligned."""
         if self.row.alignment_R is None or self.row.alignment_T is None:
             return None
         rotation = rotation_matrix("_alignment_R", self.row.numbers("alignment_R", (3, 3)))
         translation = scale * self.row.numbers("alignment_T", (3,))
-        # Of row vectors, aligned = x @ R + T; so for columns x = R @ (aligned - T).
+        # For row vectors, aligned = x @ R + T. So for column vectors, x = R @ (aligned - T).
         trans = np.eye(4)
         trans[:3, :3] = rotation
         trans[:3, 3] = -rotation @ translation

@@ -19,11 +19,12 @@ from zsp_lite.data.frames import MAX_PIXELS
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import file_size, path_inside
 
-# Limits of an unpacked zip: bytes; bytes above which it may have at most so many times those of the
-# zip.
+# Largest number of bytes of an unpacked zip. Above `_LARGE` bytes, it may also have at most
+# `_RATIO` times those of the zip: more would be a zip bomb.
 _MOST = 20e9
 _LARGE = 1e9
 _RATIO = 200
+# What Python raises for a damaged zip.
 _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
@@ -34,8 +35,8 @@ _DAMAGE = (
     RuntimeError,
     ValueError,
 )
-_MATROSKA = b"\x1aE\xdf\xa3"  # the first bytes of such a file
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # silent
+_MATROSKA = b"\x1aE\xdf\xa3"  # first bytes of a Matroska file
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # no messages
 
 
 def new_folder() -> Path:
@@ -76,7 +77,7 @@ class Video:
         file_size(path, "video")
         with open(path, "rb") as file:
             header = file.read(8)
-        # Other files may name addresses, which are not to be opened.
+        # Files of other formats, such as playlists, may name addresses, which must not be opened.
         is_video = header[4:] == b"ftyp" or header.startswith(_MATROSKA)
         video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG) if is_video else cv2.VideoCapture()
         pixels = video.get(cv2.CAP_PROP_FRAME_WIDTH) * video.get(cv2.CAP_PROP_FRAME_HEIGHT)
@@ -88,16 +89,14 @@ class Video:
         video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(displayed))
         self.path = path
         self._video = video
-        self._position = -1  # of the frame that was decoded last
+        self._position = -1  # number of the frame that was decoded last
 
     def frame(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
         """Decode the frame with a number, from 0 on; the numbers may not decrease."""
         while self._position < number and self._video.grab():
             self._position += 1
-        decoded = False
-        if self._position == number:
-            decoded, image = self._video.retrieve()
-        if not decoded:
+        decoded, image = self._video.retrieve()
+        if self._position != number or not decoded:
             raise InputError(f"video {self.path} ends before frame {number}")
         return image[..., ::-1]
 

@@ -17,9 +17,9 @@ from tqdm import tqdm
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import sha256
 
-CHUNK = 1 << 18  # bytes
-TIMEOUT = 30  # of a connection, s
-ATTEMPTS = 3
+CHUNK = 1 << 18  # bytes that are read at once
+TIMEOUT = 30  # seconds until a server that does not answer is given up
+ATTEMPTS = 3  # number of requests, before the user must call again
 # What urllib raises if a server cannot be reached, sends no file, or has an invalid address.
 NETWORK_ERRORS = (OSError, http.client.HTTPException, ValueError)
 
@@ -39,8 +39,8 @@ def fetch(
 ) -> Path:
     """Download a file of `size` bytes, or at most `most`, unless it exists.
 
-    Data is written to `path`.part, which is renamed after its size, the first digits of its MD5
-    digest and its SHA-256 `digest` were verified. An interrupted download is resumed, in up to
+    Data is written to `path`.part. This file is renamed after its size, the first digits of its MD5
+    digest and its SHA-256 `digest` are verified. An interrupted download is resumed, in up to
     three attempts and by later calls.
     """
     if path.exists():
@@ -50,6 +50,7 @@ def fetch(
         most = size
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        # `any` stops after the first attempt that is not interrupted.
         complete = any(_fetch_rest(url, part, most) for _ in range(ATTEMPTS))
         received = part.stat().st_size
     except NETWORK_ERRORS as error:
@@ -75,7 +76,7 @@ def has_size_and_hash(path: Path, size: int | None = None, md5_prefix: str = "")
     digest = ""
     with open(path, "rb") as file:
         if md5_prefix:
-            # MD5 finds errors of the transfer, not attacks; systems that forbid it allow that.
+            # MD5 finds errors of the transfer, not attacks: systems without MD5 allow this use.
             md5 = hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False))
             digest = md5.hexdigest()
     return size in (None, path.stat().st_size) and digest.startswith(md5_prefix)
@@ -147,7 +148,7 @@ def _is_part(response: http.client.HTTPResponse, start: int) -> bool:
 
 
 def _fetch_rest(url: str, part: Path, most: float) -> bool:
-    """Request the missing rest of `part`, at most so many bytes; False if it was interrupted."""
+    """Request the rest of `part`, up to `most` bytes of the file; False if it is interrupted."""
     start = part.stat().st_size if part.exists() else 0
     if start >= most:
         return True
@@ -156,15 +157,16 @@ def _fetch_rest(url: str, part: Path, most: float) -> bool:
     except urllib.error.HTTPError as error:
         if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
             raise
-        part.unlink()  # the file was complete, or it has changed on the server
+        # The part is as long as the file, or the file has changed on the server: start again.
+        part.unlink()
         return False
     with response:
         # A server that does not resume sends the whole file.
         start = start if _is_part(response, start) else 0
         length = response.headers.get("Content-Length")
         total = None if length is None else start + int(length)
-        shown = tqdm.wrapattr(response, "read", total, desc=part.stem, initial=start, disable=None)
-        with shown as source, open(part, "ab" if start else "wb") as file:
+        bar = tqdm.wrapattr(response, "read", total, desc=part.stem, initial=start, disable=None)
+        with bar as source, open(part, "ab" if start else "wb") as file:
             try:
                 while file.tell() <= most and (chunk := source.read(CHUNK)):
                     file.write(chunk)

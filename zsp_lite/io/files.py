@@ -18,18 +18,19 @@ import msgspec
 
 from zsp_lite.errors import InputError
 
-REPOSITORY = Path(__file__).resolve().parents[2]  # of an installed copy: the folder of the packages
+# The root of the repository; for an installed copy, the folder of the packages.
+REPOSITORY = Path(__file__).resolve().parents[2]
 MAX_FILE = 1 << 30  # bytes of a file that is read at once, and of what is decompressed from it
 MAX_WEIGHTS = 4 << 30  # bytes of a file of weights
-# Compressed data may grow to this many bytes, or by this factor if that is more. Annotations grow
-# by 10.
+# Compressed data may grow to this many bytes, or by the factor below if that is more. Annotations
+# grow by a factor of 10.
 GROWTH_ALLOWED = 1 << 26
 _GROWTH_FACTOR = 32
-_LONGEST_NAME = 255  # bytes, on most file systems
+_LONGEST_NAME = 255  # bytes of a file's name, on most file systems
 
 
 class OutsideError(InputError):
-    """A path that leads out of its folder by its own text."""
+    """A path whose text leads out of its folder, not a link on it."""
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:
@@ -78,7 +79,7 @@ def file_size(path: str | Path, what: str, most: float = math.inf) -> int:
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):
             problem = "is a directory"
-        elif not stat.S_ISREG(status.st_mode):  # it may never end
+        elif not stat.S_ISREG(status.st_mode):  # what a pipe or device sends may never end
             problem = "a pipe or a device, expected a file"
         elif status.st_size > most:
             problem = f"{status.st_size} bytes, expected at most {most}"
@@ -156,18 +157,16 @@ def path_inside(root: str | Path, relative: str) -> Path:
 
 
 def find_inside(root: str | Path, text: str) -> Path | None:
-    """Find a file by a path that another file gives: relative or absolute.
+    """Find a file in a folder by a path, relative or absolute, that another file gives.
 
-    The path of an image may lack its extension.
-
-    Links inside the folder, which its owner made, may lead anywhere. OutsideError if the text
-    itself leads out of it.
+    The path of an image may lack its extension. Links inside the folder may lead anywhere, because
+    its owner made them. OutsideError if the text of the path leads out of the folder.
     """
     root = os.path.abspath(root)
     text = text.replace("\\", "/")
     # A path with a drive is absolute, also on systems that have no drives.
     path = os.path.normpath(text if PureWindowsPath(text).drive else os.path.join(root, text))
-    # The folder may be given by its own path or by that behind links.
+    # An absolute path may begin with the folder as it is given, or with the folder behind links.
     if text and not path.startswith(
         (os.path.join(root, ""), os.path.join(os.path.realpath(root), ""))
     ):
@@ -182,9 +181,9 @@ def find_inside(root: str | Path, text: str) -> Path | None:
 
 
 def plain_name(name: str, what: str) -> str:
-    """Return the name of a file or folder; InputError, which begins with `what`, for no name."""
-    separated = not name or name.startswith(".") or any(character in "/\\:\0" for character in name)
-    if separated or len(os.fsencode(name)) > _LONGEST_NAME:
+    """Return the name of a file or folder; InputError, beginning with `what`, if it is a path."""
+    is_path = not name or name.startswith(".") or any(character in "/\\:\0" for character in name)
+    if is_path or len(os.fsencode(name)) > _LONGEST_NAME:
         raise InputError(
             f"{what} name is {_shown(name)!r}, expected a plain folder name of at most "
             f"{_LONGEST_NAME} bytes"

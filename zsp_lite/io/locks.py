@@ -17,6 +17,7 @@ def writing(folder: str | Path) -> Iterator[None]:
     The folder is made if it does not exist. If nothing was written into it, it is removed again.
     """
     folder = Path(folder)
+    # The folders that are made here, the innermost first.
     missing = [place for place in (folder, *folder.parents) if not os.path.exists(place)]
     path = folder / ".writing.lock"
     lock = FileLock(path, timeout=0)
@@ -25,7 +26,7 @@ def writing(folder: str | Path) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire()
-    except OSError as error:  # a Timeout of the lock is one, too
+    except OSError as error:  # the lock's Timeout is an OSError, too
         problem = f"cannot be written ({error})"
         if isinstance(error, Timeout):
             problem = "another process is writing to it"
@@ -35,9 +36,9 @@ def writing(folder: str | Path) -> Iterator[None]:
     try:
         yield
     finally:
-        with suppress(OSError):  # Windows keeps an open file
+        with suppress(OSError):  # Windows does not remove an open file
             path.unlink()
         lock.release()
-        with suppress(OSError):  # not empty
+        with suppress(OSError):  # a folder that is not empty stays
             for place in missing:
                 place.rmdir()

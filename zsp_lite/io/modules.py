@@ -12,9 +12,10 @@ from zsp_lite.errors import InputError, describe_failure
 def import_object(path: str) -> Any:
     """Import "module:name", of an installed module or one in the current folder."""
     if "" not in sys.path and os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # the path of a console script lacks the current folder
+        # The module path of a console script lacks the current folder.
+        sys.path.append(os.getcwd())
     try:
-        with chdir("."):  # and back, wherever the module goes
+        with chdir("."):  # returns to the current folder if the module leaves it
             return pkgutil.resolve_name(path)
     except (Exception, SystemExit) as error:  # a module may raise anything
         raise InputError(f"{path!r} cannot be imported: {describe_failure(error)}") from error

@@ -24,7 +24,7 @@ _PROPERTIES = [
     "uchar green",
     "uchar blue",
 ]
-# The names of PLY for numpy's types; some programs write numpy's own, such as float32.
+# numpy's types by their names in PLY. Some programs write numpy's own names, such as float32.
 _TYPES = {
     "char": "i1",
     "uchar": "u1",
@@ -86,7 +86,8 @@ def _vertex_columns(data: bytes) -> dict[str, np.ndarray]:
     header, _, rest = data.partition(b"end_header")
     body = rest[rest.index(b"\n") + 1 :]
 
-    # The header: names and numbers of all elements, and types of the properties of the first.
+    # The header has names and numbers of all elements; the types of the first element's properties
+    # are kept.
     encoding = ""
     elements = []
     types = {}
@@ -131,8 +132,8 @@ def load_open3d():
     """Import and return the `open3d` module."""
     # Open3D would start a server in a notebook.
     os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
-    # Open3D's Linux wheels link against libusb-1.0, which is often not installed: it is loaded from
-    # a package.
+    # Open3D's Linux wheels link against libusb-1.0, which is often not installed. A package of
+    # Python provides it.
     if sys.platform.startswith("linux"):
         import libusb_package
 

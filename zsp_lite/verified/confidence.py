@@ -7,13 +7,14 @@ poses is right. Of the different poses (see `modes`) of an estimate, pose k has 
     p_k = (1 - \lambda h) \exp(-a (S_1 - S_k)) / (\exp(b) + \sum_j \exp(-a (S_1 - S_j))),
     \log a = \alpha . x,   b = \beta . x.
 
-x is what is known about the estimate beside the scores (see `evidence`), above all the span: how
-far around the target its views go. Where they show one side only, the best pose turns that side to
-the reference, and whether the reference shows a hidden side that looks alike cannot be known. h is
-the share of the circle around the target from where no view is within 60 degrees, relative to that
-of a single view, and \lambda the chance of such a side. What the p_k leave of 1 is the probability
-of none of these. The confidence of an estimate is p_1. `viz.reliability` measures how well such
-probabilities are calibrated.
+x is what is known about the estimate beside the scores (see `evidence`). Its most important entry
+is the span: how far around the target its views go. Where the views show one side only, the best
+pose turns that side to the reference, and whether the reference shows a hidden side that looks
+alike cannot be known. \lambda is the chance of such a hidden side. h is the hidden share of the
+circle around the target, from where no view is within 60 degrees, divided by the hidden share of a
+single view. The p_k sum to less than 1; the rest is the probability that no pose is right. The
+confidence of an estimate is p_1. `viz.reliability` measures how well such probabilities are
+calibrated.
 """
 
 from collections.abc import Sequence
@@ -30,10 +31,10 @@ from zsp_lite.verified.verification import VIEWPOINT_SIGMA
 MODE_ANGLE = 30.0
 # A pose with more than this share of the best pose's probability is nearly as probable.
 TIE_RATIO = float(np.exp(-1))
-# Share of the points on an observed surface. With less in both directions, a pose is flagged.
+# A pose is flagged if in both directions a smaller share of its points lies on an observed surface.
 _MIN_OVERLAP = 0.05
-# Likewise of the similarity term. Poses, right or wrong, have 0.06 and more; views that share no
-# side have 0.01.
+# A pose is flagged if in both directions its similarity term is smaller. Poses, right or wrong,
+# have 0.06 and more; views that share no side have 0.01.
 _MIN_SIMILARITY = 0.02
 
 
@@ -50,14 +51,14 @@ def evidence(
     # Part of the best score from overlap, silhouettes and free space; small if shapes do not fit.
     shape_fit: float,
 ) -> Float[np.ndarray, "6"]:
-    """Return a constant and what probabilities depend on beside the scores of the poses."""
+    """Return the vector x, which begins with a constant."""
     nearness = np.exp(-((nearest / VIEWPOINT_SIGMA) ** 2))
     return np.array([1.0, span / 360, np.log(n_views), nearness, view_std, shape_fit])
 
 
 @dataclass(frozen=True)
 class Calibration:
-    r"""The coefficients \alpha, \beta of the `evidence`, and \lambda (fit: `tools/tuning.py`)."""
+    r"""The coefficients \alpha and \beta of x, and \lambda, all fitted by `tools/tuning.py`."""
 
     scale: tuple[float, ...] = (-0.40, 1.46, 0.025, -0.93, 2.90, -0.063)  # \alpha
     none: tuple[float, ...] = (0.55, -2.87, 0.72, 0.61, -28.5, -0.501)  # \beta
@@ -72,17 +73,20 @@ class Calibration:
 
 
 def hidden_share(span: float | Float[np.ndarray, " n"]) -> float | Float[np.ndarray, " n"]:
-    """Return h of the probabilities for a share of the circle that the views span."""
-    # A single view leaves 240 degrees of the circle hidden, and a span leaves less by its angle:
-    # h = (240 - 360 * span) / 240.
+    """Return h for views that span a share of the circle around the target."""
+    # A single view sees 60 degrees to both sides and leaves 240 degrees hidden. Views that span an
+    # angle leave that much less: h = (240 - 360 * span) / 240.
     return np.maximum(0.0, 1 - 1.5 * span)
 
 
 def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
-    """Say whose pose each hypothesis has: its own or the nearest better one's within 30 degrees."""
+    """Return each hypothesis's mode: the nearest mode within 30 degrees, or a new one of its own.
+
+    Hypotheses are sorted, best first. A mode is the number of its best hypothesis.
+    """
     mode_of: list[int] = []
     for i, row in enumerate(angle):
-        # The better hypotheses nearby that stand for themselves.
+        # The modes of better hypotheses that are within 30 degrees.
         near = [j for j in range(i) if mode_of[j] == j and row[j] < MODE_ANGLE]
         mode_of.append(min(near, key=row.__getitem__, default=i))
     return np.array(mode_of)
@@ -94,15 +98,15 @@ def reliability_flags(
     """Say why the best hypothesis may be wrong, a line per reason, and whether it is one of two."""
     flags = []
 
-    # Different poses that are about as probable as the best one, which is the first of them.
+    # The best hypotheses of all modes that are about as probable as the first.
     probability = np.array([hypothesis.confidence for hypothesis in hypotheses])
     tied = [
         k
         for k, hypothesis in enumerate(hypotheses)
         if hypothesis.mode == k and probability[k] > TIE_RATIO * probability[0]
     ]
-    # Together more probable than not; more than 60 degrees apart, no rotation is within 30 degrees
-    # of both.
+    # One of two is meant if the two are together more probable than not, and if they are so far
+    # apart that no rotation is within 30 degrees of both.
     one_of_two = bool(
         len(tied) == 2
         and probability[tied].sum() > 0.5
@@ -119,7 +123,7 @@ def reliability_flags(
         )
 
     terms = hypotheses[0].terms
-    if terms:  # a pose that is made of several estimates has none
+    if terms:  # a pose that combines several estimates has no terms
         if max(terms["forward_overlap"], terms["reverse_overlap"]) < _MIN_OVERLAP:
             flags.append("no view confirms the pose: nearly no point lies on an observed surface")
         if max(terms["forward_similarity"], terms["reverse_similarity"]) < _MIN_SIMILARITY:

@@ -62,7 +62,7 @@ def float_tensor(values) -> Tensor:
 
 
 def exp_(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Compute exp(max(x, -80)) in place: underflow would be slow."""
+    """Compute exp(max(x, -80)) in place: processors are slow with numbers below exp(-87)."""
     return x.clamp_min_(-80).exp_()
 
 
@@ -88,9 +88,9 @@ def rotation_matrices(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
 def non_maximum_suppression(
     rotation: Float[Tensor, "m 3 3"], score: Float[Tensor, " m"], min_angle: float, max_count: int
 ) -> Int[Tensor, " kept"]:
-    """Select the best-scored poses whose rotations differ."""
+    """Return the indices of the best poses whose rotations differ by `min_angle` degrees."""
     order = torch.argsort(score, descending=True, stable=True)
-    # (m, m), rows and columns in the order of the scores.
+    # (m, m): rows and columns are sorted by the scores, as `order` is.
     near = (rotation_angles(rotation[order], rotation[order]) < min_angle).numpy()
     selected: list[int] = []
     for candidate in range(len(order)):

@@ -21,14 +21,16 @@ from zsp_lite.verified.poses import (
 )
 from zsp_lite.verified.scene import Scene
 
-_TRIALS = 300  # samples of three matches, per view
-_PER_VIEW = 6  # proposals kept per view
+_TRIALS = 300  # number of samples of three matches, per view
+_PER_VIEW = 6  # largest number of proposals of a view
 _INLIER_DISTANCE = 0.3  # working units
 _MIN_ANGLE = 20.0  # degrees between the proposals of a view
-_POOL = 200  # best samples of a view that go into non-maximum suppression
-_TURNS = torch.deg2rad(torch.arange(30.0, 360.0, 30.0))  # of a viewpoint about the vertical
-# Scale of the poses from views: the spread of what one view shows is about this fraction of the
-# whole object's.
+# So many best samples of a view go into non-maximum suppression, which compares all pairs.
+_POOL = 200
+# Turns of the first view's viewpoint about the vertical: once around in steps of 30 degrees.
+_TURNS = torch.deg2rad(torch.arange(30.0, 360.0, 30.0))
+# Scale of the proposals that are viewpoints: the points that one view shows have about this
+# fraction of the whole object's spread.
 _VIEW_SCALE = 0.9
 
 
@@ -38,14 +40,15 @@ def poses_from_matches(
     """Fit poses to random samples of three matches and keep the best that differ."""
     if len(source) < 3:
         return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
-    # The three smallest of random numbers are a sample without repetition: (trials, 3).
+    # The positions of the three smallest of k random numbers are a sample without repetition:
+    # (trials, 3).
     sample = np.argpartition(rng.random((_TRIALS, len(source))), (0, 1, 2), axis=1)[:, :3]
     fitted = umeyama_batch(source.double().numpy()[sample], target.double().numpy()[sample])
     poses = Poses(*map(float_tensor, fitted[:3]))  # scales, rotations, translations
     poses = poses[poses.scale == poses.scale.clamp(*SCALE_RANGE)]
 
     squared_residual = (poses.apply(source) - target).square_().sum(dim=2)  # (trials, k)
-    # As in MSAC (Torr and Zisserman 2000), sum_i max(0, 1 - (|T x_i - y_i| / 0.3)^2).
+    # The score of MSAC (Torr and Zisserman 2000): sum_i max(0, 1 - (|T x_i - y_i| / 0.3)^2).
     score = (1 - squared_residual / _INLIER_DISTANCE**2).clamp_min_(0).sum(dim=1)
     best = torch.argsort(score, descending=True, stable=True)[:_POOL]
     different = non_maximum_suppression(poses.rotation[best], score[best], _MIN_ANGLE, _PER_VIEW)
@@ -53,8 +56,8 @@ def poses_from_matches(
 
 
 def poses_from_views(scene: Scene) -> Poses:
-    """Return poses with the target views' viewpoints, and the first turned about the vertical."""
-    # A pose with the inverse of a view's rotation turns the reference's camera as that view's.
+    """Return poses with the viewpoint of each target view, or the first one's turned sideways."""
+    # A pose with the inverse of a view's rotation gives the reference's camera that view's axes.
     views = scene.target_maps.rotation.transpose(1, 2)
     # The mean of the directions that are up in the target images.
     vertical = F.normalize(-scene.target_maps.rotation[:, 1].mean(dim=0), dim=0)

@@ -6,7 +6,6 @@ shrinking width and keeps the best one.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -24,15 +23,20 @@ from zsp_lite.verified.poses import (
 from zsp_lite.verified.scene import Scene
 from zsp_lite.verified.verification import WEIGHTS, score_terms
 
-MAX_HYPOTHESES = 6  # kept from search to search
-MIN_ANGLE = 15.0  # degrees between them
-_MAX_POLISHED = 3  # of these, the best that are polished
-# About this many points of the reference and of the targets are scored, in the searches and in the
-# polish.
+# Each search keeps at most this many poses, as does the ranking after the last one.
+MAX_HYPOTHESES = 6
+# The rotations of the poses that are kept differ by at least this angle, degrees.
+MIN_ANGLE = 15.0
+# The polish scores many points and takes long, so that only the best poses get it.
+_MAX_POLISHED = 3
+# Approximate numbers of reference points and of target points that a search scores. Few points
+# suffice to find the better of two distant poses; the polish compares near ones.
 _SEARCH_POINTS = (150, 375)
 _POLISH_POINTS = (450, 2000)
-# Steps of a round that are recombined into one candidate of the next round (mu in CMA-ES).
+# Number of a round's best steps whose mean is a candidate of the next round (mu in CMA-ES).
 _PARENTS = 6
+
+_Score = Callable[[Poses], Float[Tensor, " _"]]  # computes a score for each pose
 
 
 class SearchSchedule(NamedTuple):
@@ -46,6 +50,8 @@ class SearchSchedule(NamedTuple):
     decay: float  # factor on all three after each round
 
 
+# `tools/tuning.py` does not fit these values. Each search begins with narrower steps than the one
+# before began with, but with wider steps than that one ended with.
 COARSE = SearchSchedule(
     rounds=3, samples=16, rotation=7.0, translation=0.12, scale=0.08, decay=0.65
 )
@@ -57,24 +63,23 @@ POLISH = SearchSchedule(
 
 def refine_coarse_to_fine(scene: Scene, poses: Poses, rng: np.random.Generator) -> Poses:
     """Refine poses in three searches of decreasing width, on some of the points."""
-
-    def score(poses: Poses, points: tuple[int, int] = _SEARCH_POINTS) -> Float[Tensor, " m"]:
-        """Score poses on about so many points of the reference and of the targets."""
-        totals = (len(scene.reference_points), len(scene.target_points))
-        # Every so many points are scored, of the reference and of the targets.
-        stride = tuple(max(round(total / count), 1) for total, count in zip(totals, points))
-        return WEIGHTS.score(score_terms(scene, poses, stride))
-
     for schedule in (COARSE, FINE):
-        poses, reached = refine(poses, score, schedule, rng)
+        poses, reached = refine(poses, _scorer(scene, _SEARCH_POINTS), schedule, rng)
         poses = poses[non_maximum_suppression(poses.rotation, reached, MIN_ANGLE, MAX_HYPOTHESES)]
-    polished, _ = refine(poses[:_MAX_POLISHED], partial(score, points=_POLISH_POINTS), POLISH, rng)
+    polished, _ = refine(poses[:_MAX_POLISHED], _scorer(scene, _POLISH_POINTS), POLISH, rng)
     return concatenate([polished, poses[_MAX_POLISHED:]])
+
+
+def _scorer(scene: Scene, counts: tuple[int, int]) -> _Score:
+    """Return a function that scores poses on about `counts` reference points and target points."""
+    reference_stride = max(round(len(scene.reference_points) / counts[0]), 1)
+    target_stride = max(round(len(scene.target_points) / counts[1]), 1)
+    return lambda poses: WEIGHTS.score(score_terms(scene, poses, (reference_stride, target_stride)))
 
 
 def refine(
     poses: Poses,
-    score: Callable[[Poses], Float[Tensor, " _"]],
+    score: _Score,
     schedule: SearchSchedule,
     rng: np.random.Generator,
 ) -> tuple[Poses, Float[Tensor, " m"]]:
@@ -88,25 +93,27 @@ def refine(
     weights = torch.tensor(weights / weights.sum(), dtype=torch.float32)[:, None]
     recombined = None  # (m, 7), one step of the next round for each pose
     for turn in range(schedule.rounds):
-        # All poses get the same steps: the result for one pose does not depend on the number of
-        # others.
+        # All poses get the same random steps: the result for one pose does not depend on the number
+        # of others. From the second round on, the mean of a pose's best steps replaces the first.
         draws = rng.standard_normal((schedule.samples, 7)).astype(np.float32) * schedule.decay**turn
         steps = torch.from_numpy(draws).repeat(m, 1, 1)  # (m, samples, 7)
         if recombined is not None:
             steps[:, 0] = recombined
 
-        # The best steps of each pose, best first: (m, parents).
+        # Scores and numbers of each pose's best steps, best first: (m, parents).
         candidates = _perturb(poses, steps, schedule)
-        top_score, top = score(candidates).view(m, -1).topk(_PARENTS, dim=1)
-        index = rows * schedule.samples + top[:, 0]  # of the best step, among all candidates
-        improved = top_score[:, 0] > best_score
+        top_scores, top_steps = score(candidates).view(m, -1).topk(_PARENTS, dim=1)
+        best_step = top_steps[:, 0]
+        improved = top_scores[:, 0] > best_score
 
-        mean = (steps[rows[:, None], top] * weights).sum(dim=1)
-        # Relative to the pose from which the next round starts.
-        recombined = mean - torch.where(improved[:, None], steps[rows, top[:, 0]], 0)
-        # The candidates stand behind the m poses.
-        poses = concatenate([poses, candidates])[torch.where(improved, m + index, rows)]
-        best_score = torch.maximum(best_score, top_score[:, 0])
+        # The next round starts from the best candidate where it improves the pose: the mean step
+        # leads from there.
+        mean_step = (steps[rows[:, None], top_steps] * weights).sum(dim=1)
+        recombined = mean_step - torch.where(improved[:, None], steps[rows, best_step], 0)
+        # The candidates follow the m poses in the concatenation, `samples` of them for each pose.
+        best_candidate = m + rows * schedule.samples + best_step
+        poses = concatenate([poses, candidates])[torch.where(improved, best_candidate, rows)]
+        best_score = torch.maximum(best_score, top_scores[:, 0])
     return poses, best_score
 
 

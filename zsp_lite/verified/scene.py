@@ -1,9 +1,10 @@
 """The scene: the points, feature similarities and maps of all views, in two normalised frames.
 
 Working units: the reference's points are centred at their mean and divided by their spread
-(standard deviation, averaged over the axes); the points of all target views together likewise, with
-the axes of the first target camera. A pose between the two then has a scale near 1 and a
-translation near 0, and all lengths in the solver are relative to the size of the object.
+(standard deviation, averaged over the axes). The points of all target views together are normalised
+in the same way, with the axes of the first target camera. A pose between the two frames then has a
+scale near 1 and a translation near 0, and all lengths in the solver are relative to the size of the
+object.
 
 Maps have depth, mask, silhouette distance and patch of each pixel. A pixel of unknown depth gives
 no information about surfaces: its weight is 0. It may still lie inside or outside the silhouette,
@@ -30,16 +31,16 @@ from zsp_lite.views import View
 # Points farther from the median point than this many median distances are outliers: patches at a
 # silhouette may have the depth of the background.
 _OUTLIER_DISTANCE = 3.0
-_DENSITY_SIGMA = 0.25  # working units
-_DENSITY_ROWS = 200  # points at a time
+_DENSITY_SIGMA = 0.25  # width of the kernel by which points are weighted, working units
+_DENSITY_ROWS = 200  # number of points whose densities are computed together
 MIN_POINTS = 8  # fewer do not determine a shape to align
 # Resolution of the maps. Finer maps do not change results with patches of 8 pixels, and exceed the
 # processor's cache.
 _MAP_PIXELS = 128 * 128
-# The silhouette of a soft mask is uncertain: distances to it are averaged over these.
+# The silhouette of a soft mask is uncertain: distances are averaged over several thresholds.
 _MASK_THRESHOLDS = (0.3, 0.5, 0.7)
 _NO_SILHOUETTE = 1e4  # distance in pixels where the mask is empty
-_MIN_DEPTH = 1e-3  # working units; depths are clamped to it before the projection
+_MIN_DEPTH = 1e-3  # working units; smaller depths are raised to it before the projection
 
 _Rigid = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]  # rotation and translation
 
@@ -69,7 +70,7 @@ class Projection:
 
     depth: Float[Tensor, "m v n"]  # depth of the point, working units
     surface_depth: Float[Tensor, "m v n"]  # measured depth at its pixel, working units
-    # of the measured depth, in [0, 1]; 0 where it is unknown or background
+    # weight of the measured depth, in [0, 1]; 0 where it is unknown or background
     weight: Float[Tensor, "m v n"]
     silhouette_distance: Float[Tensor, "m v n"]  # at the point's depth, working units; 0 inside
     patch: Int[Tensor, "m v n"]  # similarity column of the patch at its pixel, -1 for none
@@ -82,18 +83,18 @@ class Scene:
 
     # foreground patches of known depth in the reference, working units
     reference_points: Float[Tensor, "n 3"]
-    target_points: Float[Tensor, "m 3"]  # the same of all target views
+    target_points: Float[Tensor, "m 3"]  # such patches of all target views together
     target_column: Int[Tensor, " m"]  # column of each target point in `similarity`
     # share of the surface that each target point represents; they sum to 1
     target_weight: Float[Tensor, " m"]
-    # of each point to each foreground patch of all targets, double-centred
+    # of each reference point to each foreground patch of all targets, double-centred
     similarity: Float[Tensor, "n columns"]
-    reference_maps: ViewMaps  # per-pixel maps of the reference
-    target_maps: ViewMaps  # per-pixel maps of the targets
-    reference_to_working: Sim3  # Reference camera to working units
-    target_to_working: Sim3  # first target camera to working units
-    target_cameras: tuple[Camera, ...]  # cameras of the targets
-    # points of reference and target, per target
+    reference_maps: ViewMaps  # of the reference alone
+    target_maps: ViewMaps  # of the targets
+    reference_to_working: Sim3  # from the reference's camera frame
+    target_to_working: Sim3  # from the first target's camera frame
+    target_cameras: tuple[Camera, ...]
+    # for each target, the points of its matches: in the reference, and in the target
     matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]
     view_similarity: Float[Tensor, " v"]  # of each target view to the reference, less their mean
     view_similarity_std: float  # standard deviation of that similarity over the target views
@@ -105,7 +106,7 @@ class Scene:
 
     def to_sim3(self, poses: Poses, index: int, view: int) -> Sim3:
         """Convert a pose in working units to one from the reference's camera to a view's camera."""
-        # The nearest orthogonal matrix: the float32 one is not orthogonal in float64.
+        # The nearest orthogonal matrix: a rotation in float32 is not orthogonal in float64.
         left, _, right = np.linalg.svd(poses.rotation[index].double().numpy())
         pose = Sim3(
             float(poses.scale[index]), left @ right, poses.translation[index].double().numpy()
@@ -128,7 +129,8 @@ def build_scene(
     cameras = tuple(target.frame.camera for target in targets)
     to_camera = [_relative_pose(cameras[0], camera) for camera in cameras]
 
-    # Points of all patches, (patches, 3) each: the targets' with the axes of the first camera.
+    # Points of all patches, (patches, 3) per view. Those of the targets are moved to the frame of
+    # the first target camera.
     source = reference.measured_points[0].reshape(-1, 3)
     clouds = [
         (view.measured_points[0].reshape(-1, 3) - t) @ R for view, (R, t) in zip(targets, to_camera)
@@ -136,17 +138,16 @@ def build_scene(
     cloud = np.concatenate(clouds)
     known = np.concatenate([target.known_foreground.ravel() for target in targets])
 
-    # To working units.
-    name = reference.frame.name or "reference"
+    # Both clouds in working units.
     reference_to_working, source_valid = _normalisation(
-        source, reference.known_foreground.ravel(), name
+        source, reference.known_foreground.ravel(), reference.frame.name or "reference"
     )
     target_to_working, valid = _normalisation(cloud, known, "target views")
     source = reference_to_working.apply(source)
     cloud = target_to_working.apply(cloud)
 
-    # Similarities of the foreground patches: a row for each of the reference's, and a column for
-    # each of all targets'.
+    # Similarities of the foreground patches: a row for each patch of the reference, and a column
+    # for each patch of a target.
     foregrounds = [target.foreground.ravel() for target in targets]
     column = _number(np.concatenate(foregrounds))
     reference_foreground = reference.foreground.ravel()
@@ -154,8 +155,8 @@ def build_scene(
         similarity.float()[reference_foreground][:, foreground]
         for similarity, foreground in zip(similarities, foregrounds, strict=True)
     ]
-    # Of each view: each foreground patch's highest similarity in the other view, averaged in both
-    # directions.
+    # The similarity of a target view to the reference: the highest similarity of each patch to any
+    # patch of the other view, averaged over the reference's patches and over the target's.
     best = torch.stack(
         [(block.amax(dim=1).mean() + block.amax(dim=0).mean()) / 2 for block in between_foregrounds]
     )
@@ -163,10 +164,10 @@ def build_scene(
     valid_rows = torch.from_numpy(source_valid)[reference_foreground]
 
     # Points of the matches with measured depth on both sides.
-    starts = np.cumsum([len(points) for points in clouds])[:-1]  # of each target but the first
+    starts = np.cumsum([len(points) for points in clouds])[:-1]  # rows where later targets begin
     matched = []
     for target, points, match in zip(targets, np.split(cloud, starts), matches):
-        # Patches as indices of the flattened grids.
+        # Indices of the matched patches in the flattened grids.
         u = np.ravel_multi_index(tuple(match.reference.T), reference.features.grid)
         v = np.ravel_multi_index(tuple(match.target.T), target.features.grid)
         both = reference.measured_points[1].ravel()[u] & target.measured_points[1].ravel()[v]
@@ -180,7 +181,7 @@ def build_scene(
         similarity=torch.cat(
             [double_centre(block[valid_rows]) for block in between_foregrounds], dim=1
         ).contiguous(),
-        # The world of the reference's points is its camera's frame.
+        # The reference's points are in its camera's frame: its camera has the identity as pose.
         reference_maps=build_maps(
             [reference],
             [(np.eye(3), np.zeros(3))],
@@ -210,7 +211,7 @@ def build_maps(
     ]
     cameras, tables = zip(*maps)
     sizes = np.array([camera.size[::-1] for camera in cameras])
-    pixels = [0, *(table.shape[1] for table in tables[:-1])]  # of the views before each
+    pixels = [0, *(table.shape[1] for table in tables[:-1])]  # their running sum: the first rows
     return ViewMaps(
         float_tensor([R for R, _ in world_to_camera]),
         # From x_cam = R @ x + t, with x_working = scale * x + to_working.t.
@@ -243,13 +244,13 @@ def project_points(
     )
     # The greatest coordinates within the image: its size is beyond it.
     last = torch.nextafter(maps.size, torch.zeros(()))[..., None]
-    # A point beyond the border reads the nearest border pixel, and its silhouette distance is
-    # larger by the distance to it; but where the silhouette reaches the border, the object is cut
-    # off, its extent unknown, and the distance 0.
+    # A point beyond the border reads the nearest border pixel, and the distance to that pixel is
+    # added to its silhouette distance. Where the silhouette reaches the border, the object is cut
+    # off and its extent unknown: the distance stays 0.
     nearest = torch.minimum(pixels.clamp_min(0), last)
     column, row = nearest.int().unbind(2)
     index = (row * maps.size[:, :1].int()).add_(column).add_(maps.first_row[:, None].int())
-    # One column of the table at a time: (m, v, n) each.
+    # The columns of the table are read one after the other: (m, v, n) each.
     read = [
         values.index_select(0, index.flatten()).view(index.shape) for values in maps.table.unbind(1)
     ]
@@ -263,10 +264,11 @@ def project_points(
 def _table(
     view: View, columns: Int[np.ndarray, " patches"], scale: float
 ) -> tuple[Camera, Float[np.ndarray, "4 pixels"]]:
-    """Resize the camera to about _MAP_PIXELS pixels, with equal focal lengths; fill its table."""
+    """Return the camera of a map of about `_MAP_PIXELS` pixels, and the map's table."""
     camera = view.frame.camera
     grid = view.features.grid
-    # Height by width of the field of view, in tangents of angles.
+    # Height over width of the field of view, in tangents of angles: a map with such sides has
+    # equal focal lengths.
     aspect = (camera.size[0] / camera.focal_length[1]) / (camera.size[1] / camera.focal_length[0])
     height = max(round(float(np.sqrt(_MAP_PIXELS * aspect))), 1)
     width = max(round(_MAP_PIXELS / height), 1)
@@ -301,11 +303,11 @@ def double_centre(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
 
 def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
     """Weight points by the inverse of a Gaussian kernel density."""
-    # What three views show has three times the points.
+    # A surface that three views show has three times the points of one that a single view shows.
     points = points / _DENSITY_SIGMA
     square = points.square().sum(dim=1, keepdim=True)
-    # -|x - y|^2 / 2 = -|y|^2 / 2 + (x, |x|^2) . (y, -1/2), for few x at a time, so that the product
-    # stays in the processor's cache.
+    # The exponent is one matrix product: -|x - y|^2 / 2 = -|y|^2 / 2 + (x, |x|^2) . (y, -1/2).
+    # It is computed for few x at a time, so that the product stays in the processor's cache.
     left = torch.cat([points, square], dim=1)
     right = torch.cat([points, torch.full_like(square, -0.5)], dim=1)
     products = (torch.addmm(-square.T / 2, part, right.T) for part in left.split(_DENSITY_ROWS))
@@ -327,7 +329,7 @@ def _number(selected: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
 def _normalisation(
     points: Float[np.ndarray, "n 3"], valid: Bool[np.ndarray, " n"], name: str
 ) -> tuple[Sim3, Bool[np.ndarray, " n"]]:
-    """Give the valid points mean 0 and unit spread, and mark the outliers as invalid."""
+    """Return the transform to mean 0 and unit spread, and which valid points are no outliers."""
     n = int(valid.sum())
     if n < MIN_POINTS:
         raise NoPoseError(

@@ -23,7 +23,7 @@ from zsp_lite.verified.scene import Scene
 
 _ITERATIONS = 6
 _FEATURE_WEIGHT = 8.0  # lambda
-_MAX_POINTS = (100, 300)  # of the reference, of the targets
+_MAX_POINTS = (100, 300)  # largest numbers of reference points and of target points
 _SIGMAS = (0.5, 0.15)  # first and last, working units
 _OUTLIER_AFFINITY = 0.01  # a_0 divided by the number of target points
 
@@ -59,8 +59,8 @@ def soft_icp(scene: Scene, poses: Poses) -> Poses:
         covariance = (weight * y).transpose(1, 2) @ x
         rotation = float_tensor(nearest_rotation(covariance.double().numpy())[0])
         # Soft partners are averages and have a smaller spread than the targets, so the
-        # least-squares scale would shrink in each iteration. The ratio of spreads does not; half
-        # steps make it converge.
+        # least-squares scale would shrink in each iteration. The ratio of spreads does not shrink.
+        # The mean of that ratio and the last scale makes the iteration converge.
         source_variance = (weight * x.square()).sum(dim=(1, 2)).clamp_min(1e-9)
         variance_ratio = (weight * y.square()).sum(dim=(1, 2)) / source_variance
         scale = (variance_ratio.sqrt().clamp(*SCALE_RANGE) + poses.scale) / 2
@@ -70,6 +70,6 @@ def soft_icp(scene: Scene, poses: Poses) -> Poses:
 
 
 def _evenly_spaced(total: int, most: int) -> Int[Tensor, " n"]:
-    """Return at most so many evenly spaced indices below a total."""
+    """Return at most `most` evenly spaced indices below `total`."""
     count = min(total, most)
     return torch.arange(count) * total // count

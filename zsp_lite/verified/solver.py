@@ -22,25 +22,25 @@ from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import TERM_NAMES, WEIGHTS, score_terms
 from zsp_lite.views import View
 
-_MAX_REFINED = 12  # poses that go from the proposals to the refinement
-_MIN_ANGLE_REFINED = 20.0  # degrees between them
+_MAX_REFINED = 12  # largest number of proposals that are refined
+_MIN_ANGLE_REFINED = 20.0  # degrees between the rotations of these proposals
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Hypotheses of the verified solver, and what they were scored on."""
+    """Hypotheses of the verified solver, and the scene on which their poses were scored."""
 
     hypotheses: tuple[Hypothesis, ...]  # best score first, at least one, at least 15 degrees apart
-    # degrees from the reference's camera to each target view's under the best one
+    # Angle in degrees from the reference's camera to each target view's, under the best hypothesis.
     view_angles: Float[np.ndarray, " n"]
     timings: dict[str, float]  # seconds per stage
-    scene: Scene  # the scene that poses were scored on
+    scene: Scene
     view_order: tuple[int, ...]  # index of the target view behind each view of the scene
     poses: Poses  # the hypotheses in the scene's working units
 
 
 class VerifiedSolver:
-    """A `estimates.Solver` that scores many poses against all target views."""
+    """An `estimates.Solver` that scores many poses against all target views."""
 
     kmeans = False  # the best matches, without clusters (see `ZeroShotPose.kmeans`)
 
@@ -64,7 +64,8 @@ class VerifiedSolver:
             solution.hypotheses, rotation_angles(rotation, rotation).numpy()
         )
         matches = matched[best.view].matches
-        spread = 1 / solution.scene.target_to_working.scale  # of the target's points from all views
+        # The spread of the target's points from all views: the threshold is relative to it.
+        spread = 1 / solution.scene.target_to_working.scale
         inliers = measured_inliers(
             reference, targets[best.view], matches, best.sim3, threshold * spread
         )
@@ -121,13 +122,13 @@ class VerifiedSolver:
             poses = poses[best]
             angles = scene.view_angles(poses).numpy()
             hypotheses = _hypotheses(scene, poses, terms[best], angles, order)
-        # From the scene's order of the views back to the caller's.
+        # The inverse permutation leads from the scene's order of the views back to the caller's.
         view_angles = angles[0][np.argsort(order)].astype(np.float64)
         return Solution(hypotheses, view_angles, timings, scene, order, poses)
 
 
 def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
-    """Order views by a hash, which neither their order nor the axes of their world change."""
+    """Order views by a hash of their pixels, whatever their order and the axes of their world."""
     digests = []
     for target in targets:
         content = target.frame.rgb.tobytes() + target.foreground.numpy().tobytes()
@@ -143,7 +144,7 @@ def _hypotheses(
     score = WEIGHTS.score(terms).double().numpy()
     shape_fit = WEIGHTS.of_shape().score(terms).double().numpy()
 
-    # Poses of one mode share a probability: only its best pose enters, the others' odds are 0.
+    # Poses of one mode share a probability: the odds of all but the best one are 0.
     mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
     deficit = np.where(mode == np.arange(len(mode)), score[0] - score, np.inf)
     known = evidence(
@@ -156,7 +157,7 @@ def _hypotheses(
     confidence = Calibration().probabilities(deficit, known)[mode]
 
     hypotheses = []
-    # The scene's view that is closest under each pose.
+    # The view of each hypothesis is the one whose camera is nearest under its pose.
     for i, view in enumerate(angles.argmin(axis=1).tolist()):
         hypotheses.append(
             Hypothesis(
@@ -177,7 +178,7 @@ def measured_inliers(
     """Return which matches have measured depth on both sides and a small residual under a pose."""
     source, known = reference.measured_points
     destination, seen = target.measured_points
-    # (row, col) of patches, as indices of the grids
+    # Index arrays (rows, columns) into the grids of patches: one entry per match.
     u = tuple(matches.reference.T)
     v = tuple(matches.target.T)
     residual = np.linalg.norm(sim3.apply(source[u]) - destination[v], axis=1)

@@ -52,7 +52,7 @@ SURFACE_SIGMA = 0.25  # sigma, working units
 MAX_VIOLATION = 0.5  # rho, working units: distance at which b and c reach 1
 VIEWPOINT_SIGMA = 45.0  # degrees
 _SIMILARITY_PRIOR = 0.5  # kappa
-# Projected points at a time, so that intermediate results stay in the processor's cache.
+# So many projected points are scored at a time: intermediate results stay in the processor's cache.
 _CHUNK = 250_000
 
 
@@ -75,12 +75,12 @@ class ScoreCoefficients:
         return terms @ torch.tensor(astuple(self), dtype=torch.float32)
 
     def of_shape(self) -> "ScoreCoefficients":
-        """Return the weights of the terms that compare shapes; those of `FEATURE_TERMS` are 0."""
+        """Return the same weights, but 0 for `FEATURE_TERMS`: what remains compares shapes."""
         return replace(self, **dict.fromkeys(FEATURE_TERMS, 0.0))
 
 
 TERM_NAMES = tuple(field.name for field in fields(ScoreCoefficients))
-# The other terms compare shapes.
+# Terms that compare features; the others compare shapes.
 FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint")
 WEIGHTS = ScoreCoefficients()
 
@@ -98,8 +98,9 @@ class PointTerms:
     similarity: Float[Tensor, "m v n"]
 
     def averages(self, point_weights: Float[Tensor, " n"]) -> Iterator[Float[Tensor, " m"]]:
-        """Yield similarity, overlap, silhouette and free space of each pose: averages."""
+        """Yield similarity, overlap, silhouette and free space, each averaged for every pose."""
         q = point_weights / point_weights.sum()
+        # A point on a pixel without a foreground patch is not on the surface: a = 0.
         surface = self.surface * (self.projection.patch >= 0)
         total = surface.sum(dim=1)
         yield (surface.mul_(self.similarity).sum(dim=1) / (total + _SIMILARITY_PRIOR)) @ q
@@ -113,7 +114,8 @@ def forward_terms(scene: Scene, poses: Poses, stride: int = 1) -> PointTerms:
     points = scene.reference_points[::stride]
     projection = project_points(scene.target_maps, poses.linear, poses.translation, points)
     n, columns = scene.similarity.shape
-    return _point_terms(scene, projection, torch.arange(0, n, stride) * columns, 1)
+    row_starts = torch.arange(0, n, stride) * columns
+    return _point_terms(scene, projection, row_starts, patch_stride=1)
 
 
 def reverse_terms(scene: Scene, poses: Poses, stride: int = 1) -> PointTerms:
@@ -127,7 +129,10 @@ def reverse_terms(scene: Scene, poses: Poses, stride: int = 1) -> PointTerms:
 def score_terms(
     scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)
 ) -> Float[Tensor, "m 9"]:
-    """Compute the terms of every pose, columns as in `TERM_NAMES`, on a part of the points."""
+    """Compute the terms of every pose, columns as in `TERM_NAMES`, on every n-th point.
+
+    `stride` has the n of the reference points and that of the target points.
+    """
     target_weights = scene.target_weight[:: stride[1]]
     reference_weights = torch.ones(len(scene.reference_points[:: stride[0]]))
     per_pose = len(reference_weights) * len(scene.target_cameras) + len(target_weights)
@@ -138,7 +143,7 @@ def score_terms(
         forward = forward_terms(scene, chunk, stride[0]).averages(reference_weights)
         reverse = reverse_terms(scene, chunk, stride[1]).averages(target_weights)
         chunks.append(torch.stack([*forward, *reverse], dim=1))
-    # The angle includes rotation about the line of sight, with which features change.
+    # The angle includes rotation about the line of sight, because it changes features, too.
     angle = scene.view_angles(poses)
     viewpoint = torch.exp(-((angle / VIEWPOINT_SIGMA) ** 2)) @ scene.view_similarity
     return torch.cat([torch.cat(chunks), viewpoint[:, None]], dim=1)
@@ -147,7 +152,11 @@ def score_terms(
 def _point_terms(
     scene: Scene, projection: Projection, offset: Int[Tensor, " n"], patch_stride: int
 ) -> PointTerms:
-    """Read the similarity of point i to patch j at index `offset[i] + patch_stride * j`."""
+    """Compute a, b, c and s of each projected point.
+
+    The similarity of point i to patch j is at index `offset[i] + patch_stride * j`.
+    """
+    # Intermediate results are overwritten in place, because new arrays would leave the cache.
     delta = projection.depth - projection.surface_depth
     surface = exp_(delta.square().mul_(-0.5 / SURFACE_SIGMA**2)).mul_(projection.weight)
     free_space = delta.add_(SURFACE_SIGMA).div_(-MAX_VIOLATION).clamp_(0, 1).mul_(projection.weight)
