@@ -1,8 +1,8 @@
 """Fuzzing of everything that reads files: damaged and invented files must be read, or refused by
 InputError.
 
-Most readers, and the folder of valid files, are shared with `tests.hostile`. The inputs are the same
-in each run.
+Most readers, and the folder of valid files, are shared with `tests.hostile`. The inputs are the
+same in each run.
 """
 
 import gzip
