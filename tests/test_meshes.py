@@ -118,11 +118,7 @@ def test_an_unusable_file_is_refused_with_its_reason(tmp_path, monkeypatch, name
 def test_orientations_are_rotations_to_front_x_and_up_z():
     rotation = ModelInfo(front="-x", up="+y").axes(".obj")
     assert rotation @ [-1, 0, 0] == pytest.approx([1, 0, 0])
-    assert rotation @ [
-        0,
-        1,
-        0,
-    ] == pytest.approx([0, 0, 1])
+    assert rotation @ [0, 1, 0] == pytest.approx([0, 0, 1])
     oblique = ModelInfo(front=(1, 1, 0), up=(0, 0, 2)).axes(".ply")
     assert oblique @ oblique.T == pytest.approx(np.eye(3))
     assert np.linalg.det(oblique) == pytest.approx(1)
@@ -175,9 +171,7 @@ def intersect(camera, vertices, faces):
 
 
 @pytest.mark.parametrize("samples", [1, 2])
-def test_depth_and_mask_are_those_of_the_triangles_and_the_floor(
-    samples,
-):
+def test_depth_and_mask_are_those_of_the_triangles_and_the_floor(samples):
     mesh = painted(wedge())
     camera = view(mesh.vertices, azimuth=200)
     drawn = render(mesh, camera, samples)

@@ -86,9 +86,7 @@ def test_it_gives_the_librarys_pose_for_two_pairs_at_full_size(dataset):
 
 
 @pytest.mark.slow
-def test_it_gives_the_librarys_pose_for_all_categories_and_one_to_five_views(
-    dataset,
-):
+def test_it_gives_the_librarys_pose_for_all_categories_and_one_to_five_views(dataset):
     # A coarse grid, fewer matches and fewer trials: 60 pairs.
     settings = {"k": 12, "trials": 30}
     method = zsp_lite.ZeroShotPose(load_backbone(image_size=64), **settings)

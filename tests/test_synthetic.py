@@ -61,9 +61,7 @@ def chairs():
 
 
 @pytest.mark.parametrize("category", sorted(ALL))
-def test_objects_of_a_category_have_unit_size_vary_and_differ_from_their_half_turn(
-    category,
-):
+def test_objects_of_a_category_have_unit_size_vary_and_differ_from_their_half_turn(category):
     shapes = [make_shape(ALL[category], seed) for seed in range(4)]
     for shape in shapes:
         assert shape.faces.max() < len(shape.vertices)

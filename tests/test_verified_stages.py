@@ -393,12 +393,7 @@ def test_probabilities_by_hand():
         ((0.6, 0.2, 0.1), APART, False, ""),
         ((0.4, 0.3, 0.2), APART, False, "3 poses more than 30 degrees apart"),
         # probably none is right
-        (
-            (0.25, 0.2, 0.05),
-            APART,
-            False,
-            "2 poses more than 30 degrees apart",
-        ),
+        ((0.25, 0.2, 0.05), APART, False, "2 poses more than 30 degrees apart"),
         # 59.8 degrees apart: a third rotation may be near both.
         ((0.45, 0.35, 0.1), APART / 3.01, False, "2 poses more than 30 degrees apart"),
     ],

@@ -45,10 +45,7 @@ from zsp_lite.importers.files import read_depth_file, read_mask_file, read_pictu
 CONTINUED = f"{BENCHMARK} --data ROOT/data --out ROOT/out"
 # Every command, with a file that it reads.
 COMMANDS_OF = {
-    "picture": (
-        "a.png",
-        "estimate ROOT/a.png ROOT/b.png --intrinsics 60,60,32,32 --out ROOT/e",
-    ),
+    "picture": ("a.png", "estimate ROOT/a.png ROOT/b.png --intrinsics 60,60,32,32 --out ROOT/e"),
     "results": (RESULTS, "tables ROOT/out"),
     "packed results": (f"{RESULTS}.gz", "tables ROOT/out"),
     "run to continue": ("out/run.jsonl", CONTINUED),
@@ -128,12 +125,7 @@ command(
     "tables ROOT/out",
     written(f"{RESULTS}.gz", gzip_bomb),
 )
-case(
-    "oversized",
-    "depth map of 10^15 numbers",
-    read_capture("lists"),
-    depth_map(_npy((10**15,))),
-)
+case("oversized", "depth map of 10^15 numbers", read_capture("lists"), depth_map(_npy((10**15,))))
 
 
 # malicious: links that lead out of a folder, code in files and as values of options
@@ -220,11 +212,7 @@ CLIMBING = """{"fl_x": 1, "frames": [{
 for name, layout, change in (
     ("zip that unpacks to 3 GB", "nerfstudio", zip_of("transforms.json", 3 << 30)),
     ("zip with a path that climbs", "nerfstudio", zip_of("../../executed", 1 << 20)),
-    (
-        "transforms.json with a path that climbs",
-        "polycam",
-        written("transforms.json", CLIMBING),
-    ),
+    ("transforms.json with a path that climbs", "polycam", written("transforms.json", CLIMBING)),
     (
         "quaternion of zeros",
         "stray",
