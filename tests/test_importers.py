@@ -192,7 +192,7 @@ def test_distortion_is_corrected(tmp_path, views, model):
     inside = np.s_[10:-10, 10:-10]  # without the border, which the stored picture may lack
     # In pixels; the differences are those of JPEG and of the 256 levels.
     errors = np.abs(loaded - places)[inside]
-    assert errors.mean() < 0.25  # without the correction it is 0.6
+    assert errors.mean() < 0.3  # without the correction it is 0.6
     assert errors.max() < 2
 
 
