@@ -153,6 +153,20 @@ def exact_keypoints(dataset, category):
 
 CATEGORIES = ("bicycle", "hydrant", "motorcycle", "teddybear", "toaster", "chair")
 PAIRS = 8
+# All that a result of a pair can have.
+RESULT = {
+    "error": 10.0,
+    "symmetric_error": 5.0,
+    "translation": 0.5,
+    "scale": 1.1,
+    "view": 1,
+    "inliers": 9,
+    "seconds": 2.0,
+    "note": "flat",
+    "confidence": 0.7,
+    "rotation": np.eye(3).ravel().tolist(),
+    "position": [1.0, 2.0, 3.0],
+}
 
 
 def write_run(out, rows, categories=CATEGORIES, **settings):

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from functools import partial
 
 import pytest
-from benchmark_folder import write_run
+from benchmark_folder import RESULT, write_run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -80,19 +80,8 @@ def folder(tmp_path_factory):
     """The folder of the hostile inputs, and a benchmark run without the times and versions of this
     machine."""
     folder = prepare(tmp_path_factory.mktemp("fuzzing"))
-    result = {
-        "error": 10.0,
-        "symmetric_error": 5.0,
-        "translation": 0.5,
-        "scale": 1.1,
-        "view": 1,
-        "inliers": 9,
-        "seconds": 2.0,
-        "note": "flat",
-        "confidence": 0.7,
-        "position": [0.5, 1.0, 2.0],
-    }
-    write_run(folder / "made", {"icp": {"cup/a:0/b:1,3": result, "cup/b:2/a:0,2": result}}, ["cup"])
+    results = dict.fromkeys(["cup/a:0/b:1,3", "cup/b:2/a:0,2"], RESULT)
+    write_run(folder / "made", {"icp": results}, ["cup"])
     return folder
 
 

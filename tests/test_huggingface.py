@@ -14,8 +14,17 @@ import torch
 import transformers
 from refusals import refused
 from safetensors.torch import load, load_file, save_file
-from small_backbones import ARCHITECTURES, DIM, HEADS, configuration, save_all, save_model
-from torch.testing import assert_close
+from small_backbones import (
+    ARCHITECTURES,
+    DIM,
+    HEADS,
+    MEAN,
+    STD,
+    close,
+    configuration,
+    save_all,
+    save_model,
+)
 from transformers import AutoModel
 
 from zsp_lite import load_backbone
@@ -34,11 +43,6 @@ def folders(tmp_path_factory) -> dict[str, Path]:
 # A square picture and a wide one: both become square images.
 SHAPES = (64, 64, 3), (50, 90, 3)
 PICTURES = [np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8) for shape in SHAPES]
-# Mean and standard deviation of the colours of ImageNet, (3, 1, 1).
-MEAN = torch.tensor([0.485, 0.456, 0.406]).view(3, 1, 1)
-STD = torch.tensor([0.229, 0.224, 0.225]).view(3, 1, 1)
-# Two implementations in single precision agree up to these tolerances.
-close = functools.partial(assert_close, atol=2e-5, rtol=1e-4)
 
 
 @functools.cache

@@ -12,6 +12,8 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
+from refusals import refused
 from uco3d_folders import RATE, STEP, WORLD, blob, write_uco3d
 
 import zsp_lite

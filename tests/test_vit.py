@@ -1,11 +1,10 @@
 """The transformer against an independent one built from torch.nn.MultiheadAttention with the same
 weights."""
 
-from functools import partial
-
 import pytest
 import torch
 import torch.nn.functional as F
+from small_backbones import close
 from torch import nn
 from torch.testing import assert_close
 
@@ -14,10 +13,6 @@ from zsp_lite.choices import FACETS
 
 DEPTH, DIM, HEADS = 3, 48, 6
 PATCH = 8  # pixels
-
-
-# Two implementations in single precision agree up to these tolerances.
-close = partial(assert_close, atol=2e-5, rtol=1e-4)
 
 
 @pytest.fixture(scope="module")
