@@ -154,7 +154,8 @@ def open_notebook(page, lab: Lab, name: str) -> None:
 
 
 # Expressions of JavaScript: whether some cell has begun to run, and whether some cell still runs or
-# waits. The prompt of a cell is "[ ]:" before it begins, "[*]:" while it runs or waits, then "[1]:".
+# waits. The prompt of a cell is "[ ]:" before it begins, "[*]:" while it runs or waits, and "[1]:"
+# afterwards.
 _BEGUN = (
     "[...document.querySelectorAll('.jp-CodeCell .jp-InputPrompt')].some(e => "
     "/[*0-9]/.test(e.innerText))"
