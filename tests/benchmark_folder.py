@@ -1,5 +1,5 @@
-"""A small CO3D folder for the tests of the benchmark, made once, what runs on it, and runs that are
-made up."""
+"""For the tests of the benchmark: a small CO3D folder, a user's methods that run on it, and runs
+whose results are made up."""
 
 import atexit
 import functools
@@ -29,8 +29,8 @@ FRAMES = 8
 
 @functools.cache
 def small_folder() -> Path:
-    """Two categories of three sequences of eight frames: one object, put into each sequence's world
-    in its own way."""
+    """The folder, made once: two categories of three sequences of eight frames of one object,
+    which has another orientation in the world of each sequence."""
     root = Path(tempfile.mkdtemp(prefix="co3d-"))
     atexit.register(shutil.rmtree, root, ignore_errors=True)
     for offset, category in enumerate(("lump", "pebble")):
@@ -41,7 +41,7 @@ def small_folder() -> Path:
             )
             placement = Sim3(1.0, turn, np.zeros(3))
             angles = np.linspace(0, 2 * np.pi, FRAMES, endpoint=False) + 0.3 * index
-            # Upright cameras around the object; the world they stand in is turned.
+            # Upright cameras around the object; then the world is turned with them.
             views = [
                 look_at((np.cos(a), np.sin(a), 0.4), size=(90, 100), focal=120.0) for a in angles
             ]
@@ -62,7 +62,7 @@ def small_folder() -> Path:
 
 @dataclass(frozen=True)
 class SlowBackbone(CoordinateBackbone):
-    """Takes its time, so that a test can come in between."""
+    """A backbone that takes some time for each image, so that a test can interrupt it."""
 
     name = "slow"
     _seconds: float = 0.05
@@ -99,13 +99,13 @@ own_estimator = OwnEstimator()
 
 
 def own_matcher(similarity, on_reference, on_target):
-    """A user's matcher of patches: each one's nearest neighbour."""
+    """A user's matcher of patches: the nearest neighbour of each patch."""
     score, partner = similarity.max(dim=1)
     return partner, score.double()
 
 
 def own_keypoints(first, second):
-    """A user's matcher of pixels: every tenth one, where it is."""
+    """A user's matcher of pixels: every tenth pixel matches that at the same place."""
     side = min(first.shape[:2])
     grid = np.stack(np.mgrid[:side:10, :side:10], -1).reshape(-1, 2) + 0.5
     return grid, grid, np.ones(len(grid))
@@ -120,14 +120,14 @@ def own_solver(reference, targets, matched, *, seed=0, threshold=0.2):
 
 
 def placement(category, sequence) -> Sim3:
-    """From the world of the first sequence to that of another one, by the label."""
+    """The map from the world of the first sequence to that of another one, by its label."""
     trans = read_labels(small_folder(), category)[sequence].trans
     return Sim3(1.0, trans[:3, :3], trans[:3, 3])
 
 
 def exact_keypoints(dataset, category):
-    """Return a matcher of the full crops of a category that knows the geometry: every visible pixel
-    and its place."""
+    """Return a matcher of crops that knows the geometry: it matches every pixel of the first crop
+    with the place where the second one shows its point."""
     crops = {}
     for name in SEQUENCES:
         for frame in (
@@ -153,6 +153,20 @@ def exact_keypoints(dataset, category):
 
 CATEGORIES = ("bicycle", "hydrant", "motorcycle", "teddybear", "toaster", "chair")
 PAIRS = 8
+# All that a result of a pair can have.
+RESULT = {
+    "error": 10.0,
+    "symmetric_error": 5.0,
+    "translation": 0.5,
+    "scale": 1.1,
+    "view": 1,
+    "inliers": 9,
+    "seconds": 2.0,
+    "note": "flat",
+    "confidence": 0.7,
+    "rotation": np.eye(3).ravel().tolist(),
+    "position": [1.0, 2.0, 3.0],
+}
 
 
 def write_run(out, rows, categories=CATEGORIES, **settings):

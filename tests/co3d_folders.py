@@ -31,7 +31,7 @@ def random_camera(seed: int = 0, size: tuple[int, int] | None = None) -> Camera:
 def sequence_data(
     name: str, frames: int = 4, seed: int = 0, quality: float = 1.0, **options
 ) -> SequenceData:
-    """`frames` views of 24 x 32 pixels with a smooth picture, a disc for a mask and depth with a
+    """A sequence of views of 24 x 32 pixels: a smooth picture, a disc as mask, random depth with a
     hole."""
     rng = default_rng([seed, *name.encode()])
     height, width = 24, 32
@@ -58,7 +58,7 @@ def write_category(root: Path, category: str, names: Iterable[str], **options) -
 
 
 def write_identities(root: Path, category: str, names: Sequence[str]) -> None:
-    """Write labels that say that the worlds of sequences are that of the first one."""
+    """Write labels by which all sequences are in the world of the first one."""
     for name in names:
         write_label(root, category, PoseLabel(np.eye(4), name, names[0]))
 

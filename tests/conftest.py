@@ -1,5 +1,5 @@
-"""Checks of the annotations in every test (shapes by jaxtyping, types by beartype), and a shared
-data set."""
+"""Fixtures that several files use; in every test the library's annotations are checked, shapes by
+jaxtyping and types by beartype."""
 
 import contextlib
 import os
@@ -17,8 +17,7 @@ os.environ.setdefault("MPLBACKEND", "Agg")  # without windows
 settings.register_profile("no deadline", deadline=None)
 settings.load_profile("no deadline")
 
-# Must precede the first import of zsp_lite. Outside the tests, and in `make check`, which is to be
-# quick, nothing is checked.
+# The hook must precede the first import of zsp_lite. `make check` leaves it out, to be quick.
 if os.environ.get("ZSP_LITE_CHECK_ANNOTATIONS") != "0":
     install_import_hook("zsp_lite", "typechecking.typechecker")
 
@@ -32,7 +31,7 @@ def raises(expected, **options):
     """`pytest.raises`, but inside `raises(InputError)` and `raises(FatalError)` annotations are not
     checked.
 
-    Bad input violates the annotations as well, but these tests are about the library's own error.
+    Bad input violates the annotations as well, but the tests are about the error of the library.
     """
     before = config.jaxtyping_disable
     config.update("jaxtyping_disable", before or expected in (InputError, FatalError))
@@ -58,8 +57,10 @@ def links(tmp_path_factory):
 
 @pytest.fixture
 def run(capsys):
-    """Runs a command line, whose words have no spaces, that ends with an exit code; returns what it
-    printed, with stderr where it did not succeed."""
+    """A function that runs a command line, checks its exit code, and returns what it printed.
+
+    No word of the line has spaces. What was printed to stderr is included for codes above 1.
+    """
     from zsp_lite.cli.main import main
 
     def run_command(line: str, code: int = 0) -> str:
@@ -118,7 +119,7 @@ def ellipsoids(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def frames():
-    """A frame of the object of `synthetic_views`, and five frames of it elsewhere."""
+    """A reference frame and five target frames of the object of `synthetic_views`."""
     from synthetic_views import reference_and_targets
 
     return reference_and_targets(5)
@@ -126,13 +127,13 @@ def frames():
 
 @pytest.fixture
 def loaded(monkeypatch):
-    """What the commands ask `load_backbone` for; they get a backbone that needs no weights."""
+    """A list of what commands ask `load_backbone` for; they get a backbone without weights."""
     from synthetic_views import CoordinateBackbone
 
     asked = []
     monkeypatch.setattr(
         "zsp_lite.backbones.load.load_backbone",
-        lambda one: asked.append(one) or CoordinateBackbone(),
+        lambda name: asked.append(name) or CoordinateBackbone(),
     )
     monkeypatch.setattr(CoordinateBackbone, "name", "coordinates", raising=False)
     return asked

@@ -10,10 +10,10 @@ class Server:
 
     def __init__(self, files: dict[str, bytes]):
         self.files = files  # content by path
-        self.ranges = []  # Range header of each GET request so far, or None
-        self.break_after = None  # the connection is closed after so many bytes of a response
+        self.ranges = []  # the Range header of each GET request, None where it has none
+        self.break_after = None  # bytes of a response after which the connection is closed
         self.knows_ranges = True  # whether Range headers are honoured
-        self.chunked = False  # whether the length is not sent
+        self.chunked = False  # whether the server leaves out the length
         outer = self
 
         class Handler(http.server.BaseHTTPRequestHandler):
@@ -62,5 +62,6 @@ class Server:
         threading.Thread(target=self.http.serve_forever, args=(0.02,), daemon=True).start()
 
     def close(self) -> None:
+        """Stop the server."""
         self.http.shutdown()
         self.http.server_close()

@@ -2,20 +2,28 @@
 Face's format."""
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import torch
 import transformers
 from torch import nn
+from torch.testing import assert_close
 from transformers import AutoModel
 
 from zsp_lite.backbones.vit import VisionTransformer
 
-# Of the models in Hugging Face's format: small, for speed, with more than one of each.
+# Sizes of the models in Hugging Face's format: small, for speed, with more than one block and head.
 DEPTH, HEADS, DIM = 3, 4, 32
+# Mean and standard deviation of the colours of ImageNet, (3, 1, 1).
+MEAN = torch.tensor([0.485, 0.456, 0.406]).view(3, 1, 1)
+STD = torch.tensor([0.229, 0.224, 0.225]).view(3, 1, 1)
+# Two implementations in single precision agree up to these tolerances.
+close = partial(assert_close, atol=2e-5, rtol=1e-4)
 
 
 def small_vit(seed: int = 0, **sizes) -> VisionTransformer:
+    """A DINO transformer with random weights; options replace its sizes."""
     torch.manual_seed(seed)
     # A grid of 4 x 4 patches; one head has the 64 dimensions of a head of every DINO model.
     standard = {"image_size": 32, "patch_size": 8, "embed_dim": 64, "depth": 3, "num_heads": 1}
@@ -31,8 +39,8 @@ def with_large_weights(model: nn.Module) -> nn.Module:
 
 @dataclass(frozen=True)
 class Architecture:
-    """What the tests know of an architecture by themselves: what stands before the patches, and a
-    part's name."""
+    """What the tests know of an architecture of Hugging Face: the tokens before the patches, and
+    the name of the norm before attention."""
 
     patch: int
     special: int  # tokens before the patches
@@ -71,13 +79,16 @@ def configuration(kind: str, patch: int = 16, **settings):
 
 
 def save_model(folder: Path, config) -> Path:
+    """Save a model with random weights."""
     torch.manual_seed(0)
     with_large_weights(AutoModel.from_config(config)).save_pretrained(folder)
     return folder
 
 
 def save_all(root: Path) -> dict[str, Path]:
+    """Save a small model of each architecture; returns their folders."""
     configurations = {
-        kind: configuration(kind, one.patch, **one.settings) for kind, one in ARCHITECTURES.items()
+        kind: configuration(kind, architecture.patch, **architecture.settings)
+        for kind, architecture in ARCHITECTURES.items()
     }
-    return {kind: save_model(root / kind, one) for kind, one in configurations.items()}
+    return {kind: save_model(root / kind, config) for kind, config in configurations.items()}

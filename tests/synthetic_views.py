@@ -17,8 +17,8 @@ from zsp_lite.verified.poses import Poses
 from zsp_lite.verified.scene import Scene, build_scene
 from zsp_lite.views import View
 
-AXES = np.array([1.2, 0.8, 0.6])
-REACH = 1.6  # colours map [-REACH, REACH]
+AXES = np.array([1.2, 0.8, 0.6])  # half axes of the ellipsoid without its bumps
+REACH = 1.6  # no point of the object is farther from its middle; colours encode [-REACH, REACH]
 
 
 def inside(points: np.ndarray) -> np.ndarray:
@@ -29,7 +29,7 @@ def inside(points: np.ndarray) -> np.ndarray:
 
 
 def look_at(direction, distance: float = 4.0, size=(140, 180), focal: float = 190.0) -> Camera:
-    """A camera at `distance` in `direction` from the origin, looking at the origin."""
+    """A camera at `distance` in `direction` from the origin that looks at the origin."""
     forward = -np.asarray(direction, dtype=float) / np.linalg.norm(direction)
     right = np.cross(forward, (0.1, 0.2, 1.0))
     right /= np.linalg.norm(right)
@@ -69,7 +69,7 @@ def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
     height, width = camera.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width)))
-    # of a ball that holds the object
+    # Rays that miss the ball around the object see nothing.
     middle = camera.to_camera(placement.t)
     reach = REACH * placement.scale
     near = np.linalg.norm(np.cross(rays, middle), axis=-1) < reach * np.linalg.norm(rays, axis=-1)
@@ -78,12 +78,14 @@ def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
     )
     along = ends - start  # per unit of depth, in object coordinates
     # From far to near, so that the last crossing found is the nearest one.
-    far, behind = np.full(len(along), np.inf), np.zeros(len(along), dtype=bool)
+    far = np.full(len(along), np.inf)
+    behind = np.zeros(len(along), dtype=bool)
     steps, step = np.linspace(7.0, 1.5, 56, retstep=True)
     for depth in steps[np.abs(steps - middle[2]) < reach - step]:
         now = inside(start + depth * along) <= 0
         far[behind & ~now] = depth - step
         behind = now
+    # Bisection between the last step inside the object, `low`, and the step before it, `high`.
     hit = np.isfinite(far)
     high = np.where(hit, far, 1.0)
     low = high + step
@@ -107,7 +109,7 @@ def around(placement: Sim3, count: int = 7, arc: float = 360) -> list[Frame]:
 
 @dataclass(frozen=True)
 class CoordinateBackbone:
-    """Fourier features of the object coordinates that are encoded in the colours; black is
+    """Features are sines and cosines of the object coordinates that the colours encode; black is
     background."""
 
     grid: int = 28
@@ -117,6 +119,7 @@ class CoordinateBackbone:
         return [self.features(np.asarray(image)) for image in images]
 
     def features(self, image: np.ndarray) -> FeatureMap:
+        """The features of one image from the mean colour of each of n x n patches."""
         n, p = self.grid, len(image) // self.grid
         patches = image.reshape(n, p, n, p, 3).swapaxes(1, 2).reshape(n, n, p * p, 3).astype(float)
         painted = patches.min(axis=-1) > 0
@@ -134,14 +137,15 @@ class CoordinateBackbone:
 
 
 def true_pose(reference: Camera, placement: Sim3, target: Camera, target_placement: Sim3) -> Sim3:
-    """Reference-camera points to target-camera points, for the same object at two placements."""
+    """The true map from the reference's camera frame to the target's, for one object at two
+    placements."""
     first = Sim3(1.0, reference.R, reference.t) @ placement
     return Sim3(1.0, target.R, target.t) @ target_placement @ first.inverse()
 
 
 def reference_and_targets(targets: int = 3) -> list[Frame]:
-    """A frame of the object at home, and some of the object elsewhere, by upright cameras turned
-    with its world."""
+    """A frame of the object AT_HOME, and some frames of it ELSEWHERE, by cameras that are turned
+    with the world of the object."""
     cameras = [
         turned(look_at(direction, distance=4.5), ELSEWHERE.R) for direction in DIRECTIONS[:targets]
     ]

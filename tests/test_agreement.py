@@ -1,4 +1,4 @@
-"""Depth and poses of a few frames that agree, and each usual mistake, which is named."""
+"""Depth and poses of a few frames are compared; each usual mistake is named."""
 
 import re
 from dataclasses import replace
@@ -12,36 +12,43 @@ from synthetic_views import ELSEWHERE, look_at, render
 from zsp_lite import Frame
 from zsp_lite.importers.agreement import disagreement
 
-FLIP = np.diag([1.0, -1, -1, 1])
+FLIP = np.diag([1.0, -1, -1, 1])  # y and z of OpenGL's cameras are those of OpenCV's, reversed
+DEPTH_UNIT = 0.001  # metres per stored value of depth
 
 
 def views(focal: float, nearer: float = 1.0) -> list[Frame]:
+    """Frames "0" to "3" of the object, by cameras at a quarter of a circle, each at a distance of
+    its own, which is divided by `nearer`."""
     turns = np.radians([0, 25, 50, 75])
     directions = np.column_stack([np.cos(turns), np.sin(turns), [0.3, 0.5, 0.2, 0.6]])
     return [
-        render(look_at(one, distance / nearer, focal=focal), ELSEWHERE, f"{k}")
-        for k, (one, distance) in enumerate(zip(directions, (3.5, 4.0, 4.6, 4.2)))
+        render(look_at(direction, distance / nearer, focal=focal), ELSEWHERE, f"{k}")
+        for k, (direction, distance) in enumerate(zip(directions, (3.5, 4.0, 4.6, 4.2)))
     ]
 
 
 @pytest.fixture(scope="module")
-def frames():
+def frames() -> list[Frame]:
+    """Frames with a focal length at which the object fills the images."""
     return views(190.0)
 
 
-def posed(frame, to_camera) -> Frame:
+def posed(frame: Frame, to_camera: np.ndarray) -> Frame:
+    """The frame with another matrix from world to camera, (4, 4)."""
     return replace(frame, camera=replace(frame.camera, R=to_camera[:3, :3], t=to_camera[:3, 3]))
 
 
-def inverted(frame):
+def inverted(frame: Frame) -> Frame:
+    """The pose if the matrix from world to camera is read as that from camera to world."""
     return posed(frame, np.linalg.inv(frame.camera.matrix))
 
 
-def flipped(frame):
+def flipped(frame: Frame) -> Frame:
+    """The pose if OpenGL's axes are read as OpenCV's."""
     return posed(frame, FLIP @ frame.camera.matrix)
 
 
-def reordered(frame):
+def reordered(frame: Frame) -> Frame:
     """The pose if a quaternion w, x, y, z is read as x, y, z, w."""
     to_world = np.linalg.inv(frame.camera.matrix)
     x, y, z, w = Rotation.from_matrix(to_world[:3, :3]).as_quat()
@@ -49,28 +56,28 @@ def reordered(frame):
     return posed(frame, np.linalg.inv(to_world))
 
 
-def scaled(factor, frame):
+def scaled(factor: float, frame: Frame) -> Frame:
+    """The depth if its unit is wrong by a factor."""
     return replace(frame, depth=frame.depth * np.float32(factor))
 
 
-def along_ray(frame):
+def along_ray(frame: Frame) -> Frame:
+    """The depth if it is measured along the ray of each pixel, not along the axis of the camera."""
     height, width = frame.camera.size
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
-    lengths = np.linalg.norm(
-        frame.camera.unproject_camera(pixels, np.ones((height, width))), axis=-1
-    )
+    rays = frame.camera.unproject_camera(pixels, np.ones((height, width)))
+    lengths = np.linalg.norm(rays, axis=-1)
     return replace(frame, depth=(frame.depth * lengths).astype(np.float32))
 
 
-def farther(frame):
-    """Every other camera is at another distance."""
-    return replace(
-        frame, camera=replace(frame.camera, t=frame.camera.t * (1, 1, 1 + int(frame.name) % 2 / 2))
-    )
+def farther(frame: Frame) -> Frame:
+    """The camera of a frame with an odd number at 1.5 times its distance."""
+    factor = 1.5 if int(frame.name) % 2 else 1
+    return replace(frame, camera=replace(frame.camera, t=frame.camera.t * (1, 1, factor)))
 
 
 @pytest.mark.parametrize(
-    "mistake, named",
+    "mistake, message",
     [
         (inverted, r"agree \(\d+%\) if the poses are world to camera$"),
         (flipped, "if the poses have the other axes, OpenGL's for OpenCV's or the reverse"),
@@ -83,29 +90,31 @@ def farther(frame):
         (farther, "no usual mistake in units or poses explains it"),
     ],
 )
-def test_each_mistake_is_named(frames, mistake, named):
-    line = disagreement([mistake(frame) for frame in frames], 0.001)
-    assert re.search(named, line)
+def test_each_mistake_is_named(frames, mistake, message):
+    line = disagreement([mistake(frame) for frame in frames], DEPTH_UNIT)
+    assert re.search(message, line)
 
 
 def test_right_frames_agree(frames):
-    assert disagreement(frames, 0.001) == ""
+    assert disagreement(frames, DEPTH_UNIT) == ""
 
 
 def test_depth_along_the_ray_is_named():
-    assert re.search(
-        "if depth is the distance along the ray of a pixel",
-        disagreement(map(along_ray, views(45.0, 1.6)), 0.001),
-    )
+    # Only wide views from near tell both kinds of depth apart.
+    line = disagreement(map(along_ray, views(45.0, nearer=1.6)), DEPTH_UNIT)
+    assert "if depth is the distance along the ray of a pixel" in line
 
 
 def test_positions_of_another_unit_are_named_where_the_depth_is_plausible(frames):
+    # Millimetres.
     wrong = [
         replace(frame, camera=replace(frame.camera, t=1000 * frame.camera.t)) for frame in frames
     ]
-    assert "if the positions of the cameras are multiplied by 0.001" in disagreement(wrong, 0.001)
+    line = disagreement(wrong, DEPTH_UNIT)
+    assert "if the positions of the cameras are multiplied by 0.001" in line
 
 
 def test_a_small_error_of_scale_is_given_by_its_number(frames):
-    line = disagreement([scaled(1.3, frame) for frame in frames], 0.001)
+    line = disagreement([scaled(1.3, frame) for frame in frames], DEPTH_UNIT)
+    # 1 / 1.3 = 0.77, estimated.
     assert 0.72 < float(re.search(r"multiplied by ([\d.]+)", line)[1]) < 0.82

@@ -62,9 +62,7 @@ def test_what_is_no_similarity_is_refused(scale, R, t):
 @pytest.mark.parametrize(
     "rounded", [lambda R: R.astype(np.float16), lambda R: R.round(4), lambda R: R.round(2)]
 )
-def test_a_rounded_rotation_becomes_the_nearest_one_and_another_is_refused(
-    rounded,
-):
+def test_a_rounded_rotation_becomes_the_nearest_one_and_another_is_refused(rounded):
     exact = similarity(3).R
     R = rounded(exact)
     nearest = Rotation.from_matrix(R.astype(float)).as_matrix()
@@ -177,9 +175,7 @@ def test_the_same_seed_gives_the_same_result_and_a_generator_will_do():
     assert_array_equal(first[1], second[1])
 
 
-def test_many_trials_need_little_memory_and_a_better_one_wins_wherever_it_is(
-    monkeypatch,
-):
+def test_many_trials_need_little_memory_and_a_better_one_wins_wherever_it_is(monkeypatch):
     source, target, truth, right = contaminated(3, outliers=0.8)
     tracemalloc.start()
     found, inliers = ransac(np.tile(source, (20, 1)), np.tile(target, (20, 1)), trials=20_000)

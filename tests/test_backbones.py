@@ -12,7 +12,7 @@ from loopback import Server
 from numpy.random import default_rng
 from refusals import refused
 from safetensors.torch import save_file
-from small_backbones import ARCHITECTURES, save_all, small_vit
+from small_backbones import ARCHITECTURES, MEAN, STD, close, save_all, small_vit
 from torch import nn
 from torch.testing import assert_close
 
@@ -47,13 +47,13 @@ def pictures():
 def assert_same_features(first, second):
     for a, b in zip(first, second, strict=True):
         for name in ("keys", "saliency", "global_feature"):
-            assert_close(getattr(a, name), getattr(b, name), atol=2e-5, rtol=1e-4)
+            close(getattr(a, name), getattr(b, name))
 
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory, vit):
-    """The embedded backbone, a checkpoint in DINO's layout, a model of each architecture of Hugging
-    Face's format."""
+    """What `load_backbone` takes for the embedded backbone, for a checkpoint in DINO's layout, and
+    for each architecture of Hugging Face's format."""
     root = tmp_path_factory.mktemp("backbones")
     torch.save(vit.state_dict(), root / "checkpoint.pth")
     models = {kind: f"hf:{folder}" for kind, folder in save_all(root).items()}
@@ -62,23 +62,24 @@ def places(tmp_path_factory, vit):
 
 @pytest.fixture(params=["zsp-tiny", "checkpoint", *ARCHITECTURES])
 def place(request, places) -> str:
+    """What `load_backbone` takes for one backbone after the other."""
     return places[request.param]
 
 
 @pytest.fixture
 def backbone(place):
-    """One of 4 x 4 patches."""
+    """One backbone after the other, with 4 x 4 patches."""
     return load_backbone(place, "cpu", image_size=4 * load_backbone(place, "cpu").patch_size)
 
 
 def test_keys_are_float32_per_patch_and_saliency_spans_0_to_1(backbone, pictures):
     features = backbone(pictures)
-    for one in features:
-        assert one.keys.shape == (4, 4, backbone.embed_dim)
-        assert one.keys.dtype == torch.float32
-        assert one.saliency.min() == 0
-        assert one.saliency.max() == 1
-        assert one.saliency.std() > 0.05
+    for maps in features:
+        assert maps.keys.shape == (4, 4, backbone.embed_dim)
+        assert maps.keys.dtype == torch.float32
+        assert maps.saliency.min() == 0
+        assert maps.saliency.max() == 1
+        assert maps.saliency.std() > 0.05  # not one value for all patches
     assert not torch.allclose(features[0].keys, features[1].keys)
 
 
@@ -110,7 +111,8 @@ def test_keys_are_tensors_of_their_own_that_can_enter_a_graph_with_gradients(bac
 def test_layer_and_facet_change_the_keys_alone_and_stand_in_the_name(place, pictures):
     plain = load_backbone(place, "cpu")
     size = 3 * plain.patch_size
-    found, last = [], plain.model.depth - 1
+    found = []
+    last = plain.model.depth - 1
     for layer, index, facet in [("last", last, "key"), *((0, 0, facet) for facet in FACETS)]:
         backbone = load_backbone(place, "cpu", layer=layer, facet=facet, image_size=size + 1)
         assert (backbone.layer, backbone.facet, backbone.image_size) == (index, facet, size)
@@ -142,9 +144,8 @@ def test_features_are_the_models_keys_saliency_and_cls(pictures):
         pictures
     )
     pixels = torch.from_numpy(pictures[0]).permute(2, 0, 1)[None] / 255
-    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
     with torch.no_grad():
-        tokens = vit.extract((pixels - mean.view(3, 1, 1)) / std.view(3, 1, 1), 1)
+        tokens = vit.extract((pixels - MEAN) / STD, 1)
     assert_close(features[0].keys, tokens.keys[0].view(4, 4, 64))
     assert_close(features[0].global_feature, tokens.cls[0])
     raw = tokens.attention[0, [0, 3]].mean(0).view(4, 4)
@@ -161,10 +162,8 @@ def test_uniform_attention_is_no_foreground():
 
 
 def test_of_dino_vits_four_heads_are_salient_and_of_others_all():
-    vits, other = (
-        Backbone(vit, "x", device="cpu")
-        for vit in (VisionTransformer(32, 8), small_vit(num_heads=4))
-    )
+    vits = Backbone(VisionTransformer(32, 8), "x", device="cpu")
+    other = Backbone(small_vit(num_heads=4), "x", device="cpu")
     assert (vits.saliency_heads, vits.layer) == ((0, 2, 4, 5), 9)
     assert (other.saliency_heads, other.layer) == ((0, 1, 2, 3), 2)
 

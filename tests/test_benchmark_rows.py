@@ -62,8 +62,7 @@ def test_a_row_of_fewer_views_sees_the_first_ones(run):
 
 
 @pytest.mark.parametrize(
-    "name",
-    "ours ours-published ours-k70-nokmeans ours-transport ours-saliencyiou".split(),
+    "name", "ours ours-published ours-k70-nokmeans ours-transport ours-saliencyiou".split()
 )
 def test_a_row_is_the_method_with_its_settings_on_the_frames_themselves(run, name):
     dataset = Co3D(small_folder())

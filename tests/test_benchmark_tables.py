@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from benchmark_folder import CATEGORIES, PAIRS, made_up_run, write_run
+from benchmark_folder import CATEGORIES, PAIRS, RESULT, made_up_run, write_run
 from refusals import refused
 
 from zsp_lite.benchmark import tables
@@ -350,19 +350,6 @@ def test_each_line_of_the_papers_tables_is_whole_and_of_a_known_row():
 
 
 KEY = "chair/a:3/b.c:0,12"
-RESULT = {
-    "error": 10.0,
-    "symmetric_error": 5.0,
-    "translation": 0.5,
-    "scale": 1.1,
-    "view": 1,
-    "inliers": 9,
-    "seconds": 2.0,
-    "note": "flat",
-    "confidence": 0.7,
-    "rotation": np.eye(3).ravel().tolist(),
-    "position": [1.0, 2.0, 3.0],
-}
 
 
 @pytest.fixture
@@ -455,8 +442,7 @@ def test_a_damaged_gzip_is_refused(folder):
 
 
 @pytest.mark.parametrize(
-    "right, wrong",
-    [(".*", "{}"), ('"calls"', '"call"'), ('"targets": 5', '"targets": "5"')],
+    "right, wrong", [(".*", "{}"), ('"calls"', '"call"'), ('"targets": 5', '"targets": "5"')]
 )
 def test_settings_of_another_form_are_refused(folder, right, wrong):
     path = folder / SETTINGS

@@ -1,12 +1,13 @@
-"""Catalogues of models: complete, consistent, built as they are listed; training, validation and
-evaluation have no concept and no model file in common (`tools/concepts.csv`)."""
+"""The catalogues of models are complete and consistent; training, validation and evaluation have no
+concept (`tools/concepts.csv`) and no model file in common."""
 
 import csv
 import json
+from collections.abc import Mapping
 
 import pytest
 
-from tools.models import LICENCES, attribution, read_catalogue
+from tools.models import LICENCES, Entry, attribution, read_catalogue
 from tools.training_categories import TRAINING
 from tools.validation_categories import VALIDATION
 from zsp_lite.course.synthetic.categories import CATEGORIES
@@ -14,67 +15,68 @@ from zsp_lite.io.files import REPOSITORY
 
 TOOLS = REPOSITORY / "tools"
 ARTISTS, SAMPLES = TOOLS / "artists.json", TOOLS / "samples.json"
-TRAINED, CHOSEN_BY = TOOLS / "training.json", TOOLS / "validation.json"
-CATALOGUES = {
-    path.stem: read_catalogue(path).models for path in (ARTISTS, SAMPLES, TRAINED, CHOSEN_BY)
-}
-ATTRIBUTION = REPOSITORY / "zsp_lite/weights/ATTRIBUTION.md"
+TRAINING_MODELS, VALIDATION_MODELS = TOOLS / "training.json", TOOLS / "validation.json"
+PATHS = ARTISTS, SAMPLES, TRAINING_MODELS, VALIDATION_MODELS
+# The works of each catalogue by category and name of the model.
+CATALOGUES = {path.stem: read_catalogue(path).models for path in PATHS}
+WEIGHTS = REPOSITORY / "zsp_lite/weights"
 
+# Licences of the models that the network sees, and such of Creative Commons.
+FREE = LICENCES.keys() - {"Public Domain Mark 1.0"}
 CC = {"CC0 1.0", "CC BY 3.0", "CC BY 3.0 US"}
 
 
+def works(catalogue: Mapping[str, Mapping[str, Entry]]) -> list[Entry]:
+    """All works of a catalogue."""
+    return [work for models in catalogue.values() for work in models.values()]
+
+
+# A model that is added or lost by mistake changes the numbers of categories and models.
 @pytest.mark.parametrize(
     "path, categories, count, licences",
     [
         (ARTISTS, 8, 59, CC | {"Public Domain Mark 1.0", "GPL-2+"}),
         (SAMPLES, 4, 16, CC),
-        (TRAINED, 49, 320, LICENCES.keys() - {"Public Domain Mark 1.0"}),
-        (CHOSEN_BY, 10, 28, LICENCES.keys() - {"Public Domain Mark 1.0"}),
+        (TRAINING_MODELS, 49, 320, FREE),
+        (VALIDATION_MODELS, 10, 28, FREE),
     ],
 )
 def test_every_model_of_a_catalogue_has_a_free_licence_and_names_its_author(
     path, categories, count, licences
 ):
     catalogue = read_catalogue(path)
-    entries = [entry for models in catalogue.models.values() for entry in models.values()]
+    listed = works(catalogue.models)
     assert len(catalogue.models) == categories
-    assert len(entries) == count
-    assert len({entry.sha256 for entry in entries}) == count  # no file twice
-    assert {entry.package for entry in entries} == set(catalogue.packages)
-    assert {entry.licence for entry in entries} <= licences
-    assert all(entry.author and entry.licence_file for entry in entries)
-    links = sum(entry.licence in LICENCES for entry in entries)
+    assert len(listed) == count
+    assert {work.package for work in listed} == set(catalogue.packages)
+    assert {work.licence for work in listed} <= licences
+    assert all(work.author and work.licence_file for work in listed)
+    links = sum(work.licence in LICENCES for work in listed)
     assert attribution(catalogue).count("https://creativecommons.org/") == links
 
 
-def test_no_file_is_in_two_catalogues_and_the_sample_data_show_those_of_theirs():
-    for name in (lambda entry: entry.sha256, lambda entry: entry.member or entry.file):
-        files = [
-            name(one)
-            for models in CATALOGUES.values()
-            for entries in models.values()
-            for one in entries.values()
-        ]
-        assert len(set(files)) == len(files)
+def test_no_file_is_listed_twice():
+    listed = [work for catalogue in CATALOGUES.values() for work in works(catalogue)]
+    assert len({work.sha256 for work in listed}) == len(listed)
+    assert len({work.member or work.file for work in listed}) == len(listed)
+
+
+def test_the_sample_data_show_the_models_of_their_catalogue():
     records = json.loads((REPOSITORY / "data_samples/rendered_models.json").read_text())
     shown = {
         record["sha256"] for models in records["sequences"].values() for record in models.values()
     }
-    assert shown == {
-        entry.sha256 for models in CATALOGUES["samples"].values() for entry in models.values()
-    }
+    assert shown == {work.sha256 for work in works(CATALOGUES["samples"])}
 
 
 def test_the_weights_name_every_model_that_they_were_trained_on():
-    page = ATTRIBUTION.read_text("utf-8")
-    text = " ".join(page.split())
-    for name, work in [one for models in CATALOGUES["training"].values() for one in models.items()]:
-        assert f"**{work.author}**: " in text
-        assert " ".join((work.title or name.replace("_", " ")).split()) in text
-        assert f"### {work.licence} <{LICENCES[work.licence]}>" in text
-    assert f"]({ATTRIBUTION.name})" in (ATTRIBUTION.parent / "MODEL_CARD.md").read_text(
-        encoding="utf-8"
-    )
+    text = " ".join((WEIGHTS / "ATTRIBUTION.md").read_text("utf-8").split())
+    for models in CATALOGUES["training"].values():
+        for name, work in models.items():
+            assert f"**{work.author}**: " in text
+            assert " ".join((work.title or name.replace("_", " ")).split()) in text
+            assert f"### {work.licence} <{LICENCES[work.licence]}>" in text
+    assert "](ATTRIBUTION.md)" in (WEIGHTS / "MODEL_CARD.md").read_text("utf-8")
 
 
 with (TOOLS / "concepts.csv").open(newline="") as _file:
@@ -94,11 +96,12 @@ def test_every_category_is_listed_on_its_side():
     samples = [
         path.parent.name for path in (REPOSITORY / "data_samples").glob("*/frame_annotations.jgz")
     ]
+    # Names that a model for evaluation may have, whether there is one or not.
     reserved = (
         "armchair bench bicycle bus car chair motorcycle scooter sofa stool toilet truck van "
         "washbasin aircraft"
     )
-    named = {
+    names_of = {
         "training": [*TRAINING, *CATALOGUES["training"]],
         "validation": [*VALIDATION, *CATALOGUES["validation"]],
         "evaluation": [
@@ -109,7 +112,7 @@ def test_every_category_is_listed_on_its_side():
             *reserved.split(),
         ],
     }
-    for side, names in named.items():
+    for side, names in names_of.items():
         assert {name: SIDE_OF.get(name) for name in names} == dict.fromkeys(names, side)
 
 
@@ -121,8 +124,8 @@ def test_no_model_for_training_has_the_name_of_an_evaluation_category():
         for names in CATALOGUES[side].values()
         for model in names
     ]
-    # Two fittings of a bathroom are no toilet.
-    assert {one for one in models if reserved & {*one.split("_")}} == {
+    # A brush and a dispenser are no toilets.
+    assert {model for model in models if reserved & {*model.split("_")}} == {
         "toilet_brush",
         "toilet_paper_dispenser",
     }

@@ -82,18 +82,9 @@ WRONG = [
     ("benchmark --methods ,", "expected names separated by commas"),
     ("benchmark --metrics acc30,speed", "got 'acc30,speed'"),
     ("synth --preset demo", "Missing option '--out'"),
-    (
-        "synth --preset a --category b --out x",
-        "expected either --preset or --category",
-    ),
-    (
-        "synth --preset demo --frames 3 --out x",
-        "--frames does not go with --preset",
-    ),
-    (
-        "synth --category mouse --up +z --out x",
-        "--up does not go with --category",
-    ),
+    ("synth --preset a --category b --out x", "expected either --preset or --category"),
+    ("synth --preset demo --frames 3 --out x", "--frames does not go with --preset"),
+    ("synth --category mouse --up +z --out x", "--up does not go with --category"),
     ("estimate a b --depth-unit 0", "got '0', expected a positive number"),
     ("estimate a b --box 1,2,3,4.5", "got '1,2,3,4.5', expected four integers"),
     ("estimate a b --intrinsics inf,1,2,3", "got 'inf,1,2,3', expected four numbers"),
@@ -106,10 +97,7 @@ WRONG = [
     ("benchmark --categories ellipsoid,cube", "'cube'"),
     ("tables .", "run.json"),
     ("synth --category sofa --out x", "sofa"),
-    (
-        f"{DOWNLOAD} co3d --category spaceship",
-        "co3d (full) is 'spaceship', expected one of ",
-    ),
+    (f"{DOWNLOAD} co3d --category spaceship", "co3d (full) is 'spaceship', expected one of "),
     (
         f"{DOWNLOAD} co3d-v1 --category toaster --single-sequence",
         "--single-sequence does not go with co3d-v",
@@ -123,10 +111,7 @@ WRONG = [
         "--labels does not go with co3d: labels are of v1",
     ),
     (f"{IMPORT} lists /nowhere", "rgb.txt"),
-    (
-        f"{IMPORT} nerfstudio x --object=2",
-        "--object does not go with x, of the format nerfstudio",
-    ),
+    (f"{IMPORT} nerfstudio x --object=2", "--object does not go with x, of the format nerfstudio"),
     (f"{IMPORT} lists x --box=1,1,9,9 --masks=m", "--masks does not go with --box"),
 ]
 
@@ -169,8 +154,7 @@ def test_the_demo_prints_a_table_and_writes_its_report(ellipsoids, tmp_path, loa
 
 
 @pytest.mark.parametrize(
-    "words, inside",
-    [("demo --data .", ""), ("estimate ellipsoid/a ellipsoid/b", "deeper")],
+    "words, inside", [("demo --data .", ""), ("estimate ellipsoid/a ellipsoid/b", "deeper")]
 )
 def test_an_output_folder_that_is_a_file_is_refused_before_any_computation(
     words, inside, ellipsoids, tmp_path, monkeypatch, loaded, run

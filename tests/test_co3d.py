@@ -172,10 +172,7 @@ def test_an_invalid_frame_fails_by_name_and_field(root, change, message):
             lambda root: Co3D(root).frame_list("../chair"),
             "category is '../chair', expected one of chair",
         ),
-        (
-            lambda root: write_co3d(root, "../chair", []),
-            "category name is '../chair', expected",
-        ),
+        (lambda root: write_co3d(root, "../chair", []), "category name is '../chair', expected"),
         (lambda root: Co3D(root).frames("chair", "c_3"), "no frames of 'c_3'"),
     ],
 )

@@ -28,10 +28,7 @@ from traitlets.config import Config, PyFileConfigLoader
 
 from zsp_lite.views import View
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.filterwarnings("ignore::sqlalchemy.exc.SAWarning"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::sqlalchemy.exc.SAWarning")]
 
 EXERCISES = Path(__file__).parents[1] / "notebooks/exercises"
 ASSIGNMENTS = sorted(folder.name for folder in (EXERCISES / "source").iterdir())

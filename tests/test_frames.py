@@ -48,21 +48,15 @@ SIZE = (24, 32)
 @pytest.mark.parametrize(
     "parts, padding, box",
     [
-        ([(20, 40, 40, 60, 1.0)], 0.1, (18, 37, 44, 66)),  # a tenth, half of it on each side
-        ([(0, 0, 100, 200, 1.0)], 0.1, (0, 0, 100, 200)),  # in the image
+        # Padding adds a tenth of each side, half of it at each end.
+        ([(20, 40, 40, 60, 1.0)], 0.1, (18, 37, 44, 66)),
+        # The box stays in the image.
+        ([(0, 0, 100, 200, 1.0)], 0.1, (0, 0, 100, 200)),
         ([(0, 180, 40, 20, 1.0)], 0.1, (0, 179, 42, 21)),
-        # pixels at the threshold do not count
-        (
-            [(20, 40, 40, 60, 1.0), (0, 0, 5, 5, 0.4)],
-            0,
-            (20, 40, 40, 60),
-        ),
-        # a lowered threshold
-        (
-            [(20, 40, 40, 60, 0.1), (30, 50, 10, 10, 0.3)],
-            0,
-            (30, 50, 10, 10),
-        ),
+        # Pixels below the threshold do not count.
+        ([(20, 40, 40, 60, 1.0), (0, 0, 5, 5, 0.4)], 0, (20, 40, 40, 60)),
+        # Where no pixel is above the threshold, it is lowered.
+        ([(20, 40, 40, 60, 0.1), (30, 50, 10, 10, 0.3)], 0, (30, 50, 10, 10)),
     ],
 )
 def test_the_box_bounds_the_pixels_above_the_threshold(parts, padding, box):
@@ -106,7 +100,7 @@ def test_resized_depth_is_the_depth_under_the_new_pixels_centre(seed, height, wi
 @pytest.mark.parametrize("size", [(4, 48), (48, 4)])
 def test_colours_are_averaged_along_a_side_that_shrinks_while_the_other_grows(size):
     stripes = np.zeros((24, 24, 3), np.uint8)
-    stripes[::3] = 240  # every third row, each row of the result covers two periods
+    stripes[::3] = 240  # every third row: a row of the result covers two periods, with mean 80
     stripes = stripes if size[0] < 24 else stripes.swapaxes(0, 1)
     resized = resize_frame(Frame(stripes, None, None, random_camera(0, (24, 24))), size)
     assert_array_equal(resized.rgb, 80)
@@ -224,7 +218,7 @@ def test_depth_and_masks_survive_their_files(tmp_path):
     assert_array_equal(read_mask(tmp_path / "mask.png"), mask)
     write_mask(tmp_path / "known.png", depth > 0)
     assert_array_equal(read_mask(tmp_path / "known.png"), depth > 0)
-    # bit depth in the PNG's header: a mask of booleans
+    # Byte 24 of a PNG is the bits per pixel: a mask of booleans has one.
     assert (tmp_path / "known.png").read_bytes()[24] == 1
 
 
@@ -240,7 +234,8 @@ def test_depth_and_masks_survive_their_files(tmp_path):
 def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension, options):
     pixels = default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
     data, path = cv2.imencode(extension, pixels, options)[1].tobytes(), tmp_path / "image"
-    if extension == ".jpg":  # a thumbnail in a segment of its own
+    # A thumbnail, which ends as the image does, in a segment of its own.
+    if extension == ".jpg":
         thumbnail = cv2.imencode(".jpg", pixels[::4, ::4])[1].tobytes()
         data = data[:2] + b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2) + thumbnail + data[2:]
     decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
@@ -298,6 +293,7 @@ def test_the_two_spreads_average_deviations_and_variances_of_the_axes():
 
 
 def frontal(size):
+    """A camera at the origin that looks along z."""
     centre = np.array([size[1] / 2, size[0] / 2])
     return Camera(np.eye(3), np.zeros(3), np.array([50.0, 60.0]), centre, size)
 
@@ -315,7 +311,7 @@ def test_a_hole_in_a_plane_is_filled_with_the_plane():
     holed = plane.copy()
     holed[10:20, 12:25] = 0
     filled = inpaint_depth(holed)
-    assert_allclose(filled, plane, atol=0.05)  # the hole spans a range of 0.27
+    assert_allclose(filled, plane, atol=0.05)  # depth differs by 0.27 across the hole
     assert_array_equal(filled[holed > 0], plane[holed > 0])
 
 
@@ -361,7 +357,7 @@ def test_a_patchs_point_has_the_lower_quartile_of_its_known_depths(seed):
     rows, cols = np.floor(pixels[..., 1]).astype(int), np.floor(pixels[..., 0]).astype(int)
     for row, col, expected in patch_depths_one_by_one(depth, (6, 8)):
         assert known[row, col] == (expected is not None)
-        # the pixel is one of the patch
+        # The point lies on the ray of a pixel of the patch, which has 4 x 4 pixels.
         assert rows[row, col] // 4 == row
         assert cols[row, col] // 4 == col
         if expected is not None:

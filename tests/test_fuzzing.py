@@ -1,15 +1,17 @@
-"""Fuzzing of everything that reads files: damaged and invented files must be read or refused by
+"""Fuzzing of everything that reads files: damaged and invented files must be read, or refused by
 InputError.
 
-The readers are those of the hostile inputs with the valid files of their folder; the inputs are the
+Most readers, and the folder of valid files, are shared with `tests.hostile`. The inputs are the
 same in each run.
 """
 
 import gzip
 import json
+from collections.abc import Iterator
+from functools import partial
 
 import pytest
-from benchmark_folder import write_run
+from benchmark_folder import RESULT, write_run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -30,14 +32,15 @@ _NAMES = (
     "poses",
 )
 _JPEG = "data/cup/a/images/frame000001.jpg"
-# Every reader, with the file that it reads.
+# Every reader, by a name: the valid file, relative to the folder, and the call that reads it.
 READERS = {name: READERS_OF[name] for name in _NAMES} | {
     "image": (_JPEG, lambda folder: read_image(folder / _JPEG)),
     "lists": ("capture/poses.txt", read_capture("lists")),
     "results": ("made/run.jsonl", lambda folder: read_run(folder / "made").summary),
     "settings of a run": ("made/run.json", lambda folder: read_run(folder / "made").summary),
 }
-_STRANGE = st.sampled_from(
+# Bytes that break text, numbers, JSON, paths or UTF-8.
+_STRANGE_BYTES = st.sampled_from(
     [
         b"",
         b"\0",
@@ -55,11 +58,14 @@ _STRANGE = st.sampled_from(
         b"\xed\xa0\x80",
     ]
 )
+# Beside all others, numbers at the limits: squares that overflow or vanish, integers beyond 64 bits
+# and beyond what a double holds exactly.
 _NUMBERS = (
     st.integers()
     | st.floats()
-    | st.sampled_from([10**30, 1e308, -1e308, 1e155, 1e-300, 0, -1, 2**63, 1 << 53])
+    | st.sampled_from([10**30, 1e308, -1e308, 1e155, 1e-300, 0, -1, 2**63, 2**53])
 )
+# Small JSON documents of any kind.
 _VALUES = st.recursive(
     st.none() | st.booleans() | _NUMBERS | st.text(max_size=8),
     lambda inner: (
@@ -74,19 +80,8 @@ def folder(tmp_path_factory):
     """The folder of the hostile inputs, and a benchmark run without the times and versions of this
     machine."""
     folder = prepare(tmp_path_factory.mktemp("fuzzing"))
-    result = {
-        "error": 10.0,
-        "symmetric_error": 5.0,
-        "translation": 0.5,
-        "scale": 1.1,
-        "view": 1,
-        "inliers": 9,
-        "seconds": 2.0,
-        "note": "flat",
-        "confidence": 0.7,
-        "position": [0.5, 1.0, 2.0],
-    }
-    write_run(folder / "made", {"icp": {"cup/a:0/b:1,3": result, "cup/b:2/a:0,2": result}}, ["cup"])
+    results = dict.fromkeys(["cup/a:0/b:1,3", "cup/b:2/a:0,2"], RESULT)
+    write_run(folder / "made", {"icp": results}, ["cup"])
     return folder
 
 
@@ -97,34 +92,35 @@ def unpack(file: str, data: bytes) -> bytes:
 
 
 def pack(file: str, text: bytes) -> bytes:
+    """The reverse of `unpack`, for texts that may be damaged."""
     if file.endswith(".jsonl"):
         try:
             text = b"".join(json.dumps(line).encode() + b"\n" for line in json.loads(text))
-        except (ValueError, TypeError):  # damaged
+        except (ValueError, TypeError):  # no list, or no JSON at all
             text += b"\n"
-    return gzip.compress(text, 1) if file.endswith(".jgz") else text
+    return gzip.compress(text, compresslevel=1) if file.endswith(".jgz") else text
 
 
 @st.composite
 def mutated(draw, data: bytes) -> bytes:
-    """A content with parts that were replaced, removed or repeated; most are near the start, where
-    headers are."""
+    """Draw a content in which one to four parts are replaced, removed or repeated."""
     for _ in range(draw(st.integers(1, 4))):
+        # Half of the parts are among the first 1500 bytes, where headers are.
         start = draw(st.integers(0, min(len(data), 1500)) | st.integers(0, len(data)))
         end = min(len(data), start + draw(st.integers(0, 12)))
-        part = draw(_STRANGE | st.binary(max_size=8) | st.just(data[start:end] * 3))
+        part = draw(_STRANGE_BYTES | st.binary(max_size=8) | st.just(data[start:end] * 3))
         data = data[:start] + part + data[end:]
     return data
 
 
 @st.composite
 def changed_json(draw, data: bytes) -> bytes:
-    """A JSON document of which one or two values were replaced, or members removed."""
+    """Draw a JSON document in which one or two members are replaced or removed."""
     content = json.loads(data)
     for _ in range(draw(st.integers(1, 2))):
-        places = list(_places(content))
-        parent, key = places[draw(st.integers(0, len(places) - 1))]
-        if draw(st.integers(0, 4)) == 0:
+        members = list(_members(content))
+        parent, key = members[draw(st.integers(0, len(members) - 1))]
+        if draw(st.integers(0, 4)) == 0:  # one time in five
             del parent[key]
         else:
             parent[key] = draw(_VALUES)
@@ -133,38 +129,42 @@ def changed_json(draw, data: bytes) -> bytes:
     return json.dumps(content).encode()
 
 
-def _places(content):
-    """The members of a JSON document, as (object or list, key or index)."""
+def _members(content: dict | list) -> Iterator[tuple[dict | list, str | int]]:
+    """The members of a JSON document at all depths, as (object or list, key or index)."""
     for key, value in content.items() if isinstance(content, dict) else enumerate(content):
         yield content, key
         if isinstance(value, dict | list):
-            yield from _places(value)
+            yield from _members(value)
 
 
 @pytest.mark.parametrize("name", READERS)
 def test_a_reader_accepts_its_format_and_refuses_damage_by_an_input_error(folder, name):
-    """The first content that raises another error than InputError is printed in its
-    smallest form."""
+    """Hypothesis prints the smallest content that raises another error than InputError."""
     file, read = READERS[name]
-    valid = (folder / file).read_bytes()
-    text = unpack(file, valid)
-    contents = mutated(text).map(lambda one: pack(file, one)) | mutated(valid)
-    if text[:1] in (b"[", b"{"):
-        contents |= changed_json(text).map(lambda one: pack(file, one))
+    path = folder / file
+    valid = path.read_bytes()
     read(folder)
+    text = unpack(file, valid)
+    # Damage of the packed file, of its text, and of the values in it.
+    contents = mutated(valid)
+    damaged_texts = mutated(text)
+    if text[:1] in (b"[", b"{"):
+        damaged_texts |= changed_json(text)
+    contents |= damaged_texts.map(partial(pack, file))
 
     @settings(
         max_examples=100, database=None, derandomize=True, suppress_health_check=list(HealthCheck)
     )
     @given(contents)
-    def test_one(data: bytes) -> None:
-        (folder / file).write_bytes(data)
+    def read_damaged(data: bytes) -> None:
+        path.write_bytes(data)
         try:
             read(folder)
         except InputError as error:
+            # A message is of one line, unless it quotes a line break of the file.
             assert "\n" not in str(error) or b"\n" in data
 
     try:
-        test_one()
+        read_damaged()
     finally:
-        (folder / file).write_bytes(valid)
+        path.write_bytes(valid)

@@ -4,7 +4,6 @@ transformers itself."""
 import functools
 import json
 import re
-import shutil
 import sys
 from pathlib import Path
 
@@ -15,8 +14,17 @@ import torch
 import transformers
 from refusals import refused
 from safetensors.torch import load, load_file, save_file
-from small_backbones import ARCHITECTURES, DEPTH, DIM, HEADS, configuration, save_all, save_model
-from torch.testing import assert_close
+from small_backbones import (
+    ARCHITECTURES,
+    DIM,
+    HEADS,
+    MEAN,
+    STD,
+    close,
+    configuration,
+    save_all,
+    save_model,
+)
 from transformers import AutoModel
 
 from zsp_lite import load_backbone
@@ -27,41 +35,45 @@ from zsp_lite.choices import FACETS
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory):
+def folders(tmp_path_factory) -> dict[str, Path]:
+    """The folder of a small model of each architecture."""
     return save_all(tmp_path_factory.mktemp("models"))
 
 
+# A square picture and a wide one: both become square images.
 SHAPES = (64, 64, 3), (50, 90, 3)
 PICTURES = [np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8) for shape in SHAPES]
 
 
 @functools.cache
 def by_transformers(folder: Path, kind: str, size: int):
-    """For `PICTURES`, return input and output of every block of the eager model, its output, and
-    its blocks."""
+    """Run a model of transformers on `PICTURES`; returns (input, output) of each of its blocks,
+    its output, and its blocks."""
     architecture = ARCHITECTURES[kind]
+    # The eager implementation of attention is the one that returns attention weights.
     model = AutoModel.from_pretrained(folder, attn_implementation="eager", dtype=torch.float32)
     model = getattr(model, "vision_model", model).eval()
-    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
     options = {"interpolate_pos_encoding": True} if architecture.interpolates else {}
     if kind == "vit_mae":
+        # A masked autoencoder hides patches and sorts them by noise: hide none, keep their order.
         model.config.mask_ratio = 0.0
-        options["noise"] = (
-            torch.arange((size // architecture.patch) ** 2).float().repeat(len(PICTURES), 1)
-        )
+        patches = (size // architecture.patch) ** 2
+        options["noise"] = torch.arange(patches).float().repeat(len(PICTURES), 1)
     (blocks,) = [module for module in model.modules() if isinstance(module, torch.nn.ModuleList)]
-    seen = []
+    calls = []
     for block in blocks:
-        block.register_forward_hook(lambda module, inputs, output: seen.append((inputs[0], output)))
+        block.register_forward_hook(lambda _, inputs, output: calls.append((inputs[0], output)))
     with torch.no_grad():
-        images = (prepare_images(PICTURES, size) - mean.view(3, 1, 1)) / std.view(3, 1, 1)
+        images = (prepare_images(PICTURES, size) - MEAN) / STD
         output = model(images, output_attentions=True, **options)
-    return [(x, y if torch.is_tensor(y) else y[0]) for x, y in seen], output, blocks
+    # Some blocks return their tokens in a tuple.
+    return [(x, y if torch.is_tensor(y) else y[0]) for x, y in calls], output, blocks
 
 
-def projection(architecture, block, x, facet: str):
-    """Return queries, keys or values of a block for its input."""
-    names = f"{facet[0]}_proj", facet  # of newer and of older releases of transformers
+def projection(architecture, block, x, facet: str) -> torch.Tensor:
+    """Return queries, keys or values of a block for its input x."""
+    # Newer and older releases of transformers name the projection in different ways.
+    names = f"{facet[0]}_proj", facet
     (project,) = [
         module for name, module in block.named_modules() if name.rpartition(".")[2] in names
     ]
@@ -75,43 +87,47 @@ def test_facets_are_the_projections_of_the_blocks_normalised_input_and_its_outpu
 ):
     architecture = ARCHITECTURES[kind]
     size = 4 * architecture.patch
-    seen, _, blocks = by_transformers(folders[kind], kind, size)
-    for layer in range(DEPTH):
-        before, after = seen[layer]
-        expected = (
-            after if facet == "token" else projection(architecture, blocks[layer], before, facet)
-        )
+    calls, _, blocks = by_transformers(folders[kind], kind, size)
+    for layer, (x, tokens) in enumerate(calls):
+        if facet != "token":
+            tokens = projection(architecture, blocks[layer], x, facet)
+        patches = tokens[:, architecture.special :].unflatten(1, (4, 4))
         backbone = load_backbone(
             f"hf:{folders[kind]}", "cpu", layer=layer, facet=facet, image_size=size
         )
-        for features, values in zip(
-            backbone(PICTURES), expected[:, architecture.special :], strict=True
-        ):
-            assert_close(features.keys, values.view(4, 4, DIM), atol=2e-5, rtol=1e-4)
+        for features, expected in zip(backbone(PICTURES), patches, strict=True):
+            close(features.keys, expected)
 
 
 @pytest.mark.parametrize("kind", ARCHITECTURES)
 def test_saliency_is_the_last_cls_attention_and_the_global_feature_the_cls_output(kind, folders):
     architecture = ARCHITECTURES[kind]
     size = 4 * architecture.patch
-    seen, output, blocks = by_transformers(folders[kind], kind, size)
-    if kind == "dinov3_vit":  # its attention adds a rotary embedding
+    calls, output, blocks = by_transformers(folders[kind], kind, size)
+    # The attention of the CLS token to all tokens, (pictures, heads, tokens).
+    if kind == "dinov3_vit":
+        # Its attention adds a rotary embedding, which the projections lack.
         attention = output.attentions[-1][:, :, 0]
     else:
-        q, k = (
-            projection(architecture, blocks[-1], seen[-1][0], facet)
-            .unflatten(-1, (HEADS, -1))
-            .transpose(1, 2)
-            for facet in ("query", "key")
-        )
-        attention = (q @ k.transpose(-1, -2) / (DIM / HEADS) ** 0.5).softmax(-1)[:, :, 0]
-    expected = attention[:, :, architecture.special :].mean(1)
-    expected = expected - expected.amin(1, keepdim=True)
-    expected = (expected / expected.amax(1, keepdim=True)).view(-1, 4, 4)
-    features = load_backbone(f"hf:{folders[kind]}", "cpu", image_size=size)(PICTURES)
-    for one, saliency, cls in zip(features, expected, output.last_hidden_state[:, 0], strict=True):
-        assert_close(one.saliency, saliency, atol=2e-5, rtol=1e-4)
-        assert_close(one.global_feature, cls, atol=2e-5, rtol=1e-4)
+
+        def heads(facet: str) -> torch.Tensor:
+            """The projection of the last block, (pictures, heads, tokens, dimensions)."""
+            x, _ = calls[-1]
+            tokens = projection(architecture, blocks[-1], x, facet)
+            return tokens.unflatten(-1, (HEADS, -1)).transpose(1, 2)
+
+        logits = heads("query") @ heads("key").mT / (DIM / HEADS) ** 0.5
+        attention = logits.softmax(-1)[:, :, 0]
+    mean = attention[:, :, architecture.special :].mean(1)
+    # Saliency is scaled to 0 to 1 in each picture.
+    raised = mean - mean.amin(1, keepdim=True)
+    saliencies = (raised / raised.amax(1, keepdim=True)).view(-1, 4, 4)
+    maps = load_backbone(f"hf:{folders[kind]}", "cpu", image_size=size)(PICTURES)
+    for features, saliency, cls in zip(
+        maps, saliencies, output.last_hidden_state[:, 0], strict=True
+    ):
+        close(features.saliency, saliency)
+        close(features.global_feature, cls)
 
 
 def test_a_model_that_nobody_thought_of_is_read_by_the_names_of_its_parts(tmp_path):
@@ -122,21 +138,16 @@ def test_a_model_that_nobody_thought_of_is_read_by_the_names_of_its_parts(tmp_pa
 
 
 @pytest.mark.parametrize(
-    "file, content, mean, std",
+    "processor, mean, std",
     [
-        ("preprocessor_config.json", {"image_mean": [0.5] * 3, "image_std": [0.25] * 3}, 0.5, 0.25),
-        (
-            "preprocessor_config.json",
-            {"do_normalize": False, "image_mean": [0.5] * 3, "image_std": [1] * 3},
-            0,
-            1,
-        ),
+        ({"image_mean": [0.5] * 3, "image_std": [0.25] * 3}, 0.5, 0.25),
+        ({"do_normalize": False, "image_mean": [0.5] * 3, "image_std": [1] * 3}, 0, 1),
     ],
 )
-def test_the_image_processors_mean_and_deviation_are_taken(file, content, mean, std, tmp_path):
+def test_the_image_processors_mean_and_deviation_are_taken(processor, mean, std, tmp_path):
     folder = save_model(tmp_path / "vit", configuration("vit"))
     plain = load_backbone(f"hf:{folder}", "cpu", image_size=48)
-    (folder / file).write_text(json.dumps(content))
+    (folder / "preprocessor_config.json").write_text(json.dumps(processor))
     backbone = load_backbone(f"hf:{folder}", "cpu", image_size=48)
     assert (backbone.mean, backbone.std) == ((mean,) * 3, (std,) * 3)
     assert not torch.allclose(backbone(PICTURES)[0].keys, plain(PICTURES)[0].keys)
@@ -148,7 +159,7 @@ def test_without_transformers_the_package_is_named(folders, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "kind, settings, match",
+    "kind, settings, message",
     [
         ("siglip", {}, "a siglip_vision_model model, expected .* a CLS token"),
         ("blip", {}, "a blip_vision_model model, expected .* the projections q_proj or query"),
@@ -162,32 +173,32 @@ def test_without_transformers_the_package_is_named(folders, monkeypatch):
         ),
     ],
 )
-def test_models_that_cannot_be_read_are_refused(kind, settings, match, tmp_path):
-    config = (
-        transformers.ResNetConfig(**settings)
-        if kind == "resnet"
-        else configuration(kind, **settings)
-    )
-    refused(
-        match, load_backbone, f"hf:{save_model(tmp_path / 'model', config)}", "cpu", image_size=32
-    )
+def test_models_that_cannot_be_read_are_refused(kind, settings, message, tmp_path):
+    # A convolutional network has none of the settings of a transformer.
+    make = transformers.ResNetConfig if kind == "resnet" else functools.partial(configuration, kind)
+    folder = save_model(tmp_path / "model", make(**settings))
+    refused(message, load_backbone, f"hf:{folder}", "cpu", image_size=32)
 
 
-def test_missing_weights_are_refused_and_not_made_up(tmp_path):
+def without(tmp_path: Path, part: str) -> str:
+    """Save a model without the weights whose names contain a part; returns its name."""
     folder = save_model(tmp_path / "vit", configuration("vit"))
+    # From bytes: Windows does not replace a file whose tensors are in use.
     weights = load((folder / "model.safetensors").read_bytes())
-    kept = {key: x for key, x in weights.items() if "pooler" not in key}
-    save_file(kept, folder / "model.safetensors", metadata={"format": "pt"})
-    # Nobody reads the pooler.
-    first, second = (load_backbone(f"hf:{folder}", "cpu", image_size=48) for _ in range(2))
-    assert fingerprint(first) == fingerprint(second)
-    del kept["layernorm.weight"]
-    # Windows keeps a file whose tensors are in use
-    other = shutil.copytree(folder, tmp_path / "other")
-    save_file(kept, other / "model.safetensors", metadata={"format": "pt"})
-    refused(
-        "1 weights are not in the file, first layernorm.weight", load_backbone, f"hf:{other}", "cpu"
-    )
+    remaining = {name: weight for name, weight in weights.items() if part not in name}
+    save_file(remaining, folder / "model.safetensors", metadata={"format": "pt"})
+    return f"hf:{folder}"
+
+
+def test_a_missing_pooler_changes_nothing_because_no_feature_depends_on_it(tmp_path):
+    name = without(tmp_path, "pooler")
+    # transformers draws weights that are missing: two models would differ.
+    assert fingerprint(load_backbone(name, "cpu")) == fingerprint(load_backbone(name, "cpu"))
+
+
+def test_missing_weights_are_refused(tmp_path):
+    name = without(tmp_path, "layernorm.weight")
+    refused("1 weights are not in the file, first layernorm.weight", load_backbone, name, "cpu")
 
 
 def test_pickles_are_not_read(tmp_path):
@@ -199,8 +210,9 @@ def test_pickles_are_not_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "file, content, match",
+    "file, content, message",
     [
+        # A page of an error instead of the weights, with a length that is plausible for weights.
         ("model.safetensors", b"<html>404</html>" + bytes(1 << 20), ""),
         ("config.json", b"{", "config.json"),
         (
@@ -210,16 +222,17 @@ def test_pickles_are_not_read(tmp_path):
         ),
     ],
 )
-def test_damaged_folders_are_refused_in_one_line(file, content, match, tmp_path):
+def test_damaged_folders_are_refused_in_one_line(file, content, message, tmp_path):
     folder = save_model(tmp_path / "vit", configuration("vit"))
     (folder / file).write_bytes(content)
-    told = re.escape(f"hf:{folder}") + f": cannot be loaded by the package transformers .*{match}"
-    refused(told, load_backbone, f"hf:{folder}", "cpu")
+    name = f"hf:{folder}"
+    refusal = f"{re.escape(name)}: cannot be loaded by the package transformers .*{message}"
+    refused(refusal, load_backbone, name, "cpu")
 
 
-@pytest.fixture()
+@pytest.fixture
 def offline(tmp_path, monkeypatch) -> Path:
-    """No hub, and an empty cache."""
+    """The empty cache of a machine without a hub."""
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
@@ -227,12 +240,13 @@ def offline(tmp_path, monkeypatch) -> Path:
 
 def test_what_is_in_the_cache_needs_no_hub(offline):
     repository = offline / "models--someone--small"
+    commit = 40 * "0"  # the hub names commits by 40 hexadecimal digits
     (repository / "refs").mkdir(parents=True)
-    (repository / "refs/main").write_text("0" * 40)
-    folder = save_model(repository / "snapshots" / ("0" * 40), configuration("vit"))
+    (repository / "refs/main").write_text(commit)
+    folder = save_model(repository / "snapshots" / commit, configuration("vit"))
     backbone = load_backbone("hf:someone/small", "cpu")
     assert backbone.name == "hf:someone/small"
-    assert backbone(PICTURES)[0].grid == (14, 14)
+    assert backbone(PICTURES)[0].grid == (14, 14)  # 224 pixels in patches of 16
     assert download("hf:someone/small").samefile(folder)
 
 

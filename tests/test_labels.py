@@ -22,7 +22,7 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from zsp_lite import Co3D, Sim3
-from zsp_lite.data.co3d import Pair, write_co3d
+from zsp_lite.data.co3d import Pair, SequenceData, write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose, write_label
 from zsp_lite.data.pairs import shipped_pairs, write_published_pairs
 from zsp_lite.data.published import align_worlds, import_labels, transfer_labels
@@ -31,6 +31,7 @@ from zsp_lite.metrics import rotation_error
 
 @pytest.fixture
 def root(tmp_path):
+    """A data set without labels: two sequences of chairs."""
     folder = tmp_path / "data"
     write_category(folder, "chair", "ab")
     return folder
@@ -38,33 +39,36 @@ def root(tmp_path):
 
 @pytest.fixture
 def clone(tmp_path, root):
-    """A folder with the layout of the published repository."""
-    folder, dataset = tmp_path / "clone", Co3D(root)
+    """A folder with the layout of the published repository: labels, two pairs, and a text."""
+    folder = tmp_path / "clone"
     write_identities(folder / "data", "chair", "ab")
-    pairs = [Pair("chair", *names) for names in (("a", 0, "b", (1, 3)), ("b", 2, "a", (0, 2)))]
-    write_published_pairs(folder / "data/determ_eval/200samples_2tgt/chair.pt", pairs, dataset)
+    pairs = [Pair("chair", "a", 0, "b", (1, 3)), Pair("chair", "b", 2, "a", (0, 2))]
+    write_published_pairs(folder / "data/determ_eval/200samples_2tgt/chair.pt", pairs, Co3D(root))
     (folder / "README.md").write_text("code")
     return folder
 
 
-def test_labels_and_pairs_are_imported_and_replace_others_only_on_request(clone, root):
+def test_labels_and_pairs_alone_are_imported(clone, root):
     assert import_labels(clone, root) == {"class_labels": 2, "determ_eval": 1}
     assert list(read_labels(root, "chair")) == ["a", "b"]
     assert len(shipped_pairs(Co3D(root), "chair", 2)) == 2
     assert not (root / "README.md").exists()
+
+
+def test_a_repeated_import_changes_nothing(clone, root):
+    import_labels(clone, root)
     before = contents(root)
     import_labels(clone, root)
-    assert contents(root) == before  # a repeated import changes nothing
-    mine = np.eye(4)
-    mine[:3, 3] = 0.1
-    write_label(root, "chair", PoseLabel(mine, "b", "a"))
+    assert contents(root) == before
+
+
+def test_a_label_of_the_users_is_replaced_only_on_request(clone, root):
+    moved_label = np.eye(4)
+    moved_label[:3, 3] = 0.1
+    write_label(root, "chair", PoseLabel(moved_label, "b", "a"))
     before = contents(root)
-    refused(
-        r"b\.json would be replaced by other content, expected --replace",
-        import_labels,
-        clone,
-        root,
-    )
+    message = r"b\.json would be replaced by other content, expected --replace"
+    refused(message, import_labels, clone, root)
     assert contents(root) == before
     import_labels(clone, root, replace=True)
     assert_array_equal(read_labels(root, "chair")["b"].trans, np.eye(4))
@@ -94,22 +98,25 @@ def test_nothing_is_written_if_one_file_is_bad(clone, root, tmp_path, file, cont
     assert contents(root) == before
 
 
-def test_sources_without_labels_are_refused(root, tmp_path):
+@pytest.mark.parametrize("source", ["a missing folder", "labels.zip"])
+def test_a_source_without_labels_is_refused(root, tmp_path, source):
     (tmp_path / "labels.zip").write_bytes(b"text")
-    for source in ("none", "labels.zip"):
-        refused(
-            f"{source} holds no class_labels.*, expected a clone",
-            import_labels,
-            tmp_path / source,
-            root,
-        )
-    refused("does not exist", import_labels, tmp_path, tmp_path / "nowhere")
+    message = f"{source} holds no class_labels.*, expected a clone"
+    refused(message, import_labels, tmp_path / source, root)
+
+
+def test_a_missing_data_set_is_refused(clone, tmp_path):
+    refused("does not exist", import_labels, clone, tmp_path / "nowhere")
+
+
+def test_a_transfer_without_labels_is_refused(root):
     refused("has no labels of category chair", transfer_labels, root, root, "chair")
 
 
-def moved(sequence, world: Sim3, noise: float = 0.0):
-    """The same sequence in another world."""
-    rng, frames = default_rng(0), []
+def moved(sequence: SequenceData, world: Sim3, noise: float) -> SequenceData:
+    """The same sequence in another world, with noise in the positions of its cameras."""
+    rng = default_rng(0)
+    frames = []
     for frame in sequence.frames:
         rotation = frame.camera.R @ world.R.T
         centre = world.apply(frame.camera.centre) + noise * rng.normal(size=3)
@@ -120,15 +127,15 @@ def moved(sequence, world: Sim3, noise: float = 0.0):
 
 
 def two_layouts(tmp_path, noise=0.0):
-    """Write a v1 folder with labels, and a v2 folder with other worlds; returns these worlds and a
-    label."""
+    """Write a labelled folder "v1", and "v2" with the same sequences, each in a world of its own.
+
+    Returns the maps from the worlds of v1 to those of v2 by sequence, and the label of "b".
+    """
     sequences = {name: sequence_data(name, frames=6) for name in "ab"}
-    worlds = {
-        name: Sim3(
-            0.5 + seed, Rotation.random(random_state=seed).as_matrix(), np.full(3, float(seed))
-        )
-        for seed, name in enumerate("ab", 1)
-    }
+    worlds = {}
+    for seed, name in enumerate("ab", 1):
+        turn = Rotation.random(random_state=seed).as_matrix()
+        worlds[name] = Sim3(0.5 + seed, turn, np.full(3, float(seed)))
     write_co3d(tmp_path / "v1", "chair", sequences.values())
     write_co3d(
         tmp_path / "v2", "chair", [moved(sequences[name], worlds[name], noise) for name in "ab"]
@@ -137,7 +144,7 @@ def two_layouts(tmp_path, noise=0.0):
     trans = np.eye(4)
     trans[:3, :3] = Rotation.random(random_state=9).as_matrix()
     write_label(tmp_path / "v1", "chair", PoseLabel(np.eye(4), "a", "a"))
-    # as a text of few decimals
+    # Labels may be texts of few decimals, and are rotations only up to these.
     write_label(tmp_path / "v1", "chair", PoseLabel(trans.round(4), "b", "a"))
     return worlds, trans
 
@@ -148,31 +155,28 @@ def test_labels_are_transferred_between_worlds(tmp_path):
     assert max(residuals.values()) < 1e-6
     labels = read_labels(tmp_path / "v2", "chair")
     assert_array_equal(labels["a"].trans, np.eye(4))
+    rotation, translation = labels["b"].trans[:3, :3], labels["b"].trans[:3, 3]
     expected = worlds["b"].R @ trans[:3, :3] @ worlds["a"].R.T
-    assert rotation_error(labels["b"].trans[:3, :3], expected) < 0.01
+    assert rotation_error(rotation, expected) < 0.01  # degrees, of the label's few decimals
     # Both labels map the centre of the reference cloud to the same point of the other object.
     centre = Co3D(tmp_path / "v2").point_cloud("chair", "a")[0].mean(axis=0)
-    landed = labels["b"].trans[:3, :3] @ centre + labels["b"].trans[:3, 3]
-    assert_allclose(
-        landed, worlds["b"].apply(trans[:3, :3] @ worlds["a"].inverse().apply(centre)), atol=1e-3
-    )
+    in_v1 = trans[:3, :3] @ worlds["a"].inverse().apply(centre)
+    assert_allclose(rotation @ centre + translation, worlds["b"].apply(in_v1), atol=1e-3)
 
 
-def test_the_residual_is_reported_and_a_large_one_refused(tmp_path):
+def test_worlds_that_differ_by_more_than_a_similarity_are_refused(tmp_path):
     two_layouts(tmp_path, noise=0.5)
-    old, new = Co3D(tmp_path / "v1"), Co3D(tmp_path / "v2")
-    assert 0.05 < align_worlds(old, new, "chair", "a")[1] < 0.5
-    refused(
-        "centres differ by .*, expected at most 0.05",
-        transfer_labels,
-        tmp_path / "v1",
-        tmp_path / "v2",
-        "chair",
-    )
-    assert read_labels(tmp_path / "v2", "chair") == {}
+    old, new = tmp_path / "v1", tmp_path / "v2"
+    _, residual = align_worlds(Co3D(old), Co3D(new), "chair", "a")
+    # The best similarity leaves less than the noise, and more than the limit.
+    assert 0.05 < residual < 0.5
+    message = "centres differ by .*, expected at most 0.05"
+    refused(message, transfer_labels, old, new, "chair")
+    assert read_labels(new, "chair") == {}
 
 
-def random_label(seed, name="a"):
+def random_label(seed: int, name: str = "a") -> PoseLabel:
+    """A label with a random pose of a sequence, relative to a sequence "zero"."""
     trans = np.eye(4)
     trans[:3, :3] = Rotation.random(random_state=seed % 2**31).as_matrix()
     trans[:3, 3] = default_rng(seed).normal(size=3)
@@ -183,19 +187,19 @@ def random_label(seed, name="a"):
 def test_the_relative_pose_takes_what_one_camera_sees_to_what_the_other_sees(seed):
     label_a, label_b = random_label(seed), random_label(seed + 1, "b")
     camera_a, camera_b = random_camera(seed), random_camera(seed + 1)
-    # points of the reference sequence's cloud
+    # Points in the world of the reference sequence.
     canonical = default_rng(seed).normal(size=(6, 3))
     seen_a = camera_a.to_camera(Sim3.from_matrix(label_a.trans).apply(canonical))
     seen_b = camera_b.to_camera(Sim3.from_matrix(label_b.trans).apply(canonical))
-    pose = relative_pose(label_a, camera_a, label_b, camera_b)
-    assert_allclose(Sim3.from_matrix(pose).apply(seen_a), seen_b, atol=1e-9)
-    assert_allclose(
-        pose @ relative_pose(label_b, camera_b, label_a, camera_a), np.eye(4), atol=1e-9
-    )
+    forth = relative_pose(label_a, camera_a, label_b, camera_b)
+    back = relative_pose(label_b, camera_b, label_a, camera_a)
+    assert_allclose(Sim3.from_matrix(forth).apply(seen_a), seen_b, atol=1e-9)
+    assert_allclose(Sim3.from_matrix(back).apply(seen_b), seen_a, atol=1e-9)
 
 
 def test_labels_are_read_back_from_files_in_the_published_format(tmp_path):
-    written = {name: random_label(number, name) for number, name in enumerate("ba")}
+    # Written in the order b, a; read in the order of their names.
+    written = {name: random_label(seed, name) for seed, name in enumerate("ba")}
     for name, label in written.items():
         path = write_label(tmp_path, "chair", label)
         assert path == tmp_path / "class_labels/chair" / f"{name}.json"

@@ -1,5 +1,5 @@
-"""Masks from depth and from a box, and what is said against a mask, on a red ball on a grey floor
-and a photograph."""
+"""Masks from depth and from a box, and flags of masks that may be wrong: on a red ball on a grey
+floor, and on a photograph."""
 
 from dataclasses import replace
 
@@ -14,17 +14,17 @@ from zsp_lite.course.motorcycle import load_photograph
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth, separate_colours
 
-RADIUS = 0.3
+RADIUS = 0.3  # of the ball, metres
+# Directions of cameras, from the middle of the ball.
 DIRECTIONS = [(1, 0.2, 0.6), (0.4, 1, 0.5), (0.7, -0.8, 0.4), (1, 0.5, 1.5)]
 
 
 def ball_on_floor(direction) -> tuple[Frame, np.ndarray]:
-    """A frame of a ball on a floor in front of a wall, in metres, and the true mask; the depth has
-    holes."""
+    """A frame of the ball on a floor before a wall, whose depth has holes, and the true mask."""
     camera = look_at(direction, 2.0)
     height, width = camera.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    # world directions
+    # Directions of the rays in the world, with depth 1.
     rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width))) @ camera.R
     start = camera.centre
     along, across = rays @ start, np.square(rays).sum(axis=-1)
@@ -45,6 +45,7 @@ def ball_on_floor(direction) -> tuple[Frame, np.ndarray]:
 
 
 def overlap(mask, truth):
+    """Intersection over union of a mask and a boolean one."""
     found = mask > 0.5
     return (found & truth).sum() / (found | truth).sum()
 
@@ -72,6 +73,7 @@ def test_depth_without_an_object_is_refused_and_no_depth_gives_an_empty_mask():
 
 
 def bounding(mask, margin):
+    """The slices of the box around a mask, with a margin in pixels."""
     rows, columns = np.nonzero(mask.any(axis=1))[0], np.nonzero(mask.any(axis=0))[0]
     return np.s_[
         rows[0] - margin : rows[-1] + 1 + margin, columns[0] - margin : columns[-1] + 1 + margin
@@ -150,7 +152,8 @@ def test_the_photographed_motorcycle_is_found():
 
 def test_separating_colours_on_a_smaller_copy_does_not_shift_the_mask():
     off = []
-    for first in (300, 301, 302):  # the copy has a third of the rows
+    # The copy has a third of the rows: try all three positions.
+    for first in (300, 301, 302):
         inside = np.zeros((960, 960), bool)
         inside[first : first + 360, first : first + 360] = True
         rgb = np.where(inside[..., None], np.uint8([180, 60, 60]), np.uint8(120))

@@ -1,6 +1,6 @@
-"""Matchers against their definitions, worked out another way:
+"""Matchers against their definitions, worked out another way.
 
-POT for the transport, loops for mutual neighbours.
+The transport is that of the package POT; mutual neighbours are found by a loop.
 """
 
 import numpy as np
@@ -10,72 +10,76 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from test_matching import feature_map
 
-from zsp_lite.matchers import MATCHERS, dual_softmax, sinkhorn
+from zsp_lite.matchers import MATCHERS, SOFTMAX_TEMPERATURE, dual_softmax, sinkhorn
 from zsp_lite.matching import key_similarities, match
 
-
-def similarities(seed: int = 0, n1: int = 12, n2: int = 15) -> torch.Tensor:
-    return torch.rand(n1, n2, generator=torch.Generator().manual_seed(seed))
-
-
-def masks() -> tuple[torch.Tensor, torch.Tensor]:
-    return torch.arange(12) % 4 > 0, torch.arange(15) % 3 > 0
+# Similarities of the 12 patches of one image and the 15 of another, and which patches are on the
+# object: not every fourth of the first image, nor every third of the second.
+SIMILARITIES = torch.rand(12, 15, generator=torch.Generator().manual_seed(0))
+ON_FIRST = torch.arange(12) % 4 > 0
+ON_SECOND = torch.arange(15) % 3 > 0
 
 
 def test_the_transport_plan_is_pots():
-    sim = similarities()
-    uniform = [np.full(n, 1 / n) for n in sim.shape]
-    expected = ot.sinkhorn(
-        *uniform, 1 - sim.double().numpy(), reg=0.05, numItermax=5000, stopThr=1e-14
-    )
-    assert np.abs(sinkhorn(1 - sim, 0.05, 5000).numpy() - expected).max() < 1e-9
+    uniform = [np.full(n, 1 / n) for n in SIMILARITIES.shape]
+    cost = 1 - SIMILARITIES.double()
+    # So many steps that both have converged.
+    steps = 5000
+    expected = ot.sinkhorn(*uniform, cost.numpy(), reg=0.05, numItermax=steps, stopThr=1e-14)
+    assert_allclose(sinkhorn(cost, 0.05, steps).numpy(), expected, rtol=0, atol=1e-9)
 
 
 def test_the_dual_softmax_is_the_product_of_two_softmaxes():
-    sim = similarities()
-    product = (sim / 0.1).softmax(0) * (sim / 0.1).softmax(1)
-    partner, score = dual_softmax(sim)
+    logits = SIMILARITIES / SOFTMAX_TEMPERATURE
+    product = logits.softmax(0) * logits.softmax(1)
+    partner, score = dual_softmax(SIMILARITIES)
     assert_array_equal(partner, product.argmax(1))
     assert_allclose(score.exp().numpy(), product.max(1).values.numpy(), rtol=1e-4)
 
 
 def test_mutual_neighbours_are_each_others_choice_among_the_objects_patches():
-    sim, (on1, on2) = similarities(), masks()
-    partner, score = MATCHERS["mutual"](sim, on1, on2)
-    hidden = sim.clone()
-    hidden[~on1] = hidden[:, ~on2] = -1
-    for u in range(len(sim)):
+    partner, score = MATCHERS["mutual"](SIMILARITIES, ON_FIRST, ON_SECOND)
+    # Patches off the object are less similar than all others.
+    hidden = SIMILARITIES.clone()
+    hidden[~ON_FIRST] = hidden[:, ~ON_SECOND] = -1
+    for u in range(len(hidden)):
         v = int(hidden[u].argmax())
-        if on1[u] and int(hidden[:, v].argmax()) == u:
+        if ON_FIRST[u] and int(hidden[:, v].argmax()) == u:
             assert partner[u] == v
-            assert score[u] == sim[u, v]
+            assert score[u] == SIMILARITIES[u, v]
         else:
             assert score[u] == -torch.inf
 
 
 @pytest.mark.parametrize("name", MATCHERS)
-def test_partners_are_on_the_objects_and_nothing_is_found_without_one(name):
-    sim, (on1, on2) = similarities(), masks()
-    partner, score = MATCHERS[name](sim, on1, on2)
-    found = score.isfinite()
-    assert found.any()
-    assert on1[found].all()
-    assert on2[partner[found]].all()
-    assert not MATCHERS[name](sim, on1, torch.zeros_like(on2))[1].isfinite().any()
+def test_matched_patches_and_their_partners_are_on_the_object(name):
+    partner, score = MATCHERS[name](SIMILARITIES, ON_FIRST, ON_SECOND)
+    matched = score.isfinite()
+    assert matched.any()
+    assert ON_FIRST[matched].all()
+    assert ON_SECOND[partner[matched]].all()
 
 
 @pytest.mark.parametrize("name", MATCHERS)
-def test_every_matcher_finds_an_image_in_itself(name):
+def test_nothing_is_matched_with_an_image_without_the_object(name):
+    _, score = MATCHERS[name](SIMILARITIES, ON_FIRST, torch.zeros_like(ON_SECOND))
+    assert not score.isfinite().any()
+
+
+@pytest.mark.parametrize("kmeans", [False, True])
+@pytest.mark.parametrize("name", MATCHERS)
+def test_every_matcher_finds_an_image_in_itself(name, kmeans):
     features = feature_map(3)
-    for kmeans in (False, True):
-        found = match(features, features, k=10, kmeans=kmeans, matcher=name)
-        assert len(found) == 10
-        assert_array_equal(found.reference, found.target)
-        assert_allclose(found.similarity, np.ones(10), atol=1e-5)
+    matches = match(features, features, k=10, kmeans=kmeans, matcher=name)
+    assert len(matches) == 10
+    assert_array_equal(matches.reference, matches.target)
+    assert_allclose(matches.similarity, np.ones(10), atol=1e-5)
 
 
 def test_plain_similarity_is_the_cosine_of_the_keys():
     first, second = feature_map(5), feature_map(6)
-    (found,) = key_similarities(first, [second])
+    (sim,) = key_similarities(first, [second])
     u, v = first.keys[2, 3], second.keys[4, 5]
-    assert_allclose(found[2 * 9 + 3, 4 * 9 + 5], float(u @ v / u.norm() / v.norm()), atol=1e-6)
+    # Patches are counted by rows of 9.
+    cosine = float(u @ v / u.norm() / v.norm())
+    assert_allclose(sim[2 * 9 + 3, 4 * 9 + 5], cosine, atol=1e-6)

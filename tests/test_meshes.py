@@ -1,4 +1,4 @@
-"""Model files give one record in the canonical frame, or the reason why not; their renderings have
+"""Model files are read into the canonical frame or refused with a reason; their renderings have
 exact geometry."""
 
 import numpy as np
@@ -28,8 +28,9 @@ def test_an_obj_file_gives_texture_coordinates_texture_colour_and_opacity(tmp_pa
     assert material.texture[..., :3].tolist() == CHECKS.tolist()
     assert_array_equal(material.texture[..., 3], 255)
     assert_allclose(material.colour, [0.5, 1, 1, 0.25], atol=0.01)
-    corner = mesh.vertices[mesh.faces].reshape(-1, 3)
-    assert mesh.uv.reshape(-1, 2) == pytest.approx(corner[:, :2] / 2 + 0.5)  # u to the right, v up
+    # Texture coordinates of each corner: u to the right, v up.
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+    assert mesh.uv.reshape(-1, 2) == pytest.approx(corners[:, :2] / 2 + 0.5)
     assert np.abs(mesh.normals) == pytest.approx(np.broadcast_to([0, 0, 1.0], (2, 3, 3)))
 
 
@@ -50,20 +51,18 @@ def test_every_format_gives_the_same_canonical_shape(tmp_path, extension):
     turned = shape.vertices[:, [1, 0, 2]] * (1, -1, 1)
     vertices = turned if extension == "stl" else shape.vertices[:, [1, 2, 0]]
     path = tmp_path / f"wedge.{extension}"
-    exported = trimesh.Trimesh(vertices, shape.faces, process=False)
-    exported.export(path)
+    trimesh.Trimesh(vertices, shape.faces, process=False).export(path)
     mesh = canonical_mesh(read_mesh(path), ModelInfo().axes(path.suffix))
-    expected = shape.vertices - (shape.vertices.max(0) + shape.vertices.min(0)) / 2
-    expected /= surface_spread(expected, shape.faces)
-    assert_allclose(
-        np.sort(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0),
-        np.sort(expected[shape.faces].reshape(-1, 3), axis=0),
-        atol=1e-5,
-    )
+    centred = shape.vertices - (shape.vertices.max(0) + shape.vertices.min(0)) / 2
+    expected = centred / surface_spread(centred, shape.faces)
+    # Formats differ in the order of faces: compare the sorted coordinates of all corners.
+    corners = np.sort(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0)
+    assert_allclose(corners, np.sort(expected[shape.faces].reshape(-1, 3), axis=0), atol=1e-5)
     assert surface_spread(mesh.vertices, mesh.faces) == pytest.approx(1)
 
 
 def test_parts_of_a_scene_are_placed_by_its_graph(tmp_path):
+    # A cube around the origin, and one around x = 5 that is mirrored and twice as long in x.
     cube = box((1, 1, 1))
     mirrored = np.diag([-2.0, 1, 1, 1])
     mirrored[0, 3] = 5
@@ -72,8 +71,8 @@ def test_parts_of_a_scene_are_placed_by_its_graph(tmp_path):
         scene.add_geometry(trimesh.Trimesh(cube.vertices, cube.faces), transform=transform)
     scene.export(tmp_path / "two.glb")
     mesh = read_mesh(tmp_path / "two.glb")
-    assert mesh.vertices[:, 0].min() == pytest.approx(-0.5)
-    assert mesh.vertices[:, 0].max() == pytest.approx(6)
+    x = mesh.vertices[:, 0]
+    assert (x.min(), x.max()) == pytest.approx((-0.5, 6))
     assert_allclose(np.linalg.norm(mesh.normals, axis=-1), np.ones((24, 3)), atol=1e-5)
 
 
@@ -104,30 +103,32 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
     ],
 )
 def test_an_unusable_file_is_refused_with_its_reason(tmp_path, monkeypatch, name, content, reason):
-    monkeypatch.setattr(meshes, "find_spec", lambda name: None)
+    monkeypatch.setattr(meshes, "find_spec", lambda name: None)  # no optional package
     monkeypatch.setattr(meshes, "MAX_FACES", 2)
     monkeypatch.setattr(meshes, "MAX_BYTES", 1000)
     if content == "quad":
         write_quad(tmp_path / name, CHECKS, opacity=float(name != "clear.obj"))
         (tmp_path / "bare.png").unlink(missing_ok=True)
-    elif content:
+    else:
         (tmp_path / name).write_text(content)
     refused(reason, read_mesh, tmp_path / name)
 
 
-def test_orientations_are_rotations_to_front_x_and_up_z():
+def test_an_orientation_is_a_rotation_to_front_x_and_up_z():
     rotation = ModelInfo(front="-x", up="+y").axes(".obj")
     assert rotation @ [-1, 0, 0] == pytest.approx([1, 0, 0])
-    assert rotation @ [
-        0,
-        1,
-        0,
-    ] == pytest.approx([0, 0, 1])
-    oblique = ModelInfo(front=(1, 1, 0), up=(0, 0, 2)).axes(".ply")
-    assert oblique @ oblique.T == pytest.approx(np.eye(3))
-    assert np.linalg.det(oblique) == pytest.approx(1)
-    for info in (ModelInfo(front="+y", up="+y"), ModelInfo(up=(0, 0, 0))):
-        refused("expected", info.axes, ".obj")
+    assert rotation @ [0, 1, 0] == pytest.approx([0, 0, 1])
+
+
+def test_an_oblique_orientation_is_a_rotation():
+    rotation = ModelInfo(front=(1, 1, 0), up=(0, 0, 2)).axes(".ply")
+    assert rotation @ rotation.T == pytest.approx(np.eye(3))
+    assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("info", [ModelInfo(front="+y", up="+y"), ModelInfo(up=(0, 0, 0))])
+def test_impossible_orientations_are_refused(info):
+    refused("expected", info.axes, ".obj")
 
 
 @pytest.mark.parametrize(
@@ -147,6 +148,7 @@ def test_a_folder_without_models_and_a_wrong_list_are_refused(tmp_path, folder, 
 
 
 def render(mesh, camera, samples=1):
+    """A picture of a mesh on the floor of the studio, by so many rays per side of a pixel."""
     return MeshScene(mesh, STUDIO, 0, samples=samples).render(camera)
 
 
@@ -157,12 +159,13 @@ def standing_quad(folder, texture, **material):
 
 
 def from_the_front(mesh):
+    """A camera in front of a mesh, slightly above it, for an image of 48 x 48 pixels."""
     return framed_camera(mesh.vertices, *orbit_pose(0, 0.02, 0, 8, np.zeros(3)), 48, margin=1.5)
 
 
 def intersect(camera, vertices, faces):
-    """Depth (h, w) of the nearest triangle at the centre of each pixel, from a linear system each;
-    inf elsewhere."""
+    """Depth (h, w) of the nearest triangle at the centre of each pixel, inf where there is none;
+    each triangle is a linear system."""
     x, y = np.meshgrid(np.arange(camera.size[1]) + 0.5, np.arange(camera.size[0]) + 0.5)
     rays = camera.unproject_camera(np.stack([x, y], -1), np.ones(camera.size))
     nearest = np.full(camera.size, np.inf)
@@ -175,57 +178,66 @@ def intersect(camera, vertices, faces):
 
 
 @pytest.mark.parametrize("samples", [1, 2])
-def test_depth_and_mask_are_those_of_the_triangles_and_the_floor(
-    samples,
-):
+def test_depth_and_mask_are_those_of_the_triangles_and_the_floor(samples):
     mesh = painted(wedge())
     camera = view(mesh.vertices, azimuth=200)
     drawn = render(mesh, camera, samples)
     expected = intersect(camera, mesh.vertices, mesh.faces)
+    # A pixel whose centre lies on an edge may be inside or outside.
     assert (drawn.mask == np.isfinite(expected)).mean() > 0.999
     both = drawn.mask & np.isfinite(expected)
     assert_allclose(drawn.depth[both], expected[both], atol=1e-4)
     row, col = np.nonzero((drawn.depth > 0) & ~drawn.mask)
     floor = camera.unproject(np.stack([col + 0.5, row + 0.5], 1), drawn.depth[row, col])
-    assert len(row) > 500
+    assert len(row) > 500  # the floor is seen beside the object
     assert_allclose(floor[:, 2], mesh.vertices[:, 2].min(), atol=1e-3)
+
+
+def test_normals_have_unit_length_and_face_the_camera():
+    mesh = painted(wedge())
+    camera = view(mesh.vertices, azimuth=200)
+    drawn = render(mesh, camera)
     row, col = np.nonzero(drawn.mask)
-    ray = camera.unproject_camera(np.stack([col + 0.5, row + 0.5], 1), np.ones(len(row)))
-    facing = (drawn.normals[row, col] * ray).sum(1)
-    assert_allclose(np.linalg.norm(drawn.normals[row, col], axis=1), 1, atol=1e-4)
-    assert (facing < 1e-6).all()
+    rays = camera.unproject_camera(np.stack([col + 0.5, row + 0.5], 1), np.ones(len(row)))
+    normals = drawn.normals[row, col]
+    assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
+    assert ((normals * rays).sum(1) < 1e-6).all()
 
 
 def test_a_texture_is_upright_and_not_mirrored(tmp_path):
+    # Red and green above blue and yellow, 16 x 16 pixels each.
     colours = np.array([[[200, 40, 40], [40, 180, 40]], [[40, 60, 200], [200, 190, 60]]], np.uint8)
-    texture = np.repeat(np.repeat(colours, 16, 0), 16, 1)
-    mesh = standing_quad(tmp_path, texture)
+    mesh = standing_quad(tmp_path, colours.repeat(16, axis=0).repeat(16, axis=1))
     drawn = render(mesh, from_the_front(mesh))
+    # A pixel in the middle of each quarter of the square.
     row, col = np.nonzero(drawn.mask)
-    (top, bottom), (left, right) = (
-        np.quantile(axis, (0.25, 0.75)).astype(int) for axis in (row, col)
-    )
-    seen = drawn.rgb[np.ix_([top, bottom], [left, right])].astype(int)
-    # Red, green / blue, yellow: the brighter channels tell them apart.
-    assert_array_equal(seen.argmax(-1)[0], [0, 1])
-    assert seen[1, 0].argmax() == 2
-    assert seen[1, 1].argmin() == 2
+    rows = np.quantile(row, (0.25, 0.75)).astype(int)
+    columns = np.quantile(col, (0.25, 0.75)).astype(int)
+    (red, green), (blue, yellow) = drawn.rgb[np.ix_(rows, columns)].astype(int)
+    # The light changes the colours; their brightest and darkest channels tell them apart.
+    assert [red.argmax(), green.argmax(), blue.argmax(), yellow.argmin()] == [0, 1, 2, 2]
 
 
-def test_a_hole_in_a_texture_is_a_hole_in_mask_depth_and_shadow(tmp_path):
+@pytest.fixture
+def holed(tmp_path):
+    """A square that is clear in its middle, a quarter of its area."""
     texture = np.full((64, 64, 4), 255, np.uint8)
     texture[16:48, 16:48, 3] = 0
-    mesh = standing_quad(tmp_path, texture)
-    scene = MeshScene(mesh, STUDIO, 0)
-    drawn = scene.render(from_the_front(mesh))
+    return standing_quad(tmp_path, texture)
+
+
+def test_a_hole_in_a_texture_is_a_hole_in_mask_and_coordinates(holed):
+    drawn = render(holed, from_the_front(holed))
     row, col = np.nonzero(drawn.mask)
     middle = round(row.mean()), round(col.mean())
     assert not drawn.mask[middle]
     assert np.isnan(drawn.canonical[middle]).all()
-    full = (np.ptp(row) + 1) * (np.ptp(col) + 1)
-    assert_allclose(drawn.mask.sum() / full, 0.75, atol=0.05)
-    behind = np.array([[-3.0, 0, 0], [-3.0, 0.9 * mesh.vertices[:, 1].max(), 0]], np.float32)
-    assert scene._visible_share(behind, np.tile(np.float32([1, 0, 0]), (2, 1, 1))).tolist() == [
-        1,
-        0,
-    ]
+    square = (np.ptp(row) + 1) * (np.ptp(col) + 1)  # pixels, hole included
+    assert_allclose(drawn.mask.sum() / square, 0.75, atol=0.05)
+
+
+def test_light_falls_through_a_hole_in_a_texture(holed):
+    # Points behind the middle and behind the side of the square, with light from the front.
+    points = np.array([[-3.0, 0, 0], [-3.0, 0.9 * holed.vertices[:, 1].max(), 0]], np.float32)
+    light = np.tile(np.float32([1, 0, 0]), (2, 1, 1))
+    assert MeshScene(holed, STUDIO, 0)._visible_share(points, light).tolist() == [1, 0]

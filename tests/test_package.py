@@ -75,10 +75,7 @@ def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
     call makes nothing."""
     site, empty, cache = (tmp_path / name for name in ("site", "empty", "cache"))
     empty.mkdir()
-    install = [
-        sys.executable,
-        *"-m pip install --quiet --no-deps --no-index --no-compile".split(),
-    ]
+    install = [sys.executable, *"-m pip install --quiet --no-deps --no-index --no-compile".split()]
     subprocess.run([*install, "--target", str(site), str(wheel)], check=True)
     readme = (REPOSITORY / "README.md").read_text("utf-8")
     (example, *_) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)

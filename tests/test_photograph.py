@@ -1,5 +1,5 @@
-"""The photograph of a motorcycle: depth, mask, directions; and the demo with a rendered stand-in of
-known pose."""
+"""The photograph of a motorcycle: its depth, mask and directions; and the demo with a rendered
+picture of known pose in its place."""
 
 import json
 
@@ -19,16 +19,15 @@ from zsp_lite.points import axis_deviation, object_points
 
 pytestmark = pytest.mark.slow
 
-# front, left and up of the object, in the coordinates of `synthetic_views`
+# Front, left and up of the object, in the coordinates of `synthetic_views`: any rotation does.
 CANONICAL = look_at((1, 0.5, 0.2)).R
-CLEAR_OF_THE_FLOOR = np.s_[450:, :]  # the motorcycle does not reach the lowest rows
+FLOOR = np.s_[450:, :]  # the lowest rows, which the motorcycle does not reach
 
 
 def angle(first, second) -> float:
-    first, second = np.asarray(first), np.asarray(second)
-    return float(
-        np.degrees(np.arccos(first @ second / np.linalg.norm(first) / np.linalg.norm(second)))
-    )
+    """The angle between two vectors in degrees."""
+    cosine = np.dot(first, second) / np.linalg.norm(first) / np.linalg.norm(second)
+    return float(np.degrees(np.arccos(cosine)))
 
 
 @pytest.fixture(scope="module")
@@ -46,46 +45,50 @@ def test_the_mask_holds_the_seat_and_both_wheels_and_neither_the_floor_nor_the_b
     front_tyre = (370, 675)
     floor = (470, 300)
     bench = (160, 100)
-    assert [frame.mask[pixel] for pixel in (seat, rear_tyre, front_tyre, floor, bench)] == [
-        1,
-        1,
-        1,
-        0,
-        0,
-    ]
+    pixels = (seat, rear_tyre, front_tyre, floor, bench)
+    assert [frame.mask[pixel] for pixel in pixels] == [1, 1, 1, 0, 0]
 
 
 def test_up_is_the_normal_of_the_floor_and_front_is_parallel_to_it(frame):
-    floor = frame.depth[CLEAR_OF_THE_FLOOR] > 0
-    normal, _ = fit_plane(
-        unproject_depth(frame.depth, frame.camera)[CLEAR_OF_THE_FLOOR][floor], 0.01
-    )
+    known = frame.depth[FLOOR] > 0
+    points = unproject_depth(frame.depth, frame.camera)[FLOOR][known]
+    normal, _ = fit_plane(points, 0.01)
+    # y points down in cameras: the normal that points up has a negative y. In degrees.
     assert angle(-np.sign(normal[1]) * normal, UP) < 2
     assert abs(angle(FRONT, UP) - 90) < 1
 
 
-def test_the_photograph_is_scaled_as_scenes_of_co3d_and_is_the_same_at_every_call(frame):
-    first, second = load_photograph(), load_photograph()
-    assert_allclose(axis_deviation(object_points(first)), 1, atol=1e-4)
+def test_the_photograph_is_scaled_as_scenes_of_co3d(frame):
+    photograph = load_photograph()
+    assert_allclose(axis_deviation(object_points(photograph)), 1, atol=1e-4)
     unit = axis_deviation(object_points(frame))
     assert_allclose(unit, 0.22, atol=0.005)  # metres, as the documentation says
-    np.testing.assert_allclose(first.depth * unit, frame.depth, rtol=1e-5)
-    assert all(
-        np.array_equal(getattr(first, name), getattr(second, name))
-        for name in ("rgb", "depth", "mask")
-    )
+    assert_allclose(photograph.depth * unit, frame.depth, rtol=1e-5)
+
+
+def test_the_photograph_is_the_same_at_every_call():
+    first, second = load_photograph(), load_photograph()
+    for name in ("rgb", "depth", "mask"):
+        assert_array_equal(getattr(first, name), getattr(second, name))
 
 
 def test_depth_follows_from_the_disparity_by_the_calibration(frame):
     import skimage.data
 
-    _, right, disparity = skimage.data.stereo_motorcycle()
+    *_, disparity = skimage.data.stereo_motorcycle()
     row, col = 330, 390  # on the engine
-    point = frame.camera.unproject_camera(np.array([col + 0.5, row + 0.5]), frame.depth[row, col])
-    # The right camera stands 0.193001 m to the right; its principal point lies 31.086 pixels
+    x, _, z = frame.camera.unproject_camera(np.array([col + 0.5, row + 0.5]), frame.depth[row, col])
+    # Middlebury's calibration, in metres and pixels. The principal point of the right camera lies
     # farther right.
-    seen = 994.978 * (point[0] - 0.193001) / point[2] + 311.193 + 31.086
+    focal, centre, farther, baseline = 994.978, 311.193, 31.086, 0.193001
+    seen = focal * (x - baseline) / z + centre + farther
     assert_allclose(seen, col + 0.5 - disparity[row, col], atol=1e-3)
+
+
+def test_depth_is_zero_where_the_disparity_is_unknown(frame):
+    import skimage.data
+
+    *_, disparity = skimage.data.stereo_motorcycle()
     unknown = ~np.isfinite(disparity)
     assert unknown.any()
     assert_array_equal(frame.depth[unknown], 0)
@@ -93,23 +96,23 @@ def test_depth_follows_from_the_disparity_by_the_calibration(frame):
 
 @pytest.fixture(scope="module")
 def motorcycles(tmp_path_factory):
-    """A synthetic category "motorcycle" with two sequences, elsewhere in their world, and their
-    object poses."""
-    root, sequences, poses = tmp_path_factory.mktemp("motorcycles"), [], {}
-    points = default_rng(0).uniform(-1, 1, (400, 3))
-    for name in ("second", "first"):
-        frames, colours = around(ELSEWHERE), np.full((400, 3), 128, np.uint8)
-        sequences.append(
-            SequenceData(name, frames, list(range(7)), ELSEWHERE.apply(points), colours)
-        )
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = ELSEWHERE.R @ CANONICAL, ELSEWHERE.t
-        poses[name] = {
-            "trans": pose.tolist(),
-            "scale": ELSEWHERE.scale,
-            "low": [-1.0] * 3,
-            "high": [1.0] * 3,
-        }
+    """A synthetic category "motorcycle" of two sequences of the object ELSEWHERE, with its true
+    pose."""
+    root = tmp_path_factory.mktemp("motorcycles")
+    frames = around(ELSEWHERE)
+    points = ELSEWHERE.apply(default_rng(0).uniform(-1, 1, (400, 3)))
+    colours = np.full((400, 3), 128, np.uint8)
+    trans = np.eye(4)
+    trans[:3, :3] = ELSEWHERE.R @ CANONICAL
+    trans[:3, 3] = ELSEWHERE.t
+    pose = {
+        "trans": trans.tolist(),
+        "scale": ELSEWHERE.scale,
+        "low": [-1.0] * 3,
+        "high": [1.0] * 3,
+    }
+    poses = dict.fromkeys(("second", "first"), pose)
+    sequences = [SequenceData(name, frames, list(range(7)), points, colours) for name in poses]
     write_co3d(root, "motorcycle", sequences, quality=98)
     (root / "motorcycle/object_poses.json").write_text(json.dumps(poses))
     (root / "rendered_models.json").write_text("{}")
@@ -118,7 +121,7 @@ def motorcycles(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def photograph():
-    """Stands in for the photograph in all that follows."""
+    """A rendered frame that takes the place of the photograph."""
     rendered = render(look_at((-0.7, 1, 0.35)), AT_HOME, "photograph")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("zsp_lite.course.motorcycle.load_photograph", lambda: rendered)
@@ -129,19 +132,19 @@ def test_with_perfect_features_the_directions_and_the_cloud_are_those_of_the_obj
     motorcycles, photograph
 ):
     truth = photograph.camera.R @ CANONICAL
+    # The cloud of the sequences, seen by the camera of the photograph.
     points = photograph.camera.to_camera(default_rng(0).uniform(-1, 1, (400, 3)))
-    by_eye = np.array([FRONT, UP])
     results = list(run_photograph(motorcycles, CoordinateBackbone()))
     assert len(results) == 4  # two foregrounds, two solvers
     for result in results:
         relative = result.estimate.target_camera.R @ ELSEWHERE.R @ photograph.camera.R.T
         error = rotation_error(result.estimate.sim3.R, relative)
-        assert error < 12
+        assert error < 12  # degrees: two patches
         assert_allclose(rotation_error(result.axes, truth), error, atol=1e-4)
-        cosines = (result.axes.T[[0, 2]] * by_eye).sum(axis=1) / np.linalg.norm(by_eye, axis=1)
-        assert_allclose(
-            np.cos(np.radians([result.front_error, result.up_error])), cosines, atol=1e-6
-        )
+        front, _, up = result.axes.T
+        assert_allclose(result.front_error, angle(front, FRONT), atol=1e-4)
+        assert_allclose(result.up_error, angle(up, UP), atol=1e-4)
+        # The cloud has a size of 2; `along` is the coordinate of each point towards the front.
         assert np.linalg.norm(result.cloud - points, axis=1).mean() < 0.3
         assert np.corrcoef(points @ truth[:, 0], result.along)[0, 1] > 0.999
 

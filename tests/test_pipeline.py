@@ -147,10 +147,9 @@ def test_a_setting_reaches_its_stage_and_no_earlier_one(
     reference, targets, setting, value, first_changed
 ):
     frames = reference, targets[::2]
-    base, found = (
-        by_stage(one.estimate(*frames)) for one in (BASE, replace(BASE, **{setting: value}))
-    )
-    changed = [name for name in base if not np.array_equal(base[name], found[name])]
+    base = by_stage(BASE.estimate(*frames))
+    other = by_stage(replace(BASE, **{setting: value}).estimate(*frames))
+    changed = [name for name in base if not np.array_equal(base[name], other[name])]
     assert changed[0] == first_changed
 
 

@@ -11,76 +11,92 @@ from zsp_lite.verified.scene import Projection
 from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, PointTerms
 from zsp_lite.viz import plots, point_classes
 
+GRID = (3, 4)  # patches of 20 x 20 pixels
 IMAGE = np.zeros((60, 80, 3), np.uint8)
 pytestmark = pytest.mark.usefixtures("closed_figures")
 CAMERA = Camera(np.eye(3), np.zeros(3), np.array([100.0, 100.0]), np.array([40.0, 30.0]), (60, 80))
 
 
 def test_patches_are_marked_at_their_centres_in_pixels_x_y():
-    centres = plots.patch_centres(np.array([[0, 0], [2, 3]]), (3, 4), (60, 80))
+    centres = plots.patch_centres(np.array([[0, 0], [2, 3]]), GRID, (60, 80))
     assert_allclose(centres, [[10, 10], [70, 50]])
-    similar = np.zeros((3, 4))
-    similar[2, 1] = 0.9
-    maps, circles = {"this patch": None, "key": similar}, [(0, 0), (2, 1)]
-    first, second = plots.show_maps(
-        [IMAGE, IMAGE], maps, circles=circles, stars=[None, (1, 3)]
-    ).axes
-    marks = [
-        (line.get_marker(), *line.get_xydata()[0])
-        for axis in (first, second)
-        for line in axis.lines
-    ]
+
+
+def test_patches_of_maps_are_marked_at_their_centres():
+    figure = plots.show_maps(
+        [IMAGE, IMAGE],
+        {"this patch": None, "key": np.zeros(GRID)},
+        circles=[(0, 0), (2, 1)],
+        stars=[None, (1, 3)],
+    )
+    lines = [line for axis in figure.axes for line in axis.lines]
+    marks = [(line.get_marker(), *line.get_xydata()[0]) for line in lines]
     assert marks == [("o", 10, 10), ("o", 30, 50), ("*", 70, 30)]
 
 
 def test_lines_join_the_centres_of_matched_patches_and_those_of_outliers_are_dashed():
     cells = np.array([[0, 0], [1, 1], [2, 3]])
     figure = plots.show_matches(
-        [IMAGE, IMAGE], [cells, cells[::-1]], (3, 4), np.array([True, False, True])
+        [IMAGE, IMAGE], [cells, cells[::-1]], GRID, np.array([True, False, True])
     )
     lines = {(tuple(line.xy1), tuple(line.xy2)): line.get_linestyle() for line in figure.artists}
-    assert set(lines) == {((10, 10), (70, 50)), ((30, 30), (30, 30)), ((70, 50), (10, 10))}
-    # outliers first, below
-    assert [line in ("-", "solid") for line in lines.values()] == [
-        False,
-        True,
-        True,
-    ]
+    # Outliers are drawn first, so that they lie below; their match here is the middle one.
+    outlier, *inliers = lines
+    assert outlier == ((30, 30), (30, 30))
+    assert set(inliers) == {((10, 10), (70, 50)), ((70, 50), (10, 10))}
+    assert [line in ("-", "solid") for line in lines.values()] == [False, True, True]
 
 
-def test_points_and_axes_are_drawn_where_they_project_unless_behind_the_camera():
+@pytest.fixture
+def axis():
+    """The axes of a picture of `IMAGE`."""
     _, (axis,) = plots.show_images([IMAGE])
-    # With focal length 100 and principal point (40, 30), (0.1, 0, 1) is 10 pixels to the right of
-    # the latter.
+    return axis
+
+
+def test_points_are_drawn_where_they_project_unless_behind_the_camera(axis):
+    # The first point is 0.1 to the right at depth 1: 10 pixels right of the principal point.
     plots.draw_points(axis, CAMERA, np.array([[0.1, 0, 1], [0, 0, 2], [0, 0, -1]]))
     assert_allclose(axis.collections[0].get_offsets(), [[40, 30], [50, 30]])
+    # The picture keeps its limits, with y down.
     assert axis.get_xlim() == (0, 80)
     assert axis.get_ylim() == (60, 0)
-    plots.draw_axes(
-        axis, CAMERA, np.array([0, 0, 2]), np.array([[0.2, 0, 2], [0, 0.2, 2], [0, 0, -1]]), "xyz"
-    )
-    at = {text.get_text(): text.get_position() for text in axis.texts if text.get_text()}
-    assert at == {"x": pytest.approx((50, 30)), "y": pytest.approx((40, 40))}
 
 
-def test_each_kind_of_point_is_told_from_the_others_and_drawn_where_it_projects():
-    # Points: on the surface, far behind it, far before it, outside the silhouette, over a hole in
-    # the depth.
-    behind, weight = torch.tensor([0.0, 1, -1, 0, 0]), torch.tensor([1.0, 1, 1, 0, 0])
-    off = torch.tensor([0.0, 0, 0, 0.4, 0])
-    pixels = torch.tensor([[10.0, 5], [20, 5], [30, 5], [55, 5], [20, 20]])
-    parts = (3 + behind, torch.full((5,), 3.0), weight, off, torch.arange(5), pixels)
+def test_axes_are_named_where_their_ends_project_unless_behind_the_camera(axis):
+    ends = np.array([[0.2, 0, 2], [0, 0.2, 2], [0, 0, -1]])
+    plots.draw_axes(axis, CAMERA, np.array([0, 0, 2]), ends, "xyz")
+    places = {text.get_text(): text.get_position() for text in axis.texts if text.get_text()}
+    assert places == {"x": pytest.approx((50, 30)), "y": pytest.approx((40, 40))}
+
+
+# Where five points project: on the surface, far behind it, far before it, outside the silhouette,
+# and over a hole in the depth.
+PIXELS = torch.tensor([[10.0, 5], [20, 5], [30, 5], [55, 5], [20, 20]])
+
+
+def test_each_kind_of_point_is_told_from_the_others():
+    surface = torch.full((5,), 3.0)  # depth of the view
+    behind = torch.tensor([0.0, 1, -1, 0, 0])
+    # A point outside the silhouette or over a hole says nothing of the depth.
+    weight = torch.tensor([1.0, 1, 1, 0, 0])
+    outside = torch.tensor([0.0, 0, 0, 0.4, 0])  # distance from the silhouette
+    parts = (surface + behind, surface, weight, outside, torch.arange(5), PIXELS)
     touch = weight * torch.exp(-(behind**2) / (2 * SURFACE_SIGMA**2))
     front = weight * (-(behind + SURFACE_SIGMA) / MAX_VIOLATION).clamp(0, 1)
-    values = (touch, off / MAX_VIOLATION, front, torch.zeros(5))
+    values = (touch, outside / MAX_VIOLATION, front, torch.zeros(5))
+    # The terms are of one pose and one view: (1, 1, 5).
     terms = PointTerms(
         Projection(*(x[None, None] for x in parts)), *(x[None, None] for x in values)
     )
     assert point_classes.classify_points(terms).tolist() == [[0, 1, 2, 3, 4]]
     assert list(point_classes.POINT_CLASSES)[2:4] == ["in free space", "outside the silhouette"]
+
+
+def test_points_of_all_classes_are_drawn_where_they_project():
     figure = point_classes.show_point_classes(
-        [IMAGE], ["view"], [2 * pixels.numpy()], [*point_classes.classify_points(terms)]
+        [IMAGE], ["view"], [2 * PIXELS.numpy()], [np.arange(5)]
     )
     drawn = np.concatenate([collection.get_offsets() for collection in figure.axes[0].collections])
-    # The point beyond the border (110) stands at it (80).
+    # The fourth point, at x = 110, is beyond the border and is drawn at it, x = 80.
     assert_allclose(sorted(map(tuple, drawn)), [(20, 10), (40, 10), (40, 40), (60, 10), (80, 10)])

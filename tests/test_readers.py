@@ -1,5 +1,5 @@
-"""Scans in the layouts of apps and depth cameras, made of rendered frames: what is read, refused
-and left out."""
+"""Scans in the layouts of apps and depth cameras, made of rendered frames: which are read, which
+are refused, and which frames are left out."""
 
 import json
 import re
@@ -35,39 +35,47 @@ from zsp_lite.importers import open_capture, recognise
 from zsp_lite.importers.capture import find_masks, sharpest, trusted
 from zsp_lite.importers.sources import spread_views
 
+# Frames are of a rendered hairdryer, and all writers take a folder and frames; they return the path
+# of the scan. OPENGL turns OpenCV's axes of a camera into OpenGL's.
 OPENGL = np.diag([1.0, -1, -1, 1])
+CERTAIN = 2  # the highest level of confidence, of 0 to 2
 
 
 @pytest.fixture(scope="module")
 def views():
+    """Four frames."""
     return hairdryer_views()[:4]
 
 
 def write_files(
     folder, frames, images="images/{}.jpg", depths="depth/{}.png", unit=0.001, masks="masks/{}.png"
 ):
-    """Write the images, the depth in 16 bits (0 where it is too far) and the masks of frames by
-    their numbers."""
+    """Write the images, the masks, and the depth in a unit of metres as 16 bits, of frames by their
+    numbers."""
     for k, frame in enumerate(frames):
-        write_image(folder / images.format(f"{k:06d}"), frame.rgb, 95)
+        number = f"{k:06d}"
+        write_image(folder / images.format(number), frame.rgb, quality=95)
         values = np.rint(frame.depth / unit)
-        write_depth16(
-            folder / depths.format(f"{k:06d}"), np.where(values < 65536, values, 0) / 1000
-        )
-        write_mask(folder / masks.format(f"{k:06d}"), frame.mask)
+        # 0, unknown, where 16 bits do not hold the depth; write_depth16 stores millimetres.
+        stored = np.where(values < 65536, values, 0)
+        write_depth16(folder / depths.format(number), stored / 1000)
+        write_mask(folder / masks.format(number), frame.mask)
 
 
 def write_confidence(folder, frames):
+    """Write maps of the highest confidence."""
     for k, frame in enumerate(frames):
         folder.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(folder / f"{k:06d}.png"), np.full(frame.camera.size, 2, np.uint8))
+        cv2.imwrite(str(folder / f"{k:06d}.png"), np.full(frame.camera.size, CERTAIN, np.uint8))
 
 
-def quaternion(pose):
+def quaternion(pose: np.ndarray) -> list[float]:
+    """The rotation of a pose as x, y, z, w."""
     return Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
 
 
 def write_video(path, images):
+    """Write images as a video of 30 frames per second."""
     height, width = images[0].shape[:2]
     video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30, (width, height))
     for image in images:
@@ -76,6 +84,7 @@ def write_video(path, images):
 
 
 def write_stray(folder, frames):
+    """The layout of Stray Scanner: poses in a table, 60 per second."""
     write_files(folder, frames)
     write_confidence(folder / "confidence", frames)
     write_video(folder / "rgb.mp4", [frame.rgb for frame in frames])
@@ -90,24 +99,24 @@ def write_stray(folder, frames):
 
 
 def write_polycam(folder, frames):
+    """The layout of Polycam's raw data: a JSON file for each camera."""
     inside = folder / "keyframes"
     write_files(inside, frames, images="corrected_images/{}.jpg", masks="../masks/{}.png")
     write_confidence(inside / "confidence", frames)
+    (inside / "corrected_cameras").mkdir()
     for k, frame in enumerate(frames):
         pose = to_world(frame) @ OPENGL
-        (fx, fy) = frame.camera.focal_length
-        (cx, cy) = frame.camera.principal_point
+        fx, fy = frame.camera.focal_length
+        cx, cy = frame.camera.principal_point
         camera = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
-        path = inside / f"corrected_cameras/{k:06d}.json"
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(
-            json.dumps(camera | {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "blur_score": 1.5})
-        )
+        camera |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "blur_score": 1.5}
+        (inside / f"corrected_cameras/{k:06d}.json").write_text(json.dumps(camera))
     (inside / "cameras").mkdir()
     return folder
 
 
 def write_record3d(folder, frames):
+    """The layout of Record3D: a zip with depth and confidence compressed by LZFSE."""
     height, width = frames[0].camera.size
     poses = [to_world(frame) @ OPENGL for frame in frames]
     metadata = {
@@ -122,46 +131,43 @@ def write_record3d(folder, frames):
     with zipfile.ZipFile(path, "w") as zipped:
         zipped.writestr("metadata", json.dumps(metadata))
         for k, frame in enumerate(frames):
-            zipped.writestr(
-                f"rgbd/{k}.jpg", cv2.imencode(".jpg", frame.rgb[..., ::-1])[1].tobytes()
-            )
-            zipped.writestr(
-                f"rgbd/{k}.depth",
-                lzfse.compress(np.where(frame.depth > 0, frame.depth, np.nan).tobytes()),
-            )
-            zipped.writestr(
-                f"rgbd/{k}.conf", lzfse.compress(np.full(frame.depth.shape, 2, np.uint8).tobytes())
-            )
-            zipped.writestr(
-                f"masks/{k}.png", cv2.imencode(".png", np.uint8(255 * frame.mask))[1].tobytes()
-            )
+            _, image = cv2.imencode(".jpg", frame.rgb[..., ::-1])
+            _, mask = cv2.imencode(".png", np.uint8(255 * frame.mask))
+            depth = np.where(frame.depth > 0, frame.depth, np.nan)
+            confidence = np.full(depth.shape, CERTAIN, np.uint8)
+            zipped.writestr(f"rgbd/{k}.jpg", image.tobytes())
+            zipped.writestr(f"rgbd/{k}.depth", lzfse.compress(depth.tobytes()))
+            zipped.writestr(f"rgbd/{k}.conf", lzfse.compress(confidence.tobytes()))
+            zipped.writestr(f"masks/{k}.png", mask.tobytes())
     return path
 
 
 def write_tum(folder, frames):
+    """The layout of TUM RGB-D: depth and poses have times of their own, a little later than those
+    of the images."""
     write_files(folder, frames, unit=1 / 5000)
-    for kind, ending in (("rgb", "images/{:06d}.jpg"), ("depth", "depth/{:06d}.png")):
-        lines = [
-            f"{10 + k + 0.01 * (kind == 'depth')} {ending.format(k)}" for k in range(len(frames))
-        ]
-        (folder / f"{kind}.txt").write_text("# time file\n" + "\n".join(lines))
+    numbers = range(len(frames))
+    images = [f"{10 + k} images/{k:06d}.jpg" for k in numbers]
+    depths = [f"{10.01 + k} depth/{k:06d}.png" for k in numbers]
+    (folder / "rgb.txt").write_text("\n".join(["# time file", *images]))
+    (folder / "depth.txt").write_text("\n".join(["# time file", *depths]))
     rows = [
-        [10.005 + k, *to_world(one)[:3, 3], *quaternion(to_world(one))]
-        for k, one in enumerate(frames)
+        [10.005 + k, *to_world(frame)[:3, 3], *quaternion(to_world(frame))]
+        for k, frame in enumerate(frames)
     ]
     np.savetxt(folder / "groundtruth.txt", rows, header="time tx ty tz qx qy qz qw")
     return folder
 
 
 def write_bop(folder, frames, objects=(5,)):
-    write_files(
-        folder,
-        frames,
-        "rgb/{}.jpg",
-        unit=0.0005,
-        masks="mask_visib/{}_" + f"{len(objects) - 1:06d}.png",
-    )
-    scene, cameras = {}, {}
+    """The layout of BOP: poses of objects by their numbers, in millimetres; depth in 0.5 mm.
+
+    The masks are those of the last object.
+    """
+    masks = "mask_visib/{}_" + f"{len(objects) - 1:06d}.png"
+    write_files(folder, frames, "rgb/{}.jpg", unit=0.0005, masks=masks)
+    scene = {}
+    cameras = {}
     for k, frame in enumerate(frames):
         pose = {
             "cam_R_m2c": frame.camera.R.ravel().tolist(),
@@ -176,18 +182,20 @@ def write_bop(folder, frames, objects=(5,)):
 
 
 def write_scannet(folder, frames):
+    """The layout of ScanNet: a text file for each matrix."""
     write_files(folder, frames, "color/{}.jpg")
     for name in ("pose", "intrinsic"):
         (folder / name).mkdir()
     for k, frame in enumerate(frames):
         np.savetxt(folder / f"pose/{k:06d}.txt", to_world(frame))
-    whole = np.eye(4)
-    whole[:3, :3] = frames[0].camera.K
-    np.savetxt(folder / "intrinsic/intrinsic_color.txt", whole)
+    intrinsics = np.eye(4)
+    intrinsics[:3, :3] = frames[0].camera.K
+    np.savetxt(folder / "intrinsic/intrinsic_color.txt", intrinsics)
     return folder
 
 
 def write_open3d(folder, frames):
+    """The layout of Open3D's reconstruction system: poses in one log."""
     write_files(folder, frames, "color/{}.jpg")
     K = frames[0].camera.K - HALF_PIXEL
     (folder / "intrinsic.json").write_text(json.dumps({"intrinsic_matrix": K.T.ravel().tolist()}))
@@ -198,7 +206,7 @@ def write_open3d(folder, frames):
 
 
 def write_zip_of_nerfstudio(folder, frames):
-    """As an app shares it: with one folder in the zip."""
+    """The layout of nerfstudio in one folder of a zip, as an app shares it."""
     write_nerfstudio(folder / "my scan", frames)
     return shutil.make_archive(folder, "zip", folder)
 
@@ -219,10 +227,12 @@ WRITERS = {
 def write(layout, folder, frames):
     """Write a scan; returns its path, and the options by which it is read."""
     folder.mkdir()
-    (fx, fy), (cx, cy) = frames[0].camera.focal_length, frames[0].camera.principal_point
+    path = WRITERS[layout](folder, frames)
+    if layout != "tum":
+        return path, {}
     # The files of TUM say nothing of the camera.
-    options = {"intrinsics": (fx, fy, cx, cy)} if layout == "tum" else {}
-    return WRITERS[layout](folder, frames), options
+    camera = frames[0].camera
+    return path, {"intrinsics": (*camera.focal_length, *camera.principal_point)}
 
 
 @pytest.mark.parametrize("layout", WRITERS)
@@ -234,12 +244,14 @@ def test_each_layout_is_recognised_and_gives_the_cameras_the_depth_and_the_masks
     assert recognise(path)[0] == layout
     assert not capture.left_out
     assert open_source(path, **options).mask == "given"
-    for one, view in zip(capture.frames, views, strict=True):
-        frame, known = one.load(), view.depth > 0
+    for read, view in zip(capture.frames, views, strict=True):
+        frame = read.load()
+        known = view.depth > 0
         assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
         assert_allclose(frame.camera.K, view.camera.K, atol=1e-6)
-        assert_allclose(frame.depth[known], view.depth[known], atol=6e-4)
+        assert_allclose(frame.depth[known], view.depth[known], atol=6e-4)  # depth in millimetres
         assert_array_equal(frame.mask > 0.5, view.mask > 0.5)
+        # The images are JPEG, or frames of a video.
         assert np.abs(frame.rgb.astype(int) - view.rgb).mean() < 8
 
 
@@ -249,11 +261,13 @@ def each(change: Callable[[dict], object]) -> Callable[[dict], list]:
 
 
 def linked(folder):
+    """Move the images elsewhere, with a link in their place."""
     (folder / "images").rename(folder.parent / "large disk")
     (folder / "images").symlink_to(folder.parent / "large disk")
     return folder
 
 
+# Each takes the folder of a scan of nerfstudio, changes it, and returns the path to open.
 RELATIVES = {
     "camera_angle_x": edited(
         lambda c: c.update(camera_angle_x=2 * np.arctan(c.pop("w") / 2 / c.pop("fl_x"))),
@@ -284,16 +298,18 @@ def test_relatives_of_nerfstudio_are_read(tmp_path, views, kind, links):
     (tmp_path / "scan").mkdir()
     write_nerfstudio(tmp_path / "scan", views)
     capture = open_capture(RELATIVES[kind](tmp_path / "scan"))
-    for one, view in zip(capture.frames, views, strict=True):
-        frame = one.load()
+    for read, view in zip(capture.frames, views, strict=True):
+        frame = read.load()
+        known = view.mask > 0
         assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
-        # 0.6 pixels off the middle
+        # Where a file gives an angle alone, the principal point is the middle, 0.6 pixels off.
         assert_allclose(frame.camera.K, view.camera.K, rtol=0.02)
-        assert_allclose(frame.depth[view.mask > 0], view.depth[view.mask > 0], atol=6e-4)
+        assert_allclose(frame.depth[known], view.depth[known], atol=6e-4)
 
 
 def first(change):
-    return edited(lambda c: change(c["frames"][0]))
+    """Return a change of the first frame of transforms.json."""
+    return edited(lambda content: change(content["frames"][0]))
 
 
 @pytest.mark.parametrize(
@@ -322,26 +338,37 @@ def test_a_frame_that_cannot_be_used_is_left_out_and_named(tmp_path, views, dama
     write_nerfstudio(tmp_path, views)
     damage(tmp_path)
     capture = open_capture(tmp_path)
-    assert [one.image.name for one in capture.frames] == ["0001.jpg", "0002.jpg", "0003.jpg"]
+    assert [frame.image.name for frame in capture.frames] == ["0001.jpg", "0002.jpg", "0003.jpg"]
     source = open_source(tmp_path)
     (flag,) = source.flags(source.load([0]))
     assert all(re.search(message, line) for line in (*capture.left_out, flag))
     assert "frames left out: 1: " in flag
 
 
-def test_a_damaged_picture_is_left_out_and_named_unless_too_few_remain(tmp_path, views, run):
-    (tmp_path / "scan").mkdir()
-    write_nerfstudio(tmp_path / "scan", views)
-    images = sorted((tmp_path / "scan/images").iterdir())
-    images[2].write_bytes(images[2].read_bytes()[:500])
-    found = estimate_pose(*2 * [tmp_path / "scan"], "paper", backbone=CoordinateBackbone())
-    assert len(found.targets) == 3
-    assert sum("frames left out: 1: image" in flag for flag in found.estimates["paper"].flags) == 2
-    line = f"data import {tmp_path}/scan --root {tmp_path}/mine --category teapot --sequence"
+@pytest.fixture
+def damaged(tmp_path, views):
+    """A scan of four frames, one of whose images is cut off."""
+    folder = tmp_path / "scan"
+    folder.mkdir()
+    write_nerfstudio(folder, views)
+    image = folder / "images/0002.jpg"
+    image.write_bytes(image.read_bytes()[:500])
+    return folder
+
+
+def test_an_estimate_names_a_damaged_image_of_each_side(damaged):
+    result = estimate_pose(damaged, damaged, "paper", backbone=CoordinateBackbone())
+    assert len(result.targets) == 3
+    flags = result.estimates["paper"].flags
+    assert sum("frames left out: 1: image" in flag for flag in flags) == 2
+
+
+def test_an_import_names_a_damaged_image_unless_too_few_remain(damaged, tmp_path, run):
+    line = f"data import {damaged} --root {tmp_path}/mine --category teapot --sequence"
     text = run(f"{line} one")
     assert "3 frames" in text
     assert "flag: frames left out: 1: image" in text
-    images[1].write_bytes(b"")
+    (damaged / "images/0001.jpg").write_bytes(b"")
     assert "2 frames remain, expected 3: image" in run(f"{line} two", 2)
 
 
@@ -351,26 +378,24 @@ def test_a_damaged_picture_is_left_out_and_named_unless_too_few_remain(tmp_path,
 def test_a_path_that_leads_out_of_the_capture_is_refused(tmp_path, views, path):
     write_nerfstudio(tmp_path, views)
     first(lambda f: f.update(file_path=path))(tmp_path)
-    refused(
-        "leads out of the folder .*, expected a path inside, relative or absolute",
-        open_capture,
-        tmp_path,
-    )
+    message = "leads out of the folder .*, expected a path inside, relative or absolute"
+    refused(message, open_capture, tmp_path)
 
 
 def test_masks_belong_to_images_by_relative_path_then_name_then_stem(tmp_path):
     for name in "a/1.png 2.jpg.png 2.png 3.png 4.png".split():
         write_mask(tmp_path / name, np.ones((4, 4), np.float32))
-    names = ("a/1.jpg", "b/1.jpg", "a/2.jpg", "a/3.jpg", "a/4.jpg", "b/4.jpg")
-    found = find_masks(tmp_path, [Path("scan/images", name) for name in names])
-    assert found == [
-        tmp_path / "a/1.png",
-        None,
-        tmp_path / "2.jpg.png",
-        tmp_path / "3.png",
-        None,
-        None,
-    ]
+    mask_of = {
+        "a/1.jpg": tmp_path / "a/1.png",
+        "b/1.jpg": None,
+        "a/2.jpg": tmp_path / "2.jpg.png",
+        "a/3.jpg": tmp_path / "3.png",
+        # Two images have this name: it tells them not apart.
+        "a/4.jpg": None,
+        "b/4.jpg": None,
+    }
+    images = [Path("scan/images", name) for name in mask_of]
+    assert find_masks(tmp_path, images) == [*mask_of.values()]
 
 
 def test_lists_have_names_with_signs_cameras_for_each_image_and_several_sizes(tmp_path, views):
@@ -381,26 +406,38 @@ def test_lists_have_names_with_signs_cameras_for_each_image_and_several_sizes(tm
         mask=views[1].mask[:, :64],
         camera=views[1].camera.crop((0, 0, 96, 64)),
     )
-    frames = [replace(views[0], name="cup #10"), replace(upright, name="cup #9")]
-    write_lists(tmp_path, frames)
+    write_lists(tmp_path, [replace(views[0], name="cup #10"), replace(upright, name="cup #9")])
     np.savetxt(tmp_path / "intrinsics.txt", [[300, 301, 60, 48], [200, 201, 40, 48]])
-    nine, ten = (one.load().camera for one in open_capture(tmp_path).frames)
-    assert (nine.size, ten.size) == ((96, 64), (96, 128))
-    assert (nine.focal_length.tolist(), ten.focal_length.tolist()) == ([200, 201], [300, 301])
+    # Frames are in the order of the numbers in their names.
+    upright, wide = [frame.load().camera for frame in open_capture(tmp_path).frames]
+    assert upright.size == (96, 64)
+    assert wide.size == (96, 128)
+    assert upright.focal_length.tolist() == [200, 201]
+    assert wide.focal_length.tolist() == [300, 301]
+
+
+def test_lists_may_have_one_camera_for_all_images(tmp_path, views):
+    write_lists(tmp_path, views)
     (tmp_path / "intrinsics.txt").write_text("300 301 60 48\n")
-    assert {one.camera.focal_length[0] for one in open_capture(tmp_path).frames} == {300}
+    assert {frame.camera.focal_length[0] for frame in open_capture(tmp_path).frames} == {300}
 
 
-def test_options_of_formats(tmp_path, views):
+def test_the_camera_of_tum_is_by_default_that_of_its_sensors(tmp_path, views):
     write("tum", tmp_path / "tum", views)
     assert open_capture(tmp_path / "tum").frames[0].camera.principal_point.tolist() == [320, 240]
-    write_bop(tmp_path / "bop", views, objects=(3, 5))
-    refused(
-        "has the objects 3, 5, expected one of them as --object N", open_source, tmp_path / "bop"
-    )
-    source = open_source(tmp_path / "bop", object=5, depth_unit=0.01)
-    assert source.mask == "given"
-    assert source.load([0])[0].depth.max() > 15 * views[0].depth.max()
+
+
+def test_of_several_objects_of_bop_one_is_chosen(tmp_path, views):
+    write_bop(tmp_path, views, objects=(3, 5))
+    refused("has the objects 3, 5, expected one of them as --object N", open_source, tmp_path)
+    assert open_source(tmp_path, object=5).mask == "given"
+
+
+def test_the_unit_of_depth_can_be_given(tmp_path, views):
+    write_bop(tmp_path, views)
+    # 10 mm, where the files say 0.5 mm: 20 times as far.
+    (frame,) = open_source(tmp_path, depth_unit=0.01).load([0])
+    assert frame.depth.max() == pytest.approx(20 * views[0].depth.max(), rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -428,6 +465,7 @@ def test_what_is_no_capture_is_answered_with_what_it_lacks(tmp_path, files, mess
 
 
 def zipped(path, name="rgb.txt", data=b"", flag=0):
+    """Write a zip with one file; the flag 1 says that it is encrypted."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         member = zipfile.ZipInfo(name)
         member.compress_type = zipfile.ZIP_DEFLATED
@@ -452,62 +490,78 @@ def test_a_zip_that_is_damaged_malicious_or_large_is_refused(tmp_path, monkeypat
     refused(f"zip .*scan.zip cannot be unpacked: {message}", recognise, tmp_path / "scan.zip")
 
 
-def test_the_sharpest_frames_of_a_video_and_of_images_are_chosen(tmp_path, views):
-    read = []
-    blank = np.zeros((8, 8), np.uint8)
-    chosen = list(sharpest(range(2000), 100, lambda k: read.append(k) or blank, []))
-    assert len(chosen) == 100
-    assert len(read) <= 1000
-    blurred = [
-        replace(views[0], rgb=cv2.GaussianBlur(views[0].rgb, (15, 15), 3), name=f"{k:04d}")
-        for k in range(9)
-    ]
-    for sharp in (3, 8):
-        blurred[sharp] = replace(blurred[sharp], rgb=views[0].rgb)
-    for layout in ("stray", "lists", "record3d"):
-        path, _ = write(layout, tmp_path / layout, blurred)
-        assert [int(one.image.stem) for one in open_capture(path, count=3).frames] == [0, 3, 8]
+def test_at_most_ten_images_are_compared_for_each_that_is_chosen():
+    compared = []
+
+    def read(number: int) -> np.ndarray:
+        compared.append(number)
+        return np.zeros((8, 8), np.uint8)
+
+    assert len(list(sharpest(range(2000), 100, read, []))) == 100
+    assert len(compared) <= 1000
 
 
-def test_the_scans_of_record3d_without_tracking_or_without_the_package_are_refused(
-    tmp_path, views, monkeypatch
-):
-    path, _ = write(
-        "record3d", tmp_path / "scan", [replace(view, camera=views[0].camera) for view in views]
-    )
+# Images of a video, of files, and of a zip.
+@pytest.mark.parametrize("layout", ["stray", "lists", "record3d"])
+def test_the_sharpest_image_of_each_part_is_chosen(tmp_path, views, layout):
+    image = views[0].rgb
+    blurred = cv2.GaussianBlur(image, ksize=(15, 15), sigmaX=3)
+    # In the first of three parts all images are equal.
+    images = [image if k in (3, 8) else blurred for k in range(9)]
+    frames = [replace(views[0], rgb=rgb, name=f"{k:04d}") for k, rgb in enumerate(images)]
+    path, _ = write(layout, tmp_path / layout, frames)
+    assert [int(frame.image.stem) for frame in open_capture(path, count=3).frames] == [0, 3, 8]
+
+
+def test_a_scan_of_record3d_is_refused_without_its_package(tmp_path, views, monkeypatch):
+    path, _ = write("record3d", tmp_path / "scan", views)
     monkeypatch.setitem(sys.modules, "lzfse", None)
     refused("compressed by LZFSE, expected its package: pip install lzfse", open_capture, path)
+
+
+def test_a_scan_of_record3d_without_tracking_is_refused(tmp_path):
     metadata = {"K": [1.0] * 9, "dw": 4, "dh": 4, "poses": [[0.0] * 7] * 3}
-    (tmp_path / "scan/rgbd").mkdir()
-    (tmp_path / "scan/metadata").write_text(json.dumps(metadata))
-    refused("all 3 poses are zero: the tracking failed", open_capture, tmp_path / "scan")
+    (tmp_path / "rgbd").mkdir()
+    (tmp_path / "metadata").write_text(json.dumps(metadata))
+    refused("all 3 poses are zero: the tracking failed", open_capture, tmp_path)
 
 
-def test_depth_of_middle_confidence_is_dropped_in_thin_bands_only():
-    """Smeared silhouettes: the depth map is low-pass filtered, and its confidence is 1 where it is
-    wrong."""
-    y, x = np.mgrid[:192, :256]
-    disc = (y - 96) ** 2 + (x - 128) ** 2 < 50**2
-    true = np.where(disc, 0.5, 1.2)
-    smeared = cv2.blur(true, (5, 5))
-    wrong = np.abs(smeared - true) > 0.01
-    levels = np.where(wrong, 1, 2).astype(np.uint8)
-    kept = trusted(levels)
-    assert wrong.mean() > 0.01
-    assert not (kept & wrong).any()
-    assert kept[~wrong].all()
-    # A dark surface is all of the middle level, and is kept; level 0 never is. The levels of
-    # Polycam reach 255.
-    dark = np.where(disc & ~wrong, 1, levels).astype(np.uint8)
-    assert trusted(dark)[disc & ~wrong].mean() > 0.95
-    assert_array_equal(trusted(dark * np.uint8(127) + (dark == 2)), trusted(dark))
-    dark[:20] = 0
-    assert not trusted(dark)[:20].any()
+# A disc before a wall, in metres, whose depth map is low-pass filtered: its silhouette is smeared.
+# The confidence is in the middle, 1, where the depth is wrong.
+_Y, _X = np.mgrid[:192, :256]
+DISC = (_Y - 96) ** 2 + (_X - 128) ** 2 < 50**2
+TRUE_DEPTH = np.where(DISC, 0.5, 1.2)
+WRONG = np.abs(cv2.blur(TRUE_DEPTH, (5, 5)) - TRUE_DEPTH) > 0.01
+LEVELS = np.where(WRONG, 1, CERTAIN).astype(np.uint8)
+# The disc is dark, so that the middle level is all that there is.
+DARK = np.where(DISC, 1, LEVELS).astype(np.uint8)
+
+
+def test_thin_bands_of_middle_confidence_are_dropped():
+    assert WRONG.mean() > 0.01
+    assert_array_equal(trusted(LEVELS), ~WRONG)
+
+
+def test_a_surface_of_middle_confidence_is_kept():
+    assert trusted(DARK)[DISC & ~WRONG].mean() > 0.95
+
+
+def test_polycams_levels_of_confidence_mean_the_same():
+    levels = np.array([0, 127, 255], np.uint8)[DARK]
+    assert_array_equal(trusted(levels), trusted(DARK))
+
+
+def test_no_confidence_is_never_trusted():
+    levels = DARK.copy()
+    levels[:20] = 0
+    assert not trusted(levels)[:20].any()
 
 
 def test_a_confidence_map_has_the_size_of_the_depth(tmp_path, views):
     path, _ = write("stray", tmp_path / "scan", views)
-    levels = np.repeat([[0], [2]], 48, axis=0).repeat(128, axis=1).astype(np.uint8)
+    # The depth of the upper half is not trusted.
+    levels = np.full((96, 128), CERTAIN, np.uint8)
+    levels[:48] = 0
     cv2.imwrite(str(path / "confidence/000001.png"), levels)
     depth = open_capture(path).frames[1].load().depth
     assert not depth[:48].any()
@@ -517,8 +571,8 @@ def test_a_confidence_map_has_the_size_of_the_depth(tmp_path, views):
     assert "000001.png is (48, 128) pixels, expected (H, W) = (96, 128)" in line
 
 
-def circle(degrees):
-    """Cameras around the origin."""
+def circle(degrees: np.ndarray) -> list[Camera]:
+    """Cameras around the origin at some azimuths."""
     turns = Rotation.from_euler("y", degrees[:, None], degrees=True).as_matrix()
     return [
         Camera(turn, np.array([0, 0, 2.0]), np.array([90.0, 90]), np.array([32.0, 32]), (64, 64))
@@ -533,7 +587,8 @@ def test_views_are_spread_evenly_whatever_their_order(count):
     gaps = np.diff(chosen, append=chosen[0] + 360)
     assert len(chosen) == count
     assert chosen[0] == 0
-    assert np.abs(gaps - 360 / count).max() <= 15
+    assert np.abs(gaps - 360 / count).max() <= 15  # the cameras stand 10 degrees apart
+    # The first view is always taken; the order of the others is of no account.
     shuffled = np.array([0, *np.random.default_rng(0).permutation(degrees[1:])])
     assert_array_equal(np.sort(shuffled[spread_views(circle(shuffled), count)]), chosen)
 

@@ -1,4 +1,4 @@
-"""Synthetic data: exports read like CO3D; labels, cameras and depth agree with the geometry."""
+"""Synthetic data: exports are read like CO3D; labels, cameras and depth agree with the geometry."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,14 +33,16 @@ from zsp_lite.course.synthetic.sequences import (
 from zsp_lite.data.labels import read_labels
 from zsp_lite.io.files import stable_hash
 
+# The builders of all categories, those of training and validation included.
 ALL = {
     name: build for builders in (*SPLITS.values(), CATEGORIES) for name, build in builders.items()
 }
-SEED, FRAMES, SIZE = 5, 6, 72
+SEED, FRAMES, SIZE = 5, 6, 72  # few frames of a small size, for speed
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
+    """An export of two objects of two categories."""
     out = tmp_path_factory.mktemp("synthetic")
     export_categories(["chair", "toytruck"], out, 2, FRAMES, SEED, SIZE)
     return out
@@ -48,35 +50,43 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def chairs():
-    """Two chairs with simulated sensor errors, each with its exact pose and scale, and its exact
-    views before that."""
+    """Two chairs as recorded by a sensor, with their exact pose, scale and views."""
 
     def recorded(index):
         name, key = sequence_name(SEED, "chair", index), stable_hash(f"{SEED}/chair/{index}")
         mesh = make_object("chair", index, SEED)
+        # `record_sequence` draws the views with the same generator.
         views, _ = render_sequence(mesh, default_rng([key, 1]), FRAMES, SIZE)
         return *record_sequence(mesh, name, key, FRAMES, SIZE), views
 
     return [recorded(0), recorded(1)]
 
 
-@pytest.mark.parametrize("category", sorted(ALL))
-def test_objects_of_a_category_have_unit_size_vary_and_differ_from_their_half_turn(
-    category,
-):
-    shapes = [make_shape(ALL[category], seed) for seed in range(4)]
+@pytest.fixture(scope="module", params=sorted(ALL))
+def shapes(request):
+    """Four objects of one category after the other."""
+    return [make_shape(ALL[request.param], seed) for seed in range(4)]
+
+
+def test_objects_have_unit_size_and_known_materials(shapes):
     for shape in shapes:
         assert shape.faces.max() < len(shape.vertices)
         assert np.isfinite(shape.vertices).all()
         assert surface_spread(shape.vertices, shape.faces) == pytest.approx(1)
-        assert 0 <= shape.material.min()
-        assert shape.material.max() < 8
+        assert set(shape.material) <= set(range(8))
+
+
+def test_objects_of_a_category_vary(shapes):
     extents = np.array([np.ptp(shape.vertices, axis=0) for shape in shapes])
     assert (extents.std(0) / extents.mean(0)).max() > 0.02
-    turned = shapes[3].vertices * [-1, -1, 1]
-    assert (
-        np.linalg.norm(shapes[3].vertices[:, None] - turned[None, ::3], axis=-1).min(0).max() > 0.2
-    )
+
+
+def test_an_object_differs_from_its_half_turn_so_that_its_pose_is_unique(shapes):
+    vertices = shapes[-1].vertices
+    turned = vertices[::3] * [-1, -1, 1]
+    distances = np.linalg.norm(vertices[:, None] - turned, axis=-1)
+    # Some vertex of the turned object is a fifth of the object's size from all others.
+    assert distances.min(0).max() > 0.2
 
 
 def test_a_soft_mask_is_1_inside_0_outside_and_between_at_the_edge():
@@ -85,26 +95,35 @@ def test_a_soft_mask_is_1_inside_0_outside_and_between_at_the_edge():
     mask = soft_mask(truth, default_rng(0))
     assert mask[30:50, 30:50].min() > 0.99
     assert mask[:16].max() < 0.1
+    # The edge of the square has 160 pixels.
     assert ((mask > 0.1) & (mask < 0.9)).sum() > 100
 
 
-def test_depth_has_holes_and_noise_and_masks_are_accurate_to_two_pixels(chairs):
+def test_depth_has_holes_and_noise(chairs):
     for data, _, scale, views in chairs:
         for frame, view in zip(data.frames, views, strict=True):
-            known = frame.depth[view.mask] > 0
-            assert 0.45 < known.mean() < 0.8  # and the others are holes
-            assert (
-                np.abs(frame.depth[view.mask] / (scale * view.depth[view.mask]) - 1)[known].mean()
-                < 0.02
-            )
+            depth = frame.depth[view.mask]
+            known = depth > 0
+            assert 0.45 < known.mean() < 0.8
+            ratios = depth[known] / (scale * view.depth[view.mask][known])
+            assert 0 < np.abs(ratios - 1).mean() < 0.02
+
+
+def test_masks_are_accurate_to_two_pixels(chairs):
+    for data, _, _, views in chairs:
+        for frame, view in zip(data.frames, views, strict=True):
             inside = view.mask.astype(np.uint8)
-            to_edge = cv2.distanceTransform(inside, cv2.DIST_L2, 5) + cv2.distanceTransform(
-                1 - inside, cv2.DIST_L2, 5
-            )
+            # The distance of each pixel from the edge, in pixels.
+            distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
+            distance += cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
             wrong = (frame.mask > 0.5) != view.mask
-            assert 0 < wrong.sum()
-            assert to_edge[wrong].max() <= 2.5
-    edge_on = replace(view, mask=np.zeros_like(view.mask))  # of a flat object
+            assert wrong.any()
+            assert distance[wrong].max() <= 2.5
+
+
+def test_a_flat_object_seen_edge_on_has_finite_depth(chairs):
+    *_, views = chairs[0]
+    edge_on = replace(views[0], mask=np.zeros_like(views[0].mask))
     assert np.isfinite(stereo_depth(edge_on, 0.3, 0.2, default_rng(0))).all()
 
 
@@ -115,15 +134,18 @@ def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):
         R, t = pose[:3, :3], pose[:3, 3]
         canonical = (data.points - t) @ R / scale
         seen = np.concatenate([view.canonical[view.mask] for view in views])
+        # The views do not show all of the object, so that points may lie a little outside.
         assert (canonical > seen.min(0) - 0.3).all()
         assert (canonical < seen.max(0) + 0.3).all()
-        for frame, view in zip(
-            data.frames, views, strict=True
-        ):  # coordinates project onto their own pixels and depth
+
+
+def test_coordinates_of_the_object_project_onto_their_own_pixels_and_depth(chairs):
+    for data, pose, scale, views in chairs:
+        R, t = pose[:3, :3], pose[:3, 3]
+        for frame, view in zip(data.frames, views, strict=True):
             row, col = np.nonzero(view.mask)
-            pixels, depth = frame.camera.project(
-                scale * view.canonical[row, col].astype(float) @ R.T + t
-            )
+            points = scale * view.canonical[row, col].astype(float) @ R.T + t
+            pixels, depth = frame.camera.project(points)
             assert np.abs(pixels - np.stack([col + 0.5, row + 0.5], 1)).max() < 0.02
             assert_allclose(depth, scale * view.depth[row, col], rtol=1e-4)
 
@@ -135,21 +157,25 @@ def test_an_export_reads_back(folder, chairs):
     assert list(read_labels(folder, "chair")) == [data.name for data, *_ in chairs]
     for data, *_ in chairs:
         assert_allclose(dataset.point_cloud("chair", data.name)[0], data.points, atol=1e-4)
-        for annotation, wanted in zip(dataset.frames("chair", data.name), data.frames, strict=True):
-            assert_allclose(dataset.load(annotation).depth, wanted.depth, rtol=1e-3)
+        for annotation, frame in zip(dataset.frames("chair", data.name), data.frames, strict=True):
+            # Files hold depth in 16 bits.
+            assert_allclose(dataset.load(annotation).depth, frame.depth, rtol=1e-3)
 
 
 def test_an_interrupted_export_is_completed_and_complete_sequences_stay(tmp_path, monkeypatch):
+    def export_mice(out: Path) -> None:
+        export_categories(["mouse"], out, 2, frames=2, seed=1, image_size=48)
+
+    # The second of two sequences is interrupted; the first is not recorded again.
     record = Mock(wraps=record_sequence, side_effect=[DEFAULT, KeyboardInterrupt, DEFAULT])
     with monkeypatch.context() as context:
         context.setattr(export, "record_sequence", record)
         with pytest.raises(KeyboardInterrupt):
-            export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
-        export_categories(["mouse"], tmp_path / "a", 2, 2, 1, 48)
-    assert [call.args[1] for call in record.call_args_list] == [
-        sequence_name(1, "mouse", k) for k in (0, 1, 1)
-    ]
-    export_categories(["mouse"], tmp_path / "b", 2, 2, 1, 48)
+            export_mice(tmp_path / "a")
+        export_mice(tmp_path / "a")
+    recorded = [call.args[1] for call in record.call_args_list]
+    assert recorded == [sequence_name(1, "mouse", k) for k in (0, 1, 1)]
+    export_mice(tmp_path / "b")
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
@@ -160,7 +186,8 @@ def test_folders_with_other_or_damaged_settings_are_input_errors(folder, tmp_pat
 
 
 def test_turns_after_which_a_shape_is_the_same_are_known():
-    square = np.array([[x, y, z] for x in (0, 2) for y in (0, 2) for z in (0, 1)], float)
-    assert shape_turns(square) == (90, 180, 270)
-    assert shape_turns(square * (2, 1, 1)) == (180,)
-    assert shape_turns(np.vstack([square, [[3, 1, 0]]])) == ()
+    # The corners of a box on a square.
+    box = np.array([[x, y, z] for x in (0, 2) for y in (0, 2) for z in (0, 1)], float)
+    assert shape_turns(box) == (90, 180, 270)
+    assert shape_turns(box * (2, 1, 1)) == (180,)
+    assert shape_turns(np.vstack([box, [[3, 1, 0]]])) == ()

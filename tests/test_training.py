@@ -1,4 +1,4 @@
-"""Training: renders of one object at a time, batches with their geometry, three losses;
+"""Training: renders of objects, batches of crops with their geometry, the three losses, and
 self-distillation."""
 
 import copy
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module", autouse=True)
 def two_rooms():
-    """Rooms take five times as long as a view."""
+    """Two rooms in place of many: a room takes five times as long as a view."""
     with patch.object(rendering, "ROOMS", 2):
         yield
 
@@ -47,11 +47,12 @@ def rendered():
 
 @pytest.fixture(scope="module")
 def renders(rendered):
+    """The renders alone."""
     return rendered[0]
 
 
 def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(rendered):
-    partner = np.arange(VIEWS) ^ 1
+    partner = np.arange(VIEWS) ^ 1  # of views 0 and 1, 2 and 3, ...
     for of_object in np.reshape(rendered[1], (3, VIEWS)):
         turns = np.subtract.outer(of_object, of_object)
         apart = np.degrees(np.abs((turns + np.pi) % (2 * np.pi) - np.pi))
@@ -119,9 +120,9 @@ def test_normals_turn_and_flip_with_the_crop(renders):
     assert set(torch.linalg.det(turn).round().tolist()) == {-1.0, 1.0}
     for crop in range(3 * VIEWS):
         right, down = grid[crop, 4, 5] - grid[crop, 4, 4], grid[crop, 5, 4] - grid[crop, 4, 4]
-        # of the crop, in the uncropped view
+        # The axes of the crop in the uncropped view.
         axes = torch.stack([right / right.norm(), down / down.norm()])
-        # a crop that is not square leans a little
+        # A crop that is not square is stretched, so that its axes lean a little.
         torch.testing.assert_close(turn[crop], axes, atol=0.15, rtol=0)
         on_object = ~batch.surface[crop, :, 0].isnan()
         before = batch.geometry[crop, on_object, :3].clone()
@@ -144,9 +145,9 @@ def test_the_correspondence_loss_of_right_and_of_wrong_keys_is_that_of_its_formu
             descriptors, places, 1, 0.15, 0.1, 48, torch.Generator().manual_seed(0)
         )
 
-    # of the place itself and of its neighbour
+    # The target weighs the place itself and its neighbour, one radius away.
     target = np.array([1, np.exp(-0.5)]) / (1 + np.exp(-0.5))
-    # similarities divided by 0.1, and zeros
+    # Logits: the similarity 1 of the own key divided by 0.1, and zeros for the 23 others.
     constant = (target * np.log(target)).sum() + np.log(np.exp(10) + 23)
     right, accuracy = loss(keys)
     assert (float(right), accuracy) == (pytest.approx(constant - 10 * target[0], abs=1e-4), 1)

@@ -44,11 +44,13 @@ def first_terms(scene, poses: Poses, stride=(1, 1)) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def views(frames):
+    """A reference view and three target views."""
     return extract_views(CoordinateBackbone(), [object_crop(frame) for frame in frames[:4]])
 
 
 @pytest.fixture(scope="module")
 def scene(views):
+    """Their scene."""
     return matched_scene(views)
 
 
@@ -81,18 +83,22 @@ def test_suppression_keeps_the_best_of_each_neighbourhood(seed):
 def test_an_object_cut_off_by_the_border_is_not_known_to_end_there():
     camera = Camera(np.eye(3), np.zeros(3), np.full(2, 64.0), np.full(2, 32.0), (64, 64))
     mask = np.zeros((64, 64), np.float32)
-    mask[:, :32] = 1  # reaches the left border, ends in the middle
+    mask[:, :32] = 1  # The object reaches the left border and ends in the middle of the image.
     features = FeatureMap(torch.zeros(8, 8, 4), torch.ones(8, 8), torch.ones(4))
     frame = Frame(np.zeros((64, 64, 3), np.uint8), np.full((64, 64), 2, np.float32), mask, camera)
     view = View(frame, features, torch.ones(8, 8, dtype=torch.bool), mask)
     maps = build_maps([view], [(np.eye(3), np.zeros(3))], Sim3.identity(), [np.arange(64)])
-    left, right = (torch.tensor([[x, 0.0, 2.0]]) for x in (-1.6, 1.6))
-    one = torch.eye(3)[None], torch.zeros(1, 3)
-    assert float(project_points(maps, *one, left).silhouette_distance) == 0
+
+    def distance(x: float) -> float:
+        """The distance from the silhouette of a point at depth 2, for the pose of no movement."""
+        point = torch.tensor([[x, 0.0, 2.0]])
+        projected = project_points(maps, torch.eye(3)[None], torch.zeros(1, 3), point)
+        return float(projected.silhouette_distance)
+
+    # Both points project 19.2 pixels beyond a border.
+    assert distance(-1.6) == 0
     # 32 pixels to the border and 19.2 beyond are 51.2, at 32 pixels per unit of length.
-    assert_allclose(
-        float(project_points(maps, *one, right).silhouette_distance), 51.2 / 32, rtol=0.05
-    )
+    assert_allclose(distance(1.6), 51.2 / 32, rtol=0.05)
 
 
 @pytest.mark.parametrize(
@@ -109,25 +115,28 @@ def test_a_map_pixel_reads_the_patch_that_its_centre_lies_in(size, grid):
         [view], [(np.eye(3), np.zeros(3))], Sim3.identity(), [np.arange(grid[0] * grid[1])]
     )
     width, height = maps.size[0].int().tolist()
-    # floor((i + 1/2) / n * cells), in exact fractions
-    row, column = (
-        [int(Fraction(2 * i + 1, 2 * n) * k) for i in range(n)]
-        for n, k in zip((height, width), grid)
-    )
-    expected = np.array(row)[:, None] * grid[1] + np.array(column)
+
+    def cells(pixels: int, count: int) -> np.ndarray:
+        """The cell in which the centre of each pixel of a side lies, in exact fractions."""
+        return np.array([int(Fraction(2 * i + 1, 2 * pixels) * count) for i in range(pixels)])
+
+    rows, columns = grid
+    expected = cells(height, rows)[:, None] * columns + cells(width, columns)
     assert_array_equal(maps.table[:, 3].reshape(height, width), expected)
 
 
 def test_outliers_far_behind_the_object_are_left_out(views):
     reference, *targets = views
     depth = reference.frame.depth.copy()
-    row, column = (int(i) for i in np.argwhere(depth > 0)[len(np.argwhere(depth > 0)) // 2])
-    row, column = row // 8 * 8, column // 8 * 8
+    # All pixels of one patch of the object, 8 x 8, are ten times as far as the object.
+    known = np.argwhere(depth > 0)
+    row, column = known[len(known) // 2] // 8 * 8
     depth[row : row + 8, column : column + 8] = 40
     spoilt = replace(reference, frame=replace(reference.frame, depth=depth))
-    whole, without = (featureless_scene([view, *targets]) for view in (reference, spoilt))
+    whole = featureless_scene(views)
+    without = featureless_scene([spoilt, *targets])
     assert len(without.reference_points) == len(whole.reference_points) - 1
-    assert float(without.reference_points.abs().max()) < 4
+    assert float(without.reference_points.abs().max()) < 4  # times the size of the object
 
 
 @pytest.mark.slow
@@ -140,7 +149,8 @@ def test_matches_with_outliers_propose_the_true_pose(seed):
     source = rng.normal(size=(30, 3))
     target = pose.apply(source)
     target[:12] = rng.normal(size=(12, 3))
-    points = (torch.tensor(part, dtype=torch.float32) for part in (source, target))
+    # The first 12 of 30 matches are outliers.
+    points = [torch.tensor(part, dtype=torch.float32) for part in (source, target)]
     found = poses_from_matches(*points, default_rng(seed))
     assert rotation_error(found.rotation[0].double().numpy(), pose.R) < 1
     assert len(found) <= 6
@@ -179,11 +189,12 @@ def test_soft_icp_approaches_the_true_pose_and_keeps_it(scene, truth):
     assert (aligned.scale / truth.scale - 1).abs().max() < 0.12
 
 
-EVERY = (5, 10)  # by hand it takes a while
+# Every fifth point of the reference and every tenth of the targets: the loops below are slow.
+EVERY = (5, 10)
 
 
 def by_hand(scene, views, pose: Sim3) -> dict[str, float]:
-    """The terms computed point by point with the cameras of the frames."""
+    """The terms of a pose, computed point by point with the cameras of the frames."""
     reference, *targets = views
     unit = 1 / scene.target_to_working.scale  # of the targets' working frame
     first = scene.target_cameras[0]
@@ -216,6 +227,8 @@ def by_hand(scene, views, pose: Sim3) -> dict[str, float]:
 
 
 def met(view: View, world: np.ndarray, unit: float) -> dict:
+    """What a point of the world meets in a view: how far it is off the silhouette or in front of
+    the surface, how near to the surface, and in which patch."""
     camera, mask = view.frame.camera, view.soft_mask
     (x, y), depth = camera.project(world)
     column, row = int(np.clip(x, 0, 223)), int(np.clip(y, 0, 223))
@@ -234,6 +247,7 @@ def met(view: View, world: np.ndarray, unit: float) -> dict:
 
 
 def patch_column(scene, targets, view, patch):
+    """The column of the similarities for a patch of a target view, None off the foreground."""
     if not targets[view].foreground[patch]:
         return None
     before = sum(int(target.foreground.sum()) for target in targets[:view])
@@ -393,12 +407,7 @@ def test_probabilities_by_hand():
         ((0.6, 0.2, 0.1), APART, False, ""),
         ((0.4, 0.3, 0.2), APART, False, "3 poses more than 30 degrees apart"),
         # probably none is right
-        (
-            (0.25, 0.2, 0.05),
-            APART,
-            False,
-            "2 poses more than 30 degrees apart",
-        ),
+        ((0.25, 0.2, 0.05), APART, False, "2 poses more than 30 degrees apart"),
         # 59.8 degrees apart: a third rotation may be near both.
         ((0.45, 0.35, 0.1), APART / 3.01, False, "2 poses more than 30 degrees apart"),
     ],

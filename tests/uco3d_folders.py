@@ -1,4 +1,4 @@
-"""A small uCO3D, made from sequences of a data folder in the layout of the published one."""
+"""Writes a small data set in the layout of uCO3D, made of sequences of a data folder."""
 
 import functools
 import sqlite3
@@ -13,7 +13,7 @@ from zsp_lite.data.labels import read_labels
 from zsp_lite.importers.capture import HALF_PIXEL
 from zsp_lite.io.ply import write_ply
 
-# The columns of both tables, those of paths and scores that the importer does not read included
+# The columns of both tables; some of them hold paths and scores that the importer does not read.
 SEQUENCE_COLUMNS = """sequence_name VARCHAR, category VARCHAR, super_category VARCHAR,
 _video_path VARCHAR, _mask_video_path VARCHAR, _depth_video_path VARCHAR,
 _segmented_point_cloud_path VARCHAR, _reconstruction_quality_viewpoint FLOAT,
@@ -26,49 +26,57 @@ _viewpoint_focal_length BLOB, _viewpoint_principal_point BLOB,
 _viewpoint_colmap_distortion_coeffs BLOB, _viewpoint_intrinsics_format VARCHAR,
 PRIMARY KEY (sequence_name, frame_number)"""
 RATE = 10.0  # frames of the videos per second
-STEP = 3  # every third frame has depth, as 200 frames of a video of uCO3D
-# k1, k2, p1, p2, k3 to k6, s1 to s4; of a phone, which moves pixels near the corners by ten
+STEP = 3  # Every third frame of the video has depth; in uCO3D 200 frames of a video have it.
+# The distortion of a phone in OpenCV's order k1, k2, p1, p2, k3 to k6, s1 to s4. It moves pixels
+# near the corners by ten pixels.
 DISTORTION = np.array([-0.06, 0.004, 0.002, -0.003, 0, 0, 0, 0, 0.001, 0, -0.001, 0])
-WORLD = 3.0  # uCO3D's lengths per length of the data folder
+# Numbers that differ from 1, so that none can be left out unnoticed.
+WORLD = 3.0  # length in uCO3D per length in the data folder
 ADJUSTMENT = 0.25  # depth per stored depth
 ALIGNED = 0.5  # scale of uCO3D's alignment
 
 
 def blob(values, kind="<f4") -> bytes:
+    """Numbers as the tables store them."""
     return np.asarray(values).astype(kind).tobytes()
 
 
 @functools.cache
 def distortion_maps(size, K):
-    """For each pixel that a camera with the `DISTORTION` takes, the pixel of a pinhole camera."""
+    """Map each pixel of a camera with the `DISTORTION` to the pixel of a pinhole camera,
+    (H, W, 2)."""
     K = np.reshape(K, (3, 3))
     rows, columns = np.indices(size, dtype=np.float64)
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
+    # Up to 50 iterations, until a step is below 1e-9 pixels.
     precisely = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-9)
     straight = cv2.undistortPoints(pixels, K, DISTORTION, R=None, P=K, criteria=precisely)
     return straight.reshape(*size, 2).astype(np.float32)
 
 
 def distort(image, K):
+    """The image of a pinhole camera as the camera with the `DISTORTION` takes it."""
     maps = distortion_maps(image.shape[:2], tuple(K.ravel()))
     return cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def insert(metadata, table, **values):
-    places = ", ".join("?" * len(values))
+    """Insert a row with values by column."""
+    marks = ", ".join("?" * len(values))
     metadata.execute(
-        f"INSERT INTO {table} ({', '.join(values)}) VALUES ({places})", [*values.values()]
+        f"INSERT INTO {table} ({', '.join(values)}) VALUES ({marks})", [*values.values()]
     )
 
 
 def open_metadata(root):
+    """Connect with the tables."""
     return sqlite3.connect(root / "metadata.sqlite")
 
 
 def write_uco3d(root, dataset, category, names):
-    """Write sequences to ROOT/things/CATEGORY; later ones have the better cameras.
+    """Write sequences to ROOT/things/CATEGORY; the quality of the cameras rises in their order.
 
-    The objects are aligned as the labels of the data folder say.
+    The alignment of the objects is that of the labels of the data folder.
     """
     root.mkdir()
     metadata = open_metadata(root)
@@ -78,7 +86,8 @@ def write_uco3d(root, dataset, category, names):
     for rank, name in enumerate(names):
         folder = f"things/{category}/{name}"
         (root / folder).mkdir(parents=True)
-        # Of column vectors, x = label @ aligned; so for rows, aligned = x @ R + T.
+        # The label maps aligned points to the world, as column vectors: x = R a + t. uCO3D stores
+        # the inverse for row vectors: a = x R - t R.
         R, t = labels[name].trans[:3, :3], labels[name].trans[:3, 3]
         insert(
             metadata,
@@ -97,7 +106,7 @@ def write_uco3d(root, dataset, category, names):
         )
         points, colours = dataset.point_cloud(category, name)
         write_ply(root / folder / "segmented_point_cloud.ply", WORLD * points, colours)
-        frames = [dataset.load(one) for one in dataset.frames(category, name)]
+        frames = [dataset.load(frame) for frame in dataset.frames(category, name)]
         _write_frames(root / folder, metadata, name, frames)
     metadata.commit()
     metadata.close()
@@ -123,9 +132,10 @@ def _write_frames(folder, metadata, name, frames):
             frame = frames[number // STEP]
             camera = frame.camera
             K = camera.K - HALF_PIXEL
-            sharp = number % STEP == 0  # the others are black
-            rgb = frame.rgb if sharp else np.zeros_like(frame.rgb)
-            mask = frame.mask if sharp else np.zeros_like(frame.mask)
+            has_depth = number % STEP == 0
+            # The other frames are black, so that a test sees if they are read.
+            rgb = frame.rgb if has_depth else np.zeros_like(frame.rgb)
+            mask = frame.mask if has_depth else np.zeros_like(frame.mask)
             videos[0].write(np.ascontiguousarray(distort(rgb, K)[..., ::-1]))
             videos[1].write(np.rint(255 * distort(mask, K)).astype(np.uint8))
             view = replace(camera, t=WORLD * camera.t).to_pytorch3d(NDC_ISOTROPIC)
@@ -136,7 +146,7 @@ def _write_frames(folder, metadata, name, frames):
                 frame_number=number,
                 frame_timestamp=number / RATE,
                 _image_size=blob(size, "<i4"),
-                _depth_scale_adjustment=ADJUSTMENT if sharp else None,
+                _depth_scale_adjustment=ADJUSTMENT if has_depth else None,
                 _mask_mass=float(frame.mask.sum()),
                 _viewpoint_R=blob(view["R"]),
                 _viewpoint_T=blob(view["T"]),
@@ -145,14 +155,14 @@ def _write_frames(folder, metadata, name, frames):
                 _viewpoint_colmap_distortion_coeffs=blob(DISTORTION),
                 _viewpoint_intrinsics_format="ndc_norm_image_bounds",
             )
-            if sharp:
+            if has_depth:
                 depths[str(number + 1)] = _stored_depth(frame, K)
     for video in videos:
         video.release()
 
 
 def _stored_depth(frame, K):
-    """The depth in the view of the undistorted image, of twice its size, infinite where unknown."""
+    """The depth of the undistorted image at twice its size, infinite where it is unknown."""
     size = frame.camera.size[::-1]
     straight, _ = cv2.getOptimalNewCameraMatrix(K, DISTORTION, size, 0)
     depth = cv2.warpPerspective(

@@ -1,5 +1,5 @@
-"""A JupyterLab of one's own on loopback, and what a reader does there: open, run, look, move a
-slider."""
+"""A JupyterLab on loopback with settings of its own, and what a reader does there: open a notebook,
+run it, look at it, move its sliders."""
 
 import json
 import os
@@ -20,7 +20,7 @@ import pytest
 
 REPOSITORY = Path(__file__).parents[2]
 
-# A notebook of which every cell is in the page, no news asked for.
+# Every cell of a notebook is in the page at all times, and nothing is asked of the network.
 _SETTINGS = {
     "@jupyterlab/notebook-extension/tracker": {"windowingMode": "none"},
     "@jupyterlab/apputils-extension/notification": {"fetchNews": "false", "checkForUpdates": False},
@@ -84,8 +84,8 @@ class Lab:
 
 @contextmanager
 def serve(folder: Path, state: Path, data: Path):
-    """A `Lab` on `folder`, with settings, workspaces and log in `state`, so that the user's own
-    stay as they are."""
+    """A `Lab` that serves `folder`; its settings, workspaces and log are in `state`, so that those
+    of the user stay as they are."""
     for plugin, settings in _SETTINGS.items():
         path = state / "settings" / f"{plugin}.jupyterlab-settings"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -101,7 +101,8 @@ def serve(folder: Path, state: Path, data: Path):
         ),
         "ZSP_LITE_DATA": str(data),
     }
-    environment.pop("MPLBACKEND", None)  # the tests' own: kernels draw into the notebook
+    # The tests draw without windows; kernels draw into the notebook.
+    environment.pop("MPLBACKEND", None)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -152,8 +153,9 @@ def open_notebook(page, lab: Lab, name: str) -> None:
     page.wait_for_selector('.jp-Notebook-ExecutionIndicator[data-status="idle"]', timeout=180_000)
 
 
-# Whether some cell has begun to run, and whether one still runs or waits: "[ ]:" has not begun,
-# "[*]:" runs.
+# Expressions of JavaScript: whether some cell has begun to run, and whether some cell still runs or
+# waits. The prompt of a cell is "[ ]:" before it begins, "[*]:" while it runs or waits, and "[1]:"
+# afterwards.
 _BEGUN = (
     "[...document.querySelectorAll('.jp-CodeCell .jp-InputPrompt')].some(e => "
     "/[*0-9]/.test(e.innerText))"
@@ -170,14 +172,15 @@ def run_all(page, patience: float) -> None:
     while not page.evaluate(_BEGUN):
         if time.monotonic() > deadline:
             raise TimeoutError(f"no code cell had begun to run after {patience:.0f} s")
-        # a notebook that has only just opened may not hear the menu
+        # A notebook that has only just opened may miss the menu: ask again after 20 s.
         if time.monotonic() > asked + 20:
             page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
             page.locator('.lm-Menu-item[data-command="runmenu:run-all"]').click()
             asked = time.monotonic()
         page.wait_for_timeout(500)
+    # Between two cells there is a moment in which none runs: it must last for three looks.
     rest = 0
-    while rest < 3:  # between two cells there is a moment in which none runs
+    while rest < 3:
         rest = 0 if page.evaluate(_RUNNING) else rest + 1
         if time.monotonic() > deadline:
             raise TimeoutError(f"code cells still ran after {patience:.0f} s")
@@ -193,8 +196,8 @@ def saved(page, lab: Lab, name: str) -> dict:
 
 
 def errors(page, notebook: dict) -> list[str]:
-    """What went wrong: error outputs of a saved notebook, cells that never ran, and what the page
-    cannot show."""
+    """The error outputs of a saved notebook, its cells that never ran, and the widgets and pictures
+    that the page cannot show."""
     found = []
     for number, cell in enumerate(notebook["cells"]):
         if cell["cell_type"] == "code":
@@ -209,8 +212,7 @@ def errors(page, notebook: dict) -> list[str]:
         "JavaScript Error",
     ):
         found += page.locator(".jp-OutputArea-output", has_text=failure).all_inner_texts()
-    # What has no source shows nothing on purpose, as the picture that plotly keeps beside its
-    # drawings.
+    # A picture without a source, as plotly keeps one beside its drawings, shows nothing on purpose.
     broken = """() => [...document.querySelectorAll('.jp-Notebook img[src]')]
       .filter(e => e.complete && !e.naturalWidth)
       .map(e => `picture not shown: ${e.src.slice(0, 80)}`)"""
@@ -243,7 +245,8 @@ def slider_moves_picture(output) -> bool:
     output.scroll_into_view_if_needed()
     before = output.evaluate(_PICTURES)
     for handle in output.locator(".noUi-handle").all():
-        for key in ("ArrowRight", "ArrowLeft", "ArrowLeft"):  # it may stand at one end
+        # Right, and then left of where it was: a slider may stand at one end.
+        for key in ("ArrowRight", "ArrowLeft", "ArrowLeft"):
             handle.focus()
             handle.press(key)
             deadline = time.monotonic() + 30
@@ -296,6 +299,7 @@ def _pick_outermost(page, cloud: str, first: int = 0) -> None:
 
 
 def _await_marks(page, cloud: str, number: int) -> None:
+    """Wait until a cloud has so many marked points."""
     page.wait_for_function(
         "([name, n]) => document.querySelector(`.zsp-cloud-${name} canvas`).dataset.marks == n",
         arg=[cloud, str(number)],

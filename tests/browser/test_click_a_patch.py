@@ -30,6 +30,7 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.pair_result import PairResult
 from zsp_lite.views import View
 
+# The settings that the page begins with.
 DEFAULTS = {
     "saliency": 0.05,
     "binned": True,
@@ -39,6 +40,8 @@ DEFAULTS = {
     "trials": 1000,
     "threshold": 0.2,
 }
+# Functions of JavaScript: the pose that the page computes with chosen settings, the pixels of the
+# picture of the first target view, and the bytes of an array as text.
 SOLVE = """(chosen) => {
   const { targets, best, pose, error } = solveViews(state.views, chosen);
   const kept = ({ matches, score, distances }) => ({ matches, score, distances: [...distances] });
@@ -64,7 +67,7 @@ def site(tmp_path_factory) -> Path:
     only = "-D include_patterns=docs/playground.md -D root_doc=docs/playground".split()
     options = ["-q", "-c", "docs/site", "-d", folder / "doctrees", *only]
     command = [sys.executable, "-m", "sphinx", *options, ".", folder]
-    # links to other pages are missing
+    # Sphinx warns of links to other pages, which this site does not have.
     subprocess.run(command, cwd=REPOSITORY, check=True, stderr=subprocess.DEVNULL)
     write_page_data(folder / "docs/playground")
     return folder
@@ -101,7 +104,7 @@ def array(page: Page, expression: str, kind: type = np.float32) -> np.ndarray:
 
 
 def nearest(sim: torch.Tensor, on1: torch.Tensor, on2: torch.Tensor):
-    """Rank patches by the similarity to their nearest neighbour, a `Matcher`."""
+    """Match each patch with its nearest neighbour, if both are on the object: a `Matcher`."""
     best, partner = sim.max(dim=1)
     return partner, best.masked_fill(~(on1 & on2[partner]), -torch.inf)
 
@@ -111,9 +114,9 @@ class Shown(NamedTuple):
 
     page: Page
     result: PairResult
-    views: list[View]  # the library's: the reference, and the targets
+    views: list[View]  # of the library: the reference and the targets
     stored: list[FeatureMap]  # of the views, with the rounded keys that the page stores
-    solved: dict[bool, dict]  # the page's, by whether matches are cyclical
+    solved: dict[bool, dict]  # what the page computes, by whether matches are cyclical
 
     def compared(self, target: int, binned: bool) -> torch.Tensor:
         """The page's similarities of the patches of the reference and a target, (784, 784)."""
@@ -135,7 +138,7 @@ def shown(stored, method, request) -> Shown:
     for i, view in enumerate(views):
         keys = torch.from_numpy(array(stored, f"state.views[{i}].keys").reshape(*GRID, -1))
         maps.append(FeatureMap(keys, view.features.saliency, view.features.global_feature))
-    # Without k-means, whose draws are the page's own.
+    # Without k-means: the page draws other random numbers than the library.
     settings = DEFAULTS | {"kmeans": False}
     solved = {cycle: stored.evaluate(SOLVE, settings | {"cycle": cycle}) for cycle in (True, False)}
     return Shown(stored, result, views, maps, solved)
@@ -145,7 +148,8 @@ def test_the_page_has_the_librarys_pose_by_default(shown):
     expected = shown.result.estimate
     found = shown.page.evaluate(SOLVE, DEFAULTS)
     assert found["best"] == expected.view
-    scores = [one["score"] for one in found["targets"]]
+    scores = [target["score"] for target in found["targets"]]
+    # The page stores rounded features, and its random draws are its own.
     assert_allclose(scores, expected.view_scores, atol=0.05)
     assert rotation_error(np.array(found["pose"]["R"]), expected.sim3.R) < 1
     assert_allclose(found["error"], shown.result.error, atol=1)
@@ -163,6 +167,7 @@ def test_the_page_has_the_librarys_similarities(shown):
     first, *maps = shown.stored
     for i, (view, rounded) in enumerate(zip(targets, maps)):
         sim = shown.compared(i, binned=True)
+        # The similarities of the exact features, and of the rounded ones that the page has.
         assert_close(sim, similarity(reference.features, view.features), atol=1e-3, rtol=0)
         assert_close(sim, similarity(first, rounded), atol=1e-5, rtol=0)
         (plain,) = key_similarities(reference.features, [view.features])
@@ -235,7 +240,7 @@ def test_photographs_get_the_features_of_the_library_and_no_pose(
         for name in ("keys", "saliency"):
             found = array(page, f"state.views[{i}].{name}")
             assert_allclose(found, getattr(view.features, name).flatten(), atol=1e-3)
-    page.select_option("#pair", "3")  # the pair shown before
+    page.select_option("#pair", "3")  # back to a stored pair
     wait_for_notice(page, "3D models")
     assert page.evaluate("state.views.length") == 6
     assert "No pose" not in page.inner_text("#stages")
@@ -257,7 +262,7 @@ def touched(browser, site, request) -> Page:
 
 def tab_to(page: Page, name: str) -> None:
     """Press Tab until an element has the focus."""
-    for _ in range(60):  # more than there are elements
+    for _ in range(60):  # The page has fewer elements.
         if page.evaluate("document.activeElement.id") == name:
             return
         page.keyboard.press("Tab")

@@ -1,7 +1,7 @@
 """Every notebook runs without errors in JupyterLab in Chromium, and its widgets react to their
 sliders.
 
-A self-check gives feedback, and asks nothing of the network.
+A self-check gives feedback and asks nothing of the network.
 """
 
 import shutil
@@ -14,14 +14,15 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 NOTEBOOKS = sorted(path.name for path in (reader.REPOSITORY / "notebooks").glob("*.ipynb"))
 PICTURES = reader.REPOSITORY / "outputs/browser"
-LABELLING = {"08_label_poses.ipynb"}  # have a 3D view that a click labels
+LABELLING = {"08_label_poses.ipynb"}  # notebooks with a 3D view in which clicks label points
 WIDGET = "application/vnd.jupyter.widget-view+json"
 MINUTES = 20  # a notebook may take on a busy machine
 
 
 @pytest.fixture(scope="module")
 def lab(browser, tmp_path_factory):
-    """JupyterLab on copies of notebooks, without their outputs, and data."""
+    """JupyterLab on copies of the data and of the notebooks, which have no outputs, and a notebook
+    "asking" with a self-check."""
     folder = tmp_path_factory.mktemp("lab")
     left_out = shutil.ignore_patterns("exercises", ".*")
     shutil.copytree(reader.REPOSITORY / "notebooks", folder / "notebooks", ignore=left_out)
@@ -44,6 +45,7 @@ def lab(browser, tmp_path_factory):
 
 @pytest.fixture
 def page(browser, lab):
+    """An empty page of the browser; kernels of its notebook end with it."""
     context = browser.new_context(viewport={"width": 1300, "height": 1000})
     context.set_default_timeout(180_000)  # milliseconds, for a busy machine
     yield context.new_page()
@@ -63,7 +65,7 @@ def test_a_self_check_gives_feedback_without_a_network(page, lab):
     ):
         page.locator(".MCButton", has_text=answer).click()
         assert feedback.inner_text().startswith(words)
-    page.wait_for_timeout(2000)  # jupyterquiz looks for MathJax after half a second
+    page.wait_for_timeout(2000)  # milliseconds: jupyterquiz looks for MathJax after 500
     assert page.evaluate("typeof MathJax") == "object"
     assert asked
     assert not [

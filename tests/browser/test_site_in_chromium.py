@@ -6,10 +6,12 @@ import pytest
 
 def test_no_page_is_wider_than_the_screen_of_a_phone(browser, site):
     screen = 390  # pixels
-    page, wide = browser.new_page(viewport={"width": screen, "height": 800}), {}
+    page = browser.new_page(viewport={"width": screen, "height": 800})
+    wide = {}
     for path in sorted(site.rglob("*.html")):
         name = str(path.relative_to(site))
-        if "_static" not in path.parts and name != "index.html":  # which leads on to the start page
+        # index.html leads on to the start page.
+        if "_static" not in path.parts and name != "index.html":
             page.goto(path.as_uri())
             width = page.evaluate("document.documentElement.scrollWidth")
             if width > screen:
@@ -19,7 +21,7 @@ def test_no_page_is_wider_than_the_screen_of_a_phone(browser, site):
 
 @pytest.fixture
 def windows(browser, site):
-    """What the class sees of a lab's slides, and the presenter's view."""
+    """The window of a lab's slides that the class sees, and the presenter's window."""
     page = browser.new_page()
     page.goto((site / "docs/slides/lab_2.html").as_uri())
     with page.expect_popup() as opened:
@@ -40,7 +42,8 @@ def test_the_keys_of_both_windows_turn_the_slides_of_both(windows):
 def test_notes_are_shown_in_the_presenters_view_alone(windows):
     page, presenter = windows
     page.keyboard.press("ArrowRight")
-    for notes in (["comes close"], ["equation 3", "Taken literally"]):  # of the slides 3 and 4
+    # Parts of the notes on slides 3 and 4.
+    for notes in (["comes close"], ["equation 3", "Taken literally"]):
         page.keyboard.press("ArrowRight")
         for note in notes:
             assert note in presenter.inner_text("article")

@@ -31,70 +31,68 @@ from zsp_lite.io.files import REPOSITORY
 from zsp_lite.metrics import rotation_error
 from zsp_lite.views import extract_views, object_crop
 
-CORES, LARGEST_ANGLE = os.cpu_count(), 1.0  # degrees between the poses of two devices
-# Share of pairs of a solver that may differ: of features that differ in the last digits, a tie may
+CORES = os.cpu_count()
+LARGEST_ANGLE = 1.0  # degrees between the poses of two devices that count as equal
+# Share of pairs of a solver that may differ: where features differ in their last digits, a tie may
 # fall the other way.
 TIES = 0.05
-Result = tuple[list[str], list[str]]  # lines of a table, and what failed
+Result = tuple[list[str], list[str]]  # lines of a table, and failures in words
 
 
 def solve(pickled: bytes) -> dict[str, np.ndarray]:
-    """Estimate the rotations of a reference in the world of its targets by both solvers, on one
+    """Estimate the rotation of a reference in the world of its targets by each solver, on one
     thread."""
     torch.set_num_threads(1)
     reference, *targets = pickle.loads(pickled)
-    backbone, found = load_backbone(device="cpu"), {}
+    backbone = load_backbone(device="cpu")
+    rotations = {}
     for solver in SOLVERS["both"]:
-        found[solver] = (
-            ZeroShotPose(backbone, solver=solver)
-            .estimate_from_views(reference, targets)
-            .world_rotation()
-        )
-    return found
+        method = ZeroShotPose(backbone, solver=solver)
+        rotations[solver] = method.estimate_from_views(reference, targets).world_rotation()
+    return rotations
 
 
 def poses(device: str) -> Result:
-    """Compare the poses of all evaluation pairs with five target views that features of both
-    devices give."""
-    dataset, work = Co3D(sample_data()), []
+    """Compare the poses from the features of both devices, of all pairs with five target views."""
+    dataset = Co3D(sample_data())
     pairs = [
         pair
         for category in labelled_categories(dataset)
         for pair in shipped_pairs(dataset, category, 5)
     ]
+    views = []
     for backbone in (load_backbone(device=device), load_backbone(device="cpu")):
         for pair in pairs:
             reference, targets = dataset.load_pair(pair)
             crops = [object_crop(frame, backbone.image_size) for frame in (reference, *targets)]
             # As bytes: tensors would go through shared memory, of which containers have little.
-            work.append(pickle.dumps(extract_views(backbone, crops)))
+            views.append(pickle.dumps(extract_views(backbone, crops)))
     with ProcessPoolExecutor(CORES, get_context("spawn")) as executor:
-        found = list(executor.map(solve, work))
-    lines, failures = [], []
+        solved = list(executor.map(solve, views))
+    lines = []
+    failures = []
     for solver in SOLVERS["both"]:
-        first, second = (
-            np.stack([one[solver] for one in some])
-            for some in (found[: len(pairs)], found[len(pairs) :])
-        )
-        angles = rotation_error(first, second)
+        # Rotations of both devices, (2, pairs, 3, 3).
+        rotations = np.stack([pose[solver] for pose in solved]).reshape(2, len(pairs), 3, 3)
+        angles = rotation_error(*rotations)
         differ = [
             f"{pairs[k].key} by {angles[k]:.1f}°" for k in np.flatnonzero(angles > LARGEST_ANGLE)
         ]
-        told = (
+        line = (
             f"{solver} solver: {len(differ)} of {len(pairs)} poses differ between {device} and "
             f"cpu: {differ}"
         )
-        lines.append(f"| {told} | | |")
+        lines.append(f"| {line} | | |")
         if len(differ) > TIES * len(pairs):
-            failures.append(told)
+            failures.append(line)
     return lines, failures
 
 
 def notebooks(device: str) -> Result:
-    """Execute notebooks 00 to 04, with their assertions, on the device; outputs are of a CPU and
-    are not compared.
+    """Execute notebooks 00 to 04, with their assertions, on the device.
 
-    Notebook 01 computes inside the network and names the CPU.
+    Their stored outputs are those of a CPU and are not compared. A notebook that uses
+    `backbone.model` computes inside the network: it stays on the CPU.
     """
     with tempfile.TemporaryDirectory() as folder:
         for path in sorted((REPOSITORY / "notebooks").glob("0[0-4]*.ipynb")):
@@ -119,37 +117,35 @@ def speed(device: str) -> Result:
     images = [object_crop(reference).rgb] * 64
 
     def measured(function) -> float:
-        def to_its_end():
+        def to_its_end() -> None:
+            """Wait for the GPU, which works while Python goes on."""
             function()
-            torch.cuda.synchronize() if device == "cuda" else None
+            if device == "cuda":
+                torch.cuda.synchronize()
 
-        return seconds(to_its_end, 3)
+        return seconds(to_its_end, repeats=3)
 
-    for one in dict.fromkeys((device, "cpu")):
-        dino = Backbone(
-            VisionTransformer(224, 8, 384, 12, 6), "DINO ViT-S/8, random weights", device=one
-        )
-        for backbone in (load_backbone(device=one), dino):
+    for place in dict.fromkeys((device, "cpu")):
+        dino = Backbone(VisionTransformer(), "DINO ViT-S/8, random weights", device=place)
+        for backbone in (load_backbone(device=place), dino):
+            name = backbone.name
             for size in (8, 64):
                 backbone.batch_size = size
                 rate = size / measured(lambda: backbone(images[:size]))
-                lines.append(
-                    f"| {backbone.name}, batches of {size} | {one} | {rate:.0f} images/s |"
-                )
+                lines.append(f"| {name}, batches of {size} | {place} | {rate:.0f} images/s |")
             for solver in SOLVERS["both"]:
                 method = ZeroShotPose(backbone, solver=solver)
                 rate = 1 / measured(lambda: method.estimate(reference, targets))
-                lines.append(f"| {backbone.name}, {solver} solver | {one} | {rate:.1f} pairs/s |")
-            if one == "cuda":
-                lines.append(
-                    f"| {backbone.name}, memory | {one} | "
-                    f"{torch.cuda.max_memory_allocated() / 1e9:.2f} GB |"
-                )
+                lines.append(f"| {name}, {solver} solver | {place} | {rate:.1f} pairs/s |")
+            if place == "cuda":
+                gigabytes = torch.cuda.max_memory_allocated() / 1e9
+                lines.append(f"| {name}, memory | {place} | {gigabytes:.2f} GB |")
                 torch.cuda.reset_peak_memory_stats()
     return lines, []
 
 
 def main() -> int:
+    """Run the parts, write outputs/gpu/gpu.md after each, and print it with what failed."""
     parts = {"poses": poses, "notebooks": notebooks, "speed": speed}
     parser = argparse.ArgumentParser(prog="python -m tests.gpu")
     parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts))
@@ -172,5 +168,5 @@ def main() -> int:
         report += [*lines, f"| the part {part} | | {time.perf_counter() - start:.0f} s |"]
         failures += failed
         (options.out / "gpu.md").write_text("\n".join([*report, ""]), "utf-8")
-    print("\n".join([*report, *(f"FAILED {one}" for one in failures)]))
+    print("\n".join([*report, *(f"FAILED {failure}" for failure in failures)]))
     return 1 if failures else 0

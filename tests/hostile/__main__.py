@@ -3,9 +3,9 @@ outcomes.
 
     python -m tests.hostile [GROUP ...]
 
-The libraries are imported once, before the processes fork. A case fails by a traceback, by a wrong
-answer without an error, after 20 s of processor time or two minutes, or with 1 GB more memory than
-the idle process. Linux only.
+The libraries are imported once, before the processes fork. A case fails if it ends with a traceback
+or gives a wrong answer without an error, if it takes more than 20 s of processor time or two
+minutes, or if it needs 1 GB more memory than an idle process. Linux only.
 """
 
 import gc
@@ -32,36 +32,39 @@ from tests.hostile import cases  # noqa: E402, F401
 from tests.hostile.harness import CASES, prepare  # noqa: E402
 from zsp_lite.errors import InputError  # noqa: E402
 
-SECONDS, WAIT, MEMORY = 20, 120, 1 << 30  # limits of a case: processor time, time, bytes
+# Limits of a case: seconds of processor time, seconds, and bytes above those of an idle process.
+SECONDS, WAIT, MEMORY = 20, 120, 1 << 30
+# A message of a refusal is one line that can be read.
+LONGEST_MESSAGE = 1500
 
 
 def attempt(case, folder: Path, answers) -> None:
-    """Run a case with limits, and send the outcome, the message and the memory that was used, in
-    bytes."""
-    os.setsid()
+    """Run a case with limits, and send (outcome, message, bytes of memory used)."""
+    os.setsid()  # a group of its own, which can be killed with all that the case starts
     for stream in (1, 2):
         os.dup2(os.open(folder / f"stream{stream}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
     os.chdir(folder)
     resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    # the machine's memory is not to fill up
+    # No case fills the memory of the machine; address space is larger than the memory in use.
     resource.setrlimit(resource.RLIMIT_AS, (size + 3 * MEMORY,) * 2)
     try:
         kind, message = case.call(folder)
     except InputError as error:
-        kind = "wrong" if "\n" in str(error) or len(str(error)) > 1500 else "refused"
         message = str(error)
+        kind = "wrong" if "\n" in message or len(message) > LONGEST_MESSAGE else "refused"
     except BaseException as error:
         lines = traceback.format_exc().strip().splitlines()
         kind, message = "traceback", f"{type(error).__name__}: {error} | {' '.join(lines[-3:-1])}"
+    # The code in a malicious file writes this file.
     kind = "wrong" if (folder / "executed").exists() else kind
     answers.send((kind, message, 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))
 
 
 def run_case(case, folder: Path, idle: int) -> tuple[str, str]:
-    """Run a case in a forked process.
+    """Run a case in a forked process, where an idle one has `idle` bytes of memory.
 
-    Returns the outcome and the message; `idle`: bytes of an idle process.
+    Returns the outcome and the message.
     """
     context = multiprocessing.get_context("fork")
     answers, sending = context.Pipe(duplex=False)
@@ -79,17 +82,21 @@ def run_case(case, folder: Path, idle: int) -> tuple[str, str]:
 
 
 def main(groups: list[str]) -> int:
+    """Run the cases of some groups, or all; returns 1 if one fails."""
+    # Threads do not survive a fork.
     torch.set_num_threads(1)
     cv2.setNumThreads(0)
-    start, work = time.monotonic(), Path(tempfile.mkdtemp(prefix="hostile-"))
+    start = time.monotonic()
+    work = Path(tempfile.mkdtemp(prefix="hostile-"))
+    chosen = [case for case in CASES if not groups or case.group in groups]
+    counts = Counter()
     try:
         template = prepare(work / "template")
         gc.freeze()  # a collection in a child would copy every page
-        idle, counts = 0, Counter()
-        for number, case in enumerate(one for one in CASES if not groups or one.group in groups):
+        idle = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        for number, case in enumerate(chosen):
             folder = work / str(number)
             shutil.copytree(template, folder, symlinks=True)
-            idle = idle or 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
             kind, message = run_case(case, folder, idle)
             shutil.rmtree(folder, ignore_errors=True)
             counts[case.group, kind] += 1

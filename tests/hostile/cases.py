@@ -1,5 +1,4 @@
-"""What a process must withstand: endless, oversized and malicious files and options, for every
-reader and command."""
+"""The cases: endless, oversized and malicious files and options, for every reader and command."""
 
 import gzip
 import io
@@ -45,10 +44,7 @@ from zsp_lite.importers.files import read_depth_file, read_mask_file, read_pictu
 CONTINUED = f"{BENCHMARK} --data ROOT/data --out ROOT/out"
 # Every command, with a file that it reads.
 COMMANDS_OF = {
-    "picture": (
-        "a.png",
-        "estimate ROOT/a.png ROOT/b.png --intrinsics 60,60,32,32 --out ROOT/e",
-    ),
+    "picture": ("a.png", "estimate ROOT/a.png ROOT/b.png --intrinsics 60,60,32,32 --out ROOT/e"),
     "results": (RESULTS, "tables ROOT/out"),
     "packed results": (f"{RESULTS}.gz", "tables ROOT/out"),
     "run to continue": ("out/run.jsonl", CONTINUED),
@@ -64,31 +60,31 @@ for kind in STRANGE:
         command("file", f"{what}: {kind}", line, strange(name, kind), code)
 
 
-# oversized
+# Oversized files: small on the disk, large in memory.
 def png(width: int, height: int) -> bytes:
-    """A picture that says to be of a size, and has a megabyte of zeros."""
+    """A grey picture whose header claims a size, with a megabyte of zeros for its pixels."""
     chunks = (
         (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)),
         (b"IDAT", zlib.compress(bytes(1 << 20), 9)),
         (b"IEND", b""),
     )
-    packed = (
-        struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+    content = b"\x89PNG\r\n\x1a\n"
+    for kind, data in chunks:
+        checksum = zlib.crc32(kind + data)
+        content += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", checksum)
+    return content
 
 
 def safetensors(header: dict | bytes, data: bytes = b"") -> bytes:
-    """Weights with a header of one's own."""
+    """Weights in the format of safetensors, with any header."""
     encoded = header if isinstance(header, bytes) else json.dumps(header).encode()
     return struct.pack("<Q", len(encoded)) + encoded + data
 
 
 def _npy(shape: tuple[int, ...], descr: str = "<f8", data: bytes = b"") -> bytes:
-    """An array file that says to be of a shape and type."""
-    header = (
-        str({"descr": descr, "fortran_order": False, "shape": shape}).encode().ljust(117) + b"\n"
-    )
+    """An array file of NumPy whose header claims a shape and type."""
+    fields = str({"descr": descr, "fortran_order": False, "shape": shape}).encode()
+    header = fields.ljust(117) + b"\n"  # 128 bytes with what stands before it
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + data
 
 
@@ -97,7 +93,8 @@ def depth_map(content: bytes) -> Callable[[Path], None]:
     return both(written("capture/z/0.npy", content), written("capture/depth.txt", "z/0.npy\n"))
 
 
-DEEP = b"[" * 100_000
+DEEP = b"[" * 100_000  # JSON of so many nested lists
+# For each case: the reader, and the content of its file.
 OVERSIZED = [
     ("image", png(30_000, 30_000)),
     ("depth", png(2**31 - 1, 2**31 - 1)),
@@ -128,15 +125,10 @@ command(
     "tables ROOT/out",
     written(f"{RESULTS}.gz", gzip_bomb),
 )
-case(
-    "oversized",
-    "depth map of 10^15 numbers",
-    read_capture("lists"),
-    depth_map(_npy((10**15,))),
-)
+case("oversized", "depth map of 10^15 numbers", read_capture("lists"), depth_map(_npy((10**15,))))
 
 
-# malicious: links that lead out of a folder, code in files and as values of options
+# Malicious files: links that lead out of a folder, and code.
 def link(name: str, target: str) -> Callable[[Path], None]:
     """Return a function that replaces a file of the folder by a link."""
 
@@ -205,11 +197,13 @@ def without_lzfse(path: Path) -> None:
 
 
 def ten_hours(data: bytes) -> bytes:
-    """The duration of the header of an MP4 file and of its media, in their time scale."""
-    for kind, at in ((b"mvhd", 16), (b"mdhd", 16)):
-        start = data.index(kind) + 4
-        scale = int.from_bytes(data[start + at - 4 : start + at])
-        data = data[: start + at] + (36_000 * scale).to_bytes(4) + data[start + at + 4 :]
+    """Make an MP4 file claim a duration of ten hours, for the movie and for its media."""
+    for kind in (b"mvhd", b"mdhd"):
+        # Behind the name of either header: 12 bytes, units per second, and the duration in units.
+        scale = data.index(kind) + 16
+        duration = scale + 4
+        ten = 36_000 * int.from_bytes(data[scale:duration])
+        data = data[:duration] + ten.to_bytes(4) + data[duration + 4 :]
     return data
 
 
@@ -220,11 +214,7 @@ CLIMBING = """{"fl_x": 1, "frames": [{
 for name, layout, change in (
     ("zip that unpacks to 3 GB", "nerfstudio", zip_of("transforms.json", 3 << 30)),
     ("zip with a path that climbs", "nerfstudio", zip_of("../../executed", 1 << 20)),
-    (
-        "transforms.json with a path that climbs",
-        "polycam",
-        written("transforms.json", CLIMBING),
-    ),
+    ("transforms.json with a path that climbs", "polycam", written("transforms.json", CLIMBING)),
     (
         "quaternion of zeros",
         "stray",
@@ -279,8 +269,9 @@ for name, layout, change in (
     case("scan", f"{layout}: {name}", read_scan, scan(layout, change))
 
 
-# uCO3D's tables and depth maps
+# uCO3D's tables and depth maps.
 def rows_without_end(folder):
+    """Replace the table of frames by a view that has endless rows."""
     with closing(open_metadata(folder / "uco3d")) as metadata, metadata:
         metadata.execute("DROP TABLE frame_annots")
         endless = "SELECT 1 AS n UNION ALL SELECT n + 1 FROM numbers"
@@ -291,6 +282,8 @@ def rows_without_end(folder):
 
 
 def depth_of(shape, **options):
+    """Return a function that replaces the depth maps by one of a shape, without values."""
+
     def write(folder):
         with h5py.File(folder / OF_UCO3D / "depth_maps.h5", "w") as depths:
             depths.create_dataset("1", shape, np.float32, **options)
@@ -306,7 +299,7 @@ for name, change in (
     case("uCO3D", name, READERS_OF["uCO3D's depth"][1], change)
 
 
-# pictures, depth maps and masks of other kinds
+# Pictures, depth maps and masks of other kinds.
 def encoded(values: np.ndarray, kind: str, palette: bool = False, **options) -> bytes:
     """A picture in a format of Pillow."""
     image, file = Image.fromarray(values), io.BytesIO()
@@ -324,8 +317,10 @@ def npz(*members: np.ndarray) -> bytes:
 
 
 def exif(kind: int, count: int, value: bytes) -> bytes:
-    """A JPEG whose EXIF orientation has a type, a number of values and a value or an offset; its
-    directory repeats."""
+    """A JPEG whose EXIF orientation has a type, a number of values, and a value or an offset.
+
+    The directory of EXIF names itself as the next one.
+    """
     directory = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + struct.pack(
         "<HHI4sI", 0x0112, kind, count, value, 8
     )
@@ -404,7 +399,7 @@ for option in (
 ):
     command("malicious", f"benchmark {option}", f"{ON_DATA} {option}", module_that_exits)
 
-# options that reach beyond their folder, or ask for more than there is
+# Options that reach beyond their folder, or ask for more than there is.
 for line in (
     f"{ON_DATA} --pairs 100000000",
     f"{ON_DATA} --workers 100000000000",

@@ -1,4 +1,4 @@
-"""Cases, and the folder that they damage."""
+"""What a case of a hostile input is, the folder that each case damages, and every reader."""
 
 import gzip
 import io
@@ -33,8 +33,8 @@ CASES: list["Case"] = []
 
 @dataclass(frozen=True)
 class Case:
-    """A call with the case's own copy of the folder that raises InputError, or returns an outcome
-    and a message."""
+    """A call that gets a copy of the folder, and raises InputError or returns an outcome and a
+    message."""
 
     group: str
     name: str
@@ -56,30 +56,35 @@ def case(
 def command(
     group: str, name: str, line: str, change: Callable[[Path], object] | None = None, code: int = 2
 ) -> None:
-    """Register a command line that must end with an exit code: with 2, one line on stderr."""
+    """Register a command line that must end with an exit code; where it is 2, with one line on
+    stderr."""
 
     def call(folder: Path) -> tuple[str, str]:
         if change is not None:
             change(folder)
         stderr = io.TextIOWrapper(io.BytesIO(), "utf-8", errors="backslashreplace")
         with redirect_stderr(stderr):
-            found = main(line.replace("ROOT", str(folder)).split())
+            status = main(line.replace("ROOT", str(folder)).split())
         stderr.flush()
         text = stderr.buffer.getvalue().decode()
         one_line = len(text.strip().splitlines()) == 1
-        if found != code or "Traceback" in text or (code == 2 and not one_line):
-            return "wrong", f"exit code {found}, expected {code}, and one line on stderr: {text}"
+        if status != code or "Traceback" in text or (code == 2 and not one_line):
+            return "wrong", f"exit code {status}, expected {code}, and one line on stderr: {text}"
         return "refused" if code == 2 else "right", text
 
     CASES.append(Case(group, name, call))
 
 
 def prepare(folder: Path) -> Path:
-    """Write what the cases change, each in its own copy.
+    """Write the folder of which each case changes a copy.
 
-    data: two labelled sequences of one category; out: a benchmark run on them; capture: one frame
-    as lists and as nerfstudio's; uco3d: a sequence of uCO3D; a.png and b.png: pictures with depth
-    and mask; x.safetensors: a small network; poses.csv: one pose.
+    - data: two labelled sequences of one category
+    - uco3d: one of them in the layout of uCO3D
+    - out: a benchmark run on them
+    - capture: one frame in the layouts of lists and of nerfstudio
+    - a.png, b.png: pictures of a tilted disc, with depth and mask
+    - poses.csv: one pose
+    - x.safetensors: a small network
     """
     data = folder / "data"
     write_co3d(data, "cup", [sequence_data("a", 6), sequence_data("b", 6, seed=1)])
@@ -113,7 +118,9 @@ def read_frames(folder: Path) -> list[Frame]:
 
 def read_capture(layout: str) -> Callable[[Path], list[Frame]]:
     """Return a function that reads the frames of the capture in a layout."""
-    return lambda folder: [one.load() for one in open_capture(folder / "capture", layout).frames]
+    return lambda folder: [
+        frame.load() for frame in open_capture(folder / "capture", layout).frames
+    ]
 
 
 def read_uco3d(folder: Path) -> list:
@@ -127,7 +134,7 @@ SEQUENCES = "data/cup/sequence_annotations.jgz"
 PAIRS = "data/determ_eval/1samples_2tgt/cup.pt"
 LABEL = "data/class_labels/cup/b.json"
 RESULTS = "out/run.jsonl"
-# Every reader, with the file that it reads.
+# Every reader, by a name: the file, relative to the folder, and the call that reads it.
 READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
     "image": ("a.png", lambda folder: read_image(folder / "a.png")),
     "mask": ("a_mask.png", lambda folder: read_mask(folder / "a_mask.png")),
@@ -162,7 +169,7 @@ POSES = """pair,target_frame,rotation,translation,scale
 
 
 def written(name: str, data: bytes | str | Callable[[], bytes]) -> Callable[[Path], object]:
-    """Return a function that replaces a file of the folder."""
+    """Return a function that writes a file of the folder, or replaces it."""
 
     def write(folder: Path):
         content = data() if callable(data) else data
@@ -176,14 +183,15 @@ def both(*changes: Callable[[Path], object]) -> Callable[[Path], None]:
     """Return a function that makes several changes of the folder."""
 
     def change(folder: Path) -> None:
-        for one in changes:
-            one(folder)
+        for apply in changes:
+            apply(folder)
 
     return change
 
 
 def gzip_bomb() -> bytes:
-    """8 GB of spaces, compressed."""
+    """8 GB of spaces, compressed: 128 times a gzip member of 64 MB, which are read one after the
+    other."""
     return gzip.compress(b" " * (1 << 26)) * 128
 
 
@@ -193,8 +201,8 @@ def _sparse(path: Path) -> None:
         file.truncate(20 << 30)
 
 
-# What does not end, or does not fit into memory. What is damaged is for tests/test_files.py and
-# tests/test_fuzzing.py.
+# Files that do not end or do not fit into memory. Damaged files are the subject of
+# tests/test_files.py and tests/test_fuzzing.py.
 STRANGE: dict[str, Callable[[Path], object]] = {
     "pipe": lambda path: os.mkfifo(path),  # looked up late: Windows has none
     "link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
