@@ -101,7 +101,7 @@ def same(copy: Path, file: Path | str) -> bool:
     return copy.is_file() and filecmp.cmp(copy, file, shallow=False)
 
 
-def keep_hand_ins(notebooks: list, **_: object) -> None:
+def keep_hand_ins(notebooks: list, **_) -> None:
     """Copy each hand-in that was graded, to compare a later one with it."""
     for path in map(Path, notebooks):
         *_, student, name = path.parent.parts
@@ -138,8 +138,8 @@ def fault(handed_in: NotebookNode, exercise: str) -> str:
     for name in released | returned:
         cells = returned.get(name, [])
         # A release has one cell of each name; a name that it does not have is a fault.
-        (blank,) = released.get(name, [None])
-        data = blank and blank.metadata.nbgrader
+        (original,) = released.get(name, [None])
+        data = original and original.metadata.nbgrader
         if any(cell.metadata.nbgrader != data for cell in cells):
             cause = "cells of another release"
         elif not cells and (data.solution or not data.grade):
@@ -147,7 +147,9 @@ def fault(handed_in: NotebookNode, exercise: str) -> str:
         elif data.solution and len(cells) > 1:
             cause = "cells that are there twice"
         elif (
-            data.solution and blank.cell_type == "code" and cells[0].cell_type != "code"
+            data.solution
+            and original.cell_type == "code"
+            and cells[0].cell_type != "code"
         ):
             cause = "solutions that are not code"
         else:
