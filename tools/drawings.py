@@ -40,8 +40,8 @@ TILT = 20
 EYE_LEVEL = 0.92
 FIELD = 2.45
 
-# The parts of a chair are boxes with a centre and a size. The axes are x to the right of who sits on
-# the chair, y forward, z up.
+# The parts of a chair are boxes with a centre and a size. The axes are x to the right of who sits
+# on the chair, y forward, z up.
 Chair = dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]]
 
 
@@ -142,8 +142,8 @@ class Photo:
         far ones first."""
         dots = []
         for part, (a, b, c, d), _, _ in self.faces:
-            # The face is a parallelogram with corners a, b, c, d. A place is given by the share i of
-            # the way from a to b, and the share j of the way from a to d.
+            # The face is a parallelogram with corners a, b, c, d. A place is given by the share i
+            # of the way from a to b, and the share j of the way from a to d.
             along = max(2, round(np.linalg.norm(b - a) / step))
             across = max(2, round(np.linalg.norm(d - a) / step))
             i, j = np.meshgrid((np.arange(along) + 0.5) / along, (np.arange(across) + 0.5) / across)
