@@ -1,5 +1,5 @@
-"""The sample data: those of the repository, or, outside a clone, synthetic objects that are made
-once in the cache."""
+"""The sample data: the folder of the repository, or, outside a clone, synthetic objects in the
+cache."""
 
 import logging
 from pathlib import Path
@@ -34,7 +34,7 @@ def sample_data() -> Path:
             export_preset("demo", part)
         part.rename(made)
     except (OSError, InputError) as error:
-        if not made.is_dir():  # otherwise another process has made them meanwhile
+        if not made.is_dir():  # If the folder is there, another process has made it meanwhile.
             cure = "set ZSP_LITE_CACHE to a folder that can be written"
             raise InputError(f"samples cannot be made in {made} ({error}); {cure}") from error
     return made
