@@ -37,7 +37,8 @@ def collect(
     def view(name: str, number: int) -> View:
         return method.views([data.load(data.frame(category, name, number))])[0]
 
-    for pair in object_pairs(data, category, names, None, 5):  # all pairs, with 5 target views
+    # All pairs of the objects, none left out.
+    for pair in object_pairs(data, category, names, per_object=None, targets=5):
         reference = view(pair.reference_sequence, pair.reference_frame)
         targets = [view(pair.target_sequence, number) for number in pair.target_frames]
         estimate = replace(method, seed=pair.seed).estimate_from_views(reference, targets)

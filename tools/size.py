@@ -42,7 +42,7 @@ class Room(NamedTuple):
 
 
 def rooms() -> Iterator[Room]:
-    """Measure all rooms."""
+    """Measure all rooms. A file that several patterns of a room match counts once."""
     with LIMITS.open(newline="") as table:
         for row in csv.DictReader(table):
             files = {file for pattern in row["files"].split() for file in ROOT.glob(pattern)}

@@ -229,12 +229,12 @@ def collect_scans(
                     ranked.append((rank, world_hypotheses(first, second, estimate)))
 
         # The pose from 1, 2, 4 and all of the reference frames, at equal steps.
-        place = " and ".join(f"{views} views within {arc:.0f}°" for arc, views in setting)
+        words = " and ".join(f"{views} views within {arc:.0f}°" for arc, views in setting)
         for count in _FRAMES:
             step = _FRAMES[-1] // count
             chosen = [hypotheses for rank, hypotheses in ranked if rank % step == 0]
             poses, known = pose_of_two(chosen, labels)
-            outcomes.append(ScanOutcome(f"{root.name}/{category}", place, count, poses, known))
+            outcomes.append(ScanOutcome(f"{root.name}/{category}", words, count, poses, known))
     return outcomes
 
 

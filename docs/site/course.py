@@ -91,6 +91,7 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
                 cell.outputs = [
                     shown for output in cell.outputs for shown in static_outputs(output, widgets)
                 ]
+        # `describe_pictures` gives these to the pictures of the page, in the same order.
         app.env.temp_data["alternative texts"] = [
             output.metadata[form]["alt"]
             for cell in notebook.cells

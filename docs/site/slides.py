@@ -49,10 +49,10 @@ class Picture(SphinxDirective):
             alt = unescape(re.search("<desc[^>]*>(.*?)</desc>", path.read_text("utf-8"))[1])
         else:
             heading = self.options["heading"]
-            found = pictures_below(nbformat.read(path, as_version=4), heading)
-            if not found:
+            pictures = pictures_below(nbformat.read(path, as_version=4), heading)
+            if not pictures:
                 raise self.error(f"{path.name} has no picture below the heading {heading!r}")
-            form, data, alt = found[0]
+            form, data, alt = pictures[0]
             if "tiles" in self.options:
                 data = arranged(data, *self.options["tiles"])
         image = f'<img src="data:{form};base64,{data}" alt="{escape(alt)}">'

@@ -80,8 +80,10 @@ def align_picks(reference: ArrayLike, picks: ArrayLike) -> Alignment:
     reference = np.asarray(reference, dtype=np.float64)
     picks = np.asarray(picks, dtype=np.float64)
     if len(reference) != len(picks) or len(picks) < MIN_KEYPOINTS:
-        found = f"{len(picks)} keypoints picked and {len(reference)} on the reference"
-        raise InputError(f"{found}, expected equally many, at least {MIN_KEYPOINTS}")
+        raise InputError(
+            f"{len(picks)} keypoints picked and {len(reference)} on the reference, expected "
+            f"equally many, at least {MIN_KEYPOINTS}"
+        )
     sim3 = umeyama(reference, picks)
     distance = np.linalg.norm(sim3.apply(reference) - picks, axis=1)
     return Alignment(sim3, distance / np.sqrt(picks.var(axis=0).mean()))
@@ -143,8 +145,10 @@ class Labelling:
             references.add(stored.reference_seq)
         references.update(label.reference_seq for label in read_labels(root, category).values())
         if len(references) > 1:
-            found = f"reference, stored picks and labels name {', '.join(sorted(references))}"
-            raise InputError(f"category {category}: {found}, expected one reference sequence")
+            raise InputError(
+                f"category {category}: reference, stored picks and labels name "
+                f"{', '.join(sorted(references))}, expected one reference sequence"
+            )
 
         # The sequences to label, each once.
         best_clouds = [sequence.sequence_name for sequence in self.dataset.select(category)]

@@ -348,7 +348,7 @@ class _LabellingWidget:
         # Clouds and the cross-hair.
         caption = f"{_dot(BLUE)} reference {html.escape(labelling.reference)}"
         self.captions["reference"].value = caption
-        self._show_cloud("reference", labelling.reference, None)
+        self._show_cloud("reference", labelling.reference, overlay=None)
         if self.on_reference:
             self.shown.pop("sequence", None)
             self.views["sequence"].clear("Empty: no other sequence is chosen")
