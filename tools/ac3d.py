@@ -14,7 +14,7 @@ from PIL import Image
 
 from zsp_lite.errors import InputError
 
-Material = dict[str, list[float]]  # numbers by keyword
+Material = dict[str, list[float]]  # the numbers after each keyword
 Corners = list[tuple[int, float, float]]  # vertex, u, v
 
 
@@ -23,7 +23,7 @@ class Ac3dObject:
     """One object of the file, in the coordinates of the file's world."""
 
     vertices: np.ndarray  # (v, 3)
-    texture: str | None  # its name
+    texture: str | None  # name of the texture file
     faces: list[tuple[int, Corners]]  # polygons: index of the material, corners
 
 
@@ -53,9 +53,10 @@ def convert(path: Path, out: Path, texture_folders: Sequence[Path] = ()) -> None
     materials, objects = read_ac3d(path)
     out.parent.mkdir(parents=True, exist_ok=True)
 
-    # Vertices, texture coordinates and faces. OBJ counts vertices and corners from 1 in the file.
+    # Vertices, texture coordinates and faces. OBJ counts vertices and corners from 1 in the whole
+    # file. `names` has the OBJ material of each combination of material and texture.
     obj = [f"mtllib {out.stem}.mtl"]
-    names = {}  # of the materials of the OBJ file, by material and texture of the model
+    names = {}
     vertex_start = 1
     corner_start = 1
     for part in objects:
@@ -70,7 +71,7 @@ def convert(path: Path, out: Path, texture_folders: Sequence[Path] = ()) -> None
             corner_start += len(corners)
         vertex_start += len(part.vertices)
 
-    # Materials, with white and a broad highlight where the model says nothing.
+    # Materials. Where the model says nothing: white, opaque, with a broad highlight.
     mtl = []
     for (index, texture), name in names.items():
         material = materials[index]
@@ -90,7 +91,7 @@ def convert(path: Path, out: Path, texture_folders: Sequence[Path] = ()) -> None
 
 
 def _material(words: list[str]) -> Material:
-    """Return the numbers after each keyword of a MATERIAL line."""
+    """Parse a MATERIAL line: each keyword is followed by its numbers."""
     material: Material = {}
     for word in words:
         if word.isalpha():
@@ -118,9 +119,10 @@ def _read_object(
         if keyword == "loc":
             offset = np.array(rest, float)
         elif keyword == "rot":
-            # rows of the file are the images of the axes
+            # The rows of the file are the images of the axes.
             turn = np.array(rest, float).reshape(3, 3).T
-        elif keyword == "data":  # so many characters of text, with the ends of lines
+        elif keyword == "data":
+            # A comment of this length follows, in characters, ends of lines included: skip it.
             left = int(rest[0])
             while left > 0:
                 left -= len(next(lines)) + 1
@@ -146,7 +148,7 @@ def _read_object(
                 objects.append(Ac3dObject(vertices @ rotation.T + shift, texture, faces))
             for _ in range(int(rest[0])):
                 line = next(lines, None)
-                if line is None:  # some exporters count more children than they write
+                if line is None:  # Some exporters count more children than they write.
                     return
                 if not line.startswith("OBJECT"):
                     raise ValueError(f"expected a child object, got {line!r}")
@@ -176,6 +178,7 @@ def _read_surface(
 
 
 def _write_texture(texture: str, model: Path, out: Path, folders: Sequence[Path]) -> str:
+    """Write a texture of a model as PNG and return the name of the file."""
     name = texture.replace("\\", "/").split("/")[-1]
     for folder in (model.parent, *folders):
         if (folder / name).is_file():

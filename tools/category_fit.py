@@ -1,11 +1,10 @@
-"""Fit the probabilities of `zsp_lite.category`: that the pose of an object, or its alternative, is
-right.
+"""Fit the probabilities that `zsp_lite.category` gives to an object's pose and its alternative.
 
     python -m tools.category_fit outputs/validation
 
-Sets of three to five objects are aligned, with all pairs and with a third. A pose is right within
-30 degrees of the frame that most objects agree with. Prints constants of zsp_lite/category.py, and
-calibration on categories left out.
+Sets of three to five objects are aligned, once with all pairs and once with a third of them. A pose
+is right within 30 degrees of the frame that most objects agree with. The tool prints constants of
+zsp_lite/category.py, and how well they are calibrated on categories left out of the fit.
 """
 
 import sys
@@ -38,7 +37,8 @@ def collect(
     def view(name: str, number: int) -> View:
         return method.views([data.load(data.frame(category, name, number))])[0]
 
-    for pair in object_pairs(data, category, names, None, 5):
+    # All pairs of the objects, none left out.
+    for pair in object_pairs(data, category, names, per_object=None, targets=5):
         reference = view(pair.reference_sequence, pair.reference_frame)
         targets = [view(pair.target_sequence, number) for number in pair.target_frames]
         estimate = replace(method, seed=pair.seed).estimate_from_views(reference, targets)
@@ -48,8 +48,12 @@ def collect(
 def examples(
     pairs: list[PairHypotheses], labels: dict[str, Float[np.ndarray, "3 3"]]
 ) -> list[tuple]:
-    """Return for each object of each set: number of objects, share of pairs, margin, agreeing
-    share, and 0, 1 or 2 if its pose, its alternative or neither is right."""
+    """Align many sets of objects.
+
+    Returns:
+        For each object of each set: number of objects, share of the pairs that are used, margin,
+        agreeing share, and 0, 1 or 2 if its pose, its alternative or neither is right.
+    """
     rng = np.random.default_rng(0)
     rows = []
     sets = [names for size in (3, 4, 5) for names in combinations(labels, size)]
@@ -59,19 +63,22 @@ def examples(
         solved = [pair for pair in pairs if [pair.reference, pair.target] in ends]
         try:
             objects = synchronise(solved).objects
-        except InputError:  # they do not connect all objects
+        except InputError:  # The chosen pairs do not connect all objects.
             continue
 
-        # Rotations from the frame of the labels to that of the alignment, which should be one: the
-        # true one is that which most objects agree with.
+        # Rotations from the frame of the labels to the frame of the alignment, by each object. They
+        # should be equal; the one that most objects agree with counts as true.
         frames = np.stack([pose.sim3.R @ labels[name] for name, pose in objects.items()])
         agreeing = (rotation_angle(frames[:, None], frames) < module.SAME_ANGLE).sum(axis=1)
         common = frames[agreeing.argmax()]
         for name, pose in objects.items():
             other = pose.alternative or pose.sim3
             turns = rotation_angle(np.stack([pose.sim3.R, other.R]) @ labels[name], common)
-            right = [*(turns < module.SAME_ANGLE), True].index(True)
-            # The terms of the logit, from the probabilities that it gave with present constants.
+            right = [*(turns < module.SAME_ANGLE), True].index(
+                True
+            )  # of pose, alternative, neither
+            # The terms of the logit are computed back from the probabilities that it gave with the
+            # present constants.
             other_probability = pose.alternative_probability
             neither = 1 - pose.probability - other_probability
             odds = np.array([other_probability, neither]) / pose.probability
@@ -84,7 +91,10 @@ def examples(
 def probabilities(
     terms: Float[np.ndarray, "n 2"], coefficients: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Return the probabilities of pose, alternative and neither: a conditional logit."""
+    """Return the probabilities of pose, alternative and neither, by a conditional logit.
+
+    `terms` are margin and agreeing share. The score of the pose is 0.
+    """
     margin, none, agreeing = coefficients
     scores = [0 * terms[:, 0], -margin * terms[:, 0], none + agreeing * terms[:, 1]]
     odds = np.exp(np.stack(scores, axis=1))
@@ -92,8 +102,8 @@ def probabilities(
 
 
 def fit(terms: Float[np.ndarray, "n 2"], right: Int[np.ndarray, " n"]) -> Float[np.ndarray, "3"]:
-    """Fit the coefficients by maximum likelihood, with a ridge."""
-    chosen = np.eye(3, dtype=bool)[right]
+    """Fit the coefficients by maximum likelihood, with a ridge that keeps them finite."""
+    chosen = np.eye(3, dtype=bool)[right]  # (n, 3): the right one of the three in each row
 
     def loss(x: np.ndarray) -> float:
         return 1e-3 * x @ x - np.log(probabilities(terms, x)[chosen]).mean()
@@ -107,8 +117,9 @@ def main(root: str) -> None:
     method = ZeroShotPose(load_backbone(), solver="verified")
     rows = []
     for k, category in enumerate(data.categories()):
-        labels = {name: one.trans[:3, :3] for name, one in read_labels(root, category).items()}
-        labels = dict(list(labels.items())[:5])
+        # The rotations of the first five labels: sets have up to five objects.
+        stored = list(read_labels(root, category).items())[:5]
+        labels = {name: label.trans[:3, :3] for name, label in stored}
         pairs = list(collect(data, category, list(labels), method))
         rows += [(k, *row) for row in examples(pairs, labels)]
     table = np.array(rows)  # category, and the columns of `examples`
@@ -116,11 +127,15 @@ def main(root: str) -> None:
     right = table[:, 5].astype(int)
     print("MARGIN, NONE, NONE_AGREEING:", fit(terms, right))
 
-    # Calibration: the probability of each pose by a fit that has not seen its category.
+    # The probability of each pose by a fit that has not seen its category.
     p = np.empty(len(table))
     for k in set(table[:, 0]):
-        mine = table[:, 0] == k
-        p[mine] = probabilities(terms[mine], fit(terms[~mine], right[~mine]))[:, 0]
+        held_out = table[:, 0] == k
+        coefficients = fit(terms[~held_out], right[~held_out])
+        p[held_out] = probabilities(terms[held_out], coefficients)[:, 0]
+
+    # The calibration error, in four bins of equal count, for each size of the sets and share of
+    # their pairs.
     for size, share in np.unique(table[:, 1:3], axis=0):
         members = np.flatnonzero((table[:, 1:3] == (size, share)).all(axis=1))
         quarters = np.array_split(members[np.argsort(p[members])], 4)

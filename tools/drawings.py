@@ -32,7 +32,7 @@ LINE = "#B8B8B0"
 SKY = "#56B4E9"
 PINK = "#CC79A7"
 WIDTH = 940  # of the two large drawings, in pixels
-MARGIN = 14
+MARGIN = 14  # from the border of a large drawing to its content
 PICTOGRAM = (204, 110)  # size of a stage's picture in `method.svg`
 # The camera of every `Photo`: it looks down by this angle (degrees) at this height of a chair, and
 # this length of the chair's world fills the picture.
@@ -40,7 +40,8 @@ TILT = 20
 EYE_LEVEL = 0.92
 FIELD = 2.45
 
-# Parts of a chair as boxes, centre and size: x to the right of who sits on it, y forward, z up.
+# The parts of a chair are boxes with a centre and a size. The axes are x to the right of who sits
+# on the chair, y forward, z up.
 Chair = dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]]
 
 
@@ -109,8 +110,8 @@ class Photo:
         for part, axis, sign in product(self.chair, range(3), (-1, 1)):
             normal = sign * np.eye(3)[axis]
             _, (start, end) = self.project(np.array([np.zeros(3), normal]))
-            if end - start >= -1e-9:
-                continue  # the normal does not lead towards the camera
+            if end - start >= -1e-9:  # The normal does not lead towards the camera.
+                continue
             others = [other for other in range(3) if other != axis]
             corners = np.tile(normal, (4, 1))
             corners[:, others] = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
@@ -141,7 +142,8 @@ class Photo:
         far ones first."""
         dots = []
         for part, (a, b, c, d), _, _ in self.faces:
-            # The face is a parallelogram: shares i of the way from a to b, j of that from a to d.
+            # The face is a parallelogram with corners a, b, c, d. A place is given by the share i
+            # of the way from a to b, and the share j of the way from a to d.
             along = max(2, round(np.linalg.norm(b - a) / step))
             across = max(2, round(np.linalg.norm(d - a) / step))
             i, j = np.meshgrid((np.arange(along) + 0.5) / along, (np.arange(across) + 0.5) / across)
@@ -155,12 +157,13 @@ class Photo:
         """Draw the picture in shades of a colour."""
         drawn = self.ground(frame, thick)
         for _, corners, normal, _ in self.faces:
-            shade = (0.78, 0.9, 1.0)[int(np.abs(normal).argmax())]  # light from above
+            # Light from above: the brightness of faces across x, y and z.
+            shade = (0.78, 0.9, 1.0)[int(np.abs(normal).argmax())]
             drawn += polygon(corners, mix(colour, INK, shade))
         return drawn
 
     def draw_depth(self) -> str:
-        """Draw its depth map: near is dark."""
+        """Draw the depth map of the picture: near is dark."""
         far = self.faces[0][3]
         near = self.faces[-1][3]
         drawn = self.ground()
@@ -183,12 +186,13 @@ def mix(first: str, second: str, share: float) -> str:
 
 
 def number(value: float) -> str:
-    """Return a number with at most one decimal."""
-    return f"{round(value, 1) + 0.0:.1f}".removesuffix(".0")  # + 0.0: no "-0"
+    """Write a number with at most one decimal."""
+    # Adding 0.0 turns -0.0 into 0.0, which is written without a sign.
+    return f"{round(value, 1) + 0.0:.1f}".removesuffix(".0")
 
 
 def attributes(**values: object) -> str:
-    """Write attributes; "_" in a name stands for "-", and a value None leaves it out."""
+    """Write attributes; "_" in a name stands for "-", and None leaves the attribute out."""
     written = ""
     for name, value in values.items():
         if isinstance(value, int | float):
@@ -214,6 +218,7 @@ def rect(
     thick: float = 1,
     corner: float = 0,
 ) -> str:
+    """Draw a rectangle, with corners of a radius `corner`."""
     line = {} if stroke is None else {"stroke": stroke, "stroke_width": thick}
     return element(
         "rect", x=x, y=y, width=width, height=height, rx=corner or None, fill=fill, **line
@@ -221,6 +226,7 @@ def rect(
 
 
 def polygon(corners: np.ndarray, fill: str, stroke: str | None = None) -> str:
+    """Draw a polygon; its outline is by default a darker shade of its colour."""
     points = " ".join(f"{number(x)},{number(y)}" for x, y in corners)
     stroke = stroke or mix(fill, INK, 0.7)
     return element(
@@ -236,6 +242,7 @@ def polygon(corners: np.ndarray, fill: str, stroke: str | None = None) -> str:
 def dot(
     place: np.ndarray, fill: str, radius: float = 4, stroke: str = "white", thick: float = 1.2
 ) -> str:
+    """Draw a filled circle with an outline."""
     return element(
         "circle", cx=place[0], cy=place[1], r=radius, fill=fill, stroke=stroke, stroke_width=thick
     )
@@ -287,6 +294,7 @@ def arc(start: np.ndarray, end: np.ndarray, bend: float, gap: float = 6) -> str:
     return f"M{pair(start)}Q{pair(control)} {pair(end)}"
 
 
+# Names of the arrow heads by colour.
 _HEADS = {
     INK: "ink",
     GREY: "grey",
@@ -296,7 +304,8 @@ _HEADS = {
     VERMILLION: "red",
 }
 _TOKEN = re.compile(r"\*(.+?)\*|_\{(.+?)\}|\^\{(.+?)\}")
-_SHIFTS = (0, 0, 0.28, -0.38)  # down, of plain, italic, subscript, superscript; 1 is the font size
+# How far plain, italic, subscript and superscript are below the line, in font sizes.
+_SHIFTS = (0, 0, 0.28, -0.38)
 
 
 def text(
@@ -320,7 +329,7 @@ def text(
         shift = size * _SHIFTS[kind]
         if shift != below:
             style["dy"] = shift - below
-        if shift:
+        if shift:  # Subscripts and superscripts are smaller.
             style["font_size"] = 0.72 * size
         spans += f"<tspan{attributes(**style)}>{escape(part)}</tspan>" if style else escape(part)
         below = shift
@@ -383,7 +392,7 @@ def svg(content: str, width: float, height: float, title: str, description: str)
     )
 
 
-# The pictures of the stages, each in a field of PICTOGRAM; `words` are left out in the small strip
+# The pictures of the stages, each in a field of PICTOGRAM; the small strip leaves out `words`
 
 
 @cache
@@ -415,8 +424,8 @@ def draw_features(words: bool = True) -> str:
     features = grid.ground()
     for row, column in np.ndindex(cells, cells):
         corner = np.array([grid.x + column * side, grid.y + row * side])
-        # Nine places in the cell; a cell with three or more on the chair has a feature of the part
-        # that most of them show.
+        # Of nine places in the cell, at 0.2, 0.5 and 0.8 of its side, three or more have to be on
+        # the chair. The colour is that of the part that most of them show.
         places = corner + side * (np.indices((3, 3)).reshape(2, -1).T * 0.3 + 0.2)
         shown = [part for part in grid.parts_at(places) if part]
         if len(shown) > 2:
@@ -492,7 +501,7 @@ def draw_fit(words: bool = True) -> str:
     second = (first - first.mean(0)) @ turn.T * 0.95 + [158, 56]
     second[4] = [196, 18]  # a wrong match
     drawn = ""
-    for i, (a, b) in enumerate(zip(first, second, strict=True)):
+    for i, (a, b) in enumerate(zip(first, second)):
         if i == 4:
             x, y = a + (b - a) * 0.72
             drawn += curve(straight(a, b, 6), VERMILLION, 1.8, "4 4")
@@ -534,7 +543,7 @@ STAGES: dict[str, tuple[str, Callable[..., str]]] = {
 
 
 PANEL = (216, 208)  # width and height of the field of a stage
-_GROUND = "#FBFBF9"  # of a field
+_GROUND = "#FBFBF9"  # colour of a field
 
 
 def draw_panel(
@@ -766,7 +775,7 @@ def draw_vector(
     return drawn
 
 
-# Of the three vectors of one patch, and of the values of four patches.
+# Shades of the cells of vectors: the three vectors of one patch, and the values of four patches.
 _SHADES = (
     (0.9, 0.35, 0.7, 0.2),
     (0.3, 0.8, 0.45, 0.95),
@@ -790,7 +799,7 @@ def draw_query_key_value() -> str:
         (138, VERMILLION, "key_{i}", "what the patch offers"),
         (220, GREEN, "value_{i}", "what the patch hands on"),
     )
-    for (y, colour, title, meaning), shades in zip(rows, _SHADES, strict=False):
+    for (y, colour, title, meaning), shades in zip(rows, _SHADES):
         drawn += curve(f"M222 138L294 {y}", INK, 1.8, head=True)
         drawn += draw_vector(302, y - 8, colour, shades)
         drawn += text(title, 372, y - 3, 13, bold=True)
@@ -920,12 +929,12 @@ def draw_frames() -> str:
     drawn += draw_camera(np.array([x[4], y]), ORANGE, -1)
     for place, turn in ((x[1], 12), (x[2], 0), (x[3], -20)):
         drawn += draw_axes(np.array([place - 4, y + 10]), turn)
-    for left, right, (step, kind) in zip(x[:-1], x[1:], steps, strict=True):
+    for left, right, (step, kind) in zip(x[:-1], x[1:], steps):
         middle = (left + right) / 2
         drawn += curve(f"M{left + 48} {y}H{right - 48}", INK, 2.2, head=True)
         drawn += text(step, middle, y - 14, 15, anchor="middle")
         drawn += text(kind, middle, y + 22, 13, GREY, "middle")
-    for place, lines in zip(x, names, strict=True):
+    for place, lines in zip(x, names):
         drawn += paragraph(lines, place, y + 62, 18, 13, "middle")
 
     # The arrow from the first to the last, and its formula.
@@ -948,8 +957,10 @@ def draw_frames() -> str:
 
 
 def _frame_of(chair: Chair) -> np.ndarray:
-    """Return corners (10, 3) of a chair: feet, seat and top, back before front, in turn left and
-    right."""
+    """Return corners (10, 3) of a chair: feet, seat and top.
+
+    Left and right alternate; those at the back come before those in front.
+    """
     legs = [chair[f"leg {side}{end}"][0] for end in ("", " front") for side in ("left", "right")]
     feet = np.array(legs) * [1, 1, 0]
     _, _, seat_height = chair["seat"][0]
@@ -959,8 +970,10 @@ def _frame_of(chair: Chair) -> np.ndarray:
 
 
 def best_matrix(x: np.ndarray, y: np.ndarray, proper: bool) -> np.ndarray:
-    """Return the orthogonal matrix that lays centred points x (n, d) best on y, by Umeyama's
-    method; a `proper` one is a rotation."""
+    """Return the orthogonal matrix that lays centred points x (n, d) best on y.
+
+    By Umeyama's method; a `proper` matrix is a rotation.
+    """
     u, _, vt = np.linalg.svd(y.T @ x)
     signs = np.ones(len(u))
     if proper:
@@ -976,7 +989,9 @@ def draw_mirror() -> str:
     # Between the corners of `_frame_of`: legs, sides of the seat, sides of the back and its top.
     edges = [(0, 4), (1, 5), (2, 6), (3, 7), (4, 5), (5, 7), (7, 6), (6, 4), (4, 8), (5, 9), (8, 9)]
     x = _frame_of(REFERENCE)
-    y = x[np.arange(len(x)) ^ 1]  # left and right exchanged
+    # Left corners have even and right ones odd indices: an index with its last bit flipped
+    # exchanges them.
+    y = x[np.arange(len(x)) ^ 1]
     centre = x.mean(0)
 
     # The matches of some corners, between two pictures.
@@ -988,7 +1003,7 @@ def draw_mirror() -> str:
     words = ("They join the left of a chair", "with its right.")
     drawn += paragraph(words, 10 + panel / 2, 246, 20, 14, "middle")
 
-    # Both fits, each over a picture.
+    # Both fits, each over a picture. The index of a fit says whether the matrix is `proper`.
     fits = (
         (
             "The best matrix: det = −1",
@@ -1027,7 +1042,7 @@ def draw_title(title: str, left: float, width: float) -> str:
 
 
 def draw_matches(points: np.ndarray, matches: np.ndarray, shown: Iterable[int], colour: str) -> str:
-    """Draw some of the points (n, 2) and their matches (n, 2), with dashed lines between them."""
+    """Draw the `shown` points (n, 2) and their matches (n, 2), with dashed lines between them."""
     drawn = ""
     for j in shown:
         if np.linalg.norm(matches[j] - points[j]) > 1:
@@ -1064,6 +1079,7 @@ def draw_three() -> str:
         if i:
             drawn += curve(f"M{x} 20V{height - 20}", LINE, 1.2)
         for chair, colour, (left, top) in chairs:
+            # In the last panel the chair b stands the other way round.
             azimuth = 205 if i == 2 and chair is TARGET else 25
             drawn += Photo(chair, azimuth, x + left, top, size).draw(colour)
         centres = [np.add(corner, size / 2) + [x, 0] for _, _, corner in chairs]
@@ -1091,7 +1107,7 @@ def draw_three() -> str:
 def draw_ransac() -> str:
     """Draw the inliers of a sample with wrong matches, of one without, and of the last fit."""
     panel = 280
-    radius = 15  # of the threshold
+    radius = 15  # threshold of inliers, in pixels
     random = np.random.default_rng(3)
     x = np.array(
         [
@@ -1108,8 +1124,10 @@ def draw_ransac() -> str:
         ],
         float,
     )
+    # The matches are the points, turned by 12 degrees, with noise. Two are wrong and agree by
+    # chance.
     y = x @ np.array([[0.96, -0.2], [0.2, 0.96]]).T + random.normal(0, 3.5, x.shape)
-    y[[2, 6]] = [[74, 34], [-62, -22]]  # wrong matches, which agree by chance
+    y[[2, 6]] = [[74, 34], [-62, -22]]
     panels = (
         ("A sample with wrong matches", [2, 6, 8, 9], f" of {len(x)}: forgotten"),
         ("A sample of right matches", [0, 3, 5, 8], f" of {len(x)}: kept"),
@@ -1118,7 +1136,7 @@ def draw_ransac() -> str:
     drawn = ""
     inliers = np.array([], int)
     for i, (title, sample, words) in enumerate(panels):
-        # The fit to the sample, or to the inliers of the one before.
+        # The last fit has no sample: it uses the inliers of the fit before.
         fitted = sample or inliers
         centre = x[fitted].mean(0)
         goal = y[fitted].mean(0)
@@ -1128,7 +1146,7 @@ def draw_ransac() -> str:
         inliers = np.flatnonzero(inside)
 
         picture = ""
-        for j, (point, match) in enumerate(zip(moved, y, strict=True)):
+        for j, (point, match) in enumerate(zip(moved, y)):
             if inside[j]:
                 picture += ring(match, GREEN, radius, 2.6)
             else:
@@ -1216,7 +1234,8 @@ def _phone(place: np.ndarray, towards: np.ndarray) -> str:
 
 
 def _types(names: Iterable[str]) -> list[str]:
-    """Write the first two types among imported names in at most three lines of 11 letters."""
+    """Write the first two types among imported names in at most three lines of 11 letters, the
+    width of a box."""
     lines = []
     types = [name for name in names if name[0].isupper() and not name.isupper()]
     for name in types[:2]:
@@ -1231,9 +1250,9 @@ def _types(names: Iterable[str]) -> list[str]:
 
 
 def draw_rooms() -> str:
-    """Draw the rooms on a diagonal; what one gives to another is at the right of the one and above
-    the other."""
-    # From a room to the next, and size of a box, in pixels.
+    """Draw the rooms on a diagonal. What a room gives to another is at the right of the first and
+    above the second."""
+    # The step from a room to the next, and the size of a box, in pixels.
     across = 74
     down = 50
     wide = 68

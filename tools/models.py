@@ -1,15 +1,15 @@
-"""Build a folder of models of a catalogue from unpacked Debian packages.
+"""Build a folder with the models of a catalogue from unpacked Debian packages.
 
     apt-get download sweethome3d-furniture flightgear-data-ai
     mkdir packages
     for file in *.deb; do dpkg-deb -x $file packages/${file%%_*}; done
     python -m tools.models tools/artists.json packages outputs/artists_models
 
-A catalogue names every model: package, file, licence, author and orientation. `artists.json` is
-that of the evaluation preset `artists`, `samples.json` that of `data_samples/`, `training.json`
-that of training, and `validation.json` that of the choice between weights. The models themselves
-are not part of this repository. Those under GPL may be rendered for evaluation only; neither they
-nor pictures of them are to be published.
+A catalogue gives the package, file, licence, author and orientation of every model. There are
+catalogues for the evaluation preset `artists` (`artists.json`), for `data_samples/`
+(`samples.json`), for training (`training.json`) and for the choice between weights
+(`validation.json`). The models themselves are not part of this repository. Models under GPL may be
+rendered for evaluation only; neither they nor pictures of them are to be published.
 """
 
 import hashlib
@@ -40,13 +40,13 @@ class Source(msgspec.Struct, frozen=True, omit_defaults=True):
 
     package: str
     file: str  # in the package
-    sha256: str  # of the work's own file (of the archive member where `member` is given)
+    sha256: str  # checksum of the work's own file: of the archive's member if `member` is given
     licence: str
     author: str
-    # where the licence was read: in the package, or in the archive beside the work
+    # file in which the licence was read, of the package or of the archive
     licence_file: str
     member: str = ""  # path of the work in the archive `file`
-    title: str = ""  # that the author gave to the work
+    title: str = ""  # the author's title of the work
 
     def path(self, packages: Path) -> Path:
         """Return the path of `file`. Raises InputError if it is missing."""
@@ -157,7 +157,7 @@ def attribution(catalogue: Catalogue) -> str:
 
 
 def _changes(entry: Entry) -> str:
-    """List the changes of a model besides those of all models."""
+    """List the changes that were made to this model but not to all models."""
     changes = []
     if not entry.member:
         changes.append("converted from AC3D")

@@ -1,7 +1,7 @@
 """Put the tables of the stored runs into the pages: python -m tools.results_page.
 
-A table of a page stands between the lines <!-- table RUN NAME --> and <!-- end of table -->,
-without its notes: the figures of the paper, over all categories.
+A table of a page stands between the lines <!-- table RUN NAME --> and <!-- end of table -->. It has
+the columns with the measures of the paper, over all categories, and no notes.
 """
 
 import re
@@ -13,19 +13,20 @@ from zsp_lite.io.files import REPOSITORY, write_atomic
 
 RUNS = REPOSITORY / "notebooks" / "results" / "paper_run"
 PAGE = REPOSITORY / "docs" / "results.md"
-_FIGURES = [METRICS[name] for name in PAPER]
+_MEASURES = [METRICS[name] for name in PAPER]  # as they are called in the heads of tables
 _MARKED = re.compile(r"(<!-- table (\w+) (\w+) -->\n)(.*?)(<!-- end of table -->)", re.DOTALL)
 
 
 def updated(text: str) -> str:
     """Replace the marked tables of a page."""
 
-    def render(found: re.Match[str]) -> str:
-        start, run, name, _, end = found.groups()
+    def render(marked: re.Match[str]) -> str:
+        start, run, name, _, end = marked.groups()
         summary = read_run(RUNS / run).summary
         (table,) = [table for table in every_table(summary) if table.name == name]
-        # A column is called FIGURE, or PART: FIGURE.
-        columns = [column for column in table.cells if column.rpartition(": ")[2] in _FIGURES]
+        # A column is called MEASURE, or PART: MEASURE.
+        columns = [column for column in table.cells if column.rpartition(": ")[2] in _MEASURES]
+        # Some methods may be evaluated on a part of the pairs only.
         pairs = max(method["n"] for method in summary["methods"].values())
         shown = Table(name, f"{table.title} ({pairs:,} pairs)", table.cells[columns])
         return f"{start}{as_markdown(shown)}\n{end}"

@@ -29,8 +29,10 @@ ROOM_OF = {module: room for room, modules in ROOMS.items() for module in modules
 
 
 def modules() -> dict[str, Path]:
-    """Return the file of every module of the package but its `__init__`, by dotted name without
-    "zsp_lite."."""
+    """Return the file of every module by its dotted name without "zsp_lite.".
+
+    The package's own `__init__` is left out.
+    """
     paths = {
         path: path.relative_to(PACKAGE).with_suffix("").parts
         for path in sorted(PACKAGE.rglob("*.py"))
@@ -43,8 +45,10 @@ def modules() -> dict[str, Path]:
 
 
 def imports() -> Iterator[tuple[str, str, int]]:
-    """Find every import, also inside functions: a module, "package.module.name" that it imports,
-    and the line."""
+    """Find every import, also inside functions.
+
+    Yields the importing module, the imported name such as "package.module.name", and the line.
+    """
     for module, path in modules().items():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
@@ -60,12 +64,12 @@ def imports() -> Iterator[tuple[str, str, int]]:
 
 
 def flows() -> dict[tuple[str, str], Counter[str]]:
-    """Count the names that flow from one room to another, which imports them: by (from, to)."""
-    found = defaultdict(Counter)
+    """Count the imported names by the rooms (giver, taker) between which they flow."""
+    counts = defaultdict(Counter)
     for module, imported, _ in imports():
         package, _, name = imported.partition(".")
-        to = ROOM_OF[module.partition(".")[0]]
-        giver = ROOM_OF.get(name.partition(".")[0], to)
-        if package == "zsp_lite" and giver != to:
-            found[giver, to][name.rpartition(".")[2]] += 1
-    return found
+        taker = ROOM_OF[module.partition(".")[0]]
+        giver = ROOM_OF.get(name.partition(".")[0], taker)
+        if package == "zsp_lite" and giver != taker:
+            counts[giver, taker][name.rpartition(".")[2]] += 1
+    return counts

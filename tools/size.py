@@ -42,7 +42,7 @@ class Room(NamedTuple):
 
 
 def rooms() -> Iterator[Room]:
-    """Measure all rooms."""
+    """Measure all rooms. A file that several patterns of a room match counts once."""
     with LIMITS.open(newline="") as table:
         for row in csv.DictReader(table):
             files = {file for pattern in row["files"].split() for file in ROOT.glob(pattern)}
@@ -51,6 +51,7 @@ def rooms() -> Iterator[Room]:
 
 
 def _tokens(file: Path) -> int:
+    """Count the tokens of a file of code."""
     text = file.read_text(encoding="utf-8")
     return python_tokens(text) if file.suffix == ".py" else other_tokens(text, file.name)
 
@@ -66,26 +67,29 @@ def python_tokens(text: str) -> int:
         if token.type not in _LAYOUT
         and not (token.type == tokenize.STRING and token.start[0] in docstrings)
     ]
-    # The formatter alone decides on a comma before a closing bracket and where a string is broken.
-    by_formatter = sum(
-        (first.string == "," and second.string in {")", "]", "}"})
-        or first.type == second.type == tokenize.STRING
-        for first, second in itertools.pairwise(tokens)
-    )
+    # The formatter alone decides on a comma before a closing bracket and where a string is broken:
+    # neither counts.
+    by_formatter = 0
+    for first, second in itertools.pairwise(tokens):
+        last_comma = first.string == "," and second.string in {")", "]", "}"}
+        broken_string = first.type == second.type == tokenize.STRING
+        by_formatter += last_comma or broken_string
     return len(tokens) - by_formatter
 
 
 def other_tokens(text: str, name: str) -> int:
     """Count the tokens of JavaScript, CSS or HTML that are neither comments nor white space."""
-    found = get_lexer_for_filename(name).get_tokens(text)
-    return sum(kind not in Comment and kind not in Text for kind, _ in found)
+    tokens = get_lexer_for_filename(name).get_tokens(text)
+    return sum(kind not in Comment and kind not in Text for kind, _ in tokens)
 
 
 def _words(file: Path) -> int:
+    """Count the words of a page, or of the text cells of a notebook."""
     text = file.read_text(encoding="utf-8")
     if file.suffix == ".ipynb":
         cells = json.loads(text)["cells"]
-        text = "\n".join("".join(one["source"]) for one in cells if one["cell_type"] == "markdown")
+        pages = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown"]
+        text = "\n".join(pages)
     return len(text.split())
 
 

@@ -1,8 +1,7 @@
-"""Print the times that docs/scale.md quotes, and the memory: `python -m tools.speed`, from the root
-of the repository.
+"""Print the times and the memory that docs/scale.md quotes: `python -m tools.speed`.
 
-All estimates are of one pair of the sample data with five target views. Times are medians; run it
-on an idle machine.
+Run it from the root of the repository, on an idle machine. All estimates are of one pair of the
+sample data with five target views. Times are medians.
 """
 
 import resource
@@ -23,11 +22,11 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.matching import similarities
 from zsp_lite.pipeline import ZeroShotPose
 
-REPEATS = 7
+REPEATS = 7  # odd, so that the median is one of the times
 
 
 def seconds(function: Callable[[], object], repeats: int = REPEATS) -> float:
-    """Return the median time of a call; the first call is not counted."""
+    """Return the median time of a call; the first call, which fills caches, is not counted."""
     times = []
     for _ in range(repeats + 1):
         start = time.perf_counter()
@@ -37,8 +36,8 @@ def seconds(function: Callable[[], object], repeats: int = REPEATS) -> float:
 
 
 def one_estimate() -> None:
-    """Make one estimate and print the peak memory of this process in bytes; `main` runs it in a new
-    one."""
+    """Make one estimate and print the peak memory of this process in bytes; `main` runs this in a
+    new process."""
     dataset = Co3D(sample_data())
     ZeroShotPose(load_backbone(device="cpu")).estimate(*dataset.load_pair(example_pair(dataset)))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -66,7 +65,7 @@ def main() -> None:
     )
     report(f"the same with {tiny.name}", 1000 * seconds(lambda: tiny(images)))
 
-    # The stages of an estimate; the first run is not counted.
+    # The stages of an estimate, by medians; the first run is not counted.
     for solver in ("paper", "verified"):
         method = ZeroShotPose(tiny, solver=solver)
         runs = [method.estimate(reference, targets).timings for _ in range(REPEATS + 1)][1:]
@@ -80,6 +79,7 @@ def main() -> None:
         1000 * seconds(lambda: method.views([dataset.load(frame)])),
     )
 
+    # Random keys of the reference and five targets, as large as DINO's.
     keys = [torch.randn(28, 28, 384, generator=torch.Generator().manual_seed(i)) for i in range(6)]
     report(
         "similarity of log-binned descriptors, 5 targets",

@@ -29,17 +29,17 @@ def main(arguments: list[str] | None = None) -> None:
         help="range of the cameras' mean elevation",
     )
     parser.add_argument("--out", type=Path, required=True)
-    given = parser.parse_args(arguments)
-    builders = SPLITS[given.split]
-    with writing(given.out):
+    options = parser.parse_args(arguments)
+    builders = SPLITS[options.split]
+    with writing(options.out):
         export_categories(
             list(builders),
-            given.out,
-            given.sequences,
-            given.frames,
-            given.seed,
+            options.out,
+            options.sequences,
+            options.frames,
+            options.seed,
             builders=builders,
-            heights=tuple(given.heights),
+            heights=tuple(options.heights),
         )
 
 

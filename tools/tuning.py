@@ -1,18 +1,18 @@
 """Fit the constants of the verified solver: the weights of the score, and the calibration.
 
-Run from the root of the repository. The weights are fitted on training categories, the calibration
-on validation categories, that neither the backbone nor the weights were fitted on. docs/rebuild.md
-makes the data:
+Run it from the root of the repository. The weights are fitted on training categories. The
+calibration is fitted on validation categories, on which neither the backbone nor the weights were
+fitted. docs/rebuild.md makes the data:
 
     python -m tools.tuning weights outputs/training_poses:30 outputs/training:30
     python -m tools.tuning calibration outputs/{validation:60,validation_poses:60}
     python -m tools.tuning scans outputs/{validation:6,validation_poses:6}
 
-The last fits `category.OF_TWO`. FOLDER:PAIRS is a data folder and the number of pairs of each of
-its categories, in each setting of the target views: all around the object, and but for the weights
-also within arcs. Folders with categories of another side (`concepts.csv`) are refused. The tool
-prints the fitted values and how well they do on categories left out of the fit; the constants of
-the library are these, rounded.
+The command `scans` fits `category.OF_TWO`. FOLDER:PAIRS is a data folder and the number of pairs of
+each of its categories, in each setting of the target views: all around the object, and but for the
+weights also within arcs. Folders with categories of another side (`concepts.csv`) are refused. The
+tool prints the fitted values and how well they do on categories left out of the fit. The constants
+of the library are the fitted values, rounded.
 
 The weights are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the
 probability that one is correct is the softmax of their scores. They are fitted to hypotheses that
@@ -62,16 +62,17 @@ from zsp_lite.views import View, usable_targets
 from zsp_lite.viz.reliability import reliability
 
 CONCEPTS = Path(__file__).with_name("concepts.csv")  # the side of every name of a category
-CORRECT_ANGLE = 30.0  # degrees
-# A hypothesis counts as correct to the degree exp(-(error / 12 degrees)^2); pairs without one above
-# 0.3 are not used.
+CORRECT_ANGLE = 30.0  # a pose with a smaller error is right, in degrees
+# A hypothesis counts as correct to the degree exp(-(error / _SOFT_ANGLE)^2), in degrees.
 _SOFT_ANGLE = 12.0
+# A pair is used for the weights if one of its hypotheses is correct to a higher degree.
 _MIN_CORRECTNESS = 0.3
+# Ridges keep the coefficients finite where the evidence separates right from wrong poses.
 _WEIGHT_RIDGE = 1e-2
 _CALIBRATION_RIDGE = 1e-3
-_SURE = 0.8  # confidences above this are reported by themselves
-# The settings of the target views, by what is fitted: their number, and the arc in degrees that
-# they lie in.
+_SURE = 0.8  # confidences above this are also reported by themselves
+# The settings by what is fitted: the number of target views, and the arc in degrees in which they
+# lie.
 ALL_AROUND = 360.0
 _SETTINGS = {
     "weights": ((5, ALL_AROUND),),
@@ -79,7 +80,7 @@ _SETTINGS = {
         *((n, ALL_AROUND) for n in (1, 2, 3, 5, 10)),
         *((5, arc) for arc in (30.0, 60.0, 90.0, 120.0)),
     ),
-    # Degrees that each of two objects was seen around, and number of its target views.
+    # For each of two objects, the arc in degrees of its frames, and the number of target views.
     "scans": (
         ((360.0, 5), (360.0, 5)),
         ((360.0, 3), (360.0, 3)),
@@ -89,11 +90,11 @@ _SETTINGS = {
         ((100.0, 5), (360.0, 5)),
     ),
 }
-_FRAMES = (1, 2, 4, 8)  # reference frames of each object
-_OBJECTS = 8  # of a category, in pairs of scans
+_FRAMES = (1, 2, 4, 8)  # numbers of reference frames of each object, which divide the last
+_OBJECTS = 8  # largest number of objects of a category that are paired as scans
 _Fit = TypeVar("_Fit")
-# Of the different poses of a pair, best first: by how many nats each is below the best, and its
-# error in degrees.
+# The different poses of a pair, best first: by how many nats each is below the best, and its error
+# in degrees.
 Poses = tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]
 
 
@@ -102,12 +103,12 @@ class Outcome:
     """The m hypotheses of the verified solver for one pair, with their errors."""
 
     category: str
-    terms: Float[np.ndarray, "m terms"]  # of the score, in the order of `TERM_NAMES`
-    errors: Float[np.ndarray, " m"]  # of the rotations, degrees
-    angles: Float[np.ndarray, "m m"]  # between the rotations, degrees
-    setting: str  # of the target views, in words
+    terms: Float[np.ndarray, "m terms"]  # terms of the score, in the order of `TERM_NAMES`
+    errors: Float[np.ndarray, " m"]  # errors of the rotations, degrees
+    angles: Float[np.ndarray, "m m"]  # angles between the rotations, degrees
+    setting: str  # setting of the target views, in words
     span: float  # angle in degrees that the usable target views span around the target
-    n_views: int  # usable target views
+    n_views: int  # number of usable target views
     # degrees between the reference's camera and the nearest target view's
     nearest: Float[np.ndarray, " m"]
     view_std: float  # standard deviation of the target views' similarity to the reference
@@ -121,7 +122,8 @@ class Outcome:
         """Return the different poses under the weights."""
         scores = self.terms @ np.array(astuple(weights))
         order = np.argsort(-scores, kind="stable")
-        # `modes` names for each hypothesis the best one of the same pose: keep those themselves.
+        # `modes` gives for each hypothesis the index of the best one with the same pose. The best
+        # ones themselves, which have their own index, are the different poses.
         different = order[modes(self.angles[np.ix_(order, order)]) == np.arange(len(order))]
         return scores[order[0]] - scores[different], self.errors[different]
 
@@ -137,11 +139,11 @@ def collect_outcomes(
 ) -> list[Outcome]:
     """Run the verified solver on `pairs` pairs of a category in each setting; features are
     extracted once per image."""
-    torch.set_num_threads(1)  # every category has a process
+    torch.set_num_threads(1)  # Each category has a process of its own.
     dataset = Co3D(root)
     method = ZeroShotPose(load_backbone(device="cpu"), solver="verified")
     labels = read_labels(root, category)
-    name = f"{root.name}/{category}"  # folders may share names of categories
+    name = f"{root.name}/{category}"  # Folders may share names of categories.
     numbers: dict[str, list[int]] = {}
     for frame in dataset.frame_list(category):
         numbers.setdefault(frame.sequence_name, []).append(frame.frame_number)
@@ -156,10 +158,11 @@ def collect_outcomes(
         if arc < ALL_AROUND:
             setting = f"views within {arc:.0f} degrees"
         for pair in sample_pairs(dataset, category, pairs, n_targets, seed):
-            shown = pair.target_frames
+            # Within an arc, the target views are drawn from all frames of the sequence.
+            target_frames = pair.target_frames
             if arc < ALL_AROUND:
-                shown = sorted(numbers[pair.target_sequence])
-            targets = [view(pair.target_sequence, number) for number in shown]
+                target_frames = sorted(numbers[pair.target_sequence])
+            targets = [view(pair.target_sequence, number) for number in target_frames]
             if arc < ALL_AROUND:
                 targets = views_within(targets, arc, np.random.default_rng(pair.seed))
             reference = view(pair.reference_sequence, pair.reference_frame)
@@ -171,8 +174,8 @@ def collect_outcomes(
 
 @dataclass(frozen=True, eq=False)
 class ScanOutcome:
-    """What an `Outcome` tells the calibration, of two objects that are solved from several frames
-    of both."""
+    """The same for the calibration as an `Outcome`, of two objects that are solved from several
+    frames of both."""
 
     category: str
     setting: str
@@ -192,7 +195,7 @@ def collect_scans(
 ) -> list[ScanOutcome]:
     """Find the poses between `pairs` pairs of objects of a category from several frames of both, in
     each setting."""
-    torch.set_num_threads(1)  # every category has a process
+    torch.set_num_threads(1)  # Each category has a process of its own.
     dataset = Co3D(root)
     method = ZeroShotPose(load_backbone(device="cpu"), solver="verified")
     labels = read_labels(root, category)
@@ -201,11 +204,11 @@ def collect_scans(
     def view(name: str, index: int) -> View:
         return method.views([dataset.load(dataset.frames(category, name)[index])])[0]
 
-    every = list(combinations(list(labels)[:_OBJECTS], 2))
+    all_pairs = list(combinations(list(labels)[:_OBJECTS], 2))
     # A seed is 63 bits of a hash.
-    order = np.random.default_rng(stable_hash(category) >> 1).permutation(len(every))
+    order = np.random.default_rng(stable_hash(category) >> 1).permutation(len(all_pairs))
     outcomes = []
-    for ends, setting in product([every[k] for k in order[:pairs]], settings):
+    for ends, setting in product([all_pairs[k] for k in order[:pairs]], settings):
         # The frames of each object within its arc, as references and as target views.
         rng = np.random.default_rng(stable_hash(f"{ends}{setting}") >> 1)
         references = {}
@@ -225,21 +228,24 @@ def collect_scans(
                     estimate = method.estimate_from_views(view(first, k), targets[second])
                     ranked.append((rank, world_hypotheses(first, second, estimate)))
 
-        # The pose from fewer and fewer of the frames.
-        place = " and ".join(f"{views} views within {arc:.0f}°" for arc, views in setting)
+        # The pose from 1, 2, 4 and all of the reference frames, at equal steps.
+        words = " and ".join(f"{views} views within {arc:.0f}°" for arc, views in setting)
         for count in _FRAMES:
             step = _FRAMES[-1] // count
             chosen = [hypotheses for rank, hypotheses in ranked if rank % step == 0]
             poses, known = pose_of_two(chosen, labels)
-            outcomes.append(ScanOutcome(f"{root.name}/{category}", place, count, poses, known))
+            outcomes.append(ScanOutcome(f"{root.name}/{category}", words, count, poses, known))
     return outcomes
 
 
 def pose_of_two(
     pairs: Sequence[PairHypotheses], labels: Mapping[str, PoseLabel]
 ) -> tuple[Poses, Float[np.ndarray, "5"]]:
-    """Align two objects by the hypotheses of their frames; return `ScanOutcome.poses` and
-    `known`."""
+    """Align two objects by the hypotheses of their frames.
+
+    Returns:
+        `ScanOutcome.poses` and `ScanOutcome.known`.
+    """
     objects = synchronise(pairs).objects
     names = sorted(objects)
     rotations = np.stack([objects[name].sim3.R for name in names])
@@ -247,6 +253,7 @@ def pose_of_two(
     spans = np.array([pair.span for pair in pairs])
     margin, other, known = compare_two(_build_nodes(pairs, ends)[1], rotations, 1, spans)
     poses = [rotations[1]] if other is None else [rotations[1], other]
+    # From the world of the first object to the world of the second, as `pose.T @ rotations[0]`.
     true = labels[names[1]].trans[:3, :3] @ labels[names[0]].trans[:3, :3].T
     errors = rotation_error(np.stack([pose.T @ rotations[0] for pose in poses]), true)
     deficit = np.array([0.0, margin])[: len(poses)]
@@ -254,8 +261,10 @@ def pose_of_two(
 
 
 def views_within(around: Sequence[View], arc: float, rng: np.random.Generator) -> list[View]:
-    """Draw two to ten views from a random arc of the views that go once around an object, in their
-    order."""
+    """Draw two to ten views from a random arc.
+
+    `around` has the views that go once around an object, in their order.
+    """
     points = [
         view.frame.camera.to_world(view.measured_points[0][view.known_foreground])
         for view in around
@@ -278,8 +287,10 @@ def solve_views(
     targets: Sequence[View],
     labels: tuple[PoseLabel, PoseLabel],
 ) -> Outcome:
-    """Run the verified solver on the views of a pair, of a category and setting, and measure its
-    hypotheses."""
+    """Run the verified solver on the views of a pair, and measure its hypotheses.
+
+    `names` are the category and the setting of the outcome.
+    """
     targets = [targets[index] for index in usable_targets(targets)[0]]
     solution = VerifiedSolver().solve(
         reference, targets, method.match_views(reference, targets), method.seed
@@ -292,16 +303,16 @@ def solve_views(
     ]
     hypotheses = solution.hypotheses
     # Rotations to the targets' world, which hypotheses in different target views have in common.
-    in_world = np.stack([cameras[one.view].R.T @ one.sim3.R for one in hypotheses])
+    in_world = np.stack([cameras[pose.view].R.T @ pose.sim3.R for pose in hypotheses])
     return Outcome(
         names[0],
-        np.array([[one.terms[name] for name in TERM_NAMES] for one in hypotheses]),
-        np.array([rotation_error(one.sim3.R, true[one.view]) for one in hypotheses]),
+        np.array([[pose.terms[name] for name in TERM_NAMES] for pose in hypotheses]),
+        np.array([rotation_error(pose.sim3.R, true[pose.view]) for pose in hypotheses]),
         rotation_error(in_world[:, None], in_world[None]),
         names[1],
         solution.scene.view_span,
         len(targets),
-        np.array([float(rotation_error(np.eye(3), one.sim3.R)) for one in hypotheses]),
+        np.array([float(rotation_error(np.eye(3), pose.sim3.R)) for pose in hypotheses]),
         solution.scene.view_similarity_std,
     )
 
@@ -309,8 +320,8 @@ def solve_views(
 def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> ScoreCoefficients:
     r"""Fit the weights of a conditional logit with soft labels.
 
-    Minimises -mean_pairs \log \sum_i softmax(S)_i c_i + ridge |w|^2 with c_i = \exp(-(error_i / 12
-    degrees)^2) and w the weights per standard deviation of their terms.
+    Minimises -mean_pairs \log \sum_i softmax(S)_i c_i + ridge |w|^2. S_i is the score of
+    hypothesis i, c_i its correctness, and w are the weights per standard deviation of their terms.
 
     Raises:
         InputError: No pair has a correct hypothesis among several.
@@ -361,8 +372,10 @@ def fit_calibration(
     """Fit the calibration by maximum likelihood: which of the different poses, if any, is right?
 
     Every category counts the same, so that the numbers of pairs chosen per category do not decide.
-    The `ridge` is on coefficients per standard deviation of the evidence. InputError if all
-    estimates are right, or none is.
+    The `ridge` is on coefficients per standard deviation of the evidence.
+
+    Raises:
+        InputError: All outcomes have a right pose, or none has.
     """
     ranked = [outcome.ranked(weights) for outcome in outcomes]
     right = [np.flatnonzero(errors < CORRECT_ANGLE) for _, errors in ranked]
@@ -371,8 +384,8 @@ def fit_calibration(
             f"{len(outcomes)} pairs: all have a right pose or none has, expected both kinds"
         )
 
-    # Poses, a row per outcome, padded with a deficit whose probability is 0; the class behind the
-    # last is "none is right".
+    # The deficits of the poses, a row per outcome, padded with one whose probability is 0. The
+    # target is the class of the first right pose; the class `most` is "none is right".
     most = max(len(deficit) for deficit, _ in ranked)
     deficits = torch.full((len(outcomes), most), 1e3, dtype=torch.float64)
     for row, (deficit, _) in zip(deficits, ranked):
@@ -407,7 +420,7 @@ def fit_calibration(
 
     with torch.enable_grad():
         optimiser.step(loss)
-    # Back from standardised evidence.
+    # From coefficients of standardised evidence to coefficients of the evidence itself.
     fitted = theta.detach().numpy()
     slopes = fitted[:, 1:] / std
     scale, none = np.column_stack([fitted[:, 0] - slopes @ mean, slopes]).tolist()
@@ -418,20 +431,23 @@ def leave_out(outcomes: Sequence[Outcome], fit: Callable[[Sequence[Outcome]], _F
     """Return for each outcome a fit that has not seen its category."""
     fitted = {}
     for category in {outcome.category for outcome in outcomes}:
-        fitted[category] = fit([one for one in outcomes if one.category != category])
+        fitted[category] = fit([seen for seen in outcomes if seen.category != category])
     return [fitted[outcome.category] for outcome in outcomes]
 
 
 def report_weights(outcomes: Sequence[Outcome], present: ScoreCoefficients) -> list[str]:
     """Format the fit of the weights and its accuracy on categories that the fit has not seen."""
-    lines = [f"{len(outcomes)} pairs of {len({one.category for one in outcomes})} categories"]
+    lines = [
+        f"{len(outcomes)} pairs of {len({outcome.category for outcome in outcomes})} categories"
+    ]
     held_out = leave_out(outcomes, fit_weights)
+    # Errors of the best pose: `ranked` gives deficits and errors, best first.
     rows = {
-        "present weights": [one.ranked(present)[1][0] for one in outcomes],
+        "present weights": [outcome.ranked(present)[1][0] for outcome in outcomes],
         "fitted weights, held-out category": [
-            one.ranked(weights)[1][0] for one, weights in zip(outcomes, held_out)
+            outcome.ranked(weights)[1][0] for outcome, weights in zip(outcomes, held_out)
         ],
-        "most accurate hypothesis": [one.errors.min() for one in outcomes],
+        "most accurate hypothesis": [outcome.errors.min() for outcome in outcomes],
     }
     for name, errors in rows.items():
         lines.append(f"{name:35s}{_accuracy(np.array(errors))}")
@@ -444,7 +460,7 @@ def report_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) 
     """Format the fit of the calibration, and how well it holds on categories that the fit has not
     seen."""
     fitted = fit_calibration(outcomes, weights)
-    held_out = leave_out(outcomes, lambda some: fit_calibration(some, weights))
+    held_out = leave_out(outcomes, lambda seen: fit_calibration(seen, weights))
 
     # Probability and correctness of the best pose of each outcome, and of all other poses.
     best = []
@@ -456,8 +472,9 @@ def report_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) 
         best.append(first)
         others += rest
     confidence, right = map(np.array, zip(*best))
+    categories = {outcome.category for outcome in outcomes}
     lines = [
-        f"{len(outcomes)} outcomes of {len({one.category for one in outcomes})} categories",
+        f"{len(outcomes)} outcomes of {len(categories)} categories",
         f"scale: {_numbers(fitted.scale)}; none: {_numbers(fitted.none)}; unseen: "
         f"{fitted.unseen:.3f}",
         "confidence, held-out category:",
@@ -465,7 +482,7 @@ def report_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) 
     ]
 
     # The same for each setting.
-    settings = np.array([one.setting for one in outcomes])
+    settings = np.array([outcome.setting for outcome in outcomes])
     for setting in dict.fromkeys(settings.tolist()):
         chosen = settings == setting
         sure = chosen & (confidence > _SURE)
@@ -486,10 +503,12 @@ def report_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) 
 
 
 def _numbers(values: Sequence[float]) -> str:
+    """Format coefficients."""
     return ", ".join(f"{value:.3f}" for value in values)
 
 
 def _accuracy(errors: Float[np.ndarray, " n"]) -> str:
+    """Format the accuracy of poses by their errors in degrees."""
     return f"median {np.median(errors):.1f} degrees, Acc30 {100 * np.mean(errors < 30):.1f} %"
 
 
@@ -510,9 +529,11 @@ def check_sides(folders: Iterable[str | Path], side: str) -> None:
     for folder in folders:
         for category in Co3D(folder).categories():
             # A concept is the part of a name before its hyphen.
-            found = sides.get(category.partition("-")[0], "no side")
-            if found != side:
-                raise InputError(f"{folder}: category {category} is for {found}, expected {side}")
+            own_side = sides.get(category.partition("-")[0], "no side")
+            if own_side != side:
+                raise InputError(
+                    f"{folder}: category {category} is for {own_side}, expected {side}"
+                )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -522,25 +543,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("constants", choices=_SETTINGS, help="what to fit")
     parser.add_argument("data", nargs="+", type=folder_and_pairs, metavar="FOLDER:PAIRS")
-    given = parser.parse_args(arguments)
-    fit = given.constants
+    options = parser.parse_args(arguments)
+    fit = options.constants
     side = "training" if fit == "weights" else "validation"
     collect = collect_scans if fit == "scans" else collect_outcomes
     report = report_weights if fit == "weights" else report_calibration
     try:
-        check_sides([folder for folder, _ in given.data], side)
+        check_sides([folder for folder, _ in options.data], side)
         jobs = [
             (root, category, pairs)
-            for root, pairs in given.data
+            for root, pairs in options.data
             for category in Co3D(root).categories()
         ]
         with ProcessPoolExecutor(os.cpu_count()) as pool:
             parts = pool.map(collect, *zip(*jobs), [_SETTINGS[fit]] * len(jobs))
-            outcomes = [one for part in tqdm(parts, "categories", len(jobs)) for one in part]
+            outcomes = []
+            for part in tqdm(parts, "categories", len(jobs)):
+                outcomes += part
         print("\n".join(report(outcomes, ScoreCoefficients())))
         if fit == "scans":
             by_frames = [
-                replace(one, setting=f"{one.frames} frames of each object") for one in outcomes
+                replace(outcome, setting=f"{outcome.frames} frames of each object")
+                for outcome in outcomes
             ]
             print("\n".join(report(by_frames, ScoreCoefficients())))
     except InputError as error:

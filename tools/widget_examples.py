@@ -24,12 +24,12 @@ from zsp_lite.matching import key_similarities, match, similarity
 from zsp_lite.views import View, extract_views
 from zsp_lite.viz.plots import match_pixels
 
-GRID = (28, 28)  # patches of zsp-tiny
+GRID = (28, 28)  # rows and columns of zsp-tiny's patches
 
 
 @cache
 def sample_pair() -> GroundTruthPair:
-    """Load a sample pair with its ground-truth matches."""
+    """Load a sample pair, the last of the demo, with its ground-truth matches."""
     dataset = Co3D(sample_data())
     return ground_truth_pair(dataset, demo_pairs(dataset)[-1])
 
@@ -53,16 +53,16 @@ def attention() -> Widget:
 
 
 def patch_similarities() -> Widget:
-    """`patches.patch_similarities` on a sample pair: the keys of two layers, and those of the last
-    with context."""
+    """`patches.patch_similarities` on a sample pair: keys with their context of an early and of the
+    last layer, and keys without context."""
     pair = sample_pair()
-    first, second = sample_views()
+    reference, target = sample_views()
     tokens = patches.all_facets(_backbone(), [pair.reference.rgb, pair.target.rgb])
     sims = {}
-    for layer in (3, 11):
+    for layer in (3, 11):  # of the layers 0 to 11
         keys = tokens[layer, "key"][:, 1:].unflatten(1, GRID)  # without CLS: (2, rows, cols, d)
         sims[f"layer {layer}, key"] = similarity(*keys)
-    sims["bare key"] = key_similarities(first.features.keys, [second.features.keys])[0]
+    sims["bare key"] = key_similarities(reference.features.keys, [target.features.keys])[0]
     return patches.patch_similarities(
         pair.reference.rgb, pair.target.rgb, sims, pair.cells, pair.valid
     )
@@ -97,7 +97,8 @@ def one_outlier() -> Widget:
 
 
 def box_to_mask() -> Widget:
-    """`mask_box.box_to_mask` on a sample frame."""
+    """`mask_box.box_to_mask` on a sample frame, whose object, unlike in a crop, has much around
+    it."""
     dataset = Co3D(sample_data())
     category = dataset.categories()[0]
     sequence = dataset.sequences(category)[0].sequence_name
@@ -106,7 +107,7 @@ def box_to_mask() -> Widget:
 
 
 def label_poses() -> Widget:
-    """`labelling.label_poses` on a temporary copy of a sample category, with four keypoints on two
+    """`labelling.label_poses` on a copy of a sample category, with four keypoints on two
     objects."""
     folder = TemporaryDirectory(prefix="zsp-lite-")
     category = Co3D(sample_data()).categories()[0]
@@ -114,11 +115,12 @@ def label_poses() -> Widget:
     session = Labelling(folder.name, category)
     for sequence in session.sequences[:2]:
         points = session.cloud(sequence)[0]
+        # Four points at equal steps of the cloud.
         for point in points[:: len(points) // 4][:4]:
             session.pick(sequence, point)
     box = labelling.label_poses(session)
     box.controls["sequence"].value = session.sequences[1]
-    box.folder = folder  # deleted with the widget
+    box.folder = folder  # The folder is deleted with the widget.
     return box
 
 
@@ -139,4 +141,5 @@ WIDGETS: dict[str, Callable[[], Widget]] = {
 
 @cache
 def _backbone() -> Backbone:
+    """Load the backbone once."""
     return load_backbone("zsp-tiny", "cpu")

@@ -1,7 +1,9 @@
-"""Write what docs/playground.md loads: `python -m docs.playground.build
-outputs/site/docs/playground`.
+"""Write what docs/playground.md loads.
 
-onnxruntime-web is fetched from the npm registry, or that in npm_config_registry, into the cache.
+    python -m docs.playground.build outputs/site/docs/playground
+
+onnxruntime-web is fetched into the cache, from the npm registry or from the registry that
+npm_config_registry names.
 """
 
 import json
@@ -28,20 +30,23 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.points import near_median
 from zsp_lite.views import View
 
-# Of each category the first evaluation pair, whatever its result, and the next with an error below
-# 15 degrees.
+# Indices of evaluation pairs: in each category the first, whatever its result, and the next with an
+# error below 15 degrees.
 PAIRS = {"bicycle": (0, 1), "car": (0, 6), "chair": (0, 4), "motorcycle": (0, 1)}
-# Steps of the stored numbers, 16-bit integers. Cosines of descriptors are off by at most 5e-4, of
-# bare keys by 2e-3.
+# Keys and points are stored as 16-bit integers in these steps. Cosines of descriptors are off by at
+# most 5e-4, cosines of bare keys by at most 2e-3.
 KEY_STEP = 1 / 64
 POINT_STEP = 1 / 1024
-GRID = (28, 28)  # patches
-NUMBER = (28, 1)  # factors of row and column in the number of a patch
+GRID = (28, 28)  # rows and columns of patches
+NUMBER = (28, 1)  # row and column of a patch times these factors give its number
 RUNTIME = "onnxruntime-web-1.30.0.tgz"
 RUNTIME_SHA256 = "d2228df7e4616bc3348bf504ee888f3bec43789a273f0a63f3e68d203ce3bf71"
-_TYPES = {"float32": 1, "int64": 7, "float16": 10}  # in ONNX files, as in onnx.proto
-_ATTRIBUTES = {float: (2, 1), int: (3, 2), str: (4, 3), list: (8, 7)}  # field and type
-_FROM_SECOND = (np.array([0, 1]), np.array([1, 1 << 30]))  # starts and ends of a slice: [:1, 1:]
+# Numbers of onnx.proto: types of tensors, and field and type of an attribute by its Python type.
+_TYPES = {"float32": 1, "int64": 7, "float16": 10}
+_ATTRIBUTES = {float: (2, 1), int: (3, 2), str: (4, 3), list: (8, 7)}
+# Starts and ends of the slice [:1, 1:], which leaves out the token CLS; the last end is beyond any
+# length.
+_FROM_SECOND = (np.array([0, 1]), np.array([1, 1 << 30]))
 
 
 def stored_pairs(dataset: Co3D) -> list[Pair]:
@@ -54,26 +59,30 @@ def stored_pairs(dataset: Co3D) -> list[Pair]:
 
 
 def pair_data(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> tuple[list[dict], float]:
-    """Compute the data of each view, the reference first; of targets also truth and matches; and
-    the error."""
+    """Compute what the page shows of a pair.
+
+    Returns:
+        The data of each view, the reference first, for targets with the truth and the matches; and
+        the error of the method's pose in degrees.
+    """
     reference, targets = dataset.load_pair(pair)
     views = method.views([reference, *targets])
     first, *others = views
 
     # Keys (views, patches, d) on their principal axes, of which few matter, and rounded.
     keys = np.stack([view.features.keys.flatten(0, 1).numpy() for view in views])
-    axes = np.linalg.svd(keys.reshape(-1, keys.shape[-1]), full_matrices=False)[2]
+    axes = np.linalg.svd(np.concatenate(keys), full_matrices=False)[2]
     rounded = np.round(keys @ axes.T / KEY_STEP).astype("<i2").swapaxes(1, 2)
     rounded = rounded[:, rounded.any(axis=(0, 2))]  # without axes that are 0 everywhere
-    data = [_view_data(view, own) for view, own in zip(views, rounded)]
+    data = [_view_data(view, view_keys) for view, view_keys in zip(views, rounded)]
 
     # True matches, true rotation and the method's matches of each target.
     labels = read_labels(dataset.root, pair.category)
     poses = object_poses(dataset, pair.category)
     seen = patch_coordinates(first.frame, poses[pair.reference_sequence], GRID)
     matched = method.match_views(first, others)
-    for target, one in zip(data[1:], matched):
-        frame = one.target.frame
+    for target, matched_view in zip(data[1:], matched):
+        frame = matched_view.target.frame
         cells, valid = ground_truth_matches(
             seen, patch_coordinates(frame, poses[pair.target_sequence], GRID)
         )
@@ -83,7 +92,9 @@ def pair_data(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> tuple[list[dic
             labels[pair.target_sequence],
             frame.camera,
         )
-        chosen = [one.matches.reference @ NUMBER, one.matches.target @ NUMBER]
+        matches = matched_view.matches
+        chosen = [matches.reference @ NUMBER, matches.target @ NUMBER]
+        # The true match of each reference patch by its number, or -1.
         target["truth"] = _packed(np.where(valid, cells @ NUMBER, -1).astype("<i2"))
         target["rotation"] = true[:3, :3].tolist()
         target["chosen"] = np.stack(chosen, axis=1).tolist()
@@ -92,7 +103,7 @@ def pair_data(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> tuple[list[dic
 
 
 def _packed(array: np.ndarray) -> str:
-    """Compress the bytes of an array, as text."""
+    """Compress the bytes of an array and encode them as text."""
     return b64encode(zlib.compress(array.tobytes())).decode()
 
 
@@ -113,7 +124,7 @@ def write_page_data(folder: Path) -> None:
             f"STORED[{index}] = {json.dumps(views, separators=(',', ':'))};\n"
         )
     (folder / "zsp-tiny.onnx").write_bytes(onnx_model(method.backbone))
-    # The random numbers of RANSAC.
+    # The random numbers that RANSAC draws in Python, for the same samples in the browser.
     draws = np.random.default_rng(method.seed).bit_generator.random_raw(5000)
     content = {
         "titles": titles,
@@ -151,7 +162,8 @@ def _view_data(view: View, keys: np.ndarray) -> dict:
     points, _ = view.patch_points
     camera = view.frame.camera
     solid = view.known_foreground
-    solid[solid] = near_median(points[solid], 2.5)  # to draw in 3D
+    # The 3D drawing leaves out points more than 2.5 median distances from the middle.
+    solid[solid] = near_median(points[solid], 2.5)
     jpeg = cv2.imencode(".jpg", view.frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
     return {
         "jpeg": b64encode(jpeg).decode(),
@@ -169,8 +181,11 @@ def _view_data(view: View, keys: np.ndarray) -> dict:
 # ONNX files are protocol buffers. Weights are float16, as in the embedded checkpoint, and cast
 # where they are used.
 def onnx_model(backbone: Backbone) -> bytes:
-    """Encode the graph from "image" (1, 3, side, side), RGB in [0, 1], to "keys" (1, n, d),
-    "saliency" (1, 1, 1, n)."""
+    """Encode a backbone as an ONNX file.
+
+    Its input is "image" (1, 3, side, side), RGB in [0, 1]; its outputs are "keys" (1, n, d) and
+    "saliency" (1, 1, 1, n).
+    """
     graph = _Graph()
     add = graph.add
     linear = graph.linear
@@ -205,7 +220,7 @@ def onnx_model(backbone: Backbone) -> bytes:
         products = add("Einsum", query, key, equation="bihd,bjhd->bhij")
         attention = add("Softmax", add("Mul", products, np.float32(block.attn.scale)), axis=-1)
         if block is model.blocks[-1]:
-            break  # its attention is all that is needed
+            break  # Of the last block only the attention is needed.
         heads = add("Reshape", add("Einsum", attention, value, equation="bhij,bjhd->bihd"), joined)
         tokens = add("Add", tokens, linear(heads, *block.attn.proj.parameters()))
         normed = add(
@@ -222,6 +237,7 @@ def onnx_model(backbone: Backbone) -> bytes:
     low = add("ReduceMin", saliency)
     high = add("ReduceMax", saliency)
     add("Div", add("Sub", saliency, low), add("Sub", high, low), name="saliency")
+    # Field 11 of the graph has its inputs, field 12 its outputs.
     side = backbone.image_size
     return graph.encode((11, "image", (1, 3, side, side)), (12, "keys", ()), (12, "saliency", ()))
 
@@ -230,7 +246,7 @@ class _Graph:
     """Nodes (field 1) and stored tensors (field 5) of a network, by the numbers of onnx.proto."""
 
     def __init__(self):
-        self.fields = [(2, "vit")]
+        self.fields = [(2, "vit")]  # the graph's name
 
     def add(
         self, operator: str, *inputs: str | np.ndarray | torch.Tensor, name: str = "", **attributes
@@ -239,11 +255,13 @@ class _Graph:
 
         Arrays are stored as they are, tensors as float16.
         """
-        fields = [(1, one if isinstance(one, str) else self._store(one)) for one in inputs]
+        fields = []
+        for value in inputs:
+            fields.append((1, value if isinstance(value, str) else self._store(value)))
         name = name or f"{operator}{len(self.fields)}"
         for attribute, value in attributes.items():
             field, kind = _ATTRIBUTES[type(value)]
-            values = [(field, one) for one in np.atleast_1d(value).tolist()]
+            values = [(field, number) for number in np.atleast_1d(value).tolist()]
             fields.append((5, _message((1, attribute), *values, (20, kind))))
         self.fields.append((1, _message(*fields, (2, name), (4, operator))))
         return name
@@ -253,7 +271,8 @@ class _Graph:
         return self.add("Add", self.add("MatMul", x, weight.T), bias)
 
     def _store(self, values: np.ndarray | torch.Tensor) -> str:
-        """Store a tensor and return the name of its values in float32, or of an array as it is."""
+        """Store values and return their name: an array as it is, a tensor as float16 with a cast to
+        float32."""
         name = f"tensor{len(self.fields)}"
         is_weight = torch.is_tensor(values)
         if is_weight:
@@ -275,11 +294,16 @@ class _Graph:
                 content.append((2, _message(*sizes)))
             kind = _message((1, _message(*content)))
             self.fields.append((field, _message((1, name), (2, kind))))
+        # Version 9 of the format (field 1), the graph (7), and version 20 of the operators (8).
         return _message((1, 9), (7, _message(*self.fields)), (8, _message((1, ""), (2, 20))))
 
 
 def _message(*fields: tuple[int, int | float | str | bytes]) -> bytes:
-    """Encode fields (number, value) of a protocol buffer."""
+    """Encode fields (number, value) of a protocol buffer.
+
+    Each field begins with its number and, in the low three bits, the kind of its value: an integer
+    (0), bytes with their length (2) or a float32 (5).
+    """
     parts = []
     for number, value in fields:
         if isinstance(value, float):
@@ -293,8 +317,9 @@ def _message(*fields: tuple[int, int | float | str | bytes]) -> bytes:
 
 
 def _varint(value: int) -> bytes:
-    """Encode an integer in groups of seven bits, the lowest first."""
-    rest, last = divmod(value & (1 << 64) - 1, 128)  # negative numbers in two's complement
+    """Encode an integer in groups of seven bits, the lowest first; bit 8 says that more follow."""
+    # Negative numbers are in two's complement of 64 bits.
+    rest, last = divmod(value & (1 << 64) - 1, 128)
     return bytes([last | 128]) + _varint(rest) if rest else bytes([last])
 
 

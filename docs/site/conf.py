@@ -1,14 +1,13 @@
-"""Sphinx configuration of the course site (`make site`): the notebooks as stored, docs/ and the API
-reference."""
+"""Sphinx configuration of the course site (`make site`): stored notebooks, docs/, API reference."""
 
 import sys
 import tomllib
 from pathlib import Path
 
-# jsonschema would build parsers of addresses with it, which takes seconds
+# jsonschema imports this package to check addresses, which takes seconds and is not needed.
 sys.modules["rfc3987_syntax"] = None
 
-# also Sphinx's source folder, so that all relative links stay as they are
+# The repository is Sphinx's source folder, so that all relative links stay as they are.
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
@@ -46,14 +45,15 @@ exclude_patterns = [
 ]
 exclude_patterns += ["**/.ipynb_checkpoints", "notebooks/exercises/release", "data_samples/*/*"]
 
-nb_execution_mode = "off"  # outputs are those stored in the notebooks
+nb_execution_mode = "off"  # The pages show the stored outputs.
 nb_merge_streams = True
 myst_enable_extensions = ["attrs_block", "colon_fence", "deflist", "dollarmath"]
-myst_disable_syntax = ["myst_line_comment"]  # a line may begin with a percent sign
-myst_heading_anchors = 4  # the anchors of GitHub
+myst_disable_syntax = ["myst_line_comment"]  # A line of text may begin with a percent sign.
+myst_heading_anchors = 4  # Headings down to this level have anchors, named as on GitHub.
+# No warning about stored outputs of a type that MyST-NB cannot show.
 suppress_warnings = ["mystnb.unknown_mime_type"]
 
-default_role = "py:obj"  # `name` in docstrings: a link if the name is documented here
+default_role = "py:obj"  # `name` in a docstring becomes a link if the name is documented here.
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
@@ -70,21 +70,21 @@ html_title = "zsp-lite"
 html_css_files = ["style.css"]
 html_js_files = [("site.js", {"defer": "defer"})]
 html_static_path = ["static", "../playground"]
-html_sidebars = {"docs/playground": []}  # its pictures take the whole width
+html_sidebars = {"docs/playground": []}  # The pictures of this page take the whole width.
 templates_path = ["templates"]
 html_additional_pages = {"index": "redirect.html"}
 html_math_renderer = "mathml"
-html_copy_source = False  # the sources of the exercises hold their solutions
+html_copy_source = False  # The sources of the exercises hold their solutions.
 html_show_sourcelink = False
 html_domain_indices = False
 html_use_index = False
-html_context = {"default_mode": "auto"}  # light or dark as in the system
+html_context = {"default_mode": "auto"}  # Pages are light or dark as the system is.
 html_theme_options = {
     "repository_url": course_repository,
     "use_repository_button": bool(course_repository),
-    # would offer the source; `course` links to the notebook for students
+    # The button would offer the source; `course` links to the notebook for students.
     "use_download_button": False,
-    "navbar_persistent": [],  # the search field is in the sidebar
+    "navbar_persistent": [],  # The search field is in the sidebar.
     "show_navbar_depth": 1,
     "max_navbar_depth": 1,
     "pygments_light_style": "a11y-high-contrast-light",

@@ -36,11 +36,13 @@ WIDGET = "application/vnd.jupyter.widget-view+json"
 PLOTLY = "application/vnd.plotly.v1+json"
 BRANCH = "gh-pages"  # where the workflow publishes the site, and so the notebooks that Colab opens
 
-WIDE_COLUMNS = 7  # from which on, and
-WIDE_ROW = 80  # characters of a row, a table uses the margin
+# A table uses the margin if one of its rows has at least as many cells and characters.
+WIDE_COLUMNS = 7
+WIDE_ROW = 80
+# An interval such as [47.6, −6.2].
 INTERVAL = re.compile(r"\[[-−]?[\d.]+, [-−]?[\d.]+\]")
 
-# The pages below a page, which the sidebar leaves out.
+# Pages that belong to a page but that the sidebar leaves out, as patterns.
 CHILDREN = {"notebooks/README": "../docs/slides/*", "notebooks/exercises/README": "source/*/*"}
 HIDDEN_LINKS = """
 
@@ -89,6 +91,7 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
                 cell.outputs = [
                     shown for output in cell.outputs for shown in static_outputs(output, widgets)
                 ]
+        # `describe_pictures` gives these to the pictures of the page, in the same order.
         app.env.temp_data["alternative texts"] = [
             output.metadata[form]["alt"]
             for cell in notebook.cells
@@ -100,7 +103,8 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
             1, nbformat.v4.new_markdown_cell(run_links(docname, app.config.course_repository))
         )
         source[0] = nbformat.writes(notebook)
-    else:  # a link to a folder has no page to lead to
+    else:
+        # A link to a folder, which has no page, becomes its text.
         source[0] = re.sub(
             r"\[([^]]*)\]\(([^)#:\s]+)\)",
             lambda link: link[1] if (path.parent / link[2]).is_dir() else link[0],
@@ -113,7 +117,8 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
 
 
 def remove_solutions(notebook: NotebookNode, root: Path) -> None:
-    """Make the student version of an exercise. Other notebooks have no cells of nbgrader."""
+    """Make the student version of an exercise; other notebooks, without cells of nbgrader, stay as
+    they are."""
     if any("nbgrader" in cell.metadata for cell in notebook.cells):
         config = PyFileConfigLoader(
             "nbgrader_config.py", path=str(root / "notebooks" / "exercises")
@@ -123,9 +128,9 @@ def remove_solutions(notebook: NotebookNode, root: Path) -> None:
 
 
 def static_outputs(output: NotebookNode, widgets: dict) -> list[NotebookNode]:
-    """The forms of a stored output that need no kernel:
+    """Return the forms of a stored output that need no kernel.
 
-    HTML of a plotly figure, picture and caption of a widget.
+    A plotly figure becomes HTML, a widget its picture and caption; other outputs stay as they are.
     """
     data = output.get("data", {})
     if PLOTLY in data:
@@ -145,12 +150,14 @@ def html_output(html: str) -> NotebookNode:
 
 
 def widget_outputs(models: dict, identifier: str) -> list[NotebookNode]:
-    """The stored picture of a widget, its caption, and the names and values of its controls."""
+    """Return the stored picture of a widget, its caption, and the names and values of its
+    controls."""
     pictures = []
     captions = []
     controls = []
 
     def visit(identifier: str) -> None:
+        """Collect what a part of the widget, and the parts inside it, show."""
         model = models[identifier]
         state = model["state"]
         if model["model_name"] == "ImageModel":
@@ -233,14 +240,14 @@ def is_wide(rows: list[list[str]]) -> bool:
 
 
 def mark_place(app: Sphinx, doctree: nodes.document) -> None:
-    """Class the strip at the top of a notebook by the middle of its first marked box, in percent
-    (`doctree-read`)."""
+    """Give the strip at the top of a notebook a class such as here-42: the middle of its first
+    marked box is at 42 % of its width (`doctree-read`)."""
     for image in doctree.findall(nodes.image):
         if "/here_" in image["uri"]:
             strip = (app.srcdir / image["uri"]).read_text(encoding="utf-8")
             box = re.search('<rect x="([^"]*)"[^>]*? width="([^"]*)"[^>]*stroke="#0072B2"', strip)
             middle = float(box[1]) + float(box[2]) / 2
-            width = float(re.search('width="(.*?)"', strip)[1])  # of the whole strip
+            width = float(re.search('width="(.*?)"', strip)[1])  # the first is that of the strip
             image["classes"].append(f"here-{100 * (middle / width):.0f}")
 
 
@@ -266,8 +273,8 @@ def fold_members(app: Sphinx, doctree: nodes.document) -> None:
 
 
 def shorten_titles(app: Sphinx, env: BuildEnvironment) -> None:
-    """Leave the part before the colon of the notebooks' titles in the sidebar (Sphinx's event
-    `env-updated`)."""
+    """Shorten the titles of the notebooks in the sidebar to the part before the colon (Sphinx's
+    event `env-updated`)."""
     for name, contents in env.tocs.items():
         if name.startswith("notebooks/"):
             title = next(contents.findall(nodes.Text))
@@ -275,7 +282,7 @@ def shorten_titles(app: Sphinx, env: BuildEnvironment) -> None:
 
 
 def run_links(docname: str, repository: str) -> str:
-    """HTML with the links to download a notebook and to open it in Colab or in a dev container."""
+    """Return HTML with links to run a notebook: instructions, download, Colab, dev container."""
     up = "../" * docname.count("/")
     links = [
         (f"{up}docs/install.html#run-the-notebooks", "Run it"),
@@ -355,9 +362,10 @@ def mark_examples(
     """Mark indented blocks of a docstring as literal, and link pages (`autodoc-process-docstring`,
     before napoleon)."""
     text = []
-    literal = False
+    literal = False  # whether the present line belongs to a literal block
     for line in lines:
         indented = line.startswith("    ")
+        # A block begins with an indented line below an empty one that ends a paragraph of text.
         if not literal and indented and text and not text[-1] and not text[-2].startswith(" "):
             literal = True
             text += ["::", ""]

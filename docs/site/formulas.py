@@ -1,5 +1,4 @@
-"""Sphinx extension of the course site: formulas as MathML, with a font for them that comes with the
-site.
+"""Sphinx extension of the course site: formulas as MathML, and the font that shows them.
 
 MathML needs no script from the network, but a font with mathematical metrics: without one, brackets
 do not grow and bars touch letters. The font is STIX Two Math of the package `ziamath`, cut down to
@@ -22,17 +21,18 @@ from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
 
-# Latin, accents, Greek, punctuation, letters and operators, brackets; bold, italic and script
-# alphabets.
+# First and last code of the characters of formulas.
 CHARACTERS = [
-    (0x20, 0xFF),
-    (0x300, 0x36F),
-    (0x391, 0x3F6),
-    (0x2010, 0x2063),
-    (0x2100, 0x22FF),
-    (0x2308, 0x230B),
+    (0x20, 0xFF),  # Latin
+    (0x300, 0x36F),  # accents
+    (0x391, 0x3F6),  # Greek
+    (0x2010, 0x2063),  # punctuation and invisible operators
+    (0x2100, 0x22FF),  # letter-like symbols, arrows and operators
+    (0x2308, 0x230B),  # ceilings and floors
+    (0x27E6, 0x27EB),  # brackets
+    (0x1D400, 0x1D503),  # bold, italic and script Latin
+    (0x1D6A4, 0x1D7FF),  # bold and italic Greek, bold digits
 ]
-CHARACTERS += [(0x27E6, 0x27EB), (0x1D400, 0x1D503), (0x1D6A4, 0x1D7FF)]
 
 
 @cache
@@ -42,8 +42,14 @@ def math_font() -> bytes:
     if package is None:
         return b""
     font = TTFont(Path(package.origin).parent / "fonts" / "STIXTwoMath-Regular.ttf")
-    features = ["ssty", "dtls", "flac", "kern", "mark"]
-    # All names, since the licence is one of them.
+    features = [
+        "ssty",  # forms of subscripts and superscripts
+        "dtls",  # letters without a dot, below accents
+        "flac",  # flat accents, above capitals
+        "kern",  # distances between letters
+        "mark",  # places of accents
+    ]
+    # All names of the font are kept, since the licence is one of them.
     subsetter = Subsetter(Options(hinting=False, layout_features=features, name_IDs=["*"]))
     codes = [code for first, last in CHARACTERS for code in range(first, last + 1)]
     subsetter.populate(unicodes=codes)
@@ -57,13 +63,14 @@ def math_font() -> bytes:
 def mathml(latex: str, display: str = "inline") -> str:
     r"""Convert a formula, with four repairs of what latex2mathml makes.
 
-    The names of `\operatorname` become text. Bold and script letters become characters of their
-    own, as browsers know no `mathvariant`. The bars of a norm do not grow: each would grow by
-    itself, as only one of them has the exponent. A minus after an equals sign is close to its term.
+    The names of `\operatorname` become text, with a space for `\,`. Bold and script letters become
+    characters of their own, as browsers know no `mathvariant`. A minus after an equals sign is a
+    sign, close to its term. The bars of a norm do not grow: as only the last of them has the
+    exponent, they would become unequal.
     """
     latex = re.sub(
         r"\\operatorname\*?\{(.*?)\}",
-        lambda name: rf"\text{{{name[1]}}}".replace(r"\,", " "),
+        lambda match: rf"\text{{{match[1]}}}".replace(r"\,", " "),
         latex,
     )
     text = convert(latex, display=display)
@@ -72,18 +79,20 @@ def mathml(latex: str, display: str = "inline") -> str:
     return text.replace("<mo>&#x02016;", '<mo stretchy="false">&#x02016;')
 
 
-def _letter(found: re.Match[str]) -> str:
-    """Return the character of a letter in a style."""
-    style = found[1].upper().replace("-", " ")
-    name = re.sub("LATIN |GREEK |LETTER ", "", unicodedata.name(unescape(found[2])))
+def _letter(element: re.Match[str]) -> str:
+    """Replace an element <mi> with a style, such as bold, by one with the character of this
+    style."""
+    style = element[1].upper().replace("-", " ")
+    # LATIN CAPITAL LETTER R becomes MATHEMATICAL BOLD CAPITAL R.
+    name = re.sub("LATIN |GREEK |LETTER ", "", unicodedata.name(unescape(element[2])))
     try:
         return f"<mi>{unicodedata.lookup(f'MATHEMATICAL {style} {name}')}</mi>"
-    except KeyError:  # SCRIPT CAPITAL R and few others are older characters
+    except KeyError:  # Older characters, such as SCRIPT CAPITAL R, lack the first word.
         return f"<mi>{unicodedata.lookup(f'{style} {name}')}</mi>"
 
 
 def visit_math(translator: HTML5Translator, node: nodes.math) -> None:
-    """Write a formula in a line."""
+    """Write a formula within a line of text."""
     translator.body.append(mathml(node.astext()))
     raise nodes.SkipNode
 
@@ -103,11 +112,12 @@ def write_font(app: Sphinx, error: Exception | None) -> None:
 def pass_font(
     app: Sphinx, pagename: str, templatename: str, context: dict, doctree: nodes.document | None
 ) -> None:
-    """Let templates embed the font."""
+    """Pass the font to the templates, which may embed it (`html-page-context`)."""
     context["math_font"] = base64.b64encode(math_font()).decode()
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
+    """Register how formulas are written, and connect the functions to Sphinx's events."""
     app.add_html_math_renderer("mathml", (visit_math, None), (visit_displayed_math, None))
     app.connect("html-page-context", pass_font)
     app.connect("build-finished", write_font)

@@ -8,10 +8,10 @@ the slides show the stored results:
     :heading: The map of a real pair
     ```
 
-is the first picture below the heading that contains these words. The path may also be that of a
-drawing, which has its description inside. `:tiles: 3 3 8 4` cuts a picture of 3 columns and 3 rows,
-and shows the first 8 parts in 4 columns. What stands in the directive `notes` is shown in the
-presenter's view only.
+embeds the first picture below the heading that contains these words. The path may also be that of a
+drawing, whose description becomes the alternative text. `:tiles: 3 3 8 4` cuts a picture into
+3 columns and 3 rows, and shows the first 8 tiles in 4 columns. The text of the directive `notes` is
+shown in the presenter's view only.
 """
 
 import base64
@@ -49,10 +49,10 @@ class Picture(SphinxDirective):
             alt = unescape(re.search("<desc[^>]*>(.*?)</desc>", path.read_text("utf-8"))[1])
         else:
             heading = self.options["heading"]
-            found = pictures_below(nbformat.read(path, as_version=4), heading)
-            if not found:
+            pictures = pictures_below(nbformat.read(path, as_version=4), heading)
+            if not pictures:
                 raise self.error(f"{path.name} has no picture below the heading {heading!r}")
-            form, data, alt = found[0]
+            form, data, alt = pictures[0]
             if "tiles" in self.options:
                 data = arranged(data, *self.options["tiles"])
         image = f'<img src="data:{form};base64,{data}" alt="{escape(alt)}">'
@@ -81,9 +81,9 @@ def pictures_below(notebook: NotebookNode, heading: str) -> list[tuple[str, str,
         level. Empty without such a heading.
     """
     pictures = []
-    level = 0  # of the heading; 0 before it
+    level = 0  # number of # of the heading; 0 above it
     for cell in notebook.cells:
-        if cell.cell_type == "markdown" and level:
+        if cell.cell_type == "markdown" and level:  # Does the section end here?
             if re.search(rf"^#{{1,{level}}} ", cell.source, re.MULTILINE):
                 break
         elif cell.cell_type == "markdown":
@@ -98,8 +98,18 @@ def pictures_below(notebook: NotebookNode, heading: str) -> list[tuple[str, str,
 
 
 def arranged(data: str, columns: int, rows: int, count: int, new_columns: int) -> str:
-    """Cut a picture in base64 into equal tiles, and lay the first of them out in another number of
-    columns."""
+    """Rearrange the tiles of a picture.
+
+    Args:
+        data: The picture in base64.
+        columns: Columns of equal tiles in the picture.
+        rows: Rows of equal tiles in the picture.
+        count: Number of tiles to show, row by row.
+        new_columns: Columns in which they are shown.
+
+    Returns:
+        The new picture in base64.
+    """
     picture = Image.open(io.BytesIO(base64.b64decode(data)))
     width = picture.width // columns
     height = picture.height // rows
@@ -124,6 +134,7 @@ def choose_template(
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
+    """Register the directives and the choice of the template with Sphinx."""
     app.add_directive("picture", Picture)
     app.add_directive("notes", Notes)
     app.connect("html-page-context", choose_template)

@@ -1,10 +1,12 @@
 """Configuration of this course; nbgrader reads it when started in this folder."""
 
 import csv
+import filecmp
 import re
 import shutil
 import zipfile
 from datetime import UTC, datetime
+from functools import cache
 from html import escape
 from pathlib import Path
 
@@ -13,11 +15,11 @@ from jinja2 import pass_context
 from latex2mathml.converter import convert
 from nbconvert.exporters import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
-from nbgrader.api import MissingEntry
+from nbformat import NotebookNode
+from nbgrader.api import Gradebook, MissingEntry
 from nbgrader.converters.base import NbGraderException
 from nbgrader.plugins import ExportPlugin, FileNameCollectorPlugin
 from nbgrader.preprocessors import NbGraderPreprocessor
-from traitlets import Dict
 
 c = get_config()  # noqa: F821, nbgrader defines it
 HERE = Path(__file__).parent
@@ -34,6 +36,7 @@ c.ClearSolutions.text_stub = "*Write your answer here, in place of this line.*"
 # Names of handed-in files, for `nbgrader zip_collect`. Moodle:
 # NAME_STUDENT_assignsubmission_file_EXERCISE.ipynb, or with "/" before EXERCISE.
 # Canvas: NAME_STUDENT_NUMBER_EXERCISE.ipynb. Browsers and people add " (1)", "-Copy1".
+# From the path: the number of the student and the name of the exercise.
 EXERCISES = "|".join(sorted(folder.name for folder in (HERE / "source").glob("*")))
 STUDENT = r".*/[^/]+?_(?:LATE_)?(?P<student_id>\d+)_(?:assignsubmission_file_?/?|\d+_)"
 HANDED_IN = rf"{STUDENT}(?P<file_id>{EXERCISES})[^/]*\.ipynb$"
@@ -42,40 +45,45 @@ c.FileNameCollectorPlugin.named_regexp = HANDED_IN
 c.ZipCollectApp.force = c.ExtractorPlugin.force = True
 
 
-def downloaded(assignment):
-    """Files of a download by (student, exercise); "" for what a name does not have."""
-    found, folder = {}, HERE / "downloaded" / assignment / "extracted"
+@cache
+def downloaded(assignment: str) -> dict:
+    """List the files of a download by (student, exercise).
+
+    A student or an exercise that the name of a file does not give is "".
+    """
+    files = {}
+    folder = HERE / "downloaded" / assignment / "extracted"
     for file in sorted(folder.rglob("*")):
         if file.is_file():
             path = file.as_posix()
             named = re.match(HANDED_IN, path) or re.match(STUDENT, path)
             names = named.groupdict() if named else {}
             key = names.get("student_id", ""), names.get("file_id", "")
-            found.setdefault(key, []).append(file.relative_to(folder).as_posix())
-    return found
+            files.setdefault(key, []).append(file.relative_to(folder).as_posix())
+    return files
 
 
 class Collector(FileNameCollectorPlugin):
-    """Files whose names match HANDED_IN. None of a student who has two of them.
+    """Collector of the files whose names match HANDED_IN.
+
+    It collects no file of a student who has two of them.
 
     `nbgrader autograde` grades what is newer than what it has graded. So a file keeps
     the time of its first collection, until the student hands in another one.
     """
 
-    files = Dict()
-
-    def collect(self, submitted_file):
+    def collect(self, submitted_file: str) -> dict | None:
+        """Return what nbgrader needs to know of a file; None leaves it out."""
         info = super().collect(submitted_file)
         if info:
             student, name = info["student_id"], info["file_id"]
             assignment = self.parent.coursedir.assignment_id
-            self.files = self.files or downloaded(assignment)
-            if len(self.files[student, name]) > 1:
+            if len(downloaded(assignment)[student, name]) > 1:
                 self.log.warning("%s has several files %s: skipped", student, name)
                 return None
             folder = HERE / "submitted" / student / assignment
             time = self.parent.coursedir.get_existing_timestamp(str(folder))
-            if not time or not same(folder / f"{name}.ipynb", Path(submitted_file)):
+            if not time or not same(folder / f"{name}.ipynb", submitted_file):
                 time = datetime.now(UTC).replace(tzinfo=None)
             info["timestamp"] = time
         return info
@@ -88,12 +96,12 @@ COPY = "handed_in.copy"
 c.CourseDirectory.ignore = [".ipynb_checkpoints", "*.pyc", "__pycache__", COPY]
 
 
-def same(one, other):
-    """Whether two files exist and have the same contents."""
-    return one.is_file() and other.is_file() and one.read_bytes() == other.read_bytes()
+def same(copy: Path, file: Path | str) -> bool:
+    """Whether a copy of a file exists and has the same contents."""
+    return copy.is_file() and filecmp.cmp(copy, file, shallow=False)
 
 
-def keep_hand_ins(notebooks, **_):
+def keep_hand_ins(notebooks: list, **_) -> None:
     """Copy each hand-in that was graded, to compare a later one with it."""
     for path in map(Path, notebooks):
         *_, student, name = path.parent.parts
@@ -103,18 +111,18 @@ def keep_hand_ins(notebooks, **_):
 c.Autograde.post_convert_hook = keep_hand_ins
 
 
-def marked(notebook):
-    """Cells with metadata of nbgrader by their grade id; None if there is no id."""
-    found = {}
+def marked(notebook: NotebookNode) -> dict:
+    """List the cells with metadata of nbgrader by their grade id (None without one)."""
+    marked_cells = {}
     for cell in notebook.cells:
         if "nbgrader" in cell.metadata:
             grade_id = (cell.metadata.nbgrader or {}).get("grade_id")
-            found.setdefault(grade_id, []).append(cell)
-    return found
+            marked_cells.setdefault(grade_id, []).append(cell)
+    return marked_cells
 
 
-def fault(handed_in, exercise):
-    """Why a notebook cannot be graded; empty if it can be.
+def fault(handed_in: NotebookNode, exercise: str) -> str:
+    """Say why a notebook cannot be graded; "" if it can be.
 
     nbgrader puts back a test and the text of the first cell. It cannot know which of
     two solutions or answers counts, nor find one without its metadata. A solution that
@@ -123,19 +131,26 @@ def fault(handed_in, exercise):
     path = HERE / "release" / exercise / f"{exercise}.ipynb"
     if not path.is_file():
         return f"no file release/{exercise}/{path.name}"
-    release, found = marked(nbformat.read(path, as_version=4)), marked(handed_in)
-    found.pop(None, None)
+    released = marked(nbformat.read(path, as_version=4))
+    returned = marked(handed_in)
+    returned.pop(None, None)  # cells without an id, which nbgrader does not grade
     faults = {}
-    for name in release | found:
-        given, (wanted,) = found.get(name, []), release.get(name, [None])
-        data = wanted and wanted.metadata.nbgrader
-        if any(cell.metadata.nbgrader != data for cell in given):
+    for name in released | returned:
+        cells = returned.get(name, [])
+        # A release has one cell of each name; a name that it does not have is a fault.
+        (original,) = released.get(name, [None])
+        data = original and original.metadata.nbgrader
+        if any(cell.metadata.nbgrader != data for cell in cells):
             cause = "cells of another release"
-        elif not given and (data.solution or not data.grade):
+        elif not cells and (data.solution or not data.grade):
             cause = "cells deleted or without metadata"
-        elif data.solution and len(given) > 1:
+        elif data.solution and len(cells) > 1:
             cause = "cells that are there twice"
-        elif data.solution and wanted.cell_type == "code" != given[0].cell_type:
+        elif (
+            data.solution
+            and original.cell_type == "code"
+            and cells[0].cell_type != "code"
+        ):
             cause = "solutions that are not code"
         else:
             continue
@@ -146,14 +161,17 @@ def fault(handed_in, exercise):
 class CheckHandIn(NbGraderPreprocessor):
     """Refuse what cannot be graded, and remove metadata that nbgrader stumbles over."""
 
-    def preprocess(self, nb, resources):
+    def preprocess(self, nb: NotebookNode, resources: dict) -> tuple:
         names = resources["nbgrader"]
-        if cause := fault(nb, names["assignment"]):
-            file = "submitted/{student}/{assignment}/{notebook}.ipynb".format(**names)
-            raise NbGraderException(f"not graded: {file}: {cause}")
+        cause = fault(nb, names["assignment"])
+        if cause:
+            raise NbGraderException(
+                f"not graded: submitted/{names['student']}/{names['assignment']}/"
+                f"{names['notebook']}.ipynb: {cause}"
+            )
         for grade_id, cells in marked(nb).items():
             if grade_id:
-                cells.pop()  # the last copy of a test counts
+                cells.pop()  # The last copy of a test counts and keeps its metadata.
             for cell in cells:
                 del cell.metadata["nbgrader"]
         return nb, resources
@@ -167,25 +185,26 @@ c.ServerApp.tornado_settings = {"page_config_data": {"buildCheck": False}}
 c.LabApp.news_url = None
 
 
-def seconds(cell):
-    """Limit for a cell: that of `nbgrader validate`, but time to import torch."""
-    first = cell.metadata.get("nbgrader", {}).get("grade_id") == "setup"
-    return 120 if first else 30
+def seconds(cell: NotebookNode) -> int:
+    """Limit a cell to 30 s, as `nbgrader validate` does."""
+    # The cell of the set-up imports torch, which may take longer.
+    grade_id = cell.metadata.get("nbgrader", {}).get("grade_id")
+    return 120 if grade_id == "setup" else 30
 
 
 c.Execute.timeout_func = seconds
 
 
 class Renderer(IPythonRenderer):
-    """Formulas as MathML, which needs no script from the network."""
+    """Renderer of formulas as MathML, which needs no script from the network."""
 
-    def inline_math(self, body, display="inline"):
+    def inline_math(self, body: str, display: str = "inline") -> str:
         try:
             return convert(body, display=display)
-        except Exception:  # a formula of a student
+        except Exception:  # The formula of a student may be anything.
             return f"<code>{escape(body)}</code>"
 
-    def block_math(self, body):
+    def block_math(self, body: str) -> str:
         return f"<p>{self.inline_math(body, 'block')}</p>"
 
 
@@ -193,31 +212,41 @@ class FeedbackPage(HTMLExporter):
     """nbgrader's page, without a network, with the names of the tasks in its list."""
 
     @pass_context
-    def markdown2html(self, context, source):
+    def markdown2html(self, context: object, source: str) -> str:
         pictures = context.get("cell", {}).get("attachments", {})
         renderer = Renderer(escape=False, attachments=pictures)
         return MarkdownWithMath(renderer=renderer).render(source)
 
-    def from_notebook_node(self, nb, resources=None, **keywords):
-        page, resources = super().from_notebook_node(nb, resources, **keywords)
-        page = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
-        names, task = {}, ""
+    def from_notebook_node(
+        self, nb: NotebookNode, resources: dict | None = None, **options: object
+    ) -> tuple:
+        page, resources = super().from_notebook_node(nb, resources, **options)
+        page = re.sub(r"(?s)<script.*?</script>", "", page)
+
+        # A graded cell is named by its task, a test also by the comment in line 1.
+        names = {}
+        task = ""
         for cell in nb.cells:
-            if heading := re.match(r"## (Task .*?) \(\d+ points", cell.source):
+            heading = re.match(r"## (Task .*?) \(\d+ points", cell.source)
+            if heading:
                 task = heading[1]
             part = re.match(r"# (.*)\.\n", cell.source)
             name = f"{task}: {part[1]}" if task and part else task
             names[cell.metadata.get("nbgrader", {}).get("grade_id")] = name
 
-        def with_name(link):
+        def with_name(link: re.Match) -> str:
             name = escape(names.get(link["cell"], ""))
-            if not name:  # a student's own link
+            if not name:  # The link is a student's own.
                 return link[0]
-            return link["start"] + (f"{name}: comment" if link["comment"] else name)
+            suffix = ": comment" if link["comment"] else ""
+            return f"{link['start']}{name}{suffix}"
 
-        link = r'(?P<start><a href="#(?P<comment>comment-)?(?P<cell>\w+)">)'
-        text = "(?:Test cell|Written response|Comment)(?=</a>)"
-        return re.sub(link + text, with_name, page), resources
+        # A link to a cell, or to the comment on it, with the text that nbgrader gives.
+        link = (
+            r'(?P<start><a href="#(?P<comment>comment-)?(?P<cell>\w+)">)'
+            "(?:Test cell|Written response|Comment)(?=</a>)"
+        )
+        return re.sub(link, with_name, page), resources
 
 
 c.GenerateFeedback.exporter_class = FeedbackPage
@@ -229,106 +258,111 @@ GRADE = "Grade"
 class Marks(ExportPlugin):
     """`nbgrader export`: grades.csv, Moodle's worksheets, and what has no grade yet.
 
-    A hand-in that was not graded has an empty score, never 0, and is listed.
+    `marks` has the score and the state of each hand-in, as text, by student. A hand-in
+    that was not graded has an empty score, never 0, and is listed.
     """
 
-    def export(self, gradebook):
-        self.root, rows = Path(self.parent.coursedir.root), []
+    def export(self, gradebook: Gradebook) -> None:
+        rows = [["assignment", "student_id", "score", "max_score", "state"]]
         for assignment in gradebook.assignments:
-            if self.assignment and assignment.name not in self.assignment:
+            name = assignment.name
+            if self.assignment and name not in self.assignment:
                 continue
-            folders = sorted(self.root.glob(f"submitted/*/{assignment.name}"))
-            found = {
-                one.parent.name: self.score(gradebook, assignment, one.parent.name)
-                for one in folders
-            }
-            found = dict(sorted((found | self.not_collected(assignment.name)).items()))
+            marks = self.not_collected(name)
+            for folder in HERE.glob(f"submitted/*/{name}"):
+                student = folder.parent.name
+                if student not in marks:
+                    marks[student] = self.score(gradebook, name, student)
+            marks = dict(sorted(marks.items()))
             rows += [
-                (assignment.name, student, score, f"{assignment.max_score:g}", state)
-                for student, (score, state) in found.items()
+                [name, student, score, f"{assignment.max_score:g}", state]
+                for student, (score, state) in marks.items()
             ]
-            self.list_open(assignment.name, found)
-            if (self.root / "downloaded" / assignment.name).is_dir():
-                self.fill_worksheet(assignment.name, found)
-                self.pack_feedback(assignment.name, found)
-        with open(self.to or self.root / "grades.csv", "w", newline="") as file:
-            names = ["assignment", "student_id", "score", "max_score", "state"]
-            csv.writer(file).writerows([names, *rows])
+            self.list_open(name, marks)
+            if (HERE / "downloaded" / name).is_dir():
+                self.fill_worksheet(name, marks)
+                self.pack_feedback(name, marks)
+        with open(self.to or HERE / "grades.csv", "w", newline="") as file:
+            csv.writer(file).writerows(rows)
 
-    def not_collected(self, name):
-        """No score, and the reason, for students without exactly one valid file.
+    def not_collected(self, name: str) -> dict:
+        """Return no score, and the reason, for students without exactly one valid file.
 
         What was copied by hand counts: only `zip_collect` writes timestamp.txt.
         """
-        files, found = downloaded(name), {}
+        files = downloaded(name)
+        marks = {}
         for student in {student for student, _ in files}:
-            folder = self.root / "submitted" / student / name
+            folder = HERE / "submitted" / student / name
             valid = files.get((student, name), [])
             collected = len(valid) == 1 or not (folder / "timestamp.txt").is_file()
             if collected and (folder / f"{name}.ipynb").is_file():
                 continue
-            others = [files[key] for key in files if key[0] == student]
             count = f"{len(valid)} files, " if len(valid) > 1 else ""
-            names = ", ".join(valid or sum(others, []))
-            found[student] = "", f"not collected: {count}{names}"
-        return found
+            # Without a valid file, all files of the student are listed.
+            keys = [key for key in files if key[0] == student]
+            names = ", ".join(valid or [file for key in keys for file in files[key]])
+            marks[student] = "", f"not collected: {count}{names}"
+        return marks
 
-    def score(self, gradebook, assignment, student):
-        """The score as text, empty if there is none, and the state of a hand-in."""
-        name = f"{assignment.name}.ipynb"
-        handed_in = self.root / "submitted" / student / assignment.name
-        graded = self.root / "autograded" / student / assignment.name
-        if not (handed_in / name).is_file():
+    def score(self, gradebook: Gradebook, exercise: str, student: str) -> tuple:
+        """Return the score as text, "" if there is none, and the state of a hand-in."""
+        name = f"{exercise}.ipynb"
+        handed_in = HERE / "submitted" / student / exercise / name
+        graded = HERE / "autograded" / student / exercise
+        if not handed_in.is_file():
             return "", f"not graded: no file {name}"
-        if not same(handed_in / name, graded / COPY):
+        if not same(graded / COPY, handed_in):
             try:
-                cause = fault(nbformat.read(handed_in / name, 4), assignment.name)
-            except Exception:  # whatever a damaged file raises
+                cause = fault(nbformat.read(handed_in, 4), exercise)
+            except Exception:  # A damaged file may raise anything.
                 cause = "damaged file"
             if cause:
-                file = f"submitted/{student}/{assignment.name}/{name}"
-                return "", f"not graded: {file}: {cause}"
+                return "", f"not graded: submitted/{student}/{exercise}/{name}: {cause}"
             again = "handed in again, " if (graded / name).is_file() else ""
             return "", f"{again}not graded"
         try:
-            submission = gradebook.find_submission(assignment.name, student)
+            submission = gradebook.find_submission(exercise, student)
         except MissingEntry:
             return "", "not graded"
         if submission.needs_manual_grade:
             return "", "answers to be graded by hand"
         return f"{submission.score - submission.late_submission_penalty:g}", "graded"
 
-    def list_open(self, name, found):
-        for student, (_, state) in found.items():
+    def list_open(self, name: str, marks: dict) -> None:
+        """Warn of hand-ins without a grade, and of files that were not collected."""
+        for student, (_, state) in marks.items():
             if state != "graded":
                 self.log.warning("%s of %s: %s", name, student or "?", state)
         for (student, exercise), files in downloaded(name).items():
-            if exercise != name and not found[student][1].startswith("not collected"):
-                names = ", ".join(files)
-                self.log.warning("%s of %s: not collected: %s", name, student, names)
+            if exercise != name and not marks[student][1].startswith("not collected"):
+                self.log.warning(
+                    "%s of %s: not collected: %s", name, student, ", ".join(files)
+                )
 
-    def fill_worksheet(self, name, found):
+    def fill_worksheet(self, name: str, marks: dict) -> None:
         """Fill in downloaded/EXERCISE/worksheet.csv; its lines are "Participant N"."""
-        path = self.root / "downloaded" / name / "worksheet.csv"
+        path = HERE / "downloaded" / name / "worksheet.csv"
         if not path.is_file():
             return
         with path.open(newline="", encoding="utf-8-sig") as file:
             head, *lines = csv.reader(file)
         for line in lines:
             number = re.sub(r"\D", "", line[0])
-            score, _ = found.get(number, ("", ""))
-            line[head.index(GRADE)] = score or line[head.index(GRADE)]
+            score, _ = marks.get(number, ("", ""))
+            if score:  # otherwise a grade of the worksheet stays
+                line[head.index(GRADE)] = score
         filled = path.with_name("worksheet_filled.csv")
         with filled.open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([head, *lines])
         self.log.info("%s: upload %s in Moodle", name, filled)
 
-    def pack_feedback(self, name, found):
+    def pack_feedback(self, name: str, marks: dict) -> None:
         """Zip the pages of feedback/; Moodle finds the student by the file's name."""
-        path = self.root / "downloaded" / name / "feedback_files.zip"
+        path = HERE / "downloaded" / name / "feedback_files.zip"
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-            for student, (_, state) in found.items():
-                page = self.root / "feedback" / student / name / f"{name}.html"
+            for student, (_, state) in marks.items():
+                page = HERE / "feedback" / student / name / f"{name}.html"
                 if state == "graded" and page.is_file():
                     moodle = f"Participant_{student}_assignfeedback_file_{name}.html"
                     archive.write(page, moodle)

@@ -9,12 +9,12 @@ from zsp_lite.features import FeatureExtractor
 from zsp_lite.pair_result import PairResult, label_errors
 from zsp_lite.pipeline import ZeroShotPose
 
-N_TARGETS = 5
+N_TARGETS = 5  # target views of each pair, as in the paper's main results
 
 
 def demo_pairs(dataset: Co3D) -> list[Pair]:
-    """Select, independently of results, the first stored or sampled evaluation pair of every
-    labelled category."""
+    """Select the first evaluation pair, stored or sampled, of every labelled category: no result is
+    looked at."""
     return [
         category_pairs(dataset, category, 1, N_TARGETS)[0]
         for category in labelled_categories(dataset)
@@ -45,8 +45,10 @@ def run_demo(
 def run_pair(
     dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[str] = ()
 ) -> PairResult:
-    """Estimate the pose of a pair by each solver, by default the method's own, and its error if it
-    has labels."""
+    """Estimate the pose of a pair by each solver, and its error if the pair has labels.
+
+    Without `solvers`, the method's own solver is used.
+    """
     reference, targets = dataset.load_pair(pair)
     # The solvers share the features.
     view, *target_views = method.views([reference, *targets])

@@ -26,7 +26,7 @@ _FOCAL_LENGTH = 994.978  # pixels
 _PRINCIPAL_POINT = (311.193, 254.877)  # pixels
 _PRINCIPAL_DIFFERENCE = 31.086  # pixels between the principal points of both cameras, along x
 _BASELINE = 0.193001  # metres between both cameras
-_FLOOR_ROWS = slice(300, None)  # lower part of the photograph, mostly floor
+_FLOOR_ROWS = slice(300, None)  # lower part of the photograph, which shows mostly floor
 _FLOOR_DISTANCE = 0.01  # metres; largest distance of a floor point from the plane
 _CLEARANCE = 0.02  # metres; smallest height of an object point above the floor
 _FARTHEST = 2.75  # metres; the motorcycle is nearer, the bench and the shelf behind it are not
@@ -64,7 +64,7 @@ def motorcycle_frame(
     floor = points[_FLOOR_ROWS][known[_FLOOR_ROWS]]
     normal, offset = fit_plane(floor, _FLOOR_DISTANCE)
     height = (points @ normal - offset) * -np.sign(normal[1])  # +y is down
-    # Thin parts, such as the brake cables and a mirror, are missing, and so are the lowest 2 cm of
-    # the tyres.
+    # This mask lacks thin parts, such as the brake cables and a mirror, and the lowest 2 cm of the
+    # tyres.
     mask = largest_region(known & (depth < _FARTHEST) & (height > _CLEARANCE))
     return Frame(rgb, depth, mask.astype(np.float32), camera, "motorcycle photograph")

@@ -24,14 +24,14 @@ from zsp_lite.viz import plots
 from zsp_lite.viz.report import PhotographSection
 
 _COLUMNS = ("foreground", "solver", "front off by", "up off by", "confidence")
-# settings of `ZeroShotPose`, and their names here
+# Values of the setting `foreground` of `ZeroShotPose`, and their names in tables and figures.
 _FOREGROUNDS = {
     "mask": "mask",
     "saliency": "own saliency",
 }
 _SOLVERS = ("paper", "verified")
-_POINTS = 1500  # drawn of the aligned cloud
-_LENGTH = 2.2  # of the arrows; the points of the motorcycle have unit standard deviation
+_POINTS = 1500  # largest number of points that are drawn of the aligned cloud
+_LENGTH = 2.2  # length of the arrows; the points of the motorcycle have unit standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +41,8 @@ class PhotographResult:
 
     photograph: Frame
     sequence: str  # sequence of the synthetic motorcycle
-    foreground: str  # setting of `ZeroShotPose`
-    solver: str  # setting of `ZeroShotPose`
+    foreground: str  # as set in `ZeroShotPose`
+    solver: str  # as set in `ZeroShotPose`
     estimate: PoseEstimate  # the photograph is the reference
     # columns: front, left and up of the photographed motorcycle, as estimated
     axes: Float[np.ndarray, "3 3"]
@@ -68,6 +68,7 @@ def run_photograph(dataset: Co3D, backbone: FeatureExtractor) -> Iterator[Photog
     poses = object_poses(dataset, motorcycle.CATEGORY)
     sequence = motorcycle.TARGET if motorcycle.TARGET in poses else min(poses)
     frames = dataset.frames(motorcycle.CATEGORY, sequence)
+    # Frames at equal steps of the sequence.
     targets = [dataset.load(frames[k * len(frames) // N_TARGETS]) for k in range(N_TARGETS)]
     pose = poses[sequence]
     points, _ = dataset.point_cloud(motorcycle.CATEGORY, sequence)
@@ -78,7 +79,7 @@ def run_photograph(dataset: Co3D, backbone: FeatureExtractor) -> Iterator[Photog
         reference, *views = method.views([photograph, *targets])
         for solver in _SOLVERS:
             estimate = replace(method, solver=solver).estimate_from_views(reference, views)
-            # From the target's camera to the photograph's: the photograph is the reference.
+            # The estimate leads from the photograph, the reference, to the target's camera.
             camera = estimate.target_camera
             to_photograph = estimate.sim3.inverse()
             axes = to_photograph.R @ camera.R @ pose.R
@@ -133,6 +134,7 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
         f"front {result.front_error:.0f}°, up {result.up_error:.0f}° off"
         for result in results
     ]
+    # The left column: the view of the synthetic motorcycle, and below it the directions by eye.
     titles.insert(len(_SOLVERS), "directions judged by eye\n")
     titles.insert(0, f"a view of the synthetic motorcycle,\n{results[0].sequence}")
     images = [view, *[photograph.rgb] * (len(titles) - 1)]

@@ -1,5 +1,5 @@
-"""The sample data: those of the repository, or, outside a clone, synthetic objects that are made
-once in the cache."""
+"""The sample data: the folder of the repository, or, outside a clone, synthetic objects in the
+cache."""
 
 import logging
 from pathlib import Path
@@ -28,15 +28,13 @@ def sample_data() -> Path:
 
     # A warning, because a program without logging settings shows nothing else.
     logger.warning("No data_samples/ here: making synthetic samples in %s, once", made)
-    part = made.with_name(f"{made.name}.part")
+    part = made.with_name(made.name + ".part")
     try:
         with writing(part):
             export_preset("demo", part)
         part.rename(made)
     except (OSError, InputError) as error:
-        if not made.is_dir():  # otherwise another process has made them meanwhile
-            raise InputError(
-                f"samples cannot be made in {made} ({error}); set ZSP_LITE_CACHE to a folder that "
-                "can be written"
-            ) from error
+        if not made.is_dir():  # If the folder is there, another process has made it meanwhile.
+            cure = "set ZSP_LITE_CACHE to a folder that can be written"
+            raise InputError(f"samples cannot be made in {made} ({error}); {cure}") from error
     return made

@@ -18,7 +18,7 @@ from zsp_lite.data.ground_truth import ObjectPose, object_poses
 from zsp_lite.views import object_crop, patch_mask
 
 _MARGIN = 0.05  # a point farther outside the box than this belongs to the background
-_MASK_THRESHOLD = 0.8  # masks are soft and accurate to one or two pixels
+_MASK_THRESHOLD = 0.8  # above this a pixel is surely of the object: masks are soft at its border
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +36,13 @@ class GroundTruthPair:
 def patch_coordinates(
     frame: Frame, pose: ObjectPose, grid: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-    """Return the box coordinates of the object point that each patch shows, and the patches where
-    they are known.
+    """Return the box coordinates of the object point that each patch shows, and the patches with
+    known coordinates.
 
-    They are known where the mask covers a quarter of the patch, one of its object pixels has depth,
-    and the point is inside the box.
+    Coordinates are known where the mask covers a quarter of the patch, one of its object pixels has
+    depth, and the point is inside the box.
     """
-    # Object pixels only: the floor between the spokes of a bicycle is inside the box as well.
+    # Only object pixels count: the floor between the spokes of a bicycle is inside the box, too.
     points, measured = patch_points(
         np.where(frame.mask > _MASK_THRESHOLD, frame.depth, 0), frame.camera, grid
     )

@@ -16,7 +16,7 @@ from zsp_lite.viz.plots import VERMILLION
 COLUMNS = ("object", "right (%)", "else turned by", "that (%)")
 _DOUBTFUL = 0.8  # an object with a lower probability should be looked at
 MOST = 10  # objects of a figure
-# Width and height that the figure has for one picture with its texts, and its border, in inches.
+# Width and height of a picture with its texts, and the figure's border, in inches.
 _WIDTH = 1.25
 _HEIGHT = 1.35
 _BORDER = 0.3
@@ -31,12 +31,11 @@ def objects_figure(
     The camera is that of the first frame of the most probable object of the category. Doubtful
     objects are shown in their next best turn, too. At most ten objects are shown.
     """
-    names = list(names or alignment.objects)[:MOST]
     objects = alignment.objects
+    names = list(names or objects)[:MOST]
     flagged = doubtful(alignment)
 
-    # Each row shows an object by the frame that is nearest to a rotation from its world to the
-    # camera.
+    # The rows: for each object, the rotation from its world to the camera that should see it.
     surest = max(objects, key=lambda name: objects[name].probability)
     camera = dataset.camera(_frames(dataset, category, surest)[0]).R
     common = camera @ objects[surest].sim3.R.T  # from the common frame to the camera
@@ -52,15 +51,16 @@ def objects_figure(
     if turned:
         rows["or turned"] = turned
 
-    # The pictures.
+    # Each picture is the object's frame whose camera is nearest to this rotation.
     size = (_WIDTH * len(names) + _BORDER, _HEIGHT * len(rows) + _BORDER)
     figure, axes = plt.subplots(
         len(rows), len(names), figsize=size, layout="constrained", squeeze=False
     )
-    for line, (title, rotations) in zip(axes, rows.items(), strict=True):
-        first = names.index(next(iter(rotations)))  # the last row has pictures of some names only
-        line[first].set_ylabel(title)
-        for axis, name in zip(line, names, strict=True):
+    for panels, (title, rotations) in zip(axes, rows.items(), strict=True):
+        # The row "or turned" has pictures of some objects only; its title is at the first.
+        first = names.index(next(iter(rotations)))
+        panels[first].set_ylabel(title)
+        for axis, name in zip(panels, names, strict=True):
             axis.set(xticks=[], yticks=[], frame_on=False)
             if name in rotations:
                 frames = _frames(dataset, category, name)
@@ -96,7 +96,7 @@ def object_rows(alignment: CategoryAlignment) -> list[tuple[str, ...]]:
 
 
 def _frames(dataset: Co3D, category: str, name: str) -> list[FrameAnnotation]:
-    """Read the frames of an object with a camera and a mask; if none has a mask, those with a
+    """Read the frames of an object with a camera and a mask; without any mask, all frames with a
     camera."""
     frames = [frame for frame in dataset.frames(category, name) if frame.viewpoint is not None]
     return [frame for frame in frames if frame.mask is not None] or frames

@@ -41,21 +41,23 @@ BLUE = "#0072B2"
 ORANGE = "#E69F00"
 GREEN = "#009E73"
 VERMILLION = "#D55E00"
-CHOSEN = ORANGE
-# Of several curves or groups of points in one figure, in this order and then again.
+CHOSEN = ORANGE  # marks what is chosen: a view, a patch, an image
+# Several curves or groups of points of a figure have these, in this order and then again.
 COLOURS = (BLUE, ORANGE, GREEN, VERMILLION, "#56B4E9", "#CC79A7", "#000000")
 _LINES = ("-", "--", "-.", ":")
 _MARKERS = "os^DvP*X"
-_CLOUD_MARKERS = "oxs^"  # crosses let discs below them be seen
-_AXIS_COLOURS = (VERMILLION, GREEN, BLUE)
-_FONT = 10  # points
+_CLOUD_MARKERS = "oxs^"  # the discs of the first cloud are visible below crosses
+_AXIS_COLOURS = (VERMILLION, GREEN, BLUE)  # of the axes x, y and z
+_FONT = 10  # size of the text, in points
 _TITLE_LINE = 0.2  # height of a line of a title at this font, in inches
-_MARKED = 20  # points of a curve; more have no markers
-_JOINED = 15  # matches with a line
-_INSIDE = 0.9  # a mask above this leaves out the border of the object
+_MARKED = 20  # a curve with more points has no markers, which would cover it
+_JOINED = 15  # number of matches with a line: more lines would cover the images
+_INSIDE = 0.9  # a soft mask above this leaves out the border of the object
 _OUTLIER = 2.5  # median distances; points farther out are background (see `near_median`)
-_OUTLINE = [Stroke(linewidth=3, foreground="white"), Normal()]  # for lines and texts on dark images
-BORDER = [Stroke(linewidth=4, foreground="black"), Normal()]  # for white lines on light images
+# A white outline lets lines and texts stand out from dark images, a black one white lines from
+# light images.
+_OUTLINE = [Stroke(linewidth=3, foreground="white"), Normal()]
+BORDER = [Stroke(linewidth=4, foreground="black"), Normal()]
 _WHITE_BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
 
 
@@ -105,17 +107,15 @@ def overlay_map(
 ) -> AxesImage:
     """Draw a map on the patch grid over the image of an axis, transparent where it is not finite.
 
-    `limits` are the values at the ends of the colour map, `label` is that of a colour bar.
-    `set_data` fills it anew.
+    `limits` are the values at the ends of the colour map; `label` adds a colour bar with this
+    label. `set_data` of the returned image shows other values.
     """
-    low, high = limits or (None, None)
     drawn = axis.imshow(
         np.asarray(values, np.float64),
         cmap=cmap,
         alpha=alpha,
         interpolation="nearest",
-        vmin=low,
-        vmax=high,
+        clim=limits,
         extent=(*axis.get_xlim(), *axis.get_ylim()),
     )
     if label is not None:
@@ -128,7 +128,7 @@ def overlay_map(
 def mark(axis: Axes, text: str, colour: str = CHOSEN, size: float = _FONT) -> None:
     """Draw a coloured frame around the image of an axis and write `text` in its corner, `size`
     points high."""
-    whole = axis.transAxes  # from fractions of the width and height of the axis
+    whole = axis.transAxes  # the coordinates below are fractions of the axis's width and height
     frame = Rectangle(
         (0, 0), 1, 1, fill=False, edgecolor=colour, linewidth=5, transform=whole, zorder=10
     )
@@ -228,7 +228,6 @@ def draw_cycle(
             pixels[start],
             pixels[start + 1],
             "data",
-            "data",
             axesA=stops[start],
             axesB=stops[start + 1],
             arrowstyle="-|>",
@@ -259,7 +258,9 @@ def show_matches(
 ) -> Figure:
     """Show two images and matches of their patches (row, col), as `draw_matches` draws them."""
     figure, axes = show_images(images, titles, size=size)
-    pixels = [patch_centres(own, grid, image.shape[:2]) for own, image in zip(cells, images)]
+    pixels = [
+        patch_centres(matched, grid, image.shape[:2]) for matched, image in zip(cells, images)
+    ]
     draw_matches(axes, pixels, inliers)
     return figure
 
@@ -276,16 +277,18 @@ def draw_matches(
     """
     count = len(pixels[0])
     inliers = np.ones(count, bool) if inliers is None else inliers
-    order = np.argsort(inliers, kind="stable")  # inliers last, above
+    # Inliers come last, so that their lines are above the others. Matches at equal steps of this
+    # order have the same share of inliers as all.
+    order = np.argsort(inliers, kind="stable")
+    steps = np.linspace(0, count - 1, min(count, _JOINED)).astype(int)
     drawn = []
-    for index in order[np.linspace(0, count - 1, min(count, _JOINED)).astype(int)]:
+    for index in order[steps]:
         style = {"color": VERMILLION, "linewidth": 1.2, "linestyle": (0, (4, 2))}
         if inliers[index]:  # with a white outline, to be visible on dark images
             style = {"color": BLUE, "linewidth": 1.8, "path_effects": _OUTLINE}
         line = ConnectionPatch(
             pixels[0][index],
             pixels[1][index],
-            "data",
             "data",
             axesA=axes[0],
             axesB=axes[1],
@@ -294,7 +297,7 @@ def draw_matches(
         )
         drawn.append(axes[0].figure.add_artist(line))
     for axis, places in zip(axes, pixels):
-        wrong = places[~inliers].T  # (2, m)
+        wrong = places[~inliers].T  # rows: x, y
         right = places[inliers].T
         drawn += [
             axis.scatter(*wrong, 25, VERMILLION, marker="x", linewidths=1.2, zorder=6),
@@ -319,7 +322,7 @@ def show_panels(
     legend.
 
     Curves differ in colour, line and marker. `size` is the width of the figure and the height of a
-    row; `labels` is what `Axes.set` takes.
+    row, in inches; `labels` is what `Axes.set` takes.
     """
     width = size[0] / min(columns or len(panels), len(panels))
     figure, axes = _panels(len(panels), columns, width, size[1])
@@ -331,7 +334,14 @@ def show_panels(
                 axis.plot(x, y, line, color=colour, label=name, marker=marker, markersize=5)
             else:
                 axis.scatter(
-                    x, y, 50, colour, marker, edgecolors="black", linewidths=0.4, label=name
+                    x,
+                    y,
+                    s=50,
+                    c=colour,
+                    marker=marker,
+                    edgecolors="black",
+                    linewidths=0.4,
+                    label=name,
                 )
         axis.set(title=title, **labels)
     _legend(figure, axes[0])
@@ -356,19 +366,21 @@ def show_points(
     firsts = [next(iter(sets.values()))[:, :2] for sets in panels.values()]
     ranges = np.array([np.percentile(points, [1, 99], axis=0) for points in firsts])
     extent = (ranges[:, 1] - ranges[:, 0]).max(axis=0)
-    half = extent / 2 + 0.2 * extent.max()
+    half = extent / 2 + 0.2 * extent.max()  # with a margin of a fifth on each side
     height = size * half[1] / half[0] + 0.6 + _TITLE_LINE * _lines_of(panels)  # 0.6: the legend
     figure, axes = _panels(len(panels), columns, size, height)
     for axis, (title, sets), centre in zip(axes, panels.items(), ranges.mean(axis=1)):
         for (name, points), colour, marker in zip(sets.items(), colours, _CLOUD_MARKERS):
-            area = np.clip(6000 / max(len(points), 1), 3, 40)  # of a mark: less for more points
+            # The more points, the smaller their marks (square points) and the thinner their lines.
+            area = np.clip(6000 / max(len(points), 1), 3, 40)
             thick = 0.3 + 0.03 * area
-            axis.scatter(*points.T[:2], area, colour, marker, linewidths=thick, label=name)
+            axis.scatter(*points.T[:2], area, colour, marker=marker, linewidths=thick, label=name)
         axis.set_title(title, fontsize=_FONT, parse_math=False)
         left, bottom = centre - half
         right, top = centre + half
         y_limits = (top, bottom) if down else (bottom, top)
-        axis.set(**{"xlim": (left, right), "ylim": y_limits, "aspect": "equal"} | labels)
+        axis.set(xlim=(left, right), ylim=y_limits, aspect="equal")
+        axis.set(**labels)
     for handle in _legend(figure, axes[0], "outside lower center").legend_handles:
         handle.set(sizes=[40], linewidths=[1.5])  # small marks would be pale
     return figure
@@ -390,21 +402,22 @@ def show_dots(
     styles = zip(groups.items(), cycle(COLOURS), cycle(_MARKERS))
     for index, ((group, values), colour, marker) in enumerate(styles):
         for row, name in enumerate(rows):
+            x = values[name]
             middle = row + width * (index - (len(groups) - 1) / 2)
             # Dots are scattered over the band, so that equal values can be told apart.
-            height = middle + width * rng.uniform(-0.4, 0.4, len(values[name]))
+            height = middle + width * rng.uniform(-0.4, 0.4, len(x))
             axis.scatter(
-                values[name],
+                x,
                 height,
-                40,
-                colour,
-                marker,
+                s=40,
+                c=colour,
+                marker=marker,
                 edgecolors="white",
                 linewidths=0.4,
-                label="" if row else group,
+                label="" if row else group,  # one entry of the legend for all rows
             )
-            if median and len(values[name]):
-                centre = np.median(values[name])
+            if median and len(x):
+                centre = np.median(x)
                 axis.vlines(centre, middle - 0.4, middle + 0.4, color=VERMILLION, linewidth=2.5)
     axis.set_yticks(range(len(rows)), rows)
     axis.set(ylim=(len(rows) - 0.4, -0.6), **labels)
@@ -591,12 +604,14 @@ def draw_estimates(
     estimate."""
     views = chosen_views(estimates)
     cameras = [view.frame.camera for view in views]
-    poses = [Sim3.identity(), *(_rounded(one.sim3) for one in estimates)]
-    draw_moved_cloud(axes, cameras, object_cloud(views[0], most), poses, None, size)
+    poses = [Sim3.identity(), *(_rounded(estimate.sim3) for estimate in estimates)]
+    cloud = object_cloud(views[0], most)
+    draw_moved_cloud(axes, cameras, cloud, poses, names=None, size=size)
 
 
 def _rounded(pose: Sim3) -> Sim3:
-    """Round a pose: the number of threads changes its last digits, but shall not a picture."""
+    """Round a pose, so that the number of threads, which changes its last digits, does not change
+    pictures."""
     turn = Rotation.from_rotvec(Rotation.from_matrix(pose.R).as_rotvec().round(3))
     return Sim3(round(pose.scale, 3), turn.as_matrix(), pose.t.round(3))
 
@@ -663,5 +678,5 @@ def _lines_of(titles: Iterable[str]) -> int:
 
 
 def _size(axis: Axes) -> tuple[int, int]:
-    """Return the size (H, W) of the image that covers an axis."""
+    """Return the size (H, W) of the image that covers an axis (see `draw_image` for its limits)."""
     return round(axis.get_ylim()[0]), round(axis.get_xlim()[1])

@@ -1,5 +1,5 @@
-"""Points of the verified solver in a view: on a surface, occluded, or a contradiction to
-the pose."""
+"""Points of the verified solver in a view: on a surface, occluded, or in contradiction to the
+pose."""
 
 from collections.abc import Sequence
 
@@ -18,22 +18,24 @@ POINT_CLASSES: dict[str, tuple[str, str]] = {
     "outside the silhouette": (VERMILLION, "X"),
     "depth unknown": ("white", "s"),
 }
-_DRAWN = (1, 4, 0, 2, 3)  # contradictions last, so that no other point covers them
+# Order in which the classes are drawn, by index: contradictions last, so that nothing covers them.
+_DRAWN = (1, 4, 0, 2, 3)
 
 
 def classify_points(terms: PointTerms, pose: int = 0) -> Int[np.ndarray, "v n"]:
     """Classify each point in each view under one of the poses, as indices into `POINT_CLASSES`.
 
     A point is on the surface if its surface weight is at least half of what it would be exactly on
-    the surface. The points that are left are behind it: occluded.
+    the surface. Points for which no condition holds are behind the surface: occluded.
     """
     distance = terms.projection.silhouette_distance[pose].numpy()
     weight = terms.projection.weight[pose].numpy()
     surface = terms.surface[pose].numpy()
     free_space = terms.free_space[pose].numpy()
-    # The first condition that holds decides; where none does, the point is occluded (1).
+    # The first condition that holds decides: outside the silhouette (3), depth unknown (4), on the
+    # surface (0), in free space (2); where none holds, occluded (1).
     conditions = [distance > 0, weight <= 0, surface >= weight / 2, free_space > 0]
-    return np.select(conditions, [3, 4, 0, 2], 1)
+    return np.select(conditions, [3, 4, 0, 2], default=1)
 
 
 def show_point_classes(
@@ -52,22 +54,21 @@ def show_point_classes(
         for index in _DRAWN:
             name = list(POINT_CLASSES)[index]
             colour, marker = POINT_CLASSES[name]
-            area = 6 if name == "depth unknown" else 14  # those say nothing, and are many
+            # Points of unknown depth are small: they say nothing about the pose, and are many.
+            area = 6 if name == "depth unknown" else 14
             axis.scatter(
                 *places[point_classes == index].T,
-                area,
-                colour,
-                marker,
+                s=area,
+                c=colour,
+                marker=marker,
                 edgecolors="black",
                 linewidths=0.4,
                 label=name,
             )
-    handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(
-        handles,
-        labels,
+        *axes[0].get_legend_handles_labels(),
         loc="outside lower center",
-        ncols=len(labels),
+        ncols=len(POINT_CLASSES),
         fontsize=9,
         handletextpad=0.1,
     )

@@ -18,9 +18,9 @@ from zsp_lite.pair_result import PairResult
 from zsp_lite.points import world_cloud
 from zsp_lite.viz import plots
 
-_OTHERS = 4  # target views that are shown beside the chosen one
-_POINTS = 3000  # of the target, drawn from above
-# reach of the object in the drawing from above; the cameras are on or inside a circle of radius 1
+_OTHERS = 4  # number of target views beside the chosen one
+_POINTS = 3000  # largest number of the target's points in the drawing from above
+# Reach of the object in the drawing from above; the cameras are on or inside a circle of radius 1.
 _OBJECT = 0.45
 
 
@@ -45,20 +45,21 @@ def coverage(
     """Compute where the target cameras, by number, and the centre of the reference camera are
     around an object."""
     numbers = list(cameras)
-    cameras = list(cameras.values())
-    # Unit vectors (n + 1, 3) from the object to the cameras, the reference's last.
-    offsets = np.stack([*(camera.centre for camera in cameras), reference]) - centre
+    targets = list(cameras.values())
+    # Unit vectors (n + 1, 3) from the object to the cameras, to that of the reference last.
+    offsets = np.stack([*(camera.centre for camera in targets), reference]) - centre
     directions = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
 
     # The axes of the ground, turned so that the reference camera is below.
-    axes = ground_axes(cameras)
+    axes = ground_axes(targets)
     x, y = axes @ directions[-1]
     turn = -np.pi / 2 - np.arctan2(y, x)
     axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ axes
-    *targets, seen_reference = directions @ axes.T
+    *target_places, reference_place = directions @ axes.T
 
-    # The widest gap between neighbours on the circle, of the cameras that are not right above.
-    around = azimuths(cameras, centre)
+    # The widest gap between neighbours on the circle. The azimuth of a camera right above the
+    # object is NaN.
+    around = azimuths(targets, centre)
     around = np.sort(around[~np.isnan(around)] + np.degrees(turn))
     gap = (0.0, 360.0)
     if len(around):
@@ -69,7 +70,13 @@ def coverage(
     angles = np.degrees(np.arccos((directions[:-1] @ directions[-1]).clip(-1, 1)))
     nearest = numbers[int(angles.argmin())]
     return Coverage(
-        dict(zip(numbers, targets)), seen_reference, gap, nearest, float(angles.min()), centre, axes
+        dict(zip(numbers, target_places)),
+        reference_place,
+        gap,
+        nearest,
+        float(angles.min()),
+        centre,
+        axes,
     )
 
 
@@ -85,7 +92,7 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
     reference = estimate.reference_view
 
     # The views and their titles.
-    used = np.flatnonzero(np.isfinite(estimate.view_scores))  # others were left out
+    used = np.flatnonzero(np.isfinite(estimate.view_scores))  # unusable views have no score
     others = used[used != chosen]
     spaced = np.linspace(0, len(others), min(_OTHERS, len(others)), endpoint=False)
     shown = [chosen, *others[spaced.astype(int)]]
@@ -109,8 +116,8 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
         axes[1].contour(columns, rows, mask, [ON_OBJECT], colors=["white"], linewidths=1.5)
     cloud = plots.object_cloud(reference, most=20000)
     cameras = [frames[view].camera for view in shown]
-    plots.draw_moved_cloud(axes[:1], [reference.frame.camera], cloud, [Sim3.identity()], None)
-    plots.draw_moved_cloud(axes[2:], cameras, cloud, estimate.propagate(cameras), None)
+    plots.draw_moved_cloud(axes[:1], [reference.frame.camera], cloud, [Sim3.identity()], names=None)
+    plots.draw_moved_cloud(axes[2:], cameras, cloud, estimate.propagate(cameras), names=None)
 
     # Seen from above.
     target_cloud = world_cloud(result.targets)[0]
@@ -135,12 +142,13 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
 def draw_cameras(axis: Axes, seen: Coverage, chosen: int, reference: str = "reference") -> None:
     """Draw the target cameras with their numbers, and a star for the reference camera, around the
     object."""
+    # The cameras are on a circle of radius 1, their numbers outside.
     axis.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal")
     for number, place in seen.targets.items():
         colour = plots.CHOSEN if number == chosen else plots.BLUE
         axis.plot(*place, "o", color=colour, markersize=11, markeredgecolor="white")
         axis.text(
-            *(1.23 * place),  # beyond its mark
+            *(1.23 * place),
             str(number),
             color=colour,
             ha="center",
@@ -165,11 +173,25 @@ def _draw_from_above(axis: Axes, seen: Coverage, target: np.ndarray, reference: 
     begin, end = seen.gap
     axis.images[0].remove()
     axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0))
+    # An arc is given by the width and the height of its whole ellipse.
     axis.add_patch(Arc((0, 0), 2, 2, theta1=end, theta2=begin + 360, color=plots.BLUE, linewidth=4))
-    empty = f"no target view in these {end - begin:.0f}°"
-    spanned = f"the target views span {360 - end + begin:.0f}°"
-    axis.plot([], [], "s", color="0.5", alpha=0.25, markersize=14, label=empty)
-    axis.plot([], [], color=plots.BLUE, linewidth=4, label=spanned)
+    # Entries of the legend, without a point.
+    axis.plot(
+        [],
+        [],
+        "s",
+        color="0.5",
+        alpha=0.25,
+        markersize=14,
+        label=f"no target view in these {end - begin:.0f}°",
+    )
+    axis.plot(
+        [],
+        [],
+        color=plots.BLUE,
+        linewidth=4,
+        label=f"the target views span {360 - end + begin:.0f}°",
+    )
     step = -(-len(target) // _POINTS)  # rounded up
     flat = [(points - seen.centre) @ seen.axes.T for points in (target[::step], reference)]
     # Nine tenths of the target's points are within `_OBJECT`.

@@ -39,11 +39,12 @@ _MEANINGS = {
     "error": "angle to the labelled rotation",
     "confidence": "probability of an error below 30°, calibrated on renderings",
 }
-_RIGHT = 30.0  # degrees; a pose with a smaller error is marked as right
+_RIGHT = 30.0  # a pose with a smaller error is marked as right, in degrees
 _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark ground
 _TEMPLATES = Environment(
     loader=PackageLoader("zsp_lite.viz"), autoescape=True, undefined=StrictUndefined
 )
+# Parts of figures in this grey on the page, as keys of matplotlib's settings.
 _COLOURED = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")
 
 
@@ -58,12 +59,12 @@ class PhotographSection(NamedTuple):
 
 def write_pair_report(path: Path, result: PairResult) -> Path:
     """Write the page of one pair of the user's own."""
-    names = {
+    origins = {
         "given": "given with the images",
         "box": "GrabCut from a box",
         "auto": "found by depth and colours",
     }
-    note = f"reference {names[result.masks[0]]}, target {names[result.masks[1]]}"
+    note = f"reference {origins[result.masks[0]]}, target {origins[result.masks[1]]}"
     return write_report(path, [result], result.backbone, data_note=note, own=True)
 
 
@@ -99,7 +100,20 @@ def write_report(
     photograph: PhotographSection | None = None,
     own: bool = False,
 ) -> Path:
-    """Write the page of the demo, or of a pair of the user's `own`."""
+    """Write the page of the demo, or of a pair of the user's `own`.
+
+    Args:
+        path: File to write.
+        results: Results in the order of the page.
+        backbone: Name of the backbone.
+        data: Name of the data, for the first paragraph.
+        data_note: What the page says of the data.
+        photograph: Section on the photographed motorcycle; None leaves it out.
+        own: Whether the pair is the user's own.
+
+    Returns:
+        The path of the page.
+    """
     with plt.rc_context(dict.fromkeys(_COLOURED, _GREY)):
         pairs = [_pair_parts(result, f"scene-{index}") for index, result in enumerate(results, 1)]
         picture = _data_uri(photograph.draw()) if photograph else ""
@@ -122,17 +136,17 @@ def write_report(
 def _pair_parts(result: PairResult, scene_id: str) -> dict[str, Any]:
     """Make the rows and the pictures of a pair for the template."""
     pictures = {}
-    both = {}
+    two_poses = {}
     for solver, estimate in result.estimates.items():
         pictures[solver] = _data_uri(pose_picture(result, solver))
         if estimate.one_of_two:
-            both[solver] = _data_uri(_two_poses_figure(estimate))
+            two_poses[solver] = _data_uri(_two_poses_figure(estimate))
     votes = [votes_figure(result.votes), ring_figure(result)] if result.votes else []
     return {
         "result": result,
         "rows": table_rows(result),
         "pictures": pictures,
-        "both": both,
+        "both": two_poses,
         "votes": [_data_uri(figure) for figure in votes],
         "stages": _stages(result, scene_id),
     }
@@ -169,8 +183,10 @@ def legend(columns: Sequence[str] = COLUMNS) -> str:
 
 def write_overview(path: Path, results: Sequence[PairResult]) -> None:
     """Write the picture of `overview` as a JPEG."""
-    style = {"format": "jpeg", "bbox_inches": "tight", "pil_kwargs": {"quality": 88}}
-    write_atomic(path, _encode(overview(results), **style))
+    picture = _encode(
+        overview(results), format="jpeg", bbox_inches="tight", pil_kwargs={"quality": 88}
+    )
+    write_atomic(path, picture)
 
 
 def overview(results: Sequence[PairResult]) -> Figure:
@@ -192,7 +208,7 @@ def overview(results: Sequence[PairResult]) -> Figure:
         axis.set_title(title, fontsize=14)
     for result, panels in zip(results, np.reshape(axes, (-1, len(titles)))):
         plots.draw_estimates(panels, result.estimates.values())
-        plots.mark(panels[0], result.title, "none", 14)
+        plots.mark(panels[0], result.title, colour="none", size=14)
         for axis, error in zip(panels[1:], result.errors.values()):
             right = error < _RIGHT
             word = "right" if right else "wrong"
@@ -296,7 +312,7 @@ def _data_uri(figure: Figure) -> str:
     return "data:image/webp;base64," + base64.b64encode(data).decode()
 
 
-def _encode(figure: Figure, dpi: int = 110, **options) -> bytes:
+def _encode(figure: Figure, dpi: int = 110, **options: Any) -> bytes:
     """Encode a figure and close it; `options` is what `Figure.savefig` takes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=dpi, **options)

@@ -13,7 +13,7 @@ from zsp_lite.data.cameras import ground_axes
 from zsp_lite.pair_result import PairResult, Vote
 from zsp_lite.viz import plots
 
-_SHOWN = 8  # votes with pictures
+_SHOWN = 8  # largest number of votes with pictures
 
 
 def votes_figure(votes: Sequence[Vote]) -> Figure:
@@ -28,14 +28,16 @@ def votes_figure(votes: Sequence[Vote]) -> Figure:
     for vote in shown:
         reference, target = plots.chosen_views([vote.estimate])
         images += [plots.pale(reference.frame.rgb), plots.pale(target.frame.rgb)]
-        confidence = f"prob. {vote.estimate.confidence:.2f}"
-        titles += [vote.name.replace(" of ", "\nof "), f"{vote.degrees:.0f}° off,\n{confidence}"]
+        titles += [
+            vote.name.replace(" of ", "\nof "),
+            f"{vote.degrees:.0f}° off,\nprob. {vote.estimate.confidence:.2f}",
+        ]
     figure, axes = plots.show_images(images, titles, columns=8, size=1.45)
     for k, vote in enumerate(shown):
-        pair = axes[2 * k : 2 * k + 2]
-        plots.draw_estimates(pair, [vote.estimate], most=1500, size=2)
+        panels = axes[2 * k : 2 * k + 2]  # the frame and the view that it leads to
+        plots.draw_estimates(panels, [vote.estimate], most=1500, size=2)
         colour = plots.VERMILLION if vote.degrees > SAME_ANGLE else plots.BLUE
-        pair[1].title.set_color(colour)
+        panels[1].title.set_color(colour)
     return figure
 
 
@@ -53,7 +55,7 @@ def ring_figure(result: PairResult) -> Figure:
         x, y, z, w = Rotation.from_matrix(rotation @ answer.world_sim3.R.T).as_quat()
         return 2 * np.arctan2(up @ (x, y, z), w)
 
-    # Dots on the outer circle, their areas by confidence.
+    # Dots on the outer circle, of radius 1; their areas in square points grow with confidence.
     for vote in result.votes:
         for pose in vote.estimate.hypotheses:
             world = vote.estimate.between_worlds(pose.sim3, pose.view)

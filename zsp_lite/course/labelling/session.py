@@ -5,10 +5,10 @@ See "Labelling pose for evaluation" in the paper's supplement: at least four key
 the same order on the clouds of the reference sequence and of another sequence, and aligned by
 Umeyama's method with scale.
 
-ROOT/label_picks/CATEGORY.json holds the names of the keypoints and all picks;
-ROOT/class_labels/CATEGORY/SEQ.json holds the accepted labels in the format of the published code;
-ROOT/label_proposals/CATEGORY/SEQ.json, in the same format, what `zsp-lite align --propose`
-proposes.
+ROOT/label_picks/CATEGORY.json holds the names of the keypoints and all picks.
+ROOT/class_labels/CATEGORY/SEQ.json holds an accepted label in the format of the published code.
+ROOT/label_proposals/CATEGORY/SEQ.json holds, in the same format, a label that
+`zsp-lite align --propose` proposes.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ from zsp_lite.errors import InputError, check_choice, check_magnitude, real_arra
 from zsp_lite.io.files import plain_name, read_json, write_atomic
 
 Point = Real[np.ndarray, "3"] | Sequence[float]
-MIN_KEYPOINTS = 4
+MIN_KEYPOINTS = 4  # as in the paper
 # A label whose RMS residual is above this fraction of the object's size is accepted on request
 # only: usually two keypoints are confused. The size is the longest side of the point cloud without
 # outliers.
@@ -64,17 +64,26 @@ class Alignment:
 
 
 def align_picks(reference: ArrayLike, picks: ArrayLike) -> Alignment:
-    """Align keypoints (n, 3) of the reference sequence, n >= 4, and of another one by Umeyama's
-    method with scale.
+    """Align keypoints by Umeyama's method with scale.
 
-    InputError if the numbers differ or are below 4, a keypoint is not finite, or all are equal or
-    collinear.
+    Args:
+        reference: Keypoints (n, 3) of the reference sequence in its world, n >= 4.
+        picks: The same keypoints of another sequence in its world.
+
+    Returns:
+        The alignment from the world of the reference to that of the other sequence.
+
+    Raises:
+        InputError: The numbers differ or are below 4, a keypoint is not finite, or all keypoints
+            are equal or collinear.
     """
     reference = np.asarray(reference, dtype=np.float64)
     picks = np.asarray(picks, dtype=np.float64)
     if len(reference) != len(picks) or len(picks) < MIN_KEYPOINTS:
-        found = f"{len(picks)} keypoints picked and {len(reference)} on the reference"
-        raise InputError(f"{found}, expected equally many, at least {MIN_KEYPOINTS}")
+        raise InputError(
+            f"{len(picks)} keypoints picked and {len(reference)} on the reference, expected "
+            f"equally many, at least {MIN_KEYPOINTS}"
+        )
     sim3 = umeyama(reference, picks)
     distance = np.linalg.norm(sim3.apply(reference) - picks, axis=1)
     return Alignment(sim3, distance / np.sqrt(picks.var(axis=0).mean()))
@@ -96,7 +105,7 @@ class Progress:
     sequence: str
     state: str  # "reference", "open", "accepted" or "skipped"
     picks: int
-    # of the residuals relative to the spread of the picks; None before all keypoints are picked
+    # RMS residual relative to the spread of the picks; None before all keypoints are picked
     rms: float | None
     problem: str = ""  # why the picks give no alignment, such as all on one line
 
@@ -119,8 +128,8 @@ class Labelling:
         self.root = Path(root)
         self.category = plain_name(category, "category")
         self.dataset = Co3D(root)
-        known = {one.sequence_name: one for one in self.dataset.sequences(category)}
-        with_cloud = [name for name, one in known.items() if one.point_cloud is not None]
+        known = {sequence.sequence_name: sequence for sequence in self.dataset.sequences(category)}
+        with_cloud = [name for name in known if known[name].point_cloud is not None]
 
         # The stored picks, and the reference that they and the labels name.
         self.path = self.root / "label_picks" / f"{self.category}.json"
@@ -136,12 +145,14 @@ class Labelling:
             references.add(stored.reference_seq)
         references.update(label.reference_seq for label in read_labels(root, category).values())
         if len(references) > 1:
-            found = f"reference, stored picks and labels name {', '.join(sorted(references))}"
-            raise InputError(f"category {category}: {found}, expected one reference sequence")
+            raise InputError(
+                f"category {category}: reference, stored picks and labels name "
+                f"{', '.join(sorted(references))}, expected one reference sequence"
+            )
 
-        # The sequences to label.
-        chosen = [one.sequence_name for one in self.dataset.select(category)] or with_cloud
-        chosen = list(dict.fromkeys([*references, *chosen]))  # each once
+        # The sequences to label, each once.
+        best_clouds = [sequence.sequence_name for sequence in self.dataset.select(category)]
+        chosen = list(dict.fromkeys([*references, *(best_clouds or with_cloud)]))
         missing = [name for name in chosen if name not in with_cloud]
         if missing:
             allowed = ", ".join(with_cloud) or "none"
@@ -154,7 +165,8 @@ class Labelling:
             )
         best = max(chosen, key=lambda name: known[name].point_cloud.quality_score or -np.inf)
         self.reference = next(iter(references), best)
-        self.sequences = sorted(chosen, key=lambda name: name != self.reference)  # it comes first
+        # The reference comes first; the order of the others stays.
+        self.sequences = sorted(chosen, key=lambda name: name != self.reference)
         self._stored = stored or _Picks(self.reference, [], {}, [])
         proposals = read_label_folder(self.root / "label_proposals" / self.category)
         self._proposals = {name: label.trans for name, label in proposals.items()}
@@ -189,10 +201,16 @@ class Labelling:
         return np.eye(3)
 
     def pick(self, sequence: str, point: Point, name: str = "") -> None:
-        """Add the next keypoint (3,) of a sequence, in its world coordinates; on the reference, a
-        new one of that name.
+        """Add the next keypoint of a sequence.
 
-        InputError if all are picked, or the reference's keypoints are in use on other sequences.
+        Args:
+            sequence: Name of the sequence.
+            point: The keypoint in world coordinates of the sequence.
+            name: Name of the keypoint, if it is a new one of the reference.
+
+        Raises:
+            InputError: All keypoints are picked, or the keypoints of the reference are in use on
+                other sequences.
         """
         picks = self.picks(sequence)
         if sequence != self.reference and len(picks) >= len(self.names):
@@ -243,20 +261,20 @@ class Labelling:
         self._save(sequence)
 
     def alignment(self, sequence: str) -> Alignment | None:
-        """Align the reference with a sequence by the picks; None before all keypoints are
-        picked."""
+        """Align the reference with a sequence by the picks; None before all are picked."""
         picks = self.picks(sequence)
         if len(picks) < MIN_KEYPOINTS or len(picks) != len(self.names):
             return None
         return align_picks(self.picks(self.reference), picks)
 
     def doubt(self, sequence: str) -> str:
-        """Say in a line why a label should be checked: its RMS residual is above `MAX_RESIDUAL`; ""
-        otherwise."""
+        """Say in a line why a label should be checked, or "": its RMS residual is above
+        `MAX_RESIDUAL`."""
         alignment = self.alignment(sequence)
         if alignment is None:
             return ""
-        # From fractions of the spread of the picks to fractions of the object's size.
+        # The factor from the spread of the picks to the object's size: residuals are relative to
+        # the spread.
         low, high = np.percentile(self.cloud(sequence)[0], [1, 99], axis=0)
         scale = np.sqrt(self.picks(sequence).var(axis=0).mean()) / max((high - low).max(), 1e-12)
         residuals = scale * alignment.residuals
@@ -271,12 +289,20 @@ class Labelling:
         )
 
     def accept(self, sequence: str, confirmed: bool = False) -> Path:
-        """Write the label of a sequence, also in `doubt` if `confirmed`, and that of the reference,
-        the identity.
+        """Write the label of a sequence, and the label of the reference, which is the identity.
 
-        Without picks on the sequence, the label is the proposal. Returns the label file of the
-        sequence. InputError if keypoints are missing, the sequence is the reference, or the label
-        is in doubt and not confirmed.
+        Without picks on the sequence, the label is the proposal.
+
+        Args:
+            sequence: Name of the sequence.
+            confirmed: Whether a label in `doubt` is written, too.
+
+        Returns:
+            The label file of the sequence.
+
+        Raises:
+            InputError: Keypoints are missing, the sequence is the reference, or the label is in
+                doubt and not confirmed.
         """
         alignment = self.alignment(sequence)
         picked = len(self.picks(sequence))
@@ -313,7 +339,8 @@ class Labelling:
         """Exclude a sequence, for instance one with a bad point cloud, and delete the label made of
         its picks."""
         path = label_folder(self.root, self.category) / f"{self._known(sequence)}.json"
-        # Labels do not say where they come from: one with all its picks was made of them.
+        # Labels do not say where they come from. If all keypoints are picked, the label was made of
+        # the picks.
         all_picked = len(self.picks(sequence)) == len(self.names) > 0
         refusal = f"sequence {sequence} cannot be skipped: it"
         if path.is_file() and not all_picked:

@@ -19,7 +19,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, ORANGE
 
 MAX_POINTS = 6000  # points drawn; more are slow in the browser
-# points farther behind the front point under the pointer cannot be clicked; in view units
+# A point that is farther behind the front point under the pointer cannot be clicked, in view units.
 _DEPTH_TOLERANCE = 0.15
 
 _STYLE = """
@@ -29,14 +29,14 @@ _STYLE = """
 
 
 def view_units(points: Real[np.ndarray, "n 3"]) -> Sim3:
-    """Return the similarity from the world to view units: the ball around a cloud becomes the unit
-    ball.
+    """Return the similarity from the world to view units, in which a cloud fills the unit ball.
 
-    The ball is from the 1st to the 99th percentile along each axis, robust to outliers.
+    The ball is around the box from the 1st to the 99th percentile along each axis, which is robust
+    to outliers.
     """
     low, high = np.percentile(points, [1, 99], axis=0) if len(points) else np.zeros((2, 3))
     radius = float(np.linalg.norm(high - low)) / 2
-    if not radius >= 1e-12:  # so, and not `<`, for a radius that is NaN
+    if not radius >= 1e-12:  # also for a radius that is NaN, for which `<` is false
         raise InputError(
             f"point cloud of {len(points)} points has no extent, expected an object of finite "
             "points"
@@ -45,12 +45,12 @@ def view_units(points: Real[np.ndarray, "n 3"]) -> Sim3:
 
 
 def subsample(points: Real[np.ndarray, "n 3"], most: int = MAX_POINTS) -> Int[np.ndarray, " m"]:
-    """Return the indices of at most `most` points, neighbours after each other, as the slider goes
-    through them."""
+    """Return the indices of at most `most` points, in an order in which neighbours follow each
+    other: the slider goes through it."""
     chosen = np.arange(len(points))
     if len(points) > most:
         chosen = np.random.default_rng(0).choice(len(points), most, replace=False)
-    return chosen[KDTree(points[chosen]).indices]  # leaf by leaf
+    return chosen[KDTree(points[chosen]).indices]  # ordered leaf by leaf
 
 
 def point_under(
@@ -95,11 +95,15 @@ class CloudView:
         alt: str,
         overlay: Real[np.ndarray, "m 3"] | None = None,
     ) -> None:
-        """Show a cloud of coloured world points, seen along `view` (see `point_under`; None keeps
-        the present one).
+        """Show a cloud of coloured world points.
 
-        With an `overlay`, the points of a second cloud, the first is orange discs, the second blue
-        crosses.
+        Args:
+            points: World points of the cloud.
+            colours: Colours of the points.
+            view: Direction of view (see `point_under`); None keeps the present one.
+            alt: Alternative text.
+            overlay: World points of a second cloud. The first cloud is then orange discs, the
+                second blue crosses.
         """
         self._cloud = np.asarray(points, dtype=np.float64)
         self._to_view = view_units(points)

@@ -70,10 +70,11 @@ def slider(label: str, low: float, high: float, value: float, step: float = 1) -
 def patch_sliders(grid: tuple[int, int], start: tuple[int, int], of: str = "") -> dict[str, Widget]:
     """Return sliders over the rows and columns of a patch grid, counted from 0, that begin at a
     patch."""
-    names = (("row", f"row{of}"), ("col", f"column{of}"))
+    rows, columns = grid
+    row, column = start
     return {
-        name: slider(label, 0, cells - 1, at)
-        for (name, label), cells, at in zip(names, grid, start)
+        "row": slider(f"row{of}", 0, rows - 1, row),
+        "col": slider(f"column{of}", 0, columns - 1, column),
     }
 
 
@@ -88,7 +89,7 @@ def interactive_figure(
     whatever the controls are.
     """
     widgets = load_package()
-    plt.close(figure)  # otherwise the notebook shows it a second time
+    plt.close(figure)  # A notebook shows open figures below the cell, a second time.
     canvas = FigureCanvasAgg(figure)
     # Not stretched in wide windows, and low enough for the controls to stay in sight on a screen of
     # 800 pixels.
@@ -113,8 +114,8 @@ def interactive_figure(
 
     for control in controls.values():
         control.observe(redraw, names="value")
-    # The layout is computed once and then fixed, so that the figure does not move between updates.
-    # That of images with colour bars is exact only after the second pass.
+    # The layout is computed and then fixed, so that the figure does not move between updates. For
+    # images with colour bars it is exact only after the second pass.
     redraw()
     redraw()
     figure.set_layout_engine("none")
@@ -127,8 +128,8 @@ def interactive_figure(
 
 
 def redrawing(draw: Callable[..., list[Artist]]) -> Callable[..., None]:
-    """Return a function that calls `draw`, which returns artists, and removes those of the call
-    before."""
+    """Return a function that removes the artists of its last call and calls `draw`, which returns
+    new ones."""
     drawn: list[Artist] = []
 
     def redraw(*values: Any, **named: Any) -> None:

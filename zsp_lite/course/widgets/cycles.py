@@ -22,7 +22,7 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
     draw = redrawing(plots.draw_cycle)
 
     def update(row: int, col: int) -> str:
-        # Numbers of the patches u, v and u', which is w here, and their cells.
+        # Numbers of the patches u, v and u' (w in this code), and their cells.
         u = row * grid[1] + col
         v = int(forth[u])
         w = int(back[v])
@@ -43,7 +43,7 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
             text += f"; {', '.join(off)} not on the foreground, so the distance is infinite"
         return f"{text}."
 
-    # The foreground patch with the most similar neighbour; -2 is below every cosine.
+    # It begins at the foreground patch with the most similar neighbour; -2 is below every cosine.
     similar = np.where(reference.foreground, values.max(1).reshape(grid), -2)
     start = divmod(int(similar.argmax()), grid[1])
     alt = (

@@ -59,20 +59,24 @@ _STYLE = """<style>
 
 
 def label_poses(labelling: Labelling) -> Widget:
-    """Label a category: the point cloud of the reference on the left, that of the current sequence
-    on the right."""
+    """Label a category, with the point clouds of the reference (left) and of the current sequence
+    (right)."""
     return _LabellingWidget(labelling).box
 
 
 class _LabellingWidget:
-    """The parts of the widget, the action of each button, which returns the message to show, and
-    the display."""
+    """The parts of the widget, the actions of its buttons, and the display.
+
+    Each button calls the method of its name, which returns the message to show.
+    """
 
     def __init__(self, labelling: Labelling):
         self.labelling = labelling
+        # For each canvas, the sequence and the overlay that it shows.
         self.shown: dict[str, object] = {}
-        # the label in doubt that accept was pressed for
+        # Sequence and picks of the label in doubt for which accept was pressed once.
         self.asked: tuple[str, bytes] | None = None
+        # Whether the display is being updated, which must not start another update.
         self.refreshing = False
         self.box = self._build()
         sequence = labelling.reference
@@ -84,7 +88,7 @@ class _LabellingWidget:
         self._do(lambda: text)
 
     def _build(self) -> Widget:
-        """Create the parts and arrange them; CSS classes begin with `zsp-`."""
+        """Create the parts and arrange them; the names of CSS classes begin with `zsp-`."""
         widgets = load_package()
         style = {"description_width": "initial"}
         narrow = {"width": "auto"}
@@ -118,7 +122,7 @@ class _LabellingWidget:
         self.tables = {name: widgets.HTML() for name in ("progress", "keypoints")}
         self.message = widgets.HTML()
 
-        # Classes and actions.
+        # CSS classes, and what controls and buttons do.
         parts = {**controls, **buttons, **self.tables, "message": self.message}
         for name, part in parts.items():
             part.add_class(f"zsp-{name}")
@@ -127,7 +131,7 @@ class _LabellingWidget:
         for name, button in buttons.items():
             button.on_click(lambda _, name=name: self._do(getattr(self, name)))
 
-        # The rows, from top to bottom.
+        # The rows of the widget, from top to bottom.
         clouds = [
             widgets.VBox([self.captions[name], view.widget], layout={"margin": "0 8px 0 0"})
             for name, view in self.views.items()
@@ -261,6 +265,7 @@ class _LabellingWidget:
         text = ""
         problem = ""
         try:
+            # The display is updated even if the action fails.
             for step in (action, self._refresh):
                 try:
                     text = step() or text
@@ -275,13 +280,13 @@ class _LabellingWidget:
             shown = f"Not done: {problem}"
         elif not text:
             shown = self._instruction()
-        # Announced by screen readers.
+        # With this role, screen readers announce the message.
         self.message.value = (
             f'<p class="{kind}" role="status" aria-live="polite">{html.escape(shown)}</p>'
         )
 
     def _next_open(self, sequence: str) -> str:
-        """Return the next open sequence after this one, cyclically; itself if none is open."""
+        """Return the next open sequence, cyclically; the given one if none is open."""
         rows = self.labelling.progress()
         index = [row.sequence for row in rows].index(sequence)
         following = rows[index + 1 :] + rows[:index]
@@ -343,7 +348,7 @@ class _LabellingWidget:
         # Clouds and the cross-hair.
         caption = f"{_dot(BLUE)} reference {html.escape(labelling.reference)}"
         self.captions["reference"].value = caption
-        self._show_cloud("reference", labelling.reference, None)
+        self._show_cloud("reference", labelling.reference, overlay=None)
         if self.on_reference:
             self.shown.pop("sequence", None)
             self.views["sequence"].clear("Empty: no other sequence is chosen")
@@ -364,7 +369,7 @@ class _LabellingWidget:
         if self.on_reference:
             return None
         if alignment is None and len(self.labelling.picks(self.current)):
-            return None  # the picks are not complete
+            return None  # The picks are not complete.
         label = read_labels(self.labelling.root, self.labelling.category).get(self.current)
         if alignment is not None:
             sim3 = alignment.sim3

@@ -33,7 +33,8 @@ def box_to_mask(frame: Frame, box: Box) -> Widget:
             text += f", IoU with the true mask {(mask & true).sum() / (mask | true).sum():.2f}"
         return text
 
-    controls = {  # sides at least 4 pixels inside the image; an empty box gives an empty mask
+    # Sides may move up to 4 pixels from the opposite border. An empty box gives an empty mask.
+    controls = {
         "top": slider("top", 0, height - 4, top),
         "left": slider("left", 0, width - 4, left),
         "bottom": slider("bottom", 4, height, top + box_height),

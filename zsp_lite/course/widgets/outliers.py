@@ -17,7 +17,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION, draw_image, draw_matches, show_points
 
-_FARTHEST = 6.0  # that `one_outlier` moves the point, scene units
+_FARTHEST = 6.0  # largest distance by which `one_outlier` moves the point, scene units
 _TRIALS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
@@ -27,8 +27,14 @@ def ransac_settings(
     points: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
     truth: Float[np.ndarray, "3 3"] | None = None,
 ) -> Widget:
-    """Show the inliers of RANSAC on matches, given by pixels (x, y) in both images and by points in
-    both cameras."""
+    """Show the inliers of RANSAC on matches.
+
+    Args:
+        images: Images of the reference and of the target.
+        pixels: Pixels (x, y) of the matches in both images.
+        points: Points of the matches in the frames of both cameras, scene units.
+        truth: True rotation, for the error of the fit; None leaves the error out.
+    """
     source, target = points
     n = len(source)
     figure, (*axes, graph) = plt.subplots(
@@ -85,7 +91,8 @@ def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3
     """Show the least-squares fit of corresponding points while the last target point moves
     along x."""
     exact = umeyama(source, target)
-    farthest = np.vstack([target, target[-1] + [_FARTHEST, 0, 0]])  # the panel has room for it
+    # The panel is made with the farthest place of the point, so that it has room for all.
+    farthest = np.vstack([target, target[-1] + [_FARTHEST, 0, 0]])
     sets = {"target": farthest, "source after the fit": target}
     labels = {"xlabel": "x (scene units)", "ylabel": "y, down (scene units)"}
     figure = show_points({"": sets}, size=7, colours=(ORANGE, BLUE), down=True, **labels)

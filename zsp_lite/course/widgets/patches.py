@@ -59,8 +59,10 @@ def attention(
     grid: tuple[int, int],
     heads: int,
 ) -> Widget:
-    """Show the attention weights of one patch; queries and keys are of all tokens, CLS first, heads
-    concatenated."""
+    """Show the attention weights of one patch.
+
+    Queries and keys are of all tokens, CLS first, with heads concatenated.
+    """
     layers, _, dim = queries.shape
     figure, axes = plots.show_images([image, image], ["query patch", "attention weights"], size=3.2)
     outline = redrawing(plots.outline_patch)
@@ -70,7 +72,7 @@ def attention(
     axes[0].set_anchor("N")
 
     def update(row: int, col: int, layer: int, head: int) -> str:
-        part = slice(head * dim // heads, (head + 1) * dim // heads)
+        part = slice(head * dim // heads, (head + 1) * dim // heads)  # dimensions of the head
         query = queries[layer, 1 + row * grid[1] + col, part]
         # Weights of all tokens: the softmax of q · k / √d.
         tokens = (keys[layer, :, part] @ query * (dim // heads) ** -0.5).softmax(0)
@@ -105,8 +107,13 @@ def patch_similarities(
     """Show how similar one patch is to all patches of the target, its nearest neighbour and its
     true match.
 
-    `sims` has the matrix of each kind of similarity, `start` is the kind shown first. `cells` and
-    `valid` are the true matches of the reference patches, from `ground_truth_matches`.
+    Args:
+        reference: Image of the reference.
+        target: Image of the target.
+        sims: Similarities of all pairs of patches, by the name of their kind.
+        cells: True match (row, col) of each reference patch, as of `ground_truth_matches`.
+        valid: Whether a reference patch has a true match.
+        start: Kind of similarity that is shown first; by default the first of `sims`.
     """
     grid = valid.shape
     figure, axes = plots.show_images(
@@ -130,6 +137,7 @@ def patch_similarities(
 
     @cache
     def share_correct(kind: str) -> float:
+        # Numbers of the nearest neighbours, and their cells (rows, cols, 2).
         numbers = sims[kind].argmax(1).numpy()
         nearest = np.stack(np.divmod(numbers, grid[1]), -1).reshape(*grid, 2)
         return correct_matches(nearest, cells)[valid].mean()

@@ -14,7 +14,8 @@ from zsp_lite.errors import InputError, check_choice, check_integer
 from zsp_lite.viz.plots import BLUE
 
 QUESTIONS = Path(__file__).parent / "questions"
-# Also legible on dark pages; blue-green and orange differ for colour-blind readers too.
+# These colours are legible on dark pages, too. Colour-blind readers can tell the blue-green of
+# right answers from the orange of wrong ones.
 _COLOURS = {
     **{f"--jq-{kind}-bg": BLUE for kind in ("multiple-choice", "many-choice", "numeric")},
     "--jq-correct-color": "#007A5A",
@@ -50,7 +51,7 @@ def self_check(notebook: str, number: int) -> None:
         )
     with ipython.utils.capture.capture_output() as captured:
         jupyterquiz.display_quiz(checks[number - 1], colors=_COLOURS)
-    # The form is a <div> that jupyterquiz leaves open.
+    # The form is a <div> that jupyterquiz leaves open: the style goes inside, and closes it.
     form, script = captured.outputs
     html = f"{form.data['text/html']}<style>{_STYLE}</style></div>"
     ipython.display.display(ipython.display.HTML(html))
