@@ -51,6 +51,7 @@ def __getattr__(name: str):
     home = importlib.import_module(_HOME_OF[name])
     if name in vars(home):
         return vars(home)[name]
+    # A public module is no name of its package, the home, before it is imported.
     return importlib.import_module(f"{home.__name__}.{name}")
 
 

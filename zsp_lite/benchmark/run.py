@@ -2,7 +2,7 @@
 
 The way of a pair: `evaluate` samples it, `execution.evaluate_pairs` hands it to this process or a
 worker, `PairEvaluator.line` reads frames and features, asks each row (`_ask`) and measures its
-answer; `write_reports` makes tables of what is stored.
+answer; `runs.add_lines` adds the line to run.jsonl, from which `write_reports` makes tables.
 
 `rows` are always the `Method`s by name, `names` are names of rows.
 """
@@ -89,8 +89,8 @@ def evaluate(
         sweep: RANSAC thresholds V; each row is evaluated with each, as NAME@threshold=V.
 
     Returns:
-        The summary (see `statistics.summarise`), which `write_reports` writes, with tables and
-        figures.
+        The summary (see `statistics.summarise`), for callers from Python; nothing is written but
+        the run. `write_reports` computes it again from there, with tables and figures.
 
     Raises:
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds
@@ -266,6 +266,7 @@ class PairEvaluator:
                 # 180 degrees: without these pairs, methods that fail often would look better.
                 results[name] = {"error": 180.0, "failed": printable(error)}
 
+        # The store and the problem have added the seconds of each stage.
         timings = {}
         for stage, seconds in self.store.timings.items():
             timings[stage] = round(float(np.median(seconds)), 5)
@@ -293,7 +294,7 @@ def _ask(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -
             reference.frame, target.frame, estimate.matches, reference.features.grid
         )
         return Answer(rotation, answer.view, note=note, inliers=inliers)
-    return answer
+    return answer  # "pose"
 
 
 def _measure(

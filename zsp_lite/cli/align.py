@@ -91,14 +91,14 @@ def align(
         print(f"{first} to {second}: the best pose of the pair alone is {angle:.0f}° away")
     for kind, what in (("class_labels", "pose labels"), ("label_proposals", "proposals")):
         labels = read_label_folder(dataset.root / kind / category)
-        together, alone = alignment_errors(alignment, labels)
-        if alone:
-            right = accuracy(together, SAME_ANGLE)
-            before = accuracy(alone, SAME_ANGLE)
+        errors, errors_before = alignment_errors(alignment, labels)
+        if errors_before:
+            right = accuracy(errors, SAME_ANGLE)
+            before = accuracy(errors_before, SAME_ANGLE)
             print(
-                f"By the {what}, {right:.1f}% of {len(together)} ordered pairs are within "
-                f"{SAME_ANGLE:.0f}°; of the best poses of {len(alone)} pairs of views and objects "
-                f"alone, {before:.1f}%."
+                f"By the {what}, {right:.1f}% of {len(errors)} ordered pairs are within "
+                f"{SAME_ANGLE:.0f}° in the common frame; before the alignment, {before:.1f}% of "
+                f"{len(errors_before)} best poses, each of one frame and its target views."
             )
     if propose:
         written.append(write_labels(alignment, dataset.root, category, "label_proposals", replace))

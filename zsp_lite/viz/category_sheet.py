@@ -13,6 +13,7 @@ from zsp_lite.metrics import rotation_angle
 from zsp_lite.views import object_crop
 from zsp_lite.viz.plots import VERMILLION
 
+# Probabilities that the pose is right, and that the next best one is, by the angle between both.
 COLUMNS = ("object", "right (%)", "else turned by", "that (%)")
 _DOUBTFUL = 0.8  # an object with a lower probability should be looked at
 MOST = 10  # objects of a figure
