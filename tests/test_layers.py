@@ -18,6 +18,7 @@ LAYERS = [
     "pipeline backbones pair_result",
     "verified importers baselines",
     "category scans",
+    "transfer",
     "viz",
     "benchmark own_objects",
     "align",
