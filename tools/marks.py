@@ -12,7 +12,8 @@ it is the point of the same box coordinates.
 
 PCK@0.1 is the share of marks whose place is within 0.1 of the diagonal of the other object's box,
 of all marks whose part the other object has. A mark whose part it does not have is never right.
---fit fits the coefficients of the confidence, and tests them on categories left out of the fit.
+Pairs of objects whose pose is 30 degrees off or more count in the first figures only. --fit fits
+the coefficients of the confidence to the others, and tests them on categories left out of the fit.
 """
 
 import sys
@@ -32,7 +33,7 @@ from sklearn.metrics import roc_auc_score
 from tools.validation_categories import VALIDATION
 from zsp_lite.align import read_hypotheses
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.category import synchronise
+from zsp_lite.category import SAME_ANGLE, synchronise
 from zsp_lite.course.synthetic.assembly import BODY, Assembly
 from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.course.synthetic.export import SETTINGS_FILE, make_object
@@ -40,6 +41,7 @@ from zsp_lite.course.synthetic.primitives import Mesh, area_normals
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.ground_truth import ObjectPose, object_poses
 from zsp_lite.io.files import read_json
+from zsp_lite.metrics import rotation_error
 from zsp_lite.transfer import SurfaceView, surface_views, transfer
 
 BUILDERS = CATEGORIES | VALIDATION
@@ -133,12 +135,13 @@ def ground_truth(data: Co3D, category: str) -> dict[str, Parts] | dict[str, Box]
     return {name: Parts(category, int(name[:3]) - 100, seed) for name in poses}
 
 
-def measure(data: Co3D, category: str, run: Path) -> Float[np.ndarray, "n 6"]:
+def measure(data: Co3D, category: str, run: Path) -> Float[np.ndarray, "n 7"]:
     """Transfer marks between all objects of a category.
 
     Returns:
         For each mark: the error of each of the `METHODS` in diagonals of the object's box, infinite
-        where it has no such part; cosine, distance and confidence of the place.
+        where it has no such part; cosine, distance and confidence of the place; 1 if the pose of
+        the two objects is right, else 0.
     """
     alignment = synchronise(list(read_hypotheses(run).values()))
     poses = object_poses(data, category)
@@ -172,7 +175,10 @@ def measure(data: Co3D, category: str, run: Path) -> Float[np.ndarray, "n 6"]:
         errors = [
             np.linalg.norm(pose.to_object(place) - true, axis=1) / diagonal for place in places
         ]
-        columns = [*errors, found.cosine, found.distance, found.confidence]
+        turn = pose.R @ poses[first].R.T
+        off = rotation_error(alignment.between(first, second).R, turn)
+        right = np.full(MARKS, float(off < SAME_ANGLE))
+        columns = [*errors, found.cosine, found.distance, found.confidence, right]
         rows.append(np.stack(columns, axis=1)[~np.isnan(true[:, 0])])
     return np.concatenate(rows)
 
@@ -186,7 +192,7 @@ def most_similar(
     return (descriptors @ others.T).argmax(dim=1).numpy()
 
 
-def print_measured(name: str, table: Float[np.ndarray, "n 6"]) -> None:
+def print_measured(name: str, table: Float[np.ndarray, "n 7"]) -> None:
     """Print the figures of a category, or of all."""
     errors = table[:, :3]
     has_part = np.isfinite(errors[:, 0])
@@ -201,7 +207,7 @@ def print_measured(name: str, table: Float[np.ndarray, "n 6"]) -> None:
     print(f"  AUC of the confidence {roc_auc_score(right, table[:, 5]):.3f}")
 
 
-def print_fit(tables: dict[str, Float[np.ndarray, "n 6"]]) -> None:
+def print_fit(tables: dict[str, Float[np.ndarray, "n 7"]]) -> None:
     """Fit the confidence to all categories, and test fits that have not seen a category on it."""
 
     def fitted(names: list[str]) -> LogisticRegression:
@@ -231,8 +237,10 @@ def main(arguments: list[str]) -> None:
         tables[run.name] = measure(Co3D(options.data), run.name, run)
         print_measured(run.name, tables[run.name])
     print_measured("all", np.concatenate(list(tables.values())))
+    posed = {name: table[table[:, 6] == 1] for name, table in tables.items()}
+    print_measured("all of right pose", np.concatenate(list(posed.values())))
     if options.fit:
-        print_fit(tables)
+        print_fit(posed)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 from scipy.special import expit, softmax
 
 from zsp_lite.alignment import Sim3
@@ -33,22 +34,21 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import frame_defect
 from zsp_lite.errors import InputError, check_choice, real_array
 from zsp_lite.features import log_bin
+from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import near_median
-from zsp_lite.views import IMAGE_SIZE, View, extract_views, object_crop
+from zsp_lite.views import View
 
 VIEWS = 12  # frames of an object whose patches are its surface
 _TARGET_VIEWS = 3  # views of the target that a source view is compared with
-_SIMILAR_SIDE = 0.5  # least cosine of the directions of two views that are compared
 # Lengths in sizes of the target object.
 _BALL = 0.15  # radius in which corresponding patches are sought
 _PRIOR = 0.05  # standard deviation of the distance of corresponding patches
 _SMOOTHING = 0.06  # standard deviation of the Gaussian around a marked point
 _TEMPERATURE = 0.05  # of cosines, for the patches of the target
 _SOURCE_TEMPERATURE = 0.1  # of cosines, for the patches around a marked point
-_OUTLIER = 4.0  # multiple of the median distance from the median point, as in `points`
 # Coefficients of the confidence: constant, cosine, and distance to the surface in sizes of the
 # object. Fitted by tools/marks.py on validation categories.
-CONFIDENCE = (-9.4, 18.7, -64.0)
+CONFIDENCE = (-9.1, 16.3, -22.2)
 FOUND = 0.5  # least confidence of a point that is found
 
 
@@ -58,13 +58,14 @@ class TransferredPoints:
 
     world: Float[np.ndarray, "n 3"]  # points of the object's surface, in its world
     # of the patches around each marked point, weighted mean of the highest cosine with a patch of
-    # this object; 0 where no patch is compared
+    # this object; 0 or less where no patch is near
     cosine: Float[np.ndarray, " n"]
     distance: Float[np.ndarray, " n"]  # of the marked point to the surface, in sizes of the object
 
     @property
     def confidence(self) -> Float[np.ndarray, " n"]:
-        """Probability that a place is within a tenth of the object's size of the right one."""
+        """Probability that a place is within a tenth of the object's size of the right one, if the
+        pose is right."""
         constant, cosine, distance = CONFIDENCE
         logit = constant + cosine * self.cosine + distance * self.distance
         return np.where(self.distance < _BALL, expit(logit), 0.0)
@@ -111,25 +112,21 @@ def surface_views(
         InputError: The alignment has no such object, or no frame shows its surface.
     """
     check_choice("sequence", sequence, alignment.objects)
-    sim3 = alignment.objects[sequence].sim3
     annotations = dataset.frames(category, sequence)
-    chosen = np.unique(np.arange(count) * len(annotations) // count)
-    loaded = {annotations[k].frame_number: dataset.load(annotations[k]) for k in chosen}
-    usable = {number: frame for number, frame in loaded.items() if not frame_defect(frame)}
-
-    extractor = as_backbone(backbone)
-    size = getattr(extractor, "image_size", IMAGE_SIZE)
-    crops = [object_crop(frame, size) for frame in usable.values()]
-    masked = all(crop.mask is not None for crop in crops)
-    views = extract_views(extractor, crops, "mask" if masked else "saliency")
+    spaced = np.unique(np.arange(count) * len(annotations) // count)
+    chosen = [annotations[k] for k in spaced]
+    frames = {one.frame_number: dataset.load(one) for one in chosen}
+    usable = {number: frame for number, frame in frames.items() if not frame_defect(frame)}
+    unmasked = any(frame.mask is None for frame in usable.values())
+    method = ZeroShotPose(as_backbone(backbone), foreground="saliency" if unmasked else "mask")
     surface = [
-        _surface_view(number, view, sim3)
-        for number, view in zip(usable, views, strict=True)
+        _surface_view(number, view, alignment.objects[sequence].sim3)
+        for number, view in zip(usable, method.views(usable.values()), strict=True)
         if view.known_foreground.any()
     ]
     if not surface:
         raise InputError(
-            f"sequence {category}/{sequence}: none of {len(loaded)} frames shows the object with "
+            f"sequence {category}/{sequence}: none of {len(frames)} frames shows the object with "
             "depth"
         )
     return surface
@@ -139,21 +136,14 @@ def _surface_view(number: int, view: View, sim3: Sim3) -> SurfaceView:
     """Gather the patches of a view."""
     camera = view.frame.camera
     patches = np.flatnonzero(view.known_foreground)
-    in_camera = view.measured_points[0].reshape(-1, 3)[patches]
-    near = near_median(in_camera, _OUTLIER)
-    patches = patches[near]
-    points = sim3.apply(camera.to_world(in_camera[near]))
+    points = sim3.apply(camera.to_world(view.measured_points[0].reshape(-1, 3)[patches]))
+    near = near_median(points, 4)  # as in `points.world_cloud`
     towards = sim3.apply(camera.centre) - np.median(points, axis=0)
+    direction = towards / np.linalg.norm(towards)
+    patches = patches[near]
     binned = log_bin(view.features.keys[None]).flatten(0, 2)[patches]
-    return SurfaceView(
-        number,
-        view,
-        sim3,
-        towards / np.linalg.norm(towards),
-        patches,
-        points,
-        F.normalize(binned, dim=1),
-    )
+    descriptors = F.normalize(binned, dim=1)
+    return SurfaceView(number, view, sim3, direction, patches, points[near], descriptors)
 
 
 def object_size(views: Sequence[SurfaceView]) -> float:
@@ -184,61 +174,43 @@ def transfer(
     surface = KDTree(np.concatenate([view.points for view in target]))
     distance, _ = surface.query(marks)
 
-    # The source patches around any of the marks, with their displacements and highest cosines.
-    around = KDTree(marks)
-    starts = [np.zeros((0, 3))]
-    displacements = [np.zeros((0, 3))]
-    cosines = [np.zeros(0)]
-    for view in source:
-        near = around.query(view.points, distance_upper_bound=_BALL * size)[0] < np.inf
-        likeness = np.array([other.direction @ view.direction for other in target])
-        similar = np.argsort(-likeness)[:_TARGET_VIEWS]
-        compared = [target[k] for k in similar if likeness[k] > _SIMILAR_SIDE]
-        if near.any() and compared:
-            moved, cosine = _displacements(view, near, compared, size)
-            known = np.isfinite(cosine)
-            starts.append(view.points[near][known])
-            displacements.append(moved[known])
-            cosines.append(cosine[known])
-    start = np.concatenate(starts)
-    best = np.concatenate(cosines)
+    # All source patches (p, 3), with their displacements (p, 3) and highest cosines (p).
+    start = np.concatenate([view.points for view in source])
+    compared = [_compare(view, target, size) for view in source]
+    displacement, cosine = map(np.concatenate, zip(*compared))
 
-    # Their mean around each mark. Marks without a patch in the ball have neither correction nor
-    # cosine.
-    squared = np.square(marks[:, None] - start).sum(axis=2) / size**2  # (marks, patches)
-    inside = squared < _BALL**2
-    logits = best / _SOURCE_TEMPERATURE - squared / (2 * _SMOOTHING**2)
-    weights = _masked_softmax(logits, inside)
-    places = marks + weights @ np.concatenate(displacements)
-    _, nearest = surface.query(places)
-    world = target[0].sim3.inverse().apply(surface.data[nearest])
-    return TransferredPoints(world, weights @ best, distance / size)
+    # Their mean around each mark.
+    squared = cdist(marks, start, "sqeuclidean") / size**2  # (marks, patches)
+    logits = cosine / _SOURCE_TEMPERATURE - squared / (2 * _SMOOTHING**2)
+    weights = _softmax_within(squared, logits)
+    _, nearest = surface.query(marks + weights @ displacement)
+    places = target[0].sim3.inverse().apply(surface.data[nearest])
+    return TransferredPoints(places, weights @ cosine, distance / size)
 
 
-def _displacements(
-    view: SurfaceView, near: Bool[np.ndarray, " n"], target: Sequence[SurfaceView], size: float
-) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, " m"]]:
-    """Compute the displacement of patches of a source view, and the highest cosine of each.
+def _compare(
+    view: SurfaceView, target: Sequence[SurfaceView], size: float
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Compute the displacement of each patch of a source view, and its highest cosine.
 
-    Patches without a patch of the target in their ball have the cosine minus infinity.
+    They are 0 and -1 without a patch of the target in the ball.
     """
-    points = np.concatenate([other.points for other in target])
-    descriptors = torch.cat([other.descriptors for other in target])
-    cosines = (view.descriptors[near] @ descriptors.T).double().numpy()
-    squared = np.square(view.points[near][:, None] - points).sum(axis=2) / size**2
-    inside = squared < _BALL**2
-    weights = _masked_softmax(cosines / _TEMPERATURE - squared / (2 * _PRIOR**2), inside)
-    highest = np.where(inside, cosines, -np.inf).max(axis=1)
-    return weights @ points - view.points[near], highest
+    similar = sorted(target, key=lambda other: other.direction @ view.direction)[-_TARGET_VIEWS:]
+    points = np.concatenate([other.points for other in similar])
+    descriptors = torch.cat([other.descriptors for other in similar])
+    cosines = (view.descriptors @ descriptors.T).double().numpy()
+    squared = cdist(view.points, points, "sqeuclidean") / size**2
+    weights = _softmax_within(squared, cosines / _TEMPERATURE - squared / (2 * _PRIOR**2))
+    displacement = weights @ points - weights.sum(axis=1, keepdims=True) * view.points
+    return displacement, np.where(squared < _BALL**2, cosines, -1).max(axis=1)
 
 
-def _masked_softmax(
-    logits: Float[np.ndarray, "n m"], allowed: Bool[np.ndarray, "n m"]
+def _softmax_within(
+    squared: Float[np.ndarray, "n m"], logits: Float[np.ndarray, "n m"]
 ) -> Float[np.ndarray, "n m"]:
-    """Return the softmax of each row over the columns that are allowed; 0 for a row without one."""
-    if not allowed.any():
-        return np.zeros(allowed.shape)
-    return allowed * softmax(np.where(allowed, logits, logits.min() - 1e3), axis=1)
+    """Return the softmax of each row over the patches in the ball; 0 for a row without one."""
+    inside = squared < _BALL**2
+    return inside * softmax(np.where(inside, logits, -1e9), axis=1)
 
 
 def transfer_points(
