@@ -10,8 +10,10 @@ exactly for procedural objects: the same point of the same face of the same part
 mesh that the same lines of the builder add, by the same count. For other objects with known poses,
 it is the point of the same box coordinates.
 
-PCK@0.1 is the share of marks whose place is within 0.1 of the diagonal of the other object's box,
-of all marks whose part the other object has. A mark whose part it does not have is never right.
+PCK@0.1 is the share of marks whose place is within 0.1 of the diagonal of the other object's box.
+Marks whose part the other object does not have by this definition are counted, but not judged:
+another part may do as well, as a pedestal for legs.
+
 Pairs of objects whose pose is 30 degrees off or more count in the first figures only. --fit fits
 the coefficients of the confidence to the others, and tests them on categories left out of the fit.
 """
@@ -194,17 +196,16 @@ def most_similar(
 
 def print_measured(name: str, table: Float[np.ndarray, "n 7"]) -> None:
     """Print the figures of a category, or of all."""
-    errors = table[:, :3]
-    has_part = np.isfinite(errors[:, 0])
-    print(f"{name}: {len(table)} marks, {1 - has_part.mean():.3f} of them without a true place")
-    for method, error in zip(METHODS, errors[has_part].T, strict=True):
+    placed = table[np.isfinite(table[:, 0])]
+    print(f"{name}: {len(placed)} marks, beside {len(table) - len(placed)} without a true place")
+    for method, error in zip(METHODS, placed[:, :3].T, strict=True):
         shares = f"PCK@0.1 {(error < 0.1).mean():.3f}, PCK@0.05 {(error < 0.05).mean():.3f}"
         print(f"  {method:18} {shares}, median {np.median(error):.3f}")
-    found = table[:, 5] >= 0.5
-    right = errors[:, 2] < 0.1
+    right = placed[:, 2] < 0.1
+    found = placed[:, 5] >= 0.5
     shares = [f"{part.mean():.3f}" for part in (found, right[found], right[~found])]
     print("  found {}; right of those found {}, of the others {}".format(*shares))
-    print(f"  AUC of the confidence {roc_auc_score(right, table[:, 5]):.3f}")
+    print(f"  AUC of the confidence {roc_auc_score(right, placed[:, 5]):.3f}")
 
 
 def print_fit(tables: dict[str, Float[np.ndarray, "n 7"]]) -> None:
@@ -237,7 +238,10 @@ def main(arguments: list[str]) -> None:
         tables[run.name] = measure(Co3D(options.data), run.name, run)
         print_measured(run.name, tables[run.name])
     print_measured("all", np.concatenate(list(tables.values())))
-    posed = {name: table[table[:, 6] == 1] for name, table in tables.items()}
+    # Without marks that have no true place, too: their errors are infinite.
+    posed = {
+        name: table[(table[:, 6] == 1) & np.isfinite(table[:, 0])] for name, table in tables.items()
+    }
     print_measured("all of right pose", np.concatenate(list(posed.values())))
     if options.fit:
         print_fit(posed)

@@ -48,7 +48,7 @@ _TEMPERATURE = 0.05  # of cosines, for the patches of the target
 _SOURCE_TEMPERATURE = 0.1  # of cosines, for the patches around a marked point
 # Coefficients of the confidence: constant, cosine, and distance to the surface in sizes of the
 # object. Fitted by tools/marks.py on validation categories.
-CONFIDENCE = (-9.1, 16.3, -22.2)
+CONFIDENCE = (-10.4, 18.4, -22.7)
 FOUND = 0.5  # least confidence of a point that is found
 
 
