@@ -19,6 +19,7 @@ LAYERS = [
     "verified importers baselines",
     "category scans",
     "transfer",
+    "marks",
     "viz",
     "benchmark own_objects",
     "align",

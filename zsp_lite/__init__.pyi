@@ -18,6 +18,7 @@ from zsp_lite import (
     features as features,
     importers as importers,
     io as io,
+    marks as marks,
     matchers as matchers,
     matching as matching,
     metrics as metrics,
