@@ -18,6 +18,8 @@ LAYERS = [
     "pipeline backbones pair_result",
     "verified importers baselines",
     "category scans",
+    "transfer",
+    "marks",
     "viz",
     "benchmark own_objects",
     "align",

@@ -21,6 +21,8 @@ Read the files in this order:
     scans        frames of objects of your own, loaded for an estimate
     own_objects  one pair of your own, from files to files
     category     all objects of a category in one frame, by the verified solver
+    transfer     points marked on one object, found on all others of its category
+    marks        pixels of frames to mark such points, and files of where they are found
 
     data, backbones, viz, io, benchmark, baselines, importers, cli
     verified     a solver beyond the paper that tests many poses in all target views
