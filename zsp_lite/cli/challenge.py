@@ -56,11 +56,9 @@ def rank(handins, keep, out, workers, minutes, pair_seconds, memory) -> None:
     columns = ("team", "place", "Acc30 (%)", "95 % interval", "answered")
     rows = []
     for one in standings:
-        low, high = one.interval
         answered = f"{one.answered} of {one.pairs}"
-        rows.append(
-            (one.team, str(one.place), f"{one.acc30:.1f}", f"{low:.1f} to {high:.1f}", answered)
-        )
+        interval = f"{one.low:.1f} to {one.high:.1f}"
+        rows.append((one.team, str(one.place), f"{one.acc30:.1f}", interval, answered))
     print_rows("Ranking", columns, rows)
     for one in standings:
         if one.note:

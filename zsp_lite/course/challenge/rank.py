@@ -13,12 +13,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from jinja2 import Environment, StrictUndefined
 
-from zsp_lite.benchmark.run import evaluate
-from zsp_lite.benchmark.runs import read_run
-from zsp_lite.benchmark.statistics import draws_of, figures_of, paired_difference
+from zsp_lite.benchmark.statistics import figures_of, object_draws, paired_difference
 from zsp_lite.course.challenge.answer import COLUMNS
 from zsp_lite.course.challenge.make import (
     SETTINGS_FILE,
@@ -26,10 +26,12 @@ from zsp_lite.course.challenge.make import (
     asked_pairs,
     copy_without_labels,
 )
-from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.exchange import read_stored_poses, write_questions
+from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.exchange import StoredPose, read_stored_poses, write_questions
+from zsp_lite.data.pairs import true_poses
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_json, write_atomic
+from zsp_lite.metrics import rotation_error
 
 _SIGNIFICANT = 0.05  # a difference with a smaller p value is not left to chance
 _LONGEST_NOTE = 200  # characters
@@ -45,7 +47,8 @@ class Standing:
     place: int  # shared by teams whose difference to the first of them may be chance
     team: str
     acc30: float  # percent
-    interval: tuple[float, float]  # 95 %, by bootstrap over objects
+    low: float  # ends of the 95 % interval, by bootstrap over objects
+    high: float
     answered: int  # pairs with a pose
     pairs: int
     note: str  # why pairs have none; "" if all have
@@ -88,14 +91,13 @@ def rank(
             f"{handins} has {len(files)} hand-ins of {len(teams)} teams, expected one of each, "
             "TEAM.py or TEAM.csv"
         )
+    pairs = asked_pairs(keep / "data", challenge)
     poses = out / "poses"
     poses.mkdir(parents=True, exist_ok=True)
     hidden = [path.resolve() for path in (keep, handins, out)]
     with TemporaryDirectory(prefix="challenge-") as given:
         copy_without_labels(keep / "data", Path(given, "data"))
-        questions = write_questions(
-            Path(given, "pairs.csv"), Co3D(keep / "data"), asked_pairs(keep / "data", challenge)
-        )
+        questions = write_questions(Path(given, "pairs.csv"), Co3D(keep / "data"), pairs)
 
         def run(team: str) -> str:
             source, target = teams[team], poses / f"{team}.csv"
@@ -108,14 +110,7 @@ def rank(
         with ThreadPoolExecutor(workers) as pool:
             notes = dict(zip(teams, pool.map(run, teams), strict=True))
 
-    for team in teams:
-        unreadable = _complete(poses / f"{team}.csv")
-        notes[team] = notes[team] or unreadable
-    # The folder of the run is new: the poses of a team may have changed since the last ranking.
-    shutil.rmtree(out / "run", ignore_errors=True)
-    rows = {f"hand-in {team}": str(poses / f"{team}.csv") for team in teams}
-    evaluate(keep / "data", "zsp-tiny", rows, challenge.pairs, challenge.targets, out / "run")
-    standings = _standings(read_run(out / "run").table, notes)
+    standings = _standings(keep / "data", pairs, poses, notes)
     _write(standings, out)
     return standings
 
@@ -185,41 +180,70 @@ def _end(process: subprocess.Popen) -> None:
     process.wait()
 
 
-def _complete(path: Path) -> str:
-    """Replace a file of poses that cannot be read by an empty one; return why it was."""
-    try:
-        read_stored_poses(path)
-    except InputError as error:
-        write_atomic(path, (",".join(COLUMNS) + "\n").encode())
-        return str(error)
-    return ""
-
-
-def _standings(table: pd.DataFrame, notes: Mapping[str, str]) -> list[Standing]:
+def _standings(
+    data: Path, pairs: Sequence[Pair], poses: Path, notes: Mapping[str, str]
+) -> list[Standing]:
     """Sort the teams by Acc30, and join those whose difference may be chance."""
-    rows = {team: table[table["row"] == f"hand-in {team}"] for team in notes}
-    figures = {team: figures_of(row["error"], draws_of(row)) for team, row in rows.items()}
-    ordered = sorted(figures, key=lambda team: -figures[team]["acc30"])
-    first = ordered[0]  # of the teams that share a place
+    objects = [
+        [f"{pair.category}/{name}" for name in (pair.reference_sequence, pair.target_sequence)]
+        for pair in pairs
+    ]
+    drawn = object_draws(objects, [pair.category for pair in pairs])
+    errors = {}
+    answered = {}
+    problems = {}
+    for team, note in notes.items():
+        try:
+            stored, _ = read_stored_poses(poses / f"{team}.csv")
+        except InputError as error:
+            stored = {}
+            note = note or str(error)
+        # In the order of the pairs; an answer for a frame that was not asked for is none.
+        answers = {pair: stored[pair.key] for pair in pairs if pair.key in stored}
+        for pair in list(answers):
+            if answers[pair].target_frame not in pair.target_frames:
+                del answers[pair]
+        errors[team] = _errors(data, pairs, answers)
+        answered[team] = len(answers)
+        problems[team] = note
+    figures = {team: figures_of(error, drawn) for team, error in errors.items()}
+
     standings = []
-    for position, team in enumerate(ordered, 1):
-        weights = draws_of(rows[team])
-        gain = paired_difference(rows[team]["error"], rows[first]["error"], weights=weights)
-        if position == 1 or gain["accuracy_gain_p"] < _SIGNIFICANT:
+    first = ""  # of the teams that share a place
+    for position, team in enumerate(sorted(figures, key=lambda team: -figures[team]["acc30"]), 1):
+        if first:
+            gain = paired_difference(errors[team], errors[first], weights=drawn)
+        if not first or gain["accuracy_gain_p"] < _SIGNIFICANT:
             first = team
             place = position
+        low, high = figures[team]["acc30_ci"]
         standings.append(
             Standing(
                 place,
                 team,
                 figures[team]["acc30"],
-                tuple(figures[team]["acc30_ci"]),
-                int((rows[team]["failed"] == "").sum()),
-                len(rows[team]),
-                notes[team],
+                low,
+                high,
+                answered[team],
+                len(pairs),
+                problems[team],
             )
         )
     return standings
+
+
+def _errors(
+    data: Path, pairs: Sequence[Pair], answers: Mapping[Pair, StoredPose]
+) -> Float[np.ndarray, " n"]:
+    """Compute the error of each pair's rotation in degrees; 180 without an answer."""
+    errors = np.full(len(pairs), 180.0)
+    if answers:
+        views = [pair.target_frames.index(pose.target_frame) for pair, pose in answers.items()]
+        truths = true_poses(data, list(answers), np.array(views))
+        rotations = np.stack([pose.rotation for pose in answers.values()])
+        answered = [pair in answers for pair in pairs]
+        errors[answered] = rotation_error(rotations, truths[:, :3, :3])
+    return errors
 
 
 def _write(standings: Sequence[Standing], out: Path) -> None:
