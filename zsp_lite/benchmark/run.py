@@ -1,7 +1,7 @@
 """Run the benchmark: rotation errors of rows over many pairs of a CO3D-format folder (sec. 5).
 
 The way of a pair: `evaluate` samples it, `execution.evaluate_pairs` hands it to this process or a
-worker, `PairEvaluator.line` reads frames and features, asks each row (`_ask`) and measures its
+worker, `PairEvaluator.line` reads frames and features, asks each row (`ask`) and measures its
 answer; `runs.add_lines` adds the line to run.jsonl, from which `write_reports` makes tables.
 
 `rows` are always the `Method`s by name, `names` are names of rows.
@@ -259,7 +259,7 @@ class PairEvaluator:
             try:
                 with fails_alone(self.row_seconds) if own else nullcontext():
                     start = time.perf_counter()
-                    answer = _ask(method, seen, truths)
+                    answer = ask(method, seen, truths)
                     seconds = time.perf_counter() - start
                     results[name] = _measure(answer, problem, truths, extents, seconds)
             except InputError as error:
@@ -273,8 +273,10 @@ class PairEvaluator:
         return {"pair": pair.key, "results": results, "repeat": pair.repeat, "timings": timings}
 
 
-def _ask(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:
-    """Ask a row for its pose of a pair."""
+def ask(
+    method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"] | None = None
+) -> Answer:
+    """Ask a row for its pose of a pair; the true poses are for rows that are given the view."""
     if method.solve is not None:
         return as_answer(seeded(method.solve, problem.seed)(problem))
     nearest = None
