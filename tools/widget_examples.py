@@ -6,8 +6,6 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
-
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.course.demo import demo_pairs
