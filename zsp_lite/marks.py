@@ -140,7 +140,7 @@ def marked_points(
             raise InputError(f"{what} has no depth, expected a pixel with measured depth")
         if frame.mask is not None and not object_pixels(frame)[row, column]:
             raise InputError(f"{what} is not on the object, expected a pixel of its mask")
-        points.append(frame.camera.unproject([mark.x, mark.y], frame.depth[row, column]))
+        points.append(frame.camera.unproject(np.array([mark.x, mark.y]), frame.depth[row, column]))
     return points
 
 
