@@ -148,10 +148,13 @@ def test_the_caption_agrees_with_ransac():
     assert widget.caption.value.startswith("No fit: ")
 
 
-def test_the_caption_agrees_with_least_squares():
-    source = default_rng(2).normal(size=(9, 3))
-    widget = outliers.one_outlier(source, source)
-    widget.controls["distance"].value = 3.0
-    fit = umeyama(source, source + np.outer(np.arange(9) == 8, [3.0, 0, 0]))
-    assert f"rotation changes by {rotation_error(fit.R, np.eye(3)):.1f}°" in widget.caption.value
-    assert f"to {fit.scale:.2f}" in widget.caption.value
+def test_a_dragged_match_turns_the_least_squares_chair_and_loses_the_vote():
+    widget = outliers.drag_match()
+    for distance in (1.0, 4.0):
+        widget.controls["distance"].value = distance
+        target = outliers.CHAIR.copy()
+        target[-1] += distance * outliers.RIGHT
+        turn = rotation_error(umeyama(outliers.CHAIR, target).R, np.eye(3))
+        assert f"least squares: {turn:.0f}° off" in widget.caption.value
+        assert "RANSAC: 0° off, 11 of 12 matches agree" in widget.caption.value
+    assert turn > 20

@@ -90,12 +90,6 @@ def ransac_settings() -> Widget:
     )
 
 
-def one_outlier() -> Widget:
-    """`outliers.one_outlier` on random points."""
-    points = np.random.default_rng(0).normal(size=(12, 3))
-    return outliers.one_outlier(points, points)
-
-
 def box_to_mask() -> Widget:
     """`mask_box.box_to_mask` on a sample frame, whose object, unlike in a crop, has much around
     it."""
@@ -132,7 +126,7 @@ WIDGETS: dict[str, Callable[[], Widget]] = {
         saliency,
         cycle,
         ransac_settings,
-        one_outlier,
+        outliers.drag_match,
         box_to_mask,
         label_poses,
     )

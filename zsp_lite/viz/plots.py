@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer, Real, UInt8
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.legend import Legend
@@ -297,12 +298,7 @@ def draw_matches(
         )
         drawn.append(axes[0].figure.add_artist(line))
     for axis, places in zip(axes, pixels):
-        wrong = places[~inliers].T  # rows: x, y
-        right = places[inliers].T
-        drawn += [
-            axis.scatter(*wrong, 25, VERMILLION, marker="x", linewidths=1.2, zorder=6),
-            axis.scatter(*right, 25, BLUE, edgecolors="white", linewidths=0.7, zorder=6),
-        ]
+        drawn += _mark_matches(axis, places, inliers)
     return drawn
 
 
@@ -353,14 +349,13 @@ def show_points(
     columns: int | None = None,
     size: float = 4.5,
     colours: Sequence[str] = (BLUE, ORANGE),
-    down: bool = False,
     **labels: Any,
 ) -> Figure:
     """Show sets of points (x, y, ...) in each panel, by its title, with equal scales and one
     legend.
 
-    All panels have the same extent, around the first set of each; points far off it are cut. The y
-    axis points `down` as in images. `labels` is what `Axes.set` takes.
+    All panels have the same extent, around the first set of each; points far off it are cut.
+    `labels` is what `Axes.set` takes.
     """
     # The range of each panel's first set, without outliers: (panels, low and high, x and y).
     firsts = [next(iter(sets.values()))[:, :2] for sets in panels.values()]
@@ -378,8 +373,7 @@ def show_points(
         axis.set_title(title, fontsize=_FONT, parse_math=False)
         left, bottom = centre - half
         right, top = centre + half
-        y_limits = (top, bottom) if down else (bottom, top)
-        axis.set(xlim=(left, right), ylim=y_limits, aspect="equal")
+        axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
         axis.set(**labels)
     for handle in _legend(figure, axes[0], "outside lower center").legend_handles:
         handle.set(sizes=[40], linewidths=[1.5])  # small marks would be pale
@@ -578,6 +572,40 @@ def draw_moved_cloud(
             draw_axes(axis, camera, pose.apply(middle), pose.apply(ends), names)
 
 
+def show_residuals(
+    views: Sequence[View],
+    points: Sequence[Real[np.ndarray, "n 3"]],
+    fits: Mapping[str, Sim3],
+    threshold: float = 0.2,
+) -> Figure:
+    """Show the reference, and below each title the target with the reference's points, moved by a
+    fit.
+
+    `views` and the `points` of matches are those of the reference and of the target. Lines join
+    fitted points to their partners; discs mark residuals below the threshold, in the reference
+    those of the last fit, crosses the others.
+    """
+    target = views[1].frame
+    images = [views[0].frame.rgb, *[target.rgb] * len(fits)]
+    titles = ["reference", *fits]
+    figure, axes = show_images([pale(image) for image in images], titles, columns=2, size=3.6)
+    cameras = [target.camera] * len(fits)
+    cloud = object_cloud(views[0], most=900)
+    draw_moved_cloud(axes[1:], cameras, cloud, list(fits.values()), names=None, size=5)
+    partners = target.camera.project(target.camera.to_world(points[1]))[0]
+    for axis, fit in zip(axes[1:], fits.values()):
+        fitted = fit.apply(points[0])
+        inliers = np.linalg.norm(fitted - points[1], axis=1) < threshold
+        starts = target.camera.project(target.camera.to_world(fitted))[0]
+        lines = np.stack([starts, partners], axis=1)
+        colours = np.where(inliers, BLUE, VERMILLION)
+        axis.add_collection(LineCollection(lines, colors=colours, linewidths=0.8, zorder=5))
+        _mark_matches(axis, partners, inliers)
+    camera = views[0].frame.camera
+    _mark_matches(axes[0], camera.project(camera.to_world(points[0]))[0], inliers)
+    return figure
+
+
 def moved_points(
     estimates: Mapping[str, PoseEstimate], size: float = 3.4, columns: int | None = None
 ) -> Figure:
@@ -651,6 +679,18 @@ def frame_cloud(
         chosen = np.random.default_rng(0).choice(len(points), most, replace=False)
         points = points[np.sort(chosen)]
     return points
+
+
+def _mark_matches(
+    axis: Axes, pixels: Real[np.ndarray, "n 2"], inliers: Bool[np.ndarray, " n"]
+) -> list[Artist]:
+    """Mark matches at pixels (x, y) of one image: inliers by discs, others by crosses."""
+    wrong = pixels[~inliers].T  # rows: x, y
+    right = pixels[inliers].T
+    return [
+        axis.scatter(*wrong, 25, VERMILLION, marker="x", linewidths=1.2, zorder=6),
+        axis.scatter(*right, 25, BLUE, edgecolors="white", linewidths=0.7, zorder=6),
+    ]
 
 
 def _panels(

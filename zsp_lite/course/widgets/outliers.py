@@ -1,9 +1,15 @@
-"""Widgets on alignment: the settings of RANSAC, and the effect of one outlier on least squares."""
+"""Widgets on alignment: one match that is dragged away from its place, and the settings of
+RANSAC."""
+
+from collections.abc import Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float, Real
+from matplotlib.artist import Artist
 from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import SCALE_RANGE, ransac, umeyama
 from zsp_lite.course.widgets.common import (
@@ -11,13 +17,29 @@ from zsp_lite.course.widgets.common import (
     interactive_figure,
     load_package,
     redrawing,
+    show,
     slider,
 )
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import rotation_error
-from zsp_lite.viz.plots import BLUE, ORANGE, VERMILLION, draw_image, draw_matches, show_points
+from zsp_lite.viz.plots import BLUE, VERMILLION, draw_image, draw_matches
 
-_FARTHEST = 6.0  # largest distance by which `one_outlier` moves the point, scene units
+# Twelve points of a chair in scene units, y down: ends of the legs, corners of the seat, ends of
+# two rails of the back.
+CHAIR = np.array(
+    [[x, y, z] for y in (1.2, 0.0) for x in (-0.7, 0.7) for z in (-0.7, 0.7)]
+    + [[-0.7, y, z] for y in (-0.8, -1.6) for z in (-0.7, 0.7)]
+)
+_BARS = [(0, 4), (1, 5), (2, 6), (3, 7), (4, 5), (6, 7), (4, 6), (5, 7)]
+_BARS += [(4, 8), (5, 9), (8, 10), (9, 11), (8, 9), (10, 11)]
+_SEEN_FROM = Rotation.from_euler("yx", [-25, 15], degrees=True).as_matrix()
+RIGHT = _SEEN_FROM[0]  # the picture's direction to the right, in which a corner is dragged
+_FARTHEST = 4.0  # largest distance of the dragged point from its place, scene units
+_THRESHOLD = 0.2  # largest residual of a match that agrees, scene units
+_DRAGGED = (
+    "A chair of bars in grey, one corner of which is dragged to the right, and the chair after "
+    "each fit: least squares tilts it towards the corner, RANSAC leaves it in its place"
+)
 _TRIALS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
@@ -87,37 +109,61 @@ def ransac_settings(
     return interactive_figure(figure, controls, update, alt)
 
 
-def one_outlier(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> Widget:
-    """Show the least-squares fit of corresponding points while the last target point moves
-    along x."""
-    exact = umeyama(source, target)
-    # The panel is made with the farthest place of the point, so that it has room for all.
-    farthest = np.vstack([target, target[-1] + [_FARTHEST, 0, 0]])
-    sets = {"target": farthest, "source after the fit": target}
-    labels = {"xlabel": "x (scene units)", "ylabel": "y, down (scene units)"}
-    figure = show_points({"": sets}, size=7, colours=(ORANGE, BLUE), down=True, **labels)
-    (axis,) = figure.axes
-    circles, crosses = axis.collections
-    bars = axis.add_collection(LineCollection([], colors="0.5", linewidths=0.8))
+def drag_match() -> Widget:
+    """Show `draw_dragged` with a slider for the distance."""
+    figure, axes = _dragging_panels(1)
+    draw = redrawing(draw_dragged)
 
     def update(distance: float) -> str:
-        changed = target.copy()
-        changed[-1, 0] += distance
-        fit = umeyama(source, changed)
-        fitted = fit.apply(source)[:, :2]
-        circles.set_offsets(changed[:, :2])
-        crosses.set_offsets(fitted)
-        bars.set_segments(np.stack([fitted, changed[:, :2]], axis=1))
-        return (
-            f"The last of {len(source)} points has moved by {distance:.1f}: the rotation "
-            "changes by "
-            f"{rotation_error(fit.R, exact.R):.1f}°, the scale from {exact.scale:.2f} to "
-            f"{fit.scale:.2f}."
-        )
+        draw(axes[0], distance)
+        titles = [axis.get_title().replace("\n", " ") for axis in axes[0]]
+        return f"One of {len(CHAIR)} matches is {distance:.1f} units wrong. {'; '.join(titles)}."
 
-    controls = {"distance": slider("moved by", 0.0, _FARTHEST, 0.0, 0.1)}
-    alt = (
-        "Target points and source points after the least-squares fit; lines connect "
-        "corresponding points"
+    controls = {"distance": slider("one match is wrong by", 0.0, _FARTHEST, 0.0, 0.1)}
+    return interactive_figure(figure, controls, update, _DRAGGED)
+
+
+def show_dragged(distances: Sequence[float]) -> None:
+    """Show the picture of `drag_match` at some distances, one below the other."""
+    figure, axes = _dragging_panels(len(distances))
+    for row, distance in zip(axes, distances):
+        draw_dragged(row, distance)
+    show(figure, _DRAGGED)
+
+
+def draw_dragged(axes: np.ndarray, distance: float) -> list[Artist]:
+    """Draw two fits of a chair to its copy, one corner of which is moved to the right by a
+    distance: least squares and RANSAC.
+
+    The copy is grey; a line joins each fitted point to its partner, dashed where the two are more
+    than the threshold apart.
+    """
+    target = CHAIR.copy()
+    target[-1] += distance * RIGHT
+    fits = {"least squares": umeyama(CHAIR, target), "RANSAC": ransac(CHAIR, target)[0]}
+    drawn: list[Artist] = []
+    for axis, (name, fit) in zip(axes, fits.items()):
+        fitted = fit.apply(CHAIR)
+        agree = np.linalg.norm(fitted - target, axis=1) < _THRESHOLD
+        turn = rotation_error(fit.R, np.eye(3))
+        axis.set_title(f"{name}: {turn:.0f}° off,\n{agree.sum()} of {len(CHAIR)} matches agree")
+        flat = [(points @ _SEEN_FROM.T)[:, :2] for points in (target, fitted)]
+        for points, colour, width in zip(flat, ("0.7", BLUE), (5, 2)):
+            bars = [points[list(bar)] for bar in _BARS]
+            drawn.append(axis.add_collection(LineCollection(bars, colors=colour, linewidths=width)))
+        pulls = np.stack(flat, axis=1)[~agree]
+        style = {"colors": VERMILLION, "linewidths": 1.5, "linestyles": "--"}
+        drawn.append(axis.add_collection(LineCollection(pulls, **style)))
+        drawn += axis.plot(*flat[0][-1], "o", color=VERMILLION, markersize=9)
+    return drawn
+
+
+def _dragging_panels(rows: int) -> tuple[Figure, np.ndarray]:
+    """Return a figure with two axes in each row, which have room for the farthest corner."""
+    figure, axes = plt.subplots(
+        rows, 2, figsize=(8, 3.2 * rows), layout="constrained", squeeze=False
     )
-    return interactive_figure(figure, controls, update, alt)
+    for axis in axes.flat:
+        axis.set(xlim=(-1.5, 4.6), ylim=(2, -2.1), aspect="equal")
+        axis.set_axis_off()
+    return figure, axes
