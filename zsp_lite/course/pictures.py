@@ -1,6 +1,7 @@
 """Pictures of the lessons: a curve above what it measures, and a graph of objects."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -8,12 +9,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.metrics import rotation_angle
+from zsp_lite.views import object_crop
 from zsp_lite.viz.plots import GREEN, VERMILLION, draw_image
 
-# Radii of the circle of pictures, of a picture, and of the arrows' ends, in axis units.
-_CIRCLE = 1.0
-_PICTURE = 0.3
-_ENDS = 0.36
+# Pictures stand on a circle of radius 1; half the width of a picture, and how far from its middle
+# arrows end.
+_PICTURE = 0.34
+_ENDS = 0.42
 _ARROWS = {True: (GREEN, "-"), False: (VERMILLION, "--"), None: ("0.6", ":")}
 
 
@@ -21,7 +25,7 @@ def curve_above_pictures(
     curve: tuple[np.ndarray, np.ndarray],
     pictures: Mapping[float, np.ndarray],
     title: str = "x = {:.0f}",
-    **labels: str,
+    **labels: Any,
 ) -> tuple[Figure, list[Axes]]:
     """Show a curve (x, y) with dots at some x, and below it one picture for each of these x.
 
@@ -46,36 +50,46 @@ def curve_above_pictures(
 
 
 def show_graphs(
-    pictures: Mapping[str, np.ndarray],
-    graphs: Mapping[str, Mapping[tuple[str, str], bool | None]],
-    turned: Mapping[str, Sequence[str]],
+    graphs: Mapping[str, tuple[Mapping[str, np.ndarray], Mapping[tuple[str, str], bool | None]]],
 ) -> Figure:
-    """Show named pictures on a circle with arrows between them, once for each graph by its title.
+    """Show for each title named pictures on a circle, with arrows between them.
 
     An arrow is green if it is true, red and dashed if it is false, grey and dotted if it is None.
-    `turned` has the names of the pictures of each graph that are marked as wrong.
     """
-    size = (3.9 * len(graphs), 4.1)
-    figure, axes = plt.subplots(1, len(graphs), figsize=size, layout="constrained")
-    angles = np.pi / 4 + 2 * np.pi * np.arange(len(pictures)) / len(pictures)
-    centres = dict(zip(pictures, _CIRCLE * np.column_stack([np.cos(angles), np.sin(angles)])))
-    for axis, (title, arrows) in zip(np.atleast_1d(axes), graphs.items()):
-        axis.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), aspect="equal", title=title)
-        axis.set_axis_off()
+    size = (4.1 * len(graphs), 4.4)
+    figure, axes = plt.subplots(1, len(graphs), figsize=size, layout="constrained", squeeze=False)
+    for axis, (title, (pictures, arrows)) in zip(axes.flat, graphs.items(), strict=True):
+        angles = np.pi * (0.75 + 2 * np.arange(len(pictures)) / len(pictures))
+        centres = dict(zip(pictures, np.column_stack([np.cos(angles), np.sin(angles)])))
         for name, picture in pictures.items():
             x, y = centres[name]
             box = (x - _PICTURE, x + _PICTURE, y - _PICTURE, y + _PICTURE)
             axis.imshow(picture, extent=box, zorder=2)
-            if name in turned[title]:
-                frame = plt.Rectangle(
-                    (box[0], box[2]), 2 * _PICTURE, 2 * _PICTURE, fill=False, zorder=3
-                )
-                frame.set(edgecolor=VERMILLION, linewidth=4)
-                axis.add_patch(frame)
+            axis.text(x, y - _PICTURE, name, ha="center", va="top", fontsize=9, parse_math=False)
         for (start, end), right in arrows.items():
             axis.add_patch(_arrow(centres[start], centres[end], *_ARROWS[right]))
-        axis.set(xlim=(-1.4, 1.4), ylim=(-1.4, 1.4))
+        axis.set(xlim=(-1.1, 1.1), ylim=(-1.15, 1.1), aspect="equal", title=title)
+        axis.set_axis_off()
     return figure
+
+
+def alike(
+    dataset: Co3D, category: str, rotations: Mapping[str, np.ndarray], first: str
+) -> dict[str, np.ndarray]:
+    """Return for each object the picture that is nearest to the first frame of one of them.
+
+    `rotations` lead from the objects' worlds to a common frame: if they are right, all objects are
+    seen from the same side.
+    """
+    camera = dataset.camera(dataset.frames(category, first)[0]).R
+    pictures = {}
+    for name, rotation in rotations.items():
+        frames = dataset.frames(category, name)
+        wanted = camera @ rotations[first].T @ rotation
+        seen = np.stack([dataset.camera(frame).R for frame in frames])
+        nearest = int(np.argmin(rotation_angle(seen, wanted)))
+        pictures[name] = object_crop(dataset.load(frames[nearest])).rgb
+    return pictures
 
 
 def _arrow(start: np.ndarray, end: np.ndarray, colour: str, line: str) -> FancyArrowPatch:
