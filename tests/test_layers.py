@@ -24,9 +24,10 @@ LAYERS = [
     "benchmark own_objects",
     "align",
     "course course.synthetic course.labelling course.motorcycle course.true_matches",
-    "course.samples course.demo",
+    "course.samples course.demo course.hypotheses course.pictures",
     "course.photograph course.training",
     "course.widgets",
+    "course.lessons",
     "cli",
     "__main__",
 ]

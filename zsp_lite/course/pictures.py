@@ -1,4 +1,4 @@
-"""Pictures of the lessons: a curve above what it measures, and a graph of objects."""
+"""Pictures of the lessons: a curve above what it measures, a graph of objects, winners as dots."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,7 +12,7 @@ from matplotlib.patches import FancyArrowPatch
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.metrics import rotation_angle
 from zsp_lite.views import object_crop
-from zsp_lite.viz.plots import GREEN, VERMILLION, draw_image
+from zsp_lite.viz.plots import BLUE, GREEN, VERMILLION, draw_image
 
 # Pictures stand on a circle of radius 1; half the width of a picture, and how far from its middle
 # arrows end.
@@ -107,3 +107,24 @@ def _arrow(start: np.ndarray, end: np.ndarray, colour: str, line: str) -> FancyA
         linewidth=2.2,
         zorder=1,
     )
+
+
+def show_winners(gains: Mapping[str, np.ndarray], true_gain: float) -> Figure:
+    """Show the measured gains of simulated benchmarks as a row of dots for each name; those in
+    which the better method does not win are red crosses."""
+    figure, axis = plt.subplots(figsize=(7.4, 0.9 + 0.75 * len(gains)), layout="constrained")
+    for row, values in enumerate(gains.values()):
+        height = row + np.linspace(-0.28, 0.28, len(values))
+        wins = np.asarray(values) > 0
+        style = {"s": 42, "edgecolors": "white", "linewidths": 0.5}
+        axis.scatter(values[wins], height[wins], color=BLUE, label="better method wins", **style)
+        style = {"s": 46, "linewidths": 2.2, "marker": "x"}
+        axis.scatter(values[~wins], height[~wins], color=VERMILLION, label="it does not", **style)
+    axis.axvline(0, color="0.3", linewidth=1)
+    axis.axvline(true_gain, color=GREEN, linestyle="--", label="true gain")
+    axis.set_yticks(range(len(gains)), gains)
+    axis.set(xlabel="measured gain (points of Acc30)", ylim=(len(gains) - 0.5, -0.5))
+    handles, names = axis.get_legend_handles_labels()
+    each = dict(zip(names, handles))
+    figure.legend(each.values(), each.keys(), ncols=3, loc="outside upper center", fontsize=9)
+    return figure
