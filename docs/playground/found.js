@@ -16,13 +16,14 @@ async function openCategory(name) {
   Object.assign(state, { objects, source: 0, held: false });
   element("objects").replaceChildren(...objects.map(figure));
   turn();
-  mark(0, [FULL / 2, FULL / 2]);
+  markNearest(0, [FULL / 2, FULL / 2]);
   element("objects").setAttribute("aria-busy", "false");
 }
 
 /** The pictures and the mark of object i. */
 function figure(_, i) {
-  const picture = create("div", { className: "picture", tabIndex: 0, role: "application" }), whole = create("figure", {});
+  const whole = create("figure", {});
+  const picture = create("div", { className: "picture", tabIndex: 0, role: "application" });
   picture.ariaLabel = `Object ${i + 1}. Arrow keys move the mark, Enter holds and releases it.`;
   picture.append(create("img", { alt: "", draggable: false }), create("span", {}));
   Object.assign(picture, { onpointermove: point, onpointerdown: point, onclick: point, onkeydown: press });
@@ -56,8 +57,8 @@ function placeOn(i) {
   return { kind: i === source ? "mark" : "found", confidence, pixel };
 }
 
-/** Mark the point of object i, among those that its picture gives, that is nearest by a distance of columns and rows. */
-function mark(i, from, distance = (x, y) => Math.hypot(x, y)) {
+/** Mark that patch of the picture of object i that is nearest to a pixel, by a distance of columns and rows. */
+function markNearest(i, from, distance = Math.hypot) {
   const object = state.objects[i], picture = object.sides[state.side];
   let least = Infinity;
   for (let one = object.starts[picture]; one < object.starts[picture + 1]; one++) {
@@ -68,13 +69,15 @@ function mark(i, from, distance = (x, y) => Math.hypot(x, y)) {
 }
 
 function show() {
-  const shown = state.objects.map((_, i) => placeOn(i)), count = (kind) => shown.filter((one) => one.kind === kind).length;
+  const shown = state.objects.map((_, i) => placeOn(i));
+  const count = (kind) => shown.filter((one, i) => i !== state.source && one.kind === kind).length;
   document.querySelectorAll("#objects figure").forEach((whole, i) => {
-    const { kind, confidence, pixel } = shown[i], [picture, caption] = whole.children, percent = Math.round(confidence / 2.56);
+    const { kind, confidence, pixel: [x, y] } = shown[i], [picture, caption] = whole.children;
     whole.className = i === state.source ? "chosen" : kind;
-    Object.assign(picture.lastChild, { className: kind, style: `left: ${pixel[0] / 2.54}%; top: ${pixel[1] / 2.54}%` });
+    Object.assign(picture.lastChild, { className: kind, style: `left: ${x / 2.54}%; top: ${y / 2.54}%` });
     caption.textContent = {
-      mark: state.held ? "□ held" : "□ click to hold", found: `● ${percent} %`, nothing: "✕ nothing here", hidden: "hidden in this view",
+      mark: state.held ? "□ held" : "□ click to hold", found: `● ${Math.round(confidence / 2.56)} %`,
+      nothing: "✕ nothing here", hidden: "hidden in this view",
     }[kind];
   });
   notice(`Marked on object ${state.source + 1}${state.held ? ", held" : ""}: found on ${count("found")} others, ` +
@@ -87,7 +90,7 @@ function point(event) {
   if (event.type === "click") state.held = !state.held;
   else if (state.held) return;
   const { left, top, width } = event.currentTarget.getBoundingClientRect();
-  mark(indexOf(event), [event.clientX - left, event.clientY - top].map((one) => one / width * FULL));
+  markNearest(indexOf(event), [event.clientX - left, event.clientY - top].map((one) => one / width * FULL));
 }
 
 function press(event) {
@@ -98,9 +101,9 @@ function press(event) {
     state.held = !state.held;
     return show();
   }
-  const [down, right] = step, from = kind === "mark" || kind === "found" ? pixel : [FULL / 2, FULL / 2];
+  const [down, right] = step, from = ["mark", "found"].includes(kind) ? pixel : [FULL / 2, FULL / 2];
   // The nearest point in the direction of the key, preferably straight on.
-  mark(i, from, (x, y) => {
+  markNearest(i, from, (x, y) => {
     const along = x * right + y * down, across = Math.abs(x * down) + Math.abs(y * right);
     return along > 0 ? along + 2 * across : Infinity;
   });

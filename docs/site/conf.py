@@ -71,7 +71,7 @@ html_css_files = ["style.css"]
 html_js_files = [("site.js", {"defer": "defer"})]
 html_static_path = ["static", "../playground"]
 # The pictures of these pages take the whole width.
-html_sidebars = dict.fromkeys(["docs/playground", "docs/find_on_all"], [])
+html_sidebars = {"docs/playground": [], "docs/find_on_all": []}
 templates_path = ["templates"]
 html_additional_pages = {"index": "redirect.html"}
 html_math_renderer = "mathml"
