@@ -23,7 +23,7 @@ from zsp_lite.course.synthetic.export import export_categories
 from zsp_lite.data.frames import Frame, mask_to_bbox, resize_frame
 from zsp_lite.transfer import SurfaceView, object_size, surface_views, transfer
 
-CATEGORIES = ["car", "chair"]
+CATEGORIES = ["chair", "toyplane"]
 RENDERED = {"frames": 24, "seed": 17, "image_size": 384}
 OBJECTS = 8  # of each category
 SIDES = 6  # from which objects are shown
@@ -157,7 +157,7 @@ def main(work: Path, folder: Path) -> None:
     backbone = load_backbone("zsp-tiny", "cpu")
     folder.mkdir(parents=True, exist_ok=True)
     for category in CATEGORIES:
-        alignment = align_category(dataset, category, backbone, pairs=2, out=work / category)
+        alignment = align_category(dataset, category, backbone, pairs=4, out=work / category)
         data = category_data(dataset, category, alignment, backbone)
         text = json.dumps(data, separators=(",", ":"))
         (folder / f"{category}.js").write_text(f"FOUND.{category} = {text};\n")
