@@ -13,7 +13,7 @@ async function openCategory(name) {
     confidences: await unpack(stored.confidences, Uint8Array),
   })));
   if (element("category").value !== name) return; // another one was chosen meanwhile
-  Object.assign(state, { objects, source: 0, held: false });
+  Object.assign(state, { objects, source: 0, mark: 0, held: false });
   element("objects").replaceChildren(...objects.map(figure));
   turn();
   markNearest(0, [FULL / 2, FULL / 2]);

@@ -157,7 +157,7 @@ def main(work: Path, folder: Path) -> None:
     backbone = load_backbone("zsp-tiny", "cpu")
     folder.mkdir(parents=True, exist_ok=True)
     for category in CATEGORIES:
-        alignment = align_category(dataset, category, backbone, pairs=4, out=work / category)
+        alignment = align_category(dataset, category, backbone, out=work / category)
         data = category_data(dataset, category, alignment, backbone)
         text = json.dumps(data, separators=(",", ":"))
         (folder / f"{category}.js").write_text(f"FOUND.{category} = {text};\n")
