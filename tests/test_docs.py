@@ -90,7 +90,8 @@ def test_every_environment_variable_and_make_target_that_is_named_exists(page):
         assert name.removeprefix("$") in all_code(), name
     targets = set(re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))
     for command in (*inline, *command_blocks(page)):
-        assert set(re.findall(r"(?:^|\s)make ([a-z-]+)", command)) <= targets, command
+        # Not `zsp-lite challenge make`, a command of its own.
+        assert set(re.findall(r"(?<!challenge)(?:^|\s)make ([a-z-]+)", command)) <= targets, command
 
 
 def parse(words: list[str]) -> None:

@@ -25,7 +25,7 @@ LAYERS = [
     "align",
     "course course.synthetic course.labelling course.motorcycle course.true_matches",
     "course.samples course.demo course.hypotheses course.pictures",
-    "course.photograph course.training",
+    "course.challenge course.photograph course.training",
     "course.widgets",
     "course.lessons",
     "cli",
