@@ -25,6 +25,7 @@ LAYERS = [
     "course.samples course.demo",
     "course.photograph course.training",
     "course.widgets",
+    "course.lessons",
     "cli",
     "__main__",
 ]
