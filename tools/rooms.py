@@ -17,7 +17,7 @@ ROOMS = {
     "stages": "best_view estimates matching pair_result pipeline points views",
     "backbones": "backbones",
     "baselines": "baselines",
-    "verified": "category verified",
+    "verified": "category marks transfer verified",
     "importers": "importers",
     "viz": "viz",
     "benchmark": "benchmark",

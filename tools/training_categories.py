@@ -93,7 +93,8 @@ def teapot(a: Assembly) -> None:
     a.add(ellipsoid((0.09, 0.09, 0.1), (0, 0, height + 0.15)), HANDLE)
     spout = (radius * 1.25, 0, height * a.uniform(0.7, 1.1))
     a.add(rod((radius * 0.75, 0, height * 0.35), spout, 0.14, 0.06))
-    # The handle is a little less than half a ring.
+    # The handle is a little less than half a ring. About Y, angles begin at the top and go to the
+    # front: from 180 degrees, below, to 360 degrees, the arc is behind.
     ring = height * a.uniform(0.25, 0.35)
     place = (-radius * 0.9, 0, height * 0.5)
     a.add(torus(ring, a.uniform(0.04, 0.07), Y, place, 1.05 * np.pi, 1.95 * np.pi), HANDLE)

@@ -6,8 +6,6 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import torch
-
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.course.demo import demo_pairs
@@ -22,8 +20,6 @@ from zsp_lite.estimates import match_points
 from zsp_lite.matching import key_similarities, match, similarity
 from zsp_lite.views import View, extract_views
 from zsp_lite.viz.plots import match_pixels
-
-GRID = (28, 28)  # rows and columns of zsp-tiny's patches
 
 
 @cache
@@ -40,36 +36,14 @@ def sample_views() -> tuple[View, View]:
     return reference, target
 
 
-def attention() -> Widget:
-    """`patches.attention` on a sample object."""
-    image = sample_pair().reference.rgb
-    backbone = _backbone()
-    facets = patches.all_facets(backbone, [image])
-    layers = range(backbone.model.depth)
-    queries = torch.cat([facets[layer, "query"] for layer in layers])
-    keys = torch.cat([facets[layer, "key"] for layer in layers])
-    return patches.attention(image, queries, keys, GRID, backbone.model.num_heads)
-
-
 def patch_similarities() -> Widget:
-    """`patches.patch_similarities` on a sample pair: keys with their context of an early and of the
-    last layer, and keys without context."""
+    """`patches.patch_similarities` on a sample pair: keys with and without their context."""
     pair = sample_pair()
-    reference, target = sample_views()
-    tokens = patches.all_facets(_backbone(), [pair.reference.rgb, pair.target.rgb])
-    sims = {}
-    for layer in (3, 11):  # of the layers 0 to 11
-        keys = tokens[layer, "key"][:, 1:].unflatten(1, GRID)  # without CLS: (2, rows, cols, d)
-        sims[f"layer {layer}, key"] = similarity(*keys)
-    sims["bare key"] = key_similarities(reference.features.keys, [target.features.keys])[0]
+    keys, other = (view.features.keys for view in sample_views())
+    sims = {"17 bins": similarity(keys, other), "bare key": key_similarities(keys, [other])[0]}
     return patches.patch_similarities(
         pair.reference.rgb, pair.target.rgb, sims, pair.cells, pair.valid
     )
-
-
-def saliency() -> Widget:
-    """`patches.saliency` on a sample object."""
-    return patches.saliency(sample_views()[0])
 
 
 def cycle() -> Widget:
@@ -120,9 +94,7 @@ def label_poses() -> Widget:
 WIDGETS: dict[str, Callable[[], Widget]] = {
     build.__name__: build
     for build in (
-        attention,
         patch_similarities,
-        saliency,
         cycle,
         ransac_settings,
         outliers.drag_match,

@@ -21,6 +21,8 @@ Read the files in this order:
     scans        frames of objects of your own, loaded for an estimate
     own_objects  one pair of your own, from files to files
     category     all objects of a category in one frame, by the verified solver
+    transfer     points marked on one object, found on all others of its category
+    marks        pixels of frames to mark such points, and files of where they are found
 
     data, backbones, viz, io, benchmark, baselines, importers, cli
     verified     a solver beyond the paper that tests many poses in all target views
@@ -51,6 +53,7 @@ def __getattr__(name: str):
     home = importlib.import_module(_HOME_OF[name])
     if name in vars(home):
         return vars(home)[name]
+    # A public module is no name of its package, the home, before it is imported.
     return importlib.import_module(f"{home.__name__}.{name}")
 
 

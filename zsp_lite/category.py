@@ -1,6 +1,9 @@
 r"""All objects of a category in one common frame, without labels: synchronisation of the hypotheses
 of many pairs.
 
+Here a pair is an ordered pair of objects with the hypotheses of one pair of frames: a `Pair`, one
+frame of the first object and views of the second. Two objects may have several.
+
 The verified solver gives a few hypotheses for each ordered pair (a, b) of objects: similarities
 from the world of a to that of b, with probabilities. One pair often cannot tell the front from the
 back; all pairs, each seen from several sides, mostly can (Birdal et al., Synchronizing probability
@@ -61,12 +64,14 @@ _AVERAGING_SWEEPS = 6  # sweeps over all objects
 _REWEIGHTINGS = 10  # steps of the least absolute deviations
 # Weight of hypotheses that disagree, so that every object gets a scale and a translation.
 _WEAK = 1e-3
-# Coefficients of `_judge`, fitted by tools/category_fit.py on validation categories to sets of
-# three to five objects.
+# Coefficients of the logit in `_judge`: of the margin, of the case that no rotation is right, and
+# of the share of agreeing pairs in this case. tools/category_fit.py fitted them on validation
+# categories to sets of three to five objects.
 MARGIN = 1.57
 NONE = -3.07
 NONE_AGREEING = -2.37
-# Probabilities of two objects, whose evidence `compare_two` returns (fit: `tools/tuning.py`).
+# Gives the probabilities of the rotation of one of two objects, and of the best other one, from
+# their scores and the evidence that `compare_two` returns. `tools/tuning.py` fitted it.
 OF_TWO = Calibration((-1.08, -0.02, -0.65, 1.57, 0.35), (2.62, 0.27, 0.54, -6.18, -2.27), 0.112)
 _LEAST_WEIGHT = 0.05  # of a pair whose target was seen from one place
 
@@ -154,6 +159,8 @@ def object_pairs(
     ends = [(circle[k], circle[(k + step) % n]) for k in range(n) for step in steps[:per_object]]
     pairs = []
     for reference, target in sorted(ends):
+        # numpy does not need the shift by one bit, but it is part of the seed: without it, there
+        # would be other pairs.
         rng = np.random.default_rng([0, stable_hash(f"{category}/{reference}/{target}") >> 1])
         # Frames that are evenly spaced over a sequence show several sides; the random starts depend
         # on the names only.
@@ -164,8 +171,8 @@ def object_pairs(
         count = min(references_per_pair(n), len(first))
         for r in range(count):
             frame = first[(start + r * len(first) // count) % len(first)]
-            turn = (np.arange(targets) + r / count) / targets  # of the sequence, from its start
-            positions = (target_start + (turn * len(around)).astype(int)) % len(around)
+            share = (np.arange(targets) + r / count) / targets  # of the sequence, from its start
+            positions = (target_start + (share * len(around)).astype(int)) % len(around)
             pairs.append(
                 Pair(category, reference, frame, target, tuple(around[k] for k in positions))
             )
@@ -243,6 +250,7 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
             probability, turned, other = _judge(nodes[i], rotations, i, float(agreeing.mean()))
         else:
             margin, turned, known = compare_two(nodes[i], rotations, i, spans)
+            # The scores of the rotation and of the best other one differ by the margin.
             probability, other = OF_TWO.probabilities(np.array([0.0, margin]), known).tolist()
         alternative = None
         if turned is not None:  # about the object's centre
@@ -386,9 +394,10 @@ def compare_two(
     """Return the `_margin` of one of two objects, the best other rotation, and the evidence for
     `OF_TWO`.
 
-    This is how far around the better seen object the target views go, the number of pairs, and the
-    probability that the surest pair, and all in the mean, give to the rotation. Pairs count by the
-    share of the circle that they show.
+    The evidence is a 1 for the constant; the largest share of the circle around a target that its
+    views span; the logarithm of the effective number of pairs; and the probability that the pairs
+    give to the rotation, of the surest pair and in the weighted mean. A pair has more weight if its
+    views show more of the circle; equal weights make the effective number that of all pairs.
     """
     margin, best = _margin(node, rotations, i)
     near = rotation_angle(node.proposals(rotations[None])[0], rotations[i]) < SAME_ANGLE

@@ -45,7 +45,9 @@ class PoseEstimate:
     # (K,) the matches that agree with the pose; with the verified solver, of those with measured
     # depth on both sides
     inliers: Bool[np.ndarray, " k"]
-    # (N,) score of every target view, higher is better; -inf for views that were left out
+    # (N,) score of every target view, higher is better; -inf for views that were left out. The
+    # verified solver's is minus the angle in degrees between the view's camera and the reference's
+    # under the pose
     view_scores: Float[np.ndarray, " n"]
     reference_view: View  # crop, features and foreground of the reference
     target_views: tuple[View, ...]  # the same of all N target views

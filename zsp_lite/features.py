@@ -124,8 +124,9 @@ def bin_indices(grid: Grid) -> Int[Tensor, "17 n"]:
 
 
 def average_pool(x: Tensor, axes: tuple[int, int]) -> Tensor:
-    """Average over 3x3 windows of two axes at stride 1, smaller ones at the border
-    (count_include_pad=False)."""
+    """Average over 3x3 windows of two axes at stride 1, smaller ones at the border."""
+    # torch's `avg_pool2d` pools the last two axes only, and `matching` pools others of large
+    # tensors, which it would have to copy. Its last digits differ, too.
     for axis in axes:
         n = x.shape[axis]
         total = x.clone()

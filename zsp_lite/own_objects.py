@@ -2,6 +2,11 @@
 
 A source is a sequence of a data folder, a folder with a capture, an image with depth, or frames in
 memory.
+
+The way of a pair: `estimate_pose` opens the sources and loads a `Scan` of each, `_solve` estimates
+the pose of the first reference frame by each solver. Where several frames vote, `_solve_others`
+estimates those of the others, `_agreed_pose` finds the pose that most agree on and counts the
+votes, and `_answer` makes an estimate of it; `_pair_result` collects all, `write_pair` writes it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,6 +38,7 @@ from zsp_lite.points import world_cloud
 from zsp_lite.scans import Scan, scan_flags, stood_up
 from zsp_lite.verified.confidence import reliability_flags
 from zsp_lite.verified.solver import measured_inliers
+from zsp_lite.views import usable_targets
 
 _TARGETS = 5
 _REFERENCES = 4  # frames of each object that are solved against views of the other
@@ -108,7 +114,8 @@ def estimate_pose(
         sources = _open_objects(reference, target, mask, intrinsics, helpers)
         model = as_backbone(backbone)
         foreground = "saliency" if getattr(model, "has_saliency", True) else "mask"
-        # Of both solvers the last is the verified one, whose frames vote.
+        # `_solve` takes the method with each solver. All else, the turns and the frames that vote,
+        # takes the last one, of both solvers the verified one.
         method = ZeroShotPose(model, foreground=foreground, solver=solvers[-1])
 
         # The frames of all objects. Only where frames vote, the reference also has target views,
@@ -149,7 +156,8 @@ def _open_objects(
     intrinsics: Values | None,
     helpers: Sequence[SourceLike],
 ) -> list[Source]:
-    """Open the sources of all objects; InputError if two of several are the same."""
+    """Open the sources of all objects that are not open; InputError if two of several are the
+    same."""
     given = {}
     if mask is not None:
         given["mask"] = (mask,)
@@ -323,7 +331,8 @@ def _answer(
     turns = np.stack([sim3.R for sim3, _ in answers])
     between = rotation_angle(turns[:, None], turns)
     doubts, one_of_two = reliability_flags(hypotheses, between)
-    views_left_out = [flag for flag in estimate.flags if "left out" in flag]
+    # The estimate's other flags, the solver's, are of its own pose.
+    _, views_left_out = usable_targets(targets)
     return replace(
         estimate,
         sim3=best.sim3,

@@ -26,7 +26,7 @@ from zsp_lite.views import IMAGE_SIZE, View, extract_views, object_crop, usable_
 
 # Solvers beyond the paper by name, as "module:class"; a module is imported when its name is used.
 SOLVER_CLASSES = {"verified": "zsp_lite.verified:VerifiedSolver"}
-_FEW = 10  # fewer points do not give a standard deviation
+_FEW = 10  # the standard deviation of fewer points says little of the object's size
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,9 @@ class ZeroShotPose:
 
     def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:
         """Estimate the pose of the reference object in the best of N target views.
+
+        The commands and the benchmark, which share views between solvers, pairs or rows, enter at
+        `estimate_from_views`.
 
         A frame without a mask is not cropped. Target views with a `frame_defect`, such as an empty
         mask, or without foreground are left out, with a flag each. If the matches of the best view
@@ -188,7 +191,8 @@ class ZeroShotPose:
         if not isinstance(self.solver, str):  # a plug-in may overwrite what it gets
             seen = deepcopy(seen)
         found = self._solver()(*seen, seed=self.seed, threshold=self.threshold)
-        # The solver's views are the usable ones: back to the numbers of all.
+        # The solver's views are the usable ones: back to the numbers of all. `reshape` refuses
+        # another number of scores, of which a single one would be written to all views.
         scores = np.full(len(targets), -np.inf)
         scores[usable] = np.reshape(found.view_scores, len(usable))
         return replace(
@@ -280,8 +284,8 @@ def view_alignment(reference: View, target: View) -> Sim3:
 
 
 def _foreground_points(view: View) -> Float[np.ndarray, "n 3"]:
-    """Get the points of the foreground patches with measured depth; if they are too few, those of
-    the whole crop."""
+    """Get the points of the foreground patches with measured depth; if they are too few, of all
+    patches with measured depth; if these are too few, of all patches."""
     points, known = view.patch_points
     for chosen in (view.known_foreground, known):
         if chosen.sum() >= _FEW:

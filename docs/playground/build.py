@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from jaxtyping import UInt8
 
 from zsp_lite import Backbone, Co3D, InputError, ZeroShotPose, load_backbone
 from zsp_lite.course.samples import sample_data
@@ -95,16 +96,23 @@ def pair_data(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> tuple[list[dic
         matches = matched_view.matches
         chosen = [matches.reference @ NUMBER, matches.target @ NUMBER]
         # The true match of each reference patch by its number, or -1.
-        target["truth"] = _packed(np.where(valid, cells @ NUMBER, -1).astype("<i2"))
+        target["truth"] = packed(np.where(valid, cells @ NUMBER, -1).astype("<i2"))
         target["rotation"] = true[:3, :3].tolist()
         target["chosen"] = np.stack(chosen, axis=1).tolist()
     estimate = method.estimate_from_views(first, others, matched)
     return data, rotation_error(estimate.sim3.R, data[1 + estimate.view]["rotation"])
 
 
-def _packed(array: np.ndarray) -> str:
+def packed(array: np.ndarray) -> str:
     """Compress the bytes of an array and encode them as text."""
     return b64encode(zlib.compress(array.tobytes())).decode()
+
+
+def webp(rgb: UInt8[np.ndarray, "h w 3"]) -> str:
+    """Compress an image and encode it as text."""
+    return b64encode(
+        cv2.imencode(".webp", rgb[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 80])[1]
+    ).decode()
 
 
 def write_page_data(folder: Path) -> None:
@@ -129,7 +137,7 @@ def write_page_data(folder: Path) -> None:
     content = {
         "titles": titles,
         "steps": (KEY_STEP, POINT_STEP),
-        "draws": _packed(draws.astype("<u8")),
+        "draws": packed(draws.astype("<u8")),
         "runtime": fetch_runtime(folder),
     }
     (folder / "data.js").write_text(f"const STORED = [], DATA = {json.dumps(content)};\n")
@@ -164,12 +172,11 @@ def _view_data(view: View, keys: np.ndarray) -> dict:
     solid = view.known_foreground
     # The 3D drawing leaves out points more than 2.5 median distances from the middle.
     solid[solid] = near_median(points[solid], 2.5)
-    jpeg = cv2.imencode(".jpg", view.frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
     return {
-        "jpeg": b64encode(jpeg).decode(),
-        "keys": _packed(keys),
-        "saliency": _packed(view.features.saliency.numpy()),
-        "points": _packed(np.round(points / POINT_STEP).astype("<i2")),
+        "webp": webp(view.frame.rgb),
+        "keys": packed(keys),
+        "saliency": packed(view.features.saliency.numpy()),
+        "points": packed(np.round(points / POINT_STEP).astype("<i2")),
         "solid": np.flatnonzero(solid).tolist(),
         **{
             name: getattr(camera, name).tolist()

@@ -6,13 +6,6 @@ const SIDE = 28, PATCHES = SIDE * SIDE, ORTHOGONAL = Math.SQRT2;
 const rowColumn = (patch) => [Math.floor(patch / SIDE), patch % SIDE];
 const SCALES = [0.2, 5], COLLINEAR = 1e-6, IDENTITY = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
 
-/** Decode base64, inflate, and view as a typed array. */
-async function unpack(text, ArrayType) {
-  const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-  const inflated = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-  return new ArrayType(await new Response(inflated).arrayBuffer());
-}
-
 // ---- Similarity: sec. 4.1, and the algebra in the docstring of zsp_lite/matching.py ----
 
 const inside = (i) => Math.min(SIDE - 1, Math.max(0, i));

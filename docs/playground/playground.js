@@ -5,14 +5,11 @@ const CANVAS = 448, CELL = CANVAS / SIDE, CROP = 224, FIRST_PAIR = 3; // sizes i
 const MARKS = { // told apart by shape as well as by colour
   right: ["●", "#56b4e9"], wrong: ["✕", "#e69f00"], unknown: ["▲", "#d0d0d0"], u: ["□", "white"], back: ["○", "yellow"],
 };
-const STEPS = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0] };
 const LIBRARY_DEFAULTS = { saliency: 0.05, binned: true, cycle: true, k: 50, kmeans: true };
 const state = { views: [], solved: null, patch: 14 * SIDE + 14, held: false, shown: 0, turn: [0.5, 0.3] };
 
-const element = (id) => document.getElementById(id);
 const all = (selector) => [...document.querySelectorAll(`#playground ${selector}`)];
 const stageIs = (...names) => names.includes(document.querySelector("[name=stage]:checked").value);
-const notice = (text) => { element("notice").textContent = text; };
 
 /** The settings of the method by the names of their controls. */
 function settings() {
@@ -20,13 +17,8 @@ function settings() {
   return Object.fromEntries(inputs.map((one) => [one.id, one.type === "checkbox" ? one.checked : Number(one.value)]));
 }
 
-const create = (name, properties) => Object.assign(document.createElement(name), properties);
-const loadScript = (src) => new Promise((onload, onerror) => {
-  document.head.append(create("script", { src, onload, onerror }));
-});
-
 async function storedView(stored) {
-  const picture = create("img", { src: `data:image/jpeg;base64,${stored.jpeg}` });
+  const picture = create("img", { src: `data:image/webp;base64,${stored.webp}` });
   await picture.decode();
   const rounded = await unpack(stored.keys, Int16Array), axes = rounded.length / PATCHES;
   const keys = Float32Array.from(rounded, (_, i) => DATA.steps[0] * rounded[i % axes * PATCHES + Math.floor(i / axes)]);

@@ -70,7 +70,8 @@ html_title = "zsp-lite"
 html_css_files = ["style.css"]
 html_js_files = [("site.js", {"defer": "defer"})]
 html_static_path = ["static", "../playground"]
-html_sidebars = {"docs/playground": []}  # The pictures of this page take the whole width.
+# The pictures of these pages take the whole width.
+html_sidebars = {"docs/playground": [], "docs/find_on_all": []}
 templates_path = ["templates"]
 html_additional_pages = {"index": "redirect.html"}
 html_math_renderer = "mathml"

@@ -2,8 +2,6 @@
 use it."""
 
 import base64
-import subprocess
-import sys
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -14,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from lab_in_browser import REPOSITORY
 from numpy.testing import assert_allclose, assert_array_equal
+from one_page import SCREENS, build_page, open_page, screen, tab_to
 from playwright.sync_api import Browser, Page
 from torch.testing import assert_close
 
@@ -63,12 +61,7 @@ PACK = """(array) => {
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> Path:
     """Folder of a site with this one page."""
-    folder = tmp_path_factory.mktemp("site")
-    only = "-D include_patterns=docs/playground.md -D root_doc=docs/playground".split()
-    options = ["-q", "-c", "docs/site", "-d", folder / "doctrees", *only]
-    command = [sys.executable, "-m", "sphinx", *options, ".", folder]
-    # Sphinx warns of links to other pages, which this site does not have.
-    subprocess.run(command, cwd=REPOSITORY, check=True, stderr=subprocess.DEVNULL)
+    folder = build_page("docs/playground", tmp_path_factory.mktemp("site"))
     write_page_data(folder / "docs/playground")
     return folder
 
@@ -82,20 +75,12 @@ def method() -> ZeroShotPose:
 @pytest.fixture(scope="module")
 def stored(browser, site) -> Page:
     """The page opened as a file."""
-    return open_page(browser, site.as_uri())
+    return open_playground(browser, site.as_uri())
 
 
-def open_page(browser: Browser, address: str, **options) -> Page:
-    """Open the page and wait until its pictures are drawn; `broken` collects its errors."""
-    page = browser.new_context(**options).new_page()
-    page.set_default_timeout(180_000)  # milliseconds, for a busy machine
-    page.broken = []
-    page.on("pageerror", lambda error: page.broken.append(str(error)))
-    page.goto(f"{address}/docs/playground.html")
-    page.wait_for_function(
-        "document.getElementById('pictures').getAttribute('aria-busy') === 'false'"
-    )
-    return page
+def open_playground(browser: Browser, address: str, **options) -> Page:
+    """Open the page and wait until its pictures are drawn."""
+    return open_page(browser, f"{address}/docs/playground.html", "pictures", **options)
 
 
 def array(page: Page, expression: str, kind: type = np.float32) -> np.ndarray:
@@ -228,7 +213,7 @@ def test_photographs_get_the_features_of_the_library_and_no_pose(
     files = [tmp_path / "a.png", tmp_path / "b.png"]
     for file, view in zip(files, views):
         cv2.imwrite(str(file), view.frame.rgb[..., ::-1])
-    page, requests = open_page(browser, address), []
+    page, requests = open_playground(browser, address), []
     if not page.evaluate("DATA.runtime"):
         pytest.skip("onnxruntime-web could not be fetched")
     page.on("request", lambda request: requests.append((request.method, request.url)))
@@ -248,25 +233,10 @@ def test_photographs_get_the_features_of_the_library_and_no_pose(
     assert all(url.startswith((address, "data:", "blob:")) for _, url in requests)
 
 
-SCREENS = [(width, scheme) for width in (1280, 390) for scheme in ("light", "dark")]
-
-
 @pytest.fixture(params=SCREENS, ids=str)
 def touched(browser, site, request) -> Page:
     """The page on a screen of a width, in a scheme of colours."""
-    width, scheme = request.param
-    viewport = {"width": width, "height": 900}
-    options = {"viewport": viewport, "color_scheme": scheme, "has_touch": True}
-    return open_page(browser, site.as_uri(), **options)
-
-
-def tab_to(page: Page, name: str) -> None:
-    """Press Tab until an element has the focus."""
-    for _ in range(60):  # The page has fewer elements.
-        if page.evaluate("document.activeElement.id") == name:
-            return
-        page.keyboard.press("Tab")
-    pytest.fail(f"{name} is not reached by the keyboard")
+    return open_playground(browser, site.as_uri(), **screen(*request.param))
 
 
 def test_a_patch_is_held_by_keyboard_and_touch(touched):

@@ -89,7 +89,8 @@ def poses(device: str) -> Result:
 
 
 def notebooks(device: str) -> Result:
-    """Execute notebooks 00 to 04, with their assertions, on the device.
+    """Execute notebooks 00 to 04, which run all stages of the paper's method, with their assertions
+    on the device.
 
     Their stored outputs are those of a CPU and are not compared. A notebook that uses
     `backbone.model` computes inside the network: it stays on the CPU.
@@ -98,12 +99,14 @@ def notebooks(device: str) -> Result:
         for path in sorted((REPOSITORY / "notebooks").glob("0[0-4]*.ipynb")):
             text = path.read_text("utf-8")
             if "backbone.model" not in text:
+                # Raw strings: in the JSON of a notebook, a backslash is before each quote.
                 text = text.replace(r"device=\"cpu\"", rf"device=\"{device}\"")
             Path(folder, path.name).write_text(
                 text.replace("nbval-check-output", "not-compared"), "utf-8"
             )
         words = "-m pytest -c pyproject.toml -q --nbval-lax --nbval-current-env"
         words += " --nbval-cell-timeout=300 -n 4 --dist loadfile --rootdir"
+        # The folder is the value of --rootdir, and what pytest collects.
         command = [sys.executable, *words.split(), folder, folder]
         threads = {"OMP_NUM_THREADS": str(max(1, CORES // 4))}
         status = subprocess.run(command, cwd=REPOSITORY, env=os.environ | threads).returncode

@@ -65,7 +65,7 @@ def category(problem: PairProblem) -> Answer:
         per_object=None,
         targets=len(pair.target_frames),
     )
-    return _agreed(problem, [pair, *pairs])
+    return _agreed(problem, pairs)
 
 
 @dataclass(frozen=True)
@@ -80,11 +80,11 @@ class Scans:
 
 
 def _agreed(problem: PairProblem, pairs: Sequence[Pair]) -> Answer:
-    """Return the pose that the hypotheses of several pairs agree on, the problem's pair among
-    them."""
+    """Return the pose that the hypotheses of the problem's pair and of other pairs agree on."""
     of_problem = problem.hypotheses()
     hypotheses = [of_problem]
     for pair in pairs:
+        # With the random draws of the same evaluation (see `seeds` of `run.evaluate`).
         pair = replace(pair, repeat=problem.pair.repeat)
         if pair != problem.pair:
             of_pair = problem.store.hypotheses(pair)

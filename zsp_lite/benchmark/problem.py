@@ -188,7 +188,7 @@ class Problem:
     seed: int
     crops: Sequence[Crop]  # the reference's crop first
     _extractors: Mapping[str, Any]
-    _timings: dict[str, list]
+    _timings: dict[str, list]  # those of the store, which this problem adds to
     # What is computed already: estimates by the arguments of `estimate`, similarities by two
     # feature maps and `binning`.
     _estimates: dict[tuple, PoseEstimate] = field(default_factory=dict)

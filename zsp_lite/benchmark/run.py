@@ -1,8 +1,8 @@
 """Run the benchmark: rotation errors of rows over many pairs of a CO3D-format folder (sec. 5).
 
 The way of a pair: `evaluate` samples it, `execution.evaluate_pairs` hands it to this process or a
-worker, `PairEvaluator.line` reads frames and features, asks each row (`_ask`) and measures its
-answer; `write_reports` makes tables of what is stored.
+worker, `PairEvaluator.line` reads frames and features, asks each row (`ask`) and measures its
+answer; `runs.add_lines` adds the line to run.jsonl, from which `write_reports` makes tables.
 
 `rows` are always the `Method`s by name, `names` are names of rows.
 """
@@ -89,8 +89,8 @@ def evaluate(
         sweep: RANSAC thresholds V; each row is evaluated with each, as NAME@threshold=V.
 
     Returns:
-        The summary (see `statistics.summarise`), which `write_reports` writes, with tables and
-        figures.
+        The summary (see `statistics.summarise`), for callers from Python; nothing is written but
+        the run. `write_reports` computes it again from there, with tables and figures.
 
     Raises:
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds
@@ -259,21 +259,24 @@ class PairEvaluator:
             try:
                 with fails_alone(self.row_seconds) if own else nullcontext():
                     start = time.perf_counter()
-                    answer = _ask(method, seen, truths)
+                    answer = ask(method, seen, truths)
                     seconds = time.perf_counter() - start
                     results[name] = _measure(answer, problem, truths, extents, seconds)
             except InputError as error:
                 # 180 degrees: without these pairs, methods that fail often would look better.
                 results[name] = {"error": 180.0, "failed": printable(error)}
 
+        # The store and the problem have added the seconds of each stage.
         timings = {}
         for stage, seconds in self.store.timings.items():
             timings[stage] = round(float(np.median(seconds)), 5)
         return {"pair": pair.key, "results": results, "repeat": pair.repeat, "timings": timings}
 
 
-def _ask(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -> Answer:
-    """Ask a row for its pose of a pair."""
+def ask(
+    method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"] | None = None
+) -> Answer:
+    """Ask a row for its pose of a pair; the true poses are for rows that are given the view."""
     if method.solve is not None:
         return as_answer(seeded(method.solve, problem.seed)(problem))
     nearest = None
@@ -293,7 +296,7 @@ def _ask(method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"]) -
             reference.frame, target.frame, estimate.matches, reference.features.grid
         )
         return Answer(rotation, answer.view, note=note, inliers=inliers)
-    return answer
+    return answer  # "pose"
 
 
 def _measure(

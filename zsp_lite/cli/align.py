@@ -8,10 +8,24 @@ from zsp_lite.cli.common import (
     COUNT,
     NAMES,
     PATH,
+    Parsed,
     backbone_options,
     examples,
     replace_option,
     workers_option,
+)
+
+
+def _read_mark(text: str):
+    from zsp_lite.marks import Mark  # slow to import, and most calls have no mark
+
+    return Mark.parse(text)
+
+
+MARK = Parsed(
+    "sequence:frame:x,y[:name]",
+    parse=_read_mark,
+    expected="SEQUENCE:FRAME:X,Y or SEQUENCE:FRAME:X,Y:NAME",
 )
 
 
@@ -44,11 +58,18 @@ from zsp_lite.cli.common import (
     is_flag=True,
     help="Write the labels into DATA as proposals, which notebook 08 shows.",
 )
+@click.option(
+    "--mark",
+    "marks",
+    type=MARK,
+    multiple=True,
+    help="A pixel with depth to find on all objects; may be repeated.",
+)
 @replace_option
 @workers_option
 @backbone_options
 def align(
-    data, category, sequences, pairs, targets, out, propose, replace, backbone, workers
+    data, category, sequences, pairs, targets, out, propose, marks, replace, backbone, workers
 ) -> None:
     """Align all objects of a category in one frame; no label is needed.
 
@@ -61,6 +82,9 @@ def align(
     DATA` takes, and as pictures in report.html. With fewer than five objects, or where objects look
     alike from two sides, some may be turned round against the rest: look at the report. Pose labels
     and proposals that DATA has already, such as those of uCO3D, are compared with the result.
+
+    A pixel of one object, --mark, is found on all others: OUT gets marks.json, marks/SEQUENCE.ply
+    with balls in each object's world, and a section of the report.
     """
     from zsp_lite.align import align_category, alignment_errors, write_alignment, write_labels
     from zsp_lite.category import SAME_ANGLE
@@ -68,6 +92,7 @@ def align(
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.labels import read_label_folder
     from zsp_lite.importers.convert import import_captures
+    from zsp_lite.marks import marked_points, place_marks, write_marks
     from zsp_lite.metrics import accuracy
     from zsp_lite.viz.category_sheet import COLUMNS, object_rows
     from zsp_lite.viz.report import write_category_report
@@ -79,26 +104,37 @@ def align(
                 print(f"{name}: {flag}")
         data = out / "data"
     dataset = Co3D(data)
+    marked_points(dataset, category, marks)  # refuses wrong marks before minutes of computing
     alignment = align_category(dataset, category, backbone, sequences, pairs, targets, out, workers)
+    placed = place_marks(alignment, dataset, category, marks, backbone) if marks else []
     written = [
         write_alignment(alignment, out),
         write_labels(alignment, out, category, replace=True),
-        write_category_report(out / "report.html", alignment, dataset, category),
+        write_category_report(out / "report.html", alignment, dataset, category, placed),
     ]
+    if placed:
+        written.append(write_marks(placed, dataset, category, out))
     title = f"{category}: {len(alignment.objects)} objects in one frame"
     print_rows(title, COLUMNS, object_rows(alignment))
+    for one in placed:
+        found = {name: place for name, place in one.places.items() if name != one.mark.sequence}
+        places = [
+            (name, f"{100 * place.confidence:.0f}" if place.found else "nothing here")
+            for name, place in found.items()
+        ]
+        print_rows(f"Mark {one.mark.name}", ("object", "right (%)"), places)
     for (first, second), angle in alignment.disagreements.items():
         print(f"{first} to {second}: the best pose of the pair alone is {angle:.0f}° away")
     for kind, what in (("class_labels", "pose labels"), ("label_proposals", "proposals")):
         labels = read_label_folder(dataset.root / kind / category)
-        together, alone = alignment_errors(alignment, labels)
-        if alone:
-            right = accuracy(together, SAME_ANGLE)
-            before = accuracy(alone, SAME_ANGLE)
+        errors, errors_before = alignment_errors(alignment, labels)
+        if errors_before:
+            right = accuracy(errors, SAME_ANGLE)
+            before = accuracy(errors_before, SAME_ANGLE)
             print(
-                f"By the {what}, {right:.1f}% of {len(together)} ordered pairs are within "
-                f"{SAME_ANGLE:.0f}°; of the best poses of {len(alone)} pairs of views and objects "
-                f"alone, {before:.1f}%."
+                f"By the {what}, {right:.1f}% of {len(errors)} ordered pairs are within "
+                f"{SAME_ANGLE:.0f}° in the common frame; before the alignment, {before:.1f}% of "
+                f"{len(errors_before)} best poses, each of one frame and its target views."
             )
     if propose:
         written.append(write_labels(alignment, dataset.root, category, "label_proposals", replace))

@@ -132,6 +132,7 @@ def benchmark(
         asked = pairs_of_rows(dataset, resolve(methods), pairs_per_category, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
+    # Its summary is of all rows, as is the one that `write_reports` returns and writes.
     evaluate(
         dataset.root,
         backbone,

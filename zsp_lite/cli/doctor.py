@@ -29,8 +29,10 @@ def doctor() -> int:
 
 
 def run_checks() -> Iterator[tuple[str, str, str, str]]:
-    """Yield name, state ("ok", "note" if it is optional, "bad"), what was found, and the fix, first
-    problems first."""
+    """Yield name, state ("ok", "note" if it is optional, "bad"), what was found, and the fix.
+
+    What others need comes first: without the packages, nothing after them is checked.
+    """
     yield (
         "Python",
         "ok",

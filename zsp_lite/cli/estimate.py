@@ -105,6 +105,8 @@ def estimate(
         raise click.UsageError(
             f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers"
         )
+    # Opened here, since an option may differ from object to object; `estimate_pose` takes open
+    # sources as they are.
     sources = open_pair(reference, target, once_per_object, (*helpers, *others))
     result = estimate_pose(
         sources[0],

@@ -15,6 +15,7 @@ import click
 from zsp_lite import __version__
 from zsp_lite.cli.align import align
 from zsp_lite.cli.benchmark import benchmark, compare, tables
+from zsp_lite.cli.challenge import challenge
 from zsp_lite.cli.common import examples
 from zsp_lite.cli.data import data
 from zsp_lite.cli.demo import demo
@@ -39,7 +40,7 @@ def cli() -> None:
     """Zero-shot category-level object pose estimation: demo, benchmark, data, backbones."""
 
 
-for command in (demo, estimate, align, benchmark, tables, compare, synth, data, doctor):
+for command in (demo, estimate, align, benchmark, tables, compare, synth, challenge, data, doctor):
     cli.add_command(command)
 
 

@@ -70,7 +70,9 @@ def run_pair(
         pair,
         backbone=getattr(method.backbone, "name", ""),
     )
-    errors = label_errors(
-        result, dataset.root / pair.category, (pair.reference_sequence, pair.target_sequence)
+    return replace(
+        result,
+        errors=label_errors(
+            result, dataset.root / pair.category, (pair.reference_sequence, pair.target_sequence)
+        ),
     )
-    return replace(result, errors=errors)

@@ -31,7 +31,8 @@ _FOREGROUNDS = {
 }
 _SOLVERS = ("paper", "verified")
 _POINTS = 1500  # largest number of points that are drawn of the aligned cloud
-_LENGTH = 2.2  # length of the arrows; the points of the motorcycle have unit standard deviation
+# Length of the arrows; the points of the photographed motorcycle have unit standard deviation.
+_LENGTH = 2.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +111,9 @@ def photograph_section(results: Sequence[PhotographResult]) -> PhotographSection
             "–" if confidence is None else f"{confidence:.2f}",
         )
         rows.append(row)
-    figure = partial(photograph_figure, results)
-    return PhotographSection(results[0].sequence, _COLUMNS, rows, figure)
+    return PhotographSection(
+        results[0].sequence, _COLUMNS, rows, partial(photograph_figure, results)
+    )
 
 
 def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
@@ -121,9 +123,10 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
     The left column shows a view of the synthetic motorcycle, and the directions judged by eye.
     """
     # A view of the synthetic motorcycle, with white margins to the aspect of the photograph.
-    photograph = results[0].photograph
+    first = results[0]
+    photograph = first.photograph
     height, width = photograph.camera.size
-    estimate = results[0].estimate
+    estimate = first.estimate
     view = estimate.target_views[estimate.view].frame.rgb
     margin = round((view.shape[0] * width / height - view.shape[1]) / 2)
     view = np.pad(view, ((0, 0), (margin, margin), (0, 0)), constant_values=255)
@@ -134,20 +137,23 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
         f"front {result.front_error:.0f}°, up {result.up_error:.0f}° off"
         for result in results
     ]
-    # The left column: the view of the synthetic motorcycle, and below it the directions by eye.
-    titles.insert(len(_SOLVERS), "directions judged by eye\n")
-    titles.insert(0, f"a view of the synthetic motorcycle,\n{results[0].sequence}")
-    images = [view, *[photograph.rgb] * (len(titles) - 1)]
-    figure, (_, *axes) = plots.show_images(images, titles, columns=1 + len(_SOLVERS), size=3.6)
+    count = len(_SOLVERS)
+    upper = [f"a view of the synthetic motorcycle,\n{first.sequence}"] + titles[:count]
+    lower = ["directions judged by eye\n"] + titles[count:]
+    columns = len(upper)
+    images = [view] + [photograph.rgb] * (len(results) + 1)
+    figure, axes = plots.show_images(images, upper + lower, columns=columns, size=3.6)
+    _, *above = axes[:columns]
+    by_eye, *below = axes[columns:]
 
     # The directions judged by eye, and those of the results.
-    up = np.array(motorcycle.UP)
-    front = np.array(motorcycle.FRONT)
-    directions = np.stack([front, np.cross(up, front), up])  # rows: front, left, up
+    left = np.cross(motorcycle.UP, motorcycle.FRONT)
+    directions = np.array([motorcycle.FRONT, left, motorcycle.UP])
     centre = np.median(object_points(photograph), axis=0)
-    _draw_directions(axes.pop(len(_SOLVERS)), photograph, centre, directions)
-    for axis, result in zip(axes, results):
-        chosen = np.linspace(0, len(result.cloud) - 1, min(_POINTS, len(result.cloud))).astype(int)
+    _draw_directions(by_eye, photograph, centre, directions)
+    for axis, result in zip(above + below, results):
+        size = len(result.cloud)
+        chosen = np.linspace(0, size - 1, min(_POINTS, size)).astype(int)
         colours = plt.get_cmap("viridis")(result.along[chosen].clip(0, 1))[:, :3]
         plots.draw_points(axis, photograph.camera, result.cloud[chosen], colours, size=6)
         _draw_directions(axis, photograph, result.cloud.mean(axis=0), result.axes.T)

@@ -35,6 +35,8 @@ def sample_data() -> Path:
         part.rename(made)
     except (OSError, InputError) as error:
         if not made.is_dir():  # If the folder is there, another process has made it meanwhile.
-            cure = "set ZSP_LITE_CACHE to a folder that can be written"
-            raise InputError(f"samples cannot be made in {made} ({error}); {cure}") from error
+            raise InputError(
+                f"samples cannot be made in {made} ({error}); set ZSP_LITE_CACHE to a folder that "
+                "can be written"
+            ) from error
     return made

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import cv2
 import numpy as np
@@ -44,14 +44,16 @@ class CaptureFrame:
     fisheye: bool = False
     confidence: Path | None = None  # of each pixel of the depth map, see `trusted`
     label: int | None = None  # number of the object in masks that label several objects
-    # "stored" or "displayed": how camera, depth and mask refer to a turned photograph.
+    # Whether camera, depth and mask are those of the photograph as "stored", or as "displayed" by
+    # its EXIF orientation; None if their sizes show it (see `files.lies_as_stored`).
     orientation: str | None = None
     posed: bool = True  # False for a single image, whose world is its camera's frame
 
     def load(self) -> Frame:
         """Load the frame as viewers display it; InputError if a file cannot be used."""
         rgb, exif = files.read_picture(self.image)
-        # A function that says whether an image of a size lies as the stored pixels.
+        # A function that says whether an image of a size is in the form of the stored pixels, which
+        # the EXIF orientation turns to the displayed form.
         lies_stored = partial(files.lies_as_stored, rgb.shape, exif, self.orientation, self.image)
 
         def displayed(image: np.ndarray) -> np.ndarray:
@@ -101,7 +103,8 @@ class CaptureFrame:
         else:
             undistortion = cv2.initUndistortRectifyMap
             p1, p2 = coefficients[2:4]
-            # The tangential coefficients, as (p2, p1), are a vector that turns with the image.
+            # In OpenCV's model, p2 shifts points along x and p1 along y: the vector (p2, p1) turns
+            # with the image.
             coefficients[[3, 2]] = (camera.R @ self.camera.R.T)[:2, :2] @ (p2, p1)
         return undistortion(
             matrix, coefficients, np.eye(3), matrix, camera.size[::-1], cv2.CV_32FC1
@@ -164,7 +167,7 @@ def make_frame(
     return CaptureFrame(paths[0], paths[1], camera, mask=paths[2], confidence=paths[3], **others)
 
 
-def refuse(problem: str) -> CaptureFrame:
+def refuse(problem: str) -> NoReturn:
     """Raise InputError: a maker for a frame that cannot be made."""
     raise InputError(problem)
 
@@ -201,6 +204,7 @@ def sharpest(
     """
     stretches = [[position] for position in range(len(items))]
     if len(items) > count:
+        # With a count of 1, the slice below drops the single later stretch.
         later = np.array_split(np.arange(1, len(items)), max(count - 1, 1))
         # Evenly spaced candidates of each stretch: the step is rounded up.
         stretches = [[0], *(part[:: -(-len(part) // _CANDIDATES)].tolist() for part in later)]
@@ -243,8 +247,9 @@ def trusted(levels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
     """Find the mask of each image in a folder: its path there is an end of the image's path.
 
-    The extension of the image may be part of the mask's name. The longest such path counts. An end
-    that several images share is no name of a mask.
+    For example, the mask of `scan/images/a/1.jpg` is `images/a/1.png`, `a/1.png`, `1.jpg.png` or
+    `1.png` in the folder. The extension of the image may be part of the mask's name. The longest
+    such path counts. An end that several images share is no name of a mask.
     """
     named = {}
     for path in sorted(Path(folder).rglob("*.*")):

@@ -1,4 +1,8 @@
-"""Scenes of benchmarks and of depth cameras: BOP, ScanNet, Open3D's recorder."""
+"""Scenes of benchmarks and of depth cameras: BOP, ScanNet, Open3D's recorder.
+
+Each reader yields functions that make a frame (see `capture.Makers`), so that a frame that cannot
+be made is left out alone.
+"""
 
 from functools import partial
 from pathlib import Path
@@ -51,11 +55,11 @@ def _make_bop(
     if len(indices) > 1:
         raise InputError(f"{where} shows object {object} {len(indices)} times, expected once")
     placed = scene[indices[0]]
-    R = real_array(f"{where}: cam_R_m2c", placed.cam_R_m2c, (9,))
+    R = real_array(f"{where}: cam_R_m2c", placed.cam_R_m2c, (9,)).reshape(3, 3)
     t = real_array(f"{where}: cam_t_m2c", placed.cam_t_m2c, (3,))
     K = real_array(f"{where}: cam_K", camera.get("cam_K"), (9,))
     # From camera to object: the inverse of the file's pose.
-    pose = np.column_stack([R.reshape(3, 3).T, -_MILLIMETRES * R.reshape(3, 3).T @ t])
+    pose = np.column_stack([R.T, -_MILLIMETRES * R.T @ t])
     scale = real_array(f"{where}: depth_scale", camera.get("depth_scale", 1), ())
     unit = _MILLIMETRES * float(scale)
     check_number(f"{where}: depth_scale", unit, above=0)
@@ -74,7 +78,9 @@ def _make_bop(
 
 def read_scannet(folder: Path) -> Makers:
     """Read a scene in ScanNet's format, with a text file for the pose of each image."""
-    K = read_numbers(folder / "intrinsic/intrinsic_color.txt", (3, 4))[:3, :3]
+    # ScanNet's depth is aligned to its colours: their intrinsics hold for both. The format does not
+    # document its pixel centres, so that K counts as it is.
+    K = read_numbers(folder / "intrinsic/intrinsic_color.txt", columns=(3, 4))[:3, :3]
     for path in sorted((folder / "pose").glob("*.txt")):
         yield partial(_make_scannet, folder, path, K)
 
@@ -106,9 +112,10 @@ def read_open3d(folder: Path) -> Makers:
         for path in (folder / "color").glob("*")
         if path.suffix.lower() in (".jpg", ".png")
     )
-    # The log has five lines for each image: three frame numbers, and the four rows of a matrix. By
-    # these columns, the last of the three numbers is read twice.
-    lines = read_numbers(log, (4,), usecols=(0, 1, 2, -1))
+    # The log has five lines for each image: one of three frame numbers, which is not used, and the
+    # four rows of a matrix. `numpy.loadtxt` needs equally many columns in all lines: these are the
+    # four of a matrix, and of three numbers they read the last one twice.
+    lines = read_numbers(log, columns=(4,), usecols=(0, 1, 2, -1))
     if len(lines) != 5 * len(images):
         raise InputError(
             f"{log} has {len(lines)} lines, expected 5 for each of {len(images)} images"

@@ -50,8 +50,9 @@ class SearchSchedule(NamedTuple):
     decay: float  # factor on all three after each round
 
 
-# `tools/tuning.py` does not fit these values. Each search begins with narrower steps than the one
-# before began with, but with wider steps than that one ended with.
+# These values are chosen, not fitted: `tools/tuning.py` fits weights and probabilities only. Each
+# search begins with narrower steps than the one before began with, but with wider steps than that
+# one ended with.
 COARSE = SearchSchedule(
     rounds=3, samples=16, rotation=7.0, translation=0.12, scale=0.08, decay=0.65
 )
@@ -107,7 +108,8 @@ def refine(
         improved = top_scores[:, 0] > best_score
 
         # The next round starts from the best candidate where it improves the pose: the mean step
-        # leads from there.
+        # leads from there. The difference of two rotation vectors is nearly the rotation between
+        # them, since steps are small; the score judges the candidate in any case.
         mean_step = (steps[rows[:, None], top_steps] * weights).sum(dim=1)
         recombined = mean_step - torch.where(improved[:, None], steps[rows, best_step], 0)
         # The candidates follow the m poses in the concatenation, `samples` of them for each pose.

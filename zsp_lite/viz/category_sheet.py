@@ -9,10 +9,12 @@ from matplotlib.figure import Figure
 from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.annotations import FrameAnnotation
 from zsp_lite.data.co3d import Co3D
+from zsp_lite.marks import COLOURS, PlacedMark
 from zsp_lite.metrics import rotation_angle
 from zsp_lite.views import object_crop
 from zsp_lite.viz.plots import VERMILLION
 
+# Probabilities that the pose is right, and that the next best one is, by the angle between both.
 COLUMNS = ("object", "right (%)", "else turned by", "that (%)")
 _DOUBTFUL = 0.8  # an object with a lower probability should be looked at
 MOST = 10  # objects of a figure
@@ -73,6 +75,48 @@ def objects_figure(
         text = f"{name[:16]}\n{100 * objects[name].probability:.0f} %"
         colour = VERMILLION if name in flagged else "black"
         axis.set_xlabel(text, fontsize=8, color=colour, parse_math=False)
+    return figure
+
+
+def marks_figure(
+    dataset: Co3D, category: str, alignment: CategoryAlignment, placed: Sequence[PlacedMark]
+) -> Figure:
+    """Show marks on all objects, a row for each: first the frame that is marked, then of each other
+    object the frame that sees the place from the most similar side."""
+    names = list(alignment.objects)
+    size = (_WIDTH * len(names) + _BORDER, (_HEIGHT + _BORDER) * len(placed))
+    figure, axes = plt.subplots(
+        len(placed), len(names), figsize=size, layout="constrained", squeeze=False
+    )
+    for number, (panels, one) in enumerate(zip(axes, placed, strict=True)):
+        mark = one.mark
+        marked = dataset.camera(dataset.frame(category, mark.sequence, mark.frame)).R
+        common = marked @ alignment.objects[mark.sequence].sim3.R.T  # from the common frame
+        ordered = [mark.sequence, *(name for name in names if name != mark.sequence)]
+        panels[0].set_ylabel(mark.name[:24], fontsize=8, parse_math=False)
+        for axis, name in zip(panels, ordered, strict=True):
+            place = one.places[name]
+            frames = _frames(dataset, category, name)
+            seeing = [frame for frame in frames if frame.frame_number in place.pixels]
+            if name == mark.sequence:
+                seeing = [frame for frame in frames if frame.frame_number == mark.frame]
+            candidates = seeing if place.found and seeing else frames
+            seen_from = np.stack([dataset.camera(frame).R for frame in candidates])
+            nearest = rotation_angle(seen_from, common @ alignment.objects[name].sim3.R).argmin()
+            crop = object_crop(dataset.load(candidates[nearest]))
+            axis.set(xticks=[], yticks=[], frame_on=False)
+            axis.imshow(crop.rgb)
+            if name == mark.sequence:
+                label = "marked"
+            elif not place.found:
+                label = "nothing here"
+            else:
+                label = f"{100 * place.confidence:.0f} %" + ("" if seeing else ", not seen")
+            axis.set_xlabel(f"{name[:16]}\n{label}", fontsize=8, parse_math=False)
+            if place.found and seeing:
+                x, y = crop.camera.project(place.world)[0] - 0.5  # pixel centres at integers
+                colour = COLOURS[number % len(COLOURS)]
+                axis.plot(x, y, "o", ms=8, mfc=colour, mec="white", mew=1.5)
     return figure
 
 

@@ -104,7 +104,8 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
     titles.append("seen from above")
     images = [reference.frame.rgb, frames[chosen].rgb]
     images += [plots.pale(frames[view].rgb) for view in shown]
-    images.append(np.full_like(images[0], 255))  # white ground for the drawing from above
+    # A white image holds the place of the drawing from above, which removes it.
+    images.append(np.full_like(images[0], 255))
     figure, axes = plots.show_images(images, titles, columns=4, size=2.5)
     figure.set_figheight(figure.get_figheight() + 0.4)  # space for the legend
 
@@ -114,6 +115,7 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
         rows = np.arange(mask.shape[0]) + 0.5
         columns = np.arange(mask.shape[1]) + 0.5
         axes[1].contour(columns, rows, mask, [ON_OBJECT], colors=["white"], linewidths=1.5)
+    # Dense, as `plots.draw_estimates` draws it, and without axes: `names=None`.
     cloud = plots.object_cloud(reference, most=20000)
     cameras = [frames[view].camera for view in shown]
     plots.draw_moved_cloud(axes[:1], [reference.frame.camera], cloud, [Sim3.identity()], names=None)
@@ -171,7 +173,7 @@ def _draw_from_above(axis: Axes, seen: Coverage, target: np.ndarray, reference: 
     """Draw world points of the target (grey) and of the reference, the arc of the target cameras,
     and its gap."""
     begin, end = seen.gap
-    axis.images[0].remove()
+    axis.images[0].remove()  # the white image that held the place
     axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0))
     # An arc is given by the width and the height of its whole ellipse.
     axis.add_patch(Arc((0, 0), 2, 2, theta1=end, theta2=begin + 360, color=plots.BLUE, linewidth=4))

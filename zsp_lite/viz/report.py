@@ -24,6 +24,7 @@ from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.io.files import REPOSITORY, write_atomic
+from zsp_lite.marks import PlacedMark
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.pair_result import PairResult
 from zsp_lite.viz import category_sheet, plots
@@ -69,26 +70,42 @@ def write_pair_report(path: Path, result: PairResult) -> Path:
 
 
 def write_category_report(
-    path: Path, alignment: CategoryAlignment, dataset: Co3D, category: str
+    path: Path,
+    alignment: CategoryAlignment,
+    dataset: Co3D,
+    category: str,
+    placed: Sequence[PlacedMark] = (),
 ) -> Path:
-    """Write a page with contact sheets and the table of all objects, and the first sheet as
-    objects.jpg beside it."""
+    """Write a page with contact sheets, the table of all objects and the marks, and the first sheet
+    as objects.jpg beside it."""
     names = list(alignment.objects)
     sheets = []
     for start in range(0, len(names), category_sheet.MOST):
         part = names[start : start + category_sheet.MOST]
         figure = category_sheet.objects_figure(dataset, category, alignment, part)
-        sheets.append(_encode(figure, dpi=150, format="jpg", pil_kwargs={"quality": 90}))
+        sheets.append(_encode_sheet(figure))
+    marked = []
+    if placed:
+        marked = [_encode_sheet(category_sheet.marks_figure(dataset, category, alignment, placed))]
     text = _TEMPLATES.get_template("category.html").render(
         category=category,
         columns=category_sheet.COLUMNS,
         rows=category_sheet.object_rows(alignment),
-        images=[f"data:image/jpeg;base64,{base64.b64encode(sheet).decode()}" for sheet in sheets],
+        images=[_jpeg_uri(sheet) for sheet in sheets],
+        marked=[_jpeg_uri(sheet) for sheet in marked],
         doubtful=category_sheet.doubtful(alignment),
     )
     write_atomic(path.with_name("objects.jpg"), sheets[0])
     write_atomic(path, text.encode())
     return path
+
+
+def _encode_sheet(figure: Figure) -> bytes:
+    return _encode(figure, dpi=150, format="jpg", pil_kwargs={"quality": 90})
+
+
+def _jpeg_uri(image: bytes) -> str:
+    return f"data:image/jpeg;base64,{base64.b64encode(image).decode()}"
 
 
 def write_report(

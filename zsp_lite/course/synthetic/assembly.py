@@ -89,9 +89,9 @@ def make_shape(
     vertices, faces = joined(assembly.meshes)
     material = np.repeat(assembly.materials, [len(mesh.faces) for mesh in assembly.meshes])
     # Each axis has a small random scale of its own.
-    vertices = vertices * np.exp(assembly.rng.normal(0, 0.08, 3))
-    vertices = vertices - box_centre(vertices)
-    vertices = vertices / surface_spread(vertices, faces)
+    vertices *= np.exp(assembly.rng.normal(0, 0.08, 3))
+    vertices -= box_centre(vertices)
+    vertices /= surface_spread(vertices, faces)
     n = len(faces)
     uv = np.zeros((n, 3, 2), np.float32)
     white = np.ones((n, 3, 3), np.float32)
@@ -111,9 +111,10 @@ def rounded_box(
     line = np.sin(np.linspace(-TAU / 4, TAU / 4, n))
     u, v = np.meshgrid(line, line, indexing="ij")
     sides = [np.dstack([np.full_like(u, sign), sign * u, v]) for sign in (-1.0, 1.0)]
-    vertices = np.stack([np.roll(side, axis, axis=2) for axis in range(3) for side in sides])
-    vertices = vertices.reshape(-1, 3)
-    # Two triangles fill each cell of a grid; `corner` is the cell's vertex of the lowest index.
+    grids = [np.roll(side, axis, axis=2) for axis in range(3) for side in sides]
+    vertices = np.reshape(grids, (-1, 3))
+    # Two triangles fill each cell of a grid, counter-clockwise seen from outside; `corner` is the
+    # cell's vertex of the lowest index.
     corner = np.arange(n * n).reshape(n, n)[:-1, :-1].reshape(-1, 1)
     cells = np.concatenate([corner + [0, n, n + 1], corner + [0, n + 1, 1]])
     faces = np.concatenate([cells + side * n * n for side in range(6)])
@@ -131,7 +132,10 @@ def tapered(mesh: Mesh, low: float, high: float, factor: float) -> Mesh:
 
 
 def pane(start: Coordinates, end: Coordinates, width: float, thickness: float = 0.04) -> Mesh:
-    """Return a slab between two points (x, z), for example a windscreen; the width is along y."""
+    """Return a slab between two points (x, z), for example a windscreen; the width is along y.
+
+    All vectors here are (x, z), in the plane of the slab's outline.
+    """
     x, z = np.subtract(end, start) / np.linalg.norm(np.subtract(end, start))
     # Half the thickness, perpendicular to the line from start to end.
     across = thickness / 2 * point(-z, x)
@@ -165,6 +169,7 @@ class _Kind(NamedTuple):
     waves: tuple[int, ...] = (5,)
     frequency: tuple[float, float] = (2, 8)  # of the pattern, in radians per unit
     contrast: tuple[float, float] = (0.05, 0.2)  # of the pattern
+    two_hues: bool = False  # else the pattern's second colour is a darker shade of the first
 
 
 _MUTED = (0, 0.8)  # saturation of painted and woven surfaces
@@ -183,6 +188,7 @@ _KINDS = (
         waves=(1, 2, 5),
         frequency=(3, 14),
         contrast=(0.3, 1),
+        two_hues=True,
     ),
     # plastic
     _Kind(0.23, ANY_HUE, (0, 0.9), _NO_EXTREMES, (0.15, 0.4), specular=0.05),
@@ -227,9 +233,9 @@ def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
     """Draw a material of a kind: two sRGB colours that sine waves through the object mix."""
     colour = random_colour(rng, kind.hue, kind.saturation, kind.value)
     second = random_colour(rng, kind.hue, kind.saturation, kind.value)
-    # Only printed paint, the kind with a choice of waves, has a second hue; the second colour of
-    # other kinds is a darker shade of the first.
-    if len(kind.waves) == 1:
+    # The second colour is drawn for all kinds: without the draw, those of one hue would get other
+    # random numbers from here on, and seeds other objects.
+    if not kind.two_hues:
         second = 0  # black
     mixed = colour + rng.uniform(*kind.contrast) * (second - colour)
     # The wave vectors (k, 3) have one length.
@@ -247,5 +253,8 @@ def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
         return (colour + share * (mixed - colour)).astype(np.float32)
 
     return Material(
-        np.ones(4), pattern=pattern, specular=kind.specular, roughness=rng.uniform(*kind.roughness)
+        colour=np.ones(4),
+        pattern=pattern,
+        specular=kind.specular,
+        roughness=rng.uniform(*kind.roughness),
     )

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 TAU = 2 * np.pi
-Coordinates = Sequence | np.ndarray  # of a point (3,), or of the points of an outline (n, 2)
+# Of a point (3,), of a point (2,) in the plane of an outline, or of an outline's points (n, 2).
+Coordinates = Sequence | np.ndarray
 # Radius where a lathe's profile meets the axis; zero would give triangles without an area.
 _ON_AXIS = 1e-4
 # The plane of an outline: indices of the outline's two axes, and of the axis of the thickness.

@@ -35,7 +35,7 @@ WEIGHT_DECAY = 0.04, 0.4  # AdamW's, at the first and the last step
 LEARNING_RATE_DECAY = 1.0, 0.01  # factors of the largest rate, at the first and the last step
 # Share of the run in which the last layer is fixed; DINO fixes it in the first epoch.
 FIXED_LAST_LAYER = 0.05
-_CROPS = 3  # gives the crops random numbers of their own among those of one seed
+_CROPS = 3  # seeds the random crops with the run's seed and the step; any other number would do
 MAX_GRADIENT_NORM = 3.0  # gradients with a larger norm are scaled down to it
 
 

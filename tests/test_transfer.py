@@ -1,0 +1,142 @@
+"""Points marked on one object, found on the others: places, shifted poses, and nothing here."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from refusals import refused
+from scipy.spatial import KDTree
+from synthetic_views import CoordinateBackbone, look_at, turned
+
+from zsp_lite import Co3D, Sim3, load_backbone, transfer_points
+from zsp_lite.category import AlignedObject, CategoryAlignment
+from zsp_lite.data.co3d import SequenceData, write_co3d
+from zsp_lite.data.ground_truth import read_poses
+from zsp_lite.transfer import object_size, surface_views, transfer
+
+
+def aligned(sim3s: dict[str, Sim3]) -> CategoryAlignment:
+    """An alignment with these similarities from the objects' worlds."""
+    objects = {
+        name: AlignedObject(sim3, np.zeros(3), 1.0, None, 0.0) for name, sim3 in sim3s.items()
+    }
+    return CategoryAlignment(objects, (), {})
+
+
+def world_points(views) -> np.ndarray:
+    """The points of a surface in the object's world."""
+    return views[0].sim3.inverse().apply(np.concatenate([view.points for view in views]))
+
+
+@pytest.fixture(scope="module")
+def samples():
+    """Surfaces of a car; of the same car from other frames, with a pose that is wrong by 0.08 of
+    its size; and of a chair."""
+    dataset = Co3D("data_samples")
+    backbone = load_backbone()
+
+    def surface(category, name, count, shift=0.0):
+        pose = read_poses(dataset.root, category)[name]
+        sim3 = Sim3(pose.scale, pose.R, pose.t).inverse()
+        moved = aligned({name: Sim3(1.0, np.eye(3), np.array([shift, 0, 0])) @ sim3})
+        return surface_views(moved, dataset, category, name, backbone, count)
+
+    car = surface("car", "suv", 3)
+    shift = 0.08 * object_size(car)
+    return car, surface("car", "suv", 5, shift), surface("chair", "plaid_chair", 3)
+
+
+def test_features_find_the_places_that_a_shifted_pose_misses(samples):
+    car, shifted, _ = samples
+    marks = world_points(car)
+    found = transfer(marks, car, shifted)
+    # Worlds and object are the same: each mark is its own true place.
+    size = object_size(car) / car[0].sim3.scale
+    errors = np.linalg.norm(found.world - marks, axis=1) / size
+    nearest = KDTree(np.concatenate([view.points for view in shifted])).query(
+        np.concatenate([view.points for view in car])
+    )[1]
+    misses = np.linalg.norm(world_points(shifted)[nearest] - marks, axis=1) / size
+    assert np.median(misses) > 0.06
+    assert np.median(errors) < 0.03
+    assert found.found.mean() > 0.95
+
+
+def test_nothing_is_found_where_nothing_is_near_or_alike(samples):
+    car, _, chair = samples
+    marks = world_points(car)
+    assert transfer(marks, car, chair).found.mean() < 0.4
+
+    far = marks + [0, 0, 0.3 * object_size(car) / car[0].sim3.scale]
+    above = transfer(far, car, car)
+    missed = above.distance > 0.15
+    assert missed.any()
+    assert_array_equal(above.confidence[missed], 0)
+    assert not above.found[missed].any()
+
+
+def test_points_of_a_copy_in_another_world_are_the_same_points(samples, tmp_path):
+    car, *_ = samples
+    dataset = Co3D("data_samples")
+    frames = [dataset.load(dataset.frame("car", "suv", view.number)) for view in car]
+    to_copy = Sim3(1.3, look_at((0.3, -1, 0.4)).R, np.zeros(3))
+    copies = []
+    for frame in frames:
+        camera = turned(frame.camera, to_copy.R)
+        camera = replace(camera, t=to_copy.scale * camera.t)
+        copies.append(replace(frame, camera=camera, depth=frame.depth * np.float32(to_copy.scale)))
+    marks = world_points(car)[::9]
+    times = range(len(frames))
+    grey = np.full(marks.shape, 128, np.uint8)
+    sequences = [
+        SequenceData("suv", frames, times, marks, grey),
+        SequenceData("copy", copies, times, to_copy.apply(marks), grey),
+    ]
+    write_co3d(tmp_path, "car", sequences, quality=100)
+
+    sim3 = car[0].sim3
+    alignment = aligned({"suv": sim3, "copy": sim3 @ to_copy.inverse()})
+    places = transfer_points(alignment, Co3D(tmp_path), "car", "suv", marks)
+    assert list(places) == ["copy"]
+    found = places["copy"]
+    errors = sim3.scale / to_copy.scale * np.linalg.norm(found.world - to_copy.apply(marks), axis=1)
+    spacing = KDTree(car[0].points).query(car[0].points, k=2)[0][:, 1]  # of patches
+    assert errors.max() < np.median(spacing)
+    assert found.confidence.shape == found.found.shape == (len(marks),)
+    assert found.found.all()
+
+
+def test_no_points_have_no_places(samples):
+    car, shifted, _ = samples
+    found = transfer(np.zeros((0, 3)), car, shifted)
+    assert found.world.shape == (0, 3)
+    assert found.confidence.shape == (0,)
+
+
+def test_wrong_points_sequences_and_frames_are_refused(samples, ellipsoids, tmp_path):
+    car, shifted, _ = samples
+    refused(
+        r"points has shape \(2,\), expected real numbers of shape \(n, 3\)",
+        transfer,
+        [0, 1],
+        car,
+        shifted,
+    )
+    refused("points have values that are not finite", transfer, [[0, 0, np.nan]], car, shifted)
+
+    alignment = aligned(dict.fromkeys("ab", Sim3.identity()))
+    backbone = CoordinateBackbone()
+    marks = np.zeros((1, 3))
+    refused(
+        "sequence is 'c', expected one of a, b",
+        transfer_points, alignment, ellipsoids, "ellipsoid", "c", marks, backbone,
+    )  # fmt: skip
+
+    frame = ellipsoids.load(ellipsoids.frame("ellipsoid", "a", 0))
+    blind = replace(frame, depth=np.zeros_like(frame.depth))
+    write_co3d(tmp_path, "ellipsoid", [SequenceData("a", [blind], [0], marks, marks.astype("u1"))])
+    refused(
+        "ellipsoid/a: none of 1 frames shows the object with depth",
+        surface_views, alignment, Co3D(tmp_path), "ellipsoid", "a", backbone,
+    )  # fmt: skip

@@ -1,0 +1,66 @@
+"""The commands `challenge make` and `challenge rank`."""
+
+import click
+
+from zsp_lite.cli.common import COUNT, NAMES, PATH, examples
+
+
+@click.group(
+    no_args_is_help=False,
+    epilog=examples(
+        "challenge make --secret 'a long sentence' --categories car,chair --out challenge",
+        "challenge rank handins --keep challenge/keep --out ranking",
+    ),
+)
+def challenge() -> None:
+    """Set a class a problem that nobody has seen, and rank what it hands in."""
+
+
+@challenge.command(
+    epilog=examples(
+        "challenge make --secret 'a long sentence' --categories car,chair --out challenge"
+    )
+)
+@click.option("--secret", required=True, help="At least 8 characters; gives all random draws.")
+@click.option("--categories", type=NAMES, required=True, help="Of `zsp-lite synth --category`.")
+@click.option("--sequences", type=click.IntRange(2, 900), default=6, help="Objects of each.")
+@click.option("--frames", type=click.IntRange(5, 1000), default=24, help="Frames of each object.")
+@click.option("--pairs", type=COUNT, default=200, help="Pairs in all.")
+@click.option("--out", type=PATH, required=True, help="New folder; gets give/ and keep/.")
+def make(secret, categories, sequences, frames, pairs, out) -> None:
+    """Render objects: OUT/give for students, without labels, and OUT/keep for yourself."""
+    from zsp_lite.course.challenge.make import make_challenge
+
+    make_challenge(secret, categories, out, sequences, frames, pairs)
+    print(f"Written: {out / 'give'} for students, {out / 'keep'} with the labels")
+
+
+@challenge.command(epilog=examples("challenge rank handins --keep challenge/keep --out ranking"))
+@click.argument("handins", type=PATH)
+@click.option("--keep", type=PATH, required=True, help="Folder keep/ of the challenge.")
+@click.option("--out", type=PATH, required=True, help="Folder of the ranking.")
+@click.option("--workers", type=COUNT, default=2, help="Hand-ins that run at the same time.")
+@click.option("--minutes", type=COUNT, default=10, help="Time limit of a hand-in.")
+@click.option("--pair-seconds", type=COUNT, default=20, help="Time limit of it for a pair.")
+@click.option("--memory", type=COUNT, default=4, help="Limit of its memory in GB (Linux).")
+def rank(handins, keep, out, workers, minutes, pair_seconds, memory) -> None:
+    """Run TEAM.py and read TEAM.csv of the folder HANDINS, and rank the teams by Acc30.
+
+    Each file runs alone, without labels or network where the system allows (Linux). OUT gets
+    ranking.html for the projector, and ranking.csv.
+    """
+    from zsp_lite.cli.terminal import print_rows
+    from zsp_lite.course.challenge import rank as ranking
+
+    standings = ranking.rank(handins, keep, out, workers, minutes, pair_seconds, memory)
+    columns = ("team", "place", "Acc30 (%)", "95 % interval", "answered")
+    rows = []
+    for one in standings:
+        answered = f"{one.answered} of {one.pairs}"
+        interval = f"{one.low:.1f} to {one.high:.1f}"
+        rows.append((one.team, str(one.place), f"{one.acc30:.1f}", interval, answered))
+    print_rows("Ranking", columns, rows)
+    for one in standings:
+        if one.note:
+            print(f"{one.team}: {one.note}")
+    print(f"Written: {out / 'ranking.html'}, ranking.csv")

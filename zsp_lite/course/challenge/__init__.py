@@ -1,0 +1,1 @@
+"""A challenge for a class: objects that nobody has seen, and a ranking of hand-ins."""

@@ -1,0 +1,92 @@
+"""Answer the pairs of a challenge by one hand-in, in the process that `rank` starts for it."""
+
+import csv
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from zsp_lite.backbones.load import as_backbone
+from zsp_lite.benchmark.methods import Method, make_extractors, resolve
+from zsp_lite.benchmark.own import fails_alone, problem_of_own
+from zsp_lite.benchmark.problem import FrameStore, PairProblem
+from zsp_lite.benchmark.run import ask
+from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.errors import InputError, describe_failure
+from zsp_lite.threads import one_thread
+
+_LARGEST_FILE = 1 << 28  # bytes
+COLUMNS = ("pair", "target_frame", "rotation", "translation", "scale")
+
+
+def answer(handin: Path, data: Path, questions: Path, out: Path, row_seconds: int) -> None:
+    """Write the poses of all pairs, each as soon as it is found.
+
+    Failed pairs have no line; their first reason is printed.
+    """
+    with questions.open(newline="", encoding="utf-8") as file:
+        keys = dict.fromkeys(line["pair"] for line in csv.DictReader(file))
+    method, backbone = _load(handin)
+    store = FrameStore(Co3D(data), make_extractors(backbone, {"hand-in": method}), threads=1)
+    failures = []
+    with out.open("w", newline="", encoding="utf-8") as file, one_thread():
+        lines = csv.writer(file)
+        lines.writerow(COLUMNS)
+        for key in keys:
+            problem = PairProblem(Pair.from_key(key), store, {method.features} - {"none"})
+            try:
+                with fails_alone(row_seconds):
+                    seen = problem_of_own(method.solve, problem) if method.solve else problem
+                    found = ask(method, seen)
+                frame = problem.pair.target_frames[found.view]
+            except (InputError, IndexError) as error:
+                failures.append(f"{key}: {error}")
+                continue
+            position = [] if found.translation is None else found.translation
+            scale = "" if found.scale is None else found.scale
+            lines.writerow([key, frame, _numbers(found.rotation), _numbers(position), scale])
+            file.flush()
+    if failures:
+        print(f"{len(failures)} of {len(keys)} pairs failed; the first: {failures[0]}")
+
+
+def _load(handin: Path) -> tuple[Method, object]:
+    """Import a hand-in; return its row and its backbone, each the library's if it has none."""
+    spec = importlib.util.spec_from_file_location("handin", handin)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["handin"] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # a module may raise anything
+        raise InputError(f"{handin.name} cannot be imported: {describe_failure(error)}") from error
+    backbone = getattr(module, "backbone", None)
+    if hasattr(module, "method"):
+        method = resolve({"hand-in": module.method})["hand-in"]
+    elif backbone is None:
+        raise InputError(f"{handin.name} defines neither `method` nor `backbone`, expected one")
+    else:
+        masked = getattr(backbone, "has_saliency", True) is False
+        method = Method(settings={"foreground": "mask"} if masked else {})
+    return method, as_backbone("zsp-tiny" if backbone is None else backbone)
+
+
+def _numbers(values: np.ndarray) -> str:
+    return " ".join(repr(float(value)) for value in np.ravel(values))
+
+
+def main(handin: str, data: str, questions: str, out: str, row_seconds: str, memory: str) -> None:
+    """Limit the memory of this process to a number of bytes where the system can, and answer."""
+    if sys.platform == "linux":
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_DATA, (int(memory), int(memory)))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (_LARGEST_FILE, _LARGEST_FILE))
+    try:
+        answer(Path(handin), Path(data), Path(questions), Path(out), int(row_seconds))
+    except InputError as error:
+        sys.exit(str(error))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

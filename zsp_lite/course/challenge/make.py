@@ -1,0 +1,103 @@
+"""Make a challenge: a folder to give to students, and one to keep."""
+
+import hashlib
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from zsp_lite.course.synthetic.categories import CATEGORIES
+from zsp_lite.course.synthetic.export import export_categories
+from zsp_lite.data.annotations import FRAMES_FILE, SEQUENCES_FILE
+from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.exchange import write_questions
+from zsp_lite.data.pairs import category_pairs
+from zsp_lite.errors import InputError, check_choice
+from zsp_lite.io.files import write_atomic
+
+SETTINGS_FILE = "challenge.json"  # in the folder that is kept
+TARGETS = 5  # target views of a pair
+_SHORTEST = 8  # characters of a secret; shorter ones are soon guessed
+# Of all files that are given, the first second of 2000: times of rendering tell nothing then.
+_TIME = 946_684_800
+_RULES = Path(__file__).with_name("rules.md")
+_STARTER = Path(__file__).with_name("starter.py")
+
+
+class Challenge(msgspec.Struct):
+    """Settings of a challenge, without its secret."""
+
+    pairs: dict[str, int]  # number of pairs by category
+    targets: int = TARGETS
+
+
+def make_challenge(
+    secret: str,
+    categories: Sequence[str],
+    out: str | Path,
+    sequences: int = 6,
+    frames: int = 24,
+    pairs: int = 200,
+) -> None:
+    """Render objects from a secret, into OUT/give without labels and into OUT/keep with them.
+
+    Args:
+        secret: Any text of at least eight characters; who knows it can render the objects.
+        categories: Names of the categories.
+        out: New folder.
+        sequences: Number of objects of each category.
+        frames: Number of frames of each object.
+        pairs: Number of pairs, in equal parts of each category.
+
+    Raises:
+        InputError: For a short secret, an unknown category, or a folder that has other files.
+    """
+    if len(secret) < _SHORTEST:
+        raise InputError(
+            f"the secret has {len(secret)} characters, expected at least {_SHORTEST}: it could be "
+            "guessed"
+        )
+    for category in categories:
+        check_choice("category", category, CATEGORIES)
+    out = Path(out)
+    if out.exists() and any(out.iterdir()):
+        raise InputError(f"folder {out} is not empty, expected a new one")
+
+    # Slow on purpose: a guess costs a tenth of a second, so that no dictionary can be tried.
+    salt = b"zsp-lite challenge"
+    key = hashlib.scrypt(secret.encode(), salt=salt, n=1 << 15, r=8, p=1, maxmem=1 << 26, dklen=7)
+    kept = out / "keep" / "data"
+    export_categories(categories, kept, sequences, frames, int.from_bytes(key))
+    challenge = Challenge(dict.fromkeys(categories, -(-pairs // len(categories))))
+    write_atomic(out / "keep" / SETTINGS_FILE, msgspec.json.encode(challenge))
+
+    given = out / "give"
+    copy_without_labels(kept, given / "data")
+    write_questions(given / "pairs.csv", Co3D(given / "data"), asked_pairs(kept, challenge))
+    shutil.copyfile(_RULES, given / "rules.md")
+    shutil.copyfile(_STARTER, given / "starter.py")
+    for path in [*given.rglob("*"), given]:
+        os.utime(path, (_TIME, _TIME))
+
+
+def asked_pairs(data: str | Path, challenge: Challenge) -> list[Pair]:
+    """Return the pairs of a challenge."""
+    dataset = Co3D(data)
+    return [
+        pair
+        for category, count in challenge.pairs.items()
+        for pair in category_pairs(dataset, category, count, challenge.targets)
+    ]
+
+
+def copy_without_labels(data: Path, out: Path) -> None:
+    """Copy annotations, images, depth, masks and point clouds of a data folder, nothing else."""
+    for category in Co3D(data).categories():
+        annotations = [data / category / name for name in (FRAMES_FILE, SEQUENCES_FILE)]
+        media = [path for path in (data / category).glob("*/**/*") if path.is_file()]
+        for path in annotations + media:
+            copy = out / path.relative_to(data)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copy)

@@ -1,0 +1,255 @@
+"""Rank hand-ins of a challenge: each runs in a process of its own, which sees no labels."""
+
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from jinja2 import Environment, StrictUndefined
+
+from zsp_lite.benchmark.statistics import figures_of, object_draws, paired_difference
+from zsp_lite.course.challenge.answer import COLUMNS
+from zsp_lite.course.challenge.make import (
+    SETTINGS_FILE,
+    Challenge,
+    asked_pairs,
+    copy_without_labels,
+)
+from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.exchange import StoredPose, read_stored_poses, write_questions
+from zsp_lite.data.pairs import true_poses
+from zsp_lite.errors import InputError
+from zsp_lite.io.files import read_json, write_atomic
+from zsp_lite.metrics import rotation_error
+
+_SIGNIFICANT = 0.05  # a difference with a smaller p value is not left to chance
+_LONGEST_NOTE = 200  # characters
+_PAGE = Path(__file__).with_name("ranking.html")
+# Variables of the environment that a hand-in gets.
+_PASSED = ("PATH", "PYTHONPATH", "SYSTEMROOT", "LANG", "TMPDIR")
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A line of the ranking."""
+
+    place: int  # shared by teams whose difference to the first of them may be chance
+    team: str
+    acc30: float  # percent
+    low: float  # ends of the 95 % interval, by bootstrap over objects
+    high: float
+    answered: int  # pairs with a pose
+    pairs: int
+    note: str  # why pairs have none; "" if all have
+
+
+def rank(
+    handins: str | Path,
+    keep: str | Path,
+    out: str | Path,
+    workers: int = 2,
+    minutes: float = 10,
+    pair_seconds: int = 20,
+    memory: float = 4,
+) -> list[Standing]:
+    """Run and rank the hand-ins of a folder, and write OUT/ranking.csv and OUT/ranking.html.
+
+    On Linux a hand-in sees neither `keep` nor `handins` nor `out`, and has no network, where users
+    may make namespaces; elsewhere it is only not told where they are.
+
+    Args:
+        handins: Folder with a file TEAM.py or TEAM.csv of each team.
+        keep: Folder that `make_challenge` wrote.
+        out: Folder to write.
+        workers: Hand-ins that run at the same time.
+        minutes: Time limit of a hand-in.
+        pair_seconds: Time limit of a hand-in for a pair.
+        memory: Limit of its memory in gigabytes, on Linux.
+
+    Raises:
+        InputError: `keep` holds no challenge, or `handins` no hand-in, or two of one team.
+    """
+    handins = Path(handins)
+    keep = Path(keep)
+    out = Path(out)
+    challenge = read_json(keep / SETTINGS_FILE, Challenge, "challenge")
+    files = sorted(path for path in handins.glob("*") if path.suffix in (".py", ".csv"))
+    teams = {path.stem: path for path in files}
+    if not files or len(teams) < len(files):
+        raise InputError(
+            f"{handins} has {len(files)} hand-ins of {len(teams)} teams, expected one of each, "
+            "TEAM.py or TEAM.csv"
+        )
+    pairs = asked_pairs(keep / "data", challenge)
+    poses = out / "poses"
+    poses.mkdir(parents=True, exist_ok=True)
+    hidden = [path.resolve() for path in (keep, handins, out)]
+    with TemporaryDirectory(prefix="challenge-") as given:
+        copy_without_labels(keep / "data", Path(given, "data"))
+        questions = write_questions(Path(given, "pairs.csv"), Co3D(keep / "data"), pairs)
+
+        def run(team: str) -> str:
+            source, target = teams[team], poses / f"{team}.csv"
+            if source.suffix == ".csv":
+                shutil.copyfile(source, target)
+                return ""
+            limits = (minutes, pair_seconds, int(memory * 1e9))
+            return _run_alone(source, questions, target, hidden, limits)
+
+        with ThreadPoolExecutor(workers) as pool:
+            notes = dict(zip(teams, pool.map(run, teams), strict=True))
+
+    standings = _standings(keep / "data", pairs, poses, notes)
+    _write(standings, out)
+    return standings
+
+
+def _run_alone(
+    source: Path, questions: Path, target: Path, hidden: Sequence[Path], limits: tuple
+) -> str:
+    """Run a hand-in in an empty folder; return the last line that it printed, or why it ended."""
+    minutes, pair_seconds, memory = limits
+    with TemporaryDirectory(prefix="hand-in-") as folder:
+        alone = Path(shutil.copy(source, folder))
+        found = Path(folder, "poses.csv")
+        words = [alone, questions.with_name("data"), questions, found, pair_seconds, memory]
+        command = [sys.executable, "-m", "zsp_lite.course.challenge.answer", *map(str, words)]
+        environment = {name: os.environ[name] for name in _PASSED if name in os.environ}
+        environment |= {"HOME": folder, "OMP_NUM_THREADS": "1"}
+        # A file, not a pipe: what a hand-in starts may hold a pipe open, or fill the memory by it.
+        with Path(folder, "printed.txt").open("w+b") as printed:
+            process = subprocess.Popen(
+                _hiding(hidden) + command,
+                cwd=folder,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=printed,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+            try:
+                code = process.wait(timeout=60 * minutes)
+                problem = f"ended abruptly, exit status {code}" if code else ""
+            except subprocess.TimeoutExpired:
+                problem = f"ended after {minutes:g} minutes"
+            finally:
+                _end(process)
+            printed.seek(max(0, printed.seek(0, os.SEEK_END) - _LONGEST_NOTE))
+            lines = printed.read().decode(errors="replace").strip().splitlines()
+        if found.is_file():
+            shutil.copyfile(found, target)
+        else:
+            target.write_text(",".join(COLUMNS) + "\n")
+    return "; ".join([*filter(None, [problem]), *lines[-1:]])
+
+
+def _hiding(folders: Sequence[Path]) -> list[str]:
+    """Return the words before a command that hide folders and the network from it; none where the
+    system has no namespaces for users."""
+    # In a second namespace of users the command has no right to unmount what the first mounted. A
+    # namespace of processes ends all of them with the first.
+    outer = ["unshare", "--map-root-user", "--mount", "--net", "--pid", "--fork", "--kill-child"]
+    mounts = [f"mount -t tmpfs none {shlex.quote(str(folder))}" for folder in folders]
+    inner = 'exec unshare --map-root-user --mount "$@"'
+    words = [*outer, "--mount-proc", "sh", "-c", " && ".join([*mounts, inner]), "sh"]
+    try:
+        subprocess.run([*words, "true"], check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        return []
+    return words
+
+
+def _end(process: subprocess.Popen) -> None:
+    """End a process and all of its group."""
+    with suppress(ProcessLookupError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
+    process.wait()
+
+
+def _standings(
+    data: Path, pairs: Sequence[Pair], poses: Path, notes: Mapping[str, str]
+) -> list[Standing]:
+    """Sort the teams by Acc30, and join those whose difference may be chance."""
+    objects = [
+        [f"{pair.category}/{name}" for name in (pair.reference_sequence, pair.target_sequence)]
+        for pair in pairs
+    ]
+    drawn = object_draws(objects, [pair.category for pair in pairs])
+    errors = {}
+    answered = {}
+    problems = {}
+    for team, note in notes.items():
+        try:
+            stored, _ = read_stored_poses(poses / f"{team}.csv")
+        except InputError as error:
+            stored = {}
+            note = note or str(error)
+        # In the order of the pairs; an answer for a frame that was not asked for is none.
+        answers = {pair: stored[pair.key] for pair in pairs if pair.key in stored}
+        for pair in list(answers):
+            if answers[pair].target_frame not in pair.target_frames:
+                del answers[pair]
+        errors[team] = _errors(data, pairs, answers)
+        answered[team] = len(answers)
+        problems[team] = note
+    figures = {team: figures_of(error, drawn) for team, error in errors.items()}
+
+    standings = []
+    first = ""  # of the teams that share a place
+    for position, team in enumerate(sorted(figures, key=lambda team: -figures[team]["acc30"]), 1):
+        if first:
+            gain = paired_difference(errors[team], errors[first], weights=drawn)
+        if not first or gain["accuracy_gain_p"] < _SIGNIFICANT:
+            first = team
+            place = position
+        low, high = figures[team]["acc30_ci"]
+        standings.append(
+            Standing(
+                place,
+                team,
+                figures[team]["acc30"],
+                low,
+                high,
+                answered[team],
+                len(pairs),
+                problems[team],
+            )
+        )
+    return standings
+
+
+def _errors(
+    data: Path, pairs: Sequence[Pair], answers: Mapping[Pair, StoredPose]
+) -> Float[np.ndarray, " n"]:
+    """Compute the error of each pair's rotation in degrees; 180 without an answer."""
+    errors = np.full(len(pairs), 180.0)
+    if answers:
+        views = [pair.target_frames.index(pose.target_frame) for pair, pose in answers.items()]
+        truths = true_poses(data, list(answers), np.array(views))
+        rotations = np.stack([pose.rotation for pose in answers.values()])
+        answered = [pair in answers for pair in pairs]
+        errors[answered] = rotation_error(rotations, truths[:, :3, :3])
+    return errors
+
+
+def _write(standings: Sequence[Standing], out: Path) -> None:
+    """Write the ranking as a table and as a page for the projector."""
+    table = pd.DataFrame([asdict(standing) for standing in standings])
+    write_atomic(out / "ranking.csv", table.to_csv(index=False, lineterminator="\n").encode())
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    page = environment.from_string(_PAGE.read_text("utf-8"))
+    write_atomic(out / "ranking.html", page.render(standings=standings).encode())

@@ -1,0 +1,98 @@
+"""What the lesson on hypotheses computes beside the library: a full turn of a pose, and the answers
+of several objects."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from zsp_lite.align import read_hypotheses
+from zsp_lite.category import SAME_ANGLE, PairHypotheses
+from zsp_lite.metrics import rotation_angle
+from zsp_lite.verified.poses import Poses
+from zsp_lite.verified.solver import Solution
+from zsp_lite.verified.verification import ScoreCoefficients, score_terms
+
+_Rotations = Mapping[str, Float[np.ndarray, "3 3"]]  # of objects, by their names
+
+
+def full_turn(
+    solution: Solution, step: float = 5.0
+) -> tuple[Float[np.ndarray, " n"], Poses, Float[np.ndarray, " n"]]:
+    """Turn the best pose of a solution by a full circle, about the axis that leads to the second.
+
+    Returns the angles in degrees, the turned poses, and their scores.
+    """
+    best = solution.poses[[0]]
+    first, second = (solution.poses.rotation[k].double().numpy() for k in (0, 1))
+    axis = cv2.Rodrigues(second @ first.T)[0]
+    axis = axis / np.linalg.norm(axis)
+    degrees = np.arange(0, 360 + step, step)
+    matrices = [cv2.Rodrigues(np.radians(angle) * axis)[0] for angle in degrees]
+    turns = torch.from_numpy(np.stack(matrices)).float()
+    # The turn is about the origin of the scene, which is amid the object.
+    shift = (turns @ best.translation[..., None])[..., 0]
+    turned = Poses(best.scale.expand(len(turns)), turns @ best.rotation, shift)
+    scores = ScoreCoefficients().score(score_terms(solution.scene, turned))
+    return degrees, turned, scores.numpy()
+
+
+def draw_answers(run: str | Path, seed: int) -> list[PairHypotheses]:
+    """Draw one stored answer for each ordered pair of objects, of those from several frames."""
+    answers: dict[tuple[str, str], list[PairHypotheses]] = {}
+    for answer in read_hypotheses(run).values():
+        answers.setdefault((answer.reference, answer.target), []).append(answer)
+    rng = np.random.default_rng(seed)
+    return [several[rng.integers(len(several))] for several in answers.values()]
+
+
+def spanning_tree(answers: Sequence[PairHypotheses]) -> dict[str, Float[np.ndarray, "3 3"]]:
+    """Place one object after the other by the surest answer that leads to it.
+
+    Returns the rotation from each object's world to that of the first.
+    """
+    names = sorted({name for one in answers for name in (one.reference, one.target)})
+    placed = {names[0]: np.eye(3)}
+    while len(placed) < len(names):
+        leading = [one for one in answers if (one.reference in placed) != (one.target in placed)]
+        surest = max(leading, key=lambda one: one.probabilities[0])
+        turn = surest.sim3s[0].R
+        if surest.reference in placed:
+            placed[surest.target] = placed[surest.reference] @ turn.T
+        else:
+            placed[surest.reference] = placed[surest.target] @ turn
+    return {name: placed[name] for name in names}
+
+
+def right_answers(
+    answers: Sequence[PairHypotheses], truth: _Rotations, rotations: _Rotations | None = None
+) -> dict[tuple[str, str], bool | None]:
+    """Say of each ordered pair whether its answer is right: its surest one, or with `rotations` the
+    one that fits them.
+
+    `truth` and `rotations` lead from the objects' worlds to a common frame. None where no
+    hypothesis of a pair fits.
+    """
+    right: dict[tuple[str, str], bool | None] = {}
+    for one in answers:
+        a, b = one.reference, one.target
+        turns = np.stack([sim3.R for sim3 in one.sim3s])
+        off = rotation_angle(turns, truth[b].T @ truth[a])
+        chosen = 0
+        if rotations is not None:
+            away = rotation_angle(turns, rotations[b].T @ rotations[a])
+            chosen = int(away.argmin())
+            if away[chosen] > SAME_ANGLE:
+                right[a, b] = None
+                continue
+        right[a, b] = bool(off[chosen] < SAME_ANGLE)
+    return right
+
+
+def all_alike(truth: _Rotations, rotations: _Rotations) -> bool:
+    """Whether rotations from the objects' worlds turn all objects the same way."""
+    frames = np.stack([rotations[name] @ truth[name].T for name in truth])
+    return bool((rotation_angle(frames[0], frames) < SAME_ANGLE).all())

@@ -1,0 +1,130 @@
+"""Pictures of the lessons: a curve above what it measures, a graph of objects, winners as dots."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch
+
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.metrics import rotation_angle
+from zsp_lite.views import object_crop
+from zsp_lite.viz.plots import BLUE, GREEN, VERMILLION, draw_image
+
+# Pictures stand on a circle of radius 1; half the width of a picture, and how far from its middle
+# arrows end.
+_PICTURE = 0.34
+_ENDS = 0.42
+_ARROWS = {True: (GREEN, "-"), False: (VERMILLION, "--"), None: ("0.6", ":")}
+
+
+def curve_above_pictures(
+    curve: tuple[np.ndarray, np.ndarray],
+    pictures: Mapping[float, np.ndarray],
+    title: str = "x = {:.0f}",
+    **labels: Any,
+) -> tuple[Figure, list[Axes]]:
+    """Show a curve (x, y) with dots at some x, and below it one picture for each of these x.
+
+    `title` is formatted with x; `labels` is what `Axes.set` takes. Returns the figure and the axes
+    of the pictures.
+    """
+    places = list(pictures)
+    figure = plt.figure(figsize=(7.4, 5.2), layout="constrained")
+    grid = figure.add_gridspec(2, len(places), height_ratios=(1, 1.15))
+    above = figure.add_subplot(grid[0, :])
+    above.plot(*curve)
+    above.plot(places, np.interp(places, *curve), "o", color=VERMILLION, markersize=9)
+    above.set(**labels)
+    axes = []
+    for column, (place, picture) in enumerate(pictures.items()):
+        axis = figure.add_subplot(grid[1, column])
+        axis.set_axis_off()
+        axis.set_title(title.format(place), fontsize=10)
+        draw_image(axis, picture)
+        axes.append(axis)
+    return figure, axes
+
+
+def show_graphs(
+    graphs: Mapping[str, tuple[Mapping[str, np.ndarray], Mapping[tuple[str, str], bool | None]]],
+) -> Figure:
+    """Show for each title named pictures on a circle, with arrows between them.
+
+    An arrow is green if it is true, red and dashed if it is false, grey and dotted if it is None.
+    """
+    size = (4.1 * len(graphs), 4.4)
+    figure, axes = plt.subplots(1, len(graphs), figsize=size, layout="constrained", squeeze=False)
+    for axis, (title, (pictures, arrows)) in zip(axes.flat, graphs.items(), strict=True):
+        angles = np.pi * (0.75 + 2 * np.arange(len(pictures)) / len(pictures))
+        centres = dict(zip(pictures, np.column_stack([np.cos(angles), np.sin(angles)])))
+        for name, picture in pictures.items():
+            x, y = centres[name]
+            box = (x - _PICTURE, x + _PICTURE, y - _PICTURE, y + _PICTURE)
+            axis.imshow(picture, extent=box, zorder=2)
+            axis.text(x, y - _PICTURE, name, ha="center", va="top", fontsize=9, parse_math=False)
+        for (start, end), right in arrows.items():
+            axis.add_patch(_arrow(centres[start], centres[end], *_ARROWS[right]))
+        axis.set(xlim=(-1.1, 1.1), ylim=(-1.15, 1.1), aspect="equal", title=title)
+        axis.set_axis_off()
+    return figure
+
+
+def alike(
+    dataset: Co3D, category: str, rotations: Mapping[str, np.ndarray], first: str
+) -> dict[str, np.ndarray]:
+    """Return for each object the picture that is nearest to the first frame of one of them.
+
+    `rotations` lead from the objects' worlds to a common frame: if they are right, all objects are
+    seen from the same side.
+    """
+    camera = dataset.camera(dataset.frames(category, first)[0]).R
+    pictures = {}
+    for name, rotation in rotations.items():
+        frames = dataset.frames(category, name)
+        wanted = camera @ rotations[first].T @ rotation
+        seen = np.stack([dataset.camera(frame).R for frame in frames])
+        nearest = int(np.argmin(rotation_angle(seen, wanted)))
+        pictures[name] = object_crop(dataset.load(frames[nearest])).rgb
+    return pictures
+
+
+def _arrow(start: np.ndarray, end: np.ndarray, colour: str, line: str) -> FancyArrowPatch:
+    """Return a curved arrow between the borders of two pictures, so that two opposite ones can be
+    told apart."""
+    along = (end - start) / np.linalg.norm(end - start)
+    return FancyArrowPatch(
+        start + _ENDS * along,
+        end - _ENDS * along,
+        arrowstyle="-|>",
+        mutation_scale=16,
+        connectionstyle="arc3,rad=0.12",
+        color=colour,
+        linestyle=line,
+        linewidth=2.2,
+        zorder=1,
+    )
+
+
+def show_winners(gains: Mapping[str, np.ndarray], true_gain: float) -> Figure:
+    """Show the measured gains of simulated benchmarks as a row of dots for each name; those in
+    which the better method does not win are red crosses."""
+    figure, axis = plt.subplots(figsize=(7.4, 0.9 + 0.75 * len(gains)), layout="constrained")
+    for row, values in enumerate(gains.values()):
+        height = row + np.linspace(-0.28, 0.28, len(values))
+        wins = np.asarray(values) > 0
+        style = {"s": 42, "edgecolors": "white", "linewidths": 0.5}
+        axis.scatter(values[wins], height[wins], color=BLUE, label="better method wins", **style)
+        style = {"s": 46, "linewidths": 2.2, "marker": "x"}
+        axis.scatter(values[~wins], height[~wins], color=VERMILLION, label="it does not", **style)
+    axis.axvline(0, color="0.3", linewidth=1)
+    axis.axvline(true_gain, color=GREEN, linestyle="--", label="true gain")
+    axis.set_yticks(range(len(gains)), gains)
+    axis.set(xlabel="measured gain (points of Acc30)", ylim=(len(gains) - 0.5, -0.5))
+    handles, names = axis.get_legend_handles_labels()
+    each = dict(zip(names, handles))
+    figure.legend(each.values(), each.keys(), ncols=3, loc="outside upper center", fontsize=9)
+    return figure

@@ -1,0 +1,248 @@
+r"""Points marked on one object, found on all other objects of an aligned category.
+
+A point goes to the common frame of the category. There its place on another object is the nearest
+point of that object's surface, after a local and smooth correction by features:
+
+1. A patch p of a source view, at the point x_p, is compared with the patches q of three views of
+   the target object from similar sides. With c_pq the cosine of their log-binned descriptors and
+   d_pq the distance of their points in sizes of the target object, its displacement is the mean of
+   x_q - x_p over the patches in a ball around x_p, weighted by exp(c_pq / 0.05 - d_pq^2 / (2 *
+   0.05^2)).
+2. The correction of a marked point is the mean displacement of the source patches around it,
+   weighted by a Gaussian of their distance, and by how similar the most similar patch is.
+
+The confidence is a logistic function of that similarity, and of the distance of the marked point to
+the surface before the correction. A part that the other object does not have is far from its
+surface or looks unlike it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
+from scipy.special import expit, softmax
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.backbones.load import BackboneLike, as_backbone
+from zsp_lite.category import CategoryAlignment
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.frames import frame_defect
+from zsp_lite.errors import InputError, check_choice, real_array
+from zsp_lite.features import log_bin
+from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.points import near_median
+from zsp_lite.views import View
+
+VIEWS = 12  # frames of an object whose patches are its surface
+_TARGET_VIEWS = 3  # views of the target that a source view is compared with
+# Lengths in sizes of the target object.
+_BALL = 0.15  # radius in which corresponding patches are sought
+_PRIOR = 0.05  # standard deviation of the distance of corresponding patches
+_SMOOTHING = 0.06  # standard deviation of the Gaussian around a marked point
+_TEMPERATURE = 0.05  # of cosines, for the patches of the target
+_SOURCE_TEMPERATURE = 0.1  # of cosines, for the patches around a marked point
+# Coefficients of the confidence: constant, cosine, and distance to the surface in sizes of the
+# object. Fitted by tools/marks.py on validation categories.
+CONFIDENCE = (-10.4, 18.4, -22.7)
+FOUND = 0.5  # least confidence of a point that is found
+
+
+@dataclass(frozen=True, eq=False)
+class TransferredPoints:
+    """The places of marked points on another object."""
+
+    world: Float[np.ndarray, "n 3"]  # points of the object's surface, in its world
+    # of the patches around each marked point, weighted mean of the highest cosine with a patch of
+    # this object; 0 or less where no patch is near
+    cosine: Float[np.ndarray, " n"]
+    distance: Float[np.ndarray, " n"]  # of the marked point to the surface, in sizes of the object
+
+    @property
+    def confidence(self) -> Float[np.ndarray, " n"]:
+        """Probability that a place is within a tenth of the object's size of the right one, if the
+        pose is right."""
+        constant, cosine, distance = CONFIDENCE
+        logit = constant + cosine * self.cosine + distance * self.distance
+        return np.where(self.distance < _BALL, expit(logit), 0.0)
+
+    @property
+    def found(self) -> Bool[np.ndarray, " n"]:
+        """Points with a confidence of at least a half; the object has nothing like the others."""
+        return self.confidence >= FOUND
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceView:
+    """The part of an object's surface that one frame shows: its patches with measured depth."""
+
+    number: int  # of the frame
+    view: View
+    sim3: Sim3  # from the object's world to the common frame
+    direction: Float[np.ndarray, "3"]  # from the object to the camera, in the common frame
+    patches: Int[np.ndarray, " n"]  # indices in the view's grid, row by row
+    points: Float[np.ndarray, "n 3"]  # in the common frame
+    descriptors: Float[torch.Tensor, "n d"]  # of length 1
+
+
+def surface_views(
+    alignment: CategoryAlignment,
+    dataset: Co3D,
+    category: str,
+    sequence: str,
+    backbone: BackboneLike = "zsp-tiny",
+    count: int = VIEWS,
+) -> list[SurfaceView]:
+    """Describe the surface of an object of an aligned category for `transfer`.
+
+    Args:
+        alignment: Poses of the objects in the common frame.
+        dataset: Data set.
+        category: Name of the category.
+        sequence: Name of the object's sequence.
+        backbone: Backbone, or what `load_backbone` takes.
+        count: Number of frames, evenly spaced over the sequence. Frames with a `frame_defect` are
+            left out.
+
+    Raises:
+        InputError: The alignment has no such object, or no frame shows its surface.
+    """
+    check_choice("sequence", sequence, alignment.objects)
+    annotations = dataset.frames(category, sequence)
+    spaced = np.unique(np.arange(count) * len(annotations) // count)
+    chosen = [annotations[k] for k in spaced]
+    frames = {one.frame_number: dataset.load(one) for one in chosen}
+    usable = {number: frame for number, frame in frames.items() if not frame_defect(frame)}
+    unmasked = any(frame.mask is None for frame in usable.values())
+    method = ZeroShotPose(as_backbone(backbone), foreground="saliency" if unmasked else "mask")
+    surface = [
+        _surface_view(number, view, alignment.objects[sequence].sim3)
+        for number, view in zip(usable, method.views(usable.values()), strict=True)
+        if view.known_foreground.any()
+    ]
+    if not surface:
+        raise InputError(
+            f"sequence {category}/{sequence}: none of {len(frames)} frames shows the object with "
+            "depth"
+        )
+    return surface
+
+
+def _surface_view(number: int, view: View, sim3: Sim3) -> SurfaceView:
+    """Gather the patches of a view."""
+    camera = view.frame.camera
+    patches = np.flatnonzero(view.known_foreground)
+    points = sim3.apply(camera.to_world(view.measured_points[0].reshape(-1, 3)[patches]))
+    near = near_median(points, 4)  # as in `points.world_cloud`
+    towards = sim3.apply(camera.centre) - np.median(points, axis=0)
+    direction = towards / np.linalg.norm(towards)
+    patches = patches[near]
+    binned = log_bin(view.features.keys[None]).flatten(0, 2)[patches]
+    descriptors = F.normalize(binned, dim=1)
+    return SurfaceView(number, view, sim3, direction, patches, points[near], descriptors)
+
+
+def object_size(views: Sequence[SurfaceView]) -> float:
+    """Return the diameter of an object in the common frame, as `Co3D.extent` defines it."""
+    points = np.concatenate([view.points for view in views])
+    low, high = np.quantile(points, (0.02, 0.98), axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def transfer(
+    points: Float[np.ndarray, "n 3"], source: Sequence[SurfaceView], target: Sequence[SurfaceView]
+) -> TransferredPoints:
+    """Find the places of marked points on another object (see the module's docstring).
+
+    Args:
+        points: Marked points, in the world of the source object.
+        source: `surface_views` of the object that the points are marked on.
+        target: `surface_views` of the other object.
+
+    Raises:
+        InputError: The points are not of shape (n, 3), or not finite.
+    """
+    marked = real_array("points", points, (None, 3))
+    if not np.isfinite(marked).all():
+        raise InputError("points have values that are not finite, expected finite coordinates")
+    marks = source[0].sim3.apply(marked)
+    size = object_size(target)
+    surface = KDTree(np.concatenate([view.points for view in target]))
+    distance, _ = surface.query(marks)
+
+    # All source patches (p, 3), with their displacements (p, 3) and highest cosines (p).
+    start = np.concatenate([view.points for view in source])
+    compared = [_compare(view, target, size) for view in source]
+    displacement = np.concatenate([displacement for displacement, _ in compared])
+    cosine = np.concatenate([cosine for _, cosine in compared])
+
+    # Their mean around each mark.
+    squared = cdist(marks, start, "sqeuclidean") / size**2  # (marks, patches)
+    logits = cosine / _SOURCE_TEMPERATURE - squared / (2 * _SMOOTHING**2)
+    weights = _softmax_within(squared, logits)
+    _, nearest = surface.query(marks + weights @ displacement)
+    places = target[0].sim3.inverse().apply(surface.data[nearest])
+    return TransferredPoints(places, weights @ cosine, distance / size)
+
+
+def _compare(
+    view: SurfaceView, target: Sequence[SurfaceView], size: float
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Compute the displacement of each patch of a source view, and its highest cosine.
+
+    They are 0 and -1 without a patch of the target in the ball.
+    """
+    similar = sorted(target, key=lambda other: other.direction @ view.direction)[-_TARGET_VIEWS:]
+    points = np.concatenate([other.points for other in similar])
+    descriptors = torch.cat([other.descriptors for other in similar])
+    cosines = (view.descriptors @ descriptors.T).double().numpy()
+    squared = cdist(view.points, points, "sqeuclidean") / size**2
+    weights = _softmax_within(squared, cosines / _TEMPERATURE - squared / (2 * _PRIOR**2))
+    displacement = weights @ points - weights.sum(axis=1, keepdims=True) * view.points
+    return displacement, np.where(squared < _BALL**2, cosines, -1).max(axis=1)
+
+
+def _softmax_within(
+    squared: Float[np.ndarray, "n m"], logits: Float[np.ndarray, "n m"]
+) -> Float[np.ndarray, "n m"]:
+    """Return the softmax of each row over the patches in the ball; 0 for a row without one."""
+    inside = squared < _BALL**2
+    return inside * softmax(np.where(inside, logits, -1e9), axis=1)
+
+
+def transfer_points(
+    alignment: CategoryAlignment,
+    dataset: Co3D,
+    category: str,
+    sequence: str,
+    points: Float[np.ndarray, "n 3"],
+    backbone: BackboneLike = "zsp-tiny",
+) -> dict[str, TransferredPoints]:
+    """Find points that are marked on one object on all other objects of an aligned category.
+
+    Args:
+        alignment: Poses of the objects in the common frame, of `align_category`.
+        dataset: Data set.
+        category: Name of the category.
+        sequence: Name of the sequence that the points are marked in.
+        points: Marked points of the object's surface, in the world of the sequence.
+        backbone: Backbone, or what `load_backbone` takes.
+
+    Returns:
+        The places of the points by the name of the object.
+
+    Raises:
+        InputError: The alignment has no such sequence, the points are not of shape (n, 3) or not
+            finite, or no frame of an object shows its surface.
+    """
+    extractor = as_backbone(backbone)
+    source = surface_views(alignment, dataset, category, sequence, extractor)
+    return {
+        name: transfer(points, source, surface_views(alignment, dataset, category, name, extractor))
+        for name in alignment.objects
+        if name != sequence
+    }
