@@ -7,6 +7,7 @@ import torch
 from numpy.testing import assert_allclose
 
 from zsp_lite import Camera
+from zsp_lite.course.view_circle import show_view_circle
 from zsp_lite.verified.scene import Projection
 from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, PointTerms
 from zsp_lite.viz import plots, point_classes
@@ -45,6 +46,16 @@ def test_lines_join_the_centres_of_matched_patches_and_those_of_outliers_are_das
     assert outlier == ((30, 30), (30, 30))
     assert set(inliers) == {((10, 10), (70, 50)), ((70, 50), (10, 10))}
     assert [line in ("-", "solid") for line in lines.values()] == [False, True, True]
+
+
+def test_the_view_with_the_best_score_is_marked_and_has_a_thumbnail():
+    turns = np.array([-170.0, -90, 5, 20, 90, 150])
+    scores = np.array([-20.0, -40, -30, -32, -41, -25])
+    circle, *thumbnails, _ = show_view_circle(IMAGE, [IMAGE] * 6, turns, scores).axes
+    assert_allclose(circle.lines[1].get_xydata(), [[np.radians(-170), -20]])
+    # Every third view in the order of the turns, from the best one.
+    assert [axis.get_title() for axis in thumbnails] == ["-20.0", "-32.0"]
+    assert thumbnails[0].texts[0].get_text() == "wins"
 
 
 @pytest.fixture

@@ -12,14 +12,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from plotly.offline import get_plotlyjs
 from synthetic_views import CoordinateBackbone
 
-from zsp_lite import Camera, Co3D
+from zsp_lite import Camera, Co3D, Sim3
 from zsp_lite.choices import SOLVERS
 from zsp_lite.course.demo import N_TARGETS, demo_pairs, run_demo
 from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 from zsp_lite.estimates import Hypothesis, PoseEstimate
 from zsp_lite.io.files import REPOSITORY
 from zsp_lite.metrics import rotation_error
-from zsp_lite.viz.plots import object_cloud
+from zsp_lite.viz.plots import object_cloud, show_residuals
 from zsp_lite.viz.report import (
     _two_poses_figure,
     overview,
@@ -168,6 +168,19 @@ def test_two_poses_are_shown_in_the_same_view(results, exact_poses):
         pixels, depth = camera.project(points)
         far_to_near = pixels[np.argsort(-depth)]
         assert_allclose(axis.collections[0].get_offsets(), far_to_near, atol=1e-6)
+
+
+def test_lines_end_at_the_partners_and_each_fit_marks_its_own_inliers(results):
+    estimate = results[0].estimate
+    source, target = estimate.points
+    views = estimate.reference_view, estimate.target_views[estimate.view]
+    fits = {"moved away": Sim3(1.0, np.eye(3), np.full(3, 50.0)), "estimate": estimate.sim3}
+    _, away, fitted = show_residuals(views, (source, target), fits).axes
+    pixels, _ = views[1].frame.camera.project(views[1].frame.camera.to_world(target))
+    inliers = np.linalg.norm(estimate.sim3.apply(source) - target, axis=1) < 0.2
+    assert_allclose(fitted.collections[3].get_offsets(), pixels[inliers])
+    assert len(away.collections[3].get_offsets()) == 0
+    assert_allclose([line[1] for line in fitted.collections[1].get_segments()], pixels)
 
 
 @pytest.fixture

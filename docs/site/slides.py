@@ -9,13 +9,11 @@ the slides show the stored results:
     ```
 
 embeds the first picture below the heading that contains these words. The path may also be that of a
-drawing, whose description becomes the alternative text. `:tiles: 3 3 8 4` cuts a picture into
-3 columns and 3 rows, and shows the first 8 tiles in 4 columns. The text of the directive `notes` is
-shown in the presenter's view only.
+drawing, whose description becomes the alternative text. The text of the directive `notes` is shown
+in the presenter's view only.
 """
 
 import base64
-import io
 import re
 from html import escape, unescape
 from pathlib import Path
@@ -24,7 +22,6 @@ import nbformat
 from docutils import nodes
 from docutils.parsers.rst import directives
 from nbformat import NotebookNode
-from PIL import Image
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
@@ -36,7 +33,7 @@ class Picture(SphinxDirective):
     alternative text."""
 
     required_arguments = 1
-    option_spec = {"heading": directives.unchanged, "tiles": directives.positive_int_list}
+    option_spec = {"heading": directives.unchanged}
 
     def run(self) -> list[nodes.Node]:
         path = (Path(self.env.doc2path(self.env.docname)).parent / self.arguments[0]).resolve()
@@ -53,8 +50,6 @@ class Picture(SphinxDirective):
             if not pictures:
                 raise self.error(f"{path.name} has no picture below the heading {heading!r}")
             form, data, alt = pictures[0]
-            if "tiles" in self.options:
-                data = arranged(data, *self.options["tiles"])
         image = f'<img src="data:{form};base64,{data}" alt="{escape(alt)}">'
         return [nodes.raw("", image, format="html")]
 
@@ -95,34 +90,6 @@ def pictures_below(notebook: NotebookNode, heading: str) -> list[tuple[str, str,
                     data = output.data[form].replace("\n", "")
                     pictures.append((form, data, output.metadata.get(form, {}).get("alt", "")))
     return pictures
-
-
-def arranged(data: str, columns: int, rows: int, count: int, new_columns: int) -> str:
-    """Rearrange the tiles of a picture.
-
-    Args:
-        data: The picture in base64.
-        columns: Columns of equal tiles in the picture.
-        rows: Rows of equal tiles in the picture.
-        count: Number of tiles to show, row by row.
-        new_columns: Columns in which they are shown.
-
-    Returns:
-        The new picture in base64.
-    """
-    picture = Image.open(io.BytesIO(base64.b64decode(data)))
-    width = picture.width // columns
-    height = picture.height // rows
-    new_rows = -(-count // new_columns)  # rounded up
-    result = Image.new("RGB", (new_columns * width, new_rows * height), "white")
-    for tile in range(count):
-        left = tile % columns * width
-        top = tile // columns * height
-        part = picture.crop((left, top, left + width, top + height))
-        result.paste(part, (tile % new_columns * width, tile // new_columns * height))
-    file = io.BytesIO()
-    result.save(file, picture.format, quality=95)
-    return base64.b64encode(file.getvalue()).decode()
 
 
 def choose_template(
