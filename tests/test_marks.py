@@ -1,6 +1,7 @@
 """Pixels of one object's frames, found on the other objects of its category."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,9 +55,6 @@ def test_the_seat_of_one_scooter_is_found_on_the_seat_of_the_other(placed, datas
     common = alignment.objects["scooter2"].sim3.apply(place.world)
     size = dataset.extent("motorcycle", "scooter2")[1] * alignment.objects["scooter2"].sim3.scale
     assert np.linalg.norm(common - placed[0].common) < 0.15 * size
-    for number, (x, y) in place.pixels.items():
-        frame = dataset.load(dataset.frame("motorcycle", "scooter2", number))
-        assert frame.mask[int(y), int(x)] > 0.5
 
 
 def test_marks_are_written_for_other_programs(placed, dataset, alignment, tmp_path):
@@ -66,6 +64,22 @@ def test_marks_are_written_for_other_programs(placed, dataset, alignment, tmp_pa
     world = mark["objects"]["scooter2"]["world"]
     points, _ = read_ply(tmp_path / "marks/scooter2.ply")
     assert np.allclose(points.mean(axis=0), world, atol=0.01)
+
+
+def test_a_place_is_seen_on_the_object_alone(placed, dataset):
+    for name, place in placed[0].places.items():
+        for number, (x, y) in place.pixels.items():
+            frame = dataset.load(dataset.frame("motorcycle", name, number))
+            assert frame.mask[int(y), int(x)] > 0.5
+
+
+def test_an_object_without_any_place_has_no_file_of_an_earlier_call(placed, dataset, tmp_path):
+    write_marks(placed, dataset, "motorcycle", tmp_path)
+    assert (tmp_path / "marks/scooter2.ply").is_file()
+    missing = dict(placed[0].places)
+    missing["scooter2"] = replace(missing["scooter2"], found=False)
+    write_marks([replace(placed[0], places=missing)], dataset, "motorcycle", tmp_path)
+    assert [path.name for path in (tmp_path / "marks").iterdir()] == ["scooter.ply"]
 
 
 def test_the_report_shows_the_marks(placed, dataset, alignment, tmp_path):
@@ -85,13 +99,16 @@ def test_the_report_shows_the_marks(placed, dataset, alignment, tmp_path):
         (["scooter:99:1,1"], "has no frame number 99"),
         (["scooter:0:900,1"], "outside the image, expected one of 320 x 240"),
         (["scooter:0:nan,1"], "outside the image"),
+        (["scooter:0:180,114:"], "expected SEQUENCE:FRAME:X,Y"),
+        (["scooter:0:180,114:a\x07"], "expected SEQUENCE:FRAME:X,Y"),
+        (["scooter:0:180,114", "--sequences", "scooter2,yamaha_yzr_r6"], "sequence of the mark"),
         (["scooter:0:1,1"], "has no depth"),
         (["scooter:0:20,160"], "is not on the object"),
         (["scooter:0:180,114:a", "scooter:0:181,114:a"], "2 marks are named 'a'"),
     ],
 )
 def test_wrong_marks_are_refused_before_anything_is_computed(marks, message, tmp_path, run):
-    words = " ".join(f"--mark {mark}" for mark in marks)
+    words = " ".join(f"--mark {mark}" if ":" in mark or len(marks) == 1 else mark for mark in marks)
     out = tmp_path / "out"
     printed = run(f"align data_samples --category motorcycle {words} --out {out}", code=2)
     assert message in printed

@@ -2,8 +2,8 @@
 category (see `transfer`)."""
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +12,11 @@ from jaxtyping import Float
 from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import plain_name, write_atomic
 from zsp_lite.io.ply import write_ply
 from zsp_lite.points import object_pixels
-from zsp_lite.transfer import TransferredPoints, object_size, surface_views, transfer
+from zsp_lite.transfer import SurfaceView, object_size, surface_views, transfer
 
 # A point is seen if the depth map is nearer by at most this part of the object's size.
 _HIDDEN = 0.05
@@ -45,7 +44,10 @@ class Mark:
         """
         sequence, frame, pixel, *names = text.split(":", 3)
         x, y = map(float, pixel.split(","))
-        return cls(sequence, int(frame), x, y, (names or [text])[0])
+        name = names[0] if names else text
+        if not (name and name.isprintable()):
+            raise ValueError("no printable name")
+        return cls(sequence, int(frame), x, y, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,44 +90,67 @@ def place_marks(
         InputError: A mark is in no frame, not on the object or without depth, two marks have one
             name, or no frame of an object shows its surface.
     """
-    worlds = marked_points(dataset, category, marks)
-    for mark in marks:
-        check_choice("sequence of the mark", mark.sequence, alignment.objects)
+    worlds = marked_points(dataset, category, marks, alignment.objects)
     extractor = as_backbone(backbone)
-    surfaces = {
-        name: surface_views(alignment, dataset, category, name, extractor)
-        for name in alignment.objects
-    }
-    frames = {
-        name: {one.frame_number: dataset.load(one) for one in dataset.frames(category, name)}
-        for name in alignment.objects
-    }
+
+    def surface(name: str) -> list[SurfaceView]:
+        return surface_views(alignment, dataset, category, name, extractor)
+
+    sources = {name: surface(name) for name in dict.fromkeys(mark.sequence for mark in marks)}
+    places: list[dict[str, Place]] = [{} for _ in marks]
+    for name, aligned in alignment.objects.items():
+        target = sources[name] if name in sources else surface(name)
+        found = _find(marks, worlds, sources, name, target)
+        size = object_size(target) / aligned.sim3.scale  # in the object's world
+        pixels = _pixels(dataset, category, name, [one.world for one in found], _HIDDEN * size)
+        for of_mark, one, seen in zip(places, found, pixels, strict=True):
+            of_mark[name] = replace(one, pixels=seen)
     placed = []
-    for mark, world in zip(marks, worlds, strict=True):
-        places = {}
-        for name, surface in surfaces.items():
-            if name == mark.sequence:
-                found = TransferredPoints(world[None], np.ones(1), np.zeros(1))
-                confidence = 1.0
-            else:
-                found = transfer(world[None], surfaces[mark.sequence], surface)
-                confidence = float(found.confidence[0])
-            size = object_size(surface) / alignment.objects[name].sim3.scale  # in its world
-            pixels = _pixels(found.world[0], frames[name], _HIDDEN * size)
-            here = name == mark.sequence or bool(found.found[0])
-            places[name] = Place(found.world[0], confidence, here, pixels)
+    for mark, world, of_mark in zip(marks, worlds, places, strict=True):
         common = alignment.objects[mark.sequence].sim3.apply(world)
-        placed.append(PlacedMark(mark, common, places))
+        placed.append(PlacedMark(mark, common, of_mark))
     return placed
 
 
+def _find(
+    marks: Sequence[Mark],
+    worlds: Sequence[Float[np.ndarray, "3"]],
+    sources: Mapping[str, Sequence[SurfaceView]],
+    name: str,
+    target: Sequence[SurfaceView],
+) -> list[Place]:
+    """Find all marks on one object; on their own object, they are where they are."""
+    found: dict[Mark, Place] = {}
+    for sequence, source in sources.items():
+        # The marks of one object go together: its patches are compared once.
+        own = [(mark, world) for mark, world in zip(marks, worlds) if mark.sequence == sequence]
+        if sequence == name:
+            for mark, world in own:
+                found[mark] = Place(world, 1.0, True)
+            continue
+        moved = transfer(np.stack([world for _, world in own]), source, target)
+        for (mark, _), world, confidence, here in zip(
+            own, moved.world, moved.confidence, moved.found
+        ):
+            found[mark] = Place(world, float(confidence), bool(here))
+    return [found[mark] for mark in marks]
+
+
 def marked_points(
-    dataset: Co3D, category: str, marks: Sequence[Mark]
+    dataset: Co3D,
+    category: str,
+    marks: Sequence[Mark],
+    sequences: Collection[str] | None = None,
 ) -> list[Float[np.ndarray, "3"]]:
-    """Return the world point of each mark; see `place_marks` for what is refused."""
+    """Return the world point of each mark; see `place_marks` for what is refused.
+
+    `sequences` are those that may be marked, by default all.
+    """
     names = [mark.name for mark in marks]
     points = []
     for mark in marks:
+        if sequences is not None:
+            check_choice("sequence of the mark", mark.sequence, sequences)
         if names.count(mark.name) > 1:
             raise InputError(
                 f"{names.count(mark.name)} marks are named {mark.name!r}, expected one"
@@ -145,18 +170,30 @@ def marked_points(
 
 
 def _pixels(
-    point: Float[np.ndarray, "3"], frames: dict[int, Frame], tolerance: float
-) -> dict[int, tuple[float, float]]:
-    """Return the pixel of a world point in each frame that sees it."""
-    pixels = {}
-    for number, frame in frames.items():
-        (x, y), depth = frame.camera.project(point)
-        height, width = frame.camera.size
-        if depth <= 0 or not (0 <= x < width and 0 <= y < height) or frame.depth is None:
+    dataset: Co3D,
+    category: str,
+    name: str,
+    points: Sequence[Float[np.ndarray, "3"]],
+    tolerance: float,
+) -> list[dict[int, tuple[float, float]]]:
+    """Return for each world point its pixel in each frame of an object that sees it.
+
+    One frame at a time is in memory: real sequences have hundreds.
+    """
+    pixels: list[dict[int, tuple[float, float]]] = [{} for _ in points]
+    for annotation in dataset.frames(category, name):
+        if annotation.viewpoint is None or annotation.depth is None:
             continue
-        measured = frame.depth[int(y), int(x)]
-        if measured > 0 and depth - measured <= tolerance:
-            pixels[number] = (round(float(x), 2), round(float(y), 2))
+        frame = dataset.load(annotation)
+        shown = object_pixels(frame)  # on the object, with measured depth
+        height, width = frame.camera.size
+        for seen, point in zip(pixels, points, strict=True):
+            (x, y), depth = frame.camera.project(point)
+            if depth <= 0 or not (0 <= x < width and 0 <= y < height):
+                continue
+            row, column = int(y), int(x)
+            if shown[row, column] and depth - frame.depth[row, column] <= tolerance:
+                seen[annotation.frame_number] = (round(float(x), 2), round(float(y), 2))
     return pixels
 
 
@@ -193,14 +230,17 @@ def write_marks(
     for name in placed[0].places:
         extent = dataset.extent(category, name)
         radius = _RADIUS * (extent[1] if extent else 1.0)
-        points = [np.zeros((0, 3))]
-        colours = [np.zeros((0, 3), np.uint8)]
+        points = []
+        colours = []
         for number, one in enumerate(placed):
             if one.places[name].found:
                 colour = bytes.fromhex(COLOURS[number % len(COLOURS)][1:])
                 points.append(one.places[name].world + radius * ball)
                 colours.append(np.tile(np.frombuffer(colour, np.uint8), (_BALL_POINTS, 1)))
         path = out / "marks" / f"{plain_name(name, 'sequence')}.ply"
-        write_ply(path, np.concatenate(points), np.concatenate(colours))
+        if points:
+            write_ply(path, np.concatenate(points), np.concatenate(colours))
+        else:
+            path.unlink(missing_ok=True)  # of an earlier call with other marks
     write_atomic(out / "marks.json", json.dumps(document, indent=1).encode())
     return out / "marks.json"

@@ -105,14 +105,16 @@ def surface_views(
         category: Name of the category.
         sequence: Name of the object's sequence.
         backbone: Backbone, or what `load_backbone` takes.
-        count: Number of frames, evenly spaced over the sequence. Frames with a `frame_defect` are
-            left out.
+        count: Number of frames, evenly spaced over those with a camera. Frames with a
+            `frame_defect` are left out.
 
     Raises:
         InputError: The alignment has no such object, or no frame shows its surface.
     """
     check_choice("sequence", sequence, alignment.objects)
-    annotations = dataset.frames(category, sequence)
+    annotations = [
+        frame for frame in dataset.frames(category, sequence) if frame.viewpoint is not None
+    ]
     spaced = np.unique(np.arange(count) * len(annotations) // count)
     chosen = [annotations[k] for k in spaced]
     frames = {one.frame_number: dataset.load(one) for one in chosen}

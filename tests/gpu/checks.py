@@ -101,6 +101,7 @@ def notebooks(device: str) -> Result:
             if "backbone.model" not in text:
                 # Raw strings: in the JSON of a notebook, a backslash is before each quote.
                 text = text.replace(r"device=\"cpu\"", rf"device=\"{device}\"")
+                text = text.replace("open_lesson()", rf"open_lesson(\"{device}\")")
             Path(folder, path.name).write_text(
                 text.replace("nbval-check-output", "not-compared"), "utf-8"
             )

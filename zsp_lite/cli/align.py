@@ -104,7 +104,8 @@ def align(
                 print(f"{name}: {flag}")
         data = out / "data"
     dataset = Co3D(data)
-    marked_points(dataset, category, marks)  # refuses wrong marks before minutes of computing
+    # Refuses wrong marks before minutes of computing.
+    marked_points(dataset, category, marks, sequences)
     alignment = align_category(dataset, category, backbone, sequences, pairs, targets, out, workers)
     placed = place_marks(alignment, dataset, category, marks, backbone) if marks else []
     written = [

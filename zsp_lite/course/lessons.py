@@ -11,7 +11,7 @@ from zsp_lite.data.co3d import Co3D
 __all__ = ["open_lesson", "show"]
 
 
-def open_lesson() -> tuple[Co3D, Backbone]:
+def open_lesson(device: str = "cpu") -> tuple[Co3D, Backbone]:
     """Return the data and the backbone of a lesson: the samples and zsp-tiny, or those that the
     environment names.
 
@@ -21,4 +21,4 @@ def open_lesson() -> tuple[Co3D, Backbone]:
 
     set_matplotlib_formats("jpeg", pil_kwargs={"quality": 85})
     dataset = Co3D(os.environ.get("ZSP_LITE_DATA") or sample_data())
-    return dataset, load_backbone(os.environ.get("ZSP_LITE_BACKBONE") or "zsp-tiny", device="cpu")
+    return dataset, load_backbone(os.environ.get("ZSP_LITE_BACKBONE") or "zsp-tiny", device)

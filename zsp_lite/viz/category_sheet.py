@@ -79,11 +79,14 @@ def objects_figure(
 
 
 def marks_figure(
-    dataset: Co3D, category: str, alignment: CategoryAlignment, placed: Sequence[PlacedMark]
+    dataset: Co3D,
+    category: str,
+    alignment: CategoryAlignment,
+    placed: Sequence[PlacedMark],
+    names: Sequence[str],
 ) -> Figure:
-    """Show marks on all objects, a row for each: first the frame that is marked, then of each other
-    object the frame that sees the place from the most similar side."""
-    names = list(alignment.objects)
+    """Show marks on objects, a row for each mark: each object by the frame that sees the place from
+    the most similar side, the marked one by the frame that is marked."""
     size = (_WIDTH * len(names) + _BORDER, (_HEIGHT + _BORDER) * len(placed))
     figure, axes = plt.subplots(
         len(placed), len(names), figsize=size, layout="constrained", squeeze=False
@@ -92,9 +95,8 @@ def marks_figure(
         mark = one.mark
         marked = dataset.camera(dataset.frame(category, mark.sequence, mark.frame)).R
         common = marked @ alignment.objects[mark.sequence].sim3.R.T  # from the common frame
-        ordered = [mark.sequence, *(name for name in names if name != mark.sequence)]
         panels[0].set_ylabel(mark.name[:24], fontsize=8, parse_math=False)
-        for axis, name in zip(panels, ordered, strict=True):
+        for axis, name in zip(panels, names, strict=True):
             place = one.places[name]
             frames = _frames(dataset, category, name)
             seeing = [frame for frame in frames if frame.frame_number in place.pixels]

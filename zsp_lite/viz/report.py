@@ -80,13 +80,14 @@ def write_category_report(
     as objects.jpg beside it."""
     names = list(alignment.objects)
     sheets = []
+    marked = []
     for start in range(0, len(names), category_sheet.MOST):
         part = names[start : start + category_sheet.MOST]
         figure = category_sheet.objects_figure(dataset, category, alignment, part)
         sheets.append(_encode_sheet(figure))
-    marked = []
-    if placed:
-        marked = [_encode_sheet(category_sheet.marks_figure(dataset, category, alignment, placed))]
+        if placed:
+            figure = category_sheet.marks_figure(dataset, category, alignment, placed, part)
+            marked.append(_encode_sheet(figure))
     text = _TEMPLATES.get_template("category.html").render(
         category=category,
         columns=category_sheet.COLUMNS,
