@@ -3,14 +3,11 @@ counts and intervals."""
 
 import numpy as np
 import pytest
-import torch
 from numpy.testing import assert_allclose
 
 from zsp_lite import Camera
 from zsp_lite.course.view_circle import show_view_circle
-from zsp_lite.verified.scene import Projection
-from zsp_lite.verified.verification import MAX_VIOLATION, SURFACE_SIGMA, PointTerms
-from zsp_lite.viz import plots, point_classes
+from zsp_lite.viz import plots
 
 GRID = (3, 4)  # patches of 20 x 20 pixels
 IMAGE = np.zeros((60, 80, 3), np.uint8)
@@ -79,35 +76,3 @@ def test_axes_are_named_where_their_ends_project_unless_behind_the_camera(axis):
     plots.draw_axes(axis, CAMERA, np.array([0, 0, 2]), ends, "xyz")
     places = {text.get_text(): text.get_position() for text in axis.texts if text.get_text()}
     assert places == {"x": pytest.approx((50, 30)), "y": pytest.approx((40, 40))}
-
-
-# Where five points project: on the surface, far behind it, far before it, outside the silhouette,
-# and over a hole in the depth.
-PIXELS = torch.tensor([[10.0, 5], [20, 5], [30, 5], [55, 5], [20, 20]])
-
-
-def test_each_kind_of_point_is_told_from_the_others():
-    surface = torch.full((5,), 3.0)  # depth of the view
-    behind = torch.tensor([0.0, 1, -1, 0, 0])
-    # A point outside the silhouette or over a hole says nothing of the depth.
-    weight = torch.tensor([1.0, 1, 1, 0, 0])
-    outside = torch.tensor([0.0, 0, 0, 0.4, 0])  # distance from the silhouette
-    parts = (surface + behind, surface, weight, outside, torch.arange(5), PIXELS)
-    touch = weight * torch.exp(-(behind**2) / (2 * SURFACE_SIGMA**2))
-    front = weight * (-(behind + SURFACE_SIGMA) / MAX_VIOLATION).clamp(0, 1)
-    values = (touch, outside / MAX_VIOLATION, front, torch.zeros(5))
-    # The terms are of one pose and one view: (1, 1, 5).
-    terms = PointTerms(
-        Projection(*(x[None, None] for x in parts)), *(x[None, None] for x in values)
-    )
-    assert point_classes.classify_points(terms).tolist() == [[0, 1, 2, 3, 4]]
-    assert list(point_classes.POINT_CLASSES)[2:4] == ["in free space", "outside the silhouette"]
-
-
-def test_points_of_all_classes_are_drawn_where_they_project():
-    figure = point_classes.show_point_classes(
-        [IMAGE], ["view"], [2 * PIXELS.numpy()], [np.arange(5)]
-    )
-    drawn = np.concatenate([collection.get_offsets() for collection in figure.axes[0].collections])
-    # The fourth point, at x = 110, is beyond the border and is drawn at it, x = 80.
-    assert_allclose(sorted(map(tuple, drawn)), [(20, 10), (40, 10), (40, 40), (60, 10), (80, 10)])
