@@ -43,7 +43,12 @@ _sources = {"docs", "notebooks", "data_samples", "zsp_lite"}
 exclude_patterns = [
     path.name for path in ROOT.iterdir() if path.is_dir() and path.name not in _sources
 ]
-exclude_patterns += ["**/.ipynb_checkpoints", "notebooks/exercises/release", "data_samples/*/*"]
+exclude_patterns += [
+    "**/.ipynb_checkpoints",
+    "notebooks/exercises/release",
+    "data_samples/*/*",
+    "zsp_lite/course/**",  # texts that commands write, not pages
+]
 
 nb_execution_mode = "off"  # The pages show the stored outputs.
 nb_merge_streams = True
