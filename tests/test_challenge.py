@@ -18,20 +18,22 @@ PAIRS = 6
 STARTER = "starter.py"
 LOOPS = "def method(similarity, foreground1, foreground2):\n    while True:\n        pass\n"
 CRASHES = "import os\ndef method(similarity, foreground1, foreground2):\n    os._exit(3)\n"
-# Looks for labels in the folder beside it, in the folder to keep, and in the network.
+# Looks for labels and other hand-ins beside it and in the lecturer's folders, and for a network.
 CHEATS = """
 import socket
 from pathlib import Path
 
-for folder in (Path.cwd().parent, Path({keep!r}), Path({handins!r})):
+found = []
+for folder in (*Path.cwd().parent.glob("challenge-*"), Path({keep!r}), Path({handins!r})):
     for path in folder.rglob("*"):
-        if path.name in ("object_poses.json", "loops.py") or "class_labels" in path.parts:
-            print("found", path)
+        if path.name in ("object_poses.json", "crashes.py") or "class_labels" in path.parts:
+            found.append(path.name)
 try:
     socket.create_connection(("127.0.0.1", {port}), timeout=5)
-    print("found a network")
+    found.append("a network")
 except OSError:
-    print("found nothing")
+    pass
+print("found", *(found or ["nothing"]))
 raise SystemExit
 """
 
@@ -99,7 +101,7 @@ def test_a_ranking_of_hand_ins_that_answer_loop_crash_and_cheat(challenge, tmp_p
     (handins / "crashes.py").write_text(CRASHES)
     cheats = CHEATS.format(keep=str(challenge / "keep"), handins=str(handins), port=9)
     (handins / "cheats.py").write_text(cheats)
-    standings = rank(handins, challenge / "keep", tmp_path / "out", workers=1, pair_seconds=2)
+    standings = rank(handins, challenge / "keep", tmp_path / "out", pair_seconds=2)
     found = {one.team: one for one in standings}
     assert standings[0].team == "right"
     assert (found["right"].acc30, found["turned"].acc30) == (100, 0)

@@ -16,6 +16,7 @@ import click
 import nbformat
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from tools import drawings
 from zsp_lite.cli.main import cli, main
@@ -105,7 +106,8 @@ def parse(words: list[str]) -> None:
         if name not in command.commands:
             raise click.UsageError(f"no command {name!r}")
         command = command.commands[name]
-    command.make_context(command.name, words)
+    with CliRunner().isolation(input="a secret\n" * 2):  # what commands ask for
+        command.make_context(command.name, words)
 
 
 def options_of(command: click.Command) -> set[str]:

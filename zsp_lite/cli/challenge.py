@@ -8,7 +8,7 @@ from zsp_lite.cli.common import COUNT, NAMES, PATH, examples
 @click.group(
     no_args_is_help=False,
     epilog=examples(
-        "challenge make --secret 'a long sentence' --categories car,chair --out challenge",
+        "challenge make --categories car,chair --out challenge",
         "challenge rank handins --keep challenge/keep --out ranking",
     ),
 )
@@ -16,12 +16,15 @@ def challenge() -> None:
     """Set a class a problem that nobody has seen, and rank what it hands in."""
 
 
-@challenge.command(
-    epilog=examples(
-        "challenge make --secret 'a long sentence' --categories car,chair --out challenge"
-    )
+@challenge.command(epilog=examples("challenge make --categories car,chair --out challenge"))
+# A secret among the words of a command stays in the shell's history.
+@click.option(
+    "--secret",
+    prompt="Secret sentence",
+    hide_input=True,
+    confirmation_prompt=True,
+    help="At least 8 characters, gives all random draws; asked for if left out.",
 )
-@click.option("--secret", required=True, help="At least 8 characters; gives all random draws.")
 @click.option("--categories", type=NAMES, required=True, help="Of `zsp-lite synth --category`.")
 @click.option("--sequences", type=click.IntRange(2, 900), default=6, help="Objects of each.")
 @click.option("--frames", type=click.IntRange(5, 1000), default=24, help="Frames of each object.")

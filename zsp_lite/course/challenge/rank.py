@@ -95,17 +95,19 @@ def rank(
     poses = out / "poses"
     poses.mkdir(parents=True, exist_ok=True)
     hidden = [path.resolve() for path in (keep, handins, out)]
-    with TemporaryDirectory(prefix="challenge-") as given:
-        copy_without_labels(keep / "data", Path(given, "data"))
-        questions = write_questions(Path(given, "pairs.csv"), Co3D(keep / "data"), pairs)
+    with TemporaryDirectory(prefix="challenge-") as all_runs:
 
         def run(team: str) -> str:
             source, target = teams[team], poses / f"{team}.csv"
             if source.suffix == ".csv":
                 shutil.copyfile(source, target)
                 return ""
+            # Each has a copy of the data, as it may write there.
+            folder = Path(all_runs, team)
+            copy_without_labels(keep / "data", folder / "data")
+            write_questions(folder / "pairs.csv", Co3D(keep / "data"), pairs)
             limits = (minutes, pair_seconds, int(memory * 1e9))
-            return _run_alone(source, questions, target, hidden, limits)
+            return _run_alone(source, folder, target, hidden, limits)
 
         with ThreadPoolExecutor(workers) as pool:
             notes = dict(zip(teams, pool.map(run, teams), strict=True))
@@ -116,53 +118,56 @@ def rank(
 
 
 def _run_alone(
-    source: Path, questions: Path, target: Path, hidden: Sequence[Path], limits: tuple
+    source: Path, folder: Path, target: Path, hidden: Sequence[Path], limits: tuple
 ) -> str:
-    """Run a hand-in in an empty folder; return the last line that it printed, or why it ended."""
+    """Run a hand-in in a folder that has the data; return the last line that it printed, or why it
+    ended."""
     minutes, pair_seconds, memory = limits
-    with TemporaryDirectory(prefix="hand-in-") as folder:
-        alone = Path(shutil.copy(source, folder))
-        found = Path(folder, "poses.csv")
-        words = [alone, questions.with_name("data"), questions, found, pair_seconds, memory]
-        command = [sys.executable, "-m", "zsp_lite.course.challenge.answer", *map(str, words)]
-        environment = {name: os.environ[name] for name in _PASSED if name in os.environ}
-        environment |= {"HOME": folder, "OMP_NUM_THREADS": "1"}
-        # A file, not a pipe: what a hand-in starts may hold a pipe open, or fill the memory by it.
-        with Path(folder, "printed.txt").open("w+b") as printed:
-            process = subprocess.Popen(
-                _hiding(hidden) + command,
-                cwd=folder,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stdout=printed,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
-            try:
-                code = process.wait(timeout=60 * minutes)
-                problem = f"ended abruptly, exit status {code}" if code else ""
-            except subprocess.TimeoutExpired:
-                problem = f"ended after {minutes:g} minutes"
-            finally:
-                _end(process)
-            printed.seek(max(0, printed.seek(0, os.SEEK_END) - _LONGEST_NOTE))
-            lines = printed.read().decode(errors="replace").strip().splitlines()
-        if found.is_file():
-            shutil.copyfile(found, target)
-        else:
-            target.write_text(",".join(COLUMNS) + "\n")
+    alone = Path(shutil.copy(source, folder))
+    found = folder / "poses.csv"
+    words = [alone.name, "data", "pairs.csv", found.name, str(pair_seconds), str(memory)]
+    # Without the folder in the search path, where `torch.py` of a team `torch` would be found.
+    command = [sys.executable, "-P", "-m", "zsp_lite.course.challenge.answer", *words]
+    environment = {name: os.environ[name] for name in _PASSED if name in os.environ}
+    environment |= {"HOME": ".", "OMP_NUM_THREADS": "1"}
+    # A file, not a pipe: what a hand-in starts may hold a pipe open, or fill the memory by it.
+    with (folder / "printed.txt").open("w+b") as printed:
+        process = subprocess.Popen(
+            _hiding(hidden, folder) + command,
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=printed,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        try:
+            code = process.wait(timeout=60 * minutes)
+            problem = f"ended abruptly, exit status {code}" if code else ""
+        except subprocess.TimeoutExpired:
+            problem = f"ended after {minutes:g} minutes"
+        finally:
+            _end(process)
+        printed.seek(max(0, printed.seek(0, os.SEEK_END) - _LONGEST_NOTE))
+        lines = printed.read().decode(errors="replace").strip().splitlines()
+    if found.is_file():
+        shutil.copyfile(found, target)
+    else:
+        target.write_text(",".join(COLUMNS) + "\n")
     return "; ".join([*filter(None, [problem]), *lines[-1:]])
 
 
-def _hiding(folders: Sequence[Path]) -> list[str]:
-    """Return the words before a command that hide folders and the network from it; none where the
-    system has no namespaces for users."""
+def _hiding(folders: Sequence[Path], own: Path) -> list[str]:
+    """Return the words before a command that hide folders, the network, and what lies beside its
+    own folder from it; none where the system has no namespaces for users."""
     # In a second namespace of users the command has no right to unmount what the first mounted. A
     # namespace of processes ends all of them with the first.
     outer = ["unshare", "--map-root-user", "--mount", "--net", "--pid", "--fork", "--kill-child"]
-    mounts = [f"mount -t tmpfs none {shlex.quote(str(folder))}" for folder in folders]
+    beside = shlex.quote(str(own.parent))
+    steps = [f"mount -t tmpfs none {shlex.quote(str(folder))}" for folder in folders]
+    steps += [f"mount --bind {shlex.quote(str(own))} {beside}", f"cd {beside}"]
     inner = 'exec unshare --map-root-user --mount "$@"'
-    words = [*outer, "--mount-proc", "sh", "-c", " && ".join([*mounts, inner]), "sh"]
+    words = [*outer, "--mount-proc", "sh", "-c", " && ".join([*steps, inner]), "sh"]
     try:
         subprocess.run([*words, "true"], check=True, capture_output=True)
     except (OSError, subprocess.CalledProcessError):
