@@ -1,15 +1,18 @@
 """The class challenge: what is given away, what a hand-in can see, and who wins."""
 
 import gzip
-import sys
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from zsp_lite.course.challenge.make import Challenge, asked_pairs, make_challenge
+import zsp_lite
+from zsp_lite.course.challenge.answer import read_questions
+from zsp_lite.course.challenge.make import make_challenge
 from zsp_lite.course.challenge.rank import rank
 from zsp_lite.data.pairs import true_poses
+from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_json
 
 SECRET = "an owl counts seventeen boats"
@@ -18,6 +21,7 @@ PAIRS = 6
 STARTER = "starter.py"
 LOOPS = "def method(similarity, foreground1, foreground2):\n    while True:\n        pass\n"
 CRASHES = "import os\ndef method(similarity, foreground1, foreground2):\n    os._exit(3)\n"
+FAILS = "def backbone(images):\n    raise ValueError('no network')\n"
 # Looks for labels and other hand-ins beside it and in the lecturer's folders, and for a network.
 CHEATS = """
 import socket
@@ -33,6 +37,7 @@ try:
     found.append("a network")
 except OSError:
     pass
+Path("poses.csv").symlink_to({handins!r} + "/right.csv")
 print("found", *(found or ["nothing"]))
 raise SystemExit
 """
@@ -49,7 +54,7 @@ def challenge(tmp_path_factory):
 def write_answers(challenge, path, turn=np.eye(3)):
     """Write the true poses, each followed by a turn."""
     kept = challenge / "keep/data"
-    pairs = asked_pairs(kept, read_json(challenge / "keep/challenge.json", Challenge, "challenge"))
+    pairs = read_questions(challenge / "keep/pairs.csv")
     truths = true_poses(kept, pairs, np.zeros(len(pairs), int))[:, :3, :3]
     poses = {
         "pair": [pair.key for pair in pairs],
@@ -64,7 +69,7 @@ def test_what_is_given_leads_neither_to_the_secret_nor_to_labels(challenge):
     given = [path for path in (challenge / "give").rglob("*") if path.is_file()]
     assert {path.suffix for path in given} == {".jgz", ".jpg", ".png", ".ply", ".csv", ".md", ".py"}
     kept = {path.name for path in (challenge / "keep").rglob("*.json")}
-    assert kept >= {"synthetic.json", "object_poses.json", "challenge.json"}
+    assert kept >= {"synthetic.json", "object_poses.json"}
     for path in given:
         content = path.read_bytes()
         if path.suffix == ".jgz":
@@ -101,16 +106,23 @@ def test_a_ranking_of_hand_ins_that_answer_loop_crash_and_cheat(challenge, tmp_p
     (handins / "crashes.py").write_text(CRASHES)
     cheats = CHEATS.format(keep=str(challenge / "keep"), handins=str(handins), port=9)
     (handins / "cheats.py").write_text(cheats)
-    standings = rank(handins, challenge / "keep", tmp_path / "out", pair_seconds=2)
-    found = {one.team: one for one in standings}
-    assert standings[0].team == "right"
+    (handins / "fails.py").write_text(FAILS)
+    (handins / "._fails.py").write_bytes(b"of macOS")
+    out = handins / "out"  # in a folder that is hidden as well
+    ranking = rank(handins, challenge / "keep", out, pair_seconds=2)
+    found = {one.team: one for one in ranking.standings}
+    assert ranking.standings[0].team == "right"
     assert (found["right"].acc30, found["turned"].acc30) == (100, 0)
     assert found["starter"].answered > 0
     assert "takes more than 2 s" in found["loops"].note
     assert "exit status 3" in found["crashes"].note
-    if sys.platform == "linux":
+    assert found["fails"].note.endswith("ValueError: no network")
+    assert found["cheats"].answered == 0
+    assert "._fails" not in found
+    assert not found["starter"].note
+    if ranking.alone:
         assert found["cheats"].note.endswith("found nothing")
-    page = (tmp_path / "out/ranking.html").read_text("utf-8")
+    page = (out / "ranking.html").read_text("utf-8")
     assert page.index("right") < page.index("turned")
 
 
@@ -121,7 +133,7 @@ def test_teams_whose_difference_is_chance_share_a_place(challenge, tmp_path):
     lines = (handins / "first.csv").read_text().splitlines()
     (handins / "one_less.csv").write_text("\n".join(lines[:-1]))
     (handins / "none.csv").write_text(lines[0])
-    standings = rank(handins, challenge / "keep", tmp_path / "out")
+    standings = rank(handins, challenge / "keep", tmp_path / "out").standings
     assert [(one.team, one.place) for one in standings] == [
         ("first", 1),
         ("one_less", 1),
@@ -134,9 +146,14 @@ def test_a_file_that_is_no_table_counts_as_no_answer(challenge, tmp_path):
     handins = tmp_path / "handins"
     handins.mkdir()
     (handins / "odd.csv").write_text("hello")
-    (one,) = rank(handins, challenge / "keep", tmp_path / "out")
+    (one,) = rank(handins, challenge / "keep", tmp_path / "out").standings
     assert one.answered == 0
     assert "expected a CSV file" in one.note
+
+
+def test_a_folder_that_holds_the_program_cannot_be_hidden(challenge, tmp_path):
+    with pytest.raises(InputError, match="holds this program"):
+        rank(Path(zsp_lite.__file__).parent, challenge / "keep", tmp_path / "out")
 
 
 @pytest.mark.parametrize(
@@ -144,7 +161,7 @@ def test_a_file_that_is_no_table_counts_as_no_answer(challenge, tmp_path):
     [
         ("make --secret short --categories car --out x", "expected at least 8"),
         ("make --secret long_enough --categories cow --out x", "category"),
-        ("rank nowhere --keep nowhere --out x", "challenge nowhere/challenge.json"),
+        ("rank nowhere --keep nowhere --out x", "pairs nowhere/pairs.csv"),
     ],
 )
 def test_bad_input_is_refused(words, message, tmp_path, monkeypatch, run):

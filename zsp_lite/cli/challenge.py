@@ -55,15 +55,17 @@ def rank(handins, keep, out, workers, minutes, pair_seconds, memory) -> None:
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.course.challenge import rank as ranking
 
-    standings = ranking.rank(handins, keep, out, workers, minutes, pair_seconds, memory)
+    found = ranking.rank(handins, keep, out, workers, minutes, pair_seconds, memory)
     columns = ("team", "place", "Acc30 (%)", "95 % interval", "answered")
     rows = []
-    for one in standings:
+    for one in found.standings:
         answered = f"{one.answered} of {one.pairs}"
         interval = f"{one.low:.1f} to {one.high:.1f}"
         rows.append((one.team, str(one.place), f"{one.acc30:.1f}", interval, answered))
     print_rows("Ranking", columns, rows)
-    for one in standings:
+    for one in found.standings:
         if one.note:
             print(f"{one.team}: {one.note}")
+    if not found.alone:
+        print("Hand-ins could read labels and each other: no user can make namespaces here")
     print(f"Written: {out / 'ranking.html'}, ranking.csv")

@@ -5,8 +5,6 @@ import importlib.util
 import sys
 from pathlib import Path
 
-import numpy as np
-
 from zsp_lite.backbones.load import as_backbone
 from zsp_lite.benchmark.methods import Method, make_extractors, resolve
 from zsp_lite.benchmark.own import fails_alone, problem_of_own
@@ -14,10 +12,11 @@ from zsp_lite.benchmark.problem import FrameStore, PairProblem
 from zsp_lite.benchmark.run import ask
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.errors import InputError, describe_failure
+from zsp_lite.io.files import read_bytes
 from zsp_lite.threads import one_thread
 
 _LARGEST_FILE = 1 << 28  # bytes
-COLUMNS = ("pair", "target_frame", "rotation", "translation", "scale")
+COLUMNS = ("pair", "target_frame", "rotation")
 
 
 def answer(handin: Path, data: Path, questions: Path, out: Path, row_seconds: int) -> None:
@@ -25,30 +24,35 @@ def answer(handin: Path, data: Path, questions: Path, out: Path, row_seconds: in
 
     Failed pairs have no line; their first reason is printed.
     """
-    with questions.open(newline="", encoding="utf-8") as file:
-        keys = dict.fromkeys(line["pair"] for line in csv.DictReader(file))
     method, backbone = _load(handin)
     store = FrameStore(Co3D(data), make_extractors(backbone, {"hand-in": method}), threads=1)
     failures = []
     with out.open("w", newline="", encoding="utf-8") as file, one_thread():
         lines = csv.writer(file)
         lines.writerow(COLUMNS)
-        for key in keys:
-            problem = PairProblem(Pair.from_key(key), store, {method.features} - {"none"})
+        asked = read_questions(questions)
+        for pair in asked:
             try:
                 with fails_alone(row_seconds):
+                    problem = PairProblem(pair, store, {method.features} - {"none"})
                     seen = problem_of_own(method.solve, problem) if method.solve else problem
                     found = ask(method, seen)
-                frame = problem.pair.target_frames[found.view]
+                frame = pair.target_frames[found.view]
             except (InputError, IndexError) as error:
-                failures.append(f"{key}: {error}")
+                failures.append(f"{pair.key}: {error}")
                 continue
-            position = [] if found.translation is None else found.translation
-            scale = "" if found.scale is None else found.scale
-            lines.writerow([key, frame, _numbers(found.rotation), _numbers(position), scale])
+            rotation = " ".join(map(repr, found.rotation.ravel().tolist()))
+            lines.writerow([pair.key, frame, rotation])
             file.flush()
     if failures:
-        print(f"{len(failures)} of {len(keys)} pairs failed; the first: {failures[0]}")
+        print(f"{len(failures)} of {len(asked)} pairs failed; the first: {failures[0]}")
+
+
+def read_questions(path: Path) -> list[Pair]:
+    """Read the pairs of the file that asks for them."""
+    text = read_bytes(path, "pairs").decode()
+    keys = dict.fromkeys(line["pair"] for line in csv.DictReader(text.splitlines()))
+    return [Pair.from_key(key) for key in keys]
 
 
 def _load(handin: Path) -> tuple[Method, object]:
@@ -69,10 +73,6 @@ def _load(handin: Path) -> tuple[Method, object]:
         masked = getattr(backbone, "has_saliency", True) is False
         method = Method(settings={"foreground": "mask"} if masked else {})
     return method, as_backbone("zsp-tiny" if backbone is None else backbone)
-
-
-def _numbers(values: np.ndarray) -> str:
-    return " ".join(repr(float(value)) for value in np.ravel(values))
 
 
 def main(handin: str, data: str, questions: str, out: str, row_seconds: str, memory: str) -> None:

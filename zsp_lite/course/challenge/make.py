@@ -6,31 +6,20 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-import msgspec
-
-from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.course.synthetic.export import export_categories
 from zsp_lite.data.annotations import FRAMES_FILE, SEQUENCES_FILE
-from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.exchange import write_questions
 from zsp_lite.data.pairs import category_pairs
-from zsp_lite.errors import InputError, check_choice
-from zsp_lite.io.files import write_atomic
+from zsp_lite.errors import InputError
 
-SETTINGS_FILE = "challenge.json"  # in the folder that is kept
-TARGETS = 5  # target views of a pair
+QUESTIONS_FILE = "pairs.csv"
+_TARGETS = 5  # target views of a pair
 _SHORTEST = 8  # characters of a secret; shorter ones are soon guessed
 # Of all files that are given, the first second of 2000: times of rendering tell nothing then.
 _TIME = 946_684_800
 _RULES = Path(__file__).with_name("rules.md")
 _STARTER = Path(__file__).with_name("starter.py")
-
-
-class Challenge(msgspec.Struct):
-    """Settings of a challenge, without its secret."""
-
-    pairs: dict[str, int]  # number of pairs by category
-    targets: int = TARGETS
 
 
 def make_challenge(
@@ -59,8 +48,6 @@ def make_challenge(
             f"the secret has {len(secret)} characters, expected at least {_SHORTEST}: it could be "
             "guessed"
         )
-    for category in categories:
-        check_choice("category", category, CATEGORIES)
     out = Path(out)
     if out.exists() and any(out.iterdir()):
         raise InputError(f"folder {out} is not empty, expected a new one")
@@ -70,26 +57,22 @@ def make_challenge(
     key = hashlib.scrypt(secret.encode(), salt=salt, n=1 << 15, r=8, p=1, maxmem=1 << 26, dklen=7)
     kept = out / "keep" / "data"
     export_categories(categories, kept, sequences, frames, int.from_bytes(key))
-    challenge = Challenge(dict.fromkeys(categories, -(-pairs // len(categories))))
-    write_atomic(out / "keep" / SETTINGS_FILE, msgspec.json.encode(challenge))
 
     given = out / "give"
     copy_without_labels(kept, given / "data")
-    write_questions(given / "pairs.csv", Co3D(given / "data"), asked_pairs(kept, challenge))
+    dataset = Co3D(kept)
+    count = -(-pairs // len(categories))
+    asked = [
+        pair
+        for category in categories
+        for pair in category_pairs(dataset, category, count, _TARGETS)
+    ]
+    for folder in (given, kept.parent):
+        write_questions(folder / QUESTIONS_FILE, dataset, asked)
     shutil.copyfile(_RULES, given / "rules.md")
     shutil.copyfile(_STARTER, given / "starter.py")
     for path in [*given.rglob("*"), given]:
         os.utime(path, (_TIME, _TIME))
-
-
-def asked_pairs(data: str | Path, challenge: Challenge) -> list[Pair]:
-    """Return the pairs of a challenge."""
-    dataset = Co3D(data)
-    return [
-        pair
-        for category, count in challenge.pairs.items()
-        for pair in category_pairs(dataset, category, count, challenge.targets)
-    ]
 
 
 def copy_without_labels(data: Path, out: Path) -> None:

@@ -19,24 +19,20 @@ from jaxtyping import Float
 from jinja2 import Environment, StrictUndefined
 
 from zsp_lite.benchmark.statistics import figures_of, object_draws, paired_difference
-from zsp_lite.course.challenge.answer import COLUMNS
-from zsp_lite.course.challenge.make import (
-    SETTINGS_FILE,
-    Challenge,
-    asked_pairs,
-    copy_without_labels,
-)
-from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.exchange import StoredPose, read_stored_poses, write_questions
+from zsp_lite.course.challenge.answer import COLUMNS, read_questions
+from zsp_lite.course.challenge.make import QUESTIONS_FILE, copy_without_labels
+from zsp_lite.data.co3d import Pair
+from zsp_lite.data.exchange import StoredPose, read_stored_poses
 from zsp_lite.data.pairs import true_poses
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import read_json, write_atomic
+from zsp_lite.io.download import cache_folder
+from zsp_lite.io.files import write_atomic
 from zsp_lite.metrics import rotation_error
 
 _SIGNIFICANT = 0.05  # a difference with a smaller p value is not left to chance
 _LONGEST_NOTE = 200  # characters
 _PAGE = Path(__file__).with_name("ranking.html")
-# Variables of the environment that a hand-in gets.
+# Variables of the environment that a hand-in gets; the folder that it finds weights in is added.
 _PASSED = ("PATH", "PYTHONPATH", "SYSTEMROOT", "LANG", "TMPDIR")
 
 
@@ -54,6 +50,23 @@ class Standing:
     note: str  # why pairs have none; "" if all have
 
 
+@dataclass(frozen=True)
+class Ranking:
+    """What a ranking page shows."""
+
+    standings: list[Standing]
+    alone: bool  # hand-ins found neither labels nor each other; False where the system cannot
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of a hand-in."""
+
+    minutes: float
+    pair_seconds: int
+    memory: float  # gigabytes
+
+
 def rank(
     handins: str | Path,
     keep: str | Path,
@@ -62,11 +75,11 @@ def rank(
     minutes: float = 10,
     pair_seconds: int = 20,
     memory: float = 4,
-) -> list[Standing]:
+) -> Ranking:
     """Run and rank the hand-ins of a folder, and write OUT/ranking.csv and OUT/ranking.html.
 
-    On Linux a hand-in sees neither `keep` nor `handins` nor `out`, and has no network, where users
-    may make namespaces; elsewhere it is only not told where they are.
+    On Linux a hand-in finds neither labels nor other hand-ins nor a network, where users may make
+    namespaces.
 
     Args:
         handins: Folder with a file TEAM.py or TEAM.csv of each team.
@@ -78,24 +91,29 @@ def rank(
         memory: Limit of its memory in gigabytes, on Linux.
 
     Raises:
-        InputError: `keep` holds no challenge, or `handins` no hand-in, or two of one team.
+        InputError: `keep` holds no challenge, or `handins` no hand-in, or two of one team; or one
+            of both folders holds this program.
     """
     handins = Path(handins)
     keep = Path(keep)
     out = Path(out)
-    challenge = read_json(keep / SETTINGS_FILE, Challenge, "challenge")
-    files = sorted(path for path in handins.glob("*") if path.suffix in (".py", ".csv"))
+    pairs = read_questions(keep / QUESTIONS_FILE)
+    # Not the hidden files that macOS adds to archives.
+    files = sorted(path for path in handins.glob("[!.]*") if path.suffix in (".py", ".csv"))
     teams = {path.stem: path for path in files}
     if not files or len(teams) < len(files):
         raise InputError(
             f"{handins} has {len(files)} hand-ins of {len(teams)} teams, expected one of each, "
             "TEAM.py or TEAM.csv"
         )
-    pairs = asked_pairs(keep / "data", challenge)
     poses = out / "poses"
     poses.mkdir(parents=True, exist_ok=True)
-    hidden = [path.resolve() for path in (keep, handins, out)]
-    with TemporaryDirectory(prefix="challenge-") as all_runs:
+    hidden = _folders_to_hide(keep, handins, poses)
+    limits = Limits(minutes, pair_seconds, memory)
+    with TemporaryDirectory(prefix="challenge-") as runs:
+        probe = Path(runs, "probe")
+        probe.mkdir()
+        alone = _works([*_hiding(hidden, probe), "true"])
 
         def run(team: str) -> str:
             source, target = teams[team], poses / f"{team}.csv"
@@ -103,37 +121,49 @@ def rank(
                 shutil.copyfile(source, target)
                 return ""
             # Each has a copy of the data, as it may write there.
-            folder = Path(all_runs, team)
+            folder = Path(runs, "team", team)
             copy_without_labels(keep / "data", folder / "data")
-            write_questions(folder / "pairs.csv", Co3D(keep / "data"), pairs)
-            limits = (minutes, pair_seconds, int(memory * 1e9))
-            return _run_alone(source, folder, target, hidden, limits)
+            shutil.copy(keep / QUESTIONS_FILE, folder)
+            before = _hiding(hidden, folder) if alone else []
+            return _run_alone(before, source, folder, target, limits)
 
         with ThreadPoolExecutor(workers) as pool:
             notes = dict(zip(teams, pool.map(run, teams), strict=True))
 
-    standings = _standings(keep / "data", pairs, poses, notes)
-    _write(standings, out)
-    return standings
+    ranking = Ranking(_standings(keep / "data", pairs, poses, notes), alone)
+    _write(ranking, out)
+    return ranking
+
+
+def _folders_to_hide(*folders: Path) -> list[Path]:
+    """Return the folders that lie in no other one; InputError if one holds this program."""
+    folders = {folder.resolve() for folder in folders}
+    for program in (Path(sys.prefix), Path(__file__).resolve()):
+        for folder in folders.intersection(program.parents):
+            raise InputError(
+                f"folder {folder} holds this program, expected one for the challenge alone"
+            )
+    return [folder for folder in folders if not folders.intersection(folder.parents)]
 
 
 def _run_alone(
-    source: Path, folder: Path, target: Path, hidden: Sequence[Path], limits: tuple
+    before: Sequence[str], source: Path, folder: Path, target: Path, limits: Limits
 ) -> str:
     """Run a hand-in in a folder that has the data; return the last line that it printed, or why it
     ended."""
-    minutes, pair_seconds, memory = limits
     alone = Path(shutil.copy(source, folder))
     found = folder / "poses.csv"
-    words = [alone.name, "data", "pairs.csv", found.name, str(pair_seconds), str(memory)]
+    numbers = [str(limits.pair_seconds), str(int(limits.memory * 1e9))]
+    words = [alone.name, "data", QUESTIONS_FILE, found.name, *numbers]
     # Without the folder in the search path, where `torch.py` of a team `torch` would be found.
     command = [sys.executable, "-P", "-m", "zsp_lite.course.challenge.answer", *words]
     environment = {name: os.environ[name] for name in _PASSED if name in os.environ}
-    environment |= {"HOME": ".", "OMP_NUM_THREADS": "1"}
+    environment |= {"HOME": ".", "USERPROFILE": ".", "OMP_NUM_THREADS": "1"}
+    environment["ZSP_LITE_CACHE"] = str(cache_folder())
     # A file, not a pipe: what a hand-in starts may hold a pipe open, or fill the memory by it.
     with (folder / "printed.txt").open("w+b") as printed:
         process = subprocess.Popen(
-            _hiding(hidden, folder) + command,
+            [*before, *command],
             cwd=folder,
             env=environment,
             stdin=subprocess.DEVNULL,
@@ -142,15 +172,15 @@ def _run_alone(
             start_new_session=True,
         )
         try:
-            code = process.wait(timeout=60 * minutes)
+            code = process.wait(timeout=60 * limits.minutes)
             problem = f"ended abruptly, exit status {code}" if code else ""
         except subprocess.TimeoutExpired:
-            problem = f"ended after {minutes:g} minutes"
+            problem = f"ended after {limits.minutes:g} minutes"
         finally:
             _end(process)
         printed.seek(max(0, printed.seek(0, os.SEEK_END) - _LONGEST_NOTE))
         lines = printed.read().decode(errors="replace").strip().splitlines()
-    if found.is_file():
+    if found.is_file() and not found.is_symlink():  # a link may lead to another team's poses
         shutil.copyfile(found, target)
     else:
         target.write_text(",".join(COLUMNS) + "\n")
@@ -158,21 +188,26 @@ def _run_alone(
 
 
 def _hiding(folders: Sequence[Path], own: Path) -> list[str]:
-    """Return the words before a command that hide folders, the network, and what lies beside its
-    own folder from it; none where the system has no namespaces for users."""
-    # In a second namespace of users the command has no right to unmount what the first mounted. A
-    # namespace of processes ends all of them with the first.
-    outer = ["unshare", "--map-root-user", "--mount", "--net", "--pid", "--fork", "--kill-child"]
-    beside = shlex.quote(str(own.parent))
+    """Return the words before a command that hide folders, what lies beside its own folder, and the
+    network from it.
+
+    `own` takes the place of the folder of all runs.
+    """
+    runs = shlex.quote(str(own.parent))
     steps = [f"mount -t tmpfs none {shlex.quote(str(folder))}" for folder in folders]
-    steps += [f"mount --bind {shlex.quote(str(own))} {beside}", f"cd {beside}"]
-    inner = 'exec unshare --map-root-user --mount "$@"'
-    words = [*outer, "--mount-proc", "sh", "-c", " && ".join([*steps, inner]), "sh"]
-    try:
-        subprocess.run([*words, "true"], check=True, capture_output=True)
-    except (OSError, subprocess.CalledProcessError):
-        return []
-    return words
+    steps += [f"mount --bind {shlex.quote(str(own))} {runs}", f"cd {runs}"]
+    # In a second namespace of users the command has no right to unmount what the first mounted.
+    steps.append('exec unshare --map-root-user --mount "$@"')
+    # A namespace of processes ends all of them with the first.
+    first = ["unshare", "--map-root-user", "--mount", "--net", "--pid", "--fork", "--kill-child"]
+    return [*first, "--mount-proc", "sh", "-c", " && ".join(steps), "sh"]
+
+
+def _works(command: Sequence[str]) -> bool:
+    """Return whether this system runs a command without an error."""
+    with suppress(FileNotFoundError):
+        return subprocess.run(command, capture_output=True).returncode == 0
+    return False
 
 
 def _end(process: subprocess.Popen) -> None:
@@ -204,13 +239,14 @@ def _standings(
             stored = {}
             note = note or str(error)
         # In the order of the pairs; an answer for a frame that was not asked for is none.
-        answers = {pair: stored[pair.key] for pair in pairs if pair.key in stored}
-        for pair in list(answers):
-            if answers[pair].target_frame not in pair.target_frames:
-                del answers[pair]
+        answers = {
+            pair: stored[pair.key]
+            for pair in pairs
+            if pair.key in stored and stored[pair.key].target_frame in pair.target_frames
+        }
         errors[team] = _errors(data, pairs, answers)
         answered[team] = len(answers)
-        problems[team] = note
+        problems[team] = note if len(answers) < len(pairs) else ""
     figures = {team: figures_of(error, drawn) for team, error in errors.items()}
 
     standings = []
@@ -251,10 +287,10 @@ def _errors(
     return errors
 
 
-def _write(standings: Sequence[Standing], out: Path) -> None:
-    """Write the ranking as a table and as a page for the projector."""
-    table = pd.DataFrame([asdict(standing) for standing in standings])
+def _write(ranking: Ranking, out: Path) -> None:
+    """Write a ranking as a table and as a page for the projector."""
+    table = pd.DataFrame([asdict(standing) for standing in ranking.standings])
     write_atomic(out / "ranking.csv", table.to_csv(index=False, lineterminator="\n").encode())
     environment = Environment(autoescape=True, undefined=StrictUndefined)
     page = environment.from_string(_PAGE.read_text("utf-8"))
-    write_atomic(out / "ranking.html", page.render(standings=standings).encode())
+    write_atomic(out / "ranking.html", page.render(asdict(ranking)).encode())
