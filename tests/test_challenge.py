@@ -119,7 +119,6 @@ def test_a_ranking_of_hand_ins_that_answer_loop_crash_and_cheat(challenge, tmp_p
     assert found["fails"].note.endswith("ValueError: no network")
     assert found["cheats"].answered == 0
     assert "._fails" not in found
-    assert not found["starter"].note
     if ranking.alone:
         assert found["cheats"].note.endswith("found nothing")
     page = (out / "ranking.html").read_text("utf-8")
