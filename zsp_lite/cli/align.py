@@ -83,8 +83,8 @@ def align(
     alike from two sides, some may be turned round against the rest: look at the report. Pose labels
     and proposals that DATA has already, such as those of uCO3D, are compared with the result.
 
-    A pixel of one object, --mark, is found on all others: OUT gets marks.json, marks/SEQUENCE.ply
-    with balls in each object's world, and a section of the report.
+    A pixel of one object, --mark, is found on all others: OUT gets marks.json, marks.jpg,
+    marks/SEQUENCE.ply with balls in each object's world, and a section of the report.
     """
     from zsp_lite.align import align_category, alignment_errors, write_alignment, write_labels
     from zsp_lite.category import SAME_ANGLE

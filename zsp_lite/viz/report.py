@@ -77,7 +77,7 @@ def write_category_report(
     placed: Sequence[PlacedMark] = (),
 ) -> Path:
     """Write a page with contact sheets, the table of all objects and the marks, and the first sheet
-    as objects.jpg beside it."""
+    of each as objects.jpg and marks.jpg beside it."""
     names = list(alignment.objects)
     sheets = []
     marked = []
@@ -97,6 +97,8 @@ def write_category_report(
         doubtful=category_sheet.doubtful(alignment),
     )
     write_atomic(path.with_name("objects.jpg"), sheets[0])
+    if placed:
+        write_atomic(path.with_name("marks.jpg"), marked[0])
     write_atomic(path, text.encode())
     return path
 
