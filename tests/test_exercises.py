@@ -33,8 +33,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::sqlalchemy.e
 EXERCISES = Path(__file__).parents[1] / "notebooks/exercises"
 ASSIGNMENTS = sorted(folder.name for folder in (EXERCISES / "source").iterdir())
 
-# For each assignment and task: the name of a mistake, the part of the solution to replace, and its
-# replacement.
+# For each assignment and function: the name of a mistake, the part of the solution to replace, and
+# its replacement. The first is the commonest.
 MISTAKES = json.loads(Path(__file__).with_name("exercise_mistakes.json").read_text("utf-8"))
 
 # For each assignment: a statement of a marking guide, and an expression that holds for what the
@@ -102,11 +102,11 @@ def prepared():
     return prepare
 
 
-def failing_tests(namespace: dict, answers: NotebookNode, tests: NotebookNode) -> set[str]:
-    """Names of the test cells of notebook `tests` that fail for the functions defined in notebook
-    `answers`."""
+def failing_tests(namespace: dict, answers: NotebookNode, tests: NotebookNode) -> dict[str, str]:
+    """Messages by the name of the test cells of notebook `tests` that fail for the functions
+    defined in notebook `answers`."""
     exec(code(answers, solution=True, grade=False), namespace)
-    failing = set()
+    failing = {}
     for name, cell in graded(tests, grade=True, solution=False).items():
         try:
             exec(cell.source, dict(namespace))
@@ -117,9 +117,25 @@ def failing_tests(namespace: dict, answers: NotebookNode, tests: NotebookNode) -
             IndexError,
             ArithmeticError,
             NotImplementedError,
-        ):
-            failing.add(name)
+        ) as error:
+            failing[name] = f"{error}"
     return failing
+
+
+def names_of_tests(assignment: str, function: str) -> set[str]:
+    """Names of the test cells of a function: test_FUNCTION_1, ..."""
+    names = graded(source(assignment), grade=True)
+    return {name for name in names if re.fullmatch(rf"test_{function}_\d", name)}
+
+
+def mistaken(assignment: str, function: str, mistake: str) -> NotebookNode:
+    """The source with a mistake in the solution."""
+    notebook = source(assignment)
+    cell = graded(notebook, solution=True)[function]
+    right, wrong = MISTAKES[assignment][function][mistake]
+    assert right in cell.source, f"the solution does not contain {right!r}"
+    cell.source = cell.source.replace(right, wrong)
+    return notebook
 
 
 def tasks(notebook: NotebookNode) -> list[list[NotebookNode]]:
@@ -134,26 +150,31 @@ def tasks(notebook: NotebookNode) -> list[list[NotebookNode]]:
 
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_the_given_cells_of_the_handed_out_notebook_run_and_agree_with_the_guides(
-    prepared, config, assignment
+def test_the_given_cells_run_and_agree_with_the_expected_outputs_and_the_guides(
+    prepared, config, assignment, capsys
 ):
-    """No given cell needs more than the first cell of the notebook and the function of its own
+    """No given cell needs more than the first cell of the notebook and the functions of its own
     task."""
     handed_out = students_version(assignment, config)
     solutions = graded(source(assignment), solution=True)
-    computed, given = {"turned_similarity": turned_similarity}, 0
+    computed = {"turned_similarity": turned_similarity}
+    expected = 0
     for cells in tasks(handed_out):
         namespace = prepared(assignment)
         exec(code(handed_out, solution=True, grade=False), namespace)
-        for cell in [one for one in cells if one.cell_type == "code"]:
-            if "nbgrader" not in cell.metadata:
+        for cell, following in zip(cells, [*cells[1:], None], strict=True):
+            if cell.cell_type == "code" and "nbgrader" not in cell.metadata:
+                capsys.readouterr()
                 exec(cell.source, namespace)
-                given += 1
-            elif cell.metadata.nbgrader.solution:
+                if following.source.startswith("Expected:"):
+                    (text,) = re.findall(r"```text\n(.*?)\n```", following.source, re.DOTALL)
+                    assert capsys.readouterr().out.strip() == text.strip()
+                    expected += 1
+            elif cell.cell_type == "code" and cell.metadata.nbgrader.solution:
                 exec(solutions[cell.metadata.nbgrader.grade_id].source, namespace)
         computed |= namespace
     plt.close("all")
-    assert given == len(tasks(handed_out))
+    assert expected == len(MISTAKES[assignment])
     exec(code(source(assignment), solution=True, grade=False), computed)
     guides = " ".join(code(source(assignment), solution=True, grade=True).split())
     for statement, expression in STATEMENTS[assignment].items():
@@ -166,30 +187,52 @@ def test_the_solutions_pass_every_test_and_the_students_version_none(prepared, c
     notebook, handed_out = source(assignment), students_version(assignment, config)
     text = "\n".join(cell.source for cell in handed_out.cells)
     assert not re.search("SOLUTION|HIDDEN|Guide for marking", text)
-    assert failing_tests(prepared(assignment), notebook, notebook) == set()
+    assert failing_tests(prepared(assignment), notebook, notebook) == {}
     every = set(graded(notebook, grade=True, locked=True))
-    assert failing_tests(prepared(assignment), handed_out, notebook) == every
+    assert failing_tests(prepared(assignment), handed_out, notebook).keys() == every
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # some mistakes divide by zero or overflow
 @pytest.mark.parametrize(
-    "assignment, task, mistake",
+    "assignment, function, mistake",
     [
-        (assignment, task, mistake)
-        for assignment, of_tasks in MISTAKES.items()
-        for task, mistakes in of_tasks.items()
+        (assignment, function, mistake)
+        for assignment, of_functions in MISTAKES.items()
+        for function, mistakes in of_functions.items()
         for mistake in mistakes
     ],
 )
-def test_each_mistake_fails_its_own_task_and_no_other(prepared, assignment, task, mistake):
-    notebook = source(assignment)
-    cell = graded(notebook, solution=True)[task]
-    right, wrong = MISTAKES[assignment][task][mistake]
-    assert right in cell.source, f"the solution does not contain {right!r}"
-    cell.source = cell.source.replace(right, wrong)
+def test_each_mistake_fails_its_own_function_and_no_other(prepared, assignment, function, mistake):
+    notebook = mistaken(assignment, function, mistake)
     failing = failing_tests(prepared(assignment), notebook, notebook)
-    # The tests of a task are called test_TASK_1 and test_TASK_2.
-    assert {name.removeprefix("test_")[:-2] for name in failing} == {task}
+    assert failing and failing.keys() <= names_of_tests(assignment, function)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("assignment", ASSIGNMENTS)
+def test_students_see_a_test_of_the_commonest_mistake_that_says_what_to_look_at(
+    prepared, config, assignment
+):
+    for function, (commonest, *_) in MISTAKES[assignment].items():
+        notebook = mistaken(assignment, function, commonest)
+        failing = failing_tests(
+            prepared(assignment), notebook, students_version(assignment, config)
+        )
+        assert failing and all(len(message.split()) > 4 for message in failing.values()), function
+
+
+@pytest.mark.parametrize("assignment", ASSIGNMENTS)
+def test_functions_have_two_hints_and_questions_the_headings_of_their_guide(assignment):
+    for cells in tasks(source(assignment)):
+        text = "\n".join(cell.source for cell in cells if cell.cell_type == "markdown")
+        functions = graded(NotebookNode(cells=cells), solution=True, grade=False)
+        assert text.count("*Hint:* ") == len(functions)
+        assert text.count("<details><summary>Second hint</summary>") == len(functions)
+        for answer in graded(NotebookNode(cells=cells), solution=True, grade=True).values():
+            guide = re.findall(r"^\d\. \*\*(.+?)\*\*", answer.source, re.MULTILINE)
+            (shown,) = re.findall(r"^\*Points:\* (.*)", cells[0].source, re.MULTILINE | re.DOTALL)
+            assert re.findall(r"\*\*(.+?)\*\*", shown) == guide
+            assert len(guide) == answer.metadata.nbgrader.points
 
 
 CALLS_THE_LIBRARY = """
@@ -201,12 +244,12 @@ def {0}(*arguments):
 
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_a_function_that_calls_the_library_fails_all_tests_of_its_task(prepared, assignment):
-    for task in MISTAKES[assignment]:
+def test_a_function_that_calls_the_library_fails_all_its_tests(prepared, assignment):
+    for function in MISTAKES[assignment]:
         notebook = source(assignment)
-        graded(notebook, solution=True)[task].source += CALLS_THE_LIBRARY.format(task)
+        graded(notebook, solution=True)[function].source += CALLS_THE_LIBRARY.format(function)
         failing = failing_tests(prepared(assignment), notebook, notebook)
-        assert failing == {f"test_{task}_1", f"test_{task}_2"}
+        assert failing.keys() == names_of_tests(assignment, function)
 
 
 def turn_into_text(cell: NotebookNode) -> None:
@@ -448,8 +491,10 @@ def test_an_exercise_has_20_points_and_no_test_decides_more_than_two(assignment)
     notebook = source(assignment)
     cells = graded(notebook, grade=True)
     points = {name: cell.metadata.nbgrader.points for name, cell in cells.items()}
-    tests = [f"test_{task}_{i}" for task in MISTAKES[assignment] for i in (1, 2)]
-    assert [name for name in points if name.startswith("test_")] == tests
+    tests = set().union(
+        *(names_of_tests(assignment, function) for function in MISTAKES[assignment])
+    )
+    assert {name for name in points if name.startswith("test_")} == tests
     assert [*points.values()] == [2] * 6 + [4] * 2  # six tests, two answers
     assert "20 points: 12 by tests, 8 by" in notebook.cells[0].source
 
