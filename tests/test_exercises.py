@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 import zipfile
 from collections.abc import Callable
 from copy import deepcopy
@@ -33,8 +34,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::sqlalchemy.e
 EXERCISES = Path(__file__).parents[1] / "notebooks/exercises"
 ASSIGNMENTS = sorted(folder.name for folder in (EXERCISES / "source").iterdir())
 
-# For each assignment and task: the name of a mistake, the part of the solution to replace, and its
-# replacement.
+# For each assignment and function: the name of a mistake, the part of the solution to replace, and
+# its replacement. The first is the commonest.
 MISTAKES = json.loads(Path(__file__).with_name("exercise_mistakes.json").read_text("utf-8"))
 
 # For each assignment: a statement of a marking guide, and an expression that holds for what the
@@ -102,11 +103,11 @@ def prepared():
     return prepare
 
 
-def failing_tests(namespace: dict, answers: NotebookNode, tests: NotebookNode) -> set[str]:
-    """Names of the test cells of notebook `tests` that fail for the functions defined in notebook
-    `answers`."""
+def failing_tests(namespace: dict, answers: NotebookNode, tests: NotebookNode) -> dict[str, str]:
+    """Messages by the name of the test cells of notebook `tests` that fail for the functions
+    defined in notebook `answers`."""
     exec(code(answers, solution=True, grade=False), namespace)
-    failing = set()
+    failing = {}
     for name, cell in graded(tests, grade=True, solution=False).items():
         try:
             exec(cell.source, dict(namespace))
@@ -117,9 +118,25 @@ def failing_tests(namespace: dict, answers: NotebookNode, tests: NotebookNode) -
             IndexError,
             ArithmeticError,
             NotImplementedError,
-        ):
-            failing.add(name)
+        ) as error:
+            failing[name] = f"{error}"
     return failing
+
+
+def names_of_tests(assignment: str, function: str) -> set[str]:
+    """Names of the test cells of a function: test_FUNCTION_1, ..."""
+    names = graded(source(assignment), grade=True)
+    return {name for name in names if re.fullmatch(rf"test_{function}_\d", name)}
+
+
+def mistaken(assignment: str, function: str, mistake: str) -> NotebookNode:
+    """The source with a mistake in the solution."""
+    notebook = source(assignment)
+    cell = graded(notebook, solution=True)[function]
+    right, wrong = MISTAKES[assignment][function][mistake]
+    assert right in cell.source, f"the solution does not contain {right!r}"
+    cell.source = cell.source.replace(right, wrong)
+    return notebook
 
 
 def tasks(notebook: NotebookNode) -> list[list[NotebookNode]]:
@@ -134,26 +151,31 @@ def tasks(notebook: NotebookNode) -> list[list[NotebookNode]]:
 
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_the_given_cells_of_the_handed_out_notebook_run_and_agree_with_the_guides(
-    prepared, config, assignment
+def test_the_given_cells_run_and_agree_with_the_expected_outputs_and_the_guides(
+    prepared, config, assignment, capsys
 ):
-    """No given cell needs more than the first cell of the notebook and the function of its own
+    """No given cell needs more than the first cell of the notebook and the functions of its own
     task."""
     handed_out = students_version(assignment, config)
     solutions = graded(source(assignment), solution=True)
-    computed, given = {"turned_similarity": turned_similarity}, 0
+    computed = {"turned_similarity": turned_similarity}
+    expected = 0
     for cells in tasks(handed_out):
         namespace = prepared(assignment)
         exec(code(handed_out, solution=True, grade=False), namespace)
-        for cell in [one for one in cells if one.cell_type == "code"]:
-            if "nbgrader" not in cell.metadata:
+        for cell, following in zip(cells, [*cells[1:], None], strict=True):
+            if cell.cell_type == "code" and "nbgrader" not in cell.metadata:
+                capsys.readouterr()
                 exec(cell.source, namespace)
-                given += 1
-            elif cell.metadata.nbgrader.solution:
+                if following.source.startswith("Expected:"):
+                    (text,) = re.findall(r"```text\n(.*?)\n```", following.source, re.DOTALL)
+                    assert capsys.readouterr().out.strip() == text.strip()
+                    expected += 1
+            elif cell.cell_type == "code" and cell.metadata.nbgrader.solution:
                 exec(solutions[cell.metadata.nbgrader.grade_id].source, namespace)
         computed |= namespace
     plt.close("all")
-    assert given == len(tasks(handed_out))
+    assert expected == len(MISTAKES[assignment])
     exec(code(source(assignment), solution=True, grade=False), computed)
     guides = " ".join(code(source(assignment), solution=True, grade=True).split())
     for statement, expression in STATEMENTS[assignment].items():
@@ -166,30 +188,52 @@ def test_the_solutions_pass_every_test_and_the_students_version_none(prepared, c
     notebook, handed_out = source(assignment), students_version(assignment, config)
     text = "\n".join(cell.source for cell in handed_out.cells)
     assert not re.search("SOLUTION|HIDDEN|Guide for marking", text)
-    assert failing_tests(prepared(assignment), notebook, notebook) == set()
+    assert failing_tests(prepared(assignment), notebook, notebook) == {}
     every = set(graded(notebook, grade=True, locked=True))
-    assert failing_tests(prepared(assignment), handed_out, notebook) == every
+    assert failing_tests(prepared(assignment), handed_out, notebook).keys() == every
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # some mistakes divide by zero or overflow
 @pytest.mark.parametrize(
-    "assignment, task, mistake",
+    "assignment, function, mistake",
     [
-        (assignment, task, mistake)
-        for assignment, of_tasks in MISTAKES.items()
-        for task, mistakes in of_tasks.items()
+        (assignment, function, mistake)
+        for assignment, of_functions in MISTAKES.items()
+        for function, mistakes in of_functions.items()
         for mistake in mistakes
     ],
 )
-def test_each_mistake_fails_its_own_task_and_no_other(prepared, assignment, task, mistake):
-    notebook = source(assignment)
-    cell = graded(notebook, solution=True)[task]
-    right, wrong = MISTAKES[assignment][task][mistake]
-    assert right in cell.source, f"the solution does not contain {right!r}"
-    cell.source = cell.source.replace(right, wrong)
+def test_each_mistake_fails_its_own_function_and_no_other(prepared, assignment, function, mistake):
+    notebook = mistaken(assignment, function, mistake)
     failing = failing_tests(prepared(assignment), notebook, notebook)
-    # The tests of a task are called test_TASK_1 and test_TASK_2.
-    assert {name.removeprefix("test_")[:-2] for name in failing} == {task}
+    assert failing and failing.keys() <= names_of_tests(assignment, function)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("assignment", ASSIGNMENTS)
+def test_students_see_a_test_of_the_commonest_mistake_that_says_what_to_look_at(
+    prepared, config, assignment
+):
+    for function, (commonest, *_) in MISTAKES[assignment].items():
+        notebook = mistaken(assignment, function, commonest)
+        failing = failing_tests(
+            prepared(assignment), notebook, students_version(assignment, config)
+        )
+        assert failing and all(len(message.split()) > 4 for message in failing.values()), function
+
+
+@pytest.mark.parametrize("assignment", ASSIGNMENTS)
+def test_functions_have_two_hints_and_questions_the_headings_of_their_guide(assignment):
+    for cells in tasks(source(assignment)):
+        text = "\n".join(cell.source for cell in cells if cell.cell_type == "markdown")
+        functions = graded(NotebookNode(cells=cells), solution=True, grade=False)
+        assert text.count("*Hint:* ") == len(functions)
+        assert text.count("<details><summary>Second hint</summary>") == len(functions)
+        for answer in graded(NotebookNode(cells=cells), solution=True, grade=True).values():
+            guide = re.findall(r"^\d\. \*\*(.+?)\*\*", answer.source, re.MULTILINE)
+            (shown,) = re.findall(r"^\*Points:\* (.*)", cells[0].source, re.MULTILINE | re.DOTALL)
+            assert re.findall(r"\*\*(.+?)\*\*", shown) == guide
+            assert len(guide) == answer.metadata.nbgrader.points
 
 
 CALLS_THE_LIBRARY = """
@@ -201,12 +245,12 @@ def {0}(*arguments):
 
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_a_function_that_calls_the_library_fails_all_tests_of_its_task(prepared, assignment):
-    for task in MISTAKES[assignment]:
+def test_a_function_that_calls_the_library_fails_all_its_tests(prepared, assignment):
+    for function in MISTAKES[assignment]:
         notebook = source(assignment)
-        graded(notebook, solution=True)[task].source += CALLS_THE_LIBRARY.format(task)
+        graded(notebook, solution=True)[function].source += CALLS_THE_LIBRARY.format(function)
         failing = failing_tests(prepared(assignment), notebook, notebook)
-        assert failing == {f"test_{task}_1", f"test_{task}_2"}
+        assert failing.keys() == names_of_tests(assignment, function)
 
 
 def turn_into_text(cell: NotebookNode) -> None:
@@ -227,6 +271,7 @@ DAMAGES = {
 
 
 METRICS = "05_metrics"
+LAB = "lab_90_minutes"
 RIGHT, CALLS, _ = MISTAKES[METRICS]  # the task that Ada has right, and where she calls the library
 
 
@@ -234,6 +279,7 @@ class Collected(NamedTuple):
     """What the commands of a lecturer make of the hand-ins of an assignment."""
 
     folder: Path  # of the exercises
+    endless: tuple[float, list[float]]  # seconds and scores of `autograde` for an endless loop
     log: str  # of `autograde`
     exported: str  # the output of `export` before the answers are graded by hand
     points: dict[str, float]  # of the tests of Ada's notebook
@@ -243,7 +289,7 @@ class Collected(NamedTuple):
 @pytest.fixture(scope="module")
 def collected(tmp_path_factory) -> Collected:
     """Ada has one task right and calls the library in another; Bob's file is damaged, Eve's a PDF,
-    Dan has two."""
+    Dan has two. In the lab, Ida's function never ends."""
     root = tmp_path_factory.mktemp("course")
     folder = copy_course(root)
     with pytest.MonkeyPatch.context() as patch:
@@ -265,8 +311,9 @@ def collected(tmp_path_factory) -> Collected:
         points = grade_by_hand(folder)
         run_nbgrader(["export"])
         run_nbgrader(["generate_feedback", METRICS, "--force"])
+        endless = grade_endless_loop(folder)
     unignored = git(root, "ls-files", "--others", "--exclude-standard")
-    return Collected(folder, log, exported, points, unignored)
+    return Collected(folder, endless, log, exported, points, unignored)
 
 
 def git(root: Path, *words: str) -> str:
@@ -277,7 +324,8 @@ def git(root: Path, *words: str) -> str:
 def copy_course(root: Path) -> Path:
     """Copy what a lecturer needs of the repository; returns the folder of the exercises."""
     folder = root / "notebooks/exercises"
-    shutil.copytree(EXERCISES / "source" / METRICS, folder / "source" / METRICS)
+    for assignment in (METRICS, LAB):
+        shutil.copytree(EXERCISES / "source" / assignment, folder / "source" / assignment)
     shutil.copy(EXERCISES / "nbgrader_config.py", folder)
     shutil.copy(EXERCISES.parents[1] / ".gitignore", root)
     return folder
@@ -337,10 +385,52 @@ def grade_by_hand(folder: Path) -> dict[str, float]:
     return points
 
 
+def grade_endless_loop(folder: Path) -> tuple[float, list[float]]:
+    """Grade a hand-in for the lab whose function never ends; returns the seconds and the scores."""
+    run_nbgrader(["generate_assignment", LAB])
+    path = folder / "submitted/127" / LAB / f"{LAB}.ipynb"
+    path.parent.mkdir(parents=True)
+    notebook = nbformat.read(folder / "release" / LAB / path.name, as_version=4)
+    answer = graded(notebook, solution=True)["row_of_lengths"]
+    answer.source = "def row_of_lengths(*_):\n    while True:\n        pass"
+    nbformat.write(notebook, path)
+    start = time.monotonic()
+    run_nbgrader(["autograde", LAB])
+    seconds = time.monotonic() - start
+    with Gradebook(f"sqlite:///{folder / 'gradebook.db'}", "zsp-lite") as gradebook:
+        grades = gradebook.find_submission(LAB, "127").notebooks[0].grades
+        return seconds, [grade.auto_score for grade in grades]
+
+
 def test_each_test_of_a_task_that_is_right_gives_two_points_and_the_others_none(collected):
     assert collected.points == {
         f"test_{task}_{i}": 2 * (task == RIGHT) for task in MISTAKES[METRICS] for i in (1, 2)
     }
+
+
+def test_an_endless_loop_costs_its_points_and_at_most_30_s(collected):
+    seconds, scores = collected.endless
+    assert scores == [0, 0, 0]
+    assert 10 < seconds < 10 + 30  # the second is for the start, and the set-up
+
+
+def test_several_loops_cost_no_more_than_the_limit_and_spare_other_functions(config, monkeypatch):
+    execute = config.Autograde.autograde_preprocessors[0]
+    monkeypatch.setitem(execute.preprocess.__globals__, "LIMIT", 3)
+    monkeypatch.setitem(execute.preprocess.__globals__, "LOST", 6)
+    cells = []
+    for i, statement in enumerate(["while True: pass", "pass", "while True: pass", "pass"]):
+        for is_solution, line in ((True, f"def f{i}():\n    {statement}"), (False, f"f{i}()")):
+            cells += [
+                nbformat.v4.new_code_cell(line, metadata={"nbgrader": {"solution": is_solution}})
+            ]
+        cells += deepcopy(cells[-1:])  # a second test
+    notebook, _ = execute(config=config).preprocess(nbformat.v4.new_notebook(cells=cells), {})
+    failed = [bool(cell.outputs) for cell in notebook.cells]
+    stopped, passed = [False, True, True], [False] * 3
+    assert failed == stopped + passed + stopped + [True] * 3
+    (first, *_), (second, *_) = (notebook.cells[i].outputs[::-1] for i in (1, 2))
+    assert first.traceback != second.traceback == ["not run: a cell before this one did not end"]
 
 
 def test_tests_that_students_changed_are_put_back(collected):
@@ -435,33 +525,46 @@ def test_a_second_collection_renews_only_files_that_changed(config, tmp_path, mo
         "Ada Lovelace_123_assignsubmission_file_05_metrics (1).ipynb",
         "lovelaceada_LATE_123_67890_05_metrics-2.ipynb",
         "lovelaceada_123_67890_05_metrics-Copy1.ipynb",
+        "Ada Lovelace_123_assignsubmission_file_lab_90_minutes.ipynb",
+        "lovelaceada_123_67890_lab_90_minutes-1.ipynb",
     ],
 )
 def test_nbgrader_recognises_the_files_of_learning_platforms(config, name):
     path = f"downloaded/{METRICS}/extracted/all/{name}"
     found = re.match(config.FileNameCollectorPlugin.named_regexp, path)
-    assert found.groupdict() == {"student_id": "123", "file_id": METRICS}
+    assignment = LAB if LAB in name else METRICS
+    assert found.groupdict() == {"student_id": "123", "file_id": assignment}
 
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_an_exercise_has_20_points_and_no_test_decides_more_than_two(assignment):
+def test_the_points_add_up_and_no_test_decides_more_than_two(assignment):
     notebook = source(assignment)
     cells = graded(notebook, grade=True)
     points = {name: cell.metadata.nbgrader.points for name, cell in cells.items()}
-    tests = [f"test_{task}_{i}" for task in MISTAKES[assignment] for i in (1, 2)]
-    assert [name for name in points if name.startswith("test_")] == tests
-    assert [*points.values()] == [2] * 6 + [4] * 2  # six tests, two answers
-    assert "20 points: 12 by tests, 8 by" in notebook.cells[0].source
+    of_functions = (names_of_tests(assignment, function) for function in MISTAKES[assignment])
+    tests = set().union(*of_functions)
+    assert {name for name in points if name.startswith("test_")} == tests
+    by_tests, by_reader = (4, [1]) if assignment == LAB else (12, [4, 4])
+    assert [points[name] for name in tests] == [2] * (by_tests // 2)
+    assert [points[name] for name in points if name not in tests] == by_reader
+    total = f"{by_tests + sum(by_reader)} points: {by_tests} by tests, {sum(by_reader)} by"
+    assert total in " ".join(notebook.cells[0].source.split())
 
 
-def test_there_are_five_exercises():
-    assert len(ASSIGNMENTS) == 5
+def test_there_are_five_exercises_and_a_lab():
+    assert len(ASSIGNMENTS) == 5 + len([LAB])
 
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_the_readme_lists_the_five_tasks_of_an_exercise(assignment):
-    readme = (EXERCISES / "README.md").read_text("utf-8").lower()
+def test_the_readme_lists_the_tasks_and_the_hours_of_an_exercise(assignment):
+    (row,) = [
+        line.lower()
+        for line in (EXERCISES / "README.md").read_text("utf-8").splitlines()
+        if line.startswith(f"| [{assignment}]")
+    ]
     text = "\n".join(cell.source for cell in source(assignment).cells)
-    titles = re.findall(r"^## Task \d · (.*) \(4 points", text, re.MULTILINE)
-    assert len(titles) == 5
-    assert [title for title in titles if title.lower() not in readme] == []
+    titles = re.findall(r"^## Task \d · (.*) \(\d points?", text, re.MULTILINE)
+    assert len(titles) == (2 if assignment == LAB else 5)
+    assert [title for title in titles if title.lower() not in row] == []
+    (hours,) = re.findall(r"\*\*Time and hand-in\.\*\* (?:About )?(.*?)\.", text)
+    assert f"| {hours.lower()} |" in row

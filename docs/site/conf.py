@@ -31,7 +31,7 @@ include_patterns = [
     "*.md",
     "docs/**.md",
     "notebooks/README.md",
-    "notebooks/exercises/README.md",
+    "notebooks/exercises/*.md",
     "notebooks/*.ipynb",
     "notebooks/exercises/source/*/*.ipynb",
     "notebooks/results/*/README.md",

@@ -43,7 +43,7 @@ WIDE_ROW = 80
 INTERVAL = re.compile(r"\[[-−]?[\d.]+, [-−]?[\d.]+\]")
 
 # Pages that belong to a page but that the sidebar leaves out, as patterns.
-CHILDREN = {"notebooks/README": "../docs/slides/*", "notebooks/exercises/README": "source/*/*"}
+CHILDREN = {"notebooks/README": "../docs/slides/*", "notebooks/exercises/README": "**_*"}
 HIDDEN_LINKS = """
 
 ```{toctree}

@@ -4,6 +4,7 @@ import csv
 import filecmp
 import re
 import shutil
+import time
 import zipfile
 from datetime import UTC, datetime
 from functools import cache
@@ -16,10 +17,12 @@ from latex2mathml.converter import convert
 from nbconvert.exporters import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 from nbformat import NotebookNode
+from nbformat.v4 import new_output
 from nbgrader.api import Gradebook, MissingEntry
+from nbgrader.converters import Autograde
 from nbgrader.converters.base import NbGraderException
 from nbgrader.plugins import ExportPlugin, FileNameCollectorPlugin
-from nbgrader.preprocessors import NbGraderPreprocessor
+from nbgrader.preprocessors import Execute, NbGraderPreprocessor
 
 c = get_config()  # noqa: F821, nbgrader defines it
 HERE = Path(__file__).parent
@@ -185,14 +188,49 @@ c.ServerApp.tornado_settings = {"page_config_data": {"buildCheck": False}}
 c.LabApp.news_url = None
 
 
-def seconds(cell: NotebookNode) -> int:
-    """Limit a cell to 30 s, as `nbgrader validate` does."""
-    # The cell of the set-up imports torch, which may take longer.
-    grade_id = cell.metadata.get("nbgrader", {}).get("grade_id")
-    return 120 if grade_id == "setup" else 30
+# Seconds that a hand-in may lose to cells that do not end.
+LOST = 30
+# Seconds for a cell of a task with tests: about 8 times what slow but right code takes.
+LIMIT = 10
 
 
-c.Execute.timeout_func = seconds
+class ExecuteHandIn(Execute):
+    """Stop a cell that does not end, and run no further cell of its function."""
+
+    def preprocess(self, nb: NotebookNode, *args: object) -> tuple:
+        self.left = LOST
+        self.limit = LIMIT
+        self.stopped = False
+        return super().preprocess(nb, *args)
+
+    def preprocess_cell(self, cell: NotebookNode, resources: dict, index: int) -> tuple:
+        data = cell.metadata.get("nbgrader", {})
+        if cell.source.startswith("## "):
+            self.limit = LOST if "read by a person" in cell.source else LIMIT
+        if cell.source.startswith("## ") or data.get("solution"):
+            self.stopped = False
+        if cell.cell_type == "code" and (self.stopped or self.left == 0):
+            error = new_output("error", ename="CellTimeoutError", evalue="")
+            error.traceback = ["not run: a cell before this one did not end"]
+            cell.outputs = [error]
+            return cell, resources
+        # The cell of the set-up imports torch.
+        setup = data.get("grade_id") == "setup"
+        self.timeout = 120 if setup else min(self.limit, self.left)
+        start = time.monotonic()
+        cell, resources = super().preprocess_cell(cell, resources, index)
+        errors = [output.get("ename") for output in cell.get("outputs", [])]
+        if "CellTimeoutError" in errors:
+            self.stopped = True
+            self.left = max(0, self.left - round(time.monotonic() - start))
+        return cell, resources
+
+
+steps = Autograde().autograde_preprocessors
+steps[steps.index(Execute)] = ExecuteHandIn
+c.Autograde.autograde_preprocessors = steps
+# A cell that catches its interruption costs its own points, not those of the hand-in.
+c.Execute.raise_on_iopub_timeout = False
 
 
 class Renderer(IPythonRenderer):

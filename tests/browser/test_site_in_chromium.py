@@ -1,5 +1,5 @@
-"""The course site in Chromium: pages fit a phone, fields can be read, the class does not see the
-presenter's notes."""
+"""The course site in Chromium: pages fit a phone, the worksheet one sheet, and the class does not
+see the presenter's notes."""
 
 import pytest
 
@@ -17,6 +17,12 @@ def test_no_page_is_wider_than_the_screen_of_a_phone(browser, site):
             if width > screen:
                 wide[name] = width
     assert wide == {}
+
+
+def test_the_worksheet_prints_on_one_page(browser, site):
+    page = browser.new_page()
+    page.goto((site / "notebooks/exercises/worksheet_06.html").as_uri())
+    assert page.pdf(format="A4").count(b"/Type /Page\n") == 1
 
 
 @pytest.fixture
@@ -43,7 +49,7 @@ def test_notes_are_shown_in_the_presenters_view_alone(windows):
     page, presenter = windows
     page.keyboard.press("ArrowRight")
     # Parts of the notes on slides 3 and 4.
-    for notes in (["comes close"], ["equation 3", "Taken literally"]):
+    for notes in (["Let the class order"], ["equation 3", "Taken literally"]):
         page.keyboard.press("ArrowRight")
         for note in notes:
             assert note in presenter.inner_text("article")
