@@ -137,7 +137,7 @@ def evaluate(
 
     # The lines as one table, and its summary.
     run = read_run(out)
-    for remark in [*remarks.values(), *run.failures]:
+    for remark in [*remarks.values(), *run.failures.values()]:
         if remark:
             logger.warning("%s", remark)
     return run.summary
