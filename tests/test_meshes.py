@@ -1,8 +1,6 @@
 """Model files are read into the canonical frame or refused with a reason; their renderings have
 exact geometry."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import trimesh
@@ -236,22 +234,6 @@ def test_a_hole_in_a_texture_is_a_hole_in_mask_and_coordinates(holed):
     assert np.isnan(drawn.canonical[middle]).all()
     square = (np.ptp(row) + 1) * (np.ptp(col) + 1)  # pixels, hole included
     assert_allclose(drawn.mask.sum() / square, 0.75, atol=0.05)
-
-
-def test_a_surface_behind_many_holes_is_seen(holed):
-    sheets = np.arange(6)
-    behind = sheets[:, None, None] * [-0.1, 0, 0]
-    mesh = replace(
-        holed,
-        vertices=(holed.vertices + behind).reshape(-1, 3),
-        faces=(holed.faces + len(holed.vertices) * sheets[:, None, None]).reshape(-1, 3),
-        normals=np.tile(holed.normals, (6, 1, 1)),
-        uv=np.tile(holed.uv, (6, 1, 1)) * np.repeat(sheets < 5, 2)[:, None, None],
-        colours=np.tile(holed.colours, (6, 1, 1)),
-        material=np.tile(holed.material, 6),
-    )
-    row, col = np.nonzero(render(holed, from_the_front(holed)).mask)
-    assert render(mesh, from_the_front(holed)).mask[round(row.mean()), round(col.mean())]
 
 
 def test_light_falls_through_a_hole_in_a_texture(holed):

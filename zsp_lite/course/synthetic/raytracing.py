@@ -25,6 +25,7 @@ from zsp_lite.course.synthetic.textures import (
 from zsp_lite.data.cameras import Camera
 from zsp_lite.io.ply import load_open3d
 
+_LAYERS = 4  # surfaces that a ray meets at most, as it passes through the holes of textures
 _HOLE = 128  # opacity of a texture, 0 to 255, below which it has a hole
 # Distance in units between a surface and the start of a ray that leaves it: the ray must not meet
 # the same surface again.
@@ -154,7 +155,7 @@ class MeshScene:
         start = np.zeros(len(rays), np.float32)  # the parameter from which each ray is followed
         active = np.arange(len(rays))  # indices of the rays that are still followed
         layers = []
-        while True:
+        for _ in range(_LAYERS):
             points = origin[active] + start[active, None] * rays[active]
             result = self._raycaster.cast_rays(self._tensor(np.hstack([points, rays[active]])))
             reach = result["t_hit"].numpy()
@@ -171,7 +172,8 @@ class MeshScene:
             active = ray[hole]
             start[active] = distance[hole] + _OFFSET
             if not len(active):
-                return _Hits(*map(np.concatenate, zip(*layers, strict=True)))
+                break
+        return _Hits(*map(np.concatenate, zip(*layers, strict=True)))
 
     def _is_hole(self, face: Int[np.ndarray, " n"], weights: Vectors) -> Bool[np.ndarray, " n"]:
         """Return at which surface points the texture has a hole."""
