@@ -472,7 +472,7 @@ def test_each_pair_has_its_own_pose_and_missing_ones_are_told(tmp_path, monkeypa
     found = read_run(tmp_path / "run")
     assert [(row["n"], row["failed"]) for row in rows.values()] == [(2, 0), (2, 1)]
     assert found.row("both")["error"].nunique() == 2
-    (failure,) = found.failures
+    (failure,) = found.failures.values()
     reason = "one failed on 1 of 2 pairs, counted as 180°; the first: .*one.csv has no pose"
     assert re.match(reason, failure)
     assert failure in next(iter(every_table(found.summary))).note

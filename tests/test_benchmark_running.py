@@ -425,6 +425,20 @@ def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
     run(tmp_path / "other")
 
 
+def test_a_scene_that_another_processor_rendered_continues_a_run(tmp_path):
+    """Its labels differ as those of a backpack did on two processors: the unit of length by 3e-5,
+    and the last digit of a rotation."""
+    root = shutil.copytree(small_folder(), tmp_path / "data")
+    evaluate(root, BACKBONE, ["ours-bv"], {"lump": 1}, 2, tmp_path / "run")
+    for label in read_labels(root, "lump").values():
+        if label.seq != label.reference_seq:
+            trans = label.trans + 1e-9 * np.eye(4, k=1)
+            trans[:3, 3] *= 1 + 3e-5
+            write_label(root, "lump", replace(label, trans=trans))
+    evaluate(root, BACKBONE, ["icp"], {"lump": 1}, 2, tmp_path / "run")
+    assert list(read_run(tmp_path / "run").settings.methods) == ["ours-bv", "icp"]
+
+
 def stop() -> None:
     """Interrupt a run."""
     raise KeyboardInterrupt

@@ -259,6 +259,18 @@ def test_a_chosen_row_that_the_run_lacks_is_refused(run):
     refused(message, tables.choose, run, ["ours", "nobody"])
 
 
+def test_tables_of_chosen_rows_say_nothing_of_the_failures_of_others(tmp_path):
+    ours = {"bicycle/a:0/b:4": {"error": 1.0}}
+    failed = {"bicycle/a:0/b:4": {"error": 180.0, "failed": "no depth map"}}
+    run = write_run(tmp_path, {"ours": ours, "icp": failed}, ["bicycle"])
+    notes = {
+        row: by_name(every_table(tables.choose(run, [row])))["all_rows"].note
+        for row in ("ours", "icp")
+    }
+    assert "failed" not in notes["ours"]
+    assert "icp failed on 1 of 1 pairs" in notes["icp"]
+
+
 @pytest.fixture
 def timed(tmp_path) -> Run:
     """A run whose pairs take 20 ms by ours and 10 ms by icp, with errors of 0 to 160 degrees."""

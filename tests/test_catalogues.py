@@ -6,7 +6,9 @@ import json
 from collections.abc import Mapping
 
 import pytest
+from refusals import refused
 
+from tools.ac3d import read_ac3d
 from tools.models import LICENCES, Entry, attribution, read_catalogue
 from tools.training_categories import TRAINING
 from tools.validation_categories import VALIDATION
@@ -129,3 +131,9 @@ def test_no_model_for_training_has_the_name_of_an_evaluation_category():
         "toilet_brush",
         "toilet_paper_dispenser",
     }
+
+
+def test_a_damaged_model_of_flightgear_is_refused_with_its_path(tmp_path):
+    path = tmp_path / "a.ac"
+    path.write_text('AC3Db\nMATERIAL "paint" 1 1 1 amb 0.2 0.2 0.2\n')
+    refused("a.ac is damaged", read_ac3d, path)

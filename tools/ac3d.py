@@ -42,7 +42,7 @@ def read_ac3d(path: Path) -> tuple[list[Material], list[Ac3dObject]]:
                 materials.append(_material(words[2:]))
             elif words[:1] == ["OBJECT"]:
                 _read_object(lines, np.eye(3), np.zeros(3), objects)
-    except (StopIteration, ValueError, IndexError) as error:
+    except (StopIteration, ValueError, LookupError) as error:
         raise InputError(f"{path} is damaged: {error!r}") from error
     return materials, objects
 
@@ -93,6 +93,7 @@ def convert(path: Path, out: Path, texture_folders: Sequence[Path] = ()) -> None
 def _material(words: list[str]) -> Material:
     """Parse a MATERIAL line: each keyword is followed by its numbers."""
     material: Material = {}
+    keyword = ""
     for word in words:
         if word.isalpha():
             keyword = word
@@ -114,8 +115,7 @@ def _read_object(
     displacement = (0, 0)
     faces: list[tuple[int, Corners]] = []
     for line in lines:
-        words = shlex.split(line) if '"' in line else line.split()
-        keyword, *rest = words
+        keyword, *rest = shlex.split(line) if '"' in line else line.split()
         if keyword == "loc":
             offset = np.array(rest, float)
         elif keyword == "rot":

@@ -215,22 +215,22 @@ class Run:
             "targets": self.settings.targets,
         }
         summary = {"data": data, "backbone": backbone}
-        notes = " ".join(filter(None, [self.note, *self.failures]))
+        notes = " ".join(filter(None, [self.note, *self.failures.values()]))
         if notes:
             summary["note"] = notes
         return summary | summarise(self.table) | {"timings": self.timings}
 
     @functools.cached_property
-    def failures(self) -> list[str]:
-        """Of each row that failed on pairs: on how many, and the reason of the first."""
+    def failures(self) -> dict[str, str]:
+        """By row that failed on pairs: on how many, and the reason of the first."""
         failed = self.table[self.table["failed"] != ""].groupby("row", sort=False)
         counts = failed["pair"].nunique()
         pairs = self.table.groupby("row")["pair"].nunique()
-        return [
-            f"{name} failed on {counts[name]} of {pairs[name]} pairs, counted as 180°; the first: "
-            f"{reason}."
+        return {
+            name: f"{name} failed on {counts[name]} of {pairs[name]} pairs, counted as 180°; the "
+            f"first: {reason}."
             for name, reason in failed["failed"].first().items()
-        ]
+        }
 
     def row(self, name: str) -> pd.DataFrame:
         """Return the table's lines of a row by pair key; InputError for an unknown row."""

@@ -99,7 +99,9 @@ def choose(run: Run, rows: Sequence[str]) -> dict[str, Any]:
     unknown row."""
     for name in rows:
         run.row(name)
+    notes = [run.note, *(run.failures.get(name, "") for name in rows)]
     return run.summary | {
+        "note": " ".join(filter(None, notes)),
         "methods": {name: run.summary["methods"][name] for name in rows},
         "chosen": list(rows),
     }

@@ -46,7 +46,7 @@ DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 @click.option("--out", type=PATH, required=True, help="Folder to write.")
 def synth(preset, categories, models_folder, seed, out, **given) -> None:
     """Render procedural objects or your own models into a CO3D folder; the same seed gives the same
-    files.
+    objects and cameras.
 
     \b
     --preset    demo (3 categories, 15 s), paper-small (20 of 5 sequences of 24 frames), or paper

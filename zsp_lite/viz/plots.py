@@ -315,7 +315,7 @@ def show_panels(
     **labels: Any,
 ) -> Figure:
     """Show curves (x, y), or points that are not `joined`, in each panel, by its title, with one
-    legend.
+    legend of those with a name.
 
     Curves differ in colour, line and marker. `size` is the width of the figure and the height of a
     row, in inches; `labels` is what `Axes.set` takes.
@@ -340,7 +340,8 @@ def show_panels(
                     label=name,
                 )
         axis.set(title=title, **labels)
-    _legend(figure, axes[0])
+    if any(panels[title]):
+        _legend(figure, axes[0])
     return figure
 
 
