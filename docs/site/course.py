@@ -65,14 +65,17 @@ MODULE = r"""
 """
 
 INSTALL_IN_COLAB = """\
-# Colab only: fetches the repository with its sample data, installs zsp-lite (minutes).
+# Colab only: fetches zsp-lite with its sample data, installs what Colab lacks (about a minute).
 import sys
 
 if "google.colab" in sys.modules:
-    !git clone --quiet --depth 1 {repository} /content/{folder}
-    %pip install --quiet /content/{folder} anywidget jupyterquiz
-    %cd /content/{folder}/notebooks
-    !ln -sfn ../data_samples data_samples
+    # Without the exercises, which have the solutions, and, by `cat`, without progress bars.
+    !git clone --depth 1 --filter=blob:none --sparse {repository} /content/{folder} 2>&1 | cat
+    %cd /content/{folder}
+    !git sparse-checkout add zsp_lite data_samples notebooks/results 2>&1 | cat
+    %pip install --quiet . anywidget jupyterquiz
+    %cd notebooks
+    !ln -sfn ../data_samples
     from google.colab import output
 
     output.enable_custom_widget_manager()  # the 3D view for clicks on point clouds
