@@ -91,6 +91,8 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
         widgets = notebook.metadata.pop("widgets", {})
         for cell in notebook.cells:
             if cell.cell_type == "code":
+                if "checks" in cell.metadata.get("tags", []):
+                    cell.metadata.tags.append("hide-cell")  # folded
                 cell.outputs = [
                     shown for output in cell.outputs for shown in static_outputs(output, widgets)
                 ]
