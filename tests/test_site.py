@@ -31,6 +31,7 @@ class Page:
         self.links = [tag["href"] for tag in html.find_all("a", href=True)]
         self.pictures = html.find_all("img")
         self.text = html.get_text()
+        self.folded = len(html.select("div.cell > details"))
         self.loaded = [tag["src"] for tag in html.select("img[src], script[src], iframe[src]")]
         # All other links of the head load a file.
         leading_on = {"next", "prev", "canonical", "search", "index"}
@@ -110,6 +111,7 @@ def test_a_notebook_shows_its_stored_pictures_its_drawings_and_what_it_printed(p
     assert [text for text in shown if text in texts] == texts
     drawings = re.findall(r"!\[([^]]+)\]\(", "\n".join(cell.source for cell in cells))
     assert all(" ".join(text.split()) in shown for text in drawings)
+    assert page.folded == sum("checks" in cell.metadata.get("tags", []) for cell in cells)
     for output in outputs:
         if output.output_type == "stream" and output.text.strip():
             assert output.text.strip().splitlines()[0].strip() in page.text
@@ -176,8 +178,12 @@ def test_with_an_address_a_notebook_has_links_to_run_it_and_an_install_cell(monk
     branch = f"https://colab.research.google.com/github/someone/zsp/blob/{course.BRANCH}"
     assert f'href="{branch}/run/notebooks/00_quickstart.ipynb"' in links
     stored = nbformat.read(NOTEBOOKS[0], 4)
-    first, *others = course.runnable(stored, address).cells
-    assert others == stored.cells
+    first, *others = course.runnable(stored, "notebooks/00_quickstart", address).cells
+    assert [cell.id for cell in others] == [cell.id for cell in stored.cells]
+    text = "\n".join(cell.source for cell in others if cell.cell_type == "markdown")
+    assert f"({address}/raw/HEAD/notebooks/figures/here_00.svg)" in text
+    assert f"({address}/blob/HEAD/docs/glossary.md#depth)" in text
+    assert not re.search(r"\]\((?!https:|#)", text)
     # Outside Colab the cell does nothing: its commands are lines of IPython, indented below the
     # condition.
     assert re.match(
@@ -202,7 +208,7 @@ def test_in_colab_the_cell_fetches_everything_but_the_exercises(monkeypatch, tmp
     (tmp_path / "google").mkdir()
     (tmp_path / "google/__init__.py").write_text("")
     (tmp_path / "google/colab.py").write_text("class output: enable_custom_widget_manager = print")
-    cell = course.runnable(nbformat.v4.new_notebook(), source.as_uri()).cells[0].source
+    cell = course.runnable(nbformat.v4.new_notebook(), "a", source.as_uri()).cells[0].source
     cell = cell.replace("/content", str(tmp_path / "content")).replace("%pip", "!echo")
     (tmp_path / "cell.ipy").write_text(f"import google.colab\n{cell}")
     settings = {"PYTHONPATH": str(tmp_path), "IPYTHONDIR": str(tmp_path / "ipython")}
@@ -222,7 +228,8 @@ def test_in_colab_the_cell_fetches_everything_but_the_exercises(monkeypatch, tmp
     assert f"?{hashed.stdout.strip()}" in objects.splitlines()
 
 
-def test_one_line_of_pyproject_gives_the_site_the_address_of_the_repository(tmp_path):
+def test_one_line_of_pyproject_gives_the_site_the_address_of_the_repository(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(tmp_path)  # restores the path, which the configuration changes
     (tmp_path / "docs/site").mkdir(parents=True)
     conf = shutil.copy(REPOSITORY / "docs/site/conf.py", tmp_path / "docs/site")
     project = (REPOSITORY / "pyproject.toml").read_text("utf-8")

@@ -19,7 +19,7 @@ from copy import deepcopy
 from html import escape, unescape
 from pathlib import Path
 from types import FunctionType, ModuleType
-from urllib.parse import urlsplit
+from urllib.parse import urljoin, urlsplit
 
 import nbformat
 import plotly
@@ -306,11 +306,20 @@ def run_links(docname: str, repository: str) -> str:
     return f'<p class="run">{shown}</p>'
 
 
-def runnable(notebook: NotebookNode, repository: str) -> NotebookNode:
-    """Copy a notebook with a first cell that installs zsp-lite in Colab, if the repository's
-    address is known."""
+def runnable(notebook: NotebookNode, docname: str, repository: str) -> NotebookNode:
+    """Copy a notebook for Colab, if the repository's address is known: with a first cell that
+    installs zsp-lite, and with the addresses of drawings and pages on GitHub."""
     notebook = deepcopy(notebook)
     if repository:
+        for cell in notebook.cells:
+            if cell.cell_type == "markdown":
+                for sign, kind in (("!", "raw"), ("", "blob")):
+                    place = f"{repository}/{kind}/HEAD/{docname}"
+                    cell.source = re.sub(
+                        rf"({sign}\[[^]]*\]\()(?![a-z]+:|#)([^)]+)",
+                        lambda link: link[1] + urljoin(place, link[2]),
+                        cell.source,
+                    )
         folder = repository.rstrip("/").removesuffix(".git").rpartition("/")[2]
         cell = nbformat.v4.new_code_cell(
             INSTALL_IN_COLAB.format(repository=repository, folder=folder), id="install"
@@ -331,7 +340,7 @@ def write_files(app: Sphinx, error: Exception | None) -> None:
             remove_solutions(notebook, app.srcdir)
             copy = app.outdir / "run" / f"{docname}.ipynb"
             copy.parent.mkdir(parents=True, exist_ok=True)
-            nbformat.write(runnable(notebook, app.config.course_repository), copy)
+            nbformat.write(runnable(notebook, docname, app.config.course_repository), copy)
     shutil.copytree(
         app.srcdir / "notebooks" / "figures",
         app.outdir / "run" / "notebooks" / "figures",
