@@ -2,7 +2,12 @@
 out."""
 
 import importlib
+import os
 import re
+import runpy
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
@@ -26,6 +31,7 @@ class Page:
         self.links = [tag["href"] for tag in html.find_all("a", href=True)]
         self.pictures = html.find_all("img")
         self.text = html.get_text()
+        self.folded = len(html.select("div.cell > details"))
         self.loaded = [tag["src"] for tag in html.select("img[src], script[src], iframe[src]")]
         # All other links of the head load a file.
         leading_on = {"next", "prev", "canonical", "search", "index"}
@@ -105,6 +111,7 @@ def test_a_notebook_shows_its_stored_pictures_its_drawings_and_what_it_printed(p
     assert [text for text in shown if text in texts] == texts
     drawings = re.findall(r"!\[([^]]+)\]\(", "\n".join(cell.source for cell in cells))
     assert all(" ".join(text.split()) in shown for text in drawings)
+    assert page.folded == sum("checks" in cell.metadata.get("tags", []) for cell in cells)
     for output in outputs:
         if output.output_type == "stream" and output.text.strip():
             assert output.text.strip().splitlines()[0].strip() in page.text
@@ -171,12 +178,63 @@ def test_with_an_address_a_notebook_has_links_to_run_it_and_an_install_cell(monk
     branch = f"https://colab.research.google.com/github/someone/zsp/blob/{course.BRANCH}"
     assert f'href="{branch}/run/notebooks/00_quickstart.ipynb"' in links
     stored = nbformat.read(NOTEBOOKS[0], 4)
-    first, *others = course.runnable(stored, address).cells
-    assert others == stored.cells
-    assert f"git clone --quiet --depth 1 {address} /content/zsp\n" in first.source
-    assert "%cd /content/zsp/notebooks\n" in first.source
+    first, *others = course.runnable(stored, "notebooks/00_quickstart", address).cells
+    assert [cell.id for cell in others] == [cell.id for cell in stored.cells]
+    text = "\n".join(cell.source for cell in others if cell.cell_type == "markdown")
+    assert f"({address}/raw/HEAD/notebooks/figures/here_00.svg)" in text
+    assert f"({address}/blob/HEAD/docs/glossary.md#depth)" in text
+    assert not re.search(r"\]\((?!https:|#)", text)
     # Outside Colab the cell does nothing: its commands are lines of IPython, indented below the
     # condition.
     assert re.match(
         r'# .*\nimport sys\n\nif "google.colab" in sys.modules:\n(( {4}.*)?\n)+$', first.source
     )
+
+
+def test_in_colab_the_cell_fetches_everything_but_the_exercises(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(REPOSITORY / "docs/site")
+    course = importlib.import_module("course")
+    source = tmp_path / "zsp"
+    needed = {"pyproject.toml", "zsp_lite/a.py", "data_samples/a.jpg", "notebooks/results/a.csv"}
+    solution = "notebooks/exercises/source/a.ipynb"
+    for name in (*needed, solution):
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        (source / name).write_text(name)
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a", "-c", "init.defaultBranch=main", "-C"]
+    for words in ("init -q", "config uploadpack.allowFilter true", "add .", "commit -qm a"):
+        subprocess.run([*git, source, *words.split()], check=True)
+
+    # Colab's module and folder, and no installation.
+    (tmp_path / "google").mkdir()
+    (tmp_path / "google/__init__.py").write_text("")
+    (tmp_path / "google/colab.py").write_text("class output: enable_custom_widget_manager = print")
+    cell = course.runnable(nbformat.v4.new_notebook(), "a", source.as_uri()).cells[0].source
+    cell = cell.replace("/content", str(tmp_path / "content")).replace("%pip", "!echo")
+    (tmp_path / "cell.ipy").write_text(f"import google.colab\n{cell}")
+    settings = {"PYTHONPATH": str(tmp_path), "IPYTHONDIR": str(tmp_path / "ipython")}
+    command = [sys.executable, "-m", "IPython", "cell.ipy"]
+    subprocess.run(command, cwd=tmp_path, env=os.environ | settings, check=True)
+
+    clone = tmp_path / "content/zsp"
+    files = {str(path.relative_to(clone)) for path in clone.rglob("*") if path.is_file()}
+    assert {name for name in files if not name.startswith(".git/")} == needed
+    assert (clone / "notebooks/data_samples/a.jpg").is_file()
+    # Nor is the solution among the stored objects.
+    missing = [*git, clone, "rev-list", "--objects", "--missing=print", "HEAD"]
+    objects = subprocess.run(missing, capture_output=True, text=True, check=True).stdout
+    hashed = subprocess.run(
+        [*git, source, "rev-parse", f"HEAD:{solution}"], capture_output=True, text=True, check=True
+    )
+    assert f"?{hashed.stdout.strip()}" in objects.splitlines()
+
+
+def test_one_line_of_pyproject_gives_the_site_the_address_of_the_repository(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(tmp_path)  # restores the path, which the configuration changes
+    (tmp_path / "docs/site").mkdir(parents=True)
+    conf = shutil.copy(REPOSITORY / "docs/site/conf.py", tmp_path / "docs/site")
+    project = (REPOSITORY / "pyproject.toml").read_text("utf-8")
+    line = '# Repository = "https://github.com/YOU/zsp-lite"'
+    assert line in project
+    for text, address in ((line, ""), (line[2:], "https://github.com/YOU/zsp-lite")):
+        (tmp_path / "pyproject.toml").write_text(project.replace(line, text))
+        assert runpy.run_path(conf)["course_repository"] == address

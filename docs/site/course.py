@@ -19,7 +19,7 @@ from copy import deepcopy
 from html import escape, unescape
 from pathlib import Path
 from types import FunctionType, ModuleType
-from urllib.parse import urlsplit
+from urllib.parse import urljoin, urlsplit
 
 import nbformat
 import plotly
@@ -65,14 +65,17 @@ MODULE = r"""
 """
 
 INSTALL_IN_COLAB = """\
-# Colab only: fetches the repository with its sample data, installs zsp-lite (minutes).
+# Colab only: fetches zsp-lite with its sample data, installs what Colab lacks (about a minute).
 import sys
 
 if "google.colab" in sys.modules:
-    !git clone --quiet --depth 1 {repository} /content/{folder}
-    %pip install --quiet /content/{folder} anywidget jupyterquiz
-    %cd /content/{folder}/notebooks
-    !ln -sfn ../data_samples data_samples
+    # Without the exercises, which have the solutions, and, by `cat`, without progress bars.
+    !git clone --depth 1 --filter=blob:none --sparse {repository} /content/{folder} 2>&1 | cat
+    %cd /content/{folder}
+    !git sparse-checkout add zsp_lite data_samples notebooks/results 2>&1 | cat
+    %pip install --quiet . anywidget jupyterquiz
+    %cd notebooks
+    !ln -sfn ../data_samples
     from google.colab import output
 
     output.enable_custom_widget_manager()  # the 3D view for clicks on point clouds
@@ -88,6 +91,8 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
         widgets = notebook.metadata.pop("widgets", {})
         for cell in notebook.cells:
             if cell.cell_type == "code":
+                if "checks" in cell.metadata.get("tags", []):
+                    cell.metadata.tags.append("hide-cell")  # folded
                 cell.outputs = [
                     shown for output in cell.outputs for shown in static_outputs(output, widgets)
                 ]
@@ -301,11 +306,20 @@ def run_links(docname: str, repository: str) -> str:
     return f'<p class="run">{shown}</p>'
 
 
-def runnable(notebook: NotebookNode, repository: str) -> NotebookNode:
-    """Copy a notebook with a first cell that installs zsp-lite in Colab, if the repository's
-    address is known."""
+def runnable(notebook: NotebookNode, docname: str, repository: str) -> NotebookNode:
+    """Copy a notebook for Colab, if the repository's address is known: with a first cell that
+    installs zsp-lite, and with the addresses of drawings and pages on GitHub."""
     notebook = deepcopy(notebook)
     if repository:
+        for cell in notebook.cells:
+            if cell.cell_type == "markdown":
+                for sign, kind in (("!", "raw"), ("", "blob")):
+                    place = f"{repository}/{kind}/HEAD/{docname}"
+                    cell.source = re.sub(
+                        rf"({sign}\[[^]]*\]\()(?![a-z]+:|#)([^)]+)",
+                        lambda link: link[1] + urljoin(place, link[2]),
+                        cell.source,
+                    )
         folder = repository.rstrip("/").removesuffix(".git").rpartition("/")[2]
         cell = nbformat.v4.new_code_cell(
             INSTALL_IN_COLAB.format(repository=repository, folder=folder), id="install"
@@ -326,7 +340,7 @@ def write_files(app: Sphinx, error: Exception | None) -> None:
             remove_solutions(notebook, app.srcdir)
             copy = app.outdir / "run" / f"{docname}.ipynb"
             copy.parent.mkdir(parents=True, exist_ok=True)
-            nbformat.write(runnable(notebook, app.config.course_repository), copy)
+            nbformat.write(runnable(notebook, docname, app.config.course_repository), copy)
     shutil.copytree(
         app.srcdir / "notebooks" / "figures",
         app.outdir / "run" / "notebooks" / "figures",

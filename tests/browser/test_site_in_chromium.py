@@ -1,12 +1,15 @@
-"""The course site in Chromium: pages fit a phone, the worksheet one sheet, and the class does not
-see the presenter's notes."""
+"""The course site in Chromium: pages fit the screen, the start page shows how to begin, the
+worksheet prints on one page, the class does not see the presenter's notes."""
 
 import pytest
 
+# Widths and heights of a phone and of a projector, in pixels.
+SCREENS = [(390, 844), (1280, 720)]
 
-def test_no_page_is_wider_than_the_screen_of_a_phone(browser, site):
-    screen = 390  # pixels
-    page = browser.new_page(viewport={"width": screen, "height": 800})
+
+@pytest.mark.parametrize("screen, height", SCREENS)
+def test_no_page_is_wider_than_the_screen(browser, site, screen, height):
+    page = browser.new_page(viewport={"width": screen, "height": height})
     wide = {}
     for path in sorted(site.rglob("*.html")):
         name = str(path.relative_to(site))
@@ -23,6 +26,17 @@ def test_the_worksheet_prints_on_one_page(browser, site):
     page = browser.new_page()
     page.goto((site / "notebooks/exercises/worksheet_06.html").as_uri())
     assert page.pdf(format="A4").count(b"/Type /Page\n") == 1
+
+
+@pytest.mark.parametrize("width, height", SCREENS)
+def test_the_start_page_shows_its_picture_and_three_ways_to_begin_at_once(
+    browser, site, width, height
+):
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.goto((site / "docs/index.html").as_uri())
+    shown = [part.bounding_box() for part in page.locator("article img, article li").all()]
+    assert len(shown) == 4
+    assert max(box["y"] + box["height"] for box in shown) <= height
 
 
 @pytest.fixture
@@ -51,6 +65,8 @@ def test_notes_are_shown_in_the_presenters_view_alone(windows):
     # Parts of the notes on slides 3 and 4.
     for notes in (["Let the class order"], ["equation 3", "Taken literally"]):
         page.keyboard.press("ArrowRight")
+        box = presenter.locator(".notes").bounding_box()
+        assert box["y"] + box["height"] < presenter.evaluate("innerHeight")
         for note in notes:
             assert note in presenter.inner_text("article")
             assert note not in page.inner_text("main")
