@@ -4,7 +4,14 @@
     zsp-lite align outputs/validation --category drill --pairs 2 --out outputs/aligned/drill
     python -m tools.marks outputs/validation outputs/aligned [--fit]
 
-The folder of alignments has a run of `zsp-lite align` for each category. Marks are patches of an
+The folder of alignments has a run of `zsp-lite align` for each category. The figures of evaluation
+are of bicycle, car, chair, motorcycle and toyplane, in the same way, of
+
+    zsp-lite synth --category bicycle ... --sequences 4 --seed 11 --out outputs/evaluation
+
+and those of artist-made motorcycles of `data_samples` without `--pairs`.
+
+Marks are patches of an
 object with measured depth, as many of each part. Their true places on another object are known
 exactly for procedural objects: the same point of the same face of the same part, that is of the
 mesh that the same lines of the builder add, by the same count. For other objects with known poses,
