@@ -76,7 +76,7 @@ def test_a_place_is_seen_on_the_object_alone(placed, dataset):
 def test_an_object_without_any_place_has_no_file_of_an_earlier_call(placed, dataset, tmp_path):
     write_marks(placed, dataset, "motorcycle", tmp_path)
     missing = dict(placed[0].places)
-    missing["scooter2"] = replace(missing["scooter2"], found=False)
+    missing["scooter2"] = replace(missing["scooter2"], confidence=0.49)
     write_marks([replace(placed[0], places=missing)], dataset, "motorcycle", tmp_path)
     assert [path.name for path in (tmp_path / "marks").iterdir()] == ["scooter.ply"]
 

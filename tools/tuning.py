@@ -49,9 +49,8 @@ from zsp_lite.category import (
 from zsp_lite.data.cameras import view_span
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
-from zsp_lite.data.pairs import sample_pairs
+from zsp_lite.data.pairs import sample_pairs, spread
 from zsp_lite.errors import InputError, NoPoseError
-from zsp_lite.importers.sources import spread
 from zsp_lite.io.files import stable_hash
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose
