@@ -316,10 +316,10 @@ def solve_views(
     )
 
 
-def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> ScoreCoefficients:
+def fit_weights(outcomes: Sequence[Outcome]) -> ScoreCoefficients:
     r"""Fit the weights of a conditional logit with soft labels.
 
-    Minimises -mean_pairs \log \sum_i softmax(S)_i c_i + ridge |w|^2. S_i is the score of
+    Minimises -mean_pairs \log \sum_i softmax(S)_i c_i + _WEIGHT_RIDGE |w|^2. S_i is the score of
     hypothesis i, c_i its correctness, and w are the weights per standard deviation of their terms.
 
     Raises:
@@ -356,7 +356,7 @@ def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> Sc
         optimiser.zero_grad()
         score = x @ w + padding
         negative = torch.logsumexp(score, dim=1) - torch.logsumexp(score + log_correctness, dim=1)
-        value = negative.mean() + ridge * w.square().sum()
+        value = negative.mean() + _WEIGHT_RIDGE * w.square().sum()
         value.backward()
         return value
 
@@ -365,13 +365,11 @@ def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> Sc
     return ScoreCoefficients(*(w.detach().numpy() / std).tolist())
 
 
-def fit_calibration(
-    outcomes: Sequence[Outcome], weights: ScoreCoefficients, ridge: float = _CALIBRATION_RIDGE
-) -> Calibration:
+def fit_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) -> Calibration:
     """Fit the calibration by maximum likelihood: which of the different poses, if any, is right?
 
     Every category counts the same, so that the numbers of pairs chosen per category do not decide.
-    The `ridge` is on coefficients per standard deviation of the evidence.
+    A ridge is on coefficients per standard deviation of the evidence.
 
     Raises:
         InputError: All outcomes have a right pose, or none has.
@@ -413,7 +411,7 @@ def fit_calibration(
         probability = (1 - look_alike) * logits.softmax(dim=1)
         probability = torch.cat([probability[:, :-1], probability[:, -1:] + look_alike], dim=1)
         likelihood = probability.gather(1, target[:, None])[:, 0].clamp_min(1e-12)
-        value = ridge * theta[:, 1:].square().sum() - importance @ likelihood.log()
+        value = _CALIBRATION_RIDGE * theta[:, 1:].square().sum() - importance @ likelihood.log()
         value.backward()
         return value
 

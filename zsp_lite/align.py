@@ -16,7 +16,7 @@ import numpy as np
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
-from zsp_lite.benchmark.execution import evaluate_pairs, open_workers
+from zsp_lite.benchmark.execution import Evaluator, evaluate_pairs, open_workers
 from zsp_lite.benchmark.problem import FrameStore, PairProblem
 from zsp_lite.benchmark.runs import open_run, read_lines, run_settings
 from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
@@ -44,16 +44,16 @@ class _Line(msgspec.Struct):
 
 @dataclass
 class HypothesisFinder:
-    """Finds the hypotheses of pairs (see `execution.Evaluator`); frames and features are kept from
-    pair to pair."""
+    """Finds the hypotheses of pairs; frames and features are kept from pair to pair."""
 
     root: str  # the data folder
     backbone: BackboneLike
 
-    def open(self, threads: int) -> None:
+    def open(self, threads: int) -> Evaluator:
         """Load the backbone."""
         extractors = {"backbone": as_backbone(self.backbone)}
         self.store = FrameStore(Co3D(self.root), extractors, threads)
+        return self.line
 
     def line(self, pair: Pair, names: Sequence[str]) -> dict[str, Any]:
         """Find the hypotheses of a pair: a `_Line` of the run."""
@@ -119,7 +119,7 @@ def align_category(
             sent = backbone if workers.executor else loaded
             finder = HypothesisFinder(str(dataset.root.resolve()), sent)
             work = dict.fromkeys(chosen.values(), ["alignment"])
-            evaluate_pairs(folder, finder, work, workers, _Line)
+            evaluate_pairs(folder, finder.open, work, workers, _Line)
         stored = read_hypotheses(folder)
     hypotheses = [stored[key] for key in chosen if key in stored]
     if not hypotheses:
