@@ -52,7 +52,7 @@ from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
 from zsp_lite.data.pairs import sample_pairs, spread
 from zsp_lite.errors import InputError, NoPoseError
 from zsp_lite.io.files import stable_hash
-from zsp_lite.metrics import rotation_error
+from zsp_lite.metrics import SAME_ANGLE, rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.verified.confidence import Calibration, evidence, hidden_share, modes
@@ -61,7 +61,6 @@ from zsp_lite.views import View, usable_targets
 from zsp_lite.viz.reliability import reliability
 
 CONCEPTS = Path(__file__).with_name("concepts.csv")  # the side of every name of a category
-CORRECT_ANGLE = 30.0  # a pose with a smaller error is right, in degrees
 # A hypothesis counts as correct to the degree exp(-(error / _SOFT_ANGLE)^2), in degrees.
 _SOFT_ANGLE = 12.0
 # A pair is used for the weights if one of its hypotheses is correct to a higher degree.
@@ -375,7 +374,7 @@ def fit_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) -> 
         InputError: All outcomes have a right pose, or none has.
     """
     ranked = [outcome.ranked(weights) for outcome in outcomes]
-    right = [np.flatnonzero(errors < CORRECT_ANGLE) for _, errors in ranked]
+    right = [np.flatnonzero(errors < SAME_ANGLE) for _, errors in ranked]
     if min(map(len, right)) > 0 or max(map(len, right)) == 0:
         raise InputError(
             f"{len(outcomes)} pairs: all have a right pose or none has, expected both kinds"
@@ -465,7 +464,7 @@ def report_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) 
     for outcome, calibration in zip(outcomes, held_out):
         deficit, errors = outcome.ranked(weights)
         probabilities = calibration.probabilities(deficit, outcome.evidence(weights))
-        first, *rest = zip(probabilities, errors < CORRECT_ANGLE)
+        first, *rest = zip(probabilities, errors < SAME_ANGLE)
         best.append(first)
         others += rest
     confidence, right = map(np.array, zip(*best))

@@ -24,7 +24,7 @@ from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
 from zsp_lite.data.published import write_all
 from zsp_lite.errors import InputError, NoPoseError
-from zsp_lite.io.files import write_atomic
+from zsp_lite.io.files import plain_name, read_json, write_atomic
 from zsp_lite.metrics import rotation_error
 
 logger = logging.getLogger(__name__)
@@ -40,6 +40,12 @@ class _Line(msgspec.Struct):
     matrices: list[list[list[float]]] = []
     probabilities: list[float] = []
     span: float = 360.0
+
+
+class _Written(msgspec.Struct):
+    """The objects of OUT/alignment.json."""
+
+    objects: dict[str, Any]
 
 
 @dataclass
@@ -184,6 +190,19 @@ def write_alignment(found: CategoryAlignment, out: str | Path) -> Path:
     ]
     write_atomic(path, json.dumps({"objects": objects, "disagreements": pairs}, indent=1).encode())
     return path
+
+
+def remove_outputs(out: str | Path, category: str) -> None:
+    """Remove what an earlier run has written to OUT for each of its objects, and for marks."""
+    out = Path(out)
+    if not (out / "alignment.json").is_file():
+        return
+    for name in read_json(out / "alignment.json", _Written, "alignment").objects:
+        plain_name(name, "object")
+        (out / "class_labels" / category / f"{name}.json").unlink(missing_ok=True)
+        (out / "marks" / f"{name}.ply").unlink(missing_ok=True)
+    for file in ("marks.json", "marks.jpg"):
+        (out / file).unlink(missing_ok=True)
 
 
 def write_labels(

@@ -217,19 +217,15 @@ def write_marks(
     directions = np.random.default_rng(0).normal(size=(_BALL_POINTS, 3))
     ball = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     for name in placed[0].places:
+        found = [k for k, one in enumerate(placed) if one.places[name].found]
+        if not found:
+            continue
         extent = dataset.extent(category, name)
         radius = _RADIUS * (extent[1] if extent else 1.0)
-        points = []
-        colours = []
-        for number, one in enumerate(placed):
-            if one.places[name].found:
-                colour = bytes.fromhex(COLOURS[number % len(COLOURS)][1:])
-                points.append(one.places[name].world + radius * ball)
-                colours.append(np.tile(np.frombuffer(colour, np.uint8), (_BALL_POINTS, 1)))
+        points = [placed[k].places[name].world + radius * ball for k in found]
+        colours = [list(bytes.fromhex(COLOURS[k % len(COLOURS)][1:])) for k in found]
+        of_points = np.repeat(np.array(colours, np.uint8), _BALL_POINTS, axis=0)
         path = out / "marks" / f"{plain_name(name, 'sequence')}.ply"
-        if points:
-            write_ply(path, np.concatenate(points), np.concatenate(colours))
-        else:
-            path.unlink(missing_ok=True)  # of an earlier call with other marks
+        write_ply(path, np.concatenate(points), of_points)
     write_atomic(out / "marks.json", json.dumps(document, indent=1).encode())
     return out / "marks.json"

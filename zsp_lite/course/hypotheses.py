@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 
 from zsp_lite.align import read_hypotheses
-from zsp_lite.category import SAME_ANGLE, PairHypotheses
-from zsp_lite.metrics import rotation_angle
+from zsp_lite.category import PairHypotheses
+from zsp_lite.metrics import SAME_ANGLE, rotation_angle
 from zsp_lite.verified.poses import Poses
 from zsp_lite.verified.solver import Solution
 from zsp_lite.verified.verification import ScoreCoefficients, score_terms
