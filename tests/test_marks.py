@@ -74,16 +74,15 @@ def test_a_place_is_seen_on_the_object_alone(placed, dataset):
 
 
 def test_an_object_without_any_place_has_no_file(placed, dataset, tmp_path):
-    missing = dict(placed[0].places)
-    missing["scooter2"] = replace(missing["scooter2"], confidence=0.49)
+    places = placed[0].places
+    missing = places | {"scooter2": replace(places["scooter2"], confidence=0.49)}
     write_marks([replace(placed[0], places=missing)], dataset, "motorcycle", tmp_path)
     assert [path.name for path in (tmp_path / "marks").iterdir()] == ["scooter.ply"]
 
 
 def test_a_run_leaves_no_outputs_of_an_earlier_one(placed, alignment, tmp_path, run, monkeypatch):
-    objects = alignment.objects
-    others = replace(alignment, objects={"scooter2": objects["scooter2"]})
-    answers = iter([alignment, others])
+    one = {"scooter2": alignment.objects["scooter2"]}
+    answers = iter([alignment, replace(alignment, objects=one)])
     monkeypatch.setattr("zsp_lite.align.align_category", lambda *_: next(answers))
     monkeypatch.setattr("zsp_lite.marks.place_marks", lambda *_: placed)
     line = f"align data_samples --category motorcycle --out {tmp_path}"

@@ -101,7 +101,7 @@ def place_marks(
         return surface_views(alignment, dataset, category, name, extractor)
 
     marked = np.array([mark.sequence for mark in marks])
-    sources = {str(name): surface(str(name)) for name in np.unique(marked)}
+    sources = {name: surface(name) for name in {mark.sequence for mark in marks}}
     places = {}  # by the name of the object, in the order of the marks
     for name, aligned in alignment.objects.items():
         target = sources[name] if name in sources else surface(name)

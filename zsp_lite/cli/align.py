@@ -124,10 +124,10 @@ def align(
     title = f"{category}: {len(alignment.objects)} objects in one frame"
     print_rows(title, COLUMNS, object_rows(alignment))
     for one in placed:
-        found = {name: place for name, place in one.places.items() if name != one.mark.sequence}
         places = [
             (name, f"{100 * place.confidence:.0f}" if place.found else "nothing here")
-            for name, place in found.items()
+            for name, place in one.places.items()
+            if name != one.mark.sequence
         ]
         print_rows(f"Mark {one.mark.name}", ("object", "right (%)"), places)
     for (first, second), angle in alignment.disagreements.items():

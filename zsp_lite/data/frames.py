@@ -192,9 +192,10 @@ def mask_to_bbox(mask: Real[np.ndarray, "h w"], padding: float = 0.1) -> Box:
     if not (mask > 0).any():
         raise InputError(f"object mask of shape {mask.shape} is empty, expected a pixel above 0")
     threshold = 0.4
-    while not (mask > max(threshold, 0.0)).any():
-        threshold -= 0.05
-    inside = mask > max(threshold, 0.0)
+    inside = mask > threshold
+    while not inside.any():
+        threshold = max(threshold - 0.05, 0.0)
+        inside = mask > threshold
     top, bottom = _span(inside.any(axis=1), padding)
     left, right = _span(inside.any(axis=0), padding)
     return top, left, bottom - top, right - left
