@@ -48,7 +48,7 @@ def test_lines_join_the_centres_of_matched_patches_and_those_of_outliers_are_das
 def test_the_view_with_the_best_score_is_marked_and_has_a_thumbnail():
     turns = np.array([-170.0, -90, 5, 20, 90, 150])
     scores = np.array([-20.0, -40, -30, -32, -41, -25])
-    circle, *thumbnails, _ = show_view_circle(IMAGE, [IMAGE] * 6, turns, scores, (-60, -15)).axes
+    circle, *thumbnails, _ = show_view_circle(IMAGE, [IMAGE] * 6, turns, scores).axes
     assert_allclose(circle.lines[1].get_xydata(), [[np.radians(-170), -20]])
     # Every third view in the order of the turns, from the best one.
     assert [axis.get_title() for axis in thumbnails] == ["-20.0", "-32.0"]

@@ -19,7 +19,7 @@ def show_view_circle(
     images: Sequence[np.ndarray],
     turns: Float[np.ndarray, " n"],
     scores: Float[np.ndarray, " n"],
-    limits: tuple[float, float],
+    limits: tuple[float, float] = (-52, -22),
 ) -> Figure:
     """Show the scores of views as radius over their turn from the reference, which is in the
     middle.
