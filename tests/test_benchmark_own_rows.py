@@ -55,7 +55,6 @@ from zsp_lite.data.frames import mask_to_bbox
 from zsp_lite.data.labels import PoseLabel
 from zsp_lite.data.pairs import category_pairs
 from zsp_lite.errors import FatalError
-from zsp_lite.pipeline import align_best_view
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.views import object_crop
 
@@ -171,7 +170,6 @@ class NetworkOfProblems(Network):
         (lambda one, two, three=3, **options: 0, "keypoints"),
         (Network(), "keypoints"),
         (NetworkOfProblems(), "problem"),
-        (align_best_view, "solver"),
         (VerifiedSolver(), "solver"),
         (lambda one, two, three, seed, threshold: 0, "solver"),
         (lambda one, two, three, *, seed, level=0.2: 0, "matcher"),

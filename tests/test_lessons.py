@@ -41,14 +41,14 @@ def test_a_tree_believes_the_surest_answer_and_all_pairs_can_outvote_it(truth):
     together = {name: one.sim3.R for name, one in objects.items()}
     assert hypotheses.all_alike(truth, together)
 
-    surest = hypotheses.right_answers(drawn, truth)
+    surest = hypotheses.surest_right(drawn, truth)
     wrong = {pair for pair, right in surest.items() if not right}
     assert wrong == {
         ("wooden_car", "peugeot_308"),
         ("seat_leon", "peugeot_308"),
         ("seat_leon", "wooden_car"),
     }
-    fitting = hypotheses.right_answers(drawn, truth, together)
+    fitting = hypotheses.fitting_right(drawn, truth, together)
     assert [pair for pair, right in fitting.items() if not right] == [("seat_leon", "wooden_car")]
     assert fitting["seat_leon", "wooden_car"] is None
 

@@ -73,12 +73,30 @@ def test_a_place_is_seen_on_the_object_alone(placed, dataset):
             assert frame.mask[int(y), int(x)] > 0.5
 
 
-def test_an_object_without_any_place_has_no_file_of_an_earlier_call(placed, dataset, tmp_path):
-    write_marks(placed, dataset, "motorcycle", tmp_path)
-    missing = dict(placed[0].places)
-    missing["scooter2"] = replace(missing["scooter2"], found=False)
+def test_an_object_without_any_place_has_no_file(placed, dataset, tmp_path):
+    places = placed[0].places
+    missing = places | {"scooter2": replace(places["scooter2"], confidence=0.49)}
     write_marks([replace(placed[0], places=missing)], dataset, "motorcycle", tmp_path)
     assert [path.name for path in (tmp_path / "marks").iterdir()] == ["scooter.ply"]
+
+
+def test_a_run_leaves_no_outputs_of_an_earlier_one(placed, alignment, tmp_path, run, monkeypatch):
+    one = {"scooter2": alignment.objects["scooter2"]}
+    answers = iter([alignment, replace(alignment, objects=one)])
+    monkeypatch.setattr("zsp_lite.align.align_category", lambda *_: next(answers))
+    monkeypatch.setattr("zsp_lite.marks.place_marks", lambda *_: placed)
+    line = f"align data_samples --category motorcycle --out {tmp_path}"
+    run(f"{line} --mark scooter:0:180,114:seat")
+    (tmp_path / "marks/mine.ply").touch()
+    run(line)
+    written = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
+    assert written == {
+        "alignment.json",
+        "class_labels/motorcycle/scooter2.json",
+        "marks/mine.ply",
+        "objects.jpg",
+        "report.html",
+    }
 
 
 def test_the_report_shows_the_marks(placed, dataset, alignment, tmp_path):

@@ -22,7 +22,7 @@ from zsp_lite.best_view import correspondence_score
 from zsp_lite.errors import FatalError
 from zsp_lite.estimates import match_points
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pipeline import align_best_view, view_alignment
+from zsp_lite.pipeline import view_alignment
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.views import extract_views, object_crop, patch_mask
 
@@ -161,6 +161,15 @@ def test_the_range_of_scales_reaches_ransac(views, monkeypatch):
     assert not bounded.flags
 
 
+def first_view(reference, targets, matched, *, seed, threshold):
+    """A solver of one's own: it fits the pose in the first target view."""
+    sim3, inliers = ransac(
+        *match_points(reference, targets[0], matched[0].matches), threshold, seed=seed
+    )
+    views = np.zeros(len(targets)), reference, tuple(targets)
+    return PoseEstimate(sim3, 0, matched[0].matches, inliers, *views, {"solver": 1.0})
+
+
 def test_a_given_matcher_selector_and_solver_are_called(views):
     def match_nothing(similarity, foreground1, foreground2):
         return similarity.argmax(dim=1), similarity.new_full((len(similarity),), -np.inf)
@@ -170,13 +179,6 @@ def test_a_given_matcher_selector_and_solver_are_called(views):
     estimate = estimate_noisy(views, view_selector=lambda pair: next(numbers))
     assert estimate.view == 1
     assert estimate.view_scores.tolist() == [1, 3, 2]
-
-    def first_view(reference, targets, matched, *, seed, threshold):
-        sim3, inliers = ransac(
-            *match_points(reference, targets[0], matched[0].matches), threshold, seed=seed
-        )
-        views = np.zeros(len(targets)), reference, tuple(targets)
-        return PoseEstimate(sim3, 0, matched[0].matches, inliers, *views, {"solver": 1.0})
 
     estimate = estimate_noisy(views, solver=first_view, seed=5, threshold=0.3)
     alone = estimate_noisy(views[:2], trials=1000, seed=5, threshold=0.3)
@@ -215,7 +217,7 @@ def nearest(similarity, *_):
     [
         {"matcher": nearest},
         {"matcher": nearest, "solver": "verified"},
-        {"solver": align_best_view},
+        {"solver": first_view},
         {"view_selector": lambda one: correspondence_score(one.matches, one.k)},
         {"backbone": CoordinateBackbone()},
     ],
@@ -261,7 +263,7 @@ def test_a_solver_says_whether_kmeans_selects_its_matches(views):
 
     clustered, best = matches(kmeans=True), matches(kmeans=False)
     assert not np.array_equal(clustered, best)
-    assert_array_equal(matches(solver=pipeline.align_best_view), clustered)
+    assert_array_equal(matches(solver=first_view), clustered)
     for chosen in ("verified", VerifiedSolver()):
         assert_array_equal(matches(solver=chosen), best)
         assert_array_equal(matches(solver=chosen, kmeans=True), clustered)

@@ -58,7 +58,7 @@ def text(page) -> str:
 
 def test_the_demo_takes_a_pair_of_each_category_and_both_solvers(results):
     (result,) = results
-    assert result.pair.category == "ellipsoid"
+    assert result.title == "ellipsoid"
     assert list(result.errors) == ["paper", "verified"]
 
 

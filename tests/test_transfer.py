@@ -40,7 +40,9 @@ def samples():
         pose = read_poses(dataset.root, category)[name]
         sim3 = Sim3(pose.scale, pose.R, pose.t).inverse()
         moved = aligned({name: Sim3(1.0, np.eye(3), np.array([shift, 0, 0])) @ sim3})
-        return surface_views(moved, dataset, category, name, backbone, count)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("zsp_lite.transfer.VIEWS", count)
+            return surface_views(moved, dataset, category, name, backbone)
 
     car = surface("car", "suv", 3)
     shift = 0.08 * object_size(car)
@@ -123,7 +125,7 @@ def test_wrong_points_sequences_and_frames_are_refused(samples, ellipsoids, tmp_
         car,
         shifted,
     )
-    refused("points have values that are not finite", transfer, [[0, 0, np.nan]], car, shifted)
+    refused("points holds nan, expected finite numbers", transfer, [[0, 0, np.nan]], car, shifted)
 
     alignment = aligned(dict.fromkeys("ab", Sim3.identity()))
     backbone = CoordinateBackbone()

@@ -36,9 +36,10 @@ def sample_outcomes(n: int, rng: np.random.Generator) -> list[Outcome]:
     return outcomes
 
 
-def test_the_weights_of_the_sampling_distribution_are_recovered():
+def test_the_weights_of_the_sampling_distribution_are_recovered(monkeypatch):
+    monkeypatch.setattr("tools.tuning._WEIGHT_RIDGE", 0)
     # The error of the fit falls with the number of pairs: of 1200 it is below 1.
-    fitted = fit_weights(sample_outcomes(1200, default_rng(0)), ridge=0)
+    fitted = fit_weights(sample_outcomes(1200, default_rng(0)))
     assert_allclose(astuple(fitted), astuple(TRUE_WEIGHTS), atol=1)
 
 
@@ -71,10 +72,9 @@ TRUE_CALIBRATION = Calibration(
 )
 
 
-def test_the_coefficients_of_the_calibration_are_recovered():
-    fitted = fit_calibration(
-        sample_ranked(6000, TRUE_CALIBRATION, default_rng(0)), FIRST_TERMS, ridge=0
-    )
+def test_the_coefficients_of_the_calibration_are_recovered(monkeypatch):
+    monkeypatch.setattr("tools.tuning._CALIBRATION_RIDGE", 0)
+    fitted = fit_calibration(sample_ranked(6000, TRUE_CALIBRATION, default_rng(0)), FIRST_TERMS)
     # The fifth coefficient is that of the deviation of the view similarities, at most 0.2: it is
     # large, and known less precisely.
     atol = np.array([0.6, 0.6, 0.6, 0.6, 2.0, 0.6])

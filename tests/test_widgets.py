@@ -75,9 +75,9 @@ def sim():
 
 def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim):
     pair = examples.sample_pair()
-    kinds, cells = {"one": sim, "other": -sim}, np.stack(np.divmod(sim.argmax(1).numpy(), 28), -1)
+    kinds, cells = {"other": -sim, "one": sim}, np.stack(np.divmod(sim.argmax(1).numpy(), 28), -1)
     widget = patches.patch_similarities(
-        pair.reference.rgb, pair.target.rgb, kinds, pair.cells, pair.valid, "other"
+        pair.reference.rgb, pair.target.rgb, kinds, pair.cells, pair.valid
     )
     widget.controls["kind"].value = "one"
     widget.controls["row"].value = 15

@@ -23,7 +23,7 @@ from zsp_lite.category import PairHypotheses, object_pairs, synchronise, world_h
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
-from zsp_lite.metrics import rotation_angle
+from zsp_lite.metrics import SAME_ANGLE, rotation_angle
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import View
 
@@ -69,14 +69,12 @@ def examples(
         # Rotations from the frame of the labels to the frame of the alignment, by each object. They
         # should be equal; the one that most objects agree with counts as true.
         frames = np.stack([pose.sim3.R @ labels[name] for name, pose in objects.items()])
-        agreeing = (rotation_angle(frames[:, None], frames) < module.SAME_ANGLE).sum(axis=1)
+        agreeing = (rotation_angle(frames[:, None], frames) < SAME_ANGLE).sum(axis=1)
         common = frames[agreeing.argmax()]
         for name, pose in objects.items():
             other = pose.alternative or pose.sim3
             turns = rotation_angle(np.stack([pose.sim3.R, other.R]) @ labels[name], common)
-            right = [*(turns < module.SAME_ANGLE), True].index(
-                True
-            )  # of pose, alternative, neither
+            right = [*(turns < SAME_ANGLE), True].index(True)  # of pose, alternative, neither
             # The terms of the logit are computed back from the probabilities that it gave with the
             # present constants.
             other_probability = pose.alternative_probability

@@ -396,7 +396,7 @@ def svg(content: str, width: float, height: float, title: str, description: str)
 
 
 @cache
-def draw_images(words: bool = True) -> str:
+def draw_images() -> str:
     """Draw the picture of the reference, and three of the target, one over the other."""
     width, _ = PICTOGRAM
     drawn = Photo(REFERENCE, 35, 2, 18, 76).draw(BLUE)
@@ -415,7 +415,7 @@ def draw_grid(x: float, y: float, size: float, cells: int, thick: float = 0.8) -
 
 
 @cache
-def draw_features(words: bool = True) -> str:
+def draw_features() -> str:
     """Draw the reference in patches, and their features: a colour for each part of the chair."""
     cells = 9
     photo = Photo(REFERENCE, 35, 4, 13, 84)
@@ -465,7 +465,7 @@ def draw_walk(
 
 
 @cache
-def draw_best_view(words: bool = True) -> str:
+def draw_best_view() -> str:
     """Draw three target views with bars of their scores; the best one is framed."""
     drawn = ""
     for i, (azimuth, score) in enumerate(((110, 0.35), (30, 0.95), (-50, 0.6))):
@@ -478,7 +478,7 @@ def draw_best_view(words: bool = True) -> str:
 
 
 @cache
-def draw_depth(words: bool = True) -> str:
+def draw_depth() -> str:
     """Draw a depth map, and beside it a camera with rays from its centre through the image plane
     to points."""
     drawn = Photo(REFERENCE, 35, 4, 13, 84).draw_depth()
@@ -493,7 +493,7 @@ def draw_depth(words: bool = True) -> str:
 
 
 @cache
-def draw_fit(words: bool = True) -> str:
+def draw_fit() -> str:
     """Draw matches between two sets of points, the last of them wrong and crossed out."""
     first = np.array([[20, 24], [66, 18], [18, 70], [62, 66], [40, 94]], float)
     angle = np.radians(18)
@@ -529,13 +529,13 @@ def draw_pose(words: bool = True) -> str:
     return drawn
 
 
-STAGES: dict[str, tuple[str, Callable[..., str]]] = {
+STAGES: dict[str, tuple[str, Callable[[], str]]] = {
     "images": ("images", draw_images),
     "features": ("01 features", draw_features),
-    "cycle": ("02 cycle", draw_cycle),
+    "cycle": ("02 cycle", partial(draw_cycle, words=False)),
     "best view": ("03 best view", draw_best_view),
     "fit": ("04 depth, RANSAC", draw_fit),
-    "pose": ("pose", draw_pose),
+    "pose": ("pose", partial(draw_pose, words=False)),
 }
 
 
@@ -747,7 +747,7 @@ def draw_stage(name: str, x: float, y: float, on: bool) -> str:
     title, draw = STAGES[name]
     width, height = BOX
     scale = 0.58
-    picture = group(draw(words=False), x + (width - scale * PICTOGRAM[0]) / 2, y + 8, scale)
+    picture = group(draw(), x + (width - scale * PICTOGRAM[0]) / 2, y + 8, scale)
     if on:
         drawn = rect(x, y, width, height, mix(SKY, "white", 0.22), BLUE, 3, 8) + picture
     else:
@@ -765,10 +765,9 @@ def draw_stage(name: str, x: float, y: float, on: bool) -> str:
 WIDTH_OF_IDEAS = 860
 
 
-def draw_vector(
-    x: float, y: float, colour: str, shades: tuple[float, ...], side: float = 15
-) -> str:
+def draw_vector(x: float, y: float, colour: str, shades: tuple[float, ...]) -> str:
     """Draw a vector as a row of cells."""
+    side = 15
     drawn = ""
     for i, share in enumerate(shades):
         drawn += rect(x + i * side, y, side, side, mix(colour, "white", share), "white")

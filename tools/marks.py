@@ -42,7 +42,7 @@ from sklearn.metrics import roc_auc_score
 from tools.validation_categories import VALIDATION
 from zsp_lite.align import read_hypotheses
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.category import SAME_ANGLE, synchronise
+from zsp_lite.category import synchronise
 from zsp_lite.course.synthetic.assembly import BODY, Assembly
 from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.course.synthetic.export import SETTINGS_FILE, make_object
@@ -50,7 +50,7 @@ from zsp_lite.course.synthetic.primitives import Mesh, area_normals
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.ground_truth import ObjectPose, object_poses
 from zsp_lite.io.files import read_json
-from zsp_lite.metrics import rotation_error
+from zsp_lite.metrics import SAME_ANGLE, rotation_error
 from zsp_lite.transfer import SurfaceView, surface_views, transfer
 
 BUILDERS = CATEGORIES | VALIDATION

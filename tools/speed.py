@@ -25,10 +25,10 @@ from zsp_lite.pipeline import ZeroShotPose
 REPEATS = 7  # odd, so that the median is one of the times
 
 
-def seconds(function: Callable[[], object], repeats: int = REPEATS) -> float:
+def seconds(function: Callable[[], object]) -> float:
     """Return the median time of a call; the first call, which fills caches, is not counted."""
     times = []
-    for _ in range(repeats + 1):
+    for _ in range(REPEATS + 1):
         start = time.perf_counter()
         function()
         times.append(time.perf_counter() - start)

@@ -49,11 +49,10 @@ from zsp_lite.category import (
 from zsp_lite.data.cameras import view_span
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
-from zsp_lite.data.pairs import sample_pairs
+from zsp_lite.data.pairs import sample_pairs, spread
 from zsp_lite.errors import InputError, NoPoseError
-from zsp_lite.importers.sources import spread
 from zsp_lite.io.files import stable_hash
-from zsp_lite.metrics import rotation_error
+from zsp_lite.metrics import SAME_ANGLE, rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.verified.confidence import Calibration, evidence, hidden_share, modes
@@ -62,7 +61,6 @@ from zsp_lite.views import View, usable_targets
 from zsp_lite.viz.reliability import reliability
 
 CONCEPTS = Path(__file__).with_name("concepts.csv")  # the side of every name of a category
-CORRECT_ANGLE = 30.0  # a pose with a smaller error is right, in degrees
 # A hypothesis counts as correct to the degree exp(-(error / _SOFT_ANGLE)^2), in degrees.
 _SOFT_ANGLE = 12.0
 # A pair is used for the weights if one of its hypotheses is correct to a higher degree.
@@ -317,10 +315,10 @@ def solve_views(
     )
 
 
-def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> ScoreCoefficients:
+def fit_weights(outcomes: Sequence[Outcome]) -> ScoreCoefficients:
     r"""Fit the weights of a conditional logit with soft labels.
 
-    Minimises -mean_pairs \log \sum_i softmax(S)_i c_i + ridge |w|^2. S_i is the score of
+    Minimises -mean_pairs \log \sum_i softmax(S)_i c_i + _WEIGHT_RIDGE |w|^2. S_i is the score of
     hypothesis i, c_i its correctness, and w are the weights per standard deviation of their terms.
 
     Raises:
@@ -357,7 +355,7 @@ def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> Sc
         optimiser.zero_grad()
         score = x @ w + padding
         negative = torch.logsumexp(score, dim=1) - torch.logsumexp(score + log_correctness, dim=1)
-        value = negative.mean() + ridge * w.square().sum()
+        value = negative.mean() + _WEIGHT_RIDGE * w.square().sum()
         value.backward()
         return value
 
@@ -366,19 +364,17 @@ def fit_weights(outcomes: Sequence[Outcome], ridge: float = _WEIGHT_RIDGE) -> Sc
     return ScoreCoefficients(*(w.detach().numpy() / std).tolist())
 
 
-def fit_calibration(
-    outcomes: Sequence[Outcome], weights: ScoreCoefficients, ridge: float = _CALIBRATION_RIDGE
-) -> Calibration:
+def fit_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) -> Calibration:
     """Fit the calibration by maximum likelihood: which of the different poses, if any, is right?
 
     Every category counts the same, so that the numbers of pairs chosen per category do not decide.
-    The `ridge` is on coefficients per standard deviation of the evidence.
+    A ridge is on coefficients per standard deviation of the evidence.
 
     Raises:
         InputError: All outcomes have a right pose, or none has.
     """
     ranked = [outcome.ranked(weights) for outcome in outcomes]
-    right = [np.flatnonzero(errors < CORRECT_ANGLE) for _, errors in ranked]
+    right = [np.flatnonzero(errors < SAME_ANGLE) for _, errors in ranked]
     if min(map(len, right)) > 0 or max(map(len, right)) == 0:
         raise InputError(
             f"{len(outcomes)} pairs: all have a right pose or none has, expected both kinds"
@@ -414,7 +410,7 @@ def fit_calibration(
         probability = (1 - look_alike) * logits.softmax(dim=1)
         probability = torch.cat([probability[:, :-1], probability[:, -1:] + look_alike], dim=1)
         likelihood = probability.gather(1, target[:, None])[:, 0].clamp_min(1e-12)
-        value = ridge * theta[:, 1:].square().sum() - importance @ likelihood.log()
+        value = _CALIBRATION_RIDGE * theta[:, 1:].square().sum() - importance @ likelihood.log()
         value.backward()
         return value
 
@@ -468,7 +464,7 @@ def report_calibration(outcomes: Sequence[Outcome], weights: ScoreCoefficients) 
     for outcome, calibration in zip(outcomes, held_out):
         deficit, errors = outcome.ranked(weights)
         probabilities = calibration.probabilities(deficit, outcome.evidence(weights))
-        first, *rest = zip(probabilities, errors < CORRECT_ANGLE)
+        first, *rest = zip(probabilities, errors < SAME_ANGLE)
         best.append(first)
         others += rest
     confidence, right = map(np.array, zip(*best))

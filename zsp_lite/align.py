@@ -16,7 +16,7 @@ import numpy as np
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
-from zsp_lite.benchmark.execution import evaluate_pairs, open_workers
+from zsp_lite.benchmark.execution import Evaluator, evaluate_pairs, open_workers
 from zsp_lite.benchmark.problem import FrameStore, PairProblem
 from zsp_lite.benchmark.runs import open_run, read_lines, run_settings
 from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
@@ -24,7 +24,7 @@ from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
 from zsp_lite.data.published import write_all
 from zsp_lite.errors import InputError, NoPoseError
-from zsp_lite.io.files import write_atomic
+from zsp_lite.io.files import plain_name, read_json, write_atomic
 from zsp_lite.metrics import rotation_error
 
 logger = logging.getLogger(__name__)
@@ -42,18 +42,24 @@ class _Line(msgspec.Struct):
     span: float = 360.0
 
 
+class _Written(msgspec.Struct):
+    """The objects of OUT/alignment.json."""
+
+    objects: dict[str, Any]
+
+
 @dataclass
 class HypothesisFinder:
-    """Finds the hypotheses of pairs (see `execution.Evaluator`); frames and features are kept from
-    pair to pair."""
+    """Finds the hypotheses of pairs; frames and features are kept from pair to pair."""
 
     root: str  # the data folder
     backbone: BackboneLike
 
-    def open(self, threads: int) -> None:
+    def open(self, threads: int) -> Evaluator:
         """Load the backbone."""
         extractors = {"backbone": as_backbone(self.backbone)}
         self.store = FrameStore(Co3D(self.root), extractors, threads)
+        return self.line
 
     def line(self, pair: Pair, names: Sequence[str]) -> dict[str, Any]:
         """Find the hypotheses of a pair: a `_Line` of the run."""
@@ -119,7 +125,7 @@ def align_category(
             sent = backbone if workers.executor else loaded
             finder = HypothesisFinder(str(dataset.root.resolve()), sent)
             work = dict.fromkeys(chosen.values(), ["alignment"])
-            evaluate_pairs(folder, finder, work, workers, _Line)
+            evaluate_pairs(folder, finder.open, work, workers, _Line)
         stored = read_hypotheses(folder)
     hypotheses = [stored[key] for key in chosen if key in stored]
     if not hypotheses:
@@ -184,6 +190,19 @@ def write_alignment(found: CategoryAlignment, out: str | Path) -> Path:
     ]
     write_atomic(path, json.dumps({"objects": objects, "disagreements": pairs}, indent=1).encode())
     return path
+
+
+def remove_outputs(out: str | Path, category: str) -> None:
+    """Remove what an earlier run has written to OUT for each of its objects, and for marks."""
+    out = Path(out)
+    if not (out / "alignment.json").is_file():
+        return
+    for name in read_json(out / "alignment.json", _Written, "alignment").objects:
+        plain_name(name, "object")
+        (out / "class_labels" / category / f"{name}.json").unlink(missing_ok=True)
+        (out / "marks" / f"{name}.ply").unlink(missing_ok=True)
+    for file in ("marks.json", "marks.jpg"):
+        (out / file).unlink(missing_ok=True)
 
 
 def write_labels(

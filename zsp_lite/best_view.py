@@ -13,6 +13,8 @@ from zsp_lite.features import FeatureMap
 from zsp_lite.matching import Matches, cyclical_distances
 from zsp_lite.views import View
 
+_NEIGHBOUR = 1.5  # patches; the eight neighbours of a patch are nearer
+
 Mask = Bool[torch.Tensor, "rows cols"] | Bool[np.ndarray, "rows cols"]
 
 
@@ -78,39 +80,24 @@ def cyclical_iou(
     similarity: Float[torch.Tensor, "reference target"],
     reference_foreground: Bool[torch.Tensor, "rows cols"],
     target_foreground: Bool[torch.Tensor, "target_rows target_cols"],
-    threshold: float = 1.5,
 ) -> float:
     """Compute "CyclicalDistIoU": the IoU of the target's foreground and its patches of small
     cyclical distance.
 
     The distance is that of a cycle from a target patch through the reference back to the target.
-    The paper gives no threshold; 1.5 patches take a return to the patch itself or to one of its
-    eight neighbours.
+    The paper gives no threshold. Here the cycle returns to the patch itself or to one of its eight
+    neighbours.
     """
     grids = tuple(target_foreground.shape), tuple(reference_foreground.shape)
     distances = cyclical_distances(similarity.T, *grids, target_foreground, reference_foreground)
-    return mask_iou(distances >= -threshold, target_foreground)
-
-
-def _by_correspondences(one: ViewMatch) -> float:
-    return correspondence_score(one.matches, one.k)
-
-
-def _by_global_features(one: ViewMatch) -> float:
-    return global_score(one.reference.features, one.target.features)
-
-
-def _by_saliency(one: ViewMatch) -> float:
-    return mask_iou(one.reference.foreground, one.target.foreground)
-
-
-def _by_cycles(one: ViewMatch) -> float:
-    return cyclical_iou(one.similarity, one.reference.foreground, one.target.foreground)
+    return mask_iou(distances >= -_NEIGHBOUR, target_foreground)
 
 
 VIEW_SELECTORS: dict[str, ViewSelector] = {
-    "correspond": _by_correspondences,
-    "global": _by_global_features,
-    "saliency": _by_saliency,
-    "cyclical": _by_cycles,
+    "correspond": lambda one: correspondence_score(one.matches, one.k),
+    "global": lambda one: global_score(one.reference.features, one.target.features),
+    "saliency": lambda one: mask_iou(one.reference.foreground, one.target.foreground),
+    "cyclical": lambda one: cyclical_iou(
+        one.similarity, one.reference.foreground, one.target.foreground
+    ),
 }

@@ -40,14 +40,13 @@ from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.io.files import stable_hash
-from zsp_lite.metrics import rotation_angle
+from zsp_lite.metrics import SAME_ANGLE, rotation_angle
 from zsp_lite.verified.confidence import Calibration, hidden_share
 
 # \kappa of the objective: a hypothesis 20 degrees off counts 1/e of one that agrees.
 KAPPA = 16.0
 # \epsilon of the objective, where a sure hypothesis that agrees counts 1.
 FLOOR = 0.1
-SAME_ANGLE = 30.0  # degrees, as in Acc30; rotations further apart disagree
 # All pairs of a category are solved below this number of objects, since pairs grow as its square;
 # from it on, each object is the reference of a few.
 ALL_PAIRS_BELOW = 12

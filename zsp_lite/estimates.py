@@ -93,16 +93,11 @@ class PoseEstimate:
         target = self.target_views[view].frame.camera
         return Sim3(1.0, target.R, target.t).inverse() @ sim3 @ Sim3(1.0, reference.R, reference.t)
 
-    def world_rotation(self, pose: Hypothesis | None = None) -> Float[np.ndarray, "3 3"]:
-        """Return the rotation from the reference camera's frame to the world of the target
-        views."""
-        found = self if pose is None else pose
-        return self.target_views[found.view].frame.camera.R.T @ found.sim3.R
-
     def angle_to(self, pose: Hypothesis) -> float:
         """Return the angle in degrees between the rotation of the estimate and that of another
         pose."""
-        return float(rotation_error(self.world_rotation(), self.world_rotation(pose)))
+        other = self.between_worlds(pose.sim3, pose.view)
+        return float(rotation_error(self.world_sim3.R, other.R))
 
     @property
     def note(self) -> str:

@@ -2,8 +2,8 @@
 category (see `transfer`)."""
 
 import json
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import plain_name, write_atomic
 from zsp_lite.io.ply import write_ply
 from zsp_lite.points import object_pixels
-from zsp_lite.transfer import SurfaceView, object_size, surface_views, transfer
+from zsp_lite.transfer import FOUND, SurfaceView, object_size, surface_views, transfer
 
 # A point is seen if the depth map is nearer by at most this part of the object's size.
 _HIDDEN = 0.05
@@ -56,9 +56,13 @@ class Place:
 
     world: Float[np.ndarray, "3"]  # in the world of the object
     confidence: float  # 1 on the object that is marked
-    found: bool
     # the pixel (x, y) in each frame that sees the place, by the frame's number
-    pixels: dict[int, tuple[float, float]] = field(default_factory=dict)
+    pixels: dict[int, tuple[float, float]]
+
+    @property
+    def found(self) -> bool:
+        """Whether the object has such a place."""
+        return self.confidence >= FOUND
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,50 +94,35 @@ def place_marks(
         InputError: A mark is in no frame, not on the object or without depth, two marks have one
             name, or no frame of an object shows its surface.
     """
-    worlds = marked_points(dataset, category, marks, alignment.objects)
+    worlds = np.stack(marked_points(dataset, category, marks, alignment.objects))
     extractor = as_backbone(backbone)
 
     def surface(name: str) -> list[SurfaceView]:
         return surface_views(alignment, dataset, category, name, extractor)
 
-    sources = {name: surface(name) for name in dict.fromkeys(mark.sequence for mark in marks)}
-    places: list[dict[str, Place]] = [{} for _ in marks]
+    marked = np.array([mark.sequence for mark in marks])
+    sources = {name: surface(name) for name in {mark.sequence for mark in marks}}
+    places = {}  # by the name of the object, in the order of the marks
     for name, aligned in alignment.objects.items():
         target = sources[name] if name in sources else surface(name)
-        found = _find(marks, worlds, sources, name, target)
+        # On their own object, marks are where they are. Those of another object go together: its
+        # patches are compared once.
+        world = worlds.copy()
+        confidence = np.ones(len(marks))
+        for other in sources.keys() - {name}:
+            moved = marked == other
+            found = transfer(worlds[moved], sources[other], target)
+            world[moved] = found.world
+            confidence[moved] = found.confidence
         size = object_size(target) / aligned.sim3.scale  # in the object's world
-        pixels = _pixels(dataset, category, name, [one.world for one in found], _HIDDEN * size)
-        for of_mark, one, seen in zip(places, found, pixels, strict=True):
-            of_mark[name] = replace(one, pixels=seen)
+        pixels = _pixels(dataset, category, name, world, _HIDDEN * size)
+        places[name] = [Place(*place) for place in zip(world, confidence.tolist(), pixels)]
+
     placed = []
-    for mark, world, of_mark in zip(marks, worlds, places, strict=True):
-        common = alignment.objects[mark.sequence].sim3.apply(world)
-        placed.append(PlacedMark(mark, common, of_mark))
+    for k, mark in enumerate(marks):
+        common = alignment.objects[mark.sequence].sim3.apply(worlds[k])
+        placed.append(PlacedMark(mark, common, {name: row[k] for name, row in places.items()}))
     return placed
-
-
-def _find(
-    marks: Sequence[Mark],
-    worlds: Sequence[Float[np.ndarray, "3"]],
-    sources: Mapping[str, Sequence[SurfaceView]],
-    name: str,
-    target: Sequence[SurfaceView],
-) -> list[Place]:
-    """Find all marks on one object; on their own object, they are where they are."""
-    found: dict[Mark, Place] = {}
-    for sequence, source in sources.items():
-        # The marks of one object go together: its patches are compared once.
-        own = [(mark, world) for mark, world in zip(marks, worlds) if mark.sequence == sequence]
-        if sequence == name:
-            for mark, world in own:
-                found[mark] = Place(world, 1.0, True)
-            continue
-        moved = transfer(np.stack([world for _, world in own]), source, target)
-        for (mark, _), world, confidence, here in zip(
-            own, moved.world, moved.confidence, moved.found
-        ):
-            found[mark] = Place(world, float(confidence), bool(here))
-    return [found[mark] for mark in marks]
 
 
 def marked_points(
@@ -173,7 +162,7 @@ def _pixels(
     dataset: Co3D,
     category: str,
     name: str,
-    points: Sequence[Float[np.ndarray, "3"]],
+    points: Float[np.ndarray, "n 3"],
     tolerance: float,
 ) -> list[dict[int, tuple[float, float]]]:
     """Return for each world point its pixel in each frame of an object that sees it.
@@ -228,19 +217,15 @@ def write_marks(
     directions = np.random.default_rng(0).normal(size=(_BALL_POINTS, 3))
     ball = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     for name in placed[0].places:
+        found = [k for k, one in enumerate(placed) if one.places[name].found]
+        if not found:
+            continue
         extent = dataset.extent(category, name)
         radius = _RADIUS * (extent[1] if extent else 1.0)
-        points = []
-        colours = []
-        for number, one in enumerate(placed):
-            if one.places[name].found:
-                colour = bytes.fromhex(COLOURS[number % len(COLOURS)][1:])
-                points.append(one.places[name].world + radius * ball)
-                colours.append(np.tile(np.frombuffer(colour, np.uint8), (_BALL_POINTS, 1)))
+        points = [placed[k].places[name].world + radius * ball for k in found]
+        colours = [list(bytes.fromhex(COLOURS[k % len(COLOURS)][1:])) for k in found]
+        of_points = np.repeat(np.array(colours, np.uint8), _BALL_POINTS, axis=0)
         path = out / "marks" / f"{plain_name(name, 'sequence')}.ply"
-        if points:
-            write_ply(path, np.concatenate(points), np.concatenate(colours))
-        else:
-            path.unlink(missing_ok=True)  # of an earlier call with other marks
+        write_ply(path, np.concatenate(points), of_points)
     write_atomic(out / "marks.json", json.dumps(document, indent=1).encode())
     return out / "marks.json"

@@ -7,6 +7,8 @@ from numpy.typing import ArrayLike
 
 from zsp_lite.errors import rotation_matrix
 
+SAME_ANGLE = 30.0  # degrees, as in Acc30: nearer rotations are the same, a smaller error is right
+
 
 def rotation_error(first: ArrayLike, second: ArrayLike) -> np.ndarray | float:
     """Compute the geodesic angle between rotations, exact near 0 and 180 degrees.

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import DEFAULT, BackboneLike, as_backbone
-from zsp_lite.category import SAME_ANGLE, references_per_pair, synchronise, world_hypotheses
+from zsp_lite.category import references_per_pair, synchronise, world_hypotheses
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.cameras import Values
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
@@ -31,7 +31,7 @@ from zsp_lite.importers.masks import DOUBTFUL
 from zsp_lite.importers.sources import Source, SourceLike, open_pair
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
-from zsp_lite.metrics import rotation_angle, rotation_error
+from zsp_lite.metrics import SAME_ANGLE, rotation_angle, rotation_error
 from zsp_lite.pair_result import PairResult, Vote, label_errors
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import world_cloud

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.data.co3d import Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.estimates import PoseEstimate
@@ -35,7 +34,6 @@ class PairResult:
     estimates: dict[str, PoseEstimate]  # estimate of each solver by its name, at least one
     # rotation error of each estimate in degrees; empty without pose labels
     errors: dict[str, float]
-    pair: Pair | None = None  # the evaluation pair, or None
     # where the masks of the reference and of the targets come from: "given", "box" or "auto"
     masks: tuple[str, str] = ("given", "given")
     backbone: str = ""  # name of the backbone
@@ -63,7 +61,7 @@ class PairResult:
         """Angle in degrees between the rotations of two solvers; None if only one ran."""
         if len(self.estimates) < 2:
             return None
-        first, second = [estimate.world_rotation() for estimate in self.estimates.values()]
+        first, second = [estimate.world_sim3.R for estimate in self.estimates.values()]
         return float(rotation_error(first, second))
 
     def __repr__(self) -> str:

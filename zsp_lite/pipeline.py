@@ -224,11 +224,11 @@ def align_best_view(
     targets: Sequence[View],
     matched: Sequence[ViewMatch],
     *,
-    seed: int = 0,
-    threshold: float = 0.2,
-    view_selector: str | ViewSelector = "correspond",
-    trials: int = 1000,
-    sample_size: int = 4,
+    seed: int,
+    threshold: float,
+    view_selector: str | ViewSelector,
+    trials: int,
+    sample_size: int,
 ) -> PoseEstimate:
     """Solve as the paper does: select the best view (sec. 4.2) and fit the pose to its matches by
     RANSAC (sec. 4.3).

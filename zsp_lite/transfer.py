@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from scipy.special import expit, softmax
@@ -32,7 +32,8 @@ from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import frame_defect
-from zsp_lite.errors import InputError, check_choice, real_array
+from zsp_lite.data.pairs import spread
+from zsp_lite.errors import InputError, check_choice, check_magnitude, real_array
 from zsp_lite.features import log_bin
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import near_median
@@ -72,7 +73,7 @@ class TransferredPoints:
 
     @property
     def found(self) -> Bool[np.ndarray, " n"]:
-        """Points with a confidence of at least a half; the object has nothing like the others."""
+        """Whether each point has a place on this object: a confidence of at least a half."""
         return self.confidence >= FOUND
 
 
@@ -81,11 +82,9 @@ class SurfaceView:
     """The part of an object's surface that one frame shows: its patches with measured depth."""
 
     number: int  # of the frame
-    view: View
     sim3: Sim3  # from the object's world to the common frame
     direction: Float[np.ndarray, "3"]  # from the object to the camera, in the common frame
-    patches: Int[np.ndarray, " n"]  # indices in the view's grid, row by row
-    points: Float[np.ndarray, "n 3"]  # in the common frame
+    points: Float[np.ndarray, "n 3"]  # of the patches, in the common frame
     descriptors: Float[torch.Tensor, "n d"]  # of length 1
 
 
@@ -95,9 +94,10 @@ def surface_views(
     category: str,
     sequence: str,
     backbone: BackboneLike = "zsp-tiny",
-    count: int = VIEWS,
 ) -> list[SurfaceView]:
     """Describe the surface of an object of an aligned category for `transfer`.
+
+    It is seen in evenly spaced frames with a camera, without those with a `frame_defect`.
 
     Args:
         alignment: Poses of the objects in the common frame.
@@ -105,8 +105,6 @@ def surface_views(
         category: Name of the category.
         sequence: Name of the object's sequence.
         backbone: Backbone, or what `load_backbone` takes.
-        count: Number of frames, evenly spaced over those with a camera. Frames with a
-            `frame_defect` are left out.
 
     Raises:
         InputError: The alignment has no such object, or no frame shows its surface.
@@ -115,8 +113,7 @@ def surface_views(
     annotations = [
         frame for frame in dataset.frames(category, sequence) if frame.viewpoint is not None
     ]
-    spaced = np.unique(np.arange(count) * len(annotations) // count)
-    chosen = [annotations[k] for k in spaced]
+    chosen = [annotations[k] for k in spread(VIEWS, len(annotations))]
     frames = {one.frame_number: dataset.load(one) for one in chosen}
     usable = {number: frame for number, frame in frames.items() if not frame_defect(frame)}
     unmasked = any(frame.mask is None for frame in usable.values())
@@ -142,10 +139,9 @@ def _surface_view(number: int, view: View, sim3: Sim3) -> SurfaceView:
     near = near_median(points, 4)  # as in `points.world_cloud`
     towards = sim3.apply(camera.centre) - np.median(points, axis=0)
     direction = towards / np.linalg.norm(towards)
-    patches = patches[near]
-    binned = log_bin(view.features.keys[None]).flatten(0, 2)[patches]
+    binned = log_bin(view.features.keys[None]).flatten(0, 2)[patches[near]]
     descriptors = F.normalize(binned, dim=1)
-    return SurfaceView(number, view, sim3, direction, patches, points[near], descriptors)
+    return SurfaceView(number, sim3, direction, points[near], descriptors)
 
 
 def object_size(views: Sequence[SurfaceView]) -> float:
@@ -169,8 +165,7 @@ def transfer(
         InputError: The points are not of shape (n, 3), or not finite.
     """
     marked = real_array("points", points, (None, 3))
-    if not np.isfinite(marked).all():
-        raise InputError("points have values that are not finite, expected finite coordinates")
+    check_magnitude("points", marked)
     marks = source[0].sim3.apply(marked)
     size = object_size(target)
     surface = KDTree(np.concatenate([view.points for view in target]))

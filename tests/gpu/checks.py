@@ -48,7 +48,7 @@ def solve(pickled: bytes) -> dict[str, np.ndarray]:
     rotations = {}
     for solver in SOLVERS["both"]:
         method = ZeroShotPose(backbone, solver=solver)
-        rotations[solver] = method.estimate_from_views(reference, targets).world_rotation()
+        rotations[solver] = method.estimate_from_views(reference, targets).world_sim3.R
     return rotations
 
 

@@ -11,14 +11,14 @@ import pkgutil
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
 from itertools import chain, groupby
 from multiprocessing import active_children, get_context, parent_process
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 from uuid import uuid4
 
 import cloudpickle
@@ -31,6 +31,11 @@ from zsp_lite.errors import InputError, check_integer, ends_the_run
 from zsp_lite.io.files import digest, read_bytes, write_atomic
 from zsp_lite.threads import one_thread
 
+# Evaluates the named rows on a pair, and returns the line of the run.
+Evaluator = Callable[[Pair, list[str]], dict[str, Any]]
+# Loads an evaluator, which computes features with this number of threads. It travels to a worker
+# and is called there.
+Opener = Callable[[int], Evaluator]
 Chunk = list[tuple[Pair, list[str]]]  # pairs of one category, each with the names of its rows
 CHUNK_SIZE = 16  # pairs
 # Assumed of an executor that does not tell its number of workers: many, so that chunks are small
@@ -38,17 +43,6 @@ CHUNK_SIZE = 16  # pairs
 _UNKNOWN_WORKERS = 256
 _MOST_WORKERS = 4096  # largest number of processes that is accepted
 logger = logging.getLogger(__name__)
-
-
-@runtime_checkable
-class Evaluator(Protocol):
-    """Evaluates pairs; it travels to a worker as it was made, and is opened there."""
-
-    def open(self, threads: int) -> None:
-        """Load what evaluation needs; features are computed with this number of threads."""
-
-    def line(self, pair: Pair, names: Sequence[str]) -> dict[str, Any]:
-        """Evaluate the named rows on a pair; return the line of the run."""
 
 
 class Workers(NamedTuple):
@@ -71,7 +65,7 @@ def make_chunks(work: Mapping[Pair, list[str]], size: int = CHUNK_SIZE) -> list[
 
 def evaluate_pairs(
     out: str | Path,
-    evaluator: Evaluator,
+    opener: Opener,
     work: Mapping[Pair, list[str]],
     workers: Workers,
     kind: type = ResultLine,
@@ -80,7 +74,7 @@ def evaluate_pairs(
 
     Args:
         out: Folder of the run.
-        evaluator: Evaluates a pair.
+        opener: Loads what evaluates a pair.
         work: The names of the rows of each pair.
         workers: Where to evaluate.
         kind: Type of the lines.
@@ -102,7 +96,7 @@ def evaluate_pairs(
     threads = max(1, get_num_threads() // workers.count)
     # None shows the bar in a terminal only.
     hidden = None if logger.isEnabledFor(logging.INFO) else True
-    found = _lines(evaluator, threads, workers, chunks, out)
+    found = _lines(opener, threads, workers, chunks, out)
     # Closed, so that workers get no more to do where a line cannot be stored.
     with (
         tqdm(
@@ -116,19 +110,19 @@ def evaluate_pairs(
 
 
 def _lines(
-    evaluator: Evaluator, threads: int, workers: Workers, chunks: list[Chunk], out: str | Path
+    opener: Opener, threads: int, workers: Workers, chunks: list[Chunk], out: str | Path
 ) -> Iterator[list[dict[str, Any]]]:
     """Yield the lines of pairs when they are found: one by one in this process, else by chunk."""
     if workers.executor is None:
-        evaluator.open(threads)
+        evaluate = opener(threads)
         with one_thread():
             for pair, names in chain.from_iterable(chunks):
-                yield [evaluator.line(pair, names)]
+                yield [evaluate(pair, names)]
         return
 
-    # A backbone has megabytes: each worker reads the evaluator once, from a file in the run's
+    # A backbone has megabytes: each worker reads the opener once, from a file in the run's
     # folder, which all workers see.
-    pickled = _pickle(evaluator, workers)
+    pickled = _pickle(opener, workers)
     checksum = digest(pickled)
     # Absolute, because a worker may have another current folder.
     path = Path(out).resolve() / f".rows-{uuid4()}"
@@ -160,8 +154,8 @@ def _lines(
         path.unlink(missing_ok=True)
 
 
-def _pickle(evaluator: Evaluator, workers: Workers) -> bytes:
-    """Pickle an evaluator; what a notebook or a module in the current folder defines goes with it,
+def _pickle(opener: Opener, workers: Workers) -> bytes:
+    """Pickle an opener; what a notebook or a module in the current folder defines goes with it,
     since workers need not see it."""
     # Processes of this machine import what this one can import.
     if not isinstance(workers.executor, ProcessPoolExecutor):
@@ -169,7 +163,7 @@ def _pickle(evaluator: Evaluator, workers: Workers) -> bytes:
         for name in local & sys.modules.keys():
             cloudpickle.register_pickle_by_value(sys.modules[name])
     with ends_the_run("sending the rows to workers"):
-        return cloudpickle.dumps(evaluator)
+        return cloudpickle.dumps(opener)
 
 
 _worker = threading.local()  # an executor's workers may be threads
@@ -183,11 +177,10 @@ def _evaluate_chunk(path: str, checksum: str, threads: int, chunk: Chunk) -> lis
             raise InputError(
                 f"rows of the run {path} have changed, expected the file that this run wrote"
             )
-        _worker.evaluator = cloudpickle.loads(pickled)
-        _worker.evaluator.open(threads)
+        _worker.evaluate = cloudpickle.loads(pickled)(threads)
         _worker.path = path
     with one_thread():
-        return [_worker.evaluator.line(pair, names) for pair, names in chunk]
+        return [_worker.evaluate(pair, names) for pair, names in chunk]
 
 
 @contextmanager

@@ -133,7 +133,7 @@ def evaluate(
         sent = backbone if workers.executor else loaded
         evaluator = PairEvaluator(str(Path(data).resolve()), rows, sent, row_seconds)
         with open_run(out, settings):
-            execution.evaluate_pairs(out, evaluator, repeated, workers)
+            execution.evaluate_pairs(out, evaluator.open, repeated, workers)
 
     # The lines as one table, and its summary.
     run = read_run(out)
@@ -226,18 +226,18 @@ def _hash_of_labels(dataset: Co3D, category: str) -> str:
 
 @dataclass
 class PairEvaluator:
-    """Evaluates rows on pairs (see `execution.Evaluator`); frames and features are kept from pair
-    to pair."""
+    """Evaluates rows on pairs; frames and features are kept from pair to pair."""
 
     root: str  # the data folder
     rows: Mapping[str, Method]
     backbone: BackboneLike
     row_seconds: int = 60  # time limit of a row of one's own for a pair
 
-    def open(self, threads: int) -> None:
+    def open(self, threads: int) -> execution.Evaluator:
         """Load the backbone and the extractors."""
         extractors = make_extractors(as_backbone(self.backbone), self.rows)
         self.store = FrameStore(Co3D(self.root), extractors, threads)
+        return self.line
 
     def line(self, pair: Pair, names: Collection[str]) -> dict[str, Any]:
         """Evaluate the named rows on a pair: a line of the run's results (see

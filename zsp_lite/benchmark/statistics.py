@@ -83,11 +83,9 @@ def draws_of(row: pd.DataFrame) -> Draws:
     return drawn * of_seeds[:, repeat]
 
 
-def object_draws(
-    objects: ArrayLike, categories: ArrayLike = "", resamples: int = RESAMPLES
-) -> Draws:
+def object_draws(objects: ArrayLike, categories: ArrayLike = "") -> Draws:
     """Draw bootstrap weights (resamples, n) of pairs by resampling the objects (n, 2) that the
-    are made of. Categories (n,) are those of the pairs, by default one.
+    pairs are made of. Categories (n,) are those of the pairs, by default one.
 
     In each replicate the objects of a category are drawn with replacement, and the weight of a pair
     is the product of its two objects' multiplicities: the pigeonhole bootstrap (Owen 2007) with one
@@ -97,15 +95,15 @@ def object_draws(
     """
     objects = np.asarray(objects, dtype=str)
     categories = np.broadcast_to(np.asarray(categories, dtype=str), len(objects))
-    weights = np.empty((resamples, len(objects)))  # a column for each pair
+    weights = np.empty((RESAMPLES, len(objects)))  # a column for each pair
     for category in np.unique(categories):
         rng = np.random.default_rng([0, stable_hash(category)])
         members = np.nonzero(categories == category)[0]
         names, sides = np.unique(objects[members], return_inverse=True)
         first, second = sides.reshape(-1, 2).T
-        drawn = np.zeros((resamples, len(members)))
+        drawn = np.zeros((RESAMPLES, len(members)))
         # A draw without both objects of any pair has no weight at all and is repeated.
-        empty = np.arange(resamples)
+        empty = np.arange(RESAMPLES)
         while len(empty):
             if len(names) < _FEWEST_OBJECTS:
                 drawn[empty] = _multiplicities(len(members), len(empty), rng)
@@ -209,13 +207,11 @@ def paired_difference(
     }
 
 
-def paired_test(
-    first: ArrayLike, second: ArrayLike, threshold: float = 30, weights: Draws | None = None
-) -> dict:
+def paired_test(first: ArrayLike, second: ArrayLike) -> dict:
     """Test whether the second method is better than the first on the same pairs. All p values are
     two-sided.
 
-    Errors (n,) are in degrees; a pair is solved below the threshold. To what `paired_difference`
+    Errors (n,) are in degrees; a pair is solved below 30. To what `paired_difference`
     returns are added "sign_test_p", of McNemar's exact test, and "permutation_test_p", of the mean
     difference, by 10,000 flips of signs. Both treat pairs as independent: where pairs share
     objects, these p values are too small.
@@ -225,8 +221,8 @@ def paired_test(
     first = np.asarray(first, np.float64)
     second = np.asarray(second, np.float64)
     # McNemar's test is the sign test of the pairs that one method alone solves.
-    solved = first < threshold
-    solved_by_second = second < threshold
+    solved = first < 30
+    solved_by_second = second < 30
     alone = np.count_nonzero(solved != solved_by_second)
     sign = 1.0
     if alone:
@@ -244,7 +240,7 @@ def paired_test(
             rng=0,
         ).pvalue
     tests = {"sign_test_p": float(sign), "permutation_test_p": float(flips)}
-    return paired_difference(first, second, threshold, weights) | tests
+    return paired_difference(first, second) | tests
 
 
 def _multiplicities(

@@ -86,14 +86,19 @@ def align(
     A pixel of one object, --mark, is found on all others: OUT gets marks.json, marks.jpg,
     marks/SEQUENCE.ply with balls in each object's world, and a section of the report.
     """
-    from zsp_lite.align import align_category, alignment_errors, write_alignment, write_labels
-    from zsp_lite.category import SAME_ANGLE
+    from zsp_lite.align import (
+        align_category,
+        alignment_errors,
+        remove_outputs,
+        write_alignment,
+        write_labels,
+    )
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.labels import read_label_folder
     from zsp_lite.importers.convert import import_captures
     from zsp_lite.marks import marked_points, place_marks, write_marks
-    from zsp_lite.metrics import accuracy
+    from zsp_lite.metrics import SAME_ANGLE, accuracy
     from zsp_lite.viz.category_sheet import COLUMNS, object_rows
     from zsp_lite.viz.report import write_category_report
 
@@ -108,6 +113,7 @@ def align(
     marked_points(dataset, category, marks, sequences)
     alignment = align_category(dataset, category, backbone, sequences, pairs, targets, out, workers)
     placed = place_marks(alignment, dataset, category, marks, backbone) if marks else []
+    remove_outputs(out, category)  # those that are not written again would be of other objects
     written = [
         write_alignment(alignment, out),
         write_labels(alignment, out, category, replace=True),
@@ -118,10 +124,10 @@ def align(
     title = f"{category}: {len(alignment.objects)} objects in one frame"
     print_rows(title, COLUMNS, object_rows(alignment))
     for one in placed:
-        found = {name: place for name, place in one.places.items() if name != one.mark.sequence}
         places = [
             (name, f"{100 * place.confidence:.0f}" if place.found else "nothing here")
-            for name, place in found.items()
+            for name, place in one.places.items()
+            if name != one.mark.sequence
         ]
         print_rows(f"Mark {one.mark.name}", ("object", "right (%)"), places)
     for (first, second), angle in alignment.disagreements.items():

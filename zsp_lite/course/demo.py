@@ -67,7 +67,6 @@ def run_pair(
         tuple(targets),
         estimates,
         {},
-        pair,
         backbone=getattr(method.backbone, "name", ""),
     )
     return replace(

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 
 from zsp_lite.align import read_hypotheses
-from zsp_lite.category import SAME_ANGLE, PairHypotheses
-from zsp_lite.metrics import rotation_angle
+from zsp_lite.category import PairHypotheses
+from zsp_lite.metrics import SAME_ANGLE, rotation_angle
 from zsp_lite.verified.poses import Poses
 from zsp_lite.verified.solver import Solution
 from zsp_lite.verified.verification import ScoreCoefficients, score_terms
@@ -20,9 +20,10 @@ _Rotations = Mapping[str, Float[np.ndarray, "3 3"]]  # of objects, by their name
 
 
 def full_turn(
-    solution: Solution, step: float = 5.0
+    solution: Solution,
 ) -> tuple[Float[np.ndarray, " n"], Poses, Float[np.ndarray, " n"]]:
-    """Turn the best pose of a solution by a full circle, about the axis that leads to the second.
+    """Turn the best pose of a solution by a full circle, in steps of 5 degrees, about the axis that
+    leads to the second.
 
     Returns the angles in degrees, the turned poses, and their scores.
     """
@@ -30,7 +31,7 @@ def full_turn(
     first, second = (solution.poses.rotation[k].double().numpy() for k in (0, 1))
     axis = cv2.Rodrigues(second @ first.T)[0]
     axis = axis / np.linalg.norm(axis)
-    degrees = np.arange(0, 360 + step, step)
+    degrees = np.arange(0, 365, 5.0)
     matrices = [cv2.Rodrigues(np.radians(angle) * axis)[0] for angle in degrees]
     turns = torch.from_numpy(np.stack(matrices)).float()
     # The turn is about the origin of the scene, which is amid the object.
@@ -67,29 +68,38 @@ def spanning_tree(answers: Sequence[PairHypotheses]) -> dict[str, Float[np.ndarr
     return {name: placed[name] for name in names}
 
 
-def right_answers(
-    answers: Sequence[PairHypotheses], truth: _Rotations, rotations: _Rotations | None = None
-) -> dict[tuple[str, str], bool | None]:
-    """Say of each ordered pair whether its answer is right: its surest one, or with `rotations` the
-    one that fits them.
+def surest_right(
+    answers: Sequence[PairHypotheses], truth: _Rotations
+) -> dict[tuple[str, str], bool]:
+    """Say of each ordered pair whether its surest answer is right.
 
-    `truth` and `rotations` lead from the objects' worlds to a common frame. None where no
-    hypothesis of a pair fits.
+    `truth` leads from the objects' worlds to a common frame.
     """
-    right: dict[tuple[str, str], bool | None] = {}
+    return {
+        (one.reference, one.target): bool(_angles(one, truth)[0] < SAME_ANGLE) for one in answers
+    }
+
+
+def fitting_right(
+    answers: Sequence[PairHypotheses], truth: _Rotations, rotations: _Rotations
+) -> dict[tuple[str, str], bool | None]:
+    """Say of each ordered pair whether the answer that fits `rotations` is right; None if none
+    fits."""
+    right = {}
     for one in answers:
-        a, b = one.reference, one.target
-        turns = np.stack([sim3.R for sim3 in one.sim3s])
-        off = rotation_angle(turns, truth[b].T @ truth[a])
-        chosen = 0
-        if rotations is not None:
-            away = rotation_angle(turns, rotations[b].T @ rotations[a])
-            chosen = int(away.argmin())
-            if away[chosen] > SAME_ANGLE:
-                right[a, b] = None
-                continue
-        right[a, b] = bool(off[chosen] < SAME_ANGLE)
+        away = _angles(one, rotations)
+        nearest = away.argmin()
+        fits = away[nearest] <= SAME_ANGLE
+        is_right = bool(_angles(one, truth)[nearest] < SAME_ANGLE)
+        right[one.reference, one.target] = is_right if fits else None
     return right
+
+
+def _angles(answers: PairHypotheses, rotations: _Rotations) -> Float[np.ndarray, " m"]:
+    """Return the angles in degrees between the answers of a pair and the rotation between its
+    objects."""
+    turns = np.stack([sim3.R for sim3 in answers.sim3s])
+    return rotation_angle(turns, rotations[answers.target].T @ rotations[answers.reference])
 
 
 def all_alike(truth: _Rotations, rotations: _Rotations) -> bool:

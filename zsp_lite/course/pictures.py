@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.metrics import rotation_angle
-from zsp_lite.views import object_crop
+from zsp_lite.viz.category_sheet import nearest_crop
 from zsp_lite.viz.plots import BLUE, GREEN, VERMILLION, draw_image
 
 # Pictures stand on a circle of radius 1; half the width of a picture, and how far from its middle
@@ -84,11 +83,8 @@ def alike(
     camera = dataset.camera(dataset.frames(category, first)[0]).R
     pictures = {}
     for name, rotation in rotations.items():
-        frames = dataset.frames(category, name)
         wanted = camera @ rotations[first].T @ rotation
-        seen = np.stack([dataset.camera(frame).R for frame in frames])
-        nearest = int(np.argmin(rotation_angle(seen, wanted)))
-        pictures[name] = object_crop(dataset.load(frames[nearest])).rgb
+        pictures[name] = nearest_crop(dataset, dataset.frames(category, name), wanted).rgb
     return pictures
 
 

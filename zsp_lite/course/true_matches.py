@@ -17,6 +17,7 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.data.ground_truth import ObjectPose, object_poses
 from zsp_lite.views import object_crop, patch_mask
 
+_NEAR = 0.1  # largest distance of a match in box coordinates
 _MARGIN = 0.05  # a point farther outside the box than this belongs to the background
 _MASK_THRESHOLD = 0.8  # above this a pixel is surely of the object: masks are soft at its border
 
@@ -54,10 +55,9 @@ def patch_coordinates(
 def ground_truth_matches(
     reference: tuple[Float[np.ndarray, "r1 c1 3"], Bool[np.ndarray, "r1 c1"]],
     target: tuple[Float[np.ndarray, "r2 c2 3"], Bool[np.ndarray, "r2 c2"]],
-    tolerance: float = 0.1,
 ) -> tuple[Int[np.ndarray, "r1 c1 2"], Bool[np.ndarray, "r1 c1"]]:
-    """Match each reference patch to the target patch with the nearest box coordinates, at most
-    `tolerance` away.
+    """Match each reference patch to the target patch with the nearest box coordinates, at most 0.1
+    away.
 
     `reference` and `target` are results of `patch_coordinates`. Returns the target patch (row, col)
     of each reference patch, (0, 0) without a match, and the reference patches that have one.
@@ -70,7 +70,7 @@ def ground_truth_matches(
         search = NearestNeighbors(n_neighbors=1).fit(target_points[target_known])
         distance, index = search.kneighbors(points[known])
         cells[known] = np.argwhere(target_known)[index[:, 0]]
-        valid[known] = distance[:, 0] <= tolerance
+        valid[known] = distance[:, 0] <= _NEAR
         cells[~valid] = 0
     return cells, valid
 

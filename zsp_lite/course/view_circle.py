@@ -19,6 +19,7 @@ def show_view_circle(
     images: Sequence[np.ndarray],
     turns: Float[np.ndarray, " n"],
     scores: Float[np.ndarray, " n"],
+    limits: tuple[float, float] = (-52, -22),
 ) -> Figure:
     """Show the scores of views as radius over their turn from the reference, which is in the
     middle.
@@ -31,6 +32,7 @@ def show_view_circle(
         images: Images of the views.
         turns: Angle from the reference to each view, degrees, of both signs.
         scores: Score of each view.
+        limits: Scores in the middle and at the rim.
 
     Returns:
         The figure, with 0 degrees at the top and 180 at the bottom.
@@ -40,10 +42,8 @@ def show_view_circle(
     circle.set_theta_zero_location("N")
     circle.set_theta_direction(-1)
     circle.set_xticks(np.radians(range(0, 360, 90)), ["0°", "90°", "180°", "90°"])
-    spread = np.ptp(scores)
-    # The curve leaves the inner third to the reference.
-    circle.set_ylim(scores.min() - 0.7 * spread, scores.max() + 0.1 * spread)
-    circle.set_yticks(np.arange(np.ceil(scores.min() / 5) * 5, scores.max(), 5))
+    circle.set_ylim(*limits)
+    circle.set_yticks(np.arange(-40, limits[1], 5))
     circle.tick_params(axis="y", labelsize=8)
 
     order = np.argsort(turns)

@@ -182,20 +182,20 @@ def frame_defect(frame: Frame) -> str:
     return "" if (frame.depth > 0).any() else "no known depth"
 
 
-def mask_to_bbox(
-    mask: Real[np.ndarray, "h w"], threshold: float = 0.4, padding: float = 0.1
-) -> Box:
-    """Compute the padded bounding box (top, left, height, width) of the mask above a threshold.
+def mask_to_bbox(mask: Real[np.ndarray, "h w"], padding: float = 0.1) -> Box:
+    """Compute the padded bounding box (top, left, height, width) of the mask above 0.4.
 
-    If no pixel is above the threshold, it is lowered in steps of 0.05, down to 0. Height and width
+    If no pixel is above it, the threshold is lowered in steps of 0.05, down to 0. Height and width
     grow by the fraction `padding`, half of it on each side, as in CO3D's loader. InputError if the
     mask is empty.
     """
     if not (mask > 0).any():
         raise InputError(f"object mask of shape {mask.shape} is empty, expected a pixel above 0")
-    while not (mask > max(threshold, 0.0)).any():
-        threshold -= 0.05
-    inside = mask > max(threshold, 0.0)
+    threshold = 0.4
+    inside = mask > threshold
+    while not inside.any():
+        threshold = max(threshold - 0.05, 0.0)
+        inside = mask > threshold
     top, bottom = _span(inside.any(axis=1), padding)
     left, right = _span(inside.any(axis=0), padding)
     return top, left, bottom - top, right - left

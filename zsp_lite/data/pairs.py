@@ -66,10 +66,16 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
             target = others[rng.integers(len(others))]
             frame = numbers[reference][rng.integers(len(numbers[reference]))]
             length = len(numbers[target])
-            positions = (rng.integers(length) + np.arange(n_targets) * length // n_targets) % length
-            targets = tuple(numbers[target][position] for position in positions)
+            start = rng.integers(length)
+            steps = spread(n_targets, length)
+            targets = tuple(numbers[target][(start + step) % length] for step in steps)
             pairs[Pair(category, reference, frame, target, targets)] = None
         unsampled[reference] -= len(pairs) - before
+
+
+def spread(count: int, length: int) -> list[int]:
+    """Return at most `count` evenly spaced positions below `length`, 0 among them."""
+    return sorted({k * length // count for k in range(count)})
 
 
 def _labelled_frames(dataset: Co3D, category: str, least: int) -> dict[str, list[int]]:

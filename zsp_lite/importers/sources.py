@@ -14,6 +14,7 @@ from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
+from zsp_lite.data.pairs import spread
 from zsp_lite.errors import InputError
 from zsp_lite.importers import FORMATS, open_capture, recognise
 from zsp_lite.importers.agreement import disagreement, neighbours
@@ -496,11 +497,6 @@ def _beside(path: Path, kind: str, suffixes: Sequence[str]) -> Path | None:
     """Find the file of a kind, such as NAME_depth.png, beside an image."""
     files = [path.with_name(f"{path.stem}_{kind}{suffix}") for suffix in suffixes]
     return next((file for file in files if file.is_file()), None)
-
-
-def spread(count: int, length: int) -> list[int]:
-    """Return at most `count` evenly spaced positions below `length`, 0 among them."""
-    return sorted({k * length // count for k in range(count)})
 
 
 def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:

@@ -23,6 +23,7 @@ from zsp_lite.data.co3d import SequenceData
 from zsp_lite.data.depth import zero_unknown
 from zsp_lite.data.frames import MAX_PIXELS, Frame, check_pixels
 from zsp_lite.data.labels import PoseLabel, label_bytes
+from zsp_lite.data.pairs import spread
 from zsp_lite.errors import (
     InputError,
     check_choice,
@@ -39,7 +40,6 @@ from zsp_lite.importers.convert import (
     scale_frame,
     write_sequence,
 )
-from zsp_lite.importers.sources import spread
 from zsp_lite.importers.unpacked import Video
 from zsp_lite.io.files import file_size, path_inside, write_atomic
 from zsp_lite.io.ply import read_ply

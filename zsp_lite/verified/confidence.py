@@ -24,11 +24,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from zsp_lite.estimates import Hypothesis
+from zsp_lite.metrics import SAME_ANGLE
 from zsp_lite.verified.verification import VIEWPOINT_SIGMA
 
-# Hypotheses whose rotations differ by more than this many degrees are distinct: the paper's wider
-# error threshold.
-MODE_ANGLE = 30.0
 # A pose with more than this share of the best pose's probability is nearly as probable.
 TIE_RATIO = float(np.exp(-1))
 # A pose is flagged if in both directions a smaller share of its points lies on an observed surface.
@@ -87,7 +85,7 @@ def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
     mode_of: list[int] = []
     for i, row in enumerate(angle):
         # The modes of better hypotheses that are within 30 degrees.
-        near = [j for j in range(i) if mode_of[j] == j and row[j] < MODE_ANGLE]
+        near = [j for j in range(i) if mode_of[j] == j and row[j] < SAME_ANGLE]
         mode_of.append(min(near, key=row.__getitem__, default=i))
     return np.array(mode_of)
 
@@ -110,7 +108,7 @@ def reliability_flags(
     one_of_two = bool(
         len(tied) == 2
         and probability[tied].sum() > 0.5
-        and angle[tied[0], tied[1]] > 2 * MODE_ANGLE
+        and angle[tied[0], tied[1]] > 2 * SAME_ANGLE
     )
     if len(tied) > 1:
         shown = " and ".join(f"{probability[i]:.2f}" for i in tied)

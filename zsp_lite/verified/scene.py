@@ -61,7 +61,6 @@ class ViewMaps:
     # soft mask, 0 where the depth is unknown); distance to the silhouette in map pixels (0 inside);
     # similarity column of the patch (-1: none)
     table: Float[Tensor, "pixels 4"]
-    pixel_scale: Float[Tensor, "v 2"]  # (x, y) pixels of the view's frame per map pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +73,6 @@ class Projection:
     weight: Float[Tensor, "m v n"]
     silhouette_distance: Float[Tensor, "m v n"]  # at the point's depth, working units; 0 inside
     patch: Int[Tensor, "m v n"]  # similarity column of the patch at its pixel, -1 for none
-    pixels: Float[Tensor, "m v n 2"]  # (x, y) in map pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +219,6 @@ def build_maps(
         float_tensor(sizes),
         torch.from_numpy(np.cumsum(pixels)),
         torch.from_numpy(np.concatenate(tables, axis=1)).T,
-        float_tensor([view.frame.camera.size[::-1] for view in views] / sizes),
     )
 
 
@@ -258,7 +255,7 @@ def project_points(
     beyond = torch.sub(pixels, nearest).abs_().sum(2)  # 0 within the image
     # The sign is 0 where the border pixel is inside the silhouette.
     distance = distance.addcmul_(beyond, distance.sign()).div_(pixels_per_unit)
-    return Projection(depth, surface_depth, weight, distance, patch.int(), pixels.transpose(2, 3))
+    return Projection(depth, surface_depth, weight, distance, patch.int())
 
 
 def _table(

@@ -87,9 +87,10 @@ WEIGHTS = ScoreCoefficients()
 
 @dataclass(frozen=True, eq=False)
 class PointTerms:
-    """The terms of each point in each view, before averaging (see the module's docstring)."""
+    """The terms of n points in v views under m poses, before averaging (see the module's
+    docstring)."""
 
-    projection: Projection  # where the n points fall in the v views under m poses
+    patch: Int[Tensor, "m v n"]  # similarity column of the patch at the point's pixel, -1 for none
     # a: weight in [0, 1] with which the point lies on the measured surface
     surface: Float[Tensor, "m v n"]
     silhouette: Float[Tensor, "m v n"]  # c: in [0, 1]
@@ -101,7 +102,7 @@ class PointTerms:
         """Yield similarity, overlap, silhouette and free space, each averaged for every pose."""
         q = point_weights / point_weights.sum()
         # A point on a pixel without a foreground patch is not on the surface: a = 0.
-        surface = self.surface * (self.projection.patch >= 0)
+        surface = self.surface * (self.patch >= 0)
         total = surface.sum(dim=1)
         yield (surface.mul_(self.similarity).sum(dim=1) / (total + _SIMILARITY_PRIOR)) @ q
         yield total.clamp_max(1) @ q
@@ -164,4 +165,4 @@ def _point_terms(
     similarity = scene.similarity.reshape(-1).index_select(0, index.flatten()).view(index.shape)
     similarity = similarity.mul_(projection.patch >= 0)
     silhouette = (projection.silhouette_distance / MAX_VIOLATION).clamp_max_(1)
-    return PointTerms(projection, surface, silhouette, free_space, similarity)
+    return PointTerms(projection.patch, surface, silhouette, free_space, similarity)

@@ -4,12 +4,14 @@ from collections.abc import Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.annotations import FrameAnnotation
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.marks import COLOURS, PlacedMark
+from zsp_lite.data.frames import Frame
+from zsp_lite.marks import COLOURS, Place, PlacedMark
 from zsp_lite.metrics import rotation_angle
 from zsp_lite.views import object_crop
 from zsp_lite.viz.plots import VERMILLION
@@ -53,7 +55,6 @@ def objects_figure(
     if turned:
         rows["or turned"] = turned
 
-    # Each picture is the object's frame whose camera is nearest to this rotation.
     size = (_WIDTH * len(names) + _BORDER, _HEIGHT * len(rows) + _BORDER)
     figure, axes = plt.subplots(
         len(rows), len(names), figsize=size, layout="constrained", squeeze=False
@@ -66,9 +67,7 @@ def objects_figure(
             axis.set(xticks=[], yticks=[], frame_on=False)
             if name in rotations:
                 frames = _frames(dataset, category, name)
-                seen_from = np.stack([dataset.camera(frame).R for frame in frames])
-                nearest = int(np.argmin(rotation_angle(seen_from, rotations[name])))
-                axis.imshow(object_crop(dataset.load(frames[nearest])).rgb)
+                axis.imshow(nearest_crop(dataset, frames, rotations[name]).rgb)
 
     # Names and probabilities below the row "aligned".
     for axis, name in zip(axes[1], names, strict=True):
@@ -100,26 +99,35 @@ def marks_figure(
             place = one.places[name]
             frames = _frames(dataset, category, name)
             seeing = [frame for frame in frames if frame.frame_number in place.pixels]
-            if name == mark.sequence:
-                seeing = [frame for frame in frames if frame.frame_number == mark.frame]
-            candidates = seeing if place.found and seeing else frames
-            seen_from = np.stack([dataset.camera(frame).R for frame in candidates])
-            nearest = rotation_angle(seen_from, common @ alignment.objects[name].sim3.R).argmin()
-            crop = object_crop(dataset.load(candidates[nearest]))
+            shown = place.found and len(seeing) > 0
+            rotation = common @ alignment.objects[name].sim3.R
+            crop = nearest_crop(dataset, seeing if shown else frames, rotation)
             axis.set(xticks=[], yticks=[], frame_on=False)
             axis.imshow(crop.rgb)
-            if name == mark.sequence:
-                label = "marked"
-            elif not place.found:
-                label = "nothing here"
-            else:
-                label = f"{100 * place.confidence:.0f} %" + ("" if seeing else ", not seen")
+            label = "marked" if name == mark.sequence else _found(place, shown)
             axis.set_xlabel(f"{name[:16]}\n{label}", fontsize=8, parse_math=False)
-            if place.found and seeing:
+            if shown:
                 x, y = crop.camera.project(place.world)[0] - 0.5  # pixel centres at integers
                 colour = COLOURS[number % len(COLOURS)]
                 axis.plot(x, y, "o", ms=8, mfc=colour, mec="white", mew=1.5)
     return figure
+
+
+def _found(place: Place, shown: bool) -> str:
+    """Say whether and how surely an object has a place."""
+    if not place.found:
+        return "nothing here"
+    percent = f"{100 * place.confidence:.0f} %"
+    return percent if shown else f"{percent}, not seen"
+
+
+def nearest_crop(
+    dataset: Co3D, frames: Sequence[FrameAnnotation], rotation: Float[np.ndarray, "3 3"]
+) -> Frame:
+    """Return the object crop of the frame whose camera is nearest to a rotation from the world."""
+    seen_from = np.stack([dataset.camera(frame).R for frame in frames])
+    nearest = rotation_angle(seen_from, rotation).argmin()
+    return object_crop(dataset.load(frames[nearest]))
 
 
 def doubtful(alignment: CategoryAlignment) -> list[str]:

@@ -54,6 +54,7 @@ _TITLE_LINE = 0.2  # height of a line of a title at this font, in inches
 _MARKED = 20  # a curve with more points has no markers, which would cover it
 _JOINED = 15  # number of matches with a line: more lines would cover the images
 _INSIDE = 0.9  # a soft mask above this leaves out the border of the object
+_RESIDUAL = 0.2  # an inlier has a smaller one: the default threshold of RANSAC
 _OUTLIER = 2.5  # median distances; points farther out are background (see `near_median`)
 # A white outline lets lines and texts stand out from dark images, a black one white lines from
 # light images.
@@ -577,14 +578,13 @@ def show_residuals(
     views: Sequence[View],
     points: Sequence[Real[np.ndarray, "n 3"]],
     fits: Mapping[str, Sim3],
-    threshold: float = 0.2,
 ) -> Figure:
     """Show the reference, and below each title the target with the reference's points, moved by a
     fit.
 
     `views` and the `points` of matches are those of the reference and of the target. Lines join
-    fitted points to their partners; discs mark residuals below the threshold, in the reference
-    those of the last fit, crosses the others.
+    fitted points to their partners; discs mark residuals below 0.2, in the reference those of the
+    last fit, crosses the others.
     """
     target = views[1].frame
     images = [views[0].frame.rgb, *[target.rgb] * len(fits)]
@@ -596,7 +596,7 @@ def show_residuals(
     partners = target.camera.project(target.camera.to_world(points[1]))[0]
     for axis, fit in zip(axes[1:], fits.values()):
         fitted = fit.apply(points[0])
-        inliers = np.linalg.norm(fitted - points[1], axis=1) < threshold
+        inliers = np.linalg.norm(fitted - points[1], axis=1) < _RESIDUAL
         starts = target.camera.project(target.camera.to_world(fitted))[0]
         lines = np.stack([starts, partners], axis=1)
         colours = np.where(inliers, BLUE, VERMILLION)

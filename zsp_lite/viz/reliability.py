@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
-from scipy.stats import binomtest, mannwhitneyu
+from scipy.stats import mannwhitneyu
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,6 @@ class Reliability:
     count: np.ndarray  # number of estimates in each bin
     confidence: Float[np.ndarray, " bins"]  # mean
     accuracy: Float[np.ndarray, " bins"]  # fraction of correct estimates
-    interval: Float[np.ndarray, "2 bins"]  # lower and upper ends of its 95 % interval (Wilson)
 
     def __str__(self) -> str:
         columns = {
@@ -57,8 +56,6 @@ def reliability(
     mean_confidence = np.array([confidence[part].mean() for part in parts])
     accuracy = np.array([correct[part].mean() for part in parts])
     count = np.array([len(part) for part in parts])
-    tests = [binomtest(int(correct[part].sum()), len(part)) for part in parts]
-    interval = np.transpose([test.proportion_ci(method="wilson") for test in tests])
     calibration_error = float((count * np.abs(mean_confidence - accuracy)).sum() / count.sum())
     top_half_accuracy = float(correct[order[len(order) // 2 :]].mean())
     right = confidence[correct]
@@ -67,5 +64,5 @@ def reliability(
     pairs = len(right) * len(wrong)
     auroc = float(mannwhitneyu(right, wrong).statistic / pairs) if pairs else float("nan")
     return Reliability(
-        auroc, calibration_error, top_half_accuracy, count, mean_confidence, accuracy, interval
+        auroc, calibration_error, top_half_accuracy, count, mean_confidence, accuracy
     )

@@ -26,6 +26,7 @@ from zsp_lite.estimates import PoseEstimate
 from zsp_lite.io.files import REPOSITORY, write_atomic
 from zsp_lite.marks import PlacedMark
 from zsp_lite.matching import cyclical_distances, similarity
+from zsp_lite.metrics import SAME_ANGLE
 from zsp_lite.pair_result import PairResult
 from zsp_lite.viz import category_sheet, plots
 from zsp_lite.viz.pose_picture import pose_picture
@@ -40,7 +41,6 @@ _MEANINGS = {
     "error": "angle to the labelled rotation",
     "confidence": "probability of an error below 30°, calibrated on renderings",
 }
-_RIGHT = 30.0  # a pose with a smaller error is marked as right, in degrees
 _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark ground
 _TEMPLATES = Environment(
     loader=PackageLoader("zsp_lite.viz"), autoescape=True, undefined=StrictUndefined
@@ -230,7 +230,7 @@ def overview(results: Sequence[PairResult]) -> Figure:
         plots.draw_estimates(panels, result.estimates.values())
         plots.mark(panels[0], result.title, colour="none", size=14)
         for axis, error in zip(panels[1:], result.errors.values()):
-            right = error < _RIGHT
+            right = error < SAME_ANGLE
             word = "right" if right else "wrong"
             colour = plots.BLUE if right else plots.VERMILLION
             plots.mark(axis, f"{word}: {error:.0f}° off", colour, 14)

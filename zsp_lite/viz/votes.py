@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.category import SAME_ANGLE
 from zsp_lite.data.cameras import ground_axes
+from zsp_lite.metrics import SAME_ANGLE
 from zsp_lite.pair_result import PairResult, Vote
 from zsp_lite.viz import plots
 

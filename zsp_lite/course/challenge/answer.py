@@ -22,16 +22,15 @@ COLUMNS = ("pair", "target_frame", "rotation")
 def answer(handin: Path, data: Path, questions: Path, out: Path, row_seconds: int) -> None:
     """Write the poses of all pairs, each as soon as it is found.
 
-    Failed pairs have no line; their first reason is printed.
+    Failed pairs have no line. Their first reason is printed at once, as the time may run out.
     """
     method, backbone = _load(handin)
     store = FrameStore(Co3D(data), make_extractors(backbone, {"hand-in": method}), threads=1)
-    failures = []
+    failed = 0
     with out.open("w", newline="", encoding="utf-8") as file, one_thread():
         lines = csv.writer(file)
         lines.writerow(COLUMNS)
-        asked = read_questions(questions)
-        for pair in asked:
+        for pair in read_questions(questions):
             try:
                 with fails_alone(row_seconds):
                     problem = PairProblem(pair, store, {method.features} - {"none"})
@@ -39,13 +38,13 @@ def answer(handin: Path, data: Path, questions: Path, out: Path, row_seconds: in
                     found = ask(method, seen)
                 frame = pair.target_frames[found.view]
             except (InputError, IndexError) as error:
-                failures.append(f"{pair.key}: {error}")
+                failed += 1
+                if failed == 1:
+                    print(f"the first pair that failed: {error}", flush=True)
                 continue
             rotation = " ".join(map(repr, found.rotation.ravel().tolist()))
             lines.writerow([pair.key, frame, rotation])
             file.flush()
-    if failures:
-        print(f"{len(failures)} of {len(asked)} pairs failed; the first: {failures[0]}")
 
 
 def read_questions(path: Path) -> list[Pair]:

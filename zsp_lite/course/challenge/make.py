@@ -56,23 +56,26 @@ def make_challenge(
     salt = b"zsp-lite challenge"
     key = hashlib.scrypt(secret.encode(), salt=salt, n=1 << 15, r=8, p=1, maxmem=1 << 26, dklen=7)
     kept = out / "keep" / "data"
-    export_categories(categories, kept, sequences, frames, int.from_bytes(key))
+    export_categories(categories, kept, sequences, frames, int.from_bytes(key), name_of=_plain_name)
 
     given = out / "give"
     copy_without_labels(kept, given / "data")
     dataset = Co3D(kept)
     count = -(-pairs // len(categories))
-    asked = [
-        pair
-        for category in categories
-        for pair in category_pairs(dataset, category, count, _TARGETS)
-    ]
+    by_category = [category_pairs(dataset, name, count, _TARGETS) for name in categories]
+    # In turn, so that a hand-in that is cut off by time has answered as many of each.
+    asked = [pair for pairs_in_turn in zip(*by_category) for pair in pairs_in_turn]
     for folder in (given, kept.parent):
         write_questions(folder / QUESTIONS_FILE, dataset, asked)
     shutil.copyfile(_RULES, given / "rules.md")
     shutil.copyfile(_STARTER, given / "starter.py")
     for path in [*given.rglob("*"), given]:
         os.utime(path, (_TIME, _TIME))
+
+
+def _plain_name(seed: int, category: str, index: int) -> str:
+    """Return a name that says nothing of the seed, other than that of `sequence_name`."""
+    return str(100 + index)
 
 
 def copy_without_labels(data: Path, out: Path) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 from jinja2 import Environment, StrictUndefined
+from tqdm import tqdm
 
 from zsp_lite.benchmark.statistics import figures_of, object_draws, paired_difference
 from zsp_lite.course.challenge.answer import COLUMNS, read_questions
@@ -31,6 +32,7 @@ from zsp_lite.metrics import rotation_error
 
 _SIGNIFICANT = 0.05  # a difference with a smaller p value is not left to chance
 _LONGEST_NOTE = 200  # characters
+_LAST_PRINTED = 10_000  # bytes that are read of what a hand-in printed
 _PAGE = Path(__file__).with_name("ranking.html")
 # Variables of the environment that a hand-in gets; the folder that it finds weights in is added.
 _PASSED = ("PATH", "PYTHONPATH", "SYSTEMROOT", "LANG", "TMPDIR")
@@ -55,6 +57,7 @@ class Ranking:
     """What a ranking page shows."""
 
     standings: list[Standing]
+    categories: list[str]
     alone: bool  # hand-ins found neither labels nor each other; False where the system cannot
 
 
@@ -128,9 +131,11 @@ def rank(
             return _run_alone(before, source, folder, target, limits)
 
         with ThreadPoolExecutor(workers) as pool:
-            notes = dict(zip(teams, pool.map(run, teams), strict=True))
+            done = tqdm(pool.map(run, teams), "hand-ins", len(teams), disable=None)
+            notes = dict(zip(teams, done, strict=True))
 
-    ranking = Ranking(_standings(keep / "data", pairs, poses, notes), alone)
+    standings = _standings(keep / "data", pairs, poses, notes)
+    ranking = Ranking(standings, sorted({pair.category for pair in pairs}), alone)
     _write(ranking, out)
     return ranking
 
@@ -178,13 +183,17 @@ def _run_alone(
             problem = f"ended after {limits.minutes:g} minutes"
         finally:
             _end(process)
-        printed.seek(max(0, printed.seek(0, os.SEEK_END) - _LONGEST_NOTE))
-        lines = printed.read().decode(errors="replace").strip().splitlines()
+        printed.seek(max(0, printed.seek(0, os.SEEK_END) - _LAST_PRINTED))
+        text = printed.read().decode(errors="replace")
     if found.is_file() and not found.is_symlink():  # a link may lead to another team's poses
         shutil.copyfile(found, target)
     else:
         target.write_text(",".join(COLUMNS) + "\n")
-    return "; ".join([*filter(None, [problem]), *lines[-1:]])
+    # Where it is hidden, its folder has the name of the one above.
+    for path in (folder, folder.parent):
+        text = text.replace(f"{path}{os.sep}", "")
+    last = text.strip().splitlines()[-1:]
+    return "; ".join([*filter(None, [problem]), *last])[:_LONGEST_NOTE]
 
 
 def _hiding(folders: Sequence[Path], own: Path) -> list[str]:

@@ -3,6 +3,9 @@
 Try it on objects with known poses:
 
     zsp-lite benchmark --pairs 5 --methods ours,mine=starter:method --out outputs/mine
+
+After a change give the row another name, as in `mine2=starter:method`: a row that is there is not
+computed again.
 """
 
 import torch

@@ -1,7 +1,7 @@
 """Export of procedural categories, or of models, to a data folder with labels and pairs."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -63,6 +63,12 @@ def export_preset(preset: str, out: str | Path, seed: int = 0) -> None:
         write_pairs(Path(out), category, size.pairs, size.targets, seed)
 
 
+def sequence_name(seed: int, category: str, index: int) -> str:
+    """Return a name like CO3D's, three groups of digits; below index 900, names sort by index."""
+    digits = _key(seed, category, index)
+    return f"{100 + index}_{1000 + digits % 9000}_{1000 + digits // 9000 % 9000}"
+
+
 def export_categories(
     categories: Sequence[str],
     out: str | Path,
@@ -72,6 +78,7 @@ def export_categories(
     image_size: int = 256,
     builders: Mapping[str, Builder] = CATEGORIES,
     heights: tuple[float, float] = HEIGHTS,
+    name_of: Callable[[int, str, int], str] = sequence_name,
 ) -> None:
     """Write sequences of procedural categories to a folder, with pose labels.
 
@@ -87,6 +94,7 @@ def export_categories(
         image_size: shorter image side in pixels.
         builders: functions that build an object, by category.
         heights: range of the mean elevation of a sequence's cameras in degrees.
+        name_of: name of a sequence, from the seed, its category and its index.
 
     Raises:
         InputError: if a category is unknown, or the folder was written with other settings.
@@ -101,14 +109,14 @@ def export_categories(
     write_atomic(out / SETTINGS_FILE, json.dumps(settings).encode())
     jobs = [(category, index) for category in categories for index in range(sequences)]
     for category, index in tqdm(jobs, "rendering", disable=None):
-        name = sequence_name(seed, category, index)
+        name = name_of(seed, category, index)
         key = _key(seed, category, index)
         if name not in read_poses(out, category):
             mesh = make_object(category, index, seed, builders)
             recorded = record_sequence(mesh, name, key, frames, image_size, heights)
             write_sequence(out, category, mesh, recorded)
     for category in categories:
-        names = [sequence_name(seed, category, index) for index in range(sequences)]
+        names = [name_of(seed, category, index) for index in range(sequences)]
         write_true_labels(out, category, names)
 
 
@@ -118,12 +126,6 @@ def make_object(
     """Return the object of sequence number `index` in canonical coordinates, with its materials."""
     key = _key(seed, category, index)
     return replace(make_shape(builders[category], [key, 0]), materials=random_materials([key, 3]))
-
-
-def sequence_name(seed: int, category: str, index: int) -> str:
-    """Return a name like CO3D's, three groups of digits; below index 900, names sort by index."""
-    digits = _key(seed, category, index)
-    return f"{100 + index}_{1000 + digits % 9000}_{1000 + digits // 9000 % 9000}"
 
 
 class _Rendered(msgspec.Struct):

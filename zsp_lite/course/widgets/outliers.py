@@ -117,7 +117,7 @@ def drag_match() -> Widget:
     def update(distance: float) -> str:
         draw(axes[0], distance)
         titles = [axis.get_title().replace("\n", " ") for axis in axes[0]]
-        return f"One of {len(CHAIR)} matches is {distance:.1f} units wrong. {'; '.join(titles)}."
+        return f"{'; '.join(titles)}."
 
     controls = {"distance": slider("one match is wrong by", 0.0, _FARTHEST, 0.0, 0.1)}
     return interactive_figure(figure, controls, update, _DRAGGED)
@@ -146,7 +146,10 @@ def draw_dragged(axes: np.ndarray, distance: float) -> list[Artist]:
         fitted = fit.apply(CHAIR)
         agree = np.linalg.norm(fitted - target, axis=1) < _THRESHOLD
         turn = rotation_error(fit.R, np.eye(3))
-        axis.set_title(f"{name}: {turn:.0f}° off,\n{agree.sum()} of {len(CHAIR)} matches agree")
+        axis.set_title(
+            f"Wrong by {distance:g}, {name}: {turn:.0f}° off,\n"
+            f"{agree.sum()} of {len(CHAIR)} matches agree"
+        )
         flat = [(points @ _SEEN_FROM.T)[:, :2] for points in (target, fitted)]
         for points, colour, width in zip(flat, ("0.7", BLUE), (5, 2)):
             bars = [points[list(bar)] for bar in _BARS]

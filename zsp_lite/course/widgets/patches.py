@@ -27,7 +27,6 @@ def patch_similarities(
     sims: Mapping[str, Float[Tensor, "n n"]],
     cells: Int[np.ndarray, "h w 2"],
     valid: Bool[np.ndarray, "h w"],
-    start: str | None = None,
 ) -> Widget:
     """Show how similar one patch is to all patches of the target, its nearest neighbour and its
     true match.
@@ -38,7 +37,6 @@ def patch_similarities(
         sims: Similarities of all pairs of patches, by the name of their kind.
         cells: True match (row, col) of each reference patch, as of `ground_truth_matches`.
         valid: Whether a reference patch has a true match.
-        start: Kind of similarity that is shown first; by default the first of `sims`.
     """
     grid = valid.shape
     figure, axes = plots.show_images(
@@ -88,9 +86,7 @@ def patch_similarities(
     known = np.argwhere(valid)
     off_middle = np.abs(known - np.median(known, axis=0)).sum(axis=1)
     middle = tuple(known[off_middle.argmin()].tolist())
-    kinds = load_package().Dropdown(
-        options=list(sims), value=start or next(iter(sims)), description="similarity"
-    )
+    kinds = load_package().Dropdown(options=list(sims), description="similarity")
     controls = {**patch_sliders(grid, middle), "kind": kinds}
     alt = (
         "A patch of the reference; its similarities, nearest neighbour and true match in the "
