@@ -391,8 +391,8 @@ def grade_endless_loop(folder: Path) -> tuple[float, list[float]]:
     path = folder / "submitted/127" / LAB / f"{LAB}.ipynb"
     path.parent.mkdir(parents=True)
     notebook = nbformat.read(folder / "release" / LAB / path.name, as_version=4)
-    answer = graded(notebook, solution=True)["row_of_lengths"]
-    answer.source = "def row_of_lengths(*_):\n    while True:\n        pass"
+    answer = graded(notebook, solution=True)["cycle_ends"]
+    answer.source = "def cycle_ends(*_):\n    while True:\n        pass"
     nbformat.write(notebook, path)
     start = time.monotonic()
     run_nbgrader(["autograde", LAB])

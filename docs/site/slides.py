@@ -8,9 +8,9 @@ the slides show the stored results:
     :heading: The map of a real pair
     ```
 
-embeds the first picture below the heading that contains these words. The path may also be that of a
-drawing, whose description becomes the alternative text. The text of the directive `notes` is shown
-in the presenter's view only.
+embeds the first picture below the heading that contains these words; with the option `number` the
+second one, the third one, ... The path may also be that of a drawing, whose description becomes the
+alternative text. The text of the directive `notes` is shown in the presenter's view only.
 """
 
 import base64
@@ -33,7 +33,7 @@ class Picture(SphinxDirective):
     alternative text."""
 
     required_arguments = 1
-    option_spec = {"heading": directives.unchanged}
+    option_spec = {"heading": directives.unchanged, "number": directives.positive_int}
 
     def run(self) -> list[nodes.Node]:
         path = (Path(self.env.doc2path(self.env.docname)).parent / self.arguments[0]).resolve()
@@ -47,9 +47,10 @@ class Picture(SphinxDirective):
         else:
             heading = self.options["heading"]
             pictures = pictures_below(nbformat.read(path, as_version=4), heading)
-            if not pictures:
-                raise self.error(f"{path.name} has no picture below the heading {heading!r}")
-            form, data, alt = pictures[0]
+            number = self.options.get("number", 1)
+            if len(pictures) < number:
+                raise self.error(f"no picture {number} below {heading!r}")
+            form, data, alt = pictures[number - 1]
         image = f'<img src="data:{form};base64,{data}" alt="{escape(alt)}">'
         return [nodes.raw("", image, format="html")]
 
@@ -79,16 +80,15 @@ def pictures_below(notebook: NotebookNode, heading: str) -> list[tuple[str, str,
     level = 0  # number of # of the heading; 0 above it
     for cell in notebook.cells:
         if cell.cell_type == "markdown" and level:  # Does the section end here?
-            if re.search(rf"^#{{1,{level}}} ", cell.source, re.MULTILINE):
+            if re.search(rf"(?m)^#{{1,{level}}} ", cell.source):
                 break
         elif cell.cell_type == "markdown":
-            mark = re.search(rf"^(#+) .*{re.escape(heading)}", cell.source, re.MULTILINE)
+            mark = re.search(rf"(?m)^(#+) .*{re.escape(heading)}", cell.source)
             level = len(mark[1]) if mark else 0
         elif level:
             for output in cell.get("outputs", []):
                 for form in {"image/png", "image/jpeg"} & set(output.get("data", {})):
-                    data = output.data[form].replace("\n", "")
-                    pictures.append((form, data, output.metadata.get(form, {}).get("alt", "")))
+                    pictures.append((form, output.data[form], output.metadata[form]["alt"]))
     return pictures
 
 
