@@ -1,13 +1,12 @@
 """The class challenge: what is given away, what a hand-in can see, and who wins."""
 
 import gzip
-from pathlib import Path
+import socket
 
 import numpy as np
 import pandas as pd
 import pytest
 
-import zsp_lite
 from zsp_lite.course.challenge.answer import read_questions
 from zsp_lite.course.challenge.make import make_challenge
 from zsp_lite.course.challenge.rank import rank
@@ -20,8 +19,9 @@ PAIRS = 6
 
 STARTER = "starter.py"
 LOOPS = "def method(similarity, foreground1, foreground2):\n    while True:\n        pass\n"
-CRASHES = "import os\ndef method(similarity, foreground1, foreground2):\n    os._exit(3)\n"
+CRASHES = "import os\nos._exit(3)\n"
 FAILS = "def backbone(images):\n    raise ValueError('no network')\n"
+SHUTS = "import os\nopen('poses.csv', 'w')\nos.chmod('.', 0)\nraise SystemExit\n"
 # Looks for labels and other hand-ins beside it and in the lecturer's folders, and for a network.
 CHEATS = """
 import socket
@@ -106,20 +106,25 @@ def test_a_ranking_of_hand_ins_that_answer_loop_crash_and_cheat(challenge, tmp_p
     (handins / STARTER).write_bytes((challenge / "give" / STARTER).read_bytes())
     (handins / "loops.py").write_text(LOOPS)
     (handins / "crashes.py").write_text(CRASHES)
-    cheats = CHEATS.format(keep=str(challenge / "keep"), handins=str(handins), port=9)
-    (handins / "cheats.py").write_text(cheats)
     (handins / "fails.py").write_text(FAILS)
+    (handins / "shuts.py").write_text(SHUTS)
     (handins / "._fails.py").write_bytes(b"of macOS")
+    (handins / "folder.py").mkdir()
     out = handins / "out"  # in a folder that is hidden as well
-    ranking = rank(handins, challenge / "keep", out, pair_seconds=2)
-    found = {one.team: one for one in ranking.standings}
-    assert ranking.standings[0].team == "right"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        cheats = CHEATS.format(keep=str(challenge / "keep"), handins=str(handins), port=port)
+        (handins / "cheats.py").write_text(cheats)
+        ranking = rank(handins, challenge / "keep", out, pair_seconds=3)
+    found = {one.team: one for _, one in ranking.places}
+    assert ranking.places[0][1].team == "right"
     assert (found["right"].acc30, found["turned"].acc30) == (100, 0)
     assert found["starter"].answered > 0
-    assert "takes more than 2 s" in found["loops"].note
+    assert "takes more than 3 s" in found["loops"].note
     assert "exit status 3" in found["crashes"].note
     assert found["fails"].note.endswith("ValueError: no network")
     assert found["cheats"].answered == 0
+    assert found["shuts"].answered == 0
     assert "._fails" not in found
     if ranking.alone:
         assert found["cheats"].note.endswith("found nothing")
@@ -134,27 +139,37 @@ def test_teams_whose_difference_is_chance_share_a_place(challenge, tmp_path):
     lines = (handins / "first.csv").read_text().splitlines()
     (handins / "one_less.csv").write_text("\n".join(lines[:-1]))
     (handins / "none.csv").write_text(lines[0])
-    standings = rank(handins, challenge / "keep", tmp_path / "out").standings
-    assert [(one.team, one.place) for one in standings] == [
-        ("first", 1),
-        ("one_less", 1),
-        ("none", 3),
+    places = rank(handins, challenge / "keep", tmp_path / "out").places
+    assert [(place, one.team) for place, one in places] == [
+        (1, "first"),
+        (1, "one_less"),
+        (3, "none"),
     ]
-    assert [one.answered for one in standings] == [PAIRS, PAIRS - 1, 0]
+    assert [one.answered for _, one in places] == [PAIRS, PAIRS - 1, 0]
 
 
 def test_a_file_that_is_no_table_counts_as_no_answer(challenge, tmp_path):
     handins = tmp_path / "handins"
     handins.mkdir()
     (handins / "odd.csv").write_text("hello")
-    (one,) = rank(handins, challenge / "keep", tmp_path / "out").standings
+    ((_, one),) = rank(handins, challenge / "keep", tmp_path / "out").places
     assert one.answered == 0
     assert "expected a CSV file" in one.note
 
 
-def test_a_folder_that_holds_the_program_cannot_be_hidden(challenge, tmp_path):
-    with pytest.raises(InputError, match="holds this program"):
-        rank(Path(zsp_lite.__file__).parent, challenge / "keep", tmp_path / "out")
+def test_poses_that_were_not_asked_for_are_counted(challenge, tmp_path):
+    handins = tmp_path / "handins"
+    handins.mkdir()
+    write_answers(challenge, handins / "other.csv")
+    text = (handins / "other.csv").read_text()
+    (handins / "other.csv").write_text(text.replace("toytruck/", "car/"))
+    ((_, one),) = rank(handins, challenge / "keep", tmp_path / "out").places
+    assert one.note == f"{PAIRS} of {PAIRS} poses are of no pair and frame of pairs.csv"
+
+
+def test_the_folder_that_is_given_has_no_labels_to_rank_by(challenge, tmp_path):
+    with pytest.raises(InputError, match="expected the folder keep/"):
+        rank(tmp_path, challenge / "give", tmp_path / "out")
 
 
 @pytest.mark.parametrize(
@@ -162,7 +177,7 @@ def test_a_folder_that_holds_the_program_cannot_be_hidden(challenge, tmp_path):
     [
         ("make --secret short --categories car --out x", "expected at least 8"),
         ("make --secret long_enough --categories cow --out x", "category"),
-        ("rank nowhere --keep nowhere --out x", "pairs nowhere/pairs.csv"),
+        ("rank nowhere --keep nowhere --out x", "nowhere has no labels"),
     ],
 )
 def test_bad_input_is_refused(words, message, tmp_path, monkeypatch, run):

@@ -81,5 +81,5 @@ def test_axes_are_named_where_their_ends_project_unless_behind_the_camera(axis):
 def test_the_legend_of_panels_has_the_curves_with_a_name():
     curve = ([0, 1], [0, 1])
     assert not plots.show_curves([0, 1], {"": [0, 1]}).legends
-    (legend,) = plots.show_panels({"left": {"a": curve, "b": curve}, "right": {"a": curve}}).legends
+    (legend,) = plots.show_panels({"left": {"a": curve, "b": curve}, "right": {"": curve}}).legends
     assert [text.get_text() for text in legend.get_texts()] == ["a", "b"]

@@ -68,7 +68,7 @@ python_maximum_signature_line_length = 80
 napoleon_use_ivar = True
 
 # Address of the repository on GitHub, for the links "Open in Colab"; without it there are none.
-course_repository = _project.get("urls", {}).get("Repository", "")
+course_repository = _project.get("urls", {}).get("Repository", "").rstrip("/").removesuffix(".git")
 
 html_theme = "sphinx_book_theme"
 html_title = "zsp-lite"

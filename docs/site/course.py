@@ -70,8 +70,8 @@ import sys
 
 if "google.colab" in sys.modules:
     # Without the exercises, which have the solutions, and, by `cat`, without progress bars.
-    !git clone --depth 1 --filter=blob:none --sparse {repository} /content/{folder} 2>&1 | cat
-    %cd /content/{folder}
+    !git clone --depth 1 --filter=blob:none --sparse {repository} /content/zsp-lite 2>&1 | cat
+    %cd /content/zsp-lite
     !git sparse-checkout add zsp_lite data_samples notebooks/results 2>&1 | cat
     %pip install --quiet . anywidget jupyterquiz
     %cd notebooks
@@ -320,10 +320,8 @@ def runnable(notebook: NotebookNode, docname: str, repository: str) -> NotebookN
                         lambda link: link[1] + urljoin(place, link[2]),
                         cell.source,
                     )
-        folder = repository.rstrip("/").removesuffix(".git").rpartition("/")[2]
-        cell = nbformat.v4.new_code_cell(
-            INSTALL_IN_COLAB.format(repository=repository, folder=folder), id="install"
-        )
+        source = INSTALL_IN_COLAB.format(repository=repository)
+        cell = nbformat.v4.new_code_cell(source, id="install")
         notebook.cells.insert(0, cell)
     return notebook
 

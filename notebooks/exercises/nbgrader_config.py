@@ -4,12 +4,12 @@ import csv
 import filecmp
 import re
 import shutil
-import time
 import zipfile
 from datetime import UTC, datetime
 from functools import cache
 from html import escape
 from pathlib import Path
+from time import monotonic
 
 import nbformat
 from jinja2 import pass_context
@@ -205,9 +205,10 @@ class ExecuteHandIn(Execute):
 
     def preprocess_cell(self, cell: NotebookNode, resources: dict, index: int) -> tuple:
         data = cell.metadata.get("nbgrader", {})
-        if cell.source.startswith("## "):
+        heading = cell.cell_type == "markdown" and cell.source.startswith("## ")
+        if heading:
             self.limit = LOST if "read by a person" in cell.source else LIMIT
-        if cell.source.startswith("## ") or data.get("solution"):
+        if heading or data.get("solution"):
             self.stopped = False
         if cell.cell_type == "code" and (self.stopped or self.left == 0):
             error = new_output("error", ename="CellTimeoutError", evalue="")
@@ -217,12 +218,12 @@ class ExecuteHandIn(Execute):
         # The cell of the set-up imports torch.
         setup = data.get("grade_id") == "setup"
         self.timeout = 120 if setup else min(self.limit, self.left)
-        start = time.monotonic()
+        start = monotonic()
         cell, resources = super().preprocess_cell(cell, resources, index)
         errors = [output.get("ename") for output in cell.get("outputs", [])]
         if "CellTimeoutError" in errors:
             self.stopped = True
-            self.left = max(0, self.left - round(time.monotonic() - start))
+            self.left = max(0, self.left - round(monotonic() - start))
         return cell, resources
 
 

@@ -58,14 +58,14 @@ def rank(handins, keep, out, workers, minutes, pair_seconds, memory) -> None:
     found = ranking.rank(handins, keep, out, workers, minutes, pair_seconds, memory)
     columns = ("team", "place", "Acc30 (%)", "95 % interval", "answered")
     rows = []
-    for one in found.standings:
-        answered = f"{one.answered} of {one.pairs}"
+    for place, one in found.places:
+        answered = f"{one.answered} of {found.pairs}"
         interval = f"{one.low:.1f} to {one.high:.1f}"
-        rows.append((one.team, str(one.place), f"{one.acc30:.1f}", interval, answered))
+        rows.append((one.team, str(place), f"{one.acc30:.1f}", interval, answered))
     print_rows("Ranking", columns, rows)
-    for one in found.standings:
+    for _, one in found.places:
         if one.note:
             print(f"{one.team}: {one.note}")
     if not found.alone:
-        print("Hand-ins could read labels and each other: no user can make namespaces here")
+        print("Hand-ins could read labels and each other")
     print(f"Written: {out / 'ranking.html'}, ranking.csv")

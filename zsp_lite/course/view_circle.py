@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from zsp_lite.viz.plots import BLUE, CHOSEN, draw_image, mark
 
+_LIMITS = (-52, -22)  # scores in the middle and at the rim
 _EVERY = 3  # views from one thumbnail to the next
 _THUMBNAIL = 0.17  # width and height, of the figure's
 _RING = 0.395  # distance of the thumbnails from the middle, of the figure's width
@@ -19,7 +20,6 @@ def show_view_circle(
     images: Sequence[np.ndarray],
     turns: Float[np.ndarray, " n"],
     scores: Float[np.ndarray, " n"],
-    limits: tuple[float, float] = (-52, -22),
 ) -> Figure:
     """Show the scores of views as radius over their turn from the reference, which is in the
     middle.
@@ -32,7 +32,6 @@ def show_view_circle(
         images: Images of the views.
         turns: Angle from the reference to each view, degrees, of both signs.
         scores: Score of each view.
-        limits: Scores in the middle and at the rim.
 
     Returns:
         The figure, with 0 degrees at the top and 180 at the bottom.
@@ -42,8 +41,8 @@ def show_view_circle(
     circle.set_theta_zero_location("N")
     circle.set_theta_direction(-1)
     circle.set_xticks(np.radians(range(0, 360, 90)), ["0°", "90°", "180°", "90°"])
-    circle.set_ylim(*limits)
-    circle.set_yticks(np.arange(-40, limits[1], 5))
+    circle.set_ylim(*_LIMITS)
+    circle.set_yticks(np.arange(-40, _LIMITS[1], 5))
     circle.tick_params(axis="y", labelsize=8)
 
     order = np.argsort(turns)

@@ -341,7 +341,7 @@ def show_panels(
                     label=name,
                 )
         axis.set(title=title, **labels)
-    if any(panels[title]):
+    if axes[0].get_legend_handles_labels()[1]:
         _legend(figure, axes[0])
     return figure
 

@@ -16,7 +16,7 @@ from zsp_lite.io.files import read_bytes
 from zsp_lite.threads import one_thread
 
 _LARGEST_FILE = 1 << 28  # bytes
-COLUMNS = ("pair", "target_frame", "rotation")
+_COLUMNS = ("pair", "target_frame", "rotation")
 
 
 def answer(handin: Path, data: Path, questions: Path, out: Path, row_seconds: int) -> None:
@@ -29,7 +29,7 @@ def answer(handin: Path, data: Path, questions: Path, out: Path, row_seconds: in
     failed = 0
     with out.open("w", newline="", encoding="utf-8") as file, one_thread():
         lines = csv.writer(file)
-        lines.writerow(COLUMNS)
+        lines.writerow(_COLUMNS)
         for pair in read_questions(questions):
             try:
                 with fails_alone(row_seconds):

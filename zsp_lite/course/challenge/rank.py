@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -20,8 +20,9 @@ from jinja2 import Environment, StrictUndefined
 from tqdm import tqdm
 
 from zsp_lite.benchmark.statistics import figures_of, object_draws, paired_difference
-from zsp_lite.course.challenge.answer import COLUMNS, read_questions
+from zsp_lite.course.challenge.answer import read_questions
 from zsp_lite.course.challenge.make import QUESTIONS_FILE, copy_without_labels
+from zsp_lite.course.synthetic.export import SETTINGS_FILE
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.exchange import StoredPose, read_stored_poses
 from zsp_lite.data.pairs import true_poses
@@ -33,41 +34,33 @@ from zsp_lite.metrics import rotation_error
 _SIGNIFICANT = 0.05  # a difference with a smaller p value is not left to chance
 _LONGEST_NOTE = 200  # characters
 _LAST_PRINTED = 10_000  # bytes that are read of what a hand-in printed
+_POSES_FILE = "poses.csv"
 _PAGE = Path(__file__).with_name("ranking.html")
 # Variables of the environment that a hand-in gets; the folder that it finds weights in is added.
 _PASSED = ("PATH", "PYTHONPATH", "SYSTEMROOT", "LANG", "TMPDIR")
 
 
 @dataclass(frozen=True)
-class Standing:
-    """A line of the ranking."""
+class Result:
+    """Result of a team."""
 
-    place: int  # shared by teams whose difference to the first of them may be chance
     team: str
     acc30: float  # percent
     low: float  # ends of the 95 % interval, by bootstrap over objects
     high: float
     answered: int  # pairs with a pose
-    pairs: int
     note: str  # why pairs have none; "" if all have
+    errors: Float[np.ndarray, " n"]  # of each pair, degrees; 180 without an answer
 
 
 @dataclass(frozen=True)
 class Ranking:
     """What a ranking page shows."""
 
-    standings: list[Standing]
+    places: list[tuple[int, Result]]  # teams whose difference may be chance share a place
+    pairs: int
     categories: list[str]
-    alone: bool  # hand-ins found neither labels nor each other; False where the system cannot
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Limits of a hand-in."""
-
-    minutes: float
-    pair_seconds: int
-    memory: float  # gigabytes
+    alone: bool  # hand-ins found neither labels nor each other
 
 
 def rank(
@@ -94,77 +87,81 @@ def rank(
         memory: Limit of its memory in gigabytes, on Linux.
 
     Raises:
-        InputError: `keep` holds no challenge, or `handins` no hand-in, or two of one team; or one
-            of both folders holds this program.
+        InputError: `keep` holds no challenge, or `handins` no hand-in, or two of one team.
     """
     handins = Path(handins)
     keep = Path(keep)
     out = Path(out)
+    data = keep / "data"
+    if not (data / SETTINGS_FILE).is_file():
+        raise InputError(f"{keep} has no labels, expected the folder keep/ of a challenge")
     pairs = read_questions(keep / QUESTIONS_FILE)
     # Not the hidden files that macOS adds to archives.
-    files = sorted(path for path in handins.glob("[!.]*") if path.suffix in (".py", ".csv"))
+    files = [path for path in sorted(handins.glob("[!.]*.*")) if path.is_file()]
+    files = [path for path in files if path.suffix in (".py", ".csv")]
     teams = {path.stem: path for path in files}
     if not files or len(teams) < len(files):
         raise InputError(
             f"{handins} has {len(files)} hand-ins of {len(teams)} teams, expected one of each, "
             "TEAM.py or TEAM.csv"
         )
-    poses = out / "poses"
-    poses.mkdir(parents=True, exist_ok=True)
-    hidden = _folders_to_hide(keep, handins, poses)
-    limits = Limits(minutes, pair_seconds, memory)
+    hidden = {keep.resolve(), handins.resolve()}
+    hidden = [folder for folder in hidden if not hidden.intersection(folder.parents)]
+    limits = [str(pair_seconds), str(int(memory * 1e9))]
     with TemporaryDirectory(prefix="challenge-") as runs:
         probe = Path(runs, "probe")
         probe.mkdir()
-        alone = _works([*_hiding(hidden, probe), "true"])
+        alone = _works([*_hiding(hidden, probe), sys.executable, "-c", "import zsp_lite"])
 
-        def run(team: str) -> str:
-            source, target = teams[team], poses / f"{team}.csv"
+        def answers_of(team: str) -> tuple[dict[str, StoredPose], str]:
+            source = teams[team]
             if source.suffix == ".csv":
-                shutil.copyfile(source, target)
-                return ""
+                return _read(source)
             # Each has a copy of the data, as it may write there.
             folder = Path(runs, "team", team)
-            copy_without_labels(keep / "data", folder / "data")
+            copy_without_labels(data, folder / "data")
             shutil.copy(keep / QUESTIONS_FILE, folder)
             before = _hiding(hidden, folder) if alone else []
-            return _run_alone(before, source, folder, target, limits)
+            note = _run_alone(before, source, folder, minutes, limits)
+            poses, problem = _read(folder / _POSES_FILE)
+            return poses, note or problem
 
         with ThreadPoolExecutor(workers) as pool:
-            done = tqdm(pool.map(run, teams), "hand-ins", len(teams), disable=None)
-            notes = dict(zip(teams, done, strict=True))
+            done = tqdm(pool.map(answers_of, teams), "hand-ins", len(teams), disable=None)
+            answers = dict(zip(teams, done, strict=True))
 
-    standings = _standings(keep / "data", pairs, poses, notes)
-    ranking = Ranking(standings, sorted({pair.category for pair in pairs}), alone)
+    ranking = Ranking(
+        _places(data, pairs, answers),
+        len(pairs),
+        sorted({pair.category for pair in pairs}),
+        alone or {path.suffix for path in files} == {".csv"},
+    )
     _write(ranking, out)
     return ranking
 
 
-def _folders_to_hide(*folders: Path) -> list[Path]:
-    """Return the folders that lie in no other one; InputError if one holds this program."""
-    folders = {folder.resolve() for folder in folders}
-    for program in (Path(sys.prefix), Path(__file__).resolve()):
-        for folder in folders.intersection(program.parents):
-            raise InputError(
-                f"folder {folder} holds this program, expected one for the challenge alone"
-            )
-    return [folder for folder in folders if not folders.intersection(folder.parents)]
+def _read(path: Path) -> tuple[dict[str, StoredPose], str]:
+    """Read the poses of a hand-in, and say why it has none."""
+    try:
+        if path.is_symlink():  # perhaps to another team's poses
+            raise InputError(f"{path.name} is a link, expected a file")
+        return read_stored_poses(path)[0], ""
+    except (InputError, OSError) as error:
+        return {}, str(error)
 
 
 def _run_alone(
-    before: Sequence[str], source: Path, folder: Path, target: Path, limits: Limits
+    before: Sequence[str], source: Path, folder: Path, minutes: float, limits: Sequence[str]
 ) -> str:
     """Run a hand-in in a folder that has the data; return the last line that it printed, or why it
     ended."""
-    alone = Path(shutil.copy(source, folder))
-    found = folder / "poses.csv"
-    numbers = [str(limits.pair_seconds), str(int(limits.memory * 1e9))]
-    words = [alone.name, "data", QUESTIONS_FILE, found.name, *numbers]
+    copy = Path(shutil.copy(source, folder))
+    words = [copy.name, "data", QUESTIONS_FILE, _POSES_FILE, *limits]
     # Without the folder in the search path, where `torch.py` of a team `torch` would be found.
     command = [sys.executable, "-P", "-m", "zsp_lite.course.challenge.answer", *words]
     environment = {name: os.environ[name] for name in _PASSED if name in os.environ}
     environment |= {"HOME": ".", "USERPROFILE": ".", "OMP_NUM_THREADS": "1"}
-    environment["ZSP_LITE_CACHE"] = str(cache_folder())
+    environment["ZSP_LITE_CACHE"] = str(cache_folder().resolve())
     # A file, not a pipe: what a hand-in starts may hold a pipe open, or fill the memory by it.
     with (folder / "printed.txt").open("w+b") as printed:
         process = subprocess.Popen(
@@ -177,19 +174,16 @@ def _run_alone(
             start_new_session=True,
         )
         try:
-            code = process.wait(timeout=60 * limits.minutes)
+            code = process.wait(timeout=60 * minutes)
             problem = f"ended abruptly, exit status {code}" if code else ""
         except subprocess.TimeoutExpired:
-            problem = f"ended after {limits.minutes:g} minutes"
+            problem = f"ended after {minutes:g} minutes"
         finally:
             _end(process)
-        printed.seek(max(0, printed.seek(0, os.SEEK_END) - _LAST_PRINTED))
+        size = printed.seek(0, os.SEEK_END)
+        printed.seek(max(0, size - _LAST_PRINTED))
         text = printed.read().decode(errors="replace")
-    if found.is_file() and not found.is_symlink():  # a link may lead to another team's poses
-        shutil.copyfile(found, target)
-    else:
-        target.write_text(",".join(COLUMNS) + "\n")
-    # Where it is hidden, its folder has the name of the one above.
+    # A hand-in that is hidden sees its folder in place of the one above.
     for path in (folder, folder.parent):
         text = text.replace(f"{path}{os.sep}", "")
     last = text.strip().splitlines()[-1:]
@@ -229,57 +223,44 @@ def _end(process: subprocess.Popen) -> None:
     process.wait()
 
 
-def _standings(
-    data: Path, pairs: Sequence[Pair], poses: Path, notes: Mapping[str, str]
-) -> list[Standing]:
+def _places(
+    data: Path, pairs: Sequence[Pair], answers: Mapping[str, tuple[dict[str, StoredPose], str]]
+) -> list[tuple[int, Result]]:
     """Sort the teams by Acc30, and join those whose difference may be chance."""
     objects = [
         [f"{pair.category}/{name}" for name in (pair.reference_sequence, pair.target_sequence)]
         for pair in pairs
     ]
     drawn = object_draws(objects, [pair.category for pair in pairs])
-    errors = {}
-    answered = {}
-    problems = {}
-    for team, note in notes.items():
-        try:
-            stored, _ = read_stored_poses(poses / f"{team}.csv")
-        except InputError as error:
-            stored = {}
-            note = note or str(error)
+    results = []
+    for team, (stored, note) in answers.items():
         # In the order of the pairs; an answer for a frame that was not asked for is none.
-        answers = {
+        poses = {
             pair: stored[pair.key]
             for pair in pairs
             if pair.key in stored and stored[pair.key].target_frame in pair.target_frames
         }
-        errors[team] = _errors(data, pairs, answers)
-        answered[team] = len(answers)
-        problems[team] = note if len(answers) < len(pairs) else ""
-    figures = {team: figures_of(error, drawn) for team, error in errors.items()}
+        surplus = len(stored) - len(poses)
+        if surplus:
+            note = f"{surplus} of {len(stored)} poses are of no pair and frame of {QUESTIONS_FILE}"
+        if len(poses) == len(pairs):
+            note = ""
+        errors = _errors(data, pairs, poses)
+        figures = figures_of(errors, drawn)
+        low, high = figures["acc30_ci"]
+        results.append(Result(team, figures["acc30"], low, high, len(poses), note, errors))
 
-    standings = []
-    first = ""  # of the teams that share a place
-    for position, team in enumerate(sorted(figures, key=lambda team: -figures[team]["acc30"]), 1):
-        if first:
-            gain = paired_difference(errors[team], errors[first], weights=drawn)
-        if not first or gain["accuracy_gain_p"] < _SIGNIFICANT:
-            first = team
+    results.sort(key=lambda result: -result.acc30)
+    places = []
+    place = 1
+    first = results[0]  # of those that share a place
+    for position, result in enumerate(results, 1):
+        gain = paired_difference(result.errors, first.errors, weights=drawn)
+        if gain["accuracy_gain_p"] < _SIGNIFICANT:
             place = position
-        low, high = figures[team]["acc30_ci"]
-        standings.append(
-            Standing(
-                place,
-                team,
-                figures[team]["acc30"],
-                low,
-                high,
-                answered[team],
-                len(pairs),
-                problems[team],
-            )
-        )
-    return standings
+            first = result
+        places.append((place, result))
+    return places
 
 
 def _errors(
@@ -298,8 +279,9 @@ def _errors(
 
 def _write(ranking: Ranking, out: Path) -> None:
     """Write a ranking as a table and as a page for the projector."""
-    table = pd.DataFrame([asdict(standing) for standing in ranking.standings])
-    write_atomic(out / "ranking.csv", table.to_csv(index=False, lineterminator="\n").encode())
+    table = pd.DataFrame([{"place": place, **vars(result)} for place, result in ranking.places])
+    text = table.drop(columns="errors").to_csv(index=False, lineterminator="\n")
+    write_atomic(out / "ranking.csv", text.encode())
     environment = Environment(autoescape=True, undefined=StrictUndefined)
     page = environment.from_string(_PAGE.read_text("utf-8"))
-    write_atomic(out / "ranking.html", page.render(asdict(ranking)).encode())
+    write_atomic(out / "ranking.html", page.render(vars(ranking)).encode())
