@@ -215,7 +215,7 @@ def test_in_colab_the_cell_fetches_everything_but_the_exercises(monkeypatch, tmp
     command = [sys.executable, "-m", "IPython", "cell.ipy"]
     subprocess.run(command, cwd=tmp_path, env=os.environ | settings, check=True)
 
-    clone = tmp_path / "content/zsp"
+    clone = tmp_path / "content/zsp-lite"
     files = {str(path.relative_to(clone)) for path in clone.rglob("*") if path.is_file()}
     assert {name for name in files if not name.startswith(".git/")} == needed
     assert (clone / "notebooks/data_samples/a.jpg").is_file()
