@@ -41,7 +41,7 @@ $(STAMP): environment.txt pyproject.toml
 	@touch $@
 
 demo: $(STAMP)
-	$(RUN) -m zsp_lite demo --out "$(OUT)"
+	OMP_NUM_THREADS=1 $(RUN) -m zsp_lite demo --out "$(OUT)"
 
 # One pytest run: the cells with the tag `nbval-check-output` must reproduce their stored output, the others must run.
 # Two processes of one thread each; a file, and so a notebook, stays in one process. The notebooks take longest, so

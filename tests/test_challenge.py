@@ -175,6 +175,7 @@ def test_the_folder_that_is_given_has_no_labels_to_rank_by(challenge, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        ("make --categories car --out x", "no terminal to ask"),
         ("make --secret short --categories car --out x", "expected at least 8"),
         ("make --secret long_enough --categories cow --out x", "category"),
         ("rank nowhere --keep nowhere --out x", "nowhere has no labels"),

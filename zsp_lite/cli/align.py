@@ -118,9 +118,10 @@ def align(
         write_alignment(alignment, out),
         write_labels(alignment, out, category, replace=True),
         write_category_report(out / "report.html", alignment, dataset, category, placed),
+        out / "objects.jpg",
     ]
     if placed:
-        written.append(write_marks(placed, dataset, category, out))
+        written += [write_marks(placed, dataset, category, out), out / "marks.jpg", out / "marks"]
     title = f"{category}: {len(alignment.objects)} objects in one frame"
     print_rows(title, COLUMNS, object_rows(alignment))
     for one in placed:

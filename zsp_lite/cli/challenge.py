@@ -1,8 +1,11 @@
 """The commands `challenge make` and `challenge rank`."""
 
+import sys
+
 import click
 
 from zsp_lite.cli.common import COUNT, NAMES, PATH, examples
+from zsp_lite.errors import InputError
 
 
 @click.group(
@@ -17,13 +20,8 @@ def challenge() -> None:
 
 
 @challenge.command(epilog=examples("challenge make --categories car,chair --out challenge"))
-# A secret among the words of a command stays in the shell's history.
 @click.option(
-    "--secret",
-    prompt="Secret sentence",
-    hide_input=True,
-    confirmation_prompt=True,
-    help="At least 8 characters, gives all random draws; asked for if left out.",
+    "--secret", help="At least 8 characters, gives all random draws; asked for if left out."
 )
 @click.option("--categories", type=NAMES, required=True, help="Of `zsp-lite synth --category`.")
 @click.option("--sequences", type=click.IntRange(2, 900), default=6, help="Objects of each.")
@@ -34,6 +32,10 @@ def make(secret, categories, sequences, frames, pairs, out) -> None:
     """Render objects: OUT/give for students, without labels, and OUT/keep for yourself."""
     from zsp_lite.course.challenge.make import make_challenge
 
+    if secret is None:  # among the words of a command, it stays in the shell's history
+        if not sys.stdin.isatty():
+            raise InputError("no --secret, and no terminal to ask for it")
+        secret = click.prompt("Secret sentence", hide_input=True, confirmation_prompt=True)
     make_challenge(secret, categories, out, sequences, frames, pairs)
     print(f"Written: {out / 'give'} for students, {out / 'keep'} with the labels")
 
