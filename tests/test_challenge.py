@@ -154,7 +154,7 @@ def test_a_file_that_is_no_table_counts_as_no_answer(challenge, tmp_path):
     (handins / "odd.csv").write_text("hello")
     ((_, one),) = rank(handins, challenge / "keep", tmp_path / "out").places
     assert one.answered == 0
-    assert "expected a CSV file" in one.note
+    assert "poses odd.csv: no or two columns" in one.note
 
 
 def test_poses_that_were_not_asked_for_are_counted(challenge, tmp_path):

@@ -97,8 +97,8 @@ def rank(
         raise InputError(f"{keep} has no labels, expected the folder keep/ of a challenge")
     pairs = read_questions(keep / QUESTIONS_FILE)
     # Not the hidden files that macOS adds to archives.
-    files = [path for path in sorted(handins.glob("[!.]*.*")) if path.is_file()]
-    files = [path for path in files if path.suffix in (".py", ".csv")]
+    found = sorted(handins.glob("[!.]*.*"))
+    files = [path for path in found if path.suffix in (".py", ".csv") and path.is_file()]
     teams = {path.stem: path for path in files}
     if not files or len(teams) < len(files):
         raise InputError(
@@ -147,7 +147,7 @@ def _read(path: Path) -> tuple[dict[str, StoredPose], str]:
             raise InputError(f"{path.name} is a link, expected a file")
         return read_stored_poses(path)[0], ""
     except (InputError, OSError) as error:
-        return {}, str(error)
+        return {}, str(error).replace(f"{path.parent}{os.sep}", "")
 
 
 def _run_alone(
@@ -175,9 +175,9 @@ def _run_alone(
         )
         try:
             code = process.wait(timeout=60 * minutes)
-            problem = f"ended abruptly, exit status {code}" if code else ""
+            problem = [f"ended abruptly, exit status {code}"] if code else []
         except subprocess.TimeoutExpired:
-            problem = f"ended after {minutes:g} minutes"
+            problem = [f"ended after {minutes:g} minutes"]
         finally:
             _end(process)
         size = printed.seek(0, os.SEEK_END)
@@ -187,7 +187,7 @@ def _run_alone(
     for path in (folder, folder.parent):
         text = text.replace(f"{path}{os.sep}", "")
     last = text.strip().splitlines()[-1:]
-    return "; ".join([*filter(None, [problem]), *last])[:_LONGEST_NOTE]
+    return "; ".join(problem + last)[:_LONGEST_NOTE]
 
 
 def _hiding(folders: Sequence[Path], own: Path) -> list[str]:
