@@ -209,7 +209,13 @@ def test_an_interrupt_ends_a_run_and_its_workers_with_one_line(tmp_path, monkeyp
     words = f"benchmark --data {small_folder()} {options}".split()
     command = [sys.executable, "-m", "zsp_lite", *words, "--workers", "2"]
     with subprocess.Popen(
-        command, env=PATHS, stderr=subprocess.PIPE, text=True, start_new_session=True
+        command,
+        env=PATHS,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # as in a terminal, also where the tests themselves ignore interrupts
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         while not (tmp_path / "run" / LINES).exists() or not pairs_in(tmp_path / "run"):
             time.sleep(0.05)

@@ -252,6 +252,11 @@ def test_a_function_that_calls_the_library_fails_all_its_tests(prepared, assignm
         assert failing.keys() == names_of_tests(assignment, function)
 
 
+def copied(cell: NotebookNode) -> NotebookNode:
+    """Copy a cell as JupyterLab does, with an id of its own."""
+    return NotebookNode(deepcopy(cell), id=nbformat.v4.new_code_cell().id)
+
+
 def turn_into_text(cell: NotebookNode) -> None:
     """Make a text cell of a code cell."""
     cell.cell_type = "markdown"
@@ -260,7 +265,7 @@ def turn_into_text(cell: NotebookNode) -> None:
 
 # What is listed, and a damage to a solution that is its cause.
 DAMAGES = {
-    "cells that are there twice": lambda cell, cells: cells.append(deepcopy(cell)),
+    "cells that are there twice": lambda cell, cells: cells.append(copied(cell)),
     "solutions that are not code": lambda cell, _: turn_into_text(cell),
     "cells deleted or without metadata": lambda cell, _: cell.metadata.pop("nbgrader"),
     "cells of another release": lambda cell, _: cell.metadata.nbgrader.update(
@@ -352,7 +357,7 @@ def download(folder: Path, notebook: NotebookNode) -> None:
     # Changes of given cells, which nbgrader puts back.
     text, test, stripped, *_ = graded(notebook, grade=True, locked=True).values()
     turn_into_text(text)
-    notebook.cells.insert(1, deepcopy(test))
+    notebook.cells.insert(1, copied(test))
     stripped.metadata.pop("nbgrader")
     whole = nbformat.writes(notebook)
     files |= {
@@ -419,7 +424,7 @@ def test_several_loops_cost_no_more_than_the_limit_and_spare_other_functions(con
             cells += [
                 nbformat.v4.new_code_cell(line, metadata={"nbgrader": {"solution": is_solution}})
             ]
-        cells += deepcopy(cells[-1:])  # a second test
+        cells.append(copied(cells[-1]))  # a second test
     notebook, _ = execute(config=config).preprocess(nbformat.v4.new_notebook(cells=cells), {})
     failed = [bool(cell.outputs) for cell in notebook.cells]
     stopped, passed = [False, True, True], [False] * 3

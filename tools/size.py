@@ -13,7 +13,7 @@ import io
 import itertools
 import json
 import tokenize
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,7 +63,7 @@ def python_tokens(text: str) -> int:
     docstrings = {node.body[0].lineno for node in nodes if ast.get_docstring(node) is not None}
     tokens = [
         token
-        for token in tokenize.generate_tokens(io.StringIO(text).readline)
+        for token in _whole_strings(tokenize.generate_tokens(io.StringIO(text).readline))
         if token.type not in _LAYOUT
         and not (token.type == tokenize.STRING and token.start[0] in docstrings)
     ]
@@ -75,6 +75,20 @@ def python_tokens(text: str) -> int:
         broken_string = first.type == second.type == tokenize.STRING
         by_formatter += last_comma or broken_string
     return len(tokens) - by_formatter
+
+
+def _whole_strings(tokens: Iterable[tokenize.TokenInfo]) -> Iterator[tokenize.TokenInfo]:
+    """Make one token of each f-string, as before Python 3.12, which splits them."""
+    depth = 0
+    for token in tokens:
+        kind = tokenize.tok_name[token.type]
+        depth += kind.endswith("STRING_START")
+        if depth == 0:
+            yield token
+        elif kind.endswith("STRING_END"):
+            depth -= 1
+            if depth == 0:
+                yield token._replace(type=tokenize.STRING)
 
 
 def other_tokens(text: str, name: str) -> int:

@@ -30,7 +30,9 @@ Read the files in this order:
 """
 
 import ast
-import importlib
+import ctypes
+import importlib.util
+import os
 from pathlib import Path
 
 __version__ = "0.3.0"
@@ -45,6 +47,14 @@ for _node in _STUB.body:
             _HOME_OF[_alias.name] = _node.module
 
 __all__ = ["__version__", *_HOME_OF]
+
+# Without it, Open3D starts a server in a notebook.
+os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
+# Open3D's Linux wheels link against libusb-1.0, which is often not installed. A package of Python
+# carries it; importing that package takes longer than all else here.
+_found = importlib.util.find_spec("libusb_package")
+if _found and (_library := Path(_found.origin).with_name("libusb-1.0.so")).is_file():
+    ctypes.CDLL(str(_library), mode=ctypes.RTLD_GLOBAL)
 
 
 def __getattr__(name: str):

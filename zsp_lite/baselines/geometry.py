@@ -10,7 +10,6 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.io.ply import load_open3d
 from zsp_lite.matching import Matches
 from zsp_lite.points import object_points
 
@@ -22,7 +21,8 @@ _MAX_DISTANCE = 1e6
 
 def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> Sim3:
     """Align point clouds by Open3D's point-to-point ICP with scale, starting from the identity."""
-    open3d = load_open3d()
+    import open3d
+
     vectors = open3d.utility.Vector3dVector
     registration = open3d.pipelines.registration
     result = registration.registration_icp(

@@ -15,7 +15,6 @@ from zsp_lite.importers.capture import HALF_PIXEL
 from zsp_lite.importers.sources import Source, open_source
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
-from zsp_lite.io.ply import load_open3d
 from zsp_lite.points import axis_deviation, object_pixels, sampling_step, world_points
 
 # Voxels per three standard deviations of the object: they are finer than the noise of depth
@@ -122,7 +121,8 @@ def fuse(
     frames: Collection[Frame],
 ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Fuse the depth inside the masks (Curless and Levoy 1996) to points, colours and normals."""
-    o3d = load_open3d()
+    import open3d as o3d
+
     voxel = 3 * _spread(frames) / _VOXELS
     # A voxel has a distance to the surface, a weight and a colour. The grid starts with space for
     # 2000 blocks and grows.

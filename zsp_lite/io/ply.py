@@ -1,9 +1,5 @@
-"""Point clouds: PLY files, and the import of Open3D, for which all modules call `load_open3d`."""
+"""Point clouds as PLY files."""
 
-import ctypes
-import functools
-import os
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -125,19 +121,3 @@ def _colours(columns: dict[str, np.ndarray]) -> UInt8[np.ndarray, "n 3"] | None:
     if colours.dtype.kind == "f":
         colours = (np.where(np.isfinite(colours), colours, 0) * 255).clip(0, 255).round()
     return colours.astype(np.uint8)
-
-
-@functools.cache
-def load_open3d():
-    """Import and return the `open3d` module."""
-    # Open3D would start a server in a notebook.
-    os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
-    # Open3D's Linux wheels link against libusb-1.0, which is often not installed. A package of
-    # Python provides it.
-    if sys.platform.startswith("linux"):
-        import libusb_package
-
-        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-    import open3d
-
-    return open3d

@@ -23,7 +23,6 @@ from zsp_lite.course.synthetic.textures import (
     srgb_to_linear,
 )
 from zsp_lite.data.cameras import Camera
-from zsp_lite.io.ply import load_open3d
 
 _LAYERS = 4  # surfaces that a ray meets at most, as it passes through the holes of textures
 _HOLE = 128  # opacity of a texture, 0 to 255, below which it has a hole
@@ -81,7 +80,8 @@ class MeshScene:
         coordinates: Float[np.ndarray, "v 3"] | None = None,
         samples: int = 2,
     ):
-        o3d = load_open3d()
+        import open3d as o3d
+
         self.mesh = mesh
         self.room = room
         self._rng = np.random.default_rng(seed)
