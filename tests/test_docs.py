@@ -17,7 +17,7 @@ import nbformat
 import numpy as np
 import pytest
 
-from tools import drawings
+from tools import rooms
 from zsp_lite.cli.main import cli, main
 from zsp_lite.data.labels import read_labels
 from zsp_lite.metrics import rotation_error
@@ -256,13 +256,8 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "outputs/cups-python/report.html").is_file()
 
 
-def test_the_stored_drawings_are_those_of_the_script():
-    assert {path.stem for path in drawings.FOLDER.iterdir()} == set(drawings.DRAWINGS)
-    for name, draw in drawings.DRAWINGS.items():
-        assert (drawings.FOLDER / f"{name}.svg").read_text("utf-8") == draw(), name
-    assert drawings.ROOMS_FILE.read_text("utf-8") == drawings.draw_rooms(), (
-        "run python -m tools.drawings"
-    )
+def test_the_stored_drawing_of_the_rooms_follows_the_imports():
+    assert rooms.DRAWING.read_text("utf-8") == rooms.draw(), "run python -m tools.rooms"
 
 
 def test_the_readme_says_how_many_lines_the_library_has_without_the_course():

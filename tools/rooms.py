@@ -1,14 +1,22 @@
 """The rooms of the library, and what flows between them: the names that one room imports from
-another."""
+another.
+
+    python -m tools.rooms
+
+draws them in `docs/rooms.svg`.
+"""
 
 import ast
+import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
+from textwrap import wrap
 
 import zsp_lite
 
 PACKAGE = Path(zsp_lite.__file__).parent
+DRAWING = Path(__file__).parents[1] / "docs" / "rooms.svg"
 # From the bottom to the top: the modules and subpackages of each room.
 ROOMS = {
     "files": "choices errors io threads",
@@ -73,3 +81,67 @@ def flows() -> dict[tuple[str, str], Counter[str]]:
         if package == "zsp_lite" and giver != taker:
             counts[giver, taker][name.rpartition(".")[2]] += 1
     return counts
+
+
+def _type_lines(names: Counter[str]) -> list[str]:
+    """Write the two types imported most, broken between their words into at most three lines."""
+    types = [name for name in names if name[0].isupper() and not name.isupper()]
+    lines = []
+    for name in sorted(types, key=lambda name: (-names[name], name))[:2]:
+        words = re.sub("(?<=[a-z0-9])(?=[A-Z])", " ", name)
+        broken = [line.replace(" ", "") for line in wrap(words, 13)]
+        if len(lines + broken) <= 3:
+            lines += broken
+    return lines
+
+
+def _box(x: int, y: int, lines: list[str], kind: str) -> str:
+    """Draw a box around (x, y) with lines of text in its middle."""
+    drawn = f'<rect class="{kind}" x="{x - 36}" y="{y - 20}" width="72" height="40" rx="4"/>\n'
+    for i, line in enumerate(lines):
+        below = 4 + 12 * i - 6 * (len(lines) - 1)
+        drawn += f'<text class="{kind}" x="{x}" y="{y + below}">{line}</text>\n'
+    return drawn
+
+
+def draw() -> str:
+    """Draw the rooms on a diagonal, with a line from each to those that import from it."""
+    place = {room: (56 + 78 * i, 34 + 50 * i) for i, room in enumerate(ROOMS)}
+    width, height = (end + 56 for end in place[list(ROOMS)[-1]])
+    lines = boxes = ""
+    for (giver, taker), names in sorted(flows().items()):
+        left, y = place[giver]
+        x, bottom = place[taker]
+        lines += f'<path d="M{left} {y}H{x}V{bottom - 21}m-5-7l5 7 5-7"/>\n'
+        types = _type_lines(names)
+        boxes += _box(x, y, types, "types") if types else f'<circle cx="{x}" cy="{y}" r="4"/>\n'
+    for room, (x, y) in place.items():
+        boxes += _box(x, y, [room], "room")
+    legend = [
+        "A room gives what is at its right, and takes what is above it.",
+        "Shown are the types that are imported most; a dot: functions or constants only.",
+        "Nothing flows back: the half below the rooms is empty.",
+        "",
+        *(f"{room}: {names.replace(' ', ', ')}" for room, names in ROOMS.items() if room != names),
+    ]
+    for i, line in enumerate(reversed(legend)):
+        boxes += f'<text x="20" y="{height - 24 - 20 * i}">{line}</text>\n'
+    return f"""\
+<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}"
+  viewBox="0 0 {width} {height}" font-family="sans-serif" font-size="13" role="img">
+<title>The rooms of zsp_lite, and the types that flow from each to those after it</title>
+<style>
+  path {{ fill: none; stroke: #8C8C8C }}
+  rect {{ fill: white; stroke: #B8B8B0 }}
+  circle {{ fill: #595959 }}
+  .types {{ font-size: 10px; text-anchor: middle }}
+  rect.room {{ fill: #CCE8F8; stroke: #0072B2 }}
+  text.room {{ font-size: 11px; font-weight: bold; text-anchor: middle }}
+</style>
+<rect width="100%" height="100%"/>
+{lines}{boxes}</svg>
+"""
+
+
+if __name__ == "__main__":
+    DRAWING.write_text(draw(), encoding="utf-8")
