@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmark_folder import BACKBONE, own_method, run_rows, small_folder
+from benchmark_folder import BACKBONE, SEQUENCES, own_method, run_rows, small_folder
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from synthetic_views import CoordinateBackbone
@@ -20,7 +20,7 @@ from zsp_lite.benchmark.runs import Run, add_lines, read_lines, read_run
 from zsp_lite.benchmark.tables import pair_figure
 from zsp_lite.data.frames import write_mask
 from zsp_lite.data.ground_truth import POSES_FILE, ObjectPose, object_poses
-from zsp_lite.data.labels import read_labels, relative_pose
+from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import category_pairs, sample_pairs, true_poses, write_published_pairs
 from zsp_lite.metrics import rotation_error
 from zsp_lite.views import object_crop
@@ -247,19 +247,20 @@ def _object_pose(matrix: np.ndarray) -> dict:
 def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(
     tmp_path, monkeypatch, turns, expected
 ):
-    labels = read_labels(small_folder(), "lump")
-
-    def half_turned(problem):
-        reference, target = problem.frames()
-        first, second = [labels[one.name.partition("/")[0]] for one in (reference, target)]
-        truth = relative_pose(first, reference.camera, second, target.camera)
+    dataset = Co3D(small_folder())
+    lines = ["pair,target_frame,rotation"]
+    for pair in category_pairs(dataset, "lump", 2, 1):
+        (truth,) = true_poses(dataset.root, [pair], np.array([0]))
+        _, (target,) = dataset.load_pair(pair)
         half_turn = target.camera.R @ np.diag([-1.0, -1, 1]) @ target.camera.R.T
-        return half_turn @ truth[:3, :3]
-
+        rotation = " ".join(map(repr, (half_turn @ truth[:3, :3]).ravel().tolist()))
+        lines.append(f'"{pair.key}",{pair.target_frames[0]},{rotation}')
+    half_turned = tmp_path / "half_turned.csv"
+    half_turned.write_text("\n".join(lines))
     pose = ObjectPose(np.eye(4)[:3].tolist(), 1.0, (0, 0, 0), (1, 1, 1), turns)
-    poses = dict.fromkeys(labels, pose)
+    poses = dict.fromkeys(SEQUENCES, pose)
     monkeypatch.setattr("zsp_lite.data.ground_truth.read_poses", lambda *_: poses)
-    mine = run_rows({"mine": half_turned}, tmp_path, pairs=2, targets=1)["mine"]
+    mine = run_rows({"mine": str(half_turned)}, tmp_path, pairs=2, targets=1)["mine"]
     found = read_run(tmp_path).row("mine")[["symmetric_error", "error"]]
     assert_allclose(found, [[expected, 180]] * 2, atol=1e-5)
     assert mine["symmetric_acc30"] == 100 * (expected < 30)

@@ -6,7 +6,7 @@ import pytest
 from benchmark_folder import BACKBONE, run_rows, small_folder
 from refusals import refused
 
-from zsp_lite import Co3D, ZeroShotPose
+from zsp_lite import Co3D, InputError, ZeroShotPose
 from zsp_lite.baselines.sift import Sift
 from zsp_lite.benchmark.methods import GROUPS, METHODS, resolve
 from zsp_lite.benchmark.problem import FrameStore, PairProblem
@@ -106,5 +106,19 @@ def test_a_pair_without_depth_fails(row, monkeypatch):
     monkeypatch.setattr(Co3D, "load", lambda *frame: replace(load(*frame), depth=None))
     (pair,) = category_pairs(dataset, "pebble", 1, 2)
     problem = PairProblem(pair, FrameStore(dataset, {"sift": Sift()}), ["sift"])
-    refused("no depth map: 100_a", METHODS[row].solve, problem)
+    refused("no depth map: frame ", METHODS[row].solve, problem)
     assert [frame.depth for frame in problem.frames()] == [None] * 3  # one reference, two targets
+
+
+def test_poses_without_a_fit_are_counted(tmp_path, monkeypatch):
+    def fails(*_, **__):
+        raise InputError("too few points")
+
+    for fit in ("pipeline.ransac", "benchmark.own.ransac", "baselines.geometry.icp"):
+        monkeypatch.setattr(f"zsp_lite.{fit}", fails)
+    monkeypatch.setattr("cv2.findEssentialMat", lambda *_, **__: (None, None))
+    rows = ["ours", "sift", "icp", "ours-nodepth"]
+    run_rows(rows, tmp_path, 2)
+    failures = read_run(tmp_path).failures
+    for row in rows:
+        assert f"{row} has no fit on 2 of 2 pairs; the first, lump/" in failures[row]

@@ -415,9 +415,12 @@ def test_the_same_data_by_another_path_continue_a_run_and_other_data_do_not(
     assert run(tmp_path / "data", "ours-bv") == str(tmp_path / "data")
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert run("../link", "ours") == "../link"
-    message = "a run with data .*data, this is .*elsewhere/data; choose another folder"
-    refused(message, run, "data", "ours")
-    assert list(read_run(tmp_path / "run").settings.methods) == ["icp", "ours-bv", "ours"]
+    assert run("data", "sift") == "data"
+    # Another image, and the same labels.
+    (tmp_path / "data/lump/300_c/images/frame000001.jpg").write_bytes(b"")
+    message = "a run with data .*elsewhere/data, this is .*data; choose another folder"
+    refused(message, run, "../data", "ours")
+    assert list(read_run(tmp_path / "run").settings.methods) == ["icp", "ours-bv", "ours", "sift"]
 
 
 def test_pose_labels_that_have_changed_do_not_mix(tmp_path):

@@ -5,6 +5,7 @@ import csv
 import gzip
 import io
 import re
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -386,6 +387,21 @@ def test_a_runs_table_has_the_parts_of_each_result_and_of_each_pairs_key(mine):
     }
     failure = {"category": "lamp", "error": 180, "failed": "no depth", "note": ""}
     assert failure.items() <= second.items()
+
+
+def test_names_with_commas_and_bars_keep_their_pairs(tmp_path):
+    names = ["plain", "red,small", 'a "b" | c:7,8']
+    pairs = [Pair("mug, cup", *ends) for ends in product(names, (1, 2), names, [(3, 4), (5,)])]
+    results = dict.fromkeys([pair.key for pair in pairs], RESULT)
+    run = write_run(tmp_path, {"ours": results}, ["mug, cup"], backbone="my net")
+    assert set(run.poses("ours")[0]) == set(pairs)
+    assert (run.summary["backbone"], run.note) == ("my net", "")
+
+
+def test_the_note_counts_results_that_tables_leave_out(tmp_path):
+    results = {"chair/a:0/b:0": RESULT, "chair/b:0/a:0": RESULT}
+    run = write_run(tmp_path, {"ours": results, "mine": {"chair/a:0/b:0": RESULT}})
+    assert run.note.startswith("Without 1 of 3 results, which are of other pairs")
 
 
 def test_a_runs_summary_is_of_the_pairs_and_rows_with_results(mine):

@@ -107,7 +107,8 @@ def essential_rotation(
     inliers, rotation = max(poses, key=lambda pose: pose[0], default=(0, None))
     if inliers and np.isfinite(rotation).all():
         return rotation, int(inliers), ""
-    return np.eye(3), 0, f"pose is the best view's: no essential matrix in {len(matches)} matches"
+    note = f"pose is the best view's, not a fit: no essential matrix in {len(matches)} matches"
+    return np.eye(3), 0, note
 
 
 def _directions(

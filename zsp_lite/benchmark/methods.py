@@ -147,6 +147,9 @@ def resolve(
     # "alignment" is the row that `align` stores.
     taken = {name.casefold() for name in (*METHODS, *GROUPS, *labels, "alignment")}
     for name, meant in methods.items():
+        # Tables have a line for each row, and legends of figures no name with an underscore.
+        if not str(name).isprintable() or str(name).startswith("_"):
+            raise InputError(f"method {name!r}: expected a printable name, not with _ first")
         plain = str(name).strip().casefold()
         text = meant if isinstance(meant, str) else ""
         if text != name and taken & {plain, base_name(plain), base_name(text)}:

@@ -11,12 +11,14 @@ from inspect import Parameter
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from zsp_lite.alignment import SCALE_RANGE, ransac
 from zsp_lite.baselines.sift import unproject_pixels
 from zsp_lite.benchmark.problem import Answer, Crop, PairProblem, Problem, parameters, seeded
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.exchange import StoredPose, check_poses
+from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError, describe_failure, ends_the_run, real_array
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.views import object_crop
@@ -104,7 +106,9 @@ def problem_of_own(solve: Any, problem: PairProblem) -> Problem:
         return Problem(problem.seed, deepcopy(problem.crops), problem.store.extractors, {})
     with ends_the_run("reading frames"):
         reference, targets = problem.store.dataset.load_pair(problem.pair)
-    frames = [reference, *targets]
+    # A crop has no object's name.
+    named = zip([reference, *targets], problem.frames())
+    frames = [replace(frame, name=crop.name) for frame, crop in named]
     if isinstance(solve, KeypointMatcher):
         frames = [object_crop(frame, size=None) for frame in frames]
     return Problem(problem.seed, [Crop(frame) for frame in frames], {}, {})
@@ -135,30 +139,44 @@ class KeypointMatcher:
     def __call__(self, problem: Problem) -> Answer:
         reference, *targets = problem.frames()
         own = seeded(self.own, problem.seed)
-        matches = [own(reference.rgb.copy(), target.rgb) for target in targets]
+        matches = []
         sums = []
-        for _, _, scores in matches:
+        for target in targets:
+            first, second, scores = own(reference.rgb.copy(), target.rgb)
+            first = _points_in(reference, first)
+            second = _points_in(target, second, len(first))
             scores = real_array("scores of matches", scores)
             if not (scores >= 0).all():
                 raise InputError("scores of matches are negative or NaN, expected 0 or more")
             sums.append(scores.sum())
+            matches.append((first, second))
         view = int(np.argmax(sums))
-        return fit_keypoints(problem, view, *matches[view][:2], self.threshold)
+        return fit_keypoints(problem, view, *matches[view], self.threshold)
+
+
+def _points_in(crop: Frame, points: Any, count: int | None = None) -> Float[np.ndarray, "n 2"]:
+    """Convert a matcher's points; InputError if one is not in the crop, or for another count."""
+    points = real_array("matched points", points if len(points) else np.zeros((0, 2)), (count, 2))
+    height, width = crop.camera.size
+    inside = ((points >= 0) & (points <= (width, height))).all(axis=1)  # NaN is not
+    if not inside.all():
+        x, y = points[~inside][0]
+        raise InputError(
+            f"matched point ({x:g}, {y:g}) is outside the crop of {width} x {height} pixels"
+        )
+    return points
 
 
 def fit_keypoints(
-    problem: Problem, view: int, first: Any, second: Any, threshold: float = 0.2
+    problem: Problem,
+    view: int,
+    first: Float[np.ndarray, "n 2"],
+    second: Float[np.ndarray, "n 2"],
+    threshold: float = 0.2,
 ) -> Answer:
     """Fit the pose to matched pixels of the crops of the reference and of a target: unproject them,
     then RANSAC (sec. 4.3)."""
     reference, *targets = problem.frames(depth=True)
-    empty = np.zeros((0, 2))
-    first = real_array("matched points", first if len(first) else empty, (None, 2))
-    second = real_array("matched points", second if len(second) else empty, (None, 2))
-    if len(first) != len(second):
-        raise InputError(
-            f"matched points are {len(first)} and {len(second)}, expected as many in both images"
-        )
     try:
         points = unproject_pixels(reference, first), unproject_pixels(targets[view], second)
         sim3, inliers = ransac(

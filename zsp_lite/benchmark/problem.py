@@ -148,7 +148,9 @@ class FrameStore:
         with ends_the_run(f"reading frame {sequence}/{number}"):
             annotation = self.dataset.frame(category, sequence, number)
             with _time_added(self.timings, "reading"):
-                return Crop(object_crop(self.dataset.load(annotation), size))
+                crop = object_crop(self.dataset.load(annotation), size)
+        # Rows are not told the names of objects.
+        return Crop(replace(crop, name=f"frame {number}"))
 
     def _hypotheses(self, pair: Pair) -> PairHypotheses | None:
         """Return `PairProblem.hypotheses` of a pair; None if its views determine no pose."""
@@ -218,15 +220,15 @@ class Problem:
     ) -> PoseEstimate:
         """Estimate the pose by `ZeroShotPose` with some settings, in all targets or in the one with
         index `target`."""
-        settings = settings or {}
-        key = (features, target, *sorted(settings.items()))
+        plugged = dict(settings or {})
+        # Estimates by plug-ins, which may have no hash, are not kept.
+        plugins = [name for name in plugged if callable(plugged[name])]
+        key = None if plugins else (features, target, *sorted(plugged.items()))
         if key in self._estimates:
             return self._estimates[key]
         # A matcher of one's own may take a seed; a solver gets it when it is called.
-        plugged = dict(settings)
-        for name, value in settings.items():
-            if callable(value) and name != "solver":
-                plugged[name] = seeded(value, self.seed)
+        for name in {*plugins} - {"solver"}:
+            plugged[name] = seeded(plugged[name], self.seed)
         method = ZeroShotPose(self._extractors[features], **plugged, seed=self.seed)
         crops = self.crops if target is None else [self.crops[0], self.crops[1 + target]]
         reference, *targets = [crop.view(features, method.foreground) for crop in crops]
@@ -234,7 +236,8 @@ class Problem:
         estimate = method.estimate_from_views(reference, targets, matched)
         for stage, seconds in estimate.timings.items():
             self._timings.setdefault(stage, []).append(seconds)
-        self._estimates[key] = estimate
+        if key:
+            self._estimates[key] = estimate
         return estimate
 
     def _match(self, method: ZeroShotPose, reference: View, target: View) -> ViewMatch:

@@ -49,7 +49,7 @@ from zsp_lite.data.ground_truth import common_turns
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import category_pairs, labelled_categories, true_pose
 from zsp_lite.errors import InputError, check_integer
-from zsp_lite.io.files import digest, write_atomic
+from zsp_lite.io.files import digest, path_inside, read_bytes, write_atomic
 from zsp_lite.metrics import rotation_error
 from zsp_lite.pipeline import ZeroShotPose, view_alignment
 
@@ -131,6 +131,7 @@ def evaluate(
         )
         # Workers load a named backbone themselves; an object travels to them.
         sent = backbone if workers.executor else loaded
+        settings.images = {name: _hash_of_images(dataset, name) for name in pairs_per_category}
         evaluator = PairEvaluator(str(Path(data).resolve()), rows, sent, row_seconds)
         with open_run(out, settings):
             execution.evaluate_pairs(out, evaluator.open, repeated, workers)
@@ -221,6 +222,17 @@ def _hash_of_labels(dataset: Co3D, category: str) -> str:
     for name, label in read_labels(dataset.root, category).items():
         rotation = np.round(label.trans[:3, :3], 6) + 0.0
         parts += [name, rotation.tobytes(), label.reference_seq]
+    return digest(*parts)
+
+
+def _hash_of_images(dataset: Co3D, category: str) -> str:
+    """Hash the first image of each labelled sequence: data with equal labels may differ."""
+    labels = read_labels(dataset.root, category)
+    parts = []
+    for name, numbers in dataset.frame_numbers(category).items():
+        if name in labels:
+            image = dataset.frame(category, name, numbers[0]).image
+            parts.append(read_bytes(path_inside(dataset.root, image.path), "image"))
     return digest(*parts)
 
 

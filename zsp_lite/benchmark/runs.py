@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -75,6 +76,7 @@ class Settings(msgspec.Struct):
     labels: dict[str, str]  # hash of the pose labels by category
     calls: Annotated[list[Call], msgspec.Meta(min_length=1)]
     folder: str = ""  # absolute path of the data, without links
+    images: dict[str, str] = {}  # hash of images by category
 
 
 class Result(msgspec.Struct):
@@ -206,8 +208,8 @@ class Run:
     @functools.cached_property
     def summary(self) -> dict[str, Any]:
         """The content of summary.json."""
-        # A backbone's fingerprint is its name and a hash.
-        backbone = self.settings.backbone.rpartition(" ")[0] or self.settings.backbone
+        # A backbone's fingerprint is its name, and a hash if it has weights.
+        backbone = re.sub(" [0-9a-f]{16}$", "", self.settings.backbone)
         data = {
             "root": self.settings.data,
             "categories": list(self.table["category"].unique()),
@@ -222,15 +224,21 @@ class Run:
 
     @functools.cached_property
     def failures(self) -> dict[str, str]:
-        """By row that failed on pairs: on how many, and the reason of the first."""
-        failed = self.table[self.table["failed"] != ""].groupby("row", sort=False)
-        counts = failed["pair"].nunique()
+        """By row that failed on pairs or answered them without a fit: on how many, and the reason
+        of the first."""
         pairs = self.table.groupby("row")["pair"].nunique()
-        return {
-            name: f"{name} failed on {counts[name]} of {pairs[name]} pairs, counted as 180°; the "
-            f"first: {reason}."
-            for name, reason in failed["failed"].first().items()
-        }
+        told: dict[str, str] = {}
+        for column, pattern, what in (
+            ("failed", ".", "failed on {} of {} pairs, counted as 180°"),
+            ("note", "not a fit", "has no fit on {} of {} pairs"),
+        ):
+            lines = self.table[self.table[column].str.contains(pattern)]
+            for name, found in lines.groupby("row", sort=False):
+                first = found.iloc[0]
+                text = what.format(found["pair"].nunique(), pairs[name])
+                text = f"{name} {text}; the first, {first['pair']}: {first[column]}."
+                told[name] = f"{told.get(name, '')} {text}".strip()
+        return told
 
     def row(self, name: str) -> pd.DataFrame:
         """Return the table's lines of a row by pair key; InputError for an unknown row."""
@@ -287,6 +295,9 @@ def _continued(out: Path, now: Settings) -> Settings:
     before = read_json(out / SETTINGS, Settings, "settings of a run")
     held = _decisive(before)
     asked = _decisive(now)
+    common = before.images.keys() & now.images.keys()
+    if common and all(before.images[name] == now.images[name] for name in common):
+        del held["data"]  # the same data may lie at another path
     for name in asked:
         if held.get(name, asked[name]) != asked[name]:
             raise InputError(
@@ -298,6 +309,7 @@ def _continued(out: Path, now: Settings) -> Settings:
         library=[old for old in before.library if old not in now.library] + now.library,
         methods=before.methods | now.methods,
         labels=before.labels | now.labels,
+        images=before.images | now.images,
         calls=before.calls + now.calls,
     )
 
@@ -372,6 +384,12 @@ def read_run(out: str | Path) -> Run:
     hidden = [name for name in settings.methods if name not in rows]
     if hidden:
         notes.append(f"Without {', '.join(hidden)}, which lack pairs of the last call.")
+    stored = sum(len(line.results.keys() & set(rows)) for line in lines)
+    if last.finished and stored > len(table):
+        notes.append(
+            f"Without {stored - len(table)} of {stored} results, which are of other pairs, "
+            "categories or seeds than the last call."
+        )
     remarks: dict[str, str] = {}
     for call in settings.calls:
         remarks |= call.remarks
@@ -403,7 +421,8 @@ def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
     """Keep the pairs that all rows of the last call have finished, and the rows, by seed, that have
     all of these pairs."""
     last = settings.calls[-1]
-    commas = table["pair"].str.count(",")  # in the key of a pair: one less than its target views
+    # Commas between the target frames of a pair, at the end of its key: one less than its views.
+    commas = table["pair"].str.count(r",(?=[\d,]*$)")
 
     # The finished pairs have a line for each row and seed of the last call; by number of commas.
     finished = {}
@@ -415,7 +434,7 @@ def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
 
     # A row at a number of target views that the last call does not have needs the same problems.
     complete = [table[:0]]
-    for _, lines in table.groupby(["row", "repeat"]):
+    for _, lines in table.groupby(["row", "repeat", commas]):
         column = "pair"
         wanted = finished.get(commas[lines.index[0]])
         if wanted is None:
