@@ -1,21 +1,25 @@
-"""Rows of the library that are functions of a `PairProblem`: the paper's baselines (sec. 5.2 and
-supplement), and poses that several pairs of frames or objects agree on."""
+"""What the library's own rows consist of: functions of a `PairProblem` for the paper's baselines
+(sec. 5.2 and supplement), for the fit without RANSAC and for poses that several pairs of frames or
+objects agree on, and the matcher without cycles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
-from zsp_lite.alignment import Sim3
+from zsp_lite.alignment import Sim3, umeyama
 from zsp_lite.baselines.geometry import align
-from zsp_lite.baselines.sift import Keypoints, mutual_matches
+from zsp_lite.baselines.sift import mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints
 from zsp_lite.benchmark.problem import Answer, PairProblem
 from zsp_lite.best_view import score_from_cosines
 from zsp_lite.category import object_pairs, scan_pairs, synchronise
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError
+from zsp_lite.estimates import PoseEstimate
 
 _K = 50  # number of matches, as in "Ours"
 
@@ -26,9 +30,10 @@ def icp(problem: PairProblem, view: int = 0) -> Answer:
     # ICP starts where the first cameras of both sequences coincide.
     dataset = problem.store.dataset
     pair = problem.pair
-    reference_frames = dataset.frames(pair.category, pair.reference_sequence)
-    target_frames = dataset.frames(pair.category, pair.target_sequence)
-    first_cameras = (dataset.camera(reference_frames[0]), dataset.camera(target_frames[0]))
+    first_cameras = tuple(
+        dataset.camera(dataset.frames(pair.category, sequence)[0])
+        for sequence in (pair.reference_sequence, pair.target_sequence)
+    )
     try:
         sim3 = align(reference, targets, view, first_cameras, problem.seed)
     except InputError as error:
@@ -44,8 +49,7 @@ def icp_best_view(problem: PairProblem) -> Answer:
 def sift(problem: PairProblem) -> Answer:
     """Run "SIFT": select the view by the similarity of its mutual nearest neighbours, and fit the
     pose by RANSAC."""
-    keypoints: list[Keypoints] = [crop.described["sift"] for crop in problem.crops]
-    reference, *targets = keypoints
+    reference, *targets = [crop.described["sift"] for crop in problem.crops]
     matches = [mutual_matches(reference, target, _K) for target in targets]
     scores = [score_from_cosines(torch.from_numpy(cosines), _K) for _, _, cosines in matches]
     view = int(np.argmax(scores))
@@ -53,6 +57,26 @@ def sift(problem: PairProblem) -> Answer:
     return fit_keypoints(
         problem, view, reference.pixels[in_reference], targets[view].pixels[in_target]
     )
+
+
+def least_squares(problem: PairProblem) -> PoseEstimate | tuple[Sim3, int]:
+    """Run "ours-least-squares": fit the pose to all matches of the best view, without RANSAC."""
+    estimate = problem.estimate()
+    try:
+        return umeyama(*estimate.points), estimate.view
+    except InputError:
+        return estimate  # where RANSAC fits no pose either: that of the best view
+
+
+def nearest_patches(
+    similarity: Float[Tensor, "n1 n2"],
+    foreground1: Bool[Tensor, " n1"],
+    foreground2: Bool[Tensor, " n2"],
+) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
+    """Match each patch with its nearest neighbour, as the cycles do, without the way back; the
+    score is their similarity."""
+    score, partner = similarity.max(dim=1)
+    return partner, score.masked_fill(~(foreground1 & foreground2[partner]), -torch.inf)
 
 
 def category(problem: PairProblem) -> Answer:
@@ -93,9 +117,9 @@ def _agreed(problem: PairProblem, pairs: Sequence[Pair]) -> Answer:
     alignment = synchronise(hypotheses)
 
     # From the worlds of both objects to the cameras of the reference and the first target view.
-    reference, target = [frame.camera for frame in problem.frames()[:2]]
-    to_reference = Sim3(1.0, reference.R, reference.t)
-    to_target = Sim3(1.0, target.R, target.t)
+    to_reference, to_target = [
+        Sim3(1.0, frame.camera.R, frame.camera.t) for frame in problem.frames()[:2]
+    ]
     between = alignment.between(of_problem.reference, of_problem.target)
     sim3 = to_target @ between @ to_reference.inverse()
     probability = alignment.objects[of_problem.target].probability

@@ -65,6 +65,10 @@ METHODS: dict[str, Method] = {
     "ours-nodepth": Method(answer="essential matrix"),
     # Cycles, clusters and saliency of the target view, as in the published code.
     "ours-published": Method(settings={"cycle_from": "target"}),
+    # Without log-binning, without the way back of the cycles, and without RANSAC.
+    "ours-keys": Method(settings={"binning": False}),
+    "ours-nearest": Method(settings={"matcher": baseline_rows.nearest_patches}),
+    "ours-least-squares": Method(solve=baseline_rows.least_squares),
     # Table 1, the baselines; SWaV and PoseContrast have published figures only.
     "icp": Method("none", solve=baseline_rows.icp),
     "icp-bv": Method(solve=baseline_rows.icp_best_view),
@@ -105,6 +109,7 @@ GROUPS: dict[str, list[str]] = {
         "trials",
         "depth",
         "published",
+        "parts",
     ],
     "paper": ["ours", "ours-bv", "table1", "ablations", "views", "rootsift", "ours-mask"],
     "all": ["paper", "verified-views", "oracle-view"],
