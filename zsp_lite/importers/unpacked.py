@@ -103,8 +103,9 @@ class Video:
         """Decode the frame with a number, from 0 on; the numbers may not decrease."""
         while self._position < number and self._video.grab():
             self._position += 1
-        decoded, image = self._video.retrieve()
-        if self._position != number or not decoded:
+        # Behind the end, OpenCV would print a message.
+        image = self._video.retrieve()[1] if self._position == number else None
+        if image is None:
             raise InputError(f"video {self.path} ends before frame {number}")
         return image[..., ::-1]
 
