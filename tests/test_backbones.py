@@ -3,6 +3,7 @@ and bad."""
 
 import hashlib
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -296,6 +297,13 @@ def test_whatever_part_is_there_the_file_is_complete_afterwards(
     server.knows_ranges = knows_ranges
     fetch(f"{server.url}/file", tmp_path / "file", size, server.md5)
     assert (tmp_path / "file").read_bytes() == server.content
+
+
+def test_downloads_of_one_file_at_once_take_turns(server, tmp_path):
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(lambda _: fetch(f"{server.url}/file", tmp_path / "file"), range(4)))
+    assert server.ranges == [None]
+    assert list(tmp_path.iterdir()) == [tmp_path / "file"]
 
 
 @pytest.mark.parametrize("chunked", [False, True])  # whether the server announces no size

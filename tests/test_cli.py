@@ -17,6 +17,7 @@ from synthetic_views import CoordinateBackbone
 from zsp_lite import __version__, errors
 from zsp_lite.backbones.load import BackboneConfig
 from zsp_lite.cli import demo, doctor
+from zsp_lite.cli.estimate import estimate
 from zsp_lite.cli.main import cli, main
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
@@ -56,6 +57,11 @@ def test_the_help_lists_every_command(run):
     assert [name for name in names.split() if f"\n  {name} " not in text] == []
 
 
+@pytest.mark.parametrize("group", ["", "data ", "weights ", "challenge "])
+def test_no_line_of_the_list_of_commands_is_cut(group, run):
+    assert "...\n" not in run(f"{group}--help").partition("Commands:")[2]
+
+
 def test_the_version_is_told(run):
     assert run("--version") == f"zsp-lite, version {__version__}\n"
 
@@ -67,6 +73,13 @@ main(['benchmark', '--help'])
 large = {'torch', 'numpy', 'pandas', 'scipy', 'matplotlib', 'cv2', 'rich'}
 print(large & set(sys.modules), file=sys.stderr)
 """
+
+
+def test_helpers_are_the_paths_up_to_the_next_option():
+    for line in ("a b --helpers c d --json", "--helpers c d -- a b", "--helpers c d --json a b"):
+        given = estimate.make_context("estimate", line.split()).params
+        assert (given["reference"], given["target"]) == (Path("a"), Path("b"))
+        assert given["helpers"] == (Path("c"), Path("d"))
 
 
 def test_help_imports_no_large_library():
@@ -89,6 +102,8 @@ WRONG = [
     ("estimate a b --box 1,2,3,4.5", "got '1,2,3,4.5', expected four integers"),
     ("estimate a b --intrinsics inf,1,2,3", "got 'inf,1,2,3', expected four numbers"),
     ("estimate a b c", "1 more paths, expected these after --helpers"),
+    ("estimate --helpers c d a b", "Missing argument 'REFERENCE'"),
+    ("estimate a --helpers c --helpers d b", "Missing argument 'TARGET'"),
     ("estimate a b --helpers c --solver paper", "--helpers"),
     ("demo --data no/such/folder", str(Path("no/such/folder"))),
     ("demo --backbone resnet", "resnet"),

@@ -291,9 +291,16 @@ def test_positions_are_read_in_every_encoding(path, encoding):
 
 @pytest.mark.parametrize(
     "kind, code, scale",
-    [("uchar", "u1", 1), ("int", "i4", 1), ("float", "f4", 1 / 255), ("double", "f8", 1 / 255)],
+    [
+        ("uchar", "u1", 1),
+        ("int", "i4", 1),
+        ("ushort", "u2", 257),
+        ("float", "f4", 1),
+        ("float", "f4", 1 / 255),
+        ("double", "f8", 1 / 255),
+    ],
 )
-def test_colours_of_8_bits_or_from_0_to_1_are_read_as_8_bit(path, kind, code, scale):
+def test_colours_of_8_or_16_bits_to_255_or_to_1_are_read_as_8_bit(path, kind, code, scale):
     table = np.zeros(len(POINTS), [("position", "<f4", 3), ("colour", f"<{code}", 3)])
     table["position"], table["colour"] = POINTS, COLOURS * np.float64(scale)
     path.write_bytes(_ply(len(POINTS), table.tobytes(), kind=kind))

@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import lzfse
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
@@ -34,11 +35,15 @@ from zsp_lite.data.frames import write_image, write_mask
 from zsp_lite.importers import open_capture, recognise
 from zsp_lite.importers.capture import find_masks, sharpest, trusted
 from zsp_lite.importers.sources import spread_views
+from zsp_lite.importers.unpacked import Video
 
 # Frames are of a rendered hairdryer, and all writers take a folder and frames; they return the path
 # of the scan. OPENGL turns OpenCV's axes of a camera into OpenGL's.
 OPENGL = np.diag([1.0, -1, -1, 1])
 CERTAIN = 2  # the highest level of confidence, of 0 to 2
+# Columns of Stray Scanner; the next two are empty.
+ODOMETRY = "timestamp frame x y z qx qy qz qw fx fy cx cy".split()
+OTHER_FOCUS = np.diag([1.1, 1.1, 1])  # times a camera's matrix
 
 
 @pytest.fixture(scope="module")
@@ -84,17 +89,19 @@ def write_video(path, images):
 
 
 def write_stray(folder, frames):
-    """The layout of Stray Scanner: poses in a table, 60 per second."""
+    """The layout of Stray Scanner: poses in a table, 60 per second; K of another focus."""
     write_files(folder, frames)
     write_confidence(folder / "confidence", frames)
     write_video(folder / "rgb.mp4", [frame.rgb for frame in frames])
-    np.savetxt(folder / "camera_matrix.csv", frames[0].camera.K, delimiter=", ")
-    rows = [
-        [k / 60, k, *to_world(frame)[:3, 3], *quaternion(to_world(frame))]
-        for k, frame in enumerate(frames)
-    ]
-    header = "timestamp, frame, x, y, z, qx, qy, qz, qw"
-    np.savetxt(folder / "odometry.csv", rows, delimiter=", ", header=header, comments="")
+    np.savetxt(folder / "camera_matrix.csv", OTHER_FOCUS @ frames[0].camera.K, delimiter=", ")
+    rows = []
+    for k, frame in enumerate(frames):
+        pose = to_world(frame)
+        camera = (*frame.camera.focal_length, *frame.camera.principal_point)
+        rows.append([k / 60, k, *pose[:3, 3], *quaternion(pose), *camera])
+    header = ", ".join([*ODOMETRY, "distortion_center_x", "distortion_center_y"])
+    form = len(ODOMETRY) * "%.9g, " + ", "  # two empty columns
+    np.savetxt(folder / "odometry.csv", rows, form, header=header, comments="")
     return folder
 
 
@@ -253,6 +260,52 @@ def test_each_layout_is_recognised_and_gives_the_cameras_the_depth_and_the_masks
         assert_array_equal(frame.mask > 0.5, view.mask > 0.5)
         # The images are JPEG, or frames of a video.
         assert np.abs(frame.rgb.astype(int) - view.rgb).mean() < 8
+
+
+@pytest.mark.parametrize(
+    "names, factor",
+    [
+        (ODOMETRY[:9], OTHER_FOCUS),
+        ([*ODOMETRY[:12], "note"], OTHER_FOCUS),
+        (["note", *reversed(ODOMETRY)], np.eye(3)),
+    ],
+)
+def test_odometry_is_read_by_the_names_of_its_columns(tmp_path, views, names, factor):
+    path, _ = write("stray", tmp_path / "scan", views)
+    table = pd.read_csv(path / "odometry.csv", skipinitialspace=True).assign(note="good")
+    table[names].to_csv(path / "odometry.csv", index=False)
+    for frame, view in zip(open_capture(path).frames, views, strict=True):
+        assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
+        assert_allclose(frame.camera.K, factor @ view.camera.K, atol=1e-6)
+
+
+def test_odometry_without_a_row_or_a_column_is_refused(tmp_path, views):
+    path, _ = write("stray", tmp_path / "scan", views)
+    (path / "odometry.csv").write_text(",".join(ODOMETRY))
+    refused("odometry.csv has 1 lines, expected at least 2", open_capture, path)
+    (path / "odometry.csv").write_text("timestamp, frame, x, y, z, qx, qy\n0, 0, 0, 0, 0, 0, 0")
+    refused("odometry.csv has no column qz, qw, expected frame, x", open_capture, path)
+
+
+@pytest.mark.parametrize("steps, last", [([0, 1, 4, 5], "000005"), ([0, 1, 2, 3], "000003")])
+def test_images_that_a_video_lacks_are_counted_and_found_by_time(
+    tmp_path, monkeypatch, steps, last
+):
+    views = hairdryer_views()[:6]
+    path, _ = write("stray", tmp_path / "scan", views)
+    write_video(path / "rgb.mp4", [view.rgb for view in views[:2] + views[4:]])
+    assert_allclose(Video(path / "rgb.mp4").times(), 1000 / 30 * np.arange(4))
+    monkeypatch.setattr(Video, "times", lambda _: [1000 / 60 * step for step in steps])
+    source = open_source(path)
+    flags = " ".join(source.flags(source.load([0])))
+    assert "the video has 2 images fewer than odometry.csv (4 of 6)" in flags
+    assert ("images after a gap may be late" in flags) == (last == "000003")
+    assert source.read_frame(3).name == f"{last}.jpg"
+
+
+def test_the_inner_folder_of_polycam_is_its_scan(tmp_path, views):
+    path, _ = write("polycam", tmp_path / "scan", views)
+    assert recognise(path / "keyframes") == ("polycam", path)
 
 
 def each(change: Callable[[dict], object]) -> Callable[[dict], list]:

@@ -4,10 +4,11 @@ Textures are looked for beside the model and in the given folders, and written a
 file.
 """
 
+import re
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 from PIL import Image
@@ -29,7 +30,10 @@ class Ac3dObject:
 
 def read_ac3d(path: Path) -> tuple[list[Material], list[Ac3dObject]]:
     """Return the materials and the objects of an AC3D file."""
-    text = path.read_bytes().decode("latin-1")
+    text = path.read_text("latin-1")
+    # After a line "data N", N characters are a comment.
+    while comment := re.search(r"(?m)^data (\d+)\n", text):
+        text = text[: comment.start()] + text[comment.end() + int(comment[1]) :]
     lines = iter([line for line in text.splitlines() if line.strip()])
     if not next(lines, "").startswith("AC3D"):
         raise InputError(f"{path} does not begin with AC3D")
@@ -121,11 +125,6 @@ def _read_object(
         elif keyword == "rot":
             # The rows of the file are the images of the axes.
             turn = np.array(rest, float).reshape(3, 3).T
-        elif keyword == "data":
-            # A comment of this length follows, in characters, ends of lines included: skip it.
-            left = int(rest[0])
-            while left > 0:
-                left -= len(next(lines)) + 1
         elif keyword == "texture":
             texture = rest[0]
         elif keyword == "texrep":
@@ -179,7 +178,7 @@ def _read_surface(
 
 def _write_texture(texture: str, model: Path, out: Path, folders: Sequence[Path]) -> str:
     """Write a texture of a model as PNG and return the name of the file."""
-    name = texture.replace("\\", "/").split("/")[-1]
+    name = PureWindowsPath(texture).name
     for folder in (model.parent, *folders):
         if (folder / name).is_file():
             written = Path(name).stem + ".png"

@@ -211,6 +211,7 @@ CLIMBING = """{"fl_x": 1, "frames": [{
     "file_path": "../../../../../etc/passwd", "depth_path": "/dev/zero",
     "transform_matrix": [[1, 0, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]]
 }]}"""
+ODOMETRY = "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
 for name, layout, change in (
     ("zip that unpacks to 3 GB", "nerfstudio", zip_of("transforms.json", 3 << 30)),
     ("zip with a path that climbs", "nerfstudio", zip_of("../../executed", 1 << 20)),
@@ -218,7 +219,7 @@ for name, layout, change in (
     (
         "quaternion of zeros",
         "stray",
-        written("odometry.csv", "timestamp, frame\n0, 0, 0, 0, 0, 0, 0, 0, 0\n"),
+        written("odometry.csv", ODOMETRY + "0, 0, 0, 0, 0, 0, 0, 0, 0\n"),
     ),
     (
         "frames without end",
@@ -226,7 +227,7 @@ for name, layout, change in (
         both(
             written(
                 "odometry.csv",
-                "timestamp, frame\n"
+                ODOMETRY
                 + "".join(f"0, {k}, 0, 0, 0, 0, 0, 0, 1\n" for k in (1e9, 1e18, -5, "nan")),
             ),
             written("depth/1000000000.png", ""),
@@ -237,7 +238,7 @@ for name, layout, change in (
         "stray",
         both(
             rewritten("rgb.mp4", ten_hours),
-            rewritten("odometry.csv", lambda data: data.replace(b", 0.0", b", 9e5")),
+            rewritten("odometry.csv", lambda data: data.replace(b"\n0, 0,", b"\n0, 900000,")),
             written("depth/900000.png", ""),
         ),
     ),

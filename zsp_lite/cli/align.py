@@ -71,7 +71,7 @@ MARK = Parsed(
 def align(
     data, category, sequences, pairs, targets, out, propose, marks, replace, backbone, workers
 ) -> None:
-    """Align all objects of a category in one frame; no label is needed.
+    """Align all objects of a category in one frame. No label is needed.
 
     DATA is a data folder, or a folder with a capture of each object (see `zsp-lite data import
     --help`).

@@ -114,7 +114,7 @@ def benchmark(
     seeds,
     sweep,
 ) -> None:
-    """Measure rotation errors over many pairs, and write tables, figures and results."""
+    """Measure rotation errors over many pairs. OUT gets tables, figures and results."""
     if list_only:
         return _list_methods()
     from zsp_lite.benchmark.methods import resolve
@@ -207,7 +207,7 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
 )
 @click.option("--data", type=PATH, show_default="the run's", help="Data folder, for --pair.")
 def tables(run, out, metrics, rows, latex, size, pair, data) -> None:
-    """Write tables and figures of a benchmark run, also of one that goes on."""
+    """Write tables and figures of a benchmark run. The run may still go on."""
     from zsp_lite.benchmark.run import write_reports
     from zsp_lite.benchmark.runs import read_run
     from zsp_lite.benchmark.tables import pair_figure, save_figure
@@ -240,10 +240,10 @@ def tables(run, out, metrics, rows, latex, size, pair, data) -> None:
     help="A:B for row A of RUN_A and B of RUN_B, or A.",
 )
 def compare(run_a, run_b, rows) -> None:
-    """Compare two benchmark runs on their common pairs, with intervals over objects and tests of
-    significance.
+    """Compare two benchmark runs on their common pairs.
 
-    RUN_A and RUN_B are folders of runs.
+    RUN_A and RUN_B are folders of runs. The table has intervals over objects and tests of
+    significance.
     """
     from zsp_lite.benchmark import tables
     from zsp_lite.benchmark.runs import read_run

@@ -16,7 +16,7 @@ from zsp_lite.errors import InputError
     ),
 )
 def challenge() -> None:
-    """Set a class a problem that nobody has seen, and rank what it hands in."""
+    """Set a class a new problem, and rank what it hands in."""
 
 
 @challenge.command(epilog=examples("challenge make --categories car,chair --out challenge"))
@@ -29,7 +29,7 @@ def challenge() -> None:
 @click.option("--pairs", type=COUNT, default=200, help="Pairs in all.")
 @click.option("--out", type=PATH, required=True, help="New folder; gets give/ and keep/.")
 def make(secret, categories, sequences, frames, pairs, out) -> None:
-    """Render objects: OUT/give for students, without labels, and OUT/keep for yourself."""
+    """Render objects for a class. OUT/give is for students, OUT/keep for yourself."""
     from zsp_lite.course.challenge.make import make_challenge
 
     if secret is None:  # among the words of a command, it stays in the shell's history
@@ -49,10 +49,11 @@ def make(secret, categories, sequences, frames, pairs, out) -> None:
 @click.option("--pair-seconds", type=COUNT, default=20, help="Time limit of it for a pair.")
 @click.option("--memory", type=COUNT, default=4, help="Limit of its memory in GB (Linux).")
 def rank(handins, keep, out, workers, minutes, pair_seconds, memory) -> None:
-    """Run TEAM.py and read TEAM.csv of the folder HANDINS, and rank the teams by Acc30.
+    """Rank the teams that handed in by Acc30.
 
-    Each file runs alone, without labels or network where the system allows (Linux). OUT gets
-    ranking.html for the projector, and ranking.csv.
+    TEAM.py of the folder HANDINS is run, TEAM.csv is read. Each file runs alone, without labels or
+    network where the system allows (Linux). OUT gets ranking.html for the projector, and
+    ranking.csv.
     """
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.course.challenge import rank as ranking

@@ -42,7 +42,7 @@ root_option = click.option("--root", type=PATH, required=True, help="Data folder
     no_args_is_help=False, epilog=examples("data check path/to/co3d", "data import --help")
 )
 def data() -> None:
-    """Download or check CO3D, import labels or captures, transfer labels from CO3D v1 to v2."""
+    """Download or check CO3D, import captures or labels."""
 
 
 @data.command(epilog=examples("data check path/to/co3d", "data check path/to/co3d --deep"))
@@ -54,8 +54,8 @@ def data() -> None:
     help="A sequence without any file is not a problem: it was not downloaded.",
 )
 def check(root, deep, partial) -> int:
-    """Report missing or broken files, the number of files of evaluation pairs, and the size on
-    disk.
+    """Report missing or broken files. The number of files of evaluation pairs and the size on disk
+    are reported too.
 
     The exit code is 1 if there is any problem.
     """
@@ -136,7 +136,7 @@ def _print_checks(root: Path, checks: Sequence[Any]) -> int:
 )
 @click.option("--yes", is_flag=True, help="Download without asking.")
 def download(dataset, categories, single_sequence, chunks, root, labels, labelled_only, yes) -> int:
-    """Download categories of CO3D from its official server, check them, and import labels.
+    """Download categories of CO3D, check them, and import labels. They are on its official server.
 
     DATASET is co3d (version 2, in chunks of up to 20 GB) or co3d-v1 (the version of the paper and
     of its labels, one archive for each category). The sizes are shown and confirmed first. An
@@ -219,7 +219,7 @@ def _confirmed(
 @root_option
 @replace_option
 def labels(source, root, replace) -> None:
-    """Import the published pose labels and evaluation pairs into a data folder.
+    """Import published pose labels and evaluation pairs.
 
     SOURCE is a local clone of the published repository, or what `zsp-lite align` has written. The
     published labels are those of CO3D v1 and do not fit v2: import them into a v1 folder, then use
@@ -240,8 +240,8 @@ def labels(source, root, replace) -> None:
 @click.argument("category")
 @replace_option
 def transfer(v1, v2, category, replace) -> None:
-    """Transfer labels from a CO3D v1 folder to a v2 folder by aligning the camera centres of the
-    same frames."""
+    """Transfer labels from a CO3D v1 folder to a v2 folder. The camera centres of the same frames
+    are aligned."""
     from zsp_lite.data.published import transfer_labels
 
     residuals = transfer_labels(v1, v2, category, replace=replace)
@@ -283,13 +283,13 @@ class _Import(click.Command):
     help="Maximum number of frames, evenly spaced and sharp.",
 )
 def import_(source, root, category, sequence, mask, box, **options) -> None:
-    """Import an RGB-D capture, images with depth and camera poses in one world, as a sequence of a
-    data folder.
+    """Import an RGB-D capture as a sequence of a data folder.
 
-    SCAN is a folder, or the zip file that an app has exported. Its FORMAT is recognised, if it is
-    not given: nerfstudio (also of Blender, NeRFCapture and instant-ngp), stray (Stray Scanner),
-    polycam (its raw data), record3d (needs `pip install lzfse`), tum (RGB-D benchmark), bop,
-    scannet, open3d (recorder, with the trajectory of its reconstruction), or lists of your own:
+    A capture is images with depth and camera poses in one world. SCAN is a folder, or the zip file
+    that an app has exported. Its FORMAT is recognised, if it is not given: nerfstudio (also of
+    Blender, NeRFCapture and instant-ngp), stray (Stray Scanner), polycam (its raw data), record3d
+    (needs `pip install lzfse`), tum (RGB-D benchmark), bop, scannet, open3d (recorder, with the
+    trajectory of its reconstruction), or lists of your own:
 
     \b
       rgb.txt, depth.txt  one file per line; depth as 16-bit PNG, TIFF, .npy, ...

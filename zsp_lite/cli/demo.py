@@ -25,10 +25,10 @@ USER_NOTE = "the given folder in CO3D's layout."
 @backbone_options
 @click.option("--out", type=PATH, default="outputs/demo", help="Folder for the report.")
 def demo(data, solver, backbone, out) -> None:
-    """Estimate the pose of a real motorcycle and of one pair per category: tables, and a report
-    with pictures.
+    """Estimate poses of a real motorcycle and of sample objects.
 
-    The real motorcycle is a photograph; its targets are a category `motorcycle` of synthetic
+    One pair of each category is estimated, and a report with pictures is written. The real
+    motorcycle is a photograph; its targets are a category `motorcycle` of synthetic
     objects in the data.
     """
     from rich.console import Console

@@ -12,7 +12,7 @@ from zsp_lite.cli.common import examples
 
 @click.command(epilog=examples("doctor"))
 def doctor() -> int:
-    """Check Python, PyTorch, the weights and the cache, and print a fix for every problem."""
+    """Check the installation, and print a fix for every problem."""
     failed = []
     for name, state, found, fix in run_checks():
         print(f"{state:4}  {name:16}  {found}")

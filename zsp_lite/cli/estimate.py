@@ -8,19 +8,39 @@ from zsp_lite.choices import SOLVERS
 from zsp_lite.cli.common import COUNT, INDEX, PATH, backbone_options, examples, source_options
 
 
+class _Estimate(click.Command):
+    """The command `estimate`, whose option --helpers takes all paths up to the next option."""
+
+    def parse_args(self, context, args):
+        words = []
+        several = False
+        for word in args:
+            if word.startswith("-"):
+                several = word == "--helpers"
+            elif several and words[-1] != "--helpers":
+                words.append("--helpers")
+            words.append(word)
+        return super().parse_args(context, words)
+
+
 @click.command(
+    cls=_Estimate,
     epilog=examples(
         "estimate data_samples/motorcycle/scooter data_samples/motorcycle/scooter2",
         "estimate path/to/scan path/to/other_scan --box 120,200,300,280 --box 90,160,320,300",
         "estimate my_cup.jpg path/to/scan --intrinsics 600,600,320,240 --mask auto --json",
         "estimate path/to/scan path/to/other_scan --helpers path/to/third_scan path/to/fourth_scan",
-    )
+    ),
 )
 @click.argument("reference", type=PATH)
 @click.argument("target", type=PATH)
 @click.argument("others", type=PATH, nargs=-1, metavar="")
 @click.option(
-    "--helpers", type=PATH, multiple=True, metavar="C [D ...]", help="Other objects, last of all."
+    "--helpers",
+    type=PATH,
+    multiple=True,
+    metavar="C [D ...]",
+    help="Other objects, up to the next option.",
 )
 @click.option(
     "--solver", type=click.Choice(SOLVERS), default="verified", help="Solver of the pose."
@@ -72,7 +92,7 @@ def estimate(
     out,
     **once_per_object,
 ) -> None:
-    """Estimate the pose between two objects of one category; no label is needed.
+    """Estimate the pose between two objects of one category. No label is needed.
 
     REFERENCE and TARGET are each a sequence of a data folder (ROOT/CATEGORY/SEQUENCE), the folder
     or zip of a capture (see `zsp-lite data import --help`), or an image NAME.jpg, .png or .webp
@@ -99,15 +119,15 @@ def estimate(
     from zsp_lite.importers.sources import open_pair
     from zsp_lite.own_objects import estimate_pose
 
-    if helpers and solver != "verified":
-        raise click.UsageError("--helpers goes with --solver verified only")
-    if others and not helpers:
+    if others:
         raise click.UsageError(
             f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers"
         )
+    if helpers and solver != "verified":
+        raise click.UsageError("--helpers goes with --solver verified only")
     # Opened here, since an option may differ from object to object; `estimate_pose` takes open
     # sources as they are.
-    sources = open_pair(reference, target, once_per_object, (*helpers, *others))
+    sources = open_pair(reference, target, once_per_object, helpers)
     result = estimate_pose(
         sources[0],
         sources[1],

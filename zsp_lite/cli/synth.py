@@ -45,8 +45,8 @@ DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 @click.option("--seed", type=INDEX, default=0, help="Seed of every random draw.")
 @click.option("--out", type=PATH, required=True, help="Folder to write.")
 def synth(preset, categories, models_folder, seed, out, **given) -> None:
-    """Render procedural objects or your own models into a CO3D folder; the same seed gives the same
-    objects and cameras.
+    """Render procedural objects or your own models. They are written as a CO3D folder; the same
+    seed gives the same objects and cameras.
 
     \b
     --preset    demo (3 categories, 15 s), paper-small (20 of 5 sequences of 24 frames), or paper

@@ -34,6 +34,8 @@ class Format:
     options: tuple[str, ...] = ()  # options that `read` takes, without `count`
 
 
+PACKED = (".zip", ".r3d")  # extensions of files that apps export
+
 # The format of a folder is the first one whose signs it has.
 FORMATS = {
     "nerfstudio": Format(
@@ -89,7 +91,7 @@ def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
     """
     path = Path(path)
     folder = path
-    if path.is_file() and path.suffix.lower() in (".zip", ".r3d"):
+    if path.is_file() and path.suffix.lower() in PACKED:
         folder = unpack(path.resolve())
     if path.is_file() and path.match("transforms*.json"):
         return "nerfstudio", path
@@ -97,6 +99,8 @@ def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
     places = [folder]
     if len(files) == 1:  # an app may put a folder into its zip
         places += files
+    if path.name == "keyframes":  # the inner folder of Polycam's raw data
+        places.append(path.parent)
     for place in places:
         for name, layout in FORMATS.items():
             if all(any(place.glob(sign)) for sign in layout.signs):

@@ -48,6 +48,7 @@ class CaptureFrame:
     # its EXIF orientation; None if their sizes show it (see `files.lies_as_stored`).
     orientation: str | None = None
     posed: bool = True  # False for a single image, whose world is its camera's frame
+    doubt: str = ""  # why the image may be that of another frame
 
     def load(self) -> Frame:
         """Load the frame as viewers display it; InputError if a file cannot be used."""
@@ -272,13 +273,13 @@ def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
     return masks
 
 
-def read_text_lines(path: Path) -> list[str]:
+def read_text_lines(path: Path, least: int = 1) -> list[str]:
     """Read the lines of a text file, without empty lines and lines that begin with #."""
     text = read_bytes(path, "list").decode("utf-8-sig", "replace")
     lines = [line.strip() for line in text.splitlines()]
     lines = [line for line in lines if line and line[0] != "#"]
-    if not lines:
-        raise InputError(f"{path} is empty, expected at least 1 line")
+    if len(lines) < least:
+        raise InputError(f"{path} has {len(lines)} lines, expected at least {least}")
     return lines
 
 

@@ -1,5 +1,6 @@
 """Conversion of a source to a sequence of a data folder, with a fused point cloud (Open3D)."""
 
+import logging
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +12,14 @@ from jaxtyping import Float, UInt8
 from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
+from zsp_lite.importers import PACKED
 from zsp_lite.importers.capture import HALF_PIXEL
 from zsp_lite.importers.sources import Source, open_source
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
 from zsp_lite.points import axis_deviation, object_pixels, sampling_step, world_points
+
+logger = logging.getLogger(__name__)
 
 # Voxels per three standard deviations of the object: they are finer than the noise of depth
 # cameras.
@@ -95,10 +99,25 @@ def write_sequence(root: str | Path, category: str, data: SequenceData) -> None:
 def import_captures(
     folder: str | Path, root: str | Path, category: str
 ) -> Iterator[tuple[str, ImportResult]]:
-    """Import the captures in a folder that are not imported yet; yield names and results."""
-    for path in sorted(Path(folder).iterdir()):
+    """Import the captures in a folder that are not imported yet; yield names and results.
+
+    InputError if two have one name. Files of other kinds are left out.
+    """
+    paths = {}
+    for path in sorted(Path(folder).glob("[!.]*")):
+        if path.is_file() and path.suffix.lower() not in PACKED:
+            logger.warning("%s is left out, expected a folder, .zip or .r3d", path)
+            continue
         name = path.stem if path.is_file() else path.name
-        if not path.name.startswith(".") and not is_imported(Path(root) / category / name):
+        if name in paths:
+            raise InputError(
+                f"{folder} has {paths[name].name} and {path.name}, expected one scan of a name"
+            )
+        paths[name] = path
+    if not paths:
+        raise InputError(f"{folder} has no scan, expected a folder, .zip or .r3d of each object")
+    for name, path in paths.items():
+        if not is_imported(Path(root) / category / name):
             yield name, import_source(open_source(path), root, category, name)
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import cv2
 import msgspec
 import numpy as np
+from jaxtyping import Float
 
 from zsp_lite.data.frames import write_image
 from zsp_lite.errors import InputError
@@ -16,24 +17,51 @@ from zsp_lite.importers.capture import (
     Makers,
     make_frame,
     read_numbers,
+    read_text_lines,
     refuse,
     sharpest,
 )
 from zsp_lite.importers.unpacked import Video, new_folder
 from zsp_lite.io.files import read_bytes, read_json
 
+# Columns of Stray Scanner's odometry.csv: number, position and quaternion of a frame.
+_ODOMETRY = "frame x y z qx qy qz qw".split()
+_CAMERA = "fx fy cx cy".split()  # its camera in pixels, which older files lack
+
 
 def read_stray(folder: Path, count: int) -> Makers:
     """Read a scan of Stray Scanner, at most `count` sharp frames of its video."""
-    rows = read_numbers(folder / "odometry.csv", (9,), delimiter=",", skiprows=1)
+    path = folder / "odometry.csv"
+    rows = _read_odometry(path)
     K = read_numbers(folder / "camera_matrix.csv", (3,), delimiter=",")
-    # Column 1 has the number of the video's frame: one that is no number is not in the video.
-    rows[:, 1] = np.nan_to_num(rows[:, 1], nan=-1)
-    pictures = new_folder()
     video = Video(folder / "rgb.mp4")
+    # Number of each row's image in the video. A row without a number has no image.
+    images = np.nan_to_num(rows[:, 0], nan=-1)
     left_out = []
-    for row, image in sharpest(list(rows), count, lambda row: video.frame(int(row[1])), left_out):
-        name = f"{row[1]:06.0f}"
+    doubt = ""
+    times = np.array(video.times() if video.count < len(rows) else [])
+    if 1 < len(times) < len(rows):
+        video = Video(video.path)  # from the first image again
+        missing = len(rows) - len(times)
+        fewer = (
+            f"{folder}: the video has {missing} images fewer than odometry.csv "
+            f"({len(times)} of {len(rows)})"
+        )
+        # The times of the images count frames. They show which images are missing, if the first and
+        # the last one are there.
+        steps = np.rint((times - times[0]) / np.median(np.diff(times)).clip(1))
+        timed = np.isin(images - images[0], steps)
+        if timed[-1] and timed.sum() == len(times):
+            rows = rows[timed]
+            images = np.arange(len(times))
+            left_out += missing * [fewer]
+        else:
+            doubt = f"{fewer}: images after a gap may be late"
+
+    pictures = new_folder()
+    items = list(zip(rows, images))
+    for (row, _), image in sharpest(items, count, lambda item: video.frame(int(item[1])), left_out):
+        name = f"{row[0]:06.0f}"
         picture = pictures / f"{name}.jpg"
         write_image(picture, image, 95)
         yield partial(
@@ -41,13 +69,33 @@ def read_stray(folder: Path, count: int) -> Makers:
             folder,
             picture,
             f"depth/{name}.png",
-            row[2:],
-            K,
-            f"{folder}/odometry.csv, frame {row[1]:.0f}",
+            row[1:8],
+            row[8:] if np.isfinite(row[8:]).sum() == 4 else K,
+            f"{path}, frame {row[0]:.0f}",
             confidence=f"confidence/{name}.png",
+            doubt=doubt,
         )
     for problem in left_out:
         yield partial(refuse, problem)
+
+
+def _read_odometry(path: Path) -> Float[np.ndarray, "rows columns"]:
+    """Read the columns of odometry.csv by the names in its header; an empty number is NaN."""
+    names = [name.strip() for name in read_text_lines(path, least=2)[0].split(",")]
+    missing = [name for name in _ODOMETRY if name not in names]
+    if missing:
+        raise InputError(
+            f"{path} has no column {', '.join(missing)}, expected {', '.join(_ODOMETRY)}"
+        )
+    columns = [names.index(name) for name in (*_ODOMETRY, *_CAMERA) if name in names]
+    return read_numbers(
+        path,
+        (len(columns),),
+        delimiter=",",
+        skiprows=1,
+        usecols=columns,
+        converters=lambda text: float(text.strip() or "nan"),
+    )
 
 
 def read_polycam(folder: Path) -> Makers:

@@ -70,7 +70,7 @@ class Source:
     left_out: Sequence[str] = ()  # for each frame that cannot be used, what is wrong with it
     # Names of the frames that come without a mask, by position.
     missing: Mapping[int, str] = field(default_factory=dict)
-    doubts: Sequence[str] = ()  # reasons to doubt the intrinsics
+    doubts: Sequence[str] = ()  # reasons to doubt the intrinsics or the order of the images
     depth_unit: float | None = None  # world units per stored depth value, of an image or a capture
 
     @property
@@ -149,10 +149,9 @@ class Source:
         """List doubts about the masks and depth of frames, and the intrinsics and poses of all."""
         flags = []
         if self.left_out:
-            more = f"; and {len(self.left_out) - 3} more" if len(self.left_out) > 3 else ""
-            flags.append(
-                f"frames left out: {len(self.left_out)}: {'; '.join(self.left_out[:3])}{more}"
-            )
+            reasons = list(dict.fromkeys(self.left_out))
+            more = f"; and {len(reasons) - 3} more" if len(reasons) > 3 else ""
+            flags.append(f"frames left out: {len(self.left_out)}: {'; '.join(reasons[:3])}{more}")
         flags += depth_flags(frames, metric=self.format not in ("sequence", "frames"))
         flags += self.doubts
         if self.mask == "given":
@@ -358,11 +357,9 @@ def _from_capture(path: Path, layout: str, options: dict[str, Any]) -> Source:
         frames, left_out = open_capture(path, layout, files=files, **options)
     cameras = tuple(frame.camera for frame in frames)
     _check_poses(cameras, path)
-    # The first camera with each intrinsic matrix, so that a doubt is said once.
-    different = {camera.K.tobytes(): camera for camera in reversed(cameras)}
-    doubts = []
-    for camera in different.values():
-        doubts += question_intrinsics(camera, str(path))
+    # Intrinsics may differ from frame to frame: a doubt about them is said once.
+    questioned = [question_intrinsics(camera, str(path)) for camera in cameras]
+    doubts = [*next(filter(None, questioned), ()), *filter(None, {frame.doubt for frame in frames})]
     return Source(
         path,
         layout,

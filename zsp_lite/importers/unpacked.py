@@ -88,15 +88,24 @@ class Video:
             )
         video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(displayed))
         self.path = path
+        self.count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))  # number of frames by the header
         self._video = video
         self._position = -1  # number of the frame that was decoded last
+
+    def times(self) -> list[float]:
+        """Read the times of all frames in milliseconds, up to the end of the video."""
+        times = []
+        while self._video.grab():
+            times.append(self._video.get(cv2.CAP_PROP_POS_MSEC))
+        return times
 
     def frame(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
         """Decode the frame with a number, from 0 on; the numbers may not decrease."""
         while self._position < number and self._video.grab():
             self._position += 1
-        decoded, image = self._video.retrieve()
-        if self._position != number or not decoded:
+        # Behind the end, OpenCV would print a message.
+        image = self._video.retrieve()[1] if self._position == number else None
+        if image is None:
             raise InputError(f"video {self.path} ends before frame {number}")
         return image[..., ::-1]
 

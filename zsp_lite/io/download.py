@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import sha256
+from zsp_lite.io.locks import writing
 
 CHUNK = 1 << 18  # bytes that are read at once
 TIMEOUT = 30  # seconds until a server that does not answer is given up
@@ -41,34 +42,39 @@ def fetch(
 
     Data is written to `path`.part. This file is renamed after its size, the first digits of its MD5
     digest and its SHA-256 `digest` are verified. An interrupted download is resumed, in up to
-    three attempts and by later calls.
+    three attempts and by later calls. Processes that download the same file take turns.
     """
     if path.exists():
         return path
-    part = path.with_name(path.name + ".part")
-    if size is not None:
-        most = size
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # `any` stops after the first attempt that is not interrupted.
-        complete = any(_fetch_rest(url, part, most) for _ in range(ATTEMPTS))
-        received = part.stat().st_size
-    except NETWORK_ERRORS as error:
-        raise InputError(f"download of {url} failed: {error}") from error
-    if not complete:
-        raise InputError(
-            f"download of {url} was interrupted at {received} bytes; call again to resume"
+    with writing(path.parent, f"{path.name}.lock", timeout=-1):
+        if path.exists():  # another process has downloaded it
+            return path
+        part = path.with_name(path.name + ".part")
+        if size is not None:
+            most = size
+        try:
+            # `any` stops after the first attempt that is not interrupted.
+            complete = any(_fetch_rest(url, part, most) for _ in range(ATTEMPTS))
+            received = part.stat().st_size
+        except NETWORK_ERRORS as error:
+            raise InputError(f"download of {url} failed: {error}") from error
+        if not complete:
+            raise InputError(
+                f"download of {url} was interrupted at {received} bytes; call again to resume"
+            )
+        matches = has_size_and_hash(part, size, md5_prefix) and digest in (
+            "",
+            sha256(part, "download"),
         )
-    matches = has_size_and_hash(part, size, md5_prefix) and digest in ("", sha256(part, "download"))
-    if received > most or not matches:
-        part.unlink()  # resuming from wrong data would never succeed
-        limit = f"at most {most}" if size is None else most
-        raise InputError(
-            f"download of {url} is another file of {received} bytes, expected {limit} bytes with "
-            f"the checksum {digest or md5_prefix or '(any)'}; removed"
-        )
-    os.replace(part, path)
-    return path
+        if received > most or not matches:
+            part.unlink()  # resuming from wrong data would never succeed
+            limit = f"at most {most}" if size is None else most
+            raise InputError(
+                f"download of {url} is another file of {received} bytes, expected {limit} bytes "
+                f"with the checksum {digest or md5_prefix or '(any)'}; removed"
+            )
+        os.replace(part, path)
+        return path
 
 
 def has_size_and_hash(path: Path, size: int | None = None, md5_prefix: str = "") -> bool:

@@ -1,4 +1,4 @@
-"""One writer per folder."""
+"""One writer per folder, or per file."""
 
 import os
 from collections.abc import Iterator
@@ -11,16 +11,18 @@ from zsp_lite.errors import InputError
 
 
 @contextmanager
-def writing(folder: str | Path) -> Iterator[None]:
+def writing(folder: str | Path, name: str = ".writing.lock", timeout: float = 0) -> Iterator[None]:
     """Be the only writer of a folder; InputError if another process writes to it.
 
-    The folder is made if it does not exist. If nothing was written into it, it is removed again.
+    `name` is that of the lock's file, of which a folder may have several. Another process is waited
+    for up to `timeout` seconds, without end if it is -1. The folder is made if it does not exist.
+    If nothing was written into it, it is removed again.
     """
     folder = Path(folder)
     # The folders that are made here, the innermost first.
     missing = [place for place in (folder, *folder.parents) if not os.path.exists(place)]
-    path = folder / ".writing.lock"
-    lock = FileLock(path, timeout=0)
+    path = folder / name
+    lock = FileLock(path, timeout=timeout)
     if folder.resolve() == folder.resolve().parent:
         raise InputError(f"{folder} is the root of the disk, expected a folder for what is written")
     try:

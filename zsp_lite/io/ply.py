@@ -114,10 +114,13 @@ def _vertex_columns(data: bytes) -> dict[str, np.ndarray]:
 
 
 def _colours(columns: dict[str, np.ndarray]) -> UInt8[np.ndarray, "n 3"] | None:
-    """Return 8-bit colours, which may be stored as numbers from 0 to 1; None if there are none."""
+    """Return 8-bit colours of 16-bit ones or numbers to 1 or 255; None if there are none."""
     if not {"red", "green", "blue"} <= columns.keys():
         return None
-    colours = np.stack([columns[name] for name in ("red", "green", "blue")], axis=-1)
-    if colours.dtype.kind == "f":
-        colours = (np.where(np.isfinite(colours), colours, 0) * 255).clip(0, 255).round()
-    return colours.astype(np.uint8)
+    stored = np.stack([columns[name] for name in ("red", "green", "blue")], axis=-1)
+    colours = np.where(np.isfinite(stored), stored, 0.0)
+    if stored.dtype == np.uint16:
+        colours /= 257
+    elif stored.dtype.kind == "f" and colours.max(initial=0) < 1.01:  # rounding may exceed 1
+        colours *= 255
+    return colours.round().clip(0, 255).astype(np.uint8)
