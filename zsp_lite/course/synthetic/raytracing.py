@@ -304,15 +304,17 @@ class MeshScene:
         """Return the shares of key light and room seen from a grid on the floor, and its width."""
         # The grid is as wide as the object with a shadow on either side. The shadow counts as at
         # most 5 units long, and as at least 0.8 of the object's height even below a light from
-        # above: the object also shades the floor from the room.
+        # above: the object also shades the floor from the room. The grid has the axes of the room,
+        # as its border and its cells are visible.
         extent = np.ptp(self.mesh.vertices, axis=0)
         light = self.room.light
         length = extent[2] * max(float(np.linalg.norm(light[:2]) / max(light[2], 0.3)), 0.8)
-        width = float(extent[:2].max()) + 2 * min(length, 5.0)
+        width = float(np.linalg.norm(extent[:2])) + 2 * min(length, 5.0)
         n = _SHADOW_CELLS
         line = ((np.arange(n, dtype=np.float32) + 0.5) / n - 0.5) * width
         x, y = np.meshgrid(line, line)
-        point = np.stack([x, y, np.full_like(x, _OFFSET)], -1).reshape(-1, 3) + self.origin
+        point = np.stack([x, y, np.full_like(x, _OFFSET)], -1).reshape(-1, 3)
+        point = point @ self.room.axes.T + self.origin
         key = self._lit_share(point, _RAYS).reshape(n, n)
         around = self._room_share(point, np.float32([[0, 0, 1]])).reshape(n, n)
         # A blur hides the noise of few rays.
@@ -327,7 +329,7 @@ class MeshScene:
         radiance, reach = self.room.radiance(eye, flat_rays, 1 / camera.focal_length.mean())
         floor = np.flatnonzero(reach)
         point = eye + reach[floor, None] * flat_rays[floor]
-        u, v = (point[:, :2] / self._shadow_width + 0.5).T
+        u, v = (point @ self.room.axes[:, :2] / self._shadow_width + 0.5).T
         shares = sample_image(self._shadow, u, v, cv2.BORDER_CONSTANT)
         radiance[floor] *= self.room.on_the_floor(*shares.T)
         depth = np.where(reach < FLOOR_REACH, reach, 0).astype(np.float32)

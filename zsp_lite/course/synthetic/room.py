@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from zsp_lite.course.synthetic.primitives import direction
+from zsp_lite.course.synthetic.primitives import direction, rotation
 from zsp_lite.course.synthetic.textures import (
     ANY_HUE,
     Colour,
@@ -82,21 +82,25 @@ class CheapCamera:
 class Room:
     """A box around objects, and the light on them.
 
-    The origin of all points is on the floor below the object. `images` has one image per face, in
-    the order -x, +x, -y, +y, floor, ceiling. The image of the floor is its albedo, the other images
-    are radiances. The rows of a wall's image run down, the rows of floor and ceiling run along y.
-    The columns run along y on the first two walls, and along x on the other faces.
+    The origin of all points is on the floor below the object. The box has axes of its own, turned
+    about z. `images` has one image per face, in the order -x, +x, -y, +y, floor, ceiling of the
+    box. The image of the floor is its albedo, the other images are radiances. The rows of a wall's
+    image run down, the rows of floor and ceiling run along y. The columns run along y on the first
+    two walls, and along x on the other faces.
     """
 
-    low: Vector  # corners of the box; low[2] is 0
+    low: Vector  # corners of the box in its axes; low[2] is 0
     high: Vector
     images: tuple[np.ndarray, ...]
     light: Vector  # unit vector towards the key light
     light_radius: float  # angular radius of the key light in radians
     light_colour: Colour  # irradiance of the key light on a surface that faces it
     camera: CheapCamera
+    turn: float = 0.0  # angle in radians from the x axis of all points to that of the box
 
     def __post_init__(self):
+        # The columns are the axes of the box: `points @ axes` are points in these.
+        self.axes = rotation("z", self.turn).astype(np.float32)
         self._pyramids = [pyramid(image) for image in self.images]
         faces = np.array([image.mean((0, 1)) for image in self.images])
         # Irradiance of a surface that faces one of the six faces: half of it from there, half from
@@ -113,6 +117,7 @@ class Room:
         """Return the irradiance from the room, without its key light, where nothing blocks it."""
         # Along each axis, the normal points to one face. The squares of its coordinates are the
         # weights of these three faces; they sum to 1.
+        normal = normal @ self.axes
         face = 2 * np.arange(3) + (normal > 0)
         return np.einsum("nf,nfc->nc", normal**2, self._irradiance[face])
 
@@ -146,8 +151,10 @@ class Room:
         high = self.high[:, None].astype(np.float32)
         size = high - low
         # An eye outside the room sees it from just inside its walls.
-        eye = np.clip(eye[:, None], low + 0.05, high - 0.05).astype(np.float32)
+        eye = (eye @ self.axes)[:, None]
+        eye = np.clip(eye, low + 0.05, high - 0.05).astype(np.float32)
         # No coordinate of a ray may be zero: the distances to the planes are divided by them.
+        rays = rays @ self.axes
         rays = np.ascontiguousarray(np.where(np.abs(rays) < 1e-9, np.float32(1e-9), rays).T)
 
         # From inside a box, a ray leaves through the nearest of the three planes ahead of it.
@@ -176,7 +183,7 @@ class Room:
         return key[:, None] * direct + around[:, None] * self._ambient
 
 
-def random_room(seed: int | np.random.Generator) -> Room:
+def random_room(seed: int | np.random.Generator, turn: float = 0.0) -> Room:
     """Draw a room, independent of the object."""
     rng = np.random.default_rng(seed)
     sides = rng.uniform(11.5, 17, 4)
@@ -207,6 +214,7 @@ def random_room(seed: int | np.random.Generator) -> Room:
             noise=rng.uniform(0.01, 0.035),
             vignetting=rng.uniform(0.03, 0.25),
         ),
+        turn=turn,
     )
 
 

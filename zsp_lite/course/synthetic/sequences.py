@@ -135,7 +135,10 @@ def render_sequence(
     aspect = np.array(_ASPECTS[rng.integers(len(_ASPECTS))])
     height, width = np.rint(aspect / aspect.min() * image_size).astype(int).tolist()
     cameras = handheld_sweep(mesh.vertices, rng, frames, (height, width), heights)
-    scene = MeshScene(mesh, random_room(rng), rng)
+    # The lines of floor and walls must not tell the heading of the object: the room is turned by an
+    # angle from a random stream of its own.
+    turn = rng.spawn(1)[0].uniform(0, TAU)
+    scene = MeshScene(mesh, random_room(rng, turn), rng)
     # The frame of the first camera is the world, so that the object's pose does not depend on the
     # category.
     first = cameras[0].matrix
