@@ -259,9 +259,7 @@ class PairProblem(Problem):
     def __init__(self, pair: Pair, store: FrameStore, features: Iterable[str] = ("backbone",)):
         self.pair = pair
         self.store = store
-        frames = [(pair.reference_sequence, pair.reference_frame)]
-        frames += [(pair.target_sequence, number) for number in pair.target_frames]
-        crops = [store.crop(pair.category, *frame, features) for frame in frames]
+        crops = [store.crop(pair.category, *frame, features) for frame in pair.frames]
         super().__init__(pair.seed, crops, store.extractors, store.timings)
 
     def hypotheses(self) -> PairHypotheses:

@@ -1,11 +1,15 @@
 """The commands `challenge make` and `challenge rank`."""
 
+import signal
 import sys
 
 import click
 
 from zsp_lite.cli.common import COUNT, NAMES, PATH, examples
 from zsp_lite.errors import InputError
+
+# Signals that end a process; SIGHUP is none of Windows.
+_ENDING = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}
 
 
 @click.group(
@@ -48,17 +52,22 @@ def make(secret, categories, sequences, frames, pairs, out) -> None:
 @click.option("--minutes", type=COUNT, default=10, help="Time limit of a hand-in.")
 @click.option("--pair-seconds", type=COUNT, default=20, help="Time limit of it for a pair.")
 @click.option("--memory", type=COUNT, default=4, help="Limit of its memory in GB (Linux).")
-def rank(handins, keep, out, workers, minutes, pair_seconds, memory) -> None:
+@click.option("--unprotected", is_flag=True, help="Also where they can read and write your files.")
+def rank(handins, keep, out, workers, minutes, pair_seconds, memory, unprotected) -> None:
     """Rank the teams that handed in by Acc30.
 
-    TEAM.py of the folder HANDINS is run, TEAM.csv is read. Each file runs alone, without labels or
-    network where the system allows (Linux). OUT gets ranking.html for the projector, and
+    TEAM.py of the folder HANDINS is run, TEAM.csv is read. Each file runs alone, without labels,
+    your home folder or a network, and writes to a folder of its own. Where this is not possible (it
+    needs Linux), --unprotected runs them all the same. OUT gets ranking.html for the projector, and
     ranking.csv.
     """
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.course.challenge import rank as ranking
 
-    found = ranking.rank(handins, keep, out, workers, minutes, pair_seconds, memory)
+    for number in _ENDING:
+        if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup
+            signal.signal(number, _interrupt)
+    found = ranking.rank(handins, keep, out, workers, minutes, pair_seconds, memory, unprotected)
     columns = ("team", "place", "Acc30 (%)", "95 % interval", "answered")
     rows = []
     for place, one in found.places:
@@ -70,5 +79,12 @@ def rank(handins, keep, out, workers, minutes, pair_seconds, memory) -> None:
         if one.note:
             print(f"{one.team}: {one.note}")
     if not found.alone:
-        print("Hand-ins could read labels and each other")
+        print("Hand-ins could read labels, each other and your files")
     print(f"Written: {out / 'ranking.html'}, ranking.csv")
+
+
+def _interrupt(*_) -> None:
+    """Interrupt the command, and ignore further signals while it cleans up."""
+    for number in _ENDING:
+        signal.signal(number, signal.SIG_IGN)
+    raise KeyboardInterrupt

@@ -66,6 +66,12 @@ class Pair:
         reference = f"{self.category}/{self.reference_sequence}:{self.reference_frame}"
         return f"{reference}/{self.target_sequence}:{targets}"
 
+    @property
+    def frames(self) -> list[tuple[str, int]]:
+        """Sequence and number of each frame, the reference's first."""
+        targets = [(self.target_sequence, number) for number in self.target_frames]
+        return [(self.reference_sequence, self.reference_frame), *targets]
+
     @classmethod
     def from_key(cls, key: str) -> "Pair":
         """Return the pair with a `key`, and the repeat 0."""
@@ -194,12 +200,8 @@ class Co3D:
 
     def load_pair(self, pair: Pair) -> tuple[Frame, list[Frame]]:
         """Load the reference frame and the target frames of an evaluation pair."""
-        reference = self.load(
-            self.frame(pair.category, pair.reference_sequence, pair.reference_frame)
-        )
-        targets = [
-            self.load(self.frame(pair.category, pair.target_sequence, n))
-            for n in pair.target_frames
+        reference, *targets = [
+            self.load(self.frame(pair.category, *frame)) for frame in pair.frames
         ]
         return reference, targets
 

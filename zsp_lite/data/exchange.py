@@ -45,9 +45,7 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
     """Write pairs, with a line for each frame."""
     lines = []
     for pair in pairs:
-        views = [("reference", pair.reference_sequence, pair.reference_frame)]
-        views += [("target", pair.target_sequence, frame) for frame in pair.target_frames]
-        for role, sequence, frame in views:
+        for index, (sequence, frame) in enumerate(pair.frames):
             annotation = dataset.frame(pair.category, sequence, frame)
             depth = annotation.depth
             mask = annotation.mask
@@ -57,7 +55,7 @@ def write_questions(path: str | Path, dataset: Co3D, pairs: Sequence[Pair]) -> P
             lines.append(
                 {
                     "pair": pair.key,
-                    "role": role,
+                    "role": "target" if index else "reference",
                     "category": pair.category,
                     "sequence": sequence,
                     "frame": frame,

@@ -227,8 +227,7 @@ def write_published_pairs(path: str | Path, pairs: Sequence[Pair], dataset: Co3D
     position = {(key.sequence_name, key.frame_number): i for i, key in enumerate(keys)}
     items = []
     for pair in pairs:
-        reference = position[pair.reference_sequence, pair.reference_frame]
-        targets = [position[pair.target_sequence, number] for number in pair.target_frames]
+        reference, *targets = [position[frame] for frame in pair.frames]
         items.append(
             _PublishedPair(
                 pair.category, pair.reference_sequence, reference, pair.target_sequence, targets

@@ -1,17 +1,18 @@
 """Rank hand-ins of a challenge: each runs in a process of its own, which sees no labels."""
 
 import os
-import shlex
 import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
+from threading import Event
 
 import numpy as np
 import pandas as pd
@@ -21,14 +22,14 @@ from tqdm import tqdm
 
 from zsp_lite.benchmark.statistics import figures_of, object_draws, paired_difference
 from zsp_lite.course.challenge.answer import read_questions
-from zsp_lite.course.challenge.make import QUESTIONS_FILE, copy_without_labels
+from zsp_lite.course.challenge.make import QUESTIONS_FILE, copy_for_pairs
 from zsp_lite.course.synthetic.export import SETTINGS_FILE
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.exchange import StoredPose, read_stored_poses
 from zsp_lite.data.pairs import true_poses
 from zsp_lite.errors import InputError
 from zsp_lite.io.download import cache_folder
-from zsp_lite.io.files import write_atomic
+from zsp_lite.io.files import REPOSITORY, write_atomic
 from zsp_lite.metrics import rotation_error
 
 _SIGNIFICANT = 0.05  # a difference with a smaller p value is not left to chance
@@ -36,8 +37,9 @@ _LONGEST_NOTE = 200  # characters
 _LAST_PRINTED = 10_000  # bytes that are read of what a hand-in printed
 _POSES_FILE = "poses.csv"
 _PAGE = Path(__file__).with_name("ranking.html")
+_APART = Path(__file__).with_name("apart.sh")
 # Variables of the environment that a hand-in gets; the folder that it finds weights in is added.
-_PASSED = ("PATH", "PYTHONPATH", "SYSTEMROOT", "LANG", "TMPDIR")
+_PASSED = ("PATH", "PYTHONPATH", "SYSTEMROOT", "LANG")
 
 
 @dataclass(frozen=True)
@@ -71,11 +73,12 @@ def rank(
     minutes: float = 10,
     pair_seconds: int = 20,
     memory: float = 4,
+    unprotected: bool = False,
 ) -> Ranking:
     """Run and rank the hand-ins of a folder, and write OUT/ranking.csv and OUT/ranking.html.
 
-    On Linux a hand-in finds neither labels nor other hand-ins nor a network, where users may make
-    namespaces.
+    On Linux, where users may make namespaces, a hand-in finds neither labels nor other hand-ins
+    nor the home folder nor a network, and writes to a folder of its own alone.
 
     Args:
         handins: Folder with a file TEAM.py or TEAM.csv of each team.
@@ -85,9 +88,11 @@ def rank(
         minutes: Time limit of a hand-in.
         pair_seconds: Time limit of a hand-in for a pair.
         memory: Limit of its memory in gigabytes, on Linux.
+        unprotected: Run hand-ins also where they can read and write what you can.
 
     Raises:
-        InputError: `keep` holds no challenge, or `handins` no hand-in, or two of one team.
+        InputError: `keep` holds no challenge, or `handins` no hand-in, or two of one team; or this
+            system cannot keep hand-ins apart.
     """
     handins = Path(handins)
     keep = Path(keep)
@@ -105,36 +110,47 @@ def rank(
             f"{handins} has {len(files)} hand-ins of {len(teams)} teams, expected one of each, "
             "TEAM.py or TEAM.csv"
         )
-    hidden = {keep.resolve(), handins.resolve()}
-    hidden = [folder for folder in hidden if not hidden.intersection(folder.parents)]
+    hidden = ["hide", keep.resolve(), "hide", handins.resolve()]
     limits = [str(pair_seconds), str(int(memory * 1e9))]
     with TemporaryDirectory(prefix="challenge-") as runs:
-        probe = Path(runs, "probe")
+        probe = Path(runs).resolve() / "probe"
         probe.mkdir()
-        alone = _works([*_hiding(hidden, probe), sys.executable, "-c", "import zsp_lite"])
+        apart = {path.suffix for path in files} == {".csv"} or _works(
+            [*_apart(probe, hidden), sys.executable, "-c", "import zsp_lite"]
+        )
+        if not (apart or unprotected):
+            raise InputError(
+                "hand-ins cannot be kept from labels, your files and a network here, expected "
+                "Linux with namespaces for users; --unprotected runs them all the same"
+            )
 
         def answers_of(team: str) -> tuple[dict[str, StoredPose], str]:
             source = teams[team]
             if source.suffix == ".csv":
                 return _read(source)
             # Each has a copy of the data, as it may write there.
-            folder = Path(runs, "team", team)
-            copy_without_labels(data, folder / "data")
+            folder = probe.parent / "team" / team
+            copy_for_pairs(data, pairs, folder / "data")
             shutil.copy(keep / QUESTIONS_FILE, folder)
-            before = _hiding(hidden, folder) if alone else []
-            note = _run_alone(before, source, folder, minutes, limits)
+            before = _apart(folder, hidden) if apart else []
+            note = _run_alone(before, source, folder, minutes, limits, ended)
             poses, problem = _read(folder / _POSES_FILE)
             return poses, note or problem
 
-        with ThreadPoolExecutor(workers) as pool:
+        ended = Event()
+        pool = ThreadPoolExecutor(workers)
+        try:
             done = tqdm(pool.map(answers_of, teams), "hand-ins", len(teams), disable=None)
             answers = dict(zip(teams, done, strict=True))
+        finally:
+            ended.set()
+            pool.shutdown(cancel_futures=True)
 
     ranking = Ranking(
         _places(data, pairs, answers),
         len(pairs),
         sorted({pair.category for pair in pairs}),
-        alone or {path.suffix for path in files} == {".csv"},
+        apart,
     )
     _write(ranking, out)
     return ranking
@@ -151,10 +167,15 @@ def _read(path: Path) -> tuple[dict[str, StoredPose], str]:
 
 
 def _run_alone(
-    before: Sequence[str], source: Path, folder: Path, minutes: float, limits: Sequence[str]
+    before: Sequence[str | Path],
+    source: Path,
+    folder: Path,
+    minutes: float,
+    limits: Sequence[str],
+    ended: Event,
 ) -> str:
     """Run a hand-in in a folder that has the data; return the last line that it printed, or why it
-    ended."""
+    ended. The event ends it at once."""
     copy = Path(shutil.copy(source, folder))
     words = [copy.name, "data", QUESTIONS_FILE, _POSES_FILE, *limits]
     # Without the folder in the search path, where `torch.py` of a team `torch` would be found.
@@ -173,13 +194,14 @@ def _run_alone(
             stderr=subprocess.STDOUT,
             start_new_session=True,
         )
-        try:
-            code = process.wait(timeout=60 * minutes)
-            problem = [f"ended abruptly, exit status {code}"] if code else []
-        except subprocess.TimeoutExpired:
+        end = time.monotonic() + 60 * minutes
+        while process.poll() is None and time.monotonic() < end and not ended.wait(0.1):
+            pass
+        code = process.returncode
+        problem = [f"ended abruptly, exit status {code}"] if code else []
+        if code is None:
             problem = [f"ended after {minutes:g} minutes"]
-        finally:
-            _end(process)
+        _end(process)
         size = printed.seek(0, os.SEEK_END)
         printed.seek(max(0, size - _LAST_PRINTED))
         text = printed.read().decode(errors="replace")
@@ -190,23 +212,20 @@ def _run_alone(
     return "; ".join(problem + last)[:_LONGEST_NOTE]
 
 
-def _hiding(folders: Sequence[Path], own: Path) -> list[str]:
-    """Return the words before a command that hide folders, what lies beside its own folder, and the
-    network from it.
+def _apart(own: Path, last: Sequence[str | Path]) -> list[str | Path]:
+    """Return the words before a command that let it find little but its own folder, and write
+    there alone (see apart.sh, whose last steps are given).
 
     `own` takes the place of the folder of all runs.
     """
-    runs = shlex.quote(str(own.parent))
-    steps = [f"mount -t tmpfs none {shlex.quote(str(folder))}" for folder in folders]
-    steps += [f"mount --bind {shlex.quote(str(own))} {runs}", f"cd {runs}"]
-    # In a second namespace of users the command has no right to unmount what the first mounted.
-    steps.append('exec unshare --map-root-user --mount "$@"')
-    # A namespace of processes ends all of them with the first.
-    first = ["unshare", "--map-root-user", "--mount", "--net", "--pid", "--fork", "--kill-child"]
-    return [*first, "--mount-proc", "sh", "-c", " && ".join(steps), "sh"]
+    steps = ["hide", Path.home().resolve(), "hide", gettempdir()]
+    for needed in (sys.prefix, sys.base_prefix, REPOSITORY / "zsp_lite", cache_folder()):
+        # A path with links is shown, too: programs are found by it.
+        steps += ["show", os.path.realpath(needed), "show", needed]
+    return ["sh", _APART, own, *steps, *last, "--"]
 
 
-def _works(command: Sequence[str]) -> bool:
+def _works(command: Sequence[str | Path]) -> bool:
     """Return whether this system runs a command without an error."""
     with suppress(FileNotFoundError):
         return subprocess.run(command, capture_output=True).returncode == 0
