@@ -25,6 +25,7 @@ from zsp_lite.course.labelling.session import Labelling
 from zsp_lite.data.frames import resize_frame
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import NoPoseError
+from zsp_lite.importers.convert import scale_frame
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.category_sheet import objects_figure
 
@@ -40,6 +41,17 @@ def run(tmp_path_factory):
     """The folder of a run, and the alignment that it returned."""
     out = tmp_path_factory.mktemp("align")
     return out, align_lumps(targets=3, out=out)
+
+
+def test_sources_in_place_of_a_data_set_are_aligned_in_their_own_lengths():
+    dataset = Co3D(small_folder())
+    frames = [scale_frame(dataset.load(one), 1000.0) for one in dataset.frames("lump", B)]
+    sources = (dataset.root / "lump" / A, iter(frames))
+    found = align_category(iter(sources), backbone=BACKBONE, targets=3)
+    pose = found.between(A, "2")
+    assert rotation_error(pose.R, turns(dataset.root)[A, B]) < 15
+    assert_allclose(pose.scale, 1000, rtol=0.1)
+    refused("two objects are named 100_a", align_category, sources[:1] * 2)
 
 
 def turns(root):

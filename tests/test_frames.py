@@ -146,8 +146,9 @@ def test_the_pose_of_arrays_is_that_of_the_camera_in_the_world():
     pose = np.eye(4)
     pose[:3, :3] = random_camera(default_rng(0)).R
     pose[:3, 3] = 1, 2, 3
-    camera = Frame.from_arrays(**arrays(pose=pose)).camera
-    assert_allclose(camera.to_world(np.eye(3)), pose[:3, :3].T + (1, 2, 3))
+    for matrix in (pose, pose[:3]):
+        camera = Frame.from_arrays(**arrays(pose=matrix)).camera
+        assert_allclose(camera.to_world(np.eye(3)), pose[:3, :3].T + (1, 2, 3))
 
 
 def test_smaller_depth_of_arrays_is_enlarged_and_zero_where_it_is_unknown():
@@ -160,6 +161,7 @@ def test_smaller_depth_of_arrays_is_enlarged_and_zero_where_it_is_unknown():
     "rgb",
     [
         np.full(SIZE, 128, np.uint8),
+        np.full((*SIZE, 1), 128, np.uint8),
         np.full((*SIZE, 4), 128, np.uint8),
         np.full((*SIZE, 3), 128 / 255, np.float32),
     ],
@@ -173,6 +175,7 @@ def test_a_mask_holds_booleans_zeros_and_ones_or_up_to_255():
     inside[5:9, 3:20] = True
     for mask in (
         inside,
+        inside[..., None],
         inside.astype(np.int64),
         inside.astype(np.float32),
         255 * inside.astype(np.uint8),
@@ -200,6 +203,7 @@ def test_a_mask_holds_booleans_zeros_and_ones_or_up_to_255():
         ({"K": (-40, 41, 16, 12)}, "focal_length is -40.0"),
         ({"mask": np.full(SIZE, 7)}, "mask has 7 at most, expected booleans, 0 and 1, or 0 to 255"),
         ({"mask": np.ones((12, 16))}, "mask has shape"),
+        ({"mask": np.ones((0, 0))}, r"mask has shape \(0, 0\), expected \(h, w\)"),
         ({"pose": np.diag([2.0, 2, 2, 1])}, "camera-to-world pose"),
     ],
 )

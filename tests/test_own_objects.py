@@ -359,6 +359,10 @@ def test_a_captures_target_views_are_those_that_are_not_black_or_empty(pictures,
     assert [vote.name.split()[1] for vote in found.votes[1:]] == ["0", "1", "4", "5"]
 
 
+ONE = around(AT_HOME, 1)[0]
+LOST = Frame.from_arrays(
+    ONE.rgb, ONE.depth, ONE.camera.K, pose=np.full((3, 4), np.nan), name="lost"
+)
 SEVERAL = {"targets": 3, "references": 2, "backbone": CoordinateBackbone()}
 
 
@@ -403,10 +407,13 @@ def test_frames_in_memory_in_other_units_and_by_threads_give_the_same(several, e
     first, second = [
         [ellipsoids.load(one) for one in ellipsoids.frames("ellipsoid", name)] for name in "ab"
     ]
-    larger = [scale_frame(frame, 1000.0) for frame in second]
-    again = estimate_pose(first, larger, **SEVERAL, workers=2)
+    larger = (scale_frame(frame, 1000.0) for frame in second)
+    again = estimate_pose(np.array([LOST, *first]), larger, **SEVERAL, workers=2)
     assert (again.errors, again.masks) == ({}, ("given", "given"))
-    assert len(again.estimate.flags) == 1
+    assert again.votes[0].name == "frame 1 of lost"
+    _, lost, lengths = again.estimate.flags
+    assert lost.endswith("frames left out: 1: frame 0: the camera's pose is not finite")
+    assert "the object is 2.97e+03 m from the camera, expected 0.05 to 20 m" in lengths
     assert rotation_error(again.world_sim3.R, several.world_sim3.R) < 3
     assert_allclose(again.world_sim3.scale, 1000 * several.world_sim3.scale, rtol=0.05)
 
@@ -429,20 +436,24 @@ def test_one_reference_frame_is_the_papers_setting(ellipsoids, choice, frame):
     assert found.votes == ()
 
 
-ONE = around(AT_HOME, 1)[0]
-
-
 @pytest.mark.parametrize(
     "frames, message",
     [
-        ([], r"frames are \[\], expected a sequence of zsp_lite.Frame"),
+        ([], r"frames are \[\], expected one zsp_lite.Frame or several"),
         ([1.0], r"frames are \[1.0\], expected"),
+        (ONE.rgb, "frames are array.* expected"),
+        ([LOST, LOST], "no frame can be used: frame 0: the camera's pose is not finite"),
         ([ONE, ONE], "all 2 frames have one camera pose, expected their poses in one world"),
-        ([replace(ONE, depth=None)], "frame 0 0000 has no depth map, expected one"),
+        ([replace(ONE, depth=None)], "no frame can be used: frame 0: no depth map"),
     ],
 )
 def test_frames_that_are_no_views_of_one_object_are_refused(frames, message):
     refused(message, open_source, frames)
+
+
+def test_helpers_in_memory_may_have_equal_names():
+    black = replace(ONE, rgb=0 * ONE.rgb)
+    refused("black image", estimate_pose, black, ONE, helpers=iter([ONE]))
 
 
 def test_a_target_that_is_seen_from_one_side_is_flagged(pictures, tmp_path):

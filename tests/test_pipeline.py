@@ -348,7 +348,8 @@ def test_unusable_frames_are_refused_in_one_line(method, reference, targets):
     no_known = replace(reference, depth=np.zeros_like(reference.depth))
     for frame, word in ((empty, "mask"), (no_depth, "depth"), (no_known, "depth")):
         assert "reference" in refused(word, method.estimate, frame, targets)
-    refused("no target", method.estimate, reference, [])
+    for none in ([], reference.rgb):
+        refused("expected one zsp_lite.Frame or several", method.estimate, reference, none)
     refused(
         "mask",
         lambda: replace(method, foreground="mask").estimate(replace(reference, mask=None), targets),

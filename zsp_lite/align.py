@@ -3,7 +3,7 @@
 import json
 import logging
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
@@ -21,10 +21,12 @@ from zsp_lite.benchmark.problem import FrameStore, PairProblem
 from zsp_lite.benchmark.runs import open_run, read_lines, run_settings
 from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
 from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
 from zsp_lite.data.published import write_all
 from zsp_lite.errors import InputError, NoPoseError
-from zsp_lite.io.files import plain_name, read_json, write_atomic
+from zsp_lite.importers.sources import SourceLike, open_source
+from zsp_lite.io.files import digest, plain_name, read_json, write_atomic
 from zsp_lite.metrics import rotation_error
 
 logger = logging.getLogger(__name__)
@@ -48,17 +50,53 @@ class _Written(msgspec.Struct):
     objects: dict[str, Any]
 
 
+class SourceSet(Co3D):
+    """Sources as the sequences of a data set, each in its own world and lengths.
+
+    They are named by their folders or files, frames in memory by their position, from "1" on.
+    """
+
+    def __init__(self, sources: Iterable[SourceLike]):
+        """Open the sources, find the masks that they lack, and log doubts about them."""
+        self._by_name = {}
+        content = []  # for the name of the set, which tells runs apart
+        for position, given in enumerate(sources if np.iterable(sources) else [sources], 1):
+            source = open_source(given).segmented()
+            name = str(position) if source.format == "frames" else source.name
+            if name in self._by_name:
+                raise InputError(f"two objects are named {name}, expected different names")
+            self._by_name[name] = source
+            first = source.read_frame(0)
+            content.append(first.depth.tobytes())
+            for flag in source.flags([first]):
+                logger.warning("%s: %s", name, flag)
+        self.root = Path(f"sources {digest(*content)}")
+
+    def frame_numbers(self, category: str) -> dict[str, list[int]]:
+        """List the numbers of the frames of every source."""
+        return {name: list(source.numbers) for name, source in self._by_name.items()}
+
+    def frame(self, category: str, sequence: str, frame_number: int) -> Frame:
+        """Load the frame of a source with a number, with its mask."""
+        source = self._by_name[sequence]
+        return source.read_frame(source.numbers.index(frame_number))
+
+    def load(self, annotation: Frame) -> Frame:
+        """Return a frame, which `frame` has loaded, as it is."""
+        return annotation
+
+
 @dataclass
 class HypothesisFinder:
     """Finds the hypotheses of pairs; frames and features are kept from pair to pair."""
 
-    root: str  # the data folder
+    dataset: Co3D
     backbone: BackboneLike
 
     def open(self, threads: int) -> Evaluator:
         """Load the backbone."""
         extractors = {"backbone": as_backbone(self.backbone)}
-        self.store = FrameStore(Co3D(self.root), extractors, threads)
+        self.store = FrameStore(self.dataset, extractors, threads)
         return self.line
 
     def line(self, pair: Pair, names: Sequence[str]) -> dict[str, Any]:
@@ -66,16 +104,18 @@ class HypothesisFinder:
         line: dict[str, Any] = {"pair": pair.key}
         with suppress(NoPoseError):
             hypotheses = PairProblem(pair, self.store).hypotheses()
-            line["centre"] = hypotheses.centre.tolist()
-            line["matrices"] = [sim3.matrix.tolist() for sim3 in hypotheses.sim3s]
-            line["probabilities"] = hypotheses.probabilities.tolist()
-            line["span"] = hypotheses.span
+            line |= {
+                "centre": hypotheses.centre.tolist(),
+                "matrices": [sim3.matrix.tolist() for sim3 in hypotheses.sim3s],
+                "probabilities": hypotheses.probabilities.tolist(),
+                "span": hypotheses.span,
+            }
         return line
 
 
 def align_category(
-    dataset: Co3D,
-    category: str,
+    dataset: Co3D | Iterable[SourceLike],
+    category: str = "objects",
     backbone: BackboneLike = "zsp-tiny",
     sequences: Sequence[str] | None = None,
     pairs: int | None = None,
@@ -89,8 +129,10 @@ def align_category(
     are not solved again.
 
     Args:
-        dataset: Data set.
-        category: Name of the category.
+        dataset: Data set; or sources of the objects (see `open_source`), such as paths of scans, or
+            lists of frames: poses are in their worlds and lengths. Objects are named by their
+            folders or files, frames in memory "1", "2", and so on.
+        category: Name of the category; of sources, any name.
         backbone: Backbone, or what `load_backbone` takes.
         sequences: Names of the sequences, one per object; None for all of the category.
         pairs: Objects that each object is the reference of; None for all others, or from twelve
@@ -105,6 +147,11 @@ def align_category(
             OUT has another run.
         FatalError: The backbone is broken, or a frame cannot be read.
     """
+    if isinstance(dataset, Co3D):
+        # Workers read the annotations themselves, because these are large.
+        opened = Co3D(dataset.root.resolve())
+    else:
+        opened = dataset = SourceSet(dataset)
     chosen = {pair.key: pair for pair in object_pairs(dataset, category, sequences, pairs, targets)}
     loaded = as_backbone(backbone)
     with (
@@ -123,19 +170,18 @@ def align_category(
         with open_run(folder, settings):
             # Workers load a named backbone themselves; an object travels to them.
             sent = backbone if workers.executor else loaded
-            finder = HypothesisFinder(str(dataset.root.resolve()), sent)
+            finder = HypothesisFinder(opened, sent)
             work = dict.fromkeys(chosen.values(), ["alignment"])
             evaluate_pairs(folder, finder.open, work, workers, _Line)
         stored = read_hypotheses(folder)
     hypotheses = [stored[key] for key in chosen if key in stored]
     if not hypotheses:
         raise InputError(f"category {category}: none of {len(chosen)} pairs determines a pose")
-    left_out = {pair.reference_sequence for pair in chosen.values()}
-    for pair in hypotheses:
-        left_out -= {pair.reference, pair.target}
-    for name in sorted(left_out):
+    found = synchronise(hypotheses)
+    names = {pair.reference_sequence for pair in chosen.values()}
+    for name in sorted(names - found.objects.keys()):
         logger.warning("%s/%s is left out: none of its pairs determines a pose", category, name)
-    return synchronise(hypotheses)
+    return found
 
 
 def alignment_errors(

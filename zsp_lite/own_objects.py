@@ -9,7 +9,7 @@ estimates those of the others, `_agreed_pose` finds the pose that most agree on 
 votes, and `_answer` makes an estimate of it; `_pair_result` collects all, `write_pair` writes it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from dataclasses import replace
@@ -60,7 +60,7 @@ def estimate_pose(
     out: str | Path | None = None,
     upright: bool = True,
     references: int | None = None,
-    helpers: Sequence[SourceLike] = (),
+    helpers: Iterable[SourceLike] = (),
     workers: int = 1,
 ) -> PairResult:
     """Estimate the pose between two objects of one category, given as paths or frames; no label is
@@ -97,6 +97,7 @@ def estimate_pose(
     Raises:
         InputError: An input or an option is missing or wrong, or the pose cannot be estimated.
     """
+    helpers = list(helpers)
     check_choice("solver", solver, SOLVERS)
     solvers = SOLVERS[solver]
     n_targets = _TARGETS if targets is None else targets
@@ -164,7 +165,9 @@ def _open_objects(
     if intrinsics is not None:
         given["intrinsics"] = (intrinsics,)
     sources = open_pair(reference, target, given, helpers)
-    if helpers and len({source.path.resolve() for source in sources}) < len(sources):
+    # The names of frames in memory may be equal.
+    paths = [source.path.resolve() for source in sources if source.format != "frames"]
+    if helpers and len(set(paths)) < len(paths):
         named = ", ".join(str(source.path) for source in sources)
         raise InputError(f"{named}: expected different objects")
     return sources

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from zsp_lite.alignment import MOST_TRIALS, SCALE_RANGE, Sim3, ransac
 from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch, ViewSelector
-from zsp_lite.data.frames import Frame, frame_defect
+from zsp_lite.data.frames import Frame, frame_defect, list_frames
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer, check_number
 from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed
 from zsp_lite.features import FeatureExtractor
@@ -104,7 +104,7 @@ class ZeroShotPose:
             )
         check_number("threshold", self.threshold, above=0)
 
-    def estimate(self, reference: Frame, targets: Sequence[Frame]) -> PoseEstimate:
+    def estimate(self, reference: Frame, targets: Iterable[Frame]) -> PoseEstimate:
         """Estimate the pose of the reference object in the best of N target views.
 
         The commands and the benchmark, which share views between solvers, pairs or rows, enter at
@@ -117,7 +117,7 @@ class ZeroShotPose:
 
         Args:
             reference: Frame of the reference object.
-            targets: Frames of another object of its category, in one world.
+            targets: Frames of another object of its category, in one world: any iterable, or one.
 
         Raises:
             InputError: There are no targets, no target is usable, or the reference has an empty
@@ -125,7 +125,8 @@ class ZeroShotPose:
         """
         timings: dict[str, float] = {}
         with timed(timings, "features"):
-            first, *others = self.views([reference, *targets])
+            frames = list_frames([reference, *list_frames(targets)])
+            first, *others = self.views(frames)
         found = self.estimate_from_views(first, others)
         return replace(found, timings=timings | found.timings)
 

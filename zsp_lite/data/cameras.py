@@ -212,7 +212,10 @@ def split_intrinsics(name: str, values: Values) -> Float[np.ndarray, "4"]:
 
 
 def camera_from_pose(pose: Values, intrinsics: Values, size: tuple[int, int], where: str) -> Camera:
-    """Create a camera from intrinsics and a camera-to-world pose; errors begin with `where`."""
+    """Create a camera from intrinsics and a camera-to-world pose (4, 4) or (3, 4); errors begin
+    with `where`."""
+    if np.shape(pose) == (3, 4):
+        pose = np.vstack([pose, (0, 0, 0, 1)])
     pose = rigid_matrix(f"{where}: camera-to-world pose", pose)
     rotation = pose[:3, :3]
     values = split_intrinsics(f"{where}: intrinsics", intrinsics)

@@ -1,14 +1,15 @@
 """RGB-D frames with object masks: cropping, resizing, and the image files of data folders."""
 
 import io
-from collections.abc import Callable
+import reprlib
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Real, UInt8
+from jaxtyping import Bool, Float32, Float64, Real, UInt8
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
@@ -40,6 +41,7 @@ class Frame:
     mask: Float32[np.ndarray, "h w"] | None
     camera: Camera
     name: str = ""  # for error messages
+    defect: str = ""  # why the frame cannot be used, such as "the camera's pose is not finite"
 
     def __post_init__(self):
         label = f"frame {self.name}".rstrip()
@@ -84,17 +86,19 @@ class Frame:
         """Make a frame of arrays as a camera gives them, in any unit of length.
 
         Args:
-            rgb: Colours (H, W, 3), with or without alpha, or grey (H, W): uint8, or floats from 0
-                to 1.
+            rgb: Colours (H, W, 3), with or without alpha, or grey (H, W) or (H, W, 1): uint8, or
+                floats from 0 to 1.
             depth: Numbers (h, w) or (h, w, 1) along +z, registered to the colours, of their size,
                 or smaller and of the same aspect ratio; unknown where NaN, infinite, zero or
                 negative.
             K: Intrinsics of the colours, (3, 3) or (fx, fy, cx, cy), pixels; the first pixel's
                 centre is (0, 0).
-            mask: The object's pixels (H, W): booleans, 0 and 1, or 0 to 255. By default,
-                `estimate_pose` finds the object.
-            pose: Rigid transform (4, 4) from camera to world in OpenCV's axes (x right, y down, z
-                forward), in units of the world. By default, the world is the camera's frame.
+            mask: The object's pixels (H, W) or (H, W, 1): booleans, 0 and 1, or 0 to 255. By
+                default, `estimate_pose` finds the object.
+            pose: Rigid transform (4, 4) or (3, 4) from camera to world in OpenCV's axes (x right, y
+                down, z forward), in units of the world. By default, the world is the camera's
+                frame. A frame whose pose is NaN, as where a tracker is lost, has a `defect`:
+                estimates leave it out.
             depth_unit: World units per unit of `depth`.
             name: Name for messages and reports.
 
@@ -106,30 +110,33 @@ class Frame:
         # Colours (H, W, 3), uint8. What is still of another type below is refused by `__init__`.
         image = np.asarray(rgb)
         if image.ndim == 2:
-            image = np.repeat(image[..., None], 3, axis=2)
-        if image.ndim != 3 or image.shape[2] not in (3, 4):
+            image = image[..., None]
+        if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
             raise InputError(
                 f"{label} rgb has shape {image.shape}, expected (H, W), (H, W, 3) or (H, W, 4)"
             )
-        image = image[..., :3]
+        image = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[..., :3]
         size = image.shape[:2]
-        # From pixel centres at integers to ones at half-integers.
+
+        # The camera, from pixel centres at integers to ones at half-integers.
         intrinsics = split_intrinsics(f"{label} K", K) + (0, 0, 0.5, 0.5)
-        camera = camera_from_pose(np.eye(4) if pose is None else pose, intrinsics, size, label)
+        pose = real_array(f"{label} pose", np.eye(4) if pose is None else pose)
+        defect = ""
+        if not np.isfinite(pose).all():
+            defect = "the camera's pose is not finite"
+            pose = np.eye(4)
+        camera = camera_from_pose(pose, intrinsics, size, label)
         if image.dtype.kind == "f" and 0 <= image.min() and image.max() <= 1:
             image = np.rint(255 * image).astype(np.uint8)
 
         # Depth in units of the world, 0 where unknown.
         check_number("depth_unit", depth_unit, above=0)
-        depth = np.asarray(depth)
-        if depth.ndim == 3 and depth.shape[2] == 1:
-            depth = depth[..., 0]
-        depth = real_array(f"{label} depth", depth, (None, None)) * depth_unit
+        depth = _read_map(f"{label} depth", depth) * depth_unit
         depth = zero_unknown(depth).astype(np.float32)
 
         # Mask from 0 to 1.
         if mask is not None:
-            mask = real_array(f"{label} mask", mask).astype(np.float32)
+            mask = _read_map(f"{label} mask", mask).astype(np.float32)
             largest = mask.max()
             # Such a mask has labels or another scale: as 0 to 255, no pixel would be on the object.
             if 1 < largest <= ON_OBJECT * 255:
@@ -138,7 +145,7 @@ class Frame:
                 )
             if largest > 1:
                 mask = mask / np.float32(255)
-        return cls(image, enlarge_depth(depth, size), mask, camera, name)
+        return cls(image, enlarge_depth(depth, size), mask, camera, name, defect)
 
     @property
     def shows_object(self) -> bool:
@@ -154,6 +161,26 @@ class Frame:
         if self.mask is not None:
             mask = f"mask above {ON_OBJECT} at {(self.mask > ON_OBJECT).mean():.0%}"
         return f"Frame({self.name!r}, {height} x {width} pixels, {depth}, {mask})"
+
+
+def _read_map(name: str, values: np.ndarray) -> Float64[np.ndarray, "h w"]:
+    """Convert numbers (h, w) or (h, w, 1); InputError for another shape."""
+    values = real_array(name, values)
+    if values.shape[2:] == (1,):
+        values = values[..., 0]
+    if values.ndim != 2 or not values.size:
+        raise InputError(f"{name} has shape {values.shape}, expected (h, w) or (h, w, 1)")
+    return values
+
+
+def list_frames(frames: Frame | Iterable[Frame]) -> list[Frame]:
+    """List the frames of any iterable, or a single one; InputError if they are none."""
+    listed = list(frames) if np.iterable(frames) else [frames]
+    if not listed or not all(isinstance(frame, Frame) for frame in listed):
+        raise InputError(
+            f"frames are {reprlib.repr(frames)}, expected one zsp_lite.Frame or several"
+        )
+    return listed
 
 
 def enlarge_depth(
@@ -173,6 +200,8 @@ def enlarge_depth(
 
 def frame_defect(frame: Frame) -> str:
     """Say why a frame cannot be used, such as "black image"; "" for a usable frame."""
+    if frame.defect:
+        return frame.defect
     if frame.rgb.max() < _BLACK:
         return "black image"
     if not frame.shows_object:

@@ -148,7 +148,7 @@ def make_frame(
     if None in paths[:2]:
         raise InputError(f"{where}: {names[paths.index(None)]} is missing in {folder}")
 
-    # The pose as a matrix (4, 4).
+    # The pose as a matrix (4, 4) or (3, 4).
     pose = real_array(f"{where}: pose", pose)
     if pose.size not in (7, 12, 16):
         raise InputError(f"{where}: the pose has {pose.size} numbers, expected 7, 12 or 16")
@@ -159,8 +159,6 @@ def make_frame(
                 f"{where}: quaternion {pose[3:].tolist()} has the length {length:.3g}, expected 1"
             )
         pose = np.column_stack([Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]])
-    if pose.size == 12:
-        pose = np.vstack([pose.reshape(3, 4), (0, 0, 0, 1)])
     with np.errstate(invalid="ignore"):  # `camera_from_pose` refuses numbers that are not finite
         pose = pose.reshape(-1, 4) @ axes
 

@@ -1,8 +1,7 @@
 """Sources of frames of one object: sequences of data folders, captures, images, and frames."""
 
 import os
-import reprlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
+from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, list_frames
 from zsp_lite.data.pairs import spread
 from zsp_lite.errors import InputError
 from zsp_lite.importers import FORMATS, open_capture, recognise
@@ -152,7 +151,7 @@ class Source:
             reasons = list(dict.fromkeys(self.left_out))
             more = f"; and {len(reasons) - 3} more" if len(reasons) > 3 else ""
             flags.append(f"frames left out: {len(self.left_out)}: {'; '.join(reasons[:3])}{more}")
-        flags += depth_flags(frames, metric=self.format not in ("sequence", "frames"))
+        flags += depth_flags(frames, metric=self.format != "sequence")
         flags += self.doubts
         if self.mask == "given":
             flags += given_mask_flags(frames, self.missing.values())
@@ -207,18 +206,18 @@ class Source:
 
     def _spread(self, count: int, positions: Sequence[int]) -> list[int]:
         """Choose at most `count` positions, the first among them, by directions or by the order."""
-        if not self.cameras or count == 0:
-            return [positions[k] for k in spread(count, len(positions))]
-        cameras = [self.cameras[position] for position in positions]
-        return [positions[k] for k in spread_views(cameras, count)]
+        chosen = spread(count, len(positions))
+        if self.cameras and count:
+            chosen = spread_views([self.cameras[position] for position in positions], count)
+        return [positions[k] for k in chosen]
 
 
 # A path, frames, or what `open_source` returns.
-SourceLike = str | Path | Frame | Sequence[Frame] | Source
+SourceLike = str | Path | Frame | Iterable[Frame] | Source
 
 
 def open_source(
-    path: str | Path | Frame | Sequence[Frame],
+    path: SourceLike,
     intrinsics: Values | None = None,
     depth: str | Path | None = None,
     depth_unit: float | None = None,
@@ -237,7 +236,8 @@ def open_source(
         path: ROOT/CATEGORY/SEQUENCE of a data folder; the folder or zip of a capture (see
             `importers.recognise`); or a JPEG, PNG or WebP file NAME.EXT. Depth of an image is
             NAME_depth.png (16 bit), .npy, .tiff, ..., registered to its colours, and its mask, if
-            there is one, NAME_mask.png. Or frames, such as of `Frame.from_arrays`.
+            there is one, NAME_mask.png. Or frames, such as of `Frame.from_arrays`: one, or any
+            iterable of several. An open source is returned as it is.
         intrinsics: fx, fy, cx, cy of an image or of TUM RGB-D in pixels, or K as 3 x 3, with pixel
             centres at half-integers (0.5 more than OpenCV's cx and cy).
         depth: Depth file of an image, if it is named otherwise.
@@ -258,6 +258,8 @@ def open_source(
         InputError: The path is none of these, a file cannot be read, or an option is missing or
             does not fit.
     """
+    if isinstance(path, Source):
+        return path
     options = {
         "intrinsics": intrinsics,
         "depth": depth,
@@ -273,7 +275,7 @@ def open_source(
 
     # Refuse options that do not fit the format, or each other.
     if layout == "frames":
-        frames = _check_frames([path] if isinstance(path, Frame) else path)
+        frames = list_frames(path)
         path = frames[0].name or f"{len(frames)} frames"
     path = Path(path)
     if masks is not None and not Path(masks).is_dir():
@@ -301,10 +303,8 @@ def open_source(
 
     # Where masks come from.
     some_masked = len(source.missing) < len(source.numbers)
-    if mask is None and box is not None:
-        mask = "box"
-    elif mask is None:
-        mask = "given" if some_masked else "auto"
+    by_default = "given" if some_masked else "auto"
+    mask = mask or ("box" if box else by_default)
     if mask == "given" and not some_masked:
         raise InputError(
             f"{path}: no mask, expected masks named like the images, --mask auto or --box "
@@ -314,13 +314,25 @@ def open_source(
 
 
 def _from_frames(frames: Sequence[Frame], path: Path) -> Source:
-    """Make the source of frames in memory."""
+    """Make the source of frames in memory; InputError if they cannot be of one object in one
+    world."""
+    left_out = []
+    used = {}  # by number
+    for number, frame in enumerate(frames):
+        if frame.defect or frame.depth is None:
+            left_out.append(f"frame {number}: {frame_defect(frame)}")
+        else:
+            used[number] = frame
+    if not used:
+        raise InputError(f"no frame can be used: {left_out[0]}")
+    _check_poses([frame.camera for frame in used.values()], "in memory")
     return Source(
         path,
         "frames",
-        tuple(range(len(frames))),
-        frames.__getitem__,
-        missing={k: str(k) for k, frame in enumerate(frames) if frame.mask is None},
+        tuple(used),
+        list(used.values()).__getitem__,
+        left_out=left_out,
+        missing={k: str(number) for k, number in enumerate(used) if used[number].mask is None},
         doubts=question_intrinsics(frames[0].camera, str(path)),
     )
 
@@ -377,7 +389,7 @@ def open_pair(
     reference: SourceLike,
     target: SourceLike,
     options: Mapping[str, Sequence],
-    helpers: Sequence[SourceLike] = (),
+    helpers: Iterable[SourceLike] = (),
 ) -> list[Source]:
     """Open two sources and helpers with the options of a command line.
 
@@ -410,23 +422,7 @@ def open_pair(
             values = [*values] * len(takers)
         for k, value in zip(takers, values):
             options_of_side[k][name] = value
-    return [
-        side if isinstance(side, Source) else open_source(side, **own_options)
-        for side, own_options in zip(sides, options_of_side)
-    ]
-
-
-def _check_frames(frames: Sequence[Frame]) -> list[Frame]:
-    """Return frames as a list; InputError if they cannot be of one object in one world."""
-    if not frames or not all(isinstance(frame, Frame) for frame in frames):
-        raise InputError(
-            f"frames are {reprlib.repr(frames)}, expected a sequence of zsp_lite.Frame"
-        )
-    for number, frame in enumerate(frames):
-        if frame.depth is None:
-            raise InputError(f"frame {number} {frame.name} has no depth map, expected one")
-    _check_poses([frame.camera for frame in frames], "in memory")
-    return list(frames)
+    return [open_source(side, **own_options) for side, own_options in zip(sides, options_of_side)]
 
 
 def _check_poses(cameras: Sequence[Camera], where: str | Path) -> None:
