@@ -35,7 +35,7 @@ from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.sources import Source, open_pair
 from zsp_lite.io.ply import read_ply
 from zsp_lite.metrics import rotation_error
-from zsp_lite.own_objects import write_pair
+from zsp_lite.own_objects import dissent, write_pair
 from zsp_lite.pair_result import PairResult
 
 pytestmark = pytest.mark.slow
@@ -403,10 +403,31 @@ def test_json_has_the_votes_and_the_similarity_between_the_worlds(several):
     assert [one["frame"] for one in numbers["votes"]] == [vote.name for vote in several.votes]
 
 
-def test_frames_in_memory_in_other_units_and_by_threads_give_the_same(several, ellipsoids):
-    first, second = [
-        [ellipsoids.load(one) for one in ellipsoids.frames("ellipsoid", name)] for name in "ab"
-    ]
+@pytest.fixture
+def in_memory(ellipsoids) -> list[list[Frame]]:
+    """The frames of both sequences."""
+    return [[ellipsoids.load(one) for one in ellipsoids.frames("ellipsoid", name)] for name in "ab"]
+
+
+def test_a_contradiction_limits_the_probability_of_every_pose(in_memory, monkeypatch):
+    monkeypatch.setattr("zsp_lite.own_objects._LEAST_CONFIDENT", 1.1)
+    first, second = in_memory
+    flat = [replace(one, depth=np.where(one.depth > 0, 4, one.depth)) for one in second]
+    found = estimate_pose(first, flat, **SEVERAL)
+    assert "the object's depth is flat in 4 of 4 frames" in found.estimate.note
+    assert "low confidence: --not-upright helps" in found.estimate.note
+    estimates = [found.estimate, *(vote.estimate for vote in found.votes)]
+    assert max(one.confidence for of in estimates for one in of.hypotheses) == 0.3
+
+
+def test_if_all_vote_for_another_pose_the_number_of_those_that_agree_is_said(several):
+    votes = [replace(vote, degrees=90.0) for vote in several.votes]
+    assert dissent(votes) == ["at most 2 of 4 frames agree on a pose"]
+    assert dissent(votes[:2]) == ["no two of 2 frames agree on a pose"]
+
+
+def test_frames_in_memory_in_other_units_and_by_threads_give_the_same(several, in_memory):
+    first, second = in_memory
     larger = (scale_frame(frame, 1000.0) for frame in second)
     again = estimate_pose(np.array([LOST, *first]), larger, **SEVERAL, workers=2)
     assert (again.errors, again.masks) == ({}, ("given", "given"))

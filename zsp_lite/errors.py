@@ -49,6 +49,21 @@ class FatalError(ValueError):
     """
 
 
+class Doubt(str):
+    """A flag that says why an input is doubtful."""
+
+    most = 0.8  # largest confidence of a pose from it
+
+
+class Contradiction(Doubt):
+    """A flag that says that depth, colours and poses contradict each other.
+
+    Solvers take all as measured in one world: what they find may be far off however well it fits.
+    """
+
+    most = 0.3
+
+
 def describe_failure(error: BaseException) -> str:
     """Describe an exception of somebody else's code in one line: where it was raised, its type and
     its message."""

@@ -24,7 +24,8 @@ class Hypothesis:
 
     sim3: Sim3  # reference-camera points to camera points of target view `view`
     view: int  # index of the target view that is closest to the reference viewpoint under this pose
-    score: float  # in nats, comparable between the hypotheses of one estimate
+    # in nats, comparable between the hypotheses of one estimate, or of turns of its reference image
+    score: float
     terms: dict[str, float]  # the terms that the score is a weighted sum of, by name
     # probability that the rotation error is below 30 degrees. Over different poses, those whose
     # `mode` is their own index, the probabilities sum to at most 1 (see `verified.confidence`)

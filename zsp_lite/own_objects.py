@@ -27,7 +27,6 @@ from zsp_lite.data.cameras import Values
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
 from zsp_lite.importers.convert import scale_frame
-from zsp_lite.importers.masks import DOUBTFUL
 from zsp_lite.importers.sources import Source, SourceLike, open_pair
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
@@ -42,7 +41,7 @@ from zsp_lite.views import usable_targets
 
 _TARGETS = 5
 _REFERENCES = 4  # frames of each object that are solved against views of the other
-_MOST_DOUBTFUL = 0.8  # largest confidence of a pose whose masks are flagged
+_LEAST_CONFIDENT = 0.3  # with less, the images may stand on their heads
 _LEAST_PROBABLE = 0.005  # an alternative is named above this, where two decimals show 0.01
 # What is solved: the numbers of two objects, and the position of a frame of the first.
 _Problem = tuple[int, int, int]
@@ -139,11 +138,14 @@ def estimate_pose(
             flags = (*flags, f"{turned}: the pose is that of the turned image")
 
         # The pose, in the lengths of the sources.
-        solved, votes = _solve(scans, method, solvers, several, workers)
+        solved, votes = _solve(scans, method, solvers, several, workers, flags)
         estimates = {}
         for name, estimate in solved.items():
+            notes = flags
+            if upright and estimate.hypotheses and estimate.confidence < _LEAST_CONFIDENT:
+                notes = (*flags, "low confidence: --not-upright helps if images are turned")
             estimate = replace(estimate, timings=shared | estimate.timings)
-            estimates[name] = _in_units(estimate, scans[0].scale, scans[1].scale, flags)
+            estimates[name] = _in_units(estimate, scans[0].scale, scans[1].scale, notes)
         result = _pair_result(scans, estimates, votes, getattr(model, "name", str(backbone)))
         if out is not None:
             result = replace(result, files=tuple(write_pair(result, out)))
@@ -179,6 +181,7 @@ def _solve(
     solvers: Sequence[str],
     several: bool,
     workers: int,
+    flags: tuple[str, ...],
 ) -> tuple[dict[str, PoseEstimate], tuple[Vote, ...]]:
     """Solve the first reference frame by each solver.
 
@@ -199,7 +202,7 @@ def _solve(
     with timed(timings, "other frames"):
         others = _solve_others(scans, method, workers)
         estimates = {(0, 1, position): first, **others}
-        agreed, votes = _agreed_pose(scans, method, first, estimates)
+        agreed, votes = _agreed_pose(scans, method, first, estimates, flags)
     solved["verified"] = replace(agreed, timings=timings)
     return solved, votes
 
@@ -267,6 +270,7 @@ def _agreed_pose(
     method: ZeroShotPose,
     first: PoseEstimate,
     estimates: Mapping[_Problem, PoseEstimate],
+    scan_doubts: tuple[str, ...],
 ) -> tuple[PoseEstimate, tuple[Vote, ...]]:
     """Find the pose that the hypotheses of all estimates agree on, in the camera of the first one,
     and the votes of the frames."""
@@ -292,14 +296,24 @@ def _agreed_pose(
             name = f"frame {scans[a].source.numbers[position]} of {scans[a].source.name}"
             agreed = agreement.between(names[a], names[b])
             degrees = float(rotation_error(estimate.world_sim3.R, agreed.R))
-            own = _in_units(estimate, scans[a].scale, scans[b].scale, ())
+            own = _in_units(estimate, scans[a].scale, scans[b].scale, scan_doubts)
             votes.append(Vote(name, own, degrees, a > b))
+    return _answer(first, method, answers, dissent(votes)), tuple(votes)
+
+
+def dissent(votes: Sequence[Vote]) -> list[str]:
+    """Name the frames that vote for another pose, or if all do, say how many of them agree."""
     against = [vote.name for vote in votes if vote.degrees > SAME_ANGLE]
-    flags = []
-    if against:
+    if not against:
+        return []
+    if len(against) < len(votes):
         named = ", ".join(against)
-        flags.append(f"{len(against)} of {len(votes)} frames vote for another pose: {named}")
-    return _answer(first, method, answers, flags), tuple(votes)
+        return [f"{len(against)} of {len(votes)} frames vote for another pose: {named}"]
+    turns = [vote.estimate.world_sim3.R for vote in votes]
+    turns = np.stack([turn.T if vote.backward else turn for turn, vote in zip(turns, votes)])
+    most = (rotation_angle(turns[:, None], turns) < SAME_ANGLE).sum(axis=1).max()
+    agreeing = f"at most {most}" if most > 1 else "no two"
+    return [f"{agreeing} of {len(votes)} frames agree on a pose"]
 
 
 def _answer(
@@ -381,13 +395,13 @@ def write_pair(result: PairResult, out: str | Path) -> list[Path]:
 def _in_units(
     estimate: PoseEstimate, reference_scale: float, target_scale: float, flags: tuple[str, ...]
 ) -> PoseEstimate:
-    """Express an estimate on scaled frames in the lengths before scaling, and add flags; a flag of
-    doubtful masks limits the confidence."""
+    """Express an estimate on scaled frames in the lengths before scaling, and add flags; doubts
+    limit the confidence."""
 
     def unscaled(sim3: Sim3) -> Sim3:
         return Sim3(sim3.scale * reference_scale / target_scale, sim3.R, sim3.t / target_scale)
 
-    most = _MOST_DOUBTFUL if any(DOUBTFUL in flag for flag in flags) else 1.0
+    most = min([getattr(flag, "most", 1.0) for flag in flags], default=1.0)
     reference = estimate.reference_view
     targets = estimate.target_views
     return replace(

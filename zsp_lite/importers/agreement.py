@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
-from zsp_lite.errors import InputError
+from zsp_lite.errors import Contradiction, Doubt, InputError
 from zsp_lite.importers.files import WINDOW_5
 from zsp_lite.importers.masks import PLAUSIBLE, masks_from_depth
 from zsp_lite.metrics import rotation_angle
@@ -113,7 +113,13 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     pairs = _pairs(objects)
     whole = _pairs(scenes)
     if not pairs:
-        return ""
+        still = _pairs(objects, 0.0)
+        if not still or _share(still) > _AGREEING:
+            return ""
+        return Contradiction(
+            "the cameras hardly turn, but the object does: expected the poses of the cameras "
+            "relative to the object"
+        )
     given = _share(pairs)
     everywhere = _share(whole)
     found = f"depth and poses of the frames do not agree ({given:.0%} of the object's points do)"
@@ -123,7 +129,7 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     everywhere_by_ray = _share(whole, along_ray=True)
     gains = everywhere_by_ray > max(_RAY_GAIN * everywhere, _FITTING)
     if gains and _share(pairs, along_ray=True) > _AGREEING:
-        return (
+        return Doubt(
             f"{found}; all that is seen agrees better ({everywhere_by_ray:.0%}, not "
             f"{everywhere:.0%}) if depth is the distance along the ray of a pixel, not along the "
             "optical axis"
@@ -134,9 +140,10 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     # Mistakes in poses and units.
     for share, text in _explanations(pairs, unit):
         if share > max(_FITTING, given + _GAIN):
-            return f"{found}; they agree ({share:.0%}) if {text}"
-    contradict = max(given, everywhere) < _CONTRADICTING
-    return f"{found}, and no usual mistake in units or poses explains it" if contradict else ""
+            return Contradiction(f"{found}; they agree ({share:.0%}) if {text}")
+    if max(given, everywhere) < _CONTRADICTING:
+        return Contradiction(f"{found}, and no usual mistake in units or poses explains it")
+    return ""
 
 
 def neighbours(count: int) -> list[int]:
@@ -146,14 +153,15 @@ def neighbours(count: int) -> list[int]:
     return sorted({(third + step) % count for third in thirds for step in steps})
 
 
-def _pairs(surfaces: Sequence[_Surface]) -> list[_Pair]:
-    """Pair each surface with the one whose camera is turned by about `_BEST` degrees."""
+def _pairs(surfaces: Sequence[_Surface], nearest: float = _NEAREST) -> list[_Pair]:
+    """Pair each surface with the one whose camera is turned by about `_BEST` degrees, and at least
+    by `nearest`."""
     # No mistake changes the angle between two cameras.
     surfaces = [surface for surface in surfaces if len(surface.points) >= _LEAST_POINTS]
     pairs = []
     for surface in surfaces:
         angles = np.array([rotation_angle(surface.camera.R, other.camera.R) for other in surfaces])
-        angles[(angles < _NEAREST) | (angles > _FARTHEST)] = np.inf
+        angles[(angles < nearest) | (angles > _FARTHEST)] = np.inf
         if np.isfinite(angles).any():
             pairs.append((surface, surfaces[int(np.abs(angles - _BEST).argmin())]))
     return pairs[:: len(pairs) // _PAIRS + 1]

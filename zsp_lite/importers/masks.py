@@ -18,7 +18,7 @@ from scipy import ndimage
 from zsp_lite.data.cameras import Box, Camera
 from zsp_lite.data.depth import fit_plane
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, largest_region, mask_to_bbox
-from zsp_lite.errors import InputError
+from zsp_lite.errors import Contradiction, Doubt, InputError
 from zsp_lite.importers.files import WINDOW_3, WINDOW_5
 from zsp_lite.points import object_pixels, sampling_step, standard_deviation, world_points
 
@@ -71,6 +71,9 @@ _CARRIED = 0.05
 
 PLAUSIBLE = (0.05, 20.0)  # least and largest distance of an object, metres
 _LEAST_KNOWN = 0.4  # least share of the object's pixels that have depth
+# An object is flat whose points deviate less from a plane, relative to the distance, as where depth
+# is filled in, or of the table behind glass. Of real objects, 0.016 is the least.
+_FLAT = 0.005
 DOUBTFUL = "the masks may be wrong"
 
 # Unit normal, which points to the side of the cameras, and offset: normal @ x = offset.
@@ -248,7 +251,7 @@ def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
     # A missing plane alone is no sign: objects may fill the image, or stand on a dark turntable.
     if signs and plane is None:
         signs.append("no plane is found that the object stands on")
-    return (f"{DOUBTFUL}: {', '.join(signs)}",) if signs else ()
+    return (Doubt(f"{DOUBTFUL}: {', '.join(signs)}"),) if signs else ()
 
 
 def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
@@ -257,38 +260,45 @@ def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
     # Numbers of pixels on the object: all, and those of known depth.
     seen = 0
     known = 0
+    flat = 0
     for frame in frames:
-        depth = frame.depth[object_pixels(frame)]
+        pixels = object_pixels(frame)
+        depth = frame.depth[pixels]
         seen += (frame.mask > ON_OBJECT).sum()
         known += len(depth)
         distances.append(np.quantile(depth, 0.25) if len(depth) else np.nan)
+        # A plane has the equation plane @ x = 1 in the camera's frame.
+        points = world_points(frame, pixels, len(depth) // _POINTS + 1)
+        points = frame.camera.to_camera(points)
+        plane = np.linalg.pinv(points).sum(axis=1)
+        flat += len(depth) > _MIN_PIXELS and np.std(points @ plane) < _FLAT
     distance = float(np.nanmedian(distances)) if known else PLAUSIBLE[0]
     if metric and not PLAUSIBLE[0] <= distance <= PLAUSIBLE[1]:
-        yield (
+        yield Doubt(
             f"the object is {distance:.3g} m from the camera, expected {PLAUSIBLE[0]:g} to "
             f"{PLAUSIBLE[1]:g} m; the unit of its depth is given by --depth-unit (0.001: "
             "millimetres, 1: metres)"
         )
     if known < _LEAST_KNOWN * seen:
-        yield f"depth is known on {known / seen:.0%} of the object only"
+        yield Doubt(f"depth is known on {known / seen:.0%} of the object only")
+    if flat > len(distances) / 2:
+        yield Contradiction(f"the object's depth is flat in {flat} of {len(distances)} frames")
 
 
-def given_mask_flags(frames: Collection[Frame], missing: Collection[str]) -> tuple[str, ...]:
+def given_mask_flags(frames: Collection[Frame], missing: Collection[str]) -> Iterator[str]:
     """Name the frames without a given mask, and say how many masks cover most of the border."""
-    flags = []
     if missing:
-        flags.append(f"no mask is given for {', '.join(missing)}: found by depth")
+        yield f"no mask is given for {', '.join(missing)}: found by depth"
     count = 0
     for frame in frames:
         mask = frame.mask > ON_OBJECT
         border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
         count += border.mean() > _MOST
     if count:
-        flags.append(
+        yield Doubt(
             f"{DOUBTFUL}: those of {count} of {len(frames)} frames cover most of the border: "
             "inverted?"
         )
-    return tuple(flags)
 
 
 def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:

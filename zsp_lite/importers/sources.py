@@ -14,7 +14,7 @@ from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, list_frames
 from zsp_lite.data.pairs import spread
-from zsp_lite.errors import InputError
+from zsp_lite.errors import Doubt, InputError
 from zsp_lite.importers import FORMATS, open_capture, recognise
 from zsp_lite.importers.agreement import disagreement, neighbours
 from zsp_lite.importers.capture import CaptureFrame
@@ -34,6 +34,7 @@ from zsp_lite.importers.masks import (
     masks_from_box,
     masks_from_depth,
 )
+from zsp_lite.importers.registration import misregistration
 
 # The options that each format takes. "open" stands for a source that is open already.
 _MASKED = ("mask", "box")
@@ -152,9 +153,10 @@ class Source:
             more = f"; and {len(reasons) - 3} more" if len(reasons) > 3 else ""
             flags.append(f"frames left out: {len(self.left_out)}: {'; '.join(reasons[:3])}{more}")
         flags += depth_flags(frames, metric=self.format != "sequence")
-        flags += self.doubts
+        flags += map(Doubt, self.doubts)
         if self.mask == "given":
             flags += given_mask_flags(frames, self.missing.values())
+            flags.append(misregistration(frames))
         else:
             flags += mask_flags(frames)
         flags.append(self.contradiction())
