@@ -210,7 +210,7 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
     assert answer.confidence > 0.5
     assert not answer.one_of_two
     assert result.sources[1].endswith(f"helpers: {helper}")
-    assert answer.flags[-1].startswith("4 of 4 frames vote for another pose: frame 0 of")
+    assert answer.flags[-1] == "all 4 frames vote for other poses, 4 of them for the same"
 
 
 def test_a_helper_is_another_object():

@@ -422,8 +422,8 @@ def test_a_contradiction_limits_the_probability_of_every_pose(in_memory, monkeyp
 
 def test_if_all_vote_for_another_pose_the_number_of_those_that_agree_is_said(several):
     votes = [replace(vote, degrees=90.0) for vote in several.votes]
-    assert dissent(votes) == ["at most 2 of 4 frames agree on a pose"]
-    assert dissent(votes[:2]) == ["no two of 2 frames agree on a pose"]
+    assert dissent(votes) == ["all 4 frames vote for other poses, 2 of them for the same"]
+    assert dissent(votes[:2]) == ["all 2 frames vote for other poses, no two of them for the same"]
 
 
 def test_frames_in_memory_in_other_units_and_by_threads_give_the_same(several, in_memory):

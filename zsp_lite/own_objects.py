@@ -312,8 +312,8 @@ def dissent(votes: Sequence[Vote]) -> list[str]:
     turns = [vote.estimate.world_sim3.R for vote in votes]
     turns = np.stack([turn.T if vote.backward else turn for turn, vote in zip(turns, votes)])
     most = (rotation_angle(turns[:, None], turns) < SAME_ANGLE).sum(axis=1).max()
-    agreeing = f"at most {most}" if most > 1 else "no two"
-    return [f"{agreeing} of {len(votes)} frames agree on a pose"]
+    agreeing = most if most > 1 else "no two"
+    return [f"all {len(votes)} frames vote for other poses, {agreeing} of them for the same"]
 
 
 def _answer(
