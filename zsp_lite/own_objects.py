@@ -299,18 +299,19 @@ def _agreed_pose(
 
 
 def dissent(votes: Sequence[Vote]) -> list[str]:
-    """Name the frames that vote for another pose, or if all do, say how many of them agree."""
+    """Name the frames that vote for another pose, or say how many agree if all vote for several
+    others."""
     against = [vote.name for vote in votes if vote.degrees > SAME_ANGLE]
     if not against:
         return []
-    if len(against) < len(votes):
-        named = ", ".join(against)
-        return [f"{len(against)} of {len(votes)} frames vote for another pose: {named}"]
     turns = [vote.estimate.world_sim3.R for vote in votes]
     turns = np.stack([turn.T if vote.backward else turn for turn, vote in zip(turns, votes)])
     most = (rotation_angle(turns[:, None], turns) < SAME_ANGLE).sum(axis=1).max()
-    agreeing = f"at most {most}" if most > 1 else "no two"
-    return [f"{agreeing} of {len(votes)} frames agree on a pose"]
+    if len(against) == len(votes) > most:
+        agreeing = f"at most {most}" if most > 1 else "no two"
+        return [f"{agreeing} of {len(votes)} frames agree on a pose"]
+    named = ", ".join(against)
+    return [f"{len(against)} of {len(votes)} frames vote for another pose: {named}"]
 
 
 def _answer(
