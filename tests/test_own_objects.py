@@ -417,7 +417,7 @@ def test_a_contradiction_limits_the_probability_of_every_pose(in_memory, monkeyp
     assert "the object's depth is flat in 4 of 4 frames" in found.estimate.note
     assert "low confidence: --not-upright helps" in found.estimate.note
     estimates = [found.estimate, *(vote.estimate for vote in found.votes)]
-    assert max(one.confidence for of in estimates for one in of.hypotheses) == 0.3
+    assert max(one.confidence for of in estimates for one in of.hypotheses) < 0.301
 
 
 def test_if_all_vote_for_another_pose_the_number_of_those_that_agree_is_said(several):

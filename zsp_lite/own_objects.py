@@ -402,6 +402,7 @@ def _in_units(
         return Sim3(sim3.scale * reference_scale / target_scale, sim3.R, sim3.t / target_scale)
 
     most = min([getattr(flag, "most", 1.0) for flag in flags], default=1.0)
+    factor = min(1.0, most / (estimate.confidence or 1.0))
     reference = estimate.reference_view
     targets = estimate.target_views
     return replace(
@@ -412,7 +413,7 @@ def _in_units(
             replace(
                 hypothesis,
                 sim3=unscaled(hypothesis.sim3),
-                confidence=min(hypothesis.confidence, most),
+                confidence=factor * hypothesis.confidence,
             )
             for hypothesis in estimate.hypotheses
         ),

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Complex, Float
-from scipy import fft
+from jaxtyping import Float
 
 from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import Contradiction
@@ -17,8 +16,8 @@ from zsp_lite.errors import Contradiction
 _FRAMES = 8  # largest number of frames, about
 _FEW = 2  # so many frames show that there is a shift; more also measure it
 _SIDE = 160  # longest side of the images that are compared, pixels
-_SHIFTS = np.arange(-20, 21)  # along either axis
-_SHAPE = (180, 180)  # of the images with a border for shifts
+_SHIFT = 20  # largest shift along either axis
+_BORDER = ((_SHIFT, _SHIFT), (_SHIFT, _SHIFT), (0, 0))
 _AROUND = 0.1  # least share of the image where depth around the object is known
 # Masks that are a little too wide or narrow look like depth at one of the middle scales.
 _SCALES = (0.8, 0.9, 1.0, 1.1, 1.25)
@@ -28,15 +27,15 @@ _APART = 3
 _HIGHEST = 0.15  # higher steps, of the logarithm of depth, count as this one
 # Least share of the highest steps at the outlines. Of 34 registered scans, all have more, of their
 # single frames 99 %, also with noise and inexact masks; of the scans whose depth is shifted by 5 %
-# of the image, or has a field of view of 80 %, all have less, of their single frames two thirds.
+# of the image, or has a field of view of 80 %, all have less, of their single frames half.
 _SHARE = 0.75
 _SHARE_OF_FEW = 0.5
 
 
 def misregistration(frames: Sequence[Frame]) -> str:
     """Say how depth must be moved and scaled to fit given masks, or return ""."""
-    # The correlation of two images is the product of their spectra.
-    products = np.zeros((len(_SCALES), *_SHAPE), np.complex64)
+    # Steps across the outlines by scale, and by shift down and right.
+    steps = np.zeros((len(_SCALES), 2 * _SHIFT + 1, 2 * _SHIFT + 1))
     for position in range(0, len(frames), len(frames) // _FRAMES + 1):
         frame = frames[position]
         step = -(-max(frame.depth.shape) // _SIDE)  # rounded up
@@ -44,27 +43,25 @@ def misregistration(frames: Sequence[Frame]) -> str:
         mask = (frame.mask[::step, ::step] > ON_OBJECT).astype(np.float32)
         if (depth[mask == 0] > 0).sum() < _AROUND * depth.size:
             continue
-        spectrum = fft.fft2(_steps(np.log(np.where(depth > 0, depth, np.nan))), _SHAPE)
-        for product, scale in zip(products, _SCALES):
+        around = np.pad(_steps(np.log(np.where(depth > 0, depth, np.nan))), _BORDER)
+        for of_scale, scale in zip(steps, _SCALES):
             matrix = cv2.getRotationMatrix2D(frame.camera.principal_point / step, 0, scale)
             outline = _steps(cv2.warpAffine(mask, matrix, mask.shape[::-1]))
             outline /= np.linalg.norm(outline) + 1e-9  # an empty mask has no outline
-            product += spectrum * fft.fft2(outline, _SHAPE).conj()
+            # Inside a mask, depth is less.
+            of_scale -= cv2.matchTemplate(around, outline, cv2.TM_CCORR)
 
-    # Steps by scale and by shift, down and right. Inside a mask, depth is less.
-    steps = -fft.ifft2(products).real[:, _SHIFTS[:, None], _SHIFTS]
     few = len(frames) <= _FEW
     if steps[_REGISTERED].max() >= (_SHARE_OF_FEW if few else _SHARE) * steps.max():
         return ""
     scale, down, right = np.unravel_index(steps.argmax(), steps.shape)
-    x, y = -step * _SHIFTS[[right, down]]
+    x, y = step * (_SHIFT - right), step * (_SHIFT - down)
     fit = f": it fits if moved by about {x}, {y} pixels and scaled by {1 / _SCALES[scale]:.2f}"
     found = "depth is not registered to the colours, or the masks are wrong"
     return Contradiction(found if few else found + fit)
 
 
-def _steps(image: Float[np.ndarray, "h w"]) -> Complex[np.ndarray, "h w"]:
-    """Return the steps of an image to the right, real, and down, imaginary; 0 where unknown."""
-    right, down = [np.roll(image, -_APART, axis) - np.roll(image, _APART, axis) for axis in (1, 0)]
-    right, down = np.nan_to_num(np.clip([right, down], -_HIGHEST, _HIGHEST))
-    return right + 1j * down
+def _steps(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 2"]:
+    """Return the steps of an image to the right and down; 0 where unknown."""
+    both = [np.roll(image, -_APART, axis) - np.roll(image, _APART, axis) for axis in (1, 0)]
+    return np.nan_to_num(np.clip(np.dstack(both), -_HIGHEST, _HIGHEST))
