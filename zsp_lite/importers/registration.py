@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.data.frames import ON_OBJECT, Frame
-from zsp_lite.errors import Contradiction
+from zsp_lite.errors import Doubt
 
 _FRAMES = 8  # largest number of frames, about
 _FEW = 2  # so many frames show that there is a shift; more also measure it
@@ -58,7 +58,7 @@ def misregistration(frames: Sequence[Frame]) -> str:
     x, y = step * (_SHIFT - right), step * (_SHIFT - down)
     fit = f": it fits if moved by about {x}, {y} pixels and scaled by {1 / _SCALES[scale]:.2f}"
     found = "depth is not registered to the colours, or the masks are wrong"
-    return Contradiction(found if few else found + fit)
+    return Doubt(found if few else found + fit)
 
 
 def _steps(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 2"]:
