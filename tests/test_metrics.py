@@ -157,9 +157,6 @@ def test_the_sign_test_counts_the_pairs_that_only_one_method_solves():
     result = paired_test(first, second)
     assert result["accuracy_gain"] == pytest.approx(50)
     assert result["sign_test_p"] == pytest.approx(0.125)
-    # Sums of +-80 over 7 signs at least as far as 5 * 80: |plus - minus| >= 5, that is 2 * (1 + 7)
-    # of 128.
-    assert result["permutation_test_p"] == pytest.approx(16 / 128)
 
 
 def test_a_paired_differences_interval_and_p_value_are_those_of_its_replicates():
@@ -176,7 +173,7 @@ def test_a_paired_differences_interval_and_p_value_are_those_of_its_replicates()
 
 def test_a_method_does_not_differ_from_itself_and_one_pair_proves_nothing():
     one = paired_test([90.0], [10.0])
-    assert (one["accuracy_gain"], one["sign_test_p"], one["permutation_test_p"]) == (100, 1, 1)
+    assert (one["accuracy_gain"], one["sign_test_p"]) == (100, 1)
     errors = np.linspace(0, 180, 30)
     same = paired_test(errors, errors)
     assert (same["accuracy_gain"], same["accuracy_gain_ci"]) == (0, [0, 0])

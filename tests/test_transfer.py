@@ -9,7 +9,7 @@ from refusals import refused
 from scipy.spatial import KDTree
 from synthetic_views import CoordinateBackbone, look_at, turned
 
-from zsp_lite import Co3D, Sim3, load_backbone, transfer_points
+from zsp_lite import Co3D, Sim3, load_backbone
 from zsp_lite.category import AlignedObject, CategoryAlignment
 from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.ground_truth import read_poses
@@ -99,9 +99,9 @@ def test_points_of_a_copy_in_another_world_are_the_same_points(samples, tmp_path
 
     sim3 = car[0].sim3
     alignment = aligned({"suv": sim3, "copy": sim3 @ to_copy.inverse()})
-    places = transfer_points(alignment, Co3D(tmp_path), "car", "suv", marks)
-    assert list(places) == ["copy"]
-    found = places["copy"]
+    found = transfer(
+        marks, *(surface_views(alignment, Co3D(tmp_path), "car", name) for name in ("suv", "copy"))
+    )
     errors = sim3.scale / to_copy.scale * np.linalg.norm(found.world - to_copy.apply(marks), axis=1)
     spacing = KDTree(car[0].points).query(car[0].points, k=2)[0][:, 1]  # of patches
     assert errors.max() < np.median(spacing)
@@ -132,7 +132,7 @@ def test_wrong_points_sequences_and_frames_are_refused(samples, ellipsoids, tmp_
     marks = np.zeros((1, 3))
     refused(
         "sequence is 'c', expected one of a, b",
-        transfer_points, alignment, ellipsoids, "ellipsoid", "c", marks, backbone,
+        surface_views, alignment, ellipsoids, "ellipsoid", "c", backbone,
     )  # fmt: skip
 
     frame = ellipsoids.load(ellipsoids.frame("ellipsoid", "a", 0))

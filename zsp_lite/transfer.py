@@ -209,37 +209,3 @@ def _softmax_within(
     """Return the softmax of each row over the patches in the ball; 0 for a row without one."""
     inside = squared < _BALL**2
     return inside * softmax(np.where(inside, logits, -1e9), axis=1)
-
-
-def transfer_points(
-    alignment: CategoryAlignment,
-    dataset: Co3D,
-    category: str,
-    sequence: str,
-    points: Float[np.ndarray, "n 3"],
-    backbone: BackboneLike = "zsp-tiny",
-) -> dict[str, TransferredPoints]:
-    """Find points that are marked on one object on all other objects of an aligned category.
-
-    Args:
-        alignment: Poses of the objects in the common frame, of `align_category`.
-        dataset: Data set.
-        category: Name of the category.
-        sequence: Name of the sequence that the points are marked in.
-        points: Marked points of the object's surface, in the world of the sequence.
-        backbone: Backbone, or what `load_backbone` takes.
-
-    Returns:
-        The places of the points by the name of the object.
-
-    Raises:
-        InputError: The alignment has no such sequence, the points are not of shape (n, 3) or not
-            finite, or no frame of an object shows its surface.
-    """
-    extractor = as_backbone(backbone)
-    source = surface_views(alignment, dataset, category, sequence, extractor)
-    return {
-        name: transfer(points, source, surface_views(alignment, dataset, category, name, extractor))
-        for name in alignment.objects
-        if name != sequence
-    }

@@ -11,11 +11,11 @@ from one_page import SCREENS, build_page, open_page, screen, tab_to, wait_until_
 from playwright.sync_api import Browser, Page
 
 from docs.playground.found import CATEGORIES, OBJECTS, RENDERED, ShownObject, shown_object
-from zsp_lite import Co3D, load_backbone, transfer_points
+from zsp_lite import Co3D, load_backbone
 from zsp_lite.alignment import Sim3
 from zsp_lite.category import AlignedObject, CategoryAlignment
 from zsp_lite.course.synthetic.export import export_categories
-from zsp_lite.transfer import TransferredPoints, surface_views
+from zsp_lite.transfer import TransferredPoints, surface_views, transfer
 
 # What the page shows on the second object of every mark of a side of the first.
 SHOWN = """() => {
@@ -84,8 +84,7 @@ def expected(browser, address, tmp_path_factory, request) -> Expected:
         for name, one in zip((first, second), views, strict=True)
     ]
     marks = source.surface[: source.starts[-1]]
-    found = transfer_points(alignment, dataset, category, first, marks, backbone)
-    return Expected(category, source, target, found[second])
+    return Expected(category, source, target, transfer(marks, *views))
 
 
 @pytest.fixture(scope="module")

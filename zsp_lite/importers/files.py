@@ -5,10 +5,7 @@ mask and its camera may refer to the pixels as stored or as displayed.
 """
 
 import io
-import tokenize
 import warnings
-import zipfile
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -32,20 +29,6 @@ _FORMATS = ("JPEG", "PNG", "WEBP")
 DEPTHS = (".png", ".npy", ".npz", ".tiff", ".tif", ".pfm", ".exr")
 MASKS = (".png", ".jpg", ".jpeg", ".webp", ".tiff", ".tif", ".npy")
 CO3D_DEPTH = ".geometric.png"  # such a file has the bits of float16 values
-# What numpy, Pillow and OpenCV raise for damaged files.
-_DAMAGED = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    MemoryError,
-    RuntimeError,
-    zlib.error,
-    zipfile.BadZipFile,
-    tokenize.TokenError,
-    cv2.error,
-    Image.DecompressionBombError,
-)
 # For each EXIF orientation, 1 to 8, the number of quarter turns as in `numpy.rot90`; and the
 # orientations whose image is mirrored left to right after the turn.
 _QUARTERS = {1: 0, 2: 0, 3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
@@ -223,7 +206,7 @@ def _decoding(what: str, path: str | Path) -> Iterator[None]:
             yield
     except InputError:
         raise
-    except _DAMAGED as error:
+    except Exception as error:  # numpy, Pillow and OpenCV may raise anything
         expected = f"a complete {Path(path).suffix or 'image'} file of at most {MAX_PIXELS} pixels"
         if str(path).endswith(".exr"):
             expected = "an OpenCV that reads .exr, or the depth as .npy or a float .tiff"
@@ -276,8 +259,8 @@ def display_camera(camera: Camera, orientation: int, where: str, posed: bool) ->
     return turned if posed else replace(turned, R=np.eye(3))
 
 
-def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
-    """Say what speaks against the intrinsics of an image.
+def question_intrinsics(camera: Camera, where: str) -> str:
+    """Say what speaks against the intrinsics of an image, or return "".
 
     InputError for a field of view that no camera has.
     """
@@ -296,7 +279,7 @@ def question_intrinsics(camera: Camera, where: str) -> tuple[str, ...]:
             f"{where}: {subject} {also}have a field of view of {view:.3g} degrees, expected "
             f"{_LEAST_VIEW:g} to {_LARGEST_VIEW:g}"
         )
-    return (f"{subject} {doubt}",) if doubt else ()
+    return f"{subject} {doubt}" if doubt else ""
 
 
 def _doubt(values: Float[np.ndarray, "4"], side: Float[np.ndarray, "2"]) -> str:

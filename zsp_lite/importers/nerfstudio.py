@@ -10,7 +10,7 @@ import msgspec
 from zsp_lite.errors import MAX_LENGTH, InputError
 from zsp_lite.importers.capture import FROM_OPENGL, CaptureFrame, Makers, make_frame
 from zsp_lite.importers.files import picture_size
-from zsp_lite.io.files import decode_json, find_inside, read_json
+from zsp_lite.io.files import convert_json, find_inside, read_json
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
@@ -60,9 +60,7 @@ def read_nerfstudio(path: str | Path) -> Makers:
     if path.suffix != ".json":
         path = next((path / name for name in _NAMES if (path / name).is_file()), path / _NAMES[0])
     common = read_json(path, dict[str, Any], "capture")
-    listed = decode_json(
-        msgspec.json.encode(common.pop("frames", None)), list[dict[str, Any]], f"{path}, frames"
-    )
+    listed = convert_json(common.pop("frames", None), list[dict[str, Any]], f"{path}, frames")
     with_depth = [
         k
         for k, frame in enumerate(listed)
@@ -79,7 +77,7 @@ def read_nerfstudio(path: str | Path) -> Makers:
 
 def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     """Make a frame from its values, those of all frames included."""
-    frame = decode_json(msgspec.json.encode(values), _Frame, where)
+    frame = convert_json(values, _Frame, where)
     fisheye = frame.camera_model == _FISHEYE
     if not fisheye and (frame.camera_model not in _MODELS or frame.k4):
         raise InputError(

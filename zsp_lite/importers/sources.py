@@ -70,7 +70,8 @@ class Source:
     left_out: Sequence[str] = ()  # for each frame that cannot be used, what is wrong with it
     # Names of the frames that come without a mask, by position.
     missing: Mapping[int, str] = field(default_factory=dict)
-    doubts: Sequence[str] = ()  # reasons to doubt the intrinsics or the order of the images
+    # Reasons to doubt the intrinsics or the order of the images; "" is none.
+    doubts: Sequence[str] = ()
     depth_unit: float | None = None  # world units per stored depth value, of an image or a capture
 
     @property
@@ -335,7 +336,7 @@ def _from_frames(frames: Sequence[Frame], path: Path) -> Source:
         list(used.values()).__getitem__,
         left_out=left_out,
         missing={k: str(number) for k, number in enumerate(used) if used[number].mask is None},
-        doubts=question_intrinsics(frames[0].camera, str(path)),
+        doubts=[question_intrinsics(frames[0].camera, str(path))],
     )
 
 
@@ -373,7 +374,7 @@ def _from_capture(path: Path, layout: str, options: dict[str, Any]) -> Source:
     _check_poses(cameras, path)
     # Intrinsics may differ from frame to frame: a doubt about them is said once.
     questioned = [question_intrinsics(camera, str(path)) for camera in cameras]
-    doubts = [*next(filter(None, questioned), ()), *filter(None, {frame.doubt for frame in frames})]
+    doubts = [next(filter(None, questioned), ""), *{frame.doubt for frame in frames}]
     return Source(
         path,
         layout,
@@ -402,7 +403,7 @@ def open_pair(
     """
     sides = (reference, target, *helpers)
     formats = [_format(side) for side in sides]
-    options_of_side: list[dict] = [{} for _ in sides]
+    options_of_side: list[dict] = [{"layout": layout} for layout in formats]
     for name, values in options.items():
         takers = [k for k, layout in enumerate(formats) if name in _TAKEN[layout]]
         # There is a value for each path that takes the option, or only for those of the reference

@@ -41,12 +41,13 @@ from zsp_lite.importers.convert import (
     write_sequence,
 )
 from zsp_lite.importers.unpacked import Video
-from zsp_lite.io.files import file_size, path_inside, write_atomic
+from zsp_lite.io.files import convert_json, file_size, path_inside, write_atomic
 from zsp_lite.io.ply import read_ply
 from zsp_lite.points import axis_deviation
 
 logger = logging.getLogger(__name__)
 
+_METADATA = "metadata.sqlite"
 # Limits of a query. The rows of a sequence need some 10,000 steps of SQLite's machine; a search
 # through the rows of all categories needs hundreds of millions.
 _MOST_STEPS = 1_000_000
@@ -83,14 +84,6 @@ class _Row(msgspec.Struct, rename=_column):
     """A row of a table, in which arrays of numbers are blobs."""
 
     sequence_name: str
-
-    @classmethod
-    def decode(cls, columns: dict[str, Any]) -> "_Row":
-        """Check the columns of a row; InputError if a value has another type."""
-        try:
-            return msgspec.convert(columns, cls)
-        except msgspec.ValidationError as error:
-            raise InputError(f"metadata.sqlite: {error}") from error
 
     def numbers(self, field: str, shape: tuple[int, ...], kind: str = "<f4") -> np.ndarray:
         """Decode a blob of four bytes per number to an array; `kind` is the type of its numbers."""
@@ -190,7 +183,7 @@ def import_uco3d(
     """
     root = Path(root)
     out = Path(out)
-    with closing(_open_metadata(root / "metadata.sqlite")) as metadata:
+    with closing(_open_metadata(root / _METADATA)) as metadata:
         names = _downloaded(root, category)
         for name in sequences or ():
             check_choice(f"{root}: sequence of {category}", name, names)
@@ -209,7 +202,7 @@ def import_uco3d(
                 present += 1
                 continue
             try:
-                sequence = _Sequence(root, metadata, _SequenceRow.decode(row))
+                sequence = _Sequence(root, metadata, convert_json(row, _SequenceRow, _METADATA))
                 result = sequence.write(out, category, count)
             except InputError as error:
                 problem = f"{name}: {error}"
@@ -261,7 +254,7 @@ def _select(
         return [dict(row) for row in rows]
     except sqlite3.Error as error:
         raise InputError(
-            f"metadata.sqlite: {error}, expected uCO3D's tables with their keys"
+            f"{_METADATA}: {error}, expected uCO3D's tables with their keys"
         ) from error
 
 
@@ -300,8 +293,8 @@ class _DepthMaps:
         try:
             with h5py.File(self.path, "r") as file:
                 yield file
-        # A damaged file may raise any of these; a group has none of the attributes of a depth map.
-        except (AttributeError, KeyError, OSError, RuntimeError, TypeError, ValueError) as error:
+        # A damaged file may raise anything; a group has none of the attributes of a depth map.
+        except Exception as error:
             raise InputError(
                 f"depth maps {self.path}: {error}, expected an HDF5 file of (H, W) numbers"
             ) from error
@@ -328,7 +321,7 @@ class _Sequence:
             "AND _depth_scale_adjustment > 0 ORDER BY frame_number",
             [row.sequence_name],
         )
-        frames = [_FrameRow.decode(frame) for frame in rows]
+        frames = [convert_json(frame, _FrameRow, _METADATA) for frame in rows]
         self.frames = [frame for frame in frames if frame.depth_name() in self.depths.names]
 
     def write(self, out: Path, category: str, count: int) -> ImportResult:

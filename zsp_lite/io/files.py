@@ -73,6 +73,15 @@ def decode_json(data: bytes | msgspec.Raw, kind: Any, what: str) -> Any:
         raise InputError(f"{what}: {error}") from error
 
 
+def convert_json(value: Any, kind: Any, what: str) -> Any:
+    """Convert decoded JSON, or what is like it, to a type of msgspec, with the errors of
+    `decode_json`."""
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{what}: {error}") from error
+
+
 def file_size(path: str | Path, what: str, most: float = math.inf) -> int:
     """Return the size of a file in bytes; InputError if it exceeds `most` or cannot be read."""
     try:
