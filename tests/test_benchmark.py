@@ -49,14 +49,6 @@ def test_perfect_features_solve_nearly_every_pair_and_the_best_view_alone_does_n
     assert summary["methods"]["ours-bv"]["median"] > ours["median"]
 
 
-def test_the_figures_of_a_row_are_those_of_its_errors(run):
-    out, summary = run
-    ours = summary["methods"]["ours"]
-    errors = read_run(out).row("ours")["error"]
-    assert ours["median"] == np.median(errors)
-    assert ours["acc15"] == pytest.approx(100 * np.mean(errors < 15))
-
-
 def test_the_summary_has_the_fixed_form(run):
     _, summary = run
     assert summary["data"] == {

@@ -329,11 +329,6 @@ def sweep(tmp_path_factory) -> Run:
     return read_run(out)
 
 
-def test_a_sweep_makes_a_row_of_each_threshold():
-    expected = [f"{name}@threshold={value}" for name in SWEPT for value in THRESHOLDS]
-    assert list(resolve(SWEPT, THRESHOLDS)) == expected
-
-
 @pytest.mark.parametrize("name", ["mine", "solved"])
 def test_a_larger_threshold_of_a_sweep_gives_more_inliers(sweep, name):
     few, many = [sweep.row(f"{name}@threshold={value}")["inliers"] for value in THRESHOLDS]
@@ -678,20 +673,6 @@ def test_what_an_answer_says_besides_is_stored_rounded_and_cut(tmp_path):
     run_rows({"sure": lambda problem: answer}, tmp_path)
     (found,) = read_run(tmp_path).row("sure")[["inliers", "confidence", "note"]].to_numpy()
     assert found.tolist() == [4, 0.3333, "x" * 1000]
-
-
-def test_a_row_may_answer_in_few_digits(tmp_path):
-    exact = Rotation.from_rotvec([0.3, 0.5, -0.2]).as_matrix()
-    rows = {
-        "exact": lambda problem: exact,
-        "half": lambda problem: exact.astype(np.float16),
-        "decimals": lambda problem: Answer(exact.round(4)),
-        "sim3": lambda problem: Sim3(1.0, exact.round(3), np.ones(3)),
-    }
-    methods = run_rows(rows, tmp_path, 2)
-    assert [row["failed"] for row in methods.values()] == [0] * 4
-    medians = [row["median"] for row in methods.values()]
-    assert_allclose(medians, [medians[0]] * 4, atol=0.1)
 
 
 def overwrite(*frames: Frame) -> None:

@@ -101,7 +101,7 @@ WRONG = [
     ("estimate a b --depth-unit 0", "got '0', expected a positive number"),
     ("estimate a b --box 1,2,3,4.5", "got '1,2,3,4.5', expected four integers"),
     ("estimate a b --intrinsics inf,1,2,3", "got 'inf,1,2,3', expected four numbers"),
-    ("estimate a b c", "1 more paths, expected these after --helpers"),
+    ("estimate a b c", "unexpected extra argument (c)"),
     ("estimate --helpers c d a b", "Missing argument 'REFERENCE'"),
     ("estimate a --helpers c --helpers d b", "Missing argument 'TARGET'"),
     ("estimate a b --helpers c --solver paper", "--helpers"),

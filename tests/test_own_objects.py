@@ -264,16 +264,6 @@ def test_json_has_every_number_of_an_estimate(own, content, solver):
     assert_allclose(scaled, estimate.sim3.matrix[:3, :3])
 
 
-@pytest.mark.parametrize("solver", ["paper", "verified"])
-def test_json_has_the_alternatives_of_the_verified_solver(own, content, solver):
-    alternatives = own[0].estimates[solver].alternatives
-    expected = [(one.confidence, one.sim3.matrix.tolist()) for one in alternatives]
-    written = content["estimates"][solver]["alternatives"]
-    assert [(one["probability"], one["matrix"]) for one in written] == expected
-    assert all(probability > 0 for probability, _ in expected)
-    assert (len(expected) > 0) == (solver == "verified")
-
-
 def test_where_the_answer_is_one_of_two_both_clouds_are_written(own, tmp_path, monkeypatch):
     monkeypatch.setattr("zsp_lite.viz.report.write_report", lambda path, *_, **__: path)
     found, out = own

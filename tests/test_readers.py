@@ -19,7 +19,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
-from synthetic_views import CoordinateBackbone
 from test_importers import (
     HALF_PIXEL,
     edited,
@@ -30,7 +29,7 @@ from test_importers import (
     write_nerfstudio,
 )
 
-from zsp_lite import Camera, estimate_pose, open_source
+from zsp_lite import Camera, open_source
 from zsp_lite.data.frames import write_image, write_mask
 from zsp_lite.importers import open_capture, recognise
 from zsp_lite.importers.capture import find_masks, sharpest, trusted
@@ -407,13 +406,6 @@ def damaged(tmp_path, views):
     image = folder / "images/0002.jpg"
     image.write_bytes(image.read_bytes()[:500])
     return folder
-
-
-def test_an_estimate_names_a_damaged_image_of_each_side(damaged):
-    result = estimate_pose(damaged, damaged, "paper", backbone=CoordinateBackbone())
-    assert len(result.targets) == 3
-    flags = result.estimates["paper"].flags
-    assert sum("frames left out: 1: image" in flag for flag in flags) == 2
 
 
 def test_an_import_names_a_damaged_image_unless_too_few_remain(damaged, tmp_path, run):

@@ -109,7 +109,11 @@ def evaluate(
         pairs_per_category = dict.fromkeys(labelled_categories(dataset), pairs)
     work = pairs_of_rows(dataset, rows, pairs_per_category, targets)
     loaded = as_backbone(backbone)
-    _check_settings(rows, make_extractors(loaded, rows))
+    # Wrong settings of a row are refused before anything is computed.
+    extractors = make_extractors(loaded, rows)
+    for row in rows.values():
+        if row.solve is None:
+            ZeroShotPose(extractors[row.features], **row.settings)
     remarks = _remarks_on_stored_poses(rows, dataset, work)
     repeated = {}
     for seed in range(seeds):
@@ -142,13 +146,6 @@ def evaluate(
         if remark:
             logger.warning("%s", remark)
     return run.summary
-
-
-def _check_settings(rows: Mapping[str, Method], extractors: Mapping[str, Any]) -> None:
-    """Raise InputError for wrong settings of a row, before anything is computed."""
-    for row in rows.values():
-        if row.solve is None:
-            ZeroShotPose(extractors[row.features], **row.settings)
 
 
 def _remarks_on_stored_poses(

@@ -34,7 +34,6 @@ class _Estimate(click.Command):
 )
 @click.argument("reference", type=PATH)
 @click.argument("target", type=PATH)
-@click.argument("others", type=PATH, nargs=-1, metavar="")
 @click.option(
     "--helpers",
     type=PATH,
@@ -79,7 +78,6 @@ class _Estimate(click.Command):
 def estimate(
     reference,
     target,
-    others,
     helpers,
     solver,
     reference_frame,
@@ -119,10 +117,6 @@ def estimate(
     from zsp_lite.importers.sources import open_pair
     from zsp_lite.own_objects import estimate_pose
 
-    if others:
-        raise click.UsageError(
-            f"REFERENCE, TARGET and {len(others)} more paths, expected these after --helpers"
-        )
     if helpers and solver != "verified":
         raise click.UsageError("--helpers goes with --solver verified only")
     # Opened here, since an option may differ from object to object; `estimate_pose` takes open

@@ -9,7 +9,6 @@ from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import (
     MOST_FRAMES,
     Capture,
-    CaptureFrame,
     Makers,
     collect,
     find_masks,
@@ -20,8 +19,6 @@ from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.importers.phones import read_polycam, read_record3d, read_stray
 from zsp_lite.importers.scenes import read_bop, read_open3d, read_scannet
 from zsp_lite.importers.unpacked import unpack
-
-__all__ = ["FORMATS", "Capture", "CaptureFrame", "open_capture", "recognise"]
 
 
 @dataclass(frozen=True)

@@ -187,8 +187,15 @@ def import_uco3d(
         names = _downloaded(root, category)
         for name in sequences or ():
             check_choice(f"{root}: sequence of {category}", name, names)
-        asked = set(sequences or names)
-        rows = _ranked(metadata, sorted(asked))
+        asked = sorted(set(sequences or names))
+        places = ", ".join("?" * len(asked))  # one place per name
+        rows = _select(
+            metadata,
+            _SequenceRow,
+            f"sequence_annots WHERE sequence_name IN ({places}) "
+            "ORDER BY _reconstruction_quality_viewpoint DESC, sequence_name",
+            asked,
+        )
         absent = len(asked) - len(rows)
         if absent:
             logger.warning("%d of %d sequences are not in the metadata", absent, len(asked))
@@ -230,18 +237,6 @@ def _downloaded(root: Path, category: str) -> list[str]:
     check_choice(f"{root}: category", category, sorted({path.name for path in folders}))
     places = [path for path in folders if path.name == category]
     return sorted(path.name for place in places for path in place.iterdir() if path.is_dir())
-
-
-def _ranked(metadata: sqlite3.Connection, names: list[str]) -> list[dict[str, Any]]:
-    """Return the rows of sequences, those with the best cameras first."""
-    places = ", ".join("?" * len(names))  # one place per name
-    return _select(
-        metadata,
-        _SequenceRow,
-        f"sequence_annots WHERE sequence_name IN ({places}) "
-        "ORDER BY _reconstruction_quality_viewpoint DESC, sequence_name",
-        names,
-    )
 
 
 def _select(
