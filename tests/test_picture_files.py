@@ -117,12 +117,18 @@ def test_an_array_that_is_no_depth_map_is_refused(tmp_path, values):
 
 def test_files_that_cannot_be_read_are_refused_in_one_line(tmp_path):
     np.savez(tmp_path / "two.npz", a=DEPTH, b=DEPTH)
+    (tmp_path / "d.exr").write_bytes(b"v/1\x01" + bytes(99))
     (tmp_path / "a.heic").write_bytes(bytes(99))
     Image.fromarray(SMOOTH).convert("RGB").save(tmp_path / "a.webp")
     (tmp_path / "half.webp").write_bytes((tmp_path / "a.webp").read_bytes()[:-40])
     assert read_picture(tmp_path / "a.webp")[0].shape == (32, 40, 3)
     for name, read, message in (
         ("two.npz", read_depth_file, "two.npz holds 2 arrays, expected one"),
+        (
+            "d.exr",
+            read_depth_file,
+            "expected an OpenCV that reads .exr, or the depth as .npy or a float .tiff",
+        ),
         ("a.webp", read_depth_file, "holds uint8 of shape .*, expected numbers"),
         ("half.webp", read_picture, "half.webp cannot be decoded"),
         ("a.heic", read_picture, "HEIC is not read, expected the photograph as JPEG"),

@@ -26,7 +26,7 @@ WINDOW_3 = np.ones((3, 3), np.uint8)
 WINDOW_5 = np.ones((5, 5), np.uint8)
 PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif")
 _FORMATS = ("JPEG", "PNG", "WEBP")
-DEPTHS = (".png", ".npy", ".npz", ".tiff", ".tif", ".pfm")
+DEPTHS = (".png", ".npy", ".npz", ".tiff", ".tif", ".pfm", ".exr")
 MASKS = (".png", ".jpg", ".jpeg", ".webp", ".tiff", ".tif", ".npy")
 CO3D_DEPTH = ".geometric.png"  # such a file has the bits of float16 values
 # For each EXIF orientation, 1 to 8, the number of quarter turns as in `numpy.rot90`; and the
@@ -77,7 +77,8 @@ def read_depth_file(path: str | Path) -> Float32[np.ndarray, "h w"]:
     if path.name.endswith(CO3D_DEPTH):
         return read_depth(path)
     values = _read_values(path, "depth")
-    if values.shape[2:] == (1,):
+    # Blender writes the depth three times, as colours of an .exr file.
+    if values.ndim == 3 and (values.shape[2] == 1 or path.suffix.lower() == ".exr"):
         values = values[..., 0]
     if (
         values.ndim != 2
@@ -164,21 +165,26 @@ def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
 def _read_values(path: Path, what: str) -> Shaped[np.ndarray, "..."]:
     """Read the values of an array or image file as stored."""
     suffix = path.suffix.lower()
+    data = read_bytes(path, what)
     with _decoding(what, path):
         if suffix in (".npy", ".npz"):
-            values = np.load(io.BytesIO(read_bytes(path, what)), allow_pickle=False)
+            values = np.load(io.BytesIO(data), allow_pickle=False)
             if isinstance(values, np.lib.npyio.NpzFile):
                 if len(values.files) != 1:
                     raise InputError(
                         f"{what} {path} holds {len(values.files)} arrays, expected one"
                     )
-                if values.zip.infolist()[0].file_size > MAX_FILE:
-                    raise ValueError
-                values = values[values.files[0]]
+                (member,) = values.zip.infolist()
+                values = values[values.files[0]] if member.file_size <= MAX_FILE else None
+        elif suffix == ".exr":
+            # Without the variable OPENCV_IO_ENABLE_OPENEXR, this returns None or raises an error.
+            values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         elif suffix in (".tif", ".tiff", ".pfm", ".webp"):
             values = np.array(_open(path, what, ("TIFF", "PPM", "WEBP")))
         else:
             values = decode_image(path, what, cv2.IMREAD_UNCHANGED)
+        if values is None:
+            raise ValueError
     return values
 
 
@@ -202,6 +208,8 @@ def _decoding(what: str, path: str | Path) -> Iterator[None]:
         raise
     except Exception as error:  # numpy, Pillow and OpenCV may raise anything
         expected = f"a complete {Path(path).suffix or 'image'} file of at most {MAX_PIXELS} pixels"
+        if str(path).endswith(".exr"):
+            expected = "an OpenCV that reads .exr, or the depth as .npy or a float .tiff"
         raise InputError(
             f"{what} {path} cannot be decoded ({type(error).__name__}), expected {expected}"
         ) from error
