@@ -328,15 +328,17 @@ def test_every_capture_in_a_folder_is_imported_once(tmp_path, views, caplog):
     for name in ("one", "two"):
         write_lists(tmp_path / "scans" / name, views, masks=True)
     (tmp_path / "scans/one.txt").touch()
+    (tmp_path / "scans/__MACOSX").mkdir()
     done = dict(import_captures(tmp_path / "scans", tmp_path / "data", "teapot"))
     numbers = {name: one.frames for name, one in done.items()}
     assert numbers == {"one": len(views), "two": len(views)}
     assert "one.txt is left out" in caplog.text
+    assert "__MACOSX is left out" in caplog.text
     assert not list(import_captures(tmp_path / "scans", tmp_path / "data", "teapot"))
 
 
 def test_no_capture_and_two_captures_of_one_name_are_refused(tmp_path):
     refused("has no scan, expected", next, import_captures(tmp_path, tmp_path, "cup"))
-    (tmp_path / "cup").mkdir()
-    (tmp_path / "cup.zip").touch()
-    refused("cup and cup.zip, expected one", next, import_captures(tmp_path, tmp_path, "cup"))
+    for name in ("cup.r3d", "cup.zip"):
+        (tmp_path / name).touch()
+    refused("cup.r3d and cup.zip, expected one", next, import_captures(tmp_path, tmp_path, "cup"))

@@ -404,7 +404,7 @@ def test_a_contradiction_limits_the_probability_of_every_pose(in_memory, monkeyp
     first, second = in_memory
     flat = [replace(one, depth=np.where(one.depth > 0, 4, one.depth)) for one in second]
     found = estimate_pose(first, flat, **SEVERAL)
-    assert "the object's depth is flat in 4 of 4 frames" in found.estimate.note
+    assert "the object's depth is constant in 4 of 4 frames" in found.estimate.note
     assert "low confidence: --not-upright helps" in found.estimate.note
     estimates = [found.estimate, *(vote.estimate for vote in found.votes)]
     assert max(one.confidence for of in estimates for one in of.hypotheses) < 0.301

@@ -27,8 +27,7 @@ def moved(frame: Frame, shift: int, scale: float) -> Frame:
 @pytest.mark.parametrize("scan", SCANS)
 def test_the_shift_and_the_scale_of_depth_are_measured(scan):
     frames = [SAMPLES.load(one) for one in SAMPLES.frames(*scan)[::3]]
-    for registered in (frames, frames[:1]):
-        assert misregistration(registered) == ""
+    assert misregistration(frames) == ""
     for shift, scale, found in ((15, 1.0, "-1[46], [02].* 1.00"), (0, 0.8, "0, [024].* 1.25")):
         line = misregistration([moved(frame, shift, scale) for frame in frames])
         assert re.search(f"moved by about {found}", line)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
 from typing import Any, ClassVar
+from uuid import uuid4
 
 import msgspec
 import numpy as np
@@ -25,8 +26,8 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
 from zsp_lite.data.published import write_all
 from zsp_lite.errors import InputError, NoPoseError
-from zsp_lite.importers.sources import SourceLike, open_source
-from zsp_lite.io.files import digest, plain_name, read_json, write_atomic
+from zsp_lite.importers.sources import SourceLike, list_sources, open_source
+from zsp_lite.io.files import plain_name, read_json, write_atomic
 from zsp_lite.metrics import rotation_error
 
 logger = logging.getLogger(__name__)
@@ -59,18 +60,16 @@ class SourceSet(Co3D):
     def __init__(self, sources: Iterable[SourceLike]):
         """Open the sources, find the masks that they lack, and log doubts about them."""
         self._by_name = {}
-        content = []  # for the name of the set, which tells runs apart
-        for position, given in enumerate(sources if np.iterable(sources) else [sources], 1):
+        for position, given in enumerate(list_sources(sources), 1):
             source = open_source(given).segmented()
             name = str(position) if source.format == "frames" else source.name
             if name in self._by_name:
                 raise InputError(f"two objects are named {name}, expected different names")
             self._by_name[name] = source
-            first = source.read_frame(0)
-            content.append(first.depth.tobytes())
-            for flag in source.flags([first]):
+            for flag in source.flags([source.read_frame(0)]):
                 logger.warning("%s: %s", name, flag)
-        self.root = Path(f"sources {digest(*content)}")
+        # Files and frames may have changed since an earlier call: no run of it is continued.
+        self.root = Path(f"sources {uuid4()}")
 
     def frame_numbers(self, category: str) -> dict[str, list[int]]:
         """List the numbers of the frames of every source."""
@@ -125,8 +124,8 @@ def align_category(
 ) -> CategoryAlignment:
     """Align all objects of a category in one frame, without labels (see `category`).
 
-    Pairs whose views determine no pose are left out. A run in OUT is continued: pairs that it has
-    are not solved again.
+    Pairs whose views determine no pose are left out. A run of a data set in OUT is continued: pairs
+    that it has are not solved again. Sources need a new OUT.
 
     Args:
         dataset: Data set; or sources of the objects (see `open_source`), such as paths of scans, or

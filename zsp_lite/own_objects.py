@@ -27,7 +27,7 @@ from zsp_lite.data.cameras import Values
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
 from zsp_lite.importers.convert import scale_frame
-from zsp_lite.importers.sources import Source, SourceLike, open_pair
+from zsp_lite.importers.sources import Source, SourceLike, list_sources, open_pair
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
 from zsp_lite.metrics import SAME_ANGLE, rotation_angle, rotation_error
@@ -96,7 +96,7 @@ def estimate_pose(
     Raises:
         InputError: An input or an option is missing or wrong, or the pose cannot be estimated.
     """
-    helpers = list(helpers)
+    helpers = list_sources(helpers)
     check_choice("solver", solver, SOLVERS)
     solvers = SOLVERS[solver]
     n_targets = _TARGETS if targets is None else targets

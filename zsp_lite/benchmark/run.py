@@ -10,7 +10,7 @@ answer; `runs.add_lines` adds the line to run.jsonl, from which `write_reports` 
 import json
 import logging
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -135,7 +135,7 @@ def evaluate(
         )
         # Workers load a named backbone themselves; an object travels to them.
         sent = backbone if workers.executor else loaded
-        settings.images = {name: _hash_of_images(dataset, name) for name in pairs_per_category}
+        settings.images = _hash_of_images(dataset, work)
         evaluator = PairEvaluator(str(Path(data).resolve()), rows, sent, row_seconds)
         with open_run(out, settings):
             execution.evaluate_pairs(out, evaluator.open, repeated, workers)
@@ -222,15 +222,17 @@ def _hash_of_labels(dataset: Co3D, category: str) -> str:
     return digest(*parts)
 
 
-def _hash_of_images(dataset: Co3D, category: str) -> str:
-    """Hash the first image of each labelled sequence: data with equal labels may differ."""
-    labels = read_labels(dataset.root, category)
-    parts = []
-    for name, numbers in dataset.frame_numbers(category).items():
-        if name in labels:
-            image = dataset.frame(category, name, numbers[0]).image
-            parts.append(read_bytes(path_inside(dataset.root, image.path), "image"))
-    return digest(*parts)
+def _hash_of_images(dataset: Co3D, pairs: Iterable[Pair]) -> dict[str, str]:
+    """Hash the first image of each sequence of pairs: data with equal labels may differ."""
+    hashes = {}
+    for pair in pairs:
+        for name in (pair.reference_sequence, pair.target_sequence):
+            key = f"{pair.category}/{name}"
+            if key not in hashes:
+                image = dataset.frames(pair.category, name)[0].image
+                path = path_inside(dataset.root, image.path)
+                hashes[key] = digest(read_bytes(path, "image"))
+    return hashes
 
 
 @dataclass

@@ -76,7 +76,7 @@ class Settings(msgspec.Struct):
     labels: dict[str, str]  # hash of the pose labels by category
     calls: Annotated[list[Call], msgspec.Meta(min_length=1)]
     folder: str = ""  # absolute path of the data, without links
-    images: dict[str, str] = {}  # hash of images by category
+    images: dict[str, str] = {}  # hash of an image by CATEGORY/SEQUENCE
 
 
 class Result(msgspec.Struct):
@@ -295,8 +295,7 @@ def _continued(out: Path, now: Settings) -> Settings:
     before = read_json(out / SETTINGS, Settings, "settings of a run")
     held = _decisive(before)
     asked = _decisive(now)
-    common = before.images.keys() & now.images.keys()
-    if common and all(before.images[name] == now.images[name] for name in common):
+    if before.images.keys() & now.images.keys():
         del held["data"]  # the same data may lie at another path
     for name in asked:
         if held.get(name, asked[name]) != asked[name]:
@@ -326,6 +325,8 @@ def _decisive(settings: Settings) -> dict[str, Any]:
         parts[f"methods of {row}"] = description
     for category, code in settings.labels.items():
         parts[f"labels of {category}"] = code
+    for sequence, code in settings.images.items():
+        parts[f"images of {sequence}"] = code
     return parts
 
 

@@ -71,8 +71,7 @@ _CARRIED = 0.05
 
 PLAUSIBLE = (0.05, 20.0)  # least and largest distance of an object, metres
 _LEAST_KNOWN = 0.4  # least share of the object's pixels that have depth
-# An object is flat whose points deviate less from a plane, relative to the distance, as where depth
-# is filled in, or of the table behind glass. Of real objects, 0.016 is the least.
+# Depth that deviates less, relative to the distance, is constant, as where it is filled in.
 _FLAT = 0.005
 DOUBTFUL = "the masks may be wrong"
 
@@ -267,22 +266,18 @@ def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
         seen += (frame.mask > ON_OBJECT).sum()
         known += len(depth)
         distances.append(np.quantile(depth, 0.25) if len(depth) else np.nan)
-        # A plane has the equation plane @ x = 1 in the camera's frame.
-        points = world_points(frame, pixels, len(depth) // _POINTS + 1)
-        points = frame.camera.to_camera(points)
-        plane = np.linalg.pinv(points).sum(axis=1)
-        flat += len(depth) > _MIN_PIXELS and np.std(points @ plane) < _FLAT
+        flat += len(depth) > _MIN_PIXELS and np.std(depth) < _FLAT * distances[-1]
     distance = float(np.nanmedian(distances)) if known else PLAUSIBLE[0]
     if metric and not PLAUSIBLE[0] <= distance <= PLAUSIBLE[1]:
-        yield Doubt(
+        yield (
             f"the object is {distance:.3g} m from the camera, expected {PLAUSIBLE[0]:g} to "
-            f"{PLAUSIBLE[1]:g} m; the unit of its depth is given by --depth-unit (0.001: "
-            "millimetres, 1: metres)"
+            f"{PLAUSIBLE[1]:g} m; the unit of its depth is given by --depth-unit or depth_unit "
+            "(0.001: millimetres, 1: metres)"
         )
     if known < _LEAST_KNOWN * seen:
         yield Doubt(f"depth is known on {known / seen:.0%} of the object only")
     if flat > len(distances) / 2:
-        yield Contradiction(f"the object's depth is flat in {flat} of {len(distances)} frames")
+        yield Contradiction(f"the object's depth is constant in {flat} of {len(distances)} frames")
 
 
 def given_mask_flags(frames: Collection[Frame], missing: Collection[str]) -> Iterator[str]:

@@ -14,7 +14,7 @@ from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.errors import Doubt
 
 _FRAMES = 8  # largest number of frames, about
-_FEW = 2  # so many frames show that there is a shift; more also measure it
+_LEAST = 3  # fewer frames do not tell flat objects from a shift
 _SIDE = 160  # longest side of the images that are compared, pixels
 _SHIFT = 20  # largest shift along either axis
 _BORDER = ((_SHIFT, _SHIFT), (_SHIFT, _SHIFT), (0, 0))
@@ -25,11 +25,10 @@ _REGISTERED = np.s_[1:4, 19:22, 19:22]  # the middle scales and shifts
 # Steps are between pixels this far on both sides: right at an outline, depth is often unknown.
 _APART = 3
 _HIGHEST = 0.15  # higher steps, of the logarithm of depth, count as this one
-# Least share of the highest steps at the outlines. Of 34 registered scans, all have more, of their
-# single frames 99 %, also with noise and inexact masks; of the scans whose depth is shifted by 5 %
-# of the image, or has a field of view of 80 %, all have less, of their single frames half.
+# Least share of the highest steps at the outlines. Of 34 registered scans, all have more, also with
+# noise and inexact masks; all have less if depth is shifted by 5 % of the image, or has a field of
+# view of 80 %.
 _SHARE = 0.75
-_SHARE_OF_FEW = 0.5
 
 
 def misregistration(frames: Sequence[Frame]) -> str:
@@ -51,14 +50,14 @@ def misregistration(frames: Sequence[Frame]) -> str:
             # Inside a mask, depth is less.
             of_scale -= cv2.matchTemplate(around, outline, cv2.TM_CCORR)
 
-    few = len(frames) <= _FEW
-    if steps[_REGISTERED].max() >= (_SHARE_OF_FEW if few else _SHARE) * steps.max():
+    if len(frames) < _LEAST or steps[_REGISTERED].max() >= _SHARE * steps.max():
         return ""
     scale, down, right = np.unravel_index(steps.argmax(), steps.shape)
     x, y = step * (_SHIFT - right), step * (_SHIFT - down)
-    fit = f": it fits if moved by about {x}, {y} pixels and scaled by {1 / _SCALES[scale]:.2f}"
-    found = "depth is not registered to the colours, or the masks are wrong"
-    return Doubt(found if few else found + fit)
+    return Doubt(
+        "depth is not registered to the colours, or the masks are wrong: it fits if moved by about "
+        f"{x}, {y} pixels and scaled by {1 / _SCALES[scale]:.2f}"
+    )
 
 
 def _steps(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 2"]:

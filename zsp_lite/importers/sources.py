@@ -77,7 +77,9 @@ class Source:
     @property
     def name(self) -> str:
         """Name of the sequence, the capture or the image, also where the path is "."."""
-        return Path(os.path.abspath(self.path)).name
+        path = Path(os.path.abspath(self.path))
+        # An inner folder of Polycam's has the same name in all scans.
+        return path.parent.name if path.name == "keyframes" else path.name
 
     def describe(self, positions: Sequence[int]) -> str:
         """Name the source and its frames at some positions."""
@@ -219,6 +221,12 @@ class Source:
 SourceLike = str | Path | Frame | Iterable[Frame] | Source
 
 
+def list_sources(given: SourceLike | Iterable[SourceLike]) -> list[SourceLike]:
+    """List several sources; a path or a frame is a single one."""
+    single = isinstance(given, str | Path | Frame | Source)
+    return [given] if single else list(given)
+
+
 def open_source(
     path: SourceLike,
     intrinsics: Values | None = None,
@@ -274,7 +282,7 @@ def open_source(
         "orientation": orientation,
     }
     options = {name: value for name, value in options.items() if value is not None}
-    layout = layout or _format(path)
+    layout = layout or source_format(path)
 
     # Refuse options that do not fit the format, or each other.
     if layout == "frames":
@@ -402,7 +410,7 @@ def open_pair(
     any, or the first of all. An open source takes none.
     """
     sides = (reference, target, *helpers)
-    formats = [_format(side) for side in sides]
+    formats = [source_format(side) for side in sides]
     options_of_side: list[dict] = [{"layout": layout} for layout in formats]
     for name, values in options.items():
         takers = [k for k, layout in enumerate(formats) if name in _TAKEN[layout]]
@@ -437,7 +445,7 @@ def _check_poses(cameras: Sequence[Camera], where: str | Path) -> None:
         )
 
 
-def _format(side: SourceLike) -> str:
+def source_format(side: SourceLike) -> str:
     """Tell "open", "frames", "image" or "sequence", or return the format of a capture."""
     if not isinstance(side, str | Path):
         return "open" if isinstance(side, Source) else "frames"

@@ -119,7 +119,7 @@ def _colours(columns: dict[str, np.ndarray]) -> UInt8[np.ndarray, "n 3"] | None:
         return None
     stored = np.stack([columns[name] for name in ("red", "green", "blue")], axis=-1)
     colours = np.where(np.isfinite(stored), stored, 0.0)
-    if stored.dtype == np.uint16:
+    if stored.dtype == np.uint16 and colours.max(initial=0) > 255:
         colours /= 257
     elif stored.dtype.kind == "f" and colours.max(initial=0) < 1.01:  # rounding may exceed 1
         colours *= 255
