@@ -176,7 +176,7 @@ def _pixels(
         frame = dataset.load(annotation)
         shown = object_pixels(frame)  # on the object, with measured depth
         height, width = frame.camera.size
-        for seen, point in zip(pixels, points, strict=True):
+        for seen, point in zip(pixels, points):
             (x, y), depth = frame.camera.project(point)
             if depth <= 0 or not (0 <= x < width and 0 <= y < height):
                 continue

@@ -55,7 +55,7 @@ class Scan:
             scale = 1 / (axis_deviation(cloud) or 1)
         used = dict.fromkeys([*chosen, *shown])
         views = method.views([scale_frame(frames[position], scale) for position in used])
-        return cls(source, chosen, shown, frames, dict(zip(used, views, strict=True)), scale, cloud)
+        return cls(source, chosen, shown, frames, dict(zip(used, views)), scale, cloud)
 
     @property
     def target_views(self) -> list[View]:
@@ -96,7 +96,7 @@ def stood_up(scan: Scan, target: Scan, method: ZeroShotPose) -> tuple[Scan, int]
                 scores[quarters] = estimate.view_scores.max()
     best = max(scores, key=scores.get, default=0)
     frames = {position: turn_frame(frame, best) for position, frame in scan.frames.items()}
-    views = dict(zip(scan.views, views_of(scan.views, best), strict=True))
+    views = dict(zip(scan.views, views_of(scan.views, best)))
     return replace(scan, frames=frames, views=views), 90 * best
 
 

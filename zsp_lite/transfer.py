@@ -120,7 +120,7 @@ def surface_views(
     method = ZeroShotPose(as_backbone(backbone), foreground="saliency" if unmasked else "mask")
     surface = [
         _surface_view(number, view, alignment.objects[sequence].sim3)
-        for number, view in zip(usable, method.views(usable.values()), strict=True)
+        for number, view in zip(usable, method.views(usable.values()))
         if view.known_foreground.any()
     ]
     if not surface:

@@ -57,7 +57,7 @@ def show_graphs(
     """
     size = (4.1 * len(graphs), 4.4)
     figure, axes = plt.subplots(1, len(graphs), figsize=size, layout="constrained", squeeze=False)
-    for axis, (title, (pictures, arrows)) in zip(axes.flat, graphs.items(), strict=True):
+    for axis, (title, (pictures, arrows)) in zip(axes.flat, graphs.items()):
         angles = np.pi * (0.75 + 2 * np.arange(len(pictures)) / len(pictures))
         centres = dict(zip(pictures, np.column_stack([np.cos(angles), np.sin(angles)])))
         for name, picture in pictures.items():

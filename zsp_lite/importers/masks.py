@@ -211,7 +211,7 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
     plane = _supporting_plane(centres, np.concatenate(cloud), distance)
     if plane is not None:
         normal, offset = plane
-        for frame, selected in zip(frames, selections, strict=True):
+        for frame, selected in zip(frames, selections):
             height = world_points(frame, selected) @ normal - offset
             selected[selected] = height > _CLEARANCE * distance
 
@@ -220,10 +220,7 @@ def masks_from_depth(frames: Sequence[Frame]) -> list[Frame]:
     if len(frames) >= _MANY:
         # This raises InputError if the part is two objects close together.
         _part_at(focus, frames, parts, _VOXEL / _FINER * distance)
-    masked = [
-        replace(frame, mask=_with_unknown(frame, part))
-        for frame, part in zip(frames, parts, strict=True)
-    ]
+    masked = [replace(frame, mask=_with_unknown(frame, part)) for frame, part in zip(frames, parts)]
     if not any(frame.mask.sum() >= _MIN_PIXELS for frame in masked):
         raise InputError(
             f"{frames[0].name or 'frame'}: nothing stands out from a plane where the camera "
@@ -408,7 +405,7 @@ def _part_at(
     """
     # The box of all points. Clouds are large: they are computed twice, not kept in memory.
     corners = []
-    for frame, selected in zip(frames, pixels, strict=True):
+    for frame, selected in zip(frames, pixels):
         points = world_points(frame, selected)
         if len(points):
             corners += [points.min(axis=0), points.max(axis=0)]
@@ -448,7 +445,7 @@ def _part_at(
     # Keep the selected pixels whose voxel is in that part.
     chosen = part == first
     masks = [selected.copy() for selected in pixels]
-    for mask, cell in zip(masks, cells, strict=True):
+    for mask, cell in zip(masks, cells):
         mask[mask] = chosen[cell]
     return masks
 

@@ -108,13 +108,13 @@ class Source:
         if self.mask != "given":
             try:
                 masks = masks_from_box(loaded, self.box) if self.box else masks_from_depth(loaded)
-                frames = dict(zip(frames, masks, strict=True))
+                frames = dict(zip(frames, masks))
             except InputError as error:
                 reasons = (str(error), self.contradiction())
                 raise InputError("; ".join(filter(None, reasons))) from error
         elif any(frame.mask is None for frame in loaded):
             masked = replace(self, mask="auto").load(list(frames), context)
-            for position, frame in zip(list(frames), masked, strict=True):
+            for position, frame in zip(list(frames), masked):
                 if frames[position].mask is None:
                     frames[position] = frame
         return [frames[position] for position in positions]
@@ -146,7 +146,7 @@ class Source:
             group = positions[first::groups]
             # A small group is completed by other frames.
             masked = replace(self, mask="auto").load(group, _CONTEXT - len(group))
-            yield from zip(group, masked, strict=True)
+            yield from zip(group, masked)
 
     def flags(self, frames: Sequence[Frame]) -> list[str]:
         """List doubts about the masks and depth of frames, and the intrinsics and poses of all."""
@@ -167,15 +167,14 @@ class Source:
 
     def contradiction(self) -> str:
         """Say how depth and poses of a few frames contradict each other (see `disagreement`)."""
-        return disagreement(self._few_frames(), self.depth_unit)
-
-    def _few_frames(self) -> Iterator[Frame]:
-        """Read a few frames around the object, with their given masks only."""
+        frames = []
         for position in neighbours(len(self.numbers)):
             # A damaged file is no reason to fail here: the estimate may not use it.
             with suppress(InputError):
                 frame = self.read_frame(position)
-                yield frame if self.mask == "given" else replace(frame, mask=None)
+                # Masks that are not given are of no account.
+                frames.append(frame if self.mask == "given" else replace(frame, mask=None))
+        return disagreement(frames, self.depth_unit)
 
     def select(
         self, references: int, targets: int, first: int | None = None
@@ -199,7 +198,7 @@ class Source:
         candidates = self._spread(tried, [*every[start:], *every[:start]])
         views = self._spread(targets, every)
         needed = list(dict.fromkeys([*candidates, *views]))  # each position once
-        frames = dict(zip(needed, self.load(needed), strict=True))
+        frames = dict(zip(needed, self.load(needed)))
         defects = {position: frame_defect(frames[position]) for position in candidates}
         usable = [position for position in candidates if not defects[position]]
         if references and (not usable or first is not None and defects[start]):

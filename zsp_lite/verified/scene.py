@@ -151,7 +151,7 @@ def build_scene(
     reference_foreground = reference.foreground.ravel()
     between_foregrounds = [
         similarity.float()[reference_foreground][:, foreground]
-        for similarity, foreground in zip(similarities, foregrounds, strict=True)
+        for similarity, foreground in zip(similarities, foregrounds)
     ]
     # The similarity of a target view to the reference: the highest similarity of each patch to any
     # patch of the other view, averaged over the reference's patches and over the target's.
@@ -204,9 +204,7 @@ def build_maps(
     columns: Sequence[Int[np.ndarray, " _"]],
 ) -> ViewMaps:
     """Build the maps of views that share a world frame."""
-    maps = [
-        _table(view, column, to_working.scale) for view, column in zip(views, columns, strict=True)
-    ]
+    maps = [_table(view, column, to_working.scale) for view, column in zip(views, columns)]
     cameras, tables = zip(*maps)
     sizes = np.array([camera.size[::-1] for camera in cameras])
     pixels = [0, *(table.shape[1] for table in tables[:-1])]  # their running sum: the first rows

@@ -59,18 +59,18 @@ def objects_figure(
     figure, axes = plt.subplots(
         len(rows), len(names), figsize=size, layout="constrained", squeeze=False
     )
-    for panels, (title, rotations) in zip(axes, rows.items(), strict=True):
+    for panels, (title, rotations) in zip(axes, rows.items()):
         # The row "or turned" has pictures of some objects only; its title is at the first.
         first = names.index(next(iter(rotations)))
         panels[first].set_ylabel(title)
-        for axis, name in zip(panels, names, strict=True):
+        for axis, name in zip(panels, names):
             axis.set(xticks=[], yticks=[], frame_on=False)
             if name in rotations:
                 frames = _frames(dataset, category, name)
                 axis.imshow(nearest_crop(dataset, frames, rotations[name]).rgb)
 
     # Names and probabilities below the row "aligned".
-    for axis, name in zip(axes[1], names, strict=True):
+    for axis, name in zip(axes[1], names):
         text = f"{name[:16]}\n{100 * objects[name].probability:.0f} %"
         colour = VERMILLION if name in flagged else "black"
         axis.set_xlabel(text, fontsize=8, color=colour, parse_math=False)
@@ -90,12 +90,12 @@ def marks_figure(
     figure, axes = plt.subplots(
         len(placed), len(names), figsize=size, layout="constrained", squeeze=False
     )
-    for number, (panels, one) in enumerate(zip(axes, placed, strict=True)):
+    for number, (panels, one) in enumerate(zip(axes, placed)):
         mark = one.mark
         marked = dataset.camera(dataset.frame(category, mark.sequence, mark.frame)).R
         common = marked @ alignment.objects[mark.sequence].sim3.R.T  # from the common frame
         panels[0].set_ylabel(mark.name[:24], fontsize=8, parse_math=False)
-        for axis, name in zip(panels, names, strict=True):
+        for axis, name in zip(panels, names):
             place = one.places[name]
             frames = _frames(dataset, category, name)
             seeing = [frame for frame in frames if frame.frame_number in place.pixels]

@@ -141,7 +141,7 @@ def rank(
         pool = ThreadPoolExecutor(workers)
         try:
             done = tqdm(pool.map(answers_of, teams), "hand-ins", len(teams), disable=None)
-            answers = dict(zip(teams, done, strict=True))
+            answers = dict(zip(teams, done))
         finally:
             ended.set()
             pool.shutdown(cancel_futures=True)

@@ -191,7 +191,7 @@ def read_mesh(path: str | Path) -> TexturedMesh:
     n_faces = [len(mesh.faces) for mesh, *_ in parts]
     if not 0 < sum(n_faces) <= MAX_FACES:
         raise InputError(f"model {path} has {sum(n_faces):,} faces, expected 1 to {MAX_FACES:,}")
-    meshes, uv, colours, materials = zip(*parts, strict=True)
+    meshes, uv, colours, materials = zip(*parts)
     vertices, faces = joined(meshes)
     material = np.repeat(np.arange(len(parts)), n_faces)
     check_magnitude(f"model {path}: vertices", vertices)

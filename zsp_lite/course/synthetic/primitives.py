@@ -60,7 +60,7 @@ def point(*coordinates: float) -> Float[np.ndarray, " d"]:
 def joined(meshes: Sequence[Mesh]) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """Return the vertices and the faces of several meshes as those of one."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts)]
     return np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces)
 
 

@@ -173,7 +173,7 @@ class MeshScene:
             start[active] = distance[hole] + _OFFSET
             if not len(active):
                 break
-        return _Hits(*map(np.concatenate, zip(*layers, strict=True)))
+        return _Hits(*map(np.concatenate, zip(*layers)))
 
     def _is_hole(self, face: Int[np.ndarray, " n"], weights: Vectors) -> Bool[np.ndarray, " n"]:
         """Return at which surface points the texture has a hole."""

@@ -230,12 +230,12 @@ def fused_cloud(
 ) -> list[np.ndarray]:
     """Sample world points of the object from all depth maps, with normals and 8-bit colours."""
     clouds = []
-    for view, depth in zip(views, depths, strict=True):
+    for view, depth in zip(views, depths):
         row, col = np.nonzero((depth > 0) & view.mask)
         points = view.camera.unproject(np.stack([col + 0.5, row + 0.5], -1), depth[row, col])
         normals = view.normals[row, col] @ view.camera.R  # from the camera frame to the world
         clouds.append((points, normals, view.rgb[row, col]))
-    cloud = [np.concatenate(values) for values in zip(*clouds, strict=True)]
+    cloud = [np.concatenate(values) for values in zip(*clouds)]
     n = len(cloud[0])
     chosen = np.sort(rng.choice(n, min(n_points, n), replace=False))
     return [values[chosen] for values in cloud]
@@ -289,7 +289,7 @@ def record_sequence(
             mask,
             replace(view.camera, t=view.camera.t * factor),
         )
-        for view, depth, mask in zip(views, depths, masks, strict=True)
+        for view, depth, mask in zip(views, depths, masks)
     ]
     scores = [round(rng.uniform(*limits), 4) for limits in _SCORES]
     data = SequenceData(name, recorded, seconds, points * factor, colours, normals, *scores)

@@ -60,7 +60,7 @@ class RenderSet:
 def render_set(numbers: Iterable[int]) -> RenderSet:
     """Render the objects of these numbers, about half a second each."""
     objects = [render_object(number) for number in numbers]
-    return RenderSet(*map(np.stack, zip(*objects, strict=True)))
+    return RenderSet(*map(np.stack, zip(*objects)))
 
 
 def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -92,7 +92,7 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         camera = framed_camera(mesh.vertices, R, t, SIZE, margin, shift=rng.normal(0, 0.02, 2))
         image = render_instance(number, mesh, shape.vertices, camera, rng)
         views.append((image.rgb, *_geometry(image)))
-    return tuple(map(np.stack, zip(*views, strict=True)))
+    return tuple(map(np.stack, zip(*views)))
 
 
 def _geometry(image: Rendering) -> tuple[np.ndarray, np.ndarray]:
