@@ -88,7 +88,16 @@ class PairResult:
                 "error_degrees": self.errors.get(solver),
                 "flags": list(estimate.flags),
                 "one_of_two": estimate.one_of_two,
-                "alternatives": _alternatives(estimate),
+                "alternatives": [
+                    {
+                        "view": other.view,
+                        "matrix": other.sim3.matrix.tolist(),
+                        "probability": other.confidence,
+                        "degrees_from_best": estimate.angle_to(other),
+                        "score_below_best": estimate.hypotheses[0].score - other.score,
+                    }
+                    for other in estimate.alternatives
+                ],
                 "seconds": dict(estimate.timings),
             }
         views = [frame.name for frame in self.targets]
@@ -107,20 +116,6 @@ class PairResult:
                 for vote in self.votes
             ],
         }
-
-
-def _alternatives(estimate: PoseEstimate) -> list[dict[str, Any]]:
-    """List the alternatives of an estimate in the types of JSON."""
-    return [
-        {
-            "view": other.view,
-            "matrix": other.sim3.matrix.tolist(),
-            "probability": other.confidence,
-            "degrees_from_best": estimate.angle_to(other),
-            "score_below_best": estimate.hypotheses[0].score - other.score,
-        }
-        for other in estimate.alternatives
-    ]
 
 
 def label_errors(found: PairResult, category: Path, sequences: Sequence[str]) -> dict[str, float]:
