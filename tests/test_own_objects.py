@@ -260,6 +260,7 @@ def test_json_has_every_number_of_an_estimate(own, content, solver):
         "one_of_two": estimate.one_of_two,
     }
     assert {name: numbers[name] for name in expected} == expected
+    assert len(numbers["alternatives"]) == len(estimate.alternatives)
     scaled = np.multiply(numbers["scale"], numbers["rotation"])
     assert_allclose(scaled, estimate.sim3.matrix[:3, :3])
 
