@@ -416,10 +416,11 @@ def test_the_same_data_by_another_path_continue_a_run_and_other_data_do_not(
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert run("../link", "ours") == "../link"
     assert run("data", "sift") == "data"
-    # Another image, and the same labels.
-    (tmp_path / "data/lump/300_c/images/frame000001.jpg").write_bytes(b"")
-    message = "a run with data .*elsewhere/data, this is .*data; choose another folder"
-    refused(message, run, "../data", "ours")
+    # Other images, and the same labels, also at the path of the last call.
+    for path in tmp_path.glob("*/**/images/frame000001.jpg"):
+        path.write_bytes(b"")
+    for data in ("../data", "data"):
+        refused("a run with images of lump/.*; choose another folder", run, data, "ours")
     assert list(read_run(tmp_path / "run").settings.methods) == ["icp", "ours-bv", "ours", "sift"]
 
 
