@@ -159,7 +159,6 @@ def test_the_demo_begins_with_the_credited_photograph(
     monkeypatch.setattr(
         "zsp_lite.course.demo.run_demo", lambda dataset, backbone, solvers: iter(())
     )
-    monkeypatch.setattr("zsp_lite.viz.report.write_overview", lambda *others: None)
     text = run(f"demo --data {motorcycles.root} --out {tmp_path}")
     page = (tmp_path / "report.html").read_text("utf-8")
     assert text.index("Photographed motorcycle") < text.index("One pair per category")

@@ -41,7 +41,7 @@ def demo(data, solver, backbone, out) -> None:
     from zsp_lite.course.synthetic.export import RENDERED_FILE, SETTINGS_FILE
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.io.locks import writing
-    from zsp_lite.viz.report import COLUMNS, legend, table_rows, write_overview, write_report
+    from zsp_lite.viz.report import COLUMNS, legend, table_rows, write_report
 
     folder = data or sample_data()
     notes = {SETTINGS_FILE: SYNTHETIC_NOTE, RENDERED_FILE: MODELS_NOTE}
@@ -55,7 +55,6 @@ def demo(data, solver, backbone, out) -> None:
         path = write_report(
             out / "report.html", results, getattr(model, "name", ""), str(folder), note, photograph
         )
-        write_overview(out / "overview.jpg", results)
     if photograph:
         title = (
             f"Photographed motorcycle: directions from the rendered {photograph.sequence}, "

@@ -14,7 +14,7 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.importers import PACKED
 from zsp_lite.importers.capture import HALF_PIXEL
-from zsp_lite.importers.sources import Source, open_source, source_format
+from zsp_lite.importers.sources import Source, open_source
 from zsp_lite.io.files import plain_name
 from zsp_lite.io.locks import writing
 from zsp_lite.points import axis_deviation, object_pixels, sampling_step, world_points
@@ -101,7 +101,7 @@ def import_captures(
 ) -> Iterator[tuple[str, ImportResult]]:
     """Import the captures in a folder that are not imported yet; yield names and results.
 
-    InputError if two have one name. Files and folders of other kinds are left out.
+    InputError if two have one name. Files of other kinds are left out.
     """
     paths = {}
     for path in sorted(Path(folder).glob("[!.]*")):
@@ -109,12 +109,6 @@ def import_captures(
             logger.warning("%s is left out, expected a folder, .zip or .r3d", path)
             continue
         name = path.stem if path.is_file() else path.name
-        if path.is_dir():
-            try:
-                source_format(path)
-            except InputError as error:
-                logger.warning("%s is left out: %s", path, error)
-                continue
         if name in paths:
             raise InputError(
                 f"{folder} has {paths[name].name} and {path.name}, expected one scan of a name"

@@ -282,7 +282,7 @@ def open_source(
         "orientation": orientation,
     }
     options = {name: value for name, value in options.items() if value is not None}
-    layout = layout or source_format(path)
+    layout = layout or _format(path)
 
     # Refuse options that do not fit the format, or each other.
     if layout == "frames":
@@ -410,7 +410,7 @@ def open_pair(
     any, or the first of all. An open source takes none.
     """
     sides = (reference, target, *helpers)
-    formats = [source_format(side) for side in sides]
+    formats = [_format(side) for side in sides]
     options_of_side: list[dict] = [{"layout": layout} for layout in formats]
     for name, values in options.items():
         takers = [k for k, layout in enumerate(formats) if name in _TAKEN[layout]]
@@ -445,7 +445,7 @@ def _check_poses(cameras: Sequence[Camera], where: str | Path) -> None:
         )
 
 
-def source_format(side: SourceLike) -> str:
+def _format(side: SourceLike) -> str:
     """Tell "open", "frames", "image" or "sequence", or return the format of a capture."""
     if not isinstance(side, str | Path):
         return "open" if isinstance(side, Source) else "frames"

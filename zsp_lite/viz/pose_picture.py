@@ -115,7 +115,7 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
         rows = np.arange(mask.shape[0]) + 0.5
         columns = np.arange(mask.shape[1]) + 0.5
         axes[1].contour(columns, rows, mask, [ON_OBJECT], colors=["white"], linewidths=1.5)
-    # Dense, as `plots.draw_estimates` draws it, and without axes: `names=None`.
+    # Dense, and without axes: `names=None`.
     cloud = plots.object_cloud(reference, most=20000)
     cameras = [frames[view].camera for view in shown]
     plots.draw_moved_cloud(axes[:1], [reference.frame.camera], cloud, [Sim3.identity()], names=None)

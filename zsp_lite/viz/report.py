@@ -1,4 +1,4 @@
-"""Results as one self-contained HTML page, and as one picture.
+"""Results as one self-contained HTML page.
 
 The page is the Jinja2 template `templates/report.html`. Images are inlined as data URIs and
 plotly's script once. It follows the colour scheme of the browser: figures are transparent, with
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
@@ -26,7 +25,6 @@ from zsp_lite.estimates import PoseEstimate
 from zsp_lite.io.files import REPOSITORY, write_atomic
 from zsp_lite.marks import PlacedMark
 from zsp_lite.matching import cyclical_distances, similarity
-from zsp_lite.metrics import SAME_ANGLE
 from zsp_lite.pair_result import PairResult
 from zsp_lite.viz import category_sheet, plots
 from zsp_lite.viz.pose_picture import pose_picture
@@ -199,42 +197,6 @@ def table_rows(result: PairResult) -> list[tuple[str, ...]]:
 def legend(columns: Sequence[str] = COLUMNS) -> str:
     """Explain the columns of a table of estimates in one line of text."""
     return "; ".join(f"{name}: {_MEANINGS[name]}" for name in columns if name in _MEANINGS) + "."
-
-
-def write_overview(path: Path, results: Sequence[PairResult]) -> None:
-    """Write the picture of `overview` as a JPEG."""
-    picture = _encode(
-        overview(results), format="jpeg", bbox_inches="tight", pil_kwargs={"quality": 88}
-    )
-    write_atomic(path, picture)
-
-
-def overview(results: Sequence[PairResult]) -> Figure:
-    """Show a row per result: the reference, and for each solver the target view of its pose under
-    the moved points.
-
-    The colour of a point is its position along the reference object. The poses are marked as right
-    or wrong.
-    """
-    titles = ["reference", *(f"{solver} solver" for solver in results[0].estimates)]
-    images = []
-    for result in results:
-        reference, *targets = plots.chosen_views(result.estimates.values())
-        images.append(reference.frame.rgb)
-        images += [plots.pale(view.frame.rgb) for view in targets]
-    figure, axes = plots.show_images(images, columns=len(titles), size=2.4)
-    figure.set_layout_engine("compressed")
-    for axis, title in zip(axes, titles):
-        axis.set_title(title, fontsize=14)
-    for result, panels in zip(results, np.reshape(axes, (-1, len(titles)))):
-        plots.draw_estimates(panels, result.estimates.values())
-        plots.mark(panels[0], result.title, colour="none", size=14)
-        for axis, error in zip(panels[1:], result.errors.values()):
-            right = error < SAME_ANGLE
-            word = "right" if right else "wrong"
-            colour = plots.BLUE if right else plots.VERMILLION
-            plots.mark(axis, f"{word}: {error:.0f}° off", colour, 14)
-    return figure
 
 
 def _stages(result: PairResult, scene_id: str) -> dict[str, str]:
