@@ -218,7 +218,9 @@ def _apart(own: Path, last: Sequence[str | Path]) -> list[str | Path]:
 
     `own` takes the place of the folder of all runs.
     """
-    steps = ["hide", Path.home().resolve(), "hide", gettempdir()]
+    # The outer folder first: it would cover the other one.
+    outer, inner = sorted([Path.home().resolve(), Path(gettempdir()).resolve()])
+    steps = ["hide", outer, "hide", inner]
     for needed in (sys.prefix, sys.base_prefix, REPOSITORY / "zsp_lite", cache_folder()):
         # A path with links is shown, too: programs are found by it.
         steps += ["show", os.path.realpath(needed), "show", needed]
