@@ -306,10 +306,10 @@ class MeshScene:
         # most 5 units long, and as at least 0.8 of the object's height even below a light from
         # above: the object also shades the floor from the room. The grid has the axes of the room,
         # as its border and its cells are visible.
-        extent = np.ptp(self.mesh.vertices, axis=0)
+        extent = np.ptp(self.mesh.vertices @ self.room.axes, axis=0)
         light = self.room.light
         length = extent[2] * max(float(np.linalg.norm(light[:2]) / max(light[2], 0.3)), 0.8)
-        width = float(np.linalg.norm(extent[:2])) + 2 * min(length, 5.0)
+        width = float(extent[:2].max()) + 2 * min(length, 5.0)
         n = _SHADOW_CELLS
         line = ((np.arange(n, dtype=np.float32) + 0.5) / n - 0.5) * width
         x, y = np.meshgrid(line, line)
