@@ -2,7 +2,6 @@
 probabilities."""
 
 from dataclasses import replace
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,12 +14,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone
 
-from zsp_lite import Co3D, Sim3, ZeroShotPose
+from zsp_lite import Sim3, ZeroShotPose
 from zsp_lite.category import (
     PairHypotheses,
-    object_pairs,
-    references_per_pair,
-    scan_pairs,
+    partners,
     synchronise,
     world_hypotheses,
 )
@@ -92,40 +89,18 @@ def test_contradictory_evidence_lowers_the_probability_and_names_the_other_turn(
 
 
 @pytest.mark.parametrize("n, per_object", [(2, 1), (4, 3), (11, 10), (12, 6), (40, 6)])
-def test_pairs_connect_all_objects_and_see_each_reference_from_evenly_spaced_sides(n, per_object):
-    names = Mock(
-        Co3D, frame_numbers=lambda category: {f"{k:02d}": list(range(12)) for k in range(n)}
-    )
-    pairs = object_pairs(names, "cup", None, None, 4)
-    assert pairs == object_pairs(names, "cup", None, None, 4)
-    ends = np.array([[int(one.reference_sequence), int(one.target_sequence)] for one in pairs])
-    count = references_per_pair(n)
-    assert len(ends) == count * n * per_object
-    assert len(np.unique(ends, axis=0)) == n * per_object
-    assert (
-        connected_components(coo_array((np.ones(len(ends)), ends.T), (n, n)), connection="strong")[
-            0
-        ]
-        == 1
-    )
-    seen = [number for one in pairs[:count] for number in one.target_frames]
-    around = np.sort([one.reference_frame for one in pairs[:count]])
-    assert np.diff(around, append=around[0] + 12).max() == -(-12 // count)
-    assert len(set(seen)) == 12
-
-
-def test_scans_shorter_than_the_number_of_frames_give_every_frame_once():
-    names = Mock(Co3D, frame_numbers=lambda category: {name: list(range(5)) for name in "ab"})
-    pair = Pair("cup", "a", 2, "b", (1, 3))
-    pairs = scan_pairs(names, pair, 8)
-    assert pairs[0] == pair
-    assert len(pairs) == len(set(pairs)) == 10
-    assert {one.reference_frame for one in scan_pairs(names, pair, 2)} == {1, 2, 3, 4}
-    assert scan_pairs(names, pair, 2)[2].target_frames == (2, 4)
+def test_pairs_connect_all_objects_and_every_object_has_the_same_number_of_partners(n, per_object):
+    names = [f"{k:02d}" for k in range(n)]
+    pairs = partners(names, None)
+    assert pairs == partners(names[::-1], None) == sorted(set(pairs))
+    ends = np.array(pairs, int)
+    assert (ends[:, 0] < ends[:, 1]).all()
+    assert_array_equal(np.bincount(ends.ravel()), np.full(n, per_object))
+    assert connected_components(coo_array((np.ones(len(ends)), ends.T), (n, n)))[0] == 1
 
 
 def test_hypotheses_between_cameras_become_similarities_between_worlds(ellipsoids):
-    pair = object_pairs(ellipsoids, "ellipsoid", ["b", "a"], 1, 3)[0]
+    pair = Pair("ellipsoid", "b", 0, "a", (0, 2, 4))
     estimate = ZeroShotPose(CoordinateBackbone(), solver="verified").estimate(
         *ellipsoids.load_pair(pair)
     )
@@ -140,9 +115,13 @@ def test_hypotheses_between_cameras_become_similarities_between_worlds(ellipsoid
     )
 
 
-def test_too_few_frames_and_pairs_that_do_not_connect_all_objects_are_refused(ellipsoids):
-    refused(
-        "has 7 frames, expected at least 8", object_pairs, ellipsoids, "ellipsoid", None, None, 8
-    )
+def test_one_pair_keeps_its_own_probabilities():
+    pair = problem(0)[1][0]
+    objects = synchronise([pair]).objects.values()
+    for one in objects:
+        assert (one.probability, one.alternative_probability) == (0.6, 0.25)
+
+
+def test_pairs_that_do_not_connect_all_objects_are_refused():
     pair = problem(0)[1][0]
     refused("connect 2 of 4", lambda: synchronise([pair, replace(pair, reference="x", target="y")]))

@@ -5,7 +5,7 @@ import logging
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
@@ -18,14 +18,14 @@ import numpy as np
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.benchmark.execution import Evaluator, evaluate_pairs, open_workers
-from zsp_lite.benchmark.problem import FrameStore, PairProblem
+from zsp_lite.benchmark.problem import FrameStore, evenly_spaced
 from zsp_lite.benchmark.runs import open_run, read_lines, run_settings
-from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
+from zsp_lite.category import CategoryAlignment, PairHypotheses, partners, synchronise
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
 from zsp_lite.data.published import write_all
-from zsp_lite.errors import InputError, NoPoseError
+from zsp_lite.errors import InputError
 from zsp_lite.importers.sources import SourceLike, list_sources, open_source
 from zsp_lite.io.files import plain_name, read_json, write_atomic
 from zsp_lite.metrics import rotation_error
@@ -42,7 +42,6 @@ class _Line(msgspec.Struct):
     centre: list[float] = []
     matrices: list[list[list[float]]] = []
     probabilities: list[float] = []
-    span: float = 360.0
 
 
 class _Written(msgspec.Struct):
@@ -101,13 +100,12 @@ class HypothesisFinder:
     def line(self, pair: Pair, names: Sequence[str]) -> dict[str, Any]:
         """Find the hypotheses of a pair: a `_Line` of the run."""
         line: dict[str, Any] = {"pair": pair.key}
-        with suppress(NoPoseError):
-            hypotheses = PairProblem(pair, self.store).hypotheses()
+        hypotheses = self.store.hypotheses(pair)
+        if hypotheses is not None:
             line |= {
                 "centre": hypotheses.centre.tolist(),
                 "matrices": [sim3.matrix.tolist() for sim3 in hypotheses.sim3s],
                 "probabilities": hypotheses.probabilities.tolist(),
-                "span": hypotheses.span,
             }
         return line
 
@@ -124,8 +122,8 @@ def align_category(
 ) -> CategoryAlignment:
     """Align all objects of a category in one frame, without labels (see `category`).
 
-    Pairs whose views determine no pose are left out. A run of a data set in OUT is continued: pairs
-    that it has are not solved again. Sources need a new OUT.
+    Objects to which nothing tells a pose are left out. A run of a data set in OUT is continued:
+    frames that it has are not solved again. Sources need a new OUT.
 
     Args:
         dataset: Data set; or sources of the objects (see `open_source`), such as paths of scans, or
@@ -134,16 +132,14 @@ def align_category(
         category: Name of the category; of sources, any name.
         backbone: Backbone, or what `load_backbone` takes.
         sequences: Names of the sequences, one per object; None for all of the category.
-        pairs: Objects that each object is the reference of; None for all others, or from twelve
-            objects on, for six.
-        targets: Target frames per pair of frames; each pair of objects becomes several of these
-            (see `category.references_per_pair`).
+        pairs: Partners of each object; None for all others, or from twelve objects on, for six.
+        targets: Frames of each object, of which up to four are solved against those of another.
         out: Folder of the run, which keeps the hypotheses of the pairs; None keeps nothing.
         executor: Number of processes, or any `Executor`.
 
     Raises:
-        InputError: Sequences are fewer than two, too short, or not connected by pairs with poses;
-            OUT has another run.
+        InputError: Sequences are fewer than two, without frames, or not connected by pairs with
+            poses; OUT has another run.
         FatalError: The backbone is broken, or a frame cannot be read.
     """
     if isinstance(dataset, Co3D):
@@ -151,7 +147,16 @@ def align_category(
         opened = Co3D(dataset.root.resolve())
     else:
         opened = dataset = SourceSet(dataset)
-    chosen = {pair.key: pair for pair in object_pairs(dataset, category, sequences, pairs, targets)}
+    numbers = dataset.frame_numbers(category)
+    names = sorted(numbers if sequences is None else set(sequences))
+    if len(names) < 2:
+        raise InputError(
+            f"category {category}: {len(names)} sequences to align, expected at least 2"
+        )
+    for name in names:
+        if not numbers.get(name):
+            raise InputError(f"sequence {category}/{name} has no frames")
+    frames = evenly_spaced({name: numbers[name] for name in names}, targets)
     loaded = as_backbone(backbone)
     with (
         tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder,
@@ -164,22 +169,25 @@ def align_category(
             {"alignment": "hypotheses of the verified solver"},
             {},
             workers=workers.count,
-            pairs={category: len(chosen)},
+            pairs={category: len(names)},
         )
-        with open_run(folder, settings):
-            # Workers load a named backbone themselves; an object travels to them.
-            sent = backbone if workers.executor else loaded
-            finder = HypothesisFinder(opened, sent)
-            work = dict.fromkeys(chosen.values(), ["alignment"])
+        # Workers load a named backbone themselves; an object travels to them.
+        finder = HypothesisFinder(opened, backbone if workers.executor else loaded)
+
+        def solve(asked: list[Pair]) -> list[PairHypotheses | None]:
+            work = dict.fromkeys(asked, ["alignment"])
             evaluate_pairs(folder, finder.open, work, workers, _Line)
-        stored = read_hypotheses(folder)
-    hypotheses = [stored[key] for key in chosen if key in stored]
-    if not hypotheses:
-        raise InputError(f"category {category}: none of {len(chosen)} pairs determines a pose")
-    found = synchronise(hypotheses)
-    names = {pair.reference_sequence for pair in chosen.values()}
-    for name in sorted(names - found.objects.keys()):
-        logger.warning("%s/%s is left out: none of its pairs determines a pose", category, name)
+            stored = read_hypotheses(folder)
+            return [stored.get(pair.key) for pair in asked]
+
+        with open_run(folder, settings):
+            store = FrameStore(opened, {"backbone": loaded})
+            judged = store.judged(category, frames, pairs=partners(names, pairs), solve=solve)
+    if not judged:
+        raise InputError(f"category {category}: nothing tells the pose between any two objects")
+    found = synchronise(judged)
+    for name in sorted(set(names) - found.objects.keys()):
+        logger.warning("%s/%s is left out: nothing tells its pose", category, name)
     return found
 
 
@@ -187,7 +195,7 @@ def alignment_errors(
     alignment: CategoryAlignment, labels: Mapping[str, PoseLabel]
 ) -> tuple[list[float], list[float]]:
     """Compute the rotation errors in degrees of the alignment, for all ordered pairs of labelled
-    objects, and of the best hypothesis of each pair of frames."""
+    objects, and of the best hypothesis of each pair alone."""
     turns = {name: labels[name].trans[:3, :3] for name in alignment.objects if name in labels}
     true = {(a, b): turns[b] @ turns[a].T for a, b in permutations(turns, 2)}
     together = [float(rotation_error(alignment.between(*ends).R, true[ends])) for ends in true]
@@ -212,7 +220,6 @@ def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
                 tuple(map(Sim3.from_matrix, np.array(line.matrices))),
                 np.array(line.probabilities),
                 np.array(line.centre),
-                line.span,
             )
     return hypotheses
 

@@ -138,6 +138,7 @@ def umeyama_batch(
     source: Float[np.ndarray, "b n 3"],
     target: Float[np.ndarray, "b n 3"],
     scale_range: tuple[float, float] = (0.0, np.inf),
+    weight: Float[np.ndarray, "b n"] | None = None,
 ) -> tuple[
     Float[np.ndarray, " b"],
     Float[np.ndarray, "b 3 3"],
@@ -146,16 +147,23 @@ def umeyama_batch(
 ]:
     """Fit similarities to a batch of point sets, without checks (see `umeyama`).
 
-    The best rotation does not depend on the scale, in which the error is quadratic. Returns scales,
-    rotations, translations, and the ratio of the second to the first singular value of the
-    covariance, 0 for collinear points.
+    Squared errors count by the `weight` of their points. The best rotation does not depend on the
+    scale, in which the error is quadratic. Returns scales, rotations, translations, and the ratio
+    of the second to the first singular value of the covariance, 0 for collinear points.
     """
-    source_mean = source.mean(axis=1)
-    target_mean = target.mean(axis=1)
+    if weight is None:
+        source_mean = source.mean(axis=1)
+        target_mean = target.mean(axis=1)
+        weight = np.ones(source.shape[:2])
+    else:
+        weight = weight / weight.sum(axis=1, keepdims=True)
+        source_mean = (weight[:, None] @ source)[:, 0]
+        target_mean = (weight[:, None] @ target)[:, 0]
     centred = source - source_mean[:, None]
-    covariance = (target - target_mean[:, None]).swapaxes(1, 2) @ centred  # (b, 3, 3), times n
+    weighted = weight[:, :, None] * centred
+    covariance = (target - target_mean[:, None]).swapaxes(1, 2) @ weighted  # (b, 3, 3), times n
     rotation, singular, sign = nearest_rotation(covariance)
-    variance = np.square(centred).sum(axis=(1, 2))  # times n, too
+    variance = (weighted * centred).sum(axis=(1, 2))  # times n, too
     trace = singular[:, 0] + singular[:, 1] + sign * singular[:, 2]
     scale = (trace / np.where(variance > 0, variance, 1)).clip(*scale_range)
     translation = target_mean - scale[:, None] * (rotation @ source_mean[:, :, None])[:, :, 0]

@@ -1,15 +1,14 @@
 r"""All objects of a category in one common frame, without labels: synchronisation of the hypotheses
 of many pairs.
 
-Here a pair is an ordered pair of objects with the hypotheses of one pair of frames: a `Pair`, one
-frame of the first object and views of the second. Two objects may have several.
+Here a pair is a pair of objects (a, b) with a few hypotheses: similarities from the world of a to
+that of b, with probabilities, of a frame of a that the verified solver found in views of b, or of
+all that was seen of both (see `judge`). Two objects may have several.
 
-The verified solver gives a few hypotheses for each ordered pair (a, b) of objects: similarities
-from the world of a to that of b, with probabilities. One pair often cannot tell the front from the
-back; all pairs, each seen from several sides, mostly can (Birdal et al., Synchronizing probability
-measures on rotations, CVPR 2020). Sought is a similarity x -> s_i Q_i x + t_i from the world of
-each object i to a common frame. Hypothesis h of a pair, of rotation H_h, agrees with the rotations
-if Q_a = Q_b H_h. With \theta_h the angle between the two, they maximise
+One pair often cannot tell the front from the back; all pairs mostly can (Birdal et al.,
+Synchronizing probability measures on rotations, CVPR 2020). Sought is a similarity x -> s_i Q_i x +
+t_i from the world of each object i to a common frame. Hypothesis h of a pair, of rotation H_h,
+agrees with the rotations if Q_a = Q_b H_h. With \theta_h the angle between the two, they maximise
 
     \sum_{pairs} \log(\epsilon + \sum_h p_h \exp(\kappa (\cos\theta_h - 1))),
 
@@ -28,6 +27,7 @@ a wrong pair.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -35,13 +35,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order
 
 from zsp_lite.alignment import Sim3, nearest_rotation
-from zsp_lite.data.cameras import view_span
-from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate
-from zsp_lite.io.files import stable_hash
 from zsp_lite.metrics import SAME_ANGLE, rotation_angle
-from zsp_lite.verified.confidence import Calibration, hidden_share
 
 # \kappa of the objective: a hypothesis 20 degrees off counts 1/e of one that agrees.
 KAPPA = 16.0
@@ -51,10 +47,6 @@ FLOOR = 0.1
 # from it on, each object is the reference of a few.
 ALL_PAIRS_BELOW = 12
 PAIRS_PER_OBJECT = 6
-# Frames of the first object of a pair that are solved: 16 divided by the number of objects, so that
-# two objects have eight each, and at least 3.
-_REFERENCES = 3
-_REFERENCES_OF_ONE = 16
 _CHAINS = 48  # chains of the search, of which the best one is kept
 # Temperature of each sweep over all objects: a slow fall, then coordinate ascent.
 _TEMPERATURES = (*np.geomspace(1, 0.3, 12), 0.0, 0.0, 0.0, 0.0)
@@ -64,15 +56,11 @@ _REWEIGHTINGS = 10  # steps of the least absolute deviations
 # Weight of hypotheses that disagree, so that every object gets a scale and a translation.
 _WEAK = 1e-3
 # Coefficients of the logit in `_judge`: of the margin, of the case that no rotation is right, and
-# of the share of agreeing pairs in this case. tools/category_fit.py fitted them on validation
+# of the share of agreeing pairs in this case. tools/judge.py fits them on validation
 # categories to sets of three to five objects.
 MARGIN = 1.57
 NONE = -3.07
 NONE_AGREEING = -2.37
-# Gives the probabilities of the rotation of one of two objects, and of the best other one, from
-# their scores and the evidence that `compare_two` returns. `tools/tuning.py` fitted it.
-OF_TWO = Calibration((-1.08, -0.02, -0.65, 1.57, 0.35), (2.62, 0.27, 0.54, -6.18, -2.27), 0.112)
-_LEAST_WEIGHT = 0.05  # of a pair whose target was seen from one place
 
 _Rotations = Float[np.ndarray, "t n 3 3"]  # of n objects in each of t chains
 _Candidates = Float[np.ndarray, "t c 3 3"]  # for the rotation of one object
@@ -89,7 +77,6 @@ class PairHypotheses:
     sim3s: tuple[Sim3, ...]  # most probable first
     probabilities: Float[np.ndarray, " m"]
     centre: Float[np.ndarray, "3"]  # a point amid the reference object, in its world
-    span: float = 360.0  # angle in degrees that the target views span around the target
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,88 +108,25 @@ class CategoryAlignment:
         return self.objects[target].sim3.inverse() @ self.objects[reference].sim3
 
 
-def references_per_pair(objects: int) -> int:
-    """Return the number of frames of the first object that are solved for a pair of objects.
+def partners(names: Sequence[str], per_object: int | None) -> list[tuple[str, str]]:
+    """Choose the pairs of objects that a category is aligned by.
 
-    The fewer objects, the more frames.
+    Each object has at least `per_object` partners; None for all others, or from twelve objects on,
+    for six.
     """
-    return max(_REFERENCES, _REFERENCES_OF_ONE // objects)
-
-
-def object_pairs(
-    dataset: Co3D,
-    category: str,
-    sequences: Sequence[str] | None,
-    per_object: int | None,
-    targets: int,
-) -> list[Pair]:
-    """Choose the pairs of frames that a category is aligned by (see `align_category`)."""
-    numbers = dataset.frame_numbers(category)
-    names = sorted(numbers if sequences is None else set(sequences))
     n = len(names)
-    if n < 2:
-        raise InputError(f"category {category}: {n} sequences to align, expected at least 2")
-    least = max(targets, _REFERENCES)
-    for name in names:
-        length = len(numbers.get(name, ()))
-        if length < least:
-            raise InputError(
-                f"sequence {category}/{name} has {length} frames, expected at least {least}"
-            )
     if per_object is None:
         per_object = n - 1 if n < ALL_PAIRS_BELOW else PAIRS_PER_OBJECT
-    # The objects stand in a random circle; each has pairs with those some steps further.
+    if per_object >= n - 1:
+        return list(combinations(sorted(names), 2))
+    # The objects stand in a random circle. Each has those as partners that are some steps before
+    # and after it.
     rng = np.random.default_rng(0)
-    circle = [names[k] for k in rng.permutation(n)]
-    steps = [1, *(2 + rng.permutation(n - 2)).tolist()]  # the first connects all objects
-    ends = [(circle[k], circle[(k + step) % n]) for k in range(n) for step in steps[:per_object]]
-    pairs = []
-    for reference, target in sorted(ends):
-        # numpy does not need the shift by one bit, but it is part of the seed: without it, there
-        # would be other pairs.
-        rng = np.random.default_rng([0, stable_hash(f"{category}/{reference}/{target}") >> 1])
-        # Frames that are evenly spaced over a sequence show several sides; the random starts depend
-        # on the names only.
-        first = numbers[reference]
-        around = numbers[target]
-        start = rng.integers(len(first))
-        target_start = rng.integers(len(around))
-        count = min(references_per_pair(n), len(first))
-        for r in range(count):
-            frame = first[(start + r * len(first) // count) % len(first)]
-            share = (np.arange(targets) + r / count) / targets  # of the sequence, from its start
-            positions = (target_start + (share * len(around)).astype(int)) % len(around)
-            pairs.append(
-                Pair(category, reference, frame, target, tuple(around[k] for k in positions))
-            )
-    return pairs
-
-
-def scan_pairs(dataset: Co3D, pair: Pair, references: int) -> list[Pair]:
-    """Return the pairs of frames that the pose of a pair is found from by several frames of both
-    objects.
-
-    These are `references` frames of each object, evenly spaced over its sequence from the pair's
-    own frame on, each with as many views of the other as the pair has. The pair itself is the
-    first.
-    """
-    numbers = dataset.frame_numbers(pair.category)
-
-    def around(name: str, start: int, count: int) -> tuple[int, ...]:
-        frames = numbers[name]
-        first = frames.index(start)
-        count = min(count, len(frames))
-        return tuple(frames[(first + k * len(frames) // count) % len(frames)] for k in range(count))
-
-    a = pair.reference_sequence
-    b = pair.target_sequence
-    views = around(a, pair.reference_frame, len(pair.target_frames))
-    forward = around(a, pair.reference_frame, references)
-    backward = around(b, pair.target_frames[0], references)
-    return [
-        *(Pair(pair.category, a, frame, b, pair.target_frames) for frame in forward),
-        *(Pair(pair.category, b, frame, a, views) for frame in backward),
-    ]
+    circle = [sorted(names)[k] for k in rng.permutation(n)]
+    steps = [1, *(2 + rng.permutation(n // 2 - 1)).tolist()]  # the first connects all objects
+    steps = steps[: (per_object + 1) // 2]
+    pairs = {tuple(sorted((circle[k], circle[(k + step) % n]))) for k in range(n) for step in steps}
+    return sorted(pairs)
 
 
 def world_hypotheses(reference: str, target: str, estimate: PoseEstimate) -> PairHypotheses:
@@ -211,13 +135,10 @@ def world_hypotheses(reference: str, target: str, estimate: PoseEstimate) -> Pai
     sim3s = tuple(estimate.between_worlds(one.sim3, one.view) for one in estimate.hypotheses)
     probabilities = np.array([one.confidence for one in estimate.hypotheses])
     view = estimate.reference_view
-    used = np.flatnonzero(np.isfinite(estimate.view_scores))
     centre = view.frame.camera.to_world(
         np.median(view.measured_points[0][view.known_foreground], axis=0)
     )
-    cameras = [estimate.target_views[k].frame.camera for k in used]
-    span = view_span(cameras, sim3s[0].apply(centre))
-    return PairHypotheses(reference, target, sim3s, probabilities, centre, span)
+    return PairHypotheses(reference, target, sim3s, probabilities, centre)
 
 
 def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
@@ -240,17 +161,13 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
     # How sure each object's rotation is, and its best alternative.
     best = np.stack([pair.sim3s[0].R for pair in pairs])
     off = rotation_angle(rotations[ends[:, 0]], rotations[ends[:, 1]] @ best)
-    spans = np.array([pair.span for pair in pairs])
     objects = {}
     for i, name in enumerate(names):
         sim3 = Sim3(scales[i], rotations[i], translations[i])
-        if len(names) > 2:
-            agreeing = off[(ends == i).any(axis=1)] < SAME_ANGLE
-            probability, turned, other = _judge(nodes[i], rotations, i, float(agreeing.mean()))
-        else:
-            margin, turned, known = compare_two(nodes[i], rotations, i, spans)
-            # The scores of the rotation and of the best other one differ by the margin.
-            probability, other = OF_TWO.probabilities(np.array([0.0, margin]), known).tolist()
+        agreeing = off[(ends == i).any(axis=1)] < SAME_ANGLE
+        probability, turned, other = _judge(nodes[i], rotations, i, float(agreeing.mean()))
+        if len(pairs) == 1:  # its own probabilities say more
+            probability, other, *_ = (*pairs[0].probabilities.tolist(), 0.0)
         alternative = None
         if turned is not None:  # about the object's centre
             shift = sim3.apply(centres[i]) - scales[i] * turned @ centres[i]
@@ -377,7 +294,14 @@ def _judge(
 ) -> tuple[float, Float[np.ndarray, "3 3"] | None, float]:
     """Return the probability of an object's rotation, the best other one, all others fixed, and its
     probability."""
-    margin, best = _margin(node, rotations, i)
+    proposals = node.proposals(rotations[None])
+    others = proposals.reshape(-1, 3, 3)
+    others = others[rotation_angle(others, rotations[i]) > SAME_ANGLE]
+    margin, best = np.inf, None  # how much worse the best other rotation is
+    if len(others):
+        candidates = np.concatenate([rotations[None, i], others])
+        present, *scores = node.score(candidates[None], proposals)[0].tolist()
+        margin, best = present - max(scores), others[np.argmax(scores)]
     # A conditional logit of three cases: this rotation is right, the other one is, or none. The
     # pairs of an object err together, so the margin counts by the root of their number. That none
     # is right is less probable if more of the object's pairs agree.
@@ -385,43 +309,6 @@ def _judge(
     none = np.exp(NONE + NONE_AGREEING * agreeing)
     total = 1 + other + none
     return float(1 / total), best, float(other / total)
-
-
-def compare_two(
-    node: _Node, rotations: Float[np.ndarray, "2 3 3"], i: int, spans: Float[np.ndarray, " d"]
-) -> tuple[float, Float[np.ndarray, "3 3"] | None, Float[np.ndarray, "5"]]:
-    """Return the `_margin` of one of two objects, the best other rotation, and the evidence for
-    `OF_TWO`.
-
-    The evidence is a 1 for the constant; the largest share of the circle around a target that its
-    views span; the logarithm of the effective number of pairs; and the probability that the pairs
-    give to the rotation, of the surest pair and in the weighted mean. A pair has more weight if its
-    views show more of the circle; equal weights make the effective number that of all pairs.
-    """
-    margin, best = _margin(node, rotations, i)
-    near = rotation_angle(node.proposals(rotations[None])[0], rotations[i]) < SAME_ANGLE
-    votes = (node.weight * near).max(axis=1)
-    weight = 1 + _LEAST_WEIGHT - hidden_share(spans / 360)
-    mean = np.average(votes, weights=weight)
-    number = weight.sum() / weight.max()
-    return margin, best, np.array([1.0, spans.max() / 360, np.log(number), votes.max(), mean])
-
-
-def _margin(
-    node: _Node, rotations: Float[np.ndarray, "n 3 3"], i: int
-) -> tuple[float, Float[np.ndarray, "3 3"] | None]:
-    """Return the best other rotation of an object, all others fixed, and how much worse it is.
-
-    The margin comes first; without another rotation it is infinite.
-    """
-    proposals = node.proposals(rotations[None])
-    others = proposals.reshape(-1, 3, 3)
-    others = others[rotation_angle(others, rotations[i]) > SAME_ANGLE]
-    if not len(others):
-        return np.inf, None
-    candidates = np.concatenate([rotations[None, i], others])
-    present, *scores = node.score(candidates[None], proposals)[0].tolist()
-    return present - max(scores), others[np.argmax(scores)]
 
 
 def _scales_and_translations(

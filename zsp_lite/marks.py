@@ -16,7 +16,14 @@ from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import plain_name, write_atomic
 from zsp_lite.io.ply import write_ply
 from zsp_lite.points import object_pixels
-from zsp_lite.transfer import FOUND, SurfaceView, object_size, surface_views, transfer
+from zsp_lite.transfer import (
+    FOUND,
+    SurfaceView,
+    marked_point,
+    object_size,
+    surface_views,
+    transfer,
+)
 
 # A point is seen if the depth map is nearer by at most this part of the object's size.
 _HIDDEN = 0.05
@@ -145,16 +152,8 @@ def marked_points(
                 f"{names.count(mark.name)} marks are named {mark.name!r}, expected one"
             )
         frame = dataset.load(dataset.frame(category, mark.sequence, mark.frame))
-        height, width = frame.camera.size
         what = f"mark {mark.name!r}: pixel {mark.x:g},{mark.y:g} of frame {mark.frame}"
-        if not (0 <= mark.x < width and 0 <= mark.y < height):
-            raise InputError(f"{what} is outside the image, expected one of {width} x {height}")
-        row, column = int(mark.y), int(mark.x)
-        if frame.depth is None or not frame.depth[row, column] > 0:
-            raise InputError(f"{what} has no depth, expected a pixel with measured depth")
-        if frame.mask is not None and not object_pixels(frame)[row, column]:
-            raise InputError(f"{what} is not on the object, expected a pixel of its mask")
-        points.append(frame.camera.unproject(np.array([mark.x, mark.y]), frame.depth[row, column]))
+        points.append(marked_point(frame, mark.x, mark.y, what))
     return points
 
 

@@ -44,6 +44,14 @@ def rotation_angle(
     return np.degrees(np.arctan2(twice_sine, twice_cosine))[()]
 
 
+def vector_angle(
+    first: Float[np.ndarray, "*a 3"], second: Float[np.ndarray, "*b 3"]
+) -> np.ndarray | float:
+    """Compute the angles in degrees between vectors of any length above 0."""
+    sine = np.linalg.norm(np.cross(first, second), axis=-1)
+    return np.degrees(np.arctan2(sine, np.sum(np.multiply(first, second), axis=-1)))[()]
+
+
 def accuracy(
     errors: ArrayLike, threshold: float, weights: ArrayLike | None = None
 ) -> np.ndarray | float:

@@ -3,17 +3,16 @@
 A source is a sequence of a data folder, a folder with a capture, an image with depth, or frames in
 memory.
 
-The way of a pair: `estimate_pose` opens the sources and loads a `Scan` of each, `_solve` estimates
-the pose of the first reference frame by each solver. Where several frames vote, `_solve_others`
-estimates those of the others, `_agreed_pose` finds the pose that most agree on and counts the
-votes, and `_answer` makes an estimate of it; `_pair_result` collects all, `write_pair` writes it.
+The way of a pair: `estimate_pose` opens the sources and loads a `Scan` of each. One reference frame
+is solved by `ZeroShotPose`; several are asked by `judge.judge_pairs`, and `_answer` makes an
+estimate of its pose. `_pair_result` collects all, `write_pair` writes it.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import replace
-from itertools import permutations
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from tqdm import tqdm
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import DEFAULT, BackboneLike, as_backbone
-from zsp_lite.category import references_per_pair, synchronise, world_hypotheses
+from zsp_lite.category import PairHypotheses, synchronise, world_hypotheses
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.cameras import Values
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
@@ -30,21 +29,20 @@ from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.sources import Source, SourceLike, list_sources, open_pair
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
-from zsp_lite.metrics import SAME_ANGLE, rotation_angle, rotation_error
+from zsp_lite.judge import REFERENCES, Question, judge_pairs
+from zsp_lite.metrics import SAME_ANGLE, rotation_angle, rotation_error, vector_angle
 from zsp_lite.pair_result import PairResult, Vote, label_errors
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import world_cloud
 from zsp_lite.scans import Scan, scan_flags, stood_up
 from zsp_lite.verified.confidence import reliability_flags
 from zsp_lite.verified.solver import measured_inliers
-from zsp_lite.views import usable_targets
+from zsp_lite.views import View, usable_targets
 
 _TARGETS = 5
-_REFERENCES = 4  # frames of each object that are solved against views of the other
 _LEAST_CONFIDENT = 0.3  # with less, the images may stand on their heads
 _LEAST_PROBABLE = 0.005  # an alternative is named above this, where two decimals show 0.01
-# What is solved: the numbers of two objects, and the position of a frame of the first.
-_Problem = tuple[int, int, int]
+_TILTED = 45.0  # degrees between two verticals from which objects lie differently
 
 
 def estimate_pose(
@@ -65,11 +63,11 @@ def estimate_pose(
     """Estimate the pose between two objects of one category, given as paths or frames; no label is
     needed.
 
-    The paper takes one frame of the reference. The verified solver takes several, and where the
-    target has several frames, these against views of the reference, too: the pose is what most
-    frames agree on (see `category`). `open_source` explains the paths, and takes the settings that
-    only one of the two has, such as a box around the object. Flags name implausible lengths,
-    doubtful masks, objects seen from one side only, frames that disagree, and two categories.
+    The paper takes one frame of the reference. The verified solver takes several frames of both:
+    the pose is what their votes, both shapes and the vertical tell together (see `judge`).
+    `open_source` explains the paths, and takes the settings that only one of the two has, such as a
+    box around the object. Flags name implausible lengths, doubtful masks, objects seen from one
+    side only, frames that disagree, and two categories.
 
     Args:
         reference: The reference object.
@@ -86,9 +84,9 @@ def estimate_pose(
         upright: Whether the reference images are upright; False tries four turns by 90 degrees,
             since phones may store images turned, and keeps the best. The pose is then that of the
             turned image, and a flag says so.
-        references: Number of reference frames of each object, evenly spaced; 1 is the paper's
-            setting. By default 4, or 1 with a `reference_frame`, or more with helpers (see
-            `category.references_per_pair`).
+        references: Largest number of frames of each object that are solved against views of the
+            other, of which the first two mostly do; 1 is the paper's setting. By default 4, or 1
+            with a `reference_frame`.
         helpers: Other objects of the category: what two objects cannot tell, all together mostly
             can.
         workers: Number of frames that are solved at once, by threads.
@@ -102,10 +100,9 @@ def estimate_pose(
     n_targets = _TARGETS if targets is None else targets
     check_integer("targets", n_targets, 1)
     check_integer("workers", workers, 1)
-    if references is None and helpers:
-        references = references_per_pair(2 + len(helpers))
-    elif references is None:
-        references = _REFERENCES if reference_frame is None else 1
+    if references is None:
+        single = reference_frame is not None and not helpers
+        references = 1 if single else min(REFERENCES, n_targets)
     check_integer("references", references, 1)
     several = "verified" in solvers and (references > 1 or bool(helpers))
 
@@ -114,8 +111,7 @@ def estimate_pose(
         sources = _open_objects(reference, target, mask, intrinsics, helpers)
         model = as_backbone(backbone)
         foreground = "saliency" if getattr(model, "has_saliency", True) else "mask"
-        # `_solve` takes the method with each solver. All else, the turns and the frames that vote,
-        # takes the last one, of both solvers the verified one.
+        # Turns, and frames that vote, take the last solver, of both the verified one.
         method = ZeroShotPose(model, foreground=foreground, solver=solvers[-1])
 
         # The frames of all objects. Only where frames vote, the reference also has target views,
@@ -138,7 +134,17 @@ def estimate_pose(
             flags = (*flags, f"{turned}: the pose is that of the turned image")
 
         # The pose, in the lengths of the sources.
-        solved, votes = _solve(scans, method, solvers, several, workers, flags)
+        first = scans[0].references[0]
+        solved = {
+            name: replace(method, solver=name).estimate_from_views(
+                scans[0].views[first], scans[1].target_views
+            )
+            for name in solvers
+            if name == "paper" or not several
+        }
+        votes = ()
+        if several:
+            solved["verified"], votes = _by_all(scans, method, workers, flags)
         estimates = {}
         for name, estimate in solved.items():
             notes = flags
@@ -175,38 +181,6 @@ def _open_objects(
     return sources
 
 
-def _solve(
-    scans: Sequence[Scan],
-    method: ZeroShotPose,
-    solvers: Sequence[str],
-    several: bool,
-    workers: int,
-    flags: tuple[str, ...],
-) -> tuple[dict[str, PoseEstimate], tuple[Vote, ...]]:
-    """Solve the first reference frame by each solver.
-
-    If `several` frames vote, the pose of the verified solver becomes the one that most agree on.
-    """
-    position = scans[0].references[0]
-    reference = scans[0].views[position]
-    targets = scans[1].target_views
-    solved = {
-        name: replace(method, solver=name).estimate_from_views(reference, targets)
-        for name in solvers
-    }
-    if not several:
-        return solved, ()
-
-    first = solved["verified"]
-    timings = dict(first.timings)
-    with timed(timings, "other frames"):
-        others = _solve_others(scans, method, workers)
-        estimates = {(0, 1, position): first, **others}
-        agreed, votes = _agreed_pose(scans, method, first, estimates, flags)
-    solved["verified"] = replace(agreed, timings=timings)
-    return solved, votes
-
-
 def _pair_result(
     scans: Sequence[Scan],
     estimates: dict[str, PoseEstimate],
@@ -228,6 +202,11 @@ def _pair_result(
         masks=(first.source.mask, second.source.mask),
         backbone=backbone,
         votes=votes,
+        frames={first.source.numbers[k]: frame for k, frame in first.frames.items()},
+        views=tuple(
+            [_unscaled(view, scan.scale) for view in scan.views.values()]
+            for scan in (first, second)
+        ),
     )
     path = first.source.path.resolve()
     target_path = second.source.path.resolve()
@@ -238,67 +217,84 @@ def _pair_result(
     return result
 
 
-def _solve_others(
-    scans: Sequence[Scan], method: ZeroShotPose, workers: int
-) -> dict[_Problem, PoseEstimate]:
-    """Solve every reference frame of each object against the views of each other object, but for
-    the first of all, which is solved already."""
-    problems = [
-        (a, b, position)
-        for a, b in permutations(range(len(scans)), 2)
-        for position in scans[a].references
-    ]
-
-    def solve(a: int, b: int, position: int) -> PoseEstimate | None:
-        with suppress(NoPoseError):
-            return method.estimate_from_views(scans[a].views[position], scans[b].target_views)
-
-    others = problems[1:]
-    solved = {}
-    with ThreadPoolExecutor(workers) as pool:
-        estimates = pool.map(solve, *zip(*others))
-        # `disable=None` shows the bar in a terminal only.
-        bar = tqdm(estimates, total=len(others), unit="frame", delay=1, disable=None)
-        for problem, estimate in zip(others, bar, strict=True):
-            if estimate is not None:
-                solved[problem] = estimate
-    return solved
-
-
-def _agreed_pose(
-    scans: Sequence[Scan],
-    method: ZeroShotPose,
-    first: PoseEstimate,
-    estimates: Mapping[_Problem, PoseEstimate],
-    scan_doubts: tuple[str, ...],
+def _by_all(
+    scans: Sequence[Scan], method: ZeroShotPose, workers: int, scan_doubts: tuple[str, ...]
 ) -> tuple[PoseEstimate, tuple[Vote, ...]]:
-    """Find the pose that the hypotheses of all estimates agree on, in the camera of the first one,
-    and the votes of the frames."""
+    """Estimate the pose by all frames of all objects, in the camera of the first reference frame,
+    and return the votes of the two objects' frames."""
+    timings: dict[str, float] = {}
     names = [f"{k} {scan.source.name}" for k, scan in enumerate(scans)]
-    hypotheses = [
-        world_hypotheses(names[a], names[b], estimate) for (a, b, _), estimate in estimates.items()
-    ]
-    agreement = synchronise(hypotheses)
+    of_name = dict(zip(names, scans))
+    estimates: dict[Question, PoseEstimate] = {}
+    problems: list[NoPoseError] = []
 
-    # The answers: the pose between the worlds of both objects, and its alternative.
-    reference = agreement.objects[names[0]]
-    target = agreement.objects[names[1]]
-    probability = min(reference.probability, target.probability)
-    answers = [(agreement.between(names[0], names[1]), probability)]
-    if target.alternative and target.alternative_probability > _LEAST_PROBABLE:
-        alternative = target.alternative.inverse() @ reference.sim3
-        answers.append((alternative, target.alternative_probability))
+    def solve(question: Question) -> PairHypotheses | None:
+        scan = of_name[question.reference]
+        view = scan.views[scan.references[question.rank]]
+        try:
+            found = method.estimate_from_views(view, of_name[question.target].target_views)
+        except NoPoseError as error:
+            problems.append(error)
+            return None
+        estimates[question] = found
+        return world_hypotheses(question.reference, question.target, found)
+
+    def ask(questions: list[Question]) -> list[PairHypotheses | None]:
+        with ThreadPoolExecutor(workers) as pool:
+            answers = pool.map(solve, questions)
+            # `disable=None` shows the bar in a terminal only.
+            bar = tqdm(answers, total=len(questions), unit="frame", delay=1, disable=None)
+            return list(bar)
+
+    with timed(timings, "frames"):
+        shapes = {}
+        flags = []
+        for name, scan in of_name.items():
+            shapes[name], problem = scan.shape()
+            if problem:
+                flags.append(f"{scan.source.path}: {problem}")
+        counts = {name: len(scan.references) for name, scan in of_name.items()}
+        judged = judge_pairs(shapes, counts, ask, list(combinations(names, 2)))
+    if not judged:
+        raise problems[0]
+
+    # The answers: poses between the worlds of the two objects, with their probabilities.
+    if len(scans) == 2:
+        answers = list(zip(judged[0].sim3s, judged[0].probabilities.tolist()))
+    else:
+        agreement = synchronise(judged)
+        reference, target = (agreement.objects[name] for name in names[:2])
+        probability = min(reference.probability, target.probability)
+        answers = [(agreement.between(*names[:2]), probability)]
+        if target.alternative:
+            other = target.alternative.inverse() @ reference.sim3
+            answers.append((other, target.alternative_probability))
+    best = answers[0][0]
+    answers = [answers[0], *(one for one in answers[1:] if one[1] > _LEAST_PROBABLE)]
 
     # The votes of the frames of the two objects, not of helpers.
     votes = []
-    for (a, b, position), estimate in estimates.items():
-        if max(a, b) < 2:
-            name = f"frame {scans[a].source.numbers[position]} of {scans[a].source.name}"
-            agreed = agreement.between(names[a], names[b])
-            degrees = float(rotation_error(estimate.world_sim3.R, agreed.R))
-            own = _in_units(estimate, scans[a].scale, scans[b].scale, scan_doubts)
-            votes.append(Vote(name, own, degrees, a > b))
-    return _answer(first, method, answers, dissent(votes)), tuple(votes)
+    for question in sorted(estimates, key=lambda one: (names.index(one.reference), one.rank)):
+        estimate = estimates[question]
+        a, b = of_name[question.reference], of_name[question.target]
+        if {question.reference, question.target} == {*names[:2]}:
+            backward = question.reference == names[1]
+            name = f"frame {a.source.numbers[a.references[question.rank]]} of {a.source.name}"
+            agreed = best.R.T if backward else best.R
+            degrees = float(rotation_error(estimate.world_sim3.R, agreed))
+            own = _in_units(estimate, a.scale, b.scale, scan_doubts)
+            votes.append(Vote(name, own, degrees, backward))
+    flags += dissent(votes)
+    first, second = (shapes[name] for name in names[:2])
+    if first.upright and second.upright:
+        up = best.R @ first.from_world.R[2]
+        tilt = vector_angle(up, second.from_world.R[2])
+        if tilt > _TILTED:
+            flags.append(
+                f"the objects lie differently: their verticals are {tilt:.0f} degrees apart"
+            )
+    answer = _answer(scans, method, answers, flags)
+    return replace(answer, timings=timings), tuple(votes)
 
 
 def dissent(votes: Sequence[Vote]) -> list[str]:
@@ -317,20 +313,22 @@ def dissent(votes: Sequence[Vote]) -> list[str]:
 
 
 def _answer(
-    estimate: PoseEstimate,
+    scans: Sequence[Scan],
     method: ZeroShotPose,
     answers: Sequence[tuple[Sim3, float]],
     flags: Sequence[str],
 ) -> PoseEstimate:
-    """Replace the hypotheses of an estimate by similarities between the worlds, each with its
-    probability."""
-    reference = estimate.reference_view
-    targets = estimate.target_views
+    """Make an estimate of the first reference frame from similarities between the worlds, each with
+    its probability."""
+    reference = scans[0].views[scans[0].references[0]]
+    targets = scans[1].target_views
+    usable, views_left_out = usable_targets(targets)
+    left_out = np.full(len(targets), np.inf)
+    left_out[usable] = 0.0
     to_reference, *to_targets = [
         Sim3(1.0, view.frame.camera.R, view.frame.camera.t) for view in (reference, *targets)
     ]
     # Each answer becomes a hypothesis in the usable target view that is nearest to the reference.
-    left_out = np.where(np.isfinite(estimate.view_scores), 0.0, np.inf)
     hypotheses = []
     view_angles = []  # of each hypothesis, in degrees by target view
     for mode, (sim3, probability) in enumerate(answers):
@@ -348,18 +346,17 @@ def _answer(
     turns = np.stack([sim3.R for sim3, _ in answers])
     between = rotation_angle(turns[:, None], turns)
     doubts, one_of_two = reliability_flags(hypotheses, between)
-    # The estimate's other flags, the solver's, are of its own pose.
-    _, views_left_out = usable_targets(targets)
-    return replace(
-        estimate,
-        sim3=best.sim3,
-        view=best.view,
-        matches=matched.matches,
-        view_scores=-view_angles[0],
-        inliers=measured_inliers(reference, target, matched.matches, best.sim3, method.threshold),
+    return PoseEstimate(
+        best.sim3,
+        best.view,
+        matched.matches,
+        measured_inliers(reference, target, matched.matches, best.sim3, method.threshold),
+        -view_angles[0],
+        reference,
+        tuple(targets),
+        flags=(*doubts, *flags, *views_left_out),
         hypotheses=tuple(hypotheses),
         one_of_two=one_of_two,
-        flags=(*doubts, *flags, *views_left_out),
     )
 
 
@@ -417,8 +414,11 @@ def _in_units(
             )
             for hypothesis in estimate.hypotheses
         ),
-        reference_view=replace(reference, frame=scale_frame(reference.frame, 1 / reference_scale)),
-        target_views=tuple(
-            replace(view, frame=scale_frame(view.frame, 1 / target_scale)) for view in targets
-        ),
+        reference_view=_unscaled(reference, reference_scale),
+        target_views=tuple(_unscaled(view, target_scale) for view in targets),
     )
+
+
+def _unscaled(view: View, scale: float) -> View:
+    """Return a view in the lengths before scaling."""
+    return replace(view, frame=scale_frame(view.frame, 1 / scale))

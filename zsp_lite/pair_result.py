@@ -1,16 +1,21 @@
 """What is found for one pair: the estimates of its solvers, the votes of its frames, and the errors
 against pose labels."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from numpy.typing import ArrayLike
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels, relative_pose
+from zsp_lite.errors import check_choice
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.metrics import rotation_error
+from zsp_lite.transfer import TransferredPoints, describe_surface, marked_point, transfer
+from zsp_lite.views import View
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +45,9 @@ class PairResult:
     # votes of the frames of both objects, the reference frame's first; () if one frame was solved
     votes: tuple[Vote, ...] = ()
     files: tuple[Path, ...] = ()  # what `write_pair` has written
+    # whole frames of the reference by number, and the views of both objects, for `transfer`
+    frames: Mapping[int, Frame] = field(default_factory=dict)
+    views: tuple[Sequence[View], Sequence[View]] = ((), ())
 
     @property
     def world_sim3(self) -> Sim3:
@@ -63,6 +71,39 @@ class PairResult:
             return None
         first, second = [estimate.world_sim3.R for estimate in self.estimates.values()]
         return float(rotation_error(first, second))
+
+    def transfer(
+        self,
+        points: ArrayLike | None = None,
+        frame: int | None = None,
+        x: float = 0.0,
+        y: float = 0.0,
+    ) -> TransferredPoints:
+        """Find places of the reference on the target, by the pose and by features.
+
+        Args:
+            points: Points (n, 3) in the world of the reference.
+            frame: In their place, the number of a frame of the reference that was used (see
+                `frames`), with a pixel that has depth.
+            x: The pixel from the image's left edge; pixel centres are at half-integers.
+            y: From its upper edge.
+
+        Returns:
+            The places in the world of the target, with their confidence if the pose is right.
+
+        Raises:
+            InputError: Points of another shape, an unused frame, or a pixel without depth.
+        """
+        if points is None:
+            check_choice("frame", frame, self.frames)
+            what = f"pixel {x:g},{y:g} of frame {frame}"
+            points = marked_point(self.frames[frame], x, y, what)[None]
+        poses = self.world_sim3, Sim3.identity()
+        source, target = (
+            describe_surface(views, pose, range(len(views)))
+            for views, pose in zip(self.views, poses)
+        )
+        return transfer(points, source, target)
 
     def __repr__(self) -> str:
         return "\n".join(f"{solver}: {estimate!r}" for solver, estimate in self.estimates.items())

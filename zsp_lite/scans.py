@@ -14,10 +14,14 @@ from zsp_lite.data.frames import Frame, frame_defect, turn_frame
 from zsp_lite.errors import Doubt, NoPoseError
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.sources import Source
+from zsp_lite.judge import asked_positions
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import axis_deviation, world_cloud
+from zsp_lite.shapes import Shape
+from zsp_lite.upright import find_up
 from zsp_lite.views import View
 
+_TRIED = 8  # frames of which the first usable one is a single reference
 # Target views that span less than this angle, in degrees, show one side of the object.
 _ALL_SIDES = 120.0
 
@@ -28,7 +32,7 @@ class Scan:
     standard deviation."""
 
     source: Source
-    # positions of the frames that are solved against target views of other objects
+    # positions of the frames that are solved against target views of other objects, in their order
     references: list[int]
     targets: list[int]  # positions of the target views
     frames: dict[int, Frame]
@@ -45,17 +49,37 @@ class Scan:
         targets: int,
         first: int | None = None,
     ) -> "Scan":
-        """Load frames of a source (see `Source.select`), and extract their features."""
-        chosen, shown, frames = source.select(references, targets, first)
-        cloud = world_cloud([frames[position] for position in shown or chosen])[0]
+        """Load frames of a source (see `Source.select`), and extract their features.
+
+        The references are among the targets; without targets, there is one.
+        """
+        alone = targets == 0
+        count = max(references, targets)
+        if alone and first is None:
+            count = _TRIED
+        usable, frames = source.select(count, references > 0, first)
+        if alone:
+            frames = {usable[0]: frames[usable[0]]}
+        chosen = [usable[k] for k in asked_positions(references, len(usable))] if references else []
+        cloud = world_cloud(list(frames.values()))[0]
         # The method expects objects of about unit standard deviation. Sequences of data folders
         # have it.
         scale = 1.0
         if source.format != "sequence" and len(cloud):
             scale = 1 / (axis_deviation(cloud) or 1)
-        used = dict.fromkeys([*chosen, *shown])
-        views = method.views([scale_frame(frames[position], scale) for position in used])
-        return cls(source, chosen, shown, frames, dict(zip(used, views)), scale, cloud)
+        views = method.views([scale_frame(frame, scale) for frame in frames.values()])
+        shown = [] if alone else sorted(frames)
+        return cls(source, chosen, shown, frames, dict(zip(frames, views)), scale, cloud)
+
+    def shape(self) -> tuple[Shape, str]:
+        """Return the fused shape, and why its vertical is not known, if sources disagree."""
+        frames = [view.frame for view in self.views.values()]
+        up, problem = self.source.up, ""
+        if isinstance(up, str):
+            up, problem = find_up(frames)
+        elif not np.any(up):
+            up = None
+        return Shape.of(frames, up), problem
 
     @property
     def target_views(self) -> list[View]:

@@ -16,7 +16,7 @@ the surface before the correction. A part that the other object does not have is
 surface or looks unlike it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,12 +31,12 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.frames import frame_defect
+from zsp_lite.data.frames import Frame, frame_defect
 from zsp_lite.data.pairs import spread
 from zsp_lite.errors import InputError, check_choice, check_magnitude, real_array
 from zsp_lite.features import log_bin
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.points import near_median
+from zsp_lite.points import near_median, object_pixels
 from zsp_lite.views import View
 
 VIEWS = 12  # frames of an object whose patches are its surface
@@ -118,17 +118,27 @@ def surface_views(
     usable = {number: frame for number, frame in frames.items() if not frame_defect(frame)}
     unmasked = any(frame.mask is None for frame in usable.values())
     method = ZeroShotPose(as_backbone(backbone), foreground="saliency" if unmasked else "mask")
-    surface = [
-        _surface_view(number, view, alignment.objects[sequence].sim3)
-        for number, view in zip(usable, method.views(usable.values()))
-        if view.known_foreground.any()
-    ]
+    surface = describe_surface(
+        method.views(usable.values()), alignment.objects[sequence].sim3, list(usable)
+    )
     if not surface:
         raise InputError(
             f"sequence {category}/{sequence}: none of {len(frames)} frames shows the object with "
             "depth"
         )
     return surface
+
+
+def describe_surface(
+    views: Iterable[View], sim3: Sim3, numbers: Iterable[int]
+) -> list[SurfaceView]:
+    """Gather the patches of views of one world, with its similarity to the common frame, and the
+    numbers of their frames."""
+    return [
+        _surface_view(number, view, sim3)
+        for number, view in zip(numbers, views)
+        if view.known_foreground.any()
+    ]
 
 
 def _surface_view(number: int, view: View, sim3: Sim3) -> SurfaceView:
@@ -142,6 +152,20 @@ def _surface_view(number: int, view: View, sim3: Sim3) -> SurfaceView:
     binned = log_bin(view.features.keys[None]).flatten(0, 2)[patches[near]]
     descriptors = F.normalize(binned, dim=1)
     return SurfaceView(number, sim3, direction, points[near], descriptors)
+
+
+def marked_point(frame: Frame, x: float, y: float, what: str) -> Float[np.ndarray, "3"]:
+    """Return the world point at a pixel of a frame; InputError, which begins with `what`, if it is
+    outside, has no depth, or is not on the object."""
+    height, width = frame.camera.size
+    if not (0 <= x < width and 0 <= y < height):
+        raise InputError(f"{what} is outside the image, expected one of {width} x {height}")
+    row, column = int(y), int(x)
+    if frame.depth is None or not frame.depth[row, column] > 0:
+        raise InputError(f"{what} has no depth, expected a pixel with measured depth")
+    if frame.mask is not None and not object_pixels(frame)[row, column]:
+        raise InputError(f"{what} is not on the object, expected a pixel of its mask")
+    return frame.camera.unproject(np.array([x, y]), frame.depth[row, column])
 
 
 def object_size(views: Sequence[SurfaceView]) -> float:

@@ -2,8 +2,7 @@
 (sec. 5.2 and supplement), for the fit without RANSAC and for poses that several pairs of frames or
 objects agree on, and the matcher without cycles."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,10 +15,11 @@ from zsp_lite.baselines.sift import mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints
 from zsp_lite.benchmark.problem import Answer, PairProblem
 from zsp_lite.best_view import score_from_cosines
-from zsp_lite.category import object_pairs, scan_pairs, synchronise
-from zsp_lite.data.co3d import Pair
+from zsp_lite.category import CategoryAlignment, synchronise
+from zsp_lite.data.pairs import spread
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate
+from zsp_lite.shapes import compare_headings
 
 _K = 50  # number of matches, as in "Ours"
 
@@ -82,45 +82,68 @@ def nearest_patches(
 def category(problem: PairProblem) -> Answer:
     """Run "category": the pose by the alignment of all objects of the category, without labels."""
     pair = problem.pair
-    pairs = object_pairs(
-        problem.store.dataset,
-        pair.category,
-        sequences=None,
-        per_object=None,
-        targets=len(pair.target_frames),
-    )
-    return _agreed(problem, pairs)
+    return _between_worlds(problem, problem.store.aligned(pair.category, len(pair.target_frames)))
 
 
 @dataclass(frozen=True)
 class Scans:
-    """Run "scans-R": the pose that `references` frames of each object, in views of the other, agree
-    on."""
+    """Run "scans-R": the pose by all that frames of both objects show, of which at most
+    `references` of each are solved against views of the other."""
 
     references: int
 
     def __call__(self, problem: PairProblem) -> Answer:
-        return _agreed(problem, scan_pairs(problem.store.dataset, problem.pair, self.references))
+        frames = _frames_around(problem, self.references)
+        repeat = problem.pair.repeat
+        category = problem.pair.category
+        judged = problem.store.judged(category, frames, self.references, repeat=repeat)
+        if not judged:
+            raise InputError("neither frames nor shapes determine a pose")
+        return _between_worlds(problem, synchronise(judged))
 
 
-def _agreed(problem: PairProblem, pairs: Sequence[Pair]) -> Answer:
-    """Return the pose that the hypotheses of the problem's pair and of other pairs agree on."""
-    of_problem = problem.hypotheses()
-    hypotheses = [of_problem]
-    for pair in pairs:
-        # With the random draws of the same evaluation (see `seeds` of `run.evaluate`).
-        pair = replace(pair, repeat=problem.pair.repeat)
-        if pair != problem.pair:
-            of_pair = problem.store.hypotheses(pair)
-            if of_pair is not None:
-                hypotheses.append(of_pair)
-    alignment = synchronise(hypotheses)
+def shape_upright(problem: PairProblem) -> Answer:
+    """Run "shape-upright": the heading at which the shapes of both objects fit best, without
+    features."""
+    first, second = (
+        problem.store.shape(problem.pair.category, name, numbers)
+        for name, numbers in _frames_around(problem, 0).items()
+    )
+    if not (first.upright and second.upright):
+        raise InputError("no vertical: neither the floor nor the cameras tell it")
+    poses, distance = compare_headings(first, second)
+    best = Sim3.from_matrix(poses[distance.argmin()])
+    return _answer(problem, second.from_world.inverse() @ best @ first.from_world)
 
-    # From the worlds of both objects to the cameras of the reference and the first target view.
-    to_reference, to_target = [
+
+def _frames_around(problem: PairProblem, least: int) -> dict[str, tuple[int, ...]]:
+    """Return the numbers of frames of both objects, evenly spaced over their sequences from the
+    pair's own ones on: as many as the pair has views, or `least`."""
+    pair = problem.pair
+    numbers = problem.store.dataset.frame_numbers(pair.category)
+    around = {}
+    for name, start in (
+        (pair.reference_sequence, pair.reference_frame),
+        (pair.target_sequence, pair.target_frames[0]),
+    ):
+        first = numbers[name].index(start)
+        ordered = numbers[name][first:] + numbers[name][:first]
+        steps = spread(max(least, len(pair.target_frames)), len(ordered))
+        around[name] = tuple(ordered[step] for step in steps)
+    return around
+
+
+def _between_worlds(problem: PairProblem, alignment: CategoryAlignment) -> Answer:
+    """Return the pose of an alignment."""
+    pair = problem.pair
+    between = alignment.between(pair.reference_sequence, pair.target_sequence)
+    return _answer(problem, between, alignment.objects[pair.target_sequence].probability)
+
+
+def _answer(problem: PairProblem, between: Sim3, confidence: float | None = None) -> Answer:
+    """Return a pose from world to world as one in the first target view."""
+    reference, target = (
         Sim3(1.0, frame.camera.R, frame.camera.t) for frame in problem.frames()[:2]
-    ]
-    between = alignment.between(of_problem.reference, of_problem.target)
-    sim3 = to_target @ between @ to_reference.inverse()
-    probability = alignment.objects[of_problem.target].probability
-    return Answer(sim3.R, 0, sim3.t, sim3.scale, confidence=probability)
+    )
+    sim3 = target @ between @ reference.inverse()
+    return Answer(sim3.R, 0, sim3.t, sim3.scale, confidence=confidence)

@@ -76,9 +76,10 @@ METHODS: dict[str, Method] = {
     # Beyond the paper.
     "verified": Method(settings={"solver": "verified"}),
     "verified-mask": Method(settings={"solver": "verified"} | _MASK),
-    # These rows see more than the pair, without labels, and have tables of their own: scans-R sees
-    # R frames of both objects, "category" all objects of the category.
+    # These rows see more than the pair, without labels, and have tables of their own: scans-R and
+    # shape-upright frames all around both objects, "category" all objects of the category.
     **{f"scans-{count}": Method(solve=baseline_rows.Scans(count)) for count in (2, 4, 8)},
+    "shape-upright": Method(solve=baseline_rows.shape_upright),
     "category": Method(solve=baseline_rows.category),
 }
 
@@ -98,7 +99,7 @@ GROUPS: dict[str, list[str]] = {
         for table in read_paper_tables()
         if "group" in table
     },
-    "scans": ["scans-2", "scans-4", "scans-8"],
+    "scans": ["shape-upright", "scans-2", "scans-4", "scans-8"],
     "verified-views": ["verified", "verified-n1", "verified-n3", "verified-n10", "verified-mask"],
     # at one N
     "ablations": [

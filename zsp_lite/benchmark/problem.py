@@ -2,10 +2,11 @@
 
 import inspect
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
+from itertools import combinations
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,14 +15,24 @@ from threadpoolctl import threadpool_limits
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.best_view import ViewMatch
-from zsp_lite.category import PairHypotheses, world_hypotheses
+from zsp_lite.category import (
+    CategoryAlignment,
+    PairHypotheses,
+    partners,
+    synchronise,
+    world_hypotheses,
+)
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
+from zsp_lite.data.pairs import spread
 from zsp_lite.errors import InputError, NoPoseError, ends_the_run, real_array, rotation_matrix
 from zsp_lite.estimates import PoseEstimate
+from zsp_lite.judge import REFERENCES, Question, asked_positions, judge_pairs
 from zsp_lite.matching import similarities
 from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.shapes import Shape
+from zsp_lite.upright import find_up
 from zsp_lite.views import IMAGE_SIZE, View, feature_maps, frame_view, object_crop
 
 CAPACITY = 128  # frames in memory: those of about twenty pairs with five targets
@@ -126,6 +137,13 @@ class Crop:
         return self._views[key]
 
 
+def evenly_spaced(numbers: Mapping[str, Sequence[int]], count: int) -> dict[str, tuple[int, ...]]:
+    """Choose at most `count` of the frames of each object, evenly spaced over its sequence."""
+    return {
+        name: tuple(every[k] for k in spread(count, len(every))) for name, every in numbers.items()
+    }
+
+
 class FrameStore:
     """The crops of frames, of which the last used are kept in memory.
 
@@ -140,6 +158,8 @@ class FrameStore:
         # Functions that remember what they return: crops, which are large, up to a number.
         self._read = lru_cache(CAPACITY)(self._crop)
         self.hypotheses = cache(self._hypotheses)
+        self.shape = cache(self._shape)
+        self.aligned = cache(self._aligned)
         self.extent = cache(dataset.extent)
         self.labels = cache(partial(read_labels, dataset.root))
 
@@ -153,9 +173,54 @@ class FrameStore:
         return Crop(replace(crop, name=f"frame {number}"))
 
     def _hypotheses(self, pair: Pair) -> PairHypotheses | None:
-        """Return `PairProblem.hypotheses` of a pair; None if its views determine no pose."""
+        """Find the hypotheses of the verified solver between the worlds of both objects; None if
+        the views determine no pose."""
         with suppress(NoPoseError):
-            return PairProblem(pair, self).hypotheses()
+            estimate = PairProblem(pair, self).estimate(settings={"solver": "verified"})
+            return world_hypotheses(pair.reference_sequence, pair.target_sequence, estimate)
+
+    def _shape(self, category: str, sequence: str, numbers: tuple[int, ...]) -> Shape:
+        """Fuse frames of an object, upright if the floor or the cameras tell the vertical."""
+        frames = [self.crop(category, sequence, number).frame for number in numbers]
+        return Shape.of(frames, find_up(frames)[0])
+
+    def judged(
+        self,
+        category: str,
+        frames: Mapping[str, tuple[int, ...]],
+        references: int = REFERENCES,
+        pairs: Iterable[tuple[str, str]] | None = None,
+        repeat: int = 0,
+        solve: Callable[[list[Pair]], Iterable[PairHypotheses | None]] | None = None,
+    ) -> list[PairHypotheses]:
+        """Find the poses between objects of a category by some frames of each, whose numbers are
+        given by their names (see `judge.judge_pairs`).
+
+        `solve` finds the hypotheses of pairs of frames in the store's place, in another process.
+        """
+
+        def ask(questions: list[Question]) -> Iterable[PairHypotheses | None]:
+            asked = []
+            for one in questions:
+                number = order[one.reference][one.rank]
+                views = frames[one.target]
+                asked.append(Pair(category, one.reference, number, one.target, views, repeat))
+            return solve(asked) if solve else map(self.hypotheses, asked)
+
+        shapes = {}
+        order = {}  # the numbers of the frames that are asked
+        for name, numbers in frames.items():
+            with suppress(NoPoseError):  # objects without a surface are left out
+                shapes[name] = self.shape(category, name, numbers)
+            order[name] = [numbers[k] for k in asked_positions(references, len(numbers))]
+        counts = {name: len(numbers) for name, numbers in order.items()}
+        known = [pair for pair in pairs or combinations(frames, 2) if {*pair} <= shapes.keys()]
+        return judge_pairs(shapes, counts, ask, known)
+
+    def _aligned(self, category: str, targets: int) -> CategoryAlignment:
+        """Align all objects of a category."""
+        frames = evenly_spaced(self.dataset.frame_numbers(category), targets)
+        return synchronise(self.judged(category, frames, pairs=partners(frames, None)))
 
     def crop(self, category: str, sequence: str, number: int, features: Iterable[str] = ()) -> Crop:
         """Return a frame's crop with what some extractors compute from it, each once."""
@@ -261,11 +326,3 @@ class PairProblem(Problem):
         self.store = store
         crops = [store.crop(pair.category, *frame, features) for frame in pair.frames]
         super().__init__(pair.seed, crops, store.extractors, store.timings)
-
-    def hypotheses(self) -> PairHypotheses:
-        """Find the hypotheses of the verified solver between the worlds of both objects."""
-        return world_hypotheses(
-            self.pair.reference_sequence,
-            self.pair.target_sequence,
-            self.estimate(settings={"solver": "verified"}),
-        )

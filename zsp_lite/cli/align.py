@@ -46,7 +46,7 @@ MARK = Parsed(
     show_default="all; 6 from twelve objects on",
     help="Partners of each object.",
 )
-@click.option("--targets", type=COUNT, default=5, help="Target views per pair.")
+@click.option("--targets", type=COUNT, default=5, help="Frames of each object.")
 @click.option(
     "--out",
     type=PATH,
@@ -142,7 +142,7 @@ def align(
             print(
                 f"By the {what}, {right:.1f}% of {len(errors)} ordered pairs are within "
                 f"{SAME_ANGLE:.0f}° in the common frame; before the alignment, {before:.1f}% of "
-                f"{len(errors_before)} best poses, each of one frame and its target views."
+                f"{len(errors_before)} pairs alone."
             )
     if propose:
         written.append(write_labels(alignment, dataset.root, category, "label_proposals", replace))

@@ -60,6 +60,12 @@ INTRINSICS = Parsed(
     valid=lambda values: len(values) in (4, 9) and all(map(math.isfinite, values)),
     expected="four numbers, or K",
 )
+UP = Parsed(
+    "x,y,z",
+    parse=lambda text: (0.0,) * 3 if text == "none" else tuple(map(float, text.split(","))),
+    valid=lambda values: len(values) == 3 and all(map(math.isfinite, values)),
+    expected="three numbers, or none",
+)
 ORIENTATION = click.Choice(("stored", "displayed"))
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import click
 
 from zsp_lite.choices import SOLVERS
-from zsp_lite.cli.common import COUNT, INDEX, PATH, backbone_options, examples, source_options
+from zsp_lite.cli.common import COUNT, INDEX, PATH, UP, backbone_options, examples, source_options
 
 
 class _Estimate(click.Command):
@@ -51,7 +51,7 @@ class _Estimate(click.Command):
     "--references",
     type=COUNT,
     show_default="4; 1 with --reference-frame",
-    help="Frames of each object.",
+    help="Frames of each object that are solved at most.",
 )
 @click.option(
     "--targets", type=COUNT, show_default="5", help="Number of target views, evenly spaced."
@@ -62,6 +62,13 @@ class _Estimate(click.Command):
     type=PATH,
     multiple=True,
     help="Depth of an image, if it is not beside it. Once per image.",
+)
+@click.option(
+    "--up",
+    type=UP,
+    multiple=True,
+    show_default="by format, or the floor",
+    help="Vertical of the world, or none. Once per object.",
 )
 @click.option("--workers", type=COUNT, default=1, help="Frames that are solved at once.")
 @click.option(

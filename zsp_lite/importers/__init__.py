@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import (
@@ -29,18 +29,21 @@ class Format:
     what: str  # name of the format, for messages
     read: Callable[..., Makers]
     options: tuple[str, ...] = ()  # options that `read` takes, without `count`
+    # Direction up in its worlds, by their documents; "floor" if they say nothing of it.
+    up: tuple[float, float, float] | Literal["floor"] = "floor"
 
 
 PACKED = (".zip", ".r3d")  # extensions of files that apps export
 
+_ARKIT_UP = (0.0, 1.0, 0.0)  # gravity points along -y
 # The format of a folder is the first one whose signs it has.
 FORMATS = {
     "nerfstudio": Format(
         ("transforms*.json",), "nerfstudio, Blender, NeRFCapture or instant-ngp", read_nerfstudio
     ),
-    "stray": Format(("rgb.mp4", "odometry.csv"), "Stray Scanner", read_stray),
-    "polycam": Format(("keyframes/*cameras",), "Polycam's raw data", read_polycam),
-    "record3d": Format(("metadata", "rgbd"), "Record3D", read_record3d),
+    "stray": Format(("rgb.mp4", "odometry.csv"), "Stray Scanner", read_stray, up=_ARKIT_UP),
+    "polycam": Format(("keyframes/*cameras",), "Polycam's raw data", read_polycam, up=_ARKIT_UP),
+    "record3d": Format(("metadata", "rgbd"), "Record3D", read_record3d, up=_ARKIT_UP),
     "lists": Format(("poses.txt",), "lists", read_lists),
     "tum": Format(("groundtruth.txt", "rgb.txt"), "TUM RGB-D", read_tum, ("intrinsics",)),
     "bop": Format(("scene_gt.json", "scene_camera.json"), "BOP", read_bop, ("object",)),

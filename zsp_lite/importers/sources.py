@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from zsp_lite.importers.masks import (
 from zsp_lite.importers.registration import misregistration
 
 # The options that each format takes. "open" stands for a source that is open already.
-_MASKED = ("mask", "box")
+_MASKED = ("mask", "box", "up")
 _FILES = ("label", "orientation", "depth_unit")  # attributes of `CaptureFrame`
 _CAPTURE = (*_MASKED, *_FILES, "masks", "count")
 _TAKEN = {
@@ -73,6 +73,8 @@ class Source:
     # Reasons to doubt the intrinsics or the order of the images; "" is none.
     doubts: Sequence[str] = ()
     depth_unit: float | None = None  # world units per stored depth value, of an image or a capture
+    # Direction up in the world, zeros if it is not to be used; "floor" if `upright` is to find it.
+    up: Values | Literal["floor"] = "floor"
 
     @property
     def name(self) -> str:
@@ -178,36 +180,31 @@ class Source:
                 yield frame if self.mask == "given" else replace(frame, mask=None)
 
     def select(
-        self, references: int, targets: int, first: int | None = None
-    ) -> tuple[list[int], list[int], dict[int, Frame]]:
-        """Load frames from all sides; return positions of references and of targets, and frames.
+        self, count: int, references: bool, first: int | None = None
+    ) -> tuple[list[int], dict[int, Frame]]:
+        """Load at most `count` frames from all sides, from the one with the number `first` on.
 
-        Frames with a defect are no references. `first` is the number of the first reference frame.
-        The frames are by position.
+        Returns the positions of those without a defect, of which there is one if `references` are
+        wanted, and the frames by position.
         """
         if first not in (None, *self.numbers):
             raise InputError(
                 f"{self.path} has no frame {first}, expected one of {len(self.numbers)} from "
                 f"{min(self.numbers)} to {max(self.numbers)}"
             )
-
-        # There are more candidates than references, because some may have a defect. If the user
-        # names the first reference, it must have none.
         start = 0 if first is None else self.numbers.index(first)
-        tried = max(references, _CONTEXT) if references and first is None else references
         every = range(len(self.numbers))
-        candidates = self._spread(tried, [*every[start:], *every[:start]])
-        views = self._spread(targets, every)
-        needed = list(dict.fromkeys([*candidates, *views]))  # each position once
-        frames = dict(zip(needed, self.load(needed)))
-        defects = {position: frame_defect(frames[position]) for position in candidates}
-        usable = [position for position in candidates if not defects[position]]
+        chosen = self._spread(count, [*every[start:], *every[:start]])
+        frames = dict(zip(chosen, self.load(chosen)))
+        defects = {position: frame_defect(frame) for position, frame in frames.items()}
+        usable = [position for position in chosen if not defects[position]]
+        # A reference that the user names must have no defect.
         if references and (not usable or first is not None and defects[start]):
             raise InputError(
                 f"{self.path}: no usable reference frame: {defects[start]}, expected another "
                 "--reference-frame, --mask or --box"
             )
-        return self._spread(references, usable), views, frames
+        return usable, frames
 
     def _spread(self, count: int, positions: Sequence[int]) -> list[int]:
         """Choose at most `count` positions, the first among them, by directions or by the order."""
@@ -240,6 +237,7 @@ def open_source(
     masks: Path | None = None,
     count: int | None = None,
     layout: str | None = None,
+    up: Values | Literal["floor"] | None = None,
 ) -> Source:
     """Open a sequence, a capture, an image, or frames of one object in one world.
 
@@ -264,6 +262,8 @@ def open_source(
         masks: Folder of a capture's masks, named like its images, in place of its own.
         count: Number of sharp frames of a capture to choose; by default 100.
         layout: Format of a capture, a name in `importers.FORMATS`, if it is not to be recognised.
+        up: Direction up in the object's world, or zeros if it is not to be used. By default that of
+            the format, or "floor": the floor or table around the object tells it (see `upright`).
 
     Raises:
         InputError: The path is none of these, a file cannot be read, or an option is missing or
@@ -321,7 +321,9 @@ def open_source(
             f"{path}: no mask, expected masks named like the images, --mask auto or --box "
             "TOP,LEFT,HEIGHT,WIDTH"
         )
-    return replace(source, mask=mask, box=box)
+    if up is None:
+        up = FORMATS[layout].up if layout in FORMATS else "floor"
+    return replace(source, mask=mask, box=box, up=up)
 
 
 def _from_frames(frames: Sequence[Frame], path: Path) -> Source:

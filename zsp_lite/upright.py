@@ -1,0 +1,97 @@
+"""The vertical of a scan: which way is up around an object, in the world of its frames.
+
+The floor or table around the object tells it: the plane through most points of the background
+(RANSAC; Fischler and Bolles 1981). It must agree with the ring of the cameras, which walk around an
+object at about one height, or else with the images' own up. Without a floor, the ring tells it.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from zsp_lite.data.frames import Frame
+from zsp_lite.metrics import vector_angle
+from zsp_lite.points import world_points
+
+_TRIALS = 400  # planes through three points each
+_NEAR = 0.03  # distance of a point on the floor, in median distances of the points to their middle
+_LEAST_SHARE = 0.2  # of the background's points that a floor has
+_POINTS = 600  # of the background of a frame
+_STEEPEST = 60.0  # degrees between a floor's normal and what it must agree with, roughly
+_AGREE = 25.0  # degrees between the floor's normal and that of the ring
+# A ring is flat and round: the ratios of its extents across its plane and along it.
+_FLAT, _ROUND = 0.15, 0.3
+
+
+def find_up(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"] | None, str]:
+    """Find the direction up from the background's depth and the cameras of an object's frames.
+
+    Returns None where nothing tells it, or what tells it disagrees; then also a sentence that says
+    so.
+    """
+    cameras = [frame.camera for frame in frames]
+    centres = np.stack([camera.centre for camera in cameras])
+    of_images = -np.mean([camera.R[1] for camera in cameras], axis=0)  # image rows go down
+    ring = _ring_axis(centres)
+    # Images may be stored turned, cameras that walk around an object do not roll over.
+    floor = _floor_normal(frames, of_images if ring is None else ring, centres.mean(axis=0))
+    if floor is None and ring is not None:
+        up = ring * np.sign(ring @ of_images)
+        return (up if vector_angle(up, of_images) < _STEEPEST else None), ""
+    if floor is None:
+        return None, ""
+    if ring is not None and _between_axes(floor, ring) > _AGREE:
+        angle = _between_axes(floor, ring)
+        return None, f"no vertical: floor and ring of the cameras differ by {angle:.0f} degrees"
+    if ring is None and floor @ of_images < 0:
+        return None, "no vertical: the cameras are below the floor, or the images upside down"
+    return floor, ""
+
+
+def _between_axes(first: Float[np.ndarray, "*n 3"], second: Float[np.ndarray, "3"]) -> np.ndarray:
+    """Return the angles in degrees between axes, whatever their signs."""
+    angle = vector_angle(first, second)
+    return np.minimum(angle, 180 - angle)
+
+
+def _floor_normal(
+    frames: Sequence[Frame], axis: Float[np.ndarray, "3"], above: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"] | None:
+    """Return the normal of the largest plane of the background that is about normal to an axis, on
+    the side of a point."""
+    clouds = [np.zeros((0, 3))]
+    for frame in frames:
+        if frame.depth is not None and frame.mask is not None:
+            background = (frame.mask < 0.02) & (frame.depth > 0)
+            step = 1 + int(background.sum()) // _POINTS
+            clouds.append(world_points(frame, background, step))
+    points = np.concatenate(clouds)
+    if len(points) < _POINTS // 2:
+        return None
+    near = _NEAR * np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
+
+    # Planes through three random points each.
+    corners = points[np.random.default_rng(0).integers(len(points), size=(_TRIALS, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    allowed = (length > 0) & (_between_axes(normals, axis) < _STEEPEST)
+    if not allowed.any():
+        return None
+    normals = normals[allowed] / length[allowed, None]
+    heights = np.einsum("td,td->t", normals, corners[allowed, 0])
+    on_plane = np.abs(normals @ points.T - heights[:, None]) < near  # (t, n)
+    floor = points[on_plane[on_plane.sum(axis=1).argmax()]]
+    if len(floor) < _LEAST_SHARE * len(points):
+        return None
+    normal = np.linalg.svd(floor - floor.mean(axis=0), full_matrices=False)[2][2]
+    return normal * np.sign(normal @ (above - floor.mean(axis=0)))
+
+
+def _ring_axis(centres: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
+    """Return the axis of the ring in which cameras stand around an object, if they do."""
+    if len(centres) < 4:
+        return None
+    _, extents, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
+    widest, middle, least = extents
+    return axes[2] if least < _FLAT * middle and middle > _ROUND * widest else None
