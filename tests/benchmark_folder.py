@@ -178,12 +178,11 @@ RESULT = {
 
 def write_run(out, rows, categories=CATEGORIES, **settings):
     """Write a run's folder with results by row and pair."""
-    call = Call("now", [], {}, 1, list(rows), dict.fromkeys(categories, PAIRS))
+    call = Call("now", [], {}, list(rows), dict.fromkeys(categories, PAIRS))
     settings = {
         "data": "made up",
         "backbone": "none 0123456789abcdef",
         "targets": 5,
-        "labels": {},
     } | settings
     methods, library = dict.fromkeys(rows, "x"), [{"version": "0", "commit": None}]
     with open_run(out, Settings(methods=methods, library=library, calls=[call], **settings)):

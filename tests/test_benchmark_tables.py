@@ -383,7 +383,7 @@ def test_a_runs_table_has_the_parts_of_each_result_and_of_each_pairs_key(mine):
         "reference": "chair/a",
         "target": "chair/b.c",
         "failed": "",
-        "milliseconds": 2000,
+        "views": 2,
     }
     failure = {"category": "lamp", "error": 180, "failed": "no depth", "note": ""}
     assert failure.items() <= second.items()

@@ -17,7 +17,7 @@ import numpy as np
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
-from zsp_lite.benchmark.execution import Evaluator, evaluate_pairs, open_workers
+from zsp_lite.benchmark.execution import Evaluator, check_workers, evaluate_pairs
 from zsp_lite.benchmark.problem import FrameStore, PairProblem
 from zsp_lite.benchmark.runs import open_run, read_lines, run_settings
 from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
@@ -146,6 +146,7 @@ def align_category(
             OUT has another run.
         FatalError: The backbone is broken, or a frame cannot be read.
     """
+    check_workers(executor)
     if isinstance(dataset, Co3D):
         # Workers read the annotations themselves, because these are large.
         opened = Co3D(dataset.root.resolve())
@@ -153,25 +154,20 @@ def align_category(
         opened = dataset = SourceSet(dataset)
     chosen = {pair.key: pair for pair in object_pairs(dataset, category, sequences, pairs, targets)}
     loaded = as_backbone(backbone)
-    with (
-        tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder,
-        open_workers(executor) as workers,
-    ):
-        settings = run_settings(
-            dataset.root,
-            loaded,
-            targets,
-            {"alignment": "hypotheses of the verified solver"},
-            {},
-            workers=workers.count,
-            pairs={category: len(chosen)},
-        )
+    # Workers load a named backbone themselves; an object travels to them.
+    finder = HypothesisFinder(opened, loaded if executor == 1 else backbone)
+    work = dict.fromkeys(chosen.values(), ["alignment"])
+    settings = run_settings(
+        dataset.root,
+        loaded,
+        targets,
+        {"alignment": "hypotheses of the verified solver"},
+        {},
+        pairs={category: len(chosen)},
+    )
+    with tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder:
         with open_run(folder, settings):
-            # Workers load a named backbone themselves; an object travels to them.
-            sent = backbone if workers.executor else loaded
-            finder = HypothesisFinder(opened, sent)
-            work = dict.fromkeys(chosen.values(), ["alignment"])
-            evaluate_pairs(folder, finder.open, work, workers, _Line)
+            evaluate_pairs(folder, finder.open, work, executor, _Line)
         stored = read_hypotheses(folder)
     hypotheses = [stored[key] for key in chosen if key in stored]
     if not hypotheses:

@@ -43,8 +43,8 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
         common = ours[ours["repeat"].isin(row["repeat"])]
         if row["problem"].tolist() == common["problem"].tolist():
             against[name] = paired_difference(common["error"], row["error"], weights=drawn)
-    times = table.groupby("row", sort=False)["milliseconds"].median().dropna().to_dict()
-    summary = {"methods": methods, "milliseconds": times}
+    times = (1000 * table["seconds"].astype(float)).groupby(table["row"], sort=False).median()
+    summary = {"methods": methods, "milliseconds": times.dropna().to_dict()}
     return summary if ours is None else summary | {"against": against}
 
 
