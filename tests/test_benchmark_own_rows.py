@@ -47,7 +47,7 @@ from zsp_lite.benchmark.methods import (
 )
 from zsp_lite.benchmark.own import StoredPoses, kind_of
 from zsp_lite.benchmark.problem import Answer
-from zsp_lite.benchmark.run import PairEvaluator, evaluate
+from zsp_lite.benchmark.run import evaluate, open_evaluator
 from zsp_lite.benchmark.runs import LINES, Run, fingerprint, read_run
 from zsp_lite.benchmark.tables import every_table
 from zsp_lite.data.co3d import Pair
@@ -280,10 +280,9 @@ def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
         return pixels, places, 0.5  # of all matches, so that the views are equally good
 
     rows = resolve({"exact": exact, "one score": with_one_score})
-    evaluator = PairEvaluator(str(dataset.root), rows, BACKBONE)
-    evaluator.open(1)
+    evaluator = open_evaluator(str(dataset.root), rows, BACKBONE, 60, 1)
     for pair in category_pairs(dataset, "lump", 4, 3):
-        results = evaluator.line(pair, rows).results
+        results = evaluator(pair, rows).results
         reference, targets = dataset.load_pair(pair)
         crop = object_crop(reference, None).rgb
         counts = [len(exact(crop, object_crop(target, None).rgb)[0]) for target in targets]
@@ -651,7 +650,6 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
         lambda problem: Answer(np.eye(3), translation=np.full(3, np.nan)),
         lambda problem: Answer(np.eye(3), inliers="many"),
         lambda problem: Answer(np.eye(3), confidence=2.0),
-        lambda problem: Answer(np.eye(3), note="\udcff"),
         lambda problem: Answer(np.eye(3), view=0.5),
     ],
 )

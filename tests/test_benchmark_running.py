@@ -30,7 +30,7 @@ from zsp_lite import Backbone, Co3D, InputError
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.execution import check_workers
 from zsp_lite.benchmark.methods import resolve
-from zsp_lite.benchmark.run import PairEvaluator, evaluate, pairs_of_rows, write_reports
+from zsp_lite.benchmark.run import evaluate, open_evaluator, pairs_of_rows, write_reports
 from zsp_lite.benchmark.runs import (
     LINES,
     SETTINGS,
@@ -159,7 +159,7 @@ def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monke
     packed.write_bytes(gzip.compress((out / LINES).read_bytes()))
     assert read_run(tmp_path).table.equals(read_run(out).table)
     with monkeypatch.context() as context:
-        context.setattr(PairEvaluator, "line", None)  # nothing is left to compute
+        context.setattr("zsp_lite.benchmark.run.evaluate_pair", None)  # nothing is left to compute
         assert again(tmp_path) == summary
     assert not packed.exists()
     assert (tmp_path / LINES).read_bytes() == (out / LINES).read_bytes()
@@ -340,9 +340,8 @@ def test_a_vision_transformers_features_do_not_depend_on_threads():
     pairs = pairs_to_evaluate(["ours"], 2, 2)
 
     def errors(threads: int) -> list[float]:
-        evaluator = PairEvaluator(str(small_folder()), resolve(["ours"]), backbone)
-        evaluator.open(threads)
-        lines = [evaluator.line(pair, names) for pair, names in pairs.items()]
+        evaluator = open_evaluator(str(small_folder()), resolve(["ours"]), backbone, 60, threads)
+        lines = [evaluator(pair, names) for pair, names in pairs.items()]
         return [line.results["ours"].error for line in lines]
 
     assert errors(1) == errors(2)

@@ -470,7 +470,7 @@ def test_a_damaged_gzip_is_refused(folder):
 
 
 @pytest.mark.parametrize(
-    "right, wrong", [(".*", "{}"), ('"calls"', '"call"'), ('"targets": 5', '"targets": "5"')]
+    "right, wrong", [(".*", "{}"), ('"calls"', '"call"'), ('"targets":5', '"targets":"5"')]
 )
 def test_settings_of_another_form_are_refused(folder, right, wrong):
     path = folder / SETTINGS

@@ -19,7 +19,7 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.benchmark.execution import Evaluator, check_workers, evaluate_pairs
 from zsp_lite.benchmark.problem import FrameStore, PairProblem
-from zsp_lite.benchmark.runs import open_run, read_lines, run_settings
+from zsp_lite.benchmark.runs import open_run, read_lines
 from zsp_lite.category import CategoryAlignment, PairHypotheses, object_pairs, synchronise
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
@@ -157,16 +157,16 @@ def align_category(
     # Workers load a named backbone themselves; an object travels to them.
     finder = HypothesisFinder(opened, loaded if executor == 1 else backbone)
     work = dict.fromkeys(chosen.values(), ["alignment"])
-    settings = run_settings(
-        dataset.root,
-        loaded,
-        targets,
-        {"alignment": "hypotheses of the verified solver"},
-        {},
-        pairs={category: len(chosen)},
-    )
     with tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder:
-        with open_run(folder, settings):
+        with open_run(
+            folder,
+            dataset.root,
+            loaded,
+            targets,
+            {"alignment": "hypotheses of the verified solver"},
+            {},
+            pairs={category: len(chosen)},
+        ):
             evaluate_pairs(folder, finder.open, work, executor, _Line)
         stored = read_hypotheses(folder)
     hypotheses = [stored[key] for key in chosen if key in stored]

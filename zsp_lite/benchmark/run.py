@@ -1,7 +1,8 @@
 """Run the benchmark: rotation errors of rows over many pairs of a CO3D-format folder (sec. 5).
 
-The way of a pair: `evaluate` samples it, `evaluate_pairs` hands it to this process or a worker, `PairEvaluator.line` reads frames and features, asks each row (`ask`) and measures its
-answer; `runs.add_lines` adds the line to run.jsonl, from which `write_reports` makes tables.
+The way of a pair: `evaluate` samples it, `evaluate_pairs` hands it to this process or a worker,
+`evaluate_pair` reads frames and features, asks each row (`ask`) and measures its answer;
+`runs.add_lines` adds the line to run.jsonl, from which `write_reports` makes tables.
 
 `rows` are always the `Method`s by name, `names` are names of rows.
 """
@@ -12,7 +13,7 @@ import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,6 @@ from zsp_lite.benchmark.runs import (
     open_run,
     printable,
     read_run,
-    run_settings,
 )
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
@@ -122,8 +122,15 @@ def evaluate(
     for row in rows.values():
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)
-    remarks = _remarks_on_stored_poses(rows, dataset, work)
-    settings = run_settings(
+    # The lines of the run, pair by pair.
+    repeated = {
+        replace(pair, repeat=seed): names for seed in range(seeds) for pair, names in work.items()
+    }
+    # Workers load a named backbone themselves; an object travels to them.
+    sent = loaded if executor == 1 else backbone
+    opener = partial(open_evaluator, str(Path(data).resolve()), rows, sent, row_seconds)
+    with open_run(
+        out,
         data,
         loaded,
         targets,
@@ -131,25 +138,15 @@ def evaluate(
         _hashes(dataset, work),
         pairs=dict(pairs),
         seeds=seeds,
-        remarks=remarks,
-    )
-
-    # The lines of the run, pair by pair.
-    repeated = {
-        replace(pair, repeat=seed): names for seed in range(seeds) for pair, names in work.items()
-    }
-    # Workers load a named backbone themselves; an object travels to them.
-    sent = loaded if executor == 1 else backbone
-    evaluator = PairEvaluator(str(Path(data).resolve()), rows, sent, row_seconds)
-    with open_run(out, settings):
-        evaluate_pairs(out, evaluator.open, repeated, executor)
+        remarks=_remarks_on_stored_poses(rows, dataset, work),
+    ):
+        evaluate_pairs(out, opener, repeated, executor)
 
     # The lines as one table, and its summary.
-    run = read_run(out)
-    for remark in [*remarks.values(), *run.failures.values()]:
-        if remark:
-            logger.warning("%s", remark)
-    return run.summary
+    summary = read_run(out).summary
+    if "note" in summary:
+        logger.warning("%s", summary["note"])
+    return summary
 
 
 def _remarks_on_stored_poses(
@@ -203,24 +200,22 @@ def pairs_of_rows(
 
     All rows of one number of target views get the same pairs.
     """
+    sampled = cache(partial(category_pairs, dataset))
     work: dict[Pair, list[str]] = {}
-    targets_of = {name: row.targets or targets for name, row in rows.items()}
-    for n_targets in set(targets_of.values()):
-        names = [name for name in rows if targets_of[name] == n_targets]
+    for name, row in rows.items():
         for category, count in pairs_per_category.items():
             check_integer(f"pairs of {category}", count, 1)
-            for pair in category_pairs(dataset, category, count, n_targets):
-                work[pair] = names
+            for pair in sampled(category, count, row.targets or targets):
+                work.setdefault(pair, []).append(name)
     return work
 
 
 def _hashes(dataset: Co3D, pairs: Iterable[Pair]) -> dict[str, str]:
     """Hash the first image of each object of the pairs, and the rotation of its label."""
     labels = cache(partial(read_labels, dataset.root))
+    names = {(pair.category, name) for pair in pairs for name, _ in pair.frames}
     hashes = {}
-    for category, name in sorted(
-        {(pair.category, name) for pair in pairs for name, _ in pair.frames}
-    ):
+    for category, name in sorted(names):
         label = labels(category)[name]
         # Translations are left out: the same scene, rendered on another processor, has a unit of
         # length that differs by some 3e-5. Adding 0.0 turns negative zeros into zeros.
@@ -231,58 +226,59 @@ def _hashes(dataset: Co3D, pairs: Iterable[Pair]) -> dict[str, str]:
     return hashes
 
 
-@dataclass
-class PairEvaluator:
-    """Evaluates rows on pairs; frames and features are kept from pair to pair."""
+def open_evaluator(
+    root: str, rows: Mapping[str, Method], backbone: BackboneLike, row_seconds: int, threads: int
+) -> Evaluator:
+    """Load the backbone and the extractors; the evaluator keeps frames and features from pair to
+    pair."""
+    extractors = make_extractors(as_backbone(backbone), rows)
+    store = FrameStore(Co3D(root), extractors, threads)
+    return partial(evaluate_pair, store, rows, row_seconds)
 
-    root: str  # the data folder
-    rows: Mapping[str, Method]
-    backbone: BackboneLike
-    row_seconds: int = 60  # time limit of a row of one's own for a pair
 
-    def open(self, threads: int) -> Evaluator:
-        """Load the backbone and the extractors."""
-        extractors = make_extractors(as_backbone(self.backbone), self.rows)
-        self.store = FrameStore(Co3D(self.root), extractors, threads)
-        return self.line
+def evaluate_pair(
+    store: FrameStore,
+    rows: Mapping[str, Method],
+    row_seconds: int,
+    pair: Pair,
+    names: Collection[str],
+) -> ResultLine:
+    """Evaluate the named rows on a pair: a line of the run. `row_seconds` is the time limit of a
+    row of one's own."""
+    store.timings.clear()
+    features = {rows[name].features for name in names} - {"none"}
+    problem = PairProblem(pair, store, features)
+    # Read here, since an unreadable point cloud is no failure of a row.
+    objects = (pair.reference_sequence, pair.target_sequence)
+    extents = [store.extent(pair.category, name) for name in objects]
+    # The ground truth from the reference's camera to each target's.
+    labels = store.labels(pair.category)
+    views = range(len(pair.target_frames))
+    truths = [true_pose(store.dataset, labels, pair, view) for view in views]
+    nearest = int(np.argmin([rotation_error(np.eye(3), truth[:3, :3]) for truth in truths]))
 
-    def line(self, pair: Pair, names: Collection[str]) -> ResultLine:
-        """Evaluate the named rows on a pair: a line of the run."""
-        self.store.timings.clear()
-        features = {self.rows[name].features for name in names} - {"none"}
-        problem = PairProblem(pair, self.store, features)
-        # Read here, since an unreadable point cloud is no failure of a row.
-        objects = (pair.reference_sequence, pair.target_sequence)
-        extents = [self.store.extent(pair.category, name) for name in objects]
-        # The ground truth from the reference's camera to each target's.
-        labels = self.store.labels(pair.category)
-        views = range(len(pair.target_frames))
-        truths = [true_pose(self.store.dataset, labels, pair, view) for view in views]
-        nearest = int(np.argmin([rotation_error(np.eye(3), truth[:3, :3]) for truth in truths]))
+    # The answers of the rows, measured.
+    results = {}
+    for name in names:
+        method = rows[name]
+        # A class that somebody derives from StoredPoses is one's own, too.
+        own = is_own(name) and type(method.solve) is not StoredPoses
+        seen = problem_of_own(method.solve, problem) if own else problem
+        try:
+            with fails_alone(row_seconds) if own else nullcontext():
+                start = time.perf_counter()
+                answer = ask(method, seen, nearest)
+                seconds = time.perf_counter() - start
+                results[name] = _measure(answer, problem, truths, extents, seconds)
+        except InputError as error:
+            # 180 degrees: without these pairs, methods that fail often would look better.
+            results[name] = Result(180.0, failed=printable(error))
 
-        # The answers of the rows, measured.
-        results = {}
-        for name in names:
-            method = self.rows[name]
-            # A class that somebody derives from StoredPoses is one's own, too.
-            own = is_own(name) and type(method.solve) is not StoredPoses
-            seen = problem_of_own(method.solve, problem) if own and method.solve else problem
-            try:
-                with fails_alone(self.row_seconds) if own else nullcontext():
-                    start = time.perf_counter()
-                    answer = ask(method, seen, nearest)
-                    seconds = time.perf_counter() - start
-                    results[name] = _measure(answer, problem, truths, extents, seconds)
-            except InputError as error:
-                # 180 degrees: without these pairs, methods that fail often would look better.
-                results[name] = Result(180.0, failed=printable(error))
-
-        # The store and the problem have added the seconds of each stage.
-        timings = {
-            stage: round(float(np.median(seconds)), 5)
-            for stage, seconds in self.store.timings.items()
-        }
-        return ResultLine(pair.key, results, pair.repeat, timings)
+    # The store and the problem have added the seconds of each stage.
+    timings = {
+        stage: round(float(np.median(seconds)), 5) for stage, seconds in store.timings.items()
+    }
+    return ResultLine(pair.key, results, pair.repeat, timings)
 
 
 def ask(method: Method, problem: Problem, nearest: int | None = None) -> Answer:

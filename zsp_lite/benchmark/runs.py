@@ -12,7 +12,7 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -157,38 +157,6 @@ def printable(text: object) -> str:
     return str(text).encode(errors="replace").decode()
 
 
-def run_settings(
-    data: str | Path,
-    backbone: Any,
-    targets: int,
-    methods: dict[str, str],
-    objects: dict[str, str],
-    **call: Any,
-) -> Settings:
-    """Describe a run, and this call of it: time, command, and versions of what computes."""
-    words = [Path(sys.argv[0]).name.replace("__main__.py", "zsp-lite"), *sys.argv[1:]]
-    versions = {one.__name__: str(one.__version__) for one in (torch, np, scipy, cv2)}
-    versions["python"] = platform.python_version()
-    versions["machine"] = platform.platform()
-    this_call = Call(
-        time=datetime.now(UTC).isoformat(timespec="seconds"),
-        command=[printable(word) for word in words],
-        versions=versions,
-        rows=list(methods),
-        **call,
-    )
-    return Settings(
-        data=printable(data),
-        folder=printable(os.path.realpath(data)),
-        backbone=fingerprint(backbone),
-        targets=targets,
-        library=[library_version()],
-        methods=methods,
-        objects=objects,
-        calls=[this_call],
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Run:
     """Results of a run on the pairs that the rows of the last call have finished (see
@@ -265,20 +233,48 @@ class Run:
 
 
 @contextmanager
-def open_run(out: str | Path, settings: Settings) -> Iterator[None]:
+def open_run(
+    out: str | Path,
+    data: str | Path,
+    backbone: Any,
+    targets: int,
+    methods: dict[str, str],
+    objects: dict[str, str],
+    **call: Any,
+) -> Iterator[None]:
     """Be the only writer of a run's folder, which is new or holds a run with these settings; then
-    `add_lines` adds."""
+    `add_lines` adds. `call` has the members of this `Call` that the rest does not tell."""
+    words = [Path(sys.argv[0]).name.replace("__main__.py", "zsp-lite"), *sys.argv[1:]]
+    versions = {one.__name__: str(one.__version__) for one in (torch, np, scipy, cv2)}
+    versions |= {"python": platform.python_version(), "machine": platform.platform()}
+    this_call = Call(
+        time=datetime.now(UTC).isoformat(timespec="seconds"),
+        command=[printable(word) for word in words],
+        versions=versions,
+        rows=list(methods),
+        finished=False,
+        **call,
+    )
+    settings = Settings(
+        data=printable(data),
+        folder=printable(os.path.realpath(data)),
+        backbone=fingerprint(backbone),
+        targets=targets,
+        library=[library_version()],
+        methods=methods,
+        objects=objects,
+        calls=[this_call],
+    )
     with writing(out):
         out = Path(out)
-        packed = out / f"{LINES}.gz"
-        if any(path.exists() for path in (out / SETTINGS, out / LINES, packed)):
+        lines = _finished_lines(out)
+        if lines or (out / SETTINGS).exists():
             settings = _continued(out, settings)
-        write_atomic(out / LINES, _finished_lines(out))
-        packed.unlink(missing_ok=True)
-        settings.calls[-1].finished = False
+        write_atomic(out / LINES, lines)
+        (out / f"{LINES}.gz").unlink(missing_ok=True)
         _write_settings(out, settings)
         yield
-        settings.calls[-1].finished = True
+        this_call.finished = True
         _write_settings(out, settings)
 
 
@@ -294,11 +290,11 @@ def _continued(out: Path, now: Settings) -> Settings:
     asked = _decisive(now)
     if before.objects.keys() & now.objects.keys():
         del held["data"]  # the same data may lie at another path
-    for name in asked:
-        if held.get(name, asked[name]) != asked[name]:
+    for name, value in asked.items():
+        if held.get(name, value) != value:
             raise InputError(
-                f"{out} holds a run with {name} {held[name]}, this is {asked[name]}; choose "
-                "another folder"
+                f"{out} holds a run with {name} {held[name]}, this is {value}; choose another "
+                "folder"
             )
     return msgspec.structs.replace(
         now,
@@ -311,7 +307,7 @@ def _continued(out: Path, now: Settings) -> Settings:
 
 def _decisive(settings: Settings) -> dict[str, Any]:
     """Return by name what must be equal in two calls of one run, if both calls have it."""
-    parts: dict[str, Any] = {
+    parts = {
         "command": "align" if "alignment" in settings.methods else "benchmark",
         "backbone": settings.backbone,
         "targets": settings.targets,
@@ -427,19 +423,18 @@ def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
 def _finished(table: pd.DataFrame, last: Call) -> pd.DataFrame:
     """Keep the pairs that all rows of the last call have finished, and the rows, by seed, that have
     all of these pairs."""
-    # The finished pairs have a line for each row and seed of the last call; by number of views.
-    finished = {}
-    for views, lines in table[table["row"].isin(last.rows)].groupby("views"):
-        lines_of_pair = lines.groupby("pair").size()
-        expected = lines["row"].nunique() * last.seeds
-        finished[views] = set(lines_of_pair.index[lines_of_pair == expected])
-    problems = set(table["problem"][table["pair"].isin(set().union(*finished.values()))])
+    # A finished pair has a line for each seed and each row of the last call with as many views.
+    of_call = table[table["row"].isin(last.rows)]
+    expected = last.seeds * of_call.groupby("views")["row"].transform("nunique")
+    finished = of_call[of_call.groupby("pair")["row"].transform("size") == expected]
+    pairs = {views: set(lines["pair"]) for views, lines in finished.groupby("views")}
+    problems = set(finished["problem"])
 
     # A row at a number of target views that the last call does not have needs the same problems.
     complete = [table[:0]]
     for (_, _, views), lines in table.groupby(["row", "repeat", "views"]):
-        column = "pair" if views in finished else "problem"
-        wanted = finished.get(views, problems)
+        column = "pair" if views in pairs else "problem"
+        wanted = pairs.get(views, problems)
         lines = lines[lines[column].isin(wanted)]
         if wanted <= set(lines[column]):
             complete.append(lines)

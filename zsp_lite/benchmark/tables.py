@@ -133,8 +133,6 @@ def all_rows(
     names = [name for name in methods if _table_of(name) == table]
     if table != "all_rows" and names and "verified" in methods:  # what they add to
         names.insert(0, "verified")
-    against = summary.get("against", {})
-    rows = {name: methods[name] | against.get(name, {}) for name in names}
     titles = {
         "n": "pairs",
         **{metric: METRICS[metric] for metric in metrics},
@@ -142,11 +140,17 @@ def all_rows(
         "accuracy_gain": "Acc30 − ours",
         "accuracy_gain_p": "p",
     }
+    rows = [methods[name] | summary["against"].get(name, {}) for name in names]
+    cells = pd.DataFrame(
+        {title: [_cell(row, figure) for row in rows] for figure, title in titles.items()},
+        names,
+        dtype=object,
+    )
     gain = (
         'Acc30 − ours: difference to "ours" on the same pairs, in points, and its p value by the '
         "same bootstrap."
     )
-    return _table(summary, table, ROW_TABLES[table], _cells(rows, titles), metrics, gain)
+    return _table(summary, table, ROW_TABLES[table], cells, metrics, gain)
 
 
 def paper_tables(summary: Mapping[str, Any], metrics: Sequence[str] = PAPER) -> list[Table]:
@@ -164,40 +168,35 @@ def _paper_table(
     Table 1 has rows of one's own, too, below the paper's.
     """
     methods = summary["methods"]
-    lines = spec["rows"]
-    if spec["name"] == "table_1":
-        own = own_rows(summary)
-        lines = lines + [{"label": name, "row": name, "published": []} for name in own]
-    # Of the published figures of a single category, those of the run's categories are shown.
     categories = summary["data"]["categories"]
-    published = [
-        title for title in spec["published"] if title.removesuffix(" Acc30") in (title, *categories)
-    ]
-    titles = {metric: METRICS[metric] for metric in metrics}
-    titles |= {title: title for title in published if title.endswith(" Acc30")}
-    titles |= {f"{PUBLISHED}: {title}": f"{PUBLISHED}: {title}" for title in published}
-
-    rows = {}
-    names = {}
-    for line in lines:
+    # A row at the run's own number of target views goes by either name.
+    views = f"-n{summary['data']['targets']}"
+    lines = []  # the name of the row, and the line of the table
+    for line in spec["rows"]:
         name = line["row"]
-        if name not in methods:  # a row at the run's own number of target views goes by either name
-            name = name.removesuffix(f"-n{summary['data']['targets']}")
-        row = methods.get(name, {"per_category": {}})
-        figures = dict(row)
-        for category, of_category in row["per_category"].items():
-            figures[f"{category} Acc30"] = of_category["acc30"]
-            figures[f"{category} Acc30_ci"] = of_category["acc30_ci"]
-        for title, figure in zip(spec["published"], line["published"]):
-            figures[f"{PUBLISHED}: {title}"] = figure
-        names[line["label"]] = name
-        rows[line["label"]] = figures
+        lines.append((name if name in methods else name.removesuffix(views), line))
+    if spec["name"] == "table_1":
+        lines += [(name, {"label": name, "published": []}) for name in own_rows(summary)]
     if "chosen" in summary:
         order = summary["chosen"]
-        labels = [label for name in order for label in names if names[label] == name]
-        rows = {label: rows[label] for label in labels}
+        lines = [line for line in lines if line[0] in order]
+        lines.sort(key=lambda line: order.index(line[0]))
+
+    # The run's own figures, those of single categories, and the published ones.
+    rows = [methods.get(name, {"per_category": {}}) for name, _ in lines]
+    columns = {METRICS[metric]: [_cell(row, metric) for row in rows] for metric in metrics}
+    published = {}
+    for place, title in enumerate(spec["published"]):
+        category = title.removesuffix(" Acc30")
+        if category in categories:
+            columns[title] = [_cell(row["per_category"].get(category, {}), "acc30") for row in rows]
+        if category in (title, *categories):
+            figures = [line["published"][place : place + 1] for _, line in lines]
+            published[f"{PUBLISHED}: {title}"] = [Cell(*one) if one else None for one in figures]
+    labels = [line["label"] for _, line in lines]
+    cells = pd.DataFrame(columns | published, labels, dtype=object)
     notes = [_PUBLISHED_NOTE if published else "", spec.get("note", "")]
-    return _table(summary, spec["name"], spec["title"], _cells(rows, titles), metrics, *notes)
+    return _table(summary, spec["name"], spec["title"], cells, metrics, *notes)
 
 
 def by_category(
@@ -235,12 +234,9 @@ def compare(
         raise InputError(
             f"runs have no row in common: {', '.join(of_first)} and {', '.join(of_second)}"
         )
-    figures = {}
+    cells = {}
     for text in rows:
-        row_a = text
-        row_b = text
-        if text not in of_first:
-            row_a, _, row_b = text.partition(":")
+        row_a, _, row_b = (text, "", text) if text in of_first else text.partition(":")
         common = first.row(row_a).merge(
             second.row(row_b), on=["pair", "repeat"], suffixes=("", "_b")
         )
@@ -249,27 +245,22 @@ def compare(
                 f"rows {row_a} and {row_b} have no pair in common: other data or number of views"
             )
         errors = common[["error", "error_b"]].to_numpy().T  # (2, pairs)
-        figures[text] = {
-            "n": len(common),
-            "acc30 of A": accuracy(errors[0], 30),
-            "acc30 of B": accuracy(errors[1], 30),
-            "median of A": median(errors[0]),
-            "median of B": median(errors[1]),
-        } | paired_difference(*errors, weights=draws_of(common))
-    titles = {
-        "n": "pairs",
-        "acc30 of A": "Acc30 of A (%)",
-        "acc30 of B": "Acc30 of B (%)",
-        "accuracy_gain": "B − A",
-        "accuracy_gain_p": "p",
-        "median of A": f"A: {METRICS['median']}",
-        "median of B": f"B: {METRICS['median']}",
-    }
+        gain = paired_difference(*errors, weights=draws_of(common))
+        cells[text] = [
+            Cell(len(common), decimals=0),
+            *map(Cell, accuracy(errors, 30)),
+            _cell(gain, "accuracy_gain"),
+            _cell(gain, "accuracy_gain_p"),
+            *map(Cell, median(errors)),
+        ]
+    titles = ["pairs", "Acc30 of A (%)", "Acc30 of B (%)", "B − A", "p"]
+    titles += [f"{run}: {METRICS['median']}" for run in "AB"]
     note = (
         "On the common pairs. Intervals (95 %) and p: bootstrap over objects. "
         "Of twenty rows without a difference, one has p < 0.05 by chance."
     )
-    return Table("compare", "A = {}, B = {}".format(*names), _cells(figures, titles), note)
+    title = "A = {}, B = {}".format(*names)
+    return Table("compare", title, pd.DataFrame.from_dict(cells, "index", object, titles), note)
 
 
 def own_rows(summary: Mapping[str, Any]) -> list[str]:
@@ -294,13 +285,6 @@ def _table_of(name: str) -> str:
     if base == "category":
         return "with_others"
     return "with_scans" if base in GROUPS["scans"] else "all_rows"
-
-
-def _cells(rows: Mapping[str, Mapping[str, Any]], titles: Mapping[str, str]) -> pd.DataFrame:
-    """Make the cells of rows from their figures, in columns with titles by the name of the
-    figure."""
-    cells = {label: [_cell(row, figure) for figure in titles] for label, row in rows.items()}
-    return pd.DataFrame.from_dict(cells, "index", object, list(titles.values()))
 
 
 def _cell(row: Mapping[str, Any], figure: str) -> Cell | None:
