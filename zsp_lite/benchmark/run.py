@@ -181,13 +181,17 @@ def write_reports(
     from zsp_lite.benchmark import tables  # workers need no matplotlib
 
     results = read_run(run)
-    out = Path(out or run)
     shown = tables.choose(results, rows) if rows else results.summary
+    out = Path(out or run)
     of_paper = [spec["name"] for spec in read_paper_tables()]
     for name in (*tables.ROW_TABLES, *of_paper):
         for path in (out / "tables").glob(f"{name}.*"):
             path.unlink()
-    tables.write_tables(tables.every_table(shown, metrics), out / "tables", intervals)
+    for table in tables.every_table(shown, metrics):
+        path = out / "tables" / table.name
+        write_atomic(f"{path}.csv", tables.as_csv(table).encode())
+        write_atomic(f"{path}.md", tables.as_markdown(table).encode())
+        write_atomic(f"{path}.tex", tables.as_latex(table, intervals).encode())
     tables.write_figures(results, out / "figures", rows, size)
     write_atomic(out / "summary.json", json.dumps(results.summary, indent=1).encode())
     return shown

@@ -7,7 +7,7 @@ with 100 pairs each) with DINO ViT-S/8.
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import methodcaller
 from pathlib import Path
@@ -26,7 +26,6 @@ from zsp_lite.choices import METRICS, METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import write_atomic
 from zsp_lite.metrics import accuracy, median
 from zsp_lite.views import object_crop
 from zsp_lite.viz.plots import (
@@ -380,18 +379,6 @@ def as_latex(table: Table, intervals: bool = False) -> str:
         caption=_escape(". ".join(filter(None, [title, table.data]))),
         column_format="l" + "r" * len(titles),
     )
-
-
-def write_tables(tables: Iterable[Table], folder: str | Path, intervals: bool = False) -> None:
-    """Write each table as NAME.csv, NAME.md and NAME.tex, this with `intervals` or without."""
-    for table in tables:
-        texts = {
-            ".csv": as_csv(table),
-            ".md": as_markdown(table),
-            ".tex": as_latex(table, intervals),
-        }
-        for suffix, text in texts.items():
-            write_atomic(Path(folder) / f"{table.name}{suffix}", text.encode())
 
 
 def error_distribution(run: Run, row: str = "ours") -> Figure:
