@@ -12,15 +12,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from synthetic_views import CoordinateBackbone, look_at, render, true_pose
 
 from zsp_lite.alignment import Sim3, ransac
 from zsp_lite.benchmark.run import evaluate
-from zsp_lite.benchmark.runs import Call, Settings, add_lines, open_run, read_run
+from zsp_lite.benchmark.runs import SETTINGS, Call, Settings, add_lines, read_run
 from zsp_lite.data.co3d import Pair, SequenceData, write_co3d
 from zsp_lite.data.labels import PoseLabel, read_labels, write_label
 from zsp_lite.estimates import PoseEstimate, match_points
+from zsp_lite.io.files import write_atomic
 from zsp_lite.views import object_crop
 
 SEQUENCES = ("100_a", "200_b", "300_c")
@@ -176,21 +178,14 @@ RESULT = {
 }
 
 
-def write_run(out, rows, categories=CATEGORIES, **settings):
+def write_run(out, rows, categories=CATEGORIES, backbone="none 0123456789abcdef"):
     """Write a run's folder with results by row and pair."""
-    call = Call("now", [], {}, 1, list(rows), dict.fromkeys(categories, PAIRS))
-    settings = {
-        "data": "made up",
-        "backbone": "none 0123456789abcdef",
-        "targets": 5,
-        "labels": {},
-    } | settings
-    methods, library = dict.fromkeys(rows, "x"), [{"version": "0", "commit": None}]
-    with open_run(out, Settings(methods=methods, library=library, calls=[call], **settings)):
-        for name, results in rows.items():
-            add_lines(
-                out, ({"pair": key, "results": {name: found}} for key, found in results.items())
-            )
+    call = Call("now", [], {}, list(rows), dict.fromkeys(categories, PAIRS))
+    library, methods = [{"version": "0", "commit": None}], dict.fromkeys(rows, "x")
+    settings = Settings("made up", backbone, 5, library, methods, [call])
+    write_atomic(Path(out) / SETTINGS, msgspec.json.encode(settings))
+    for name, results in rows.items():
+        add_lines(out, ({"pair": key, "results": {name: found}} for key, found in results.items()))
     return read_run(out)
 
 

@@ -28,9 +28,9 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from zsp_lite import Backbone, Co3D, InputError
 from zsp_lite.backbones.vit import VisionTransformer
-from zsp_lite.benchmark.execution import make_chunks, open_workers
+from zsp_lite.benchmark.execution import check_workers
 from zsp_lite.benchmark.methods import resolve
-from zsp_lite.benchmark.run import PairEvaluator, evaluate, pairs_of_rows, write_reports
+from zsp_lite.benchmark.run import evaluate, open_evaluator, pairs_of_rows, write_reports
 from zsp_lite.benchmark.runs import (
     LINES,
     SETTINGS,
@@ -159,7 +159,7 @@ def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monke
     packed.write_bytes(gzip.compress((out / LINES).read_bytes()))
     assert read_run(tmp_path).table.equals(read_run(out).table)
     with monkeypatch.context() as context:
-        context.setattr(PairEvaluator, "line", None)  # nothing is left to compute
+        context.setattr("zsp_lite.benchmark.run.evaluate_pair", None)  # nothing is left to compute
         assert again(tmp_path) == summary
     assert not packed.exists()
     assert (tmp_path / LINES).read_bytes() == (out / LINES).read_bytes()
@@ -186,7 +186,7 @@ def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tabl
     assert sorted(pairs_in(tmp_path)) == sorted(pairs_in(undisturbed[0]))
 
 
-# With two workers, a chunk of 24 pairs has three: each worker finishes its first one, and no other.
+# Each of two workers finishes three of 24 pairs, which are handed out one by one.
 WAITS = """
 import time
 from pathlib import Path
@@ -325,8 +325,7 @@ def test_numbers_of_threads_are_restored_after_blocks_that_overlap():
 
 @pytest.mark.parametrize("executor", ["nowhere:Pool", 0, 10**11, 1.5, True, None])
 def test_unusable_executors_are_refused(executor):
-    with pytest.raises(InputError, match="workers"), open_workers(executor):
-        pass
+    refused("workers", check_workers, executor)
 
 
 def pairs_to_evaluate(rows: list[str], pairs: int, targets: int) -> dict:
@@ -338,12 +337,12 @@ def test_a_vision_transformers_features_do_not_depend_on_threads():
     with torch.random.fork_rng():
         torch.manual_seed(0)
         backbone = Backbone(VisionTransformer(32, 8, 24, 2, 3), "small", layer=1, device="cpu")
-    (chunk,) = make_chunks(pairs_to_evaluate(["ours"], 2, 2))
+    pairs = pairs_to_evaluate(["ours"], 2, 2)
 
     def errors(threads: int) -> list[float]:
-        evaluator = PairEvaluator(str(small_folder()), resolve(["ours"]), backbone)
-        evaluator.open(threads)
-        return [evaluator.line(pair, names)["results"]["ours"]["error"] for pair, names in chunk]
+        evaluator = open_evaluator(str(small_folder()), resolve(["ours"]), backbone, 60, threads)
+        lines = [evaluator(pair, names) for pair, names in pairs.items()]
+        return [line.results["ours"].error for line in lines]
 
     assert errors(1) == errors(2)
 
@@ -420,7 +419,7 @@ def test_the_same_data_by_another_path_continue_a_run_and_other_data_do_not(
     for path in tmp_path.glob("*/**/images/frame000001.jpg"):
         path.write_bytes(b"")
     for data in ("../data", "data"):
-        refused("a run with images of lump/.*; choose another folder", run, data, "ours")
+        refused("a run with images or labels of lump/.*; choose another folder", run, data, "ours")
     assert list(read_run(tmp_path / "run").settings.methods) == ["icp", "ours-bv", "ours", "sift"]
 
 
@@ -431,7 +430,7 @@ def test_pose_labels_that_have_changed_do_not_mix(tmp_path):
     label = next(one for one in read_labels(root, "lump").values() if one.seq != one.reference_seq)
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     write_label(root, "lump", replace(label, trans=label.trans @ half_turn))
-    refused("a run with labels of lump", run, tmp_path / "run")
+    refused("a run with images or labels of lump", run, tmp_path / "run")
     run(tmp_path / "other")
 
 

@@ -17,9 +17,9 @@ import numpy as np
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
-from zsp_lite.benchmark.execution import Evaluator, evaluate_pairs, open_workers
+from zsp_lite.benchmark.execution import Evaluator, check_workers, evaluate_pairs
 from zsp_lite.benchmark.problem import FrameStore, evenly_spaced
-from zsp_lite.benchmark.runs import open_run, read_lines, run_settings
+from zsp_lite.benchmark.runs import open_run, read_lines
 from zsp_lite.category import CategoryAlignment, PairHypotheses, partners, synchronise
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
@@ -92,9 +92,10 @@ class HypothesisFinder:
     backbone: BackboneLike
 
     def open(self, threads: int) -> Evaluator:
-        """Load the backbone."""
-        extractors = {"backbone": as_backbone(self.backbone)}
-        self.store = FrameStore(self.dataset, extractors, threads)
+        """Load the backbone, once in each process."""
+        if not hasattr(self, "store"):
+            extractors = {"backbone": as_backbone(self.backbone)}
+            self.store = FrameStore(self.dataset, extractors, threads)
         return self.line
 
     def line(self, pair: Pair, names: Sequence[str]) -> dict[str, Any]:
@@ -142,6 +143,7 @@ def align_category(
             poses; OUT has another run.
         FatalError: The backbone is broken, or a frame cannot be read.
     """
+    check_workers(executor)
     if isinstance(dataset, Co3D):
         # Workers read the annotations themselves, because these are large.
         opened = Co3D(dataset.root.resolve())
@@ -158,30 +160,26 @@ def align_category(
             raise InputError(f"sequence {category}/{name} has no frames")
     frames = evenly_spaced({name: numbers[name] for name in names}, targets)
     loaded = as_backbone(backbone)
-    with (
-        tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder,
-        open_workers(executor) as workers,
-    ):
-        settings = run_settings(
+    # Workers load a named backbone themselves; an object travels to them.
+    finder = HypothesisFinder(opened, loaded if executor == 1 else backbone)
+    with tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder:
+
+        def solve(asked: list[Pair]) -> list[PairHypotheses | None]:
+            work = dict.fromkeys(asked, ["alignment"])
+            evaluate_pairs(folder, finder.open, work, executor, _Line)
+            stored = read_hypotheses(folder)
+            return [stored.get(pair.key) for pair in asked]
+
+        with open_run(
+            folder,
             dataset.root,
             loaded,
             targets,
             {"alignment": "hypotheses of the verified solver"},
             {},
-            workers=workers.count,
             pairs={category: len(names)},
-        )
-        # Workers load a named backbone themselves; an object travels to them.
-        finder = HypothesisFinder(opened, backbone if workers.executor else loaded)
-
-        def solve(asked: list[Pair]) -> list[PairHypotheses | None]:
-            work = dict.fromkeys(asked, ["alignment"])
-            evaluate_pairs(folder, finder.open, work, workers, _Line)
-            stored = read_hypotheses(folder)
-            return [stored.get(pair.key) for pair in asked]
-
-        with open_run(folder, settings):
-            store = FrameStore(opened, {"backbone": loaded})
+        ):
+            store = FrameStore(opened, {})
             judged = store.judged(category, frames, pairs=partners(names, pairs), solve=solve)
     if not judged:
         raise InputError(f"category {category}: nothing tells the pose between any two objects")

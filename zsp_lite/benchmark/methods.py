@@ -37,45 +37,48 @@ class Method:
     solve: Callable[[Any], Any] | None = None
 
 
-_MASK = {"foreground": "mask"}
+def _ours(**settings: Any) -> Method:
+    """Return the paper's method with some settings changed."""
+    return Method(settings=settings)
+
 
 METHODS: dict[str, Method] = {
-    "ours": Method(),
+    "ours": _ours(),
     "ours-bv": Method(answer="best view"),
     # SIFT has no saliency and uses the true mask. Other rows use the mask only if their name says
     # so.
-    "rootsift": Method("rootsift", settings=_MASK),
-    "ours-mask": Method(settings=_MASK),
+    "rootsift": replace(_ours(foreground="mask"), features="rootsift"),
+    "ours-mask": _ours(foreground="mask"),
     "oracle-view": Method(answer="true view"),
     # Supplement, "Number and diversity of correspondences"; K = 50 with k-means is "ours".
-    "ours-k30": Method(settings={"k": 30}),
-    "ours-k70": Method(settings={"k": 70}),
-    "ours-k30-nokmeans": Method(settings={"k": 30, "kmeans": False}),
-    "ours-k50-nokmeans": Method(settings={"kmeans": False}),
-    "ours-k70-nokmeans": Method(settings={"k": 70, "kmeans": False}),
+    "ours-k30": _ours(k=30),
+    "ours-k70": _ours(k=70),
+    "ours-k30-nokmeans": _ours(k=30, kmeans=False),
+    "ours-k50-nokmeans": _ours(kmeans=False),
+    "ours-k70-nokmeans": _ours(k=70, kmeans=False),
     # Table 3: the other view selectors.
-    "ours-globalsim": Method(settings={"view_selector": "global"}),
-    "ours-saliencyiou": Method(settings={"view_selector": "saliency"}),
-    "ours-cyclicaliou": Method(settings={"view_selector": "cyclical"}),
+    "ours-globalsim": _ours(view_selector="global"),
+    "ours-saliencyiou": _ours(view_selector="saliency"),
+    "ours-cyclicaliou": _ours(view_selector="cyclical"),
     # Supplement, "Design of correspondence method", "RANSAC parameters", "Depth-free methods".
-    "ours-dualsoftmax": Method(settings={"matcher": "dual softmax"}),
-    "ours-transport": Method(settings={"matcher": "optimal transport"}),
-    "ours-trials500": Method(settings={"trials": 500}),
-    "ours-trials2000": Method(settings={"trials": 2000}),
+    "ours-dualsoftmax": _ours(matcher="dual softmax"),
+    "ours-transport": _ours(matcher="optimal transport"),
+    "ours-trials500": _ours(trials=500),
+    "ours-trials2000": _ours(trials=2000),
     "ours-nodepth": Method(answer="essential matrix"),
     # Cycles, clusters and saliency of the target view, as in the published code.
-    "ours-published": Method(settings={"cycle_from": "target"}),
+    "ours-published": _ours(cycle_from="target"),
     # Without log-binning, without the way back of the cycles, and without RANSAC.
-    "ours-keys": Method(settings={"binning": False}),
-    "ours-nearest": Method(settings={"matcher": baseline_rows.nearest_patches}),
+    "ours-keys": _ours(binning=False),
+    "ours-nearest": _ours(matcher=baseline_rows.nearest_patches),
     "ours-least-squares": Method(solve=baseline_rows.least_squares),
     # Table 1, the baselines; SWaV and PoseContrast have published figures only.
     "icp": Method("none", solve=baseline_rows.icp),
     "icp-bv": Method(solve=baseline_rows.icp_best_view),
     "sift": Method("sift", solve=baseline_rows.sift),
     # Beyond the paper.
-    "verified": Method(settings={"solver": "verified"}),
-    "verified-mask": Method(settings={"solver": "verified"} | _MASK),
+    "verified": _ours(solver="verified"),
+    "verified-mask": _ours(solver="verified", foreground="mask"),
     # These rows see more than the pair, without labels, and have tables of their own: scans-R and
     # shape-upright frames all around both objects, "category" all objects of the category.
     **{f"scans-{count}": Method(solve=baseline_rows.Scans(count)) for count in (2, 4, 8)},
@@ -93,27 +96,18 @@ def read_paper_tables() -> list[dict[str, Any]]:
 # Rows or other groups: the tables of the paper, one by one and together, and what goes beyond them.
 # In no group is "category".
 GROUPS: dict[str, list[str]] = {
-    "default": ["ours", "ours-bv", "rootsift"],
+    "default": "ours ours-bv rootsift".split(),
     **{
         table["group"]: [line["row"] for line in table["rows"] if line["row"]]
         for table in read_paper_tables()
         if "group" in table
     },
-    "scans": ["shape-upright", "scans-2", "scans-4", "scans-8"],
-    "verified-views": ["verified", "verified-n1", "verified-n3", "verified-n10", "verified-mask"],
+    "scans": "shape-upright scans-2 scans-4 scans-8".split(),
+    "verified-views": "verified verified-n1 verified-n3 verified-n10 verified-mask".split(),
     # at one N
-    "ablations": [
-        "ours",
-        "table3",
-        "matchers",
-        "correspondences",
-        "trials",
-        "depth",
-        "published",
-        "parts",
-    ],
-    "paper": ["ours", "ours-bv", "table1", "ablations", "views", "rootsift", "ours-mask"],
-    "all": ["paper", "verified-views", "oracle-view"],
+    "ablations": "ours table3 matchers correspondences trials depth published parts".split(),
+    "paper": "ours ours-bv table1 ablations views rootsift ours-mask".split(),
+    "all": "paper verified-views oracle-view".split(),
 }
 
 
@@ -138,7 +132,7 @@ def resolve(
     if not isinstance(methods, Mapping):
         names = [methods] if isinstance(methods, str) else methods
         meanings = {}
-        for row in dict.fromkeys(row for name in names for row in _members(name)):
+        for row in [row for name in names for row in _members(name)]:
             # "NAME=MEANING", or a name that means itself.
             name, _, meaning = row.partition("=")
             meaning = meaning or name
@@ -147,6 +141,7 @@ def resolve(
                     f"methods {', '.join(names)} are two of one name, expected one of each"
                 )
         methods = meanings
+    methods = {str(name): meant for name, meant in methods.items()}
     if not methods:
         raise InputError("no methods, expected some; `zsp-lite benchmark --list` lists them")
     labels = [line["label"] for table in read_paper_tables() for line in table["rows"]]
@@ -154,16 +149,16 @@ def resolve(
     taken = {name.casefold() for name in (*METHODS, *GROUPS, *labels, "alignment")}
     for name, meant in methods.items():
         # Tables have a line for each row, and legends of figures no name with an underscore.
-        if not str(name).isprintable() or str(name).startswith("_"):
+        if not name.isprintable() or name.startswith("_"):
             raise InputError(f"method {name!r}: expected a printable name, not with _ first")
-        plain = str(name).strip().casefold()
+        plain = name.strip().casefold()
         text = meant if isinstance(meant, str) else ""
         if text != name and taken & {plain, base_name(plain), base_name(text)}:
             raise InputError(
                 f"method {name!r} gives a library row another name, or a name of its or the "
                 "paper's away"
             )
-    rows = {str(name): _method(str(name), meant) for name, meant in methods.items()}
+    rows = {name: _method(name, meant) for name, meant in methods.items()}
     return _swept(rows, sweep) if sweep else rows
 
 

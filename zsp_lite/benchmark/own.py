@@ -49,10 +49,10 @@ def kind_of(name: str, thing: Any) -> str:
             and parameter.default is Parameter.empty
             and parameter.kind is not Parameter.VAR_KEYWORD
         ]
-        positional = {*needed} <= {Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD}
-        if positional and len(needed) == 3 and known.keys() >= {"seed", "threshold"}:
-            return "solver"
-        if positional and len(needed) in (1, 2, 3):
+        positional = {Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD}
+        if {*needed} <= positional and 1 <= len(needed) <= 3:
+            if len(needed) == 3 and known.keys() >= {"seed", "threshold"}:
+                return "solver"
             return KINDS[len(needed) - 1]
     raise InputError(
         f"method {name!r} is of type {type(thing).__name__}, expected a function of one argument "
@@ -101,7 +101,9 @@ def fails_alone(seconds: int) -> Iterator[None]:
 
 def problem_of_own(solve: Any, problem: PairProblem) -> Problem:
     """Return the problem that a row of one's own gets: copies that do not lead to the data set and
-    its labels."""
+    its labels. A matcher or solver of the paper's method gets no problem."""
+    if solve is None:
+        return problem
     if not isinstance(solve, Estimator | KeypointMatcher):
         return Problem(problem.seed, deepcopy(problem.crops), problem.store.extractors, {})
     with ends_the_run("reading frames"):

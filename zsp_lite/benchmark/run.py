@@ -1,8 +1,8 @@
 """Run the benchmark: rotation errors of rows over many pairs of a CO3D-format folder (sec. 5).
 
-The way of a pair: `evaluate` samples it, `execution.evaluate_pairs` hands it to this process or a
-worker, `PairEvaluator.line` reads frames and features, asks each row (`ask`) and measures its
-answer; `runs.add_lines` adds the line to run.jsonl, from which `write_reports` makes tables.
+The way of a pair: `evaluate` samples it, `evaluate_pairs` hands it to this process or a worker,
+`evaluate_pair` reads frames and features, asks each row (`ask`) and measures its answer;
+`runs.add_lines` adds the line to run.jsonl, from which `write_reports` makes tables.
 
 `rows` are always the `Method`s by name, `names` are names of rows.
 """
@@ -13,7 +13,8 @@ import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.baselines.geometry import essential_rotation
-from zsp_lite.benchmark import execution
+from zsp_lite.benchmark.execution import Evaluator, check_workers, evaluate_pairs
 from zsp_lite.benchmark.methods import (
     GROUPS,
     Method,
@@ -42,7 +44,13 @@ from zsp_lite.benchmark.problem import (
     as_answer,
     seeded,
 )
-from zsp_lite.benchmark.runs import Result, open_run, printable, read_run, run_settings
+from zsp_lite.benchmark.runs import (
+    Result,
+    ResultLine,
+    open_run,
+    printable,
+    read_run,
+)
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.ground_truth import common_turns
@@ -100,52 +108,45 @@ def evaluate(
     check_integer("targets", targets, 1)
     check_integer("row_seconds", row_seconds, 1, 1_000_000)
     check_integer("seeds", seeds, 1, 1000)
+    check_workers(executor)
 
     # The rows, and the pairs with the names of the rows that are evaluated on each.
     rows = resolve(methods, sweep)
     dataset = Co3D(data)
-    pairs_per_category = pairs
     if not isinstance(pairs, Mapping):
-        pairs_per_category = dict.fromkeys(labelled_categories(dataset), pairs)
-    work = pairs_of_rows(dataset, rows, pairs_per_category, targets)
+        pairs = dict.fromkeys(labelled_categories(dataset), pairs)
+    work = pairs_of_rows(dataset, rows, pairs, targets)
     loaded = as_backbone(backbone)
     # Wrong settings of a row are refused before anything is computed.
     extractors = make_extractors(loaded, rows)
     for row in rows.values():
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)
-    remarks = _remarks_on_stored_poses(rows, dataset, work)
-    repeated = {}
-    for seed in range(seeds):
-        for pair, names in work.items():
-            repeated[replace(pair, repeat=seed)] = names
-
     # The lines of the run, pair by pair.
-    with execution.open_workers(executor) as workers:
-        settings = run_settings(
-            data,
-            loaded,
-            targets,
-            {name: description(row) for name, row in rows.items()},
-            {category: _hash_of_labels(dataset, category) for category in pairs_per_category},
-            workers=workers.count,
-            pairs=dict(pairs_per_category),
-            seeds=seeds,
-            remarks=remarks,
-        )
-        # Workers load a named backbone themselves; an object travels to them.
-        sent = backbone if workers.executor else loaded
-        settings.images = _hash_of_images(dataset, work)
-        evaluator = PairEvaluator(str(Path(data).resolve()), rows, sent, row_seconds)
-        with open_run(out, settings):
-            execution.evaluate_pairs(out, evaluator.open, repeated, workers)
+    repeated = {
+        replace(pair, repeat=seed): names for seed in range(seeds) for pair, names in work.items()
+    }
+    # Workers load a named backbone themselves; an object travels to them.
+    sent = loaded if executor == 1 else backbone
+    opener = partial(open_evaluator, str(Path(data).resolve()), rows, sent, row_seconds)
+    with open_run(
+        out,
+        data,
+        loaded,
+        targets,
+        {name: description(row) for name, row in rows.items()},
+        _hashes(dataset, work),
+        pairs=dict(pairs),
+        seeds=seeds,
+        remarks=_remarks_on_stored_poses(rows, dataset, work),
+    ):
+        evaluate_pairs(out, opener, repeated, executor)
 
     # The lines as one table, and its summary.
-    run = read_run(out)
-    for remark in [*remarks.values(), *run.failures.values()]:
-        if remark:
-            logger.warning("%s", remark)
-    return run.summary
+    summary = read_run(out).summary
+    if "note" in summary:
+        logger.warning("%s", summary["note"])
+    return summary
 
 
 def _remarks_on_stored_poses(
@@ -180,13 +181,17 @@ def write_reports(
     from zsp_lite.benchmark import tables  # workers need no matplotlib
 
     results = read_run(run)
-    out = Path(out or run)
     shown = tables.choose(results, rows) if rows else results.summary
+    out = Path(out or run)
     of_paper = [spec["name"] for spec in read_paper_tables()]
-    for name in ("all_rows", *tables.SEE_MORE, *of_paper):
+    for name in (*tables.ROW_TABLES, *of_paper):
         for path in (out / "tables").glob(f"{name}.*"):
             path.unlink()
-    tables.write_tables(tables.every_table(shown, metrics), out / "tables", intervals)
+    for table in tables.every_table(shown, metrics):
+        path = out / "tables" / table.name
+        write_atomic(f"{path}.csv", tables.as_csv(table).encode())
+        write_atomic(f"{path}.md", tables.as_markdown(table).encode())
+        write_atomic(f"{path}.tex", tables.as_latex(table, intervals).encode())
     tables.write_figures(results, out / "figures", rows, size)
     write_atomic(out / "summary.json", json.dumps(results.summary, indent=1).encode())
     return shown
@@ -199,113 +204,100 @@ def pairs_of_rows(
 
     All rows of one number of target views get the same pairs.
     """
+    sampled = cache(partial(category_pairs, dataset))
     work: dict[Pair, list[str]] = {}
-    targets_of = {name: row.targets or targets for name, row in rows.items()}
-    for n_targets in set(targets_of.values()):
-        names = [name for name in rows if targets_of[name] == n_targets]
+    for name, row in rows.items():
         for category, count in pairs_per_category.items():
             check_integer(f"pairs of {category}", count, 1)
-            for pair in category_pairs(dataset, category, count, n_targets):
-                work[pair] = names
+            for pair in sampled(category, count, row.targets or targets):
+                work.setdefault(pair, []).append(name)
     return work
 
 
-def _hash_of_labels(dataset: Co3D, category: str) -> str:
-    """Hash the rotations of the pose labels of a category."""
-    # Translations are left out: the same scene, rendered on another processor, has a unit of length
-    # that differs by some 3e-5, since a few pixels of its images differ. Adding 0.0 turns negative
-    # zeros into zeros.
-    parts: list[str | bytes] = []
-    for name, label in read_labels(dataset.root, category).items():
-        rotation = np.round(label.trans[:3, :3], 6) + 0.0
-        parts += [name, rotation.tobytes(), label.reference_seq]
-    return digest(*parts)
-
-
-def _hash_of_images(dataset: Co3D, pairs: Iterable[Pair]) -> dict[str, str]:
-    """Hash the first image of each sequence of pairs: data with equal labels may differ."""
+def _hashes(dataset: Co3D, pairs: Iterable[Pair]) -> dict[str, str]:
+    """Hash the first image of each object of the pairs, and the rotation of its label."""
+    labels = cache(partial(read_labels, dataset.root))
+    names = {(pair.category, name) for pair in pairs for name, _ in pair.frames}
     hashes = {}
-    for pair in pairs:
-        for name in (pair.reference_sequence, pair.target_sequence):
-            key = f"{pair.category}/{name}"
-            if key not in hashes:
-                image = dataset.frames(pair.category, name)[0].image
-                path = path_inside(dataset.root, image.path)
-                hashes[key] = digest(read_bytes(path, "image"))
+    for category, name in sorted(names):
+        label = labels(category)[name]
+        # Translations are left out: the same scene, rendered on another processor, has a unit of
+        # length that differs by some 3e-5. Adding 0.0 turns negative zeros into zeros.
+        rotation = np.round(label.trans[:3, :3], 6) + 0.0
+        image = dataset.frames(category, name)[0].image
+        pixels = read_bytes(path_inside(dataset.root, image.path), "image")
+        hashes[f"{category}/{name}"] = digest(label.reference_seq, rotation.tobytes(), pixels)
     return hashes
 
 
-@dataclass
-class PairEvaluator:
-    """Evaluates rows on pairs; frames and features are kept from pair to pair."""
-
-    root: str  # the data folder
-    rows: Mapping[str, Method]
-    backbone: BackboneLike
-    row_seconds: int = 60  # time limit of a row of one's own for a pair
-
-    def open(self, threads: int) -> execution.Evaluator:
-        """Load the backbone and the extractors."""
-        extractors = make_extractors(as_backbone(self.backbone), self.rows)
-        self.store = FrameStore(Co3D(self.root), extractors, threads)
-        return self.line
-
-    def line(self, pair: Pair, names: Collection[str]) -> dict[str, Any]:
-        """Evaluate the named rows on a pair: a line of the run's results (see
-        `runs.ResultLine`)."""
-        self.store.timings.clear()
-        features = {self.rows[name].features for name in names} - {"none"}
-        problem = PairProblem(pair, self.store, features)
-        # Read here, since an unreadable point cloud is no failure of a row.
-        objects = (pair.reference_sequence, pair.target_sequence)
-        extents = [self.store.extent(pair.category, name) for name in objects]
-        # The ground truth from the reference's camera to each target's.
-        labels = self.store.labels(pair.category)
-        views = range(len(pair.target_frames))
-        truths = np.stack([true_pose(self.store.dataset, labels, pair, view) for view in views])
-
-        # The answers of the rows, measured.
-        results = {}
-        for name in names:
-            method = self.rows[name]
-            # A class that somebody derives from StoredPoses is one's own, too.
-            own = is_own(name) and type(method.solve) is not StoredPoses
-            seen = problem_of_own(method.solve, problem) if own and method.solve else problem
-            try:
-                with fails_alone(self.row_seconds) if own else nullcontext():
-                    start = time.perf_counter()
-                    answer = ask(method, seen, truths)
-                    seconds = time.perf_counter() - start
-                    results[name] = _measure(answer, problem, truths, extents, seconds)
-            except InputError as error:
-                # 180 degrees: without these pairs, methods that fail often would look better.
-                results[name] = {"error": 180.0, "failed": printable(error)}
-
-        # The store and the problem have added the seconds of each stage.
-        timings = {}
-        for stage, seconds in self.store.timings.items():
-            timings[stage] = round(float(np.median(seconds)), 5)
-        return {"pair": pair.key, "results": results, "repeat": pair.repeat, "timings": timings}
+def open_evaluator(
+    root: str, rows: Mapping[str, Method], backbone: BackboneLike, row_seconds: int, threads: int
+) -> Evaluator:
+    """Load the backbone and the extractors; the evaluator keeps frames and features from pair to
+    pair."""
+    extractors = make_extractors(as_backbone(backbone), rows)
+    store = FrameStore(Co3D(root), extractors, threads)
+    return partial(evaluate_pair, store, rows, row_seconds)
 
 
-def ask(
-    method: Method, problem: Problem, truths: Float[np.ndarray, "n 4 4"] | None = None
-) -> Answer:
-    """Ask a row for its pose of a pair; the true poses are for rows that are given the view."""
+def evaluate_pair(
+    store: FrameStore,
+    rows: Mapping[str, Method],
+    row_seconds: int,
+    pair: Pair,
+    names: Collection[str],
+) -> ResultLine:
+    """Evaluate the named rows on a pair: a line of the run. `row_seconds` is the time limit of a
+    row of one's own."""
+    store.timings.clear()
+    features = {rows[name].features for name in names} - {"none"}
+    problem = PairProblem(pair, store, features)
+    # Read here, since an unreadable point cloud is no failure of a row.
+    objects = (pair.reference_sequence, pair.target_sequence)
+    extents = [store.extent(pair.category, name) for name in objects]
+    # The ground truth from the reference's camera to each target's.
+    labels = store.labels(pair.category)
+    views = range(len(pair.target_frames))
+    truths = [true_pose(store.dataset, labels, pair, view) for view in views]
+    nearest = int(np.argmin([rotation_error(np.eye(3), truth[:3, :3]) for truth in truths]))
+
+    # The answers of the rows, measured.
+    results = {}
+    for name in names:
+        method = rows[name]
+        # A class that somebody derives from StoredPoses is one's own, too.
+        own = is_own(name) and type(method.solve) is not StoredPoses
+        seen = problem_of_own(method.solve, problem) if own else problem
+        try:
+            with fails_alone(row_seconds) if own else nullcontext():
+                start = time.perf_counter()
+                answer = ask(method, seen, nearest)
+                seconds = time.perf_counter() - start
+                results[name] = _measure(answer, problem, truths, extents, seconds)
+        except InputError as error:
+            # 180 degrees: without these pairs, methods that fail often would look better.
+            results[name] = Result(180.0, failed=printable(error))
+
+    # The store and the problem have added the seconds of each stage.
+    timings = {
+        stage: round(float(np.median(seconds)), 5) for stage, seconds in store.timings.items()
+    }
+    return ResultLine(pair.key, results, pair.repeat, timings)
+
+
+def ask(method: Method, problem: Problem, nearest: int | None = None) -> Answer:
+    """Ask a row for its pose of a pair; rows that are given the view get the truly nearest one."""
     if method.solve is not None:
         return as_answer(seeded(method.solve, problem.seed)(problem))
-    nearest = None
-    if method.answer == "true view":
-        nearest = int(rotation_error(np.eye(3), truths[:, :3, :3]).argmin())
-    estimate = problem.estimate(method.features, method.settings, nearest)
+    given = nearest if method.answer == "true view" else None
+    estimate = problem.estimate(method.features, method.settings, given)
     answer = as_answer(estimate)
     reference = estimate.reference_view
     target = estimate.target_views[estimate.view]
-    if method.answer == "true view":  # the only view of this estimate
-        return replace(answer, view=nearest)
+    if given is not None:  # the only view of this estimate
+        return replace(answer, view=given)
     if method.answer == "best view":
-        sim3 = view_alignment(reference, target)
-        return replace(answer, rotation=sim3.R, translation=sim3.t, scale=sim3.scale, note="")
+        return as_answer((view_alignment(reference, target), answer.view))
     if method.answer == "essential matrix":
         rotation, inliers, note = essential_rotation(
             reference.frame, target.frame, estimate.matches, reference.features.grid
@@ -317,23 +309,23 @@ def ask(
 def _measure(
     answer: Answer,
     problem: PairProblem,
-    truths: Float[np.ndarray, "n 4 4"],
+    truths: Sequence[Float[np.ndarray, "4 4"]],
     extents: Sequence[tuple | None],
     seconds: float,
-) -> dict[str, Any]:
-    """Return the members of a stored result that are known of an answer, "error" among them."""
+) -> Result:
+    """Compare an answer with the truth; InputError for what cannot be stored."""
     if not 0 <= answer.view < len(truths):
         raise InputError(f"answer is for view {answer.view}, expected 0 to {len(truths) - 1}")
-    true_rotation = truths[answer.view, :3, :3]
-    known: dict[str, Any] = {
-        "seconds": seconds,
+    truth = truths[answer.view]
+    found: dict[str, Any] = {
+        "error": rotation_error(answer.rotation, truth[:3, :3]),
+        "rotation": answer.rotation.ravel().round(6).tolist(),
         "view": answer.view,
-        "note": answer.note[:_LONGEST_NOTE],
         "scale": answer.scale,
         "inliers": answer.inliers,
         "confidence": answer.confidence,
-        "error": rotation_error(answer.rotation, true_rotation),
-        "rotation": answer.rotation.ravel().round(6).tolist(),
+        "seconds": seconds,
+        "note": printable(answer.note)[:_LONGEST_NOTE],
     }
     reference, *targets = [frame.camera for frame in problem.frames()]
 
@@ -343,29 +335,21 @@ def _measure(
     turns = common_turns(root, pair.category, pair.reference_sequence, pair.target_sequence)
     if turns is not None:
         to_camera = targets[answer.view].R
-        turned = to_camera @ turns @ to_camera.T @ true_rotation
-        known["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
+        turned = to_camera @ turns @ to_camera.T @ truth[:3, :3]
+        found["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
 
     # Where the reference object's centre comes to lie, in diameters of the target object.
     reference_extent, target_extent = extents
     if answer.translation is not None:
-        known["position"] = answer.translation.round(6).tolist()
+        found["position"] = answer.translation.round(6).tolist()
         if reference_extent and target_extent:
             centre = reference.to_camera(reference_extent[0])
-            scale = 1.0 if answer.scale is None else answer.scale
-            moved = scale * answer.rotation @ centre + answer.translation
-            true_translation = truths[answer.view, :3, 3]
-            distance = np.linalg.norm(moved - true_rotation @ centre - true_translation)
-            known["translation"] = distance / target_extent[1]
+            sim3 = Sim3(answer.scale or 1.0, answer.rotation, answer.translation)
+            distance = np.linalg.norm(sim3.apply(centre) - Sim3.from_matrix(truth).apply(centre))
+            found["translation"] = distance / target_extent[1]
 
-    # In the types of JSON. The conversion refuses what could not be stored.
-    result = {}
-    for name, value in known.items():
-        if isinstance(value, np.generic):
-            value = value.item()
+    plain = msgspec.to_builtins(found, enc_hook=np.generic.item)
+    for name, value in plain.items():
         if isinstance(value, float):
-            value = round(value, 4)
-        if value is not None:
-            result[name] = value
-    msgspec.json.encode(msgspec.convert(result, Result))
-    return result
+            plain[name] = round(value, 4)
+    return msgspec.convert(plain, Result)

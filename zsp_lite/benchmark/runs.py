@@ -1,7 +1,7 @@
 """A run: its folder, to which results are only ever added, and what it found as one table.
 
 run.json holds what decides the results, and every call of `evaluate`. A line of run.jsonl, or of
-run.jsonl.gz, is what `PairEvaluator.line` returned for a pair. One process writes to a folder;
+run.jsonl.gz, is the `ResultLine` of a pair. One process writes to a folder;
 others can read it meanwhile.
 """
 
@@ -12,10 +12,11 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -45,9 +46,7 @@ from zsp_lite.io.locks import writing
 
 SETTINGS = "run.json"
 LINES = "run.jsonl"
-# CATEGORY/SEQUENCE:FRAME/SEQUENCE:FRAME,FRAME, as of `Pair.key`; the problem is the key without
-# target frames.
-_KEY = r"^(?P<problem>(?P<reference>(?P<category>[^/]+)/[^/]+):\d+/(?P<target>[^/]+)):\d+(?:,\d+)*$"
+_KEY = r"^[^/]+/[^/]+:\d+/[^/]+:\d+(,\d+)*$"  # as of `Pair.key`
 _Degrees = Annotated[float, msgspec.Meta(ge=0, le=180)]
 
 
@@ -57,7 +56,6 @@ class Call(msgspec.Struct):
     time: str
     command: list[str]
     versions: dict[str, str]
-    workers: int
     rows: list[str]
     pairs: dict[str, int]  # by category
     seeds: int = 1  # evaluations of each pair
@@ -66,22 +64,20 @@ class Call(msgspec.Struct):
 
 
 class Settings(msgspec.Struct):
-    """What decides the results of a run; a later call may add to methods, labels, and versions."""
+    """What decides the results of a run; a later call may add to methods, objects, and versions."""
 
     data: str
     backbone: str  # fingerprint
     targets: int
     library: list[dict[str, str | None]]  # version and commit
     methods: dict[str, str]  # description by row
-    labels: dict[str, str]  # hash of the pose labels by category
     calls: Annotated[list[Call], msgspec.Meta(min_length=1)]
     folder: str = ""  # absolute path of the data, without links
-    images: dict[str, str] = {}  # hash of an image by CATEGORY/SEQUENCE
+    objects: dict[str, str] = {}  # hash of an image and the label by CATEGORY/SEQUENCE
 
 
-class Result(msgspec.Struct):
-    """What a row found for a pair (see `PairEvaluator`); other members are not part of the
-    table."""
+class Result(msgspec.Struct, omit_defaults=True):
+    """What a row found for a pair."""
 
     error: _Degrees
     confidence: Annotated[float, msgspec.Meta(ge=0, le=1)] | None = None
@@ -99,7 +95,7 @@ class Result(msgspec.Struct):
     failed: str = ""
 
 
-class ResultLine(msgspec.Struct):
+class ResultLine(msgspec.Struct, omit_defaults=True):
     """A line of run.jsonl: what the rows found for a pair."""
 
     pair: Annotated[str, msgspec.Meta(pattern=_KEY)]
@@ -161,37 +157,6 @@ def printable(text: object) -> str:
     return str(text).encode(errors="replace").decode()
 
 
-def run_settings(
-    data: str | Path,
-    backbone: Any,
-    targets: int,
-    methods: dict[str, str],
-    labels: dict[str, str],
-    **call: Any,
-) -> Settings:
-    """Describe a run, and this call of it: time, command, and versions of what computes."""
-    words = [Path(sys.argv[0]).name.replace("__main__.py", "zsp-lite"), *sys.argv[1:]]
-    versions = {one.__name__: str(one.__version__) for one in (torch, np, scipy, cv2)}
-    versions["python"] = platform.python_version()
-    versions["machine"] = platform.platform()
-    this_call = Call(
-        time=datetime.now(UTC).isoformat(timespec="seconds"),
-        command=[printable(word) for word in words],
-        versions=versions,
-        rows=list(methods),
-        **call,
-    )
-    return Settings(
-        data=printable(data),
-        backbone=fingerprint(backbone),
-        targets=targets,
-        library=[library_version()],
-        labels=labels,
-        methods=methods,
-        calls=[this_call],
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Run:
     """Results of a run on the pairs that the rows of the last call have finished (see
@@ -200,7 +165,8 @@ class Run:
     settings: Settings
     # A line for each row, pair and seed, in this order: "row", "category", "pair" (its key),
     # "repeat" (of the seed), "problem" (the key without target frames), "reference" and "target"
-    # (the objects, CATEGORY/SEQUENCE), the members of `Result`, and "milliseconds".
+    # (the objects, CATEGORY/SEQUENCE), "views" (number of target views), and the members of
+    # `Result`.
     table: pd.DataFrame
     timings: dict[str, float]  # median seconds by stage
     note: str = ""  # what is missing
@@ -267,21 +233,48 @@ class Run:
 
 
 @contextmanager
-def open_run(out: str | Path, settings: Settings) -> Iterator[None]:
+def open_run(
+    out: str | Path,
+    data: str | Path,
+    backbone: Any,
+    targets: int,
+    methods: dict[str, str],
+    objects: dict[str, str],
+    **call: Any,
+) -> Iterator[None]:
     """Be the only writer of a run's folder, which is new or holds a run with these settings; then
-    `add_lines` adds."""
+    `add_lines` adds. `call` has the members of this `Call` that the rest does not tell."""
+    words = [Path(sys.argv[0]).name.replace("__main__.py", "zsp-lite"), *sys.argv[1:]]
+    versions = {one.__name__: str(one.__version__) for one in (torch, np, scipy, cv2)}
+    versions |= {"python": platform.python_version(), "machine": platform.platform()}
+    this_call = Call(
+        time=datetime.now(UTC).isoformat(timespec="seconds"),
+        command=[printable(word) for word in words],
+        versions=versions,
+        rows=list(methods),
+        finished=False,
+        **call,
+    )
+    settings = Settings(
+        data=printable(data),
+        folder=printable(os.path.realpath(data)),
+        backbone=fingerprint(backbone),
+        targets=targets,
+        library=[library_version()],
+        methods=methods,
+        objects=objects,
+        calls=[this_call],
+    )
     with writing(out):
         out = Path(out)
-        packed = out / f"{LINES}.gz"
-        settings.folder = printable(os.path.realpath(settings.data))
-        if any(path.exists() for path in (out / SETTINGS, out / LINES, packed)):
+        lines = _finished_lines(out)
+        if lines or (out / SETTINGS).exists():
             settings = _continued(out, settings)
-        write_atomic(out / LINES, _finished_lines(out))
-        packed.unlink(missing_ok=True)
-        settings.calls[-1].finished = False
+        write_atomic(out / LINES, lines)
+        (out / f"{LINES}.gz").unlink(missing_ok=True)
         _write_settings(out, settings)
         yield
-        settings.calls[-1].finished = True
+        this_call.finished = True
         _write_settings(out, settings)
 
 
@@ -295,27 +288,26 @@ def _continued(out: Path, now: Settings) -> Settings:
     before = read_json(out / SETTINGS, Settings, "settings of a run")
     held = _decisive(before)
     asked = _decisive(now)
-    if before.images.keys() & now.images.keys():
+    if before.objects.keys() & now.objects.keys():
         del held["data"]  # the same data may lie at another path
-    for name in asked:
-        if held.get(name, asked[name]) != asked[name]:
+    for name, value in asked.items():
+        if held.get(name, value) != value:
             raise InputError(
-                f"{out} holds a run with {name} {held[name]}, this is {asked[name]}; choose "
-                "another folder"
+                f"{out} holds a run with {name} {held[name]}, this is {value}; choose another "
+                "folder"
             )
     return msgspec.structs.replace(
         now,
         library=[old for old in before.library if old not in now.library] + now.library,
         methods=before.methods | now.methods,
-        labels=before.labels | now.labels,
-        images=before.images | now.images,
+        objects=before.objects | now.objects,
         calls=before.calls + now.calls,
     )
 
 
 def _decisive(settings: Settings) -> dict[str, Any]:
     """Return by name what must be equal in two calls of one run, if both calls have it."""
-    parts: dict[str, Any] = {
+    parts = {
         "command": "align" if "alignment" in settings.methods else "benchmark",
         "backbone": settings.backbone,
         "targets": settings.targets,
@@ -323,14 +315,12 @@ def _decisive(settings: Settings) -> dict[str, Any]:
     }
     for row, description in settings.methods.items():
         parts[f"methods of {row}"] = description
-    for category, code in settings.labels.items():
-        parts[f"labels of {category}"] = code
-    for sequence, code in settings.images.items():
-        parts[f"images of {sequence}"] = code
+    for name, code in settings.objects.items():
+        parts[f"images or labels of {name}"] = code
     return parts
 
 
-def add_lines(out: str | Path, lines: Iterable[Mapping[str, Any]]) -> None:
+def add_lines(out: str | Path, lines: Iterable[Any]) -> None:
     """Add the results of pairs to run.jsonl; InputError if they cannot be written."""
     path = Path(out) / LINES
     try:
@@ -371,7 +361,9 @@ def read_run(out: str | Path) -> Run:
     settings = read_json(Path(out) / SETTINGS, Settings, "settings of a run")
     lines = read_lines(out)
     last = settings.calls[-1]
-    table = _finished(_table(lines, settings), settings)
+    table = _table(lines, settings)
+    if not table.empty:
+        table = _finished(table, last)
     if table.empty:
         raise InputError(f"{out}: the run has no pair that all its rows have finished")
     timings = pd.DataFrame([line.timings for line in lines]).median().to_dict()
@@ -400,47 +392,49 @@ def read_run(out: str | Path) -> Run:
 
 def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:
     """Tabulate the results in the categories of the last call, by row, category and pair."""
-    results = []
+    last = settings.calls[-1]
+    categories = list(last.pairs)
+    found = []
     for line in lines:
-        for row, result in line.results.items():
-            ids = {"row": row, "pair": line.pair, "repeat": line.repeat}
-            results.append(ids | msgspec.structs.asdict(result))
-    table = pd.DataFrame(results, columns=["row", "pair", "repeat", *Result.__struct_fields__])
-    table = table.join(table["pair"].astype(str).str.extract(_KEY))
-    table["milliseconds"] = 1000 * table["seconds"].astype(float)
-    table["target"] = table["category"] + "/" + table["target"]
-    # Categorical columns are sorted in the order of their categories, others by name.
-    orders = {"row": settings.methods, "category": settings.calls[-1].pairs}
-    for column, names in orders.items():
-        table = table[table[column].isin(names)].astype({column: pd.CategoricalDtype(list(names))})
-    table = table[table["repeat"] < settings.calls[-1].seeds]
-    table = table.sort_values(["row", "category", "problem", "pair", "repeat"], ignore_index=True)
-    return table.astype(dict.fromkeys(orders, object))
+        pair = Pair.from_key(line.pair)
+        if pair.category not in categories or line.repeat >= last.seeds:
+            continue
+        problem = line.pair.rpartition(":")[0]
+        of_pair = {
+            "pair": line.pair,
+            "repeat": line.repeat,
+            "problem": problem,
+            "category": pair.category,
+            "reference": f"{pair.category}/{pair.reference_sequence}",
+            "target": f"{pair.category}/{pair.target_sequence}",
+            "views": len(pair.target_frames),
+        }
+        place = categories.index(pair.category), problem, line.pair, line.repeat
+        found.append((place, of_pair, line.results))
+    found.sort(key=itemgetter(0))
+    return pd.DataFrame(
+        {"row": row} | of_pair | msgspec.structs.asdict(results[row])
+        for row in settings.methods
+        for _, of_pair, results in found
+        if row in results
+    )
 
 
-def _finished(table: pd.DataFrame, settings: Settings) -> pd.DataFrame:
+def _finished(table: pd.DataFrame, last: Call) -> pd.DataFrame:
     """Keep the pairs that all rows of the last call have finished, and the rows, by seed, that have
     all of these pairs."""
-    last = settings.calls[-1]
-    # Commas between the target frames of a pair, at the end of its key: one less than its views.
-    commas = table["pair"].str.count(r",(?=[\d,]*$)")
-
-    # The finished pairs have a line for each row and seed of the last call; by number of commas.
-    finished = {}
-    for number, lines in table[table["row"].isin(last.rows)].groupby(commas):
-        lines_of_pair = lines.groupby("pair").size()
-        expected = lines["row"].nunique() * last.seeds
-        finished[number] = set(lines_of_pair.index[lines_of_pair == expected])
-    problems = set(table["problem"][table["pair"].isin(set().union(*finished.values()))])
+    # A finished pair has a line for each seed and each row of the last call with as many views.
+    of_call = table[table["row"].isin(last.rows)]
+    expected = last.seeds * of_call.groupby("views")["row"].transform("nunique")
+    finished = of_call[of_call.groupby("pair")["row"].transform("size") == expected]
+    pairs = {views: set(lines["pair"]) for views, lines in finished.groupby("views")}
+    problems = set(finished["problem"])
 
     # A row at a number of target views that the last call does not have needs the same problems.
     complete = [table[:0]]
-    for _, lines in table.groupby(["row", "repeat", commas]):
-        column = "pair"
-        wanted = finished.get(commas[lines.index[0]])
-        if wanted is None:
-            column = "problem"
-            wanted = problems
+    for (_, _, views), lines in table.groupby(["row", "repeat", "views"]):
+        column = "pair" if views in pairs else "problem"
+        wanted = pairs.get(views, problems)
         lines = lines[lines[column].isin(wanted)]
         if wanted <= set(lines[column]):
             complete.append(lines)

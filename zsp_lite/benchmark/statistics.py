@@ -32,32 +32,33 @@ def summarise(table: pd.DataFrame) -> dict[str, Any]:
     objects.
     """
     rows = {str(name): row for name, row in table.groupby("row", sort=False)}
-    ours = rows.get("ours")
+    ours = rows.get("ours", table[:0])
     methods = {}
     against = {}
     for name, row in rows.items():
         drawn = draws_of(row)
         methods[name] = _summarise_row(row, drawn)
-        if ours is None or name == "ours":
-            continue
         common = ours[ours["repeat"].isin(row["repeat"])]
-        if row["problem"].tolist() == common["problem"].tolist():
+        if name != "ours" and row["problem"].tolist() == common["problem"].tolist():
             against[name] = paired_difference(common["error"], row["error"], weights=drawn)
-    times = table.groupby("row", sort=False)["milliseconds"].median().dropna().to_dict()
-    summary = {"methods": methods, "milliseconds": times}
-    return summary if ours is None else summary | {"against": against}
+    times = (1000 * table["seconds"].astype(float)).groupby(table["row"], sort=False).median()
+    return {
+        "methods": methods,
+        "milliseconds": times.dropna().to_dict(),
+        "against": against,
+    }
 
 
 def _summarise_row(row: pd.DataFrame, drawn: Draws) -> dict[str, Any]:
     """Summarise the results of one row, for all pairs and by category (see `summarise`)."""
     errors = row["error"].to_numpy()
     categories = row["category"].to_numpy(str)
+    summary = figures_of(errors, drawn, categories)
+    summary["failed"] = row.loc[row["failed"] != "", "pair"].nunique()
     per_category = {}
     for category in dict.fromkeys(categories):
         members = categories == category
         per_category[category] = figures_of(errors[members], drawn[:, members])
-    summary = figures_of(errors, drawn, categories)
-    summary["failed"] = row.loc[row["failed"] != "", "pair"].nunique()
     summary["per_category"] = per_category
     seeds = row["repeat"].nunique()
     for figures in (summary, *per_category.values()):

@@ -7,8 +7,8 @@ with 100 pairs each) with DINO ViT-S/8.
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from operator import methodcaller
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,6 @@ from zsp_lite.choices import METRICS, METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import write_atomic
 from zsp_lite.metrics import accuracy, median
 from zsp_lite.views import object_crop
 from zsp_lite.viz.plots import (
@@ -42,11 +41,12 @@ from zsp_lite.viz.plots import (
 PAPER = METRICS_SHOWN[:3]
 PUBLISHED = "paper, CO3D"
 _PUBLISHED_NOTE = "Figures of the paper: other data (CO3D) and another backbone (DINO ViT-S/8)."
-# Rows that see more than the pair, in tables of their own: by the name of the table its title and
-# rows.
-SEE_MORE = {
-    "with_scans": ("With several frames of the reference object", GROUPS["scans"]),
-    "with_others": ("With other unlabelled objects of the category", ["category"]),
+_DECIMALS = {"n": 0, "failed": 0, "scale": 2, "translation": 2, "accuracy_gain_p": 3}  # others: 1
+# Tables of a run's rows: all rows that see the pair only, and those that see more.
+ROW_TABLES = {
+    "all_rows": "All rows",
+    "with_scans": "With several frames of the reference object",
+    "with_others": "With other unlabelled objects of the category",
 }
 # Characters that LaTeX reads as commands or does not have in text mode.
 _LATEX = {
@@ -117,7 +117,7 @@ def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHO
     summary = {**summary, "methods": methods}
     of_paper = [*PAPER, "milliseconds"] if "milliseconds" in metrics else PAPER
     tables = [
-        *(all_rows(summary, metrics, name) for name in ("all_rows", *SEE_MORE)),
+        *(all_rows(summary, metrics, name) for name in ROW_TABLES),
         *paper_tables(summary, of_paper),
         *(by_category(summary, metric) for metric in PAPER),
     ]
@@ -127,29 +127,29 @@ def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHO
 def all_rows(
     summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN, table: str = "all_rows"
 ) -> Table:
-    """Return every row that sees the pair only, or those of a table of `SEE_MORE` below "verified",
-    which does, too."""
+    """Return one of `ROW_TABLES`; rows that see more stand below "verified", which does not."""
     methods = summary["methods"]
-    if table in SEE_MORE:
-        title, members = SEE_MORE[table]
-        names = [name for name in methods if base_name(name) in members]
-        if names and "verified" in methods:  # what they add to
-            names.insert(0, "verified")
-    else:
-        title = "All rows"
-        names = [name for name in methods if not _sees_more(name)]
-    rows = {}
-    for name in names:
-        row = methods[name]
-        figures = [_cell(row, metric) for metric in metrics]
-        difference = _difference(summary.get("against", {}).get(name))
-        rows[name] = [_count(row["n"]), *figures, _count(row["failed"]), *difference]
-    titles = ["pairs", *(METRICS[name] for name in metrics), "failed", "Acc30 − ours", "p"]
+    names = [name for name in methods if _table_of(name) == table]
+    if table != "all_rows" and names and "verified" in methods:  # what they add to
+        names.insert(0, "verified")
+    titles = {
+        "n": "pairs",
+        **{metric: METRICS[metric] for metric in metrics},
+        "failed": "failed",
+        "accuracy_gain": "Acc30 − ours",
+        "accuracy_gain_p": "p",
+    }
+    rows = [methods[name] | summary["against"].get(name, {}) for name in names]
+    cells = pd.DataFrame(
+        {title: [_cell(row, figure) for row in rows] for figure, title in titles.items()},
+        names,
+        dtype=object,
+    )
     gain = (
         'Acc30 − ours: difference to "ours" on the same pairs, in points, and its p value by the '
         "same bootstrap."
     )
-    return _table(summary, table, title, rows, titles, metrics, gain)
+    return _table(summary, table, ROW_TABLES[table], cells, metrics, gain)
 
 
 def paper_tables(summary: Mapping[str, Any], metrics: Sequence[str] = PAPER) -> list[Table]:
@@ -166,11 +166,11 @@ def _paper_table(
 
     Table 1 has rows of one's own, too, below the paper's.
     """
-    categories = summary["data"]["categories"]
     methods = summary["methods"]
+    categories = summary["data"]["categories"]
     # A row at the run's own number of target views goes by either name.
     views = f"-n{summary['data']['targets']}"
-    lines = []  # the row of the run, and the line of the table
+    lines = []  # the name of the row, and the line of the table
     for line in spec["rows"]:
         name = line["row"]
         lines.append((name if name in methods else name.removesuffix(views), line))
@@ -181,32 +181,21 @@ def _paper_table(
         lines = [line for line in lines if line[0] in order]
         lines.sort(key=lambda line: order.index(line[0]))
 
-    # Of the published figures of a single category, those of the run's categories are shown.
-    featured = []
-    shown = []
-    for title in spec["published"]:
+    # The run's own figures, those of single categories, and the published ones.
+    rows = [methods.get(name, {"per_category": {}}) for name, _ in lines]
+    columns = {METRICS[metric]: [_cell(row, metric) for row in rows] for metric in metrics}
+    published = {}
+    for place, title in enumerate(spec["published"]):
         category = title.removesuffix(" Acc30")
         if category in categories:
-            featured.append(category)
+            columns[title] = [_cell(row["per_category"].get(category, {}), "acc30") for row in rows]
         if category in (title, *categories):
-            shown.append(title)
-
-    # The run's own figures, those of single categories, and the published ones.
-    rows = {}
-    for name, line in lines:
-        row = methods.get(name)
-        cells = [_cell(row, metric) for metric in metrics]
-        for category in featured:
-            cells.append(_cell(row and row["per_category"].get(category), "acc30"))
-        published = dict(zip(spec["published"], line["published"]))
-        for title in shown:
-            cells.append(Cell(published[title]) if title in published else None)
-        rows[line["label"]] = cells
-    titles = [METRICS[metric] for metric in metrics]
-    titles += [f"{category} Acc30" for category in featured]
-    titles += [f"{PUBLISHED}: {title}" for title in shown]
-    notes = [_PUBLISHED_NOTE if shown else "", spec.get("note", "")]
-    return _table(summary, spec["name"], spec["title"], rows, titles, metrics, *notes)
+            figures = [line["published"][place : place + 1] for _, line in lines]
+            published[f"{PUBLISHED}: {title}"] = [Cell(*one) if one else None for one in figures]
+    labels = [line["label"] for _, line in lines]
+    cells = pd.DataFrame(columns | published, labels, dtype=object)
+    notes = [_PUBLISHED_NOTE if published else "", spec.get("note", "")]
+    return _table(summary, spec["name"], spec["title"], cells, metrics, *notes)
 
 
 def by_category(
@@ -214,15 +203,17 @@ def by_category(
 ) -> Table:
     """Return a figure of the first `most` rows, or of all, with a line for each category and one
     for all pairs."""
-    methods = {name: summary["methods"][name] for name in important_rows(summary)[:most]}
-    rows = {
-        category: [_cell(row["per_category"].get(category), metric) for row in methods.values()]
-        for category in summary["data"]["categories"]
-    }
-    rows["all"] = [_cell(row, metric) for row in methods.values()]
+    categories = summary["data"]["categories"]
+    cells = {}
+    for name in important_rows(summary)[:most]:
+        row = summary["methods"][name]
+        parts = [row["per_category"].get(category, {}) for category in categories]
+        cells[name] = [_cell(part, metric) for part in (*parts, row)]
     name = f"categories_{metric.rpartition('_')[2]}"
     title = f"By category: {METRICS[metric]}"
-    return _table(summary, name, title, rows, list(methods), [metric])
+    return _table(
+        summary, name, title, pd.DataFrame(cells, [*categories, "all"], dtype=object), [metric]
+    )
 
 
 def compare(
@@ -244,12 +235,10 @@ def compare(
         )
     cells = {}
     for text in rows:
-        row_a = text
-        row_b = text
-        if text not in of_first:
-            row_a, _, row_b = text.partition(":")
-        errors_b = _by_seed(second, row_b)["error"].rename("error_b")
-        common = _by_seed(first, row_a).join(errors_b, how="inner").sort_index()
+        row_a, _, row_b = (text, "", text) if text in of_first else text.partition(":")
+        common = first.row(row_a).merge(
+            second.row(row_b), on=["pair", "repeat"], suffixes=("", "_b")
+        )
         if common.empty:
             raise InputError(
                 f"rows {row_a} and {row_b} have no pair in common: other data or number of views"
@@ -257,9 +246,10 @@ def compare(
         errors = common[["error", "error_b"]].to_numpy().T  # (2, pairs)
         gain = paired_difference(*errors, weights=draws_of(common))
         cells[text] = [
-            _count(len(common)),
+            Cell(len(common), decimals=0),
             *map(Cell, accuracy(errors, 30)),
-            *_difference(gain),
+            _cell(gain, "accuracy_gain"),
+            _cell(gain, "accuracy_gain_p"),
             *map(Cell, median(errors)),
         ]
     titles = ["pairs", "Acc30 of A (%)", "Acc30 of B (%)", "B − A", "p"]
@@ -272,23 +262,6 @@ def compare(
     return Table("compare", title, pd.DataFrame.from_dict(cells, "index", object, titles), note)
 
 
-def _by_seed(run: Run, row: str) -> pd.DataFrame:
-    """Return the lines of a row by pair and seed."""
-    return run.row(row).set_index("repeat", append=True, drop=False)
-
-
-def _difference(test: Mapping[str, Any] | None) -> list[Cell | None]:
-    """Return the cells of a `paired_difference`: the gain in accuracy and its p value."""
-    if test is None:
-        return [None, None]
-    gain = Cell(test["accuracy_gain"], *test["accuracy_gain_ci"])
-    return [gain, Cell(test["accuracy_gain_p"], decimals=3)]
-
-
-def _count(number: int) -> Cell:
-    return Cell(number, decimals=0)
-
-
 def own_rows(summary: Mapping[str, Any]) -> list[str]:
     """List the rows of a run that are not the library's."""
     return [*filter(is_own, summary["methods"])]
@@ -299,46 +272,48 @@ def important_rows(summary: Mapping[str, Any]) -> list[str]:
     first; or the chosen."""
     if "chosen" in summary:
         return summary["chosen"]
-    names = [name for name in summary["methods"] if not _sees_more(name)]
+    names = [name for name in summary["methods"] if _table_of(name) == "all_rows"]
     names = names or list(summary["methods"])
     leading = ["ours", *own_rows(summary), "ours-bv", "verified"]
     return list(dict.fromkeys([name for name in leading if name in names] + names))
 
 
-def _sees_more(name: str) -> bool:
-    return any(base_name(name) in rows for _, rows in SEE_MORE.values())
+def _table_of(name: str) -> str:
+    """Return the one of `ROW_TABLES` that a row stands in."""
+    base = base_name(name)
+    if base == "category":
+        return "with_others"
+    return "with_scans" if base in GROUPS["scans"] else "all_rows"
 
 
-def _cell(row: Mapping[str, Any] | None, metric: str) -> Cell | None:
+def _cell(row: Mapping[str, Any], figure: str) -> Cell | None:
     """Return a figure of a row or of one of its categories; a category has one median only."""
-    if row is None:
-        return None
-    if metric == "mean_category_median" and metric not in row:
-        metric = "median"
-    value = row.get(metric)
+    if figure == "mean_category_median" and figure not in row:
+        figure = "median"
+    value = row.get(figure)
     if value is None:
         return None
-    decimals = 2 if metric in ("scale", "translation") else 1
-    return Cell(value, *row.get(f"{metric}_ci", ()), decimals=decimals)
+    return Cell(value, *row.get(f"{figure}_ci", ()), decimals=_DECIMALS.get(figure, 1))
 
 
 def _table(
     summary: Mapping[str, Any],
     name: str,
     title: str,
-    rows: Mapping[str, Sequence[Cell | None]],
-    titles: Sequence[str],
+    cells: pd.DataFrame,
     metrics: Sequence[str],
     *more: str,
 ) -> Table:
     """Make a table of a run, with notes on how to read it, and with what the run has evaluated."""
     data = summary["data"]
-    notes = [summary.get("note", "")]
+    methods = summary["methods"]
+    notes = [summary.get("note", "")]  # begins with that of `read_run`
+    unfinished = " of an unfinished run" if "Not finished" in notes[0] else ""
     if "mean_category_median" in metrics:
         notes.append("Med. err.: mean of the categories' medians.")
     if {"translation", "scale"} & set(metrics):
         notes.append("Translation and scale: medians of the pairs for which a row has them.")
-    if any("@threshold=" in name for name in summary["methods"]):
+    if any("@threshold=" in name for name in methods):
         notes.append(
             "A threshold is to be chosen on validation categories, never on those that are "
             "evaluated."
@@ -349,22 +324,18 @@ def _table(
             "that needs it."
         )
     notes.append("Intervals: 95 %, bootstrap over objects.")
-    for row, figures in {"ours": {}, **summary["methods"]}.items():
-        if "acc30_sd_of_seeds" in figures:
+    for row in sorted(methods, key="ours".__ne__):  # "ours" first
+        if "acc30_sd_of_seeds" in methods[row]:
             notes.append(
                 f"Means over seeds, which the intervals hold; by seed, Acc30 of {row} has a "
-                f"standard deviation of {figures['acc30_sd_of_seeds']:.1f} points."
+                f"standard deviation of {methods[row]['acc30_sd_of_seeds']:.1f} points."
             )
             break
-    notes += more
-    # The first note is that of `read_run`.
-    unfinished = " of an unfinished run" if "Not finished" in notes[0] else ""
     what = (
         f"{Path(data['root']).name}, {data['pairs']} pairs{unfinished}, {data['targets']} target "
         f"views, backbone {summary['backbone']}"
     )
-    cells = pd.DataFrame.from_dict(rows, "index", object, titles)
-    return Table(name, title, cells, " ".join(filter(None, notes)), what)
+    return Table(name, title, cells, " ".join(filter(None, [*notes, *more])), what)
 
 
 def as_csv(table: Table) -> str:
@@ -396,34 +367,18 @@ def as_latex(table: Table, intervals: bool = False) -> str:
     titles = [title for title in table.cells if title not in ("pairs", time)][:3]
     if time in table.cells:
         titles.append(time)
-    shown = table.cells[titles].dropna(how="all").map(_number, interval=intervals)
+    cells = table.text[titles][table.cells[titles].notna().any(axis="columns")]
+    if not intervals:
+        cells = cells.replace(r" \[.*", "", regex=True)
+    cells = cells.replace("-", "$-$", regex=True).replace("–", "--")
     # LaTeX counts tables itself
     title = re.sub(r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title)
-    return shown.rename(index=_escape, columns=_escape).to_latex(
+    return cells.rename(index=_escape, columns=_escape).to_latex(
         position="tb",
         label=f"tab:{table.name}",
         caption=_escape(". ".join(filter(None, [title, table.data]))),
         column_format="l" + "r" * len(titles),
     )
-
-
-def _number(cell: Any, interval: bool) -> str:
-    if not isinstance(cell, Cell):
-        return "--"
-    text = str(cell) if interval else str(replace(cell, low=None))
-    return text.replace("-", "$-$")
-
-
-def write_tables(tables: Iterable[Table], folder: str | Path, intervals: bool = False) -> None:
-    """Write each table as NAME.csv, NAME.md and NAME.tex, this with `intervals` or without."""
-    for table in tables:
-        texts = {
-            ".csv": as_csv(table),
-            ".md": as_markdown(table),
-            ".tex": as_latex(table, intervals),
-        }
-        for suffix, text in texts.items():
-            write_atomic(Path(folder) / f"{table.name}{suffix}", text.encode())
 
 
 def error_distribution(run: Run, row: str = "ours") -> Figure:
@@ -475,18 +430,16 @@ def pair_figure(run: Run, key: str, dataset: Co3D, rows: Sequence[str] | None = 
             f"{run.table['pair'].iloc[0]}"
         )
     reference, targets = dataset.load_pair(Pair.from_key(key))
-    crops = [object_crop(reference)]
+    chosen = [targets[int(result["view"])] for result in results.values()]
+    crops = [object_crop(frame) for frame in (reference, *chosen)]
     cloud = frame_cloud(crops[0])
-    poses = [Sim3.identity()]
-    errors = []
-    for result in results.values():
-        crops.append(object_crop(targets[int(result["view"])]))
-        poses.append(_pose(result, cloud, crops[-1]))
-        errors.append(f"{result['error']:.0f}° off")
+    poses = [_pose(result, cloud, crop) for result, crop in zip(results.values(), crops[1:])]
+    errors = [f"{result['error']:.0f}° off" for result in results.values()]
     images = [crop.rgb for crop in crops]
     titles = ["reference", *results, "its points", *errors]
     figure, axes = show_images([*images, *map(pale, images)], titles, len(crops))
-    draw_moved_cloud(axes[len(crops) :], [crop.camera for crop in crops], cloud, poses)
+    cameras = [crop.camera for crop in crops]
+    draw_moved_cloud(axes[len(crops) :], cameras, cloud, [Sim3.identity(), *poses])
     return figure
 
 

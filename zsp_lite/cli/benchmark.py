@@ -182,7 +182,7 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
 
     for table in tables.every_table(summary, metrics):
         by_category = table.name.startswith("categories")
-        if not by_category and (with_paper or table.name in ("all_rows", *tables.SEE_MORE)):
+        if not by_category and (with_paper or table.name in tables.ROW_TABLES):
             print_table(table)
     print_table(tables.by_category(summary, most=_ROWS_SHOWN))
 

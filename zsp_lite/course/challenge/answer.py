@@ -34,7 +34,7 @@ def answer(handin: Path, data: Path, questions: Path, out: Path, row_seconds: in
             try:
                 with fails_alone(row_seconds):
                     problem = PairProblem(pair, store, {method.features} - {"none"})
-                    seen = problem_of_own(method.solve, problem) if method.solve else problem
+                    seen = problem_of_own(method.solve, problem)
                     found = ask(method, seen)
                 frame = pair.target_frames[found.view]
             except (InputError, IndexError) as error:
