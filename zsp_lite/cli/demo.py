@@ -41,7 +41,8 @@ def demo(data, solver, backbone, out) -> None:
     from zsp_lite.course.synthetic.export import RENDERED_FILE, SETTINGS_FILE
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.io.locks import writing
-    from zsp_lite.viz.report import COLUMNS, legend, table_rows, write_report
+    from zsp_lite.viz.report import write_report
+    from zsp_lite.viz.table import COLUMNS, legend, table_rows
 
     folder = data or sample_data()
     notes = {SETTINGS_FILE: SYNTHETIC_NOTE, RENDERED_FILE: MODELS_NOTE}

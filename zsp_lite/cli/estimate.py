@@ -147,7 +147,7 @@ def estimate(
 def _print_tables(result: Any) -> None:
     """Print the answers of a `PairResult`, the other hypotheses, the matrices and the flags."""
     from zsp_lite.cli.terminal import print_rows
-    from zsp_lite.viz.report import COLUMNS, legend, table_rows
+    from zsp_lite.viz.table import COLUMNS, legend, table_rows
 
     print(f"Reference: {result.sources[0]} (mask: {result.masks[0]})")
     print(f"Target: {result.sources[1]} (masks: {result.masks[1]})")
