@@ -75,6 +75,7 @@ class _Estimate(click.Command):
     default="outputs/estimate",
     help="Folder for the report and the point clouds.",
 )
+@click.option("--no-report", is_flag=True, help="Write the point clouds only.")
 def estimate(
     reference,
     target,
@@ -88,6 +89,7 @@ def estimate(
     as_json,
     backbone,
     out,
+    no_report,
     **once_per_object,
 ) -> None:
     """Estimate the pose between two objects of one category. No label is needed.
@@ -134,6 +136,7 @@ def estimate(
         references=references,
         helpers=sources[2:],
         workers=workers,
+        report=not no_report,
     )
     if as_json:
         printed = {**result.as_json(), "files": [str(path) for path in result.files]}
