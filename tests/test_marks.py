@@ -83,7 +83,7 @@ def test_an_object_without_any_place_has_no_file(placed, dataset, tmp_path):
 def test_a_run_leaves_no_outputs_of_an_earlier_one(placed, alignment, tmp_path, run, monkeypatch):
     one = {"scooter2": alignment.objects["scooter2"]}
     answers = iter([alignment, replace(alignment, objects=one)])
-    monkeypatch.setattr("zsp_lite.align.align_category", lambda *_: next(answers))
+    monkeypatch.setattr("zsp_lite.align.align_category", lambda *_, **__: next(answers))
     monkeypatch.setattr("zsp_lite.marks.place_marks", lambda *_: placed)
     line = f"align data_samples --category motorcycle --out {tmp_path}"
     run(f"{line} --mark scooter:0:180,114:seat")

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.cluster import KMeans
 from threadpoolctl import threadpool_info
 from torch.testing import assert_close
 
@@ -171,7 +172,7 @@ def test_cycles_from_the_target_are_the_published_cycles_of_the_swapped_pair():
 
 
 def test_clusters_are_computed_by_one_thread(monkeypatch):
-    class Observed(matching.KMeans):
+    class Observed(KMeans):
         def fit(self, points):
             threads.update(
                 [cv2.getNumThreads(), *(one["num_threads"] for one in threadpool_info())]
@@ -179,6 +180,6 @@ def test_clusters_are_computed_by_one_thread(monkeypatch):
             return super().fit(points)
 
     threads = set()
-    monkeypatch.setattr(matching, "KMeans", Observed)
+    monkeypatch.setattr("sklearn.cluster.KMeans", Observed)
     matching._cluster(np.eye(8), 4, default_rng(0))
     assert threads == {1}

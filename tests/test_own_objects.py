@@ -527,8 +527,10 @@ def test_the_command_prints_json_alone(estimate_paper, tmp_path):
     assert content["files"] == [str(tmp_path / name) for name in names]
 
 
-def test_the_command_says_that_there_are_no_labels(estimate_paper):
-    text = estimate_paper("")
+def test_the_command_without_labels_and_report(estimate_paper, tmp_path):
+    (tmp_path / "report.html").write_text("of an earlier run")
+    text = estimate_paper("--no-report")
+    assert not (tmp_path / "report.html").exists()
     assert "No pose labels: the rotation error is unknown." in text
     assert "error:" not in text
     assert "(masks: auto)" in text

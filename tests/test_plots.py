@@ -15,21 +15,11 @@ pytestmark = pytest.mark.usefixtures("closed_figures")
 CAMERA = Camera(np.eye(3), np.zeros(3), np.array([100.0, 100.0]), np.array([40.0, 30.0]), (60, 80))
 
 
-def test_patches_are_marked_at_their_centres_in_pixels_x_y():
-    centres = plots.patch_centres(np.array([[0, 0], [2, 3]]), GRID, (60, 80))
-    assert_allclose(centres, [[10, 10], [70, 50]])
-
-
 def test_patches_of_maps_are_marked_at_their_centres():
-    figure = plots.show_maps(
-        [IMAGE, IMAGE],
-        {"this patch": None, "key": np.zeros(GRID)},
-        circles=[(0, 0), (2, 1)],
-        stars=[None, (1, 3)],
-    )
-    lines = [line for axis in figure.axes for line in axis.lines]
+    (axis,) = plots.show_maps([IMAGE], {"key": np.zeros(GRID)}).axes
+    lines = [*plots.circle_patch(axis, (2, 1), GRID), *plots.circle_patch(axis, (1, 3), GRID, "*")]
     marks = [(line.get_marker(), *line.get_xydata()[0]) for line in lines]
-    assert marks == [("o", 10, 10), ("o", 30, 50), ("*", 70, 30)]
+    assert marks == [("o", 30, 50), ("*", 70, 30)]
 
 
 def test_lines_join_the_centres_of_matched_patches_and_those_of_outliers_are_dashed():

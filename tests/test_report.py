@@ -46,7 +46,7 @@ def results(ellipsoids):
 def page(results, tmp_path_factory) -> Path:
     """The report of the demo."""
     path = tmp_path_factory.mktemp("demo") / "in/report.html"
-    return write_report(path, results, "a & b", "some/folder", "synthetic ellipsoids <script>")
+    return write_report(path, results, "name")
 
 
 @pytest.fixture
@@ -209,11 +209,6 @@ def test_the_scene_has_the_alternatives_in_the_same_frame(results, poses):
         expected = rotation_seen_by(result.estimate.target_camera, estimate, pose)
         scaled = matrix[:, :3]
         assert_allclose(scaled / np.cbrt(np.linalg.det(scaled)), expected, atol=1e-4)
-
-
-def test_text_of_the_page_is_escaped(text):
-    assert "synthetic ellipsoids &lt;script&gt;" in text
-    assert "a &amp; b" in text
 
 
 def test_all_text_of_a_pair_is_escaped(results, tmp_path):

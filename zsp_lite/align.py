@@ -189,20 +189,14 @@ def align_category(
     return found
 
 
-def alignment_errors(
-    alignment: CategoryAlignment, labels: Mapping[str, PoseLabel]
-) -> tuple[list[float], list[float]]:
+def alignment_errors(alignment: CategoryAlignment, labels: Mapping[str, PoseLabel]) -> list[float]:
     """Compute the rotation errors in degrees of the alignment, for all ordered pairs of labelled
-    objects, and of the best hypothesis of each pair alone."""
+    objects."""
     turns = {name: labels[name].trans[:3, :3] for name in alignment.objects if name in labels}
-    true = {(a, b): turns[b] @ turns[a].T for a, b in permutations(turns, 2)}
-    together = [float(rotation_error(alignment.between(*ends).R, true[ends])) for ends in true]
-    alone = []
-    for pair in alignment.pairs:
-        ends = pair.reference, pair.target
-        if ends in true:
-            alone.append(float(rotation_error(pair.sim3s[0].R, true[ends])))
-    return together, alone
+    return [
+        float(rotation_error(alignment.between(a, b).R, turns[b] @ turns[a].T))
+        for a, b in permutations(turns, 2)
+    ]
 
 
 def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:

@@ -22,8 +22,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
-from sklearn.cluster import KMeans
-from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
 from zsp_lite.errors import InputError
@@ -350,6 +348,10 @@ def _cluster(
     gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator
 ) -> Int[np.ndarray, " m"]:
     """Cluster m points, given by their inner products, by k-means; returns their labels."""
+    # Imported here: it takes a second, and the verified solver does not cluster.
+    from sklearn.cluster import KMeans
+    from sklearn.exceptions import ConvergenceWarning
+
     with one_thread(), _filters, warnings.catch_warnings():
         # Eigenvectors scaled by the roots of their eigenvalues are m points in m dimensions of the
         # same inner products, hence the same distances: k-means on them is k-means on the

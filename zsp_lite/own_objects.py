@@ -59,6 +59,7 @@ def estimate_pose(
     references: int | None = None,
     helpers: Iterable[SourceLike] = (),
     workers: int = 1,
+    report: bool = True,
 ) -> PairResult:
     """Estimate the pose between two objects of one category, given as paths or frames; no label is
     needed.
@@ -90,6 +91,7 @@ def estimate_pose(
         helpers: Other objects of the category: what two objects cannot tell, all together mostly
             can.
         workers: Number of frames that are solved at once, by threads.
+        report: Whether `out` gets the report beside the point clouds.
 
     Raises:
         InputError: An input or an option is missing or wrong, or the pose cannot be estimated.
@@ -154,7 +156,7 @@ def estimate_pose(
             estimates[name] = _in_units(estimate, scans[0].scale, scans[1].scale, notes)
         result = _pair_result(scans, estimates, votes, getattr(model, "name", str(backbone)))
         if out is not None:
-            result = replace(result, files=tuple(write_pair(result, out)))
+            result = replace(result, files=tuple(write_pair(result, out, report)))
     return result
 
 
@@ -360,21 +362,19 @@ def _answer(
     )
 
 
-def write_pair(result: PairResult, out: str | Path) -> list[Path]:
+def write_pair(result: PairResult, out: str | Path, report: bool = True) -> list[Path]:
     """Write the report and the point clouds of a result of `estimate_pose` to a folder, and return
     the paths.
 
-    They are `report.html`; `target.ply`, the points of the target object in all its views; and for
-    each solver `aligned_SOLVER.ply`, the points of the reference object after the pose, and
-    `aligned_SOLVER_2.ply`, after the first alternative, where the answer is one of two. The clouds
-    are in the world of the target views, which for an image is its camera's frame. Files of these
-    names that an earlier run left are removed.
+    They are `report.html`, unless `report` is false; `target.ply`, the points of the target object
+    in all its views; and for each solver `aligned_SOLVER.ply`, the points of the reference object
+    after the pose, and `aligned_SOLVER_2.ply`, after the first alternative, where the answer is one
+    of two. The clouds are in the world of the target views, which for an image is its camera's
+    frame. Files of these names that an earlier run left are removed.
     """
-    from zsp_lite.viz.report import write_pair_report
-
     out = Path(out)
     for solver in SOLVERS["both"]:
-        for name in (f"aligned_{solver}.ply", f"aligned_{solver}_2.ply"):
+        for name in ("report.html", f"aligned_{solver}.ply", f"aligned_{solver}_2.ply"):
             (out / name).unlink(missing_ok=True)
     paths = [out / "target.ply"]
     write_ply(paths[0], *world_cloud(result.targets))
@@ -386,7 +386,11 @@ def write_pair(result: PairResult, out: str | Path) -> list[Path]:
             paths.append(out / name)
             moved = pose.sim3.apply(points)
             write_ply(paths[-1], result.targets[pose.view].camera.to_world(moved), colours)
-    return [write_pair_report(out / "report.html", result), *paths]
+    if report:
+        from zsp_lite.viz.report import write_pair_report
+
+        paths.insert(0, write_pair_report(out / "report.html", result))
+    return paths
 
 
 def _in_units(

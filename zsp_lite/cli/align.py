@@ -46,7 +46,6 @@ MARK = Parsed(
     show_default="all; 6 from twelve objects on",
     help="Partners of each object.",
 )
-@click.option("--targets", type=COUNT, default=5, help="Frames of each object.")
 @click.option(
     "--out",
     type=PATH,
@@ -69,7 +68,7 @@ MARK = Parsed(
 @workers_option
 @backbone_options
 def align(
-    data, category, sequences, pairs, targets, out, propose, marks, replace, backbone, workers
+    data, category, sequences, pairs, out, propose, marks, replace, backbone, workers
 ) -> None:
     """Align all objects of a category in one frame. No label is needed.
 
@@ -111,7 +110,9 @@ def align(
     dataset = Co3D(data)
     # Refuses wrong marks before minutes of computing.
     marked_points(dataset, category, marks, sequences)
-    alignment = align_category(dataset, category, backbone, sequences, pairs, targets, out, workers)
+    alignment = align_category(
+        dataset, category, backbone, sequences, pairs, out=out, executor=workers
+    )
     placed = place_marks(alignment, dataset, category, marks, backbone) if marks else []
     remove_outputs(out, category)  # those that are not written again would be of other objects
     written = [
@@ -135,14 +136,12 @@ def align(
         print(f"{first} to {second}: the best pose of the pair alone is {angle:.0f}° away")
     for kind, what in (("class_labels", "pose labels"), ("label_proposals", "proposals")):
         labels = read_label_folder(dataset.root / kind / category)
-        errors, errors_before = alignment_errors(alignment, labels)
-        if errors_before:
+        errors = alignment_errors(alignment, labels)
+        if errors:
             right = accuracy(errors, SAME_ANGLE)
-            before = accuracy(errors_before, SAME_ANGLE)
             print(
                 f"By the {what}, {right:.1f}% of {len(errors)} ordered pairs are within "
-                f"{SAME_ANGLE:.0f}° in the common frame; before the alignment, {before:.1f}% of "
-                f"{len(errors_before)} pairs alone."
+                f"{SAME_ANGLE:.0f}° in the common frame."
             )
     if propose:
         written.append(write_labels(alignment, dataset.root, category, "label_proposals", replace))

@@ -1,8 +1,10 @@
 """Types of options, options that several commands share, and the examples below a help text."""
 
 import math
+import os
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import click
 from zsp_lite.choices import FACETS, MASKS
 
 
+@dataclass(eq=False)
 class Parsed(click.ParamType):
     """Type of an option.
 
@@ -19,17 +22,10 @@ class Parsed(click.ParamType):
     an error message what can be.
     """
 
-    def __init__(
-        self,
-        metavar: str,
-        parse: Callable[[str], Any],
-        expected: str,
-        valid: Callable[[Any], bool] = bool,
-    ):
-        self.name = metavar
-        self.parse = parse
-        self.expected = expected
-        self.valid = valid
+    name: str  # as in the help text
+    parse: Callable[[str], Any]
+    expected: str
+    valid: Callable[[Any], bool] = bool
 
     def convert(self, value, parameter, context):
         with suppress(ValueError, OverflowError):
@@ -87,6 +83,14 @@ replace_option = click.option(
 )
 
 
+def _one_thread(context, option, name):
+    """Let the default backbone, which is small, compute with one thread: more are slower. The
+    user's setting stays. Libraries read it when they are imported, so that this option is eager."""
+    if name == option.default:
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+    return name
+
+
 def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add --backbone, --layer, --facet and --image-size; the command gets `backbone`, which
     `as_backbone` takes."""
@@ -95,6 +99,8 @@ def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:
         "--backbone",
         "name",
         default="zsp-tiny",
+        is_eager=True,
+        callback=_one_thread,
         help="Name of `weights list`, file, hf:NAME, module:thing.",
     )
     @click.option(

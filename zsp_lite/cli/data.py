@@ -189,24 +189,12 @@ def _confirmed(
 ) -> bool:
     """Print the sizes of the archives and the room that they need on the disk, in bytes, and ask
     whether to download them."""
-    from zsp_lite.cli.terminal import print_rows
-
-    names = [
-        f"{len(archive.sequences)} sequences of {archive.name}"
-        if archive.sequences
-        else archive.name
-        for archive in archives
-    ]
-    rows = [
-        (name, "unknown" if size is None else f"{size / 1e9:,.2f} GB")
-        for name, size in zip(names, sizes)
-    ]
-    print_rows(
-        "To download",
-        ("archive", "size"),
-        [*rows, ("together", f"{sum(filter(None, sizes)) / 1e9:,.2f} GB")],
-    )
-    print(f"Needed on the disk of {root}: {needed / 1e9:.2f} GB. {_LICENCE}")
+    for archive, size in zip(archives, sizes):
+        part = f"{len(archive.sequences)} sequences of " if archive.sequences else ""
+        shown = "unknown size" if size is None else f"{size / 1e9:,.2f} GB"
+        print(f"{part}{archive.name}: {shown}")
+    print(f"To download: {sum(filter(None, sizes)) / 1e9:,.2f} GB.")
+    print(f"Needed on the disk of {root}: {needed / 1e9:,.2f} GB. {_LICENCE}")
     if not yes and not sys.stdin.isatty():
         raise InputError(
             "nobody can confirm the download: standard input is not a terminal, expected --yes"

@@ -16,15 +16,9 @@ USER_NOTE = "the given folder in CO3D's layout."
     epilog=examples("demo", "demo --data path/to/co3d --backbone dino_vits8 --out outputs/co3d")
 )
 @click.option("--data", type=PATH, show_default="data_samples", help="Folder in CO3D's layout.")
-@click.option(
-    "--solver",
-    type=click.Choice(SOLVERS),
-    default="both",
-    help="Solver for the pairs of the categories.",
-)
 @backbone_options
 @click.option("--out", type=PATH, default="outputs/demo", help="Folder for the report.")
-def demo(data, solver, backbone, out) -> None:
+def demo(data, backbone, out) -> None:
     """Estimate poses of a real motorcycle and of sample objects.
 
     One pair of each category is estimated, and a report with pictures is written. The real
@@ -41,7 +35,8 @@ def demo(data, solver, backbone, out) -> None:
     from zsp_lite.course.synthetic.export import RENDERED_FILE, SETTINGS_FILE
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.io.locks import writing
-    from zsp_lite.viz.report import COLUMNS, legend, table_rows, write_report
+    from zsp_lite.viz.report import write_report
+    from zsp_lite.viz.table import COLUMNS, legend, table_rows
 
     folder = data or sample_data()
     notes = {SETTINGS_FILE: SYNTHETIC_NOTE, RENDERED_FILE: MODELS_NOTE}
@@ -51,7 +46,7 @@ def demo(data, solver, backbone, out) -> None:
         model = as_backbone(backbone)
         found = list(run_photograph(dataset, model))
         photograph = photograph_section(found) if found else None
-        results = list(run_demo(dataset, model, SOLVERS[solver]))
+        results = list(run_demo(dataset, model, SOLVERS["both"]))
         path = write_report(
             out / "report.html", results, getattr(model, "name", ""), str(folder), note, photograph
         )

@@ -82,6 +82,7 @@ class _Estimate(click.Command):
     default="outputs/estimate",
     help="Folder for the report and the point clouds.",
 )
+@click.option("--no-report", is_flag=True, help="Write the point clouds only.")
 def estimate(
     reference,
     target,
@@ -95,6 +96,7 @@ def estimate(
     as_json,
     backbone,
     out,
+    no_report,
     **once_per_object,
 ) -> None:
     """Estimate the pose between two objects of one category. No label is needed.
@@ -141,6 +143,7 @@ def estimate(
         references=references,
         helpers=sources[2:],
         workers=workers,
+        report=not no_report,
     )
     if as_json:
         printed = {**result.as_json(), "files": [str(path) for path in result.files]}
@@ -154,7 +157,7 @@ def estimate(
 def _print_tables(result: Any) -> None:
     """Print the answers of a `PairResult`, the other hypotheses, the matrices and the flags."""
     from zsp_lite.cli.terminal import print_rows
-    from zsp_lite.viz.report import COLUMNS, legend, table_rows
+    from zsp_lite.viz.table import COLUMNS, legend, table_rows
 
     print(f"Reference: {result.sources[0]} (mask: {result.masks[0]})")
     print(f"Target: {result.sources[1]} (masks: {result.masks[1]})")

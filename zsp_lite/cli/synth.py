@@ -62,21 +62,19 @@ def synth(preset, categories, models_folder, seed, out, **given) -> None:
     from zsp_lite.course.synthetic.export import export_categories, export_models, export_preset
     from zsp_lite.io.locks import writing
 
-    sequences = given["sequences"] or 4
-    frames = given["frames"] or 24
+    chosen = {name: value for name, value in given.items() if value is not None}
     left_out = {}
     with writing(out):
         if preset:
-            refuse_options(given, (), "--preset")
+            refuse_options(chosen, (), "--preset")
             export_preset(preset, out, seed)
         elif categories:
-            refuse_options(given, ("sequences", "frames"), "--category")
-            export_categories(list(categories), out, sequences, frames, seed)
+            refuse_options(chosen, ("sequences", "frames"), "--category")
+            sizes = {"sequences": 4, "frames": 24} | chosen
+            export_categories(list(categories), out, seed=seed, **sizes)
         else:
-            refuse_options(given, ("frames", "image_size", "front", "up"), "--models")
-            size = given["image_size"] or 256
-            axes = given["front"], given["up"]
-            left_out = export_models(models_folder, out, frames, seed, size, *axes)
+            refuse_options(chosen, ("frames", "image_size", "front", "up"), "--models")
+            left_out = export_models(models_folder, out, seed=seed, **chosen)
     for key, reason in left_out.items():
         print(f"Left out {key}: {reason}")
     print(f"Written: {out}")

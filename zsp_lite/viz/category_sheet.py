@@ -55,16 +55,12 @@ def objects_figure(
     if turned:
         rows["or turned"] = turned
 
-    size = (_WIDTH * len(names) + _BORDER, _HEIGHT * len(rows) + _BORDER)
-    figure, axes = plt.subplots(
-        len(rows), len(names), figsize=size, layout="constrained", squeeze=False
-    )
+    figure, axes = _panels(len(rows), len(names), _HEIGHT * len(rows) + _BORDER)
     for panels, (title, rotations) in zip(axes, rows.items()):
         # The row "or turned" has pictures of some objects only; its title is at the first.
         first = names.index(next(iter(rotations)))
         panels[first].set_ylabel(title)
         for axis, name in zip(panels, names):
-            axis.set(xticks=[], yticks=[], frame_on=False)
             if name in rotations:
                 frames = _frames(dataset, category, name)
                 axis.imshow(nearest_crop(dataset, frames, rotations[name]).rgb)
@@ -86,10 +82,7 @@ def marks_figure(
 ) -> Figure:
     """Show marks on objects, a row for each mark: each object by the frame that sees the place from
     the most similar side, the marked one by the frame that is marked."""
-    size = (_WIDTH * len(names) + _BORDER, (_HEIGHT + _BORDER) * len(placed))
-    figure, axes = plt.subplots(
-        len(placed), len(names), figsize=size, layout="constrained", squeeze=False
-    )
+    figure, axes = _panels(len(placed), len(names), (_HEIGHT + _BORDER) * len(placed))
     for number, (panels, one) in enumerate(zip(axes, placed)):
         mark = one.mark
         marked = dataset.camera(dataset.frame(category, mark.sequence, mark.frame)).R
@@ -102,7 +95,6 @@ def marks_figure(
             shown = place.found and len(seeing) > 0
             rotation = common @ alignment.objects[name].sim3.R
             crop = nearest_crop(dataset, seeing if shown else frames, rotation)
-            axis.set(xticks=[], yticks=[], frame_on=False)
             axis.imshow(crop.rgb)
             label = "marked" if name == mark.sequence else _found(place, shown)
             axis.set_xlabel(f"{name[:16]}\n{label}", fontsize=8, parse_math=False)
@@ -111,6 +103,18 @@ def marks_figure(
                 colour = COLOURS[number % len(COLOURS)]
                 axis.plot(x, y, "o", ms=8, mfc=colour, mec="white", mew=1.5)
     return figure
+
+
+def _panels(rows: int, columns: int, height: float) -> tuple[Figure, np.ndarray]:
+    """Return panels without ticks and frames, in a figure of a height in inches."""
+    return plt.subplots(
+        rows,
+        columns,
+        figsize=(_WIDTH * columns + _BORDER, height),
+        layout="constrained",
+        squeeze=False,
+        subplot_kw={"xticks": [], "yticks": [], "frame_on": False},
+    )
 
 
 def _found(place: Place, shown: bool) -> str:

@@ -82,7 +82,8 @@ def show_images(
         axis.set_axis_off()
         draw_image(axis, image, cmap)
     for axis, title in zip(axes, titles):
-        axis.set_title(title, fontsize=_FONT, parse_math=False)
+        # Without `y`, the ticks, which are off, would be measured to find the height.
+        axis.set_title(title, fontsize=_FONT, parse_math=False, y=1)
     return figure, axes
 
 
@@ -310,7 +311,6 @@ def show_curves(x: ArrayLike, curves: Mapping[str, ArrayLike], **labels: Any) ->
 
 def show_panels(
     panels: Mapping[str, Mapping[str, tuple[ArrayLike, ArrayLike]]],
-    columns: int | None = None,
     joined: bool = True,
     size: tuple[float, float] = (10, 3.4),
     **labels: Any,
@@ -318,11 +318,10 @@ def show_panels(
     """Show curves (x, y), or points that are not `joined`, in each panel, by its title, with one
     legend of those with a name.
 
-    Curves differ in colour, line and marker. `size` is the width of the figure and the height of a
-    row, in inches; `labels` is what `Axes.set` takes.
+    Curves differ in colour, line and marker. `size` is that of the figure in inches; `labels` is
+    what `Axes.set` takes.
     """
-    width = size[0] / min(columns or len(panels), len(panels))
-    figure, axes = _panels(len(panels), columns, width, size[1])
+    figure, axes = _panels(len(panels), None, size[0] / len(panels), size[1])
     for axis, (title, curves) in zip(axes, panels.items()):
         styles = zip(curves.items(), cycle(COLOURS), cycle(_LINES), cycle(_MARKERS))
         for (name, (x, y)), colour, line, marker in styles:
@@ -425,18 +424,16 @@ def show_dots(
 def show_intervals(
     x: ArrayLike,
     intervals: Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike]],
-    joined: bool = True,
     **labels: Any,
 ) -> Figure:
     """Show up to four rows of values over x, each value with a bar from its lower to its upper end.
 
     A row is (values, lower ends, upper ends) by its name; bars at one x stand beside each other. A
-    line joins the values of a row if they are `joined`; `labels` is what `Axes.set` takes.
+    line joins the values of a row; `labels` is what `Axes.set` takes.
     """
     figure, axis = plt.subplots(figsize=(7, 3.8), layout="constrained")
     styles = zip(intervals.items(), COLOURS, _LINES, _MARKERS)
     for index, ((name, (values, low, high)), colour, line, marker) in enumerate(styles):
-        line = line if joined else "none"
         (row,) = axis.plot(x, values, linestyle=line, marker=marker, color=colour, label=name)
         bars = axis.vlines(x, low, high, color=colour, alpha=0.5, linewidth=3)
         # Rows are 5 points apart. They are moved here, since the axis has got its limits from them.
@@ -453,25 +450,15 @@ def show_intervals(
 def show_maps(
     images: Sequence[np.ndarray],
     maps: Mapping[str, Real[np.ndarray, "rows cols"] | None],
-    columns: int | None = None,
     size: float = 3.0,
-    circles: Sequence[Cell] = (),
-    stars: Sequence[Cell | None] = (),
     **style: Any,
 ) -> Figure:
-    """Show each map, by its title, over its image; None is an image without a map.
-
-    `circles` and `stars` mark one patch of each image, and `style` is what `overlay_map` takes.
-    """
-    figure, axes = show_images(images, list(maps), columns, size)
-    grid = next(np.shape(values) for values in maps.values() if values is not None)
+    """Show each map, by its title, over its image; None is an image without a map. `style` is what
+    `overlay_map` takes."""
+    figure, axes = show_images(images, list(maps), size=size)
     for axis, values in zip(axes, maps.values()):
         if values is not None:
             overlay_map(axis, values, **style)
-    for marker, cells in (("o", circles), ("*", stars)):
-        for axis, cell in zip(axes, cells):
-            if cell is not None:
-                circle_patch(axis, cell, grid, marker)
     return figure
 
 

@@ -132,46 +132,18 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
     reference_place = estimate.target_camera.to_world(estimate.sim3.t)
     seen = coverage(target_cameras, reference_place, np.median(target_cloud, axis=0))
     moved_cloud = estimate.target_camera.to_world(estimate.sim3.apply(cloud))
-    _draw_from_above(axes[-1], seen, target_cloud, moved_cloud)
-    label = f"reference under this pose, {seen.angle:.0f}° from view {seen.nearest}"
-    draw_cameras(axes[-1], seen, chosen + 1, label)
+    _draw_from_above(axes[-1], seen, target_cloud, moved_cloud, chosen + 1)
     figure.legend(
         *axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
     )
     return figure
 
 
-def draw_cameras(axis: Axes, seen: Coverage, chosen: int, reference: str = "reference") -> None:
-    """Draw the target cameras with their numbers, and a star for the reference camera, around the
-    object."""
-    # The cameras are on a circle of radius 1, their numbers outside.
-    axis.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal")
-    for number, place in seen.targets.items():
-        colour = plots.CHOSEN if number == chosen else plots.BLUE
-        axis.plot(*place, "o", color=colour, markersize=11, markeredgecolor="white")
-        axis.text(
-            *(1.23 * place),
-            str(number),
-            color=colour,
-            ha="center",
-            va="center",
-            fontsize=11,
-            weight="bold",
-            zorder=4,
-        )
-    axis.plot(
-        *seen.reference,
-        "*",
-        color=plots.VERMILLION,
-        markersize=20,
-        markeredgecolor="white",
-        label=reference,
-    )
-
-
-def _draw_from_above(axis: Axes, seen: Coverage, target: np.ndarray, reference: np.ndarray) -> None:
-    """Draw world points of the target (grey) and of the reference, the arc of the target cameras,
-    and its gap."""
+def _draw_from_above(
+    axis: Axes, seen: Coverage, target: np.ndarray, reference: np.ndarray, chosen: int
+) -> None:
+    """Draw world points of the target (grey) and of the reference, the arc of the target cameras
+    and its gap, these cameras with their numbers, and a star for the reference camera."""
     begin, end = seen.gap
     axis.images[0].remove()  # the white image that held the place
     axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0))
@@ -202,3 +174,27 @@ def _draw_from_above(axis: Axes, seen: Coverage, target: np.ndarray, reference: 
         # Points near the circle of the cameras would cover their marks.
         inside = np.linalg.norm(scale * points, axis=1, keepdims=True) < 0.9
         axis.scatter(*np.where(inside, scale * points, np.nan).T, s=4, c=colours, linewidths=0)
+
+    # The cameras are on a circle of radius 1, their numbers outside.
+    axis.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal")
+    for number, place in seen.targets.items():
+        colour = plots.CHOSEN if number == chosen else plots.BLUE
+        axis.plot(*place, "o", color=colour, markersize=11, markeredgecolor="white")
+        axis.text(
+            *(1.23 * place),
+            str(number),
+            color=colour,
+            ha="center",
+            va="center",
+            fontsize=11,
+            weight="bold",
+            zorder=4,
+        )
+    axis.plot(
+        *seen.reference,
+        "*",
+        color=plots.VERMILLION,
+        markersize=20,
+        markeredgecolor="white",
+        label=f"reference under this pose, {seen.angle:.0f}° from view {seen.nearest}",
+    )
