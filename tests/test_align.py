@@ -17,14 +17,13 @@ from refusals import refused
 
 from zsp_lite import Co3D, ZeroShotPose, align_category, estimate_pose
 from zsp_lite.align import read_hypotheses, write_labels
-from zsp_lite.benchmark.problem import PairProblem
+from zsp_lite.benchmark.problem import FrameStore
 from zsp_lite.benchmark.run import evaluate
 from zsp_lite.category import synchronise
 from zsp_lite.cli import main as cli
 from zsp_lite.course.labelling.session import Labelling
 from zsp_lite.data.frames import resize_frame
 from zsp_lite.data.labels import read_labels
-from zsp_lite.errors import NoPoseError
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.metrics import rotation_error
 from zsp_lite.viz.category_sheet import objects_figure
@@ -32,7 +31,7 @@ from zsp_lite.viz.category_sheet import objects_figure
 BACKBONE = SlowBackbone(grid=8, _seconds=0)
 A, B, C = SEQUENCES
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
-PAIRS = 30  # five for each of the six ordered pairs of objects
+PAIRS = 12  # two frames of each object for each ordered pair
 align_lumps = partial(align_category, Co3D(small_folder()), "lump", BACKBONE)
 
 
@@ -96,16 +95,17 @@ def test_a_killed_run_is_continued_where_it_was_and_by_other_workers(run, tmp_pa
     out, whole = run
     lines = (out / "run.jsonl").read_text().splitlines(keepends=True)
     assert len(lines) == PAIRS
-    # The run was killed while it wrote its 15th line.
+    # The run was killed while it wrote its 8th line.
     shutil.copy(out / "run.json", tmp_path)
-    (tmp_path / "run.jsonl").write_text("".join(lines[:14]) + lines[14][:30])
+    (tmp_path / "run.jsonl").write_text("".join(lines[:7]) + lines[7][:30])
     with ThreadPoolExecutor(2) as executor:
         continued = align_lumps(targets=3, out=tmp_path, executor=executor)
     assert sorted((tmp_path / "run.jsonl").read_text().splitlines(keepends=True)) == sorted(lines)
-    monkeypatch.setattr(PairProblem, "hypotheses", None)  # nothing is left to compute
+    monkeypatch.setattr(FrameStore, "_hypotheses", pytest.fail)  # nothing is left to compute
     read = align_lumps(targets=3, out=tmp_path)
-    stored = synchronise(list(read_hypotheses(tmp_path).values()))
-    assert poses(continued) == poses(read) == poses(stored) == poses(whole)
+    assert poses(continued) == poses(read) == poses(whole)
+    answers = read_hypotheses(tmp_path).values()
+    assert synchronise([*answers]).objects.keys() == whole.objects.keys()
 
 
 def test_a_run_is_continued_by_its_own_command_and_settings_alone(run):
@@ -116,22 +116,20 @@ def test_a_run_is_continued_by_its_own_command_and_settings_alone(run):
 
 
 def test_an_object_without_a_pose_is_left_out(monkeypatch):
-    def fail_for_c(problem):
-        if C in (problem.pair.reference_sequence, problem.pair.target_sequence):
-            raise NoPoseError("no pose")
-        return solve(problem)
+    def fail_for_c(store, pair):
+        if C not in (pair.reference_sequence, pair.target_sequence):
+            return solve(store, pair)
 
-    solve = PairProblem.hypotheses
-    monkeypatch.setattr(PairProblem, "hypotheses", fail_for_c)
+    solve = FrameStore._hypotheses
+    monkeypatch.setattr(FrameStore, "_hypotheses", fail_for_c)
+    monkeypatch.setattr("zsp_lite.benchmark.problem.find_up", lambda frames: (None, ""))
     assert list(align_lumps(SEQUENCES, targets=3).objects) == [A, B]
 
 
 def test_objects_without_any_pose_are_refused(monkeypatch):
-    def fail(problem):
-        raise NoPoseError("no pose")
-
-    monkeypatch.setattr(PairProblem, "hypotheses", fail)
-    refused(f"none of {PAIRS} pairs determines a pose", align_lumps, targets=3)
+    monkeypatch.setattr(FrameStore, "_hypotheses", lambda store, pair: None)
+    monkeypatch.setattr("zsp_lite.benchmark.problem.find_up", lambda frames: (None, ""))
+    refused("nothing tells the pose between any two objects", align_lumps, targets=3)
 
 
 def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
@@ -195,12 +193,14 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
             rotation = best.sim3.R @ camera @ HALF_TURN @ camera.T
         else:
             rotation = target_camera @ HALF_TURN @ target_camera.T @ best.sim3.R
-        wrong = replace(best, sim3=replace(best.sim3, R=rotation), confidence=0.6)
-        hypotheses = wrong, replace(best, confidence=0.3)
+        wrong = replace(best, sim3=replace(best.sim3, R=rotation), confidence=0.97)
+        hypotheses = wrong, replace(best, confidence=0.01)
         return replace(answer, sim3=wrong.sim3, hypotheses=hypotheses)
 
     estimate = ZeroShotPose.estimate_from_views
     monkeypatch.setattr(ZeroShotPose, "estimate_from_views", misled)
+    # The shapes, which show the error too, are equally far in all poses.
+    monkeypatch.setattr("zsp_lite.judge.chamfer_distance", lambda *_: np.ones(len(_[2])))
     *pair, helper = [small_folder() / "lump" / name for name in SEQUENCES]
     settings = {"backbone": BACKBONE, "targets": 3, "references": 2}
     assert estimate_pose(*pair, **settings).errors["verified"] > 150
@@ -208,7 +208,6 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
     answer = result.estimates["verified"]
     assert result.errors["verified"] < 15
     assert answer.confidence > 0.5
-    assert not answer.one_of_two
     assert result.sources[1].endswith(f"helpers: {helper}")
     assert answer.flags[-1] == "all 4 frames vote for other poses, 4 of them for the same"
 

@@ -6,9 +6,8 @@ fitted. docs/rebuild.md makes the data:
 
     python -m tools.tuning weights outputs/training_poses:30 outputs/training:30
     python -m tools.tuning calibration outputs/{validation:60,validation_poses:60}
-    python -m tools.tuning scans outputs/{validation:6,validation_poses:6}
 
-The command `scans` fits `category.OF_TWO`. FOLDER:PAIRS is a data folder and the number of pairs of
+FOLDER:PAIRS is a data folder and the number of pairs of
 each of its categories, in each setting of the target views: all around the object, and but for the
 weights also within arcs. Folders with categories of another side (`concepts.csv`) are refused. The
 tool prints the fitted values and how well they do on categories left out of the fit. The constants
@@ -24,12 +23,10 @@ import csv
 import os
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass, replace
 from functools import cache
-from itertools import combinations, product
 from pathlib import Path
 from typing import TypeVar
 
@@ -39,19 +36,11 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 from zsp_lite.backbones.load import load_backbone
-from zsp_lite.category import (
-    PairHypotheses,
-    _build_nodes,
-    compare_two,
-    synchronise,
-    world_hypotheses,
-)
 from zsp_lite.data.cameras import view_span
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
-from zsp_lite.data.pairs import sample_pairs, spread
-from zsp_lite.errors import InputError, NoPoseError
-from zsp_lite.io.files import stable_hash
+from zsp_lite.data.pairs import sample_pairs
+from zsp_lite.errors import InputError
 from zsp_lite.metrics import SAME_ANGLE, rotation_error
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.verified import VerifiedSolver
@@ -78,18 +67,7 @@ _SETTINGS = {
         *((n, ALL_AROUND) for n in (1, 2, 3, 5, 10)),
         *((5, arc) for arc in (30.0, 60.0, 90.0, 120.0)),
     ),
-    # For each of two objects, the arc in degrees of its frames, and the number of target views.
-    "scans": (
-        ((360.0, 5), (360.0, 5)),
-        ((360.0, 3), (360.0, 3)),
-        ((150.0, 5), (150.0, 5)),
-        ((70.0, 5), (70.0, 5)),
-        ((360.0, 5), (1.0, 1)),
-        ((100.0, 5), (360.0, 5)),
-    ),
 }
-_FRAMES = (1, 2, 4, 8)  # numbers of reference frames of each object, which divide the last
-_OBJECTS = 8  # largest number of objects of a category that are paired as scans
 _Fit = TypeVar("_Fit")
 # The different poses of a pair, best first: by how many nats each is below the best, and its error
 # in degrees.
@@ -168,94 +146,6 @@ def collect_outcomes(
             seeded = replace(method, seed=pair.seed)
             outcomes.append(solve_views(seeded, (name, setting), reference, targets, ends))
     return outcomes
-
-
-@dataclass(frozen=True, eq=False)
-class ScanOutcome:
-    """The same for the calibration as an `Outcome`, of two objects that are solved from several
-    frames of both."""
-
-    category: str
-    setting: str
-    frames: int
-    poses: Poses
-    known: Float[np.ndarray, "5"]
-
-    def ranked(self, weights: ScoreCoefficients | None) -> Poses:
-        return self.poses
-
-    def evidence(self, weights: ScoreCoefficients | None) -> Float[np.ndarray, "5"]:
-        return self.known
-
-
-def collect_scans(
-    root: Path, category: str, pairs: int, settings: Sequence[tuple]
-) -> list[ScanOutcome]:
-    """Find the poses between `pairs` pairs of objects of a category from several frames of both, in
-    each setting."""
-    torch.set_num_threads(1)  # Each category has a process of its own.
-    dataset = Co3D(root)
-    method = ZeroShotPose(load_backbone(device="cpu"), solver="verified")
-    labels = read_labels(root, category)
-
-    @cache
-    def view(name: str, index: int) -> View:
-        return method.views([dataset.load(dataset.frames(category, name)[index])])[0]
-
-    all_pairs = list(combinations(list(labels)[:_OBJECTS], 2))
-    # A seed is 63 bits of a hash.
-    order = np.random.default_rng(stable_hash(category) >> 1).permutation(len(all_pairs))
-    outcomes = []
-    for ends, setting in product([all_pairs[k] for k in order[:pairs]], settings):
-        # The frames of each object within its arc, as references and as target views.
-        rng = np.random.default_rng(stable_hash(f"{ends}{setting}") >> 1)
-        references = {}
-        targets = {}
-        for name, (arc, views) in zip(ends, setting):
-            count = len(dataset.frames(category, name))
-            length = max(1, round(count * arc / ALL_AROUND))
-            within = (rng.integers(count) + np.arange(length)) % count
-            references[name] = [int(within[k]) for k in spread(_FRAMES[-1], length)]
-            targets[name] = [view(name, int(within[k])) for k in spread(views, length)]
-
-        # Hypotheses of every reference frame, in both directions, with the rank of the frame.
-        ranked = []
-        for first, second in (ends, ends[::-1]):
-            for rank, k in enumerate(references[first]):
-                with suppress(NoPoseError):
-                    estimate = method.estimate_from_views(view(first, k), targets[second])
-                    ranked.append((rank, world_hypotheses(first, second, estimate)))
-
-        # The pose from 1, 2, 4 and all of the reference frames, at equal steps.
-        words = " and ".join(f"{views} views within {arc:.0f}°" for arc, views in setting)
-        for count in _FRAMES:
-            step = _FRAMES[-1] // count
-            chosen = [hypotheses for rank, hypotheses in ranked if rank % step == 0]
-            poses, known = pose_of_two(chosen, labels)
-            outcomes.append(ScanOutcome(f"{root.name}/{category}", words, count, poses, known))
-    return outcomes
-
-
-def pose_of_two(
-    pairs: Sequence[PairHypotheses], labels: Mapping[str, PoseLabel]
-) -> tuple[Poses, Float[np.ndarray, "5"]]:
-    """Align two objects by the hypotheses of their frames.
-
-    Returns:
-        `ScanOutcome.poses` and `ScanOutcome.known`.
-    """
-    objects = synchronise(pairs).objects
-    names = sorted(objects)
-    rotations = np.stack([objects[name].sim3.R for name in names])
-    ends = np.array([[names.index(pair.reference), names.index(pair.target)] for pair in pairs])
-    spans = np.array([pair.span for pair in pairs])
-    margin, other, known = compare_two(_build_nodes(pairs, ends)[1], rotations, 1, spans)
-    poses = [rotations[1]] if other is None else [rotations[1], other]
-    # From the world of the first object to the world of the second, as `pose.T @ rotations[0]`.
-    true = labels[names[1]].trans[:3, :3] @ labels[names[0]].trans[:3, :3].T
-    errors = rotation_error(np.stack([pose.T @ rotations[0] for pose in poses]), true)
-    deficit = np.array([0.0, margin])[: len(poses)]
-    return (deficit, errors), known
 
 
 def views_within(around: Sequence[View], arc: float, rng: np.random.Generator) -> list[View]:
@@ -542,7 +432,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     fit = options.constants
     side = "training" if fit == "weights" else "validation"
-    collect = collect_scans if fit == "scans" else collect_outcomes
     report = report_weights if fit == "weights" else report_calibration
     try:
         check_sides([folder for folder, _ in options.data], side)
@@ -552,17 +441,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for category in Co3D(root).categories()
         ]
         with ProcessPoolExecutor(os.cpu_count()) as pool:
-            parts = pool.map(collect, *zip(*jobs), [_SETTINGS[fit]] * len(jobs))
+            parts = pool.map(collect_outcomes, *zip(*jobs), [_SETTINGS[fit]] * len(jobs))
             outcomes = []
             for part in tqdm(parts, "categories", len(jobs)):
                 outcomes += part
         print("\n".join(report(outcomes, ScoreCoefficients())))
-        if fit == "scans":
-            by_frames = [
-                replace(outcome, setting=f"{outcome.frames} frames of each object")
-                for outcome in outcomes
-            ]
-            print("\n".join(report(by_frames, ScoreCoefficients())))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

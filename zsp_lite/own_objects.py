@@ -274,9 +274,14 @@ def _by_all(
     best = answers[0][0]
     answers = [answers[0], *(one for one in answers[1:] if one[1] > _LEAST_PROBABLE)]
 
+    def place(question: Question) -> tuple[int, int]:
+        """Sort votes by their objects, then by the order of the frames."""
+        scan = of_name[question.reference]
+        return names.index(question.reference), [*scan.frames].index(scan.references[question.rank])
+
     # The votes of the frames of the two objects, not of helpers.
     votes = []
-    for question in sorted(estimates, key=lambda one: (names.index(one.reference), one.rank)):
+    for question in sorted(estimates, key=place):
         estimate = estimates[question]
         a, b = of_name[question.reference], of_name[question.target]
         if {question.reference, question.target} == {*names[:2]}:

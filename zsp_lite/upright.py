@@ -49,7 +49,9 @@ def find_up(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"] | None, str
     return floor, ""
 
 
-def _between_axes(first: Float[np.ndarray, "*n 3"], second: Float[np.ndarray, "3"]) -> np.ndarray:
+def _between_axes(
+    first: Float[np.ndarray, "*n 3"], second: Float[np.ndarray, "3"]
+) -> np.ndarray | float:
     """Return the angles in degrees between axes, whatever their signs."""
     angle = vector_angle(first, second)
     return np.minimum(angle, 180 - angle)

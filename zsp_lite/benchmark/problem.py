@@ -220,7 +220,7 @@ class FrameStore:
     def _aligned(self, category: str, targets: int) -> CategoryAlignment:
         """Align all objects of a category."""
         frames = evenly_spaced(self.dataset.frame_numbers(category), targets)
-        return synchronise(self.judged(category, frames, pairs=partners(frames, None)))
+        return synchronise(self.judged(category, frames, pairs=partners([*frames], None)))
 
     def crop(self, category: str, sequence: str, number: int, features: Iterable[str] = ()) -> Crop:
         """Return a frame's crop with what some extractors compute from it, each once."""
