@@ -100,7 +100,7 @@ def test_headings_have_their_minimum_at_the_turn():
 
 def test_shapes_are_aligned_from_nearby():
     start = np.eye(4)
-    start[:3, :3] = about_z(80).R
+    start[:3, :3] = about_z(90).R
     found = refine(SHAPES["first"], SHAPES["second"], start[None])[0]
     assert rotation_error(Sim3.from_matrix(found).R, TURN) < 6
     assert_allclose(np.linalg.det(found[:3, :3]), 1, atol=0.1)
@@ -128,7 +128,7 @@ def test_shapes_settle_what_the_votes_leave_open_and_votes_what_shapes_do():
     slabs = {"first": shape(first), "second": shape(second)}
     by_votes = judge(NAMES, slabs, [vote(0, 0.8), vote(0, 0.8, backward=True)])
     assert rotation_error(by_votes.sim3s[0].R, np.eye(3)) < 5
-    assert by_votes.probabilities[0] > by_votes.probabilities[1] > 0.05
+    assert by_votes.probabilities[0] > 0.8
 
 
 def test_an_object_that_lies_in_the_second_scan_is_not_forced_upright():

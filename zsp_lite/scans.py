@@ -74,12 +74,11 @@ class Scan:
     def shape(self) -> tuple[Shape, str]:
         """Return the fused shape, and why its vertical is not known, if sources disagree."""
         frames = [view.frame for view in self.views.values()]
-        up, problem = self.source.up, ""
-        if isinstance(up, str):
+        if isinstance(self.source.up, str):
             up, problem = find_up(frames)
-        elif not np.any(up):
-            up = None
-        return Shape.of(frames, up), problem
+            return Shape.of(frames, up), problem
+        up = np.array(self.source.up, float)
+        return Shape.of(frames, up if up.any() else None), ""
 
     @property
     def target_views(self) -> list[View]:
