@@ -100,7 +100,7 @@ def test_headings_have_their_minimum_at_the_turn():
 
 def test_shapes_are_aligned_from_nearby():
     start = np.eye(4)
-    start[:3, :3] = about_z(90).R
+    start[:3, :3] = about_z(95).R
     found = refine(SHAPES["first"], SHAPES["second"], start[None])[0]
     assert rotation_error(Sim3.from_matrix(found).R, TURN) < 6
     assert_allclose(np.linalg.det(found[:3, :3]), 1, atol=0.1)

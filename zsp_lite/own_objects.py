@@ -274,14 +274,9 @@ def _by_all(
     best = answers[0][0]
     answers = [answers[0], *(one for one in answers[1:] if one[1] > _LEAST_PROBABLE)]
 
-    def place(question: Question) -> tuple[int, int]:
-        """Sort votes by their objects, then by the order of the frames."""
-        scan = of_name[question.reference]
-        return names.index(question.reference), [*scan.frames].index(scan.references[question.rank])
-
     # The votes of the frames of the two objects, not of helpers.
     votes = []
-    for question in sorted(estimates, key=place):
+    for question in sorted(estimates):  # by the names of the objects, which begin with a number
         estimate = estimates[question]
         a, b = of_name[question.reference], of_name[question.target]
         if {question.reference, question.target} == {*names[:2]}:
@@ -305,18 +300,12 @@ def _by_all(
 
 
 def dissent(votes: Sequence[Vote]) -> list[str]:
-    """Name the frames that vote for another pose, or if all do, say how many of them agree."""
+    """Name the frames that vote for another pose."""
     against = [vote.name for vote in votes if vote.degrees > SAME_ANGLE]
     if not against:
         return []
-    if len(against) < len(votes):
-        named = ", ".join(against)
-        return [f"{len(against)} of {len(votes)} frames vote for another pose: {named}"]
-    turns = [vote.estimate.world_sim3.R for vote in votes]
-    turns = np.stack([turn.T if vote.backward else turn for turn, vote in zip(turns, votes)])
-    most = (rotation_angle(turns[:, None], turns) < SAME_ANGLE).sum(axis=1).max()
-    agreeing = most if most > 1 else "no two"
-    return [f"all {len(votes)} frames vote for other poses, {agreeing} of them for the same"]
+    named = ", ".join(against)
+    return [f"{len(against)} of {len(votes)} frames vote for another pose: {named}"]
 
 
 def _answer(

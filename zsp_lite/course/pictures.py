@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 
 from zsp_lite.data.co3d import Co3D
+from zsp_lite.shapes import Shape
 from zsp_lite.viz.category_sheet import nearest_crop
 from zsp_lite.viz.plots import BLUE, GREEN, VERMILLION, draw_image
 
@@ -46,6 +48,20 @@ def curve_above_pictures(
         draw_image(axis, picture)
         axes.append(axis)
     return figure, axes
+
+
+def from_the_side(first: Shape, second: Shape, pose: np.ndarray) -> np.ndarray:
+    """Return a picture of the points of two upright shapes from their long side, the first in
+    orange after a pose (4, 4), the second in blue."""
+    length = np.linalg.svd(second.points[:, :2], full_matrices=False)[2][0]
+    picture = np.full((150, 300, 3), 255, np.uint8)
+    moved = first.points @ pose[:3, :3].T + pose[:3, 3]
+    for points, colour in ((second.points, BLUE), (moved, VERMILLION)):
+        column = 150 + 55 * (points[:, :2] @ length)
+        row = 75 - 55 * points[:, 2]
+        for at in np.stack([column, row], axis=1).round().astype(int).tolist():
+            cv2.circle(picture, at, 2, [int(colour[k : k + 2], 16) for k in (1, 3, 5)], -1)
+    return picture
 
 
 def show_graphs(
