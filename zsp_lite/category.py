@@ -57,10 +57,10 @@ _REWEIGHTINGS = 10  # steps of the least absolute deviations
 _WEAK = 1e-3
 # Coefficients of the logit in `_judge`: of the margin, of the case that no rotation is right, and
 # of the share of agreeing pairs in this case. tools/judge.py fits them on validation
-# categories to sets of three to five objects.
-MARGIN = 1.57
-NONE = -3.07
-NONE_AGREEING = -2.37
+# categories to sets of three and four objects.
+MARGIN = 2.71
+NONE = -0.59
+NONE_AGREEING = -2.93
 
 _Rotations = Float[np.ndarray, "t n 3 3"]  # of n objects in each of t chains
 _Candidates = Float[np.ndarray, "t c 3 3"]  # for the rotation of one object
