@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 from scipy.special import softmax
 
 from zsp_lite.alignment import Sim3, nearest_rotation
@@ -117,38 +118,26 @@ def judge(
     probabilities = softmax([*scores, NONE])
 
     # Candidates within 30 degrees of a better one are the same pose.
-    between = rotation_angle(candidates[order][:, None], candidates[order])
-    mode_of = modes(between)
-    different = np.unique(mode_of)
-    sums = np.array([probabilities[order[mode_of == k]].sum() for k in different])
-    best = order[different[np.argsort(-sums, kind="stable")]]
-    return PairHypotheses(
-        *names,
-        tuple(votes.mean(candidates[k], aligned[k]) for k in best),
-        np.sort(sums)[::-1],
-        first.from_world.inverse().t,
-    )
+    mode_of = order[modes(rotation_angle(candidates[order][:, None], candidates[order]))]
+    sums = np.bincount(mode_of, probabilities[order])
+    best = np.argsort(-sums, kind="stable")[: np.count_nonzero(sums)]
+    poses = tuple(votes.mean(candidates[k], aligned[k]) for k in best)
+    return PairHypotheses(*names, poses, sums[best], first.from_world.inverse().t)
 
 
 class Votes:
     """The hypotheses of several frames as similarities from the world of the first object."""
 
     def __init__(self, first: str, answers: Sequence[PairHypotheses]):
-        self.matrices = np.zeros((0, 4, 4))
-        self.weights = np.zeros((0, 0))  # probability of each hypothesis in the row of its frame
-        parts = []
-        for answer in answers:
-            forward = answer.reference == first
-            parts.append(
-                np.stack([(one if forward else one.inverse()).matrix for one in answer.sim3s])
-            )
-        if parts:
-            self.matrices = np.concatenate(parts)
-            frame = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-            probabilities = np.concatenate([answer.probabilities for answer in answers])
-            self.weights = (frame == np.arange(len(parts))[:, None]) * probabilities
-        scale = np.cbrt(np.linalg.det(self.matrices[:, :3, :3]))
-        self.turns = self.matrices[:, :3, :3] / scale[:, None, None]
+        sim3s = [
+            one if answer.reference == first else one.inverse()
+            for answer in answers
+            for one in answer.sim3s
+        ]
+        self.matrices = np.array([one.matrix for one in sim3s]).reshape(-1, 4, 4)
+        self.turns = np.array([one.R for one in sim3s]).reshape(-1, 3, 3)
+        # The probability of each hypothesis, in the row of its frame.
+        self.weights = block_diag(*(answer.probabilities for answer in answers))
 
     def agreement(self, turns: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m h"]:
         r"""Return \exp(\kappa (\cos\theta - 1)) of rotations and all hypotheses."""
@@ -157,7 +146,7 @@ class Votes:
 
     def score(self, turns: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, " m"]:
         """Return V of rotations."""
-        if not len(self.weights):
+        if not len(self.turns):
             return np.zeros(len(turns))
         return np.log(FLOOR + self.agreement(turns) @ self.weights.T).mean(axis=1)
 
@@ -166,8 +155,7 @@ class Votes:
         if not len(self.turns):
             return self.turns
         score = float_tensor(self.score(self.turns))
-        turns = float_tensor(self.turns)
-        best = non_maximum_suppression(turns, score, _DIFFERENT, _OF_VOTES)
+        best = non_maximum_suppression(float_tensor(self.turns), score, _DIFFERENT, _OF_VOTES)
         return self.turns[best.numpy()]
 
     def mean(self, turn: Float[np.ndarray, "3 3"], aligned: Sim3) -> Sim3:

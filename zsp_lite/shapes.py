@@ -22,7 +22,6 @@ from zsp_lite.points import near_median, standard_deviation, world_cloud
 
 HEADINGS = np.arange(0, 360, 5)  # degrees
 _POINTS = 600  # of a shape
-_COARSE = 300  # of its points that are compared at all headings
 # Largest distance that counts, in sizes of the object: what only one of two objects has costs no
 # more.
 _MOST_DISTANCE = 0.5
@@ -70,11 +69,6 @@ class Shape:
         """The points, to find the nearest one."""
         return KDTree(self.points)
 
-    @cached_property
-    def coarse(self) -> "Shape":
-        """The shape of fewer points."""
-        return Shape(self.points[:_COARSE], self.from_world, self.upright, self.span)
-
 
 def _middle(points: Float[np.ndarray, "*b n 3"]) -> Float[np.ndarray, "*b 3"]:
     """Return the middle of the box around points, without the outermost."""
@@ -93,9 +87,8 @@ def compare_headings(first: Shape, second: Shape) -> tuple[_Poses, Float[np.ndar
     """Return the poses of one upright shape at all `HEADINGS`, and its Chamfer distance to the
     other after each."""
     turns = Rotation.from_euler("z", HEADINGS[:, None], degrees=True).as_matrix()
-    coarse = first.coarse
-    poses = centred(coarse, turns)
-    return poses, chamfer_distance(coarse, second.coarse, poses)
+    poses = centred(first, turns)
+    return poses, chamfer_distance(first, second, poses)
 
 
 def chamfer_distance(first: Shape, second: Shape, poses: _Poses) -> Float[np.ndarray, " m"]:
