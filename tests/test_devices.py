@@ -1,5 +1,4 @@
-"""Features of a backbone on another device, and matchers that get its tensors; a class of tensors
-takes the place of the device."""
+"""Features of a backbone on another device; a class of tensors takes the place of the device."""
 
 import pytest
 import torch
@@ -9,7 +8,6 @@ from synthetic_views import CoordinateBackbone
 from zsp_lite import FeatureMap, ZeroShotPose
 from zsp_lite.choices import SOLVERS
 from zsp_lite.course.widgets import cycles
-from zsp_lite.matchers import MATCHERS
 from zsp_lite.matching import similarity
 
 
@@ -53,12 +51,3 @@ def test_a_backbone_on_another_device_gives_the_pose_of_the_cpu(frames, solver):
 def test_the_widget_of_cycles_takes_features_of_another_device(frames):
     first, second = ZeroShotPose(BackboneElsewhere()).views(frames[:2])
     cycles.cycle(first, second, similarity(first.features, second.features))
-
-
-@pytest.mark.parametrize("name", MATCHERS)
-def test_a_matcher_does_not_ask_another_device_for_float64(name):
-    arguments = torch.rand(12, 15), torch.arange(12) % 4 > 0, torch.arange(15) % 3 > 0
-    expected = MATCHERS[name](*arguments)
-    partner, score = MATCHERS[name](*[x.as_subclass(Elsewhere) for x in arguments])
-    assert torch.equal(partner, expected[0])
-    assert torch.equal(score, expected[1])

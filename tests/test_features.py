@@ -21,7 +21,6 @@ def test_foreground_is_saliency_above_the_threshold():
     features = FeatureMap(torch.zeros(2, 3, 4), saliency, torch.zeros(4))
     assert features.grid == (2, 3)
     assert features.foreground().tolist() == [[False, False, True], [True, True, True]]
-    assert features.foreground(0.25).tolist() == [[False, False, False], [True, True, False]]
 
 
 @pytest.mark.parametrize("part", ["keys", "saliency"])

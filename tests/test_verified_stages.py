@@ -87,12 +87,14 @@ def test_an_object_cut_off_by_the_border_is_not_known_to_end_there():
     features = FeatureMap(torch.zeros(8, 8, 4), torch.ones(8, 8), torch.ones(4))
     frame = Frame(np.zeros((64, 64, 3), np.uint8), np.full((64, 64), 2, np.float32), mask, camera)
     view = View(frame, features, torch.ones(8, 8, dtype=torch.bool), mask)
-    maps = build_maps([view], [(np.eye(3), np.zeros(3))], Sim3.identity(), [np.arange(64)])
+    maps = build_maps([view], [Sim3.identity()], Sim3.identity(), [np.arange(64)])
+
+    still = Poses(torch.ones(1), torch.eye(3)[None], torch.zeros(1, 3))
 
     def distance(x: float) -> float:
         """The distance from the silhouette of a point at depth 2, for the pose of no movement."""
         point = torch.tensor([[x, 0.0, 2.0]])
-        projected = project_points(maps, torch.eye(3)[None], torch.zeros(1, 3), point)
+        projected = project_points(maps, still, point)
         return float(projected.silhouette_distance)
 
     # Both points project 19.2 pixels beyond a border.
@@ -111,9 +113,7 @@ def test_a_map_pixel_reads_the_patch_that_its_centre_lies_in(size, grid):
     view = View(
         Frame(image, ones, ones, camera), features, torch.ones(grid, dtype=torch.bool), ones
     )
-    maps = build_maps(
-        [view], [(np.eye(3), np.zeros(3))], Sim3.identity(), [np.arange(grid[0] * grid[1])]
-    )
+    maps = build_maps([view], [Sim3.identity()], Sim3.identity(), [np.arange(grid[0] * grid[1])])
     width, height = maps.size[0].int().tolist()
 
     def cells(pixels: int, count: int) -> np.ndarray:
@@ -157,10 +157,9 @@ def test_matches_with_outliers_propose_the_true_pose(seed):
     assert (rotation_angles(found.rotation, found.rotation).fill_diagonal_(180) >= 20).all()
 
 
-def test_without_enough_matches_no_pose_is_proposed():
-    for count in (2, 5):  # too few; all in one place, where no scale is plausible
-        points = torch.zeros(count, 3)
-        assert len(poses_from_matches(points, points, default_rng(0))) == 0
+def test_of_matches_in_one_place_no_pose_is_proposed():
+    points = torch.zeros(5, 3)  # no scale is plausible
+    assert len(poses_from_matches(points, points, default_rng(0))) == 0
 
 
 def test_a_view_rotation_sees_the_reference_from_that_view(scene):

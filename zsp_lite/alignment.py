@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from zsp_lite.errors import (
     InputError,
-    check_integer,
     check_magnitude,
     check_number,
     real_array,
@@ -23,11 +22,9 @@ from zsp_lite.errors import (
 # of the target.
 SCALE_RANGE = (0.2, 5.0)
 # Points are treated as collinear, which leaves the rotation about their line undetermined, below
-# a ratio of the second to the first singular value.
-_COLLINEAR_SAMPLE = 1e-6  # of a sample's covariance: a ratio of squared widths
-# Of a cloud: a ratio of widths, above the rounding of float32 coordinates on a line.
-_COLLINEAR_CLOUD = 1e-5
-MOST_TRIALS = 10_000_000  # largest number of RANSAC's trials that is accepted
+# this ratio of the second to the first singular value of their covariance. It is above the rounding
+# of float32 coordinates on a line.
+_COLLINEAR = 1e-6
 _BLOCK = 1_000_000  # residuals at a time: 24 MB of offsets
 
 
@@ -52,13 +49,6 @@ class Sim3:
         object.__setattr__(self, "scale", float(self.scale))
         object.__setattr__(self, "R", rotation)
         object.__setattr__(self, "t", translation)
-
-    def __repr__(self) -> str:
-        def text(row: np.ndarray) -> str:
-            return np.array2string(row, precision=4, suppress_small=True)
-
-        rows = ",\n        ".join(map(text, self.R))
-        return f"Sim3(scale={self.scale:.4f}, t={text(self.t)},\n     R=[{rows}])"
 
     @classmethod
     def identity(cls) -> "Sim3":
@@ -111,7 +101,14 @@ def umeyama(source: ArrayLike, target: ArrayLike, with_scale: bool = True) -> Si
     """
     source, target = _point_pairs(source, target, minimum=3)
     scale_range = (0.0, np.inf) if with_scale else (1.0, 1.0)
-    scale, rotation, translation, _ = umeyama_batch(source[None], target[None], scale_range)
+    scale, rotation, translation, conditioning = umeyama_batch(
+        source[None], target[None], scale_range
+    )
+    if conditioning[0] <= _COLLINEAR:
+        raise InputError(
+            f"the {len(source)} source or target points are all equal or collinear, expected "
+            "points that span a plane"
+        )
     return Sim3(scale[0], rotation[0], translation[0])
 
 
@@ -205,39 +202,31 @@ def ransac(
         InputError: Shapes are wrong, there are too few points, values are not finite, a setting is
             out of range, or every sample is collinear or has a scale out of range.
     """
-    check_integer("ransac: trials", trials, 1, MOST_TRIALS)
-    check_integer("ransac: sample_size", sample_size, 3)
     check_number("ransac: threshold", threshold, above=0)
-    if not isinstance(seed, np.random.Generator):
-        check_integer("ransac: seed", seed, 0)
-    if np.shape(scale_range) != (2,) or not 0 <= scale_range[0] <= scale_range[1]:
-        raise InputError(
-            f"ransac: scale_range is {scale_range}, expected (smallest, largest), both not negative"
-        )
     source, target = _point_pairs(source, target, minimum=sample_size)
     rng = np.random.default_rng(seed)
     block = max(_BLOCK // len(source), 1)
-    best = None  # trial of lowest rank: its rank, similarity and inliers
+    best = (1, 0.0)  # lowest rank of a trial; that of a trial that is not usable is not lower
     for first in range(0, trials, block):
         samples = _draw_samples(len(source), sample_size, min(block, trials - first), rng)
-        trial = _best_trial(source, target, samples, threshold, scale_range)
-        if trial is not None and (best is None or trial[0] < best[0]):
-            best = trial
-    if best is None:
+        rank, *trial = _best_trial(source, target, samples, threshold, scale_range)
+        if rank < best:
+            best = rank
+            fit, inliers = trial
+    if best[0] > 0:
         raise InputError(
-            f"ransac: no usable sample in {trials} trials over {len(source)} points: all "
-            f"collinear, or scale outside {scale_range}"
+            f"ransac: none of {trials} trials with sample_size {sample_size} on {len(source)} "
+            f"points is usable: all collinear, or scale outside scale_range {scale_range}"
         )
-    _, sim3, inliers = best
 
     # The similarity of all inliers.
     if inliers.sum() >= 3:
         scale, rotation, translation, conditioning = umeyama_batch(
             source[None, inliers], target[None, inliers], scale_range
         )
-        if conditioning[0] > _COLLINEAR_SAMPLE:
-            sim3 = Sim3(scale[0], rotation[0], translation[0])
-    return sim3, inliers
+        if conditioning[0] > _COLLINEAR:
+            fit = scale[0], rotation[0], translation[0]
+    return Sim3(*fit), inliers
 
 
 def _best_trial(
@@ -246,30 +235,26 @@ def _best_trial(
     samples: Int[np.ndarray, "trials size"],
     threshold: float,
     scale_range: tuple[float, float],
-) -> tuple[tuple[int, float], Sim3, Bool[np.ndarray, " n"]] | None:
-    """Return the rank of the best sample, lower is better, its similarity and its inliers.
+) -> tuple[tuple[int, float], tuple, Bool[np.ndarray, " n"]]:
+    """Return the rank of the best sample, lower is better, its scale, rotation and translation, and
+    its inliers.
 
-    None if no sample is usable.
+    The rank begins with 1 if no sample is usable.
     """
     scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
     in_range = (scale >= scale_range[0]) & (scale <= scale_range[1])
-    usable = in_range & (conditioning > _COLLINEAR_SAMPLE)
-    if not usable.any():
-        return None
-    scale = scale[usable]
-    rotation = rotation[usable]
-    translation = translation[usable]
+    usable = in_range & (conditioning > _COLLINEAR)
     linear = scale[:, None, None] * rotation
     offset = linear @ source.T + translation[:, :, None] - target.T  # (trials, 3, N)
     residual = np.sqrt(np.square(offset).sum(axis=1))
     inlier = residual < threshold
-    counts = inlier.sum(axis=1)
+    counts = np.where(usable, inlier.sum(axis=1), -1)
     leaders = np.flatnonzero(counts == counts.max())
     sums = np.where(inlier[leaders], residual[leaders], 0).sum(axis=1)
     best = leaders[sums.argmin()]
     # More inliers, then the smaller sum of their residuals.
     rank = (-int(counts.max()), float(sums.min()))
-    return rank, Sim3(scale[best], rotation[best], translation[best]), inlier[best]
+    return rank, (scale[best], rotation[best], translation[best]), inlier[best]
 
 
 def _draw_samples(
@@ -292,21 +277,10 @@ def _point_pairs(
     source: ArrayLike, target: ArrayLike, minimum: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Convert corresponding points to float64 arrays and check them."""
-    source = real_array("source", source)
-    target = real_array("target", target)
-    if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
-        raise InputError(
-            f"source and target have shapes {source.shape} and {target.shape}, expected equal "
-            "(N, 3)"
-        )
+    source = real_array("source", source, (None, 3))
+    target = real_array("target", target, source.shape)
     if len(source) < minimum:
         raise InputError(f"got {len(source)} corresponding points, expected at least {minimum}")
-    for name, points in (("source", source), ("target", target)):
-        check_magnitude(name, points)
-        longest, width, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        if width <= _COLLINEAR_CLOUD * longest:
-            raise InputError(
-                f"the {len(points)} {name} points are all equal or collinear, expected points that "
-                "span a plane"
-            )
+    check_magnitude("source", source)
+    check_magnitude("target", target)
     return source, target

@@ -4,18 +4,15 @@
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 
 from zsp_lite.features import FeatureMap
-from zsp_lite.matching import Matches, cyclical_distances
+from zsp_lite.matching import Mask, Matches, cyclical_distances
 from zsp_lite.views import View
 
 _NEIGHBOUR = 1.5  # patches; the eight neighbours of a patch are nearer
-
-Mask = Bool[torch.Tensor, "rows cols"] | Bool[np.ndarray, "rows cols"]
 
 
 @dataclass(frozen=True, eq=False)

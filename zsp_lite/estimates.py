@@ -119,12 +119,7 @@ class PoseEstimate:
 
     def propagate(self, cameras: Sequence[Camera]) -> list[Sim3]:
         """Express the pose in other cameras of the target sequence (sec. 5.6)."""
-        best = self.target_camera
-        turns = [camera.R @ best.R.T for camera in cameras]
-        return [
-            Sim3(1.0, turn, camera.t - turn @ best.t) @ self.sim3
-            for turn, camera in zip(turns, cameras)
-        ]
+        return [between_cameras(self.target_camera, camera) @ self.sim3 for camera in cameras]
 
 
 @runtime_checkable
@@ -170,9 +165,14 @@ def match_points(
     reference: View, target: View, matches: Matches
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
     """Unproject matches to 3D points, each in the frame of its own camera (sec. 4.3)."""
-    source, _ = reference.patch_points
-    destination, _ = target.patch_points
-    return source[tuple(matches.reference.T)], destination[tuple(matches.target.T)]
+    source = reference.patch_points[0][tuple(matches.reference.T)]
+    return source, target.patch_points[0][tuple(matches.target.T)]
+
+
+def between_cameras(first: Camera, second: Camera) -> Sim3:
+    """Return the rigid transform from the first camera's frame to the second's."""
+    turn = second.R @ first.R.T
+    return Sim3(1.0, turn, second.t - turn @ first.t)
 
 
 @contextmanager

@@ -37,8 +37,8 @@ class FeatureMap:
     global_feature: Float[Tensor, " e"]  # feature of the whole image
 
     def __post_init__(self):  # because a user may plug in any backbone, on any device
-        for name in ("keys", "saliency", "global_feature"):
-            values = torch.as_tensor(getattr(self, name)).detach().cpu()
+        for name, values in list(vars(self).items()):
+            values = torch.as_tensor(values).detach().cpu()
             # `clone` outside inference mode: the copy can enter a graph with gradients.
             with torch.inference_mode(False):
                 object.__setattr__(self, name, values.to(torch.float32).clone())
@@ -49,27 +49,19 @@ class FeatureMap:
                 f"FeatureMap: keys and saliency have shapes {keys}, {saliency}, expected (H, "
                 "W, D), (H, W)"
             )
-        parts = (self.keys, self.saliency, self.global_feature)
-        if not all(part.isfinite().all() for part in parts):
+        if not all(part.isfinite().all() for part in vars(self).values()):
             raise InputError(
                 "FeatureMap: keys, saliency or global feature hold values that are not finite"
             )
 
-    def __repr__(self) -> str:
-        rows, columns, channels = self.keys.shape
-        return (
-            f"FeatureMap({rows} x {columns} patches, {int(self.foreground().sum())} foreground, "
-            f"{channels} channels)"
-        )
-
     @property
     def grid(self) -> Grid:
         """Rows and columns of patches."""
-        return self.keys.shape[0], self.keys.shape[1]
+        return tuple(self.saliency.shape)
 
-    def foreground(self, threshold: float = SALIENCY_THRESHOLD) -> Bool[Tensor, "h w"]:
-        """Select the patches whose saliency is above the threshold."""
-        return self.saliency > threshold
+    def foreground(self) -> Bool[Tensor, "h w"]:
+        """Select the patches whose saliency is above `SALIENCY_THRESHOLD`."""
+        return self.saliency > SALIENCY_THRESHOLD
 
 
 @runtime_checkable
@@ -111,7 +103,7 @@ def bin_indices(grid: Grid) -> Int[Tensor, "17 n"]:
     clamped to it.
     """
     near = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
-    far = [(3 * dy, 3 * dx) for dy, dx in near if (dy, dx) != (0, 0)]
+    far = [(3 * dy, 3 * dx) for dy, dx in near if dy or dx]
     height, width = grid
     with torch.inference_mode(False):  # the result is cached, and later callers may need gradients
         rows = torch.arange(height)[:, None]
@@ -132,7 +124,7 @@ def average_pool(x: Tensor, axes: tuple[int, int]) -> Tensor:
         total = x.clone()
         total.narrow(axis, 1, n - 1).add_(x.narrow(axis, 0, n - 1))
         total.narrow(axis, 0, n - 1).add_(x.narrow(axis, 1, n - 1))
-        count = torch.full((n,), 3.0, dtype=x.dtype, device=x.device)
+        count = x.new_full((n,), 3)
         count[0] -= 1
         count[-1] -= 1
         x = total.div_(count.view(-1, *[1] * (x.ndim - 1 - axis)))
@@ -145,9 +137,13 @@ def log_bin(
     """Compute the descriptors of all patches from keys x: 17 bins, concatenated in the order of
     `bin_indices`."""
     x = torch.as_tensor(x)
-    b, h, w, d = x.shape
-    pooled = average_pool(x, (1, 2))
-    index = bin_indices((h, w)).to(x.device)
-    near = x.flatten(1, 2)[:, index[:9]]  # (B, 9, H*W, D)
-    far = pooled.flatten(1, 2)[:, index[9:]]  # (B, 8, H*W, D)
-    return torch.cat([near, far], dim=1).transpose(1, 2).reshape(b, h, w, 17 * d)
+    return descriptors(x, bin_indices(tuple(x.shape[1:3]))).unflatten(1, x.shape[1:3])
+
+
+def descriptors(
+    keys: Float[Tensor, "b h w d"], index: Int[Tensor, "17 n"]
+) -> Float[Tensor, "b n 17*d"]:
+    """Compute the descriptors of some patches; `index` has their columns of `bin_indices`."""
+    near = keys.flatten(1, 2)[:, index[:9]]  # (B, 9, n, D)
+    far = average_pool(keys, (1, 2)).flatten(1, 2)[:, index[9:]]  # (B, 8, n, D)
+    return torch.cat([near, far], dim=1).transpose(1, 2).flatten(2)

@@ -1,9 +1,11 @@
 """Places marked in frames of one object, and where they are on the other objects of an aligned
 category (see `transfer`)."""
 
+import itertools
 import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,6 @@ from zsp_lite.io.ply import write_ply
 from zsp_lite.points import object_pixels
 from zsp_lite.transfer import (
     FOUND,
-    SurfaceView,
     marked_point,
     object_size,
     surface_views,
@@ -28,7 +29,6 @@ from zsp_lite.transfer import (
 # A point is seen if the depth map is nearer by at most this part of the object's size.
 _HIDDEN = 0.05
 _RADIUS = 0.015  # of the ball that shows a mark in a point cloud, in sizes of the object
-_BALL_POINTS = 400
 # Colours of marks in order (Okabe and Ito 2008), again from the first after the last.
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 
@@ -102,16 +102,12 @@ def place_marks(
             name, or no frame of an object shows its surface.
     """
     worlds = np.stack(marked_points(dataset, category, marks, alignment.objects))
-    extractor = as_backbone(backbone)
-
-    def surface(name: str) -> list[SurfaceView]:
-        return surface_views(alignment, dataset, category, name, extractor)
-
+    surface = partial(surface_views, alignment, dataset, category, backbone=as_backbone(backbone))
     marked = np.array([mark.sequence for mark in marks])
     sources = {name: surface(name) for name in {mark.sequence for mark in marks}}
     places = {}  # by the name of the object, in the order of the marks
     for name, aligned in alignment.objects.items():
-        target = sources[name] if name in sources else surface(name)
+        target = sources.get(name) or surface(name)
         # On their own object, marks are where they are. Those of another object go together: its
         # patches are compared once.
         world = worlds.copy()
@@ -125,11 +121,14 @@ def place_marks(
         pixels = _pixels(dataset, category, name, world, _HIDDEN * size)
         places[name] = [Place(*place) for place in zip(world, confidence.tolist(), pixels)]
 
-    placed = []
-    for k, mark in enumerate(marks):
-        common = alignment.objects[mark.sequence].sim3.apply(worlds[k])
-        placed.append(PlacedMark(mark, common, {name: row[k] for name, row in places.items()}))
-    return placed
+    return [
+        PlacedMark(
+            mark,
+            alignment.objects[mark.sequence].sim3.apply(worlds[k]),
+            {name: row[k] for name, row in places.items()},
+        )
+        for k, mark in enumerate(marks)
+    ]
 
 
 def marked_points(
@@ -198,7 +197,7 @@ def write_marks(
                 "world": place.world.round(6).tolist(),
                 "confidence": round(place.confidence, 4),
                 "found": place.found,
-                "pixels": {str(number): pixel for number, pixel in place.pixels.items()},
+                "pixels": place.pixels,
             }
             for name, place in one.places.items()
         }
@@ -213,18 +212,19 @@ def write_marks(
                 "objects": places,
             }
         )
-    directions = np.random.default_rng(0).normal(size=(_BALL_POINTS, 3))
+    directions = np.random.default_rng(0).normal(size=(400, 3))
     ball = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     for name in placed[0].places:
-        found = [k for k, one in enumerate(placed) if one.places[name].found]
-        if not found:
-            continue
         extent = dataset.extent(category, name)
         radius = _RADIUS * (extent[1] if extent else 1.0)
-        points = [placed[k].places[name].world + radius * ball for k in found]
-        colours = [list(bytes.fromhex(COLOURS[k % len(COLOURS)][1:])) for k in found]
-        of_points = np.repeat(np.array(colours, np.uint8), _BALL_POINTS, axis=0)
-        path = out / "marks" / f"{plain_name(name, 'sequence')}.ply"
-        write_ply(path, np.concatenate(points), of_points)
+        points = []
+        colours = []
+        for one, colour in zip(placed, itertools.cycle(COLOURS)):
+            if one.places[name].found:
+                points += [*one.places[name].world + radius * ball]
+                colours += [list(bytes.fromhex(colour[1:]))] * len(ball)
+        if points:
+            path = out / "marks" / f"{plain_name(name, 'sequence')}.ply"
+            write_ply(path, np.array(points), np.array(colours, np.uint8))
     write_atomic(out / "marks.json", json.dumps(document, indent=1).encode())
     return out / "marks.json"

@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+Matched = tuple[Int[Tensor, " _"], Float[Tensor, " _"]]  # partner and score of each patch
+
 
 @runtime_checkable
 class Matcher(Protocol):
@@ -36,7 +38,7 @@ class Matcher(Protocol):
         foreground1: Bool[Tensor, " n1"],
         foreground2: Bool[Tensor, " n2"],
         /,
-    ) -> tuple[Int[Tensor, " n1"], Float[Tensor, " n1"]]:
+    ) -> Matched:
         """Match the patches of image 1 with those of image 2, given the cosines between their
         descriptors.
 
@@ -54,18 +56,14 @@ TRANSPORT_REGULARISATION = 0.05
 TRANSPORT_STEPS = 100
 
 
-def mutual_nearest_neighbours(
-    similarity: Float[Tensor, "m n"],
-) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
+def mutual_nearest_neighbours(similarity: Float[Tensor, "m n"]) -> Matched:
     """Match mutual nearest neighbours, scored by their similarity."""
     best, partner = similarity.max(dim=1)
     returned = similarity.argmax(dim=0)[partner]
-    return partner, best.masked_fill(
-        returned != torch.arange(len(best), device=best.device), -torch.inf
-    )
+    return partner, best.masked_fill(returned != torch.arange(len(best)), -torch.inf)
 
 
-def dual_softmax(similarity: Float[Tensor, "m n"]) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
+def dual_softmax(similarity: Float[Tensor, "m n"]) -> Matched:
     """Match each patch with the partner of highest probability under a dual softmax (Cheng et al.
     2021).
 
@@ -77,9 +75,7 @@ def dual_softmax(similarity: Float[Tensor, "m n"]) -> tuple[Int[Tensor, " m"], F
     return partner, score
 
 
-def optimal_transport(
-    similarity: Float[Tensor, "m n"],
-) -> tuple[Int[Tensor, " m"], Float[Tensor, " m"]]:
+def optimal_transport(similarity: Float[Tensor, "m n"]) -> Matched:
     """Match each patch with the partner that receives most of its mass under optimal transport (Liu
     et al. 2020).
 
@@ -94,11 +90,11 @@ def sinkhorn(
     cost: Float[Tensor, "n1 n2"], regularisation: float, steps: int
 ) -> Float[Tensor, "n1 n2"]:
     """Compute the entropy-regularised transport plan between uniform masses (Cuturi 2013), in
-    float64 on the CPU.
+    float64.
 
     Its columns sum to 1 / n2, its rows to 1 / n1 in the limit of many steps.
     """
-    cost = cost.cpu().double()  # some GPUs do not have float64
+    cost = cost.double()
     # Subtracting the minimum leaves the plan as it is and keeps the kernel from underflowing.
     kernel = torch.exp((cost.min() - cost) / regularisation)
     n1, n2 = kernel.shape
@@ -110,16 +106,11 @@ def sinkhorn(
     return rows[:, None] * kernel * columns
 
 
-def on_foreground(
-    choose: Callable[[Float[Tensor, "m n"]], tuple[Int[Tensor, " m"], Float[Tensor, " m"]]],
-) -> Matcher:
+def on_foreground(choose: Callable[[Float[Tensor, "m n"]], Matched]) -> Matcher:
     """Make a matcher of a function that matches the foreground patches alone, given their
-    similarities; on the CPU."""
+    similarities."""
 
     def matcher(similarity, foreground1, foreground2):
-        similarity = similarity.cpu()
-        foreground1 = foreground1.cpu()
-        foreground2 = foreground2.cpu()
         partner = torch.zeros(len(foreground1), dtype=torch.long)
         score = torch.full((len(foreground1),), -torch.inf, dtype=torch.float64)
         if foreground1.any() and foreground2.any():

@@ -16,7 +16,7 @@ additions of S to itself.
 import threading
 import warnings
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
@@ -25,11 +25,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from zsp_lite.errors import InputError
-from zsp_lite.features import FeatureMap, Grid, average_pool, bin_indices
-from zsp_lite.matchers import MATCHERS, Matcher
+from zsp_lite.features import FeatureMap, Grid, average_pool, bin_indices, descriptors
+from zsp_lite.matchers import MATCHERS, Matched, Matcher
 from zsp_lite.threads import one_thread
 
 Keys = FeatureMap | Float[Tensor, "_ _ _"] | Float[np.ndarray, "_ _ _"]
+Similarities = Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"]
+Mask = Bool[Tensor, "_ _"] | Bool[np.ndarray, "_ _"]
 
 _filters = threading.Lock()  # of warnings: threads would restore each other's
 
@@ -59,7 +61,13 @@ def similarity(ref: Keys, target: Keys) -> Float[Tensor, "n1 n2"]:
         (H1 * W1, H2 * W2) cosines, patches in row-major order. Descriptors of length 0 have
         similarity 0.
     """
-    return similarities(ref, [target])[0]
+    keys1 = _keys(ref)
+    keys2 = _keys(target)
+    products = keys1.flatten(0, 1) @ keys2.flatten(0, 1).T  # (H1 W1, H2 W2)
+    summed = _bin_products(products.view(*keys1.shape[:2], *keys2.shape[:2]))
+    # In place: the matrices are the largest arrays of the method.
+    cosines = summed.view(products.shape).mul_(_inverse_norm(keys1)[:, None])
+    return cosines.mul_(_inverse_norm(keys2))
 
 
 def similarities(
@@ -69,17 +77,7 @@ def similarities(
     `binning`."""
     if not binning:
         return key_similarities(ref, targets)
-    keys1 = _keys(ref)
-    inverse_norm1 = _inverse_norm(keys1)
-    results = []
-    for target in targets:
-        keys2 = _keys(target)
-        products = keys1.flatten(0, 1) @ keys2.flatten(0, 1).T  # (H1 W1, H2 W2)
-        summed = _bin_products(products.view(*keys1.shape[:2], *keys2.shape[:2]))
-        # In place: the matrices are the largest arrays of the method.
-        cosines = summed.view(products.shape).mul_(inverse_norm1[:, None])
-        results.append(cosines.mul_(_inverse_norm(keys2)))
-    return results
+    return [similarity(ref, target) for target in targets]
 
 
 def key_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n2"]]:
@@ -92,7 +90,7 @@ def key_similarities(ref: Keys, targets: list[Keys]) -> list[Float[Tensor, "n1 n
 
 
 def nearest_neighbours(
-    sim: Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"],
+    sim: Similarities,
 ) -> tuple[Int[Tensor, " n1"], Int[Tensor, " n2"]]:
     """Find each row's most similar column and each column's most similar row (the argmins of eq.
     2)."""
@@ -101,11 +99,11 @@ def nearest_neighbours(
 
 
 def cyclical_distances(
-    sim: Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"],
+    sim: Similarities,
     grid1: Grid,
     grid2: Grid,
-    fg1: Bool[Tensor, "h1 w1"] | Bool[np.ndarray, "h1 w1"] | None = None,
-    fg2: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
+    fg1: Mask | None = None,
+    fg2: Mask | None = None,
 ) -> Float[Tensor, "h1 w1"]:
     """Compute the cyclical distance map C_u = -d(u, u') (eq. 2): u's nearest neighbour is v, and
     v's is u'.
@@ -120,10 +118,9 @@ def cyclical_distances(
     Returns:
         (H1, W1) negative distances in patches; -inf where u, v or u' is not foreground.
     """
-    sim = torch.as_tensor(sim)
-    on1 = torch.ones(grid1, dtype=torch.bool) if fg1 is None else torch.as_tensor(fg1)
-    on2 = torch.ones(grid2, dtype=torch.bool) if fg2 is None else torch.as_tensor(fg2)
-    return _cycles(sim, on1.to(sim.device), on2.to(sim.device))[0].view(grid1)
+    on1 = np.ones(grid1, dtype=bool) if fg1 is None else fg1
+    on2 = np.ones(grid2, dtype=bool) if fg2 is None else fg2
+    return _cycles(sim, on1, on2)[1].view(grid1)
 
 
 def match(
@@ -133,8 +130,8 @@ def match(
     kmeans: bool = True,
     seed: int | np.random.Generator = 0,
     cycle_from: Literal["reference", "target"] = "reference",
-    ref_foreground: Bool[Tensor, "h1 w1"] | Bool[np.ndarray, "h1 w1"] | None = None,
-    target_foreground: Bool[Tensor, "h2 w2"] | Bool[np.ndarray, "h2 w2"] | None = None,
+    ref_foreground: Mask | None = None,
+    target_foreground: Mask | None = None,
     sim: Float[Tensor, "n1 n2"] | None = None,
     matcher: str | Matcher = "cyclical",
     binning: bool = True,
@@ -164,126 +161,100 @@ def match(
     """
     if sim is None:
         (sim,) = similarities(ref, [target], binning)
-    if ref_foreground is None:
-        ref_foreground = ref.foreground()
-    if target_foreground is None:
-        target_foreground = target.foreground()
-    on_start = torch.as_tensor(ref_foreground)
-    on_end = torch.as_tensor(target_foreground)
-
-    # Both stages are about the image in which cycles start.
-    forward = cycle_from == "reference"
     start = ref
     end = target
-    if not forward:
-        start = target
-        end = ref
+    on_start = torch.as_tensor(ref.foreground() if ref_foreground is None else ref_foreground)
+    on_end = torch.as_tensor(
+        target.foreground() if target_foreground is None else target_foreground
+    )
+    published = cycle_from == "target"
+    if published:
+        start, end = end, start
         on_start, on_end = on_end, on_start
         sim = sim.T
-    ranked = _rank(sim, on_start, on_end, matcher, published=not forward)
-    chosen = _select(ranked, start, k, kmeans, seed, binning)
 
-    u = np.stack(np.unravel_index(chosen, start.grid), axis=-1)
-    v = np.stack(np.unravel_index(ranked.partner[chosen], end.grid), axis=-1)
-    reference, matched = (u, v) if forward else (v, u)
-    return Matches(reference, matched, ranked.similarity[chosen], -ranked.score[chosen])
-
-
-class _Ranked(NamedTuple):
-    """What a matcher says of each patch of one image."""
-
-    score: Float[np.ndarray, " n1"]  # higher is better; not finite without a match
-    partner: Int[np.ndarray, " n1"]  # index of a patch of the other image
-    similarity: Float[np.ndarray, " n1"]  # of the patch and its partner
-
-
-def _rank(
-    sim: Float[Tensor, "n1 n2"],
-    on_start: Bool[Tensor, "h1 w1"],
-    on_end: Bool[Tensor, "h2 w2"],
-    matcher: str | Matcher,
-    published: bool,
-) -> _Ranked:
-    """Find the partner of each patch of the first image, and the score of the two."""
     if matcher == "cyclical":
-        score, partner = _cycles(sim, on_start, on_end, published)
+        partner, score = _cycles(sim, on_start, on_end, published)
     else:
-        if isinstance(matcher, str):
-            matcher = MATCHERS[matcher]
-        # Copies, since a matcher may overwrite what it gets, such as the similarities of the
-        # background.
-        partner, score = matcher(sim.clone(), on_start.flatten().clone(), on_end.flatten().clone())
-        partner = torch.as_tensor(partner).cpu()
-        score = torch.as_tensor(score).cpu()
-        if not len(partner) == len(score) == len(sim):
-            found = f"{len(partner)} partners and {len(score)} scores"
-            raise InputError(
-                f"the matcher returned {found}, expected one for each of {len(sim)} patches"
-            )
-    cosines = sim.gather(1, partner[:, None])[:, 0]
-    return _Ranked(score.numpy(), partner.numpy(), cosines.numpy())
+        partner, score = _matched_by(matcher, sim, on_start.flatten(), on_end.flatten())
+    cosine = sim.gather(1, partner[:, None])[:, 0].numpy()
+    score = score.numpy()
+    partner = partner.numpy()
+
+    # The finite scores, highest first.
+    order = np.lexsort((-cosine, -score))
+    order = order[np.isfinite(score[order])]
+    if kmeans and len(order) > k:
+        order = _most_salient(start, order[: 2 * k], k, seed, binning)
+    chosen = order[:k]
+    u = np.stack(np.unravel_index(chosen, start.grid), axis=-1)
+    v = np.stack(np.unravel_index(partner[chosen], end.grid), axis=-1)
+    reference, matched = (v, u) if published else (u, v)
+    return Matches(reference, matched, cosine[chosen], -score[chosen])
 
 
-def _select(
-    ranked: _Ranked,
+def _matched_by(
+    matcher: str | Matcher,
+    sim: Float[Tensor, "n1 n2"],
+    on_start: Bool[Tensor, " n1"],
+    on_end: Bool[Tensor, " n2"],
+) -> Matched:
+    """Return what a matcher finds."""
+    if isinstance(matcher, str):
+        matcher = MATCHERS[matcher]
+    # Copies, since a matcher may overwrite what it gets, such as the similarities of the
+    # background.
+    partner, score = matcher(sim.clone(), on_start.clone(), on_end.clone())
+    if not len(partner) == len(score) == len(sim):
+        found = f"{len(partner)} partners and {len(score)} scores"
+        raise InputError(
+            f"the matcher returned {found}, expected one for each of {len(sim)} patches"
+        )
+    return torch.as_tensor(partner).cpu(), torch.as_tensor(score).cpu()
+
+
+def _most_salient(
     features: FeatureMap,
+    candidates: Int[np.ndarray, " m"],
     k: int,
-    kmeans: bool,
     seed: int | np.random.Generator,
     binning: bool,
-) -> Int[np.ndarray, " m"]:
-    """Select at most k patches, best first: those of the highest scores, or of twice as many the
-    most salient of each cluster."""
-    order = np.lexsort((-ranked.similarity, -ranked.score))
-    order = order[np.isfinite(ranked.score[order])]
-    if not kmeans or len(order) <= k:
-        return order[:k]
-    order = order[: 2 * k]
-    clusters = _cluster(_gram(features, order, binning), k, np.random.default_rng(seed))
-    saliency = features.saliency.flatten().numpy()[order]
+) -> Int[np.ndarray, " k"]:
+    """Cluster patches into k clusters; return the most salient patch of each, in their order."""
+    clusters = _cluster(_gram(features, candidates, binning), k, np.random.default_rng(seed))
+    saliency = features.saliency.flatten().numpy()[candidates]
     by_cluster = np.lexsort((-saliency, clusters))  # the most salient of each cluster first
     first = np.unique(clusters[by_cluster], return_index=True)[1]
-    return order[np.sort(by_cluster[first])]
+    return candidates[np.sort(by_cluster[first])]
 
 
 def _cycles(
-    sim: Float[Tensor, "n1 n2"],
-    on1: Bool[Tensor, "h1 w1"],
-    on2: Bool[Tensor, "h2 w2"],
+    sim: Similarities,
+    on1: Mask,
+    on2: Mask,
     published: bool = False,
-) -> tuple[Float[Tensor, " n1"], Int[Tensor, " n1"]]:
-    """Compute the scores of `cyclical_distances`, and each foreground patch's nearest neighbour; 0
-    for the others.
-
-    Only the foreground's neighbours, and of the patches of image 2 only theirs, are searched for.
-    """
+) -> Matched:
+    """Find each patch's nearest neighbour, scored as in `cyclical_distances`."""
+    forth, nearest = nearest_neighbours(sim)
+    back = nearest[forth]  # u' of each u
     columns = on1.shape[1]
-    on1 = on1.flatten()
-    on2 = on2.flatten()
-    # Patches by their index: u on the foreground, its neighbour v (`forth`), and v's u' (`back`).
-    u = on1.nonzero()[:, 0]
-    forth = sim[u].argmax(dim=1)
-    reached, position = forth.unique(return_inverse=True)
-    back = sim[:, reached].argmax(dim=0)[position]
     row = back // columns
     column = back % columns
+    u = torch.arange(len(forth))
     offset = torch.stack([u // columns - row, u % columns - column])
     distance = offset.to(torch.float32).square().sum(0).sqrt()
+    on1 = torch.as_tensor(on1).flatten()
     # The published code does not check that u' is foreground, and discards every u' in row 0 or
     # column 0: it marks "no cycle" by index 0, and looks for the mark in each coordinate.
     returned = (row > 0) & (column > 0) if published else on1[back]
-    valid = on2[forth] & returned
-    score = torch.full((len(sim),), -torch.inf, device=sim.device)
-    score[u] = torch.where(valid, -distance, -torch.inf)
-    neighbour = torch.zeros(len(sim), dtype=torch.long, device=sim.device)
-    neighbour[u] = forth
-    return score, neighbour
+    valid = on1 & torch.as_tensor(on2).flatten()[forth] & returned
+    return forth, torch.where(valid, -distance, -torch.inf)
 
 
 def _keys(features: Keys) -> Float[Tensor, "h w d"]:
-    """Get the keys as a float32 tensor."""
+    """Get the keys as a float32 tensor on the CPU."""
     keys = features.keys if isinstance(features, FeatureMap) else features
-    return torch.as_tensor(keys).to(torch.float32)
+    return torch.as_tensor(keys).to("cpu", torch.float32)
 
 
 def _bin_products(products: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w1 h2 w2"]:
@@ -309,7 +280,7 @@ def _joint_shifts(x: Float[Tensor, "a b c d"], step: int) -> Float[Tensor, "a b 
         shifted = x
         for axis in (0, 2):
             last = x.shape[axis] - 1
-            index = (torch.arange(last + 1, device=x.device) + shift).clamp(0, last)
+            index = (torch.arange(last + 1) + shift).clamp(0, last)
             shifted = shifted.index_select(axis, index)
         total.add_(shifted)
     return total
@@ -317,7 +288,7 @@ def _joint_shifts(x: Float[Tensor, "a b c d"], step: int) -> Float[Tensor, "a b 
 
 def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
     """Compute 1 / length of each patch's log-binned descriptor."""
-    index = bin_indices(tuple(keys.shape[:2])).to(keys.device)
+    index = bin_indices(tuple(keys.shape[:2]))
     raw = keys.square().sum(-1).flatten()
     pooled = average_pool(keys, (0, 1)).square().sum(-1).flatten()
     squared = raw[index[:9]].sum(0) + pooled[index[9:]].sum(0)
@@ -325,23 +296,20 @@ def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
 
 
 def _gram(
-    features: FeatureMap, index: Int[np.ndarray, " m"], binning: bool = True
+    features: FeatureMap, patches: Int[np.ndarray, " m"], binning: bool
 ) -> Float[np.ndarray, "m m"]:
     """Compute the cosines between the descriptors of a few patches, which are few enough to
     build."""
-    keys = features.keys.double()
-    index = torch.from_numpy(index)
-    descriptors = keys.flatten(0, 1)[index]
+    keys = features.keys.double()[None]
     if binning:
-        bins = bin_indices(features.grid)[:, index]  # (17, m)
-        near = keys.flatten(0, 1)[bins[:9]]
-        far = average_pool(keys, (0, 1)).flatten(0, 1)[bins[9:]]
-        descriptors = torch.cat([near, far]).transpose(0, 1).flatten(1)  # (m, 17 D)
-    descriptors = F.normalize(descriptors, dim=1)
+        (built,) = descriptors(keys, bin_indices(features.grid)[:, patches])
+    else:
+        built = keys[0].flatten(0, 1)[patches]
+    built = F.normalize(built, dim=1)
     # Rounded, because greedy k-means++ has exact ties (of two points that are each other's nearest,
     # either lowers the sum of squares by the same amount), which rounding errors would break
     # differently each time.
-    return (descriptors @ descriptors.T).round(decimals=6).numpy()
+    return (built @ built.T).round(decimals=6).numpy()
 
 
 def _cluster(

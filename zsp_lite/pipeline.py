@@ -5,15 +5,15 @@ import pkgutil
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from zsp_lite.alignment import MOST_TRIALS, SCALE_RANGE, Sim3, ransac
+from zsp_lite.alignment import SCALE_RANGE, Sim3, ransac
 from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch, ViewSelector
+from zsp_lite.choices import SOLVERS
 from zsp_lite.data.frames import Frame, frame_defect, list_frames
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer, check_number
 from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed
@@ -24,8 +24,6 @@ from zsp_lite.matching import similarities as cosine_similarities
 from zsp_lite.points import standard_deviation
 from zsp_lite.views import IMAGE_SIZE, View, extract_views, object_crop, usable_targets
 
-# Solvers beyond the paper by name, as "module:class"; a module is imported when its name is used.
-SOLVER_CLASSES = {"verified": "zsp_lite.verified:VerifiedSolver"}
 _FEW = 10  # the standard deviation of fewer points says little of the object's size
 
 
@@ -53,9 +51,8 @@ class ZeroShotPose:
         matcher: "cyclical", as in the paper, another name in `matchers.MATCHERS`, or a `Matcher`.
         binning: Compare log-binned descriptors, as in the paper; False compares the keys
             themselves.
-        solver: "paper" selects the best view and aligns with it by RANSAC; or a name in
-            `SOLVER_CLASSES`, such as "verified", or a `Solver`. The settings view_selector, trials
-            and sample_size are for "paper" only.
+        solver: "paper" selects the best view and aligns with it by RANSAC; or "verified", or a
+            `Solver`. The settings view_selector, trials and sample_size are for "paper" only.
         seed: Seed of k-means and of the solver.
 
     Raises:
@@ -80,7 +77,7 @@ class ZeroShotPose:
         stages = {
             "matcher": ("cyclical", *MATCHERS),
             "view_selector": VIEW_SELECTORS,
-            "solver": ("paper", *SOLVER_CLASSES),
+            "solver": SOLVERS["both"],
         }
         for name, allowed in stages.items():
             stage = getattr(self, name)
@@ -90,7 +87,7 @@ class ZeroShotPose:
         check_choice("cycle_from", self.cycle_from, ("reference", "target"))
         check_choice("kmeans", self.kmeans, (None, True, False))
         check_integer("k", self.k, 1)
-        check_integer("trials", self.trials, 1, MOST_TRIALS)
+        check_integer("trials", self.trials, 1, 10_000_000)
         check_integer("sample_size", self.sample_size, 3)
         check_integer("seed", self.seed, 0)
         if not callable(self.backbone):
@@ -209,64 +206,48 @@ class ZeroShotPose:
 
     def _solver(self) -> Solver:
         if self.solver == "paper":
-            return partial(
-                align_best_view,
-                view_selector=self.view_selector,
-                trials=self.trials,
-                sample_size=self.sample_size,
-            )
-        if isinstance(self.solver, str):
-            return pkgutil.resolve_name(SOLVER_CLASSES[self.solver])()
+            return self._align_best_view
+        if self.solver == "verified":  # a room above, imported when it is used
+            return pkgutil.resolve_name("zsp_lite.verified:VerifiedSolver")()
         return self.solver
 
-
-def align_best_view(
-    reference: View,
-    targets: Sequence[View],
-    matched: Sequence[ViewMatch],
-    *,
-    seed: int,
-    threshold: float,
-    view_selector: str | ViewSelector,
-    trials: int,
-    sample_size: int,
-) -> PoseEstimate:
-    """Solve as the paper does: select the best view (sec. 4.2) and fit the pose to its matches by
-    RANSAC (sec. 4.3).
-
-    This is the `Solver` named "paper"; `ZeroShotPose` explains the settings.
-    """
-    timings: dict[str, float] = {}
-    with timed(timings, "view"):
-        if isinstance(view_selector, str):
-            scored = [VIEW_SELECTORS[view_selector](one) for one in matched]
-        else:  # a plug-in may overwrite what it gets
-            scored = [view_selector(deepcopy(one)) for one in matched]
-        scores = np.array(scored, dtype=np.float64)
-        best = int(scores.argmax())
-        matches = matched[best].matches
-    with timed(timings, "alignment"):
-        points = match_points(reference, targets[best], matches)
-        flags: tuple[str, ...] = ()
-        try:
-            sim3, inliers = ransac(
-                *points,
-                threshold=threshold,
-                trials=trials,
-                sample_size=sample_size,
-                seed=seed,
-                scale_range=SCALE_RANGE,
-            )
-            agreeing = int(inliers.sum())
-            if agreeing < sample_size:
-                flags = (f"only {agreeing} of {len(inliers)} matches agree with the pose",)
-        except InputError as error:
-            sim3 = view_alignment(reference, targets[best])
-            inliers = np.zeros(len(points[0]), dtype=bool)
-            flags = (f"pose is the best view's, not a fit: {error}",)
-    return PoseEstimate(
-        sim3, best, matches, inliers, scores, reference, tuple(targets), timings, flags
-    )
+    def _align_best_view(
+        self,
+        reference: View,
+        targets: Sequence[View],
+        matched: Sequence[ViewMatch],
+        *,
+        seed: int,
+        threshold: float,
+    ) -> PoseEstimate:
+        """Solve as the paper does: select the best view (sec. 4.2) and fit the pose to its matches
+        by RANSAC (sec. 4.3)."""
+        timings: dict[str, float] = {}
+        with timed(timings, "view"):
+            if isinstance(self.view_selector, str):
+                scored = [VIEW_SELECTORS[self.view_selector](one) for one in matched]
+            else:  # a plug-in may overwrite what it gets
+                scored = [self.view_selector(deepcopy(one)) for one in matched]
+            scores = np.array(scored, dtype=np.float64)
+            best = int(scores.argmax())
+            matches = matched[best].matches
+        with timed(timings, "alignment"):
+            points = match_points(reference, targets[best], matches)
+            flags: tuple[str, ...] = ()
+            try:
+                sim3, inliers = ransac(
+                    *points, threshold, self.trials, self.sample_size, seed, SCALE_RANGE
+                )
+                agreeing = int(inliers.sum())
+                if agreeing < self.sample_size:
+                    flags = (f"only {agreeing} of {len(inliers)} matches agree with the pose",)
+            except InputError as error:
+                sim3 = view_alignment(reference, targets[best])
+                inliers = np.zeros(len(matches), dtype=bool)
+                flags = (f"pose is the best view's, not a fit: {error}",)
+        return PoseEstimate(
+            sim3, best, matches, inliers, scores, reference, tuple(targets), timings, flags
+        )
 
 
 def view_alignment(reference: View, target: View) -> Sim3:

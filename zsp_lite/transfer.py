@@ -33,8 +33,8 @@ from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, frame_defect
 from zsp_lite.data.pairs import spread
-from zsp_lite.errors import InputError, check_choice, check_magnitude, real_array
-from zsp_lite.features import log_bin
+from zsp_lite.errors import InputError, check_magnitude, real_array
+from zsp_lite.features import bin_indices, descriptors
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import near_median, object_pixels
 from zsp_lite.views import View
@@ -107,9 +107,8 @@ def surface_views(
         backbone: Backbone, or what `load_backbone` takes.
 
     Raises:
-        InputError: The alignment has no such object, or no frame shows its surface.
+        InputError: No frame shows the object's surface.
     """
-    check_choice("sequence", sequence, alignment.objects)
     annotations = [
         frame for frame in dataset.frames(category, sequence) if frame.viewpoint is not None
     ]
@@ -134,24 +133,27 @@ def describe_surface(
 ) -> list[SurfaceView]:
     """Gather the patches of views of one world, with its similarity to the common frame, and the
     numbers of their frames."""
-    return [
-        _surface_view(number, view, sim3)
-        for number, view in zip(numbers, views)
-        if view.known_foreground.any()
-    ]
-
-
-def _surface_view(number: int, view: View, sim3: Sim3) -> SurfaceView:
-    """Gather the patches of a view."""
-    camera = view.frame.camera
-    patches = np.flatnonzero(view.known_foreground)
-    points = sim3.apply(camera.to_world(view.measured_points[0].reshape(-1, 3)[patches]))
-    near = near_median(points, 4)  # as in `points.world_cloud`
-    towards = sim3.apply(camera.centre) - np.median(points, axis=0)
-    direction = towards / np.linalg.norm(towards)
-    binned = log_bin(view.features.keys[None]).flatten(0, 2)[patches[near]]
-    descriptors = F.normalize(binned, dim=1)
-    return SurfaceView(number, sim3, direction, points[near], descriptors)
+    surface = []
+    for number, view in zip(numbers, views):
+        patches = np.flatnonzero(view.known_foreground)
+        if not len(patches):
+            continue
+        camera = view.frame.camera
+        points = sim3.apply(camera.to_world(view.measured_points[0].reshape(-1, 3)[patches]))
+        near = near_median(points, 4)  # as in `points.world_cloud`
+        towards = sim3.apply(camera.centre) - np.median(points, axis=0)
+        index = bin_indices(view.features.grid)[:, patches[near]]
+        (built,) = descriptors(view.features.keys[None], index)
+        surface.append(
+            SurfaceView(
+                number,
+                sim3,
+                towards / np.linalg.norm(towards),
+                points[near],
+                F.normalize(built, dim=1),
+            )
+        )
+    return surface
 
 
 def marked_point(frame: Frame, x: float, y: float, what: str) -> Float[np.ndarray, "3"]:

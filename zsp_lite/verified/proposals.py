@@ -37,9 +37,8 @@ _VIEW_SCALE = 0.9
 def poses_from_matches(
     source: Float[Tensor, "k 3"], target: Float[Tensor, "k 3"], rng: np.random.Generator
 ) -> Poses:
-    """Fit poses to random samples of three matches and keep the best that differ."""
-    if len(source) < 3:
-        return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
+    """Fit poses to random samples of three matches, of at least three, and keep the best that
+    differ."""
     # The positions of the three smallest of k random numbers are a sample without repetition:
     # (trials, 3).
     sample = np.argpartition(rng.random((_TRIALS, len(source))), (0, 1, 2), axis=1)[:, :3]

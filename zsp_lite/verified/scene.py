@@ -23,6 +23,7 @@ from torch import Tensor
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera, view_span
 from zsp_lite.errors import NoPoseError
+from zsp_lite.estimates import between_cameras
 from zsp_lite.matching import Matches
 from zsp_lite.points import near_median, standard_deviation
 from zsp_lite.verified.poses import Poses, exp_, float_tensor, rotation_angles
@@ -41,8 +42,6 @@ _MAP_PIXELS = 128 * 128
 _MASK_THRESHOLDS = (0.3, 0.5, 0.7)
 _NO_SILHOUETTE = 1e4  # distance in pixels where the mask is empty
 _MIN_DEPTH = 1e-3  # working units; smaller depths are raised to it before the projection
-
-_Rigid = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]  # rotation and translation
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +109,7 @@ class Scene:
             float(poses.scale[index]), left @ right, poses.translation[index].double().numpy()
         )
         return (
-            Sim3(1.0, *_relative_pose(self.target_cameras[0], self.target_cameras[view]))
+            between_cameras(self.target_cameras[0], self.target_cameras[view])
             @ self.target_to_working.inverse()
             @ pose
             @ self.reference_to_working
@@ -125,13 +124,14 @@ def build_scene(
 ) -> Scene:
     """Prepare the scene of a reference view and its target views."""
     cameras = tuple(target.frame.camera for target in targets)
-    to_camera = [_relative_pose(cameras[0], camera) for camera in cameras]
+    to_camera = [between_cameras(cameras[0], camera) for camera in cameras]
 
     # Points of all patches, (patches, 3) per view. Those of the targets are moved to the frame of
     # the first target camera.
     source = reference.measured_points[0].reshape(-1, 3)
     clouds = [
-        (view.measured_points[0].reshape(-1, 3) - t) @ R for view, (R, t) in zip(targets, to_camera)
+        (view.measured_points[0].reshape(-1, 3) - moved.t) @ moved.R
+        for view, moved in zip(targets, to_camera)
     ]
     cloud = np.concatenate(clouds)
     known = np.concatenate([target.known_foreground.ravel() for target in targets])
@@ -182,7 +182,7 @@ def build_scene(
         # The reference's points are in its camera's frame: its camera has the identity as pose.
         reference_maps=build_maps(
             [reference],
-            [(np.eye(3), np.zeros(3))],
+            [Sim3.identity()],
             reference_to_working,
             [_number(source_valid)],
         ),
@@ -199,7 +199,7 @@ def build_scene(
 
 def build_maps(
     views: Sequence[View],
-    world_to_camera: Sequence[_Rigid],
+    world_to_camera: Sequence[Sim3],
     to_working: Sim3,
     columns: Sequence[Int[np.ndarray, " _"]],
 ) -> ViewMaps:
@@ -209,9 +209,9 @@ def build_maps(
     sizes = np.array([camera.size[::-1] for camera in cameras])
     pixels = [0, *(table.shape[1] for table in tables[:-1])]  # their running sum: the first rows
     return ViewMaps(
-        float_tensor([R for R, _ in world_to_camera]),
+        float_tensor([one.R for one in world_to_camera]),
         # From x_cam = R @ x + t, with x_working = scale * x + to_working.t.
-        float_tensor([to_working.scale * t - R @ to_working.t for R, t in world_to_camera]),
+        float_tensor([to_working.scale * one.t - one.R @ to_working.t for one in world_to_camera]),
         float_tensor([np.sqrt(camera.focal_length.prod()) for camera in cameras]),
         float_tensor([camera.principal_point for camera in cameras]),
         float_tensor(sizes),
@@ -220,17 +220,13 @@ def build_maps(
     )
 
 
-def project_points(
-    maps: ViewMaps,
-    linear: Float[Tensor, "m 3 3"],
-    translation: Float[Tensor, "m 3"],
-    points: Float[Tensor, "n 3"],
-) -> Projection:
-    """Project the points `linear @ x + translation` into every view and read the maps."""
+def project_points(maps: ViewMaps, poses: Poses, points: Float[Tensor, "n 3"]) -> Projection:
+    """Project points, moved by every pose, into every view and read the maps."""
     # The points in all cameras, (m, v, 3, n), by one product of (m * v * 3, 3) and (3, n).
-    camera_linear = (maps.rotation @ linear[:, None]).reshape(-1, 3)
-    camera_translation = (maps.rotation @ translation[:, None, :, None])[..., 0] + maps.translation
-    in_camera = (camera_linear @ points.T).view(len(linear), len(maps.size), 3, -1)
+    camera_linear = (maps.rotation @ poses.linear[:, None]).reshape(-1, 3)
+    moved = maps.rotation @ poses.translation[:, None, :, None]
+    camera_translation = moved[..., 0] + maps.translation
+    in_camera = (camera_linear @ points.T).view(len(poses), len(maps.size), 3, -1)
     in_camera = in_camera.add_(camera_translation[..., None])
     depth = in_camera[:, :, 2]
     pixels_per_unit = maps.focal_length[:, None] / depth.clamp_min(_MIN_DEPTH)
@@ -308,12 +304,6 @@ def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
     products = (torch.addmm(-square.T / 2, part, right.T) for part in left.split(_DENSITY_ROWS))
     weight = 1 / torch.cat([exp_(product).sum(dim=1) for product in products])
     return weight / weight.sum()
-
-
-def _relative_pose(first: Camera, second: Camera) -> _Rigid:
-    """Return the transform from the first camera's frame to the second's."""
-    rotation = second.R @ first.R.T
-    return rotation, second.t - rotation @ first.t
 
 
 def _number(selected: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:

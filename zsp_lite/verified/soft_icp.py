@@ -14,10 +14,9 @@ fit of the pose: a point without a target point that is near and similar has nea
 
 import numpy as np
 import torch
-from jaxtyping import Int
-from torch import Tensor
 
 from zsp_lite.alignment import nearest_rotation
+from zsp_lite.data.pairs import spread
 from zsp_lite.verified.poses import SCALE_RANGE, Poses, exp_, float_tensor
 from zsp_lite.verified.scene import Scene
 
@@ -31,8 +30,8 @@ _OUTLIER_AFFINITY = 0.01  # a_0 divided by the number of target points
 def soft_icp(scene: Scene, poses: Poses) -> Poses:
     """Align every pose to the local optimum, independently of the others."""
     # Evenly spaced points of both sides.
-    rows = _evenly_spaced(len(scene.reference_points), _MAX_POINTS[0])
-    columns = _evenly_spaced(len(scene.target_points), _MAX_POINTS[1])
+    rows = spread(_MAX_POINTS[0], len(scene.reference_points))
+    columns = spread(_MAX_POINTS[1], len(scene.target_points))
     source = scene.reference_points[rows]
     target = scene.target_points[columns]
     feature_term = _FEATURE_WEIGHT * scene.similarity[rows][:, scene.target_column[columns]]
@@ -67,9 +66,3 @@ def soft_icp(scene: Scene, poses: Poses) -> Poses:
         rotated_mean = (rotation @ source_mean[..., None])[..., 0]
         poses = Poses(scale, rotation, partner_mean - scale[:, None] * rotated_mean)
     return poses
-
-
-def _evenly_spaced(total: int, most: int) -> Int[Tensor, " n"]:
-    """Return at most `most` evenly spaced indices below `total`."""
-    count = min(total, most)
-    return torch.arange(count) * total // count

@@ -100,7 +100,8 @@ class VerifiedSolver:
             )
 
         with timed(timings, "proposals"):
-            by_view = [poses_from_matches(*points, rng) for points in scene.matches]
+            enough = [points for points in scene.matches if len(points[0]) >= 3]
+            by_view = [poses_from_matches(*points, rng) for points in enough]
             poses = concatenate([*by_view, poses_from_views(scene)])
 
         with timed(timings, "alignment"):
@@ -129,12 +130,13 @@ class VerifiedSolver:
 
 def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
     """Order views by a hash of their pixels, whatever their order and the axes of their world."""
-    digests = []
-    for target in targets:
+
+    def digest(index: int) -> bytes:
+        target = targets[index]
         content = target.frame.rgb.tobytes() + target.foreground.numpy().tobytes()
-        digests.append(hashlib.blake2b(content, digest_size=16).digest())
-    # The positions of the views, sorted by the digests.
-    return tuple(sorted(range(len(targets)), key=digests.__getitem__))
+        return hashlib.blake2b(content, digest_size=16).digest()
+
+    return tuple(sorted(range(len(targets)), key=digest))
 
 
 def _hypotheses(
@@ -142,7 +144,7 @@ def _hypotheses(
 ) -> tuple[Hypothesis, ...]:
     """Give each pose, best first, its view, score and probability."""
     score = WEIGHTS.score(terms).double().numpy()
-    shape_fit = WEIGHTS.of_shape().score(terms).double().numpy()
+    shape_fit = float(WEIGHTS.of_shape().score(terms)[0])
 
     # Poses of one mode share a probability: the odds of all but the best one are 0.
     mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
@@ -152,24 +154,22 @@ def _hypotheses(
         len(order),
         float(angles[0].min()),
         scene.view_similarity_std,
-        float(shape_fit[0]),
+        shape_fit,
     )
     confidence = Calibration().probabilities(deficit, known)[mode]
 
-    hypotheses = []
     # The view of each hypothesis is the one whose camera is nearest under its pose.
-    for i, view in enumerate(angles.argmin(axis=1).tolist()):
-        hypotheses.append(
-            Hypothesis(
-                scene.to_sim3(poses, i, view),
-                order[view],
-                float(score[i]),
-                dict(zip(TERM_NAMES, terms[i].tolist())),
-                float(confidence[i]),
-                int(mode[i]),
-            )
+    return tuple(
+        Hypothesis(
+            scene.to_sim3(poses, i, view),
+            order[view],
+            float(score[i]),
+            dict(zip(TERM_NAMES, terms[i].tolist())),
+            float(confidence[i]),
+            int(mode[i]),
         )
-    return tuple(hypotheses)
+        for i, view in enumerate(angles.argmin(axis=1).tolist())
+    )
 
 
 def measured_inliers(

@@ -85,48 +85,6 @@ FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint")
 WEIGHTS = ScoreCoefficients()
 
 
-@dataclass(frozen=True, eq=False)
-class PointTerms:
-    """The terms of n points in v views under m poses, before averaging (see the module's
-    docstring)."""
-
-    patch: Int[Tensor, "m v n"]  # similarity column of the patch at the point's pixel, -1 for none
-    # a: weight in [0, 1] with which the point lies on the measured surface
-    surface: Float[Tensor, "m v n"]
-    silhouette: Float[Tensor, "m v n"]  # c: in [0, 1]
-    free_space: Float[Tensor, "m v n"]  # b: in [0, 1]
-    # s: feature similarity to the patch at the pixel, 0 without one
-    similarity: Float[Tensor, "m v n"]
-
-    def averages(self, point_weights: Float[Tensor, " n"]) -> Iterator[Float[Tensor, " m"]]:
-        """Yield similarity, overlap, silhouette and free space, each averaged for every pose."""
-        q = point_weights / point_weights.sum()
-        # A point on a pixel without a foreground patch is not on the surface: a = 0.
-        surface = self.surface * (self.patch >= 0)
-        total = surface.sum(dim=1)
-        yield (surface.mul_(self.similarity).sum(dim=1) / (total + _SIMILARITY_PRIOR)) @ q
-        yield total.clamp_max(1) @ q
-        yield (self.silhouette @ q).mean(dim=1)
-        yield (self.free_space @ q).mean(dim=1)
-
-
-def forward_terms(scene: Scene, poses: Poses, stride: int = 1) -> PointTerms:
-    """Project every `stride`-th reference point into all target views."""
-    points = scene.reference_points[::stride]
-    projection = project_points(scene.target_maps, poses.linear, poses.translation, points)
-    n, columns = scene.similarity.shape
-    row_starts = torch.arange(0, n, stride) * columns
-    return _point_terms(scene, projection, row_starts, patch_stride=1)
-
-
-def reverse_terms(scene: Scene, poses: Poses, stride: int = 1) -> PointTerms:
-    """Project every `stride`-th target point into the reference view, by the inverse poses."""
-    inverse = poses.inverse()
-    points = scene.target_points[::stride]
-    projection = project_points(scene.reference_maps, inverse.linear, inverse.translation, points)
-    return _point_terms(scene, projection, scene.target_column[::stride], scene.similarity.shape[1])
-
-
 def score_terms(
     scene: Scene, poses: Poses, stride: tuple[int, int] = (1, 1)
 ) -> Float[Tensor, "m 9"]:
@@ -134,15 +92,23 @@ def score_terms(
 
     `stride` has the n of the reference points and that of the target points.
     """
+    source = scene.reference_points[:: stride[0]]
+    target = scene.target_points[:: stride[1]]
+    source_weights = torch.ones(len(source))
     target_weights = scene.target_weight[:: stride[1]]
-    reference_weights = torch.ones(len(scene.reference_points[:: stride[0]]))
-    per_pose = len(reference_weights) * len(scene.target_cameras) + len(target_weights)
+    # The similarity of a point to a patch is found by where those of its row, or column, begin.
+    n, columns = scene.similarity.shape
+    rows = torch.arange(0, n, stride[0]) * columns
+    target_columns = scene.target_column[:: stride[1]]
+    per_pose = len(source) * len(scene.target_cameras) + len(target)
     size = max(_CHUNK // per_pose, 1)
     chunks = []
     for first in range(0, len(poses), size):
         chunk = poses[first : first + size]
-        forward = forward_terms(scene, chunk, stride[0]).averages(reference_weights)
-        reverse = reverse_terms(scene, chunk, stride[1]).averages(target_weights)
+        seen = project_points(scene.target_maps, chunk, source)
+        forward = _averages(scene, seen, rows, 1, source_weights)
+        seen = project_points(scene.reference_maps, chunk.inverse(), target)
+        reverse = _averages(scene, seen, target_columns, columns, target_weights)
         chunks.append(torch.stack([*forward, *reverse], dim=1))
     # The angle includes rotation about the line of sight, because it changes features, too.
     angle = scene.view_angles(poses)
@@ -150,10 +116,15 @@ def score_terms(
     return torch.cat([torch.cat(chunks), viewpoint[:, None]], dim=1)
 
 
-def _point_terms(
-    scene: Scene, projection: Projection, offset: Int[Tensor, " n"], patch_stride: int
-) -> PointTerms:
-    """Compute a, b, c and s of each projected point.
+def _averages(
+    scene: Scene,
+    projection: Projection,
+    offset: Int[Tensor, " n"],
+    patch_stride: int,
+    point_weights: Float[Tensor, " n"],
+) -> Iterator[Float[Tensor, " m"]]:
+    """Yield similarity, overlap, silhouette and free space, each averaged for every pose, with a,
+    b, c and s of each projected point as in the module's docstring.
 
     The similarity of point i to patch j is at index `offset[i] + patch_stride * j`.
     """
@@ -161,8 +132,14 @@ def _point_terms(
     delta = projection.depth - projection.surface_depth
     surface = exp_(delta.square().mul_(-0.5 / SURFACE_SIGMA**2)).mul_(projection.weight)
     free_space = delta.add_(SURFACE_SIGMA).div_(-MAX_VIOLATION).clamp_(0, 1).mul_(projection.weight)
+    silhouette = (projection.silhouette_distance / MAX_VIOLATION).clamp_max_(1)
     index = projection.patch.clamp_min(0).mul_(patch_stride).add_(offset.int())
     similarity = scene.similarity.reshape(-1).index_select(0, index.flatten()).view(index.shape)
-    similarity = similarity.mul_(projection.patch >= 0)
-    silhouette = (projection.silhouette_distance / MAX_VIOLATION).clamp_max_(1)
-    return PointTerms(projection.patch, surface, silhouette, free_space, similarity)
+    # Without a foreground patch at the pixel, s = a = 0.
+    surface.mul_(projection.patch >= 0)
+    q = point_weights / point_weights.sum()
+    total = surface.sum(dim=1)
+    yield (surface.mul_(similarity).sum(dim=1) / (total + _SIMILARITY_PRIOR)) @ q
+    yield total.clamp_max(1) @ q
+    yield (silhouette @ q).mean(dim=1)
+    yield (free_space @ q).mean(dim=1)
