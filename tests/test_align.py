@@ -207,7 +207,7 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
     result = estimate_pose(*pair, helpers=[helper], **settings)
     answer = result.estimates["verified"]
     assert result.errors["verified"] < 15
-    assert answer.confidence > 0.5
+    assert answer.confidence > 0.4
     assert result.sources[1].endswith(f"helpers: {helper}")
     assert answer.flags[-1].startswith("4 of 4 frames vote for another pose: ")
 

@@ -86,7 +86,7 @@ def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
         "image_size=96)\n"
         f"{example}\nassert len(targets) == 5\n"
         "from zsp_lite.cli.main import main\n"
-        "raise SystemExit(main(['demo', '--backbone', 'zsp-tiny', '--solver', 'paper']))"
+        "raise SystemExit(main(['demo', '--backbone', 'zsp-tiny']))"
     )
     environment = os.environ | {
         "PYTHONPATH": str(site),

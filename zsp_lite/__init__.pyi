@@ -59,6 +59,6 @@ from zsp_lite.io import download as download, files as files, ply as ply
 from zsp_lite.matching import Matches as Matches
 from zsp_lite.own_objects import estimate_pose as estimate_pose
 from zsp_lite.pipeline import ZeroShotPose as ZeroShotPose
-from zsp_lite.viz import plots as plots, report as report, scene3d as scene3d
+from zsp_lite.viz import plots as plots, report as report
 
 __version__: str
