@@ -15,11 +15,11 @@ from benchmark_folder import SEQUENCES, SlowBackbone, run_rows, small_folder
 from numpy.testing import assert_allclose
 from refusals import refused
 
-from zsp_lite import Co3D, ZeroShotPose, align_category, estimate_pose
+from zsp_lite import Co3D, Sim3, ZeroShotPose, align_category, estimate_pose
 from zsp_lite.align import read_hypotheses, write_labels
 from zsp_lite.benchmark.problem import FrameStore
 from zsp_lite.benchmark.run import evaluate
-from zsp_lite.category import synchronise
+from zsp_lite.category import PairHypotheses, synchronise
 from zsp_lite.cli import main as cli
 from zsp_lite.course.labelling.session import Labelling
 from zsp_lite.data.frames import resize_frame
@@ -139,7 +139,9 @@ def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     out = tmp_path / "out"
     shutil.copytree(small_folder(), root)
     _, alignment = run
-    disagreeing = replace(alignment, disagreements={(A, C): 179.96})
+    turned = alignment.between(A, C) @ Sim3(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    wrong = PairHypotheses(A, C, (turned,), np.ones(1), np.zeros(3))
+    disagreeing = replace(alignment, pairs=(wrong,))
     monkeypatch.setattr("zsp_lite.align.align_category", lambda *_, **__: disagreeing)
     line = f"align {root} --category lump --out {out}"
     assert cli.main(f"{line} --propose".split()) == 0
@@ -150,7 +152,7 @@ def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     assert (out / "report.html").read_bytes().count(b"<img") == 1
     assert (out / "objects.jpg").stat().st_size > 1000  # bytes: more than a blank picture
     content = json.loads((out / "alignment.json").read_text())
-    assert content["disagreements"] == [{"pair": [A, C], "degrees": 179.96}]
+    assert content["disagreements"] == [{"pair": [A, C], "degrees": 180.0}]
     assert_allclose(content["objects"][B]["world_to_frame"], alignment.objects[B].sim3.matrix)
     labelling = Labelling(root, "lump")
     assert rotation_error(labelling.proposal(C).R, alignment.between(A, C).R) < 0.01

@@ -31,7 +31,7 @@ def alignment(dataset):
         pose = poses[name]
         sim3 = Sim3(pose.scale, pose.R, pose.t).inverse()
         objects[name] = AlignedObject(sim3, np.zeros(3), 1.0, None, 0.0)
-    return CategoryAlignment(objects, (), {})
+    return CategoryAlignment(objects, ())
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ def aligned(sim3s: dict[str, Sim3]) -> CategoryAlignment:
     objects = {
         name: AlignedObject(sim3, np.zeros(3), 1.0, None, 0.0) for name, sim3 in sim3s.items()
     }
-    return CategoryAlignment(objects, (), {})
+    return CategoryAlignment(objects, ())
 
 
 def world_points(views) -> np.ndarray:

@@ -15,24 +15,23 @@ agrees with the rotations if Q_a = Q_b H_h. With \theta_h the angle between the 
 the logarithm of a mixture of von Mises-Fisher densities and a uniform one, which limits the cost of
 a wrong pair.
 
-1. Search: many chains set one object after the other to a rotation that a hypothesis proposes,
-   sampled by its probability given all others (Gibbs sampling; Geman and Geman 1984), at a
-   temperature that falls to zero.
+1. Search, from many random spanning trees of hypotheses: set one object after the other to the best
+   rotation that a hypothesis proposes, given all others (iterated conditional modes; Besag 1986).
 2. Averaging on the rotation group (Hartley et al., Rotation averaging, IJCV 2013): each rotation in
    turn becomes the mean of the proposals, weighted by how well they agree (expectation
-   maximisation).
-3. Scales, linear in their logarithms, then translations: least absolute deviations over the
-   hypotheses that agree.
+   maximisation); so do the logarithms of the scales, and the places.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order
+from scipy.special import softmax
 
 from zsp_lite.alignment import Sim3, nearest_rotation
 from zsp_lite.errors import InputError
@@ -47,24 +46,17 @@ FLOOR = 0.1
 # from it on, each object is the reference of a few.
 ALL_PAIRS_BELOW = 12
 PAIRS_PER_OBJECT = 6
-_CHAINS = 48  # chains of the search, of which the best one is kept
-# Temperature of each sweep over all objects: a slow fall, then coordinate ascent.
-_TEMPERATURES = (*np.geomspace(1, 0.3, 12), 0.0, 0.0, 0.0, 0.0)
-_PROPOSERS = 8  # pairs of an object that propose rotations in a step, which bounds its time
-_AVERAGING_SWEEPS = 6  # sweeps over all objects
-_REWEIGHTINGS = 10  # steps of the least absolute deviations
-# Weight of hypotheses that disagree, so that every object gets a scale and a translation.
-_WEAK = 1e-3
+_STARTS = 48  # of the search, of which the best result is kept
+_SEARCH_SWEEPS = 8  # over all objects, at most
+_AVERAGING_SWEEPS = 30
 # Coefficients of the logit in `_judge`: of the margin, of the case that no rotation is right, and
 # of the share of agreeing pairs in this case. tools/judge.py fits them on validation
 # categories to sets of three and four objects.
-MARGIN = 2.71
-NONE = -0.59
-NONE_AGREEING = -2.93
+MARGIN = 1.57
+NONE = -3.07
+NONE_AGREEING = -2.37
 
-_Rotations = Float[np.ndarray, "t n 3 3"]  # of n objects in each of t chains
-_Candidates = Float[np.ndarray, "t c 3 3"]  # for the rotation of one object
-_Proposals = Float[np.ndarray, "t d m 3 3"]  # of m hypotheses of each of d pairs of one object
+_Poses = Float[np.ndarray, "_ 4 4"]  # matrices of similarities
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +91,18 @@ class CategoryAlignment:
 
     objects: dict[str, AlignedObject]  # by name, sorted
     pairs: tuple[PairHypotheses, ...]  # the hypotheses that were synchronised
-    # by (reference, target): median angle between the alignment and the best hypothesis of each
-    # pair of frames; only angles above 30 degrees, largest first
-    disagreements: dict[tuple[str, str], float]
+
+    @cached_property
+    def disagreements(self) -> dict[tuple[str, str], float]:
+        """Median angle between the alignment and the best hypotheses of each pair of objects, by
+        (reference, target); only angles above 30 degrees, largest first."""
+        angles = defaultdict(list)
+        for pair in self.pairs:
+            ends = pair.reference, pair.target
+            angles[ends].append(rotation_angle(self.between(*ends).R, pair.sim3s[0].R))
+        medians = {ends: float(np.median(several)) for ends, several in angles.items()}
+        worst_first = sorted(medians, key=medians.get, reverse=True)
+        return {ends: medians[ends] for ends in worst_first if medians[ends] > SAME_ANGLE}
 
     def between(self, reference: str, target: str) -> Sim3:
         """Return the similarity from the world of one object to that of another."""
@@ -150,209 +151,146 @@ def synchronise(pairs: Sequence[PairHypotheses]) -> CategoryAlignment:
     """
     pairs = sorted(pairs, key=lambda pair: (pair.reference, pair.target, pair.centre.tolist()))
     names = sorted({name for pair in pairs for name in (pair.reference, pair.target)})
-    ends = np.array([[names.index(pair.reference), names.index(pair.target)] for pair in pairs])
-    order = _connected(names, ends)
+    to_centre = [_to_centre(name, pairs) for name in names]
+    votes = _collect(pairs, names, to_centre)
+    own = [_Votes(*(column[votes.here == i] for column in votes)) for i in range(len(names))]
 
-    # The three steps of the module's docstring.
-    nodes = _build_nodes(pairs, ends)
-    rotations = _search(nodes, order, np.random.default_rng(0))
-    scales, translations, centres = _scales_and_translations(pairs, ends, rotations)
-
-    # How sure each object's rotation is, and its best alternative.
-    best = np.stack([pair.sim3s[0].R for pair in pairs])
-    off = rotation_angle(rotations[ends[:, 0]], rotations[ends[:, 1]] @ best)
-    objects = {}
-    for i, name in enumerate(names):
-        sim3 = Sim3(scales[i], rotations[i], translations[i])
-        agreeing = off[(ends == i).any(axis=1)] < SAME_ANGLE
-        probability, turned, other = _judge(nodes[i], rotations, i, float(agreeing.mean()))
-        if len(pairs) == 1:  # its own probabilities say more
-            probability, other, *_ = (*pairs[0].probabilities.tolist(), 0.0)
-        alternative = None
-        if turned is not None:  # about the object's centre
-            shift = sim3.apply(centres[i]) - scales[i] * turned @ centres[i]
-            alternative = Sim3(scales[i], turned, shift)
-        objects[name] = AlignedObject(sim3, centres[i], probability, alternative, other)
-    return CategoryAlignment(objects, tuple(pairs), _disagreements(names, ends, off))
-
-
-def _connected(names: Sequence[str], ends: Int[np.ndarray, "e 2"]) -> Int[np.ndarray, " n"]:
-    """Order the objects so that each has a pair with an earlier one; InputError if this is
-    impossible."""
-    links = coo_array((np.ones(len(ends)), ends.T), [len(names)] * 2)
-    order = breadth_first_order(links.tocsr(), 0, directed=False, return_predecessors=False)
-    if len(order) < len(names):
-        raise InputError(
-            f"pairs connect {len(order)} of {len(names)} objects with {names[0]}, expected all"
-        )
-    return order
-
-
-def _disagreements(
-    names: Sequence[str], ends: Int[np.ndarray, "e 2"], off: Float[np.ndarray, " e"]
-) -> dict[tuple[str, str], float]:
-    """Return the median angle of each pair of objects that disagrees, largest first."""
-    angles = {}
-    for a, b in ends:
-        of_both = (ends == (a, b)).all(axis=1)
-        angles[names[a], names[b]] = float(np.median(off[of_both]))
-    worst_first = sorted(angles, key=angles.get, reverse=True)
-    return {key: angles[key] for key in worst_first if angles[key] > SAME_ANGLE}
-
-
-@dataclass(frozen=True, eq=False)
-class _Node:
-    """One object, and what the hypotheses of its pairs say about its rotation."""
-
-    neighbour: Int[np.ndarray, " d"]  # the other object of each pair
-    turn: Float[np.ndarray, "d m 3 3"]  # proposes Q = Q_neighbour @ turn
-    weight: Float[np.ndarray, "d m"]  # probabilities; 0 where padded
-
-    def proposals(self, rotations: _Rotations) -> _Proposals:
-        """Return the rotations that the hypotheses propose."""
-        return rotations[:, self.neighbour][:, :, None] @ self.turn
-
-    def agreement(
-        self, candidates: _Candidates, proposals: _Proposals
-    ) -> Float[np.ndarray, "t c d m"]:
-        r"""Return \exp(\kappa (\cos\theta - 1)) of candidates and proposals; \cos\theta = (trace -
-        1) / 2."""
-        t, c = candidates.shape[:2]
-        trace = candidates.reshape(t, c, 9) @ proposals.reshape(t, -1, 9).swapaxes(1, 2)
-        return np.exp(KAPPA / 2 * (trace - 3)).reshape(t, c, *self.weight.shape)
-
-    def score(self, candidates: _Candidates, proposals: _Proposals) -> Float[np.ndarray, "t c"]:
-        """Return the part of the objective that depends on this object, for candidates of its
-        rotation."""
-        agreement = self.agreement(candidates, proposals)
-        return np.log(np.einsum("tcdm,dm->tcd", agreement, self.weight) + FLOOR).sum(axis=2)
-
-    def mean(
-        self, present: Float[np.ndarray, "t 3 3"], proposals: _Proposals
-    ) -> Float[np.ndarray, "t 3 3"]:
-        """Return the mean of the proposals, weighted by the probability that each is the pair's
-        right one."""
-        weight = self.weight * self.agreement(present[:, None], proposals)[:, 0]
-        weight /= weight.sum(axis=2, keepdims=True) + FLOOR
-        return nearest_rotation(np.einsum("tdm,tdmij->tij", weight, proposals))[0]
-
-
-def _build_nodes(pairs: Sequence[PairHypotheses], ends: Int[np.ndarray, "e 2"]) -> list[_Node]:
-    """Sort the hypotheses of e pairs by object."""
-    most = max(len(pair.sim3s) for pair in pairs)
-    rows: list[list[tuple]] = [[] for _ in range(ends.max() + 1)]
-    for (a, b), pair in zip(ends, pairs):
-        turn = np.array([one.R for one in pair.sim3s], np.float32)
-        turn = np.resize(turn, (most, 3, 3))  # padded by repetition
-        weight = np.pad(pair.probabilities, (0, most - len(pair.sim3s))).astype(np.float32)
-        rows[a].append((b, turn, weight))
-        rows[b].append((a, turn.swapaxes(1, 2), weight))
-    return [_Node(*(np.array(column) for column in zip(*row))) for row in rows]
-
-
-def _search(
-    nodes: list[_Node], order: Int[np.ndarray, " n"], rng: np.random.Generator
-) -> Float[np.ndarray, "n 3 3"]:
-    """Return the rotations that maximise the objective, relative to the first object's."""
-    rotations = np.tile(np.eye(3, dtype=np.float32), (_CHAINS, len(nodes), 1, 1))  # (t, n, 3, 3)
-    # In this order, each object has a pair with an earlier one.
-    for k, i in enumerate(order[1:], 1):
-        earlier = np.isin(nodes[i].neighbour, order[:k])
-        known = _Node(nodes[i].neighbour[earlier], nodes[i].turn[earlier], nodes[i].weight[earlier])
-        _sample(known, rotations, int(i), 1.0, rng)
-    for temperature in _TEMPERATURES:
-        for i in rng.permutation(len(nodes)).tolist():
-            _sample(nodes[i], rotations, i, temperature, rng)
+    # The two steps of the module's docstring.
+    rng = np.random.default_rng(0)
+    found = [_search(own, _random_tree(votes, names, rng)) for _ in range(_STARTS)]
+    poses = max(found, key=lambda poses: sum(one.scores(one.options(poses))[0] for one in own))
     for _ in range(_AVERAGING_SWEEPS):
-        for i, node in enumerate(nodes):
-            rotations[:, i] = node.mean(rotations[:, i], node.proposals(rotations))
-    scores = [
-        node.score(rotations[:, i, None], node.proposals(rotations)) for i, node in enumerate(nodes)
-    ]
-    best = rotations[np.sum(scores, axis=0)[:, 0].argmax()].astype(np.float64)
-    return nearest_rotation(best[0].T @ best)[0]
+        for i, one in enumerate(own):
+            poses[i] = one.mean(one.options(poses))
+
+    # The first object is the frame, and the mean log scale is zero.
+    poses = np.linalg.inv(poses[0] @ to_centre[0].matrix) @ poses
+    poses[:, :3] /= np.exp(np.log(_split(poses)[0]).mean())
+    objects = [_judge(one, poses, shift) for one, shift in zip(own, to_centre)]
+    return CategoryAlignment(dict(zip(names, objects)), tuple(pairs))
 
 
-def _sample(
-    node: _Node, rotations: _Rotations, i: int, temperature: float, rng: np.random.Generator
-) -> None:
-    """Draw the rotation of object i, in place, from its present one and the proposals of a few
-    pairs."""
-    t = len(rotations)
-    proposers = rng.permutation(len(node.neighbour))[:_PROPOSERS]
-    proposals = node.proposals(rotations)
-    proposed = proposals[:, proposers].reshape(t, -1, 3, 3)
-    candidates = np.concatenate([rotations[:, i, None], proposed], axis=1)
-    score = node.score(candidates, proposals)
-    # With Gumbel noise, the largest score is a sample of the softmax of the scores.
-    score += temperature * rng.gumbel(size=score.shape)
-    rotations[:, i] = candidates[np.arange(t), score.argmax(axis=1)]
+def _to_centre(name: str, pairs: Sequence[PairHypotheses]) -> Sim3:
+    """Return the translation that moves an object to the origin of its world."""
+    centres = [pair.centre for pair in pairs if pair.reference == name]
+    centres += [pair.sim3s[0].apply(pair.centre) for pair in pairs if pair.target == name]
+    return Sim3(1.0, np.eye(3), -np.median(centres, axis=0))
 
 
-def _judge(
-    node: _Node, rotations: Float[np.ndarray, "n 3 3"], i: int, agreeing: float
-) -> tuple[float, Float[np.ndarray, "3 3"] | None, float]:
-    """Return the probability of an object's rotation, the best other one, all others fixed, and its
-    probability."""
-    proposals = node.proposals(rotations[None])
-    others = proposals.reshape(-1, 3, 3)
-    others = others[rotation_angle(others, rotations[i]) > SAME_ANGLE]
-    margin, best = np.inf, None  # how much worse the best other rotation is
-    if len(others):
-        candidates = np.concatenate([rotations[None, i], others])
-        present, *scores = node.score(candidates[None], proposals)[0].tolist()
-        margin, best = present - max(scores), others[np.argmax(scores)]
+class _Votes(NamedTuple):
+    """Hypotheses, each in both directions: k similarities from the world of one object to that of
+    another, both objects at the origin.
+
+    The methods are for the votes on one object.
+    """
+
+    here: Int[np.ndarray, " k"]  # the object that a similarity starts from
+    there: Int[np.ndarray, " k"]  # the object that it leads to
+    pair: Int[np.ndarray, " k"]
+    probability: Float[np.ndarray, " k"]
+    matrix: _Poses
+
+    def options(self, poses: _Poses) -> _Poses:
+        """Return the present pose of the object, and those that the votes propose."""
+        return np.concatenate([poses[self.here[:1]], poses[self.there] @ self.matrix])
+
+    def agreement(self, options: _Poses) -> Float[np.ndarray, "o k"]:
+        r"""Return \exp(\kappa (\cos\theta - 1)) of the options and the votes; \cos\theta = (trace -
+        1) / 2."""
+        rotations = _split(options)[1].reshape(-1, 9)
+        return np.exp(KAPPA / 2 * (rotations @ rotations[1:].T - 3))
+
+    def by_pair(self) -> Float[np.ndarray, "d k"]:
+        """Return the probabilities, in the rows of their pairs."""
+        return (self.pair == np.unique(self.pair)[:, None]) * self.probability
+
+    def scores(self, options: _Poses) -> Float[np.ndarray, " o"]:
+        """Return the part of the objective that depends on the object, for each option."""
+        return np.log(FLOOR + self.agreement(options) @ self.by_pair().T).sum(axis=1)
+
+    def mean(self, options: _Poses) -> Float[np.ndarray, "4 4"]:
+        """Return the mean of the votes, weighted by the probability that each is its pair's right
+        one."""
+        agreement = self.by_pair() * self.agreement(options)[0]
+        weight = (agreement / (FLOOR + agreement.sum(axis=1, keepdims=True))).sum(axis=0)
+        weight /= weight.sum()
+        scales, rotations = _split(options[1:])
+        rotation = nearest_rotation(np.tensordot(weight, rotations, 1)[None])[0][0]
+        scale = np.exp(weight @ np.log(scales))
+        return Sim3(scale, rotation, weight @ options[1:, :3, 3]).matrix
+
+
+def _collect(
+    pairs: Sequence[PairHypotheses], names: Sequence[str], to_centre: Sequence[Sim3]
+) -> _Votes:
+    """Return the votes of all pairs."""
+    rows = []
+    for k, pair in enumerate(pairs):
+        a, b = names.index(pair.reference), names.index(pair.target)
+        for sim3, probability in zip(pair.sim3s, pair.probabilities):
+            forward = to_centre[b] @ sim3 @ to_centre[a].inverse()
+            rows.append((a, b, k, probability, forward.matrix))
+            rows.append((b, a, k, probability, forward.inverse().matrix))
+    return _Votes(*map(np.array, zip(*rows)))
+
+
+def _split(poses: _Poses) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3 3"]]:
+    """Return the scales and the rotations of similarities."""
+    scales = np.cbrt(np.linalg.det(poses[:, :3, :3]))
+    return scales, poses[:, :3, :3] / scales[:, None, None]
+
+
+def _random_tree(votes: _Votes, names: Sequence[str], rng: np.random.Generator) -> _Poses:
+    """Place one object after the other by a hypothesis that leads to it, drawn by its probability;
+    InputError if none leads to the rest."""
+    poses = np.tile(np.eye(4), (len(names), 1, 1))
+    placed = np.arange(len(names)) == 0
+    rank = np.log(votes.probability) + rng.gumbel(size=len(votes.pair))
+    while not placed.all():
+        leading = placed[votes.there] & ~placed[votes.here]
+        if not leading.any():
+            raise InputError(
+                f"pairs connect {placed.sum()} of {len(names)} objects with {names[0]}, expected "
+                "all"
+            )
+        k = np.argmax(np.where(leading, rank, -np.inf))
+        poses[votes.here[k]] = poses[votes.there[k]] @ votes.matrix[k]
+        placed[votes.here[k]] = True
+    return poses
+
+
+def _search(own: Sequence[_Votes], poses: _Poses) -> _Poses:
+    """Improve poses by the votes on one object after the other until nothing changes."""
+    for _ in range(_SEARCH_SWEEPS):
+        before = poses.copy()
+        for i, votes in enumerate(own):
+            options = votes.options(poses)
+            poses[i] = options[votes.scores(options).argmax()]
+        if (poses == before).all():
+            break
+    return poses
+
+
+def _judge(votes: _Votes, poses: _Poses, to_centre: Sim3) -> AlignedObject:
+    """Return an object's pose and its best other one, all others fixed, with probabilities."""
+    options = votes.options(poses)
+    rotations = _split(options)[1]
+    scores = votes.scores(options)
+    different = rotation_angle(rotations[0], rotations) > SAME_ANGLE
+    others = np.where(different, scores, -np.inf)
+    surest = np.unique(votes.pair, return_index=True)[1]  # vote of each pair
+
     # A conditional logit of three cases: this rotation is right, the other one is, or none. The
     # pairs of an object err together, so the margin counts by the root of their number. That none
     # is right is less probable if more of the object's pairs agree.
-    other = np.exp(-MARGIN * margin / np.sqrt(len(node.neighbour)))
-    none = np.exp(NONE + NONE_AGREEING * agreeing)
-    total = 1 + other + none
-    return float(1 / total), best, float(other / total)
+    margin = (scores[0] - others.max()) / np.sqrt(len(surest))
+    none = NONE + NONE_AGREEING * (1 - different[1:][surest].mean())
+    probability, other, _ = softmax([0.0, -MARGIN * margin, none]).tolist()
+    if len(surest) == 1:  # its own probabilities say more
+        probability, other, *_ = (*votes.probability.tolist(), 0.0)
 
-
-def _scales_and_translations(
-    pairs: Sequence[PairHypotheses],
-    ends: Int[np.ndarray, "e 2"],
-    rotations: Float[np.ndarray, "n 3 3"],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Fit scales and translations to the hypotheses that agree with the rotations; return the
-    objects' centres too."""
-    # A row for each hypothesis (lambda, H, tau) of each pair (a, b), k in all.
-    a, b = np.repeat(ends, [len(pair.sim3s) for pair in pairs], axis=0).T
-    sim3s = [one for pair in pairs for one in pair.sim3s]
-    turns = np.stack([one.R for one in sim3s])
-    angle = np.radians(rotation_angle(rotations[a], rotations[b] @ turns))
-    probability = np.concatenate([pair.probabilities for pair in pairs])
-    weight = probability * (np.exp(KAPPA * (np.cos(angle) - 1)) + _WEAK)
-    # The centre c of a, and y = lambda H c + tau, its place in the world of b.
-    c = np.stack([pair.centre for pair in pairs for _ in pair.sim3s])
-    y = np.stack([one.apply(centre) for one, centre in zip(sim3s, c)])
-
-    # Each demands log s_a - log s_b = log(lambda), and t_a - t_b = s_b Q_b y - s_a Q_a c.
-    of_a, of_b = np.eye(len(rotations))[a], np.eye(len(rotations))[b]  # (k, n)
-    log_ratios = np.log([[one.scale] for one in sim3s])
-    scales = np.exp(_least_absolute(of_a - of_b, log_ratios, weight))[:, 0]
-    linear = scales[:, None, None] * rotations
-    shift = np.einsum("kij,kj->ki", linear[b], y) - np.einsum("kij,kj->ki", linear[a], c)
-    t = _least_absolute(of_a - of_b, shift, weight)
-
-    # An object's centre is the weighted mean of where its pairs see it, in its own world.
-    seen = np.concatenate([of_a, of_b]) * np.r_[weight, weight][:, None]  # (2 k, n)
-    return scales, t - t[0], (seen / seen.sum(axis=0)).T @ np.r_[c, y]
-
-
-def _least_absolute(
-    incidence: Float[np.ndarray, "k n"],
-    difference: Float[np.ndarray, "k e"],
-    weight: Float[np.ndarray, " k"],
-) -> Float[np.ndarray, "n e"]:
-    """Minimise sum_k w_k |incidence_k x - difference_k| over x of mean zero, by iteratively
-    reweighted squares."""
-    scaled = weight
-    for _ in range(_REWEIGHTINGS):
-        weighted = incidence.T * scaled
-        # The solution of least norm has the mean zero.
-        x = np.linalg.lstsq(weighted @ incidence, weighted @ difference, rcond=None)[0]
-        scaled = weight / (np.linalg.norm(incidence @ x - difference, axis=1) + 1e-9)
-    return x
+    # The alternative is turned about the object's centre.
+    pose, alternative = Sim3.from_matrix(options[0]), None
+    if different.any():
+        alternative = Sim3(pose.scale, rotations[others.argmax()], pose.t) @ to_centre
+    return AlignedObject(pose @ to_centre, -to_centre.t, probability, alternative, other)

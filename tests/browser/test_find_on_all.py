@@ -71,7 +71,6 @@ def expected(browser, address, tmp_path_factory, request) -> Expected:
             for name, pose in objects[:2]
         },
         (),
-        {},
     )
     first, second = alignment.objects
     backbone = load_backbone("zsp-tiny", "cpu")
