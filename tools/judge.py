@@ -100,15 +100,15 @@ def collect(root: str, category: str) -> tuple[list[Example], list[PairHypothese
         if setting != "all around":
             pairs = [pairs[k] for k in rng.permutation(len(pairs))[:_PAIRS]]
         for names in pairs:
-            frames, order = {}, {}
+            seen, frames, order = {}, {}, {}
             for name, (arc, count) in zip(names, ends):
                 every = numbers[name]
                 start = 0 if arc == 360 else int(rng.integers(len(every)))
                 length = max(1, round(len(every) * arc / 360))
-                within = [every[(start + k) % len(every)] for k in range(length)]
-                frames[name] = tuple(within[k] for k in spread(count, length))
+                seen[name] = tuple(every[(start + k) % len(every)] for k in range(length))
+                frames[name] = tuple(seen[name][k] for k in spread(count, length))
                 order[name] = [frames[name][k] for k in asked_positions(4, len(frames[name]))]
-            shapes = {name: store.shape(category, name, frames[name]) for name in names}
+            shapes = {name: store.shape(category, name, seen[name]) for name in names}
             true = labels[names[1]] @ labels[names[0]].T
             ranked = []
             for a, b in (names, names[::-1]):

@@ -17,9 +17,9 @@ from zsp_lite.importers.sources import Source
 from zsp_lite.judge import asked_positions
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import axis_deviation, world_cloud
-from zsp_lite.shapes import Shape
+from zsp_lite.shapes import FRAMES, Shape
 from zsp_lite.upright import find_up
-from zsp_lite.views import View
+from zsp_lite.views import View, object_crop
 
 _TRIED = 8  # frames of which the first usable one is a single reference
 # Target views that span less than this angle, in degrees, show one side of the object.
@@ -39,6 +39,7 @@ class Scan:
     views: dict[int, View]
     scale: float  # from the lengths of the frames to those of the views
     cloud: Float[np.ndarray, "n 3"]
+    quarters: int = 0  # by which the frames are turned
 
     @classmethod
     def of(
@@ -73,7 +74,9 @@ class Scan:
 
     def shape(self) -> tuple[Shape, str]:
         """Return the fused shape, and why its vertical is not known, if sources disagree."""
-        frames = [view.frame for view in self.views.values()]
+        usable, loaded = self.source.select(FRAMES, references=True)
+        scaled = [scale_frame(loaded[position], self.scale) for position in usable]
+        frames = [object_crop(turn_frame(frame, self.quarters)) for frame in scaled]
         if isinstance(self.source.up, str):
             up, problem = find_up(frames)
             return Shape.of(frames, up), problem
@@ -120,7 +123,7 @@ def stood_up(scan: Scan, target: Scan, method: ZeroShotPose) -> tuple[Scan, int]
     best = max(scores, key=scores.get, default=0)
     frames = {position: turn_frame(frame, best) for position, frame in scan.frames.items()}
     views = dict(zip(scan.views, views_of(scan.views, best)))
-    return replace(scan, frames=frames, views=views), 90 * best
+    return replace(scan, frames=frames, views=views, quarters=best), 90 * best
 
 
 def scan_flags(scans: Sequence[Scan]) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ from zsp_lite.errors import NoPoseError
 from zsp_lite.points import near_median, standard_deviation, world_cloud
 
 HEADINGS = np.arange(0, 360, 5)  # degrees
+FRAMES = 12  # of a scan that its shape is fused from
 _POINTS = 600  # of a shape
 # Largest distance that counts, in sizes of the object: what only one of two objects has costs no
 # more.

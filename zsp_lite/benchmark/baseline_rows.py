@@ -93,7 +93,7 @@ class Scans:
     references: int
 
     def __call__(self, problem: PairProblem) -> Answer:
-        frames = _frames_around(problem, self.references)
+        frames = self._frames(problem)
         repeat = problem.pair.repeat
         category = problem.pair.category
         judged = problem.store.judged(category, frames, self.references, repeat=repeat)
@@ -101,36 +101,37 @@ class Scans:
             raise InputError("neither frames nor shapes determine a pose")
         return _between_worlds(problem, synchronise(judged))
 
+    def _frames(self, problem: PairProblem) -> dict[str, tuple[int, ...]]:
+        """Return the numbers of frames of both objects, evenly spaced over their sequences from the
+        pair's own ones on: as many as the pair has views, or as are solved."""
+        pair = problem.pair
+        numbers = problem.store.dataset.frame_numbers(pair.category)
+        frames = {}
+        for name, start in (
+            (pair.reference_sequence, pair.reference_frame),
+            (pair.target_sequence, pair.target_frames[0]),
+        ):
+            first = numbers[name].index(start)
+            ordered = numbers[name][first:] + numbers[name][:first]
+            steps = spread(max(self.references, len(pair.target_frames)), len(ordered))
+            frames[name] = tuple(ordered[step] for step in steps)
+        return frames
+
 
 def shape_upright(problem: PairProblem) -> Answer:
     """Run "shape-upright": the heading at which the shapes of both objects fit best, without
     features."""
+    pair = problem.pair
+    numbers = problem.store.dataset.frame_numbers(pair.category)
     first, second = (
-        problem.store.shape(problem.pair.category, name, numbers)
-        for name, numbers in _frames_around(problem, 0).items()
+        problem.store.shape(pair.category, name, tuple(numbers[name]))
+        for name in (pair.reference_sequence, pair.target_sequence)
     )
     if not (first.upright and second.upright):
         raise InputError("no vertical: neither the floor nor the cameras tell it")
     poses, distance = compare_headings(first, second)
     best = Sim3.from_matrix(poses[distance.argmin()])
     return _answer(problem, second.from_world.inverse() @ best @ first.from_world)
-
-
-def _frames_around(problem: PairProblem, least: int) -> dict[str, tuple[int, ...]]:
-    """Return the numbers of frames of both objects, evenly spaced over their sequences from the
-    pair's own ones on: as many as the pair has views, or `least`."""
-    pair = problem.pair
-    numbers = problem.store.dataset.frame_numbers(pair.category)
-    around = {}
-    for name, start in (
-        (pair.reference_sequence, pair.reference_frame),
-        (pair.target_sequence, pair.target_frames[0]),
-    ):
-        first = numbers[name].index(start)
-        ordered = numbers[name][first:] + numbers[name][:first]
-        steps = spread(max(least, len(pair.target_frames)), len(ordered))
-        around[name] = tuple(ordered[step] for step in steps)
-    return around
 
 
 def _between_worlds(problem: PairProblem, alignment: CategoryAlignment) -> Answer:

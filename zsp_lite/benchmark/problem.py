@@ -31,7 +31,7 @@ from zsp_lite.estimates import PoseEstimate
 from zsp_lite.judge import REFERENCES, Question, asked_positions, judge_pairs
 from zsp_lite.matching import similarities
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.shapes import Shape
+from zsp_lite.shapes import FRAMES, Shape
 from zsp_lite.upright import find_up
 from zsp_lite.views import IMAGE_SIZE, View, feature_maps, frame_view, object_crop
 
@@ -180,8 +180,10 @@ class FrameStore:
             return world_hypotheses(pair.reference_sequence, pair.target_sequence, estimate)
 
     def _shape(self, category: str, sequence: str, numbers: tuple[int, ...]) -> Shape:
-        """Fuse frames of an object, upright if the floor or the cameras tell the vertical."""
-        frames = [self.crop(category, sequence, number).frame for number in numbers]
+        """Fuse some of the frames of an object, upright if the floor or the cameras tell the
+        vertical."""
+        chosen = [numbers[k] for k in spread(FRAMES, len(numbers))]
+        frames = [self.crop(category, sequence, number).frame for number in chosen]
         return Shape.of(frames, find_up(frames)[0])
 
     def judged(
@@ -193,8 +195,8 @@ class FrameStore:
         repeat: int = 0,
         solve: Callable[[list[Pair]], Iterable[PairHypotheses | None]] | None = None,
     ) -> list[PairHypotheses]:
-        """Find the poses between objects of a category by some frames of each, whose numbers are
-        given by their names (see `judge.judge_pairs`).
+        """Find the poses between objects of a category by their shapes and by some frames of each,
+        whose numbers are given by their names (see `judge.judge_pairs`).
 
         `solve` finds the hypotheses of pairs of frames in the store's place, in another process.
         """
@@ -208,10 +210,11 @@ class FrameStore:
             return solve(asked) if solve else map(self.hypotheses, asked)
 
         shapes = {}
+        every = self.dataset.frame_numbers(category)
         order = {}  # the numbers of the frames that are asked
         for name, numbers in frames.items():
             with suppress(NoPoseError):  # objects without a surface are left out
-                shapes[name] = self.shape(category, name, numbers)
+                shapes[name] = self.shape(category, name, tuple(every[name]))
             order[name] = [numbers[k] for k in asked_positions(references, len(numbers))]
         counts = {name: len(numbers) for name, numbers in order.items()}
         known = [pair for pair in pairs or combinations(frames, 2) if {*pair} <= shapes.keys()]
