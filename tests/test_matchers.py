@@ -66,11 +66,10 @@ def test_nothing_is_matched_with_an_image_without_the_object(name):
     assert not score.isfinite().any()
 
 
-@pytest.mark.parametrize("kmeans", [False, True])
 @pytest.mark.parametrize("name", MATCHERS)
-def test_every_matcher_finds_an_image_in_itself(name, kmeans):
+def test_every_matcher_finds_an_image_in_itself(name):
     features = feature_map(3)
-    matches = match(features, features, k=10, kmeans=kmeans, matcher=name)
+    matches = match(features, features, k=10, matcher=name)
     assert len(matches) == 10
     assert_array_equal(matches.reference, matches.target)
     assert_allclose(matches.similarity, np.ones(10), atol=1e-5)

@@ -10,6 +10,7 @@ from synthetic_views import ELSEWHERE, REACH, CoordinateBackbone, look_at, rende
 
 from zsp_lite import FeatureMap, Frame, PoseEstimate, Sim3, ZeroShotPose
 from zsp_lite.metrics import rotation_error
+from zsp_lite.points import object_points
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 from zsp_lite.views import View, extract_views, object_crop
 
@@ -93,11 +94,7 @@ def test_the_estimate_is_for_the_view_closest_to_the_reference(estimate):
 def test_inliers_agree_with_the_pose_within_a_fraction_of_the_objects_size(estimate, frames):
     source, target = estimate.points
     residual = np.linalg.norm(estimate.sim3.apply(source) - target, axis=1)
-    seen = []
-    for frame in frames[1:]:
-        row, column = np.nonzero(frame.mask > 0.5)
-        pixels = np.stack([column, row], axis=-1) + 0.5
-        seen.append(frame.camera.unproject(pixels, frame.depth[row, column]))
+    seen = [frame.camera.to_world(object_points(frame)) for frame in frames[1:]]
     # The threshold is 0.2 of the spread of what the views show, which is known within a fifth.
     most = 0.2 * np.sqrt(np.concatenate(seen).var(axis=0).mean())
     sure = np.abs(residual / most - 1) > 0.2
@@ -216,14 +213,3 @@ def test_both_poses_of_a_symmetric_object_are_nearly_as_probable(symmetric):
     assert symmetric.confidence >= others[0] > symmetric.confidence / np.e
     assert symmetric.confidence < 0.75
     assert symmetric.confidence + sum(others) <= 1
-
-
-def test_both_poses_of_a_symmetric_object_are_among_the_hypotheses(symmetric):
-    poses = [symmetric.between_worlds(one.sim3, one.view) for one in symmetric.hypotheses]
-    in_world = np.stack([pose.R for pose in poses])
-    identity, half_turn = np.diag([1.0, 1.0, 1.0]), np.diag([-1.0, -1.0, 1.0])
-    errors = [rotation_error(in_world, turn) for turn in (identity, half_turn)]
-    assert (np.min(errors, axis=1) < 15).all()
-    assert np.min(errors) < 10
-    # The best one: where the painting says little, poses some 25 degrees off are close.
-    assert min(error[0] for error in errors) < 30

@@ -87,7 +87,7 @@ class ZeroShotPose:
         check_choice("cycle_from", self.cycle_from, ("reference", "target"))
         check_choice("kmeans", self.kmeans, (None, True, False))
         check_integer("k", self.k, 1)
-        check_integer("trials", self.trials, 1, 10_000_000)
+        check_integer("trials", self.trials, 1, 1_000_000)
         check_integer("sample_size", self.sample_size, 3)
         check_integer("seed", self.seed, 0)
         if not callable(self.backbone):
@@ -120,7 +120,7 @@ class ZeroShotPose:
             InputError: There are no targets, no target is usable, or the reference has an empty
                 mask or no known depth.
         """
-        timings: dict[str, float] = {}
+        timings = {}
         with timed(timings, "features"):
             frames = list_frames([reference, *list_frames(targets)])
             first, *others = self.views(frames)
@@ -151,7 +151,7 @@ class ZeroShotPose:
         if kmeans is None:
             kmeans = getattr(self._solver(), "kmeans", True)
         matched = []
-        for target, similarity in zip(targets, similarities, strict=True):
+        for target, similarity in zip(targets, similarities):
             matches = match(
                 reference.features,
                 target.features,
@@ -180,7 +180,7 @@ class ZeroShotPose:
         defect = frame_defect(reference.frame)
         if defect:
             raise NoPoseError(f"reference {reference.frame.name or 'view'}: {defect}")
-        timings: dict[str, float] = {}
+        timings = {}
         if matched is None:
             with timed(timings, "matching"):
                 matched = self.match_views(reference, targets)
@@ -211,18 +211,10 @@ class ZeroShotPose:
             return pkgutil.resolve_name("zsp_lite.verified:VerifiedSolver")()
         return self.solver
 
-    def _align_best_view(
-        self,
-        reference: View,
-        targets: Sequence[View],
-        matched: Sequence[ViewMatch],
-        *,
-        seed: int,
-        threshold: float,
-    ) -> PoseEstimate:
+    def _align_best_view(self, reference, targets, matched, *, seed, threshold) -> PoseEstimate:
         """Solve as the paper does: select the best view (sec. 4.2) and fit the pose to its matches
         by RANSAC (sec. 4.3)."""
-        timings: dict[str, float] = {}
+        timings = {}
         with timed(timings, "view"):
             if isinstance(self.view_selector, str):
                 scored = [VIEW_SELECTORS[self.view_selector](one) for one in matched]
@@ -233,7 +225,7 @@ class ZeroShotPose:
             matches = matched[best].matches
         with timed(timings, "alignment"):
             points = match_points(reference, targets[best], matches)
-            flags: tuple[str, ...] = ()
+            flags = ()
             try:
                 sim3, inliers = ransac(
                     *points, threshold, self.trials, self.sample_size, seed, SCALE_RANGE

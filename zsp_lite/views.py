@@ -69,9 +69,7 @@ def extract_views(
     """Extract the views of object crops, their features in one batch; see `frame_view` for the
     foreground."""
     maps = feature_maps(backbone, crops)
-    return [
-        frame_view(crop, features, foreground) for crop, features in zip(crops, maps, strict=True)
-    ]
+    return [frame_view(crop, features, foreground) for crop, features in zip(crops, maps)]
 
 
 def feature_maps(backbone: FeatureExtractor, crops: Sequence[Frame]) -> list[FeatureMap]:
@@ -89,7 +87,7 @@ def feature_maps(backbone: FeatureExtractor, crops: Sequence[Frame]) -> list[Fea
     return maps
 
 
-def frame_view(crop: Frame, features: FeatureMap, foreground: str = "saliency") -> View:
+def frame_view(crop: Frame, features: FeatureMap, foreground: str) -> View:
     """Combine an object crop with its features and its foreground patches.
 
     The foreground are the salient patches (see `FeatureMap.foreground`), or for "mask" the patches
