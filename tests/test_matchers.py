@@ -58,12 +58,8 @@ def test_matched_patches_and_their_partners_are_on_the_object(name):
     assert matched.any()
     assert ON_FIRST[matched].all()
     assert ON_SECOND[partner[matched]].all()
-
-
-@pytest.mark.parametrize("name", MATCHERS)
-def test_nothing_is_matched_with_an_image_without_the_object(name):
-    _, score = MATCHERS[name](SIMILARITIES, ON_FIRST, torch.zeros_like(ON_SECOND))
-    assert not score.isfinite().any()
+    _, without = MATCHERS[name](SIMILARITIES, ON_FIRST, torch.zeros_like(ON_SECOND))
+    assert not without.isfinite().any()
 
 
 @pytest.mark.parametrize("name", MATCHERS)

@@ -128,7 +128,7 @@ def match(
     target: FeatureMap,
     k: int = 50,
     kmeans: bool = True,
-    seed: int | np.random.Generator = 0,
+    seed: int = 0,
     cycle_from: Literal["reference", "target"] = "reference",
     ref_foreground: Mask | None = None,
     target_foreground: Mask | None = None,
@@ -149,7 +149,7 @@ def match(
         target: Feature map of the target.
         k: Number of matches.
         kmeans: False returns the k best patches without clustering.
-        seed: Seed or generator of k-means.
+        seed: Seed of k-means.
         cycle_from: Image in which cycles start and whose patches are clustered and compared in
             saliency. "reference" is the paper's; "target" follows the cycle step of the published
             code, with its masking.
@@ -217,7 +217,7 @@ def _most_salient(
     features: FeatureMap,
     candidates: Int[np.ndarray, " m"],
     k: int,
-    seed: int | np.random.Generator,
+    seed: int,
     binning: bool,
 ) -> Int[np.ndarray, " k"]:
     """Cluster patches into k clusters; return the most salient patch of each, in their order."""

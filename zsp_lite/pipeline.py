@@ -19,8 +19,7 @@ from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
 from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
-from zsp_lite.matching import match
-from zsp_lite.matching import similarities as cosine_similarities
+from zsp_lite.matching import match, similarities
 from zsp_lite.points import standard_deviation
 from zsp_lite.views import IMAGE_SIZE, View, extract_views, object_crop, usable_targets
 
@@ -137,21 +136,21 @@ class ZeroShotPose:
         self,
         reference: View,
         targets: Sequence[View],
-        similarities: Sequence[Float[torch.Tensor, "_ _"]] | None = None,
+        cosines: Sequence[Float[torch.Tensor, "_ _"]] | None = None,
     ) -> list[ViewMatch]:
         """Match the reference with each target view (sec. 4.1).
 
-        `similarities` are the cosines of the reference's patches with those of each view, if they
-        are known already.
+        `cosines` are those of the reference's patches with the patches of each view, if they are
+        known already.
         """
-        if similarities is None:
+        if cosines is None:
             features = [target.features for target in targets]
-            similarities = cosine_similarities(reference.features, features, self.binning)
+            cosines = similarities(reference.features, features, self.binning)
         kmeans = self.kmeans
         if kmeans is None:
             kmeans = getattr(self._solver(), "kmeans", True)
         matched = []
-        for target, similarity in zip(targets, similarities):
+        for target, similarity in zip(targets, cosines):
             matches = match(
                 reference.features,
                 target.features,
@@ -175,8 +174,6 @@ class ZeroShotPose:
 
         `matched` is the result of `match_views`, if it is known already.
         """
-        if not targets:
-            raise InputError("no target views, expected at least one")
         defect = frame_defect(reference.frame)
         if defect:
             raise NoPoseError(f"reference {reference.frame.name or 'view'}: {defect}")

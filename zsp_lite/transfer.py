@@ -188,9 +188,8 @@ def transfer(
 
     # All source patches (p, 3), with their displacements (p, 3) and highest cosines (p).
     start = np.concatenate([view.points for view in source])
-    compared = [_compare(view, target, size) for view in source]
-    displacement = np.concatenate([displacement for displacement, _ in compared])
-    cosine = np.concatenate([cosine for _, cosine in compared])
+    compared = zip(*(_compare(view, target, size) for view in source))
+    displacement, cosine = map(np.concatenate, compared)
 
     # Their mean around each mark.
     squared = cdist(marks, start, "sqeuclidean") / size**2  # (marks, patches)
