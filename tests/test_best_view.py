@@ -39,7 +39,7 @@ def test_the_global_score_is_the_cosine_whatever_the_lengths():
 
 
 def test_mask_iou_counts_shared_patches():
-    first, second = np.array([[1, 1], [0, 0]], bool), np.array([[1, 0], [1, 0]], bool)
+    first, second = torch.tensor([[[1, 1], [0, 0]], [[1, 0], [1, 0]]]).bool()
     assert mask_iou(first, second) == pytest.approx(1 / 3)
     assert mask_iou(first, first) == 1
     assert mask_iou(first & False, second & False) == 0

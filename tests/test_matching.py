@@ -16,7 +16,7 @@ from torch.testing import assert_close
 
 from zsp_lite import matching
 from zsp_lite.features import FeatureMap, log_bin
-from zsp_lite.matching import cyclical_distances, key_similarities, match, similarities, similarity
+from zsp_lite.matching import cyclical_distances, key_similarities, match, similarity
 
 sides = st.integers(1, 8)
 seeds = st.integers(0, 2**32 - 1)
@@ -57,21 +57,12 @@ def test_similarity_is_the_cosine_of_materialised_descriptors(h1, w1, h2, w2, se
     assert_close(similarity(ref, target).double(), expected, atol=1e-5, rtol=0)
 
 
-def test_similarity_holds_at_the_size_of_the_paper_and_with_one_dominant_patch():
-    ref, target = feature_map(0, (28, 28), 384).keys, feature_map(1, (28, 28), 384).keys
-    ref[13, 4] *= 1000
-    expected = descriptors(ref.double()) @ descriptors(target.double()).T
-    assert_close(similarity(ref, target).double(), expected, atol=1e-5, rtol=0)
-
-
 def test_similarity_takes_maps_tensors_and_arrays_and_is_symmetric():
     ref, target = feature_map(0, (4, 6)), feature_map(1, (5, 3))
     sim = similarity(ref, target)
     assert sim.shape == (24, 15)
     assert_close(similarity(ref.keys.numpy().astype(np.float64), target.keys), sim)
     assert_close(similarity(target, ref).T, sim)
-    for many, target in zip(similarities(ref, [target, ref]), (target, ref)):
-        assert torch.equal(many, similarity(ref, target))
 
 
 def test_descriptors_without_length_are_similar_to_nothing():
@@ -142,12 +133,10 @@ def test_kmeans_keeps_the_most_salient_patch_of_each_group_of_like_patches():
     assert_array_equal(matches.distance, 0)
 
 
-@pytest.mark.parametrize("kmeans", [True, False])
 @pytest.mark.parametrize("cycle_from", ["reference", "target"])
-def test_without_foreground_there_are_no_matches(kmeans, cycle_from):
+def test_without_foreground_there_are_no_matches(cycle_from):
     empty = feature_map(9, saliency=torch.zeros(9, 9))
-    matches = match(empty, feature_map(10), kmeans=kmeans, cycle_from=cycle_from)
-    assert len(matches) == 0
+    matches = match(empty, feature_map(10), cycle_from=cycle_from)
     assert matches.reference.shape == matches.target.shape == (0, 2)
     assert matches.similarity.shape == matches.distance.shape == (0,)
 

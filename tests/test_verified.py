@@ -10,6 +10,7 @@ from synthetic_views import ELSEWHERE, REACH, CoordinateBackbone, look_at, rende
 
 from zsp_lite import FeatureMap, Frame, PoseEstimate, Sim3, ZeroShotPose
 from zsp_lite.metrics import rotation_error
+from zsp_lite.points import object_points
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
 from zsp_lite.views import View, extract_views, object_crop
 
@@ -93,11 +94,7 @@ def test_the_estimate_is_for_the_view_closest_to_the_reference(estimate):
 def test_inliers_agree_with_the_pose_within_a_fraction_of_the_objects_size(estimate, frames):
     source, target = estimate.points
     residual = np.linalg.norm(estimate.sim3.apply(source) - target, axis=1)
-    seen = []
-    for frame in frames[1:]:
-        row, column = np.nonzero(frame.mask > 0.5)
-        pixels = np.stack([column, row], axis=-1) + 0.5
-        seen.append(frame.camera.unproject(pixels, frame.depth[row, column]))
+    seen = [frame.camera.to_world(object_points(frame)) for frame in frames[1:]]
     # The threshold is 0.2 of the spread of what the views show, which is known within a fifth.
     most = 0.2 * np.sqrt(np.concatenate(seen).var(axis=0).mean())
     sure = np.abs(residual / most - 1) > 0.2
@@ -114,25 +111,22 @@ def test_the_order_of_the_views_does_not_matter(method, estimate, views):
     assert_array_equal(other.view_scores, estimate.view_scores[order])
 
 
-def test_a_rotation_of_the_target_world_rotates_the_estimate(method, estimate, views):
+def test_a_larger_scene_that_is_rotated_has_a_larger_scale_and_a_rotated_pose(
+    method, estimate, views
+):
     turn = look_at((0.2, 0.5, -1)).R
-    moved = [changed(view, camera=turned(view.frame.camera, turn)) for view in views[1:]]
-    other = method.estimate_from_views(views[0], moved)
-    # Against a camera the pose is the same, in the world it has turned.
+
+    def moved(view):
+        camera = turned(view.frame.camera, turn)
+        return changed(view, camera=replace(camera, t=7 * camera.t), depth=7 * view.frame.depth)
+
+    other = method.estimate_from_views(views[0], [moved(view) for view in views[1:]])
+    assert_allclose(other.sim3.scale, 7 * estimate.sim3.scale, rtol=0.02)
+    # Against a camera the rotation is the same, in the world it has turned.
     assert other.view == estimate.view
     assert rotation_error(other.sim3.R, estimate.sim3.R) < 0.5
     in_world = [one.target_camera.R.T @ one.sim3.R for one in (estimate, other)]
     assert rotation_error(turn @ in_world[0], in_world[1]) < 0.5
-
-
-def test_a_larger_scene_has_a_larger_scale_and_the_same_rotation(method, estimate, views):
-    def larger(view):
-        camera = replace(view.frame.camera, t=7 * view.frame.camera.t)
-        return changed(view, camera=camera, depth=7 * view.frame.depth)
-
-    other = method.estimate_from_views(views[0], [larger(view) for view in views[1:]])
-    assert rotation_error(other.sim3.R, estimate.sim3.R) < 1
-    assert_allclose(other.sim3.scale, 7 * estimate.sim3.scale, rtol=0.02)
 
 
 def test_one_target_view_is_enough(method, views, frames):
@@ -216,14 +210,3 @@ def test_both_poses_of_a_symmetric_object_are_nearly_as_probable(symmetric):
     assert symmetric.confidence >= others[0] > symmetric.confidence / np.e
     assert symmetric.confidence < 0.75
     assert symmetric.confidence + sum(others) <= 1
-
-
-def test_both_poses_of_a_symmetric_object_are_among_the_hypotheses(symmetric):
-    poses = [symmetric.between_worlds(one.sim3, one.view) for one in symmetric.hypotheses]
-    in_world = np.stack([pose.R for pose in poses])
-    identity, half_turn = np.diag([1.0, 1.0, 1.0]), np.diag([-1.0, -1.0, 1.0])
-    errors = [rotation_error(in_world, turn) for turn in (identity, half_turn)]
-    assert (np.min(errors, axis=1) < 15).all()
-    assert np.min(errors) < 10
-    # The best one: where the painting says little, poses some 25 degrees off are close.
-    assert min(error[0] for error in errors) < 30

@@ -204,57 +204,41 @@ def ransac(
     """
     check_number("ransac: threshold", threshold, above=0)
     source, target = _point_pairs(source, target, minimum=sample_size)
-    rng = np.random.default_rng(seed)
-    block = max(_BLOCK // len(source), 1)
-    best = (1, 0.0)  # lowest rank of a trial; that of a trial that is not usable is not lower
-    for first in range(0, trials, block):
-        samples = _draw_samples(len(source), sample_size, min(block, trials - first), rng)
-        rank, *trial = _best_trial(source, target, samples, threshold, scale_range)
-        if rank < best:
-            best = rank
-            fit, inliers = trial
-    if best[0] > 0:
+    samples = _draw_samples(len(source), sample_size, trials, np.random.default_rng(seed))
+    scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
+    in_range = (scale >= scale_range[0]) & (scale <= scale_range[1])
+    usable = np.flatnonzero(in_range & (conditioning > _COLLINEAR))
+    if not len(usable):
         raise InputError(
             f"ransac: none of {trials} trials with sample_size {sample_size} on {len(source)} "
             f"points is usable: all collinear, or scale outside scale_range {scale_range}"
         )
 
+    def residuals(some: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t n"]:
+        linear = scale[some, None, None] * rotation[some]
+        offset = linear @ source.T + translation[some, :, None] - target.T  # (t, 3, N)
+        return np.sqrt(np.square(offset).sum(axis=1))
+
+    # Inliers are counted in blocks of trials: the residuals of all may not fit into memory.
+    blocks = np.array_split(usable, 1 + usable.size * len(source) // _BLOCK)
+    counts = np.concatenate([(residuals(block) < threshold).sum(axis=1) for block in blocks])
+    # Of the trials with the most inliers, the one with the smallest sum of their residuals.
+    leaders = usable[counts == counts.max()]
+    residual = residuals(leaders)
+    inlier = residual < threshold
+    first = np.where(inlier, residual, 0).sum(axis=1).argmin()
+    best = leaders[first]
+    fit = [scale[best], rotation[best], translation[best]]
+    inliers = inlier[first]
+
     # The similarity of all inliers.
     if inliers.sum() >= 3:
-        scale, rotation, translation, conditioning = umeyama_batch(
+        *refit, conditioning = umeyama_batch(
             source[None, inliers], target[None, inliers], scale_range
         )
         if conditioning[0] > _COLLINEAR:
-            fit = scale[0], rotation[0], translation[0]
+            fit = [part[0] for part in refit]
     return Sim3(*fit), inliers
-
-
-def _best_trial(
-    source: Float[np.ndarray, "n 3"],
-    target: Float[np.ndarray, "n 3"],
-    samples: Int[np.ndarray, "trials size"],
-    threshold: float,
-    scale_range: tuple[float, float],
-) -> tuple[tuple[int, float], tuple, Bool[np.ndarray, " n"]]:
-    """Return the rank of the best sample, lower is better, its scale, rotation and translation, and
-    its inliers.
-
-    The rank begins with 1 if no sample is usable.
-    """
-    scale, rotation, translation, conditioning = umeyama_batch(source[samples], target[samples])
-    in_range = (scale >= scale_range[0]) & (scale <= scale_range[1])
-    usable = in_range & (conditioning > _COLLINEAR)
-    linear = scale[:, None, None] * rotation
-    offset = linear @ source.T + translation[:, :, None] - target.T  # (trials, 3, N)
-    residual = np.sqrt(np.square(offset).sum(axis=1))
-    inlier = residual < threshold
-    counts = np.where(usable, inlier.sum(axis=1), -1)
-    leaders = np.flatnonzero(counts == counts.max())
-    sums = np.where(inlier[leaders], residual[leaders], 0).sum(axis=1)
-    best = leaders[sums.argmin()]
-    # More inliers, then the smaller sum of their residuals.
-    rank = (-int(counts.max()), float(sums.min()))
-    return rank, (scale[best], rotation[best], translation[best]), inlier[best]
 
 
 def _draw_samples(

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 
 from zsp_lite.features import FeatureMap
-from zsp_lite.matching import Mask, Matches, cyclical_distances
+from zsp_lite.matching import Matches, cyclical_distances
 from zsp_lite.views import View
 
 _NEIGHBOUR = 1.5  # patches; the eight neighbours of a patch are nearer
@@ -65,11 +65,11 @@ def global_score(reference: FeatureMap, target: FeatureMap) -> float:
     return float(F.cosine_similarity(reference.global_feature, target.global_feature, dim=0))
 
 
-def mask_iou(first: Mask, second: Mask) -> float:
+def mask_iou(
+    first: Bool[torch.Tensor, "rows cols"], second: Bool[torch.Tensor, "rows cols"]
+) -> float:
     """Compute the intersection over union of two masks, 0 if both are empty ("SaliencyIoU" of two
     foregrounds)."""
-    first = torch.as_tensor(first, dtype=torch.bool)
-    second = torch.as_tensor(second, dtype=torch.bool)
     return float((first & second).sum() / (first | second).sum().clamp_min(1))
 
 

@@ -168,9 +168,8 @@ def rotation_matrix(name: str, values: object) -> "np.ndarray":
     if matrix.shape[-2:] != (3, 3):
         raise InputError(f"{name} has shape {matrix.shape}, expected (..., 3, 3)")
     check_magnitude(name, matrix)
-    deviation = np.abs(matrix @ matrix.swapaxes(-1, -2) - np.eye(3)).max(axis=(-2, -1))
-    rounded = (deviation > _FLOAT32_TOLERANCE) | (np.linalg.det(matrix) < 0)
-    if not rounded.any():
+    deviation = np.abs(matrix @ matrix.swapaxes(-1, -2) - np.eye(3))
+    if (deviation <= _FLOAT32_TOLERANCE).all() and (np.linalg.det(matrix) > 0).all():
         return matrix.copy()
     left, _, right = np.linalg.svd(matrix)
     left[..., 2] *= np.linalg.det(left @ right)[..., None]  # of a reflection, the nearest rotation
@@ -181,7 +180,7 @@ def rotation_matrix(name: str, values: object) -> "np.ndarray":
             f"{name} is {reprlib.repr(matrix.tolist())}, {off:.2g} off the nearest rotation, "
             "expected a rotation, R @ R.T = identity and det R = 1"
         )
-    return np.where(rounded[..., None, None], nearest, matrix)
+    return nearest
 
 
 def rigid_matrix(name: str, values: object) -> "np.ndarray":

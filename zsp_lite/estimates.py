@@ -17,6 +17,8 @@ from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error
 from zsp_lite.views import View
 
+PointPairs = tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]  # of matches
+
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
@@ -67,7 +69,7 @@ class PoseEstimate:
         return self.target_views[self.view].frame.camera
 
     @cached_property
-    def points(self) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
+    def points(self) -> PointPairs:
         """3D points of the matches, in the reference's and in the chosen target's camera frame."""
         return match_points(self.reference_view, self.target_views[self.view], self.matches)
 
@@ -161,9 +163,7 @@ class Solver(Protocol):
         ...
 
 
-def match_points(
-    reference: View, target: View, matches: Matches
-) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
+def match_points(reference: View, target: View, matches: Matches) -> PointPairs:
     """Unproject matches to 3D points, each in the frame of its own camera (sec. 4.3)."""
     source = reference.patch_points[0][tuple(matches.reference.T)]
     return source, target.patch_points[0][tuple(matches.target.T)]

@@ -167,7 +167,7 @@ def _pixels(
 
     One frame at a time is in memory: real sequences have hundreds.
     """
-    pixels: list[dict[int, tuple[float, float]]] = [{} for _ in points]
+    pixels = [{} for _ in points]
     for annotation in dataset.frames(category, name):
         if annotation.viewpoint is None or annotation.depth is None:
             continue

@@ -128,7 +128,7 @@ def match(
     target: FeatureMap,
     k: int = 50,
     kmeans: bool = True,
-    seed: int | np.random.Generator = 0,
+    seed: int = 0,
     cycle_from: Literal["reference", "target"] = "reference",
     ref_foreground: Mask | None = None,
     target_foreground: Mask | None = None,
@@ -149,7 +149,7 @@ def match(
         target: Feature map of the target.
         k: Number of matches.
         kmeans: False returns the k best patches without clustering.
-        seed: Seed or generator of k-means.
+        seed: Seed of k-means.
         cycle_from: Image in which cycles start and whose patches are clustered and compared in
             saliency. "reference" is the paper's; "target" follows the cycle step of the published
             code, with its masking.
@@ -217,11 +217,21 @@ def _most_salient(
     features: FeatureMap,
     candidates: Int[np.ndarray, " m"],
     k: int,
-    seed: int | np.random.Generator,
+    seed: int,
     binning: bool,
 ) -> Int[np.ndarray, " k"]:
     """Cluster patches into k clusters; return the most salient patch of each, in their order."""
-    clusters = _cluster(_gram(features, candidates, binning), k, np.random.default_rng(seed))
+    keys = features.keys.double()[None]
+    if binning:
+        (built,) = descriptors(keys, bin_indices(features.grid)[:, candidates])
+    else:
+        built = keys[0].flatten(0, 1)[candidates]
+    built = F.normalize(built, dim=1)
+    # Rounded, because greedy k-means++ has exact ties (of two points that are each other's nearest,
+    # either lowers the sum of squares by the same amount), which rounding errors would break
+    # differently each time.
+    gram = (built @ built.T).round(decimals=6).numpy()
+    clusters = _cluster(gram, k, np.random.default_rng(seed))
     saliency = features.saliency.flatten().numpy()[candidates]
     by_cluster = np.lexsort((-saliency, clusters))  # the most salient of each cluster first
     first = np.unique(clusters[by_cluster], return_index=True)[1]
@@ -293,23 +303,6 @@ def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
     pooled = average_pool(keys, (0, 1)).square().sum(-1).flatten()
     squared = raw[index[:9]].sum(0) + pooled[index[9:]].sum(0)
     return squared.clamp_min(torch.finfo(squared.dtype).tiny).rsqrt()
-
-
-def _gram(
-    features: FeatureMap, patches: Int[np.ndarray, " m"], binning: bool
-) -> Float[np.ndarray, "m m"]:
-    """Compute the cosines between the descriptors of a few patches, which are few enough to
-    build."""
-    keys = features.keys.double()[None]
-    if binning:
-        (built,) = descriptors(keys, bin_indices(features.grid)[:, patches])
-    else:
-        built = keys[0].flatten(0, 1)[patches]
-    built = F.normalize(built, dim=1)
-    # Rounded, because greedy k-means++ has exact ties (of two points that are each other's nearest,
-    # either lowers the sum of squares by the same amount), which rounding errors would break
-    # differently each time.
-    return (built @ built.T).round(decimals=6).numpy()
 
 
 def _cluster(

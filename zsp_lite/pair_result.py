@@ -99,10 +99,7 @@ class PairResult:
             what = f"pixel {x:g},{y:g} of frame {frame}"
             points = marked_point(self.frames[frame], x, y, what)[None]
         poses = self.world_sim3, Sim3.identity()
-        source, target = (
-            describe_surface(views, pose, range(len(views)))
-            for views, pose in zip(self.views, poses)
-        )
+        source, target = (describe_surface(views, pose) for views, pose in zip(self.views, poses))
         return transfer(points, source, target)
 
     def __repr__(self) -> str:

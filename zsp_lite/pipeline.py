@@ -19,8 +19,7 @@ from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
 from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
-from zsp_lite.matching import match
-from zsp_lite.matching import similarities as cosine_similarities
+from zsp_lite.matching import match, similarities
 from zsp_lite.points import standard_deviation
 from zsp_lite.views import IMAGE_SIZE, View, extract_views, object_crop, usable_targets
 
@@ -87,7 +86,7 @@ class ZeroShotPose:
         check_choice("cycle_from", self.cycle_from, ("reference", "target"))
         check_choice("kmeans", self.kmeans, (None, True, False))
         check_integer("k", self.k, 1)
-        check_integer("trials", self.trials, 1, 10_000_000)
+        check_integer("trials", self.trials, 1, 1_000_000)
         check_integer("sample_size", self.sample_size, 3)
         check_integer("seed", self.seed, 0)
         if not callable(self.backbone):
@@ -120,7 +119,7 @@ class ZeroShotPose:
             InputError: There are no targets, no target is usable, or the reference has an empty
                 mask or no known depth.
         """
-        timings: dict[str, float] = {}
+        timings = {}
         with timed(timings, "features"):
             frames = list_frames([reference, *list_frames(targets)])
             first, *others = self.views(frames)
@@ -137,21 +136,21 @@ class ZeroShotPose:
         self,
         reference: View,
         targets: Sequence[View],
-        similarities: Sequence[Float[torch.Tensor, "_ _"]] | None = None,
+        cosines: Sequence[Float[torch.Tensor, "_ _"]] | None = None,
     ) -> list[ViewMatch]:
         """Match the reference with each target view (sec. 4.1).
 
-        `similarities` are the cosines of the reference's patches with those of each view, if they
-        are known already.
+        `cosines` are those of the reference's patches with the patches of each view, if they are
+        known already.
         """
-        if similarities is None:
+        if cosines is None:
             features = [target.features for target in targets]
-            similarities = cosine_similarities(reference.features, features, self.binning)
+            cosines = similarities(reference.features, features, self.binning)
         kmeans = self.kmeans
         if kmeans is None:
             kmeans = getattr(self._solver(), "kmeans", True)
         matched = []
-        for target, similarity in zip(targets, similarities, strict=True):
+        for target, similarity in zip(targets, cosines):
             matches = match(
                 reference.features,
                 target.features,
@@ -175,12 +174,10 @@ class ZeroShotPose:
 
         `matched` is the result of `match_views`, if it is known already.
         """
-        if not targets:
-            raise InputError("no target views, expected at least one")
         defect = frame_defect(reference.frame)
         if defect:
             raise NoPoseError(f"reference {reference.frame.name or 'view'}: {defect}")
-        timings: dict[str, float] = {}
+        timings = {}
         if matched is None:
             with timed(timings, "matching"):
                 matched = self.match_views(reference, targets)
@@ -211,18 +208,10 @@ class ZeroShotPose:
             return pkgutil.resolve_name("zsp_lite.verified:VerifiedSolver")()
         return self.solver
 
-    def _align_best_view(
-        self,
-        reference: View,
-        targets: Sequence[View],
-        matched: Sequence[ViewMatch],
-        *,
-        seed: int,
-        threshold: float,
-    ) -> PoseEstimate:
+    def _align_best_view(self, reference, targets, matched, *, seed, threshold) -> PoseEstimate:
         """Solve as the paper does: select the best view (sec. 4.2) and fit the pose to its matches
         by RANSAC (sec. 4.3)."""
-        timings: dict[str, float] = {}
+        timings = {}
         with timed(timings, "view"):
             if isinstance(self.view_selector, str):
                 scored = [VIEW_SELECTORS[self.view_selector](one) for one in matched]
@@ -233,7 +222,7 @@ class ZeroShotPose:
             matches = matched[best].matches
         with timed(timings, "alignment"):
             points = match_points(reference, targets[best], matches)
-            flags: tuple[str, ...] = ()
+            flags = ()
             try:
                 sim3, inliers = ransac(
                     *points, threshold, self.trials, self.sample_size, seed, SCALE_RANGE

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from scipy.special import expit, softmax
@@ -71,17 +71,12 @@ class TransferredPoints:
         logit = constant + cosine * self.cosine + distance * self.distance
         return np.where(self.distance < _BALL, expit(logit), 0.0)
 
-    @property
-    def found(self) -> Bool[np.ndarray, " n"]:
-        """Whether each point has a place on this object: a confidence of at least a half."""
-        return self.confidence >= FOUND
-
 
 @dataclass(frozen=True, eq=False)
 class SurfaceView:
     """The part of an object's surface that one frame shows: its patches with measured depth."""
 
-    number: int  # of the frame
+    name: str  # of the frame
     sim3: Sim3  # from the object's world to the common frame
     direction: Float[np.ndarray, "3"]  # from the object to the camera, in the common frame
     points: Float[np.ndarray, "n 3"]  # of the patches, in the common frame
@@ -112,14 +107,11 @@ def surface_views(
     annotations = [
         frame for frame in dataset.frames(category, sequence) if frame.viewpoint is not None
     ]
-    chosen = [annotations[k] for k in spread(VIEWS, len(annotations))]
-    frames = {one.frame_number: dataset.load(one) for one in chosen}
-    usable = {number: frame for number, frame in frames.items() if not frame_defect(frame)}
-    unmasked = any(frame.mask is None for frame in usable.values())
+    frames = [dataset.load(annotations[k]) for k in spread(VIEWS, len(annotations))]
+    usable = [frame for frame in frames if not frame_defect(frame)]
+    unmasked = any(frame.mask is None for frame in usable)
     method = ZeroShotPose(as_backbone(backbone), foreground="saliency" if unmasked else "mask")
-    surface = describe_surface(
-        method.views(usable.values()), alignment.objects[sequence].sim3, list(usable)
-    )
+    surface = describe_surface(method.views(usable), alignment.objects[sequence].sim3)
     if not surface:
         raise InputError(
             f"sequence {category}/{sequence}: none of {len(frames)} frames shows the object with "
@@ -128,13 +120,10 @@ def surface_views(
     return surface
 
 
-def describe_surface(
-    views: Iterable[View], sim3: Sim3, numbers: Iterable[int]
-) -> list[SurfaceView]:
-    """Gather the patches of views of one world, with its similarity to the common frame, and the
-    numbers of their frames."""
+def describe_surface(views: Iterable[View], sim3: Sim3) -> list[SurfaceView]:
+    """Gather the patches of views of one world, given its similarity to the common frame."""
     surface = []
-    for number, view in zip(numbers, views):
+    for view in views:
         patches = np.flatnonzero(view.known_foreground)
         if not len(patches):
             continue
@@ -146,7 +135,7 @@ def describe_surface(
         (built,) = descriptors(view.features.keys[None], index)
         surface.append(
             SurfaceView(
-                number,
+                view.frame.name,
                 sim3,
                 towards / np.linalg.norm(towards),
                 points[near],
@@ -199,9 +188,8 @@ def transfer(
 
     # All source patches (p, 3), with their displacements (p, 3) and highest cosines (p).
     start = np.concatenate([view.points for view in source])
-    compared = [_compare(view, target, size) for view in source]
-    displacement = np.concatenate([displacement for displacement, _ in compared])
-    cosine = np.concatenate([cosine for _, cosine in compared])
+    compared = zip(*(_compare(view, target, size) for view in source))
+    displacement, cosine = map(np.concatenate, compared)
 
     # Their mean around each mark.
     squared = cdist(marks, start, "sqeuclidean") / size**2  # (marks, patches)

@@ -19,6 +19,7 @@ IMAGE_SIZE = 224  # pixels of an object crop for a backbone without the attribut
 # Share of a foreground patch that the mask covers. Thin parts, such as a chair's legs, do not cover
 # half a patch.
 _MASK_SHARE = 0.25
+_PatchPoints = tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,17 +33,13 @@ class View:
     soft_mask: Float[np.ndarray, "height width"] = field(repr=False)
 
     @cached_property  # of N target views the paper's solver needs only those of the chosen one
-    def patch_points(
-        self,
-    ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
+    def patch_points(self) -> _PatchPoints:
         """Camera-frame point of each patch, and whether its depth was measured (see
         `depth.patch_points`)."""
         return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint=True)
 
     @cached_property
-    def measured_points(
-        self,
-    ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
+    def measured_points(self) -> _PatchPoints:
         """`patch_points` without in-painting: the point of a patch without measured depth is the
         origin."""
         return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint=False)
@@ -69,9 +66,7 @@ def extract_views(
     """Extract the views of object crops, their features in one batch; see `frame_view` for the
     foreground."""
     maps = feature_maps(backbone, crops)
-    return [
-        frame_view(crop, features, foreground) for crop, features in zip(crops, maps, strict=True)
-    ]
+    return [frame_view(crop, features, foreground) for crop, features in zip(crops, maps)]
 
 
 def feature_maps(backbone: FeatureExtractor, crops: Sequence[Frame]) -> list[FeatureMap]:
@@ -89,7 +84,7 @@ def feature_maps(backbone: FeatureExtractor, crops: Sequence[Frame]) -> list[Fea
     return maps
 
 
-def frame_view(crop: Frame, features: FeatureMap, foreground: str = "saliency") -> View:
+def frame_view(crop: Frame, features: FeatureMap, foreground: str) -> View:
     """Combine an object crop with its features and its foreground patches.
 
     The foreground are the salient patches (see `FeatureMap.foreground`), or for "mask" the patches

@@ -104,8 +104,8 @@ def shown_object(
     """Show an object in those of its views that are nearest to some directions."""
     nearest = [int(np.argmax([view.direction @ one for view in views])) for one in directions]
     chosen = sorted(set(nearest))
-    annotations = {one.frame_number: one for one in dataset.frames(category, name)}
-    frames = [dataset.load(annotations[views[k].number]) for k in chosen]
+    every = {frame.name: frame for frame in map(dataset.load, dataset.frames(category, name))}
+    frames = [every[views[k].name] for k in chosen]
     others = sorted(set(range(len(views))) - set(chosen))
     points = [views[k].points for k in chosen + others]
     return ShownObject(

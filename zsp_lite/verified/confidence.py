@@ -82,7 +82,7 @@ def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:
 
     Hypotheses are sorted, best first. A mode is the number of its best hypothesis.
     """
-    mode_of: list[int] = []
+    mode_of = []
     for i, row in enumerate(angle):
         # The modes of better hypotheses that are within 30 degrees.
         near = [j for j in range(i) if mode_of[j] == j and row[j] < SAME_ANGLE]
@@ -97,21 +97,16 @@ def reliability_flags(
     flags = []
 
     # The best hypotheses of all modes that are about as probable as the first.
-    probability = np.array([hypothesis.confidence for hypothesis in hypotheses])
-    tied = [
-        k
-        for k, hypothesis in enumerate(hypotheses)
-        if hypothesis.mode == k and probability[k] > TIE_RATIO * probability[0]
-    ]
+    enough = TIE_RATIO * hypotheses[0].confidence
+    tied = [k for k, one in enumerate(hypotheses) if one.mode == k and one.confidence > enough]
+    probabilities = [hypotheses[k].confidence for k in tied]
     # One of two is meant if the two are together more probable than not, and if they are so far
     # apart that no rotation is within 30 degrees of both.
     one_of_two = bool(
-        len(tied) == 2
-        and probability[tied].sum() > 0.5
-        and angle[tied[0], tied[1]] > 2 * SAME_ANGLE
+        len(tied) == 2 and sum(probabilities) > 0.5 and angle[tied[0], tied[1]] > 2 * SAME_ANGLE
     )
     if len(tied) > 1:
-        shown = " and ".join(f"{probability[i]:.2f}" for i in tied)
+        shown = " and ".join(f"{one:.2f}" for one in probabilities)
         start = f"{len(tied)} poses more than 30"
         if one_of_two:
             start = f"one of two: poses {angle[tied[0], tied[1]]:.0f}"

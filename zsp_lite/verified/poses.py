@@ -49,11 +49,8 @@ class Poses:
 
 def concatenate(batches: Sequence[Poses]) -> Poses:
     """Concatenate batches of poses."""
-    return Poses(
-        torch.cat([batch.scale for batch in batches]),
-        torch.cat([batch.rotation for batch in batches]),
-        torch.cat([batch.translation for batch in batches]),
-    )
+    parts = zip(*((batch.scale, batch.rotation, batch.translation) for batch in batches))
+    return Poses(*map(torch.cat, parts))
 
 
 def float_tensor(values) -> Tensor:
@@ -92,7 +89,7 @@ def non_maximum_suppression(
     order = torch.argsort(score, descending=True, stable=True)
     # (m, m): rows and columns are sorted by the scores, as `order` is.
     near = (rotation_angles(rotation[order], rotation[order]) < min_angle).numpy()
-    selected: list[int] = []
+    selected = []
     for candidate in range(len(order)):
         if len(selected) < max_count and not near[candidate, selected].any():
             selected.append(candidate)

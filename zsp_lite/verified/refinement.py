@@ -36,8 +36,6 @@ _POLISH_POINTS = (450, 2000)
 # Number of a round's best steps whose mean is a candidate of the next round (mu in CMA-ES).
 _PARENTS = 6
 
-_Score = Callable[[Poses], Float[Tensor, " _"]]  # computes a score for each pose
-
 
 class SearchSchedule(NamedTuple):
     """The rounds of a search, and standard deviations of the steps in the first round."""
@@ -71,7 +69,7 @@ def refine_coarse_to_fine(scene: Scene, poses: Poses, rng: np.random.Generator) 
     return concatenate([polished, poses[_MAX_POLISHED:]])
 
 
-def _scorer(scene: Scene, counts: tuple[int, int]) -> _Score:
+def _scorer(scene: Scene, counts: tuple[int, int]) -> Callable:
     """Return a function that scores poses on about `counts` reference points and target points."""
     reference_stride = max(round(len(scene.reference_points) / counts[0]), 1)
     target_stride = max(round(len(scene.target_points) / counts[1]), 1)
@@ -80,7 +78,7 @@ def _scorer(scene: Scene, counts: tuple[int, int]) -> _Score:
 
 def refine(
     poses: Poses,
-    score: _Score,
+    score: Callable[[Poses], Float[Tensor, " _"]],
     schedule: SearchSchedule,
     rng: np.random.Generator,
 ) -> tuple[Poses, Float[Tensor, " m"]]:
@@ -101,8 +99,17 @@ def refine(
         if recombined is not None:
             steps[:, 0] = recombined
 
-        # Scores and numbers of each pose's best steps, best first: (m, parents).
-        candidates = _perturb(poses, steps, schedule)
+        # A step has 3 components of rotation, 3 of translation, 1 of log-scale. Scores and numbers
+        # of each pose's best steps, best first: (m, parents).
+        vectors = torch.deg2rad(schedule.rotation * steps[..., :3]).flatten(0, 1)
+        turns = rotation_matrices(vectors).view(*steps.shape[:2], 3, 3)
+        scale = poses.scale[:, None] * torch.exp(schedule.scale * steps[..., 6])
+        translation = poses.translation[:, None] + schedule.translation * steps[..., 3:6]
+        candidates = Poses(
+            scale.clamp(*SCALE_RANGE).flatten(),
+            (turns @ poses.rotation[:, None]).flatten(0, 1),
+            translation.flatten(0, 1),
+        )
         top_scores, top_steps = score(candidates).view(m, -1).topk(_PARENTS, dim=1)
         best_step = top_steps[:, 0]
         improved = top_scores[:, 0] > best_score
@@ -117,12 +124,3 @@ def refine(
         poses = concatenate([poses, candidates])[torch.where(improved, best_candidate, rows)]
         best_score = torch.maximum(best_score, top_scores[:, 0])
     return poses, best_score
-
-
-def _perturb(poses: Poses, steps: Float[Tensor, "m samples 7"], schedule: SearchSchedule) -> Poses:
-    """Apply each step to its pose: 3 components of rotation, 3 of translation, 1 of log-scale."""
-    vectors = torch.deg2rad(schedule.rotation * steps[..., :3]).flatten(0, 1)
-    rotation = rotation_matrices(vectors).view(*steps.shape[:2], 3, 3) @ poses.rotation[:, None]
-    scale = (poses.scale[:, None] * torch.exp(schedule.scale * steps[..., 6])).clamp(*SCALE_RANGE)
-    translation = poses.translation[:, None] + schedule.translation * steps[..., 3:6]
-    return Poses(scale.flatten(), rotation.flatten(0, 1), translation.flatten(0, 1))

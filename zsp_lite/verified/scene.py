@@ -38,9 +38,9 @@ MIN_POINTS = 8  # fewer do not determine a shape to align
 # Resolution of the maps. Finer maps do not change results with patches of 8 pixels, and exceed the
 # processor's cache.
 _MAP_PIXELS = 128 * 128
+_NO_SILHOUETTE = 1e4  # distance in pixels where the mask is empty
 # The silhouette of a soft mask is uncertain: distances are averaged over several thresholds.
 _MASK_THRESHOLDS = (0.3, 0.5, 0.7)
-_NO_SILHOUETTE = 1e4  # distance in pixels where the mask is empty
 _MIN_DEPTH = 1e-3  # working units; smaller depths are raised to it before the projection
 
 
@@ -60,18 +60,6 @@ class ViewMaps:
     # soft mask, 0 where the depth is unknown); distance to the silhouette in map pixels (0 inside);
     # similarity column of the patch (-1: none)
     table: Float[Tensor, "pixels 4"]
-
-
-@dataclass(frozen=True, eq=False)
-class Projection:
-    """n points under m poses, projected into v views, with the map values at their pixels."""
-
-    depth: Float[Tensor, "m v n"]  # depth of the point, working units
-    surface_depth: Float[Tensor, "m v n"]  # measured depth at its pixel, working units
-    # weight of the measured depth, in [0, 1]; 0 where it is unknown or background
-    weight: Float[Tensor, "m v n"]
-    silhouette_distance: Float[Tensor, "m v n"]  # at the point's depth, working units; 0 inside
-    patch: Int[Tensor, "m v n"]  # similarity column of the patch at its pixel, -1 for none
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +108,7 @@ def build_scene(
     reference: View,
     targets: Sequence[View],
     similarities: Sequence[Tensor],
-    matches: Sequence[Matches] = (),
+    matches: Sequence[Matches],
 ) -> Scene:
     """Prepare the scene of a reference view and its target views."""
     cameras = tuple(target.frame.camera for target in targets)
@@ -150,7 +138,7 @@ def build_scene(
     column = _number(np.concatenate(foregrounds))
     reference_foreground = reference.foreground.ravel()
     between_foregrounds = [
-        similarity.float()[reference_foreground][:, foreground]
+        similarity[reference_foreground][:, foreground]
         for similarity, foreground in zip(similarities, foregrounds)
     ]
     # The similarity of a target view to the reference: the highest similarity of each patch to any
@@ -162,15 +150,14 @@ def build_scene(
     valid_rows = torch.from_numpy(source_valid)[reference_foreground]
 
     # Points of the matches with measured depth on both sides.
-    starts = np.cumsum([len(points) for points in clouds])[:-1]  # rows where later targets begin
     matched = []
-    for target, points, match in zip(targets, np.split(cloud, starts), matches):
-        # Indices of the matched patches in the flattened grids.
-        u = np.ravel_multi_index(tuple(match.reference.T), reference.features.grid)
-        v = np.ravel_multi_index(tuple(match.target.T), target.features.grid)
-        both = reference.measured_points[1].ravel()[u] & target.measured_points[1].ravel()[v]
-        matched.append((float_tensor(source[u[both]]), float_tensor(points[v[both]])))
+    for target, moved, match in zip(targets, to_camera, matches):
+        x, y, known = measured_match_points(reference, target, match)
+        x = reference_to_working.apply(x[known])
+        y = target_to_working.apply((y[known] - moved.t) @ moved.R)
+        matched.append((float_tensor(x), float_tensor(y)))
 
+    starts = np.cumsum([len(points) for points in clouds])[:-1]  # rows where later targets begin
     return Scene(
         reference_points=float_tensor(source[source_valid]),
         target_points=float_tensor(cloud[valid]),
@@ -178,7 +165,7 @@ def build_scene(
         target_weight=surface_weights(float_tensor(cloud[valid])),
         similarity=torch.cat(
             [double_centre(block[valid_rows]) for block in between_foregrounds], dim=1
-        ).contiguous(),
+        ),
         # The reference's points are in its camera's frame: its camera has the identity as pose.
         reference_maps=build_maps(
             [reference],
@@ -206,7 +193,6 @@ def build_maps(
     """Build the maps of views that share a world frame."""
     maps = [_table(view, column, to_working.scale) for view, column in zip(views, columns)]
     cameras, tables = zip(*maps)
-    sizes = np.array([camera.size[::-1] for camera in cameras])
     pixels = [0, *(table.shape[1] for table in tables[:-1])]  # their running sum: the first rows
     return ViewMaps(
         float_tensor([one.R for one in world_to_camera]),
@@ -214,14 +200,22 @@ def build_maps(
         float_tensor([to_working.scale * one.t - one.R @ to_working.t for one in world_to_camera]),
         float_tensor([np.sqrt(camera.focal_length.prod()) for camera in cameras]),
         float_tensor([camera.principal_point for camera in cameras]),
-        float_tensor(sizes),
+        float_tensor([camera.size[::-1] for camera in cameras]),
         torch.from_numpy(np.cumsum(pixels)),
         torch.from_numpy(np.concatenate(tables, axis=1)).T,
     )
 
 
-def project_points(maps: ViewMaps, poses: Poses, points: Float[Tensor, "n 3"]) -> Projection:
-    """Project points, moved by every pose, into every view and read the maps."""
+def project_points(
+    maps: ViewMaps, poses: Poses, points: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "m v n"] | Int[Tensor, "m v n"], ...]:
+    """Project n points, moved by m poses, into v views and read the maps at their pixels.
+
+    Returns (m, v, n) each: the depth of the point, and the measured depth at its pixel, working
+    units; the weight of the measured depth, in [0, 1], 0 where it is unknown or background; the
+    distance to the silhouette at the point's depth, working units, 0 inside; the similarity column
+    of the patch at the pixel, -1 for none.
+    """
     # The points in all cameras, (m, v, 3, n), by one product of (m * v * 3, 3) and (3, n).
     camera_linear = (maps.rotation @ poses.linear[:, None]).reshape(-1, 3)
     moved = maps.rotation @ poses.translation[:, None, :, None]
@@ -249,7 +243,7 @@ def project_points(maps: ViewMaps, poses: Poses, points: Float[Tensor, "n 3"]) -
     beyond = torch.sub(pixels, nearest).abs_().sum(2)  # 0 within the image
     # The sign is 0 where the border pixel is inside the silhouette.
     distance = distance.addcmul_(beyond, distance.sign()).div_(pixels_per_unit)
-    return Projection(depth, surface_depth, weight, distance, patch.int())
+    return depth, surface_depth, weight, distance, patch.int()
 
 
 def _table(
@@ -304,6 +298,19 @@ def surface_weights(points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
     products = (torch.addmm(-square.T / 2, part, right.T) for part in left.split(_DENSITY_ROWS))
     weight = 1 / torch.cat([exp_(product).sum(dim=1) for product in products])
     return weight / weight.sum()
+
+
+def measured_match_points(
+    reference: View, target: View, matches: Matches
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]:
+    """Return the points of matches, each in the frame of its own camera, and which have measured
+    depth on both sides."""
+    source, known = reference.measured_points
+    destination, seen = target.measured_points
+    # Index arrays (rows, columns) into the grids of patches: one entry per match.
+    u = tuple(matches.reference.T)
+    v = tuple(matches.target.T)
+    return source[u], destination[v], known[u] & seen[v]
 
 
 def _number(selected: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.best_view import ViewMatch
@@ -17,7 +16,7 @@ from zsp_lite.verified.confidence import Calibration, evidence, modes, reliabili
 from zsp_lite.verified.poses import Poses, concatenate, non_maximum_suppression, rotation_angles
 from zsp_lite.verified.proposals import poses_from_matches, poses_from_views
 from zsp_lite.verified.refinement import MAX_HYPOTHESES, MIN_ANGLE, refine_coarse_to_fine
-from zsp_lite.verified.scene import Scene, build_scene
+from zsp_lite.verified.scene import Scene, build_scene, measured_match_points
 from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import TERM_NAMES, WEIGHTS, score_terms
 from zsp_lite.views import View
@@ -44,16 +43,8 @@ class VerifiedSolver:
 
     kmeans = False  # the best matches, without clusters (see `ZeroShotPose.kmeans`)
 
-    def __call__(
-        self,
-        reference: View,
-        targets: Sequence[View],
-        matched: Sequence[ViewMatch],
-        *,
-        seed: int,
-        threshold: float,
-    ) -> PoseEstimate:
-        """Return the best hypothesis of `solve` (see `estimates.Solver`).
+    def __call__(self, reference, targets, matched, *, seed, threshold) -> PoseEstimate:
+        """Return the best hypothesis of `solve`; `estimates.Solver` describes the arguments.
 
         Inliers have measured depth on both sides.
         """
@@ -85,7 +76,7 @@ class VerifiedSolver:
 
     @torch.no_grad()
     def solve(
-        self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], seed: int = 0
+        self, reference: View, targets: Sequence[View], matched: Sequence[ViewMatch], seed: int
     ) -> Solution:
         """Run all stages on usable target views, in any order and any world, and their matches."""
         rng = np.random.default_rng(seed)
@@ -118,11 +109,36 @@ class VerifiedSolver:
 
         with timed(timings, "ranking"):
             terms = score_terms(scene, poses)
-            score = WEIGHTS.score(terms)
-            best = non_maximum_suppression(poses.rotation, score, MIN_ANGLE, MAX_HYPOTHESES)
+            best = non_maximum_suppression(
+                poses.rotation, WEIGHTS.score(terms), MIN_ANGLE, MAX_HYPOTHESES
+            )
             poses = poses[best]
+            terms = terms[best]
             angles = scene.view_angles(poses).numpy()
-            hypotheses = _hypotheses(scene, poses, terms[best], angles, order)
+            score = WEIGHTS.score(terms).double().numpy()
+            # Poses of one mode share a probability: the odds of all but the best one are 0.
+            mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
+            deficit = np.where(mode == np.arange(len(mode)), score[0] - score, np.inf)
+            known = evidence(
+                scene.view_span,
+                len(order),
+                float(angles[0].min()),
+                scene.view_similarity_std,
+                float(WEIGHTS.of_shape().score(terms)[0]),
+            )
+            confidence = Calibration().probabilities(deficit, known)[mode]
+            # The view of each hypothesis is the one whose camera is nearest under its pose.
+            hypotheses = tuple(
+                Hypothesis(
+                    scene.to_sim3(poses, i, view),
+                    order[view],
+                    float(score[i]),
+                    dict(zip(TERM_NAMES, terms[i].tolist())),
+                    float(confidence[i]),
+                    int(mode[i]),
+                )
+                for i, view in enumerate(angles.argmin(axis=1).tolist())
+            )
         # The inverse permutation leads from the scene's order of the views back to the caller's.
         view_angles = angles[0][np.argsort(order)].astype(np.float64)
         return Solution(hypotheses, view_angles, timings, scene, order, poses)
@@ -130,56 +146,17 @@ class VerifiedSolver:
 
 def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
     """Order views by a hash of their pixels, whatever their order and the axes of their world."""
-
-    def digest(index: int) -> bytes:
-        target = targets[index]
+    digests = []
+    for target in targets:
         content = target.frame.rgb.tobytes() + target.foreground.numpy().tobytes()
-        return hashlib.blake2b(content, digest_size=16).digest()
-
-    return tuple(sorted(range(len(targets)), key=digest))
-
-
-def _hypotheses(
-    scene: Scene, poses: Poses, terms: Tensor, angles: np.ndarray, order: tuple[int, ...]
-) -> tuple[Hypothesis, ...]:
-    """Give each pose, best first, its view, score and probability."""
-    score = WEIGHTS.score(terms).double().numpy()
-    shape_fit = float(WEIGHTS.of_shape().score(terms)[0])
-
-    # Poses of one mode share a probability: the odds of all but the best one are 0.
-    mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
-    deficit = np.where(mode == np.arange(len(mode)), score[0] - score, np.inf)
-    known = evidence(
-        scene.view_span,
-        len(order),
-        float(angles[0].min()),
-        scene.view_similarity_std,
-        shape_fit,
-    )
-    confidence = Calibration().probabilities(deficit, known)[mode]
-
-    # The view of each hypothesis is the one whose camera is nearest under its pose.
-    return tuple(
-        Hypothesis(
-            scene.to_sim3(poses, i, view),
-            order[view],
-            float(score[i]),
-            dict(zip(TERM_NAMES, terms[i].tolist())),
-            float(confidence[i]),
-            int(mode[i]),
-        )
-        for i, view in enumerate(angles.argmin(axis=1).tolist())
-    )
+        digests.append(hashlib.blake2b(content, digest_size=16).digest())
+    return tuple(sorted(range(len(targets)), key=digests.__getitem__))
 
 
 def measured_inliers(
     reference: View, target: View, matches: Matches, sim3: Sim3, threshold: float
 ) -> Bool[np.ndarray, " k"]:
     """Return which matches have measured depth on both sides and a small residual under a pose."""
-    source, known = reference.measured_points
-    destination, seen = target.measured_points
-    # Index arrays (rows, columns) into the grids of patches: one entry per match.
-    u = tuple(matches.reference.T)
-    v = tuple(matches.target.T)
-    residual = np.linalg.norm(sim3.apply(source[u]) - destination[v], axis=1)
-    return known[u] & seen[v] & (residual < threshold)
+    source, destination, known = measured_match_points(reference, target, matches)
+    residual = np.linalg.norm(sim3.apply(source) - destination, axis=1)
+    return known & (residual < threshold)

@@ -46,7 +46,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from zsp_lite.verified.poses import Poses, exp_
-from zsp_lite.verified.scene import Projection, Scene, project_points
+from zsp_lite.verified.scene import Scene, project_points
 
 SURFACE_SIGMA = 0.25  # sigma, working units
 MAX_VIOLATION = 0.5  # rho, working units: distance at which b and c reach 1
@@ -118,7 +118,7 @@ def score_terms(
 
 def _averages(
     scene: Scene,
-    projection: Projection,
+    projection: tuple[Tensor, ...],
     offset: Int[Tensor, " n"],
     patch_stride: int,
     point_weights: Float[Tensor, " n"],
@@ -128,15 +128,16 @@ def _averages(
 
     The similarity of point i to patch j is at index `offset[i] + patch_stride * j`.
     """
+    depth, surface_depth, weight, silhouette_distance, patch = projection
     # Intermediate results are overwritten in place, because new arrays would leave the cache.
-    delta = projection.depth - projection.surface_depth
-    surface = exp_(delta.square().mul_(-0.5 / SURFACE_SIGMA**2)).mul_(projection.weight)
-    free_space = delta.add_(SURFACE_SIGMA).div_(-MAX_VIOLATION).clamp_(0, 1).mul_(projection.weight)
-    silhouette = (projection.silhouette_distance / MAX_VIOLATION).clamp_max_(1)
-    index = projection.patch.clamp_min(0).mul_(patch_stride).add_(offset.int())
+    delta = depth - surface_depth
+    surface = exp_(delta.square().mul_(-0.5 / SURFACE_SIGMA**2)).mul_(weight)
+    free_space = delta.add_(SURFACE_SIGMA).div_(-MAX_VIOLATION).clamp_(0, 1).mul_(weight)
+    silhouette = (silhouette_distance / MAX_VIOLATION).clamp_max_(1)
+    index = patch.clamp_min(0).mul_(patch_stride).add_(offset.int())
     similarity = scene.similarity.reshape(-1).index_select(0, index.flatten()).view(index.shape)
     # Without a foreground patch at the pixel, s = a = 0.
-    surface.mul_(projection.patch >= 0)
+    surface.mul_(patch >= 0)
     q = point_weights / point_weights.sum()
     total = surface.sum(dim=1)
     yield (surface.mul_(similarity).sum(dim=1) / (total + _SIMILARITY_PRIOR)) @ q
