@@ -268,7 +268,6 @@ class SequenceData:
     normals: Real[np.ndarray, "n 3"] | None = None
     viewpoint_quality: float | None = None
     point_cloud_quality: float | None = None
-    depth_scale_adjustment: float = 1.0  # CO3D's factor from stored depth to depth
 
 
 def write_co3d(
@@ -297,8 +296,8 @@ def write_co3d(
 
         for sequence in sequences:
             new_frames, new_sequence = _write_sequence(root, category, sequence, quality)
-            _update(frames_path, frames, sequence.name, new_frames)
             _update(sequences_path, listed, sequence.name, [new_sequence])
+            _update(frames_path, frames, sequence.name, new_frames)
 
 
 def _update(path: Path, named: list[tuple[str, Any]], name: str, new: Sequence) -> None:
@@ -331,8 +330,8 @@ def _write_sequence(
         if frame.depth is not None:
             path = f"{base}/depths/{stem}.jpg.geometric.png"
             mask_path = f"{base}/depth_masks/{stem}.png"
-            depth = DepthAnnotation(path, float(sequence.depth_scale_adjustment), mask_path)
-            write_depth(root / path, frame.depth, sequence.depth_scale_adjustment)
+            depth = DepthAnnotation(path, 1.0, mask_path)
+            write_depth(root / path, frame.depth)
             write_mask(root / mask_path, frame.depth > 0)
         if frame.mask is not None:
             # The stored 8-bit values are summed, because a sum of integers is the same on every

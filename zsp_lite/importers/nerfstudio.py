@@ -14,7 +14,6 @@ from zsp_lite.io.files import convert_json, find_inside, read_json
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
-_FISHEYE = "OPENCV_FISHEYE"
 _Row = tuple[float | None, float | None, float | None, float | None]  # None: not finite
 _Side = Annotated[float, msgspec.Meta(multiple_of=1)]  # pixels; exporters write 640 or 640.0
 _Angle = Annotated[float, msgspec.Meta(gt=0, lt=math.pi)]  # radians
@@ -78,49 +77,26 @@ def read_nerfstudio(path: str | Path) -> Makers:
 def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     """Make a frame from its values, those of all frames included."""
     frame = convert_json(values, _Frame, where)
-    fisheye = frame.camera_model == _FISHEYE
-    if not fisheye and (frame.camera_model not in _MODELS or frame.k4):
+    if frame.camera_model not in _MODELS or frame.k4:
         raise InputError(
             f"{where}: camera_model is {frame.camera_model!r} with k4 = {frame.k4:g}, expected one "
-            f"of {', '.join(_MODELS)} with k4 = 0, or {_FISHEYE}"
+            f"of {', '.join(_MODELS)} with k4 = 0"
         )
-
-    # The size that the file gives, or else the picture's. The picture may be missing if the file
-    # gives a size.
-    image = find_inside(folder, frame.file_path) or folder / frame.file_path
-    size = None
-    if frame.h and frame.w:
-        size = (int(frame.h), int(frame.w))
-    own_size = picture_size(image) if image.is_file() or size is None else size
-    height, width = size or own_size
-    intrinsics = _intrinsics(frame, height, width, where)
-    # Refuse a picture that is a smaller or larger copy of the one for which the file has
-    # intrinsics.
-    own_height, own_width = own_size
-    if own_size != (height, width) and math.isclose(
-        height * own_width, width * own_height, rel_tol=0.01
-    ):
-        fitted = ", ".join(f"{value * own_width / width:.4g}" for value in intrinsics)
-        raise InputError(
-            f"{where}: w and h of {image} are {width} x {height}, expected its own size "
-            f"{own_width} x {own_height} with the intrinsics {fitted}"
-        )
-
-    # OpenCV's order of the coefficients; its model has no r^8 term, k4.
-    last = (frame.k3, frame.k4) if fisheye else (frame.p1, frame.p2, frame.k3)
+    size = (int(frame.h or 0), int(frame.w or 0))
+    if 0 in size:
+        size = picture_size(find_inside(folder, frame.file_path) or folder / frame.file_path)
     return make_frame(
         folder,
         frame.file_path,
         frame.depth_file_path or frame.depth_path,
         frame.transform_matrix,
-        intrinsics,
+        _intrinsics(frame, *size, where),
         where,
         FROM_OPENGL,
-        (height, width),
+        size,
         frame.mask_path,
-        fisheye=fisheye,
         depth_unit=frame.integer_depth_scale or frame.depth_unit_scale_factor,
-        distortion=(frame.k1, frame.k2, *last),
+        distortion=(frame.k1, frame.k2, frame.p1, frame.p2, frame.k3),
     )
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from zsp_lite.data.cameras import NDC_ISOTROPIC, Camera
-from zsp_lite.data.co3d import SequenceData
+from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.depth import zero_unknown
 from zsp_lite.data.frames import MAX_PIXELS, Frame, check_pixels
 from zsp_lite.data.labels import PoseLabel, label_bytes
@@ -38,7 +38,6 @@ from zsp_lite.importers.convert import (
     LazyFrames,
     is_imported,
     scale_frame,
-    write_sequence,
 )
 from zsp_lite.importers.unpacked import Video
 from zsp_lite.io.files import convert_json, file_size, path_inside, write_atomic
@@ -160,7 +159,6 @@ def import_uco3d(
     root: str | Path,
     out: str | Path,
     category: str,
-    sequences: Sequence[str] | None = None,
     best: int = 10,
     count: int = 24,
 ) -> Iterator[tuple[str, ImportResult]]:
@@ -173,40 +171,31 @@ def import_uco3d(
         root: uCO3D's folder, in which single categories or sequences may be missing.
         out: Data folder.
         category: Name of the category.
-        sequences: Names of sequences. By default, those with the best cameras are imported.
-        best: Number of sequences that are imported by default.
+        best: Number of sequences, those with the best cameras.
         count: Number of frames per sequence, evenly spaced among those with a mask and depth.
 
     Raises:
-        InputError: Category or sequence is not on the disk, the metadata are not those of uCO3D, or
+        InputError: The category is not on the disk, the metadata are not those of uCO3D, or
             none of the sequences can be imported.
     """
     root = Path(root)
     out = Path(out)
     with closing(_open_metadata(root / _METADATA)) as metadata:
         names = _downloaded(root, category)
-        for name in sequences or ():
-            check_choice(f"{root}: sequence of {category}", name, names)
-        asked = sorted(set(sequences or names))
-        places = ", ".join("?" * len(asked))  # one place per name
+        places = ", ".join("?" * len(names))  # one place per name
         rows = _select(
             metadata,
             _SequenceRow,
             f"sequence_annots WHERE sequence_name IN ({places}) "
             "ORDER BY _reconstruction_quality_viewpoint DESC, sequence_name",
-            asked,
+            names,
         )
-        absent = len(asked) - len(rows)
-        if absent:
-            logger.warning("%d of %d sequences are not in the metadata", absent, len(asked))
-        if sequences is None:
-            rows = rows[:best]
-        present = 0  # number of sequences in OUT
+        present = False  # whether any sequence is in OUT
         problem = "no sequence on the disk is in the metadata"
-        for row in rows:
+        for row in rows[:best]:
             name = row["sequence_name"]
-            if is_imported(out / category / name):
-                present += 1
+            if is_imported(out, category, name):
+                present = True
                 continue
             try:
                 sequence = _Sequence(root, metadata, convert_json(row, _SequenceRow, _METADATA))
@@ -215,7 +204,7 @@ def import_uco3d(
                 problem = f"{name}: {error}"
                 logger.warning("%s is left out: %s", name, error)
                 continue
-            present += 1
+            present = True
             yield name, result
     if not present:
         raise InputError(f"{root}: no sequence of {category} can be imported: {problem}")
@@ -347,7 +336,7 @@ class _Sequence:
             viewpoint_quality=self.row.reconstruction_quality_viewpoint,
         )
         # Write the sequence, and beside it the licence and the proposed label.
-        write_sequence(out, category, data)
+        write_co3d(out, category, [data])
         write_atomic(out / category / "ATTRIBUTION.md", _ATTRIBUTION.encode())
         if label is not None:
             path = out / "label_proposals" / category / f"{label.seq}.json"

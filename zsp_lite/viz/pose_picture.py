@@ -14,6 +14,7 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera, azimuths, ground_axes
 from zsp_lite.data.frames import ON_OBJECT
 from zsp_lite.errors import InputError
+from zsp_lite.metrics import vector_angle
 from zsp_lite.pair_result import PairResult
 from zsp_lite.points import world_cloud
 from zsp_lite.viz import plots
@@ -67,7 +68,7 @@ def coverage(
         widest = int((following - around).argmax())
         gap = (float(around[widest]), float(following[widest]))
 
-    angles = np.degrees(np.arccos((directions[:-1] @ directions[-1]).clip(-1, 1)))
+    angles = vector_angle(directions[:-1], directions[-1])
     nearest = numbers[int(angles.argmin())]
     return Coverage(
         dict(zip(numbers, target_places)),

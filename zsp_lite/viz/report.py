@@ -30,7 +30,7 @@ from zsp_lite.pair_result import PairResult
 from zsp_lite.viz import category_sheet, plots
 from zsp_lite.viz.pose_picture import pose_picture
 from zsp_lite.viz.table import COLUMNS, table_rows
-from zsp_lite.viz.votes import ring_figure, votes_figure
+from zsp_lite.viz.votes import votes_figure
 
 _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark ground
 _TEMPLATES = Environment(
@@ -143,13 +143,12 @@ def _pair_parts(result: PairResult) -> dict[str, Any]:
         pictures[solver] = _picture(pose_picture(result, solver))
         if estimate.one_of_two:
             two_poses[solver] = _picture(_two_poses_figure(estimate))
-    votes = [votes_figure(result.votes), ring_figure(result)] if result.votes else []
     return {
         "result": result,
         "rows": table_rows(result),
         "pictures": pictures,
         "both": two_poses,
-        "votes": [_picture(figure) for figure in votes],
+        "votes": _picture(votes_figure(result.votes)) if result.votes else "",
         "stages": _stages(result),
         "scene": _scene(result),
     }
@@ -182,15 +181,15 @@ def _stages(result: PairResult) -> dict[str, str]:
         )
         cycles[name] = distances.numpy()
 
-    matches, axes = plots.show_images(images, names, size=2.7)
-    pixels = plots.match_pixels(views, result.estimate.matches)
-    plots.draw_matches(axes, pixels, result.estimate.inliers)
+    estimate = result.estimate
+    cells = (estimate.matches.reference, estimate.matches.target)
+    grid = views[0].features.grid
     figures = {
         "saliency": plots.show_maps(images, saliency, size=2.7, limits=(0, 1), label="saliency"),
         "cycles": plots.show_maps(
             images, cycles, size=2.7, limits=(-10, 0), cmap="cividis", label="− distance (patches)"
         ),
-        "matches": matches,
+        "matches": plots.show_matches(images, cells, grid, estimate.inliers, names, size=2.7),
     }
     return {name: _picture(figure) for name, figure in figures.items()}
 
