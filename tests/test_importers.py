@@ -164,18 +164,24 @@ def test_an_import_holds_a_few_frames_at_once(tmp_path, scan, monkeypatch, box):
     assert max(held) <= 3
 
 
-def test_distortion_is_corrected(tmp_path, views):
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_distortion_is_corrected(tmp_path, views, model):
     folder = tmp_path / "scan"
     write_nerfstudio(folder, views[:1])
-    distortion = {"k1": 0.12, "k2": -0.03, "p1": 0.002, "p2": -0.001, "k3": 2.0}
-    edited(lambda content: content.update(distortion))(folder)
+    distortion = {"k1": 0.12, "k2": -0.03}
+    if model == "OPENCV_FISHEYE":
+        distortion |= {"k3": 0.02, "k4": -0.01}
+    else:
+        distortion |= {"p1": 0.002, "p2": -0.001, "k3": 2.0}
+    edited(lambda content: content.update(distortion, camera_model=model))(folder)
     # In the stored picture, red and green of a pixel are its place without distortion, by OpenCV.
     # In the corrected picture they are the place of the pixel itself.
     height, width = views[0].camera.size
     rows, columns = np.indices((height, width), np.float64)
     places = np.stack([columns, rows], axis=-1)
     matrix = views[0].camera.K - HALF_PIXEL
-    straight = cv2.undistortPoints(
+    undistort = cv2.undistortPoints if model == "OPENCV" else cv2.fisheye.undistortPoints
+    straight = undistort(
         places.reshape(-1, 1, 2), matrix, np.array([*distortion.values()]), R=np.eye(3), P=matrix
     )
     picture = np.zeros((height, width, 3))

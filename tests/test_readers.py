@@ -304,6 +304,7 @@ def test_images_that_a_video_lacks_are_counted_and_found_by_time(
 
 def test_the_inner_folder_of_polycam_is_its_scan(tmp_path, views):
     path, _ = write("polycam", tmp_path / "scan", views)
+    assert recognise(path / "keyframes") == ("polycam", path)
 
 
 def each(change: Callable[[dict], object]) -> Callable[[dict], list]:

@@ -123,7 +123,7 @@ def test_chosen_frames_are_evenly_spaced_and_have_depth_that_agrees(changed, tmp
         for number, factor in ((numbers[1], 1.1), (numbers[3], 0.5)):
             depth = depths[str(number + 1)]
             depth[...] = factor * depth[...]
-    ((_, result),) = import_uco3d(changed, tmp_path / "out", "car", 1, count=6)
+    ((_, result),) = import_uco3d(changed, tmp_path / "out", "car", [SUV], count=6)
     frames = Co3D(tmp_path / "out").frames("car", SUV)
     times = [numbers[k] / RATE for k in (0, 2, 4, 5)]
     assert [frame.frame_timestamp for frame in frames] == times
@@ -143,7 +143,7 @@ def test_the_best_sequences_are_chosen_and_those_that_are_there_stay(imports, ru
     assert f"{out / 'car' / SUV}: 4 frames" in text
     assert CAR not in text
     before = (out / "car" / SUV / "pointcloud.ply").stat().st_mtime_ns
-    text = run(f"{line} --frames 3")
+    text = run(f"{line} --sequences {CAR},{SUV} --frames 3")
     assert f"{out / 'car' / CAR}: 3 frames" in text
     assert SUV not in text
     assert (out / "car" / SUV / "pointcloud.ply").stat().st_mtime_ns == before
@@ -155,6 +155,12 @@ def test_a_sequence_without_an_alignment_is_imported_without_a_proposal(changed,
     execute(changed, "UPDATE sequence_annots SET _alignment_R = NULL")
     run(f"{line} --best 1 --frames 4")
     assert not (out / "label_proposals").exists()
+
+
+def test_sequences_are_named_or_the_best_are_chosen(imports, run):
+    line, _ = imports
+    text = run(f"{line} --sequences {CAR} --best 2", code=2)
+    assert "--best does not go with --sequences (see: zsp-lite data import uco3d --help)" in text
 
 
 def test_queries_use_the_keys_and_nothing_is_written_to_the_metadata(
@@ -184,11 +190,11 @@ def test_queries_use_the_keys_and_nothing_is_written_to_the_metadata(
             assert not any(step.startswith("SCAN") for step in steps)
 
 
-def refuse(root, tmp_path, expected, category="car"):
-    """Check that an import of the best sequence raises an error with one line that contains a
-    text, and writes nothing."""
+def refuse(root, tmp_path, expected, category="car", sequences=(SUV,)):
+    """Check that an import raises an error with one line that contains a text, and writes
+    nothing."""
     out = tmp_path / "out"
-    refused(re.escape(expected), lambda: list(import_uco3d(root, out, category, best=1)))
+    refused(re.escape(expected), lambda: list(import_uco3d(root, out, category, sequences)))
     assert not out.exists()
 
 
@@ -263,8 +269,9 @@ def test_depth_of_another_shape_is_refused(changed, tmp_path):
     refuse(changed, tmp_path, "shape (2, 3, 4), expected an HDF5 file of (H, W)")
 
 
-def test_a_category_that_is_not_on_the_disk_is_refused(uco3d, tmp_path):
+def test_a_category_or_sequence_that_is_not_on_the_disk_is_refused(uco3d, tmp_path):
     refuse(uco3d, tmp_path, "category is 'mug', expected one of car", category="mug")
+    refuse(uco3d, tmp_path, f"sequence of car is 'van', expected one of {CAR}", sequences=["van"])
 
 
 def test_the_missing_package_is_named(uco3d, tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ import click
 
 from zsp_lite.cli.common import (
     COUNT,
+    NAMES,
     PATH,
     examples,
     refuse_options,
@@ -310,12 +311,16 @@ def import_(scan, root, category, sequence, mask, box, **options) -> None:
 )
 @click.argument("root", type=PATH)
 @click.option("--category", metavar="NAME", required=True, help="Category of the objects.")
+@click.option("--sequences", type=NAMES, show_default="--best", help="Names of the sequences.")
 @click.option(
-    "--best", type=COUNT, default=10, help="Number of sequences, those with the best cameras."
+    "--best",
+    type=COUNT,
+    show_default="10",
+    help="Number of sequences, those with the best cameras.",
 )
 @click.option("--frames", "count", type=COUNT, default=24, help="Frames of each sequence.")
 @click.option("--out", type=PATH, required=True, help="Data folder.")
-def uco3d(root, category, best, count, out) -> None:
+def uco3d(root, category, sequences, best, count, out) -> None:
     """Import sequences of uCO3D into a data folder, with its alignment as proposed pose labels.
 
     ROOT is the folder in which uCO3D's script has put metadata.sqlite and the sequences; needs
@@ -323,7 +328,8 @@ def uco3d(root, category, best, count, out) -> None:
     """
     from zsp_lite.importers.uco3d import import_uco3d
 
-    for name, imported in import_uco3d(root, out, category, best, count):
+    refuse_options({"best": sequences and best}, (), "--sequences")
+    for name, imported in import_uco3d(root, out, category, sequences, best or 10, count):
         _print_import(out / category / name, imported)
 
 

@@ -17,8 +17,8 @@ TARGET = "scooter"
 # truth. The front was judged by eye from the rear wheel, since the front wheel is turned, and may
 # be wrong by 10 degrees. Up is the normal of the floor; the motorcycle leans on its side stand by a
 # few degrees.
-FRONT = (0.97, 0.06, -0.24)
-UP = (0.01, -0.97, -0.26)
+FRONT = np.array([0.97, 0.06, -0.24])
+UP = np.array([0.01, -0.97, -0.26])
 
 # Calibration at the size in scikit-image, from its documentation. The values in pixels are those of
 # the original photograph divided by 4. They therefore count from the corner of the image, as

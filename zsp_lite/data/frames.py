@@ -159,13 +159,7 @@ class Frame:
 
     def __repr__(self) -> str:
         height, width = self.camera.size
-        depth = "no depth"
-        if self.depth is not None:
-            depth = f"depth known at {(self.depth > 0).mean():.0%} of the pixels"
-        mask = "no mask"
-        if self.mask is not None:
-            mask = f"mask above {ON_OBJECT} at {(self.mask > ON_OBJECT).mean():.0%}"
-        return f"Frame({self.name!r}, {height} x {width} pixels, {depth}, {mask})"
+        return f"Frame({self.name!r}, {height} x {width} pixels)"
 
 
 def _read_map(name: str, values: np.ndarray) -> Float64[np.ndarray, "h w"]:
@@ -257,8 +251,6 @@ def crop_to_object(frame: Frame) -> Frame:
 
 def turn_frame(frame: Frame, quarters: int) -> Frame:
     """Turn a frame and its camera by quarter turns as in `numpy.rot90`; world points stay."""
-    if quarters % 4 == 0:
-        return frame
     return _changed(
         frame,
         frame.camera.turn(quarters),

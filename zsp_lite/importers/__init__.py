@@ -99,6 +99,8 @@ def recognise(path: str | Path) -> tuple[str, Path]:
     places = [folder]
     if len(files) == 1:  # an app may put a folder into its zip
         places += files
+    if path.resolve().name == "keyframes":  # the inner folder of Polycam's raw data
+        places.append(path.resolve().parent)
     for place in places:
         for name, layout in FORMATS.items():
             if all(any(place.glob(sign)) for sign in layout.signs):

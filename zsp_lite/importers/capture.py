@@ -40,6 +40,8 @@ class CaptureFrame:
     # OpenCV's k1, k2, p1, p2, k3. `load` undistorts image, depth and mask.
     distortion: tuple[float, ...] = ()
     mask: Path | None = None
+    # Whether the distortion is that of OpenCV's fisheye cameras: k1, k2, k3, k4.
+    fisheye: bool = False
     confidence: Path | None = None  # of each pixel of the depth map, see `trusted`
     label: int | None = None  # number of the object in masks that label several objects
     # Whether camera, depth and mask are those of the photograph as "stored", or as "displayed" by
@@ -97,11 +99,14 @@ class CaptureFrame:
         """Return OpenCV's maps that undistort the displayed image with this camera."""
         matrix = camera.K - HALF_PIXEL
         coefficients = np.array(self.distortion)
-        # In OpenCV's model, p2 shifts points along x and p1 along y: the vector (p2, p1) turns with
-        # the image.
-        turn = (camera.R @ self.camera.R.T)[:2, :2]
-        coefficients[[3, 2]] = turn @ coefficients[[3, 2]]
-        return cv2.initUndistortRectifyMap(
+        undistortion = cv2.fisheye.initUndistortRectifyMap
+        if not self.fisheye:
+            undistortion = cv2.initUndistortRectifyMap
+            # In OpenCV's model, p2 shifts points along x and p1 along y: the vector (p2, p1) turns
+            # with the image.
+            turn = (camera.R @ self.camera.R.T)[:2, :2]
+            coefficients[[3, 2]] = turn @ coefficients[[3, 2]]
+        return undistortion(
             matrix, coefficients, np.eye(3), matrix, camera.size[::-1], cv2.CV_32FC1
         )
 

@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32, Shaped, UInt8
 from PIL import ExifTags
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import decode_image, decoding, open_image, read_image
+from zsp_lite.data.frames import decode_image, decoding, open_image, read_depth, read_image
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import MAX_FILE
 
@@ -25,8 +25,9 @@ WINDOW_3 = np.ones((3, 3), np.uint8)
 WINDOW_5 = np.ones((5, 5), np.uint8)
 PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif")
 _FORMATS = ("JPEG", "PNG", "WEBP")
-DEPTHS = (".png", ".npy", ".npz", ".tiff", ".tif", ".pfm")
+DEPTHS = (".png", ".npy", ".npz", ".tiff", ".tif", ".pfm", ".exr")
 MASKS = (".png", ".jpg", ".jpeg", ".webp", ".tiff", ".tif", ".npy")
+CO3D_DEPTH = ".geometric.png"  # such a file has the bits of float16 values
 # For each EXIF orientation, 1 to 8, the number of quarter turns as in `numpy.rot90`; and the
 # orientations whose image is mirrored left to right after the turn.
 _QUARTERS = {1: 0, 2: 0, 3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
@@ -68,8 +69,12 @@ def read_depth_file(path: str | Path) -> Float32[np.ndarray, "h w"]:
 
     A value is unknown if it is not finite, not positive, or 65535 in 16 bits.
     """
-    values = _read_values(Path(path), "depth")
-    if values.shape[2:] == (1,):
+    path = Path(path)
+    if path.name.endswith(CO3D_DEPTH):
+        return read_depth(path)
+    values = _read_values(path, "depth")
+    # Blender writes the depth three times, as colours of an .exr file.
+    if values.ndim == 3 and (values.shape[2] == 1 or path.suffix.lower() == ".exr"):
         values = values[..., 0]
     if (
         values.ndim != 2
@@ -160,7 +165,13 @@ def _read_values(path: Path, what: str) -> Shaped[np.ndarray, "..."]:
         if suffix not in (".npy", ".npz"):
             if suffix in (".tif", ".tiff", ".pfm", ".webp"):
                 return np.array(open_image(data, ("TIFF", "PPM", "WEBP")))
-            return decode_image(path, what, cv2.IMREAD_UNCHANGED)
+            if suffix != ".exr":
+                return decode_image(path, what, cv2.IMREAD_UNCHANGED)
+            # Without the variable OPENCV_IO_ENABLE_OPENEXR, this returns None or raises an error.
+            values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            if values is None:
+                raise ValueError("damaged, or OpenCV reads no .exr here")
+            return values
         values = np.load(io.BytesIO(data), allow_pickle=False)
         if isinstance(values, np.ndarray):
             return values

@@ -14,6 +14,7 @@ from zsp_lite.io.files import convert_json, find_inside, read_json
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
+_FISHEYE = "OPENCV_FISHEYE"
 _Row = tuple[float | None, float | None, float | None, float | None]  # None: not finite
 _Side = Annotated[float, msgspec.Meta(multiple_of=1)]  # pixels; exporters write 640 or 640.0
 _Angle = Annotated[float, msgspec.Meta(gt=0, lt=math.pi)]  # radians
@@ -77,11 +78,14 @@ def read_nerfstudio(path: str | Path) -> Makers:
 def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     """Make a frame from its values, those of all frames included."""
     frame = convert_json(values, _Frame, where)
-    if frame.camera_model not in _MODELS or frame.k4:
+    fisheye = frame.camera_model == _FISHEYE
+    if not fisheye and (frame.camera_model not in _MODELS or frame.k4):
         raise InputError(
             f"{where}: camera_model is {frame.camera_model!r} with k4 = {frame.k4:g}, expected one "
-            f"of {', '.join(_MODELS)} with k4 = 0"
+            f"of {', '.join(_MODELS)} with k4 = 0, or {_FISHEYE}"
         )
+    # OpenCV's order of the coefficients; its model has no r^8 term, k4.
+    last = (frame.k3, frame.k4) if fisheye else (frame.p1, frame.p2, frame.k3)
     size = (int(frame.h or 0), int(frame.w or 0))
     if 0 in size:
         size = picture_size(find_inside(folder, frame.file_path) or folder / frame.file_path)
@@ -95,8 +99,9 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
         FROM_OPENGL,
         size,
         frame.mask_path,
+        fisheye=fisheye,
         depth_unit=frame.integer_depth_scale or frame.depth_unit_scale_factor,
-        distortion=(frame.k1, frame.k2, frame.p1, frame.p2, frame.k3),
+        distortion=(frame.k1, frame.k2, *last),
     )
 
 

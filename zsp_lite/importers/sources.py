@@ -19,6 +19,7 @@ from zsp_lite.importers import FORMATS, open_capture, recognise
 from zsp_lite.importers.agreement import disagreement, neighbours
 from zsp_lite.importers.capture import CaptureFrame
 from zsp_lite.importers.files import (
+    CO3D_DEPTH,
     DEPTHS,
     MASKS,
     PICTURES,
@@ -78,7 +79,9 @@ class Source:
     @property
     def name(self) -> str:
         """Name of the sequence, the capture or the image, also where the path is "."."""
-        return Path(os.path.abspath(self.path)).name
+        path = Path(os.path.abspath(self.path))
+        # An inner folder of Polycam's has the same name in all scans.
+        return path.parent.name if path.name == "keyframes" else path.name
 
     def describe(self, positions: Sequence[int]) -> str:
         """Name the source and its frames at some positions."""
@@ -166,15 +169,13 @@ class Source:
 
     def contradiction(self) -> str:
         """Say how depth and poses of a few frames contradict each other (see `disagreement`)."""
-        return disagreement(self._few_frames(), self.depth_unit)
-
-    def _few_frames(self) -> Iterator[Frame]:
-        """Read a few frames around the object, with their given masks only."""
+        frames = []
         for position in neighbours(len(self.numbers)):
             # A damaged file is no reason to fail here: the estimate may not use it.
             with suppress(InputError):
                 frame = self.read_frame(position)
-                yield frame if self.mask == "given" else replace(frame, mask=None)
+                frames.append(frame if self.mask == "given" else replace(frame, mask=None))
+        return disagreement(frames, self.depth_unit)
 
     def select(
         self, count: int, references: bool, first: int | None = None
@@ -478,6 +479,7 @@ def _open_image(
             f"image {path}: no {path.stem}_depth.png or {path.stem}_depth.npy beside it, expected "
             "its depth there or as --depth FILE"
         )
+    depth_unit = 1.0 if depth.name.endswith(CO3D_DEPTH) else 0.001
     rgb, orientation = read_picture(path)
     camera = camera_from_pose(np.eye(4), intrinsics, rgb.shape[:2], f"image {path}")
     # If the orientation exchanges the sides, the intrinsics are for the form, stored or displayed,
@@ -486,7 +488,9 @@ def _open_image(
     displayed = np.linalg.norm(2 * camera.principal_point - camera.size)
     if orientation > 4 and displayed < stored:
         camera = replace(camera, size=camera.size[::-1])
-    return CaptureFrame(path, depth, camera, mask=_beside(path, "mask", MASKS), posed=False)
+    return CaptureFrame(
+        path, depth, camera, depth_unit, mask=_beside(path, "mask", MASKS), posed=False
+    )
 
 
 def _beside(path: Path, kind: str, suffixes: Sequence[str]) -> Path | None:

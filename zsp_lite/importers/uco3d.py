@@ -159,6 +159,7 @@ def import_uco3d(
     root: str | Path,
     out: str | Path,
     category: str,
+    sequences: Sequence[str] | None = None,
     best: int = 10,
     count: int = 24,
 ) -> Iterator[tuple[str, ImportResult]]:
@@ -171,28 +172,34 @@ def import_uco3d(
         root: uCO3D's folder, in which single categories or sequences may be missing.
         out: Data folder.
         category: Name of the category.
-        best: Number of sequences, those with the best cameras.
+        sequences: Names of sequences. By default, those with the best cameras are imported.
+        best: Number of sequences that are imported by default.
         count: Number of frames per sequence, evenly spaced among those with a mask and depth.
 
     Raises:
-        InputError: The category is not on the disk, the metadata are not those of uCO3D, or
+        InputError: Category or sequence is not on the disk, the metadata are not those of uCO3D, or
             none of the sequences can be imported.
     """
     root = Path(root)
     out = Path(out)
     with closing(_open_metadata(root / _METADATA)) as metadata:
         names = _downloaded(root, category)
-        places = ", ".join("?" * len(names))  # one place per name
+        for name in sequences or ():
+            check_choice(f"{root}: sequence of {category}", name, names)
+        asked = sorted(set(sequences or names))
+        places = ", ".join("?" * len(asked))  # one place per name
         rows = _select(
             metadata,
             _SequenceRow,
             f"sequence_annots WHERE sequence_name IN ({places}) "
             "ORDER BY _reconstruction_quality_viewpoint DESC, sequence_name",
-            names,
+            asked,
         )
+        if sequences is None:
+            rows = rows[:best]
         present = False  # whether any sequence is in OUT
         problem = "no sequence on the disk is in the metadata"
-        for row in rows[:best]:
+        for row in rows:
             name = row["sequence_name"]
             if is_imported(out, category, name):
                 present = True

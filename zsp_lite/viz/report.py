@@ -30,7 +30,7 @@ from zsp_lite.pair_result import PairResult
 from zsp_lite.viz import category_sheet, plots
 from zsp_lite.viz.pose_picture import pose_picture
 from zsp_lite.viz.table import COLUMNS, table_rows
-from zsp_lite.viz.votes import votes_figure
+from zsp_lite.viz.votes import ring_figure, votes_figure
 
 _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark ground
 _TEMPLATES = Environment(
@@ -143,12 +143,13 @@ def _pair_parts(result: PairResult) -> dict[str, Any]:
         pictures[solver] = _picture(pose_picture(result, solver))
         if estimate.one_of_two:
             two_poses[solver] = _picture(_two_poses_figure(estimate))
+    votes = [votes_figure(result.votes), ring_figure(result)] if result.votes else []
     return {
         "result": result,
         "rows": table_rows(result),
         "pictures": pictures,
         "both": two_poses,
-        "votes": _picture(votes_figure(result.votes)) if result.votes else "",
+        "votes": [_picture(figure) for figure in votes],
         "stages": _stages(result),
         "scene": _scene(result),
     }

@@ -1,11 +1,16 @@
-"""What several frames say of one pose: each frame with the pose that it votes for."""
+"""What several frames say of one pose: each frame with the pose that it votes for, and all
+hypotheses on a ring."""
 
 from collections.abc import Sequence
 
+import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
+from zsp_lite.data.cameras import ground_axes
 from zsp_lite.metrics import SAME_ANGLE
-from zsp_lite.pair_result import Vote
+from zsp_lite.pair_result import PairResult, Vote
 from zsp_lite.viz import plots
 
 _SHOWN = 8  # largest number of votes with pictures
@@ -33,4 +38,46 @@ def votes_figure(votes: Sequence[Vote]) -> Figure:
         plots.draw_estimates(panels, [vote.estimate], most=1500, size=2)
         colour = plots.VERMILLION if vote.degrees > SAME_ANGLE else plots.BLUE
         panels[1].title.set_color(colour)
+    return figure
+
+
+def ring_figure(result: PairResult) -> Figure:
+    """Show the turns about the vertical of all hypotheses from the answer (dots), and the answer's
+    poses (stars)."""
+    answer = result.estimates["verified"]
+    up = np.cross(*ground_axes([view.frame.camera for view in answer.target_views]))
+    figure, axis = plt.subplots(
+        figsize=(3.6, 3.6), layout="constrained", subplot_kw={"polar": True}
+    )
+
+    def turn(rotation: np.ndarray) -> float:
+        """Return the angle in radians of the part of a rotation that is about the vertical."""
+        x, y, z, w = Rotation.from_matrix(rotation @ answer.world_sim3.R.T).as_quat()
+        return 2 * np.arctan2(up @ (x, y, z), w)
+
+    # Dots on the outer circle, of radius 1; their areas in square points grow with confidence.
+    for vote in result.votes:
+        for pose in vote.estimate.hypotheses:
+            world = vote.estimate.between_worlds(pose.sim3, pose.view)
+            angle = turn(world.inverse().R if vote.backward else world.R)
+            agrees = np.cos(angle) > np.cos(np.radians(SAME_ANGLE))
+            colour = plots.BLUE if agrees else plots.VERMILLION
+            axis.scatter(angle, 1, 260 * pose.confidence, colour, alpha=0.45)
+
+    # Stars inside, each with its confidence below.
+    for pose in (answer.hypotheses[0], *answer.alternatives):
+        angle = turn(answer.between_worlds(pose.sim3, pose.view).R)
+        axis.scatter(
+            angle,
+            0.5,
+            400 * pose.confidence,
+            plots.ORANGE,
+            marker="*",
+            edgecolors="black",
+            linewidths=0.5,
+        )
+        axis.text(angle, 0.24, f"{pose.confidence:.2f}", ha="center", va="center", fontsize=9)
+    axis.set(
+        theta_zero_location="N", ylim=(0, 1.15), yticks=[], xticks=np.radians([0, 90, 180, 270])
+    )
     return figure
