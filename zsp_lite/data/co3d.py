@@ -129,9 +129,9 @@ class Co3D:
         """Select at most ten sequences for labelling, those with the best point clouds first."""
         selected = []
         for sequence in self.sequences(category):
-            cloud_quality = sequence.point_cloud.quality_score if sequence.point_cloud else None
-            view_quality = sequence.viewpoint_quality_score or 0
-            if (cloud_quality or 0) > _MIN_CLOUD_QUALITY and view_quality > _MIN_VIEW_QUALITY:
+            cloud = sequence.point_cloud
+            good_cloud = cloud and (cloud.quality_score or 0) > _MIN_CLOUD_QUALITY
+            if good_cloud and (sequence.viewpoint_quality_score or 0) > _MIN_VIEW_QUALITY:
                 selected.append(sequence)
         return sorted(
             selected,

@@ -169,13 +169,15 @@ class Source:
 
     def contradiction(self) -> str:
         """Say how depth and poses of a few frames contradict each other (see `disagreement`)."""
-        frames = []
+        return disagreement(self._few_frames(), self.depth_unit)
+
+    def _few_frames(self) -> Iterator[Frame]:
+        """Read a few frames around the object, with their given masks only."""
         for position in neighbours(len(self.numbers)):
             # A damaged file is no reason to fail here: the estimate may not use it.
             with suppress(InputError):
                 frame = self.read_frame(position)
-                frames.append(frame if self.mask == "given" else replace(frame, mask=None))
-        return disagreement(frames, self.depth_unit)
+                yield frame if self.mask == "given" else replace(frame, mask=None)
 
     def select(
         self, count: int, references: bool, first: int | None = None
