@@ -31,7 +31,6 @@ class _Frame(msgspec.Struct):
     fl_x: float | None = None
     fl_y: float | None = None
     camera_angle_x: _Angle | None = None
-    camera_angle_y: _Angle | None = None
     cx: float | None = None
     cy: float | None = None
     w: _Side | None = None
@@ -108,13 +107,10 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
 def _intrinsics(frame: _Frame, height: int, width: int, where: str) -> list[float]:
     """Return fx, fy, cx, cy of a frame; by default both focal lengths are equal."""
     fx = frame.fl_x
-    fy = frame.fl_y
     if not fx and not frame.camera_angle_x:
         raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
     if not fx:
         fx = width / 2 / math.tan(frame.camera_angle_x / 2)
-    if not fy and frame.camera_angle_y:
-        fy = height / 2 / math.tan(frame.camera_angle_y / 2)
     cx = width / 2 if frame.cx is None else frame.cx
     cy = height / 2 if frame.cy is None else frame.cy
-    return [fx, fy or fx, cx, cy]
+    return [fx, frame.fl_y or fx, cx, cy]
