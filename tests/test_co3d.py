@@ -43,7 +43,7 @@ def test_a_pair_is_loaded_as_its_reference_frame_and_its_target_frames_in_order(
 @pytest.fixture(params=[1, 2], ids="CO3D v{}".format)
 def read_back(root, request):
     """A sequence that was written, and the data set that has it, in a version of CO3D."""
-    written = sequence_data("b_2")
+    written = sequence_data("b_2", depth_scale_adjustment=1.7)
     write_co3d(root, "chair", [written])
     if request.param == 2:
         convert_to_v2(root / "chair")

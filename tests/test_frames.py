@@ -215,7 +215,7 @@ def test_arrays_that_cannot_be_a_frame_are_refused_by_one_line(changes, message)
 def test_depth_and_masks_survive_their_files(tmp_path):
     rng = default_rng(0)
     depth = np.where(rng.random(SIZE) < 0.5, rng.uniform(1, 9, SIZE), 0).astype(np.float32)
-    write_depth(tmp_path / "depth.png", depth / 2)
+    write_depth(tmp_path / "depth.png", depth, 2.0)
     assert_allclose(read_depth(tmp_path / "depth.png", 2.0), depth, rtol=2**-11)
     mask = rng.integers(0, 256, SIZE).astype(np.float32) / 255
     write_mask(tmp_path / "mask.png", mask)

@@ -268,6 +268,7 @@ class SequenceData:
     normals: Real[np.ndarray, "n 3"] | None = None
     viewpoint_quality: float | None = None
     point_cloud_quality: float | None = None
+    depth_scale_adjustment: float = 1.0  # CO3D's factor from stored depth to depth
 
 
 def write_co3d(
@@ -330,8 +331,8 @@ def _write_sequence(
         if frame.depth is not None:
             path = f"{base}/depths/{stem}.jpg.geometric.png"
             mask_path = f"{base}/depth_masks/{stem}.png"
-            depth = DepthAnnotation(path, 1.0, mask_path)
-            write_depth(root / path, frame.depth)
+            depth = DepthAnnotation(path, float(sequence.depth_scale_adjustment), mask_path)
+            write_depth(root / path, frame.depth, sequence.depth_scale_adjustment)
             write_mask(root / mask_path, frame.depth > 0)
         if frame.mask is not None:
             # The stored 8-bit values are summed, because a sum of integers is the same on every

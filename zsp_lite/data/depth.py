@@ -29,9 +29,11 @@ def zero_unknown(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def encode_depth(depth: Real[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
+def encode_depth(
+    depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0
+) -> UInt16[np.ndarray, "h w"]:
     """Encode depth as the bits of float16 values; the inverse of `decode_depth`."""
-    depth = np.asarray(depth, dtype=np.float64)
+    depth = np.asarray(depth, dtype=np.float64) / scale_adjustment
     # A value beyond float16's range (65504) would become infinite; it is stored as unknown.
     usable = np.isfinite(depth) & (depth > 0) & (depth <= float(np.finfo(np.float16).max))
     return np.where(usable, depth, 0).astype(np.float16).view(np.uint16)

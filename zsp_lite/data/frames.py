@@ -324,9 +324,11 @@ def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"] | Bool[np.ndarray
     _encode(path, ".png", np.rint(mask.astype(np.float64) * 255).astype(np.uint8), options)
 
 
-def write_depth(path: str | Path, depth: Real[np.ndarray, "h w"]) -> None:
+def write_depth(
+    path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0
+) -> None:
     """Write depth (H, W) as a 16-bit PNG in CO3D's encoding (see `encode_depth`)."""
-    _encode(path, ".png", encode_depth(depth), [])
+    _encode(path, ".png", encode_depth(depth, scale_adjustment), [])
 
 
 def _changed(frame: Frame, camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Frame:
