@@ -235,4 +235,3 @@ def test_selection_takes_the_best_clouds_above_both_bounds(tmp_path):
     dataset = Co3D(tmp_path)
     names = [sequence.sequence_name for sequence in dataset.select("chair")]
     assert names == ["best", "good", "fair"]
-    assert [sequence.sequence_name for sequence in dataset.select("chair", top=1)] == names[:1]

@@ -60,7 +60,7 @@ def _ply(count, body: bytes, encoding="binary_little_endian", kind="") -> bytes:
 # Name of the file, its reader, what is wrong with it, its content, part of the message.
 BAD_FILES = [
     *(
-        (name, read, damage, data, "cannot be decoded .*expected a complete JPEG or PNG")
+        (name, read, damage, data, "cannot be decoded .*expected a complete .(jpg|png) file")
         for name, read in (
             ("x.jpg", read_image),
             ("mask.png", read_mask),
@@ -247,7 +247,7 @@ def test_the_limit_on_pixels_is_compared_with_the_header(tmp_path, monkeypatch, 
     path = tmp_path / f"x{extension}"
     path.write_bytes(JPEG if extension == ".jpg" else PNG)
     monkeypatch.setattr(frames, "MAX_PIXELS", 14_399)
-    refused("expected at most 14399 pixels, not 90 x 160", read_image, path)
+    refused("90 x 160 pixels.* of at most 14399 pixels", read_image, path)
     monkeypatch.setattr(frames, "MAX_PIXELS", 14_400)
     assert read_image(path).shape == (90, 160, 3)
 

@@ -287,7 +287,7 @@ def test_a_pixel_is_on_the_object_if_probably_so_and_of_known_depth():
     assert object_pixels(frame).tolist() == [[False, False, True, True, True, False]]
     assert len(object_points(frame)) == 3
     assert object_pixels(replace(frame, mask=None)).tolist() == (depth > 0).tolist()
-    assert "mask above 0.5 at 67%" in repr(frame)
+    assert repr(frame) == "Frame('', 1 x 6 pixels)"
 
 
 def test_the_two_spreads_average_deviations_and_variances_of_the_axes():

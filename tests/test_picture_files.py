@@ -124,14 +124,10 @@ def test_files_that_cannot_be_read_are_refused_in_one_line(tmp_path):
     assert read_picture(tmp_path / "a.webp")[0].shape == (32, 40, 3)
     for name, read, message in (
         ("two.npz", read_depth_file, "two.npz holds 2 arrays, expected one"),
-        (
-            "d.exr",
-            read_depth_file,
-            "expected an OpenCV that reads .exr, or the depth as .npy or a float .tiff",
-        ),
+        ("d.exr", read_depth_file, "expected the depth as .npy or a float .tiff"),
         ("a.webp", read_depth_file, "holds uint8 of shape .*, expected numbers"),
         ("half.webp", read_picture, "half.webp cannot be decoded"),
-        ("a.heic", read_picture, "HEIC is not read, expected the photograph as JPEG"),
+        ("a.heic", read_picture, "cannot be decoded .* expected the photograph as JPEG"),
     ):
         refused(message, read, tmp_path / name)
 

@@ -496,7 +496,7 @@ def test_the_unit_of_depth_can_be_given(tmp_path, views):
         (["model.obj", "model.mtl"], "is a model as Luma or KIRI export it"),
         (
             ["notes.doc"],
-            "expected a folder or zip with the files of nerfstudio.*; Stray.*; TUM.*; BOP.*; "
+            "expected .* a folder or zip with the files of nerfstudio.*; Stray.*; TUM.*; BOP.*; "
             "Open3D",
         ),
         (["intrinsic.json", "color/0.png"], "has no trajectory.log, expected poses: run Open3D's"),

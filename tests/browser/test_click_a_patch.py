@@ -116,7 +116,7 @@ GRID = (28, 28)
 def shown(stored, method, request) -> Shown:
     """Each stored pair in turn."""
     dataset = Co3D(sample_data())
-    result = run_pair(dataset, stored_pairs(dataset)[request.param], method)
+    result = run_pair(dataset, stored_pairs(dataset)[request.param], method, ["paper"])
     stored.evaluate("index => openStored(index)", request.param)
     views = [result.estimate.reference_view, *result.estimate.target_views]
     maps = []

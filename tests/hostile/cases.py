@@ -395,6 +395,6 @@ for line in (
     "demo --data \udcff",
     "data labels file:///etc --root ROOT/data",
     "data transfer ROOT/data ROOT/data ../cup",
-    "data import lists ROOT/capture --root ROOT/data --category c --sequence .. --box 2,2,20,20",
+    "data import ROOT/capture --root ROOT/data --category c --sequence .. --box 2,2,20,20",
 ):
     command("options", line.replace(ON_DATA, "benchmark")[:60], line)

@@ -26,10 +26,8 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]
                 weights = {key: file.get_tensor(key) for key in file.keys()}
                 return weights, dict(file.metadata() or {})
         except Exception as error:  # a damaged file can raise almost any exception
-            # The first line of the message, or the type where there is no message.
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(
-                f"checkpoint {path}: damaged, or contains more than tensors ({reason[:120]})"
+                f"checkpoint {path}: damaged, or contains more than tensors ({one_line(error)})"
             ) from error
 
     content = load_torch(path, "checkpoint")
@@ -93,7 +91,10 @@ def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> 
     try:
         model.load_state_dict({key: values.float() for key, values in weights.items()}, assign=True)
     except RuntimeError as error:  # several lines that name every key
-        raise InputError(
-            f"{path.name}: the weights do not fit: {' '.join(str(error).split())[:300]}"
-        ) from error
+        raise InputError(f"{path.name}: the weights do not fit: {one_line(error)}") from error
     return model
+
+
+def one_line(error: Exception) -> str:
+    """Return the beginning of an error's message in one line, or its type if it has none."""
+    return " ".join(str(error).split())[:300] or type(error).__name__

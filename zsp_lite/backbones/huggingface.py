@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from zsp_lite.backbones.checkpoints import one_line
 from zsp_lite.backbones.vit import Tokens, nearest_multiple
 from zsp_lite.choices import Facet
 from zsp_lite.errors import InputError
@@ -138,7 +139,7 @@ class HuggingFaceViT(nn.Module):
             raise InputError(
                 f"{name}: {type(self.vit).__name__} does not run on {self.image_size} x "
                 f"{self.image_size} pixels with "
-                f"one token per patch of {self.patch_size} x {self.patch_size} ({_one_line(error)})"
+                f"one token per patch of {self.patch_size} x {self.patch_size} ({one_line(error)})"
             ) from error
 
 
@@ -176,7 +177,7 @@ def load_huggingface(name: str, image_size: int | None) -> tuple[HuggingFaceViT,
     # Damaged JSON, unknown types, wrong fields or shapes: no common base class.
     except Exception as error:
         raise InputError(
-            f"{name}: cannot be loaded by the package transformers ({_one_line(error)})"
+            f"{name}: cannot be loaded by the package transformers ({one_line(error)})"
         ) from error
     for key, weight in model.named_parameters():
         if key in report["missing_keys"]:
@@ -211,13 +212,13 @@ def model_folder(name: str) -> Path:
     except ImportError as error:
         raise InputError(
             f"{name}: needs the package transformers: pip install transformers "
-            f"huggingface-hub ({_one_line(error)})"
+            f"huggingface-hub ({one_line(error)})"
         ) from error
     # The hub's client says what is wrong: no such model, no permission, or no network.
     except Exception as error:
         raise InputError(
             f"{name}: neither a folder nor a model OWNER/MODEL that the Hugging Face hub "
-            f"gives ({_one_line(error)})"
+            f"gives ({one_line(error)})"
         ) from error
     if not (folder / CONFIG).is_file() or not _has_weights(folder):
         raise InputError(
@@ -279,8 +280,3 @@ def _quiet():
         logging.set_verbosity(verbosity)
         if bars:
             logging.enable_progress_bar()
-
-
-def _one_line(error: Exception) -> str:
-    """Return the beginning of an error's message in one line, or its type if it has none."""
-    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -255,7 +255,7 @@ class _Import(click.Command):
         "data import uco3d --help",
     ),
 )
-@click.argument("source", metavar="[FORMAT] SCAN", type=PATH, nargs=-1, required=True)
+@click.argument("scan", type=PATH)
 @root_option
 @click.option("--category", metavar="NAME", required=True, help="Category of the object.")
 @click.option("--sequence", metavar="NAME", required=True, help="Name of the new sequence.")
@@ -270,12 +270,12 @@ class _Import(click.Command):
     default=100,
     help="Maximum number of frames, evenly spaced and sharp.",
 )
-def import_(source, root, category, sequence, mask, box, **options) -> None:
+def import_(scan, root, category, sequence, mask, box, **options) -> None:
     """Import an RGB-D capture as a sequence of a data folder.
 
     A capture is images with depth and camera poses in one world. SCAN is a folder, or the zip file
-    that an app has exported. Its FORMAT is recognised, if it is not given: nerfstudio (also of
-    Blender, NeRFCapture and instant-ngp), stray (Stray Scanner), polycam (its raw data), record3d
+    that an app has exported. Its format is recognised: nerfstudio (also of Blender, NeRFCapture and
+    instant-ngp), stray (Stray Scanner), polycam (its raw data), record3d
     (needs `pip install lzfse`), tum (RGB-D benchmark), bop, scannet, open3d (recorder, with the
     trajectory of its reconstruction), or lists of your own:
 
@@ -292,20 +292,14 @@ def import_(source, root, category, sequence, mask, box, **options) -> None:
 
     `data import uco3d ROOT --category NAME --out DATA` imports many sequences of uCO3D.
     """
-    from zsp_lite.importers import FORMATS
     from zsp_lite.importers.convert import import_source
     from zsp_lite.importers.sources import open_source
 
-    layout = str(source[0]) if len(source) > 1 else None
-    if layout not in (None, *FORMATS) or len(source) > 2:
-        raise click.UsageError(
-            f"{' '.join(map(str, source))}: expected SCAN, or one of {', '.join(FORMATS)} before it"
-        )
     refuse_options(
         {"masks": options["masks"] and (box or mask == "auto")}, (), "--box or --mask auto"
     )
     mask = mask or ("box" if box else "given")
-    opened = open_source(source[-1], mask=mask, box=box, layout=layout, **options)
+    opened = open_source(scan, mask=mask, box=box, **options)
     _print_import(root / category / sequence, import_source(opened, root, category, sequence))
 
 

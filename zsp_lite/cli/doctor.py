@@ -1,6 +1,5 @@
 """The command `doctor`: checks of the installation, each problem with the command that fixes it."""
 
-import os
 import platform
 import sys
 from collections.abc import Iterator
@@ -8,6 +7,7 @@ from collections.abc import Iterator
 import click
 
 from zsp_lite.cli.common import examples
+from zsp_lite.errors import InputError
 
 
 @click.command(epilog=examples("doctor"))
@@ -44,6 +44,7 @@ def run_checks() -> Iterator[tuple[str, str, str, str]]:
 
         from zsp_lite.backbones.load import DEFAULT, available_backbones, how_to_obtain
         from zsp_lite.io.download import cache_folder
+        from zsp_lite.io.locks import writing
     except (ImportError, OSError) as error:
         yield (
             "packages",
@@ -62,13 +63,8 @@ def run_checks() -> Iterator[tuple[str, str, str, str]]:
     state, fix = ("ok", "") if path else ("bad", how_to_obtain(DEFAULT))
     yield f"weights {DEFAULT}", state, f"{path or 'no file'} (all: zsp-lite weights list)", fix
     folder = cache_folder()
-    existing = next(one for one in (folder, *folder.parents) if one.exists())
-    if existing.is_dir() and os.access(existing, os.W_OK):
-        yield "cache", "ok", str(folder), ""
-    else:
-        yield (
-            "cache",
-            "note",
-            f"{folder} cannot be written",
-            "set ZSP_LITE_CACHE to a folder, for downloads",
-        )
+    try:
+        with writing(folder):
+            yield "cache", "ok", str(folder), ""
+    except InputError as error:
+        yield "cache", "note", str(error), "set ZSP_LITE_CACHE to a folder, for downloads"

@@ -28,9 +28,9 @@ def example_pair(dataset: Co3D) -> Pair:
     The pair of scooters is chosen by its result: a turn of 41 degrees, and both solvers are less
     than 10 off.
     """
-    scooters = Pair("motorcycle", "scooter", 10, "scooter2", (2, 6, 11, 16, 21))
-    target = dataset.root / scooters.category / scooters.target_sequence
-    return scooters if target.is_dir() else demo_pairs(dataset)[0]
+    if (dataset.root / "motorcycle/scooter2").is_dir():
+        return Pair.from_key("motorcycle/scooter:10/scooter2:2,6,11,16,21")
+    return demo_pairs(dataset)[0]
 
 
 def run_demo(
@@ -42,19 +42,14 @@ def run_demo(
         yield run_pair(dataset, pair, ZeroShotPose(backbone), solvers)
 
 
-def run_pair(
-    dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[str] = ()
-) -> PairResult:
-    """Estimate the pose of a pair by each solver, and its error if the pair has labels.
-
-    Without `solvers`, the method's own solver is used.
-    """
+def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[str]) -> PairResult:
+    """Estimate the pose of a pair by each solver, and its error if the pair has labels."""
     reference, targets = dataset.load_pair(pair)
     # The solvers share the features.
     view, *target_views = method.views([reference, *targets])
     estimates = {
         solver: replace(method, solver=solver).estimate_from_views(view, target_views)
-        for solver in solvers or [method.solver]
+        for solver in solvers
     }
     sources = (
         f"sequence {pair.reference_sequence}, frame {pair.reference_frame}",

@@ -4,10 +4,10 @@ of several objects."""
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from zsp_lite.align import read_hypotheses
 from zsp_lite.category import PairHypotheses
@@ -28,12 +28,11 @@ def full_turn(
     Returns the angles in degrees, the turned poses, and their scores.
     """
     best = solution.poses[[0]]
-    first, second = (solution.poses.rotation[k].double().numpy() for k in (0, 1))
-    axis = cv2.Rodrigues(second @ first.T)[0]
-    axis = axis / np.linalg.norm(axis)
+    first, second = solution.poses.rotation[:2].double().numpy()
+    axis = Rotation.from_matrix(second @ first.T).as_rotvec()
     degrees = np.arange(0, 365, 5.0)
-    matrices = [cv2.Rodrigues(np.radians(angle) * axis)[0] for angle in degrees]
-    turns = torch.from_numpy(np.stack(matrices)).float()
+    vectors = np.outer(np.radians(degrees), axis / np.linalg.norm(axis))
+    turns = torch.from_numpy(Rotation.from_rotvec(vectors).as_matrix()).float()
     # The turn is about the origin of the scene, which is amid the object.
     shift = (turns @ best.translation[..., None])[..., 0]
     turned = Poses(best.scale.expand(len(turns)), turns @ best.rotation, shift)
@@ -89,9 +88,8 @@ def fitting_right(
     for one in answers:
         away = _angles(one, rotations)
         nearest = away.argmin()
-        fits = away[nearest] <= SAME_ANGLE
         is_right = bool(_angles(one, truth)[nearest] < SAME_ANGLE)
-        right[one.reference, one.target] = is_right if fits else None
+        right[one.reference, one.target] = is_right if away[nearest] <= SAME_ANGLE else None
     return right
 
 

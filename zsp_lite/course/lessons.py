@@ -5,10 +5,8 @@ import os
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.course.samples import sample_data
-from zsp_lite.course.widgets.common import show
+from zsp_lite.course.widgets.common import show as show
 from zsp_lite.data.co3d import Co3D
-
-__all__ = ["open_lesson", "show"]
 
 
 def open_lesson(device: str = "cpu") -> tuple[Co3D, Backbone]:

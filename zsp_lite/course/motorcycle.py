@@ -8,6 +8,7 @@ from jaxtyping import Float32, UInt8
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.depth import fit_plane, unproject_depth
 from zsp_lite.data.frames import Frame, largest_region
+from zsp_lite.points import axis_deviation, object_points
 
 # The synthetic object whose directions are known.
 CATEGORY = "motorcycle"
@@ -16,8 +17,8 @@ TARGET = "scooter"
 # truth. The front was judged by eye from the rear wheel, since the front wheel is turned, and may
 # be wrong by 10 degrees. Up is the normal of the floor; the motorcycle leans on its side stand by a
 # few degrees.
-FRONT = (0.97, 0.06, -0.24)
-UP = (0.01, -0.97, -0.26)
+FRONT = np.array([0.97, 0.06, -0.24])
+UP = np.array([0.01, -0.97, -0.26])
 
 # Calibration at the size in scikit-image, from its documentation. The values in pixels are those of
 # the original photograph divided by 4. They therefore count from the corner of the image, as
@@ -44,8 +45,7 @@ def load_photograph() -> Frame:
 
     rgb, _, disparity = skimage.data.stereo_motorcycle()
     frame = motorcycle_frame(rgb, disparity)
-    points = unproject_depth(frame.depth, frame.camera)[(frame.mask > 0) & (frame.depth > 0)]
-    unit = np.float32(points.std(axis=0).mean())  # metres
+    unit = np.float32(axis_deviation(object_points(frame)))  # metres
     return replace(frame, depth=frame.depth / unit)
 
 
@@ -55,8 +55,8 @@ def motorcycle_frame(
     """Convert the left image and its disparities in pixels to a frame with depth in metres and an
     object mask."""
     known = np.isfinite(disparity)
-    depth = np.zeros_like(disparity)
-    depth[known] = _BASELINE * _FOCAL_LENGTH / (disparity[known] + _PRINCIPAL_DIFFERENCE)
+    depth = _BASELINE * _FOCAL_LENGTH / (disparity + _PRINCIPAL_DIFFERENCE)
+    depth = np.where(known, depth, np.float32(0))
     camera = Camera(
         np.eye(3), np.zeros(3), np.full(2, _FOCAL_LENGTH), np.array(_PRINCIPAL_POINT), depth.shape
     )

@@ -8,16 +8,17 @@ from functools import partial
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from zsp_lite.course import motorcycle
 from zsp_lite.course.demo import N_TARGETS
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
-from zsp_lite.data.ground_truth import POSES_FILE, object_poses
+from zsp_lite.data.ground_truth import read_poses
+from zsp_lite.data.pairs import spread
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureExtractor
+from zsp_lite.metrics import vector_angle
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import object_points
 from zsp_lite.viz import plots
@@ -64,13 +65,12 @@ def run_photograph(dataset: Co3D, backbone: FeatureExtractor) -> Iterator[Photog
     motorcycles. The sequence is `TARGET` of `motorcycle`, or the first of other data; both are
     independent of the results.
     """
-    if not (dataset.root / motorcycle.CATEGORY / POSES_FILE).is_file():
+    poses = read_poses(dataset.root, motorcycle.CATEGORY)
+    if not poses:
         return
-    poses = object_poses(dataset, motorcycle.CATEGORY)
     sequence = motorcycle.TARGET if motorcycle.TARGET in poses else min(poses)
     frames = dataset.frames(motorcycle.CATEGORY, sequence)
-    # Frames at equal steps of the sequence.
-    targets = [dataset.load(frames[k * len(frames) // N_TARGETS]) for k in range(N_TARGETS)]
+    targets = [dataset.load(frames[k]) for k in spread(N_TARGETS, len(frames))]
     pose = poses[sequence]
     points, _ = dataset.point_cloud(motorcycle.CATEGORY, sequence)
     along = pose.to_box(points)[:, 0]
@@ -93,8 +93,8 @@ def run_photograph(dataset: Co3D, backbone: FeatureExtractor) -> Iterator[Photog
                 axes,
                 cloud=to_photograph.apply(camera.to_camera(points)),
                 along=along,
-                front_error=_angle(axes[:, 0], motorcycle.FRONT),
-                up_error=_angle(axes[:, 2], motorcycle.UP),
+                front_error=float(vector_angle(axes[:, 0], motorcycle.FRONT)),
+                up_error=float(vector_angle(axes[:, 2], motorcycle.UP)),
             )
 
 
@@ -132,41 +132,29 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
     view = np.pad(view, ((0, 0), (margin, margin), (0, 0)), constant_values=255)
 
     # A row for each foreground: a panel at the left, then one for each solver.
-    titles = [
+    columns = 1 + len(_SOLVERS)
+    titles = [f"a view of the synthetic motorcycle,\n{first.sequence}"]
+    titles += [
         f"{_FOREGROUNDS[result.foreground]}, {result.solver} solver\n"
         f"front {result.front_error:.0f}°, up {result.up_error:.0f}° off"
         for result in results
     ]
-    count = len(_SOLVERS)
-    upper = [f"a view of the synthetic motorcycle,\n{first.sequence}"] + titles[:count]
-    lower = ["directions judged by eye\n"] + titles[count:]
-    columns = len(upper)
+    titles.insert(columns, "directions judged by eye\n")
     images = [view] + [photograph.rgb] * (len(results) + 1)
-    figure, axes = plots.show_images(images, upper + lower, columns=columns, size=3.6)
-    _, *above = axes[:columns]
-    by_eye, *below = axes[columns:]
+    figure, axes = plots.show_images(images, titles, columns=columns, size=3.6)
+    by_eye = axes.pop(columns)
 
     # The directions judged by eye, and those of the results.
     left = np.cross(motorcycle.UP, motorcycle.FRONT)
     directions = np.array([motorcycle.FRONT, left, motorcycle.UP])
-    centre = np.median(object_points(photograph), axis=0)
-    _draw_directions(by_eye, photograph, centre, directions)
-    for axis, result in zip(above + below, results):
+    arrows = [(by_eye, np.median(object_points(photograph), axis=0), directions)]
+    for axis, result in zip(axes[1:], results):
         size = len(result.cloud)
         chosen = np.linspace(0, size - 1, min(_POINTS, size)).astype(int)
         colours = plt.get_cmap("viridis")(result.along[chosen].clip(0, 1))[:, :3]
         plots.draw_points(axis, photograph.camera, result.cloud[chosen], colours, size=6)
-        _draw_directions(axis, photograph, result.cloud.mean(axis=0), result.axes.T)
+        arrows.append((axis, result.cloud.mean(axis=0), result.axes.T))
+    for axis, origin, directions in arrows:
+        ends = origin + _LENGTH * directions
+        plots.draw_axes(axis, photograph.camera, origin, ends, ("front", "left", "up"))
     return figure
-
-
-def _draw_directions(axis: Axes, frame: Frame, origin: np.ndarray, directions: np.ndarray) -> None:
-    """Draw arrows from an origin to front, left and up (rows) over a frame."""
-    plots.draw_axes(
-        axis, frame.camera, origin, origin + _LENGTH * directions, ("front", "left", "up")
-    )
-
-
-def _angle(first: np.ndarray, second: tuple[float, ...]) -> float:
-    """Return the angle between two vectors in degrees."""
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)))

@@ -34,20 +34,21 @@ def curve_above_pictures(
     of the pictures.
     """
     places = list(pictures)
-    figure = plt.figure(figsize=(7.4, 5.2), layout="constrained")
-    grid = figure.add_gridspec(2, len(places), height_ratios=(1, 1.15))
-    above = figure.add_subplot(grid[0, :])
+    figure, axes = plt.subplot_mosaic(
+        [["curve"] * len(places), places],
+        figsize=(7.4, 5.2),
+        layout="constrained",
+        height_ratios=(1, 1.15),
+    )
+    above = axes.pop("curve")
     above.plot(*curve)
     above.plot(places, np.interp(places, *curve), "o", color=VERMILLION, markersize=9)
     above.set(**labels)
-    axes = []
-    for column, (place, picture) in enumerate(pictures.items()):
-        axis = figure.add_subplot(grid[1, column])
-        axis.set_axis_off()
-        axis.set_title(title.format(place), fontsize=10)
-        draw_image(axis, picture)
-        axes.append(axis)
-    return figure, axes
+    for place, picture in pictures.items():
+        axes[place].set_axis_off()
+        axes[place].set_title(title.format(place), fontsize=10)
+        draw_image(axes[place], picture)
+    return figure, [axes[place] for place in places]
 
 
 def from_the_side(first: Shape, second: Shape, pose: np.ndarray) -> np.ndarray:
@@ -82,7 +83,22 @@ def show_graphs(
             axis.imshow(picture, extent=box, zorder=2)
             axis.text(x, y - _PICTURE, name, ha="center", va="top", fontsize=9, parse_math=False)
         for (start, end), right in arrows.items():
-            axis.add_patch(_arrow(centres[start], centres[end], *_ARROWS[right]))
+            along = centres[end] - centres[start]
+            gap = _ENDS * along / np.linalg.norm(along)
+            colour, line = _ARROWS[right]
+            # Curved, so that two opposite arrows can be told apart.
+            arrow = FancyArrowPatch(
+                centres[start] + gap,
+                centres[end] - gap,
+                arrowstyle="-|>",
+                mutation_scale=16,
+                connectionstyle="arc3,rad=0.12",
+                color=colour,
+                linestyle=line,
+                linewidth=2.2,
+                zorder=1,
+            )
+            axis.add_patch(arrow)
         axis.set(xlim=(-1.1, 1.1), ylim=(-1.15, 1.1), aspect="equal", title=title)
         axis.set_axis_off()
     return figure
@@ -104,23 +120,6 @@ def alike(
     return pictures
 
 
-def _arrow(start: np.ndarray, end: np.ndarray, colour: str, line: str) -> FancyArrowPatch:
-    """Return a curved arrow between the borders of two pictures, so that two opposite ones can be
-    told apart."""
-    along = (end - start) / np.linalg.norm(end - start)
-    return FancyArrowPatch(
-        start + _ENDS * along,
-        end - _ENDS * along,
-        arrowstyle="-|>",
-        mutation_scale=16,
-        connectionstyle="arc3,rad=0.12",
-        color=colour,
-        linestyle=line,
-        linewidth=2.2,
-        zorder=1,
-    )
-
-
 def show_winners(gains: Mapping[str, np.ndarray], true_gain: float) -> Figure:
     """Show the measured gains of simulated benchmarks as a row of dots for each name; those in
     which the better method does not win are red crosses."""
@@ -128,15 +127,28 @@ def show_winners(gains: Mapping[str, np.ndarray], true_gain: float) -> Figure:
     for row, values in enumerate(gains.values()):
         height = row + np.linspace(-0.28, 0.28, len(values))
         wins = np.asarray(values) > 0
-        style = {"s": 42, "edgecolors": "white", "linewidths": 0.5}
-        axis.scatter(values[wins], height[wins], color=BLUE, label="better method wins", **style)
-        style = {"s": 46, "linewidths": 2.2, "marker": "x"}
-        axis.scatter(values[~wins], height[~wins], color=VERMILLION, label="it does not", **style)
+        better, worse = ("", "") if row else ("better method wins", "it does not")
+        axis.scatter(
+            values[wins],
+            height[wins],
+            s=42,
+            color=BLUE,
+            edgecolors="white",
+            linewidths=0.5,
+            label=better,
+        )
+        axis.scatter(
+            values[~wins],
+            height[~wins],
+            s=46,
+            color=VERMILLION,
+            marker="x",
+            linewidths=2.2,
+            label=worse,
+        )
     axis.axvline(0, color="0.3", linewidth=1)
     axis.axvline(true_gain, color=GREEN, linestyle="--", label="true gain")
     axis.set_yticks(range(len(gains)), gains)
     axis.set(xlabel="measured gain (points of Acc30)", ylim=(len(gains) - 0.5, -0.5))
-    handles, names = axis.get_legend_handles_labels()
-    each = dict(zip(names, handles))
-    figure.legend(each.values(), each.keys(), ncols=3, loc="outside upper center", fontsize=9)
+    figure.legend(ncols=3, loc="outside upper center", fontsize=9)
     return figure

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from sklearn.neighbors import NearestNeighbors
+from scipy.spatial import cKDTree
 
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.depth import patch_points
@@ -26,7 +26,6 @@ _MASK_THRESHOLD = 0.8  # above this a pixel is surely of the object: masks are s
 class GroundTruthPair:
     """Object crops of two instances of a category with their ground-truth matches."""
 
-    category: str
     reference: Frame  # object crops
     target: Frame
     # matching target patch (row, col) of each reference patch
@@ -67,10 +66,9 @@ def ground_truth_matches(
     cells = np.zeros((*known.shape, 2), int)
     valid = np.zeros_like(known)
     if known.any() and target_known.any():
-        search = NearestNeighbors(n_neighbors=1).fit(target_points[target_known])
-        distance, index = search.kneighbors(points[known])
-        cells[known] = np.argwhere(target_known)[index[:, 0]]
-        valid[known] = distance[:, 0] <= _NEAR
+        distance, index = cKDTree(target_points[target_known]).query(points[known])
+        cells[known] = np.argwhere(target_known)[index]
+        valid[known] = distance <= _NEAR
         cells[~valid] = 0
     return cells, valid
 
@@ -100,4 +98,4 @@ def ground_truth_pair(dataset: Co3D, pair: Pair) -> GroundTruthPair:
         for target in targets
     ]
     best = int(np.argmax([valid.sum() for _, valid in matches]))
-    return GroundTruthPair(pair.category, reference, targets[best], *matches[best])
+    return GroundTruthPair(reference, targets[best], *matches[best])

@@ -38,10 +38,8 @@ def show_view_circle(
     """
     figure = plt.figure(figsize=(7, 7))
     circle = figure.add_axes((0.25, 0.25, 0.5, 0.5), projection="polar")
-    circle.set_theta_zero_location("N")
-    circle.set_theta_direction(-1)
+    circle.set(theta_zero_location="N", theta_direction=-1, ylim=_LIMITS)
     circle.set_xticks(np.radians(range(0, 360, 90)), ["0°", "90°", "180°", "90°"])
-    circle.set_ylim(*_LIMITS)
     circle.set_yticks(np.arange(-40, _LIMITS[1], 5))
     circle.tick_params(axis="y", labelsize=8)
 

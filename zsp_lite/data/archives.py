@@ -132,14 +132,11 @@ def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | Non
 
 
 def download_archives(root: Path, archives: Sequence[Archive]) -> None:
-    """Download, verify and unpack archives, or sequences of them.
-
-    An interrupted download is continued.
-    """
+    """Download, verify and unpack `missing_archives`; an interrupted download is continued."""
     with writing(root / _DOWNLOADS):
         # The first archive has the annotations. It comes last, so that a category with annotations
         # is complete.
-        for archive in reversed(missing_archives(root, archives)):
+        for archive in reversed(archives):
             path = root / _DOWNLOADS / archive.name
             if not archive.sequences and not path.exists():
                 fetch(archive.url, path, remote_size(archive.url), digest=archive.sha256)

@@ -133,13 +133,9 @@ def _check_frame(
     """Check the files and the camera of a frame; return whether its pose can be estimated."""
     depth = annotation.depth
     mask = annotation.mask
-    paths = [annotation.image.path]
-    if mask:
-        paths.append(mask.path)
-    if depth:
-        paths.append(depth.path)
-        if depth.mask_path:
-            paths.append(depth.mask_path)
+    paths = [file.path for file in (annotation.image, mask, depth) if file]
+    if depth and depth.mask_path:
+        paths.append(depth.mask_path)
     # A list, so that the files after a missing one are checked, too.
     has_files = all([_check_file(dataset, path, check) for path in paths])
     if annotation.viewpoint is None or not has_files:

@@ -125,18 +125,18 @@ class Co3D:
             )
         return list(self._sequences[category])
 
-    def select(self, category: str, top: int = 10) -> list[SequenceAnnotation]:
-        """Select at most `top` sequences for labelling, those with the best point clouds first."""
+    def select(self, category: str) -> list[SequenceAnnotation]:
+        """Select at most ten sequences for labelling, those with the best point clouds first."""
         selected = []
         for sequence in self.sequences(category):
-            cloud_quality = sequence.point_cloud.quality_score if sequence.point_cloud else None
-            view_quality = sequence.viewpoint_quality_score or 0
-            if (cloud_quality or 0) > _MIN_CLOUD_QUALITY and view_quality > _MIN_VIEW_QUALITY:
+            cloud = sequence.point_cloud
+            good_cloud = cloud and (cloud.quality_score or 0) > _MIN_CLOUD_QUALITY
+            if good_cloud and (sequence.viewpoint_quality_score or 0) > _MIN_VIEW_QUALITY:
                 selected.append(sequence)
         return sorted(
             selected,
             key=lambda sequence: (-sequence.point_cloud.quality_score, sequence.sequence_name),
-        )[:top]
+        )[:10]
 
     def frame_list(self, category: str) -> list[FrameKey]:
         """List sequence and number of all frames, in the file's order.
@@ -297,8 +297,8 @@ def write_co3d(
 
         for sequence in sequences:
             new_frames, new_sequence = _write_sequence(root, category, sequence, quality)
-            _update(frames_path, frames, sequence.name, new_frames)
             _update(sequences_path, listed, sequence.name, [new_sequence])
+            _update(frames_path, frames, sequence.name, new_frames)
 
 
 def _update(path: Path, named: list[tuple[str, Any]], name: str, new: Sequence) -> None:

@@ -2,16 +2,15 @@
 
 import io
 import reprlib
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Real, UInt8
-from PIL.JpegImagePlugin import JpegImageFile
-from PIL.PngImagePlugin import PngImageFile
+from PIL import Image
 
 from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose, split_intrinsics
 from zsp_lite.data.depth import decode_depth, encode_depth, zero_unknown
@@ -19,6 +18,12 @@ from zsp_lite.errors import MAX_LENGTH, InputError, check_number, real_array
 from zsp_lite.io.files import read_bytes, write_atomic
 
 MAX_PIXELS = 1 << 26  # of an image file
+# What is expected in place of files that no decoder here reads.
+_NOT_READ = {
+    ".heic": "the photograph as JPEG",
+    ".heif": "the photograph as JPEG",
+    ".exr": "the depth as .npy or a float .tiff",
+}
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
 # Largest relative difference of the aspect ratios of an image and its smaller depth map: sides are
 # rounded to whole pixels.
@@ -154,13 +159,7 @@ class Frame:
 
     def __repr__(self) -> str:
         height, width = self.camera.size
-        depth = "no depth"
-        if self.depth is not None:
-            depth = f"depth known at {(self.depth > 0).mean():.0%} of the pixels"
-        mask = "no mask"
-        if self.mask is not None:
-            mask = f"mask above {ON_OBJECT} at {(self.mask > ON_OBJECT).mean():.0%}"
-        return f"Frame({self.name!r}, {height} x {width} pixels, {depth}, {mask})"
+        return f"Frame({self.name!r}, {height} x {width} pixels)"
 
 
 def _read_map(name: str, values: np.ndarray) -> Float64[np.ndarray, "h w"]:
@@ -252,8 +251,6 @@ def crop_to_object(frame: Frame) -> Frame:
 
 def turn_frame(frame: Frame, quarters: int) -> Frame:
     """Turn a frame and its camera by quarter turns as in `numpy.rot90`; world points stay."""
-    if quarters % 4 == 0:
-        return frame
     return _changed(
         frame,
         frame.camera.turn(quarters),
@@ -349,30 +346,45 @@ def _span(inside: np.ndarray, padding: float) -> tuple[int, int]:
     return max(0, int(np.floor(first - margin))), min(len(inside), int(np.ceil(end + margin)))
 
 
+@contextmanager
+def decoding(path: str | Path, what: str) -> Iterator[bytes]:
+    """Read a file; InputError, in one line that names it, if the block cannot decode it."""
+    data = read_bytes(path, what)
+    try:
+        yield data
+    except InputError:
+        raise
+    except Exception as error:  # numpy, Pillow and OpenCV may raise anything
+        suffix = Path(path).suffix.lower()
+        complete = f"a complete {suffix or 'image'} file of at most {MAX_PIXELS} pixels"
+        problem = error if isinstance(error, ValueError) else type(error).__name__
+        raise InputError(
+            f"{what} {path} cannot be decoded ({problem}, {len(data)} bytes), "
+            f"expected {_NOT_READ.get(suffix, complete)}"
+        ) from error
+
+
+def open_image(data: bytes, formats: Sequence[str] = ("JPEG", "PNG")) -> Image.Image:
+    """Open an image of one of Pillow's formats, without decoding its pixels; ValueError for too
+    many."""
+    file = Image.open(io.BytesIO(data), formats=formats)
+    if file.width * file.height > MAX_PIXELS:
+        raise ValueError(f"{file.height} x {file.width} pixels")
+    return file
+
+
 def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
     """Decode a JPEG or PNG file by OpenCV with its flags; InputError if it is damaged."""
-    data = read_bytes(path, what)
-    is_jpeg = data[:2] == b"\xff\xd8"
-    image = None
-    expected = "a complete JPEG or PNG"
-    # What Pillow and OpenCV raise for another format or a damaged header.
-    with suppress(OSError, SyntaxError, ValueError, cv2.error):
-        # This reads the header only: the number of pixels is checked before any is decoded.
-        opened = (JpegImageFile if is_jpeg else PngImageFile)(io.BytesIO(data))
-        width, height = opened.size
-        if width * height > MAX_PIXELS:
-            expected = f"at most {MAX_PIXELS} pixels, not {height} x {width}"
+    with decoding(path, what) as data:
+        # Pillow refuses incomplete files; OpenCV would fill missing parts with grey.
+        file = open_image(data)
+        if file.format == "PNG":
+            file.verify()
         else:
-            # Pillow refuses incomplete files; OpenCV would fill missing parts with grey.
-            if is_jpeg:
-                opened.load()
-            else:
-                opened.verify()
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    if image is None:
-        raise InputError(
-            f"{what} {path} cannot be decoded ({len(data)} bytes), expected {expected}"
-        )
+            file.load()
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        if image is None:
+            raise ValueError("damaged")
     return image
 
 

@@ -13,7 +13,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
@@ -97,11 +96,12 @@ def label_bytes(label: PoseLabel) -> bytes:
     return json.dumps(vars(label), default=np.ndarray.tolist).encode()
 
 
-def rigid_label(sim3: Sim3, centre: ArrayLike, seq: str, reference_seq: str) -> PoseLabel:
+def rigid_label(
+    sim3: Sim3, centre: Float[np.ndarray, "3"], seq: str, reference_seq: str
+) -> PoseLabel:
     """Convert a similarity to a label with the same rotation and the same image of `centre`."""
     # A label has no scale: with the similarity's translation, an object off the origin would be
     # displaced.
-    centre = np.asarray(centre, dtype=np.float64)
     trans = np.eye(4)
     trans[:3, :3] = sim3.R
     trans[:3, 3] = sim3.apply(centre) - sim3.R @ centre

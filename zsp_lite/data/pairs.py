@@ -48,11 +48,7 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
     total = sum(unsampled.values())
     if total < n:
         logger.warning(
-            "category %s has %d different pairs of %d targets, not %d",
-            category,
-            total,
-            n_targets,
-            n,
+            f"category {category} has {total} different pairs of {n_targets} targets, not {n}"
         )
 
     pairs: dict[Pair, None] = {}  # a set that keeps the order
@@ -132,14 +128,11 @@ def true_pose(
     dataset: Co3D, labels: Mapping[str, PoseLabel], pair: Pair, view: int
 ) -> Float[np.ndarray, "4 4"]:
     """Compute the labelled pose of a pair: from the reference's camera to that of a target view."""
-    reference = dataset.frame(pair.category, pair.reference_sequence, pair.reference_frame)
-    target = dataset.frame(pair.category, pair.target_sequence, pair.target_frames[view])
-    return relative_pose(
-        labels[pair.reference_sequence],
-        dataset.camera(reference),
-        labels[pair.target_sequence],
-        dataset.camera(target),
-    )
+    ends = []
+    for sequence, number in (pair.frames[0], pair.frames[1 + view]):
+        annotation = dataset.frame(pair.category, sequence, number)
+        ends += [labels[sequence], dataset.camera(annotation)]
+    return relative_pose(*ends)
 
 
 def pairs_path(root: str | Path, category: str, n: int, n_targets: int) -> Path:
@@ -165,7 +158,7 @@ def shipped_pairs(dataset: Co3D, category: str, n_targets: int, at_least: int = 
     different = [*dict.fromkeys(pairs)]
     if len(different) < len(pairs):
         logger.warning(
-            "category %s: %d of %d stored pairs are different", category, len(different), len(pairs)
+            f"category {category}: {len(different)} of {len(pairs)} stored pairs are different"
         )
     return different
 

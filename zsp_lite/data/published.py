@@ -63,9 +63,8 @@ def published_sequences(source: Path, categories: Sequence[str]) -> dict[str, tu
             raise _no_labels(source, category)
     sequences = {}
     for category, by_path in labels.items():
-        names = {label.seq for label in by_path.values()}
-        names.update(label.reference_seq for label in by_path.values())
-        sequences[category] = tuple(sorted(names))
+        pairs = [(label.seq, label.reference_seq) for label in by_path.values()]
+        sequences[category] = tuple(sorted(set().union(*pairs)))
     return sequences
 
 

@@ -83,11 +83,11 @@ _INCOMPLETE = {
 }
 
 
-def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
+def recognise(path: str | Path) -> tuple[str, Path]:
     """Return a capture's format, a name in `FORMATS`, and the folder or file that its reader takes.
 
     A capture is a folder, the zip or .r3d file of an app, or a transforms.json. InputError for
-    anything else. The message says what is missing, or what is expected: `also` or a capture.
+    anything else. The message says what is missing, or what is expected.
     """
     path = Path(path)
     folder = path
@@ -112,7 +112,10 @@ def recognise(path: str | Path, also: str = "") -> tuple[str, Path]:
             raise InputError(f"{path} {problem}, {_HOW}")
     problem = "has another format" if path.exists() else "does not exist"
     known = "; ".join(f"{layout.what} ({', '.join(layout.signs)})" for layout in FORMATS.values())
-    raise InputError(f"{path} {problem}, expected {also}a folder or zip with the files of {known}")
+    raise InputError(
+        f"{path} {problem}, expected a picture (.jpg, .png, .webp), CATEGORY/SEQUENCE of a data "
+        f"folder, or a folder or zip with the files of {known}"
+    )
 
 
 def open_capture(
@@ -125,20 +128,13 @@ def open_capture(
 ) -> Capture:
     """Read a capture's frames (see `open_source`), with the masks of its folder masks/, if any.
 
-    `files` has attributes of `CaptureFrame` that replace those of every frame. InputError if the
-    capture cannot be read, or no frame can be used.
+    The `layout`, a name in `FORMATS`, is recognised by default; otherwise the path is what its
+    reader takes. `files` has attributes of `CaptureFrame` that replace those of every frame.
+    InputError if the capture cannot be read, or no frame can be used.
     """
-    path = Path(path)
-    folder = path
-    try:
-        recognised, place = recognise(path)
-        layout = layout or recognised
-        # Another layout is read from the path as it is given.
-        if recognised == layout:
-            folder = place
-    except InputError:
-        if not layout:
-            raise
+    folder = Path(path)
+    if layout is None:
+        layout, folder = recognise(path)
     if layout == "stray":  # the reader chooses the sharp frames, because it decodes a video
         options["count"] = count
     frames, left_out = collect(FORMATS[layout].read(folder, **options))

@@ -17,12 +17,12 @@ from scipy.spatial.transform import Rotation
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
 from zsp_lite.errors import Contradiction, Doubt, InputError
+from zsp_lite.importers.capture import FROM_OPENGL
 from zsp_lite.importers.files import WINDOW_5
 from zsp_lite.importers.masks import PLAUSIBLE, masks_from_depth
 from zsp_lite.metrics import rotation_angle
 from zsp_lite.points import object_pixels, world_points
 
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's camera axes to OpenCV's, or back
 _POINTS = 500  # largest number of points of a frame, about
 _LEAST_POINTS = 50  # with fewer points, a share says little
 _PAIRS = 8  # largest number of pairs of frames
@@ -225,7 +225,7 @@ _INVERSE = "are world to camera"
 # The axes of the world do not matter.
 _CORRECTIONS: list[tuple[str, _Correction]] = [
     (_INVERSE, np.linalg.inv),
-    (_INVERSE, lambda pose: _FLIP @ np.linalg.inv(pose)),
-    (_OTHER_AXES, lambda pose: _FLIP @ pose),
+    (_INVERSE, lambda pose: FROM_OPENGL @ np.linalg.inv(pose)),
+    (_OTHER_AXES, lambda pose: FROM_OPENGL @ pose),
     ("are from quaternions with w first", _reorder),
 ]

@@ -1,7 +1,7 @@
 """RGB-D captures: the files and camera of a frame, and what the readers of formats share."""
 
 import re
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -99,14 +99,13 @@ class CaptureFrame:
         """Return OpenCV's maps that undistort the displayed image with this camera."""
         matrix = camera.K - HALF_PIXEL
         coefficients = np.array(self.distortion)
-        if self.fisheye:
-            undistortion = cv2.fisheye.initUndistortRectifyMap
-        else:
+        undistortion = cv2.fisheye.initUndistortRectifyMap
+        if not self.fisheye:
             undistortion = cv2.initUndistortRectifyMap
-            p1, p2 = coefficients[2:4]
             # In OpenCV's model, p2 shifts points along x and p1 along y: the vector (p2, p1) turns
             # with the image.
-            coefficients[[3, 2]] = (camera.R @ self.camera.R.T)[:2, :2] @ (p2, p1)
+            turn = (camera.R @ self.camera.R.T)[:2, :2]
+            coefficients[[3, 2]] = turn @ coefficients[[3, 2]]
         return undistortion(
             matrix, coefficients, np.eye(3), matrix, camera.size[::-1], cv2.CV_32FC1
         )
@@ -186,11 +185,10 @@ def collect(makers: Iterable[Callable[[], CaptureFrame]]) -> tuple[list[CaptureF
     return sorted(frames, key=lambda frame: _natural_order(frame.image)), left_out
 
 
-def _natural_order(path: Path) -> tuple[list[str | int], str]:
+def _natural_order(path: Path) -> list[str | int]:
     """Return a key to sort paths: frame 10 follows frame 9."""
-    text = path.as_posix()
-    parts = re.split(r"(\d+)", text)  # every second part is a number
-    return [int(part) if k % 2 else part for k, part in enumerate(parts)], text
+    parts = re.split(r"(\d+)", path.as_posix())  # every second part is a number
+    return [int(part) if k % 2 else part for k, part in enumerate(parts)]
 
 
 def sharpest(
@@ -250,25 +248,19 @@ def find_masks(folder: str | Path, images: Sequence[Path]) -> list[Path | None]:
     `1.png` in the folder. The extension of the image may be part of the mask's name. The longest
     such path counts. An end that several images share is no name of a mask.
     """
-    named = {}
-    for path in sorted(Path(folder).rglob("*.*")):
-        if path.suffix.lower() in files.MASKS:
-            named[path.relative_to(folder).with_suffix("").as_posix()] = path
-
-    def tails(image: Path) -> list[str]:
-        """List the ends of a path without its extension, the longest first."""
-        parts = image.with_suffix("").parts
-        return ["/".join(parts[-count:]) for count in range(len(parts), 0, -1)]
-
-    shared = Counter(tail for image in images for tail in tails(image))
-    masks = []
+    # The images that each end of a path belongs to.
+    owners = defaultdict(list)
     for image in images:
-        names = []
-        for tail in tails(image):
-            if shared[tail] == 1:
-                names += [tail + image.suffix, tail]
-        masks.append(next((named[name] for name in names if name in named), None))
-    return masks
+        for parts in (image.parts, image.with_suffix("").parts):
+            for start in range(len(parts)):
+                owners["/".join(parts[start:])].append(image)
+    masks = {}
+    # A longer path comes later and replaces a shorter one.
+    for path in sorted(Path(folder).rglob("*.*"), key=lambda path: (len(str(path)), path)):
+        owner = owners[path.relative_to(folder).with_suffix("").as_posix()]
+        if path.suffix.lower() in files.MASKS and len(owner) == 1:
+            masks[owner[0]] = path
+    return [masks.get(image) for image in images]
 
 
 def read_text_lines(path: Path, least: int = 1) -> list[str]:

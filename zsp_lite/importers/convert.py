@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from zsp_lite.data.annotations import FRAMES_FILE, read_frame_index
 from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
@@ -16,7 +17,6 @@ from zsp_lite.importers import PACKED
 from zsp_lite.importers.capture import HALF_PIXEL
 from zsp_lite.importers.sources import Source, open_source
 from zsp_lite.io.files import plain_name
-from zsp_lite.io.locks import writing
 from zsp_lite.points import axis_deviation, object_pixels, sampling_step, world_points
 
 logger = logging.getLogger(__name__)
@@ -27,8 +27,6 @@ _VOXELS = 96
 _MAX_POINTS = 50_000  # of a fused point cloud
 # The size of the object is estimated from every seventh pixel, or fewer.
 _LEAST_STEP = 7
-# This file lies in the folder of a sequence while it is imported, and after an interruption.
-_UNFINISHED = ".unfinished"
 # This many frames must see a surface. With fewer frames, all must see it.
 MIN_VIEWS = 3
 
@@ -54,7 +52,7 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
     """
     folder = Path(root) / plain_name(category, "category") / plain_name(sequence, "sequence")
     count = len(source.numbers)
-    if is_imported(folder):
+    if is_imported(root, category, sequence):
         raise InputError(f"{folder} exists already, expected another sequence name")
     if source.left_out and count < MIN_VIEWS:
         raise InputError(
@@ -75,25 +73,16 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
     data = SequenceData(
         sequence, scaled, [float(position) for position in seen], points * scale, colours, normals
     )
-    write_sequence(root, category, data)
+    write_co3d(root, category, [data])
     return ImportResult(
         len(seen), count - len(seen), len(points), scale, tuple(source.flags(frames))
     )
 
 
-def is_imported(folder: Path) -> bool:
-    """Whether the folder of a sequence exists, and no import to it was interrupted."""
-    return folder.exists() and not (folder / _UNFINISHED).is_file()
-
-
-def write_sequence(root: str | Path, category: str, data: SequenceData) -> None:
-    """Write a new sequence, or one whose import was interrupted."""
-    folder = Path(root, category, data.name)
-    with writing(root):
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / _UNFINISHED).touch()
-        write_co3d(root, category, [data])
-        (folder / _UNFINISHED).unlink()
+def is_imported(root: str | Path, category: str, sequence: str) -> bool:
+    """Whether a data folder has a sequence; one whose import was interrupted is not annotated."""
+    path = Path(root, category, FRAMES_FILE)
+    return path.is_file() and sequence in read_frame_index(path).by_sequence
 
 
 def import_captures(
@@ -117,7 +106,7 @@ def import_captures(
     if not paths:
         raise InputError(f"{folder} has no scan, expected a folder, .zip or .r3d of each object")
     for name, path in paths.items():
-        if not is_imported(Path(root) / category / name):
+        if not is_imported(root, category, name):
             yield name, import_source(open_source(path), root, category, name)
 
 

@@ -6,20 +6,19 @@ mask and its camera may refer to the pixels as stored or as displayed.
 
 import io
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8
-from PIL import ExifTags, Image
+from PIL import ExifTags
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import MAX_PIXELS, decode_image, read_depth, read_image
+from zsp_lite.data.frames import decode_image, decoding, open_image, read_depth, read_image
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import MAX_FILE, read_bytes
+from zsp_lite.io.files import MAX_FILE
 
 # Windows of OpenCV's filters of masks: 3 x 3 and 5 x 5 pixels.
 WINDOW_3 = np.ones((3, 3), np.uint8)
@@ -52,20 +51,17 @@ _OFF_MIDDLE = 0.3
 
 def read_picture(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], int]:
     """Read the colours of a JPEG, PNG or WebP file as stored, and its EXIF orientation."""
-    with _decoding("image", path):
-        file = _open(path, "image", _FORMATS)
+    with decoding(path, "image") as data:
+        file = open_image(data, _FORMATS)
         orientation = file.getexif().get(ExifTags.Base.Orientation) if "exif" in file.info else 1
-        if file.format == "WEBP":
-            rgb = np.array(file.convert("RGB"))
-        else:
-            rgb = read_image(path)
+        rgb = np.array(file.convert("RGB")) if file.format == "WEBP" else read_image(path)
     return rgb, orientation if orientation in _QUARTERS else 1
 
 
 def picture_size(path: str | Path) -> tuple[int, int]:
     """Read the size (H, W) of a picture as stored from its header."""
-    with _decoding("image", path):
-        return _open(path, "image", _FORMATS).size[::-1]
+    with decoding(path, "image") as data:
+        return open_image(data, _FORMATS).size[::-1]
 
 
 def read_depth_file(path: str | Path) -> Float32[np.ndarray, "h w"]:
@@ -137,8 +133,8 @@ def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
     """Read the values of a mask file, and whether they are labels, each of one colour."""
     values = _read_values(path, "mask")
     if path.suffix.lower() == ".png":
-        with _decoding("mask", path):
-            file = _open(path, "mask", ("PNG", "JPEG"))
+        with decoding(path, "mask") as data:
+            file = open_image(data)
             if file.mode == "P" and np.ptp(np.array(file.convert("RGB")), axis=2).any():
                 return np.array(file), True
     if values.ndim == 3 and values.shape[2] in (1, 3, 4):
@@ -165,54 +161,25 @@ def _mask_values(path: Path) -> tuple[Shaped[np.ndarray, "h w"], bool]:
 def _read_values(path: Path, what: str) -> Shaped[np.ndarray, "..."]:
     """Read the values of an array or image file as stored."""
     suffix = path.suffix.lower()
-    data = read_bytes(path, what)
-    with _decoding(what, path):
-        if suffix in (".npy", ".npz"):
-            values = np.load(io.BytesIO(data), allow_pickle=False)
-            if isinstance(values, np.lib.npyio.NpzFile):
-                if len(values.files) != 1:
-                    raise InputError(
-                        f"{what} {path} holds {len(values.files)} arrays, expected one"
-                    )
-                (member,) = values.zip.infolist()
-                values = values[values.files[0]] if member.file_size <= MAX_FILE else None
-        elif suffix == ".exr":
+    with decoding(path, what) as data, warnings.catch_warnings(action="ignore"):
+        if suffix not in (".npy", ".npz"):
+            if suffix in (".tif", ".tiff", ".pfm", ".webp"):
+                return np.array(open_image(data, ("TIFF", "PPM", "WEBP")))
+            if suffix != ".exr":
+                return decode_image(path, what, cv2.IMREAD_UNCHANGED)
             # Without the variable OPENCV_IO_ENABLE_OPENEXR, this returns None or raises an error.
             values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        elif suffix in (".tif", ".tiff", ".pfm", ".webp"):
-            values = np.array(_open(path, what, ("TIFF", "PPM", "WEBP")))
-        else:
-            values = decode_image(path, what, cv2.IMREAD_UNCHANGED)
-        if values is None:
-            raise ValueError
-    return values
-
-
-def _open(path: str | Path, what: str, formats: Sequence[str]) -> Image.Image:
-    """Open an image file of one of the formats, without decoding its pixels."""
-    if Path(path).suffix.lower() in (".heic", ".heif"):
-        raise InputError(f"{what} {path}: HEIC is not read, expected the photograph as JPEG")
-    file = Image.open(io.BytesIO(read_bytes(path, what)), formats=formats)
-    if file.width * file.height > MAX_PIXELS:
-        raise ValueError
-    return file
-
-
-@contextmanager
-def _decoding(what: str, path: str | Path) -> Iterator[None]:
-    """Turn the errors of decoders into one line that names the file."""
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            yield
-    except InputError:
-        raise
-    except Exception as error:  # numpy, Pillow and OpenCV may raise anything
-        expected = f"a complete {Path(path).suffix or 'image'} file of at most {MAX_PIXELS} pixels"
-        if str(path).endswith(".exr"):
-            expected = "an OpenCV that reads .exr, or the depth as .npy or a float .tiff"
-        raise InputError(
-            f"{what} {path} cannot be decoded ({type(error).__name__}), expected {expected}"
-        ) from error
+            if values is None:
+                raise ValueError("damaged, or OpenCV reads no .exr here")
+            return values
+        values = np.load(io.BytesIO(data), allow_pickle=False)
+        if isinstance(values, np.ndarray):
+            return values
+        if len(values.files) != 1:
+            raise InputError(f"{what} {path} holds {len(values.files)} arrays, expected one")
+        if values.zip.infolist()[0].file_size > MAX_FILE:
+            raise ValueError("the array is too large")
+        return values[values.files[0]]
 
 
 def lies_as_stored(

@@ -234,16 +234,12 @@ def mask_flags(frames: Collection[Frame]) -> tuple[str, ...]:
 
     Frames with a defect do not count.
     """
-    plane, distance = _plane_around(frames)
-    usable = 0
-    counts = Counter()
-    for frame in frames:
-        if not frame_defect(frame):
-            usable += 1
-            counts.update(_signs(frame, plane, distance))
-    if counts.total() < _LEAST_SIGNS * usable:
+    usable = [frame for frame in frames if not frame_defect(frame)]
+    plane, distance = _plane_around(usable)
+    counts = Counter(sign for frame in usable for sign in _signs(frame, plane, distance))
+    if counts.total() < _LEAST_SIGNS * len(usable):
         return ()
-    signs = [f"{sign} ({count} of {usable} frames)" for sign, count in counts.items()]
+    signs = [f"{sign} ({count} of {len(usable)} frames)" for sign, count in counts.items()]
     # A missing plane alone is no sign: objects may fill the image, or stand on a dark turntable.
     if signs and plane is None:
         signs.append("no plane is found that the object stands on")
@@ -299,8 +295,6 @@ def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:
     around = []
     centres = []
     for frame in frames:
-        if frame_defect(frame):
-            continue
         known = frame.depth > 0
         mask = frame.mask > ON_OBJECT
         widened = cv2.dilate(mask.astype(np.uint8), WINDOW_5) > 0

@@ -31,7 +31,6 @@ class _Frame(msgspec.Struct):
     fl_x: float | None = None
     fl_y: float | None = None
     camera_angle_x: _Angle | None = None
-    camera_angle_y: _Angle | None = None
     cx: float | None = None
     cy: float | None = None
     w: _Side | None = None
@@ -84,39 +83,20 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
             f"{where}: camera_model is {frame.camera_model!r} with k4 = {frame.k4:g}, expected one "
             f"of {', '.join(_MODELS)} with k4 = 0, or {_FISHEYE}"
         )
-
-    # The size that the file gives, or else the picture's. The picture may be missing if the file
-    # gives a size.
-    image = find_inside(folder, frame.file_path) or folder / frame.file_path
-    size = None
-    if frame.h and frame.w:
-        size = (int(frame.h), int(frame.w))
-    own_size = picture_size(image) if image.is_file() or size is None else size
-    height, width = size or own_size
-    intrinsics = _intrinsics(frame, height, width, where)
-    # Refuse a picture that is a smaller or larger copy of the one for which the file has
-    # intrinsics.
-    own_height, own_width = own_size
-    if own_size != (height, width) and math.isclose(
-        height * own_width, width * own_height, rel_tol=0.01
-    ):
-        fitted = ", ".join(f"{value * own_width / width:.4g}" for value in intrinsics)
-        raise InputError(
-            f"{where}: w and h of {image} are {width} x {height}, expected its own size "
-            f"{own_width} x {own_height} with the intrinsics {fitted}"
-        )
-
     # OpenCV's order of the coefficients; its model has no r^8 term, k4.
     last = (frame.k3, frame.k4) if fisheye else (frame.p1, frame.p2, frame.k3)
+    size = (int(frame.h or 0), int(frame.w or 0))
+    if 0 in size:
+        size = picture_size(find_inside(folder, frame.file_path) or folder / frame.file_path)
     return make_frame(
         folder,
         frame.file_path,
         frame.depth_file_path or frame.depth_path,
         frame.transform_matrix,
-        intrinsics,
+        _intrinsics(frame, *size, where),
         where,
         FROM_OPENGL,
-        (height, width),
+        size,
         frame.mask_path,
         fisheye=fisheye,
         depth_unit=frame.integer_depth_scale or frame.depth_unit_scale_factor,
@@ -127,13 +107,10 @@ def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
 def _intrinsics(frame: _Frame, height: int, width: int, where: str) -> list[float]:
     """Return fx, fy, cx, cy of a frame; by default both focal lengths are equal."""
     fx = frame.fl_x
-    fy = frame.fl_y
     if not fx and not frame.camera_angle_x:
         raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
     if not fx:
         fx = width / 2 / math.tan(frame.camera_angle_x / 2)
-    if not fy and frame.camera_angle_y:
-        fy = height / 2 / math.tan(frame.camera_angle_y / 2)
     cx = width / 2 if frame.cx is None else frame.cx
     cy = height / 2 if frame.cy is None else frame.cy
-    return [fx, fy or fx, cx, cy]
+    return [fx, frame.fl_y or fx, cx, cy]

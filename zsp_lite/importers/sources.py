@@ -236,7 +236,6 @@ def open_source(
     object: int | None = None,
     masks: Path | None = None,
     count: int | None = None,
-    layout: str | None = None,
     up: Values | Literal["floor"] | None = None,
 ) -> Source:
     """Open a sequence, a capture, an image, or frames of one object in one world.
@@ -261,7 +260,6 @@ def open_source(
         object: Number of the object in a scene of BOP.
         masks: Folder of a capture's masks, named like its images, in place of its own.
         count: Number of sharp frames of a capture to choose; by default 100.
-        layout: Format of a capture, a name in `importers.FORMATS`, if it is not to be recognised.
         up: Direction up in the object's world, or zeros if it is not to be used. By default that of
             the format, or "floor": the floor or table around the object tells it (see `upright`).
 
@@ -282,7 +280,7 @@ def open_source(
         "orientation": orientation,
     }
     options = {name: value for name, value in options.items() if value is not None}
-    layout = layout or _format(path)
+    layout, place = _format(path)
 
     # Refuse options that do not fit the format, or each other.
     if layout == "frames":
@@ -308,9 +306,9 @@ def open_source(
     if layout == "frames":
         source = _from_frames(frames, path)
     elif layout == "sequence":
-        source = _from_sequence(path)
+        source = _from_sequence(path, place)
     else:
-        source = _from_capture(path, layout, options)
+        source = _from_capture(path, layout, place, options)
 
     # Where masks come from.
     some_masked = len(source.missing) < len(source.numbers)
@@ -350,9 +348,8 @@ def _from_frames(frames: Sequence[Frame], path: Path) -> Source:
     )
 
 
-def _from_sequence(path: Path) -> Source:
+def _from_sequence(path: Path, folder: Path) -> Source:
     """Make the source of a sequence of a data folder: its frames with camera and depth."""
-    folder = _sequence_folder(path)
     dataset = Co3D(folder.parents[1])
     frames = [
         frame
@@ -372,14 +369,14 @@ def _from_sequence(path: Path) -> Source:
     )
 
 
-def _from_capture(path: Path, layout: str, options: dict[str, Any]) -> Source:
-    """Make the source of a capture or an image."""
+def _from_capture(path: Path, layout: str, place: Path, options: dict[str, Any]) -> Source:
+    """Make the source of a capture, whose reader takes `place`, or of an image."""
     left_out = ()
     files = {name: options.pop(name) for name in _FILES if name in options}
     if layout == "image":
         frames = [replace(_open_image(path, **options), **files)]
     else:
-        frames, left_out = open_capture(path, layout, files=files, **options)
+        frames, left_out = open_capture(place, layout, files=files, **options)
     cameras = tuple(frame.camera for frame in frames)
     _check_poses(cameras, path)
     # Intrinsics may differ from frame to frame: a doubt about them is said once.
@@ -412,8 +409,8 @@ def open_pair(
     any, or the first of all. An open source takes none.
     """
     sides = (reference, target, *helpers)
-    formats = [_format(side) for side in sides]
-    options_of_side: list[dict] = [{"layout": layout} for layout in formats]
+    formats = [_format(side)[0] for side in sides]
+    options_of_side: list[dict] = [{} for _ in sides]
     for name, values in options.items():
         takers = [k for k, layout in enumerate(formats) if name in _TAKEN[layout]]
         # There is a value for each path that takes the option, or only for those of the reference
@@ -447,18 +444,17 @@ def _check_poses(cameras: Sequence[Camera], where: str | Path) -> None:
         )
 
 
-def _format(side: SourceLike) -> str:
-    """Tell "open", "frames", "image" or "sequence", or return the format of a capture."""
+def _format(side: SourceLike) -> tuple[str, Any]:
+    """Tell "open", "frames", "image" or "sequence", or return what `recognise` does."""
     if not isinstance(side, str | Path):
-        return "open" if isinstance(side, Source) else "frames"
+        return "open" if isinstance(side, Source) else "frames", side
     path = Path(side)
     if path.is_file() and path.suffix.lower() in PICTURES:
-        return "image"
-    if _sequence_folder(path):
-        return "sequence"
-    return recognise(
-        path, "a picture (.jpg, .png, .webp), CATEGORY/SEQUENCE of a data folder, or "
-    )[0]
+        return "image", path
+    folder = _sequence_folder(path)
+    if folder:
+        return "sequence", folder
+    return recognise(path)
 
 
 def _sequence_folder(path: Path) -> Path | None:

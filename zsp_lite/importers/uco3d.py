@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from zsp_lite.data.cameras import NDC_ISOTROPIC, Camera
-from zsp_lite.data.co3d import SequenceData
+from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.depth import zero_unknown
 from zsp_lite.data.frames import MAX_PIXELS, Frame, check_pixels
 from zsp_lite.data.labels import PoseLabel, label_bytes
@@ -38,7 +38,6 @@ from zsp_lite.importers.convert import (
     LazyFrames,
     is_imported,
     scale_frame,
-    write_sequence,
 )
 from zsp_lite.importers.unpacked import Video
 from zsp_lite.io.files import convert_json, file_size, path_inside, write_atomic
@@ -196,17 +195,14 @@ def import_uco3d(
             "ORDER BY _reconstruction_quality_viewpoint DESC, sequence_name",
             asked,
         )
-        absent = len(asked) - len(rows)
-        if absent:
-            logger.warning("%d of %d sequences are not in the metadata", absent, len(asked))
         if sequences is None:
             rows = rows[:best]
-        present = 0  # number of sequences in OUT
+        present = False  # whether any sequence is in OUT
         problem = "no sequence on the disk is in the metadata"
         for row in rows:
             name = row["sequence_name"]
-            if is_imported(out / category / name):
-                present += 1
+            if is_imported(out, category, name):
+                present = True
                 continue
             try:
                 sequence = _Sequence(root, metadata, convert_json(row, _SequenceRow, _METADATA))
@@ -215,7 +211,7 @@ def import_uco3d(
                 problem = f"{name}: {error}"
                 logger.warning("%s is left out: %s", name, error)
                 continue
-            present += 1
+            present = True
             yield name, result
     if not present:
         raise InputError(f"{root}: no sequence of {category} can be imported: {problem}")
@@ -347,7 +343,7 @@ class _Sequence:
             viewpoint_quality=self.row.reconstruction_quality_viewpoint,
         )
         # Write the sequence, and beside it the licence and the proposed label.
-        write_sequence(out, category, data)
+        write_co3d(out, category, [data])
         write_atomic(out / category / "ATTRIBUTION.md", _ATTRIBUTION.encode())
         if label is not None:
             path = out / "label_proposals" / category / f"{label.seq}.json"

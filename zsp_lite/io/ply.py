@@ -9,17 +9,6 @@ from zsp_lite.errors import InputError, check_magnitude
 from zsp_lite.io.files import read_bytes, write_atomic
 
 _VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])
-_PROPERTIES = [
-    "float x",
-    "float y",
-    "float z",
-    "float nx",
-    "float ny",
-    "float nz",
-    "uchar red",
-    "uchar green",
-    "uchar blue",
-]
 # numpy's types by their names in PLY. Some programs write numpy's own names, such as float32.
 _TYPES = {
     "char": "i1",
@@ -49,10 +38,20 @@ def write_ply(
     vertices["colour"] = colours
     if normals is not None:
         vertices["normal"] = normals
-    properties = "".join(f"property {name}\n" for name in _PROPERTIES)
     header = (
-        "ply\nformat binary_little_endian 1.0\nelement vertex "
-        f"{len(vertices)}\n{properties}end_header\n"
+        "ply\n"
+        "format binary_little_endian 1.0\n"
+        f"element vertex {len(vertices)}\n"
+        "property float x\n"
+        "property float y\n"
+        "property float z\n"
+        "property float nx\n"
+        "property float ny\n"
+        "property float nz\n"
+        "property uchar red\n"
+        "property uchar green\n"
+        "property uchar blue\n"
+        "end_header\n"
     )
     write_atomic(path, header.encode("ascii") + vertices.tobytes())
 

@@ -2,7 +2,6 @@
 seen from above."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +13,7 @@ from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera, azimuths, ground_axes
 from zsp_lite.data.frames import ON_OBJECT
 from zsp_lite.errors import InputError
+from zsp_lite.metrics import vector_angle
 from zsp_lite.pair_result import PairResult
 from zsp_lite.points import world_cloud
 from zsp_lite.viz import plots
@@ -22,62 +22,6 @@ _OTHERS = 4  # number of target views beside the chosen one
 _POINTS = 3000  # largest number of the target's points in the drawing from above
 # Reach of the object in the drawing from above; the cameras are on or inside a circle of radius 1.
 _OBJECT = 0.45
-
-
-@dataclass(frozen=True, eq=False)
-class Coverage:
-    """Directions from the target object to the cameras, from above, reference camera below."""
-
-    # unit vectors towards target cameras without their vertical part
-    targets: dict[int, Float[np.ndarray, "2"]]
-    reference: Float[np.ndarray, "2"]  # the same of the reference camera under the estimated pose
-    # no target camera is between these angles (degrees, counter-clockwise from the right)
-    gap: tuple[float, float]
-    nearest: int  # number of the target view closest to the reference viewpoint
-    angle: float  # angle in degrees between the directions of that view and of the reference
-    centre: Float[np.ndarray, "3"]  # middle of the target object in the world
-    axes: Float[np.ndarray, "2 3"]  # the drawing's axes to the right and up in the world
-
-
-def coverage(
-    cameras: Mapping[int, Camera], reference: Float[np.ndarray, "3"], centre: Float[np.ndarray, "3"]
-) -> Coverage:
-    """Compute where the target cameras, by number, and the centre of the reference camera are
-    around an object."""
-    numbers = list(cameras)
-    targets = list(cameras.values())
-    # Unit vectors (n + 1, 3) from the object to the cameras, to that of the reference last.
-    offsets = np.stack([*(camera.centre for camera in targets), reference]) - centre
-    directions = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
-
-    # The axes of the ground, turned so that the reference camera is below.
-    axes = ground_axes(targets)
-    x, y = axes @ directions[-1]
-    turn = -np.pi / 2 - np.arctan2(y, x)
-    axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ axes
-    *target_places, reference_place = directions @ axes.T
-
-    # The widest gap between neighbours on the circle. The azimuth of a camera right above the
-    # object is NaN.
-    around = azimuths(targets, centre)
-    around = np.sort(around[~np.isnan(around)] + np.degrees(turn))
-    gap = (0.0, 360.0)
-    if len(around):
-        following = np.append(around[1:], around[0] + 360)
-        widest = int((following - around).argmax())
-        gap = (float(around[widest]), float(following[widest]))
-
-    angles = np.degrees(np.arccos((directions[:-1] @ directions[-1]).clip(-1, 1)))
-    nearest = numbers[int(angles.argmin())]
-    return Coverage(
-        dict(zip(numbers, target_places)),
-        reference_place,
-        gap,
-        nearest,
-        float(angles.min()),
-        centre,
-        axes,
-    )
 
 
 def pose_picture(result: PairResult, solver: str) -> Figure:
@@ -129,10 +73,9 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
         )
     target_cameras = {int(view) + 1: frames[view].camera for view in used}
     # The reference camera is the origin of its own frame.
-    reference_place = estimate.target_camera.to_world(estimate.sim3.t)
-    seen = coverage(target_cameras, reference_place, np.median(target_cloud, axis=0))
+    viewpoint = estimate.target_camera.to_world(estimate.sim3.t)
     moved_cloud = estimate.target_camera.to_world(estimate.sim3.apply(cloud))
-    _draw_from_above(axes[-1], seen, target_cloud, moved_cloud, chosen + 1)
+    _draw_from_above(axes[-1], target_cameras, chosen + 1, viewpoint, target_cloud, moved_cloud)
     figure.legend(
         *axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
     )
@@ -140,11 +83,39 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
 
 
 def _draw_from_above(
-    axis: Axes, seen: Coverage, target: np.ndarray, reference: np.ndarray, chosen: int
+    axis: Axes,
+    cameras: Mapping[int, Camera],
+    chosen: int,
+    viewpoint: Float[np.ndarray, "3"],
+    target: Float[np.ndarray, "n 3"],
+    reference: Float[np.ndarray, "m 3"],
 ) -> None:
     """Draw world points of the target (grey) and of the reference, the arc of the target cameras
-    and its gap, these cameras with their numbers, and a star for the reference camera."""
-    begin, end = seen.gap
+    and its gap, these cameras by their numbers, and below a star for the reference camera, which is
+    at the `viewpoint`."""
+    centre = np.median(target, axis=0)
+    # Unit vectors (n + 1, 3) from the target to the cameras, to that of the reference last.
+    offsets = np.stack([*(camera.centre for camera in cameras.values()), viewpoint]) - centre
+    directions = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+    angles = vector_angle(directions[:-1], directions[-1])
+    nearest = list(cameras)[angles.argmin()]
+
+    # The axes of the ground, turned so that the reference camera is below.
+    axes = ground_axes([*cameras.values()])
+    x, y = axes @ directions[-1]
+    turn = -np.pi / 2 - np.arctan2(y, x)
+    axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ axes
+    *places, reference_place = directions @ axes.T
+
+    # The widest gap between neighbours on the circle, in degrees. The azimuth of a camera right
+    # above the object is NaN.
+    around = azimuths([*cameras.values()], centre)
+    around = np.sort(around[~np.isnan(around)] + np.degrees(turn))
+    begin, end = 0.0, 360.0
+    if len(around):
+        following = np.append(around[1:], around[0] + 360)
+        widest = (following - around).argmax()
+        begin, end = around[widest], following[widest]
     axis.images[0].remove()  # the white image that held the place
     axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0))
     # An arc is given by the width and the height of its whole ellipse.
@@ -167,7 +138,7 @@ def _draw_from_above(
         label=f"the target views span {360 - end + begin:.0f}°",
     )
     step = -(-len(target) // _POINTS)  # rounded up
-    flat = [(points - seen.centre) @ seen.axes.T for points in (target[::step], reference)]
+    flat = [(points - centre) @ axes.T for points in (target[::step], reference)]
     # Nine tenths of the target's points are within `_OBJECT`.
     scale = _OBJECT / np.quantile(np.linalg.norm(flat[0], axis=1), 0.9)
     for points, colours in zip(flat, ("0.6", plots.coordinate_colours(reference))):
@@ -177,7 +148,7 @@ def _draw_from_above(
 
     # The cameras are on a circle of radius 1, their numbers outside.
     axis.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal")
-    for number, place in seen.targets.items():
+    for number, place in zip(cameras, places):
         colour = plots.CHOSEN if number == chosen else plots.BLUE
         axis.plot(*place, "o", color=colour, markersize=11, markeredgecolor="white")
         axis.text(
@@ -191,10 +162,10 @@ def _draw_from_above(
             zorder=4,
         )
     axis.plot(
-        *seen.reference,
+        *reference_place,
         "*",
         color=plots.VERMILLION,
         markersize=20,
         markeredgecolor="white",
-        label=f"reference under this pose, {seen.angle:.0f}° from view {seen.nearest}",
+        label=f"reference under this pose, {angles.min():.0f}° from view {nearest}",
     )

@@ -182,15 +182,15 @@ def _stages(result: PairResult) -> dict[str, str]:
         )
         cycles[name] = distances.numpy()
 
-    matches, axes = plots.show_images(images, names, size=2.7)
-    pixels = plots.match_pixels(views, result.estimate.matches)
-    plots.draw_matches(axes, pixels, result.estimate.inliers)
+    estimate = result.estimate
+    cells = (estimate.matches.reference, estimate.matches.target)
+    grid = views[0].features.grid
     figures = {
         "saliency": plots.show_maps(images, saliency, size=2.7, limits=(0, 1), label="saliency"),
         "cycles": plots.show_maps(
             images, cycles, size=2.7, limits=(-10, 0), cmap="cividis", label="− distance (patches)"
         ),
-        "matches": matches,
+        "matches": plots.show_matches(images, cells, grid, estimate.inliers, names, size=2.7),
     }
     return {name: _picture(figure) for name, figure in figures.items()}
 
