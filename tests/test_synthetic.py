@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from refusals import refused
 from sklearn.linear_model import RANSACRegressor
 
-from tools.synthetic import SPLITS
+from tools.validation_categories import VALIDATION
 from zsp_lite import Co3D
 from zsp_lite.course.synthetic import export, sequences
 from zsp_lite.course.synthetic.assembly import make_shape
@@ -34,10 +34,7 @@ from zsp_lite.course.synthetic.sequences import (
 from zsp_lite.data.labels import read_labels
 from zsp_lite.io.files import stable_hash
 
-# The builders of all categories, those of training and validation included.
-ALL = {
-    name: build for builders in (*SPLITS.values(), CATEGORIES) for name, build in builders.items()
-}
+ALL = VALIDATION | CATEGORIES  # the builders of all categories
 SEED, FRAMES, SIZE = 5, 6, 72  # few frames of a small size, for speed
 
 
