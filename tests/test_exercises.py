@@ -221,20 +221,6 @@ def test_students_see_a_test_of_the_commonest_mistake_that_says_what_to_look_at(
         assert failing and all(len(message.split()) > 4 for message in failing.values()), function
 
 
-@pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_functions_have_two_hints_and_questions_the_headings_of_their_guide(assignment):
-    for cells in tasks(source(assignment)):
-        text = "\n".join(cell.source for cell in cells if cell.cell_type == "markdown")
-        functions = graded(NotebookNode(cells=cells), solution=True, grade=False)
-        assert text.count("*Hint:* ") == len(functions)
-        assert text.count("<details><summary>Second hint</summary>") == len(functions)
-        for answer in graded(NotebookNode(cells=cells), solution=True, grade=True).values():
-            guide = re.findall(r"^\d\. \*\*(.+?)\*\*", answer.source, re.MULTILINE)
-            (shown,) = re.findall(r"^\*Points:\* (.*)", cells[0].source, re.MULTILINE | re.DOTALL)
-            assert re.findall(r"\*\*(.+?)\*\*", shown) == guide
-            assert len(guide) == answer.metadata.nbgrader.points
-
-
 CALLS_THE_LIBRARY = """
 own = {0}
 def {0}(*arguments):
@@ -283,7 +269,6 @@ class Collected(NamedTuple):
     """What the commands of a lecturer make of the hand-ins of an assignment."""
 
     folder: Path  # of the exercises
-    endless: list[float]  # scores of a hand-in with an endless loop
     log: str  # of `autograde`
     exported: str  # the output of `export` before the answers are graded by hand
     points: dict[str, float]  # of the tests of Ada's notebook
@@ -293,7 +278,7 @@ class Collected(NamedTuple):
 @pytest.fixture(scope="module")
 def collected(tmp_path_factory) -> Collected:
     """Ada has one task right and calls the library in another; Bob's file is damaged, Eve's a PDF,
-    Dan has two. In the lab, Ida's function never ends."""
+    Dan has two."""
     root = tmp_path_factory.mktemp("course")
     folder = copy_course(root)
     with pytest.MonkeyPatch.context() as patch:
@@ -315,9 +300,8 @@ def collected(tmp_path_factory) -> Collected:
         points = grade_by_hand(folder)
         run_nbgrader(["export"])
         run_nbgrader(["generate_feedback", METRICS, "--force"])
-        endless = grade_endless_loop(folder)
     unignored = git(root, "ls-files", "--others", "--exclude-standard")
-    return Collected(folder, endless, log, exported, points, unignored)
+    return Collected(folder, log, exported, points, unignored)
 
 
 def git(root: Path, *words: str) -> str:
@@ -328,8 +312,7 @@ def git(root: Path, *words: str) -> str:
 def copy_course(root: Path) -> Path:
     """Copy what a lecturer needs of the repository; returns the folder of the exercises."""
     folder = root / "notebooks/exercises"
-    for assignment in (METRICS, LAB):
-        shutil.copytree(EXERCISES / "source" / assignment, folder / "source" / assignment)
+    shutil.copytree(EXERCISES / "source" / METRICS, folder / "source" / METRICS)
     shutil.copy(EXERCISES / "nbgrader_config.py", folder)
     shutil.copy(EXERCISES.parents[1] / ".gitignore", root)
     return folder
@@ -389,29 +372,10 @@ def grade_by_hand(folder: Path) -> dict[str, float]:
     return points
 
 
-def grade_endless_loop(folder: Path) -> list[float]:
-    """Grade a hand-in for the lab whose function never ends, and return the scores."""
-    run_nbgrader(["generate_assignment", LAB])
-    path = folder / "submitted/127" / LAB / f"{LAB}.ipynb"
-    path.parent.mkdir(parents=True)
-    notebook = nbformat.read(folder / "release" / LAB / path.name, as_version=4)
-    answer = graded(notebook, solution=True)["cycle_ends"]
-    answer.source = "def cycle_ends(*_):\n    while True:\n        pass"
-    nbformat.write(notebook, path)
-    run_nbgrader(["autograde", LAB])
-    with Gradebook(f"sqlite:///{folder / 'gradebook.db'}", "zsp-lite") as gradebook:
-        grades = gradebook.find_submission(LAB, "127").notebooks[0].grades
-        return [grade.auto_score for grade in grades]
-
-
 def test_each_test_of_a_task_that_is_right_gives_two_points_and_the_others_none(collected):
     assert collected.points == {
         f"test_{task}_{i}": 2 * (task == RIGHT) for task in MISTAKES[METRICS] for i in (1, 2)
     }
-
-
-def test_an_endless_loop_costs_its_points(collected):
-    assert collected.endless == [0, 0, 0]
 
 
 def test_several_loops_cost_no_more_than_the_limit_and_spare_other_functions(config, monkeypatch):
@@ -534,37 +498,3 @@ def test_nbgrader_recognises_the_files_of_learning_platforms(config, name):
     found = re.match(config.FileNameCollectorPlugin.named_regexp, path)
     assignment = LAB if LAB in name else METRICS
     assert found.groupdict() == {"student_id": "123", "file_id": assignment}
-
-
-@pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_the_points_add_up_and_no_test_decides_more_than_two(assignment):
-    notebook = source(assignment)
-    cells = graded(notebook, grade=True)
-    points = {name: cell.metadata.nbgrader.points for name, cell in cells.items()}
-    of_functions = (names_of_tests(assignment, function) for function in MISTAKES[assignment])
-    tests = set().union(*of_functions)
-    assert {name for name in points if name.startswith("test_")} == tests
-    by_tests, by_reader = (4, [1]) if assignment == LAB else (12, [4, 4])
-    assert [points[name] for name in tests] == [2] * (by_tests // 2)
-    assert [points[name] for name in points if name not in tests] == by_reader
-    total = f"{by_tests + sum(by_reader)} points: {by_tests} by tests, {sum(by_reader)} by"
-    assert total in " ".join(notebook.cells[0].source.split())
-
-
-def test_there_are_five_exercises_and_a_lab():
-    assert len(ASSIGNMENTS) == 6
-
-
-@pytest.mark.parametrize("assignment", ASSIGNMENTS)
-def test_the_readme_lists_the_tasks_and_the_hours_of_an_exercise(assignment):
-    (row,) = [
-        line.lower()
-        for line in (EXERCISES / "README.md").read_text("utf-8").splitlines()
-        if line.startswith(f"| [{assignment}]")
-    ]
-    text = "\n".join(cell.source for cell in source(assignment).cells)
-    titles = re.findall(r"^## Task \d · (.*) \(\d points?", text, re.MULTILINE)
-    assert len(titles) == (2 if assignment == LAB else 5)
-    assert [title for title in titles if title.lower() not in row] == []
-    (hours,) = re.findall(r"\*\*Time and hand-in\.\*\* (?:About )?(.*?)\.", text)
-    assert f"| {hours.lower()} |" in row

@@ -24,13 +24,17 @@ from zsp_lite.data import frames
 from zsp_lite.data.annotations import read_frame_index
 from zsp_lite.data.frames import read_depth, read_image, read_mask
 from zsp_lite.data.pairs import read_pair_file
+from zsp_lite.importers.files import read_depth_file, read_picture
 from zsp_lite.io.files import GROWTH_ALLOWED, decompress, path_inside, plain_name, read_bytes
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import read_ply, write_ply
 
 PICTURE = cv2.resize(default_rng(0).integers(0, 255, (9, 16, 3), np.uint8), (160, 90))
-JPEG, PNG = (cv2.imencode(extension, PICTURE)[1].tobytes() for extension in (".jpg", ".png"))
-FRAME = b'{"sequence_name": "a", "frame_number": %d}'
+JPEG, PNG, WEBP = (
+    cv2.imencode(extension, PICTURE)[1].tobytes() for extension in (".jpg", ".png", ".webp")
+)
+INDEX = "frame_annotations.jgz"
+FRAME = b'{"sequence_name": "a", "frame_number": 1}'
 COLOUR_NAMES = ("red", "green", "blue")
 
 
@@ -41,10 +45,16 @@ class Code:
         return open, ("executed", "w")
 
 
-def _torch(content) -> bytes:
+def _saved(save, *content) -> bytes:
+    """What a function of NumPy or PyTorch writes."""
     buffer = io.BytesIO()
-    torch.save(content, buffer)
+    save(buffer, *content)
     return buffer.getvalue()
+
+
+def _torch(content) -> bytes:
+    """A file of PyTorch."""
+    return _saved(lambda file: torch.save(content, file))
 
 
 def _ply(count, body: bytes, encoding="binary_little_endian", kind="") -> bytes:
@@ -57,133 +67,116 @@ def _ply(count, body: bytes, encoding="binary_little_endian", kind="") -> bytes:
     ).encode() + body
 
 
-# Name of the file, its reader, what is wrong with it, its content, part of the message.
+# Name of a file, its reader, part of the message, and contents of the file by what is wrong.
 BAD_FILES = [
-    *(
-        (name, read, damage, data, "cannot be decoded .*expected a complete .(jpg|png) file")
-        for name, read in (
-            ("x.jpg", read_image),
-            ("mask.png", read_mask),
-            ("depth.png", read_depth),
-        )
-        for damage, data in {
+    (
+        "x.jpg",
+        read_image,
+        "cannot be decoded .*expected a complete .jpg file",
+        {
             "empty": b"",
             "text": b"text",
             "GIF": b"GIF89a" + bytes(20),
             "PNG length": PNG[:11] + b"\5" + PNG[12:],
             "PNG with a wrong checksum": PNG[:60] + b"\0\0\0\0" + PNG[64:],
-        }.items()
+        },
     ),
-    ("depth.png", read_depth, "8 bits", PNG, "expected a 16-bit greyscale PNG"),
-    ("frame_annotations.jgz", read_frame_index, "empty", b"", "Input data was truncated"),
+    ("mask.png", read_mask, "cannot be decoded", {"empty": b""}),
+    ("depth.png", read_depth, "cannot be decoded", {"empty": b""}),
+    ("depth.png", read_depth, "expected a 16-bit greyscale PNG", {"8 bits": PNG}),
+    ("a.heic", read_picture, "cannot be decoded .* expected the photograph as JPEG", {"": JPEG}),
+    ("a.webp", read_picture, "cannot be decoded", {"cut": WEBP[:-40]}),
+    ("a.webp", read_depth_file, "holds uint8 of shape .*, expected numbers", {"colours": WEBP}),
     (
-        "frame_annotations.jgz",
+        "d.npy",
+        read_depth_file,
+        r"holds .*, expected numbers \(H, W\)",
+        {
+            "text": _saved(np.save, ["x"]),
+            "a number": _saved(np.save, 3.0),
+            "colours": _saved(np.save, np.ones((4, 4, 3))),
+            "empty": _saved(np.save, np.ones((0, 4))),
+        },
+    ),
+    ("d.npz", read_depth_file, "holds 2 arrays, expected one", {"two": _saved(np.savez, 1, 2)}),
+    (
+        "d.exr",
+        read_depth_file,
+        "expected the depth as .npy or a float .tiff",
+        {"": b"v/1\x01" + bytes(99)},
+    ),
+    (INDEX, read_frame_index, "Input data was truncated", {"empty": b""}),
+    (
+        INDEX,
         read_frame_index,
-        "cut",
-        gzip.compress(bytes(99))[:-6],
         "not complete gzip data",
+        {"cut": gzip.compress(bytes(99))[:-6], "bytes behind": gzip.compress(b"[]") + b"x"},
     ),
     (
-        "frame_annotations.jgz",
+        INDEX,
         read_frame_index,
-        "bytes behind",
-        gzip.compress(b"[]") + b"x",
-        "not complete gzip data",
-    ),
-    (
-        "frame_annotations.jgz",
-        read_frame_index,
-        "bomb",
-        gzip.compress(bytes(GROWTH_ALLOWED + 1), 1),
         "grow to more",
+        {"bomb": gzip.compress(bytes(GROWTH_ALLOWED + 1), 1)},
     ),
+    (INDEX, read_frame_index, "JSON is malformed", {"no JSON": gzip.compress(b"[{]")}),
+    (INDEX, read_frame_index, "annotations", {"nested": gzip.compress(b"[" * 100_000)}),
+    (INDEX, read_frame_index, "Expected `object`", {"numbers": gzip.compress(b"[1, 2]")}),
     (
-        "frame_annotations.jgz",
+        INDEX,
         read_frame_index,
-        "no JSON",
-        gzip.compress(b"[{]"),
-        "JSON is malformed",
-    ),
-    (
-        "frame_annotations.jgz",
-        read_frame_index,
-        "nested",
-        gzip.compress(b"[" * 100_000),
-        "annotations",
-    ),
-    (
-        "frame_annotations.jgz",
-        read_frame_index,
-        "another structure",
-        gzip.compress(b"[1, 2]"),
-        "Expected `object`",
-    ),
-    (
-        "frame_annotations.jgz",
-        read_frame_index,
-        "a frame twice",
-        gzip.compress(b"[" + FRAME % 1 + b"," + FRAME % 1 + b"]"),
         "entries 0 and 1 are both frame 1 of a",
+        {"a frame twice": gzip.compress(b"[" + FRAME + b"," + FRAME + b"]")},
     ),
-    ("x.ply", read_ply, "empty", b"", "is not a complete PLY file"),
-    ("x.ply", read_ply, "cut", _ply(3, bytes(35)), "is not a complete PLY file"),
-    ("x.ply", read_ply, "too long", _ply(3, bytes(37)), "is not a complete PLY file"),
-    ("x.ply", read_ply, "10^12 points", _ply(10**12, bytes(36)), "is not a complete PLY file"),
-    ("x.ply", read_ply, "no points", _ply(0, b""), "is not a complete PLY file"),
     (
         "x.ply",
         read_ply,
-        "not finite",
-        _ply(1, np.float32([0, np.nan, 0]).tobytes()),
+        "is not a complete PLY file",
+        {
+            "empty": b"",
+            "cut": _ply(3, bytes(35)),
+            "too long": _ply(3, bytes(37)),
+            "10^12 points": _ply(10**12, bytes(36)),
+            "no points": _ply(0, b""),
+        },
+    ),
+    (
+        "x.ply",
+        read_ply,
         "expected finite numbers",
+        {"not finite": _ply(1, np.float32([0, np.nan, 0]).tobytes())},
     ),
     (
         "x.pth",
         read_checkpoint,
-        "cut",
-        _torch({"a": torch.zeros(99)})[:-200],
         "damaged, or contains more than tensors",
+        {"cut": _torch({"a": torch.zeros(99)})[:-200], "code": _torch({"a": Code()})},
     ),
-    (
-        "x.pth",
-        read_checkpoint,
-        "code",
-        _torch({"a": Code()}),
-        "damaged, or contains more than tensors",
-    ),
-    ("x.pth", read_checkpoint, "a number", _torch(5), "expected a state dict of tensors, got int"),
+    ("x.pth", read_checkpoint, "expected a state dict of tensors", {"a number": _torch(5)}),
     (
         "x.safetensors",
         read_checkpoint,
-        "cut",
-        save({"a": torch.zeros(9)})[:-1],
         "damaged, or contains",
+        {
+            "cut": save({"a": torch.zeros(9)})[:-1],
+            "giant header": struct.pack("<Q", 2**63) + b"{}",
+        },
     ),
-    (
-        "x.safetensors",
-        read_checkpoint,
-        "giant header",
-        struct.pack("<Q", 2**63) + b"{}",
-        "damaged, or contains",
-    ),
-    ("cup.pt", read_pair_file, "code", _torch([Code()]), "damaged, or contains more than tensors"),
-    ("cup.pt", read_pair_file, "a dictionary", _torch({}), "Expected `array`, got `object`"),
-    (
-        "cup.pt",
-        read_pair_file,
-        "another structure",
-        _torch([{}]),
-        "missing required field `class` - at",
-    ),
+    ("cup.pt", read_pair_file, "contains more than tensors", {"code": _torch([Code()])}),
+    ("cup.pt", read_pair_file, "Expected `array`, got `object`", {"a dictionary": _torch({})}),
+    ("cup.pt", read_pair_file, "missing required field `class` - at", {"other": _torch([{}])}),
 ]
 
 
 @pytest.mark.parametrize(
-    "name, read, data, message",
-    [pytest.param(*row[:2], *row[3:], id=f"{row[0]} {row[2]}") for row in BAD_FILES],
+    "name, read, message, data",
+    [
+        pytest.param(*row, data, id=f"{row[0]} {damage}")
+        for *row, contents in BAD_FILES
+        for damage, data in contents.items()
+    ],
 )
 def test_a_bad_file_is_refused_in_one_line_that_names_it(
-    tmp_path, monkeypatch, name, read, data, message
+    tmp_path, monkeypatch, name, read, message, data
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / name).write_bytes(data)
@@ -242,14 +235,20 @@ def test_gzip_data_of_several_members_is_read():
     assert decompress(3 * gzip.compress(content), "data") == 3 * content
 
 
-@pytest.mark.parametrize("extension", [".jpg", ".png"])
-def test_the_limit_on_pixels_is_compared_with_the_header(tmp_path, monkeypatch, extension):
-    path = tmp_path / f"x{extension}"
-    path.write_bytes(JPEG if extension == ".jpg" else PNG)
+@pytest.mark.parametrize("data", [JPEG, PNG], ids=["JPEG", "PNG"])
+def test_the_limit_on_pixels_is_compared_with_the_header(tmp_path, monkeypatch, data):
+    path = tmp_path / "x"
+    path.write_bytes(data)
     monkeypatch.setattr(frames, "MAX_PIXELS", 14_399)
     refused("90 x 160 pixels.* of at most 14399 pixels", read_image, path)
     monkeypatch.setattr(frames, "MAX_PIXELS", 14_400)
     assert read_image(path).shape == (90, 160, 3)
+
+
+def test_a_photograph_in_webp_is_read(tmp_path):
+    (tmp_path / "a.webp").write_bytes(WEBP)
+    colours, orientation = read_picture(tmp_path / "a.webp")
+    assert (colours.shape, orientation) == ((90, 160, 3), 1)
 
 
 def test_a_long_message_keeps_its_beginning_and_end():

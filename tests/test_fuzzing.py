@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from tests.hostile.harness import READERS_OF, prepare, read_capture
 from zsp_lite import InputError
 from zsp_lite.benchmark.runs import read_run
-from zsp_lite.data.frames import read_image
 
 pytestmark = pytest.mark.slow
 
@@ -31,10 +30,8 @@ _NAMES = (
     "nerfstudio",
     "poses",
 )
-_JPEG = "data/cup/a/images/frame000001.jpg"
 # Every reader, by a name: the valid file, relative to the folder, and the call that reads it.
 READERS = {name: READERS_OF[name] for name in _NAMES} | {
-    "image": (_JPEG, lambda folder: read_image(folder / _JPEG)),
     "lists": ("capture/poses.txt", read_capture("lists")),
     "results": ("made/run.jsonl", lambda folder: read_run(folder / "made").summary),
     "settings of a run": ("made/run.json", lambda folder: read_run(folder / "made").summary),

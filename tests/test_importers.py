@@ -117,26 +117,14 @@ def imported(tmp_path_factory, views):
     return root / "data", import_source(open_source(root / "scan"), root / "data", "teapot", "mine")
 
 
-def test_an_import_is_a_complete_data_folder(imported):
+def test_an_import_is_a_complete_data_folder_with_a_cloud_of_unit_scale(imported):
     root, done = imported
     (check,) = check_folder(root, deep=True)
     assert (check.problems, check.complete) == ([], 1)
     assert done.frames == 8
-
-
-def test_an_import_has_a_cloud_of_unit_scale_on_the_object(imported):
-    root, done = imported
     points, _ = Co3D(root).point_cloud("teapot", "mine")
     assert done.points == len(points) > 500
     assert_allclose(points.std(axis=0).mean(), 1, rtol=1e-3)
-    for annotation in Co3D(root).frames("teapot", "mine"):
-        # The cloud projects into the mask of every view.
-        frame = Co3D(root).load(annotation)
-        pixels, _ = frame.camera.project(points)
-        height, width = frame.camera.size
-        column, row = np.floor(pixels).astype(int).clip(0, (width - 1, height - 1)).T
-        near_object = cv2.dilate(frame.mask, np.ones((5, 5))) > 0.5
-        assert near_object[row, column].mean() > 0.97
 
 
 def test_an_import_has_the_depth_and_cameras_in_its_scale(imported, views):
@@ -281,15 +269,6 @@ def test_an_invalid_capture_is_refused_in_one_line_that_names_the_part(
     WRITERS[kind](tmp_path, views)
     damage(tmp_path)
     refused(message, open_capture, tmp_path, kind)
-
-
-def test_a_phones_smaller_depth_map_is_enlarged_to_the_picture(tmp_path, views):
-    write_nerfstudio(tmp_path, views[:1])
-    height, width = views[0].camera.size
-    plane = np.arange(500, 500 + height // 2)[:, None].repeat(width // 2, axis=1)
-    write_depth16(tmp_path / f"depths/{views[0].name}.png", plane / 1000)
-    frame = open_capture(tmp_path, "nerfstudio").frames[0].load()
-    assert_allclose(frame.depth, np.kron(plane, np.ones((2, 2))) / 1000, rtol=1e-6)
 
 
 def test_a_single_frame_is_fused_and_what_one_of_many_frames_saw_is_left_out(views):

@@ -115,15 +115,12 @@ def test_an_unusable_file_is_refused_with_its_reason(tmp_path, monkeypatch, name
 
 
 def test_an_orientation_is_a_rotation_to_front_x_and_up_z():
+    # An oblique front.
+    rotation = ModelInfo(front=(-3, 4, 0), up=(0, 0, 2)).axes(".ply")
+    expected = np.array([[-3, 4, 0], [-4, -3, 0], [0, 0, 5]]) / 5
+    assert rotation == pytest.approx(expected)
     rotation = ModelInfo(front="-x", up="+y").axes(".obj")
-    assert rotation @ [-1, 0, 0] == pytest.approx([1, 0, 0])
-    assert rotation @ [0, 1, 0] == pytest.approx([0, 0, 1])
-
-
-def test_an_oblique_orientation_is_a_rotation():
-    rotation = ModelInfo(front=(1, 1, 0), up=(0, 0, 2)).axes(".ply")
-    assert rotation @ rotation.T == pytest.approx(np.eye(3))
-    assert np.linalg.det(rotation) == pytest.approx(1)
+    assert rotation == pytest.approx(np.array([[-1, 0, 0], [0, 0, 1], [0, 1, 0]]))
 
 
 @pytest.mark.parametrize("info", [ModelInfo(front="+y", up="+y"), ModelInfo(up=(0, 0, 0))])
@@ -135,8 +132,6 @@ def test_impossible_orientations_are_refused(info):
     "folder, entries, message",
     [
         ("", '{"chair/gone": {}}', "names 'chair/gone', which has no file"),
-        ("", '{"chair/a": {"front": 3}}', "front"),
-        ("", '{"chair/a": {"front": "ahead"}}', "Invalid enum value 'ahead'"),
         ("nowhere", "{}", "does not exist"),
         ("chair", "{}", "holds no model"),
     ],
@@ -193,17 +188,6 @@ def test_depth_and_mask_are_those_of_the_triangles_and_the_floor(samples):
     assert_allclose(floor[:, 2], mesh.vertices[:, 2].min(), atol=1e-3)
 
 
-def test_normals_have_unit_length_and_face_the_camera():
-    mesh = painted(wedge())
-    camera = view(mesh.vertices, azimuth=200)
-    drawn = render(mesh, camera)
-    row, col = np.nonzero(drawn.mask)
-    rays = camera.unproject_camera(np.stack([col + 0.5, row + 0.5], 1), np.ones(len(row)))
-    normals = drawn.normals[row, col]
-    assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
-    assert ((normals * rays).sum(1) < 1e-6).all()
-
-
 def test_a_texture_is_upright_and_not_mirrored(tmp_path):
     # Red and green above blue and yellow, 16 x 16 pixels each.
     colours = np.array([[[200, 40, 40], [40, 180, 40]], [[40, 60, 200], [200, 190, 60]]], np.uint8)
@@ -234,10 +218,3 @@ def test_a_hole_in_a_texture_is_a_hole_in_mask_and_coordinates(holed):
     assert np.isnan(drawn.canonical[middle]).all()
     square = (np.ptp(row) + 1) * (np.ptp(col) + 1)  # pixels, hole included
     assert_allclose(drawn.mask.sum() / square, 0.75, atol=0.05)
-
-
-def test_light_falls_through_a_hole_in_a_texture(holed):
-    # Points behind the middle and behind the side of the square, with light from the front.
-    points = np.array([[-3.0, 0, 0], [-3.0, 0.9 * holed.vertices[:, 1].max(), 0]], np.float32)
-    light = np.tile(np.float32([1, 0, 0]), (2, 1, 1))
-    assert MeshScene(holed, STUDIO, 0)._visible_share(points, light).tolist() == [1, 0]

@@ -160,7 +160,6 @@ def test_a_folders_own_pairs_are_found(tmp_path, caplog):
             "frame id 48 is not of s1, expected a position in the list of 48 frames",
         ),
         ({"all_target_id": []}, "all_target_id"),
-        ({"all_target_id": torch.tensor([[1, 2]])}, r"Expected `int`, got `array`"),
         ({"target_seq_name": "s3"}, "is not of s3"),
         ({"class": "sofa"}, "category is 'sofa'"),
         ({"reference_frame_id": True}, "Expected `int`, got `bool`"),

@@ -66,10 +66,3 @@ def test_axes_are_named_where_their_ends_project_unless_behind_the_camera(axis):
     plots.draw_axes(axis, CAMERA, np.array([0, 0, 2]), ends, "xyz")
     places = {text.get_text(): text.get_position() for text in axis.texts if text.get_text()}
     assert places == {"x": pytest.approx((50, 30)), "y": pytest.approx((40, 40))}
-
-
-def test_the_legend_of_panels_has_the_curves_with_a_name():
-    curve = ([0, 1], [0, 1])
-    assert not plots.show_curves([0, 1], {"": [0, 1]}).legends
-    (legend,) = plots.show_panels({"left": {"a": curve, "b": curve}, "right": {"": curve}}).legends
-    assert [text.get_text() for text in legend.get_texts()] == ["a", "b"]

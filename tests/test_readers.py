@@ -32,7 +32,7 @@ from test_importers import (
 from zsp_lite import Camera, open_source
 from zsp_lite.data.frames import write_image, write_mask
 from zsp_lite.importers import open_capture, recognise
-from zsp_lite.importers.capture import find_masks, sharpest, trusted
+from zsp_lite.importers.capture import find_masks, trusted
 from zsp_lite.importers.sources import spread_views
 from zsp_lite.importers.unpacked import Video
 
@@ -397,23 +397,15 @@ def test_a_frame_that_cannot_be_used_is_left_out_and_named(tmp_path, views, dama
     assert "frames left out: 1: " in flag
 
 
-@pytest.fixture
-def damaged(tmp_path, views):
-    """A scan of four frames, one of whose images is cut off."""
-    folder = tmp_path / "scan"
-    folder.mkdir()
-    write_nerfstudio(folder, views)
-    image = folder / "images/0002.jpg"
-    image.write_bytes(image.read_bytes()[:500])
-    return folder
-
-
-def test_an_import_names_a_damaged_image_unless_too_few_remain(damaged, tmp_path, run):
-    line = f"data import {damaged} --root {tmp_path}/mine --category teapot --sequence"
+def test_an_import_names_a_damaged_image_unless_too_few_remain(tmp_path, views, run):
+    images = tmp_path / "scan/images"
+    write_nerfstudio(images.parent, views)
+    (images / "0002.jpg").write_bytes((images / "0002.jpg").read_bytes()[:500])
+    line = f"data import {tmp_path}/scan --root {tmp_path}/mine --category teapot --sequence"
     text = run(f"{line} one")
     assert "3 frames" in text
     assert "flag: frames left out: 1: image" in text
-    (damaged / "images/0001.jpg").write_bytes(b"")
+    (images / "0001.jpg").write_bytes(b"")
     assert "2 frames remain, expected 3: image" in run(f"{line} two", 2)
 
 
@@ -533,17 +525,6 @@ def test_a_zip_that_is_damaged_malicious_or_large_is_refused(tmp_path, monkeypat
     monkeypatch.setattr("zsp_lite.importers.unpacked._LARGE", 20_000)
     make(tmp_path / "scan.zip")
     refused(f"zip .*scan.zip cannot be unpacked: {message}", recognise, tmp_path / "scan.zip")
-
-
-def test_at_most_ten_images_are_compared_for_each_that_is_chosen():
-    compared = []
-
-    def read(number: int) -> np.ndarray:
-        compared.append(number)
-        return np.zeros((8, 8), np.uint8)
-
-    assert len(list(sharpest(range(2000), 100, read, []))) == 100
-    assert len(compared) <= 1000
 
 
 # Images of a video, of files, and of a zip.

@@ -1,4 +1,4 @@
-"""The demo on synthetic data with known poses, its HTML report, and the picture of the README."""
+"""The demo on synthetic data with known poses, and its HTML report."""
 
 import json
 import re
@@ -8,32 +8,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from plotly.offline import get_plotlyjs
 from synthetic_views import CoordinateBackbone
 
-from tools.overview import overview
-from zsp_lite import Camera, Co3D, Sim3
+from zsp_lite import Camera, Co3D
 from zsp_lite.choices import SOLVERS
 from zsp_lite.course.demo import N_TARGETS, demo_pairs, run_demo
 from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 from zsp_lite.estimates import Hypothesis, PoseEstimate
 from zsp_lite.io.files import REPOSITORY
 from zsp_lite.metrics import rotation_error
-from zsp_lite.viz.plots import object_cloud, show_residuals
+from zsp_lite.viz.plots import show_residuals
 from zsp_lite.viz.report import (
-    _two_poses_figure,
     table_rows,
     write_report,
 )
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("closed_figures")]
-
-
-@pytest.fixture
-def exact_poses(monkeypatch):
-    """Figures draw the poses without rounding, which else makes them equal on all machines."""
-    monkeypatch.setattr("zsp_lite.viz.plots._rounded", lambda pose: pose)
 
 
 @pytest.fixture(scope="module")
@@ -80,16 +72,6 @@ def test_shipped_evaluation_pairs_are_preferred(ellipsoids, tmp_path):
     assert demo_pairs(dataset) == pairs[:1]
 
 
-def test_alternatives_are_the_different_poses_below_the_best(results):
-    (result,) = results
-    estimate = result.estimates["verified"]
-    # A hypothesis that begins a mode has another pose than all better ones.
-    heads = [pose for index, pose in enumerate(estimate.hypotheses) if pose.mode == index]
-    assert len(heads) > 1
-    assert estimate.alternatives == tuple(heads[1:])
-    assert result.estimates["paper"].alternatives == ()
-
-
 def rotation_seen_by(camera: Camera, estimate: PoseEstimate, pose: Hypothesis) -> np.ndarray:
     """The rotation from the reference's camera to a camera, by a hypothesis, which is a pose in
     its own target view."""
@@ -112,10 +94,6 @@ def test_the_page_loads_nothing_and_its_links_lead_to_notebooks(page, text):
     files = [(page.parent / link).resolve() for link in local]
     assert {file.parent for file in files} == {REPOSITORY / "notebooks"}
     assert all(file.is_file() for file in files)
-
-
-def test_the_page_is_small_enough_for_an_email(text):
-    assert len(text) < 12_000_000  # characters; plotly's program alone has about 5 million
 
 
 @pytest.mark.parametrize("row, solver", [(0, "paper"), (1, "verified")])
@@ -151,34 +129,14 @@ def test_the_page_says_where_the_answer_is_one_of_two(results, text, tmp_path):
     assert f"turned by {angle:.0f} degrees" in page
 
 
-def test_two_poses_are_shown_in_the_same_view(results, exact_poses):
-    estimate = results[0].estimates["verified"]
-    other = estimate.alternatives[0]
-    _, best, second = _two_poses_figure(estimate).axes
-    assert_array_equal(best.images[0].get_array(), second.images[0].get_array())
-    camera = estimate.target_camera
-    other_camera = estimate.target_views[other.view].frame.camera
-    cloud = object_cloud(estimate.reference_view, most=1500)  # The figure draws 1500 points.
-    placed = {
-        best: camera.to_world(estimate.sim3.apply(cloud)),
-        second: other_camera.to_world(other.sim3.apply(cloud)),
-    }
-    for axis, points in placed.items():
-        pixels, depth = camera.project(points)
-        far_to_near = pixels[np.argsort(-depth)]
-        assert_allclose(axis.collections[0].get_offsets(), far_to_near, atol=1e-6)
-
-
-def test_lines_end_at_the_partners_and_each_fit_marks_its_own_inliers(results):
+def test_lines_end_at_the_partners_and_a_fit_marks_its_inliers(results):
     estimate = results[0].estimate
     source, target = estimate.points
     views = estimate.reference_view, estimate.target_views[estimate.view]
-    fits = {"moved away": Sim3(1.0, np.eye(3), np.full(3, 50.0)), "estimate": estimate.sim3}
-    _, away, fitted = show_residuals(views, (source, target), fits).axes
+    _, fitted = show_residuals(views, (source, target), {"estimate": estimate.sim3}).axes
     pixels, _ = views[1].frame.camera.project(views[1].frame.camera.to_world(target))
     inliers = np.linalg.norm(estimate.sim3.apply(source) - target, axis=1) < 0.2
     assert_allclose(fitted.collections[3].get_offsets(), pixels[inliers])
-    assert len(away.collections[3].get_offsets()) == 0
     assert_allclose([line[1] for line in fitted.collections[1].get_segments()], pixels)
 
 
@@ -226,33 +184,3 @@ def test_all_text_of_a_pair_is_escaped(results, tmp_path):
     assert hostile not in page
     # The ten texts given above stand in 15 places or more; some of them stand in several.
     assert page.count("&lt;img src=x onerror=alert(1)&gt;") >= 15
-
-
-@pytest.fixture
-def axes(results, exact_poses):
-    """The axes of the overview of the demo and of a pair with other errors: three pictures for
-    each pair."""
-    # A pose is right up to 30 degrees; both errors are shown as 30 after rounding.
-    wrong = replace(results[0], title="$x$", errors={"paper": 30.4, "verified": 29.6})
-    return overview([results[0], wrong]).axes
-
-
-def test_the_overview_names_the_solvers_and_says_which_are_right(results, axes):
-    labels = [[text.get_text() for text in axis.texts] for axis in axes]
-    right = [[f"right: {error:.0f}° off"] for error in results[0].errors.values()]
-    assert labels == [["ellipsoid"], *right, ["$x$"], ["wrong: 30° off"], ["right: 30° off"]]
-    titles = ["reference", "paper solver", "verified solver", "", "", ""]
-    assert [axis.get_title() for axis in axes] == titles
-    # The frames of a wrong and of a right pose have different colours.
-    wrong, right = axes[-2:]
-    assert wrong.patches[0].get_edgecolor() != right.patches[0].get_edgecolor()
-
-
-def test_the_overview_marks_the_pose_of_each_solver_in_its_view(results, axes):
-    for axis, estimate in zip(axes[1:3], results[0].estimates.values()):
-        # The overview draws up to 20000 points, the near ones over the far ones.
-        cloud = estimate.sim3.apply(object_cloud(estimate.reference_view, most=20000))
-        far_to_near = cloud[np.argsort(-cloud[:, 2])]
-        camera = estimate.target_camera
-        pixels, _ = camera.project(camera.to_world(far_to_near))
-        assert_allclose(axis.collections[0].get_offsets(), pixels)

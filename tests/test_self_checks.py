@@ -25,24 +25,11 @@ def test_every_question_has_right_and_wrong_answers_with_feedback_to_each(path):
         if question["type"] == "multiple_choice":
             assert right == 1
         assert len({answer["feedback"] for answer in answers}) == len(answers)
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_numeric_questions_have_ranges_and_an_answer_to_all_else(path):
-    for question in sum(json.loads(path.read_text("utf-8")), []):
-        answers = question["answers"]
+        # Numbers outside of all ranges get the default answer.
         has_default = answers[-1].get("type") == "default"
         assert has_default == (question["type"] == "numeric")
         for low, high in [answer["range"] for answer in answers if "range" in answer]:
             assert low < high
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_a_notebook_has_two_checks_of_two_to_four_questions(path):
-    assert re.fullmatch(r"\d\d", path.stem)
-    first, second = json.loads(path.read_text("utf-8"))
-    assert 2 <= len(first) <= 4
-    assert 2 <= len(second) <= 4
 
 
 @pytest.mark.parametrize("number", [1, 2])

@@ -24,7 +24,7 @@ from zsp_lite.course.training.distillation import (
     distillation_loss,
 )
 from zsp_lite.course.training.objectives import attention_loss, correspondence_loss, losses
-from zsp_lite.course.training.renders import GRID, SIZE, VIEWS, render_object, render_set
+from zsp_lite.course.training.renders import GRID, SIZE, VIEWS, render_set
 from zsp_lite.course.training.trainee import Trainee, initial_backbone
 
 pytestmark = pytest.mark.slow
@@ -38,35 +38,9 @@ def two_rooms():
 
 
 @pytest.fixture(scope="module")
-def rendered():
-    """The renders of three training objects, and the azimuth of every view, one object after the
-    other."""
-    with patch.object(rendering, "orbit_pose", wraps=orbit_pose) as poses:
-        return render_set(range(3)), [call.kwargs["azimuth"] for call in poses.call_args_list]
-
-
-@pytest.fixture(scope="module")
-def renders(rendered):
-    """The renders alone."""
-    return rendered[0]
-
-
-def test_the_two_views_of_a_pair_are_nearer_in_azimuth_than_any_others(rendered):
-    partner = np.arange(VIEWS) ^ 1  # of views 0 and 1, 2 and 3, ...
-    for of_object in np.reshape(rendered[1], (3, VIEWS)):
-        turns = np.subtract.outer(of_object, of_object)
-        apart = np.degrees(np.abs((turns + np.pi) % (2 * np.pi) - np.pi))
-        found = apart[np.arange(VIEWS), partner]
-        assert ((5 <= found) & (found <= 45)).all()
-        apart[np.arange(VIEWS), partner] = apart[np.arange(VIEWS), np.arange(VIEWS)] = 360
-        assert (apart.min(1) >= 45).all()
-
-
-def test_a_number_stands_for_one_rendered_object(renders):
-    for array, rows in zip(
-        render_object(1), (renders.rgb, renders.surface, renders.geometry), strict=True
-    ):
-        assert_array_equal(array, rows[1])
+def renders():
+    """The renders of three training objects."""
+    return render_set(range(3))
 
 
 def test_surface_points_of_renders_are_coordinates_of_the_object(renders):
@@ -198,8 +172,7 @@ def test_attention_on_the_mask_is_worth_more_than_attention_off_it():
 
 
 def test_a_few_steps_teach_a_network_where_the_object_is(renders):
-    """The summed loss falls on the batch that is trained on, and its terms are those of the single
-    functions."""
+    """The losses fall on the batch that is trained on."""
     torch.manual_seed(0)
     model = Trainee(initial_backbone(renders, 24, 2, 2), 1)
     batch = sample_batch(renders, default_rng(5), 2, VIEWS, 48, (0.8, 1.0))
@@ -207,9 +180,6 @@ def test_a_few_steps_teach_a_network_where_the_object_is(renders):
         total, figures = losses(model, batch, torch.Generator().manual_seed(0), helpers=0.5)
     expected = figures["match"] + 0.5 * (figures["geometry"] + figures["attention"])
     assert_allclose(float(total), expected, rtol=1e-5)
-    with torch.no_grad():
-        attention, iou = attention_loss(model(batch.images).cls_logits, batch.coverage)
-    assert (float(attention), iou) == pytest.approx((figures["attention"], figures["iou"]))
     optimiser = torch.optim.AdamW(model.parameters(), 3e-3)
     for _ in range(24):
         optimiser.zero_grad()

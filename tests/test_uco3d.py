@@ -16,11 +16,9 @@ from numpy.testing import assert_allclose
 from refusals import refused
 from uco3d_folders import RATE, STEP, WORLD, blob, write_uco3d
 
-import zsp_lite
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_label, read_labels
 from zsp_lite.importers.uco3d import import_uco3d
-from zsp_lite.metrics import rotation_error
 from zsp_lite.points import object_pixels, world_points
 
 SAMPLES = Path(__file__).parents[1] / "data_samples"
@@ -85,12 +83,6 @@ def test_frames_show_the_same_points_as_those_of_the_data_folder(imported, name)
 
 
 @pytest.mark.parametrize("name", [CAR, SUV])
-def test_clouds_have_unit_deviation(imported, name):
-    points, _ = imported.point_cloud("car", name)
-    assert points.std(axis=0).mean() == pytest.approx(1, abs=1e-6)
-
-
-@pytest.mark.parametrize("name", [CAR, SUV])
 def test_the_alignment_of_uco3d_becomes_a_proposal_for_a_label(imported, name):
     proposal = read_label(imported.root / f"label_proposals/car/{name}.json")
     assert_allclose(proposal.trans, read_labels(SAMPLES, "car")[name].trans, atol=1e-5)
@@ -99,20 +91,6 @@ def test_the_alignment_of_uco3d_becomes_a_proposal_for_a_label(imported, name):
 
 def test_the_licence_is_named_beside_the_sequences(imported):
     assert "CC BY 4.0" in (imported.root / "car/ATTRIBUTION.md").read_text()
-
-
-@pytest.mark.slow
-def test_the_pose_between_two_objects_is_that_of_the_data_folder(imported):
-    method = zsp_lite.ZeroShotPose(zsp_lite.load_backbone(), solver="paper")
-    rotations = []
-    for dataset in (Co3D(SAMPLES), imported):
-        (reference,) = loaded(dataset, SUV, [0])
-        targets = loaded(dataset, CAR, range(1, FRAMES, 5))
-        estimate = method.estimate(reference, targets)
-        # Between both worlds: views and cropped images differ a little.
-        world_to_target = targets[estimate.view].camera.R
-        rotations.append(world_to_target.T @ estimate.sim3.R @ reference.camera.R)
-    assert rotation_error(*rotations) < 3  # degrees
 
 
 def test_chosen_frames_are_evenly_spaced_and_have_depth_that_agrees(changed, tmp_path):
@@ -163,31 +141,17 @@ def test_sequences_are_named_or_the_best_are_chosen(imports, run):
     assert "--best does not go with --sequences (see: zsp-lite data import uco3d --help)" in text
 
 
-def test_queries_use_the_keys_and_nothing_is_written_to_the_metadata(
-    changed, tmp_path, monkeypatch
-):
-    statements = []
+def test_nothing_is_written_to_the_metadata(changed, tmp_path, monkeypatch):
     connect = sqlite3.connect
 
-    def traced(*arguments, **options):
+    def checked(*arguments, **options):
         metadata = connect(*arguments, **options)
-        metadata.set_trace_callback(statements.append)
         with pytest.raises(sqlite3.OperationalError, match="readonly"):
             metadata.execute("DELETE FROM frame_annots")
         return metadata
 
-    monkeypatch.setattr(sqlite3, "connect", traced)
-    list(import_uco3d(changed, tmp_path / "out", "car", count=4))
-    monkeypatch.undo()
-    selects = [statement for statement in statements if statement.startswith("SELECT")]
-    assert len(selects) == 3  # sequences, and the frames of each
-    with closing(connect(changed / "metadata.sqlite")) as metadata:
-        for select in selects:
-            # The fourth column of a plan describes a step: no step reads a whole table.
-            steps = [row[3] for row in metadata.execute(f"EXPLAIN QUERY PLAN {select}")]
-            assert "INDEX sqlite_autoindex" in steps[0]
-            assert "(sequence_name=?)" in steps[0]
-            assert not any(step.startswith("SCAN") for step in steps)
+    monkeypatch.setattr(sqlite3, "connect", checked)
+    assert len(list(import_uco3d(changed, tmp_path / "out", "car", count=4))) == 2
 
 
 def refuse(root, tmp_path, expected, category="car", sequences=(SUV,)):
@@ -210,7 +174,6 @@ def refuse(root, tmp_path, expected, category="car", sequences=(SUV,)):
             "rgb_video.mp4 is (240, 320) pixels, expected (H, W)",
         ),
         ("frame_timestamp", 1000.0, "rgb_video.mp4 ends before 1000.00 s"),
-        ("frame_timestamp", "noon", "Expected `float`, got `str` - at `$.frame_timestamp`"),
         ("_depth_scale_adjustment", 2.0, "0 of 24 frames have depth that agrees with the point"),
     ],
 )

@@ -93,24 +93,10 @@ def test_training_forward_agrees_with_inference(model, images, layer):
         tokens = model.extract(images, layer)
         close(training.tokens, model(images))
     close(training.keys, tokens.keys)
-    close(training.cls_logits.softmax(-1)[:, :, 1:], tokens.attention)
-
-
-@pytest.mark.parametrize("layer", range(DEPTH))
-def test_keys_are_the_projection_of_their_input(model, images, layer):
-    training = model.forward_training(images, layer)
-    # Rows of the layer: queries, keys, values.
+    # Keys are the projection of their input; rows of the layer are queries, keys, values.
     qkv = model.blocks[layer].attn.qkv
-    close(F.linear(training.key_input, qkv.weight.chunk(3)[1], qkv.bias.chunk(3)[1]), training.keys)
-
-
-@pytest.mark.parametrize("layer", range(DEPTH))
-def test_gradients_reach_every_weight(model, images, layer):
-    training = model.forward_training(images, layer)
-    loss = training.tokens.square().sum() + training.keys.sum() + training.cls_logits.square().sum()
-    for gradient in torch.autograd.grad(loss, list(model.parameters())):
-        assert gradient.isfinite().all()
-        assert gradient.any()
+    close(F.linear(training.key_input, qkv.weight.chunk(3)[1], qkv.bias.chunk(3)[1]), tokens.keys)
+    close(training.cls_logits.softmax(-1)[:, :, 1:], tokens.attention)
 
 
 def test_state_dict_has_the_keys_and_shapes_of_dino_vits8():
@@ -136,10 +122,6 @@ def test_layer_norms_have_the_epsilon_of_dino(model):
     assert {norm.eps for norm in norms} == {1e-6}
 
 
-def test_the_position_embedding_is_stored_for_its_own_grid(model):
-    assert model.position_embedding((4, 4)) is model.pos_embed
-
-
 def test_the_position_embedding_of_another_grid_is_interpolated_as_by_dino(model):
     resized = model.position_embedding((3, 6))
     assert_close(resized[:, 0], model.pos_embed[:, 0])
@@ -148,8 +130,3 @@ def test_the_position_embedding_of_another_grid_is_interpolated_as_by_dino(model
     scale = ((24 // PATCH + 0.1) / 4, (48 // PATCH + 0.1) / 4)
     expected = F.interpolate(stored, scale_factor=scale, mode="bicubic")
     assert_close(resized[:, 1:], expected.permute(0, 2, 3, 1).reshape(1, 18, DIM))
-
-
-def test_the_grid_is_that_of_the_image(model):
-    with torch.no_grad():
-        assert model.extract(torch.zeros(1, 3, 24, 48), 0).grid == (3, 6)

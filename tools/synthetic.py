@@ -1,24 +1,20 @@
-"""Render the training or the validation categories into a CO3D folder.
+"""Render the validation categories into a CO3D folder.
 
-python -m tools.synthetic validation --sequences 5 --frames 16 --seed 11 --out outputs/validation
+python -m tools.synthetic --sequences 5 --frames 16 --seed 11 --out outputs/validation
 """
 
 from argparse import ArgumentParser
 from pathlib import Path
 
-from tools.training_categories import TRAINING
 from tools.validation_categories import VALIDATION
 from zsp_lite.course.synthetic.export import export_categories
 from zsp_lite.course.synthetic.sequences import HEIGHTS
 from zsp_lite.io.locks import writing
 
-SPLITS = {"training": TRAINING, "validation": VALIDATION}
-
 
 def main(arguments: list[str] | None = None) -> None:
-    """Render the sequences of all categories of a split; an existing folder is completed."""
+    """Render the sequences of all categories; an existing folder is completed."""
     parser = ArgumentParser(description=__doc__)
-    parser.add_argument("split", choices=SPLITS)
     for name, default in {"sequences": 4, "frames": 24, "seed": 0}.items():
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument(
@@ -30,15 +26,14 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args(arguments)
-    builders = SPLITS[options.split]
     with writing(options.out):
         export_categories(
-            list(builders),
+            list(VALIDATION),
             options.out,
             options.sequences,
             options.frames,
             options.seed,
-            builders=builders,
+            builders=VALIDATION,
             heights=tuple(options.heights),
         )
 

@@ -48,7 +48,7 @@ _SMOOTHING = 0.06  # standard deviation of the Gaussian around a marked point
 _TEMPERATURE = 0.05  # of cosines, for the patches of the target
 _SOURCE_TEMPERATURE = 0.1  # of cosines, for the patches around a marked point
 # Coefficients of the confidence: constant, cosine, and distance to the surface in sizes of the
-# object. Fitted by tools/marks.py on validation categories.
+# object. Fitted on validation categories (docs/rebuild.md).
 CONFIDENCE = (-10.4, 18.4, -22.7)
 FOUND = 0.5  # least confidence of a point that is found
 

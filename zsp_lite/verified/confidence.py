@@ -56,7 +56,10 @@ def evidence(
 
 @dataclass(frozen=True)
 class Calibration:
-    r"""The coefficients \alpha and \beta of x, and \lambda, all fitted by `tools/tuning.py`."""
+    r"""The coefficients \alpha and \beta of x, and \lambda, fitted on validation categories.
+
+    docs/rebuild.md names the revision with the code of the fit.
+    """
 
     scale: tuple[float, ...] = (-0.40, 1.46, 0.025, -0.93, 2.90, -0.063)  # \alpha
     none: tuple[float, ...] = (0.55, -2.87, 0.72, 0.61, -28.5, -0.501)  # \beta
@@ -70,11 +73,11 @@ class Calibration:
         return (1 - self.unseen * hidden_share(x[1])) * odds / (np.exp(x @ self.none) + odds.sum())
 
 
-def hidden_share(span: float | Float[np.ndarray, " n"]) -> float | Float[np.ndarray, " n"]:
+def hidden_share(span: float) -> float:
     """Return h for views that span a share of the circle around the target."""
     # A single view sees 60 degrees to both sides and leaves 240 degrees hidden. Views that span an
     # angle leave that much less: h = (240 - 360 * span) / 240.
-    return np.maximum(0.0, 1 - 1.5 * span)
+    return max(0.0, 1 - 1.5 * span)
 
 
 def modes(angle: Float[np.ndarray, "m m"]) -> Int[np.ndarray, " m"]:

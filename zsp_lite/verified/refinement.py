@@ -48,9 +48,8 @@ class SearchSchedule(NamedTuple):
     decay: float  # factor on all three after each round
 
 
-# These values are chosen, not fitted: `tools/tuning.py` fits weights and probabilities only. Each
-# search begins with narrower steps than the one before began with, but with wider steps than that
-# one ended with.
+# These values are chosen, not fitted. Each search begins with narrower steps than the one before
+# began with, but with wider steps than that one ended with.
 COARSE = SearchSchedule(
     rounds=3, samples=16, rotation=7.0, translation=0.12, scale=0.08, decay=0.65
 )

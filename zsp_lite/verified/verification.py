@@ -34,8 +34,9 @@ that of view v, is
 
 It is the paper's criterion for the best view (sec. 4.2), used as evidence for a pose.
 
-The weights w are those of a conditional logit (McFadden 1974), fitted by `tools/tuning.py`: among
-the hypotheses of a pair, the probability that one is correct is proportional to \exp(S).
+The weights w are those of a conditional logit (McFadden 1974): among the hypotheses of a pair, the
+probability that one is correct is proportional to \exp(S). docs/rebuild.md names the revision with
+the code of the fit.
 """
 
 from collections.abc import Iterator
