@@ -84,7 +84,12 @@ BAD_FILES = [
     ("mask.png", read_mask, "cannot be decoded", {"empty": b""}),
     ("depth.png", read_depth, "cannot be decoded", {"empty": b""}),
     ("depth.png", read_depth, "expected a 16-bit greyscale PNG", {"8 bits": PNG}),
-    ("a.heic", read_picture, "cannot be decoded .* expected the photograph as JPEG", {"": JPEG}),
+    (
+        "a.heic",
+        read_picture,
+        "cannot be decoded .* expected the photograph as JPEG",
+        {"": bytes(99)},
+    ),
     ("a.webp", read_picture, "cannot be decoded", {"cut": WEBP[:-40]}),
     ("a.webp", read_depth_file, "holds uint8 of shape .*, expected numbers", {"colours": WEBP}),
     (
