@@ -1,7 +1,7 @@
 """Evaluate pairs in this process, a pool of processes, or any `concurrent.futures.Executor`.
 
 Workers get chunks of a few pairs that share frames. A killed run loses the chunks that were being
-evaluated.
+evaluated, and those that are finished before an earlier one.
 """
 
 import logging
@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from itertools import chain
@@ -28,7 +28,7 @@ from tqdm import tqdm
 from zsp_lite.benchmark.runs import ResultLine, add_lines, read_lines
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError, check_integer, ends_the_run
-from zsp_lite.io.files import digest, read_bytes, write_atomic
+from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.threads import one_thread
 
 # Evaluates the named rows on a pair, and returns the line of the run.
@@ -99,7 +99,7 @@ def evaluate_pairs(
 def _lines(
     opener: Opener, executor: Executor | int, chunks: list[Chunk], out: str | Path
 ) -> Iterator[list[Any]]:
-    """Yield the lines of pairs when they are found: one by one in this process, else by chunk."""
+    """Yield the lines of pairs: one by one in this process, else by chunk."""
     if executor == 1:
         evaluate = opener(get_num_threads())
         with one_thread():
@@ -112,15 +112,10 @@ def _lines(
     # A backbone has megabytes: each worker reads the opener once, from a file in the run's
     # folder, which all workers see. Absolute, because a worker may have another current folder.
     path = Path(out).resolve() / f".rows-{uuid4()}"
-    futures = []
     with nullcontext(executor) if given else _processes(executor) as workers:
         try:
-            pickled = _pickle(opener, workers)
-            write_atomic(path, pickled)
-            task = partial(_evaluate_chunk, str(path), digest(pickled), threads)
-            futures += [workers.submit(task, chunk) for chunk in chunks]
-            for future in as_completed(futures):
-                yield future.result()
+            write_atomic(path, _pickle(opener, workers))
+            yield from workers.map(partial(_evaluate_chunk, str(path), threads), chunks)
         except ImportError as error:
             raise InputError(
                 f"a worker cannot import the rows: {error}, expected the module there, too"
@@ -131,10 +126,6 @@ def _lines(
                 "again to continue, with fewer workers"
             ) from error
         finally:
-            # A pool that is about to end would print a traceback for each cancelled future.
-            if given:
-                for future in futures:
-                    future.cancel()
             path.unlink(missing_ok=True)
 
 
@@ -153,15 +144,10 @@ def _pickle(opener: Opener, workers: Executor) -> bytes:
 _worker = threading.local()  # an executor's workers may be threads
 
 
-def _evaluate_chunk(path: str, checksum: str, threads: int, chunk: Chunk) -> list[Any]:
+def _evaluate_chunk(path: str, threads: int, chunk: Chunk) -> list[Any]:
     """Evaluate a chunk in a worker, which keeps the evaluator for the next chunk of the run."""
     if getattr(_worker, "path", None) != path:
-        pickled = read_bytes(path, "rows of the run")
-        if digest(pickled) != checksum:  # never unpickle what somebody else has written
-            raise InputError(
-                f"rows of the run {path} have changed, expected the file that this run wrote"
-            )
-        _worker.evaluate = cloudpickle.loads(pickled)(threads)
+        _worker.evaluate = cloudpickle.loads(read_bytes(path, "rows of the run"))(threads)
         _worker.path = path
     with one_thread():
         return [_worker.evaluate(pair, names) for pair, names in chunk]

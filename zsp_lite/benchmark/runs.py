@@ -113,8 +113,11 @@ def described(value: Any) -> str:
     name = f"{named.__module__}:{named.__qualname__}"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = [field.name for field in dataclasses.fields(value)]
-        public = [field for field in fields if not field.startswith("_")]
-        texts = [f"{field}={described(getattr(value, field))}" for field in public]
+        texts = [
+            f"{field}={described(getattr(value, field))}"
+            for field in fields
+            if not field.startswith("_")
+        ]
         return f"{name}({', '.join(texts)})"
     return name
 
@@ -162,6 +165,7 @@ class Run:
     """Results of a run on the pairs that the rows of the last call have finished (see
     `read_run`)."""
 
+    folder: str
     settings: Settings
     # A line for each row, pair and seed, in this order: "row", "category", "pair" (its key),
     # "repeat" (of the seed), "problem" (the key without target frames), "reference" and "target"
@@ -224,8 +228,6 @@ class Run:
         """Return the pairs for which a row has a pose, the target views, the rotations and the
         translations, or NaN."""
         found = self.row(name).dropna(subset=["rotation", "view"])
-        if found.empty:
-            raise InputError(f"row {name!r} has no poses in the run")
         pairs = [Pair.from_key(key) for key in found.index]
         rotations = np.array(found["rotation"].tolist()).reshape(-1, 3, 3)
         positions = np.array([position or [np.nan] * 3 for position in found["position"]])
@@ -307,17 +309,14 @@ def _continued(out: Path, now: Settings) -> Settings:
 
 def _decisive(settings: Settings) -> dict[str, Any]:
     """Return by name what must be equal in two calls of one run, if both calls have it."""
-    parts = {
+    return {
         "command": "align" if "alignment" in settings.methods else "benchmark",
         "backbone": settings.backbone,
         "targets": settings.targets,
         "data": settings.folder or os.path.realpath(settings.data),
+        **{f"methods of {row}": text for row, text in settings.methods.items()},
+        **{f"images or labels of {name}": code for name, code in settings.objects.items()},
     }
-    for row, description in settings.methods.items():
-        parts[f"methods of {row}"] = description
-    for name, code in settings.objects.items():
-        parts[f"images or labels of {name}"] = code
-    return parts
 
 
 def add_lines(out: str | Path, lines: Iterable[Any]) -> None:
@@ -387,7 +386,7 @@ def read_run(out: str | Path) -> Run:
     for call in settings.calls:
         remarks |= call.remarks
     notes += [remark for name, remark in remarks.items() if name in rows]
-    return Run(settings, table, timings, " ".join(filter(None, notes)))
+    return Run(str(out), settings, table, timings, " ".join(filter(None, notes)))
 
 
 def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:

@@ -118,7 +118,7 @@ def benchmark(
     if list_only:
         return _list_methods()
     from zsp_lite.benchmark.methods import resolve
-    from zsp_lite.benchmark.run import evaluate, pairs_of_rows, write_reports
+    from zsp_lite.benchmark.run import evaluate, pairs_of_rows
     from zsp_lite.course.samples import sample_data
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.exchange import write_questions
@@ -132,8 +132,7 @@ def benchmark(
         asked = pairs_of_rows(dataset, resolve(methods), pairs_per_category, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
-    # Its summary is of all rows, as is the one that `write_reports` returns and writes.
-    evaluate(
+    summary = evaluate(
         dataset.root,
         backbone,
         methods,
@@ -144,8 +143,8 @@ def benchmark(
         row_seconds=row_seconds,
         seeds=seeds,
         sweep=sweep or (),
+        metrics=metrics,
     )
-    summary = write_reports(out, metrics=metrics)
     if not quiet:
         print(f"{dataset.root}, backbone {summary['backbone']}, {targets} target views")
         # More rows than the default ones are for the paper's tables.
@@ -249,4 +248,4 @@ def compare(run_a, run_b, rows) -> None:
     from zsp_lite.benchmark.runs import read_run
     from zsp_lite.cli.terminal import print_table
 
-    print_table(tables.compare(read_run(run_a), read_run(run_b), rows, (str(run_a), str(run_b))))
+    print_table(tables.compare(read_run(run_a), read_run(run_b), rows))
