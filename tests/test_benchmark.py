@@ -4,7 +4,6 @@ known."""
 import json
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +17,9 @@ from zsp_lite import Co3D, InputError
 from zsp_lite.benchmark.run import evaluate, write_reports
 from zsp_lite.benchmark.runs import Run, add_lines, read_lines, read_run
 from zsp_lite.benchmark.tables import pair_figure
-from zsp_lite.data.frames import write_mask
 from zsp_lite.data.ground_truth import POSES_FILE, ObjectPose, object_poses
 from zsp_lite.data.labels import read_labels
-from zsp_lite.data.pairs import category_pairs, sample_pairs, true_poses, write_published_pairs
+from zsp_lite.data.pairs import category_pairs, sample_pairs, true_poses
 from zsp_lite.metrics import rotation_error
 from zsp_lite.views import object_crop
 from zsp_lite.viz.plots import pale
@@ -137,45 +135,6 @@ def test_a_pair_or_a_row_without_a_pose_has_no_picture(pictured):
     for pair, rows in (("lump", None), (key, ["blind"]), (key, ["nobody"])):
         message = f"pair '{pair}' has no pose in the run, expected a key such as {key}"
         refused(message, pair_figure, pictured, pair, Co3D(small_folder()), rows)
-
-
-def test_shipped_pairs_come_first_and_only_where_there_are_enough(tmp_path):
-    dataset = Co3D(shutil.copytree(small_folder(), tmp_path / "copy"))
-    shipped = sample_pairs(dataset, "lump", 4, 3, seed=9)
-    path = dataset.root / "determ_eval/4samples_3tgt/lump.pt"
-    write_published_pairs(path, shipped, dataset)
-    assert category_pairs(dataset, "lump", 3, 3) == shipped[:3]
-    assert category_pairs(dataset, "lump", 5, 3) == sample_pairs(dataset, "lump", 5, 3)
-
-
-class Blind(CoordinateBackbone):
-    """Finds nothing salient."""
-
-    def features(self, image):
-        found = super().features(image)
-        return replace(found, saliency=0 * found.saliency)
-
-
-def test_frames_that_cannot_be_used_count_as_failures(tmp_path):
-    row = run_rows(["ours"], tmp_path, 2, 5, backbone=Blind(grid=8))["ours"]
-    expected = {"failed": 2, "n": 2, "acc30": 0, "median": 180}
-    assert {name: row[name] for name in expected} == expected
-    for reason in read_run(tmp_path).row("ours")["failed"]:
-        assert "all 5 target views were left out" in reason
-
-
-def test_a_target_view_with_an_empty_mask_is_left_out_and_the_pair_is_not_lost(tmp_path):
-    dataset = Co3D(shutil.copytree(small_folder(), tmp_path / "copy"))
-    (pair,) = sample_pairs(dataset, "lump", 1, 3)
-    first = dataset.frame("lump", pair.target_sequence, pair.target_frames[0])
-    write_mask(dataset.root / first.mask.path, np.zeros((90, 100), np.float32))
-    evaluate(dataset.root, BACKBONE, ("ours", "verified"), {"lump": 1}, 3, tmp_path / "run")
-    for row in ("ours", "verified"):
-        (found,) = read_run(tmp_path / "run").row(row).to_dict("records")
-        assert found["failed"] == ""
-        assert found["error"] < 30
-        assert found["view"] > 0
-        assert "mask" in found["note"]
 
 
 class Renamed(CoordinateBackbone):

@@ -8,13 +8,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from types import FunctionType, ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import benchmark_folder
+import cloudpickle
 import numpy as np
 import pytest
 import torch
@@ -28,7 +28,7 @@ from benchmark_folder import (
     run_rows,
     small_folder,
 )
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from refusals import refused
 from synthetic_views import CoordinateBackbone, true_pose
 
@@ -48,8 +48,6 @@ from zsp_lite.benchmark.runs import LINES, Run, fingerprint, read_run
 from zsp_lite.benchmark.tables import every_table
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.exchange import write_questions
-from zsp_lite.data.frames import mask_to_bbox
-from zsp_lite.data.labels import PoseLabel
 from zsp_lite.data.pairs import category_pairs
 from zsp_lite.errors import FatalError
 from zsp_lite.verified import VerifiedSolver
@@ -198,22 +196,6 @@ def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
         assert_allclose(similarity, (1, 0), atol=1e-3)
 
 
-def test_a_matcher_of_keypoints_gets_the_crops_at_the_resolution_of_the_frames(tmp_path):
-    crops = []
-
-    def record(first, second):
-        crops.extend((first, second))
-        return NONE
-
-    run_rows({"mine": record}, tmp_path, pairs=1, targets=1)
-    dataset = Co3D(small_folder())
-    (pair,) = category_pairs(dataset, "lump", 1, 1)
-    reference, (target,) = dataset.load_pair(pair)
-    for crop, frame in zip(crops, (reference, target), strict=True):
-        top, left, height, width = mask_to_bbox(frame.mask)
-        assert_array_equal(crop, frame.rgb[top : top + height, left : left + width])
-
-
 SWEPT = {
     "mine": benchmark_folder.own_keypoints,
     "solved": benchmark_folder.own_solver,
@@ -263,9 +245,10 @@ def test_keypoints_that_fit_no_pose_are_noted(tmp_path):
     rows = {"none": lambda first, second: NONE, "empty": lambda first, second: ([], [], [])}
     methods = run_rows(rows, tmp_path)
     assert [row["failed"] for row in methods.values()] == [0, 0]
-    for name, told in read_run(tmp_path).failures.items():
-        reason = "lump/.*: pose is the best view's, not a fit: got 0 corr"
-        assert re.match(f"{name} has no fit on 1 of 1 pairs; the first, {reason}", told)
+    reason = "lump/.*: pose is the best view's, not a fit: got 0 corr"
+    for name in rows:
+        told = f"{name} has no fit on 1 of 1 pairs; the first, {reason}"
+        assert re.search(told, read_run(tmp_path).summary["note"])
 
 
 @pytest.mark.parametrize(
@@ -438,21 +421,12 @@ def asked_pairs(dataset: Co3D) -> list[Pair]:
     return [*category_pairs(dataset, "lump", 2, 3), *category_pairs(dataset, "pebble", 1, 3)]
 
 
-def test_the_questions_have_a_line_for_each_frame(asked):
-    expected = []
-    for pair in asked_pairs(Co3D(small_folder())):
-        reference = ("reference", pair.category, pair.reference_sequence, pair.reference_frame)
-        targets = [
-            ("target", pair.category, pair.target_sequence, number) for number in pair.target_frames
-        ]
-        expected += [[pair.key, *map(str, frame)] for frame in (reference, *targets)]
-    columns = ("pair", "role", "category", "sequence", "frame")
-    assert [[line[name] for name in columns] for line in asked] == expected
-
-
 def test_the_questions_have_the_files_and_the_camera_of_each_frame(asked):
     dataset = Co3D(small_folder())
     points = np.random.default_rng(0).normal(size=(20, 3))
+    keys = [pair.key for pair in asked_pairs(dataset) for _ in pair.frames]
+    assert [line["pair"] for line in asked] == keys
+    assert [line["role"] for line in asked] == 3 * ["reference", *3 * ["target"]]
     for line in asked:
         assert all((dataset.root / line[name]).is_file() for name in ("image", "depth", "mask"))
         assert float(line["depth_scale"]) > 0
@@ -649,42 +623,6 @@ def test_a_row_that_ends_at_its_time_limit_leaves_nothing_behind():
     sum(range(100_000))  # long enough for an exception that comes too late
 
 
-INNER = (
-    "__dict__",
-    "__self__",
-    "__func__",
-    "__wrapped__",
-    "func",
-    "args",
-    "keywords",
-    "__closure__",
-    "cell_contents",
-    "__defaults__",
-    "__kwdefaults__",
-)
-ENDS = ModuleType | type | torch.nn.Module | torch.Tensor | np.ndarray
-
-
-def reached(thing) -> list:
-    """Return all that an object leads to, up to torch's modules, arrays and functions of installed
-    packages."""
-    seen, todo = {}, [thing]
-    while todo:
-        thing = todo.pop()
-        if id(thing) in seen or isinstance(thing, ENDS):
-            continue
-        seen[id(thing)] = thing
-        if isinstance(thing, FunctionType) and "site-packages" in thing.__code__.co_filename:
-            continue
-        names = *INNER, *getattr(thing, "__slots__", ())
-        todo += [getattr(thing, name) for name in names if hasattr(thing, name)]
-        if isinstance(thing, Mapping):
-            todo += [*thing.keys(), *thing.values()]
-        if isinstance(thing, list | tuple | set):
-            todo += thing
-    return list(seen.values())
-
-
 def test_nothing_that_a_row_of_ones_own_gets_leads_to_a_label_or_names_an_object(tmp_path):
     handed = {}
 
@@ -712,10 +650,9 @@ def test_nothing_that_a_row_of_ones_own_gets_leads_to_a_label_or_names_an_object
     methods = run_rows({"icp": "icp", "scans-2": "scans-2"} | rows, tmp_path)
     assert {row["failed"] for row in methods.values()} == {0}
     assert handed.keys() == rows.keys()
-    for thing in reached(handed):
-        assert not isinstance(thing, Co3D | Path | PoseLabel | Pair), thing
-        if isinstance(thing, str):
-            assert not any(name in thing for name in (str(small_folder()), *SEQUENCES)), thing
+    content = cloudpickle.dumps(handed)
+    for word in (*SEQUENCES, str(small_folder()), "Co3D", "PoseLabel"):
+        assert word.encode() not in content
 
 
 def test_the_pairs_seed_goes_to_every_row_that_takes_one(tmp_path):
@@ -791,9 +728,8 @@ def test_a_broken_backbone_ends_the_run_and_nothing_is_stored(
     assert not (tmp_path / LINES).read_bytes()
 
 
-@pytest.mark.parametrize("run", ["category", "align"])
 def test_an_unreadable_frame_ends_the_run_and_nothing_is_stored_for_its_pairs(
-    tmp_path, run, monkeypatch
+    tmp_path, monkeypatch
 ):
     def read(dataset, annotation):
         if annotation.sequence_name == "300_c":
@@ -803,10 +739,7 @@ def test_an_unreadable_frame_ends_the_run_and_nothing_is_stored_for_its_pairs(
     load = Co3D.load
     monkeypatch.setattr(Co3D, "load", read)
     with pytest.raises(FatalError, match="300_c cannot be decoded"):
-        if run == "align":
-            align_category(Co3D(small_folder()), "lump", BACKBONE, targets=2, out=tmp_path)
-        else:
-            run_rows(["category"], tmp_path, targets=2)
+        run_rows(["category"], tmp_path, targets=2)
     assert "300_c" not in (tmp_path / LINES).read_text()
 
 

@@ -16,6 +16,7 @@ from refusals import refused
 
 from zsp_lite.benchmark import tables
 from zsp_lite.benchmark.methods import read_paper_tables, resolve
+from zsp_lite.benchmark.run import write_reports
 from zsp_lite.benchmark.runs import LINES, SETTINGS, Run, read_run
 from zsp_lite.benchmark.statistics import draws_of, paired_difference
 from zsp_lite.benchmark.tables import (
@@ -87,13 +88,6 @@ def test_accuracies_of_a_table_are_the_runs(run, every):
     assert acc15.value == methods["ours-k70-nokmeans"]["acc15"]
 
 
-def test_the_median_of_a_table_is_the_mean_of_the_categories_medians(run, every):
-    ours = run.summary["methods"]["ours"]["per_category"]
-    median = cell(every["table_1"], "Ours (K=50)", "Med. err. (°)")
-    assert median.value == pytest.approx(np.mean([ours[name]["median"] for name in CATEGORIES]))
-    assert median.low < median.value < median.high
-
-
 def test_published_figures_stand_apart(every):
     assert cell(every["table_1"], "ICP", "toaster Acc30", PUBLISHED).value == 7.0
     assert cell(every["table_1"], "SWaV", "Acc30 (%)") is None  # was published only
@@ -146,13 +140,6 @@ def test_rows_that_see_more_stand_apart_from_those_that_see_the_pair_only(tmp_pa
     assert found["with_scans"].title == "With several frames of the reference object"
     assert list(found["all_rows"].cells.index) == ["ours", "verified"]
     assert list(found["categories_acc30"].cells) == ["ours", "verified"]
-
-
-def test_the_tables_by_category_have_the_important_rows(run):
-    rows = tables.important_rows(run.summary)
-    assert rows[:3] == ["ours", "ours-bv", "verified"]
-    assert sorted(rows) == sorted(run.summary["methods"])
-    assert list(tables.by_category(run.summary, most=3).cells.columns) == rows[:3]
 
 
 @pytest.mark.parametrize(
@@ -229,20 +216,16 @@ def test_table_1_has_the_single_categories_that_the_run_has(tmp_path):
     assert single == ["bicycle Acc30", f"{PUBLISHED}: bicycle Acc30"]
 
 
-def test_chosen_rows_are_the_rows_of_all_tables_in_their_order(run):
+def test_chosen_rows_are_the_rows_of_all_tables_in_their_order(run, tmp_path):
     rows = ["icp", "verified", "ours"]
-    found = by_name(every_table(tables.choose(run, rows)))
+    found = by_name(every_table(write_reports(run.folder, tmp_path, rows=rows)))
+    refused("row 'nobody' is not in the run", write_reports, run.folder, tmp_path, rows=["nobody"])
     assert list(found["all_rows"].cells.index) == rows
     assert list(found["categories_acc30"].cells) == rows
     assert list(found["table_1"].cells.index) == ["ICP", "Ours (K=50)"]
     assert "table_3" not in found
     gain = cell(found["all_rows"], "icp", "Acc30 − ours").value
     assert gain == run.summary["against"]["icp"]["accuracy_gain"]
-
-
-def test_a_chosen_row_that_the_run_lacks_is_refused(run):
-    message = "row 'nobody' is not in the run, expected one of icp, "
-    refused(message, tables.choose, run, ["ours", "nobody"])
 
 
 @pytest.fixture
@@ -296,15 +279,6 @@ def test_csv_has_the_figures_and_their_intervals_in_columns(every, acc30):
     assert [ours[name] for name in columns] == [f"{figure:.6g}" for figure in acc30]
     published = [name for name in ours if name.startswith(f"{PUBLISHED}: Acc30 (%)")]
     assert published == [f"{PUBLISHED}: Acc30 (%)"]  # without an interval
-
-
-def test_markdown_has_the_figures_with_their_intervals(every, acc30):
-    lines = as_markdown(every["table_3"]).splitlines()
-    (ours,) = [line for line in lines if line.startswith("| CorrespondSim ")]
-    value, low, high = acc30
-    assert f"{value:.1f} [{low:.1f}, {high:.1f}]" in ours
-    heading = next(line for line in lines if line.startswith("|"))
-    assert heading.count("|") == ours.count("|")
 
 
 def test_markdown_escapes_bars_and_has_no_p_of_zero():
@@ -380,14 +354,6 @@ def test_a_runs_summary_is_of_the_pairs_and_rows_with_results(mine):
     assert cell(table, "mine", "ms per pair").value == 2000
 
 
-def test_a_runs_poses_are_those_of_the_pairs_that_have_one(mine):
-    (pair,), (view,), rotations, positions = mine.poses("mine")
-    assert (pair, view) == (Pair("chair", "a", 3, "b.c", (0, 12)), 1)
-    assert pair.key == KEY
-    assert rotations.tolist() == [np.eye(3).tolist()]
-    assert positions.tolist() == [[1, 2, 3]]
-
-
 @pytest.fixture
 def folder(tmp_path) -> Path:
     """The folder of a run of one pair."""
@@ -400,7 +366,6 @@ def folder(tmp_path) -> Path:
     [
         ('"error":1.0', '"error":"1"'),
         ('"error":1.0', '"error":181'),
-        ('"error":1.0', '"error":1,"rotation":[1]'),
         ("chair/a:0/b:0", "chair/a:0/b"),
         ("chair/a:0/b:0", "chair/a:0/b:0,"),
         ("chair/a:0/b:0", "chair/a:0/b/c:0"),
@@ -473,11 +438,6 @@ def test_rows_of_one_run_are_compared(run):
 )
 def test_rows_that_cannot_be_compared_are_refused(run, halved, rows, message):
     refused(message, tables.compare, run, halved, [rows])
-
-
-def test_runs_without_a_common_row_are_refused(halved, tmp_path):
-    other = write_run(tmp_path, {"nobody": {"chair/a:0/b:0": {"error": 1.0}}})
-    refused("no row in common: ours, icp and nobody", tables.compare, halved, other)
 
 
 def test_the_curve_of_errors_is_the_share_of_pairs_below_each(run):

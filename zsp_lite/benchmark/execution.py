@@ -19,7 +19,7 @@ from multiprocessing import active_children, get_context, parent_process
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
+from uuid import UUID, uuid4
 
 import cloudpickle
 from torch import get_num_threads
@@ -28,7 +28,6 @@ from tqdm import tqdm
 from zsp_lite.benchmark.runs import ResultLine, add_lines, read_lines
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError, check_integer, ends_the_run
-from zsp_lite.io.files import read_bytes, write_atomic
 from zsp_lite.threads import one_thread
 
 # Evaluates the named rows on a pair, and returns the line of the run.
@@ -39,14 +38,13 @@ Opener = Callable[[int], Evaluator]
 Chunk = list[tuple[Pair, list[str]]]  # pairs, each with the names of its rows
 # Workers keep frames from chunk to chunk: chunks are small, so that the progress bar moves.
 _LARGEST_CHUNK = 4  # pairs
-_MOST_WORKERS = 4096  # largest number of processes that is accepted
 logger = logging.getLogger(__name__)
 
 
 def check_workers(executor: Executor | int) -> None:
     """Raise InputError for what is neither an Executor nor a number of processes."""
     if not isinstance(executor, Executor):
-        check_integer("workers", executor, 1, _MOST_WORKERS)
+        check_integer("workers", executor, 1)
 
 
 def evaluate_pairs(
@@ -83,7 +81,7 @@ def evaluate_pairs(
     chunks = [todo[start : start + size] for start in range(0, len(todo), size)]
     # None shows the bar in a terminal only.
     hidden = None if logger.isEnabledFor(logging.INFO) else True
-    found = _lines(opener, executor, chunks, out)
+    found = _lines(opener, executor, chunks)
     # Closed, so that workers get no more to do where a line cannot be stored.
     with (
         tqdm(
@@ -96,9 +94,7 @@ def evaluate_pairs(
             bar.update(len(lines))
 
 
-def _lines(
-    opener: Opener, executor: Executor | int, chunks: list[Chunk], out: str | Path
-) -> Iterator[list[Any]]:
+def _lines(opener: Opener, executor: Executor | int, chunks: list[Chunk]) -> Iterator[list[Any]]:
     """Yield the lines of pairs: one by one in this process, else by chunk."""
     if executor == 1:
         evaluate = opener(get_num_threads())
@@ -109,13 +105,10 @@ def _lines(
 
     given = isinstance(executor, Executor)
     threads = 1 if given else max(1, get_num_threads() // executor)
-    # A backbone has megabytes: each worker reads the opener once, from a file in the run's
-    # folder, which all workers see. Absolute, because a worker may have another current folder.
-    path = Path(out).resolve() / f".rows-{uuid4()}"
     with nullcontext(executor) if given else _processes(executor) as workers:
+        task = partial(_evaluate_chunk, uuid4(), _pickle(opener, workers), threads)
         try:
-            write_atomic(path, _pickle(opener, workers))
-            yield from workers.map(partial(_evaluate_chunk, str(path), threads), chunks)
+            yield from workers.map(task, chunks)
         except ImportError as error:
             raise InputError(
                 f"a worker cannot import the rows: {error}, expected the module there, too"
@@ -125,8 +118,6 @@ def _lines(
                 "a worker ended abruptly, perhaps out of memory; finished pairs are stored: run "
                 "again to continue, with fewer workers"
             ) from error
-        finally:
-            path.unlink(missing_ok=True)
 
 
 def _pickle(opener: Opener, workers: Executor) -> bytes:
@@ -144,11 +135,11 @@ def _pickle(opener: Opener, workers: Executor) -> bytes:
 _worker = threading.local()  # an executor's workers may be threads
 
 
-def _evaluate_chunk(path: str, threads: int, chunk: Chunk) -> list[Any]:
+def _evaluate_chunk(run: UUID, opener: bytes, threads: int, chunk: Chunk) -> list[Any]:
     """Evaluate a chunk in a worker, which keeps the evaluator for the next chunk of the run."""
-    if getattr(_worker, "path", None) != path:
-        _worker.evaluate = cloudpickle.loads(read_bytes(path, "rows of the run"))(threads)
-        _worker.path = path
+    if getattr(_worker, "run", None) != run:
+        _worker.evaluate = cloudpickle.loads(opener)(threads)
+        _worker.run = run
     with one_thread():
         return [_worker.evaluate(pair, names) for pair, names in chunk]
 

@@ -174,7 +174,12 @@ def write_reports(
     from zsp_lite.benchmark import tables  # workers need no matplotlib
 
     results = read_run(run)
-    shown = tables.choose(results, rows) if rows else results.summary
+    shown = results.summary
+    if rows:
+        for name in rows:
+            results.row(name)  # InputError for an unknown one
+        methods = {name: shown["methods"][name] for name in rows}
+        shown = shown | {"methods": methods, "chosen": list(rows)}
     out = Path(out or run)
     of_paper = [spec["name"] for spec in read_paper_tables()]
     for name in (*tables.ROW_TABLES, *of_paper):

@@ -85,10 +85,8 @@ class Result(msgspec.Struct, omit_defaults=True):
     translation: float | None = None  # error of the object's centre in diameters of the target
     scale: float | None = None  # estimated over labelled, which is 1
     view: int | None = None
-    # row by row
-    rotation: Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)] | None = None
-    # the pose's translation
-    position: Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)] | None = None
+    rotation: list[float] | None = None  # row by row
+    position: list[float] | None = None  # the pose's translation
     inliers: int | None = None
     seconds: float | None = None
     note: str = ""
@@ -187,28 +185,25 @@ class Run:
             "targets": self.settings.targets,
         }
         summary = {"data": data, "backbone": backbone}
-        notes = " ".join(filter(None, [self.note, *self.failures.values()]))
-        if notes:
-            summary["note"] = notes
+        note = " ".join(filter(None, [self.note, *self._failures()]))
+        if note:
+            summary["note"] = note
         return summary | summarise(self.table) | {"timings": self.timings}
 
-    @functools.cached_property
-    def failures(self) -> dict[str, str]:
-        """By row that failed on pairs or answered them without a fit: on how many, and the reason
-        of the first."""
-        pairs = self.table.groupby("row")["pair"].nunique()
-        told: dict[str, str] = {}
-        for column, pattern, what in (
-            ("failed", ".", "failed on {} of {} pairs, counted as 180°"),
-            ("note", "not a fit", "has no fit on {} of {} pairs"),
-        ):
-            lines = self.table[self.table[column].str.contains(pattern)]
-            for name, found in lines.groupby("row", sort=False):
-                first = found.iloc[0]
-                text = what.format(found["pair"].nunique(), pairs[name])
-                text = f"{name} {text}; the first, {first['pair']}: {first[column]}."
-                told[name] = f"{told.get(name, '')} {text}".strip()
-        return told
+    def _failures(self) -> Iterator[str]:
+        """Say of each row on how many pairs it failed, or answered without a fit, and the reason of
+        the first."""
+        for name, row in self.table.groupby("row", sort=False):
+            pairs = row["pair"].nunique()
+            for column, pattern, what in (
+                ("failed", ".", "failed on {} of {} pairs, counted as 180°"),
+                ("note", "not a fit", "has no fit on {} of {} pairs"),
+            ):
+                found = row[row[column].str.contains(pattern)]
+                if len(found):
+                    text = what.format(found["pair"].nunique(), pairs)
+                    first = found.iloc[0]
+                    yield f"{name} {text}; the first, {first['pair']}: {first[column]}."
 
     def row(self, name: str) -> pd.DataFrame:
         """Return the table's lines of a row by pair key; InputError for an unknown row."""

@@ -119,22 +119,17 @@ def object_draws(objects: ArrayLike, categories: ArrayLike = "") -> Draws:
     return weights
 
 
-def pair_draws(n: int) -> Draws:
-    """Draw bootstrap weights of n independent pairs: how often each is drawn, with replacement."""
-    return _multiplicities(n, RESAMPLES, np.random.default_rng(0)).astype(np.float64)
-
-
 def bootstrap_ci(
     errors: ArrayLike, statistic: Callable[..., np.ndarray], weights: Draws | None = None
 ) -> list[float]:
     """Compute the 95 % percentile bootstrap interval of a statistic, such as `median`.
 
     It maps errors (n,) and weights (resamples, n) to (resamples,). Weights are those of
-    `object_draws`; by default of `pair_draws(n)`, which treats pairs as independent.
+    `object_draws`; by default pairs are drawn as if they were independent.
     """
     errors = np.asarray(errors, np.float64)
     if weights is None:
-        weights = pair_draws(len(errors))
+        weights = _multiplicities(len(errors), RESAMPLES, np.random.default_rng(0))
     return _interval(statistic(errors, weights))
 
 
@@ -181,7 +176,7 @@ def paired_difference(
     second = np.asarray(second, np.float64)
     gain = 100.0 * (second < threshold) - 100.0 * (first < threshold)
     if weights is None:
-        weights = pair_draws(len(gain))
+        weights = _multiplicities(len(gain), RESAMPLES, np.random.default_rng(0))
     # Rounding errors must not hide a difference of 0.
     replicates = weighted_mean(gain, weights).round(9)
     # Two-sided: twice the share of replicates on the rarer side, the data themselves counted in.

@@ -83,17 +83,6 @@ class Table:
         return self.cells.map(lambda cell: "–" if cell is None else str(cell))
 
 
-def choose(run: Run, rows: Sequence[str]) -> dict[str, Any]:
-    """Return the summary of a run with some rows, in this order, for the tables; InputError for an
-    unknown row."""
-    for name in rows:
-        run.row(name)
-    return run.summary | {
-        "methods": {name: run.summary["methods"][name] for name in rows},
-        "chosen": list(rows),
-    }
-
-
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
     """Return all tables of a run; `metrics` are the figures of the table of all rows (see
     `METRICS`)."""
@@ -306,9 +295,14 @@ def as_markdown(table: Table) -> str:
     """Format as a pipe table under its title."""
     escape = methodcaller("replace", "|", "\\|")
     text = table.text.rename(index=escape, columns=escape)
-    alignment = ["left", *["right"] * len(text.columns)]
-    lines = text.to_markdown(disable_numparse=True, colalign=alignment)
-    return "\n\n".join(filter(None, [f"**{table.title}**", lines, table.note])) + "\n"
+    parts = [f"**{table.title}**", _lines(text, "pipe"), table.note]
+    return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def _lines(cells: pd.DataFrame, form: str) -> str:
+    """Format texts as the lines of a table in one of tabulate's forms."""
+    alignment = ["left", *["right"] * len(cells.columns)]
+    return cells.to_markdown(tablefmt=form, disable_numparse=True, colalign=alignment)
 
 
 def as_latex(table: Table, intervals: bool = False) -> str:
@@ -320,10 +314,9 @@ def as_latex(table: Table, intervals: bool = False) -> str:
     cells = table.text[titles][table.cells[titles].notna().any(axis="columns")]
     if not intervals:
         cells = cells.replace(r" \[.*", "", regex=True)
-    alignment = ["left", *["right"] * len(titles)]
-    text = cells.to_markdown(tablefmt="latex_booktabs", disable_numparse=True, colalign=alignment)
-    text = re.sub(r"(?<=[ \[])-(?=\d)", "−", text)
-    return text.translate(_LATEX) + "\n"
+    cells = cells.replace(r"(^|\[|, )-", "\\1−", regex=True)
+    lines = _lines(cells, "latex_booktabs")
+    return lines.translate(_LATEX) + "\n"
 
 
 def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
@@ -332,9 +325,7 @@ def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
     curves = {}
     for name in rows or important_rows(run.summary)[: len(COLOURS)]:
         errors = np.sort(run.row(name)["error"])
-        shares = 100 * np.arange(len(errors) + 1) / len(errors)
-        # A step at every error: to the right at the old share, then up.
-        curves[name] = (np.repeat([0, *errors], 2)[1:], np.repeat(shares, 2)[:-1])
+        curves[name] = (errors, 100 * np.arange(1, len(errors) + 1) / len(errors))
     return show_panels(
         {"": curves},
         size=(6.5, 4),
@@ -342,7 +333,7 @@ def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
         ylabel="pairs with at most this error (%)",
         xlim=(0, 180),
         ylim=(0, 100),
-        xticks=(0, 15, 30, 60, 90, 120, 150, 180),
+        xticks=range(0, 181, 30),
     )
 
 

@@ -98,21 +98,7 @@ metrics_option = click.option(
 @metrics_option
 @click.option("--quiet", is_flag=True, help="Print no progress bar and no tables.")
 def benchmark(
-    data,
-    backbone,
-    categories,
-    pairs,
-    targets,
-    methods,
-    list_only,
-    list_pairs,
-    out,
-    workers,
-    metrics,
-    quiet,
-    row_seconds,
-    seeds,
-    sweep,
+    data, categories, pairs, list_only, list_pairs, workers, sweep, quiet, **options
 ) -> None:
     """Measure rotation errors over many pairs. OUT gets tables, figures and results."""
     if list_only:
@@ -128,28 +114,24 @@ def benchmark(
         logging.getLogger("zsp_lite").setLevel(logging.WARNING)
     dataset = Co3D(data or sample_data())
     pairs_per_category = dict.fromkeys(categories or labelled_categories(dataset), pairs)
+    targets = options["targets"]
     if list_pairs:
-        asked = pairs_of_rows(dataset, resolve(methods), pairs_per_category, targets)
+        rows = resolve(options["methods"])
+        asked = pairs_of_rows(dataset, rows, pairs_per_category, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
     summary = evaluate(
         dataset.root,
-        backbone,
-        methods,
-        pairs_per_category,
-        targets,
-        out,
+        pairs=pairs_per_category,
         executor=workers,
-        row_seconds=row_seconds,
-        seeds=seeds,
         sweep=sweep or (),
-        metrics=metrics,
+        **options,
     )
     if not quiet:
         print(f"{dataset.root}, backbone {summary['backbone']}, {targets} target views")
         # More rows than the default ones are for the paper's tables.
-        _print_summary(summary, metrics, with_paper=len(summary["methods"]) > 3)
-        print(f"Written: {out / 'summary.json'}, tables/, figures/")
+        _print_summary(summary, options["metrics"], with_paper=len(summary["methods"]) > 3)
+        print(f"Written: {options['out'] / 'summary.json'}, tables/, figures/")
     return None
 
 
