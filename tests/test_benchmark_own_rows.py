@@ -8,15 +8,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
-from types import FunctionType, ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import benchmark_folder
+import cloudpickle
 import numpy as np
 import pytest
 import torch
@@ -30,9 +28,8 @@ from benchmark_folder import (
     run_rows,
     small_folder,
 )
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from refusals import refused
-from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone, true_pose
 
 from zsp_lite import Backbone, Camera, Co3D, Frame, InputError, Sim3, ZeroShotPose, align_category
@@ -41,39 +38,24 @@ from zsp_lite.benchmark import own, runs
 from zsp_lite.benchmark.methods import (
     GROUPS,
     METHODS,
-    Method,
     description,
     resolve,
 )
-from zsp_lite.benchmark.own import StoredPoses, kind_of
+from zsp_lite.benchmark.own import kind_of
 from zsp_lite.benchmark.problem import Answer
 from zsp_lite.benchmark.run import evaluate, open_evaluator
 from zsp_lite.benchmark.runs import LINES, Run, fingerprint, read_run
 from zsp_lite.benchmark.tables import every_table
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.exchange import write_questions
-from zsp_lite.data.frames import mask_to_bbox
-from zsp_lite.data.labels import PoseLabel
 from zsp_lite.data.pairs import category_pairs
 from zsp_lite.errors import FatalError
 from zsp_lite.verified import VerifiedSolver
 from zsp_lite.views import object_crop
 
 NONE = np.zeros((0, 2)), np.zeros((0, 2)), 0.0  # no keypoints
-# The kind of each of the methods of `benchmark_folder`, as `kind_of` names it.
-OWN = {
-    "own_method": "problem",
-    "own_estimator": "estimator",
-    "own_matcher": "matcher",
-    "own_keypoints": "keypoints",
-    "own_solver": "solver",
-}
-LIBRARY = {
-    "pipeline": ZeroShotPose(BACKBONE),
-    "row": Method(settings={"matcher": own_matcher}),
-    "ours": "ours",
-}
-ENOUGH = 3  # the least inliers of a fit: three points determine a pose
+OWN = ("own_method", "own_estimator", "own_matcher", "own_keypoints", "own_solver")
+LIBRARY = {"pipeline": ZeroShotPose(BACKBONE), "ours": "ours"}
 
 
 @pytest.fixture(scope="module")
@@ -85,33 +67,14 @@ def own_run(tmp_path_factory) -> Run:
     return read_run(out)
 
 
-def test_the_kind_of_ones_own_things_is_recognised():
-    assert {name: kind_of(name, getattr(benchmark_folder, name)) for name in OWN} == OWN
-
-
 def test_rows_of_every_kind_answer_every_pair(own_run):
     methods = own_run.summary["methods"]
     assert list(methods) == [*OWN, *LIBRARY]
     assert [row["failed"] for row in methods.values()] == [0] * len(methods)
-
-
-@pytest.mark.parametrize("name, view", [("own_method", 0), ("own_estimator", 1)])
-def test_ones_own_row_chooses_the_view(own_run, name, view):
-    assert set(own_run.row(name)["view"]) == {view}
-
-
-def test_ones_own_solver_fits_a_pose_in_the_first_view(own_run):
-    assert set(own_run.row("own_solver")["view"]) == {0}
-    assert (own_run.row("own_solver")["inliers"] > ENOUGH).all()
-
-
-def test_a_pose_is_fitted_to_ones_own_keypoints(own_run):
+    assert [set(own_run.row(name)["view"]) for name in OWN[:2]] == [{0}, {1}]
     # The pixels of two views are no matches: what they fit is far from the truth, but is fitted.
-    assert (own_run.row("own_keypoints")["inliers"] > ENOUGH).all()
-
-
-def test_a_matcher_is_the_same_row_alone_and_as_a_setting(own_run):
-    assert own_run.row("own_matcher")["error"].equals(own_run.row("row")["error"])
+    for name in ("own_solver", "own_keypoints"):
+        assert (own_run.row(name)["inliers"] > 3).all()  # three points determine a pose
 
 
 def test_ones_own_things_are_rows_by_name_too(own_run, tmp_path):
@@ -121,27 +84,17 @@ def test_ones_own_things_are_rows_by_name_too(own_run, tmp_path):
         assert named.row(name)["error"].equals(own_run.row(name)["error"]), name
 
 
-def test_a_row_that_is_imported_without_a_name_is_called_as_it_is_imported(tmp_path):
-    imported = "benchmark_folder:own_method"
-    assert list(run_rows([imported], tmp_path)) == [imported]
-
-
 @pytest.mark.parametrize(
     "thing, told",
     [
-        (3, "'mine' is of type int, expected"),
         (ZeroShotPose, "'mine' is of type type, expected"),
         (lambda: 0, "a function of one"),
         (lambda a, b, c, d: 0, "a function of one"),
-        (lambda *all: 0, "of one"),
-        (lambda one, *, other: 0, "a function of one"),
         ("benchmark_folder:nothing", "has no attribute 'nothing'"),
         ("nowhere:nothing", "No module named 'nowhere'"),
-        ("./here.py:x", "cannot be imported"),
-        ("", "''|no methods"),
         ("our-bv", "'our-bv' is unknown; `zsp-lite benchmark --list`"),
         ("no/such.csv", "no/such.csv"),
-        ("ours-n0", "a library row another name"),
+        ("ours-n3", "'mine' is .* another name for one of its rows"),
     ],
 )
 def test_what_is_no_method_is_refused_by_one_line_before_anything_is_computed(
@@ -185,7 +138,6 @@ def test_arguments_without_a_default_or_the_attribute_kind_tell_the_kind(thing, 
     [
         ([], "no methods, expected some"),
         (["ours-n0"], "'ours-n0' is unknown"),
-        (["ours-n99999"], "'ours-n99999' is unknown"),
         ({"two\nlines": "ours"}, r"'two\\nlines'.* expected a printable name"),
         (["_hidden:row"], "'_hidden:row'.* not with _ first"),
     ],
@@ -203,64 +155,13 @@ def test_a_rows_name_tells_its_number_of_target_views():
 def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path):
     run_rows({"mine": own_method}, tmp_path)
     run_rows({"mine": own_method, "ours": "ours"}, tmp_path)
-    with pytest.raises(
-        InputError, match="methods of mine .*:own_method, this is .*<lambda>; choose"
-    ):
-        run_rows({"mine": lambda problem: np.eye(3)}, tmp_path)
+    told = "methods of mine .*:own_method, this is .*<lambda>; choose"
+    refused(told, run_rows, {"mine": lambda problem: np.eye(3)}, tmp_path)
 
 
-TAKEN = [
-    "ours",
-    "sift",
-    "ours-n3",
-    "verified-n0",
-    "category",
-    "table1",
-    "SIFT",
-    "Ours (K=50)",
-    "ours@threshold=0.1",
-    "verified-n3@threshold=0.1",
-    "alignment",
-    " ours",
-    "Sift",
-    "OURS (k=50)",
-]
-
-
-class Posing(StoredPoses):
-    """A row that equals every row of the library, and is poses of a file, too."""
-
-    def __eq__(self, other):
-        return True
-
-    def __call__(self, problem):
-        return keep(self._poses, "posing", np.eye(3), problem)
-
-    def remark(self, dataset, pairs):
-        return ""
-
-
-@pytest.mark.parametrize("name", TAKEN)
-def test_nothing_takes_the_name_of_a_row_of_the_library_or_the_paper(name):
-    told = re.escape(
-        f"method {name!r} gives a library row another name, or a name of its or the paper's away"
-    )
-    for thing in (
-        "benchmark_folder:own_method",
-        own_method,
-        "ours-k30",
-        Method(settings={"k": 3}),
-        Posing("", {}, ""),
-    ):
-        refused(told, resolve, {name: thing})
-    refused("or a name of its", resolve, [" sift=benchmark_folder:own_method"])
-    refused("'mine' gives a library row another name", resolve, ["mine=oracle-view-n3"])
-    assert list(resolve(["ours", "default", "verified-n3"])) == [
-        "ours",
-        "ours-bv",
-        "rootsift",
-        "verified-n3",
-    ]
+@pytest.mark.parametrize("name", ["sift", "ours-n3", "ours@threshold=0.1", "table1", "alignment"])
+def test_nothing_takes_the_name_of_a_row_of_the_library(name):
+    refused(f"{name}' is a name of the library's", resolve, {name: own_method})
 
 
 def test_of_two_methods_with_one_name_none_is_lost():
@@ -295,22 +196,6 @@ def test_exact_keypoints_give_the_exact_pose_in_the_view_with_most_of_them():
         assert_allclose(similarity, (1, 0), atol=1e-3)
 
 
-def test_a_matcher_of_keypoints_gets_the_crops_at_the_resolution_of_the_frames(tmp_path):
-    crops = []
-
-    def record(first, second):
-        crops.extend((first, second))
-        return NONE
-
-    run_rows({"mine": record}, tmp_path, pairs=1, targets=1)
-    dataset = Co3D(small_folder())
-    (pair,) = category_pairs(dataset, "lump", 1, 1)
-    reference, (target,) = dataset.load_pair(pair)
-    for crop, frame in zip(crops, (reference, target), strict=True):
-        top, left, height, width = mask_to_bbox(frame.mask)
-        assert_array_equal(crop, frame.rgb[top : top + height, left : left + width])
-
-
 SWEPT = {
     "mine": benchmark_folder.own_keypoints,
     "solved": benchmark_folder.own_solver,
@@ -332,11 +217,6 @@ def sweep(tmp_path_factory) -> Run:
 def test_a_larger_threshold_of_a_sweep_gives_more_inliers(sweep, name):
     few, many = [sweep.row(f"{name}@threshold={value}")["inliers"] for value in THRESHOLDS]
     assert (few < many).all()
-
-
-def test_the_note_of_a_sweep_says_where_it_belongs(sweep):
-    table = next(iter(every_table(sweep.summary)))
-    assert "on validation categories, never on those that are evaluated" in table.note
 
 
 def test_the_default_threshold_in_a_sweep_gives_the_row_without_a_sweep(sweep, tmp_path):
@@ -365,9 +245,10 @@ def test_keypoints_that_fit_no_pose_are_noted(tmp_path):
     rows = {"none": lambda first, second: NONE, "empty": lambda first, second: ([], [], [])}
     methods = run_rows(rows, tmp_path)
     assert [row["failed"] for row in methods.values()] == [0, 0]
-    for name, told in read_run(tmp_path).failures.items():
-        reason = "lump/.*: pose is the best view's, not a fit: got 0 corr"
-        assert re.match(f"{name} has no fit on 1 of 1 pairs; the first, {reason}", told)
+    reason = "lump/.*: pose is the best view's, not a fit: got 0 corr"
+    for name in rows:
+        told = f"{name} has no fit on 1 of 1 pairs; the first, {reason}"
+        assert re.search(told, read_run(tmp_path).summary["note"])
 
 
 @pytest.mark.parametrize(
@@ -375,11 +256,8 @@ def test_keypoints_that_fit_no_pose_are_noted(tmp_path):
     [
         (("a", "b", [1]), "matched points is .a., expected real numbers"),
         ((ONES, ONES[1:], ONES[:, 0]), r"points has shape \(8, 2\), expected .* \(9, 2\)"),
-        ((ONES, ONES, -1.0), "scores of matches are negative or NaN, expected 0 or more"),
         ((ONES, ONES, np.nan), "scores of matches are negative or NaN, expected 0 or more"),
-        ((ONES.T, ONES.T, ONES[:, 0]), "matched points has shape .2, 9., expected"),
         ((5000 * ONES, ONES, 1), r"point \(5000, 5000\) is outside the crop of \d+ x \d+"),
-        ((ONES, -ONES, 1), r"point \(-1, -1\) is outside"),
         ((ONES, np.nan * ONES, 1), r"point \(nan, nan\) is outside"),
     ],
 )
@@ -456,59 +334,33 @@ def test_a_file_without_a_pose_of_the_pairs_or_of_another_view_is_refused(answer
     refused(message, run_rows, rows, out, 4, 3)
 
 
-def test_each_pair_has_its_own_pose_and_missing_ones_are_told(tmp_path, monkeypatch):
-    """Here the pairs differ in a target frame, and both are answered in the frame that they
-    share."""
-    first, second = [Pair("lump", "100_a", 0, "200_b", (3, last)) for last in (4, 5)]
-    rows_of_pairs = dict.fromkeys([first, second], ["both", "one"])
-    monkeypatch.setattr("zsp_lite.benchmark.run.pairs_of_rows", lambda *_: rows_of_pairs)
-    one = [COLUMNS, f'"{first.key}",3,1 0 0 0 1 0 0 0 1,,']
-    both = [*one, f'"{second.key}",3,0 -1 0 1 0 0 0 0 1,,']
-    (tmp_path / "one.csv").write_text("\n".join(one))
-    (tmp_path / "both.csv").write_text("\n".join(both))
-    files = {name: f"{tmp_path / name}.csv" for name in ("both", "one")}
-    rows = run_rows(files, tmp_path / "run", 2)
-    found = read_run(tmp_path / "run")
-    assert [(row["n"], row["failed"]) for row in rows.values()] == [(2, 0), (2, 1)]
-    assert found.row("both")["error"].nunique() == 2
-    (failure,) = found.failures.values()
-    reason = f"one failed on 1 of 2 pairs, counted as 180°; the first, {second.key}: .*has no pose"
-    assert re.match(reason, failure)
-    assert failure in next(iter(every_table(found.summary))).note
-
-
 FLIP = np.diag([1.0, -1.0, -1.0])
-CONVENTIONS = {
-    "": lambda R: R,
-    "inverted": lambda R: R.T,
-    "conjugated by diag(1, -1, -1)": lambda R: FLIP @ R @ FLIP,
-    "inverted and conjugated by diag(1, -1, -1)": lambda R: FLIP @ R.T @ FLIP,
-    "conjugated by diag(-1, -1, 1)": lambda R: R * np.outer((-1, -1, 1), (-1, -1, 1)),
-}
 
 
-@pytest.mark.parametrize("convention", [*CONVENTIONS, "none", "inverted in eight of twelve"])
+@pytest.mark.parametrize(
+    "convention, turned",
+    [
+        ("", lambda R, index: R),
+        ("inverted and conjugated by diag(1, -1, -1)", lambda R, index: FLIP @ R.T @ FLIP),
+        # As of a method that confuses left and right.
+        ("inverted in eight of twelve", lambda R, index: R.T if index < 8 else R),
+    ],
+)
 def test_a_spreadsheets_poses_are_read_and_the_note_names_their_convention(
-    tmp_path, caplog, convention
+    tmp_path, caplog, convention, turned
 ):
     dataset = Co3D(small_folder())
     # As spreadsheets write where numbers have commas; the first pose fits no pair.
     lines = [COLUMNS.replace(",", ";"), "lump/x:1/y:2;2;1 0 0 0 1 0 0 0 1;;"]
     for index, pair in enumerate(category_pairs(dataset, "lump", 12, 3)):
-        true = exact_pose(dataset, pair).R
-        if convention == "none":
-            rotation = Rotation.random(random_state=index).as_matrix()
-        elif convention in CONVENTIONS:
-            rotation = CONVENTIONS[convention](true)
-        else:  # as of a method that confuses left and right
-            rotation = true.T if index < 8 else true
+        rotation = turned(exact_pose(dataset, pair).R, index)
         numbers = " ".join(f"{value:.4f}".replace(".", ",") for value in rotation.ravel())
         lines.append(f"{pair.key};{pair.target_frames[1]};{numbers};;")
     (tmp_path / "mine.csv").write_text("\ufeff" + "\r\n".join(lines), "utf-8")
     run_rows({"mine": str(tmp_path / "mine.csv")}, tmp_path / "run", 12, 3)
     found = read_run(tmp_path / "run")
     run_rows(["oracle-view"], tmp_path / "run", 12, 3)  # the note stays with the row
-    named = convention in CONVENTIONS and convention != ""
+    named = convention.startswith("inverted and")
     told = "mine: 1 of 13 poses fit no pair"
     if named:
         told += f"; rotations agree with the labels if {convention}: median 0° in place of "
@@ -524,15 +376,9 @@ RIGHT = '"lump/a:0/b:1,5",1,1 0 0 0 1 0 0 0 1,0 0 1,1'
 @pytest.mark.parametrize(
     "text, told",
     [
-        ("", "a CSV file"),
         ("\xff", "codec.* a CSV file"),
         (f"{COLUMNS}\nlump/a:0/b:1", "line 2: "),
         ("pair,scale", "columns target_frame, rotation"),
-        (f"{COLUMNS}\n{RIGHT}x", "line 2: .*1x"),
-        (
-            f"{COLUMNS}\n{RIGHT}\n{RIGHT.replace('0 0 0 1,', '0 0 0,')}",
-            "line 3: rotation has shape .8,., exp",
-        ),
         (f"{COLUMNS}\n\n{RIGHT.replace(',1 0', ',nan 0')}", "line 3: rotation holds nan"),
         (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',-1 0')}", "line 2: "),
         (f"{COLUMNS}\n{RIGHT[:-1]}0", "scale is 0.0"),
@@ -545,7 +391,6 @@ RIGHT = '"lump/a:0/b:1,5",1,1 0 0 0 1 0 0 0 1,0 0 1,1'
             f"{COLUMNS}\n{RIGHT}\n\n{RIGHT.replace(',1,1', ',5,1')}",
             "line 4: second pose of the pair of line 2",
         ),
-        (f"{COLUMNS}\n{RIGHT},surplus", "line 2: more fields than the header"),
         (
             f"{COLUMNS}\n{RIGHT}".replace('"', ""),
             "line 2: more fields than the header; a pair has commas and needs quotes",
@@ -576,21 +421,12 @@ def asked_pairs(dataset: Co3D) -> list[Pair]:
     return [*category_pairs(dataset, "lump", 2, 3), *category_pairs(dataset, "pebble", 1, 3)]
 
 
-def test_the_questions_have_a_line_for_each_frame(asked):
-    expected = []
-    for pair in asked_pairs(Co3D(small_folder())):
-        reference = ("reference", pair.category, pair.reference_sequence, pair.reference_frame)
-        targets = [
-            ("target", pair.category, pair.target_sequence, number) for number in pair.target_frames
-        ]
-        expected += [[pair.key, *map(str, frame)] for frame in (reference, *targets)]
-    columns = ("pair", "role", "category", "sequence", "frame")
-    assert [[line[name] for name in columns] for line in asked] == expected
-
-
 def test_the_questions_have_the_files_and_the_camera_of_each_frame(asked):
     dataset = Co3D(small_folder())
     points = np.random.default_rng(0).normal(size=(20, 3))
+    keys = [pair.key for pair in asked_pairs(dataset) for _ in pair.frames]
+    assert [line["pair"] for line in asked] == keys
+    assert [line["role"] for line in asked] == 3 * ["reference", *3 * ["target"]]
     for line in asked:
         assert all((dataset.root / line[name]).is_file() for name in ("image", "depth", "mask"))
         assert float(line["depth_scale"]) > 0
@@ -605,7 +441,8 @@ def test_the_questions_have_the_files_and_the_camera_of_each_frame(asked):
 
 
 def test_a_row_is_remembered_by_its_settings_and_the_names_of_its_functions():
-    rows = resolve({"own": own_method, "matcher": own_matcher})
+    rows = resolve({"own": own_method, "matcher": own_matcher, "object": ZeroShotPose(BACKBONE)})
+    assert "zsp_lite.pipeline:ZeroShotPose(" in description(rows.pop("object"))
     rows |= resolve(["ours-k30", "verified-mask-n3"])
     assert {name: description(row) for name, row in rows.items()} == {
         "own": "backbone; pose; benchmark_folder:own_method",
@@ -613,11 +450,6 @@ def test_a_row_is_remembered_by_its_settings_and_the_names_of_its_functions():
         "ours-k30": "backbone; pose; k=30",
         "verified-mask-n3": "backbone; pose; foreground=mask, solver=verified; 3 views",
     }
-
-
-def test_a_row_of_an_estimator_is_remembered_by_its_class_and_settings():
-    (estimator,) = resolve({"object": ZeroShotPose(BACKBONE, k=7)}).values()
-    assert re.search(r"zsp_lite\.pipeline:ZeroShotPose.*k=7", description(estimator))
 
 
 def test_no_two_rows_of_the_library_have_one_description():
@@ -646,6 +478,7 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
     [
         lambda problem: "north",
         lambda problem: np.diag([1.0, 1.0, -1.0]),  # a mirror
+        lambda problem: Answer(2 * np.eye(3)),
         lambda problem: (np.eye(3), 2),  # there are two views, 0 and 1
         lambda problem: Answer(np.eye(3), translation=np.full(3, np.nan)),
         lambda problem: Answer(np.eye(3), inliers="many"),
@@ -656,14 +489,6 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
 def test_an_answer_is_a_rotation_in_a_view_or_the_pair_fails(tmp_path, row):
     figures = run_rows({"mine": row}, tmp_path)["mine"]
     assert (figures["failed"], figures["median"]) == (1, 180)
-
-
-def test_the_reason_of_a_failure_is_logged_and_noted(tmp_path, caplog):
-    row = run_rows({"large": lambda problem: Answer(2 * np.eye(3))}, tmp_path)["large"]
-    assert (row["failed"], row["median"]) == (1, 180)
-    told = r"large failed on 1 of 1 pairs, counted as 180°; the first, lump/.*: Sim3: R is \[\[2.0"
-    for text in (caplog.text, next(iter(every_table(read_run(tmp_path).summary))).note):
-        assert re.search(told, text)
 
 
 def test_what_an_answer_says_besides_is_stored_rounded_and_cut(tmp_path):
@@ -711,8 +536,7 @@ class Vandal:
         return np.eye(3)
 
 
-@pytest.mark.parametrize("order", ["own first", "own last"])
-def test_rows_do_not_reach_each_other_in_any_order(tmp_path, library_alone, order):
+def test_rows_do_not_reach_each_other(tmp_path):
     vandal = Vandal()
     own = {
         "problem": vandal.problem,
@@ -720,30 +544,12 @@ def test_rows_do_not_reach_each_other_in_any_order(tmp_path, library_alone, orde
         "keypoints": vandal.keypoints,
         "estimator": vandal,
     }
-    library = dict(zip(UNREACHED, UNREACHED))
-    run_rows(own | library if order == "own first" else library | own, tmp_path, 2)
-    for name in UNREACHED:
-        results, expected = [run.row(name) for run in (read_run(tmp_path), library_alone)]
+    library = ("verified", "sift", "ours-mask", "icp", "scans-2")
+    run_rows(library, tmp_path / "alone", 2)
+    run_rows(own | dict(zip(library, library)), tmp_path / "after", 2)
+    for name in library:
+        results, expected = [read_run(tmp_path / run).row(name) for run in ("after", "alone")]
         assert results.drop(columns="seconds").equals(expected.drop(columns="seconds")), name
-
-
-UNREACHED = ("ours", "verified", "sift", "ours-mask", "icp", "scans-2")
-
-
-@pytest.fixture(scope="module")
-def library_alone(tmp_path_factory) -> Run:
-    """A run without rows of one's own."""
-    out = tmp_path_factory.mktemp("alone")
-    run_rows(UNREACHED, out, 2)
-    return read_run(out)
-
-
-@pytest.mark.slow
-def test_workers_may_have_another_current_folder_than_the_run(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with ProcessPoolExecutor(1, get_context("spawn"), os.chdir, ("/",)) as executor:
-        found = evaluate(small_folder(), "zsp-tiny", ["icp"], {"lump": 2}, 2, "run", executor)
-    assert found["methods"]["icp"]["n"] == 2
 
 
 def fails(problem):
@@ -781,14 +587,7 @@ def keep(handed: dict[str, tuple], name: str, answer, *things):
 def test_a_row_that_fails_does_not_stop_the_others(workers, tmp_path, monkeypatch, caplog):
     rows = {
         "problem": (fails, r"/.*test_benchmark_own_rows.py, line \d+: KeyError: 'angle'"),
-        "estimator": (
-            SimpleNamespace(estimate=lambda reference, targets: fails(None)),
-            ".*KeyError",
-        ),
-        "keypoints": (lambda first, second: fails(None), ".*KeyError"),
-        "matcher": (lambda similarity, first, second: fails(None), ".*KeyError"),
-        "solver": (lambda reference, targets, matched, seed, threshold: fails(None), ".*KeyError"),
-        "no estimate": (
+        "solver": (
             lambda reference, targets, matched, seed, threshold: np.eye(3),
             ".*AttributeError",
         ),
@@ -797,24 +596,22 @@ def test_a_row_that_fails_does_not_stop_the_others(workers, tmp_path, monkeypatc
         "backbone": (ZeroShotPose(lambda images: []), ".*FatalError: backbone .* returned 0"),
         "endless": (never_ends, "takes more than 1 s"),
         "untold": (untold, ".*Untold: <exception str"),
-        "memory": (lambda problem: np.zeros(10**15), ".*MemoryError: "),
         "else": (lambda problem: os.chdir("/"), ""),
-        "unsure": (
-            lambda problem: Answer(np.eye(3), confidence=np.nan),
-            ".*Error: Expected `float`",
-        ),
-        **({"thread": (leaves_a_thread, "pose of the row is None")} if workers > 1 else {}),
+        **({"thread": (leaves_a_thread, "Sim3: R is None")} if workers > 1 else {}),
     }
     monkeypatch.chdir(tmp_path)
     every = {name: row for name, (row, _) in rows.items()} | {"ours": "ours"}
-    found = evaluate(
-        small_folder(), BACKBONE, every, {"lump": 2}, 2, "run", workers, row_seconds=1
-    )["methods"]
+    options = {"executor": workers, "row_seconds": 1}
+    summary = evaluate(small_folder(), BACKBONE, every, {"lump": 2}, 2, "run", **options)
+    found = summary["methods"]
     assert found.pop("ours") == run_rows(["ours"], tmp_path / "alone", 2)["ours"]
+    note = next(iter(every_table(summary))).note
     for name, (_, told) in rows.items():
         assert re.match(told, read_run("run").row(name)["failed"].iloc[0])
         assert found[name]["median"] == 180
-        assert f"{name} failed on 2 of 2 pairs" in caplog.text
+        reason = f"{name} failed on 2 of 2 pairs, counted as 180°; the first, lump/"
+        assert reason in caplog.text
+        assert reason in note
 
 
 def test_a_row_that_ends_at_its_time_limit_leaves_nothing_behind():
@@ -824,52 +621,6 @@ def test_a_row_that_ends_at_its_time_limit_leaves_nothing_behind():
             time.sleep(delay)
     assert threading.active_count() == threads
     sum(range(100_000))  # long enough for an exception that comes too late
-
-
-def test_the_time_limit_is_not_entered_by_a_profiler():
-    """Python 3.11 never enters a function under a profiler or debugger while it waits for what was
-    raised from outside."""
-    profiled = "import sys; sys.setprofile(lambda *_: None); (lambda: None)()"
-    watched = (
-        f"from zsp_lite.benchmark.own import fails_alone\nwith fails_alone(1): pass\n{profiled}"
-    )
-    subprocess.run([sys.executable, "-c", watched], check=True, timeout=60)
-
-
-INNER = (
-    "__dict__",
-    "__self__",
-    "__func__",
-    "__wrapped__",
-    "func",
-    "args",
-    "keywords",
-    "__closure__",
-    "cell_contents",
-    "__defaults__",
-    "__kwdefaults__",
-)
-ENDS = ModuleType | type | torch.nn.Module | torch.Tensor | np.ndarray
-
-
-def reached(thing) -> list:
-    """Return all that an object leads to, up to torch's modules, arrays and functions of installed
-    packages."""
-    seen, todo = {}, [thing]
-    while todo:
-        thing = todo.pop()
-        if id(thing) in seen or isinstance(thing, ENDS):
-            continue
-        seen[id(thing)] = thing
-        if isinstance(thing, FunctionType) and "site-packages" in thing.__code__.co_filename:
-            continue
-        names = *INNER, *getattr(thing, "__slots__", ())
-        todo += [getattr(thing, name) for name in names if hasattr(thing, name)]
-        if isinstance(thing, Mapping):
-            todo += [*thing.keys(), *thing.values()]
-        if isinstance(thing, list | tuple | set):
-            todo += thing
-    return list(seen.values())
 
 
 def test_nothing_that_a_row_of_ones_own_gets_leads_to_a_label_or_names_an_object(tmp_path):
@@ -888,8 +639,6 @@ def test_nothing_that_a_row_of_ones_own_gets_leads_to_a_label_or_names_an_object
     matcher.kind, solver.kind = "matcher", "solver"
     rows = {
         "problem": problem,
-        "method": Method(solve=lambda one: keep(handed, "method", np.eye(3), one)),
-        "posing": Method(solve=Posing("", handed, "")),
         "estimator": SimpleNamespace(
             estimate=lambda *frames: keep(handed, "estimator", np.eye(3), frames)
         ),
@@ -901,10 +650,9 @@ def test_nothing_that_a_row_of_ones_own_gets_leads_to_a_label_or_names_an_object
     methods = run_rows({"icp": "icp", "scans-2": "scans-2"} | rows, tmp_path)
     assert {row["failed"] for row in methods.values()} == {0}
     assert handed.keys() == rows.keys()
-    for thing in reached(handed):
-        assert not isinstance(thing, Co3D | Path | PoseLabel | Pair), thing
-        if isinstance(thing, str):
-            assert not any(name in thing for name in (str(small_folder()), *SEQUENCES)), thing
+    content = cloudpickle.dumps(handed)
+    for word in (*SEQUENCES, str(small_folder()), "Co3D", "PoseLabel"):
+        assert word.encode() not in content
 
 
 def test_the_pairs_seed_goes_to_every_row_that_takes_one(tmp_path):
@@ -960,13 +708,12 @@ class Broken(CoordinateBackbone):
             lambda maps: [replace(one, keys=one.keys * float("nan")) for one in maps],
             "values that are not finite",
         ),
-        (lambda maps: [replace(one, keys=one.keys[:, :0]) for one in maps], "have shapes"),
         (lambda maps: maps[1:], r"returned \d of"),
         (lambda maps: maps[9], "IndexError"),
     ],
 )
 @pytest.mark.parametrize(
-    "run", ["ours", "category", lambda problem: problem.views() and np.eye(3), own_matcher, "align"]
+    "run", ["ours", "category", lambda problem: problem.views() and np.eye(3), "align"]
 )
 def test_a_broken_backbone_ends_the_run_and_nothing_is_stored(
     tmp_path, monkeypatch, wrong, told, run
@@ -981,9 +728,8 @@ def test_a_broken_backbone_ends_the_run_and_nothing_is_stored(
     assert not (tmp_path / LINES).read_bytes()
 
 
-@pytest.mark.parametrize("run", ["category", "align"])
 def test_an_unreadable_frame_ends_the_run_and_nothing_is_stored_for_its_pairs(
-    tmp_path, run, monkeypatch
+    tmp_path, monkeypatch
 ):
     def read(dataset, annotation):
         if annotation.sequence_name == "300_c":
@@ -993,19 +739,13 @@ def test_an_unreadable_frame_ends_the_run_and_nothing_is_stored_for_its_pairs(
     load = Co3D.load
     monkeypatch.setattr(Co3D, "load", read)
     with pytest.raises(FatalError, match="300_c cannot be decoded"):
-        if run == "align":
-            align_category(Co3D(small_folder()), "lump", BACKBONE, targets=2, out=tmp_path)
-        else:
-            run_rows(["category"], tmp_path, targets=2)
+        run_rows(["category"], tmp_path, targets=2)
     assert "300_c" not in (tmp_path / LINES).read_text()
-
-
-def test_no_row_has_the_name_of_a_group():
-    assert not GROUPS.keys() & METHODS.keys()
 
 
 @pytest.mark.parametrize("name", GROUPS)
 def test_a_row_of_a_group_is_taken_once_only(name):
+    assert name not in METHODS
     rows = list(resolve(name))
     assert list(resolve([name, rows[-1]])) == rows
 
@@ -1018,6 +758,7 @@ def test_a_fingerprint_tells_apart_whatever_changes_the_features():
         return fingerprint(Backbone(vit, "same name", device="cpu", **options))
 
     plain = of()
+    assert plain.startswith("same name ")
     assert plain == of(layer=2, facet="key", mean=[0.485, 0.456, 0.406])  # the defaults
     changed = [
         of(layer=1),
@@ -1031,23 +772,6 @@ def test_a_fingerprint_tells_apart_whatever_changes_the_features():
     with torch.no_grad():
         vit.cls_token += 1
     assert of() != plain
-
-
-def test_a_backbone_that_is_a_function_is_known_by_its_name():
-    def grey(images):
-        return BACKBONE([image // 2 for image in images])
-
-    assert fingerprint(grey) == f"{__name__}:{grey.__qualname__}"
-
-
-def test_a_backbone_of_ones_own_is_known_by_its_name_and_its_weights():
-    def weighed(value: float):
-        return SimpleNamespace(name="weighed", state_dict=lambda: {"value": torch.tensor(value)})
-
-    first = fingerprint(weighed(1.0))
-    assert first.startswith("weighed ")
-    assert first == fingerprint(weighed(1.0))
-    assert first != fingerprint(weighed(2.0))
 
 
 def test_the_library_is_known_by_version_and_commit(tmp_path, monkeypatch):

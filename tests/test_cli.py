@@ -16,6 +16,7 @@ from synthetic_views import CoordinateBackbone
 
 from zsp_lite import __version__, errors
 from zsp_lite.backbones.load import BackboneConfig
+from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.cli import demo, doctor
 from zsp_lite.cli.estimate import estimate
 from zsp_lite.cli.main import cli, main
@@ -295,7 +296,7 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
     given = []
 
     def record(*arguments, **options):
-        given.append((*arguments, *options.values()))
+        given.append((*arguments, options))
         raise errors.InputError("reached")
 
     monkeypatch.setattr("zsp_lite.benchmark.run.evaluate", record)
@@ -304,16 +305,26 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
         "--pairs 7 --targets 3 --methods ours,x=a:b --out there --quiet"
     )
     config, numbers = BackboneConfig("small", "3", "value", 64), {"lump": 7, "chair": 7}
-    common = (tmp_path, config, ["ours", "x=a:b"], numbers, 3, Path("there"))
-    # Workers, seconds of a row, seeds and thresholds.
-    for more, last in (
-        ("--workers 5", (5, 60, 1, ())),
-        ("--row-seconds 9", (1, 9, 1, ())),
-        ("--seeds 3 --sweep threshold=0.1,0.2", (1, 60, 3, [0.1, 0.2])),
+    common = {
+        "backbone": config,
+        "methods": ["ours", "x=a:b"],
+        "pairs": numbers,
+        "targets": 3,
+        "out": Path("there"),
+        "executor": 1,
+        "row_seconds": 60,
+        "seeds": 1,
+        "sweep": (),
+        "metrics": list(METRICS_SHOWN),
+    }
+    for more, changed in (
+        ("--workers 5", {"executor": 5}),
+        ("--row-seconds 9 --metrics scale", {"row_seconds": 9, "metrics": ["scale"]}),
+        ("--seeds 3 --sweep threshold=0.1,0.2", {"seeds": 3, "sweep": [0.1, 0.2]}),
     ):
         assert main(f"{line} {more}".split()) == 2
-        assert given.pop() == common + last
-        assert not given
+        assert given == [(tmp_path, common | changed)]
+        given.clear()
 
 
 @pytest.fixture

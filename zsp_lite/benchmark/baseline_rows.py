@@ -13,10 +13,9 @@ from zsp_lite.alignment import Sim3, umeyama
 from zsp_lite.baselines.geometry import align
 from zsp_lite.baselines.sift import mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints
-from zsp_lite.benchmark.problem import Answer, PairProblem
+from zsp_lite.benchmark.problem import Answer, PairProblem, evenly_spaced
 from zsp_lite.best_view import score_from_cosines
 from zsp_lite.category import CategoryAlignment, synchronise
-from zsp_lite.data.pairs import spread
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.shapes import compare_headings
@@ -106,16 +105,11 @@ class Scans:
         pair's own ones on: as many as the pair has views, or as are solved."""
         pair = problem.pair
         numbers = problem.store.dataset.frame_numbers(pair.category)
-        frames = {}
-        for name, start in (
-            (pair.reference_sequence, pair.reference_frame),
-            (pair.target_sequence, pair.target_frames[0]),
-        ):
+        ordered = {}
+        for name, start in pair.frames[:2]:
             first = numbers[name].index(start)
-            ordered = numbers[name][first:] + numbers[name][:first]
-            steps = spread(max(self.references, len(pair.target_frames)), len(ordered))
-            frames[name] = tuple(ordered[step] for step in steps)
-        return frames
+            ordered[name] = numbers[name][first:] + numbers[name][:first]
+        return evenly_spaced(ordered, max(self.references, len(pair.target_frames)))
 
 
 def shape_upright(problem: PairProblem) -> Answer:

@@ -131,32 +131,27 @@ def resolve(
     """
     if not isinstance(methods, Mapping):
         names = [methods] if isinstance(methods, str) else methods
-        meanings = {}
+        methods = {}
         for row in [row for name in names for row in _members(name)]:
             # "NAME=MEANING", or a name that means itself.
             name, _, meaning = row.partition("=")
             meaning = meaning or name
-            if meanings.setdefault(name.strip(), meaning) != meaning:
+            if methods.setdefault(name, meaning) != meaning:
                 raise InputError(
                     f"methods {', '.join(names)} are two of one name, expected one of each"
                 )
-        methods = meanings
-    methods = {str(name): meant for name, meant in methods.items()}
     if not methods:
         raise InputError("no methods, expected some; `zsp-lite benchmark --list` lists them")
-    labels = [line["label"] for table in read_paper_tables() for line in table["rows"]]
     # "alignment" is the row that `align` stores.
-    taken = {name.casefold() for name in (*METHODS, *GROUPS, *labels, "alignment")}
+    taken = {*METHODS, *GROUPS, "alignment"}
     for name, meant in methods.items():
         # Tables have a line for each row, and legends of figures no name with an underscore.
         if not name.isprintable() or name.startswith("_"):
             raise InputError(f"method {name!r}: expected a printable name, not with _ first")
-        plain = name.strip().casefold()
         text = meant if isinstance(meant, str) else ""
-        if text != name and taken & {plain, base_name(plain), base_name(text)}:
+        if text != name and taken & {base_name(name), base_name(text)}:
             raise InputError(
-                f"method {name!r} gives a library row another name, or a name of its or the "
-                "paper's away"
+                f"method {name!r} is a name of the library's, or another name for one of its rows"
             )
     rows = {name: _method(name, meant) for name, meant in methods.items()}
     return _swept(rows, sweep) if sweep else rows

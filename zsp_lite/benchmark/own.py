@@ -3,7 +3,7 @@ another program computed."""
 
 import ctypes
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import chdir, contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -41,18 +41,17 @@ def kind_of(name: str, thing: Any) -> str:
         if getattr(thing, "kind", None) in KINDS:
             return thing.kind
         known = parameters(thing)
-        # The kinds of the parameters that have to be given; `**options` need not be.
+        positional = Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD
         needed = [
-            parameter.kind
+            name
             for name, parameter in known.items()
             if name not in ("seed", "threshold")
             and parameter.default is Parameter.empty
-            and parameter.kind is not Parameter.VAR_KEYWORD
+            and parameter.kind in positional
         ]
-        positional = {Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD}
-        if {*needed} <= positional and 1 <= len(needed) <= 3:
-            if len(needed) == 3 and known.keys() >= {"seed", "threshold"}:
-                return "solver"
+        if len(needed) == 3 and known.keys() >= {"seed", "threshold"}:
+            return "solver"
+        if 1 <= len(needed) <= 3:
             return KINDS[len(needed) - 1]
     raise InputError(
         f"method {name!r} is of type {type(thing).__name__}, expected a function of one argument "
@@ -101,8 +100,8 @@ def fails_alone(seconds: int) -> Iterator[None]:
 
 def problem_of_own(solve: Any, problem: PairProblem) -> Problem:
     """Return the problem that a row of one's own gets: copies that do not lead to the data set and
-    its labels. A matcher or solver of the paper's method gets no problem."""
-    if solve is None:
+    its labels. A matcher or solver of the paper's method, and stored poses, get no problem."""
+    if solve is None or isinstance(solve, StoredPoses):
         return problem
     if not isinstance(solve, Estimator | KeypointMatcher):
         return Problem(problem.seed, deepcopy(problem.crops), problem.store.extractors, {})
@@ -206,6 +205,8 @@ class StoredPoses:
         view = problem.pair.target_frames.index(pose.target_frame)
         return Answer(pose.rotation, view, pose.translation, pose.scale)
 
-    def remark(self, dataset: Co3D, pairs: Sequence[Pair]) -> str:
-        """Remark on the poses of these pairs (see `exchange.check_poses`)."""
-        return check_poses(self.path, self._poses, dataset, pairs)
+    def remark(self, name: str, dataset: Co3D, work: Mapping[Pair, list[str]]) -> str:
+        """Remark on the poses of the row's pairs (see `exchange.check_poses`); "" is no remark."""
+        asked = [pair for pair, names in work.items() if name in names]
+        remark = check_poses(self.path, self._poses, dataset, asked)
+        return f"{name}: {remark}." if remark else ""

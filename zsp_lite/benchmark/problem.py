@@ -14,7 +14,6 @@ from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.best_view import ViewMatch
 from zsp_lite.category import (
     CategoryAlignment,
     PairHypotheses,
@@ -26,7 +25,7 @@ from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import spread
-from zsp_lite.errors import InputError, NoPoseError, ends_the_run, real_array, rotation_matrix
+from zsp_lite.errors import InputError, NoPoseError, ends_the_run
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.judge import REFERENCES, Question, asked_positions, judge_pairs
 from zsp_lite.matching import similarities
@@ -83,21 +82,16 @@ def as_answer(found: Any) -> Answer:
         sim3 = found.sim3
         inliers = int(found.inliers.sum())
         return Answer(sim3.R, found.view, sim3.t, sim3.scale, found.note, inliers, found.confidence)
-    if isinstance(found, Answer):
-        # Sim3 refuses what is no pose.
-        scale = 1.0 if found.scale is None else found.scale
-        if found.translation is None:
-            return replace(found, rotation=Sim3(scale, found.rotation, np.zeros(3)).R)
-        exact = Sim3(scale, found.rotation, found.translation)
-        return replace(found, rotation=exact.R, translation=exact.t)
-    pose = found
-    view = 0
-    if isinstance(found, tuple) and len(found) == 2:
-        pose, view = found
-    if isinstance(pose, Sim3):
-        return Answer(pose.R, int(view), pose.t, pose.scale)
-    what = "pose of the row"
-    return Answer(rotation_matrix(what, real_array(what, pose, (3, 3))), int(view))
+    if not isinstance(found, Answer):
+        pose, view = found if isinstance(found, tuple) and len(found) == 2 else (found, 0)
+        if isinstance(pose, Sim3):
+            return Answer(pose.R, int(view), pose.t, pose.scale)
+        found = Answer(pose, int(view))
+    # Sim3 refuses what is no pose.
+    scale = 1.0 if found.scale is None else found.scale
+    moved = found.translation is not None
+    exact = Sim3(scale, found.rotation, found.translation if moved else np.zeros(3))
+    return replace(found, rotation=exact.R, translation=exact.t if moved else None)
 
 
 def parameters(plugin: Any) -> Mapping[str, inspect.Parameter]:
@@ -127,14 +121,10 @@ class Crop:
 
     frame: Frame
     described: dict[str, Any] = field(default_factory=dict)
-    _views: dict[tuple[str, str], View] = field(default_factory=dict)
 
     def view(self, features: str, foreground: str) -> View:
         """Return the crop with its features and foreground (see `views.frame_view`)."""
-        key = (features, foreground)
-        if key not in self._views:
-            self._views[key] = frame_view(self.frame, self.described[features], foreground)
-        return self._views[key]
+        return frame_view(self.frame, self.described[features], foreground)
 
 
 def evenly_spaced(numbers: Mapping[str, Sequence[int]], count: int) -> dict[str, tuple[int, ...]]:
@@ -203,10 +193,9 @@ class FrameStore:
 
         def ask(questions: list[Question]) -> Iterable[PairHypotheses | None]:
             asked = []
-            for one in questions:
-                number = order[one.reference][one.rank]
-                views = frames[one.target]
-                asked.append(Pair(category, one.reference, number, one.target, views, repeat))
+            for name, rank, other in questions:
+                number = order[name][rank]
+                asked.append(Pair(category, name, number, other, frames[other], repeat))
             return solve(asked) if solve else map(self.hypotheses, asked)
 
         shapes = {}
@@ -288,36 +277,35 @@ class Problem:
     ) -> PoseEstimate:
         """Estimate the pose by `ZeroShotPose` with some settings, in all targets or in the one with
         index `target`."""
-        plugged = dict(settings or {})
+        settings = settings or {}
+        plugins = {
+            name: seeded(value, self.seed) for name, value in settings.items() if callable(value)
+        }
         # Estimates by plug-ins, which may have no hash, are not kept.
-        plugins = [name for name in plugged if callable(plugged[name])]
-        key = None if plugins else (features, target, *sorted(plugged.items()))
+        key = None if plugins else (features, target, *sorted(settings.items()))
         if key in self._estimates:
             return self._estimates[key]
-        # A matcher of one's own may take a seed; a solver gets it when it is called.
-        for name in {*plugins} - {"solver"}:
-            plugged[name] = seeded(plugged[name], self.seed)
-        method = ZeroShotPose(self._extractors[features], **plugged, seed=self.seed)
+        chosen = {**settings, **plugins, "seed": self.seed}
+        method = ZeroShotPose(self._extractors[features], **chosen)
         crops = self.crops if target is None else [self.crops[0], self.crops[1 + target]]
         reference, *targets = [crop.view(features, method.foreground) for crop in crops]
-        matched = [self._match(method, reference, view) for view in targets]
+        matched = []
+        for view in targets:
+            # Rows with other settings share the similarities.
+            compared = reference.features, view.features, method.binning
+            if compared not in self._similarities:
+                with _time_added(self._timings, "similarity"):
+                    self._similarities[compared] = similarities(
+                        reference.features, [view.features], method.binning
+                    )
+            with _time_added(self._timings, "matching"):
+                matched += method.match_views(reference, [view], self._similarities[compared])
         estimate = method.estimate_from_views(reference, targets, matched)
         for stage, seconds in estimate.timings.items():
             self._timings.setdefault(stage, []).append(seconds)
         if key:
             self._estimates[key] = estimate
         return estimate
-
-    def _match(self, method: ZeroShotPose, reference: View, target: View) -> ViewMatch:
-        """Match two views; rows with other settings share the similarities."""
-        key = reference.features, target.features, method.binning
-        if key not in self._similarities:
-            with _time_added(self._timings, "similarity"):
-                self._similarities[key] = similarities(
-                    reference.features, [target.features], method.binning
-                )
-        with _time_added(self._timings, "matching"):
-            return method.match_views(reference, [target], self._similarities[key])[0]
 
 
 class PairProblem(Problem):

@@ -76,6 +76,7 @@ def evaluate(
     row_seconds: int = 60,
     seeds: int = 1,
     sweep: Sequence[float] = (),
+    metrics: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Evaluate rows on pairs of every category, and store every finished pair in the folder of the
     run at once.
@@ -95,10 +96,11 @@ def evaluate(
         row_seconds: Time limit of a row of one's own for a pair, which fails beyond it.
         seeds: Number of evaluations of each pair, with other random draws of k-means and RANSAC.
         sweep: RANSAC thresholds V; each row is evaluated with each, as NAME@threshold=V.
+        metrics: Figures of the table of all rows, if tables and figures are to be written, too
+            (see `write_reports`).
 
     Returns:
-        The summary (see `statistics.summarise`), for callers from Python; nothing is written but
-        the run. `write_reports` computes it again from there, with tables and figures.
+        The summary (see `statistics.summarise`).
 
     Raises:
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds
@@ -126,6 +128,12 @@ def evaluate(
     repeated = {
         replace(pair, repeat=seed): names for seed in range(seeds) for pair, names in work.items()
     }
+    # On poses that another program computed. An empty remark replaces that of an earlier call.
+    remarks = {
+        name: row.solve.remark(name, dataset, work)
+        for name, row in rows.items()
+        if isinstance(row.solve, StoredPoses)
+    }
     # Workers load a named backbone themselves; an object travels to them.
     sent = loaded if executor == 1 else backbone
     opener = partial(open_evaluator, str(Path(data).resolve()), rows, sent, row_seconds)
@@ -138,29 +146,14 @@ def evaluate(
         _hashes(dataset, work),
         pairs=dict(pairs),
         seeds=seeds,
-        remarks=_remarks_on_stored_poses(rows, dataset, work),
+        remarks=remarks,
     ):
         evaluate_pairs(out, opener, repeated, executor)
 
-    # The lines as one table, and its summary.
-    summary = read_run(out).summary
+    summary = write_reports(out, metrics=metrics) if metrics else read_run(out).summary
     if "note" in summary:
         logger.warning("%s", summary["note"])
     return summary
-
-
-def _remarks_on_stored_poses(
-    rows: Mapping[str, Method], dataset: Co3D, work: Mapping[Pair, list[str]]
-) -> dict[str, str]:
-    """Remark on the poses of rows that another program computed, by row; "" is no remark."""
-    remarks = {}
-    for name, row in rows.items():
-        if isinstance(row.solve, StoredPoses):
-            asked = [pair for pair, names in work.items() if name in names]
-            remark = row.solve.remark(dataset, asked)
-            # An empty remark replaces that of an earlier call.
-            remarks[name] = f"{name}: {remark}." if remark else ""
-    return remarks
 
 
 def write_reports(
@@ -181,7 +174,12 @@ def write_reports(
     from zsp_lite.benchmark import tables  # workers need no matplotlib
 
     results = read_run(run)
-    shown = tables.choose(results, rows) if rows else results.summary
+    shown = results.summary
+    if rows:
+        for name in rows:
+            results.row(name)  # InputError for an unknown one
+        methods = {name: shown["methods"][name] for name in rows}
+        shown = shown | {"methods": methods, "chosen": list(rows)}
     out = Path(out or run)
     of_paper = [spec["name"] for spec in read_paper_tables()]
     for name in (*tables.ROW_TABLES, *of_paper):
@@ -265,8 +263,7 @@ def evaluate_pair(
     results = {}
     for name in names:
         method = rows[name]
-        # A class that somebody derives from StoredPoses is one's own, too.
-        own = is_own(name) and type(method.solve) is not StoredPoses
+        own = is_own(name)
         seen = problem_of_own(method.solve, problem) if own else problem
         try:
             with fails_alone(row_seconds) if own else nullcontext():

@@ -85,10 +85,8 @@ class Result(msgspec.Struct, omit_defaults=True):
     translation: float | None = None  # error of the object's centre in diameters of the target
     scale: float | None = None  # estimated over labelled, which is 1
     view: int | None = None
-    # row by row
-    rotation: Annotated[list[float], msgspec.Meta(min_length=9, max_length=9)] | None = None
-    # the pose's translation
-    position: Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)] | None = None
+    rotation: list[float] | None = None  # row by row
+    position: list[float] | None = None  # the pose's translation
     inliers: int | None = None
     seconds: float | None = None
     note: str = ""
@@ -113,8 +111,11 @@ def described(value: Any) -> str:
     name = f"{named.__module__}:{named.__qualname__}"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = [field.name for field in dataclasses.fields(value)]
-        public = [field for field in fields if not field.startswith("_")]
-        texts = [f"{field}={described(getattr(value, field))}" for field in public]
+        texts = [
+            f"{field}={described(getattr(value, field))}"
+            for field in fields
+            if not field.startswith("_")
+        ]
         return f"{name}({', '.join(texts)})"
     return name
 
@@ -162,6 +163,7 @@ class Run:
     """Results of a run on the pairs that the rows of the last call have finished (see
     `read_run`)."""
 
+    folder: str
     settings: Settings
     # A line for each row, pair and seed, in this order: "row", "category", "pair" (its key),
     # "repeat" (of the seed), "problem" (the key without target frames), "reference" and "target"
@@ -183,28 +185,25 @@ class Run:
             "targets": self.settings.targets,
         }
         summary = {"data": data, "backbone": backbone}
-        notes = " ".join(filter(None, [self.note, *self.failures.values()]))
-        if notes:
-            summary["note"] = notes
+        note = " ".join(filter(None, [self.note, *self._failures()]))
+        if note:
+            summary["note"] = note
         return summary | summarise(self.table) | {"timings": self.timings}
 
-    @functools.cached_property
-    def failures(self) -> dict[str, str]:
-        """By row that failed on pairs or answered them without a fit: on how many, and the reason
-        of the first."""
-        pairs = self.table.groupby("row")["pair"].nunique()
-        told: dict[str, str] = {}
-        for column, pattern, what in (
-            ("failed", ".", "failed on {} of {} pairs, counted as 180°"),
-            ("note", "not a fit", "has no fit on {} of {} pairs"),
-        ):
-            lines = self.table[self.table[column].str.contains(pattern)]
-            for name, found in lines.groupby("row", sort=False):
-                first = found.iloc[0]
-                text = what.format(found["pair"].nunique(), pairs[name])
-                text = f"{name} {text}; the first, {first['pair']}: {first[column]}."
-                told[name] = f"{told.get(name, '')} {text}".strip()
-        return told
+    def _failures(self) -> Iterator[str]:
+        """Say of each row on how many pairs it failed, or answered without a fit, and the reason of
+        the first."""
+        for name, row in self.table.groupby("row", sort=False):
+            pairs = row["pair"].nunique()
+            for column, pattern, what in (
+                ("failed", ".", "failed on {} of {} pairs, counted as 180°"),
+                ("note", "not a fit", "has no fit on {} of {} pairs"),
+            ):
+                found = row[row[column].str.contains(pattern)]
+                if len(found):
+                    text = what.format(found["pair"].nunique(), pairs)
+                    first = found.iloc[0]
+                    yield f"{name} {text}; the first, {first['pair']}: {first[column]}."
 
     def row(self, name: str) -> pd.DataFrame:
         """Return the table's lines of a row by pair key; InputError for an unknown row."""
@@ -224,8 +223,6 @@ class Run:
         """Return the pairs for which a row has a pose, the target views, the rotations and the
         translations, or NaN."""
         found = self.row(name).dropna(subset=["rotation", "view"])
-        if found.empty:
-            raise InputError(f"row {name!r} has no poses in the run")
         pairs = [Pair.from_key(key) for key in found.index]
         rotations = np.array(found["rotation"].tolist()).reshape(-1, 3, 3)
         positions = np.array([position or [np.nan] * 3 for position in found["position"]])
@@ -307,17 +304,14 @@ def _continued(out: Path, now: Settings) -> Settings:
 
 def _decisive(settings: Settings) -> dict[str, Any]:
     """Return by name what must be equal in two calls of one run, if both calls have it."""
-    parts = {
+    return {
         "command": "align" if "alignment" in settings.methods else "benchmark",
         "backbone": settings.backbone,
         "targets": settings.targets,
         "data": settings.folder or os.path.realpath(settings.data),
+        **{f"methods of {row}": text for row, text in settings.methods.items()},
+        **{f"images or labels of {name}": code for name, code in settings.objects.items()},
     }
-    for row, description in settings.methods.items():
-        parts[f"methods of {row}"] = description
-    for name, code in settings.objects.items():
-        parts[f"images or labels of {name}"] = code
-    return parts
 
 
 def add_lines(out: str | Path, lines: Iterable[Any]) -> None:
@@ -387,7 +381,7 @@ def read_run(out: str | Path) -> Run:
     for call in settings.calls:
         remarks |= call.remarks
     notes += [remark for name, remark in remarks.items() if name in rows]
-    return Run(settings, table, timings, " ".join(filter(None, notes)))
+    return Run(str(out), settings, table, timings, " ".join(filter(None, notes)))
 
 
 def _table(lines: Sequence[ResultLine], settings: Settings) -> pd.DataFrame:

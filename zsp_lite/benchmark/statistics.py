@@ -6,7 +6,6 @@ each pair.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,17 +24,17 @@ _FEWEST_OBJECTS = 3  # two objects have one pair in each direction: nothing to r
 def summarise(table: pd.DataFrame) -> dict[str, Any]:
     """Summarise the results of a run (see `runs.Run`).
 
-    "methods" has by row, over all pairs and "per_category", what `figures_of` returns, and where
-    they are known "symmetric_acc30" and the medians "translation" and "scale" of the pairs that
-    have them. "against" has the `paired_difference` of each row of the same problems to "ours".
+    "methods" has by row, over all pairs and "per_category", what `figures_of` returns; over all
+    pairs also the paper's average of the categories' medians, and where they are known
+    "symmetric_acc30" and the medians "translation" and "scale" of the pairs that have them.
+    "against" has the `paired_difference` of each row of the same problems to "ours".
     "milliseconds" are medians, too, apart because they differ from run to run. All draws resample
     objects.
     """
-    rows = {str(name): row for name, row in table.groupby("row", sort=False)}
-    ours = rows.get("ours", table[:0])
+    ours = table[table["row"] == "ours"]
     methods = {}
     against = {}
-    for name, row in rows.items():
+    for name, row in table.groupby("row", sort=False):
         drawn = draws_of(row)
         methods[name] = _summarise_row(row, drawn)
         common = ours[ours["repeat"].isin(row["repeat"])]
@@ -53,22 +52,26 @@ def _summarise_row(row: pd.DataFrame, drawn: Draws) -> dict[str, Any]:
     """Summarise the results of one row, for all pairs and by category (see `summarise`)."""
     errors = row["error"].to_numpy()
     categories = row["category"].to_numpy(str)
-    summary = figures_of(errors, drawn, categories)
+    summary = figures_of(errors, drawn)
     summary["failed"] = row.loc[row["failed"] != "", "pair"].nunique()
-    per_category = {}
-    for category in dict.fromkeys(categories):
+    summary["per_category"] = {}
+    medians = []  # of each category by draw
+    for category in np.unique(categories).tolist():
         members = categories == category
-        per_category[category] = figures_of(errors[members], drawn[:, members])
-    summary["per_category"] = per_category
+        summary["per_category"][category] = figures_of(errors[members], drawn[:, members])
+        medians.append(median(errors[members], drawn[:, members]))
+    known = [figures["median"] for figures in summary["per_category"].values()]
+    summary["mean_category_median"] = float(np.mean(known))
+    summary["mean_category_median_ci"] = _interval(np.mean(medians, axis=0))
     seeds = row["repeat"].nunique()
-    for figures in (summary, *per_category.values()):
+    for figures in (summary, *summary["per_category"].values()):
         figures["n"] //= seeds
     if seeds > 1:
         by_seed = (row["error"] < 30).groupby(row["repeat"]).mean()
         summary["acc30_sd_of_seeds"] = float((100 * by_seed).std())
     summary |= row[["translation", "scale"]].astype(float).median().dropna().to_dict()
     if row["symmetric_error"].notna().any():
-        known = row["symmetric_error"].fillna(row["error"]).to_numpy(np.float64)
+        known = row["symmetric_error"].fillna(row["error"]).astype(float)
         summary["symmetric_acc30"] = float(accuracy(known, 30))
     return summary
 
@@ -116,22 +119,17 @@ def object_draws(objects: ArrayLike, categories: ArrayLike = "") -> Draws:
     return weights
 
 
-def pair_draws(n: int) -> Draws:
-    """Draw bootstrap weights of n independent pairs: how often each is drawn, with replacement."""
-    return _multiplicities(n, RESAMPLES, np.random.default_rng(0)).astype(np.float64)
-
-
 def bootstrap_ci(
     errors: ArrayLike, statistic: Callable[..., np.ndarray], weights: Draws | None = None
 ) -> list[float]:
     """Compute the 95 % percentile bootstrap interval of a statistic, such as `median`.
 
     It maps errors (n,) and weights (resamples, n) to (resamples,). Weights are those of
-    `object_draws`; by default of `pair_draws(n)`, which treats pairs as independent.
+    `object_draws`; by default pairs are drawn as if they were independent.
     """
     errors = np.asarray(errors, np.float64)
     if weights is None:
-        weights = pair_draws(len(errors))
+        weights = _multiplicities(len(errors), RESAMPLES, np.random.default_rng(0))
     return _interval(statistic(errors, weights))
 
 
@@ -140,37 +138,20 @@ def _interval(replicates: Float[np.ndarray, " resamples"]) -> list[float]:
     return np.percentile(replicates, [2.5, 97.5]).tolist()
 
 
-def figures_of(
-    errors: ArrayLike, weights: Draws | None = None, categories: np.ndarray | None = None
-) -> dict:
+def figures_of(errors: ArrayLike, weights: Draws | None = None) -> dict:
     """Compute the paper's figures of rotation errors (n,) in degrees, with 95 % intervals (see
     `bootstrap_ci`).
 
     "above150" is the percentage of errors above 150 degrees, mostly confusions of front and back;
     "auc30" the area under the curve of accuracy against the threshold from 0 to 30 degrees, in
-    percent; "mean_category_median", if categories (n,) are given, the paper's average of medians.
+    percent.
     """
     errors = np.asarray(errors, np.float64)
-    figures = dict(_FIGURES)
-    if categories is not None:
-        figures["mean_category_median"] = partial(_mean_category_median, categories=categories)
     values: dict[str, Any] = {"n": int(errors.size)}
-    for name, figure in figures.items():
+    for name, figure in _FIGURES.items():
         values[name] = float(figure(errors, None))
-    for name, figure in figures.items():
         values[f"{name}_ci"] = bootstrap_ci(errors, figure, weights)
     return values
-
-
-def _mean_category_median(
-    errors: Float[np.ndarray, " n"], weights: Draws | None, categories: np.ndarray
-) -> np.ndarray | float:
-    medians = []
-    for category in np.unique(categories):
-        members = categories == category
-        drawn = None if weights is None else weights[:, members]
-        medians.append(median(errors[members], drawn))
-    return np.mean(medians, axis=0)
 
 
 # Statistics of errors (n,) with weights (resamples, n) or None.
@@ -195,7 +176,7 @@ def paired_difference(
     second = np.asarray(second, np.float64)
     gain = 100.0 * (second < threshold) - 100.0 * (first < threshold)
     if weights is None:
-        weights = pair_draws(len(gain))
+        weights = _multiplicities(len(gain), RESAMPLES, np.random.default_rng(0))
     # Rounding errors must not hide a difference of 0.
     replicates = weighted_mean(gain, weights).round(9)
     # Two-sided: twice the share of replicates on the rarer side, the data themselves counted in.

@@ -24,7 +24,6 @@ from zsp_lite.benchmark.runs import Run
 from zsp_lite.benchmark.statistics import draws_of, paired_difference
 from zsp_lite.choices import METRICS, METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.frames import Frame
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import accuracy, median
 from zsp_lite.views import object_crop
@@ -48,17 +47,8 @@ ROW_TABLES = {
     "with_scans": "With several frames of the reference object",
     "with_others": "With other unlabelled objects of the category",
 }
-# Characters that LaTeX reads as commands or does not have in text mode.
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "°": r"$^\circ$",
-    "−": "$-$",
-    **{symbol: f"\\{symbol}" for symbol in "%_&#${}"},
-    **{symbol: f"${symbol}$" for symbol in "<>|"},
-}
-_escape = methodcaller("translate", str.maketrans(_LATEX))
+# Characters that LaTeX does not have in text mode.
+_LATEX = str.maketrans({"°": r"$^\circ$", "−": "$-$", "–": "--", "|": "$|$"})
 
 
 @dataclass(frozen=True)
@@ -86,25 +76,11 @@ class Table:
     title: str
     cells: pd.DataFrame  # of `Cell`, or None
     note: str = ""  # how to read it
-    data: str = ""  # what was evaluated
 
     @property
     def text(self) -> pd.DataFrame:
         """The cells as text, "–" where there is none."""
         return self.cells.map(lambda cell: "–" if cell is None else str(cell))
-
-
-def choose(run: Run, rows: Sequence[str]) -> dict[str, Any]:
-    """Return the summary of a run with some rows, in this order, for the tables; InputError for an
-    unknown row."""
-    for name in rows:
-        run.row(name)
-    notes = [run.note, *(run.failures.get(name, "") for name in rows)]
-    return run.summary | {
-        "note": " ".join(filter(None, notes)),
-        "methods": {name: run.summary["methods"][name] for name in rows},
-        "chosen": list(rows),
-    }
 
 
 def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN) -> list[Table]:
@@ -116,17 +92,17 @@ def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHO
     }
     summary = {**summary, "methods": methods}
     of_paper = [*PAPER, "milliseconds"] if "milliseconds" in metrics else PAPER
-    tables = [
-        *(all_rows(summary, metrics, name) for name in ROW_TABLES),
-        *paper_tables(summary, of_paper),
+    by_row = [_all_rows(summary, metrics, name) for name in ROW_TABLES]
+    papers = [_paper_table(spec, summary, of_paper) for spec in read_paper_tables()]
+    return [
+        *(table for table in by_row if table.cells.size),
+        # With two of the run's rows.
+        *(table for table in papers if table.cells[METRICS["acc30"]].count() > 1),
         *(by_category(summary, metric) for metric in PAPER),
     ]
-    return [table for table in tables if table.cells.size]
 
 
-def all_rows(
-    summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHOWN, table: str = "all_rows"
-) -> Table:
+def _all_rows(summary: Mapping[str, Any], metrics: Sequence[str], table: str) -> Table:
     """Return one of `ROW_TABLES`; rows that see more stand below "verified", which does not."""
     methods = summary["methods"]
     names = [name for name in methods if _table_of(name) == table]
@@ -149,14 +125,7 @@ def all_rows(
         'Acc30 − ours: difference to "ours" on the same pairs, in points, and its p value by the '
         "same bootstrap."
     )
-    return _table(summary, table, ROW_TABLES[table], cells, metrics, gain)
-
-
-def paper_tables(summary: Mapping[str, Any], metrics: Sequence[str] = PAPER) -> list[Table]:
-    """Return tables 1 to 3, those of the supplement and more, where the run has two of
-    their rows."""
-    tables = [_paper_table(spec, summary, metrics) for spec in read_paper_tables()]
-    return [table for table in tables if table.cells[METRICS["acc30"]].count() > 1]
+    return _table(summary, table, ROW_TABLES[table], cells, gain)
 
 
 def _paper_table(
@@ -168,34 +137,32 @@ def _paper_table(
     """
     methods = summary["methods"]
     categories = summary["data"]["categories"]
+    lines = list(spec["rows"])
+    if spec["name"] == "table_1":
+        lines += [{"label": name, "row": name, "published": []} for name in own_rows(summary)]
     # A row at the run's own number of target views goes by either name.
     views = f"-n{summary['data']['targets']}"
-    lines = []  # the name of the row, and the line of the table
-    for line in spec["rows"]:
-        name = line["row"]
-        lines.append((name if name in methods else name.removesuffix(views), line))
-    if spec["name"] == "table_1":
-        lines += [(name, {"label": name, "published": []}) for name in own_rows(summary)]
-    if "chosen" in summary:
-        order = summary["chosen"]
-        lines = [line for line in lines if line[0] in order]
-        lines.sort(key=lambda line: order.index(line[0]))
+    shown = []  # lines, each with the figures of its row
+    for line in lines:
+        row = methods.get(line["row"]) or methods.get(line["row"].removesuffix(views), {})
+        if row or "chosen" not in summary:
+            shown.append((line, row))
 
     # The run's own figures, those of single categories, and the published ones.
-    rows = [methods.get(name, {"per_category": {}}) for name, _ in lines]
-    columns = {METRICS[metric]: [_cell(row, metric) for row in rows] for metric in metrics}
+    columns = {METRICS[metric]: [_cell(row, metric) for _, row in shown] for metric in metrics}
     published = {}
     for place, title in enumerate(spec["published"]):
         category = title.removesuffix(" Acc30")
         if category in categories:
-            columns[title] = [_cell(row["per_category"].get(category, {}), "acc30") for row in rows]
+            parts = [row.get("per_category", {}).get(category, {}) for _, row in shown]
+            columns[title] = [_cell(part, "acc30") for part in parts]
         if category in (title, *categories):
-            figures = [line["published"][place : place + 1] for _, line in lines]
+            figures = [line["published"][place : place + 1] for line, _ in shown]
             published[f"{PUBLISHED}: {title}"] = [Cell(*one) if one else None for one in figures]
-    labels = [line["label"] for _, line in lines]
+    labels = [line["label"] for line, _ in shown]
     cells = pd.DataFrame(columns | published, labels, dtype=object)
     notes = [_PUBLISHED_NOTE if published else "", spec.get("note", "")]
-    return _table(summary, spec["name"], spec["title"], cells, metrics, *notes)
+    return _table(summary, spec["name"], spec["title"], cells, *notes)
 
 
 def by_category(
@@ -211,19 +178,15 @@ def by_category(
         cells[name] = [_cell(part, metric) for part in (*parts, row)]
     name = f"categories_{metric.rpartition('_')[2]}"
     title = f"By category: {METRICS[metric]}"
-    return _table(
-        summary, name, title, pd.DataFrame(cells, [*categories, "all"], dtype=object), [metric]
-    )
+    return _table(summary, name, title, pd.DataFrame(cells, [*categories, "all"], dtype=object))
 
 
-def compare(
-    first: Run, second: Run, rows: Sequence[str] | None = None, names: Sequence[str] = "AB"
-) -> Table:
+def compare(first: Run, second: Run, rows: Sequence[str] | None = None) -> Table:
     """Compare rows of two runs, by default every row that both have, on the pairs that both have
     evaluated.
 
-    Rows are texts "A:B", for row A of the first and B of the second run, or "A"; `names` are those
-    of the runs. InputError if a row or a common pair is missing.
+    Rows are texts "A:B", for row A of the first and B of the second run, or "A". InputError if a
+    row or a common pair is missing.
     """
     of_first = first.table["row"].unique()
     of_second = second.table["row"].unique()
@@ -258,7 +221,7 @@ def compare(
         "On the common pairs. Intervals (95 %) and p: bootstrap over objects. "
         "Of twenty rows without a difference, one has p < 0.05 by chance."
     )
-    title = "A = {}, B = {}".format(*names)
+    title = f"A = {first.folder}, B = {second.folder}"
     return Table("compare", title, pd.DataFrame.from_dict(cells, "index", object, titles), note)
 
 
@@ -297,72 +260,53 @@ def _cell(row: Mapping[str, Any], figure: str) -> Cell | None:
 
 
 def _table(
-    summary: Mapping[str, Any],
-    name: str,
-    title: str,
-    cells: pd.DataFrame,
-    metrics: Sequence[str],
-    *more: str,
+    summary: Mapping[str, Any], name: str, title: str, cells: pd.DataFrame, *more: str
 ) -> Table:
-    """Make a table of a run, with notes on how to read it, and with what the run has evaluated."""
-    data = summary["data"]
-    methods = summary["methods"]
-    notes = [summary.get("note", "")]  # begins with that of `read_run`
-    unfinished = " of an unfinished run" if "Not finished" in notes[0] else ""
-    if "mean_category_median" in metrics:
+    """Make a table of a run, with notes on how to read it."""
+    notes = [summary.get("note", "")]
+    if METRICS["mean_category_median"] in cells:
         notes.append("Med. err.: mean of the categories' medians.")
-    if {"translation", "scale"} & set(metrics):
-        notes.append("Translation and scale: medians of the pairs for which a row has them.")
-    if any("@threshold=" in name for name in methods):
-        notes.append(
-            "A threshold is to be chosen on validation categories, never on those that are "
-            "evaluated."
-        )
-    if "milliseconds" in metrics:
+    if METRICS["milliseconds"] in cells:
         notes.append(
             "ms per pair: median; what rows share, such as features, counts for the first "
             "that needs it."
         )
     notes.append("Intervals: 95 %, bootstrap over objects.")
-    for row in sorted(methods, key="ours".__ne__):  # "ours" first
-        if "acc30_sd_of_seeds" in methods[row]:
-            notes.append(
-                f"Means over seeds, which the intervals hold; by seed, Acc30 of {row} has a "
-                f"standard deviation of {methods[row]['acc30_sd_of_seeds']:.1f} points."
-            )
-            break
-    what = (
-        f"{Path(data['root']).name}, {data['pairs']} pairs{unfinished}, {data['targets']} target "
-        f"views, backbone {summary['backbone']}"
-    )
-    return Table(name, title, cells, " ".join(filter(None, [*notes, *more])), what)
+    deviation = summary["methods"].get("ours", {}).get("acc30_sd_of_seeds")
+    if deviation is not None:
+        notes.append(
+            "Means over seeds, which the intervals hold; by seed, Acc30 of ours has a standard "
+            f"deviation of {deviation:.1f} points."
+        )
+    return Table(name, title, cells, " ".join(filter(None, [*notes, *more])))
 
 
 def as_csv(table: Table) -> str:
     """Format as plain numbers, an interval in two columns of its own."""
     columns = {}
     for title, cells in table.cells.items():
-        for part in ("value", "low", "high"):
-            column = title if part == "value" else f"{title} {part}"
-            columns[column] = [getattr(cell, part, None) for cell in cells]
+        for part, ending in (("value", ""), ("low", " low"), ("high", " high")):
+            columns[title + ending] = [getattr(cell, part, None) for cell in cells]
     numbers = pd.DataFrame(columns, table.cells.index).dropna(axis="columns", how="all")
     return numbers.to_csv(index_label="row", float_format="%.6g")
 
 
 def as_markdown(table: Table) -> str:
     """Format as a pipe table under its title."""
-
-    def escape(name: str) -> str:
-        return name.replace("|", "\\|")
-
+    escape = methodcaller("replace", "|", "\\|")
     text = table.text.rename(index=escape, columns=escape)
-    alignment = ["left", *["right"] * len(text.columns)]
-    lines = text.to_markdown(disable_numparse=True, colalign=alignment)
-    return "\n\n".join(filter(None, [f"**{table.title}**", lines, table.note])) + "\n"
+    parts = [f"**{table.title}**", _lines(text, "pipe"), table.note]
+    return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def _lines(cells: pd.DataFrame, form: str) -> str:
+    """Format texts as the lines of a table in one of tabulate's forms."""
+    alignment = ["left", *["right"] * len(cells.columns)]
+    return cells.to_markdown(tablefmt=form, disable_numparse=True, colalign=alignment)
 
 
 def as_latex(table: Table, intervals: bool = False) -> str:
-    """Format three columns and the time as a booktabs table."""
+    """Format three columns and the time as the body of a booktabs table."""
     time = METRICS["milliseconds"]
     titles = [title for title in table.cells if title not in ("pairs", time)][:3]
     if time in table.cells:
@@ -370,26 +314,9 @@ def as_latex(table: Table, intervals: bool = False) -> str:
     cells = table.text[titles][table.cells[titles].notna().any(axis="columns")]
     if not intervals:
         cells = cells.replace(r" \[.*", "", regex=True)
-    cells = cells.replace("-", "$-$", regex=True).replace("–", "--")
-    # LaTeX counts tables itself
-    title = re.sub(r"^(Table \d+|Supplement|Beyond the paper)\. ", "", table.title)
-    return cells.rename(index=_escape, columns=_escape).to_latex(
-        position="tb",
-        label=f"tab:{table.name}",
-        caption=_escape(". ".join(filter(None, [title, table.data]))),
-        column_format="l" + "r" * len(titles),
-    )
-
-
-def error_distribution(run: Run, row: str = "ours") -> Figure:
-    """Draw the rotation error of every pair, one line per category (figure "err_distrib" of the
-    supplement).
-
-    A second cluster near 180 degrees consists of confusions of front and back.
-    """
-    groups = {str(name): errors for name, errors in run.row(row).groupby("category")["error"]}
-    label = f"rotation error of {row} (degrees)"
-    return show_dots({row: groups}, xlabel=label, xlim=(-3, 183), xticks=range(0, 181, 30))
+    cells = cells.replace(r"(^|\[|, )-", "\\1−", regex=True)
+    lines = _lines(cells, "latex_booktabs")
+    return lines.translate(_LATEX) + "\n"
 
 
 def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
@@ -398,9 +325,7 @@ def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
     curves = {}
     for name in rows or important_rows(run.summary)[: len(COLOURS)]:
         errors = np.sort(run.row(name)["error"])
-        shares = 100 * np.arange(len(errors) + 1) / len(errors)
-        # A step at every error: to the right at the old share, then up.
-        curves[name] = (np.repeat([0, *errors], 2)[1:], np.repeat(shares, 2)[:-1])
+        curves[name] = (errors, 100 * np.arange(1, len(errors) + 1) / len(errors))
     return show_panels(
         {"": curves},
         size=(6.5, 4),
@@ -408,49 +333,43 @@ def error_curves(run: Run, rows: Sequence[str] | None = None) -> Figure:
         ylabel="pairs with at most this error (%)",
         xlim=(0, 180),
         ylim=(0, 100),
-        xticks=(0, 15, 30, 60, 90, 120, 150, 180),
+        xticks=range(0, 181, 30),
     )
 
 
 def pair_figure(run: Run, key: str, dataset: Co3D, rows: Sequence[str] | None = None) -> Figure:
-    """Draw the reference of a pair, and for each row with a pose its target view, below it under
-    the moved points.
+    """Draw the reference of a pair under its points, and for each row with a pose its target view
+    under the moved points.
 
     Without a translation, they are moved to the middle of the target's points. InputError if no row
     has a pose.
     """
-    results = {}
-    for name in rows or run.table["row"].unique():
-        with_pose = run.row(name).dropna(subset=["rotation", "view"])
-        if key in with_pose.index:
-            results[name] = with_pose.loc[[key]].iloc[0]  # of the first seed
-    if not results:
+    found = run.table[run.table["pair"] == key].dropna(subset=["rotation", "view"])
+    found = found.drop_duplicates("row").set_index("row")  # of the first seed
+    results = found.loc[[name for name in rows or found.index if name in found.index]]
+    if results.empty:
         raise InputError(
             f"pair {key!r} has no pose in the run, expected a key such as "
             f"{run.table['pair'].iloc[0]}"
         )
     reference, targets = dataset.load_pair(Pair.from_key(key))
-    chosen = [targets[int(result["view"])] for result in results.values()]
-    crops = [object_crop(frame) for frame in (reference, *chosen)]
+    crops = [object_crop(reference)]
+    titles = ["reference"]
+    poses = [Sim3.identity()]
     cloud = frame_cloud(crops[0])
-    poses = [_pose(result, cloud, crop) for result, crop in zip(results.values(), crops[1:])]
-    errors = [f"{result['error']:.0f}° off" for result in results.values()]
-    images = [crop.rgb for crop in crops]
-    titles = ["reference", *results, "its points", *errors]
-    figure, axes = show_images([*images, *map(pale, images)], titles, len(crops))
-    cameras = [crop.camera for crop in crops]
-    draw_moved_cloud(axes[len(crops) :], cameras, cloud, [Sim3.identity(), *poses])
+    for name, result in results.iterrows():
+        crop = object_crop(targets[int(result["view"])])
+        scale = 1.0 if pd.isna(result["scale"]) else result["scale"]
+        rotation = np.reshape(result["rotation"], (3, 3))
+        position = result["position"]
+        if position is None:
+            position = frame_cloud(crop).mean(axis=0) - scale * rotation @ cloud.mean(axis=0)
+        crops.append(crop)
+        titles.append(f"{name}, {result['error']:.0f}° off")
+        poses.append(Sim3(scale, rotation, np.array(position)))
+    figure, axes = show_images([pale(crop.rgb) for crop in crops], titles, columns=4)
+    draw_moved_cloud(axes, [crop.camera for crop in crops], cloud, poses)
     return figure
-
-
-def _pose(result: pd.Series, cloud: np.ndarray, target: Frame) -> Sim3:
-    """Return the pose of a result; without a translation, the cloud's mean goes to the target's."""
-    scale = 1.0 if pd.isna(result["scale"]) else result["scale"]
-    rotation = np.reshape(result["rotation"], (3, 3))
-    position = result["position"]
-    if position is None:
-        position = frame_cloud(target).mean(axis=0) - scale * rotation @ cloud.mean(axis=0)
-    return Sim3(scale, rotation, np.array(position))
 
 
 def write_figures(
@@ -459,10 +378,17 @@ def write_figures(
     rows: Sequence[str] | None = None,
     size: tuple[float, float] | None = None,
 ) -> None:
-    """Write the errors of the first row by category, and the error curves (see `save_figure`)."""
+    """Write the errors of the first row by category (figure "err_distrib" of the supplement), and
+    the error curves (see `save_figure`).
+
+    A second cluster near 180 degrees consists of confusions of front and back.
+    """
     first = [*(rows or own_rows(run.summary)), *important_rows(run.summary)][0]
+    errors = dict(list(run.row(first).groupby("category")["error"]))
+    label = f"rotation error of {first} (degrees)"
     with plt.rc_context({"text.parse_math": False}):  # names of rows and categories are no TeX
-        save_figure(error_distribution(run, first), folder, "error_distribution", size)
+        dots = show_dots({first: errors}, xlabel=label, xlim=(-3, 183), xticks=range(0, 181, 30))
+        save_figure(dots, folder, "error_distribution", size)
         save_figure(error_curves(run, rows), folder, "error_curves", size)
 
 

@@ -98,27 +98,13 @@ metrics_option = click.option(
 @metrics_option
 @click.option("--quiet", is_flag=True, help="Print no progress bar and no tables.")
 def benchmark(
-    data,
-    backbone,
-    categories,
-    pairs,
-    targets,
-    methods,
-    list_only,
-    list_pairs,
-    out,
-    workers,
-    metrics,
-    quiet,
-    row_seconds,
-    seeds,
-    sweep,
+    data, categories, pairs, list_only, list_pairs, workers, sweep, quiet, **options
 ) -> None:
     """Measure rotation errors over many pairs. OUT gets tables, figures and results."""
     if list_only:
         return _list_methods()
     from zsp_lite.benchmark.methods import resolve
-    from zsp_lite.benchmark.run import evaluate, pairs_of_rows, write_reports
+    from zsp_lite.benchmark.run import evaluate, pairs_of_rows
     from zsp_lite.course.samples import sample_data
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.exchange import write_questions
@@ -128,29 +114,24 @@ def benchmark(
         logging.getLogger("zsp_lite").setLevel(logging.WARNING)
     dataset = Co3D(data or sample_data())
     pairs_per_category = dict.fromkeys(categories or labelled_categories(dataset), pairs)
+    targets = options["targets"]
     if list_pairs:
-        asked = pairs_of_rows(dataset, resolve(methods), pairs_per_category, targets)
+        rows = resolve(options["methods"])
+        asked = pairs_of_rows(dataset, rows, pairs_per_category, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
         return None
-    # Its summary is of all rows, as is the one that `write_reports` returns and writes.
-    evaluate(
+    summary = evaluate(
         dataset.root,
-        backbone,
-        methods,
-        pairs_per_category,
-        targets,
-        out,
+        pairs=pairs_per_category,
         executor=workers,
-        row_seconds=row_seconds,
-        seeds=seeds,
         sweep=sweep or (),
+        **options,
     )
-    summary = write_reports(out, metrics=metrics)
     if not quiet:
         print(f"{dataset.root}, backbone {summary['backbone']}, {targets} target views")
         # More rows than the default ones are for the paper's tables.
-        _print_summary(summary, metrics, with_paper=len(summary["methods"]) > 3)
-        print(f"Written: {out / 'summary.json'}, tables/, figures/")
+        _print_summary(summary, options["metrics"], with_paper=len(summary["methods"]) > 3)
+        print(f"Written: {options['out'] / 'summary.json'}, tables/, figures/")
     return None
 
 
@@ -249,4 +230,4 @@ def compare(run_a, run_b, rows) -> None:
     from zsp_lite.benchmark.runs import read_run
     from zsp_lite.cli.terminal import print_table
 
-    print_table(tables.compare(read_run(run_a), read_run(run_b), rows, (str(run_a), str(run_b))))
+    print_table(tables.compare(read_run(run_a), read_run(run_b), rows))
