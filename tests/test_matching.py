@@ -60,7 +60,6 @@ def test_similarity_is_the_cosine_of_materialised_descriptors(h1, w1, h2, w2, se
 def test_similarity_takes_maps_tensors_and_arrays_and_is_symmetric():
     ref, target = feature_map(0, (4, 6)), feature_map(1, (5, 3))
     sim = similarity(ref, target)
-    assert sim.shape == (24, 15)
     assert_close(similarity(ref.keys.numpy().astype(np.float64), target.keys), sim)
     assert_close(similarity(target, ref).T, sim)
 

@@ -60,8 +60,7 @@ def category_data(
     # The views of the first object go around it.
     directions = [view.direction for view in views[0][:: len(views[0]) // SIDES][:SIDES]]
     shown = [
-        shown_object(dataset, category, name, one, directions)
-        for name, one in zip(names, views, strict=True)
+        shown_object(dataset, category, name, one, directions) for name, one in zip(names, views)
     ]
     trees = [KDTree(one.surface) for one in shown]
     data = []
