@@ -16,16 +16,16 @@ from numpy.testing import assert_allclose
 from refusals import refused
 
 from zsp_lite import Co3D, Sim3, ZeroShotPose, align_category, estimate_pose
-from zsp_lite.align import read_hypotheses, write_labels
 from zsp_lite.benchmark.problem import FrameStore
 from zsp_lite.benchmark.run import evaluate
-from zsp_lite.category import PairHypotheses, synchronise
 from zsp_lite.cli import main as cli
 from zsp_lite.course.labelling.session import Labelling
 from zsp_lite.data.frames import resize_frame
 from zsp_lite.data.labels import read_labels
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.metrics import rotation_error
+from zsp_lite.objects.align import read_hypotheses, write_labels
+from zsp_lite.scans.category import PairHypotheses, synchronise
 from zsp_lite.viz.category_sheet import objects_figure
 
 BACKBONE = SlowBackbone(grid=8, _seconds=0)
@@ -142,7 +142,7 @@ def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     turned = alignment.between(A, C) @ Sim3(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     wrong = PairHypotheses(A, C, (turned,), np.ones(1), np.zeros(3))
     disagreeing = replace(alignment, pairs=(wrong,))
-    monkeypatch.setattr("zsp_lite.align.align_category", lambda *_, **__: disagreeing)
+    monkeypatch.setattr("zsp_lite.objects.align.align_category", lambda *_, **__: disagreeing)
     line = f"align {root} --category lump --out {out}"
     assert cli.main(f"{line} --propose".split()) == 0
     text = capsys.readouterr().out
@@ -202,7 +202,7 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
     estimate = ZeroShotPose.estimate_from_views
     monkeypatch.setattr(ZeroShotPose, "estimate_from_views", misled)
     # The shapes, which show the error too, are equally far in all poses.
-    monkeypatch.setattr("zsp_lite.judge.chamfer_distance", lambda *_: np.ones(len(_[2])))
+    monkeypatch.setattr("zsp_lite.scans.judge.chamfer_distance", lambda *_: np.ones(len(_[2])))
     *pair, helper = [small_folder() / "lump" / name for name in SEQUENCES]
     settings = {"backbone": BACKBONE, "targets": 3, "references": 2}
     assert estimate_pose(*pair, **settings).errors["verified"] > 150

@@ -15,15 +15,15 @@ from scipy.spatial.transform import Rotation
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite import Sim3, ZeroShotPose
-from zsp_lite.category import (
+from zsp_lite.data.co3d import Pair
+from zsp_lite.data.labels import read_labels
+from zsp_lite.metrics import rotation_error
+from zsp_lite.scans.category import (
     PairHypotheses,
     partners,
     synchronise,
     world_hypotheses,
 )
-from zsp_lite.data.co3d import Pair
-from zsp_lite.data.labels import read_labels
-from zsp_lite.metrics import rotation_error
 
 seeds = st.integers(0, 2**32 - 1)
 HALF_TURN = Sim3(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from zsp_lite.align import read_hypotheses
-from zsp_lite.category import synchronise
 from zsp_lite.course import hypotheses, pictures
 from zsp_lite.course.samples import sample_data
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
+from zsp_lite.objects.align import read_hypotheses
+from zsp_lite.scans.category import synchronise
 
 RUN = Path(__file__).parents[1] / "notebooks/results/category_run/four_cars"
 

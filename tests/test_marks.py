@@ -9,7 +9,7 @@ from test_transfer import aligned, true_sim3
 
 from zsp_lite import Co3D
 from zsp_lite.io.ply import read_ply
-from zsp_lite.marks import Mark, place_marks, write_marks
+from zsp_lite.scans.marks import Mark, place_marks, write_marks
 from zsp_lite.viz.report import write_category_report
 
 SEAT = Mark("scooter", 0, 180.0, 114.0, "seat")
@@ -77,8 +77,8 @@ def test_an_object_without_any_place_has_no_file(placed, dataset, tmp_path):
 def test_a_run_leaves_no_outputs_of_an_earlier_one(placed, alignment, tmp_path, run, monkeypatch):
     one = {"scooter2": alignment.objects["scooter2"]}
     answers = iter([alignment, replace(alignment, objects=one)])
-    monkeypatch.setattr("zsp_lite.align.align_category", lambda *_, **__: next(answers))
-    monkeypatch.setattr("zsp_lite.marks.place_marks", lambda *_: placed)
+    monkeypatch.setattr("zsp_lite.objects.align.align_category", lambda *_, **__: next(answers))
+    monkeypatch.setattr("zsp_lite.scans.marks.place_marks", lambda *_: placed)
     line = f"align data_samples --category motorcycle --out {tmp_path}"
     run(f"{line} --mark scooter:0:180,114:seat")
     (tmp_path / "marks/mine.ply").touch()

@@ -35,8 +35,8 @@ from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.sources import Source, open_pair
 from zsp_lite.io.ply import read_ply
 from zsp_lite.metrics import rotation_error
-from zsp_lite.own_objects import write_pair
-from zsp_lite.pair_result import PairResult
+from zsp_lite.objects.estimate import write_pair
+from zsp_lite.scans.pair_result import PairResult
 
 pytestmark = pytest.mark.slow
 
@@ -400,7 +400,7 @@ def in_memory(ellipsoids) -> list[list[Frame]]:
 
 
 def test_a_contradiction_limits_the_probability_of_every_pose(in_memory, monkeypatch):
-    monkeypatch.setattr("zsp_lite.own_objects._LEAST_CONFIDENT", 1.1)
+    monkeypatch.setattr("zsp_lite.objects.estimate._LEAST_CONFIDENT", 1.1)
     first, second = in_memory
     flat = [replace(one, depth=np.where(one.depth > 0, 4, one.depth)) for one in second]
     found = estimate_pose(first, flat, **SEVERAL)

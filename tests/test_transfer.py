@@ -10,10 +10,10 @@ from scipy.spatial import KDTree
 from synthetic_views import CoordinateBackbone, look_at
 
 from zsp_lite import Co3D, Sim3, load_backbone
-from zsp_lite.category import AlignedObject, CategoryAlignment
 from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.ground_truth import read_poses
-from zsp_lite.transfer import object_size, surface_views, transfer
+from zsp_lite.scans.category import AlignedObject, CategoryAlignment
+from zsp_lite.scans.transfer import object_size, surface_views, transfer
 
 
 def aligned(sim3s: dict[str, Sim3]) -> CategoryAlignment:
@@ -45,7 +45,7 @@ def samples():
     def surface(category, name, count, shift=0.0):
         moved = Sim3(1.0, np.eye(3), np.array([shift, 0, 0])) @ true_sim3(dataset, category, name)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("zsp_lite.transfer.VIEWS", count)
+            patch.setattr("zsp_lite.scans.transfer.VIEWS", count)
             return surface_views(aligned({name: moved}), dataset, category, name, backbone)
 
     car = surface("car", "suv", 3)

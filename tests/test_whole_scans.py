@@ -10,15 +10,15 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from zsp_lite import Co3D, Sim3, ZeroShotPose, estimate_pose, load_backbone
-from zsp_lite.category import PairHypotheses
 from zsp_lite.course.samples import sample_data
 from zsp_lite.data.pairs import spread
 from zsp_lite.importers.sources import open_source
-from zsp_lite.judge import Question, asked_positions, judge, judge_pairs
 from zsp_lite.metrics import rotation_error, vector_angle
-from zsp_lite.scans import Scan
-from zsp_lite.shapes import HEADINGS, Shape, compare_headings, refine
-from zsp_lite.upright import find_up
+from zsp_lite.objects.scan import Scan
+from zsp_lite.scans.category import PairHypotheses
+from zsp_lite.scans.judge import Question, asked_positions, judge, judge_pairs
+from zsp_lite.scans.shapes import HEADINGS, Shape, compare_headings, refine
+from zsp_lite.scans.upright import find_up
 from zsp_lite.views import object_crop
 
 UP = np.array([0.0, 0.0, 1.0])

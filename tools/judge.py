@@ -1,4 +1,4 @@
-"""Fit the constants of `zsp_lite.judge`, and those of `zsp_lite.category` to what it judges.
+"""Fit the constants of `scans.judge`, and those of `scans.category` to what it judges.
 
     python -m tools.judge outputs/validation outputs/validation_artists
 
@@ -18,18 +18,18 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from zsp_lite import category as synchronisation
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.benchmark.problem import FrameStore
-from zsp_lite.category import PairHypotheses, synchronise
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import spread
 from zsp_lite.io.files import stable_hash
-from zsp_lite.judge import Votes, asked_positions, judge, score_terms
 from zsp_lite.metrics import SAME_ANGLE, rotation_angle
-from zsp_lite.shapes import Shape
+from zsp_lite.scans import category as synchronisation
+from zsp_lite.scans.category import PairHypotheses, synchronise
+from zsp_lite.scans.judge import Votes, asked_positions, judge, score_terms
+from zsp_lite.scans.shapes import Shape
 from zsp_lite.threads import one_thread
 
 # The arc in degrees and the number of frames of both objects.

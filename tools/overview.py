@@ -15,7 +15,7 @@ from zsp_lite.course.demo import run_demo
 from zsp_lite.course.samples import sample_data
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.metrics import SAME_ANGLE
-from zsp_lite.pair_result import PairResult
+from zsp_lite.scans.pair_result import PairResult
 from zsp_lite.viz import plots
 
 PICTURE = Path(__file__).parents[1] / "notebooks" / "overview.jpg"

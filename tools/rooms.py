@@ -25,11 +25,11 @@ ROOMS = {
     "stages": "best_view estimates matching pipeline points views",
     "backbones": "backbones",
     "baselines": "baselines",
-    "verified": "category judge marks pair_result shapes transfer upright verified",
+    "verified": "scans verified",
     "importers": "importers",
     "viz": "viz",
     "benchmark": "benchmark",
-    "objects": "align own_objects scans",
+    "objects": "objects",
     "course": "course",
     "cli": "__main__ cli",
 }

@@ -17,16 +17,15 @@ Read the files in this order:
     points       points of the object
     estimates    the results, and the protocol of solvers
     metrics      rotation errors, medians and accuracies
-    pair_result  the results of a pair, and its errors against labels
-    scans        frames of objects of your own, loaded for an estimate
-    own_objects  one pair of your own, from files to files
-    category     all objects of a category in one frame, by the verified solver
-    transfer     points marked on one object, found on all others of its category
-    marks        pixels of frames to mark such points, and files of where they are found
 
     data, backbones, viz, io, benchmark, baselines, importers, cli
-    verified     a solver beyond the paper that tests many poses in all target views
     course       what the notebooks need besides
+
+Beyond the paper:
+
+    verified     a solver that tests many poses in all target views
+    scans        what several frames, whole shapes or all objects of a category tell together
+    objects      objects of your own, from files to files
 """
 
 import ast

@@ -2,13 +2,11 @@
 # ruff: noqa: I001
 
 from zsp_lite import (
-    align as align,
     alignment as alignment,
     backbones as backbones,
     baselines as baselines,
     benchmark as benchmark,
     best_view as best_view,
-    category as category,
     choices as choices,
     cli as cli,
     course as course,
@@ -18,22 +16,18 @@ from zsp_lite import (
     features as features,
     importers as importers,
     io as io,
-    marks as marks,
     matchers as matchers,
     matching as matching,
     metrics as metrics,
     minimal as minimal,
-    own_objects as own_objects,
-    pair_result as pair_result,
+    objects as objects,
     pipeline as pipeline,
     points as points,
     scans as scans,
-    transfer as transfer,
     verified as verified,
     views as views,
     viz as viz,
 )
-from zsp_lite.align import align_category as align_category
 from zsp_lite.alignment import Sim3 as Sim3
 from zsp_lite.backbones import checkpoints as checkpoints, huggingface as huggingface, vit as vit
 from zsp_lite.backbones.backbone import Backbone as Backbone
@@ -57,7 +51,8 @@ from zsp_lite.features import FeatureMap as FeatureMap
 from zsp_lite.importers.sources import open_source as open_source
 from zsp_lite.io import download as download, files as files, ply as ply
 from zsp_lite.matching import Matches as Matches
-from zsp_lite.own_objects import estimate_pose as estimate_pose
+from zsp_lite.objects.align import align_category as align_category
+from zsp_lite.objects.estimate import estimate_pose as estimate_pose
 from zsp_lite.pipeline import ZeroShotPose as ZeroShotPose
 from zsp_lite.viz import plots as plots, report as report
 

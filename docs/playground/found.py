@@ -18,10 +18,10 @@ from scipy.spatial import KDTree
 from docs.playground.build import packed, webp
 from zsp_lite import Co3D, align_category, load_backbone
 from zsp_lite.backbones.load import BackboneLike
-from zsp_lite.category import CategoryAlignment
 from zsp_lite.course.synthetic.export import export_categories
 from zsp_lite.data.frames import Frame, mask_to_bbox, resize_frame
-from zsp_lite.transfer import SurfaceView, object_size, surface_views, transfer
+from zsp_lite.scans.category import CategoryAlignment
+from zsp_lite.scans.transfer import SurfaceView, object_size, surface_views, transfer
 
 CATEGORIES = ["chair", "toyplane"]
 RENDERED = {"frames": 24, "seed": 17, "image_size": 384}

@@ -24,7 +24,7 @@ from zsp_lite.course.demo import run_pair
 from zsp_lite.course.samples import sample_data
 from zsp_lite.matching import key_similarities, match, similarity
 from zsp_lite.metrics import rotation_error
-from zsp_lite.pair_result import PairResult
+from zsp_lite.scans.pair_result import PairResult
 from zsp_lite.views import View
 
 # The settings that the page begins with.

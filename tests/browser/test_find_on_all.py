@@ -13,9 +13,9 @@ from playwright.sync_api import Browser, Page
 from docs.playground.found import CATEGORIES, OBJECTS, RENDERED, ShownObject, shown_object
 from zsp_lite import Co3D, load_backbone
 from zsp_lite.alignment import Sim3
-from zsp_lite.category import AlignedObject, CategoryAlignment
 from zsp_lite.course.synthetic.export import export_categories
-from zsp_lite.transfer import TransferredPoints, surface_views, transfer
+from zsp_lite.scans.category import AlignedObject, CategoryAlignment
+from zsp_lite.scans.transfer import TransferredPoints, surface_views, transfer
 
 # What the page shows on the second object of every mark of a side of the first.
 SHOWN = """() => {

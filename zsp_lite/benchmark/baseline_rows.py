@@ -15,10 +15,10 @@ from zsp_lite.baselines.sift import mutual_matches
 from zsp_lite.benchmark.own import fit_keypoints
 from zsp_lite.benchmark.problem import Answer, PairProblem, evenly_spaced
 from zsp_lite.best_view import score_from_cosines
-from zsp_lite.category import CategoryAlignment, synchronise
 from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate
-from zsp_lite.shapes import compare_headings
+from zsp_lite.scans.category import CategoryAlignment, synchronise
+from zsp_lite.scans.shapes import compare_headings
 
 _K = 50  # number of matches, as in "Ours"
 

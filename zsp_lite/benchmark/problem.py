@@ -14,24 +14,24 @@ from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.category import (
-    CategoryAlignment,
-    PairHypotheses,
-    partners,
-    synchronise,
-    world_hypotheses,
-)
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import spread
 from zsp_lite.errors import InputError, NoPoseError, ends_the_run
 from zsp_lite.estimates import PoseEstimate
-from zsp_lite.judge import REFERENCES, Question, asked_positions, judge_pairs
 from zsp_lite.matching import similarities
 from zsp_lite.pipeline import ZeroShotPose
-from zsp_lite.shapes import FRAMES, Shape
-from zsp_lite.upright import find_up
+from zsp_lite.scans.category import (
+    CategoryAlignment,
+    PairHypotheses,
+    partners,
+    synchronise,
+    world_hypotheses,
+)
+from zsp_lite.scans.judge import REFERENCES, Question, asked_positions, judge_pairs
+from zsp_lite.scans.shapes import FRAMES, Shape
+from zsp_lite.scans.upright import find_up
 from zsp_lite.views import IMAGE_SIZE, View, feature_maps, frame_view, object_crop
 
 CAPACITY = 128  # frames in memory: those of about twenty pairs with five targets

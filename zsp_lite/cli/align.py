@@ -17,7 +17,7 @@ from zsp_lite.cli.common import (
 
 
 def _read_mark(text: str):
-    from zsp_lite.marks import Mark  # slow to import, and most calls have no mark
+    from zsp_lite.scans.marks import Mark  # slow to import, and most calls have no mark
 
     return Mark.parse(text)
 
@@ -85,19 +85,19 @@ def align(
     A pixel of one object, --mark, is found on all others: OUT gets marks.json, marks.jpg,
     marks/SEQUENCE.ply with balls in each object's world, and a section of the report.
     """
-    from zsp_lite.align import (
+    from zsp_lite.cli.terminal import print_rows
+    from zsp_lite.data.co3d import Co3D
+    from zsp_lite.data.labels import read_label_folder
+    from zsp_lite.importers.convert import import_captures
+    from zsp_lite.metrics import SAME_ANGLE, accuracy
+    from zsp_lite.objects.align import (
         align_category,
         alignment_errors,
         remove_outputs,
         write_alignment,
         write_labels,
     )
-    from zsp_lite.cli.terminal import print_rows
-    from zsp_lite.data.co3d import Co3D
-    from zsp_lite.data.labels import read_label_folder
-    from zsp_lite.importers.convert import import_captures
-    from zsp_lite.marks import marked_points, place_marks, write_marks
-    from zsp_lite.metrics import SAME_ANGLE, accuracy
+    from zsp_lite.scans.marks import marked_points, place_marks, write_marks
     from zsp_lite.viz.category_sheet import COLUMNS, object_rows
     from zsp_lite.viz.report import write_category_report
 

@@ -124,7 +124,7 @@ def estimate(
     import json
 
     from zsp_lite.importers.sources import open_pair
-    from zsp_lite.own_objects import estimate_pose
+    from zsp_lite.objects.estimate import estimate_pose
 
     if helpers and solver != "verified":
         raise click.UsageError("--helpers goes with --solver verified only")

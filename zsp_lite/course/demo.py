@@ -6,8 +6,8 @@ from dataclasses import replace
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.pairs import category_pairs, labelled_categories
 from zsp_lite.features import FeatureExtractor
-from zsp_lite.pair_result import PairResult, label_errors
 from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.scans.pair_result import PairResult, label_errors
 
 N_TARGETS = 5  # target views of each pair, as in the paper's main results
 

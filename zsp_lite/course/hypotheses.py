@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.align import read_hypotheses
-from zsp_lite.category import PairHypotheses
 from zsp_lite.metrics import SAME_ANGLE, rotation_angle
+from zsp_lite.objects.align import read_hypotheses
+from zsp_lite.scans.category import PairHypotheses
 from zsp_lite.verified.poses import Poses
 from zsp_lite.verified.solver import Solution
 from zsp_lite.verified.verification import ScoreCoefficients, score_terms

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.shapes import Shape
+from zsp_lite.scans.shapes import Shape
 from zsp_lite.viz.category_sheet import nearest_crop
 from zsp_lite.viz.plots import BLUE, GREEN, VERMILLION, draw_image
 

@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.annotations import FrameAnnotation
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
-from zsp_lite.marks import COLOURS, Place, PlacedMark
 from zsp_lite.metrics import rotation_angle
+from zsp_lite.scans.category import CategoryAlignment
+from zsp_lite.scans.marks import COLOURS, Place, PlacedMark
 from zsp_lite.views import object_crop
 from zsp_lite.viz.plots import VERMILLION
 

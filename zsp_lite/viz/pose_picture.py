@@ -14,8 +14,8 @@ from zsp_lite.data.cameras import Camera, azimuths, ground_axes
 from zsp_lite.data.frames import ON_OBJECT
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import vector_angle
-from zsp_lite.pair_result import PairResult
 from zsp_lite.points import world_cloud
+from zsp_lite.scans.pair_result import PairResult
 from zsp_lite.viz import plots
 
 _OTHERS = 4  # number of target views beside the chosen one

@@ -20,13 +20,13 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
-from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.io.files import REPOSITORY, write_atomic
-from zsp_lite.marks import PlacedMark
 from zsp_lite.matching import cyclical_distances, similarity
-from zsp_lite.pair_result import PairResult
+from zsp_lite.scans.category import CategoryAlignment
+from zsp_lite.scans.marks import PlacedMark
+from zsp_lite.scans.pair_result import PairResult
 from zsp_lite.viz import category_sheet, plots
 from zsp_lite.viz.pose_picture import pose_picture
 from zsp_lite.viz.table import COLUMNS, table_rows

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from zsp_lite.pair_result import PairResult
+from zsp_lite.scans.pair_result import PairResult
 
 COLUMNS = ("category", "solver", "view", "inliers", "error", "confidence", "time")
 _MEANINGS = {

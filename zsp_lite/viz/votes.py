@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from zsp_lite.data.cameras import ground_axes
 from zsp_lite.metrics import SAME_ANGLE
-from zsp_lite.pair_result import PairResult, Vote
+from zsp_lite.scans.pair_result import PairResult, Vote
 from zsp_lite.viz import plots
 
 _SHOWN = 8  # largest number of votes with pictures

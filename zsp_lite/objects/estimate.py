@@ -20,7 +20,6 @@ from tqdm import tqdm
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import DEFAULT, BackboneLike, as_backbone
-from zsp_lite.category import PairHypotheses, synchronise, world_hypotheses
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.cameras import Values
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
@@ -29,12 +28,13 @@ from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.sources import Source, SourceLike, list_sources, open_pair
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
-from zsp_lite.judge import REFERENCES, Question, judge_pairs
 from zsp_lite.metrics import SAME_ANGLE, rotation_angle, rotation_error, vector_angle
-from zsp_lite.pair_result import PairResult, Vote, label_errors
+from zsp_lite.objects.scan import Scan, scan_flags, stood_up
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import world_cloud
-from zsp_lite.scans import Scan, scan_flags, stood_up
+from zsp_lite.scans.category import PairHypotheses, synchronise, world_hypotheses
+from zsp_lite.scans.judge import REFERENCES, Question, judge_pairs
+from zsp_lite.scans.pair_result import PairResult, Vote, label_errors
 from zsp_lite.verified.confidence import reliability_flags
 from zsp_lite.verified.solver import measured_inliers
 from zsp_lite.views import View, usable_targets

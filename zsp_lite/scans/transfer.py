@@ -29,7 +29,6 @@ from scipy.special import expit, softmax
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.load import BackboneLike, as_backbone
-from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, frame_defect
 from zsp_lite.data.pairs import spread
@@ -37,6 +36,7 @@ from zsp_lite.errors import InputError, check_magnitude, real_array
 from zsp_lite.features import bin_indices, descriptors
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import near_median, object_pixels
+from zsp_lite.scans.category import CategoryAlignment
 from zsp_lite.views import View
 
 VIEWS = 12  # frames of an object whose patches are its surface

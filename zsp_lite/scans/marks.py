@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.backbones.load import BackboneLike, as_backbone
-from zsp_lite.category import CategoryAlignment
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import plain_name, write_atomic
 from zsp_lite.io.ply import write_ply
 from zsp_lite.points import object_pixels
-from zsp_lite.transfer import (
+from zsp_lite.scans.category import CategoryAlignment
+from zsp_lite.scans.transfer import (
     FOUND,
     marked_point,
     object_size,

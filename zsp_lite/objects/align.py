@@ -20,7 +20,6 @@ from zsp_lite.backbones.load import BackboneLike, as_backbone
 from zsp_lite.benchmark.execution import Evaluator, check_workers, evaluate_pairs
 from zsp_lite.benchmark.problem import FrameStore, evenly_spaced
 from zsp_lite.benchmark.runs import open_run, read_lines
-from zsp_lite.category import CategoryAlignment, PairHypotheses, partners, synchronise
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
@@ -29,6 +28,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.importers.sources import SourceLike, list_sources, open_source
 from zsp_lite.io.files import plain_name, read_json, write_atomic
 from zsp_lite.metrics import rotation_error
+from zsp_lite.scans.category import CategoryAlignment, PairHypotheses, partners, synchronise
 
 logger = logging.getLogger(__name__)
 

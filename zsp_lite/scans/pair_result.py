@@ -14,7 +14,7 @@ from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.errors import check_choice
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.metrics import rotation_error
-from zsp_lite.transfer import TransferredPoints, describe_surface, marked_point, transfer
+from zsp_lite.scans.transfer import TransferredPoints, describe_surface, marked_point, transfer
 from zsp_lite.views import View
 
 

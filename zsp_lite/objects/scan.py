@@ -14,11 +14,11 @@ from zsp_lite.data.frames import Frame, frame_defect, turn_frame
 from zsp_lite.errors import Doubt, NoPoseError
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.sources import Source
-from zsp_lite.judge import asked_positions
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import axis_deviation, world_cloud
-from zsp_lite.shapes import FRAMES, Shape
-from zsp_lite.upright import find_up
+from zsp_lite.scans.judge import asked_positions
+from zsp_lite.scans.shapes import FRAMES, Shape
+from zsp_lite.scans.upright import find_up
 from zsp_lite.views import View, object_crop
 
 _TRIED = 8  # frames of which the first usable one is a single reference

@@ -1,0 +1,2 @@
+"""Objects of one's own, from files to files: the pose between two of them, or of a whole
+category."""
