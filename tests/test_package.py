@@ -14,6 +14,7 @@ import pytest
 from refusals import refused
 
 import zsp_lite
+from zsp_lite.course import make_samples as making
 from zsp_lite.course import samples
 
 REPOSITORY = Path(__file__).parents[1]
@@ -71,8 +72,8 @@ def test_the_wheel_has_the_package_and_nothing_else(wheel):
 
 @pytest.mark.slow
 def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
-    """README's first example and the demo, with nothing of the repository on the path; a second
-    call makes nothing."""
+    """The demo and README's first example, with nothing of the repository on the path; only the
+    demo makes samples."""
     site, empty, cache = (tmp_path / name for name in ("site", "empty", "cache"))
     empty.mkdir()
     install = [sys.executable, *"-m pip install --quiet --no-deps --no-index --no-compile".split()]
@@ -84,9 +85,9 @@ def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
         "from dataclasses import replace; from zsp_lite.course.synthetic.export import PRESETS\n"
         "PRESETS['demo'] = replace(PRESETS['demo'], categories=('motorcycle',), frames=6, "
         "image_size=96)\n"
-        f"{example}\nassert len(targets) == 5\n"
         "from zsp_lite.cli.main import main\n"
-        "raise SystemExit(main(['demo', '--backbone', 'zsp-tiny']))"
+        "assert main(['demo', '--backbone', 'zsp-tiny']) == 0\n"
+        f"{example}\nassert len(targets) == 5\n"
     )
     environment = os.environ | {
         "PYTHONPATH": str(site),
@@ -120,15 +121,16 @@ def test_samples_are_made_in_the_cache_and_completed_after_an_interruption(tmp_p
         if len(calls) == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("zsp_lite.course.synthetic.export.export_preset", export)
+    monkeypatch.setattr(making, "export_preset", export)
+    refused("expected a clone of the repository, or `zsp-lite demo` once", samples.sample_data)
     with pytest.raises(KeyboardInterrupt):
-        samples.sample_data()
+        making.make_sample_data()
     made = tmp_path / "cache/samples"
     assert not made.exists()
     for _ in range(2):  # the second time they are there
-        assert samples.sample_data() == made
+        assert making.make_sample_data() == samples.sample_data() == made
         assert sorted(path.name for path in made.iterdir()) == ["made 1", "made 2"]
         assert calls == [("demo", []), ("demo", ["made 1"])]
     (tmp_path / "file").touch()
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "file"))
-    refused("set ZSP_LITE_CACHE to a folder that can be written", samples.sample_data)
+    refused("set ZSP_LITE_CACHE to a folder that can be written", making.make_sample_data)

@@ -141,9 +141,7 @@ def test_a_folder_without_synthetic_motorcycles_gives_no_result(ellipsoids):
 def test_the_demo_begins_with_the_credited_photograph(
     motorcycles, photograph, tmp_path, monkeypatch, loaded, run
 ):
-    monkeypatch.setattr(
-        "zsp_lite.course.demo.run_demo", lambda dataset, backbone, solvers: iter(())
-    )
+    monkeypatch.setattr("zsp_lite.course.demo.demo_pairs", lambda dataset: [])
     text = run(f"demo --data {motorcycles.root} --out {tmp_path}")
     page = (tmp_path / "report.html").read_text("utf-8")
     assert text.index("Photographed motorcycle") < text.index("One pair per category")

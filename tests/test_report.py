@@ -12,13 +12,14 @@ from numpy.testing import assert_allclose
 from plotly.offline import get_plotlyjs
 from synthetic_views import CoordinateBackbone
 
-from zsp_lite import Camera, Co3D
+from zsp_lite import Camera, Co3D, ZeroShotPose
 from zsp_lite.choices import SOLVERS
-from zsp_lite.course.demo import N_TARGETS, demo_pairs, run_demo
+from zsp_lite.course.demo import N_TARGETS, demo_pairs
 from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
 from zsp_lite.estimates import Hypothesis, PoseEstimate
 from zsp_lite.io.files import REPOSITORY
 from zsp_lite.metrics import rotation_error
+from zsp_lite.scans.pair_result import run_pair
 from zsp_lite.viz.plots import show_residuals
 from zsp_lite.viz.report import (
     table_rows,
@@ -31,7 +32,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("closed_figures")]
 @pytest.fixture(scope="module")
 def results(ellipsoids):
     """The demo on the ellipsoids: one pair, by both solvers."""
-    return list(run_demo(ellipsoids, CoordinateBackbone(), SOLVERS["both"]))
+    method = ZeroShotPose(CoordinateBackbone())
+    pairs = demo_pairs(ellipsoids)
+    return [run_pair(ellipsoids, pair, method, SOLVERS["both"]) for pair in pairs]
 
 
 @pytest.fixture(scope="module")

@@ -18,10 +18,10 @@ from refusals import refused
 import zsp_lite
 from zsp_lite import Sim3, load_backbone, minimal
 from zsp_lite.choices import SOLVERS
-from zsp_lite.course.demo import run_pair
 from zsp_lite.data.pairs import labelled_categories, shipped_pairs
 from zsp_lite.features import log_bin
 from zsp_lite.io.files import REPOSITORY
+from zsp_lite.scans.pair_result import run_pair
 from zsp_lite.views import View
 
 STORED = json.loads(Path(__file__).with_name("sample_poses.json").read_text("utf-8"))

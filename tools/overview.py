@@ -11,11 +11,12 @@ from matplotlib.figure import Figure
 
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.choices import SOLVERS
-from zsp_lite.course.demo import run_demo
+from zsp_lite.course.demo import demo_pairs
 from zsp_lite.course.samples import sample_data
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.metrics import SAME_ANGLE
-from zsp_lite.scans.pair_result import PairResult
+from zsp_lite.pipeline import ZeroShotPose
+from zsp_lite.scans.pair_result import PairResult, run_pair
 from zsp_lite.viz import plots
 
 PICTURE = Path(__file__).parents[1] / "notebooks" / "overview.jpg"
@@ -50,5 +51,6 @@ def overview(results: Sequence[PairResult]) -> Figure:
 
 
 if __name__ == "__main__":
-    found = list(run_demo(Co3D(sample_data()), load_backbone(), SOLVERS["both"]))
+    dataset, method = Co3D(sample_data()), ZeroShotPose(load_backbone())
+    found = [run_pair(dataset, pair, method, SOLVERS["both"]) for pair in demo_pairs(dataset)]
     overview(found).savefig(PICTURE, dpi=110, bbox_inches="tight", pil_kwargs={"quality": 88})

@@ -64,7 +64,7 @@ def category_data(
     ]
     trees = [KDTree(one.surface) for one in shown]
     data = []
-    for name, source in zip(names, shown, strict=True):
+    for name, source in zip(names, shown):
         marks = source.surface[: source.starts[-1]]
         places = []
         confidences = []

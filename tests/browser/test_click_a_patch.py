@@ -20,11 +20,10 @@ from torch.testing import assert_close
 from docs.playground.build import stored_pairs, write_page_data
 from zsp_lite import Co3D, FeatureMap, ZeroShotPose, load_backbone
 from zsp_lite.best_view import correspondence_score
-from zsp_lite.course.demo import run_pair
 from zsp_lite.course.samples import sample_data
 from zsp_lite.matching import key_similarities, match, similarity
 from zsp_lite.metrics import rotation_error
-from zsp_lite.scans.pair_result import PairResult
+from zsp_lite.scans.pair_result import PairResult, run_pair
 from zsp_lite.views import View
 
 # The settings that the page begins with.

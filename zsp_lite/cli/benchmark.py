@@ -105,14 +105,14 @@ def benchmark(
         return _list_methods()
     from zsp_lite.benchmark.methods import resolve
     from zsp_lite.benchmark.run import evaluate, pairs_of_rows
-    from zsp_lite.course.samples import sample_data
+    from zsp_lite.course.make_samples import make_sample_data
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.exchange import write_questions
     from zsp_lite.data.pairs import labelled_categories
 
     if quiet:
         logging.getLogger("zsp_lite").setLevel(logging.WARNING)
-    dataset = Co3D(data or sample_data())
+    dataset = Co3D(data or make_sample_data())
     pairs_per_category = dict.fromkeys(categories or labelled_categories(dataset), pairs)
     targets = options["targets"]
     if list_pairs:

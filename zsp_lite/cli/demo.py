@@ -29,27 +29,30 @@ def demo(data, backbone, out) -> None:
 
     from zsp_lite.backbones.load import as_backbone
     from zsp_lite.cli.terminal import print_rows
-    from zsp_lite.course.demo import run_demo
+    from zsp_lite.course.demo import demo_pairs
+    from zsp_lite.course.make_samples import make_sample_data
     from zsp_lite.course.photograph import photograph_section, run_photograph
-    from zsp_lite.course.samples import sample_data
     from zsp_lite.course.synthetic.export import RENDERED_FILE, SETTINGS_FILE
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.io.locks import writing
+    from zsp_lite.pipeline import ZeroShotPose
+    from zsp_lite.scans.pair_result import run_pair
     from zsp_lite.viz.report import write_report
     from zsp_lite.viz.table import COLUMNS, legend, table_rows
 
-    folder = data or sample_data()
+    folder = data or make_sample_data()
     notes = {SETTINGS_FILE: SYNTHETIC_NOTE, RENDERED_FILE: MODELS_NOTE}
     note = next((text for file, text in notes.items() if (folder / file).is_file()), USER_NOTE)
     with writing(out), Console().status("estimating poses"):
         dataset = Co3D(folder)
         model = as_backbone(backbone)
+        name = getattr(model, "name", str(backbone))
         found = list(run_photograph(dataset, model))
         photograph = photograph_section(found) if found else None
-        results = list(run_demo(dataset, model, SOLVERS["both"]))
-        path = write_report(
-            out / "report.html", results, getattr(model, "name", ""), str(folder), note, photograph
-        )
+        method = ZeroShotPose(model)
+        results = [run_pair(dataset, pair, method, SOLVERS["both"]) for pair in demo_pairs(dataset)]
+        report = out / "report.html"
+        path = write_report(report, results, name, str(folder), note, photograph)
     if photograph:
         title = (
             f"Photographed motorcycle: directions from the rendered {photograph.sequence}, "
@@ -57,5 +60,5 @@ def demo(data, backbone, out) -> None:
         )
         print_rows(title, photograph.columns, photograph.rows, texts=2)
     rows = [row for result in results for row in table_rows(result)]
-    print_rows(f"One pair per category in {folder}, backbone {model.name}", COLUMNS, rows, texts=2)
+    print_rows(f"One pair per category in {folder}, backbone {name}", COLUMNS, rows, texts=2)
     print(legend(), f"Data: {note}", f"Report with pictures of every stage: {path}", sep="\n")

@@ -1,123 +1,12 @@
-"""Pictures of the lessons: a curve above what it measures, a graph of objects, winners as dots."""
+"""Pictures of the lesson on metrics."""
 
 from collections.abc import Mapping
-from typing import Any
 
-import cv2
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch
 
-from zsp_lite.data.co3d import Co3D
-from zsp_lite.scans.shapes import Shape
-from zsp_lite.viz.category_sheet import nearest_crop
-from zsp_lite.viz.plots import BLUE, GREEN, VERMILLION, draw_image
-
-# Pictures stand on a circle of radius 1; half the width of a picture, and how far from its middle
-# arrows end.
-_PICTURE = 0.34
-_ENDS = 0.42
-_ARROWS = {True: (GREEN, "-"), False: (VERMILLION, "--"), None: ("0.6", ":")}
-
-
-def curve_above_pictures(
-    curve: tuple[np.ndarray, np.ndarray],
-    pictures: Mapping[float, np.ndarray],
-    title: str = "x = {:.0f}",
-    **labels: Any,
-) -> tuple[Figure, list[Axes]]:
-    """Show a curve (x, y) with dots at some x, and below it one picture for each of these x.
-
-    `title` is formatted with x; `labels` is what `Axes.set` takes. Returns the figure and the axes
-    of the pictures.
-    """
-    places = list(pictures)
-    figure, axes = plt.subplot_mosaic(
-        [["curve"] * len(places), places],
-        figsize=(7.4, 5.2),
-        layout="constrained",
-        height_ratios=(1, 1.15),
-    )
-    above = axes.pop("curve")
-    above.plot(*curve)
-    above.plot(places, np.interp(places, *curve), "o", color=VERMILLION, markersize=9)
-    above.set(**labels)
-    for place, picture in pictures.items():
-        axes[place].set_axis_off()
-        axes[place].set_title(title.format(place), fontsize=10)
-        draw_image(axes[place], picture)
-    return figure, [axes[place] for place in places]
-
-
-def from_the_side(first: Shape, second: Shape, pose: np.ndarray) -> np.ndarray:
-    """Return a picture of the points of two upright shapes from their long side, the first in
-    orange after a pose (4, 4), the second in blue."""
-    length = np.linalg.svd(second.points[:, :2], full_matrices=False)[2][0]
-    picture = np.full((150, 300, 3), 255, np.uint8)
-    moved = first.points @ pose[:3, :3].T + pose[:3, 3]
-    for points, colour in ((second.points, BLUE), (moved, VERMILLION)):
-        column = 150 + 55 * (points[:, :2] @ length)
-        row = 75 - 55 * points[:, 2]
-        for at in np.stack([column, row], axis=1).round().astype(int).tolist():
-            cv2.circle(picture, at, 2, [int(colour[k : k + 2], 16) for k in (1, 3, 5)], -1)
-    return picture
-
-
-def show_graphs(
-    graphs: Mapping[str, tuple[Mapping[str, np.ndarray], Mapping[tuple[str, str], bool | None]]],
-) -> Figure:
-    """Show for each title named pictures on a circle, with arrows between them.
-
-    An arrow is green if it is true, red and dashed if it is false, grey and dotted if it is None.
-    """
-    size = (4.1 * len(graphs), 4.4)
-    figure, axes = plt.subplots(1, len(graphs), figsize=size, layout="constrained", squeeze=False)
-    for axis, (title, (pictures, arrows)) in zip(axes.flat, graphs.items()):
-        angles = np.pi * (0.75 + 2 * np.arange(len(pictures)) / len(pictures))
-        centres = dict(zip(pictures, np.column_stack([np.cos(angles), np.sin(angles)])))
-        for name, picture in pictures.items():
-            x, y = centres[name]
-            box = (x - _PICTURE, x + _PICTURE, y - _PICTURE, y + _PICTURE)
-            axis.imshow(picture, extent=box, zorder=2)
-            axis.text(x, y - _PICTURE, name, ha="center", va="top", fontsize=9, parse_math=False)
-        for (start, end), right in arrows.items():
-            along = centres[end] - centres[start]
-            gap = _ENDS * along / np.linalg.norm(along)
-            colour, line = _ARROWS[right]
-            # Curved, so that two opposite arrows can be told apart.
-            arrow = FancyArrowPatch(
-                centres[start] + gap,
-                centres[end] - gap,
-                arrowstyle="-|>",
-                mutation_scale=16,
-                connectionstyle="arc3,rad=0.12",
-                color=colour,
-                linestyle=line,
-                linewidth=2.2,
-                zorder=1,
-            )
-            axis.add_patch(arrow)
-        axis.set(xlim=(-1.1, 1.1), ylim=(-1.15, 1.1), aspect="equal", title=title)
-        axis.set_axis_off()
-    return figure
-
-
-def alike(
-    dataset: Co3D, category: str, rotations: Mapping[str, np.ndarray], first: str
-) -> dict[str, np.ndarray]:
-    """Return for each object the picture that is nearest to the first frame of one of them.
-
-    `rotations` lead from the objects' worlds to a common frame: if they are right, all objects are
-    seen from the same side.
-    """
-    camera = dataset.camera(dataset.frames(category, first)[0]).R
-    pictures = {}
-    for name, rotation in rotations.items():
-        wanted = camera @ rotations[first].T @ rotation
-        pictures[name] = nearest_crop(dataset, dataset.frames(category, name), wanted).rgb
-    return pictures
+from zsp_lite.viz.plots import BLUE, GREEN, VERMILLION
 
 
 def show_winners(gains: Mapping[str, np.ndarray], true_gain: float) -> Figure:

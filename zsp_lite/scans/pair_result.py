@@ -2,18 +2,20 @@
 against pose labels."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import ArrayLike
 
 from zsp_lite.alignment import Sim3
+from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.errors import check_choice
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.metrics import rotation_error
+from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.scans.transfer import TransferredPoints, describe_surface, marked_point, transfer
 from zsp_lite.views import View
 
@@ -169,3 +171,33 @@ def label_errors(found: PairResult, category: Path, sequences: Sequence[str]) ->
         truth = relative_pose(first, found.reference.camera, second, camera)
         errors[name] = float(rotation_error(estimate.sim3.R, truth[:3, :3]))
     return errors
+
+
+def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[str]) -> PairResult:
+    """Estimate the pose of a pair by each solver, and its error if the pair has labels."""
+    reference, targets = dataset.load_pair(pair)
+    # The solvers share the features.
+    view, *target_views = method.views([reference, *targets])
+    estimates = {
+        solver: replace(method, solver=solver).estimate_from_views(view, target_views)
+        for solver in solvers
+    }
+    sources = (
+        f"sequence {pair.reference_sequence}, frame {pair.reference_frame}",
+        f"sequence {pair.target_sequence}, frames {', '.join(map(str, pair.target_frames))}",
+    )
+    result = PairResult(
+        pair.category,
+        sources,
+        reference,
+        tuple(targets),
+        estimates,
+        {},
+        backbone=getattr(method.backbone, "name", ""),
+    )
+    return replace(
+        result,
+        errors=label_errors(
+            result, dataset.root / pair.category, (pair.reference_sequence, pair.target_sequence)
+        ),
+    )
