@@ -249,20 +249,3 @@ def test_poses_that_were_not_asked_for_are_counted(challenge, handins, tmp_path)
 def test_the_folder_that_is_given_has_no_labels_to_rank_by(challenge, tmp_path):
     with pytest.raises(InputError, match="expected the folder keep/"):
         rank(tmp_path, challenge / "give", tmp_path / "out")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("make --categories car --out x", "no terminal to ask"),
-        ("make --secret short --categories car --out x", "expected at least 8"),
-        ("make --secret long_enough --categories cow --out x", "category"),
-        ("rank nowhere --keep nowhere --out x", "nowhere has no labels"),
-    ],
-)
-def test_bad_input_is_refused(words, message, tmp_path, monkeypatch, run):
-    monkeypatch.chdir(tmp_path)
-    printed = run(f"challenge {words}", code=2)
-    assert message in printed
-    assert printed.count("\n") == 1
-    assert not (tmp_path / "x").exists()

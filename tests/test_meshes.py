@@ -218,3 +218,10 @@ def test_a_hole_in_a_texture_is_a_hole_in_mask_and_coordinates(holed):
     assert np.isnan(drawn.canonical[middle]).all()
     square = (np.ptp(row) + 1) * (np.ptp(col) + 1)  # pixels, hole included
     assert_allclose(drawn.mask.sum() / square, 0.75, atol=0.05)
+
+
+def test_light_falls_through_a_hole_in_a_texture(holed):
+    # Points behind the middle and behind the side of the square, with light from the front.
+    points = np.array([[-3.0, 0, 0], [-3.0, 0.9 * holed.vertices[:, 1].max(), 0]], np.float32)
+    light = np.tile(np.float32([1, 0, 0]), (2, 1, 1))
+    assert MeshScene(holed, STUDIO, 0)._visible_share(points, light).tolist() == [1, 0]

@@ -80,6 +80,8 @@ def test_frames_show_the_same_points_as_those_of_the_data_folder(imported, name)
         assert (read.mask[rows, columns] > 0.5).mean() > 0.98
         assert np.median(np.abs(read.depth[rows, columns] - depth)) < 0.002
     assert np.mean(changes) < 6  # 10 and more without the undistortion
+    points, _ = imported.point_cloud("car", name)
+    assert points.std(axis=0).mean() == pytest.approx(1, abs=1e-6)
 
 
 @pytest.mark.parametrize("name", [CAR, SUV])
@@ -133,12 +135,6 @@ def test_a_sequence_without_an_alignment_is_imported_without_a_proposal(changed,
     execute(changed, "UPDATE sequence_annots SET _alignment_R = NULL")
     run(f"{line} --best 1 --frames 4")
     assert not (out / "label_proposals").exists()
-
-
-def test_sequences_are_named_or_the_best_are_chosen(imports, run):
-    line, _ = imports
-    text = run(f"{line} --sequences {CAR} --best 2", code=2)
-    assert "--best does not go with --sequences (see: zsp-lite data import uco3d --help)" in text
 
 
 def test_nothing_is_written_to_the_metadata(changed, tmp_path, monkeypatch):
