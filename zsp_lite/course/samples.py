@@ -5,8 +5,7 @@ import logging
 from pathlib import Path
 
 from zsp_lite.errors import InputError
-from zsp_lite.io.download import cache_folder
-from zsp_lite.io.files import REPOSITORY
+from zsp_lite.io.files import REPOSITORY, cache_folder
 from zsp_lite.io.locks import writing
 
 logger = logging.getLogger(__name__)
