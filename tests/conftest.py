@@ -132,7 +132,7 @@ def loaded(monkeypatch):
 
     asked = []
     monkeypatch.setattr(
-        "zsp_lite.backbones.load.load_backbone",
+        "zsp_lite.backbones.named.load_backbone",
         lambda name: asked.append(name) or CoordinateBackbone(),
     )
     monkeypatch.setattr(CoordinateBackbone, "name", "coordinates", raising=False)

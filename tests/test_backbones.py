@@ -18,13 +18,10 @@ from torch import nn
 from torch.testing import assert_close
 
 from zsp_lite import Backbone, InputError, load_backbone
-from zsp_lite.backbones import load
-from zsp_lite.backbones.load import (
-    BackboneConfig,
-    PretrainedWeights,
-    available_backbones,
-    how_to_obtain,
-)
+from zsp_lite.backbones import load, released
+from zsp_lite.backbones.load import BackboneConfig
+from zsp_lite.backbones.named import as_backbone, named_backbone
+from zsp_lite.backbones.released import PretrainedWeights, available_backbones, how_to_obtain
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.benchmark.runs import fingerprint
 from zsp_lite.choices import FACETS
@@ -221,16 +218,15 @@ def test_safetensors_bring_their_settings_and_options_override_them(pictures, tm
 
 def test_the_embedded_backbone_is_found_by_its_name(vit, tmp_path, monkeypatch):
     path = tmp_path / "zsp-tiny.safetensors"
-    monkeypatch.setattr(load, "TINY", path)
+    for module in (load, released):
+        monkeypatch.setattr(module, "TINY", path)
     refused(
         "checkpoint .*zsp-tiny.safetensors cannot be read: no such file", load_backbone, "zsp-tiny"
     )
     save_file(vit.state_dict(), path, metadata={"num_heads": "1"})
     assert load_backbone("zsp-tiny").name == "zsp-tiny"
     assert available_backbones()["zsp-tiny"] == path
-    assert (
-        load.as_backbone(path).embed_dim == load.as_backbone(str(path)).embed_dim == vit.embed_dim
-    )
+    assert as_backbone(path).embed_dim == as_backbone(str(path)).embed_dim == vit.embed_dim
 
 
 @pytest.mark.parametrize(
@@ -327,8 +323,8 @@ def test_dino_models_come_from_the_server(server, vit, pictures, tmp_path, cache
     content = (tmp_path / "made.pth").read_bytes()
     server.files["/dino/some/vit.pth"] = content
     monkeypatch.setenv("ZSP_LITE_DINO_URL", f"{server.url}/dino")
-    released = PretrainedWeights("some/vit.pth", hashlib.md5(content).hexdigest()[:6], len(content))
-    monkeypatch.setitem(load.PRETRAINED, "dino_vits8", released)
+    made = PretrainedWeights("some/vit.pth", hashlib.md5(content).hexdigest()[:6], len(content))
+    monkeypatch.setitem(released.PRETRAINED, "dino_vits8", made)
     assert how_to_obtain("dino_vits8") == "not downloaded: zsp-lite weights fetch dino_vits8"
     assert available_backbones()["dino_vits8"] is None
     loaded = load_backbone("dino_vits8", "cpu")
@@ -353,7 +349,7 @@ def test_without_the_server_one_line_says_what_to_do(server, cache, monkeypatch,
     monkeypatch.setenv("ZSP_LITE_DINO_URL", address.format(url=server.url))
     message = refused(".", load_backbone, "dino_vits8")
     for part in (
-        load.PRETRAINED["dino_vits8"].url,
+        released.PRETRAINED["dino_vits8"].url,
         str(cache / "dino_deitsmall8_pretrain.pth"),
         "zsp-tiny",
     ):
@@ -366,21 +362,20 @@ def test_a_backbone_of_ones_own_is_named_by_its_module_and_takes_no_options(tmp_
     monkeypatch.chdir(tmp_path)
     # as a console script has it
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
-    named = load.named_backbone
-    assert type(named("my_backbone_file:maps", None, "key", None)).__name__ == "Maps"
+    assert type(named_backbone("my_backbone_file:maps", None, "key", None)).__name__ == "Maps"
     for thing, told in (
         ("Maps", "is of type type, expected"),
         ("size", "is of type int, expected"),
         ("no", "imported"),
     ):
-        refused(told, named, f"my_backbone_file:{thing}", None, "key", None)
+        refused(told, named_backbone, f"my_backbone_file:{thing}", None, "key", None)
     refused(
         "is your own, expected no layer, facet or image size",
-        named,
+        named_backbone,
         "my_backbone_file:maps",
         "last",
         "key",
         None,
     )
-    assert named("hf:gpt2", None, "key", None) == "hf:gpt2"
-    assert named("hf:gpt2", None, "key", 96) == BackboneConfig("hf:gpt2", image_size=96)
+    assert named_backbone("hf:gpt2", None, "key", None) == "hf:gpt2"
+    assert named_backbone("hf:gpt2", None, "key", 96) == BackboneConfig("hf:gpt2", image_size=96)

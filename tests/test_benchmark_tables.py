@@ -18,7 +18,7 @@ from zsp_lite.benchmark import tables
 from zsp_lite.benchmark.methods import read_paper_tables, resolve
 from zsp_lite.benchmark.run import write_reports
 from zsp_lite.benchmark.runs import LINES, SETTINGS, Run, read_run
-from zsp_lite.benchmark.statistics import draws_of, paired_difference
+from zsp_lite.benchmark.summary import draws_of, paired_difference
 from zsp_lite.benchmark.tables import (
     PUBLISHED,
     Cell,

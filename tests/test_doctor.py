@@ -34,7 +34,9 @@ def test_missing_embedded_weights_fail_and_a_cache_that_cannot_be_written_is_not
 ):
     (tmp_path / "file").write_text("mine")
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "file"))
-    monkeypatch.setattr("zsp_lite.backbones.load.available_backbones", lambda: {"zsp-tiny": None})
+    monkeypatch.setattr(
+        "zsp_lite.backbones.released.available_backbones", lambda: {"zsp-tiny": None}
+    )
     python, torch, tiny, _, cache, cure, last = run("doctor", 1).splitlines()
     assert [line.split()[0] for line in (python, torch, tiny, cache)] == ["ok", "ok", "bad", "note"]
     assert "-> set ZSP_LITE_CACHE" in cure

@@ -29,7 +29,7 @@ from transformers import AutoModel
 
 from zsp_lite import load_backbone
 from zsp_lite.backbones.backbone import prepare_images
-from zsp_lite.backbones.load import download
+from zsp_lite.backbones.released import download
 from zsp_lite.benchmark.runs import fingerprint
 from zsp_lite.choices import FACETS
 

@@ -1,6 +1,7 @@
 """Pose errors against analytic angles, and the statistics against values worked out by hand."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from hypothesis import given
@@ -10,12 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.benchmark.statistics import (
-    bootstrap_ci,
-    figures_of,
-    object_draws,
-    paired_test,
-)
+from zsp_lite.benchmark.statistics import bootstrap_ci, object_draws
+from zsp_lite.benchmark.summary import figures_of, paired_test, summarise
 from zsp_lite.metrics import accuracy, median, rotation_error
 
 
@@ -128,9 +125,17 @@ def test_neither_the_order_of_pairs_nor_other_categories_change_a_draw():
 
 
 def test_the_mean_of_category_medians_is_over_categories():
-    errors, categories = np.r_[np.full(6, 10.0), np.linspace(20, 40, 6)], np.repeat(["x", "y"], 6)
-    weights = object_draws(PAIRS * 2, categories)
-    found = figures_of(errors, weights, categories)
+    table = pd.DataFrame(PAIRS * 2, columns=["reference", "target"]).assign(
+        category=np.repeat(["x", "y"], 6),
+        error=np.r_[np.full(6, 10.0), np.linspace(20, 40, 6)],
+        row="ours",
+        problem=range(12),
+        pair=range(12),
+        **dict.fromkeys(["repeat", "seconds", "translation", "scale"], 0),
+        failed="",
+        symmetric_error=None,
+    )
+    found = summarise(table)["methods"]["ours"]
     assert found["mean_category_median"] == 20
     low, high = found["mean_category_median_ci"]
     assert 15 <= low < 20 < high <= 25

@@ -87,7 +87,7 @@ def test_a_turn_that_gives_no_pose_is_passed_over(frames, monkeypatch):
 
 @pytest.mark.slow
 def test_the_command_tries_the_turns_on_demand(monkeypatch, ellipsoids, tmp_path, run):
-    monkeypatch.setattr("zsp_lite.backbones.load.load_backbone", lambda choice: UprightBackbone())
+    monkeypatch.setattr("zsp_lite.backbones.named.load_backbone", lambda choice: UprightBackbone())
     monkeypatch.setattr("zsp_lite.objects.estimate.write_pair", lambda *_: [])
     folder = ellipsoids.root / "ellipsoid"
     line = f"estimate {folder}/a {folder}/b --targets 2 --solver paper --out {tmp_path}"

@@ -26,7 +26,8 @@ from zsp_lite.data.co3d import Pair
 from zsp_lite.data.ground_truth import object_poses
 from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.data.pairs import shipped_pairs
-from zsp_lite.io.download import cache_folder, fetch
+from zsp_lite.io.download import fetch
+from zsp_lite.io.files import cache_folder
 from zsp_lite.metrics import rotation_error
 from zsp_lite.points import near_median
 from zsp_lite.views import View

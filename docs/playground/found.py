@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from docs.playground.build import packed, webp
 from zsp_lite import Co3D, align_category, load_backbone
-from zsp_lite.backbones.load import BackboneLike
+from zsp_lite.backbones.named import BackboneLike
 from zsp_lite.course.synthetic.export import export_categories
 from zsp_lite.data.frames import Frame, mask_to_bbox, resize_frame
 from zsp_lite.scans.category import CategoryAlignment

@@ -8,10 +8,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
-from torch import Tensor
+from torch import Tensor, nn
 
-from zsp_lite.backbones.huggingface import HuggingFaceViT
-from zsp_lite.backbones.vit import VisionTransformer, nearest_multiple
+from zsp_lite.backbones.vit import nearest_multiple
 from zsp_lite.choices import FACETS, Facet
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.features import FeatureMap
@@ -34,7 +33,7 @@ class Backbone:
     attributes, too.
 
     Args:
-        model: Network.
+        model: Network: a `vit.VisionTransformer`, or one with its attributes and its `extract`.
         name: Name used in tables and reports.
         layer: Block that describes the patches (see `load_backbone`). Default: block 9 counted from
             0, or the last of a shallower network.
@@ -51,7 +50,7 @@ class Backbone:
 
     def __init__(
         self,
-        model: VisionTransformer | HuggingFaceViT,
+        model: nn.Module,
         name: str,
         layer: int | str | None = None,
         saliency_heads: Sequence[int] | None = None,

@@ -9,6 +9,7 @@ use.
 
 import inspect
 import os
+from collections.abc import Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from zsp_lite.backbones.backbone import IMAGENET_MEAN, IMAGENET_STD, Backbone
 from zsp_lite.backbones.checkpoints import one_line
+from zsp_lite.backbones.load import PREFIX, BackboneConfig
 from zsp_lite.backbones.vit import Tokens, nearest_multiple
 from zsp_lite.choices import Facet
 from zsp_lite.errors import InputError
 
-PREFIX = "hf:"
 IMAGE_SIZE = 224  # default, pixels: the paper's
 CONFIG = "config.json"
 PROCESSORS = ("preprocessor_config.json", "processor_config.json")
@@ -39,8 +41,8 @@ _PROJECTIONS = {
 _CLS = {"cls_token", "class_token", "class_embedding"}
 _BEFORE_PATCHES = (*_CLS, "register_tokens", "distillation_token")
 
-# Mean and standard deviation that normalise RGB values in [0, 1]; None if unknown.
-Normalisation = tuple[list[float], list[float]] | None
+# Mean and standard deviation that normalise RGB values in [0, 1].
+Normalisation = tuple[Sequence[float], Sequence[float]]
 
 
 class HuggingFaceViT(nn.Module):
@@ -143,8 +145,30 @@ class HuggingFaceViT(nn.Module):
             ) from error
 
 
-def load_huggingface(name: str, image_size: int | None) -> tuple[HuggingFaceViT, Normalisation]:
-    """Load the model of "hf:NAME": a folder in Hugging Face's format, or a model of the hub."""
+def load_huggingface(config: BackboneConfig, device: str | torch.device | None) -> Backbone:
+    """Load the backbone of "hf:NAME": a folder in Hugging Face's format, or a model of the hub."""
+    model, (mean, std) = _load_model(config.name, config.image_size)
+    # A folder is named without its parents, so that results do not depend on where it lies.
+    folder = Path(config.name.removeprefix(PREFIX)).expanduser()
+    label = PREFIX + folder.resolve().name if os.path.isdir(folder) else config.name
+    # Three quarters of the depth, as block 9 is of DINO's 12 blocks.
+    layer = 3 * model.depth // 4 if config.layer is None else config.layer
+    # One image at a time, because transformers returns the attention of all blocks.
+    return Backbone(
+        model,
+        label,
+        layer,
+        range(model.num_heads),
+        device,
+        batch_size=1,
+        facet=config.facet,
+        mean=mean,
+        std=std,
+    )
+
+
+def _load_model(name: str, image_size: int | None) -> tuple[HuggingFaceViT, Normalisation]:
+    """Load the network of "hf:NAME", and the normalisation of its images."""
     # transformers is imported after this call, which raises InputError if the package is missing.
     folder = model_folder(name)
     from transformers import AutoConfig, AutoModel
@@ -245,18 +269,19 @@ def _projections(attention: nn.Module) -> dict[str, nn.Linear]:
 
 
 def _normalisation(folder: Path) -> Normalisation:
-    """Return the image processor's mean and standard deviation, None if it has none."""
+    """Return the image processor's mean and standard deviation, ImageNet's if it has
+    none."""
     from transformers import ImageProcessingMixin
 
     if not any((folder / file).is_file() for file in PROCESSORS):
-        return None
+        return IMAGENET_MEAN, IMAGENET_STD
     settings, _ = ImageProcessingMixin.get_image_processor_dict(folder, local_files_only=True)
     if settings.get("do_normalize") is False:
         return [0.0] * 3, [1.0] * 3
     mean = settings.get("image_mean")
     std = settings.get("image_std")
     if mean is None or std is None:
-        return None
+        return IMAGENET_MEAN, IMAGENET_STD
     if not len(mean) == len(std) == 3 or not min(std) > 0:
         raise ValueError(
             f"image_mean {mean} and image_std {std}, expected three numbers each, image_std "

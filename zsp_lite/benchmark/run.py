@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.backbones.load import BackboneLike, as_backbone
+from zsp_lite.backbones.named import BackboneLike, as_backbone
 from zsp_lite.baselines.geometry import essential_rotation
 from zsp_lite.benchmark.execution import Evaluator, check_workers, evaluate_pairs
 from zsp_lite.benchmark.methods import (
@@ -100,7 +100,7 @@ def evaluate(
             (see `write_reports`).
 
     Returns:
-        The summary (see `statistics.summarise`).
+        The summary (see `summary.summarise`).
 
     Raises:
         InputError: For unknown rows or categories, missing labels or files, and an OUT that holds

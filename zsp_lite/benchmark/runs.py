@@ -30,7 +30,7 @@ from jaxtyping import Float, Int
 
 from zsp_lite import __version__
 from zsp_lite.backbones.backbone import Backbone
-from zsp_lite.benchmark.statistics import summarise
+from zsp_lite.benchmark.summary import summarise
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import (

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from zsp_lite.alignment import Sim3
 from zsp_lite.benchmark.methods import GROUPS, base_name, is_own, read_paper_tables
 from zsp_lite.benchmark.runs import Run
-from zsp_lite.benchmark.statistics import draws_of, paired_difference
+from zsp_lite.benchmark.summary import draws_of, paired_difference
 from zsp_lite.choices import METRICS, METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.errors import InputError

@@ -119,7 +119,7 @@ def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:
     )
     @wraps(command)
     def with_backbone(name, layer, facet, image_size, **others):
-        from zsp_lite.backbones.load import named_backbone
+        from zsp_lite.backbones.named import named_backbone
 
         return command(backbone=named_backbone(name, layer, facet, image_size), **others)
 

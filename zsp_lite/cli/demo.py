@@ -27,7 +27,7 @@ def demo(data, backbone, out) -> None:
     """
     from rich.console import Console
 
-    from zsp_lite.backbones.load import as_backbone
+    from zsp_lite.backbones.named import as_backbone
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.course.demo import demo_pairs
     from zsp_lite.course.make_samples import make_sample_data

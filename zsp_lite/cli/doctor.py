@@ -42,8 +42,8 @@ def run_checks() -> Iterator[tuple[str, str, str, str]]:
     try:
         import torch
 
-        from zsp_lite.backbones.load import DEFAULT, available_backbones, how_to_obtain
-        from zsp_lite.io.download import cache_folder
+        from zsp_lite.backbones.released import DEFAULT, available_backbones, how_to_obtain
+        from zsp_lite.io.files import cache_folder
         from zsp_lite.io.locks import writing
     except (ImportError, OSError) as error:
         yield (

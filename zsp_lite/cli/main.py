@@ -85,7 +85,7 @@ def weights() -> None:
 @weights.command("list", epilog=examples("weights list"))
 def list_weights() -> None:
     """List every backbone with its file, or where to get it."""
-    from zsp_lite.backbones.load import available_backbones, how_to_obtain
+    from zsp_lite.backbones.released import available_backbones, how_to_obtain
 
     for name, path in available_backbones().items():
         print(f"{name:19} {path or how_to_obtain(name)}")
@@ -97,6 +97,6 @@ def list_weights() -> None:
 @click.argument("name")
 def fetch(name) -> None:
     """Download a backbone: NAME as `weights list` prints it, or hf:NAME."""
-    from zsp_lite.backbones.load import download
+    from zsp_lite.backbones.released import download
 
     print(f"Available: {download(name)}")

@@ -7,7 +7,7 @@ from pathlib import Path
 from zsp_lite.course.samples import sample_data
 from zsp_lite.course.synthetic.export import export_preset
 from zsp_lite.errors import InputError
-from zsp_lite.io.download import cache_folder
+from zsp_lite.io.files import cache_folder
 from zsp_lite.io.locks import writing
 
 logger = logging.getLogger(__name__)

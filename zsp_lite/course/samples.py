@@ -4,8 +4,7 @@ cache."""
 from pathlib import Path
 
 from zsp_lite.errors import InputError
-from zsp_lite.io.download import cache_folder
-from zsp_lite.io.files import REPOSITORY
+from zsp_lite.io.files import REPOSITORY, cache_folder
 
 
 def sample_data() -> Path:

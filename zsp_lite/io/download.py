@@ -25,11 +25,6 @@ ATTEMPTS = 3  # number of requests, before the user must call again
 NETWORK_ERRORS = (OSError, http.client.HTTPException, ValueError)
 
 
-def cache_folder() -> Path:
-    """Return the folder of downloaded files: $ZSP_LITE_CACHE, or ~/.cache/zsp-lite."""
-    return Path(os.environ.get("ZSP_LITE_CACHE") or Path.home() / ".cache" / "zsp-lite")
-
-
 def fetch(
     url: str,
     path: Path,

@@ -33,6 +33,11 @@ class OutsideError(InputError):
     """A path whose text leads out of its folder, not a link on it."""
 
 
+def cache_folder() -> Path:
+    """Return the folder of downloaded files: $ZSP_LITE_CACHE, or ~/.cache/zsp-lite."""
+    return Path(os.environ.get("ZSP_LITE_CACHE") or Path.home() / ".cache" / "zsp-lite")
+
+
 def write_atomic(path: str | Path, data: bytes) -> None:
     """Write a file and missing folders above it; readers see the old or all of the new content."""
     path = Path(path)

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.backbones.load import BackboneLike, as_backbone
+from zsp_lite.backbones.named import BackboneLike, as_backbone
 from zsp_lite.benchmark.execution import Evaluator, check_workers, evaluate_pairs
 from zsp_lite.benchmark.problem import FrameStore, evenly_spaced
 from zsp_lite.benchmark.runs import open_run, read_lines

@@ -19,7 +19,8 @@ import numpy as np
 from tqdm import tqdm
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.backbones.load import DEFAULT, BackboneLike, as_backbone
+from zsp_lite.backbones.load import DEFAULT
+from zsp_lite.backbones.named import BackboneLike, as_backbone
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.cameras import Values
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.backbones.load import BackboneLike, as_backbone
+from zsp_lite.backbones.named import BackboneLike, as_backbone
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import plain_name, write_atomic

@@ -28,7 +28,7 @@ from scipy.spatial.distance import cdist
 from scipy.special import expit, softmax
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.backbones.load import BackboneLike, as_backbone
+from zsp_lite.backbones.named import BackboneLike, as_backbone
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame, frame_defect
 from zsp_lite.data.pairs import spread

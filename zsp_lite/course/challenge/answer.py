@@ -5,7 +5,7 @@ import importlib.util
 import sys
 from pathlib import Path
 
-from zsp_lite.backbones.load import as_backbone
+from zsp_lite.backbones.named import as_backbone
 from zsp_lite.benchmark.methods import Method, make_extractors, resolve
 from zsp_lite.benchmark.own import fails_alone, problem_of_own
 from zsp_lite.benchmark.problem import FrameStore, PairProblem

@@ -20,7 +20,8 @@ from jaxtyping import Float
 from jinja2 import Environment, StrictUndefined
 from tqdm import tqdm
 
-from zsp_lite.benchmark.statistics import figures_of, object_draws, paired_difference
+from zsp_lite.benchmark.statistics import object_draws
+from zsp_lite.benchmark.summary import figures_of, paired_difference
 from zsp_lite.course.challenge.answer import read_questions
 from zsp_lite.course.challenge.make import QUESTIONS_FILE, copy_for_pairs
 from zsp_lite.course.synthetic.export import SETTINGS_FILE
@@ -28,8 +29,7 @@ from zsp_lite.data.co3d import Pair
 from zsp_lite.data.exchange import StoredPose, read_stored_poses
 from zsp_lite.data.pairs import true_poses
 from zsp_lite.errors import InputError
-from zsp_lite.io.download import cache_folder
-from zsp_lite.io.files import REPOSITORY, write_atomic
+from zsp_lite.io.files import REPOSITORY, cache_folder, write_atomic
 from zsp_lite.metrics import rotation_error
 
 _SIGNIFICANT = 0.05  # a difference with a smaller p value is not left to chance
