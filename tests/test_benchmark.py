@@ -17,9 +17,10 @@ from zsp_lite import Co3D, InputError
 from zsp_lite.benchmark.run import evaluate, write_reports
 from zsp_lite.benchmark.runs import Run, add_lines, read_lines, read_run
 from zsp_lite.benchmark.tables import pair_figure
+from zsp_lite.data.evaluation import sample_pairs, true_poses
 from zsp_lite.data.ground_truth import POSES_FILE, ObjectPose, object_poses
 from zsp_lite.data.labels import read_labels
-from zsp_lite.data.pairs import category_pairs, sample_pairs, true_poses
+from zsp_lite.data.pairs import category_pairs
 from zsp_lite.metrics import rotation_error
 from zsp_lite.views import object_crop
 from zsp_lite.viz.plots import pale

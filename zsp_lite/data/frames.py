@@ -9,13 +9,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Real, UInt8
+from jaxtyping import Float32, Float64, Real, UInt8
 from PIL import Image
 
 from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose, split_intrinsics
-from zsp_lite.data.depth import decode_depth, encode_depth, zero_unknown
+from zsp_lite.data.depth import decode_depth, zero_unknown
 from zsp_lite.errors import MAX_LENGTH, InputError, check_number, real_array
-from zsp_lite.io.files import read_bytes, write_atomic
+from zsp_lite.io.files import read_bytes
 
 MAX_PIXELS = 1 << 26  # of an image file
 # What is expected in place of files that no decoder here reads.
@@ -229,32 +229,12 @@ def mask_to_bbox(mask: Real[np.ndarray, "h w"], padding: float = 0.1) -> Box:
     return top, left, bottom - top, right - left
 
 
-def largest_region(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Return the largest connected region after parts thinner than 3 pixels are removed.
-
-    It is empty if there is no region.
-    """
-    opened = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    _, regions, statistics, _ = cv2.connectedComponentsWithStats(opened)
-    areas = statistics[1:, cv2.CC_STAT_AREA]  # the first region is the outside
-    return regions == 1 + areas.argmax() if len(areas) else np.zeros_like(inside)
-
-
 def crop_to_object(frame: Frame) -> Frame:
     """Crop a frame and its camera to the bounding box of its object mask (see `mask_to_bbox`)."""
     top, left, height, width = mask_to_bbox(frame.mask)
     inside = np.s_[top : top + height, left : left + width]
-    return _changed(
+    return with_images(
         frame, frame.camera.crop((top, left, height, width)), lambda image: image[inside]
-    )
-
-
-def turn_frame(frame: Frame, quarters: int) -> Frame:
-    """Turn a frame and its camera by quarter turns as in `numpy.rot90`; world points stay."""
-    return _changed(
-        frame,
-        frame.camera.turn(quarters),
-        lambda image: np.ascontiguousarray(np.rot90(image, quarters)),
     )
 
 
@@ -313,25 +293,7 @@ def check_pixels(path: str | Path, image: np.ndarray, size: tuple[int, int]) -> 
         raise InputError(f"{path} is {image.shape[:2]} pixels, expected (H, W) = {size}")
 
 
-def write_image(path: str | Path, rgb: UInt8[np.ndarray, "h w 3"], quality: int = 92) -> None:
-    """Write colours (H, W, 3) as JPEG of the given quality (0 to 100)."""
-    _encode(path, ".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
-
-
-def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"] | Bool[np.ndarray, "h w"]) -> None:
-    """Write probabilities (H, W) in [0, 1] as an 8-bit PNG, or a boolean mask as a 1-bit one."""
-    options = [cv2.IMWRITE_PNG_BILEVEL, 1] if mask.dtype == bool else []
-    _encode(path, ".png", np.rint(mask.astype(np.float64) * 255).astype(np.uint8), options)
-
-
-def write_depth(
-    path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0
-) -> None:
-    """Write depth (H, W) as a 16-bit PNG in CO3D's encoding (see `encode_depth`)."""
-    _encode(path, ".png", encode_depth(depth, scale_adjustment), [])
-
-
-def _changed(frame: Frame, camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Frame:
+def with_images(frame: Frame, camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Frame:
     """Return a frame with a new camera, and with `change` applied to colours, depth and mask."""
     images = {"rgb": frame.rgb, "depth": frame.depth, "mask": frame.mask}
     changed = {name: change(image) for name, image in images.items() if image is not None}
@@ -386,8 +348,3 @@ def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
         if image is None:
             raise ValueError("damaged")
     return image
-
-
-def _encode(path: str | Path, extension: str, image: np.ndarray, options: list[int]) -> None:
-    """Write an image file by OpenCV with its options."""
-    write_atomic(path, cv2.imencode(extension, image, options)[1].tobytes())
