@@ -15,7 +15,7 @@ from test_importers import write_lists, write_nerfstudio
 from test_masks import DIRECTIONS, ball_on_floor, overlap
 
 from zsp_lite import estimate_pose, open_source
-from zsp_lite.data.cameras import camera_from_pose
+from zsp_lite.data.arrays import camera_from_pose
 from zsp_lite.data.writing import encode_depth, write_mask
 from zsp_lite.importers import open_capture
 from zsp_lite.importers.convert import import_source

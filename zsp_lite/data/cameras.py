@@ -14,12 +14,10 @@ from jaxtyping import Float, Real
 from numpy.typing import ArrayLike
 
 from zsp_lite.errors import (
-    InputError,
     check_integer,
     check_magnitude,
     check_number,
     real_array,
-    rigid_matrix,
     rotation_matrix,
 )
 
@@ -193,34 +191,6 @@ class Camera:
                 camera.size[::-1],
             )
         return camera
-
-
-def split_intrinsics(name: str, values: Values) -> Float[np.ndarray, "4"]:
-    """Return fx, fy, cx, cy of four numbers, of a matrix (3, 3), or of its 9 numbers."""
-    numbers = real_array(name, values)
-    if numbers.shape in ((3, 3), (9,)):
-        entries = numbers.ravel().tolist()
-        fx, _, cx, _, fy, cy, *_ = entries
-        if entries != [fx, 0, cx, 0, fy, cy, 0, 0, 1]:
-            raise InputError(
-                f"{name} is {numbers.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels"
-            )
-        numbers = np.array([fx, fy, cx, cy])
-    return real_array(name, numbers, (4,))
-
-
-def camera_from_pose(pose: Values, intrinsics: Values, size: tuple[int, int], where: str) -> Camera:
-    """Create a camera from intrinsics and a camera-to-world pose (4, 4) or (3, 4); errors begin
-    with `where`."""
-    if np.shape(pose) == (3, 4):
-        pose = np.vstack([pose, (0, 0, 0, 1)])
-    pose = rigid_matrix(f"{where}: camera-to-world pose", pose)
-    rotation = pose[:3, :3]
-    values = split_intrinsics(f"{where}: intrinsics", intrinsics)
-    try:
-        return Camera(rotation.T, -rotation.T @ pose[:3, 3], values[:2], values[2:], size)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
 
 
 def _ndc(size: Sequence[int], intrinsics_format: str) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,7 @@
 """RGB-D frames with object masks: cropping, resizing, and the image files of data folders."""
 
 import io
+import pkgutil
 import reprlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,12 +10,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, Real, UInt8
+from jaxtyping import Float32, Real, UInt8
 from PIL import Image
 
-from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose, split_intrinsics
-from zsp_lite.data.depth import decode_depth, zero_unknown
-from zsp_lite.errors import MAX_LENGTH, InputError, check_number, real_array
+from zsp_lite.data.cameras import Box, Camera, Values
+from zsp_lite.data.depth import decode_depth
+from zsp_lite.errors import MAX_LENGTH, InputError, real_array
 from zsp_lite.io.files import read_bytes
 
 MAX_PIXELS = 1 << 26  # of an image file
@@ -25,9 +26,6 @@ _NOT_READ = {
     ".exr": "the depth as .npy or a float .tiff",
 }
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
-# Largest relative difference of the aspect ratios of an image and its smaller depth map: sides are
-# rounded to whole pixels.
-_SAME_ASPECT = 0.01
 # An image whose colours are all below this value is black, as CO3D's hidden frames are.
 _BLACK = 10
 
@@ -110,47 +108,9 @@ class Frame:
         Raises:
             InputError: An array has another shape or type, or the arrays do not fit together.
         """
-        label = f"frame {name}".rstrip()
-
-        # Colours (H, W, 3), uint8. What is still of another type below is refused by `__init__`.
-        image = np.asarray(rgb)
-        if image.ndim == 2:
-            image = image[..., None]
-        if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
-            raise InputError(
-                f"{label} rgb has shape {image.shape}, expected (H, W), (H, W, 3) or (H, W, 4)"
-            )
-        image = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[..., :3]
-        size = image.shape[:2]
-
-        # The camera, from pixel centres at integers to ones at half-integers.
-        intrinsics = split_intrinsics(f"{label} K", K) + (0, 0, 0.5, 0.5)
-        pose = real_array(f"{label} pose", np.eye(4) if pose is None else pose)
-        defect = ""
-        if not np.isfinite(pose).all():
-            defect = "the camera's pose is not finite"
-            pose = np.eye(4)
-        camera = camera_from_pose(pose, intrinsics, size, label)
-        if image.dtype.kind == "f" and 0 <= image.min() and image.max() <= 1:
-            image = np.rint(255 * image).astype(np.uint8)
-
-        # Depth in units of the world, 0 where unknown.
-        check_number("depth_unit", depth_unit, above=0)
-        depth = _read_map(f"{label} depth", depth) * depth_unit
-        depth = zero_unknown(depth).astype(np.float32)
-
-        # Mask from 0 to 1.
-        if mask is not None:
-            mask = _read_map(f"{label} mask", mask).astype(np.float32)
-            largest = mask.max()
-            # Such a mask has labels or another scale: as 0 to 255, no pixel would be on the object.
-            if 1 < largest <= ON_OBJECT * 255:
-                raise InputError(
-                    f"{label} mask has {largest:g} at most, expected booleans, 0 and 1, or 0 to 255"
-                )
-            if largest > 1:
-                mask = mask / np.float32(255)
-        return cls(image, enlarge_depth(depth, size), mask, camera, name, defect)
+        # A module above this one, imported when it is used.
+        frame_from_arrays = pkgutil.resolve_name("zsp_lite.data.arrays:frame_from_arrays")
+        return frame_from_arrays(rgb, depth, K, mask, pose, depth_unit, name)
 
     @property
     def shows_object(self) -> bool:
@@ -162,16 +122,6 @@ class Frame:
         return f"Frame({self.name!r}, {height} x {width} pixels)"
 
 
-def _read_map(name: str, values: np.ndarray) -> Float64[np.ndarray, "h w"]:
-    """Convert numbers (h, w) or (h, w, 1); InputError for another shape."""
-    values = real_array(name, values)
-    if values.shape[2:] == (1,):
-        values = values[..., 0]
-    if values.ndim != 2 or not values.size:
-        raise InputError(f"{name} has shape {values.shape}, expected (h, w) or (h, w, 1)")
-    return values
-
-
 def list_frames(frames: Frame | Iterable[Frame]) -> list[Frame]:
     """List the frames of any iterable, or a single one; InputError if they are none."""
     listed = list(frames) if np.iterable(frames) else [frames]
@@ -180,21 +130,6 @@ def list_frames(frames: Frame | Iterable[Frame]) -> list[Frame]:
             f"frames are {reprlib.repr(frames)}, expected one zsp_lite.Frame or several"
         )
     return listed
-
-
-def enlarge_depth(
-    depth: Float32[np.ndarray, "h w"], size: tuple[int, int]
-) -> Float32[np.ndarray, "..."]:
-    """Enlarge a depth map of the same aspect ratio to an image's size (H, W).
-
-    Depth maps of other aspect ratios, or no smaller than the image, are returned as they are.
-    """
-    rows, columns = depth.shape
-    height, width = size
-    if rows >= height or abs(rows * width / (columns * height) - 1) > _SAME_ASPECT:
-        return depth
-    # Pixels take the nearest value, because the mean of two surfaces' depths lies on neither.
-    return cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
 
 def frame_defect(frame: Frame) -> str:

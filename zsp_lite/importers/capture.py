@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.data.cameras import Camera, Values, camera_from_pose
-from zsp_lite.data.frames import Frame, check_pixels, decode_image, enlarge_depth
+from zsp_lite.data.arrays import camera_from_pose, enlarge_depth
+from zsp_lite.data.cameras import Camera, Values
+from zsp_lite.data.frames import Frame, check_pixels, decode_image
 from zsp_lite.errors import InputError, real_array
 from zsp_lite.importers import files
 from zsp_lite.io.files import read_bytes, shown
