@@ -19,8 +19,9 @@ from synthetic_views import CoordinateBackbone, look_at, render, true_pose
 from zsp_lite.alignment import Sim3, ransac
 from zsp_lite.benchmark.run import evaluate
 from zsp_lite.benchmark.runs import SETTINGS, Call, Settings, add_lines, read_run
-from zsp_lite.data.co3d import Pair, SequenceData, write_co3d
-from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.data.co3d import Pair
+from zsp_lite.data.labels import PoseLabel, read_labels
+from zsp_lite.data.writing import SequenceData, write_co3d, write_label
 from zsp_lite.estimates import PoseEstimate, match_points
 from zsp_lite.io.files import write_atomic
 from zsp_lite.views import object_crop

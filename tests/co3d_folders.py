@@ -11,8 +11,8 @@ from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
 from zsp_lite import Camera, Frame
-from zsp_lite.data.co3d import SequenceData, write_co3d
-from zsp_lite.data.labels import PoseLabel, write_label
+from zsp_lite.data.labels import PoseLabel
+from zsp_lite.data.writing import SequenceData, write_co3d, write_label
 
 seeds = st.integers(0, 2**32 - 1)
 

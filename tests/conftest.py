@@ -92,8 +92,9 @@ def ellipsoids(tmp_path_factory):
     from synthetic_views import look_at, render
 
     from zsp_lite.alignment import Sim3
-    from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
-    from zsp_lite.data.labels import PoseLabel, write_label
+    from zsp_lite.data.co3d import Co3D
+    from zsp_lite.data.labels import PoseLabel
+    from zsp_lite.data.writing import SequenceData, write_co3d, write_label
 
     root = tmp_path_factory.mktemp("co3d")
     turn = look_at((0.3, -1.0, 0.4)).R

@@ -19,7 +19,7 @@ from zsp_lite.data import archives
 from zsp_lite.data.archives import list_archives
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.labels import read_labels
-from zsp_lite.data.pairs import write_published_pairs
+from zsp_lite.data.writing import write_published_pairs
 from zsp_lite.io.locks import writing
 
 SEQUENCES, UNLABELLED = ("100_1_1", "200_2_2"), "300_3_3"

@@ -17,9 +17,10 @@ from zsp_lite import Co3D, InputError
 from zsp_lite.benchmark.run import evaluate, write_reports
 from zsp_lite.benchmark.runs import Run, add_lines, read_lines, read_run
 from zsp_lite.benchmark.tables import pair_figure
+from zsp_lite.data.evaluation import sample_pairs, true_poses
 from zsp_lite.data.ground_truth import POSES_FILE, ObjectPose, object_poses
 from zsp_lite.data.labels import read_labels
-from zsp_lite.data.pairs import category_pairs, sample_pairs, true_poses
+from zsp_lite.data.pairs import category_pairs
 from zsp_lite.metrics import rotation_error
 from zsp_lite.views import object_crop
 from zsp_lite.viz.plots import pale
@@ -187,7 +188,7 @@ def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(
     half_turned.write_text("\n".join(lines))
     pose = ObjectPose(np.eye(4)[:3].tolist(), 1.0, (0, 0, 0), (1, 1, 1), turns)
     poses = dict.fromkeys(SEQUENCES, pose)
-    monkeypatch.setattr("zsp_lite.data.ground_truth.read_poses", lambda *_: poses)
+    monkeypatch.setattr("zsp_lite.data.evaluation.read_poses", lambda *_: poses)
     mine = run_rows({"mine": str(half_turned)}, tmp_path, pairs=2, targets=1)["mine"]
     found = read_run(tmp_path).row("mine")[["symmetric_error", "error"]]
     assert_allclose(found, [[expected, 180]] * 2, atol=1e-5)

@@ -40,7 +40,8 @@ from zsp_lite.benchmark.runs import (
 )
 from zsp_lite.benchmark.tables import compare
 from zsp_lite.cli.main import main
-from zsp_lite.data.labels import read_labels, write_label
+from zsp_lite.data.labels import read_labels
+from zsp_lite.data.writing import write_label
 from zsp_lite.errors import FatalError
 from zsp_lite.threads import one_thread
 

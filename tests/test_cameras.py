@@ -9,7 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from synthetic_views import level_camera
 
-from zsp_lite.data.cameras import Camera, view_span
+from zsp_lite.data.azimuths import view_span
+from zsp_lite.data.cameras import Camera
 
 FORMATS = ["ndc_norm_image_bounds", "ndc_isotropic"]
 

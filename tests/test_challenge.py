@@ -17,7 +17,7 @@ import pytest
 from zsp_lite.course.challenge.answer import read_questions
 from zsp_lite.course.challenge.make import copy_for_pairs, make_challenge
 from zsp_lite.course.challenge.rank import rank
-from zsp_lite.data.pairs import true_poses
+from zsp_lite.data.evaluation import true_poses
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import REPOSITORY, read_json
 

@@ -21,7 +21,8 @@ from zsp_lite.cli import demo, doctor
 from zsp_lite.cli.estimate import estimate
 from zsp_lite.cli.main import cli, main
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.data.labels import PoseLabel, read_labels
+from zsp_lite.data.writing import write_label
 from zsp_lite.importers import FORMATS
 from zsp_lite.importers.convert import ImportResult
 

@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
 from zsp_lite.data.annotations import FrameAnnotation
-from zsp_lite.data.co3d import Co3D, Pair, write_co3d
-from zsp_lite.data.frames import write_depth, write_image, write_mask
+from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.writing import write_co3d, write_depth, write_image, write_mask
 
 
 @pytest.fixture

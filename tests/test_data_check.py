@@ -8,8 +8,9 @@ from refusals import refused
 
 from zsp_lite.data.check import check_folder
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import PoseLabel, write_label
-from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
+from zsp_lite.data.evaluation import sample_pairs
+from zsp_lite.data.labels import PoseLabel
+from zsp_lite.data.writing import pairs_path, write_label, write_published_pairs
 
 
 @pytest.fixture

@@ -14,13 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
 from zsp_lite import Camera, Frame
-from zsp_lite.data.depth import (
-    decode_depth,
-    encode_depth,
-    inpaint_depth,
-    patch_points,
-    unproject_depth,
-)
+from zsp_lite.data.depth import decode_depth, inpaint_depth, patch_points, unproject_depth
 from zsp_lite.data.frames import (
     crop_to_object,
     mask_to_bbox,
@@ -28,9 +22,8 @@ from zsp_lite.data.frames import (
     read_image,
     read_mask,
     resize_frame,
-    write_depth,
-    write_mask,
 )
+from zsp_lite.data.writing import encode_depth, write_depth, write_mask
 from zsp_lite.io.files import write_atomic
 from zsp_lite.points import (
     axis_deviation,

@@ -17,7 +17,7 @@ from zsp_lite import Co3D, Frame, open_source
 from zsp_lite.course.synthetic.export import make_object
 from zsp_lite.course.synthetic.sequences import render_sequence
 from zsp_lite.data.check import check_folder
-from zsp_lite.data.frames import write_image, write_mask
+from zsp_lite.data.writing import write_image, write_mask
 from zsp_lite.importers import open_capture
 from zsp_lite.importers.capture import CaptureFrame
 from zsp_lite.importers.convert import fuse, import_captures, import_source

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from zsp_lite import Sim3
 from zsp_lite.course.labelling import Labelling, align_picks
 from zsp_lite.course.labelling.session import MAX_RESIDUAL
-from zsp_lite.data.labels import PoseLabel, label_bytes, read_labels, write_label
+from zsp_lite.data.labels import PoseLabel, read_labels
+from zsp_lite.data.writing import label_bytes, write_label
 from zsp_lite.io.files import write_atomic
 
 

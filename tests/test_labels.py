@@ -22,10 +22,11 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from zsp_lite import Co3D, Sim3
-from zsp_lite.data.co3d import Pair, SequenceData, write_co3d
-from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose, write_label
-from zsp_lite.data.pairs import shipped_pairs, write_published_pairs
+from zsp_lite.data.co3d import Pair
+from zsp_lite.data.labels import PoseLabel, read_labels, relative_pose
+from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.data.published import align_worlds, import_labels, transfer_labels
+from zsp_lite.data.writing import SequenceData, write_co3d, write_label, write_published_pairs
 from zsp_lite.metrics import rotation_error
 
 

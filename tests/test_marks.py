@@ -8,6 +8,7 @@ import pytest
 from test_transfer import aligned, true_sim3
 
 from zsp_lite import Co3D
+from zsp_lite.data.clouds import extent
 from zsp_lite.io.ply import read_ply
 from zsp_lite.scans.marks import Mark, place_marks, write_marks
 from zsp_lite.viz.report import write_category_report
@@ -47,7 +48,7 @@ def test_the_seat_of_one_scooter_is_found_on_the_seat_of_the_other(placed, datas
     place = placed[0].places["scooter2"]
     assert place.found
     common = alignment.objects["scooter2"].sim3.apply(place.world)
-    size = dataset.extent("motorcycle", "scooter2")[1] * alignment.objects["scooter2"].sim3.scale
+    size = extent(dataset, "motorcycle", "scooter2")[1] * alignment.objects["scooter2"].sim3.scale
     assert np.linalg.norm(common - placed[0].common) < 0.15 * size
 
 

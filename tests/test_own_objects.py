@@ -28,9 +28,9 @@ import zsp_lite
 from zsp_lite import Frame, PoseEstimate, Sim3, ZeroShotPose, estimate_pose, open_source
 from zsp_lite.course.samples import sample_data
 from zsp_lite.data.co3d import Pair
-from zsp_lite.data.frames import write_image, write_mask
+from zsp_lite.data.evaluation import spread
 from zsp_lite.data.labels import read_labels
-from zsp_lite.data.pairs import spread
+from zsp_lite.data.writing import write_image, write_mask
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.sources import Source, open_pair
 from zsp_lite.io.ply import read_ply

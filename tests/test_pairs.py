@@ -6,16 +6,11 @@ import torch
 from co3d_folders import edit_json, sequence_data, write_category, write_identities
 from refusals import refused
 
-from zsp_lite.data.co3d import Co3D, Pair, write_co3d
-from zsp_lite.data.labels import PoseLabel, write_label
-from zsp_lite.data.pairs import (
-    category_pairs,
-    pairs_path,
-    read_published_pairs,
-    sample_pairs,
-    shipped_pairs,
-    write_published_pairs,
-)
+from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.evaluation import sample_pairs
+from zsp_lite.data.labels import PoseLabel
+from zsp_lite.data.pairs import category_pairs, read_published_pairs, shipped_pairs
+from zsp_lite.data.writing import pairs_path, write_co3d, write_label, write_published_pairs
 
 NAMES = ["s3", "s1", "s2"]
 

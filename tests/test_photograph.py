@@ -12,8 +12,10 @@ from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, look
 from zsp_lite.cli.demo import MODELS_NOTE
 from zsp_lite.course.motorcycle import FRONT, UP, load_photograph, motorcycle_frame
 from zsp_lite.course.photograph import run_photograph
-from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
-from zsp_lite.data.depth import fit_plane, unproject_depth
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.depth import unproject_depth
+from zsp_lite.data.writing import SequenceData, write_co3d
+from zsp_lite.importers.segments import fit_plane
 from zsp_lite.metrics import rotation_error
 from zsp_lite.points import axis_deviation, object_points
 

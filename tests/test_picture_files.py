@@ -15,8 +15,8 @@ from test_importers import write_lists, write_nerfstudio
 from test_masks import DIRECTIONS, ball_on_floor, overlap
 
 from zsp_lite import estimate_pose, open_source
-from zsp_lite.data.cameras import camera_from_pose
-from zsp_lite.data.frames import encode_depth, write_mask
+from zsp_lite.data.arrays import camera_from_pose
+from zsp_lite.data.writing import encode_depth, write_mask
 from zsp_lite.importers import open_capture
 from zsp_lite.importers.convert import import_source
 from zsp_lite.importers.files import (

@@ -30,7 +30,7 @@ from test_importers import (
 )
 
 from zsp_lite import Camera, open_source
-from zsp_lite.data.frames import write_image, write_mask
+from zsp_lite.data.writing import write_image, write_mask
 from zsp_lite.importers import open_capture, recognise
 from zsp_lite.importers.capture import find_masks, trusted
 from zsp_lite.importers.sources import spread_views

@@ -15,7 +15,8 @@ from synthetic_views import CoordinateBackbone
 from zsp_lite import Camera, Co3D, ZeroShotPose
 from zsp_lite.choices import SOLVERS
 from zsp_lite.course.demo import N_TARGETS, demo_pairs
-from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
+from zsp_lite.data.evaluation import sample_pairs
+from zsp_lite.data.writing import pairs_path, write_published_pairs
 from zsp_lite.estimates import Hypothesis, PoseEstimate
 from zsp_lite.io.files import REPOSITORY
 from zsp_lite.metrics import rotation_error

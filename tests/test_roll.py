@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, true_pose
 
 from zsp_lite import FeatureMap, estimate_pose
-from zsp_lite.data.frames import turn_frame
 from zsp_lite.metrics import rotation_error
+from zsp_lite.objects.scan import turn_frame
 
 
 class UprightBackbone(CoordinateBackbone):

@@ -10,8 +10,8 @@ from scipy.spatial import KDTree
 from synthetic_views import CoordinateBackbone, look_at
 
 from zsp_lite import Co3D, Sim3, load_backbone
-from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.ground_truth import read_poses
+from zsp_lite.data.writing import SequenceData, write_co3d
 from zsp_lite.scans.category import AlignedObject, CategoryAlignment
 from zsp_lite.scans.transfer import object_size, surface_views, transfer
 

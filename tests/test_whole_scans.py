@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from zsp_lite import Co3D, Sim3, ZeroShotPose, estimate_pose, load_backbone
 from zsp_lite.course.samples import sample_data
-from zsp_lite.data.pairs import spread
+from zsp_lite.data.evaluation import spread
 from zsp_lite.importers.sources import open_source
 from zsp_lite.metrics import rotation_error, vector_angle
 from zsp_lite.objects.scan import Scan

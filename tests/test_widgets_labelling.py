@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from zsp_lite import Sim3
 from zsp_lite.course.labelling import Labelling
-from zsp_lite.data.co3d import write_co3d
-from zsp_lite.data.labels import PoseLabel, read_labels, write_label
+from zsp_lite.data.labels import PoseLabel, read_labels
+from zsp_lite.data.writing import write_co3d, write_label
 from zsp_lite.metrics import rotation_error
 
 pytest.importorskip("anywidget", reason="the labelling widget is optional: pip install anywidget")

@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.benchmark.problem import FrameStore
 from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.evaluation import spread
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
-from zsp_lite.data.pairs import spread
 from zsp_lite.io.files import stable_hash
 from zsp_lite.metrics import SAME_ANGLE, rotation_angle
 from zsp_lite.scans import category as synchronisation

@@ -18,12 +18,12 @@ from uco3d_folders import write_uco3d
 from zsp_lite import Co3D, Frame, load_backbone
 from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.cli.main import main
-from zsp_lite.data.co3d import write_co3d
 from zsp_lite.data.exchange import read_stored_poses
 from zsp_lite.data.frames import read_depth, read_image, read_mask
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.data.published import import_labels
+from zsp_lite.data.writing import write_co3d
 from zsp_lite.importers import open_capture
 from zsp_lite.importers.files import read_depth_file
 from zsp_lite.importers.uco3d import import_uco3d

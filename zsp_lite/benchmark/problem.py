@@ -14,10 +14,11 @@ from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
 from zsp_lite.alignment import Sim3
+from zsp_lite.data.clouds import extent
 from zsp_lite.data.co3d import Co3D, Pair
+from zsp_lite.data.evaluation import spread
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.labels import read_labels
-from zsp_lite.data.pairs import spread
 from zsp_lite.errors import InputError, NoPoseError, ends_the_run
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.matching import similarities
@@ -150,7 +151,7 @@ class FrameStore:
         self.hypotheses = cache(self._hypotheses)
         self.shape = cache(self._shape)
         self.aligned = cache(self._aligned)
-        self.extent = cache(dataset.extent)
+        self.extent = cache(partial(extent, dataset))
         self.labels = cache(partial(read_labels, dataset.root))
 
     def _crop(self, category: str, sequence: str, number: int) -> Crop:

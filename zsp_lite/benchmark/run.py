@@ -53,9 +53,9 @@ from zsp_lite.benchmark.runs import (
 )
 from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.ground_truth import common_turns
+from zsp_lite.data.evaluation import common_turns, true_pose
 from zsp_lite.data.labels import read_labels
-from zsp_lite.data.pairs import category_pairs, labelled_categories, true_pose
+from zsp_lite.data.pairs import category_pairs, labelled_categories
 from zsp_lite.errors import InputError, check_integer
 from zsp_lite.io.files import digest, path_inside, read_bytes, write_atomic
 from zsp_lite.metrics import rotation_error

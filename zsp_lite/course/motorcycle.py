@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.depth import fit_plane, unproject_depth
-from zsp_lite.data.frames import Frame, largest_region
+from zsp_lite.data.depth import unproject_depth
+from zsp_lite.data.frames import Frame
+from zsp_lite.importers.segments import fit_plane, largest_region
 from zsp_lite.points import axis_deviation, object_points
 
 # The synthetic object whose directions are known.

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from zsp_lite.course import motorcycle
 from zsp_lite.course.demo import N_TARGETS
 from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.evaluation import spread
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.ground_truth import read_poses
-from zsp_lite.data.pairs import spread
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.features import FeatureExtractor
 from zsp_lite.metrics import vector_angle

@@ -5,8 +5,6 @@ decodes the sequence name and number of each frame only; `FrameIndex.frame` deco
 whole entry.
 """
 
-import gzip
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -139,12 +137,3 @@ def read_sequences(path: Path) -> list[SequenceAnnotation]:
 def read_annotations(path: Path) -> bytes:
     """Read the JSON of a gzipped annotation file, with null in place of NaN and Infinity."""
     return without_nan(decompress(read_bytes(path, "annotations"), f"annotations {path}"))
-
-
-def compress(data: bytes) -> bytes:
-    """Compress with gzip; equal data give equal bytes."""
-    # gzip.compress would write the platform into the header. Name and time are left out of it, too.
-    buffer = io.BytesIO()
-    with gzip.GzipFile(filename="", mode="wb", fileobj=buffer, mtime=0) as file:
-        file.write(data)
-    return buffer.getvalue()

@@ -14,12 +14,10 @@ from jaxtyping import Float, Real
 from numpy.typing import ArrayLike
 
 from zsp_lite.errors import (
-    InputError,
     check_integer,
     check_magnitude,
     check_number,
     real_array,
-    rigid_matrix,
     rotation_matrix,
 )
 
@@ -36,8 +34,6 @@ _QUARTER_TURN = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 # PyTorch3D's camera axes (+x left, +y up, +z forward) are OpenCV's rotated by 180 degrees about z.
 _AXES = np.array([-1.0, -1.0, 1.0])
 MOST_PIXELS = 1_000_000  # of a side of an image
-# A camera looks along the vertical if the sine of its angle to the vertical is at most this.
-_STEEP = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,71 +193,8 @@ class Camera:
         return camera
 
 
-def split_intrinsics(name: str, values: Values) -> Float[np.ndarray, "4"]:
-    """Return fx, fy, cx, cy of four numbers, of a matrix (3, 3), or of its 9 numbers."""
-    numbers = real_array(name, values)
-    if numbers.shape in ((3, 3), (9,)):
-        entries = numbers.ravel().tolist()
-        fx, _, cx, _, fy, cy, *_ = entries
-        if entries != [fx, 0, cx, 0, fy, cy, 0, 0, 1]:
-            raise InputError(
-                f"{name} is {numbers.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 in pixels"
-            )
-        numbers = np.array([fx, fy, cx, cy])
-    return real_array(name, numbers, (4,))
-
-
-def camera_from_pose(pose: Values, intrinsics: Values, size: tuple[int, int], where: str) -> Camera:
-    """Create a camera from intrinsics and a camera-to-world pose (4, 4) or (3, 4); errors begin
-    with `where`."""
-    if np.shape(pose) == (3, 4):
-        pose = np.vstack([pose, (0, 0, 0, 1)])
-    pose = rigid_matrix(f"{where}: camera-to-world pose", pose)
-    rotation = pose[:3, :3]
-    values = split_intrinsics(f"{where}: intrinsics", intrinsics)
-    try:
-        return Camera(rotation.T, -rotation.T @ pose[:3, 3], values[:2], values[2:], size)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
-
-
 def _ndc(size: Sequence[int], intrinsics_format: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the pixels per NDC unit and the pixel of the NDC origin, each (2,) as (x, y)."""
     half = np.array(size)[::-1] / 2
     scales = {NDC_NORM_IMAGE_BOUNDS: half, NDC_ISOTROPIC: np.full(2, half.min())}
     return scales[intrinsics_format], half
-
-
-def ground_axes(cameras: Sequence[Camera]) -> Float[np.ndarray, "2 3"]:
-    """Return the world's axes to the right and up in a drawing of the scene from above."""
-    # Images may be turned by 90 degrees: the vertical is the image axis, y or x, on which the
-    # cameras agree better, which is the one with the longer mean. If both are equal after rounding,
-    # it is y.
-    axes = np.mean([camera.R[[1, 0]] for camera in cameras], axis=0)
-    down = axes[np.linalg.norm(axes, axis=1).round(6).argmax()]
-    # The second and the third right singular vector of (1, 3) are normal to the vertical.
-    right, up = np.linalg.svd(down[None])[2][1:]
-    return np.stack([right, up if np.cross(right, up) @ down < 0 else -up])
-
-
-def azimuths(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
-    """Return the directions in degrees of cameras around a point; NaN for those above or below."""
-    directions = np.stack([camera.centre for camera in cameras]) - centre
-    x, y = ground_axes(cameras) @ directions.T
-    steep = np.hypot(x, y) <= _STEEP * np.linalg.norm(directions, axis=1)
-    return np.where(steep, np.nan, np.degrees(np.arctan2(y, x)))
-
-
-def view_span(cameras: Sequence[Camera], centre: Float[np.ndarray, "3"]) -> float:
-    """Return the angle in degrees that cameras span around a point: 360 minus the largest gap."""
-    angles = azimuths(cameras, centre)
-    angles = np.sort(angles[~np.isnan(angles)])
-    if len(angles) > 1:
-        gaps = np.diff(angles, append=angles[0] + 360)
-    else:
-        # At most one camera has a direction: the span is the largest angle between two cameras.
-        directions = np.stack([camera.centre for camera in cameras]) - centre
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        span = np.degrees(np.arccos((directions @ directions.T).clip(-1, 1).min()))
-        gaps = np.array([span, 360 - span])
-    return float(360 - gaps.max())

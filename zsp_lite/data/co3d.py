@@ -1,45 +1,29 @@
-"""Reader and writer of data sets in CO3D's layout (v1 and v2)."""
+"""Reader of data sets in CO3D's layout (v1 and v2)."""
 
-from collections.abc import Callable, Iterable, Sequence
+import pkgutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64, Real, UInt8
+from jaxtyping import Float64, UInt8
 
 from zsp_lite.data.annotations import (
     FRAMES_FILE,
     SEQUENCES_FILE,
-    DepthAnnotation,
     FrameAnnotation,
     FrameIndex,
     FrameKey,
-    ImageAnnotation,
-    MaskAnnotation,
-    PointCloudAnnotation,
     SequenceAnnotation,
-    Viewpoint,
-    compress,
     read_frame_index,
     read_sequences,
 )
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.frames import (
-    Frame,
-    check_pixels,
-    read_depth,
-    read_image,
-    read_mask,
-    write_depth,
-    write_image,
-    write_mask,
-)
+from zsp_lite.data.frames import Frame, check_pixels, read_depth, read_image, read_mask
 from zsp_lite.errors import InputError, check_choice
-from zsp_lite.io.files import path_inside, plain_name, stable_hash, write_atomic
-from zsp_lite.io.locks import writing
-from zsp_lite.io.ply import read_ply, write_ply
+from zsp_lite.io.files import path_inside, stable_hash
 
 # Sequences with greater qualities are worth labelling ("Choice of evaluation categories &
 # sequences" of the supplement).
@@ -209,29 +193,8 @@ class Co3D:
         self, category: str, sequence: str
     ) -> tuple[Float64[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"] | None]:
         """Read a sequence's point cloud: world points (n, 3), and RGB colours (n, 3) or None."""
-        path = self._cloud_path(category, sequence)
-        if path is None:
-            raise InputError(f"sequence {category}/{sequence} has no point cloud")
-        return read_ply(path)
-
-    def extent(self, category: str, sequence: str) -> tuple[Float64[np.ndarray, "3"], float] | None:
-        """Return the centre and the diameter of a sequence's object in its world.
-
-        Both describe the box around the points of its cloud, without the outermost 2 % on each
-        side. None without a point cloud.
-        """
-        path = self._cloud_path(category, sequence)
-        if path is None or not path.is_file():
-            return None
-        points, _ = read_ply(path)
-        low, high = np.quantile(points, (0.02, 0.98), axis=0)
-        return (low + high) / 2, float(np.linalg.norm(high - low))
-
-    def _cloud_path(self, category: str, sequence: str) -> Path | None:
-        """Return the path of a sequence's point cloud, None if the annotations have none."""
-        clouds = {known.sequence_name: known.point_cloud for known in self.sequences(category)}
-        cloud = clouds.get(sequence)
-        return None if cloud is None else path_inside(self.root, cloud.path)
+        # A module above this one, imported when it is used.
+        return pkgutil.resolve_name("zsp_lite.data.clouds:point_cloud")(self, category, sequence)
 
     def _read(
         self, reader: Callable[..., np.ndarray], relative: str, size: tuple[int, int], *options: Any
@@ -254,110 +217,3 @@ class Co3D:
             path = self._category_folder(category) / FRAMES_FILE
             self._index = (category, read_frame_index(path))
         return self._index[1]
-
-
-@dataclass(frozen=True, eq=False)
-class SequenceData:
-    """Content of a sequence for `write_co3d`; the points are in world coordinates."""
-
-    name: str
-    frames: Sequence[Frame]  # numbered from 0 in this order
-    timestamps: Sequence[float]  # of each frame, seconds
-    points: Real[np.ndarray, "n 3"]
-    colours: UInt8[np.ndarray, "n 3"]
-    normals: Real[np.ndarray, "n 3"] | None = None
-    viewpoint_quality: float | None = None
-    point_cloud_quality: float | None = None
-    depth_scale_adjustment: float = 1.0  # CO3D's factor from stored depth to depth
-
-
-def write_co3d(
-    root: str | Path, category: str, sequences: Iterable[SequenceData], quality: int = 92
-) -> None:
-    """Write sequences to ROOT/CATEGORY in CO3D v1's layout; equal input gives equal bytes.
-
-    Other sequences in the folder are kept; those of the same names are replaced. The annotations
-    are updated atomically after each sequence, so the folder stays readable if the run is
-    interrupted. Only one process can write to a category at a time. `quality` is that of JPEG, 0 to
-    100.
-    """
-    root = Path(root)
-    folder = root / plain_name(category, "category")
-    frames_path = folder / FRAMES_FILE
-    sequences_path = folder / SEQUENCES_FILE
-    with writing(folder):
-        # The annotations in each file, as (name of the sequence, annotation).
-        frames = []
-        listed = []
-        if frames_path.is_file():
-            index = read_frame_index(frames_path)
-            frames = [(key.sequence_name, frame) for key, frame in zip(index.keys, index.entries)]
-        if sequences_path.is_file():
-            listed = [(known.sequence_name, known) for known in read_sequences(sequences_path)]
-
-        for sequence in sequences:
-            new_frames, new_sequence = _write_sequence(root, category, sequence, quality)
-            _update(sequences_path, listed, sequence.name, [new_sequence])
-            _update(frames_path, frames, sequence.name, new_frames)
-
-
-def _update(path: Path, named: list[tuple[str, Any]], name: str, new: Sequence) -> None:
-    """Replace a sequence's annotations in the list, whose last ones they become, and in the file.
-
-    The list holds (name of the sequence, annotation).
-    """
-    named[:] = [pair for pair in named if pair[0] != name]
-    named += [(name, annotation) for annotation in new]
-    # A viewpoint holds arrays, which become lists.
-    content = msgspec.json.encode(
-        [annotation for _, annotation in named], enc_hook=np.ndarray.tolist
-    )
-    write_atomic(path, compress(content))
-
-
-def _write_sequence(
-    root: Path, category: str, sequence: SequenceData, quality: int
-) -> tuple[list[FrameAnnotation], SequenceAnnotation]:
-    """Write the files of a sequence; return the annotations of its frames, and of the sequence."""
-    base = f"{category}/{plain_name(sequence.name, 'sequence')}"
-    annotations = []
-    for number, (frame, timestamp) in enumerate(
-        zip(sequence.frames, sequence.timestamps, strict=True)
-    ):
-        stem = f"frame{number + 1:06d}"  # CO3D numbers frames from 0, and their files from 1
-        image = ImageAnnotation(f"{base}/images/{stem}.jpg", frame.camera.size)
-        write_image(root / image.path, frame.rgb, quality)
-        depth = mask = None
-        if frame.depth is not None:
-            path = f"{base}/depths/{stem}.jpg.geometric.png"
-            mask_path = f"{base}/depth_masks/{stem}.png"
-            depth = DepthAnnotation(path, float(sequence.depth_scale_adjustment), mask_path)
-            write_depth(root / path, frame.depth, sequence.depth_scale_adjustment)
-            write_mask(root / mask_path, frame.depth > 0)
-        if frame.mask is not None:
-            # The stored 8-bit values are summed, because a sum of integers is the same on every
-            # machine.
-            mass = int(np.rint(frame.mask.astype(np.float64) * 255).astype(np.int64).sum()) / 255
-            mask = MaskAnnotation(f"{base}/masks/{stem}.png", mass)
-            write_mask(root / mask.path, frame.mask)
-        annotations.append(
-            FrameAnnotation(
-                sequence.name,
-                number,
-                image,
-                float(timestamp),
-                depth,
-                mask,
-                Viewpoint(**frame.camera.to_pytorch3d()),
-            )
-        )
-    cloud = PointCloudAnnotation(
-        f"{base}/pointcloud.ply", sequence.point_cloud_quality, len(sequence.points)
-    )
-    write_ply(root / cloud.path, sequence.points, sequence.colours, sequence.normals)
-    return annotations, SequenceAnnotation(
-        sequence.name,
-        category,
-        point_cloud=cloud,
-        viewpoint_quality_score=sequence.viewpoint_quality,
-    )

@@ -10,9 +10,6 @@ from jaxtyping import Bool, Float, Real, UInt16
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError
 
-_PLANE_TRIALS = 500  # number of samples of three points
-_PLANE_POINTS = 4000  # largest number of points to which a plane is fitted, for speed
-
 
 def decode_depth(
     bits: UInt16[np.ndarray, "h w"], scale_adjustment: float = 1.0
@@ -27,16 +24,6 @@ def decode_depth(
 def zero_unknown(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Replace depth that is not finite or not positive by 0."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-
-
-def encode_depth(
-    depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0
-) -> UInt16[np.ndarray, "h w"]:
-    """Encode depth as the bits of float16 values; the inverse of `decode_depth`."""
-    depth = np.asarray(depth, dtype=np.float64) / scale_adjustment
-    # A value beyond float16's range (65504) would become infinite; it is stored as unknown.
-    usable = np.isfinite(depth) & (depth > 0) & (depth <= float(np.finfo(np.float16).max))
-    return np.where(usable, depth, 0).astype(np.float16).view(np.uint16)
 
 
 def inpaint_depth(depth: Real[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
@@ -109,27 +96,6 @@ def patch_points(
     if not inpaint:
         depths = np.where(known, depths, 0)
     return camera.unproject_camera(np.stack([x + 0.5, y + 0.5], axis=-1), depths), known
-
-
-def fit_plane(
-    points: Float[np.ndarray, "n 3"], threshold: float
-) -> tuple[Float[np.ndarray, "3"], float]:
-    """Fit a plane `normal @ x = offset` to points with outliers by RANSAC, up to its sign."""
-    # The step is rounded up.
-    points = points[:: -(-len(points) // _PLANE_POINTS)]
-    # A plane through three points in each trial: normals (trials, 3), distances (trials, n).
-    corners = points[np.random.default_rng(0).integers(len(points), size=(_PLANE_TRIALS, 3))]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = normals / np.where(lengths > 0, lengths, 1)
-    distances = np.abs(normals @ points.T - (normals * corners[:, 0]).sum(axis=1, keepdims=True))
-    # Collinear points span no plane: such a sample counts 0.
-    counts = (distances < threshold).sum(axis=1) * (lengths[:, 0] > 0)
-    # The least-squares plane of the inliers: their direction of least variance is its normal.
-    inliers = points[distances[counts.argmax()] < threshold]
-    centre = inliers.mean(axis=0)
-    normal = np.linalg.svd(inliers - centre, full_matrices=False)[2][2]
-    return normal, float(normal @ centre)
 
 
 def _split(length: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

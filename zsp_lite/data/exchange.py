@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.stats import binom
 
 from zsp_lite.data.co3d import Co3D, Pair
-from zsp_lite.data.pairs import true_poses
+from zsp_lite.data.evaluation import true_poses
 from zsp_lite.errors import (
     InputError,
     check_choice,

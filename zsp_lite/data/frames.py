@@ -1,6 +1,7 @@
 """RGB-D frames with object masks: cropping, resizing, and the image files of data folders."""
 
 import io
+import pkgutil
 import reprlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,13 +10,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Real, UInt8
+from jaxtyping import Float32, Real, UInt8
 from PIL import Image
 
-from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose, split_intrinsics
-from zsp_lite.data.depth import decode_depth, encode_depth, zero_unknown
-from zsp_lite.errors import MAX_LENGTH, InputError, check_number, real_array
-from zsp_lite.io.files import read_bytes, write_atomic
+from zsp_lite.data.cameras import Box, Camera, Values
+from zsp_lite.data.depth import decode_depth
+from zsp_lite.errors import MAX_LENGTH, InputError, real_array
+from zsp_lite.io.files import read_bytes
 
 MAX_PIXELS = 1 << 26  # of an image file
 # What is expected in place of files that no decoder here reads.
@@ -25,9 +26,6 @@ _NOT_READ = {
     ".exr": "the depth as .npy or a float .tiff",
 }
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
-# Largest relative difference of the aspect ratios of an image and its smaller depth map: sides are
-# rounded to whole pixels.
-_SAME_ASPECT = 0.01
 # An image whose colours are all below this value is black, as CO3D's hidden frames are.
 _BLACK = 10
 
@@ -110,47 +108,9 @@ class Frame:
         Raises:
             InputError: An array has another shape or type, or the arrays do not fit together.
         """
-        label = f"frame {name}".rstrip()
-
-        # Colours (H, W, 3), uint8. What is still of another type below is refused by `__init__`.
-        image = np.asarray(rgb)
-        if image.ndim == 2:
-            image = image[..., None]
-        if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
-            raise InputError(
-                f"{label} rgb has shape {image.shape}, expected (H, W), (H, W, 3) or (H, W, 4)"
-            )
-        image = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[..., :3]
-        size = image.shape[:2]
-
-        # The camera, from pixel centres at integers to ones at half-integers.
-        intrinsics = split_intrinsics(f"{label} K", K) + (0, 0, 0.5, 0.5)
-        pose = real_array(f"{label} pose", np.eye(4) if pose is None else pose)
-        defect = ""
-        if not np.isfinite(pose).all():
-            defect = "the camera's pose is not finite"
-            pose = np.eye(4)
-        camera = camera_from_pose(pose, intrinsics, size, label)
-        if image.dtype.kind == "f" and 0 <= image.min() and image.max() <= 1:
-            image = np.rint(255 * image).astype(np.uint8)
-
-        # Depth in units of the world, 0 where unknown.
-        check_number("depth_unit", depth_unit, above=0)
-        depth = _read_map(f"{label} depth", depth) * depth_unit
-        depth = zero_unknown(depth).astype(np.float32)
-
-        # Mask from 0 to 1.
-        if mask is not None:
-            mask = _read_map(f"{label} mask", mask).astype(np.float32)
-            largest = mask.max()
-            # Such a mask has labels or another scale: as 0 to 255, no pixel would be on the object.
-            if 1 < largest <= ON_OBJECT * 255:
-                raise InputError(
-                    f"{label} mask has {largest:g} at most, expected booleans, 0 and 1, or 0 to 255"
-                )
-            if largest > 1:
-                mask = mask / np.float32(255)
-        return cls(image, enlarge_depth(depth, size), mask, camera, name, defect)
+        # A module above this one, imported when it is used.
+        frame_from_arrays = pkgutil.resolve_name("zsp_lite.data.arrays:frame_from_arrays")
+        return frame_from_arrays(rgb, depth, K, mask, pose, depth_unit, name)
 
     @property
     def shows_object(self) -> bool:
@@ -162,16 +122,6 @@ class Frame:
         return f"Frame({self.name!r}, {height} x {width} pixels)"
 
 
-def _read_map(name: str, values: np.ndarray) -> Float64[np.ndarray, "h w"]:
-    """Convert numbers (h, w) or (h, w, 1); InputError for another shape."""
-    values = real_array(name, values)
-    if values.shape[2:] == (1,):
-        values = values[..., 0]
-    if values.ndim != 2 or not values.size:
-        raise InputError(f"{name} has shape {values.shape}, expected (h, w) or (h, w, 1)")
-    return values
-
-
 def list_frames(frames: Frame | Iterable[Frame]) -> list[Frame]:
     """List the frames of any iterable, or a single one; InputError if they are none."""
     listed = list(frames) if np.iterable(frames) else [frames]
@@ -180,21 +130,6 @@ def list_frames(frames: Frame | Iterable[Frame]) -> list[Frame]:
             f"frames are {reprlib.repr(frames)}, expected one zsp_lite.Frame or several"
         )
     return listed
-
-
-def enlarge_depth(
-    depth: Float32[np.ndarray, "h w"], size: tuple[int, int]
-) -> Float32[np.ndarray, "..."]:
-    """Enlarge a depth map of the same aspect ratio to an image's size (H, W).
-
-    Depth maps of other aspect ratios, or no smaller than the image, are returned as they are.
-    """
-    rows, columns = depth.shape
-    height, width = size
-    if rows >= height or abs(rows * width / (columns * height) - 1) > _SAME_ASPECT:
-        return depth
-    # Pixels take the nearest value, because the mean of two surfaces' depths lies on neither.
-    return cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
 
 def frame_defect(frame: Frame) -> str:
@@ -229,32 +164,12 @@ def mask_to_bbox(mask: Real[np.ndarray, "h w"], padding: float = 0.1) -> Box:
     return top, left, bottom - top, right - left
 
 
-def largest_region(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Return the largest connected region after parts thinner than 3 pixels are removed.
-
-    It is empty if there is no region.
-    """
-    opened = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    _, regions, statistics, _ = cv2.connectedComponentsWithStats(opened)
-    areas = statistics[1:, cv2.CC_STAT_AREA]  # the first region is the outside
-    return regions == 1 + areas.argmax() if len(areas) else np.zeros_like(inside)
-
-
 def crop_to_object(frame: Frame) -> Frame:
     """Crop a frame and its camera to the bounding box of its object mask (see `mask_to_bbox`)."""
     top, left, height, width = mask_to_bbox(frame.mask)
     inside = np.s_[top : top + height, left : left + width]
-    return _changed(
+    return with_images(
         frame, frame.camera.crop((top, left, height, width)), lambda image: image[inside]
-    )
-
-
-def turn_frame(frame: Frame, quarters: int) -> Frame:
-    """Turn a frame and its camera by quarter turns as in `numpy.rot90`; world points stay."""
-    return _changed(
-        frame,
-        frame.camera.turn(quarters),
-        lambda image: np.ascontiguousarray(np.rot90(image, quarters)),
     )
 
 
@@ -313,25 +228,7 @@ def check_pixels(path: str | Path, image: np.ndarray, size: tuple[int, int]) -> 
         raise InputError(f"{path} is {image.shape[:2]} pixels, expected (H, W) = {size}")
 
 
-def write_image(path: str | Path, rgb: UInt8[np.ndarray, "h w 3"], quality: int = 92) -> None:
-    """Write colours (H, W, 3) as JPEG of the given quality (0 to 100)."""
-    _encode(path, ".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])
-
-
-def write_mask(path: str | Path, mask: Real[np.ndarray, "h w"] | Bool[np.ndarray, "h w"]) -> None:
-    """Write probabilities (H, W) in [0, 1] as an 8-bit PNG, or a boolean mask as a 1-bit one."""
-    options = [cv2.IMWRITE_PNG_BILEVEL, 1] if mask.dtype == bool else []
-    _encode(path, ".png", np.rint(mask.astype(np.float64) * 255).astype(np.uint8), options)
-
-
-def write_depth(
-    path: str | Path, depth: Real[np.ndarray, "h w"], scale_adjustment: float = 1.0
-) -> None:
-    """Write depth (H, W) as a 16-bit PNG in CO3D's encoding (see `encode_depth`)."""
-    _encode(path, ".png", encode_depth(depth, scale_adjustment), [])
-
-
-def _changed(frame: Frame, camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Frame:
+def with_images(frame: Frame, camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Frame:
     """Return a frame with a new camera, and with `change` applied to colours, depth and mask."""
     images = {"rgb": frame.rgb, "depth": frame.depth, "mask": frame.mask}
     changed = {name: change(image) for name, image in images.items() if image is not None}
@@ -386,8 +283,3 @@ def decode_image(path: str | Path, what: str, flags: int) -> np.ndarray:
         if image is None:
             raise ValueError("damaged")
     return image
-
-
-def _encode(path: str | Path, extension: str, image: np.ndarray, options: list[int]) -> None:
-    """Write an image file by OpenCV with its options."""
-    write_atomic(path, cv2.imencode(extension, image, options)[1].tobytes())

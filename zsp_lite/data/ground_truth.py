@@ -1,19 +1,15 @@
 """Object poses of synthetic data, for evaluation only: the file object_poses.json of a category."""
 
-import functools
-import logging
 from pathlib import Path
 
 import msgspec
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.errors import InputError, rigid_matrix
 from zsp_lite.io.files import read_json
 
-_warn_once = functools.cache(logging.getLogger(__name__).warning)
 # A file in each category folder: the pose of each sequence's object in the sequence's world.
 POSES_FILE = "object_poses.json"
 _Vector = tuple[float, float, float]
@@ -58,28 +54,6 @@ def read_poses(out: Path, category: str) -> dict[str, ObjectPose]:
     for name, pose in poses.items():
         pose.trans = rigid_matrix(f"object poses {path}: {name}", pose.trans).tolist()
     return poses
-
-
-def common_turns(
-    out: Path, category: str, first: str, second: str
-) -> Float[np.ndarray, "s 3 3"] | None:
-    """Return the rotations in the second object's world after which both objects look the same.
-
-    The first of them is the identity. None if the pose of an object is not known.
-    """
-    try:
-        poses = read_poses(out, category)
-    # A damaged file costs one figure of the benchmark only.
-    except InputError as error:
-        _warn_once("%s", f"{error}: without it there is no symmetric_acc30")
-        return None
-    if not {first, second} <= poses.keys():
-        return None
-    common = [turn for turn in poses[first].turns if turn in poses[second].turns]
-    angles = [[turn] for turn in (0, *common)]
-    # A turn about the object's up axis, in the coordinates of the world.
-    to_world = poses[second].R
-    return to_world @ Rotation.from_euler("z", angles, degrees=True).as_matrix() @ to_world.T
 
 
 def object_poses(dataset: Co3D, category: str) -> dict[str, ObjectPose]:

@@ -5,7 +5,6 @@ reference sequence to the world of the sequence; the label of the reference sequ
 identity. Files: ROOT/class_labels/CATEGORY/SEQ.json.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +13,9 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.alignment import Sim3
 from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import InputError, rigid_matrix
-from zsp_lite.io.files import plain_name, read_json, write_atomic
+from zsp_lite.io.files import plain_name, read_json
 
 _Row = tuple[float, float, float, float]
 
@@ -82,30 +80,6 @@ def read_label(path: Path) -> PoseLabel:
     return PoseLabel(
         rigid_matrix(f"label {path}: trans", label.trans), label.seq, label.reference_seq
     )
-
-
-def write_label(root: str | Path, category: str, label: PoseLabel) -> Path:
-    """Write a label, in place of an earlier one of the same sequence, and return the path."""
-    path = label_folder(root, category) / f"{plain_name(label.seq, 'sequence')}.json"
-    write_atomic(path, label_bytes(label))
-    return path
-
-
-def label_bytes(label: PoseLabel) -> bytes:
-    """Encode a label as JSON in the format of the published code."""
-    return json.dumps(vars(label), default=np.ndarray.tolist).encode()
-
-
-def rigid_label(
-    sim3: Sim3, centre: Float[np.ndarray, "3"], seq: str, reference_seq: str
-) -> PoseLabel:
-    """Convert a similarity to a label with the same rotation and the same image of `centre`."""
-    # A label has no scale: with the similarity's translation, an object off the origin would be
-    # displaced.
-    trans = np.eye(4)
-    trans[:3, :3] = sim3.R
-    trans[:3, 3] = sim3.apply(centre) - sim3.R @ centre
-    return PoseLabel(trans, seq, reference_seq)
 
 
 def relative_pose(

@@ -11,14 +11,13 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import (
     PoseLabel,
     check_one_reference,
-    label_bytes,
     label_folder,
     read_label,
     read_label_files,
     read_labels,
-    rigid_label,
 )
 from zsp_lite.data.pairs import read_pair_file
+from zsp_lite.data.writing import label_bytes, rigid_label
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import read_bytes, write_atomic
 

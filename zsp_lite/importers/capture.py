@@ -1,23 +1,26 @@
 """RGB-D captures: the files and camera of a frame, and what the readers of formats share."""
 
+import os
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple, NoReturn
 
 import cv2
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.data.cameras import Camera, Values, camera_from_pose
-from zsp_lite.data.frames import Frame, check_pixels, decode_image, enlarge_depth
+from zsp_lite.data.arrays import camera_from_pose, enlarge_depth
+from zsp_lite.data.cameras import Camera, Values
+from zsp_lite.data.frames import Frame, check_pixels, decode_image
 from zsp_lite.errors import InputError, real_array
 from zsp_lite.importers import files
-from zsp_lite.io.files import OutsideError, find_inside, read_bytes
+from zsp_lite.io.files import read_bytes, shown
 
 # OpenCV's and Open3D's pixel centres are at integers: their principal points are smaller by this.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
@@ -27,6 +30,10 @@ MOST_FRAMES = 100  # by default, so many sharp frames of a larger capture are ch
 _CANDIDATES = 10  # largest number of frames of which the sharpest is chosen
 # Longest side in pixels of the copy of an image whose sharpness is measured.
 _SHARPNESS_SIDE = 640
+
+
+class OutsideError(InputError):
+    """A path whose text leads out of its folder, not a link on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,3 +294,36 @@ def read_numbers(
             f"{path}: {values.shape[1]} numbers per line, expected {' or '.join(map(str, columns))}"
         )
     return values
+
+
+def find_inside(root: str | Path, text: str) -> Path | None:
+    """Find a file in a folder by a path, relative or absolute, that another file gives.
+
+    The path of an image may lack its extension. Links inside the folder may lead anywhere, because
+    its owner made them. OutsideError if the text of the path leads out of the folder.
+    """
+    root = os.path.abspath(root)
+    text = text.replace("\\", "/")
+    # A path with a drive is absolute, also on systems that have no drives.
+    path = os.path.normpath(text if PureWindowsPath(text).drive else os.path.join(root, text))
+    # An absolute path may begin with the folder as it is given, or with the folder behind links.
+    if text and not path.startswith(
+        (os.path.join(root, ""), os.path.join(os.path.realpath(root), ""))
+    ):
+        expected = "a path inside, relative or absolute; a link inside may lead elsewhere"
+        raise OutsideError(
+            f"path {shown(text)} leads out of the folder {root}, expected {expected}"
+        )
+    for ending in ("", ".png", ".jpg", ".jpeg"):
+        if os.path.isfile(path + ending):
+            return Path(path + ending)
+    return None
+
+
+def convert_json(value: Any, kind: Any, what: str) -> Any:
+    """Convert decoded JSON, or what is like it, to a type of msgspec, with the errors of
+    `decode_json`."""
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{what}: {error}") from error

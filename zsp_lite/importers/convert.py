@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from zsp_lite.data.annotations import FRAMES_FILE, read_frame_index
-from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.frames import Frame
+from zsp_lite.data.writing import SequenceData, write_co3d
 from zsp_lite.errors import InputError
 from zsp_lite.importers import PACKED
 from zsp_lite.importers.capture import HALF_PIXEL

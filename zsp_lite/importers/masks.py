@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from zsp_lite.data.cameras import Box, Camera
-from zsp_lite.data.depth import fit_plane
-from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, largest_region, mask_to_bbox
+from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, mask_to_bbox
 from zsp_lite.errors import Contradiction, Doubt, InputError
 from zsp_lite.importers.files import WINDOW_3, WINDOW_5
+from zsp_lite.importers.segments import fit_plane, largest_region
 from zsp_lite.points import object_pixels, sampling_step, standard_deviation, world_points
 
 # Masks by colours.

@@ -8,9 +8,16 @@ from typing import Annotated, Any
 import msgspec
 
 from zsp_lite.errors import MAX_LENGTH, InputError
-from zsp_lite.importers.capture import FROM_OPENGL, CaptureFrame, Makers, make_frame
+from zsp_lite.importers.capture import (
+    FROM_OPENGL,
+    CaptureFrame,
+    Makers,
+    convert_json,
+    find_inside,
+    make_frame,
+)
 from zsp_lite.importers.files import picture_size
-from zsp_lite.io.files import convert_json, find_inside, read_json
+from zsp_lite.io.files import read_json
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")

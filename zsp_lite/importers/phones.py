@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.data.frames import write_image
+from zsp_lite.data.writing import write_image
 from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import (
     FROM_OPENGL,

@@ -10,10 +10,11 @@ from typing import Any, Literal
 import numpy as np
 
 from zsp_lite.data.annotations import FRAMES_FILE
-from zsp_lite.data.cameras import Box, Camera, Values, camera_from_pose
+from zsp_lite.data.arrays import camera_from_pose
+from zsp_lite.data.cameras import Box, Camera, Values
 from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.evaluation import spread
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, list_frames
-from zsp_lite.data.pairs import spread
 from zsp_lite.errors import Doubt, InputError
 from zsp_lite.importers import FORMATS, open_capture, recognise
 from zsp_lite.importers.agreement import disagreement, neighbours

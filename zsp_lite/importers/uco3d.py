@@ -19,11 +19,11 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from zsp_lite.data.cameras import NDC_ISOTROPIC, Camera
-from zsp_lite.data.co3d import SequenceData, write_co3d
 from zsp_lite.data.depth import zero_unknown
+from zsp_lite.data.evaluation import spread
 from zsp_lite.data.frames import MAX_PIXELS, Frame, check_pixels
-from zsp_lite.data.labels import PoseLabel, label_bytes
-from zsp_lite.data.pairs import spread
+from zsp_lite.data.labels import PoseLabel
+from zsp_lite.data.writing import SequenceData, label_bytes, write_co3d
 from zsp_lite.errors import (
     InputError,
     check_choice,
@@ -31,7 +31,7 @@ from zsp_lite.errors import (
     check_number,
     rotation_matrix,
 )
-from zsp_lite.importers.capture import HALF_PIXEL
+from zsp_lite.importers.capture import HALF_PIXEL, convert_json
 from zsp_lite.importers.convert import (
     MIN_VIEWS,
     ImportResult,
@@ -40,7 +40,7 @@ from zsp_lite.importers.convert import (
     scale_frame,
 )
 from zsp_lite.importers.unpacked import Video
-from zsp_lite.io.files import convert_json, file_size, path_inside, write_atomic
+from zsp_lite.io.files import file_size, path_inside, write_atomic
 from zsp_lite.io.ply import read_ply
 from zsp_lite.points import axis_deviation
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from zsp_lite.errors import InputError
-from zsp_lite.io.files import sha256
+from zsp_lite.io.files import file_size
 from zsp_lite.io.locks import writing
 
 CHUNK = 1 << 18  # bytes that are read at once
@@ -23,6 +23,13 @@ TIMEOUT = 30  # seconds until a server that does not answer is given up
 ATTEMPTS = 3  # number of requests, before the user must call again
 # What urllib raises if a server cannot be reached, sends no file, or has an invalid address.
 NETWORK_ERRORS = (OSError, http.client.HTTPException, ValueError)
+
+
+def sha256(path: str | Path, what: str) -> str:
+    """Return the SHA-256 digest of a file in hexadecimal digits."""
+    file_size(path, what)
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def fetch(

@@ -11,7 +11,7 @@ import re
 import secrets
 import stat
 import zlib
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -27,10 +27,6 @@ MAX_WEIGHTS = 4 << 30  # bytes of a file of weights
 GROWTH_ALLOWED = 1 << 26
 _GROWTH_FACTOR = 32
 _LONGEST_NAME = 255  # bytes of a file's name, on most file systems
-
-
-class OutsideError(InputError):
-    """A path whose text leads out of its folder, not a link on it."""
 
 
 def cache_folder() -> Path:
@@ -78,15 +74,6 @@ def decode_json(data: bytes | msgspec.Raw, kind: Any, what: str) -> Any:
         raise InputError(f"{what}: {error}") from error
 
 
-def convert_json(value: Any, kind: Any, what: str) -> Any:
-    """Convert decoded JSON, or what is like it, to a type of msgspec, with the errors of
-    `decode_json`."""
-    try:
-        return msgspec.convert(value, kind)
-    except msgspec.ValidationError as error:
-        raise InputError(f"{what}: {error}") from error
-
-
 def file_size(path: str | Path, what: str, most: float = math.inf) -> int:
     """Return the size of a file in bytes; InputError if it exceeds `most` or cannot be read."""
     try:
@@ -103,7 +90,7 @@ def file_size(path: str | Path, what: str, most: float = math.inf) -> int:
             problem = "permission denied"
     except (OSError, ValueError) as error:
         problem = str(getattr(error, "strerror", error)).lower()
-    raise InputError(f"{what} {_shown(path)} cannot be read: {problem}")
+    raise InputError(f"{what} {shown(path)} cannot be read: {problem}")
 
 
 def load_torch(path: str | Path, what: str) -> Any:
@@ -118,13 +105,6 @@ def load_torch(path: str | Path, what: str) -> Any:
         raise InputError(
             f"{what} {path}: damaged, or contains more than tensors ({type(error).__name__})"
         ) from error
-
-
-def sha256(path: str | Path, what: str) -> str:
-    """Return the SHA-256 digest of a file in hexadecimal digits."""
-    file_size(path, what)
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def digest(*parts: str | bytes) -> str:
@@ -166,32 +146,8 @@ def path_inside(root: str | Path, relative: str) -> Path:
     except (ValueError, OSError, RuntimeError):  # null byte, name too long, cyclic links
         problem = "is invalid in"
     raise InputError(
-        f"path {_shown(relative)} {problem} the data folder {root}, expected a path inside"
+        f"path {shown(relative)} {problem} the data folder {root}, expected a path inside"
     )
-
-
-def find_inside(root: str | Path, text: str) -> Path | None:
-    """Find a file in a folder by a path, relative or absolute, that another file gives.
-
-    The path of an image may lack its extension. Links inside the folder may lead anywhere, because
-    its owner made them. OutsideError if the text of the path leads out of the folder.
-    """
-    root = os.path.abspath(root)
-    text = text.replace("\\", "/")
-    # A path with a drive is absolute, also on systems that have no drives.
-    path = os.path.normpath(text if PureWindowsPath(text).drive else os.path.join(root, text))
-    # An absolute path may begin with the folder as it is given, or with the folder behind links.
-    if text and not path.startswith(
-        (os.path.join(root, ""), os.path.join(os.path.realpath(root), ""))
-    ):
-        expected = "a path inside, relative or absolute; a link inside may lead elsewhere"
-        raise OutsideError(
-            f"path {_shown(text)} leads out of the folder {root}, expected {expected}"
-        )
-    for ending in ("", ".png", ".jpg", ".jpeg"):
-        if os.path.isfile(path + ending):
-            return Path(path + ending)
-    return None
 
 
 def plain_name(name: str, what: str) -> str:
@@ -199,13 +155,13 @@ def plain_name(name: str, what: str) -> str:
     is_path = not name or name.startswith(".") or any(character in "/\\:\0" for character in name)
     if is_path or len(os.fsencode(name)) > _LONGEST_NAME:
         raise InputError(
-            f"{what} name is {_shown(name)!r}, expected a plain folder name of at most "
+            f"{what} name is {shown(name)!r}, expected a plain folder name of at most "
             f"{_LONGEST_NAME} bytes"
         )
     return name
 
 
-def _shown(path: str | Path) -> str:
+def shown(path: str | Path) -> str:
     """Format a path that may be very long or hold control characters."""
     text = str(path)
     return text if text.isprintable() and len(text) < 500 else f"{text[:100]!r}..."

@@ -22,8 +22,9 @@ from zsp_lite.benchmark.problem import FrameStore, evenly_spaced
 from zsp_lite.benchmark.runs import open_run, read_lines
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.frames import Frame
-from zsp_lite.data.labels import PoseLabel, label_bytes, rigid_label
+from zsp_lite.data.labels import PoseLabel
 from zsp_lite.data.published import write_all
+from zsp_lite.data.writing import label_bytes, rigid_label
 from zsp_lite.errors import InputError
 from zsp_lite.importers.sources import SourceLike, list_sources, open_source
 from zsp_lite.io.files import plain_name, read_json, write_atomic

@@ -9,8 +9,8 @@ from operator import itemgetter
 import numpy as np
 from jaxtyping import Float
 
-from zsp_lite.data.cameras import view_span
-from zsp_lite.data.frames import Frame, frame_defect, turn_frame
+from zsp_lite.data.azimuths import view_span
+from zsp_lite.data.frames import Frame, frame_defect, with_images
 from zsp_lite.errors import Doubt, NoPoseError
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.sources import Source
@@ -153,3 +153,12 @@ def scan_flags(scans: Sequence[Scan]) -> tuple[str, ...]:
             f"{what} {seen_from}: if {other} was taken from another side, this pose is wrong"
         )
     return tuple(flags)
+
+
+def turn_frame(frame: Frame, quarters: int) -> Frame:
+    """Turn a frame and its camera by quarter turns as in `numpy.rot90`; world points stay."""
+    return with_images(
+        frame,
+        frame.camera.turn(quarters),
+        lambda image: np.ascontiguousarray(np.rot90(image, quarters)),
+    )

@@ -25,7 +25,7 @@ from scipy.linalg import block_diag
 from scipy.special import softmax
 
 from zsp_lite.alignment import Sim3, nearest_rotation
-from zsp_lite.data.pairs import spread
+from zsp_lite.data.evaluation import spread
 from zsp_lite.metrics import rotation_angle, vector_angle
 from zsp_lite.scans.category import FLOOR, KAPPA, PairHypotheses
 from zsp_lite.scans.shapes import Shape, centred, chamfer_distance, compare_headings, refine

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from zsp_lite.backbones.named import BackboneLike, as_backbone
+from zsp_lite.data.clouds import extent
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import plain_name, write_atomic
@@ -215,8 +216,8 @@ def write_marks(
     directions = np.random.default_rng(0).normal(size=(400, 3))
     ball = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     for name in placed[0].places:
-        extent = dataset.extent(category, name)
-        radius = _RADIUS * (extent[1] if extent else 1.0)
+        box = extent(dataset, category, name)
+        radius = _RADIUS * (box[1] if box else 1.0)
         points = []
         colours = []
         for one, colour in zip(placed, itertools.cycle(COLOURS)):

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.alignment import Sim3, umeyama_batch
-from zsp_lite.data.cameras import view_span
+from zsp_lite.data.azimuths import view_span
 from zsp_lite.data.frames import Frame
 from zsp_lite.errors import NoPoseError
 from zsp_lite.points import near_median, standard_deviation, world_cloud

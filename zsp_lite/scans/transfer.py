@@ -30,8 +30,8 @@ from scipy.special import expit, softmax
 from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.named import BackboneLike, as_backbone
 from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.evaluation import spread
 from zsp_lite.data.frames import Frame, frame_defect
-from zsp_lite.data.pairs import spread
 from zsp_lite.errors import InputError, check_magnitude, real_array
 from zsp_lite.features import bin_indices, descriptors
 from zsp_lite.pipeline import ZeroShotPose
@@ -160,7 +160,7 @@ def marked_point(frame: Frame, x: float, y: float, what: str) -> Float[np.ndarra
 
 
 def object_size(views: Sequence[SurfaceView]) -> float:
-    """Return the diameter of an object in the common frame, as `Co3D.extent` defines it."""
+    """Return the diameter of an object in the common frame, as `clouds.extent` defines it."""
     points = np.concatenate([view.points for view in views])
     low, high = np.quantile(points, (0.02, 0.98), axis=0)
     return float(np.linalg.norm(high - low))

@@ -37,7 +37,7 @@ _MIN_SIMILARITY = 0.02
 
 
 def evidence(
-    # Angle in degrees that the target views span around the target (see `cameras.view_span`).
+    # Angle in degrees that the target views span around the target (see `azimuths.view_span`).
     span: float,
     n_views: int,
     # Angle in degrees from the reference's camera to the nearest target view's, under the best

@@ -21,7 +21,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.data.cameras import Camera, view_span
+from zsp_lite.data.azimuths import view_span
+from zsp_lite.data.cameras import Camera
 from zsp_lite.errors import NoPoseError
 from zsp_lite.estimates import between_cameras
 from zsp_lite.matching import Matches

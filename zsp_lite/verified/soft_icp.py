@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from zsp_lite.alignment import nearest_rotation
-from zsp_lite.data.pairs import spread
+from zsp_lite.data.evaluation import spread
 from zsp_lite.verified.poses import SCALE_RANGE, Poses, exp_, float_tensor
 from zsp_lite.verified.scene import Scene
 

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Wedge
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.data.cameras import Camera, azimuths, ground_axes
+from zsp_lite.data.azimuths import azimuths, ground_axes
+from zsp_lite.data.cameras import Camera
 from zsp_lite.data.frames import ON_OBJECT
 from zsp_lite.errors import InputError
 from zsp_lite.metrics import vector_angle

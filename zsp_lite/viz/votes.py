@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.data.cameras import ground_axes
+from zsp_lite.data.azimuths import ground_axes
 from zsp_lite.metrics import SAME_ANGLE
 from zsp_lite.scans.pair_result import PairResult, Vote
 from zsp_lite.viz import plots

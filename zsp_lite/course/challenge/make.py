@@ -10,10 +10,11 @@ from pathlib import Path
 import msgspec
 
 from zsp_lite.course.synthetic.export import export_categories
-from zsp_lite.data.annotations import FRAMES_FILE, SEQUENCES_FILE, SequenceAnnotation, compress
+from zsp_lite.data.annotations import FRAMES_FILE, SEQUENCES_FILE, SequenceAnnotation
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.exchange import write_questions
 from zsp_lite.data.pairs import category_pairs
+from zsp_lite.data.writing import compress
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import write_atomic
 

@@ -26,8 +26,8 @@ from zsp_lite.course.challenge.answer import read_questions
 from zsp_lite.course.challenge.make import QUESTIONS_FILE, copy_for_pairs
 from zsp_lite.course.synthetic.export import SETTINGS_FILE
 from zsp_lite.data.co3d import Pair
+from zsp_lite.data.evaluation import true_poses
 from zsp_lite.data.exchange import StoredPose, read_stored_poses
-from zsp_lite.data.pairs import true_poses
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import REPOSITORY, cache_folder, write_atomic
 from zsp_lite.metrics import rotation_error

@@ -23,14 +23,8 @@ from numpy.typing import ArrayLike
 from zsp_lite.alignment import Sim3, umeyama
 from zsp_lite.data.annotations import Row
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import (
-    PoseLabel,
-    label_folder,
-    read_label_folder,
-    read_labels,
-    rigid_label,
-    write_label,
-)
+from zsp_lite.data.labels import PoseLabel, label_folder, read_label_folder, read_labels
+from zsp_lite.data.writing import rigid_label, write_label
 from zsp_lite.errors import InputError, check_choice, check_magnitude, real_array
 from zsp_lite.io.files import plain_name, read_json, write_atomic
 

@@ -16,12 +16,20 @@ from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.course.synthetic.meshes import TexturedMesh, canonical_mesh, list_models, read_mesh
 from zsp_lite.course.synthetic.primitives import box_centre
 from zsp_lite.course.synthetic.sequences import HEIGHTS, record_sequence
-from zsp_lite.data.co3d import Co3D, SequenceData, write_co3d
+from zsp_lite.data.co3d import Co3D
+from zsp_lite.data.evaluation import sample_pairs
 from zsp_lite.data.ground_truth import POSES_FILE, ObjectPose, read_poses
-from zsp_lite.data.labels import PoseLabel, write_label
-from zsp_lite.data.pairs import pairs_path, sample_pairs, write_published_pairs
+from zsp_lite.data.labels import PoseLabel
+from zsp_lite.data.writing import (
+    SequenceData,
+    pairs_path,
+    write_co3d,
+    write_label,
+    write_published_pairs,
+)
 from zsp_lite.errors import InputError, check_choice
-from zsp_lite.io.files import read_json, sha256, stable_hash, write_atomic
+from zsp_lite.io.download import sha256
+from zsp_lite.io.files import read_json, stable_hash, write_atomic
 
 # File with the settings of the export, in the data folder of procedural objects.
 SETTINGS_FILE = "synthetic.json"

@@ -18,8 +18,8 @@ from zsp_lite.course.synthetic.raytracing import MeshScene, Rendering
 from zsp_lite.course.synthetic.room import random_room
 from zsp_lite.course.synthetic.textures import blur, smooth_noise
 from zsp_lite.data.cameras import Camera
-from zsp_lite.data.co3d import SequenceData
 from zsp_lite.data.frames import Frame
+from zsp_lite.data.writing import SequenceData
 from zsp_lite.points import axis_deviation
 
 _ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
