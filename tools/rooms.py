@@ -52,23 +52,29 @@ def modules() -> dict[str, Path]:
     }
 
 
-def imports() -> Iterator[tuple[str, str, int]]:
-    """Find every import, also inside functions.
+def imported_names(code: str) -> Iterator[tuple[str, int]]:
+    """Find every import of a program, also inside functions, and every `zsp_lite.NAME`.
 
-    Yields the importing module, the imported name such as "package.module.name", and the line.
+    Yields the imported name such as "package.module.name", and the line.
     """
+    homes = zsp_lite._HOME_OF  # where the public names of the package are defined
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"line {node.lineno}: relative import, expected the full name"
+            for alias in node.names:
+                home = homes.get(alias.name) if node.module == "zsp_lite" else None
+                yield f"{home or node.module}.{alias.name}", node.lineno
+        elif isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "zsp_lite":
+            yield f"{homes.get(node.attr, 'zsp_lite')}.{node.attr}", node.lineno
+
+
+def imports() -> Iterator[tuple[str, str, int]]:
+    """Find the imports of all modules: the module, the imported name and the line."""
     for module, path in modules().items():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                yield from ((module, alias.name, node.lineno) for alias in node.names)
-            elif isinstance(node, ast.ImportFrom):
-                assert not node.level, (
-                    f"{path}, line {node.lineno}: relative import, expected the full name"
-                )
-                # Where the public names of the package are defined.
-                homes = zsp_lite._HOME_OF if node.module == "zsp_lite" else {}
-                for alias in node.names:
-                    yield module, f"{homes.get(alias.name, node.module)}.{alias.name}", node.lineno
+        for name, line in imported_names(path.read_text(encoding="utf-8")):
+            yield module, name, line
 
 
 def flows() -> dict[tuple[str, str], Counter[str]]:

@@ -68,7 +68,7 @@ def category_data(
         marks = source.surface[: source.starts[-1]]
         places = []
         confidences = []
-        for target, tree in zip(shown, trees, strict=True):
+        for target, tree in zip(shown, trees):
             if target is source:
                 places.append(np.arange(len(marks)))
                 confidences.append(np.ones(len(marks)))
