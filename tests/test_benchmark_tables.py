@@ -88,6 +88,13 @@ def test_accuracies_of_a_table_are_the_runs(run, every):
     assert acc15.value == methods["ours-k70-nokmeans"]["acc15"]
 
 
+def test_the_median_of_a_table_is_the_mean_of_the_categories_medians(run, every):
+    ours = run.summary["methods"]["ours"]["per_category"]
+    median = cell(every["table_1"], "Ours (K=50)", "Med. err. (°)")
+    assert median.value == pytest.approx(np.mean([ours[name]["median"] for name in CATEGORIES]))
+    assert median.low < median.value < median.high
+
+
 def test_published_figures_stand_apart(every):
     assert cell(every["table_1"], "ICP", "toaster Acc30", PUBLISHED).value == 7.0
     assert cell(every["table_1"], "SWaV", "Acc30 (%)") is None  # was published only

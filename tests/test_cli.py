@@ -267,7 +267,7 @@ def test_tables_have_the_chosen_rows_in_their_order_and_metrics(table3, tmp_path
     options = "--rows ours-globalsim,ours --latex time,intervals --size 3,2 --metrics scale"
     assert "ms per pair" in run(f"tables {table3} {options} --out {tmp_path}")
     text = (tmp_path / "tables/all_rows.tex").read_text()
-    assert re.search(r"ms per pair.*ours-globalsim.* \[.*ours &", text, re.DOTALL)
+    assert re.search(r"ms per pair.*ours-globalsim.* \[.*ours +&", text, re.DOTALL)
     assert "scale ratio" in text
     assert "Acc15" not in text
 
