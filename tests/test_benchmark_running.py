@@ -16,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import cloudpickle
 import cv2
 import numpy as np
 import pytest
@@ -279,9 +280,21 @@ def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch
     assert evaluate(*arguments)["methods"]["ours-bv"]["n"] == 4
 
 
-def test_any_executor_will_do(undisturbed, tmp_path):
-    with ThreadPoolExecutor(2) as executor:
-        assert again(tmp_path, executor)["methods"] == undisturbed[1]["methods"]
+def test_any_executor_will_do_and_gets_the_backbone_once(undisturbed, tmp_path):
+    sizes = []
+
+    class Counting(ThreadPoolExecutor):
+        def submit(self, function, *arguments):
+            sizes.append(len(cloudpickle.dumps(arguments)))
+            return super().submit(function, *arguments)
+
+    heavy = replace(QUICK, _weights=np.zeros(1_000_000))
+    with Counting(2) as executor:
+        found = evaluate(small_folder(), heavy, ROWS, 6, 3, tmp_path, executor)
+    assert found["methods"] == undisturbed[1]["methods"]
+    assert len(sizes) > 2
+    assert max(sizes) < 10_000  # bytes: far less than the weights
+    assert list(tmp_path.glob(".rows*")) == []
 
 
 def thread_counts() -> list[int]:

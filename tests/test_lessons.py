@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from zsp_lite.course import hypotheses, pictures
+from zsp_lite.course import hypotheses, scan_pictures
 from zsp_lite.course.samples import sample_data
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
@@ -60,11 +60,11 @@ def test_a_common_turn_of_all_objects_changes_nothing_and_of_one_it_does(truth):
 
 def test_objects_are_seen_from_the_same_side_by_the_true_rotations(truth):
     dataset = Co3D(sample_data())
-    shown = pictures.alike(dataset, "car", truth, "suv")
+    shown = scan_pictures.alike(dataset, "car", truth, "suv")
     assert list(shown) == list(truth)
     assert {picture.shape for picture in shown.values()} == {(224, 224, 3)}
     turned = {name: rotation for name, rotation in truth.items()}
     turned["seat_leon"] = np.diag([-1.0, -1, 1]) @ turned["seat_leon"]
-    other = pictures.alike(dataset, "car", turned, "suv")
+    other = scan_pictures.alike(dataset, "car", turned, "suv")
     assert np.array_equal(other["suv"], shown["suv"])
     assert not np.array_equal(other["seat_leon"], shown["seat_leon"])

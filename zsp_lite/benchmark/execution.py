@@ -1,7 +1,7 @@
 """Evaluate pairs in this process, a pool of processes, or any `concurrent.futures.Executor`.
 
 Workers get chunks of a few pairs that share frames. A killed run loses the chunks that were being
-evaluated, and those that are finished before an earlier one.
+evaluated.
 """
 
 import logging
@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from itertools import chain
@@ -19,7 +19,7 @@ from multiprocessing import active_children, get_context, parent_process
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
-from uuid import UUID, uuid4
+from uuid import uuid4
 
 import cloudpickle
 from torch import get_num_threads
@@ -28,6 +28,7 @@ from tqdm import tqdm
 from zsp_lite.benchmark.runs import ResultLine, add_lines, read_lines
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError, check_integer, ends_the_run
+from zsp_lite.io.files import digest, read_bytes, write_atomic
 from zsp_lite.threads import one_thread
 
 # Evaluates the named rows on a pair, and returns the line of the run.
@@ -38,13 +39,14 @@ Opener = Callable[[int], Evaluator]
 Chunk = list[tuple[Pair, list[str]]]  # pairs, each with the names of its rows
 # Workers keep frames from chunk to chunk: chunks are small, so that the progress bar moves.
 _LARGEST_CHUNK = 4  # pairs
+_MOST_WORKERS = 4096  # largest number of processes that is accepted
 logger = logging.getLogger(__name__)
 
 
 def check_workers(executor: Executor | int) -> None:
     """Raise InputError for what is neither an Executor nor a number of processes."""
     if not isinstance(executor, Executor):
-        check_integer("workers", executor, 1)
+        check_integer("workers", executor, 1, _MOST_WORKERS)
 
 
 def evaluate_pairs(
@@ -81,7 +83,7 @@ def evaluate_pairs(
     chunks = [todo[start : start + size] for start in range(0, len(todo), size)]
     # None shows the bar in a terminal only.
     hidden = None if logger.isEnabledFor(logging.INFO) else True
-    found = _lines(opener, executor, chunks)
+    found = _lines(opener, executor, chunks, out)
     # Closed, so that workers get no more to do where a line cannot be stored.
     with (
         tqdm(
@@ -94,8 +96,10 @@ def evaluate_pairs(
             bar.update(len(lines))
 
 
-def _lines(opener: Opener, executor: Executor | int, chunks: list[Chunk]) -> Iterator[list[Any]]:
-    """Yield the lines of pairs: one by one in this process, else by chunk."""
+def _lines(
+    opener: Opener, executor: Executor | int, chunks: list[Chunk], out: str | Path
+) -> Iterator[list[Any]]:
+    """Yield the lines of pairs when they are found: one by one in this process, else by chunk."""
     if executor == 1:
         evaluate = opener(get_num_threads())
         with one_thread():
@@ -105,10 +109,18 @@ def _lines(opener: Opener, executor: Executor | int, chunks: list[Chunk]) -> Ite
 
     given = isinstance(executor, Executor)
     threads = 1 if given else max(1, get_num_threads() // executor)
+    # A backbone has megabytes: each worker reads the opener once, from a file in the run's
+    # folder, which all workers see. Absolute, because a worker may have another current folder.
+    path = Path(out).resolve() / f".rows-{uuid4()}"
+    futures = []
     with nullcontext(executor) if given else _processes(executor) as workers:
-        task = partial(_evaluate_chunk, uuid4(), _pickle(opener, workers), threads)
         try:
-            yield from workers.map(task, chunks)
+            pickled = _pickle(opener, workers)
+            write_atomic(path, pickled)
+            task = partial(_evaluate_chunk, str(path), digest(pickled), threads)
+            futures += [workers.submit(task, chunk) for chunk in chunks]
+            for future in as_completed(futures):
+                yield future.result()
         except ImportError as error:
             raise InputError(
                 f"a worker cannot import the rows: {error}, expected the module there, too"
@@ -118,6 +130,12 @@ def _lines(opener: Opener, executor: Executor | int, chunks: list[Chunk]) -> Ite
                 "a worker ended abruptly, perhaps out of memory; finished pairs are stored: run "
                 "again to continue, with fewer workers"
             ) from error
+        finally:
+            # A pool that is about to end would print a traceback for each cancelled future.
+            if given:
+                for future in futures:
+                    future.cancel()
+            path.unlink(missing_ok=True)
 
 
 def _pickle(opener: Opener, workers: Executor) -> bytes:
@@ -135,11 +153,16 @@ def _pickle(opener: Opener, workers: Executor) -> bytes:
 _worker = threading.local()  # an executor's workers may be threads
 
 
-def _evaluate_chunk(run: UUID, opener: bytes, threads: int, chunk: Chunk) -> list[Any]:
+def _evaluate_chunk(path: str, checksum: str, threads: int, chunk: Chunk) -> list[Any]:
     """Evaluate a chunk in a worker, which keeps the evaluator for the next chunk of the run."""
-    if getattr(_worker, "run", None) != run:
-        _worker.evaluate = cloudpickle.loads(opener)(threads)
-        _worker.run = run
+    if getattr(_worker, "path", None) != path:
+        pickled = read_bytes(path, "rows of the run")
+        if digest(pickled) != checksum:  # never unpickle what somebody else has written
+            raise InputError(
+                f"rows of the run {path} have changed, expected the file that this run wrote"
+            )
+        _worker.evaluate = cloudpickle.loads(pickled)(threads)
+        _worker.path = path
     with one_thread():
         return [_worker.evaluate(pair, names) for pair, names in chunk]
 

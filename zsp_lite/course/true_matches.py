@@ -26,6 +26,7 @@ _MASK_THRESHOLD = 0.8  # above this a pixel is surely of the object: masks are s
 class GroundTruthPair:
     """Object crops of two instances of a category with their ground-truth matches."""
 
+    category: str
     reference: Frame  # object crops
     target: Frame
     # matching target patch (row, col) of each reference patch
@@ -98,4 +99,4 @@ def ground_truth_pair(dataset: Co3D, pair: Pair) -> GroundTruthPair:
         for target in targets
     ]
     best = int(np.argmax([valid.sum() for _, valid in matches]))
-    return GroundTruthPair(reference, targets[best], *matches[best])
+    return GroundTruthPair(pair.category, reference, targets[best], *matches[best])

@@ -109,8 +109,8 @@ class Co3D:
             )
         return list(self._sequences[category])
 
-    def select(self, category: str) -> list[SequenceAnnotation]:
-        """Select at most ten sequences for labelling, those with the best point clouds first."""
+    def select(self, category: str, top: int = 10) -> list[SequenceAnnotation]:
+        """Select at most `top` sequences for labelling, those with the best point clouds first."""
         selected = []
         for sequence in self.sequences(category):
             cloud = sequence.point_cloud
@@ -120,7 +120,7 @@ class Co3D:
         return sorted(
             selected,
             key=lambda sequence: (-sequence.point_cloud.quality_score, sequence.sequence_name),
-        )[:10]
+        )[:top]
 
     def frame_list(self, category: str) -> list[FrameKey]:
         """List sequence and number of all frames, in the file's order.

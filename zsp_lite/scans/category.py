@@ -52,9 +52,9 @@ _AVERAGING_SWEEPS = 30
 # Coefficients of the logit in `_judge`: of the margin, of the case that no rotation is right, and
 # of the share of agreeing pairs in this case. tools/judge.py fits them on validation
 # categories to sets of three and four objects.
-MARGIN = 1.57
-NONE = -3.07
-NONE_AGREEING = -2.37
+MARGIN = 2.52
+NONE = -0.93
+NONE_AGREEING = -3.03
 
 _Poses = Float[np.ndarray, "_ 4 4"]  # matrices of similarities
 
