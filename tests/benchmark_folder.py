@@ -69,6 +69,7 @@ class SlowBackbone(CoordinateBackbone):
 
     name = "slow"
     _seconds: float = 0.05
+    _weights: np.ndarray | None = None
 
     def __call__(self, images):
         time.sleep(self._seconds * len(images))
