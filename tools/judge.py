@@ -1,6 +1,6 @@
 """Fit the constants of `scans.judge`, and those of `scans.category` to what it judges.
 
-    python -m tools.judge outputs/validation outputs/validation_artists
+    python -m tools.judge outputs/validation outputs/validation_scans
 
 Pairs of objects of validation categories are judged in several settings: scans all around, with
 noise, with an object that lies, within arcs, and a single image. The tool prints the constants, and
