@@ -9,7 +9,6 @@ from collections.abc import Mapping
 import pytest
 
 from tools.models import LICENCES, Entry, attribution, read_catalogue
-from tools.validation_categories import VALIDATION
 from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.io.files import REPOSITORY
 
@@ -108,7 +107,7 @@ def test_every_category_is_listed_on_its_side():
     )
     names_of = {
         "training": [*trained, *CATALOGUES["training"]],
-        "validation": [*VALIDATION, *CATALOGUES["validation"]],
+        "validation": CATALOGUES["validation"],
         "evaluation": [
             *CATEGORIES,
             *samples,

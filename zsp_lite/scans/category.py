@@ -50,8 +50,8 @@ _STARTS = 48  # of the search, of which the best result is kept
 _SEARCH_SWEEPS = 8  # over all objects, at most
 _AVERAGING_SWEEPS = 30
 # Coefficients of the logit in `_judge`: of the margin, of the case that no rotation is right, and
-# of the share of agreeing pairs in this case. tools/judge.py fits them on validation
-# categories to sets of three and four objects.
+# of the share of agreeing pairs in this case. Fitted on validation categories to sets of
+# three and four objects (docs/rebuild.md).
 MARGIN = 2.52
 NONE = -0.93
 NONE_AGREEING = -3.03

@@ -32,8 +32,8 @@ from zsp_lite.scans.shapes import Shape, centred, chamfer_distance, compare_head
 from zsp_lite.verified.confidence import hidden_share, modes
 from zsp_lite.verified.poses import float_tensor, non_maximum_suppression
 
-# w_1 to w_5, and the score of the case that no candidate is right. tools/judge.py fits them on
-# validation categories.
+# w_1 to w_5, and the score of the case that no candidate is right. Fitted on validation
+# categories (docs/rebuild.md).
 WEIGHTS = (2.15, -3.76, 3.16, -4.38, 2.67)
 NONE = -0.42
 REFERENCES = 4  # frames of each object that are asked at most

@@ -11,11 +11,11 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from tqdm import tqdm
 
-from zsp_lite.course.synthetic.assembly import Builder, make_shape, random_materials
+from zsp_lite.course.synthetic.assembly import make_shape, random_materials
 from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.course.synthetic.meshes import TexturedMesh, canonical_mesh, list_models, read_mesh
 from zsp_lite.course.synthetic.primitives import box_centre
-from zsp_lite.course.synthetic.sequences import HEIGHTS, record_sequence
+from zsp_lite.course.synthetic.sequences import record_sequence
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.evaluation import sample_pairs
 from zsp_lite.data.ground_truth import POSES_FILE, ObjectPose, read_poses
@@ -84,8 +84,6 @@ def export_categories(
     frames: int,
     seed: int,
     image_size: int = 256,
-    builders: Mapping[str, Builder] = CATEGORIES,
-    heights: tuple[float, float] = HEIGHTS,
     name_of: Callable[[int, str, int], str] = sequence_name,
 ) -> None:
     """Write sequences of procedural categories to a folder, with pose labels.
@@ -94,21 +92,19 @@ def export_categories(
     completed; complete sequences are not rendered again.
 
     Args:
-        categories: names of categories of `builders`.
+        categories: their names.
         out: the data folder.
         sequences: number of sequences per category; the first is the reference of the labels.
         frames: number of frames per sequence.
         seed: seed of everything random.
         image_size: shorter image side in pixels.
-        builders: functions that build an object, by category.
-        heights: range of the mean elevation of a sequence's cameras in degrees.
         name_of: name of a sequence, from the seed, its category and its index.
 
     Raises:
         InputError: if a category is unknown, or the folder was written with other settings.
     """
     for category in categories:
-        check_choice("category", category, builders)
+        check_choice("category", category, CATEGORIES)
     out = Path(out)
     settings = {"seed": seed, "frames": frames, "image_size": image_size}
     if (out / SETTINGS_FILE).is_file():
@@ -120,20 +116,18 @@ def export_categories(
         name = name_of(seed, category, index)
         key = _key(seed, category, index)
         if name not in read_poses(out, category):
-            mesh = make_object(category, index, seed, builders)
-            recorded = record_sequence(mesh, name, key, frames, image_size, heights)
+            mesh = make_object(category, index, seed)
+            recorded = record_sequence(mesh, name, key, frames, image_size)
             write_sequence(out, category, mesh, recorded)
     for category in categories:
         names = [name_of(seed, category, index) for index in range(sequences)]
         write_true_labels(out, category, names)
 
 
-def make_object(
-    category: str, index: int, seed: int, builders: Mapping[str, Builder] = CATEGORIES
-) -> TexturedMesh:
+def make_object(category: str, index: int, seed: int) -> TexturedMesh:
     """Return the object of sequence number `index` in canonical coordinates, with its materials."""
     key = _key(seed, category, index)
-    return replace(make_shape(builders[category], [key, 0]), materials=random_materials([key, 3]))
+    return replace(make_shape(CATEGORIES[category], [key, 0]), materials=random_materials([key, 3]))
 
 
 class _Rendered(msgspec.Struct):

@@ -24,7 +24,7 @@ from zsp_lite.points import axis_deviation
 
 _ASPECTS = ((1, 1), (4, 3), (3, 4))  # height : width
 # Lowest and highest mean elevation of a sequence's cameras above the object, in degrees.
-HEIGHTS = (19.0, 30.0)
+_HEIGHTS = (19.0, 30.0)
 _FRAME_MARGIN = 0.03  # free border at each image side, as a fraction of that side
 _DEPTH_NOISE = 0.005  # standard deviation relative to the depth, at the object
 # Ranges of the fraction of pixels without depth, which is drawn per sequence. Walls have no depth.
@@ -59,7 +59,6 @@ def handheld_sweep(
     rng: np.random.Generator,
     frames: int,
     size: tuple[int, int],
-    heights: tuple[float, float],
 ) -> list[Camera]:
     """Draw cameras, in object coordinates, of a hand that moves once around the object.
 
@@ -68,7 +67,6 @@ def handheld_sweep(
         rng: source of the random numbers.
         frames: number of cameras.
         size: height and width of their images in pixels.
-        heights: range of their mean elevation in degrees.
 
     Returns:
         Cameras of one focal length; the whole object is inside all their images.
@@ -82,9 +80,9 @@ def handheld_sweep(
         return np.sin(turns * TAU * progress + phase[k])
 
     azimuth = rng.uniform(0, TAU) + rng.choice([-1, 1]) * TAU * progress + 0.06 * wave(0, 2)
-    elevation = rng.uniform(*heights) + rng.uniform(3, 9) * wave(1, float(rng.choice([1, 2])))
+    elevation = rng.uniform(*_HEIGHTS) + rng.uniform(3, 9) * wave(1, float(rng.choice([1, 2])))
     elevation += rng.normal(0, 1, frames)
-    elevation = np.radians(elevation.clip(heights[0] - 9, heights[1] + 5))
+    elevation = np.radians(elevation.clip(_HEIGHTS[0] - 9, _HEIGHTS[1] + 5))
     distance = rng.uniform(6, 9) * (1 + 0.08 * wave(2, 1) + rng.normal(0, 0.01, frames))
     roll = np.radians(3 * wave(3, 1.5) + rng.normal(0, 2, frames))
     aim = box_centre(vertices) + rng.normal(0, 0.1, 3) + rng.normal(0, 0.05, (frames, 3))
@@ -117,7 +115,6 @@ def render_sequence(
     rng: np.random.Generator,
     frames: int,
     image_size: int,
-    heights: tuple[float, float] = HEIGHTS,
 ) -> tuple[list[Rendering], Float[np.ndarray, "4 4"]]:
     """Render exact views around an object in a random room.
 
@@ -126,7 +123,6 @@ def render_sequence(
         rng: source of the random numbers.
         frames: number of views.
         image_size: shorter image side in pixels.
-        heights: range of the mean elevation of the cameras in degrees.
 
     Returns:
         The views, whose cameras map from the world of the sequence; and the pose [R t] of the
@@ -134,7 +130,7 @@ def render_sequence(
     """
     aspect = np.array(_ASPECTS[rng.integers(len(_ASPECTS))])
     height, width = np.rint(aspect / aspect.min() * image_size).astype(int).tolist()
-    cameras = handheld_sweep(mesh.vertices, rng, frames, (height, width), heights)
+    cameras = handheld_sweep(mesh.vertices, rng, frames, (height, width))
     # The lines of floor and walls must not tell the heading of the object: the room is turned by an
     # angle from a random stream of its own.
     turn = rng.spawn(1)[0].uniform(0, TAU)
@@ -247,7 +243,6 @@ def record_sequence(
     key: int,
     frames: int,
     image_size: int,
-    heights: tuple[float, float] = HEIGHTS,
 ) -> tuple[SequenceData, Float[np.ndarray, "4 4"], float]:
     """Return a sequence with the errors of CO3D's data.
 
@@ -257,7 +252,6 @@ def record_sequence(
         key: seed of everything random about the sequence.
         frames: number of its frames.
         image_size: shorter image side in pixels.
-        heights: range of the mean elevation of the cameras in degrees.
 
     Returns:
         The sequence, whose point cloud has unit spread as in CO3D; and the exact pose [R t] and
@@ -265,7 +259,7 @@ def record_sequence(
     """
     # Views and errors have random numbers of their own: [key, 1] and [key, 2].
     rng = np.random.default_rng([key, 1])
-    views, pose = render_sequence(mesh, rng, frames, image_size, heights)
+    views, pose = render_sequence(mesh, rng, frames, image_size)
     seconds = np.round(np.arange(frames) * rng.uniform(0.4, 0.9), 3).tolist()
 
     # The fractions of holes vary from view to view about the fractions of the sequence.
