@@ -23,7 +23,7 @@ def truth() -> dict[str, np.ndarray]:
 
 
 def test_a_draw_has_one_stored_answer_of_each_ordered_pair(truth):
-    drawn = hypotheses.draw_answers(RUN, seed=3)
+    drawn = hypotheses.draw_answers(read_hypotheses(RUN).values(), seed=3)
     stored = [one.centre.tolist() for one in read_hypotheses(RUN).values()]
     assert {(one.reference, one.target) for one in drawn} == {
         (a, b) for a in truth for b in truth if a != b
@@ -33,7 +33,7 @@ def test_a_draw_has_one_stored_answer_of_each_ordered_pair(truth):
 
 
 def test_a_tree_believes_the_surest_answer_and_all_pairs_can_outvote_it(truth):
-    drawn = hypotheses.draw_answers(RUN, seed=62)
+    drawn = hypotheses.draw_answers(read_hypotheses(RUN).values(), seed=62)
     assert not hypotheses.all_alike(truth, hypotheses.spanning_tree(drawn))
     objects = synchronise(drawn).objects
     together = {name: one.sim3.R for name, one in objects.items()}

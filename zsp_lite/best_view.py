@@ -1,7 +1,6 @@
 """Best view selection: the paper's correspondence score and its three alternatives (sec. 4.2, table
 3)."""
 
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -10,21 +9,9 @@ from jaxtyping import Bool, Float
 
 from zsp_lite.features import FeatureMap
 from zsp_lite.matching import Matches, cyclical_distances
-from zsp_lite.views import View
+from zsp_lite.views import ViewMatch
 
 _NEIGHBOUR = 1.5  # patches; the eight neighbours of a patch are nearer
-
-
-@dataclass(frozen=True, eq=False)
-class ViewMatch:
-    """The reference and one target view, with their matches: the input of a view selector."""
-
-    reference: View
-    target: View
-    # cosines between the descriptors of their patches
-    similarity: Float[torch.Tensor, "reference target"]
-    matches: Matches  # at most k matches
-    k: int  # requested number of matches
 
 
 @runtime_checkable

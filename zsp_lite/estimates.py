@@ -11,11 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.best_view import ViewMatch
 from zsp_lite.data.cameras import Camera
 from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error
-from zsp_lite.views import View
+from zsp_lite.views import View, ViewMatch
 
 PointPairs = tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]  # of matches
 

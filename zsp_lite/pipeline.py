@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 
 from zsp_lite.alignment import SCALE_RANGE, Sim3, ransac
-from zsp_lite.best_view import VIEW_SELECTORS, ViewMatch, ViewSelector
+from zsp_lite.best_view import VIEW_SELECTORS, ViewSelector
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.frames import Frame, frame_defect, list_frames
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer, check_number
@@ -21,7 +21,7 @@ from zsp_lite.features import FeatureExtractor
 from zsp_lite.matchers import MATCHERS, Matcher
 from zsp_lite.matching import match, similarities
 from zsp_lite.points import standard_deviation
-from zsp_lite.views import IMAGE_SIZE, View, extract_views, object_crop, usable_targets
+from zsp_lite.views import IMAGE_SIZE, View, ViewMatch, extract_views, object_crop, usable_targets
 
 _FEW = 10  # the standard deviation of fewer points says little of the object's size
 

@@ -14,6 +14,7 @@ from zsp_lite.data.depth import patch_points
 from zsp_lite.data.frames import Frame, crop_to_object, frame_defect, resize_frame
 from zsp_lite.errors import FatalError, InputError, NoPoseError, ends_the_run
 from zsp_lite.features import SALIENCY_THRESHOLD, FeatureExtractor, FeatureMap
+from zsp_lite.matching import Matches
 
 IMAGE_SIZE = 224  # pixels of an object crop for a backbone without the attribute image_size
 # Share of a foreground patch that the mask covers. Thin parts, such as a chair's legs, do not cover
@@ -48,6 +49,18 @@ class View:
     def known_foreground(self) -> Bool[np.ndarray, "rows cols"]:
         """Foreground patches with measured depth."""
         return self.foreground.numpy() & self.measured_points[1]
+
+
+@dataclass(frozen=True, eq=False)
+class ViewMatch:
+    """The reference and one target view, with their matches: the input of a view selector."""
+
+    reference: View
+    target: View
+    # cosines between the descriptors of their patches
+    similarity: Float[torch.Tensor, "reference target"]
+    matches: Matches  # at most k matches
+    k: int  # requested number of matches
 
 
 def object_crop(frame: Frame, size: int | None = IMAGE_SIZE) -> Frame:

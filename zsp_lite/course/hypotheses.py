@@ -1,8 +1,7 @@
 """What the lesson on hypotheses computes beside the library: a full turn of a pose, and the answers
 of several objects."""
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -10,7 +9,6 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from zsp_lite.metrics import SAME_ANGLE, rotation_angle
-from zsp_lite.objects.align import read_hypotheses
 from zsp_lite.scans.category import PairHypotheses
 from zsp_lite.verified.poses import Poses
 from zsp_lite.verified.solver import Solution
@@ -40,10 +38,10 @@ def full_turn(
     return degrees, turned, scores.numpy()
 
 
-def draw_answers(run: str | Path, seed: int) -> list[PairHypotheses]:
-    """Draw one stored answer for each ordered pair of objects, of those from several frames."""
+def draw_answers(every: Iterable[PairHypotheses], seed: int) -> list[PairHypotheses]:
+    """Draw one answer for each ordered pair of objects, of those from several frames."""
     answers: dict[tuple[str, str], list[PairHypotheses]] = {}
-    for answer in read_hypotheses(run).values():
+    for answer in every:
         answers.setdefault((answer.reference, answer.target), []).append(answer)
     rng = np.random.default_rng(seed)
     return [several[rng.integers(len(several))] for several in answers.values()]

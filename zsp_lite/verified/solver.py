@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Bool, Float
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.best_view import ViewMatch
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
 from zsp_lite.matching import Matches
 from zsp_lite.verified.confidence import Calibration, evidence, modes, reliability_flags
@@ -19,7 +18,7 @@ from zsp_lite.verified.refinement import MAX_HYPOTHESES, MIN_ANGLE, refine_coars
 from zsp_lite.verified.scene import Scene, build_scene, measured_match_points
 from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import TERM_NAMES, WEIGHTS, score_terms
-from zsp_lite.views import View
+from zsp_lite.views import View, ViewMatch
 
 _MAX_REFINED = 12  # largest number of proposals that are refined
 _MIN_ANGLE_REFINED = 20.0  # degrees between the rotations of these proposals
