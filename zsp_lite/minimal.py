@@ -5,6 +5,7 @@ one exception is `estimate_pose`: here it takes crops, in the library files or f
 reference image, I2 a target image, Phi(I) the descriptors of I, u a patch of I1 and v one of I2.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -45,9 +46,16 @@ def estimate_pose(reference: Crop, targets, k=50, trials=1000, threshold=0.2, se
     matches = [find_matches(reference, target, k, seed) for target in targets]
     view = int(np.argmax([view_score(cosine, k) for _, _, cosine in matches]))
     u, v, _ = matches[view]
-    x, y = unproject(reference, u), unproject(targets[view], v)
+    x, y = (unproject(*pixel_depths(*end)) for end in ((reference, u), (targets[view], v)))
     (scale, R, t), inliers = ransac(x, y, trials, threshold, np.random.default_rng(seed))
     return Pose(scale, R, t, view, (u, v), inliers)
+
+
+def descriptor(image, row, column, step):
+    """Take the 9 vectors of image (h, w, d) at and around a patch; a step ends at the border."""
+    rows = [np.clip(row + step * i, 0, image.shape[0] - 1) for i in (-1, 0, 1)]
+    columns = [np.clip(column + step * i, 0, image.shape[1] - 1) for i in (-1, 0, 1)]
+    return [image[i, j] for i in rows for j in columns]
 
 
 def log_bin(keys):
@@ -56,46 +64,58 @@ def log_bin(keys):
     Bins: the keys of 3 x 3 neighbours, and means over 3 x 3 patches at the 8 ones at distance 3.
     """
     keys = torch.as_tensor(keys).double()
-    channels = keys.permute(2, 0, 1)  # first, as pooling takes them
-    coarse = avg_pool2d(channels, 3, stride=1, padding=1, count_include_pad=False).permute(1, 2, 0)
     row, column = np.indices(keys.shape[:2])
-
-    def neighbours(image, dy, dx):
-        return image[(row + dy).clip(0, row.max()), (column + dx).clip(0, column.max())]
-
-    bins = [neighbours(keys, dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
-    bins += [neighbours(coarse, dy, dx) for dy in (-3, 0, 3) for dx in (-3, 0, 3) if dy or dx]
+    far = descriptor(means(keys), row, column, 3)
+    bins = descriptor(keys, row, column, 1) + far[:4] + far[5:]
     return normalize(torch.cat(bins, dim=2).flatten(0, 1), dim=1)
+
+
+def means(keys):
+    """Compute the means of the 3 x 3 keys around each patch (h, w, d); at a border, of fewer."""
+    channels = keys.permute(2, 0, 1)  # first, as pooling takes them
+    return avg_pool2d(channels, 3, stride=1, padding=1, count_include_pad=False).permute(1, 2, 0)
+
+
+def cycle(cosine, place, on1, on2):
+    """Follow each patch u to its nearest v, and v to u' (eq. 2): v, and -C_u = d(u, u') or inf."""
+    v = cosine.argmax(axis=1)  # of unit vectors, the largest cosine is the smallest distance
+    back = cosine.argmax(axis=0)[v]
+    distance = np.linalg.norm(place - place[back], axis=1)
+    return v, np.where(on1 & on2[v] & on1[back], distance, np.inf)
+
+
+def kmeans(vectors, k, seed=0):
+    """Assign n vectors to k clusters: labels (n,)."""
+    # k-means needs only distances: points in n dimensions with the same inner products do.
+    values, axes = np.linalg.eigh((vectors @ vectors.T).round(decimals=6))
+    points = axes * np.sqrt(np.maximum(values, 0))
+    draw = int(np.random.default_rng(seed).integers(2**31))
+    return KMeans(k, n_init=1, random_state=draw).fit_predict(points)
+
+
+def choose(distance, cosine, descriptors, salience, k, kmeans=kmeans):
+    """Choose at most k patches u: the most salient of k clusters of the 2k with the smallest
+    distances; of equal distances, the most similar."""
+    best = np.lexsort([-cosine, distance])
+    best = best[np.isfinite(distance[best])][: 2 * k]
+    if len(best) <= k:
+        return best
+    label = kmeans(descriptors[best], k)
+    clusters = [best[label == cluster] for cluster in np.unique(label)]
+    return best[np.isin(best, [members[salience[members].argmax()] for members in clusters])]
 
 
 def find_matches(reference, target, k, seed):
     """Find at most k matches (sec. 4.1): patches u and v (n, 2), cosines of descriptors (n,)."""
-    phi1, phi2 = log_bin(reference.keys), log_bin(target.keys)
+    phi1, phi2 = log_bin(reference.keys).numpy(), log_bin(target.keys).numpy()
     salience1, salience2 = reference.saliency.ravel(), target.saliency.ravel()
     place1 = np.argwhere(np.ones(reference.saliency.shape))  # (row, column) of each patch
     place2 = np.argwhere(np.ones(target.saliency.shape))
-    cosine = (phi1 @ phi2.T).numpy()  # the largest cosine of unit vectors is the smallest distance
-
-    # Cycle (eq. 2): v is the nearest neighbour of u, and u' that of v. Off the object: infinite.
-    u = np.arange(len(phi1))
-    v = cosine.argmax(axis=1)
-    u_cycle = cosine.argmax(axis=0)[v]
-    on_object = np.minimum(np.minimum(salience1[u], salience2[v]), salience1[u_cycle]) > SALIENT
-    distance = np.linalg.norm(place1[u] - place1[u_cycle], axis=1)  # -C_u = d(u, u')
-    distance = np.where(on_object, distance, np.inf)
-
-    # Of the 2k smallest distances (of equal ones, the most similar), the most salient of k clusters
-    best = np.lexsort([-cosine[u, v], distance])
-    best = best[np.isfinite(distance[best])][: 2 * k]
-    if len(best) > k:
-        # k-means needs only distances: points in 2k dimensions with the same inner products do.
-        values, vectors = np.linalg.eigh((phi1[best] @ phi1[best].T).round(decimals=6).numpy())
-        points = vectors * np.sqrt(np.maximum(values, 0))
-        draw = int(np.random.default_rng(seed).integers(2**31))
-        label = KMeans(k, n_init=1, random_state=draw).fit_predict(points)
-        clusters = [best[label == cluster] for cluster in np.unique(label)]
-        best = best[np.isin(best, [members[salience1[members].argmax()] for members in clusters])]
-    return place1[best], place2[v[best]], cosine[best, v[best]]
+    cosine = phi1 @ phi2.T
+    v, distance = cycle(cosine, place1, salience1 > SALIENT, salience2 > SALIENT)
+    nearest = cosine[np.arange(len(v)), v]
+    u = choose(distance, nearest, phi1, salience1, k, partial(kmeans, seed=seed))
+    return place1[u], place2[v[u]], nearest[u]
 
 
 def view_score(cosine, k):
@@ -104,8 +124,8 @@ def view_score(cosine, k):
     return -np.sqrt(np.maximum(2 - 2 * cosine, 0)).sum() - (k - len(cosine)) * np.sqrt(2)
 
 
-def unproject(crop, patches):
-    """Compute depth * K^-1 (column, row, 1) at one pixel of each patch (supplement).
+def pixel_depths(crop, patches):
+    """Find a pixel of each patch: centres (n, 2) as (x, y), depths (n,), and the intrinsics.
 
     It is at the 25th percentile of the known depths, or the centre, in-painted, if none is known.
     """
@@ -113,16 +133,22 @@ def unproject(crop, patches):
     filled = cv2.inpaint(crop.depth, np.uint8(~known), 3, cv2.INPAINT_NS)
     filled = np.clip(np.nan_to_num(filled), crop.depth[known].min(), crop.depth.max())
     height, width = np.array(crop.depth.shape) // crop.saliency.shape  # of a patch, in pixels
-    points = []
-    for top, left in patches * (height, width):
+    found = np.empty((len(patches), 3))
+    for i, (top, left) in enumerate(patches * (height, width)):
         depth = np.where(known, crop.depth, np.inf)[top : top + height, left : left + width].ravel()
         count = np.isfinite(depth).sum()
         pixel = height // 2 * width + width // 2
         if count:
             pixel = np.argsort(depth, kind="stable")[(count - 1) // 4]
         row, column = top + pixel // width, left + pixel % width
-        points.append(filled[row, column] * np.linalg.solve(crop.K, [column + 0.5, row + 0.5, 1]))
-    return np.array(points)
+        found[i] = column + 0.5, row + 0.5, filled[row, column]
+    return found[:, :2], found[:, 2], crop.K
+
+
+def unproject(pixels, depth, K):
+    """Compute depth * K^-1 (x, y, 1), the points (n, 3) of pixels (n, 2) (supplement)."""
+    rays = np.linalg.solve(K, np.column_stack([pixels, np.ones(len(pixels))]).T).T
+    return depth[:, None] * rays
 
 
 def umeyama(x, y, scales=(0, np.inf)):
@@ -137,17 +163,22 @@ def umeyama(x, y, scales=(0, np.inf)):
     return scale, R, y.mean(axis=0) - scale * R @ x.mean(axis=0)
 
 
+def draw_samples(n, trials, rng):
+    """Draw samples of 4 of n matches, without replacement: (trials, 4)."""
+    samples = np.empty((trials, 4), dtype=int)
+    for i in range(4):  # a rank among the indices that are not in the sample yet
+        samples[:, i] = rng.integers(n - i, size=trials)
+        for earlier in np.sort(samples[:, :i]).T:
+            samples[:, i] += samples[:, i] >= earlier
+    return samples
+
+
 def ransac(x, y, trials, threshold, rng):
     """Fit a similarity to samples of 4 matches, and refit the best to its inliers (sec. 4.3)."""
     if len(x) < 4:
         raise InputError(f"the best view has {len(x)} matches, expected at least 4")
-    samples = np.empty((trials, 4), dtype=int)
-    for i in range(4):  # without replacement: a rank among the indices not in the sample yet
-        samples[:, i] = rng.integers(len(x) - i, size=trials)
-        for earlier in np.sort(samples[:, :i]).T:
-            samples[:, i] += samples[:, i] >= earlier
     best, agreement = None, (-1, 0)
-    for sample in samples:
+    for sample in draw_samples(len(x), trials, rng):
         fit = umeyama(x[sample], y[sample])
         if fit and SCALES[0] <= fit[0] <= SCALES[1]:
             scale, R, t = fit

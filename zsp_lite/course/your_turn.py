@@ -1,0 +1,360 @@
+"""The parts of the method that a student writes: `check` tests a part on small arrays, says which
+known mistake it has, and keeps a right one in `my_method.py`.
+
+A part is kept as its source, so that the file can be read and imported, and a restart of the kernel
+loses nothing. `your_turn.json` has the arrays, and the known mistakes as changes of the library's
+source.
+"""
+
+import ast
+import builtins
+import copy
+import inspect
+import json
+import runpy
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from types import FrameType, SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from zsp_lite import minimal
+from zsp_lite.alignment import Sim3
+from zsp_lite.errors import InputError
+from zsp_lite.io.files import write_atomic
+from zsp_lite.minimal import (
+    Crop,
+    choose,
+    cycle,
+    descriptor,
+    pixel_depths,
+    ransac,
+    umeyama,
+    unproject,
+    view_score,
+)
+
+FILE = "my_method.py"  # in the current folder
+SECONDS = 10.0  # that a part has for all its tests
+# What a kept file begins with: the library's parts, which those of the student replace.
+HEADER = '''\
+"""My method: the parts that I wrote. For the others it takes the library's."""
+
+import numpy as np
+
+from zsp_lite.alignment import Sim3
+from zsp_lite.course.your_turn import crops, interval, patches, rotation_error
+from zsp_lite.minimal import choose, cycle, descriptor, kmeans, pixel_depths
+from zsp_lite.minimal import ransac, umeyama, unproject, view_score
+'''
+
+
+class Patches(NamedTuple):
+    """The n patches of a crop, row by row."""
+
+    descriptors: np.ndarray  # (n, 17 d), of length 1
+    place: np.ndarray  # (n, 2), row and column
+    salience: np.ndarray  # (n,)
+    on: np.ndarray  # (n,) bool, on the object
+
+
+def crops(problem: Any) -> list[Crop]:
+    """Return the crops of a pair, the reference's first: features, depth, intrinsics.
+
+    A pair is whatever has views: `problem.views()`, as the benchmark's problems have.
+    """
+    return [
+        Crop(view.features.keys.numpy(), view.features.saliency.numpy(), view.frame.depth,
+             view.frame.camera.K)
+        for view in problem.views()
+    ]  # fmt: skip
+
+
+def patches(crop: Crop, descriptor: Callable) -> Patches:
+    """Describe each patch of a crop by 17 bins, taken by a function `descriptor`."""
+    coarse = minimal.means(torch.from_numpy(crop.keys)).numpy()
+    place = np.argwhere(np.ones(crop.saliency.shape))
+    rows = []
+    for row, column in place:
+        far = list(descriptor(coarse, row, column, 3))
+        rows.append(np.concatenate([*descriptor(crop.keys, row, column, 1), *far[:4], *far[5:]]))
+    salience = crop.saliency.ravel()
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    return Patches(rows / lengths, place, salience, salience > minimal.SALIENT)
+
+
+def rotation_error(first, second):
+    """Compute the angle between two rotations (3, 3) in degrees."""
+    cosine = (np.trace(first.T @ second) - 1) / 2
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def interval(right, first, second, rng):
+    """Compute the 95 % interval of the share of right pairs (n,), as objects are drawn again.
+
+    A pair counts as often as its objects, numbers `first` and `second` (n,), are drawn.
+    """
+    shares, n = [], max(*first, *second) + 1
+    while len(shares) < 2000:
+        times = np.bincount(rng.integers(n, size=n), minlength=n)
+        weight = times[first] * times[second]
+        if weight.any():
+            shares.append(weight @ right / weight.sum())
+    return np.percentile(shares, [2.5, 97.5])
+
+
+def estimate(problem):
+    """Estimate the pose of the reference object in the best of the target views."""
+    reference, *targets = crops(problem)
+    one, found = patches(reference, descriptor), []
+    for target in targets:
+        other = patches(target, descriptor)
+        cosine = one.descriptors @ other.descriptors.T
+        v, distance = cycle(cosine, one.place, one.on, other.on)
+        nearest = cosine.max(axis=1)
+        u = choose(distance, nearest, one.descriptors, one.salience, 50)
+        found.append((one.place[u], other.place[v[u]], nearest[u]))
+    view = int(np.argmax([view_score(cosine, 50) for _, _, cosine in found]))
+    x = unproject(*pixel_depths(reference, found[view][0]))
+    y = unproject(*pixel_depths(targets[view], found[view][1]))
+    (scale, R, t), _ = ransac(x, y, 1000, 0.2, np.random.default_rng(problem.seed))
+    return Sim3(scale, R, t), view
+
+
+_PARTS = {
+    part.__name__: part
+    for part in (
+        descriptor,
+        cycle,
+        choose,
+        view_score,
+        unproject,
+        umeyama,
+        ransac,
+        rotation_error,
+        interval,
+        estimate,
+    )
+}
+_TESTS = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
+_TOLERANCE = {"interval": 0.05}  # of random draws; else 1e-6
+
+
+def check(function: Callable) -> None:
+    """Test a part of the method on small arrays, and print what is right or wrong.
+
+    A right part is kept in `my_method.py` in the current folder. A part whose body is `...` is not
+    tested.
+
+    Raises:
+        InputError: if `my_method.py` is no Python.
+    """
+    name = getattr(function, "__name__", "?")
+    reason = f"{name} is no part of the method, expected one of {', '.join(_PARTS)}"
+    if name in _PARTS:
+        reason = _refusal(name, function) or _defect(name, _source(function))
+    if reason:
+        print(reason)
+    else:
+        print(f"right: {_keep(name, _source(function))} of {len(_PARTS)} parts are yours")
+
+
+def my_method() -> Callable[[Any], tuple[Sim3, int]]:
+    """Return the `estimate` of `my_method.py`; without this file the library's."""
+    return runpy.run_path(FILE)["estimate"] if Path(FILE).exists() else estimate
+
+
+def _source(function: Callable) -> str:
+    """Return the source of a function, at the left margin."""
+    return textwrap.dedent(inspect.getsource(function))
+
+
+def _refusal(name: str, function: Callable) -> str:
+    """Say why a part is not tested: it is not written, or not on its own; "" if it is."""
+    if function.__module__.partition(".")[0] == "zsp_lite":
+        return f"{name} is the library's own: write yours"
+    (written,) = ast.parse(_source(function)).body
+    body = [
+        one for one in written.body if not isinstance(getattr(one, "value", None), ast.Constant)
+    ]
+    if not body or all(isinstance(one, ast.Pass) for one in body):
+        return f"{name} is not written yet: the lesson goes on with the library's"
+    nodes = [*ast.walk(written)]
+    if any(isinstance(one, ast.Import | ast.ImportFrom) for one in nodes):
+        return f"{name} imports something: np and the parts of the method are there"
+    names = [one for one in nodes if isinstance(one, ast.Name)]
+    known = {one.id for one in names if not isinstance(one.ctx, ast.Load)}
+    known |= {one.arg for one in nodes if isinstance(one, ast.arg)}
+    known |= {one.name for one in nodes if isinstance(one, ast.FunctionDef)}
+    unknown = {one.id for one in names} - known - {*_namespace(), *dir(builtins)}
+    if unknown:
+        return f"{name} uses {min(unknown)}, which {FILE} does not have: put it into the function"
+    return ""
+
+
+def _namespace() -> dict[str, Any]:
+    """Return what a part can use: the parts that are kept, and the library's for the others."""
+    if Path(FILE).exists():
+        return runpy.run_path(FILE)
+    names: dict[str, Any] = {}
+    exec(HEADER, names)
+    return names
+
+
+def _defect(name: str, source: str) -> str:
+    """Compare a part with the library's; "" if all results are the same."""
+    function = _define(name, source, _namespace())
+    test, end = _TESTS[name], time.monotonic() + SECONDS
+    cases = [
+        {key: np.array(value) if isinstance(value, list) else value for key, value in case.items()}
+        for case in test["cases"]
+    ]
+    cases = cases or [{"problem": _toy_problem()}]
+    expected = [_run(_PARTS[name], case) for case in cases]
+    for case, right in zip(cases, expected):
+        try:
+            found = _run(function, case, end)
+        except _Slow:
+            return f"{name} was stopped after {SECONDS:.0f} s: does a loop never end?"
+        except Exception as error:  # of any kind, as it is the student's
+            came = f"{type(error).__name__}: {error}"
+        else:
+            if _same(name, found, right):
+                continue
+            came = _shown(found)
+        given = "a pair with two target views, of which the second is the reference itself"
+        if name != "estimate":
+            given = ", ".join(f"{key} = {_shown([value])}" for key, value in case.items())
+        lines = [f"{name} is not right yet.", f"in:       {given}", f"out:      {came}"]
+        lines.append(f"expected: {_shown(right)}")
+        for mistake in test["mistakes"]:
+            wrong = inspect.getsource(_PARTS[name])
+            for right_one, wrong_one in mistake["change"]:
+                wrong = wrong.replace(right_one, wrong_one)
+            wrong = _define(name, wrong, vars(sys.modules[_PARTS[name].__module__]))
+            if all(_alike(name, function, wrong, one, end) for one in cases):
+                lines.append(mistake["says"])
+                break
+        return "\n".join(lines)
+    return ""
+
+
+def _define(name: str, source: str, names: Mapping[str, Any]) -> Callable:
+    """Define a function by its source, among other names."""
+    names = dict(names)
+    exec(compile(source, f"<{name}>", "exec"), names)
+    return names[name]
+
+
+class _Slow(Exception):
+    """A part takes too long."""
+
+
+def _run(function: Callable, case: Mapping[str, Any], end: float | None = None) -> list[np.ndarray]:
+    """Call a part with copies of arguments, and make arrays of what it gives.
+
+    It is stopped by `_Slow` at its first line after the time `end`.
+    """
+    case = copy.deepcopy(dict(case))
+    if "rng" in inspect.signature(function).parameters:
+        case["rng"] = np.random.default_rng(0)
+
+    def trace(frame: FrameType, event: str, value: Any) -> Any:
+        if time.monotonic() > end:
+            raise _Slow
+        return trace if frame.f_code.co_filename == f"<{function.__name__}>" else None
+
+    before = sys.gettrace()
+    if end:
+        sys.settrace(trace)
+    try:
+        todo = [function(**case)]
+    finally:
+        sys.settrace(before)
+    flat = []
+    while todo:
+        one = todo.pop(0)
+        if isinstance(one, Sim3):
+            one = one.scale, one.R, one.t
+        if isinstance(one, tuple):
+            todo = [*one, *todo]
+        else:
+            flat.append(np.asarray(one, float))
+    return [np.sort(one) for one in flat] if function.__name__ == "choose" else flat
+
+
+def _same(name: str, one: list[np.ndarray], other: list[np.ndarray]) -> bool:
+    """Say whether two results of a part are the same."""
+    atol = _TOLERANCE.get(name, 1e-6)
+    return [part.shape for part in one] == [part.shape for part in other] and all(
+        np.allclose(a, b, atol=atol) for a, b in zip(one, other)
+    )
+
+
+def _alike(
+    name: str, function: Callable, wrong: Callable, case: Mapping[str, Any], end: float
+) -> bool:
+    """Say whether a part gives what a mistake gives, or fails as it does."""
+    found = []
+    for one in (function, wrong):
+        try:
+            found.append(_run(one, case, end))
+        except Exception as error:  # of any kind, as it is the student's
+            found.append(type(error))
+    return found[0] == found[1] if type in map(type, found) else _same(name, *found)
+
+
+def _shown(values: Iterable[Any]) -> str:
+    """Write arrays in a short form."""
+    lines = (
+        np.array2string(np.asarray(one), precision=2, suppress_small=True, threshold=60)
+        for one in values
+    )
+    return ", ".join(line.replace("\n", "") for line in lines)
+
+
+def _keep(name: str, source: str) -> int:
+    """Put a part into `my_method.py`; return how many are the student's."""
+    path, library = Path(FILE), inspect.getsource(estimate)
+    text = path.read_text("utf-8") if path.exists() else f"{HEADER}\n\n{library}"
+    lines = text.splitlines(keepends=True)
+    places = _places(text)
+    if name in places:
+        lines[places[name]] = [source]
+    else:
+        start = places["estimate"].start
+        lines[start:start] = [source, "\n\n"]
+    text = "".join(lines)
+    write_atomic(path, text.encode())
+    return len(_places(text)) - (library in text)
+
+
+def _places(text: str) -> dict[str, slice]:
+    """Find the parts in the lines of a file."""
+    try:
+        body = ast.parse(text).body
+    except SyntaxError as error:
+        raise InputError(f"{FILE}, line {error.lineno}: {error.msg}; mend it or move it away")
+    functions = [one for one in body if isinstance(one, ast.FunctionDef) and one.name in _PARTS]
+    return {one.name: slice(one.lineno - 1, one.end_lineno) for one in functions}
+
+
+def _toy_problem() -> Any:
+    """Build a pair with two target views: noise, and the reference's own features."""
+    rng = np.random.default_rng(3)
+    keys, salience = rng.normal(size=(6, 6, 8)), rng.uniform(0.1, 1, (6, 6))
+    depth, K = rng.uniform(4, 6, (24, 24)).astype(np.float32), [[40, 0, 12], [0, 40, 12], [0, 0, 1]]
+
+    def view(keys: np.ndarray) -> SimpleNamespace:
+        features = {"keys": torch.from_numpy(keys), "saliency": torch.from_numpy(salience)}
+        camera = SimpleNamespace(K=np.array(K, float))
+        frame = SimpleNamespace(depth=depth, camera=camera)
+        return SimpleNamespace(features=SimpleNamespace(**features), frame=frame)
+
+    views = [view(keys), view(rng.normal(size=keys.shape)), view(keys)]
+    return SimpleNamespace(views=lambda: views, seed=0)
