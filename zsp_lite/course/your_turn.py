@@ -11,7 +11,6 @@ import builtins
 import copy
 import inspect
 import json
-import runpy
 import sys
 import textwrap
 import time
@@ -166,7 +165,7 @@ def check(function: Callable) -> None:
 
 def my_method() -> Callable[[Any], tuple[Sim3, int]]:
     """Return the `estimate` of `my_method.py`; without this file the library's."""
-    return runpy.run_path(FILE)["estimate"] if Path(FILE).exists() else estimate
+    return _namespace()["estimate"]
 
 
 def _source(function: Callable) -> str:
@@ -199,11 +198,21 @@ def _refusal(name: str, function: Callable) -> str:
 
 def _namespace() -> dict[str, Any]:
     """Return what a part can use: the parts that are kept, and the library's for the others."""
-    if Path(FILE).exists():
-        return runpy.run_path(FILE)
     names: dict[str, Any] = {}
-    exec(HEADER, names)
+    exec(compile(_kept(), FILE, "exec"), names)
     return names
+
+
+def _kept() -> str:
+    """Return the text of `my_method.py`, or what it begins with."""
+    if not Path(FILE).exists():
+        return f"{HEADER}\n\n{inspect.getsource(estimate)}"
+    text = Path(FILE).read_text("utf-8")
+    try:
+        ast.parse(text)
+    except SyntaxError as error:
+        raise InputError(f"{FILE}, line {error.lineno}: {error.msg}; mend it or move it away")
+    return text
 
 
 def _defect(name: str, source: str) -> str:
@@ -320,26 +329,18 @@ def _shown(values: Iterable[Any]) -> str:
 
 def _keep(name: str, source: str) -> int:
     """Put a part into `my_method.py`; return how many are the student's."""
-    path, library = Path(FILE), inspect.getsource(estimate)
-    text = path.read_text("utf-8") if path.exists() else f"{HEADER}\n\n{library}"
-    lines = text.splitlines(keepends=True)
-    places = _places(text)
-    if name in places:
-        lines[places[name]] = [source]
-    else:
-        start = places["estimate"].start
-        lines[start:start] = [source, "\n\n"]
+    text = _kept()
+    lines, places = text.splitlines(keepends=True), _places(text)
+    start = places["estimate"].start
+    lines[places.get(name, slice(start, start))] = [source, "" if name in places else "\n\n"]
     text = "".join(lines)
-    write_atomic(path, text.encode())
-    return len(_places(text)) - (library in text)
+    write_atomic(FILE, text.encode())
+    return len(_places(text)) - (inspect.getsource(estimate) in text)
 
 
 def _places(text: str) -> dict[str, slice]:
-    """Find the parts in the lines of a file."""
-    try:
-        body = ast.parse(text).body
-    except SyntaxError as error:
-        raise InputError(f"{FILE}, line {error.lineno}: {error.msg}; mend it or move it away")
+    """Find the parts in the lines of a text."""
+    body = ast.parse(text).body
     functions = [one for one in body if isinstance(one, ast.FunctionDef) and one.name in _PARTS]
     return {one.name: slice(one.lineno - 1, one.end_lineno) for one in functions}
 
