@@ -12,6 +12,7 @@ import csv
 import io
 import itertools
 import json
+import re
 import tokenize
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -98,12 +99,12 @@ def other_tokens(text: str, name: str) -> int:
 
 
 def _words(file: Path) -> int:
-    """Count the words of a page, or of the text cells of a notebook."""
+    """Count the words of a page, or of the text cells of a notebook without their code."""
     text = file.read_text(encoding="utf-8")
     if file.suffix == ".ipynb":
         cells = json.loads(text)["cells"]
         pages = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown"]
-        text = "\n".join(pages)
+        text = re.sub("```.*?```", "", "\n".join(pages), flags=re.DOTALL)
     return len(text.split())
 
 
