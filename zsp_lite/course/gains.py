@@ -1,0 +1,110 @@
+"""What each part of the method gains: the accuracy of a row of the benchmark with it, minus that of
+a row without it, on the same pairs."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from zsp_lite.benchmark.methods import read_paper_tables
+from zsp_lite.benchmark.summary import draws_of, paired_difference
+from zsp_lite.viz import plots
+
+# By section and part: the row with the part, and the row without it.
+PARTS = {
+    "features and matches": {
+        "network, not RootSIFT": ("ours-mask", "rootsift"),
+        "log-binning, not bare keys": ("ours", "ours-keys"),
+        "saliency, not the true mask": ("ours", "ours-mask"),
+        "cycles, not nearest patches": ("ours", "ours-nearest"),
+        "cycles, not dual softmax": ("ours", "ours-dualsoftmax"),
+        "cycles, not optimal transport": ("ours", "ours-transport"),
+        "cycle from the reference, not the target": ("ours", "ours-published"),
+        "k-means, K = 30": ("ours-k30", "ours-k30-nokmeans"),
+        "k-means, K = 50": ("ours", "ours-k50-nokmeans"),
+        "k-means, K = 70": ("ours-k70", "ours-k70-nokmeans"),
+        "50 matches, not 30": ("ours", "ours-k30"),
+    },
+    "the view": {
+        "5 views, not 1": ("ours", "ours-n1"),
+        "10 views, not 5": ("ours-n10", "ours"),
+        "equation 3, not the global feature": ("ours", "ours-globalsim"),
+        "equation 3, not saliency": ("ours", "ours-saliencyiou"),
+        "equation 3, not cycles": ("ours", "ours-cyclicaliou"),
+        "the nearest view given": ("oracle-view", "ours"),
+    },
+    "the fit": {
+        "fit, not the view's pose": ("ours", "ours-bv"),
+        "RANSAC, not least squares": ("ours", "ours-least-squares"),
+        "depth, not none": ("ours", "ours-nodepth"),
+        "1,000 trials, not 500": ("ours", "ours-trials500"),
+    },
+    "beyond the paper": {
+        "verified, not the paper's": ("verified", "ours"),
+        "5 views, not 1 (verified)": ("verified", "verified-n1"),
+        "4 frames, not 1": ("scans-4", "verified"),
+        "8 frames, not 4": ("scans-8", "scans-4"),
+        "votes and shape, not shape alone": ("scans-4", "shape-upright"),
+        "all objects, not 2": ("category", "scans-4"),
+    },
+}
+
+
+def gains(runs: Mapping[str, pd.DataFrame], limit: float = 30) -> pd.DataFrame:
+    """Compute the gains in accuracy within `limit` degrees, in points.
+
+    Args:
+        runs: the tables of runs (`read_run(OUT).table`) by name.
+        limit: 15 or 30.
+
+    Returns:
+        A line for each section and part; a column for each run, with the gain and the ends of its
+        95 % interval (objects and seeds are drawn again); and "paper", with its gain on CO3D.
+    """
+    published = {}
+    for table in read_paper_tables():
+        for line in table["rows"]:
+            figures = dict(zip(table["published"], line["published"]))
+            published[line["row"]] = figures.get(f"Acc{limit:.0f} (%)", np.nan)
+    parts = {
+        (section, part): rows for section, some in PARTS.items() for part, rows in some.items()
+    }
+    columns: dict[str, list] = {}
+    for name, table in runs.items():
+        rows, draws = dict([*table.groupby("row")]), {}
+        columns[name] = []
+        for pair in parts.values():
+            # Rows of several frames or views have one seed.
+            seeds = min(rows[row]["repeat"].nunique() for row in pair)
+            first, second = (rows[row][rows[row]["repeat"] < seeds] for row in pair)
+            if seeds not in draws:
+                draws[seeds] = draws_of(first)
+            found = paired_difference(second["error"], first["error"], limit, draws[seeds])
+            columns[name].append((found["accuracy_gain"], *found["accuracy_gain_ci"]))
+    columns["paper"] = [
+        published.get(row, np.nan) - published.get(other, np.nan) for row, other in parts.values()
+    ]
+    return pd.DataFrame(columns, pd.MultiIndex.from_tuples(parts))
+
+
+def show_gains(found: pd.DataFrame, section: str) -> Figure:
+    """Draw the gains of a section's parts: a dot with its interval for each run, a cross for the
+    paper."""
+    import matplotlib.pyplot as plt
+
+    here = found.loc[section]
+    heights = np.arange(len(here))
+    figure, axis = plt.subplots(figsize=(8, 1.1 + 0.42 * len(here)), layout="constrained")
+    styles = zip("os", (plots.BLUE, plots.ORANGE), (-0.15, 0.15))
+    for name, (marker, colour, shift) in zip(found.columns.drop("paper"), styles):
+        value, low, high = np.transpose(here[name].tolist())
+        style = {"fmt": marker, "color": colour, "capsize": 2, "label": name}
+        axis.errorbar(value, heights + shift, xerr=(value - low, high - value), **style)
+    axis.plot(here["paper"], heights, "kx", label="paper, CO3D", zorder=3)
+    axis.axvline(0, color="0.4", linewidth=1)
+    axis.set_yticks(heights, here.index)
+    axis.set(xlabel="gain in Acc30 (points)", ylim=(len(here) - 0.4, -0.6))
+    figure.legend(loc="outside upper center", ncols=3)
+    plt.close(figure)
+    return figure
