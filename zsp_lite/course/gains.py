@@ -65,8 +65,9 @@ def gains(runs: Mapping[str, pd.DataFrame], limit: float = 30) -> pd.DataFrame:
     published = {}
     for table in read_paper_tables():
         for line in table["rows"]:
-            figures = dict(zip(table["published"], line["published"]))
-            published[line["row"]] = figures.get(f"Acc{limit:.0f} (%)", np.nan)
+            if f"Acc{limit:.0f} (%)" in table["published"]:
+                column = table["published"].index(f"Acc{limit:.0f} (%)")
+                published[line["row"]] = line["published"][column]
     parts = {
         (section, part): rows for section, some in PARTS.items() for part, rows in some.items()
     }
