@@ -44,7 +44,7 @@ from zsp_lite.cli.main import main
 from zsp_lite.data.labels import read_labels
 from zsp_lite.data.writing import write_label
 from zsp_lite.errors import FatalError
-from zsp_lite.threads import one_thread
+from zsp_lite.io.threads import one_thread
 
 pytestmark = pytest.mark.slow
 needs_signals = pytest.mark.skipif(

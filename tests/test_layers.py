@@ -13,7 +13,7 @@ from zsp_lite.io.files import REPOSITORY
 # and so does a part of the course. Imports inside functions, which delay the loading of large
 # libraries, follow the same rule.
 LAYERS = [
-    "choices errors threads",
+    "choices errors",
     "io",
     "alignment features matchers metrics minimal",
     "data",
@@ -36,7 +36,7 @@ LAYERS = [
     "__main__",
 ]
 # Packages that the course alone imports.
-OF_THE_COURSE = {"anywidget", "ipywidgets", "IPython", "jupyterquiz", "skimage", "trimesh"}
+OF_THE_COURSE = {"anywidget", "ipywidgets", "IPython", "jupyterquiz", "skimage"}
 LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names.split()}
 
 
@@ -95,7 +95,7 @@ def home(name: str) -> set[str]:
     return above & modules().keys() if parts[0] == "zsp_lite" else set()
 
 
-def test_lessons_00_to_06_stand_on_at_most_6000_lines():
+def test_lessons_00_to_06_stand_on_at_most_6300_lines():
     files = modules()
     below = defaultdict(set)
     for module, name, _ in imports():
@@ -116,7 +116,7 @@ def test_lessons_00_to_06_stand_on_at_most_6000_lines():
         by_name = re.findall(r'resolve_name\("zsp_lite\.([\w.]+)', text)
         assert {*by_name} <= BY_NAME
     largest = sorted(found.items(), key=lambda one: -one[1])[:10]
-    assert 5000 < sum(found.values()) <= 6000, f"{sum(found.values())} lines; largest: {largest}"
+    assert 5000 < sum(found.values()) <= 6300, f"{sum(found.values())} lines; largest: {largest}"
     assert not BY_NAME & found.keys()
 
 

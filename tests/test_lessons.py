@@ -33,7 +33,7 @@ def test_a_draw_has_one_stored_answer_of_each_ordered_pair(truth):
 
 
 def test_a_tree_believes_the_surest_answer_and_all_pairs_can_outvote_it(truth):
-    drawn = hypotheses.draw_answers(read_hypotheses(RUN).values(), seed=62)
+    drawn = hypotheses.draw_answers(read_hypotheses(RUN).values(), seed=41)
     assert not hypotheses.all_alike(truth, hypotheses.spanning_tree(drawn))
     objects = synchronise(drawn).objects
     together = {name: one.sim3.R for name, one in objects.items()}
@@ -42,13 +42,12 @@ def test_a_tree_believes_the_surest_answer_and_all_pairs_can_outvote_it(truth):
     surest = hypotheses.surest_right(drawn, truth)
     wrong = {pair for pair, right in surest.items() if not right}
     assert wrong == {
-        ("wooden_car", "peugeot_308"),
         ("seat_leon", "peugeot_308"),
-        ("seat_leon", "wooden_car"),
+        ("suv", "peugeot_308"),
+        ("peugeot_308", "wooden_car"),
     }
     fitting = hypotheses.fitting_right(drawn, truth, together)
-    assert [pair for pair, right in fitting.items() if not right] == [("seat_leon", "wooden_car")]
-    assert fitting["seat_leon", "wooden_car"] is None
+    assert len(fitting) == 12 and all(fitting.values())
 
 
 def test_a_common_turn_of_all_objects_changes_nothing_and_of_one_it_does(truth):

@@ -19,7 +19,7 @@ PACKAGE = Path(zsp_lite.__file__).parent
 DRAWING = Path(__file__).parents[1] / "docs" / "rooms.svg"
 # From the bottom to the top: the modules and subpackages of each room.
 ROOMS = {
-    "files": "choices errors io threads",
+    "files": "choices errors io",
     "geometry": "alignment features matchers metrics minimal",
     "data": "data",
     "stages": "best_view estimates matching pipeline points views",

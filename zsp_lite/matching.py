@@ -26,8 +26,8 @@ from torch import Tensor
 
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap, Grid, average_pool, bin_indices, descriptors
+from zsp_lite.io.threads import one_thread
 from zsp_lite.matchers import MATCHERS, Matched, Matcher
-from zsp_lite.threads import one_thread
 
 Keys = FeatureMap | Float[Tensor, "_ _ _"] | Float[np.ndarray, "_ _ _"]
 Similarities = Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"]

@@ -29,7 +29,7 @@ from zsp_lite.benchmark.runs import ResultLine, add_lines, read_lines
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError, check_integer, ends_the_run
 from zsp_lite.io.files import digest, read_bytes, write_atomic
-from zsp_lite.threads import one_thread
+from zsp_lite.io.threads import one_thread
 
 # Evaluates the named rows on a pair, and returns the line of the run.
 Evaluator = Callable[[Pair, list[str]], Any]
@@ -66,9 +66,8 @@ def evaluate_pairs(
         kind: Type of the lines.
     """
     # What the run lacks.
-    stored = set()
-    for line in read_lines(out, kind):
-        stored.update((name, line.pair, line.repeat) for name in line.results)
+    lines = read_lines(out, kind)
+    stored = {(name, line.pair, line.repeat) for line in lines for name in line.results}
     todo = []
     # Pairs that share frames are neighbours.
     for pair in sorted(work, key=attrgetter("category", "target_sequence", "key")):

@@ -44,7 +44,6 @@ PARTS = {
         "verified, not the paper's": ("verified", "ours"),
         "5 views, not 1 (verified)": ("verified", "verified-n1"),
         "4 frames, not 1": ("scans-4", "verified"),
-        "8 frames, not 4": ("scans-8", "scans-4"),
         "votes and shape, not shape alone": ("scans-4", "shape-upright"),
         "all objects, not 2": ("category", "scans-4"),
     },

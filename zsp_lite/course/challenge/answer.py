@@ -13,7 +13,7 @@ from zsp_lite.benchmark.run import ask
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.errors import InputError, describe_failure
 from zsp_lite.io.files import read_bytes
-from zsp_lite.threads import one_thread
+from zsp_lite.io.threads import one_thread
 
 _LARGEST_FILE = 1 << 28  # bytes
 _COLUMNS = ("pair", "target_frame", "rotation")
@@ -34,8 +34,7 @@ def answer(handin: Path, data: Path, questions: Path, out: Path, row_seconds: in
             try:
                 with fails_alone(row_seconds):
                     problem = PairProblem(pair, store, {method.features} - {"none"})
-                    seen = problem_of_own(method.solve, problem)
-                    found = ask(method, seen)
+                    found = ask(method, problem_of_own(method.solve, problem))
                 frame = pair.target_frames[found.view]
             except (InputError, IndexError) as error:
                 failed += 1
