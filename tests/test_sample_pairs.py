@@ -73,7 +73,7 @@ def check_pair(method, reference, targets, name, **settings) -> None:
 
 def test_it_is_one_page():
     lines = Path(minimal.__file__).read_text("utf-8").splitlines()
-    assert len(lines) <= 195  # as many as a page of two columns has
+    assert len(lines) <= 195  # two columns of a page
     # It shows the whole method: nothing of the library computes a part of it.
     imports = [line for line in lines if "zsp_lite" in line]
     assert imports == ["from zsp_lite.errors import InputError"]
