@@ -142,6 +142,7 @@ BAD_FILES = [
             "too long": _ply(3, bytes(37)),
             "10^12 points": _ply(10**12, bytes(36)),
             "no points": _ply(0, b""),
+            "cut text": _ply(3, b"0 0 0\n1 1 1\n", "ascii"),
         },
     ),
     (

@@ -1,6 +1,7 @@
 """Point clouds as PLY files."""
 
 import io
+import re
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,9 @@ def read_ply(
     try:
         content = load_ply(io.BytesIO(data), skip_materials=True)
         points = content["vertices"].astype(np.float64)
+        (count,) = re.findall(rb"element vertex (\d+)", data.partition(b"end_header")[0])
+        if not 0 < len(points) == int(count):
+            raise ValueError(f"{len(points)} of {int(count)} vertices")
     except Exception as error:  # whatever is malformed
         raise InputError(
             f"point cloud {path} ({len(data)} bytes) is not a complete PLY file: {error!r}"
