@@ -46,7 +46,8 @@ def estimate_pose(reference: Crop, targets, k=50, trials=1000, threshold=0.2, se
     matches = [find_matches(reference, target, k, seed) for target in targets]
     view = int(np.argmax([view_score(cosine, k) for _, _, cosine in matches]))
     u, v, _ = matches[view]
-    x, y = (unproject(*pixel_depths(*end)) for end in ((reference, u), (targets[view], v)))
+    x = unproject(*pixel_depths(reference, u))
+    y = unproject(*pixel_depths(targets[view], v))
     (scale, R, t), inliers = ransac(x, y, trials, threshold, np.random.default_rng(seed))
     return Pose(scale, R, t, view, (u, v), inliers)
 

@@ -1,7 +1,7 @@
 """What each part of the method gains: the accuracy of a row of the benchmark with it, minus that of
 a row without it, on the same pairs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from zsp_lite.benchmark.methods import read_paper_tables
 from zsp_lite.benchmark.summary import draws_of, paired_difference
 from zsp_lite.viz import plots
+from zsp_lite.viz.reliability import reliability
 
 # By section and part: the row with the part, and the row without it.
 PARTS = {
@@ -86,6 +87,25 @@ def gains(runs: Mapping[str, pd.DataFrame], limit: float = 30) -> pd.DataFrame:
         published.get(row, np.nan) - published.get(other, np.nan) for row, other in parts.values()
     ]
     return pd.DataFrame(columns, pd.MultiIndex.from_tuples(parts))
+
+
+def show_trust(runs: Mapping[str, pd.DataFrame], rows: Sequence[str]) -> Figure:
+    """Draw the share of right poses over their probability, in ten bins of equal size, for rows of
+    each run; the legend has the calibration errors."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(8, 3.6), sharey=True, layout="constrained")
+    for axis, (name, table) in zip(axes, runs.items()):
+        for row, style in zip(rows, ("o-", "s--", "^:")):
+            one = table[(table["row"] == row) & (table["repeat"] == 0)]
+            bins = reliability(one["confidence"].to_numpy(), one["error"].to_numpy() < 30)
+            label = f"{row}: error {100 * bins.calibration_error:.0f} points"
+            axis.plot(100 * bins.confidence, 100 * bins.accuracy, style, label=label)
+        axis.plot([0, 100], [0, 100], ":", color="0.5")
+        axis.set(title=name, xlabel="probability (%)", ylabel="right (%)")
+        axis.legend(loc="lower right")
+    plt.close(figure)
+    return figure
 
 
 def show_gains(found: pd.DataFrame, section: str) -> Figure:
