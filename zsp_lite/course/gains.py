@@ -51,12 +51,11 @@ PARTS = {
 }
 
 
-def gains(runs: Mapping[str, pd.DataFrame], limit: float = 30) -> pd.DataFrame:
-    """Compute the gains in accuracy within `limit` degrees, in points.
+def gains(runs: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Compute the gains in accuracy within 30 degrees (Acc30), in points.
 
     Args:
         runs: the tables of runs (`read_run(OUT).table`) by name.
-        limit: 15 or 30.
 
     Returns:
         A line for each section and part; a column for each run, with the gain and the ends of its
@@ -65,8 +64,8 @@ def gains(runs: Mapping[str, pd.DataFrame], limit: float = 30) -> pd.DataFrame:
     published = {}
     for table in read_paper_tables():
         for line in table["rows"]:
-            if f"Acc{limit:.0f} (%)" in table["published"]:
-                column = table["published"].index(f"Acc{limit:.0f} (%)")
+            if "Acc30 (%)" in table["published"]:
+                column = table["published"].index("Acc30 (%)")
                 published[line["row"]] = line["published"][column]
     parts = {
         (section, part): rows for section, some in PARTS.items() for part, rows in some.items()
@@ -81,7 +80,7 @@ def gains(runs: Mapping[str, pd.DataFrame], limit: float = 30) -> pd.DataFrame:
             first, second = (rows[row][rows[row]["repeat"] < seeds] for row in pair)
             if seeds not in draws:
                 draws[seeds] = draws_of(first)
-            found = paired_difference(second["error"], first["error"], limit, draws[seeds])
+            found = paired_difference(second["error"], first["error"], weights=draws[seeds])
             columns[name].append((found["accuracy_gain"], *found["accuracy_gain_ci"]))
     columns["paper"] = [
         published.get(row, np.nan) - published.get(other, np.nan) for row, other in parts.values()
