@@ -62,11 +62,12 @@ format: $(STAMP)
 	$(RUN) -m ruff format .
 	$(RUN) -m ruff check --fix .
 
-# On a copy, so that the tracked notebooks stay as they are. The root is this folder, as the notebooks link to docs/.
+# On a copy, so that the tracked notebooks stay as they are, without the outputs that answer a prediction. The root is this folder, as the notebooks link to docs/.
 # Open3D brings dash along, whose JupyterLab extension would ask for a build that nothing here needs; without an address
 # for news, JupyterLab does not ask whether to fetch them.
 lab: $(STAMP)
-	@[ -d $(LAB) ] || { cp -R notebooks $(LAB) && echo "Made $(LAB)/, a copy of notebooks/ that is yours"; }
+	@[ -d $(LAB) ] || { rm -rf $(LAB).new && cp -R notebooks $(LAB).new && $(RUN) -m tools.lab $(LAB).new && \
+	  mv $(LAB).new $(LAB) && echo "Made $(LAB)/, a copy of notebooks/ that is yours"; }
 	@echo "Changes are saved in $(LAB)/. For a fresh copy, move that folder away and run make lab again."
 	@[ "$$(id -u)" != 0 ] || echo "You are root, as in most containers. JupyterLab refuses to run as root without --allow-root, so it is given."
 	$(RUN) -m jupyter lab $$([ "$$(id -u)" != 0 ] || echo --allow-root) --LabApp.news_url=None \

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nbformat
 import pytest
 import yaml
 
@@ -85,6 +86,27 @@ def test_lab_opens_a_copy_of_the_notebooks_and_says_why_it_allows_root(folder, u
     assert (folder / "notebooks/00.ipynb").read_text() == "original"
     assert (folder / "my_notebooks/00.ipynb").read_text() == "changed"
     assert "move that folder away" in text
+    assert "-m tools.lab my_notebooks.new" in " ".join(calls)
+
+
+def test_the_copy_keeps_all_outputs_but_those_that_answer_a_prediction(tmp_path):
+    made = nbformat.v4
+    shown = [made.new_output("stream", text="42")]
+    texts = [
+        "A question. **Break it, predict, then run.** How many?",
+        "Text.",
+        "**Predict, then run.**",
+    ]
+    codes = ["6 * 7", 'self_check("00", 1)', "6 + 7"]
+    ask, text, ask_again = map(made.new_markdown_cell, texts)
+    answer, quiz, other = (made.new_code_cell(code, outputs=shown) for code in codes)
+    again = made.new_code_cell("1", outputs=shown)
+    cells = [ask, answer, quiz, text, other, ask_again, again]
+    nbformat.write(made.new_notebook(cells=cells), tmp_path / "00.ipynb")
+    command = [sys.executable, "-m", "tools.lab", str(tmp_path)]
+    subprocess.run(command, cwd=REPOSITORY, check=True)
+    kept = nbformat.read(tmp_path / "00.ipynb", 4).cells
+    assert [bool(cell.get("outputs")) for cell in kept] == [0, 0, 1, 0, 1, 0, 0]
 
 
 def test_the_version_is_the_same_everywhere():

@@ -16,6 +16,7 @@ import pytest
 from bs4 import BeautifulSoup
 
 import zsp_lite
+from tools.lab import answering_cells
 
 REPOSITORY = Path(__file__).parents[1]
 NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
@@ -111,7 +112,9 @@ def test_a_notebook_shows_its_stored_pictures_its_drawings_and_what_it_printed(p
     assert [text for text in shown if text in texts] == texts
     drawings = re.findall(r"!\[([^]]+)\]\(", "\n".join(cell.source for cell in cells))
     assert all(" ".join(text.split()) in shown for text in drawings)
-    assert page.folded == sum("checks" in cell.metadata.get("tags", []) for cell in cells)
+    checks = [cell for cell in cells if "checks" in cell.metadata.get("tags", [])]
+    answers = [cell for cell in answering_cells(nbformat.read(path, 4)) if cell.outputs]
+    assert page.folded == len(checks) + len(answers)
     for output in outputs:
         if output.output_type == "stream" and output.text.strip():
             assert output.text.strip().splitlines()[0].strip() in page.text
@@ -168,6 +171,8 @@ def test_every_notebook_can_be_downloaded_with_its_drawings(site, pages):
         assert any(link.endswith(str(copy)) for link in pages[page_of(path)].links), path.name
         for drawing in re.findall(r"\]\((figures/[^)]+)\)", (site / copy).read_text("utf-8")):
             assert (site / copy.parent / drawing).is_file(), f"{path.name}: {drawing}"
+        answers = answering_cells(nbformat.read(site / copy, 4))
+        assert not any(cell.outputs for cell in answers), path.name
 
 
 def test_with_an_address_a_notebook_has_links_to_run_it_and_an_install_cell(monkeypatch):

@@ -2,6 +2,7 @@
 
 - Widgets become the picture that they showed when the notebook was stored; plotly figures become
   HTML.
+- The outputs that answer a prediction are folded, and left out of the notebooks to run.
 - Exercises lose their solutions, hidden tests and guides for marking, by nbgrader's own
   preprocessors.
 - Each notebook can be downloaded and, if the repository's address is known, opened in Colab with an
@@ -31,6 +32,8 @@ from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 from traitlets.config import PyFileConfigLoader
+
+from tools.lab import answering_cells, clear_answers
 
 WIDGET = "application/vnd.jupyter.widget-view+json"
 PLOTLY = "application/vnd.plotly.v1+json"
@@ -88,6 +91,8 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
     if path.suffix == ".ipynb":
         notebook = nbformat.reads(source[0], as_version=4)
         remove_solutions(notebook, app.srcdir)
+        for cell in answering_cells(notebook):
+            cell.metadata.tags = [*cell.metadata.get("tags", []), "hide-output"]  # folded
         widgets = notebook.metadata.pop("widgets", {})
         for cell in notebook.cells:
             if cell.cell_type == "code":
@@ -336,6 +341,7 @@ def write_files(app: Sphinx, error: Exception | None) -> None:
         if path.suffix == ".ipynb":
             notebook = nbformat.read(path, as_version=4)
             remove_solutions(notebook, app.srcdir)
+            clear_answers(notebook)
             copy = app.outdir / "run" / f"{docname}.ipynb"
             copy.parent.mkdir(parents=True, exist_ok=True)
             nbformat.write(runnable(notebook, docname, app.config.course_repository), copy)
