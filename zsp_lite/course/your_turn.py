@@ -319,8 +319,6 @@ def _alike(
             found.append(_run(one, case, end))
         except _Slow:
             return False
-        except _Slow:
-            return False
         except Exception as error:  # of any kind, as it is the student's
             found.append(type(error))
     return found[0] == found[1] if type in map(type, found) else _same(name, *found)
