@@ -4,6 +4,7 @@ sliders.
 A self-check gives feedback and asks nothing of the network.
 """
 
+import re
 import shutil
 from pathlib import Path
 
@@ -95,3 +96,32 @@ def test_a_notebook_runs_and_its_widgets_react(page, lab, name):
             reader.label_by_clicks(page)
     finally:
         reader.photograph(page, PICTURES / f"{Path(name).stem}.png")
+
+
+def test_solutions_typed_in_two_notebooks_outlive_their_kernels_and_06_uses_both(page, lab):
+    try:
+        for count, (name, part) in enumerate((("02", "cycle"), ("04", "unproject")), 1):
+            (notebook,) = (path for path in NOTEBOOKS if path.startswith(name))
+            cells = lab.ask(f"contents/{notebook}")["content"]["cells"]
+            (text,) = (cell["source"] for cell in cells if f"turn: `{part}`" in cell["source"])
+            (solution,) = re.findall(r"```python\n(def .*?)```", text, re.DOTALL)
+            first, *rest = solution.splitlines()
+            leave_a_trace = f'    open("{part}.used", "w").close()'
+            lines = ["from zsp_lite.course.your_turn import check", "", first, leave_a_trace]
+            reader.open_notebook(page, lab, notebook)
+            cell = page.locator(".jp-CodeCell", has_text=f"check({part})")
+            cell.locator(".cm-content").click()
+            page.keyboard.press("Control+a")
+            page.keyboard.insert_text("\n".join([*lines, *rest, f"check({part})"]))
+            page.keyboard.press("Control+Enter")
+            cell.get_by_text(f"right: {count} of 10 parts are yours").wait_for()
+            lab.stop_kernels()
+            lab.ask(f"contents/{part}.used", "DELETE")
+        name = "06_end_to_end_demo.ipynb"
+        reader.open_notebook(page, lab, name)
+        reader.run_all(page, patience=60 * MINUTES)
+        assert not reader.errors(page, reader.saved(page, lab, name))
+        files = {file["name"] for file in lab.ask("contents")["content"]}
+        assert {"cycle.used", "unproject.used"} <= files
+    finally:
+        lab.ask("contents/my_method.py", "DELETE")
