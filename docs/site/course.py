@@ -1,7 +1,6 @@
 """Sphinx extension of the course site: what MyST-NB and the theme do not do with stored notebooks.
 
-- Widgets become the picture that they showed when the notebook was stored; plotly figures become
-  HTML.
+- Widgets become the picture that they showed when the notebook was stored.
 - The outputs that answer a prediction are folded, and left out of the notebooks to run.
 - Exercises lose their solutions, hidden tests and guides for marking, by nbgrader's own
   preprocessors.
@@ -13,7 +12,6 @@
 - The members of the modules in the reference are folded.
 """
 
-import json
 import re
 import shutil
 from copy import deepcopy
@@ -23,8 +21,6 @@ from types import FunctionType, ModuleType
 from urllib.parse import urljoin, urlsplit
 
 import nbformat
-import plotly
-import plotly.io
 from docutils import nodes
 from nbformat import NotebookNode
 from nbgrader.preprocessors import ClearHiddenTests, ClearMarkScheme, ClearSolutions
@@ -36,7 +32,6 @@ from traitlets.config import PyFileConfigLoader
 from tools.lab import answering_cells, clear_answers
 
 WIDGET = "application/vnd.jupyter.widget-view+json"
-PLOTLY = "application/vnd.plotly.v1+json"
 BRANCH = "gh-pages"  # where the workflow publishes the site, and so the notebooks that Colab opens
 
 # A table uses the margin if one of its rows has at least as many cells and characters.
@@ -138,15 +133,8 @@ def remove_solutions(notebook: NotebookNode, root: Path) -> None:
 
 
 def static_outputs(output: NotebookNode, widgets: dict) -> list[NotebookNode]:
-    """Return the forms of a stored output that need no kernel.
-
-    A plotly figure becomes HTML, a widget its picture and caption; other outputs stay as they are.
-    """
+    """Return the picture and the caption of a stored widget; other outputs stay as they are."""
     data = output.get("data", {})
-    if PLOTLY in data:
-        figure = plotly.io.from_json(json.dumps(data[PLOTLY]), skip_invalid=True)
-        figure.update_layout(width=None, autosize=True)
-        return [html_output(plotly.io.to_html(figure, include_plotlyjs=False, full_html=False))]
     if WIDGET in data:
         return widget_outputs(
             widgets["application/vnd.jupyter.widget-state+json"]["state"], data[WIDGET]["model_id"]
@@ -332,8 +320,7 @@ def runnable(notebook: NotebookNode, docname: str, repository: str) -> NotebookN
 
 
 def write_files(app: Sphinx, error: Exception | None) -> None:
-    """Write the notebooks to run with their drawings, and plotly's script (Sphinx's event
-    `build-finished`)."""
+    """Write the notebooks to run with their drawings (Sphinx's event `build-finished`)."""
     if error or app.builder.format != "html":
         return
     for docname in app.env.found_docs:
@@ -350,16 +337,6 @@ def write_files(app: Sphinx, error: Exception | None) -> None:
         app.outdir / "run" / "notebooks" / "figures",
         dirs_exist_ok=True,
     )
-    script = Path(plotly.__file__).parent / "package_data" / "plotly.min.js"
-    shutil.copy(script, app.outdir / "_static" / script.name)
-
-
-def add_plotly(
-    app: Sphinx, pagename: str, templatename: str, context: dict, doctree: nodes.document | None
-) -> None:
-    """Load plotly's script on the pages that have a figure of it (`html-page-context`)."""
-    if doctree and any("plotly-graph-div" in node.astext() for node in doctree.findall(nodes.raw)):
-        app.add_js_file("plotly.min.js", priority=100)
 
 
 def skip_imported(
@@ -405,6 +382,5 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("env-updated", shorten_titles)
     app.connect("autodoc-skip-member", skip_imported)
     app.connect("autodoc-process-docstring", mark_examples, priority=400)
-    app.connect("html-page-context", add_plotly)
     app.connect("build-finished", write_files)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
