@@ -5,15 +5,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 from test_transfer import aligned, true_sim3
 
-from zsp_lite import Co3D
+from zsp_lite import Co3D, Sim3
 from zsp_lite.data.clouds import extent
+from zsp_lite.data.ground_truth import read_poses
 from zsp_lite.io.ply import read_ply
-from zsp_lite.scans.marks import Mark, place_marks, write_marks
+from zsp_lite.metrics import vector_angle
+from zsp_lite.objects.align import write_alignment
+from zsp_lite.scans.marks import Mark, category_axes, place_marks, read_front, write_marks
+from zsp_lite.views import object_crop
+from zsp_lite.viz.category_sheet import objects_figure
 from zsp_lite.viz.report import write_category_report
 
 SEAT = Mark("scooter", 0, 180.0, 114.0, "seat")
+ARROW = Mark("scooter", 0, 200.5, 124.5, "tail"), Mark("scooter", 0, 128.5, 76.5, "tip")
 
 
 @pytest.fixture(scope="module")
@@ -103,25 +110,95 @@ def test_the_report_shows_the_marks(placed, dataset, alignment, tmp_path):
     assert "Marked once" not in path.read_text("utf-8")
 
 
+@pytest.fixture(scope="module")
+def axes(dataset, alignment):
+    return category_axes(alignment, "scooter", read_front(dataset, "motorcycle", *ARROW))
+
+
+def test_poses_in_the_axes_are_rigid_and_agree_with_the_labels(dataset, alignment, axes, tmp_path):
+    written = json.loads(write_alignment(alignment, tmp_path, axes).read_text())
+    middle = np.median([one.sim3.t for one in alignment.objects.values()], axis=0)
+    for name, label in read_poses(dataset.root, "motorcycle").items():
+        if name in alignment.objects:
+            matrix = np.array(written["objects"][name]["world_to_axes"])
+            front, left, up = matrix[:3, :3]
+            assert vector_angle(front, label.R[:, 0]) < 6  # degrees: the arrow is a bit off
+            assert vector_angle(up, label.R[:, 2]) < 1
+            assert np.allclose(np.cross(up, front), left)
+            world = alignment.objects[name].sim3.inverse().apply(middle)
+            assert np.allclose(matrix @ [*world, 1], [0, 0, 0, 1])
+
+
+def test_the_arrows_of_a_picture_point_along_the_objects_front_and_up(dataset, alignment):
+    # In the true alignment, the common frame has these axes.
+    panel = objects_figure(dataset, "motorcycle", alignment, ["scooter"], Sim3.identity()).axes[0]
+    crop = object_crop(dataset.load(dataset.frame("motorcycle", "scooter", 0)))
+    label = read_poses(dataset.root, "motorcycle")["scooter"]
+    # Each arrow is followed by its name.
+    for arrow, direction in zip(panel.texts[::2], label.R.T, strict=True):
+        (start, end), _ = crop.camera.project(np.stack([label.t, label.t + direction]))
+        assert np.allclose(arrow.xyann, start)
+        drawn = np.array([*arrow.xy - start, 0])
+        assert vector_angle(drawn, np.array([*end - start, 0])) < 1
+
+
+def test_the_command_takes_an_arrow_or_two_marks(axes, alignment, tmp_path, run, monkeypatch):
+    monkeypatch.setattr("zsp_lite.objects.align.align_category", lambda *_, **__: alignment)
+    line = f"align data_samples --category motorcycle --out {tmp_path}"
+    marks = "--mark scooter:0:200.5,124.5:rear --mark scooter:0:128.5,76.5:bow"
+    for given in ("scooter:front=0:200.5,124.5,0:128.5,76.5", f"rear,bow {marks}"):
+        run(f"{line} --axes {given}")
+        content = json.loads((tmp_path / "alignment.json").read_text())
+        pose = np.array(content["objects"]["scooter"]["world_to_axes"])
+        assert np.allclose(pose[:3, :3], axes.R @ alignment.objects["scooter"].sim3.R)
+        assert "world_to_axes" in (tmp_path / "report.html").read_text("utf-8")
+    run(line)
+    assert "axes" not in (tmp_path / "alignment.json").read_text()
+
+
 @pytest.mark.parametrize(
-    ("marks", "message"),
+    ("options", "message"),
     [
-        (["scooter"], "expected SEQUENCE:FRAME:X,Y"),
-        (["nothing:0:1,1"], "have no frames of 'nothing'"),
-        (["scooter:99:1,1"], "has no frame number 99"),
-        (["scooter:0:900,1"], "outside the image, expected one of 320 x 240"),
-        (["scooter:0:nan,1"], "outside the image"),
-        (["scooter:0:180,114:a\x07"], "expected SEQUENCE:FRAME:X,Y"),
-        (["scooter:0:180,114", "--sequences", "scooter2,yamaha_yzr_r6"], "sequence of the mark"),
-        (["scooter:0:1,1"], "has no depth"),
-        (["scooter:0:20,160"], "is not on the object"),
-        (["scooter:0:180,114:a", "scooter:0:181,114:a"], "2 marks are named 'a'"),
+        ("--mark scooter", "expected SEQUENCE:FRAME:X,Y"),
+        ("--mark nothing:0:1,1", "have no frames of 'nothing'"),
+        ("--mark scooter:99:1,1", "has no frame number 99"),
+        ("--mark scooter:0:900,1", "outside the image, expected one of 320 x 240"),
+        ("--mark scooter:0:nan,1", "outside the image"),
+        ("--mark scooter:0:180,114:a\x07", "expected SEQUENCE:FRAME:X,Y"),
+        ("--mark scooter:0:180,114 --sequences scooter2,yamaha_yzr_r6", "sequence of the mark"),
+        ("--mark scooter:0:1,1", "has no depth"),
+        ("--mark scooter:0:20,160", "is not on the object"),
+        ("--mark scooter:0:180,114:a --mark scooter:0:181,114:a", "2 marks are named 'a'"),
+        ("--axes scooter:front=0:200,124", "expected SEQUENCE:front=FRAME:X,Y,FRAME:X,Y or"),
+        ("--axes nothing:front=0:1,1,0:2,2", "have no frames of 'nothing'"),
+        ("--axes scooter:front=0:200,124,99:1,1", "has no frame number 99"),
+        (
+            "--axes scooter:front=0:200,124,0:900,1",
+            "'tip of --axes': pixel 900,1 of frame 0 is out",
+        ),
+        ("--axes scooter:front=0:1,1,0:200,124", "has no depth"),
+        ("--axes scooter:front=0:200,124,0:200,124", "is 0 long"),
+        ("--axes scooter:front=0:200,124,0:201,124", "at least 0.62, a tenth of the object"),
+        ("--axes scooter:front=0:128.5,140.5,0:128.5,76.5", "84 degrees from the floor"),
+        ("--axes scooter:front=0:200,124,0:128,76 --sequences scooter2", "sequence of the mark"),
+        ("--mark scooter:0:180,114:a --axes a,b", "mark of --axes is 'b', expected one of a"),
+        (
+            "--mark scooter:0:200,124:a --mark scooter2:0:128,120:b --axes a,b",
+            "of the arrow's tip is 'scooter2'",
+        ),
     ],
 )
-def test_wrong_marks_are_refused_before_anything_is_computed(marks, message, tmp_path, run):
-    words = " ".join(f"--mark {mark}" if ":" in mark or len(marks) == 1 else mark for mark in marks)
+def test_wrong_marks_and_axes_are_refused_before_anything_is_computed(
+    options, message, tmp_path, run
+):
     out = tmp_path / "out"
-    printed = run(f"align data_samples --category motorcycle {words} --out {out}", code=2)
+    printed = run(f"align data_samples --category motorcycle {options} --out {out}", code=2)
     assert message in printed
     assert printed.count("\n") == 1
     assert not out.exists()
+
+
+def test_axes_need_a_vertical_and_an_aligned_object(dataset, alignment, axes, monkeypatch):
+    refused("sequence with the arrow is 'x'", category_axes, alignment, "x", axes.R)
+    monkeypatch.setattr("zsp_lite.scans.marks.find_up", lambda frames: (None, ""))
+    refused("no vertical, expected a scan with a floor", read_front, dataset, "motorcycle", *ARROW)

@@ -22,10 +22,25 @@ def _read_mark(text: str):
     return Mark.parse(text)
 
 
+def _read_axes(text: str):
+    name, given, arrow = text.partition(":front=")
+    if not given:
+        tail, tip = text.split(",")
+        return tail, tip
+    x, y, other_x, other_y = arrow.split(",")
+    tail = _read_mark(f"{name}:{x},{y}:tail of --axes")
+    return tail, _read_mark(f"{name}:{other_x},{other_y}:tip of --axes")
+
+
 MARK = Parsed(
     "sequence:frame:x,y[:name]",
     parse=_read_mark,
     expected="SEQUENCE:FRAME:X,Y or SEQUENCE:FRAME:X,Y:NAME",
+)
+AXES = Parsed(
+    "tail,tip",
+    parse=_read_axes,
+    expected="SEQUENCE:front=FRAME:X,Y,FRAME:X,Y or the names of two marks",
 )
 
 
@@ -64,11 +79,16 @@ MARK = Parsed(
     multiple=True,
     help="A pixel with depth to find on all objects; may be repeated.",
 )
+@click.option(
+    "--axes",
+    type=AXES,
+    help="An arrow to the front: two marks by name, or SEQUENCE:front=FRAME:X,Y,FRAME:X,Y.",
+)
 @replace_option
 @workers_option
 @backbone_options
 def align(
-    data, category, sequences, pairs, out, propose, marks, replace, backbone, workers
+    data, category, sequences, pairs, out, propose, marks, axes, replace, backbone, workers
 ) -> None:
     """Align all objects of a category in one frame. No label is needed.
 
@@ -84,10 +104,15 @@ def align(
 
     A pixel of one object, --mark, is found on all others: OUT gets marks.json, marks.jpg,
     marks/SEQUENCE.ply with balls in each object's world, and a section of the report.
+
+    An arrow between two places of one object, --axes, names the front: alignment.json gets
+    world_to_axes, the rigid pose of each object with x to the front, y to the left and z up, by the
+    floor or the cameras of that scan. The origin is amid the objects, lengths are those of DATA.
     """
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.data.co3d import Co3D
     from zsp_lite.data.labels import read_label_folder
+    from zsp_lite.errors import check_choice
     from zsp_lite.importers.convert import import_captures
     from zsp_lite.metrics import SAME_ANGLE, accuracy
     from zsp_lite.objects.align import (
@@ -97,7 +122,13 @@ def align(
         write_alignment,
         write_labels,
     )
-    from zsp_lite.scans.marks import marked_points, place_marks, write_marks
+    from zsp_lite.scans.marks import (
+        category_axes,
+        marked_points,
+        place_marks,
+        read_front,
+        write_marks,
+    )
     from zsp_lite.viz.category_sheet import COLUMNS, object_rows
     from zsp_lite.viz.report import write_category_report
 
@@ -108,17 +139,26 @@ def align(
                 print(f"{name}: {flag}")
         data = out / "data"
     dataset = Co3D(data)
-    # Refuses wrong marks before minutes of computing.
+    # Refuses wrong marks and axes before minutes of computing.
     marked_points(dataset, category, marks, sequences)
+    if axes:
+        named = {mark.name: mark for mark in marks}
+        for end in axes:
+            if isinstance(end, str):
+                check_choice("mark of --axes", end, named)
+        tail, tip = (named.get(end, end) for end in axes)
+        marked_points(dataset, category, (tail, tip), sequences)
+        front = read_front(dataset, category, tail, tip)
     alignment = align_category(
         dataset, category, backbone, sequences, pairs, out=out, executor=workers
     )
+    frame = category_axes(alignment, tail.sequence, front) if axes else None
     placed = place_marks(alignment, dataset, category, marks, backbone) if marks else []
     remove_outputs(out, category)  # those that are not written again would be of other objects
     written = [
-        write_alignment(alignment, out),
+        write_alignment(alignment, out, frame),
         write_labels(alignment, out, category, replace=True),
-        write_category_report(out / "report.html", alignment, dataset, category, placed),
+        write_category_report(out / "report.html", alignment, dataset, category, placed, frame),
         out / "objects.jpg",
     ]
     if placed:

@@ -217,9 +217,12 @@ def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
     return hypotheses
 
 
-def write_alignment(found: CategoryAlignment, out: str | Path) -> Path:
+def write_alignment(found: CategoryAlignment, out: str | Path, axes: Sim3 | None = None) -> Path:
     """Write the poses of all objects in the common frame, and the disagreements, to
-    OUT/alignment.json."""
+    OUT/alignment.json.
+
+    With `axes` (see `category_axes`) every object also gets the rigid pose from its world to them.
+    """
     objects = {
         name: {
             "world_to_frame": one.sim3.matrix.tolist(),
@@ -233,7 +236,14 @@ def write_alignment(found: CategoryAlignment, out: str | Path) -> Path:
     pairs = [
         {"pair": pair, "degrees": round(angle, 2)} for pair, angle in found.disagreements.items()
     ]
-    write_atomic(path, json.dumps({"objects": objects, "disagreements": pairs}, indent=1).encode())
+    document = {"objects": objects, "disagreements": pairs}
+    if axes:
+        document["axes"] = "x front, y left, z up; origin amid the objects; lengths of each world"
+        for name, one in found.objects.items():
+            matrix = (axes @ one.sim3).matrix
+            matrix[:3] /= one.sim3.scale  # rigid: in the lengths of the object's world
+            objects[name]["world_to_axes"] = matrix.tolist()
+    write_atomic(path, json.dumps(document, indent=1).encode())
     return path
 
 

@@ -1,5 +1,5 @@
-"""Places marked in frames of one object, and where they are on the other objects of an aligned
-category (see `transfer`)."""
+"""Places marked in frames of one object: where they are on the other objects of an aligned category
+(see `transfer`), and the axes that two of them name, the ends of an arrow to the front."""
 
 import itertools
 import json
@@ -11,24 +11,31 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from zsp_lite.alignment import Sim3
 from zsp_lite.backbones.named import BackboneLike, as_backbone
 from zsp_lite.data.clouds import extent
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.errors import InputError, check_choice
 from zsp_lite.io.files import plain_name, write_atomic
 from zsp_lite.io.ply import write_ply
+from zsp_lite.metrics import vector_angle
 from zsp_lite.points import object_pixels
 from zsp_lite.scans.category import CategoryAlignment
 from zsp_lite.scans.transfer import (
     FOUND,
     marked_point,
     object_size,
+    spread_frames,
     surface_views,
     transfer,
 )
+from zsp_lite.scans.upright import find_up
+from zsp_lite.views import object_crop
 
 # A point is seen if the depth map is nearer by at most this part of the object's size.
 _HIDDEN = 0.05
+_SHORTEST = 0.1  # length of an arrow, in sizes of its object
+_STEEPEST = 60.0  # degrees between an arrow and the floor
 _RADIUS = 0.015  # of the ball that shows a mark in a point cloud, in sizes of the object
 # Colours of marks in order (Okabe and Ito 2008), again from the first after the last.
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -155,6 +162,52 @@ def marked_points(
         what = f"mark {mark.name!r}: pixel {mark.x:g},{mark.y:g} of frame {mark.frame}"
         points.append(marked_point(frame, mark.x, mark.y, what))
     return points
+
+
+def read_front(dataset: Co3D, category: str, tail: Mark, tip: Mark) -> Float[np.ndarray, "3 3"]:
+    """Return the directions front, left and up (rows) in the world of an object.
+
+    Args:
+        dataset: Data set.
+        category: Name of the category.
+        tail: Mark on the object, where an arrow to its front starts.
+        tip: Mark on the same object, where the arrow ends. Its part normal to the vertical counts.
+
+    Raises:
+        InputError: A mark is refused (see `place_marks`), the arrow is short or steep, or nothing
+            tells the vertical.
+    """
+    name = tail.sequence
+    check_choice("sequence of the arrow's tip", tip.sequence, [name])
+    start, end = marked_points(dataset, category, (tail, tip))
+    crops = map(object_crop, spread_frames(dataset, category, name))
+    up, problem = find_up([*crops])
+    if up is None:
+        raise InputError(
+            f"arrow on {name}: {problem or 'no vertical'}, expected a scan with a floor around it"
+        )
+    arrow = end - start
+    length = np.linalg.norm(arrow)
+    least = _SHORTEST * (extent(dataset, category, name) or (None, 0.0))[1]
+    tilt = abs(90 - vector_angle(arrow, up))
+    if length < least or tilt > _STEEPEST:
+        raise InputError(
+            f"the arrow on {name} is {length:.2g} long and {tilt:.0f} degrees from the floor, "
+            f"expected at least {least:.2g}, a tenth of the object, and at most {_STEEPEST:.0f}"
+        )
+    left = np.cross(up, arrow)
+    axes = np.stack([np.cross(left, up), left, up])
+    return axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
+def category_axes(alignment: CategoryAlignment, name: str, front: Float[np.ndarray, "3 3"]) -> Sim3:
+    """Return the rigid transform from the common frame to axes whose x, y and z are the directions
+    of `read_front` for one object, and whose origin is amid all objects."""
+    objects = alignment.objects
+    check_choice("aligned sequence with the arrow", name, objects)
+    R = front @ objects[name].sim3.R.T
+    centres = [one.sim3.apply(one.centre) for one in objects.values()]
+    return Sim3(1.0, R, -R @ np.median(centres, axis=0))
 
 
 def _pixels(

@@ -104,10 +104,7 @@ def surface_views(
     Raises:
         InputError: No frame shows the object's surface.
     """
-    annotations = [
-        frame for frame in dataset.frames(category, sequence) if frame.viewpoint is not None
-    ]
-    frames = [dataset.load(annotations[k]) for k in spread(VIEWS, len(annotations))]
+    frames = spread_frames(dataset, category, sequence)
     usable = [frame for frame in frames if not frame_defect(frame)]
     unmasked = any(frame.mask is None for frame in usable)
     method = ZeroShotPose(as_backbone(backbone), foreground="saliency" if unmasked else "mask")
@@ -118,6 +115,14 @@ def surface_views(
             "depth"
         )
     return surface
+
+
+def spread_frames(dataset: Co3D, category: str, sequence: str) -> list[Frame]:
+    """Load evenly spaced frames of an object with a camera."""
+    annotations = [
+        frame for frame in dataset.frames(category, sequence) if frame.viewpoint is not None
+    ]
+    return [dataset.load(annotations[k]) for k in spread(VIEWS, len(annotations))]
 
 
 def describe_surface(views: Iterable[View], sim3: Sim3) -> list[SurfaceView]:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from zsp_lite.alignment import Sim3
 from zsp_lite.data.annotations import FrameAnnotation
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.frames import Frame
@@ -14,7 +15,7 @@ from zsp_lite.metrics import rotation_angle
 from zsp_lite.scans.category import CategoryAlignment
 from zsp_lite.scans.marks import COLOURS, Place, PlacedMark
 from zsp_lite.views import object_crop
-from zsp_lite.viz.plots import VERMILLION
+from zsp_lite.viz.plots import VERMILLION, draw_axes
 
 # Probabilities that the pose is right, and that the next best one is, by the angle between both.
 COLUMNS = ("object", "right (%)", "else turned by", "that (%)")
@@ -27,43 +28,51 @@ _BORDER = 0.3
 
 
 def objects_figure(
-    dataset: Co3D, category: str, alignment: CategoryAlignment, names: Sequence[str] | None = None
+    dataset: Co3D,
+    category: str,
+    alignment: CategoryAlignment,
+    names: Sequence[str] | None = None,
+    front: Sim3 | None = None,
 ) -> Figure:
     """Show objects by the frame that is nearest to one camera: in their own worlds above, in the
     common frame below.
 
     The camera is that of the first frame of the most probable object of the category. Doubtful
-    objects are shown in their next best turn, too. At most ten objects are shown.
+    objects are shown in their next best turn, too. At most ten objects are shown, with the
+    axes of the category if they are known.
     """
     objects = alignment.objects
     names = list(names or objects)[:MOST]
     flagged = doubtful(alignment)
 
-    # The rows: for each object, the rotation from its world to the camera that should see it.
+    # The rows: for each object, its pose in the common frame.
     surest = max(objects, key=lambda name: objects[name].probability)
     camera = dataset.camera(_frames(dataset, category, surest)[0]).R
     common = camera @ objects[surest].sim3.R.T  # from the common frame to the camera
-    rows = {
-        "as scanned": dict.fromkeys(names, camera),
-        "aligned": {name: common @ objects[name].sim3.R for name in names},
+    poses = {name: objects[name].sim3 for name in names}
+    rows = {"as scanned": poses, "aligned": poses}
+    turned = {
+        name: pose for name in names if name in flagged and (pose := objects[name].alternative)
     }
-    turned = {}
-    for name in names:
-        alternative = objects[name].alternative
-        if name in flagged and alternative:
-            turned[name] = common @ alternative.R
     if turned:
         rows["or turned"] = turned
 
     figure, axes = _panels(len(rows), len(names), _HEIGHT * len(rows) + _BORDER)
-    for panels, (title, rotations) in zip(axes, rows.items()):
+    for panels, (title, poses) in zip(axes, rows.items()):
         # The row "or turned" has pictures of some objects only; its title is at the first.
-        first = names.index(next(iter(rotations)))
+        first = names.index(next(iter(poses)))
         panels[first].set_ylabel(title)
         for axis, name in zip(panels, names):
-            if name in rotations:
-                frames = _frames(dataset, category, name)
-                axis.imshow(nearest_crop(dataset, frames, rotations[name]).rgb)
+            if name in poses:
+                rotation = camera if title == "as scanned" else common @ poses[name].R
+                crop = nearest_crop(dataset, _frames(dataset, category, name), rotation)
+                axis.imshow(crop.rgb)
+                if front:
+                    seen = Sim3(1.0, crop.camera.R, crop.camera.t) @ (front @ poses[name]).inverse()
+                    # An arrow that is parallel to the image has 0.35 of its width.
+                    reach = 0.35 * seen.t[2] * len(crop.rgb) / crop.camera.K[0, 0]
+                    ends = seen.t + reach * seen.R.T
+                    draw_axes(axis, crop.camera, seen.t, ends, ("front", "left", "up"), 7)
 
     # Names and probabilities below the row "aligned".
     for axis, name in zip(axes[1], names):

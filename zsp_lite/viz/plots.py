@@ -510,14 +510,15 @@ def draw_axes(
     origin: Real[np.ndarray, "3"],
     ends: Real[np.ndarray, "3 3"],
     names: Sequence[str],
+    size: float = _FONT,
 ) -> None:
     """Draw arrows from an origin to three ends (rows), points of a camera's frame, in its image,
-    with their names.
+    with their names, `size` points high.
 
     Arrows with an end behind the camera are left out; names stay inside the image.
     """
     pixels, depth = camera.project(camera.to_world(np.vstack([origin, ends])))
-    size = np.array(camera.size[::-1])  # (W, H)
+    shape = np.array(camera.size[::-1])  # (W, H)
     for name, colour, end, end_depth in zip(names, _AXIS_COLOURS, pixels[1:], depth[1:]):
         if min(end_depth, depth[0]) <= 0:
             continue
@@ -526,11 +527,11 @@ def draw_axes(
         arrow.set_in_layout(False)
         arrow.arrow_patch.set_clip_path(axis.patch)
         axis.text(
-            *np.clip(end, 0.08 * size, 0.92 * size),
+            *np.clip(end, 0.08 * shape, 0.92 * shape),
             name,
             color=colour,
             zorder=7,
-            fontsize=_FONT,
+            fontsize=size,
             weight="bold",
             ha="center",
             va="center",

@@ -118,26 +118,14 @@ def _draw_from_above(
         widest = (following - around).argmax()
         begin, end = around[widest], following[widest]
     axis.images[0].remove()  # the white image that held the place
-    axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0))
+    gap = f"no target view in these {end - begin:.0f}°"
+    axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0, label=gap))
     # An arc is given by the width and the height of its whole ellipse.
-    axis.add_patch(Arc((0, 0), 2, 2, theta1=end, theta2=begin + 360, color=plots.BLUE, linewidth=4))
-    # Entries of the legend, without a point.
-    axis.plot(
-        [],
-        [],
-        "s",
-        color="0.5",
-        alpha=0.25,
-        markersize=14,
-        label=f"no target view in these {end - begin:.0f}°",
-    )
-    axis.plot(
-        [],
-        [],
-        color=plots.BLUE,
-        linewidth=4,
-        label=f"the target views span {360 - end + begin:.0f}°",
-    )
+    arc = Arc((0, 0), 2, 2, theta1=end, theta2=begin + 360, color=plots.BLUE, linewidth=4)
+    axis.add_patch(arc)
+    # Its entry of the legend is a line.
+    span = f"the target views span {360 - end + begin:.0f}°"
+    axis.plot([], [], color=plots.BLUE, linewidth=4, label=span)
     step = -(-len(target) // _POINTS)  # rounded up
     flat = [(points - centre) @ axes.T for points in (target[::step], reference)]
     # Nine tenths of the target's points are within `_OBJECT`.

@@ -20,6 +20,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from plotly.offline import get_plotlyjs
 
+from zsp_lite.alignment import Sim3
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.io.files import REPOSITORY, write_atomic
@@ -66,14 +67,15 @@ def write_category_report(
     dataset: Co3D,
     category: str,
     placed: Sequence[PlacedMark] = (),
+    axes: Sim3 | None = None,
 ) -> Path:
-    """Write a page with contact sheets, the table of all objects and the marks, and the first sheet
-    of each as objects.jpg and marks.jpg beside it."""
+    """Write a page with contact sheets, the table of all objects, the marks and the axes (see
+    `category_axes`), and the first sheet of each as objects.jpg and marks.jpg beside it."""
     names = list(alignment.objects)
     most = category_sheet.MOST
     parts = [names[start : start + most] for start in range(0, len(names), most)]
     shown = dataset, category, alignment
-    sheets = [_sheet(category_sheet.objects_figure(*shown, part)) for part in parts]
+    sheets = [_sheet(category_sheet.objects_figure(*shown, part, axes)) for part in parts]
     marked = []
     if placed:
         marked = [_sheet(category_sheet.marks_figure(*shown, placed, part)) for part in parts]
@@ -83,6 +85,7 @@ def write_category_report(
         rows=category_sheet.object_rows(alignment),
         images=[_data_uri(sheet) for sheet in sheets],
         marked=[_data_uri(sheet) for sheet in marked],
+        axes=axes,
         doubtful=category_sheet.doubtful(alignment),
     )
     write_atomic(path.with_name("objects.jpg"), sheets[0])
