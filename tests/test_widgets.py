@@ -77,11 +77,9 @@ def test_the_caption_has_the_nearest_neighbour_and_the_share_of_correct_ones(sim
     pair = examples.sample_pair()
     kinds, cells = {"other": -sim, "one": sim}, np.stack(np.divmod(sim.argmax(1).numpy(), 28), -1)
     widget = patches.patch_similarities(
-        pair.reference.rgb, pair.target.rgb, kinds, pair.cells, pair.valid
+        pair.reference.rgb, pair.target.rgb, kinds, pair.cells, pair.valid, (15, 9)
     )
     widget.controls["kind"].value = "one"
-    widget.controls["row"].value = 15
-    widget.controls["col"].value = 9
     row, col = cells[15 * 28 + 9]
     assert (
         f"nearest neighbour ({row}, {col}), cosine {sim[15 * 28 + 9].max():.2f}"
@@ -100,7 +98,8 @@ def test_an_empty_box_has_no_mask():
 
 def test_the_cycle_has_the_cyclical_distance_and_names_the_background(sim):
     pair = examples.sample_views()
-    widget = cycles.cycle(*pair, sim)
+    widget = cycles.cycle(*pair, sim, (7, 5))
+    assert "u (7, 5) →" in widget.caption.value
     distances = -cyclical_distances(sim, (28, 28), (28, 28)).numpy()
     valid = np.isfinite(
         cyclical_distances(sim, (28, 28), (28, 28), *(view.foreground for view in pair)).numpy()

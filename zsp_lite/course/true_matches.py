@@ -90,13 +90,13 @@ def ground_truth_pair(dataset: Co3D, pair: Pair) -> GroundTruthPair:
     grid = (28, 28)
     poses = object_poses(dataset, pair.category)
     reference, targets = dataset.load_pair(pair)
-    reference = object_crop(reference)
-    targets = [object_crop(target) for target in targets]
+    reference, *targets = map(object_crop, (reference, *targets))
     coordinates = patch_coordinates(reference, poses[pair.reference_sequence], grid)
-    target_pose = poses[pair.target_sequence]
     matches = [
-        ground_truth_matches(coordinates, patch_coordinates(target, target_pose, grid))
+        ground_truth_matches(
+            coordinates, patch_coordinates(target, poses[pair.target_sequence], grid)
+        )
         for target in targets
     ]
-    best = int(np.argmax([valid.sum() for _, valid in matches]))
+    best = np.argmax([valid.sum() for _, valid in matches])
     return GroundTruthPair(pair.category, reference, targets[best], *matches[best])

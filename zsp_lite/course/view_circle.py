@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from zsp_lite.viz.plots import BLUE, CHOSEN, draw_image, mark
 
-_LIMITS = (-52, -22)  # scores in the middle and at the rim
+_RINGS = (-45, -35, -25)
 _EVERY = 3  # views from one thumbnail to the next
 _THUMBNAIL = 0.17  # width and height, of the figure's
 _RING = 0.395  # distance of the thumbnails from the middle, of the figure's width
@@ -21,11 +21,10 @@ def show_view_circle(
     turns: Float[np.ndarray, " n"],
     scores: Float[np.ndarray, " n"],
 ) -> Figure:
-    """Show the scores of views as radius over their turn from the reference, which is in the
-    middle.
+    """Show the scores of views as radius over their turn from the reference.
 
     A thumbnail with its score stands outside at every third view, the one with the best score among
-    them.
+    them, and the reference in a corner.
 
     Args:
         reference: Image of the reference.
@@ -38,19 +37,22 @@ def show_view_circle(
     """
     figure = plt.figure(figsize=(7, 7))
     circle = figure.add_axes((0.25, 0.25, 0.5, 0.5), projection="polar")
-    circle.set(theta_zero_location="N", theta_direction=-1, ylim=_LIMITS)
-    circle.set_xticks(np.radians(range(0, 360, 90)), ["0°", "90°", "180°", "90°"])
-    circle.set_yticks(np.arange(-40, _LIMITS[1], 5))
-    circle.tick_params(axis="y", labelsize=8)
+    # Scores of -52 lie in the middle, of -22 at the rim.
+    circle.set(theta_zero_location="N", theta_direction=-1, ylim=(-52, -22))
+    circle.set_thetagrids(range(0, 360, 90), ["turn 0°", "+90°", "180°", "−90°"])
+    # The rings have their labels where the curve is farthest from all of them.
+    away = np.abs(scores[:, None] - _RINGS).min(axis=1)
+    circle.set_rgrids(_RINGS, ["−45", "−35", "score −25"], turns[away.argmax()], fontsize=8)
 
     order = np.argsort(turns)
     closed = np.append(order, order[0])
-    circle.fill(np.radians(turns[closed]), scores[closed], color=BLUE, alpha=0.2)
-    circle.plot(np.radians(turns[closed]), scores[closed], "o-", color=BLUE, markersize=5)
-    best = int(scores.argmax())
+    curve = np.radians(turns[closed]), scores[closed]
+    circle.fill(*curve, color=BLUE, alpha=0.2)
+    circle.plot(*curve, "o-", color=BLUE, markersize=5)
+    place = scores[order].argmax()
+    best = order[place]
     circle.plot(np.radians(turns[best]), scores[best], "o", color=CHOSEN, markersize=12)
 
-    place = order.tolist().index(best)
     for view in order[place % _EVERY :: _EVERY]:
         angle = np.radians(turns[view])
         centre = 0.5 + _RING * np.array([np.sin(angle), np.cos(angle)])
@@ -60,8 +62,8 @@ def show_view_circle(
         axis.set_title(f"{scores[view]:.1f}", fontsize=9, pad=2)
         if view == best:
             mark(axis, "wins", size=8)
-    middle = figure.add_axes((0.435, 0.435, 0.13, 0.13))
-    draw_image(middle, reference)
-    middle.set_axis_off()
-    middle.set_title("reference", fontsize=8, pad=1)
+    corner = figure.add_axes((0, 0.855, 0.12, 0.12))
+    draw_image(corner, reference)
+    corner.set_axis_off()
+    corner.set_title("reference", fontsize=9, pad=2)
     return figure

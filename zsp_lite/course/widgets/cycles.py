@@ -10,15 +10,20 @@ from zsp_lite.views import View
 from zsp_lite.viz import plots
 
 
-def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
+def cycle(
+    reference: View,
+    target: View,
+    sim: Float[Tensor, "n1 n2"],
+    start: tuple[int, int] = (14, 14),
+) -> Widget:
     """Show the cycle of a reference patch u, from its nearest neighbour v in the target back to u'
-    (eq. 2)."""
+    (eq. 2); it opens at the patch `start`."""
     grid = reference.features.grid
     values = sim.numpy()
     forth, back = nearest_neighbours(sim)
     titles = ["reference: similarity to v", "target: similarity to u"]
     figure, axes = plots.show_images([reference.frame.rgb, target.frame.rgb], titles, size=3.7)
-    maps = [plots.overlay_map(axis, np.zeros(grid), 0.55, limits=(0, 1)) for axis in axes]
+    maps = [plots.overlay_map(axis, np.zeros(grid), 0.4, limits=(0, 1)) for axis in axes]
     draw = redrawing(plots.draw_cycle)
 
     def update(row: int, col: int) -> str:
@@ -43,9 +48,6 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
             text += f"; {', '.join(off)} not on the foreground, so the distance is infinite"
         return f"{text}."
 
-    # It begins at the foreground patch with the most similar neighbour; -2 is below every cosine.
-    similar = np.where(reference.foreground, values.max(1).reshape(grid), -2)
-    start = divmod(int(similar.argmax()), grid[1])
     alt = (
         "A solid arrow from the patch u to its nearest neighbour v, a dashed arrow from v to the "
         "patch u'."

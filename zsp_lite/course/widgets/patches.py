@@ -27,16 +27,18 @@ def patch_similarities(
     sims: Mapping[str, Float[Tensor, "n n"]],
     cells: Int[np.ndarray, "h w 2"],
     valid: Bool[np.ndarray, "h w"],
+    start: tuple[int, int] = (14, 14),
 ) -> Widget:
-    """Show how similar one patch is to all patches of the target, its nearest neighbour and its
-    true match.
+    """Show how similar one patch is to all patches of the target, its nearest neighbour (a dot) and
+    its partner, the true match (a star).
 
     Args:
         reference: Image of the reference.
         target: Image of the target.
         sims: Similarities of all pairs of patches, by the name of their kind.
-        cells: True match (row, col) of each reference patch, as of `ground_truth_matches`.
-        valid: Whether a reference patch has a true match.
+        cells: Partner (row, col) of each reference patch, as of `ground_truth_matches`.
+        valid: Whether a reference patch has a partner.
+        start: The patch (row, col) at which the widget opens.
     """
     grid = valid.shape
     figure, axes = plots.show_images(
@@ -45,7 +47,11 @@ def patch_similarities(
     figure.set_figheight(4)  # space for the colour bar
     axes[0].set_anchor("N")
     shown = plots.overlay_map(
-        axes[1], np.zeros(grid), limits=(0, 1), label="cosine; star: true match"
+        axes[1],
+        np.zeros(grid),
+        0.5,
+        limits=(0, 1),
+        label="cosine; dot: nearest neighbour, star: partner",
     )
 
     @redrawing
@@ -53,10 +59,9 @@ def patch_similarities(
         drawn = plots.outline_patch(
             axes[0], cell, grid, label="u", linewidth=2, path_effects=plots.BORDER
         )
-        drawn += plots.circle_patch(axes[1], nearest, grid)
         if valid[cell]:
             drawn += plots.circle_patch(axes[1], cells[cell], grid, "*")
-        return drawn
+        return drawn + plots.circle_patch(axes[1], nearest, grid)  # the dot lies on the star
 
     @cache
     def share_correct(kind: str) -> float:
@@ -70,26 +75,19 @@ def patch_similarities(
         nearest = divmod(int(similar.argmax()), grid[1])
         shown.set_data(similar)
         mark((row, col), nearest)
-        true = "the true match is not visible"
+        true = "its partner is not visible"
         if valid[row, col]:
             true_row, true_col = cells[row, col]
             distance = np.abs(np.subtract(nearest, cells[row, col])).max()
-            true = f"true match ({true_row}, {true_col}), distance {distance} patches"
+            true = f"partner ({true_row}, {true_col}), distance {distance} patches"
         return (
             f"{kind}: nearest neighbour {nearest}, cosine {similar[nearest]:.2f}; {true}. Of "
             f"the {valid.sum()} patches "
-            f"with a true match, {share_correct(kind):.0%} have their nearest neighbour "
+            f"with a partner, {share_correct(kind):.0%} have their nearest neighbour "
             "within one patch of it."
         )
 
-    # It begins at the patch with a true match that is nearest to the middle of all of them.
-    known = np.argwhere(valid)
-    off_middle = np.abs(known - np.median(known, axis=0)).sum(axis=1)
-    middle = tuple(known[off_middle.argmin()].tolist())
     kinds = load_package().Dropdown(options=list(sims), description="similarity")
-    controls = {**patch_sliders(grid, middle), "kind": kinds}
-    alt = (
-        "A patch of the reference; its similarities, nearest neighbour and true match in the "
-        "target."
-    )
+    controls = {**patch_sliders(grid, start), "kind": kinds}
+    alt = "A patch of the reference; its similarities, nearest neighbour and partner in the target."
     return interactive_figure(figure, controls, update, alt)
