@@ -221,6 +221,19 @@ def test_students_see_a_test_of_the_commonest_mistake_that_says_what_to_look_at(
         assert failing and all(len(message.split()) > 4 for message in failing.values()), function
 
 
+def test_the_minutes_of_the_labs_add_up_in_the_guide_and_on_the_slides():
+    guide = (EXERCISES.parent / "README.md").read_text("utf-8")
+    rows = re.findall(r"^\| (\d+) \| .* \| ([\d +]+) \|$", guide, re.MULTILINE)
+    ends = np.cumsum([sum(map(int, minutes.split("+"))) for _, minutes in rows]).tolist()
+    assert [int(end) for end, _ in rows] == ends and ends[-1] == 90
+    for path in (EXERCISES.parents[1] / "docs/slides").glob("lab_*.md"):
+        cover = path.read_text("utf-8").partition("## ")[0]
+        if path.stem == LAB:
+            assert set(map(int, re.findall(r"until (?:minute )?(\d+)", cover))) <= {*ends}
+        else:
+            assert sum(map(int, re.findall(r"(\d+) min", cover))) == 120
+
+
 CALLS_THE_LIBRARY = """
 own = {0}
 def {0}(*arguments):
