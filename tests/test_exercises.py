@@ -221,6 +221,17 @@ def test_students_see_a_test_of_the_commonest_mistake_that_says_what_to_look_at(
         assert failing and all(len(message.split()) > 4 for message in failing.values()), function
 
 
+def test_the_minutes_of_the_labs_add_up_in_the_guide_and_on_the_slides():
+    guide = (EXERCISES.parent / "README.md").read_text("utf-8")
+    rows = re.findall(r"^\| (\d+) \| .* \| ([\d +]+) \|$", guide, re.MULTILINE)
+    ends = np.cumsum([int(part) for _, minutes in rows for part in minutes.split("+")])
+    *three, one = sorted(EXERCISES.parents[1].glob("docs/slides/lab_*"))
+    until = re.findall(r"until \D*(\d+)", one.read_text("utf-8"))
+    assert {"90", *until, *dict(rows)} <= {*map(str, ends)}
+    for deck in three:
+        assert sum(map(int, re.findall(r"(\d+) min\b", deck.read_text("utf-8")))) == 120
+
+
 CALLS_THE_LIBRARY = """
 own = {0}
 def {0}(*arguments):
