@@ -6,7 +6,6 @@ import linecache
 import re
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from refusals import refused
@@ -77,6 +76,8 @@ def test_every_part_has_a_solution_of_at_most_15_lines():
 def test_the_solutions_pass_one_after_the_other_and_are_kept(folder, capsys):
     for count, (name, source) in enumerate(SOLUTIONS.items(), 1):
         check(written(source, name))
+        # The file does not give a part away that is still to be written.
+        assert ("argmax" in (folder / your_turn.FILE).read_text("utf-8")) == (count > 1)
         assert capsys.readouterr().out == f"right: {count} of 10 parts are yours\n"
     kept = (folder / your_turn.FILE).read_text("utf-8")
     assert all(source.strip() in kept for source in SOLUTIONS.values())
@@ -87,19 +88,8 @@ def test_the_solutions_pass_one_after_the_other_and_are_kept(folder, capsys):
     assert kept.count("def cycle(") == 1 and "home" in kept
 
 
-class Replay(np.random.Generator):
-    """A generator that draws the samples of `minimal.ransac` one by one."""
-
-    samples = None
-
-    def choice(self, n, size, replace):
-        if self.samples is None:
-            self.samples = iter(minimal.draw_samples(n, 1000, self))
-        return next(self.samples)
-
-
 @pytest.mark.slow
-def test_the_assembled_method_gives_the_poses_of_the_one_page_version(monkeypatch):
+def test_the_assembled_method_gives_the_poses_of_the_one_page_version():
     for name, source in SOLUTIONS.items():
         check(written(source, name))
     dataset, method = Co3D(REPOSITORY / "data_samples"), ZeroShotPose(load_backbone())
@@ -109,9 +99,7 @@ def test_the_assembled_method_gives_the_poses_of_the_one_page_version(monkeypatc
         problem = SimpleNamespace(views=lambda views=views: views, seed=0)
         first, *others = your_turn.crops(problem)
         expected = minimal.estimate_pose(first, others)
-        with monkeypatch.context() as patched:
-            patched.setattr(np.random, "default_rng", lambda seed: Replay(np.random.PCG64(seed)))
-            sim3, view = my_method()(problem)
+        sim3, view = my_method()(problem)
         assert view == expected.view
         assert_allclose(sim3.R, expected.R, atol=1e-6)
         assert_allclose([sim3.scale, *sim3.t], [expected.scale, *expected.t], rtol=1e-6)

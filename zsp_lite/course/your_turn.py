@@ -11,10 +11,11 @@ import builtins
 import copy
 import inspect
 import json
+import math
 import sys
 import textwrap
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import FrameType, SimpleNamespace
 from typing import Any, NamedTuple
@@ -40,6 +41,7 @@ from zsp_lite.minimal import (
 
 FILE = "my_method.py"  # in the current folder
 SECONDS = 10.0  # that a part has for all its tests
+TRIALS = 1000  # of RANSAC
 # What a kept file begins with: the library's parts, which those of the student replace.
 HEADER = '''\
 """My method: the parts that I wrote. For the others it takes the library's."""
@@ -47,10 +49,12 @@ HEADER = '''\
 import numpy as np
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.course.your_turn import crops, interval, patches, rotation_error
+from zsp_lite.course.your_turn import composed, crops, draws, interval, patches, rotation_error
 from zsp_lite.minimal import choose, cycle, descriptor, kmeans, pixel_depths
 from zsp_lite.minimal import ransac, umeyama, unproject, view_score
 '''
+# What stands at its end until the student's own `estimate` does.
+COMPOSED = "estimate = composed(globals())  # the library's, of the parts above\n"
 
 
 class Patches(NamedTuple):
@@ -107,6 +111,31 @@ def interval(right, first, second, rng):
     return np.percentile(shares, [2.5, 97.5])
 
 
+class _Draws(np.random.Generator):
+    """A random generator that draws samples of 4 one by one as the library draws them at once."""
+
+    _samples: Sequence[np.ndarray] = ()
+
+    def choice(self, a: Any, size: Any = None, replace: bool = True, **others: Any) -> Any:
+        """Return the next sample of 4 of `a` matches without replacement; else what NumPy does."""
+        if replace or size != 4:
+            return super().choice(a, size, replace, **others)
+        if not len(self._samples):
+            self._samples = minimal.draw_samples(a, TRIALS, self)[::-1]
+        *self._samples, sample = self._samples
+        return sample
+
+
+def draws(seed: int) -> np.random.Generator:
+    """Return a random generator whose `choice` gives the samples of the library's RANSAC."""
+    return _Draws(np.random.PCG64(seed))
+
+
+def composed(parts: dict[str, Any]) -> Callable[[Any], tuple[Sim3, int]]:
+    """Return the library's `estimate` with other parts."""
+    return _define("estimate", inspect.getsource(estimate), parts)
+
+
 def estimate(problem):
     """Estimate the pose of the reference object in the best of the target views."""
     reference, *targets = crops(problem)
@@ -121,7 +150,7 @@ def estimate(problem):
     view = int(np.argmax([view_score(cosine, 50) for _, _, cosine in found]))
     x = unproject(*pixel_depths(reference, found[view][0]))
     y = unproject(*pixel_depths(targets[view], found[view][1]))
-    (scale, R, t), _ = ransac(x, y, 1000, 0.2, np.random.default_rng(problem.seed))
+    (scale, R, t), _ = ransac(x, y, 1000, 0.2, draws(problem.seed))
     return Sim3(scale, R, t), view
 
 
@@ -208,7 +237,7 @@ def _namespace() -> dict[str, Any]:
 def _kept() -> str:
     """Return the text of `my_method.py`, or what it begins with."""
     if not Path(FILE).exists():
-        return f"{HEADER}\n\n{inspect.getsource(estimate)}"
+        return f"{HEADER}\n\n{COMPOSED}"
     text = Path(FILE).read_text("utf-8")
     try:
         places = _places(text)
@@ -228,33 +257,30 @@ def _defect(name: str, source: str) -> str:
         for case in test["cases"]
     ]
     cases = cases or [{"problem": _toy_problem()}]
-    expected = [_run(_PARTS[name], case) for case in cases]
-    for case, right in zip(cases, expected):
-        try:
-            found = _run(function, case, end)
-        except _Slow:
-            return f"{name} was stopped after {SECONDS:.0f} s: does a loop never end?"
-        except Exception as error:  # of any kind, as it is the student's
-            came = f"{type(error).__name__}: {error}"
-        else:
-            if _same(name, found, right):
-                continue
-            came = _shown(found)
-        given = "a pair with two target views, of which the second is the reference itself"
-        if name != "estimate":
-            given = ", ".join(f"{key} = {_shown([value])}" for key, value in case.items())
-        lines = [f"{name} is not right yet.", f"in:       {given}", f"out:      {came}"]
-        lines.append(f"expected: {_shown(right)}")
-        for mistake in test["mistakes"]:
-            wrong = inspect.getsource(_PARTS[name])
-            for right_one, wrong_one in mistake["change"]:
-                wrong = wrong.replace(right_one, wrong_one)
-            wrong = _define(name, wrong, vars(sys.modules[_PARTS[name].__module__]))
-            if all(_alike(name, function, wrong, one, end) for one in cases):
-                lines.append(mistake["says"])
-                break
-        return "\n".join(lines)
-    return ""
+    expected = [_outcome(_PARTS[name], case) for case in cases]
+    found = [_outcome(function, case, end) for case in cases]
+    if any(isinstance(came, _Slow) for came in found):
+        return f"{name} was stopped after {SECONDS:.0f} s: does a loop never end?"
+    differ = [k for k, right in enumerate(expected) if not _same(name, found[k], right)]
+    if not differ:
+        return ""
+    case, came, right = cases[differ[0]], found[differ[0]], expected[differ[0]]
+    given = "a pair whose second target view shows the reference at twice its size"
+    if name != "estimate":
+        given = ", ".join(f"{key} = {_shown([value])}" for key, value in case.items())
+    error = isinstance(came, Exception)
+    lines = [f"{name} is not right yet.", f"in:       {given}"]
+    lines.append(f"out:      {f'{type(came).__name__}: {came}' if error else _shown(came)}")
+    lines.append(f"expected: {_shown(right)}")
+    for mistake in test["mistakes"]:
+        source = inspect.getsource(_PARTS[name])
+        for right_one, wrong_one in mistake["change"]:
+            source = source.replace(right_one, wrong_one)
+        wrong = _define(name, source, vars(sys.modules[_PARTS[name].__module__]))
+        if all(_same(name, came, _outcome(wrong, case)) for case, came in zip(cases, found)):
+            lines.append(mistake["says"])
+            break
+    return "\n".join(lines)
 
 
 def _define(name: str, source: str, names: Mapping[str, Any]) -> Callable:
@@ -268,14 +294,16 @@ class _Slow(Exception):
     """A part takes too long."""
 
 
-def _run(function: Callable, case: Mapping[str, Any], end: float | None = None) -> list[np.ndarray]:
-    """Call a part with copies of arguments, and make arrays of what it gives.
+def _outcome(
+    function: Callable, case: Mapping[str, Any], end: float = math.inf
+) -> list[np.ndarray] | Exception:
+    """Call a part with copies of arguments, and make arrays of what it gives, or return its error.
 
     It is stopped by `_Slow` at its first line after the time `end`.
     """
     case = copy.deepcopy(dict(case))
     if "rng" in inspect.signature(function).parameters:
-        case["rng"] = np.random.default_rng(0)
+        case["rng"] = draws(0)
 
     def trace(frame: FrameType, event: str, value: Any) -> Any:
         if time.monotonic() > end:
@@ -283,45 +311,36 @@ def _run(function: Callable, case: Mapping[str, Any], end: float | None = None) 
         return trace if frame.f_code.co_filename == f"<{function.__name__}>" else None
 
     before = sys.gettrace()
-    if end:
+    if end < math.inf:
         sys.settrace(trace)
+    flat = []
     try:
         todo = [function(**case)]
+        while todo:
+            one = todo.pop(0)
+            if isinstance(one, Sim3):
+                one = one.scale, one.R, one.t
+            if isinstance(one, tuple):
+                todo = [*one, *todo]
+            else:
+                flat.append(np.asarray(one, float))
+    except Exception as error:  # of any kind, as it is the student's
+        return error
     finally:
         sys.settrace(before)
-    flat = []
-    while todo:
-        one = todo.pop(0)
-        if isinstance(one, Sim3):
-            one = one.scale, one.R, one.t
-        if isinstance(one, tuple):
-            todo = [*one, *todo]
-        else:
-            flat.append(np.asarray(one, float))
-    return [np.sort(one) for one in flat] if function.__name__ == "choose" else flat
+    return flat
 
 
-def _same(name: str, one: list[np.ndarray], other: list[np.ndarray]) -> bool:
-    """Say whether two results of a part are the same."""
+def _same(
+    name: str, one: list[np.ndarray] | Exception, other: list[np.ndarray] | Exception
+) -> bool:
+    """Say whether two results of a part are the same, or errors of one type."""
+    if isinstance(one, Exception) or isinstance(other, Exception):
+        return type(one) is type(other)
     atol = _TOLERANCE.get(name, 1e-6)
     return [part.shape for part in one] == [part.shape for part in other] and all(
-        np.allclose(a, b, atol=atol) for a, b in zip(one, other)
+        np.allclose(a, b, atol=atol, equal_nan=True) for a, b in zip(one, other)
     )
-
-
-def _alike(
-    name: str, function: Callable, wrong: Callable, case: Mapping[str, Any], end: float
-) -> bool:
-    """Say whether a part gives what a mistake gives, or fails as it does."""
-    found = []
-    for one in (function, wrong):
-        try:
-            found.append(_run(one, case, end))
-        except _Slow:
-            return False
-        except Exception as error:  # of any kind, as it is the student's
-            found.append(type(error))
-    return found[0] == found[1] if type in map(type, found) else _same(name, *found)
 
 
 def _shown(values: Iterable[Any]) -> str:
@@ -341,27 +360,29 @@ def _keep(name: str, source: str) -> int:
     lines[places.get(name, slice(start, start))] = [source, "" if name in places else "\n\n"]
     text = "".join(lines)
     write_atomic(FILE, text.encode())
-    return len(_places(text)) - (inspect.getsource(estimate) in text)
+    return len(_places(text)) - (COMPOSED in text)
 
 
 def _places(text: str) -> dict[str, slice]:
     """Find the parts in the lines of a text."""
     body = ast.parse(text).body
-    functions = [one for one in body if isinstance(one, ast.FunctionDef) and one.name in _PARTS]
-    return {one.name: slice(one.lineno - 1, one.end_lineno) for one in functions}
+    names = ((one, getattr(one, "name", ast.unparse(one).partition(" = ")[0])) for one in body)
+    return {name: slice(one.lineno - 1, one.end_lineno) for one, name in names if name in _PARTS}
 
 
 def _toy_problem() -> Any:
-    """Build a pair with two target views: noise, and the reference's own features."""
+    """Build a pair with two target views: noise, and the reference at twice its size."""
     rng = np.random.default_rng(3)
     keys, salience = rng.normal(size=(6, 6, 8)), rng.uniform(0.1, 1, (6, 6))
-    depth, K = rng.uniform(4, 6, (24, 24)).astype(np.float32), [[40, 0, 12], [0, 40, 12], [0, 0, 1]]
+    depth = rng.uniform(4, 6, (24, 24)).astype(np.float32)
 
-    def view(keys: np.ndarray) -> SimpleNamespace:
-        features = {"keys": torch.from_numpy(keys), "saliency": torch.from_numpy(salience)}
-        camera = SimpleNamespace(K=np.array(K, float))
-        frame = SimpleNamespace(depth=depth, camera=camera)
-        return SimpleNamespace(features=SimpleNamespace(**features), frame=frame)
+    def view(keys: np.ndarray, depth: np.ndarray = depth, middle: int = 12) -> SimpleNamespace:
+        K = np.array([[40, 0, middle], [0, 40, 12], [0, 0, 1.0]])
+        features = SimpleNamespace(keys=torch.from_numpy(keys), saliency=torch.from_numpy(salience))
+        frame = SimpleNamespace(depth=depth, camera=SimpleNamespace(K=K))
+        return SimpleNamespace(features=features, frame=frame)
 
-    views = [view(keys), view(rng.normal(size=keys.shape)), view(keys)]
+    # A patch has 4 pixels: the picture moves to the right by one patch.
+    larger = view(np.roll(keys, 1, axis=1), 2 * np.roll(depth, 4, axis=1), 12 + 4)
+    views = [view(keys), view(rng.normal(size=keys.shape)), larger]
     return SimpleNamespace(views=lambda: views, seed=0)
