@@ -501,8 +501,8 @@ def test_the_unit_of_depth_can_be_given(tmp_path, views):
         (["depth/0.png", "rgb/0.jpg"], "has images and depth, but no poses"),
         (["scan.bag"], "is a recording of RealSense, expected the folder that open3d.t.io"),
         (["Scan.MKV"], "is a video, such as Azure Kinect's, expected .* azure_kinect_mkv_reader"),
-        (["0.JPG"], "has photographs without depth and poses, expected raw data"),
-        (["images/0.heic"], "has photographs without depth and poses, expected raw data"),
+        (["0.JPG"], "has photographs, but no depth and poses in a known .* expected raw"),
+        (["images/0.heic"], "has photographs, but no depth and poses in a known .* expected raw"),
         (["scan.mp4"], "is a video without depth and poses"),
         (["model.obj", "model.mtl"], "is a model as Luma or KIRI export it"),
         (

@@ -110,7 +110,7 @@ _OTHERS = (
     ),
     (
         tuple(f"{folder}*{ending}" for folder in ("", "images/") for ending in PICTURES),
-        "has photographs without depth and poses",
+        "has photographs, but no depth and poses in a known format",
         _HOW,
     ),
 )
