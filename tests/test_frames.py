@@ -177,9 +177,7 @@ def test_a_mask_holds_booleans_zeros_and_ones_or_up_to_255():
 @pytest.mark.parametrize("count", [4, 5, 8])
 def test_the_distortion_of_arrays_is_corrected(count):
     distortion = [-0.3, 0.1, 0.002, -0.001, 0.02, 0.01, -0.02, 0.01][:count]
-    camera = Camera(
-        np.eye(3), np.zeros(3), np.array([90.0, 91]), np.array([64.5, 48.5]), (96, 128)
-    )
+    camera = Camera(np.eye(3), np.zeros(3), np.array([90.0, 91]), np.array([64.5, 48.5]), (96, 128))
     # The depth, the colours and the mask of a pixel tell its column without distortion.
     places, straight = straight_places(camera, distortion)
     columns = straight[..., 0]

@@ -496,7 +496,7 @@ def test_the_unit_of_depth_can_be_given(tmp_path, views):
         (["rgb/0.png", "scene_camera.json"], "lacks scene_gt.json, scene_camera.json or rgb/"),
         (
             ["depth/0.exr", "rgb/0.jpg", "metadata.json"],
-            "has depth as .exr, .*Record3D's .* no library here decodes, expected .*'s .r3d export",
+            r"has depth/\*.exr, .*Record3D's .* no library here decodes, expected .*'s .r3d export",
         ),
         (["depth/0.png", "rgb/0.jpg"], "has images and depth, but no poses"),
         (["scan.bag"], "is a recording of RealSense, expected the folder that open3d.t.io"),

@@ -77,7 +77,7 @@ _OTHERS = (
     ),
     (
         ("depth/*.exr",),
-        "has depth as .exr, such as Record3D's EXR + JPG export, which no library here decodes",
+        "has depth/*.exr, as Record3D's EXR + JPG export, which no library here decodes",
         "expected Record3D's .r3d export, or the depth as .npy or a float .tiff",
     ),
     (
