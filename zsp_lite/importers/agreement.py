@@ -207,12 +207,12 @@ def _explanations(pairs: Sequence[_Pair], unit: float | None) -> Iterator[tuple[
         shares = np.array([_share(pairs, scale=factor) for factor in factors])
         alike = np.flatnonzero(shares > shares.max() - _ALIKE)
         yield shares.max(), _scaled(factors[alike[len(alike) // 2]], distance, unit)
-    # Two factors fit many wrong poses of a single pair, but not those of all pairs.
+    # Two factors fit many wrong poses of a single pair, but not those of all of several pairs.
     share = min(
         max(_share([pair], scale=factor, own_scale=True) for factor in _OWN_SCALES)
         for pair in pairs
     )
-    if share > _AGREEING:
+    if len(pairs) > 2 and share > _AGREEING:
         yield share, "each frame's depth has a factor of its own: depth of a network?"
 
 
