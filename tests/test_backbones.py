@@ -266,6 +266,21 @@ def test_metadata_that_does_not_fit_is_refused(vit, tmp_path, key, value):
     refused(f"{key} .*expected", load_backbone, tmp_path / "x.safetensors", "cpu")
 
 
+@pytest.mark.parametrize(
+    "key, told",
+    [
+        ("blocks.0.ls1.gamma", "DINOv2, expected hf:facebook/dinov2-small or its like"),
+        ("rope_embed.periods", "DINOv3, expected hf:facebook/dinov3-vits16-pretrain-lvd1689m or"),
+    ],
+)
+def test_files_of_later_dino_models_are_refused_naming_the_ones_to_take(vit, tmp_path, key, told):
+    weights = vit.state_dict() | {"blocks.0.ls1.gamma": torch.ones(4), key: torch.ones(4)}
+    if "rope" in key:
+        weights.pop("pos_embed")
+    torch.save(weights, tmp_path / "meta.pth")
+    refused(f"meta.pth is Meta's own file of {told}", load_backbone, tmp_path / "meta.pth", "cpu")
+
+
 def test_an_unknown_name_or_device_is_refused():
     refused("'resnet'.*zsp-tiny, .*dino_vits8", load_backbone, "resnet")
     refused("device", load_backbone, device="nowhere")

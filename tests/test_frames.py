@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
+from test_importers import HALF_PIXEL, straight_places
 
 from zsp_lite import Camera, Frame
 from zsp_lite.data.depth import decode_depth, inpaint_depth, patch_points, unproject_depth
@@ -173,9 +174,33 @@ def test_a_mask_holds_booleans_zeros_and_ones_or_up_to_255():
         assert_array_equal(Frame.from_arrays(**arrays(mask=mask)).mask > 0.5, inside)
 
 
+@pytest.mark.parametrize("count", [4, 5, 8])
+def test_the_distortion_of_arrays_is_corrected(count):
+    distortion = [-0.3, 0.1, 0.002, -0.001, 0.02, 0.01, -0.02, 0.01][:count]
+    camera = Camera(np.eye(3), np.zeros(3), np.array([90.0, 91]), np.array([64.5, 48.5]), (96, 128))
+    # The depth, the colours and the mask of a pixel tell its column without distortion.
+    places, straight = straight_places(camera, distortion)
+    columns = straight[..., 0]
+    grey = np.clip(columns / 128, 0, 1)
+    K = camera.K - HALF_PIXEL
+    frame = Frame.from_arrays(grey, columns + 100, K, columns > 60, distortion=distortion)
+    assert_array_equal(frame.camera.K, camera.K)
+    assert np.abs(columns - places[..., 0]).max() > 10
+    inside = np.s_[4:-4, 4:-4]
+    errors = np.abs(frame.depth - 100 - places[..., 0])[inside]
+    assert errors.max() < 1  # of the nearest pixel: no mean of two
+    assert np.isin(frame.depth, np.float32(columns + 100)).all()
+    assert np.abs(frame.rgb[..., 0] / 255 * 128 - places[..., 0])[inside].max() < 0.6
+    assert_array_equal((frame.mask > 0.5)[inside][:, :50], False)
+    assert_array_equal((frame.mask > 0.5)[inside][:, 60:], True)
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [
+        ({"distortion": [0.1, 0.2, 0]}, r"distortion is \[0.1, 0.2, 0.0\], expected OpenCV's k1"),
+        ({"distortion": [0.1, 0.2, 0.5, 0, 0]}, "with p1 and p2 from -0.1 to 0.1"),
+        ({"distortion": [np.nan] * 5}, "distortion is .nan"),
         (
             {"rgb": np.zeros((3, *SIZE), np.uint8)},
             r"rgb has shape \(3, 24, 32\), expected \(H, W\), \(H, W, 3\)",

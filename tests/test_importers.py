@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from refusals import refused
 from scipy.spatial import cKDTree
 
-from zsp_lite import Co3D, Frame, open_source
+from zsp_lite import Camera, Co3D, Frame, open_source
 from zsp_lite.course.synthetic.export import make_object
 from zsp_lite.course.synthetic.sequences import render_sequence
 from zsp_lite.data.check import check_folder
@@ -152,6 +152,16 @@ def test_an_import_holds_a_few_frames_at_once(tmp_path, scan, monkeypatch, box):
     assert max(held) <= 3
 
 
+def straight_places(camera: Camera, distortion: list[float], undistort=cv2.undistortPoints):
+    """The place (x, y) of each pixel, and its place without the distortion by OpenCV; centres are
+    integers."""
+    rows, columns = np.indices(camera.size, np.float64)
+    places = np.stack([columns, rows], axis=-1)
+    K = camera.K - HALF_PIXEL
+    straight = undistort(places.reshape(-1, 1, 2), K, np.array(distortion), R=np.eye(3), P=K)
+    return places, straight.reshape(places.shape)
+
+
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
 def test_distortion_is_corrected(tmp_path, views, model):
     folder = tmp_path / "scan"
@@ -162,19 +172,14 @@ def test_distortion_is_corrected(tmp_path, views, model):
     else:
         distortion |= {"p1": 0.002, "p2": -0.001, "k3": 2.0}
     edited(lambda content: content.update(distortion, camera_model=model))(folder)
-    # In the stored picture, red and green of a pixel are its place without distortion, by OpenCV.
-    # In the corrected picture they are the place of the pixel itself.
+    # In the stored picture, red and green of a pixel are its place without distortion. In the
+    # corrected picture they are the place of the pixel itself.
     height, width = views[0].camera.size
-    rows, columns = np.indices((height, width), np.float64)
-    places = np.stack([columns, rows], axis=-1)
-    matrix = views[0].camera.K - HALF_PIXEL
     undistort = cv2.undistortPoints if model == "OPENCV" else cv2.fisheye.undistortPoints
-    straight = undistort(
-        places.reshape(-1, 1, 2), matrix, np.array([*distortion.values()]), R=np.eye(3), P=matrix
-    )
+    places, straight = straight_places(views[0].camera, [*distortion.values()], undistort)
     picture = np.zeros((height, width, 3))
     level = 255 / width  # of a pixel
-    picture[..., :2] = level * straight.reshape(places.shape)
+    picture[..., :2] = level * straight
     picture = np.rint(picture.clip(0, 255)).astype(np.uint8)
     write_image(folder / f"images/{views[0].name}.jpg", picture, quality=98)
     loaded = open_capture(folder, "nerfstudio").frames[0].load().rgb[..., :2] / level
@@ -204,13 +209,14 @@ def replaced(name, content):
 
 
 def edited(*changes, encoding="utf-8", name="transforms.json"):
-    """Change transforms.json, or each frame of it where `changes` are of two arguments."""
+    """Change transforms.json, or a file of another name, which replaces it if there is none."""
 
     def apply(folder):
-        content = json.loads((folder / "transforms.json").read_text())
+        source = folder / (name if (folder / name).is_file() else "transforms.json")
+        content = json.loads(source.read_text())
         for change in changes:
             change(content)
-        (folder / "transforms.json").unlink()
+        source.unlink()
         (folder / name).write_text(json.dumps(content), encoding=encoding)
         return folder
 

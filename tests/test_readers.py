@@ -42,6 +42,7 @@ OPENGL = np.diag([1.0, -1, -1, 1])
 CERTAIN = 2  # the highest level of confidence, of 0 to 2
 # Columns of Stray Scanner; the next two are empty.
 ODOMETRY = "timestamp frame x y z qx qy qz qw fx fy cx cy".split()
+DISTORTION = [-0.3, 0.1, 0.002, -0.001, 0.02]  # k1, k2, p1, p2, k3
 OTHER_FOCUS = np.diag([1.1, 1.1, 1])  # times a camera's matrix
 
 
@@ -484,6 +485,24 @@ def test_the_unit_of_depth_can_be_given(tmp_path, views):
             ["sparse/0/images.bin"],
             "has COLMAP's poses, but no measured depth, expected raw data .* Stray Scanner",
         ),
+        (["cameras.bin", "points3D.bin", "0.jpg"], "has COLMAP's poses, but no measured depth"),
+        (["frame_00000.json", "depth_00000.png"], "is a scan of 3d Scanner App, .* format lists: "),
+        (["lowres_wide.traj", "mesh.ply"], "is a scene of ARKitScenes, expected .* lists: rgb.txt"),
+        (
+            ["rgb_cam1/0.png", "scene_camera_cam1.json"],
+            "several cameras, expected the files of one",
+        ),
+        (["gray/0.tif", "scene_camera.json", "scene_gt.json"], "in grey, expected rgb/ and depth/"),
+        (["rgb/0.png", "scene_camera.json"], "lacks scene_gt.json, scene_camera.json or rgb/"),
+        (
+            ["depth/0.exr", "rgb/0.jpg", "metadata.json"],
+            r"has depth/\*.exr, .*Record3D's .* no library here decodes, expected .*'s .r3d export",
+        ),
+        (["depth/0.png", "rgb/0.jpg"], "has images and depth, but no poses"),
+        (["scan.bag"], "is a recording of RealSense, expected the folder that open3d.t.io"),
+        (["Scan.MKV"], "is a video, such as Azure Kinect's, expected .* azure_kinect_mkv_reader"),
+        (["0.JPG"], "has photographs, but no depth and poses in a known .* expected raw"),
+        (["images/0.heic"], "has photographs, but no depth and poses in a known .* expected raw"),
         (["scan.mp4"], "is a video without depth and poses"),
         (["model.obj", "model.mtl"], "is a model as Luma or KIRI export it"),
         (
@@ -499,6 +518,23 @@ def test_what_is_no_capture_is_answered_with_what_it_lacks(tmp_path, files, mess
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     refused(message, open_capture, tmp_path)
+
+
+def test_a_file_that_is_no_capture_is_answered_with_what_it_is(tmp_path):
+    refused("scan.bag does not exist", open_capture, tmp_path / "scan.bag")
+    (tmp_path / "scan.bag").touch()
+    refused("scan.bag is a recording of RealSense", open_capture, tmp_path / "scan.bag")
+
+
+@pytest.mark.parametrize("layout", ["lists", "open3d"])
+def test_files_carry_the_distortion(tmp_path, views, layout):
+    folder, _ = write(layout, tmp_path / "scan", views)
+    if layout == "open3d":
+        edited(lambda c: c.update(coeffs=DISTORTION), name="intrinsic.json")(folder)
+    else:
+        (folder / "intrinsics.txt").write_text(" ".join(map(str, [60, 61, 64, 48, *DISTORTION])))
+    for frame in open_capture(folder).frames:
+        assert_array_equal(frame.distortion, DISTORTION)
 
 
 def zipped(path, name="rgb.txt", data=b"", flag=0):

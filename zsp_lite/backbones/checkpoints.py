@@ -11,6 +11,12 @@ from zsp_lite.backbones.vit import VisionTransformer
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import MAX_WEIGHTS, file_size, load_torch
 
+# Keys of Meta's own files of later models, and where the same models are in a layout that is read.
+_LATER = {
+    "rope_embed.periods": "DINOv3, expected hf:facebook/dinov3-vits16-pretrain-lvd1689m",
+    "blocks.0.ls1.gamma": "DINOv2, expected hf:facebook/dinov2-small",
+}
+
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read weights with DINO's state-dict keys, and metadata, from a .safetensors or a torch file.
@@ -69,6 +75,9 @@ def metadata_integers(metadata: dict[str, str], key: str, path: Path) -> list[in
 
 def build_vit(weights: dict[str, Tensor], num_heads: int | None, path: Path) -> VisionTransformer:
     """Build a transformer from weights in the DINO layout, whose shapes give its sizes."""
+    for key, model in _LATER.items():
+        if key in weights:
+            raise InputError(f"{path.name} is Meta's own file of {model} or its like")
     try:
         dim, _, patch_size, _ = weights["patch_embed.proj.weight"].shape
         # The position embedding has one token for CLS, and side * side for the patches.

@@ -282,8 +282,8 @@ def import_(scan, root, category, sequence, mask, box, **options) -> None:
     \b
       rgb.txt, depth.txt  one file per line; depth as 16-bit PNG, TIFF, .npy, ...
       poses.txt           lines of 12 or 16 numbers: camera to world, OpenCV's axes
-      intrinsics.txt      3 x 3 matrix in pixels, or fx fy cx cy, once or in each line;
-                          pixel centres at half-integers
+      intrinsics.txt      3 x 3 matrix in pixels, or fx fy cx cy and OpenCV's distortion k1 k2 p1
+                          p2 [k3], if any, once or in each line; pixel centres at half-integers
 
     Depth maps must be registered to the images: a pixel of both shows the same point. The object is
     given by --box, by which GrabCut segments it in all images, by --masks, or by masks of the

@@ -1,5 +1,7 @@
 """Frames and cameras from arrays as cameras and other programs give them."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -12,6 +14,11 @@ from zsp_lite.errors import InputError, check_number, real_array, rigid_matrix
 # Largest relative difference of the aspect ratios of an image and its smaller depth map: sides are
 # rounded to whole pixels.
 _SAME_ASPECT = 0.01
+# Largest coefficients of distortion: all, and p1 and p2, which are small for every lens.
+_MOST_DISTORTED = 100
+_MOST_TANGENTIAL = 0.1
+# How each image of a frame is sampled: means of depth lie on no surface.
+_SAMPLING = {"rgb": cv2.INTER_LINEAR, "depth": cv2.INTER_NEAREST, "mask": cv2.INTER_LINEAR}
 
 
 def frame_from_arrays(
@@ -22,6 +29,7 @@ def frame_from_arrays(
     pose: Values | None,
     depth_unit: float,
     name: str,
+    distortion: Values | None,
 ) -> Frame:
     """Make a frame of arrays (see `Frame.from_arrays`)."""
     label = f"frame {name}".rstrip()
@@ -64,7 +72,44 @@ def frame_from_arrays(
             )
         if largest > 1:
             mask = mask / np.float32(255)
-    return Frame(image, enlarge_depth(depth, size), mask, camera, name, defect)
+    frame = Frame(image, enlarge_depth(depth, size), mask, camera, name, defect)
+    return undistort(
+        frame, distortion_coefficients(label, () if distortion is None else distortion)
+    )
+
+
+def distortion_coefficients(where: str, values: Values) -> Float[np.ndarray, " n"]:
+    """Check coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of OpenCV, or none; errors begin with
+    `where`."""
+    numbers = real_array(f"{where}: distortion", values).ravel()
+    if (
+        numbers.shape not in ((0,), (4,), (5,), (8,))
+        or not (np.abs(numbers) <= _MOST_DISTORTED).all()
+        or not (np.abs(numbers[2:4]) <= _MOST_TANGENTIAL).all()
+    ):
+        raise InputError(
+            f"{where}: distortion is {numbers.tolist()}, expected OpenCV's k1, k2, p1, p2, then k3,"
+            f" or k3 to k6, or none, with p1 and p2 from -{_MOST_TANGENTIAL} to {_MOST_TANGENTIAL}"
+        )
+    return numbers
+
+
+def undistort(frame: Frame, coefficients: Float[np.ndarray, " n"], fisheye: bool = False) -> Frame:
+    """Return a frame without the distortion of its lens, in OpenCV's model or its fisheye one."""
+    if not coefficients.any():
+        return frame
+    camera = frame.camera
+    K = camera.K
+    K[:2, 2] -= 0.5  # OpenCV's pixel centres
+    undistortion = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+    maps = undistortion(K, coefficients, np.eye(3), K, camera.size[::-1], cv2.CV_32FC1)
+    images = {name: getattr(frame, name) for name in _SAMPLING}
+    straight = {
+        name: cv2.remap(image, *maps, _SAMPLING[name])
+        for name, image in images.items()
+        if image is not None
+    }
+    return replace(frame, **straight)
 
 
 def _read_map(name: str, values: np.ndarray) -> Float64[np.ndarray, "h w"]:

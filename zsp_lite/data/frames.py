@@ -85,6 +85,7 @@ class Frame:
         pose: Values | None = None,
         depth_unit: float = 1.0,
         name: str = "",
+        distortion: Values | None = None,
     ) -> "Frame":
         """Make a frame of arrays as a camera gives them, in any unit of length.
 
@@ -104,13 +105,15 @@ class Frame:
                 estimates leave it out.
             depth_unit: World units per unit of `depth`.
             name: Name for messages and reports.
+            distortion: Coefficients of the lens in OpenCV's order, k1, k2, p1, p2[, k3[, k4, k5,
+                k6]]. Colours, depth and mask are undistorted; `K` stays.
 
         Raises:
             InputError: An array has another shape or type, or the arrays do not fit together.
         """
         # A module above this one, imported when it is used.
         frame_from_arrays = pkgutil.resolve_name("zsp_lite.data.arrays:frame_from_arrays")
-        return frame_from_arrays(rgb, depth, K, mask, pose, depth_unit, name)
+        return frame_from_arrays(rgb, depth, K, mask, pose, depth_unit, name, distortion)
 
     @property
     def shows_object(self) -> bool:

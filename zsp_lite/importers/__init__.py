@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,6 +16,7 @@ from zsp_lite.importers.capture import (
     find_masks,
     sharpest,
 )
+from zsp_lite.importers.files import PICTURES
 from zsp_lite.importers.lists import read_lists, read_tum
 from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.importers.phones import read_polycam, read_record3d, read_stray
@@ -46,7 +49,7 @@ FORMATS = {
     "record3d": Format(("metadata", "rgbd"), "Record3D", read_record3d, up=_ARKIT_UP),
     "lists": Format(("poses.txt",), "lists", read_lists),
     "tum": Format(("groundtruth.txt", "rgb.txt"), "TUM RGB-D", read_tum, ("intrinsics",)),
-    "bop": Format(("scene_gt.json", "scene_camera.json"), "BOP", read_bop, ("object",)),
+    "bop": Format(("scene_gt.json", "scene_camera.json", "rgb"), "BOP", read_bop, ("object",)),
     "scannet": Format(("pose", "intrinsic/intrinsic_color.txt"), "ScanNet", read_scannet),
     "open3d": Format(("intrinsic.json", "color"), "Open3D's recorder", read_open3d),
 }
@@ -54,33 +57,63 @@ _HOW = (
     "expected raw data with depth and poses, as Stray Scanner, Record3D or Polycam export them "
     "from LiDAR"
 )
-# Files, by name or extension, that show why a folder is no capture, and the reason.
-_INCOMPLETE = {
+_LISTS = "expected its files as the format lists: rgb.txt, depth.txt, poses.txt, intrinsics.txt"
+# Patterns of files, in lower case, that show what is no capture; what it is, and the way out. The
+# first that has a match counts.
+_OTHERS = (
+    (("frame_[0-9]*.json",), "is a scan of 3d Scanner App", _LISTS),
+    (("lowres_wide.traj", "lowres_depth"), "is a scene of ARKitScenes", _LISTS),
     (
-        "sparse",
-        "images.bin",
-        "images.txt",
-        "database.db",
-    ): "has COLMAP's poses, but no measured depth",
+        ("scene_camera_*.json", "rgb_cam*"),
+        "is a BOP scene of several cameras",
+        "expected the files of one with the usual names: scene_gt.json, scene_camera.json, rgb, "
+        "depth, mask_visib",
+    ),
+    (("gray",), "is a BOP scene in grey", "expected rgb/ and depth/ as PNG"),
     (
-        "rgb.txt",
-        "depth.txt",
-        "depth",
-    ): "has images and depth, but no poses (groundtruth.txt, poses.txt, pose/, ...)",
+        ("scene_camera.json", "scene_gt.json"),
+        "lacks scene_gt.json, scene_camera.json or rgb/ of a BOP scene",
+        _HOW,
+    ),
     (
-        "scene_camera.json",
-        "scene_gt.json",
-    ): "lacks scene_gt.json or scene_camera.json of a BOP scene",
-    (".sens",): "is ScanNet's packed scan: unpack it by ScanNet's SensReader",
-    (".mp4", ".mov", ".m4v"): "is a video without depth and poses",
+        ("depth/*.exr",),
+        "has depth/*.exr, as Record3D's EXR + JPG export, which no library here decodes",
+        "expected Record3D's .r3d export, or the depth as .npy or a float .tiff",
+    ),
     (
-        ".ply",
-        ".splat",
-        ".obj",
-        ".glb",
-        ".usdz",
-    ): "is a model as Luma or KIRI export it, without depth and poses",
-}
+        ("sparse", "images.bin", "images.txt", "cameras.*", "points3d.*", "database.db"),
+        "has COLMAP's poses, but no measured depth",
+        _HOW,
+    ),
+    (
+        ("rgb.txt", "depth.txt", "depth"),
+        "has images and depth, but no poses (groundtruth.txt, poses.txt, pose/, ...)",
+        _HOW,
+    ),
+    (("*.sens",), "is ScanNet's packed scan", "expected it unpacked by ScanNet's SensReader"),
+    (
+        ("*.bag",),
+        "is a recording of RealSense",
+        "expected the folder that open3d.t.io.RGBDVideoReader.create(FILE).save_frames(FOLDER) "
+        "writes",
+    ),
+    (
+        ("*.mkv",),
+        "is a video, such as Azure Kinect's",
+        "expected the folder that Open3D's azure_kinect_mkv_reader.py writes",
+    ),
+    (("*.mp4", "*.mov", "*.m4v"), "is a video without depth and poses", _HOW),
+    (
+        ("*.ply", "*.splat", "*.obj", "*.glb", "*.usdz"),
+        "is a model as Luma or KIRI export it, without depth and poses",
+        _HOW,
+    ),
+    (
+        tuple(f"{folder}*{ending}" for folder in ("", "images/") for ending in PICTURES),
+        "has photographs, but no depth and poses in a known format",
+        _HOW,
+    ),
+)
 
 
 def recognise(path: str | Path) -> tuple[str, Path]:
@@ -107,9 +140,13 @@ def recognise(path: str | Path) -> tuple[str, Path]:
                 return name, place
 
     # The path has no format: say why, if its files show a reason.
-    for signs, problem in _INCOMPLETE.items():
-        if any(file.name in signs or file.suffix.lower() in signs for file in (path, *files)):
-            raise InputError(f"{path} {problem}, {_HOW}")
+    names = [path.name.lower()] if path.exists() else []
+    for place, level in product(places, ("*", "*/*")):
+        names += (file.relative_to(place).as_posix().lower() for file in place.glob(level))
+    for signs, problem, way_out in _OTHERS:
+        for sign, name in product(signs, names):
+            if fnmatch(name, sign) and name.count("/") == sign.count("/"):
+                raise InputError(f"{path} {problem}, {way_out}")
     problem = "has another format" if path.exists() else "does not exist"
     known = "; ".join(f"{layout.what} ({', '.join(layout.signs)})" for layout in FORMATS.values())
     raise InputError(

@@ -44,6 +44,7 @@ _UNITS = {1.0: "metres", 0.001: "millimetres", 0.0002: "1/5000 m"}
 _FACTORS = (1000.0, 0.001, 5.0, 0.2, 10.0, 0.1)  # from one common unit to another
 # Any factors, in steps of 5 %, without those near 1, which correct nothing.
 _SCALES = [scale for scale in np.geomspace(1e-3, 1e3, 280).tolist() if not 0.96 < scale < 1.04]
+_OWN_SCALES = np.geomspace(0.4, 2.5, 39)  # of a single frame
 
 _Pose = Float[np.ndarray, "4 4"]  # world to camera
 _Correction = Callable[[_Pose], _Pose]
@@ -71,8 +72,13 @@ class _Surface:
         distance = float(np.median(points[:, 2])) if len(points) else 0.0
         return cls(points, depth, frame.camera, distance)
 
-    def share(self, other: "_Surface", motion: _Pose, along_ray: bool) -> float:
-        """Return the share of points that lie on another surface after a motion between cameras."""
+    def share(
+        self, other: "_Surface", motion: _Pose, along_ray: bool, own_scale: bool = False
+    ) -> float:
+        """Return the share of points that lie on another surface after a motion between cameras.
+
+        `own_scale` multiplies the other surface's depth by the factor that fits.
+        """
         camera = replace(other.camera, R=motion[:3, :3], t=motion[:3, 3])
         points = self.points
         if along_ray:
@@ -83,9 +89,13 @@ class _Surface:
             (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < other.depth.shape[::-1]).all(axis=1)
         )
         stored = np.linalg.norm(camera.to_camera(points), axis=1) if along_ray else depth
+        stored = stored[inside]
         columns, rows = pixels[inside].astype(int).T
         surface = other.depth[rows, columns]
-        agreeing = np.abs(stored[inside] - surface) < _TOLERANCE * other.distance
+        seen = (surface > 0) & np.isfinite(surface)
+        if own_scale and seen.any():
+            stored = stored / np.median(stored[seen] / surface[seen])
+        agreeing = np.abs(stored - surface) < _TOLERANCE * other.distance
         # Points on pixels of unknown depth do not count.
         return agreeing.sum() / max(1, len(inside) - (surface == 0).sum())
 
@@ -172,6 +182,7 @@ def _share(
     corrected: _Correction = np.asarray,
     scale: float = 1.0,
     along_ray: bool = False,
+    own_scale: bool = False,
 ) -> float:
     """Return the median share of agreeing points, with corrected poses and with scaled depth."""
     shares = []
@@ -180,12 +191,13 @@ def _share(
         # translation by a factor is the same as multiplying all depth by the factor.
         motion = corrected(other.camera.matrix) @ np.linalg.inv(corrected(surface.camera.matrix))
         motion[:3, 3] /= scale
-        shares.append(surface.share(other, motion, along_ray))
+        shares.append(surface.share(other, motion, along_ray, own_scale))
     return float(np.median(shares))
 
 
 def _explanations(pairs: Sequence[_Pair], unit: float | None) -> Iterator[tuple[float, str]]:
-    """Yield the share and the words for the best correction of poses, common factor, any factor."""
+    """Yield the share and the words for the best correction of poses, common factor, any factor,
+    and factors of the frames."""
     shares = np.array([_share(pairs, correct) for _, correct in _CORRECTIONS])
     likeliest = int(np.argmax(shares > shares.max() - _ALIKE))
     yield shares[likeliest], f"the poses {_CORRECTIONS[likeliest][0]}"
@@ -195,6 +207,13 @@ def _explanations(pairs: Sequence[_Pair], unit: float | None) -> Iterator[tuple[
         shares = np.array([_share(pairs, scale=factor) for factor in factors])
         alike = np.flatnonzero(shares > shares.max() - _ALIKE)
         yield shares.max(), _scaled(factors[alike[len(alike) // 2]], distance, unit)
+    # Two factors fit many wrong poses of a single pair, but not those of all of several pairs.
+    share = min(
+        max(_share([pair], scale=factor, own_scale=True) for factor in _OWN_SCALES)
+        for pair in pairs
+    )
+    if len(pairs) > 2 and share > _AGREEING:
+        yield share, "each frame's depth has a factor of its own: depth of a network?"
 
 
 def _scaled(factor: float, distance: float, unit: float | None) -> str:

@@ -15,7 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.spatial.transform import Rotation
 
-from zsp_lite.data.arrays import camera_from_pose, enlarge_depth
+from zsp_lite.data.arrays import (
+    camera_from_pose,
+    distortion_coefficients,
+    enlarge_depth,
+    undistort,
+)
 from zsp_lite.data.cameras import Camera, Values
 from zsp_lite.data.frames import Frame, check_pixels, decode_image
 from zsp_lite.errors import InputError, real_array
@@ -44,8 +49,8 @@ class CaptureFrame:
     depth: Path  # of the image's aspect ratio; phones store it smaller than the image
     camera: Camera
     depth_unit: float = 0.001  # world units per stored depth value
-    # OpenCV's k1, k2, p1, p2, k3. `load` undistorts image, depth and mask.
-    distortion: tuple[float, ...] = ()
+    # OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]. `load` undistorts image, depth and mask.
+    distortion: Values = ()
     mask: Path | None = None
     # Whether the distortion is that of OpenCV's fisheye cameras: k1, k2, k3, k4.
     fisheye: bool = False
@@ -84,13 +89,14 @@ class CaptureFrame:
         if self.mask is not None:
             mask = displayed(files.read_mask_file(self.mask, self.label))
             check_pixels(self.mask, mask, camera.size)
-        if any(self.distortion):
-            maps = self._undistortion(camera)
-            rgb = cv2.remap(rgb, *maps, cv2.INTER_LINEAR)
-            enlarged = cv2.remap(enlarged, *maps, cv2.INTER_NEAREST)
-            if mask is not None:
-                mask = cv2.remap(mask, *maps, cv2.INTER_LINEAR)
-        return Frame(rgb, enlarged, mask, camera, self.image.name)
+        coefficients = np.array(self.distortion)
+        if len(coefficients) and not self.fisheye:
+            # In OpenCV's model, p2 shifts points along x and p1 along y: the vector (p2, p1) turns
+            # with the image.
+            turn = (camera.R @ self.camera.R.T)[:2, :2]
+            coefficients[[3, 2]] = turn @ coefficients[[3, 2]]
+        frame = Frame(rgb, enlarged, mask, camera, self.image.name)
+        return undistort(frame, coefficients, self.fisheye)
 
     def _read_depth(self) -> Float32[np.ndarray, "h w"]:
         """Read the depth, 0 where it is unknown, implausibly far or not trusted."""
@@ -101,21 +107,6 @@ class CaptureFrame:
             check_pixels(self.confidence, levels, depth.shape)
             known &= trusted(levels)
         return np.where(known, depth, np.float32(0))
-
-    def _undistortion(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return OpenCV's maps that undistort the displayed image with this camera."""
-        matrix = camera.K - HALF_PIXEL
-        coefficients = np.array(self.distortion)
-        undistortion = cv2.fisheye.initUndistortRectifyMap
-        if not self.fisheye:
-            undistortion = cv2.initUndistortRectifyMap
-            # In OpenCV's model, p2 shifts points along x and p1 along y: the vector (p2, p1) turns
-            # with the image.
-            turn = (camera.R @ self.camera.R.T)[:2, :2]
-            coefficients[[3, 2]] = turn @ coefficients[[3, 2]]
-        return undistortion(
-            matrix, coefficients, np.eye(3), matrix, camera.size[::-1], cv2.CV_32FC1
-        )
 
 
 class Capture(NamedTuple):
@@ -140,6 +131,8 @@ def make_frame(
     size: tuple[int, int] | None = None,
     mask: str | None = None,
     confidence: str | Path | None = None,
+    distortion: Values = (),
+    fisheye: bool = False,
     **others: Any,
 ) -> CaptureFrame:
     """Make a frame from files and numbers of a capture; InputError if a file is missing or wrong.
@@ -169,7 +162,18 @@ def make_frame(
         pose = pose.reshape(-1, 4) @ axes
 
     camera = camera_from_pose(pose, intrinsics, size or files.picture_size(paths[0]), where)
-    return CaptureFrame(paths[0], paths[1], camera, mask=paths[2], confidence=paths[3], **others)
+    if not fisheye:
+        distortion = distortion_coefficients(where, distortion)
+    return CaptureFrame(
+        paths[0],
+        paths[1],
+        camera,
+        distortion=distortion,
+        mask=paths[2],
+        fisheye=fisheye,
+        confidence=paths[3],
+        **others,
+    )
 
 
 def refuse(problem: str) -> NoReturn:

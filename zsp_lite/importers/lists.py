@@ -20,9 +20,12 @@ def read_lists(folder: Path) -> Makers:
     images = read_text_lines(folder / "rgb.txt")
     depths = read_text_lines(folder / "depth.txt")
     poses = read_numbers(folder / "poses.txt", (12, 16))
-    intrinsics = read_numbers(folder / "intrinsics.txt", (3, 4))
+    # K, or fx, fy, cx, cy and coefficients of distortion.
+    intrinsics = read_numbers(folder / "intrinsics.txt", (3, 4, 8, 9, 12))
+    distortion = intrinsics[:, 4:]
     if intrinsics.shape[1] == 3 or len(intrinsics) == 1:
         intrinsics = [intrinsics.squeeze()] * len(poses)
+        distortion = [distortion[0]] * len(poses)
     counts = {
         "rgb.txt": len(images),
         "depth.txt": len(depths),
@@ -34,7 +37,15 @@ def read_lists(folder: Path) -> Makers:
         raise InputError(f"capture {folder}: the lists have lines: {found}; expected equal numbers")
     for line, names in enumerate(zip(images, depths)):
         where = f"capture {folder}, line {line + 1} of the lists"
-        yield partial(make_frame, folder, *names, poses[line], intrinsics[line], where)
+        yield partial(
+            make_frame,
+            folder,
+            *names,
+            poses[line],
+            intrinsics[line][:4],
+            where,
+            distortion=distortion[line],
+        )
 
 
 def read_tum(

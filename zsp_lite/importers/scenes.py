@@ -129,4 +129,6 @@ def read_open3d(folder: Path) -> Makers:
             pose,
             K.reshape(3, 3).T + HALF_PIXEL,
             f"{log}, frame {image}",
+            # RealSense's, which its SDK applies like OpenCV's k1, k2, p1, p2, k3.
+            distortion=camera.get("coeffs", ()),
         )
