@@ -39,8 +39,7 @@ class ZeroShotPose:
         view_selector: "correspond", as in the paper, another name in `best_view.VIEW_SELECTORS`, or
             a `ViewSelector`.
         trials: Number of RANSAC trials.
-        threshold: Largest residual of a RANSAC inlier in scene units. (The scenes of CO3D are
-            scaled to unit standard deviation.)
+        threshold: Largest residual of a RANSAC inlier in standard deviations of the target object.
         sample_size: Points per RANSAC trial.
         foreground: "saliency", as in the paper, or "mask" for the frame's own object mask.
             Backbones without saliency need "mask".
@@ -126,11 +125,15 @@ class ZeroShotPose:
         found = self.estimate_from_views(first, others)
         return replace(found, timings=timings | found.timings)
 
-    def views(self, frames: Iterable[Frame]) -> list[View]:
-        """Crop frames to their objects and extract features and foregrounds, all in one batch."""
-        size = getattr(self.backbone, "image_size", IMAGE_SIZE)
-        crops = [object_crop(frame, size) for frame in frames]
-        return extract_views(self.backbone, crops, self.foreground)
+    def views(self, frames: Iterable[Frame], size: float = 1.0) -> list[View]:
+        """Crop frames to their objects and extract features and foregrounds, all in one batch.
+
+        `size` is the object's (see `View`).
+        """
+        side = getattr(self.backbone, "image_size", IMAGE_SIZE)
+        crops = [object_crop(frame, side) for frame in frames]
+        views = extract_views(self.backbone, crops, self.foreground)
+        return [replace(view, size=size) for view in views]
 
     def match_views(
         self,
@@ -222,10 +225,12 @@ class ZeroShotPose:
             matches = matched[best].matches
         with timed(timings, "alignment"):
             points = match_points(reference, targets[best], matches)
+            size = targets[best].size
+            scales = tuple(size / reference.size * scale for scale in SCALE_RANGE)
             flags = ()
             try:
                 sim3, inliers = ransac(
-                    *points, threshold, self.trials, self.sample_size, seed, SCALE_RANGE
+                    *points, threshold * size, self.trials, self.sample_size, seed, scales
                 )
                 agreeing = int(inliers.sum())
                 if agreeing < self.sample_size:

@@ -1,11 +1,13 @@
 """Import of RGB-D captures: formats, object masks, and sequences in CO3D's layout."""
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from zsp_lite.errors import InputError
+from zsp_lite.data.annotations import FRAMES_FILE
+from zsp_lite.errors import InputError, check_choice
 from zsp_lite.importers.capture import (
     MOST_FRAMES,
     Capture,
@@ -14,6 +16,7 @@ from zsp_lite.importers.capture import (
     find_masks,
     sharpest,
 )
+from zsp_lite.importers.files import PICTURES
 from zsp_lite.importers.lists import read_lists, read_tum
 from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.importers.phones import read_polycam, read_record3d, read_stray
@@ -83,13 +86,23 @@ _INCOMPLETE = {
 }
 
 
-def recognise(path: str | Path) -> tuple[str, Path]:
-    """Return a capture's format, a name in `FORMATS`, and the folder or file that its reader takes.
+def recognise(given: Any) -> tuple[str, Any]:
+    """Return the format of an object's frames, and the folder or file that its reader takes.
 
-    A capture is a folder, the zip or .r3d file of an app, or a transforms.json. InputError for
-    anything else. The message says what is missing, or what is expected.
+    The format is "image", "sequence" of a data folder, a name in `FORMATS` of a capture (a folder,
+    the zip or .r3d file of an app, or a transforms.json), or "frames" for what is no path.
+    InputError for another path. The message says what is missing, or what is expected.
     """
-    path = Path(path)
+    if not isinstance(given, str | Path):
+        return "frames", given
+    path = Path(given)
+    if path.is_file() and path.suffix.lower() in PICTURES:
+        return "image", path
+    # The path as it is given, or behind links; both absolute, so that "." and "mine/cup/.." have
+    # names.
+    for folder in (Path(os.path.abspath(path)), path.resolve()):
+        if folder.is_dir() and (folder.parent / FRAMES_FILE).is_file():
+            return "sequence", folder
     folder = path
     if path.is_file() and path.suffix.lower() in PACKED:
         folder = unpack(path.resolve())
@@ -135,6 +148,7 @@ def open_capture(
     folder = Path(path)
     if layout is None:
         layout, folder = recognise(path)
+        check_choice(f"format of {path}", layout, FORMATS)
     if layout == "stray":  # the reader chooses the sharp frames, because it decodes a video
         options["count"] = count
     frames, left_out = collect(FORMATS[layout].read(folder, **options))
