@@ -72,18 +72,18 @@ class ZeroShotPose:
     seed: int = 0
 
     def __post_init__(self):
-        stages = {
+        choices = {
             "matcher": ("cyclical", *MATCHERS),
             "view_selector": VIEW_SELECTORS,
             "solver": SOLVERS["both"],
+            "foreground": ("saliency", "mask"),
+            "cycle_from": ("reference", "target"),
+            "kmeans": (None, True, False),
         }
-        for name, allowed in stages.items():
-            stage = getattr(self, name)
-            if not callable(stage):  # else a plug-in
-                check_choice(name, stage, allowed)
-        check_choice("foreground", self.foreground, ("saliency", "mask"))
-        check_choice("cycle_from", self.cycle_from, ("reference", "target"))
-        check_choice("kmeans", self.kmeans, (None, True, False))
+        for name, allowed in choices.items():
+            chosen = getattr(self, name)
+            if not callable(chosen):  # else a plug-in
+                check_choice(name, chosen, allowed)
         check_integer("k", self.k, 1)
         check_integer("trials", self.trials, 1, 1_000_000)
         check_integer("sample_size", self.sample_size, 3)
@@ -93,9 +93,8 @@ class ZeroShotPose:
                 f"backbone is {self.backbone!r}, expected what `load_backbone` returns"
             )
         if self.foreground == "saliency" and not getattr(self.backbone, "has_saliency", True):
-            name = getattr(self.backbone, "name", type(self.backbone).__name__)
             raise InputError(
-                f"foreground is 'saliency', which {name} does not have; expected 'mask'"
+                "foreground is 'saliency', which the backbone does not have; expected 'mask'"
             )
         check_number("threshold", self.threshold, above=0)
 
@@ -125,15 +124,11 @@ class ZeroShotPose:
         found = self.estimate_from_views(first, others)
         return replace(found, timings=timings | found.timings)
 
-    def views(self, frames: Iterable[Frame], size: float = 1.0) -> list[View]:
-        """Crop frames to their objects and extract features and foregrounds, all in one batch.
-
-        `size` is the object's (see `View`).
-        """
-        side = getattr(self.backbone, "image_size", IMAGE_SIZE)
-        crops = [object_crop(frame, side) for frame in frames]
-        views = extract_views(self.backbone, crops, self.foreground)
-        return [replace(view, size=size) for view in views]
+    def views(self, frames: Iterable[Frame]) -> list[View]:
+        """Crop frames to their objects and extract features and foregrounds, all in one batch."""
+        size = getattr(self.backbone, "image_size", IMAGE_SIZE)
+        crops = [object_crop(frame, size) for frame in frames]
+        return extract_views(self.backbone, crops, self.foreground)
 
     def match_views(
         self,

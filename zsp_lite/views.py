@@ -39,17 +39,19 @@ class View:
     def patch_points(self) -> _PatchPoints:
         """Camera-frame point of each patch, and whether its depth was measured (see
         `depth.patch_points`)."""
-        # OpenCV's in-painting depends on the unit of length.
-        points, known = patch_points(
-            self.frame.depth / self.size, self.frame.camera, self.features.grid, inpaint=True
-        )
-        return self.size * points, known
+        return self._points(inpaint=True)
 
     @cached_property
     def measured_points(self) -> _PatchPoints:
         """`patch_points` without in-painting: the point of a patch without measured depth is the
         origin."""
-        return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint=False)
+        return self._points(inpaint=False)
+
+    def _points(self, inpaint: bool) -> _PatchPoints:
+        # OpenCV's in-painting depends on the unit of length.
+        depth = self.frame.depth / self.size
+        points, known = patch_points(depth, self.frame.camera, self.features.grid, inpaint)
+        return self.size * points, known
 
     @property
     def known_foreground(self) -> Bool[np.ndarray, "rows cols"]:

@@ -12,8 +12,9 @@ from zsp_lite.importers.capture import (
     MOST_FRAMES,
     Capture,
     Makers,
-    collect,
+    OutsideError,
     find_masks,
+    natural_order,
     sharpest,
 )
 from zsp_lite.importers.files import PICTURES
@@ -151,7 +152,17 @@ def open_capture(
         check_choice(f"format of {path}", layout, FORMATS)
     if layout == "stray":  # the reader chooses the sharp frames, because it decodes a video
         options["count"] = count
-    frames, left_out = collect(FORMATS[layout].read(folder, **options))
+    frames = []
+    left_out = []
+    for make in FORMATS[layout].read(folder, **options):
+        try:
+            frames.append(make())
+        # A path out of the folder is no mistake of one frame: nothing of such a capture is read.
+        except OutsideError:
+            raise
+        except (InputError, OSError) as error:  # OSError for a name that is too long
+            left_out.append(str(error))
+    frames.sort(key=lambda frame: natural_order(frame.image))
 
     # A frame's own mask comes before the one in the capture's folder masks/. If the folder `masks`
     # is given, all masks are from it.
@@ -167,8 +178,8 @@ def open_capture(
         paths = [frame.mask or mask for frame, mask in zip(frames, paths)]
     frames = [replace(frame, mask=mask, **files) for frame, mask in zip(frames, paths)]
 
-    frames_and_images = sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
-    frames = [frame for frame, _ in frames_and_images]
+    sharp = sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
+    frames = [frame for frame, _ in sharp]
     if not frames:
         problem = "no frame, expected some"
         if left_out:

@@ -192,8 +192,13 @@ class Source:
                 f"{min(self.numbers)} to {max(self.numbers)}"
             )
         start = 0 if first is None else self.numbers.index(first)
-        every = range(len(self.numbers))
-        chosen = self._spread(count, [*every[start:], *every[:start]])
+        # By the directions of the cameras, or by the order.
+        every = [*range(len(self.numbers))]
+        every = every[start:] + every[:start]
+        chosen = spread(count, len(every))
+        if self.cameras and count:
+            chosen = spread_views([self.cameras[position] for position in every], count)
+        chosen = [every[k] for k in chosen]
         frames = dict(zip(chosen, self.load(chosen)))
         defects = {position: frame_defect(frame) for position, frame in frames.items()}
         usable = [position for position in chosen if not defects[position]]
@@ -204,13 +209,6 @@ class Source:
                 "--reference-frame, --mask or --box"
             )
         return usable, frames
-
-    def _spread(self, count: int, positions: Sequence[int]) -> list[int]:
-        """Choose at most `count` positions, the first among them, by directions or by the order."""
-        chosen = spread(count, len(positions))
-        if self.cameras and count:
-            chosen = spread_views([self.cameras[position] for position in positions], count)
-        return [positions[k] for k in chosen]
 
 
 # A path, frames, or what `open_source` returns.

@@ -64,7 +64,7 @@ class Scan:
         size = 1.0  # that of sequences of data folders
         if source.format != "sequence" and len(cloud):
             size = axis_deviation(cloud) or 1.0
-        views = method.views(frames.values(), size)
+        views = [replace(view, size=size) for view in method.views(frames.values())]
         shown = [] if alone else sorted(frames)
         return cls(source, chosen, shown, frames, dict(zip(frames, views)), size, cloud)
 
@@ -103,7 +103,8 @@ def stood_up(scan: Scan, target: Scan, method: ZeroShotPose) -> tuple[Scan, int]
     """
 
     def views_of(positions: Iterable[int], quarters: int) -> list[View]:
-        return method.views([turn_frame(scan.frames[k], quarters) for k in positions], scan.size)
+        turned = method.views([turn_frame(scan.frames[k], quarters) for k in positions])
+        return [replace(view, size=scan.size) for view in turned]
 
     scores = {}
     for quarters in range(4):
