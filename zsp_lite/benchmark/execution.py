@@ -81,13 +81,12 @@ def evaluate_pairs(
     chunks = [todo[start : start + size] for start in range(0, len(todo), size)]
     # None shows the bar in a terminal only.
     hidden = None if logger.isEnabledFor(logging.INFO) else True
-    found = _lines(opener, executor, chunks, out)
     # Closed, so that workers get no more to do where a line cannot be stored.
     with (
         tqdm(
             total=len(work), initial=len(work) - len(todo), unit="pair", delay=1, disable=hidden
         ) as bar,
-        closing(found),
+        closing(_lines(opener, executor, chunks, out)) as found,
     ):
         for some in found:
             add_lines(out, some)
