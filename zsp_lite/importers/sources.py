@@ -98,26 +98,23 @@ class Source:
         """
         # The frames, and those from which their masks are made.
         needed = set(positions)
+        missing = needed & self.missing.keys() if self.mask == "given" else needed
         if self.mask == "box":
-            needed.add(0)
-        elif self.mask == "auto":
-            needed.update(map(int, np.linspace(0, len(self.numbers) - 1, context).round()))
+            needed = needed | {0}
+        elif missing:
+            every = np.linspace(0, len(self.numbers) - 1, context).round()
+            needed = needed.union(map(int, every))
         frames = {position: self.read_frame(position) for position in sorted(needed)}
-        loaded = list(frames.values())
 
         # Make all masks, or those that are missing.
-        if self.mask != "given":
+        if missing:
+            loaded = list(frames.values())
             try:
-                masks = masks_from_box(loaded, self.box) if self.box else masks_from_depth(loaded)
-                frames = dict(zip(frames, masks))
+                made = masks_from_box(loaded, self.box) if self.box else masks_from_depth(loaded)
             except InputError as error:
                 reasons = (str(error), self.contradiction())
                 raise InputError("; ".join(filter(None, reasons))) from error
-        elif any(frame.mask is None for frame in loaded):
-            masked = replace(self, mask="auto").load(list(frames), context)
-            for position, frame in zip(list(frames), masked):
-                if frames[position].mask is None:
-                    frames[position] = frame
+            frames |= {k: frame for k, frame in zip(frames, made) if k in missing}
         return [frames[position] for position in positions]
 
     def segmented(self) -> "Source":
