@@ -58,7 +58,7 @@ class Sim3:
     @classmethod
     def from_matrix(cls, matrix: Float[np.ndarray, "4 4"]) -> "Sim3":
         """Return the transform with this `matrix`."""
-        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
         return cls(scale, matrix[:3, :3] / scale, matrix[:3, 3])
 
     @property

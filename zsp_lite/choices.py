@@ -10,7 +10,7 @@ SOLVERS = {"paper": ("paper",), "verified": ("verified",), "both": ("paper", "ve
 # Activation of a transformer block that describes a patch (compared by Amir et al. 2021): an input
 # of its attention, or its output, not normalised ("token").
 Facet = Literal["key", "query", "value", "token"]
-FACETS: tuple[str, ...] = get_args(Facet)
+FACETS = get_args(Facet)
 # Where object masks come from: with the frames, GrabCut from a box, or depth.
 MASKS = ("given", "box", "auto")
 # Figures of a benchmark row by their names in a summary, with their titles.

@@ -48,12 +48,9 @@ class Matcher(Protocol):
         ...
 
 
-# The paper gives neither. LoFTR (Sun et al. 2021) divides its similarities by 0.1 before a dual
-# softmax; 0.05 is the weight of the entropy in SCOT (Liu et al. 2020), the optimal transport that
-# the paper cites.
+# The paper gives none; LoFTR (Sun et al. 2021) divides its similarities by this before a dual
+# softmax.
 SOFTMAX_TEMPERATURE = 0.1
-TRANSPORT_REGULARISATION = 0.05
-TRANSPORT_STEPS = 100
 
 
 def mutual_nearest_neighbours(similarity: Float[Tensor, "m n"]) -> Matched:
@@ -82,17 +79,18 @@ def optimal_transport(similarity: Float[Tensor, "m n"]) -> Matched:
     The plan moves uniform mass between the patches at cost 1 - similarity. The score is the mass
     moved.
     """
-    score, partner = sinkhorn(1 - similarity, TRANSPORT_REGULARISATION, TRANSPORT_STEPS).max(dim=1)
+    score, partner = sinkhorn(1 - similarity).max(dim=1)
     return partner, score
 
 
 def sinkhorn(
-    cost: Float[Tensor, "n1 n2"], regularisation: float, steps: int
+    cost: Float[Tensor, "n1 n2"], regularisation: float = 0.05, steps: int = 100
 ) -> Float[Tensor, "n1 n2"]:
     """Compute the entropy-regularised transport plan between uniform masses (Cuturi 2013), in
     float64.
 
-    Its columns sum to 1 / n2, its rows to 1 / n1 in the limit of many steps.
+    The paper gives no weight of the entropy; the default is that of SCOT (Liu et al. 2020). The
+    plan's columns sum to 1 / n2, its rows to 1 / n1 in the limit of many steps.
     """
     cost = cost.double()
     # Subtracting the minimum leaves the plan as it is and keeps the kernel from underflowing.

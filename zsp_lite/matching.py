@@ -231,7 +231,7 @@ def _most_salient(
     # either lowers the sum of squares by the same amount), which rounding errors would break
     # differently each time.
     gram = (built @ built.T).round(decimals=6).numpy()
-    clusters = _cluster(gram, k, np.random.default_rng(seed))
+    clusters = _cluster(gram, k, seed)
     saliency = features.saliency.flatten().numpy()[candidates]
     by_cluster = np.lexsort((-saliency, clusters))  # the most salient of each cluster first
     first = np.unique(clusters[by_cluster], return_index=True)[1]
@@ -305,9 +305,7 @@ def _inverse_norm(keys: Float[Tensor, "h w d"]) -> Float[Tensor, " n"]:
     return squared.clamp_min(torch.finfo(squared.dtype).tiny).rsqrt()
 
 
-def _cluster(
-    gram: Float[np.ndarray, "m m"], k: int, rng: np.random.Generator
-) -> Int[np.ndarray, " m"]:
+def _cluster(gram: Float[np.ndarray, "m m"], k: int, seed: int) -> Int[np.ndarray, " m"]:
     """Cluster m points, given by their inner products, by k-means; returns their labels."""
     # Imported here: it takes a second, and the verified solver does not cluster.
     from sklearn.cluster import KMeans
@@ -322,4 +320,5 @@ def _cluster(
         # Equal descriptors (a uniform surface) leave clusters empty: that gives fewer matches and
         # needs no warning.
         warnings.simplefilter("ignore", ConvergenceWarning)
-        return KMeans(k, n_init=1, random_state=int(rng.integers(2**31))).fit(points).labels_
+        state = int(np.random.default_rng(seed).integers(2**31))
+        return KMeans(k, n_init=1, random_state=state).fit(points).labels_

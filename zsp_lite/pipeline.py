@@ -39,8 +39,7 @@ class ZeroShotPose:
         view_selector: "correspond", as in the paper, another name in `best_view.VIEW_SELECTORS`, or
             a `ViewSelector`.
         trials: Number of RANSAC trials.
-        threshold: Largest residual of a RANSAC inlier in scene units. (The scenes of CO3D are
-            scaled to unit standard deviation.)
+        threshold: Largest residual of a RANSAC inlier in standard deviations of the target object.
         sample_size: Points per RANSAC trial.
         foreground: "saliency", as in the paper, or "mask" for the frame's own object mask.
             Backbones without saliency need "mask".
@@ -73,18 +72,18 @@ class ZeroShotPose:
     seed: int = 0
 
     def __post_init__(self):
-        stages = {
+        choices = {
             "matcher": ("cyclical", *MATCHERS),
             "view_selector": VIEW_SELECTORS,
             "solver": SOLVERS["both"],
+            "foreground": ("saliency", "mask"),
+            "cycle_from": ("reference", "target"),
+            "kmeans": (None, True, False),
         }
-        for name, allowed in stages.items():
-            stage = getattr(self, name)
-            if not callable(stage):  # else a plug-in
-                check_choice(name, stage, allowed)
-        check_choice("foreground", self.foreground, ("saliency", "mask"))
-        check_choice("cycle_from", self.cycle_from, ("reference", "target"))
-        check_choice("kmeans", self.kmeans, (None, True, False))
+        for name, allowed in choices.items():
+            chosen = getattr(self, name)
+            if not callable(chosen):  # else a plug-in
+                check_choice(name, chosen, allowed)
         check_integer("k", self.k, 1)
         check_integer("trials", self.trials, 1, 1_000_000)
         check_integer("sample_size", self.sample_size, 3)
@@ -94,9 +93,8 @@ class ZeroShotPose:
                 f"backbone is {self.backbone!r}, expected what `load_backbone` returns"
             )
         if self.foreground == "saliency" and not getattr(self.backbone, "has_saliency", True):
-            name = getattr(self.backbone, "name", type(self.backbone).__name__)
             raise InputError(
-                f"foreground is 'saliency', which {name} does not have; expected 'mask'"
+                "foreground is 'saliency', which the backbone does not have; expected 'mask'"
             )
         check_number("threshold", self.threshold, above=0)
 
@@ -222,10 +220,12 @@ class ZeroShotPose:
             matches = matched[best].matches
         with timed(timings, "alignment"):
             points = match_points(reference, targets[best], matches)
+            size = targets[best].size
+            scales = tuple(size / reference.size * scale for scale in SCALE_RANGE)
             flags = ()
             try:
                 sim3, inliers = ransac(
-                    *points, threshold, self.trials, self.sample_size, seed, SCALE_RANGE
+                    *points, threshold * size, self.trials, self.sample_size, seed, scales
                 )
                 agreeing = int(inliers.sum())
                 if agreeing < self.sample_size:

@@ -32,18 +32,26 @@ class View:
     foreground: Bool[torch.Tensor, "rows cols"] = field(repr=False)  # patches on the object
     # probability of each pixel of being on the object, in [0, 1]
     soft_mask: Float[np.ndarray, "height width"] = field(repr=False)
+    # standard deviation of the object in the frame's lengths; the scenes of CO3D are scaled to 1
+    size: float = 1.0
 
     @cached_property  # of N target views the paper's solver needs only those of the chosen one
     def patch_points(self) -> _PatchPoints:
         """Camera-frame point of each patch, and whether its depth was measured (see
         `depth.patch_points`)."""
-        return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint=True)
+        return self._points(inpaint=True)
 
     @cached_property
     def measured_points(self) -> _PatchPoints:
         """`patch_points` without in-painting: the point of a patch without measured depth is the
         origin."""
-        return patch_points(self.frame.depth, self.frame.camera, self.features.grid, inpaint=False)
+        return self._points(inpaint=False)
+
+    def _points(self, inpaint: bool) -> _PatchPoints:
+        # OpenCV's in-painting depends on the unit of length.
+        depth = self.frame.depth / self.size
+        points, known = patch_points(depth, self.frame.camera, self.features.grid, inpaint)
+        return self.size * points, known
 
     @property
     def known_foreground(self) -> Bool[np.ndarray, "rows cols"]:

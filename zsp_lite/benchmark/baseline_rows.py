@@ -92,24 +92,19 @@ class Scans:
     references: int
 
     def __call__(self, problem: PairProblem) -> Answer:
-        frames = self._frames(problem)
-        repeat = problem.pair.repeat
-        category = problem.pair.category
-        judged = problem.store.judged(category, frames, self.references, repeat=repeat)
-        if not judged:
-            raise InputError("neither frames nor shapes determine a pose")
-        return _between_worlds(problem, synchronise(judged))
-
-    def _frames(self, problem: PairProblem) -> dict[str, tuple[int, ...]]:
-        """Return the numbers of frames of both objects, evenly spaced over their sequences from the
-        pair's own ones on: as many as the pair has views, or as are solved."""
+        # The frames of both objects, evenly spaced over their sequences from the pair's own ones
+        # on: as many as the pair has views, or as are solved.
         pair = problem.pair
         numbers = problem.store.dataset.frame_numbers(pair.category)
         ordered = {}
         for name, start in pair.frames[:2]:
             first = numbers[name].index(start)
             ordered[name] = numbers[name][first:] + numbers[name][:first]
-        return evenly_spaced(ordered, max(self.references, len(pair.target_frames)))
+        frames = evenly_spaced(ordered, max(self.references, len(pair.target_frames)))
+        judged = problem.store.judged(pair.category, frames, self.references, repeat=pair.repeat)
+        if not judged:
+            raise InputError("neither frames nor shapes determine a pose")
+        return _between_worlds(problem, synchronise(judged))
 
 
 def shape_upright(problem: PairProblem) -> Answer:

@@ -25,7 +25,7 @@ import cloudpickle
 from torch import get_num_threads
 from tqdm import tqdm
 
-from zsp_lite.benchmark.runs import ResultLine, add_lines, read_lines
+from zsp_lite.benchmark.runs import add_lines
 from zsp_lite.data.co3d import Pair
 from zsp_lite.errors import InputError, check_integer, ends_the_run
 from zsp_lite.io.files import digest, read_bytes, write_atomic
@@ -54,7 +54,7 @@ def evaluate_pairs(
     opener: Opener,
     work: Mapping[Pair, list[str]],
     executor: Executor | int,
-    kind: type = ResultLine,
+    lines: list[Any],
 ) -> None:
     """Evaluate the rows and pairs that a run lacks, and add each line to the run when it is found.
 
@@ -63,10 +63,9 @@ def evaluate_pairs(
         opener: Loads what evaluates a pair.
         work: The names of the rows of each pair.
         executor: Number of processes, 1 for this one, or an Executor, which stays open.
-        kind: Type of the lines.
+        lines: Those of the run (see `open_run`); the new ones are appended.
     """
     # What the run lacks.
-    lines = read_lines(out, kind)
     stored = {(name, line.pair, line.repeat) for line in lines for name in line.results}
     todo = []
     # Pairs that share frames are neighbours.
@@ -82,17 +81,17 @@ def evaluate_pairs(
     chunks = [todo[start : start + size] for start in range(0, len(todo), size)]
     # None shows the bar in a terminal only.
     hidden = None if logger.isEnabledFor(logging.INFO) else True
-    found = _lines(opener, executor, chunks, out)
     # Closed, so that workers get no more to do where a line cannot be stored.
     with (
         tqdm(
             total=len(work), initial=len(work) - len(todo), unit="pair", delay=1, disable=hidden
         ) as bar,
-        closing(found),
+        closing(_lines(opener, executor, chunks, out)) as found,
     ):
-        for lines in found:
-            add_lines(out, lines)
-            bar.update(len(lines))
+        for some in found:
+            add_lines(out, some)
+            lines += some
+            bar.update(len(some))
 
 
 def _lines(

@@ -147,8 +147,8 @@ def evaluate(
         pairs=dict(pairs),
         seeds=seeds,
         remarks=remarks,
-    ):
-        evaluate_pairs(out, opener, repeated, executor)
+    ) as lines:
+        evaluate_pairs(out, opener, repeated, executor, lines)
 
     summary = write_reports(out, metrics=metrics) if metrics else read_run(out).summary
     if "note" in summary:

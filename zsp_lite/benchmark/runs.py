@@ -237,10 +237,14 @@ def open_run(
     targets: int,
     methods: dict[str, str],
     objects: dict[str, str],
+    kind: type = ResultLine,
     **call: Any,
-) -> Iterator[None]:
-    """Be the only writer of a run's folder, which is new or holds a run with these settings; then
-    `add_lines` adds. `call` has the members of this `Call` that the rest does not tell."""
+) -> Iterator[list[Any]]:
+    """Be the only writer of a run's folder, which is new or holds a run with these settings.
+
+    Yields its lines, of a `kind`, to which `add_lines` adds. `call` has the members of this `Call`
+    that the rest does not tell.
+    """
     words = [Path(sys.argv[0]).name.replace("__main__.py", "zsp-lite"), *sys.argv[1:]]
     versions = {one.__name__: str(one.__version__) for one in (torch, np, scipy, cv2)}
     versions |= {"python": platform.python_version(), "machine": platform.platform()}
@@ -270,7 +274,7 @@ def open_run(
         write_atomic(out / LINES, lines)
         (out / f"{LINES}.gz").unlink(missing_ok=True)
         _write_settings(out, settings)
-        yield
+        yield read_lines(out, kind)
         this_call.finished = True
         _write_settings(out, settings)
 

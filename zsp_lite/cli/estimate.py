@@ -123,17 +123,13 @@ def estimate(
     """
     import json
 
-    from zsp_lite.importers.sources import open_pair
     from zsp_lite.objects.estimate import estimate_pose
 
     if helpers and solver != "verified":
         raise click.UsageError("--helpers goes with --solver verified only")
-    # Opened here, since an option may differ from object to object; `estimate_pose` takes open
-    # sources as they are.
-    sources = open_pair(reference, target, once_per_object, helpers)
     result = estimate_pose(
-        sources[0],
-        sources[1],
+        reference,
+        target,
         solver,
         reference_frame,
         targets,
@@ -141,9 +137,10 @@ def estimate(
         out=out,
         upright=not not_upright,
         references=references,
-        helpers=sources[2:],
+        helpers=helpers,
         workers=workers,
         report=not no_report,
+        options=once_per_object,
     )
     if as_json:
         printed = {**result.as_json(), "files": [str(path) for path in result.files]}

@@ -1,5 +1,6 @@
 """Import of RGB-D captures: formats, object masks, and sequences in CO3D's layout."""
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
@@ -7,13 +8,15 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from zsp_lite.errors import InputError
+from zsp_lite.data.annotations import FRAMES_FILE
+from zsp_lite.errors import InputError, check_choice
 from zsp_lite.importers.capture import (
     MOST_FRAMES,
     Capture,
     Makers,
-    collect,
+    OutsideError,
     find_masks,
+    natural_order,
     sharpest,
 )
 from zsp_lite.importers.files import PICTURES
@@ -116,13 +119,23 @@ _OTHERS = (
 )
 
 
-def recognise(path: str | Path) -> tuple[str, Path]:
-    """Return a capture's format, a name in `FORMATS`, and the folder or file that its reader takes.
+def recognise(given: Any) -> tuple[str, Any]:
+    """Return the format of an object's frames, and the folder or file that its reader takes.
 
-    A capture is a folder, the zip or .r3d file of an app, or a transforms.json. InputError for
-    anything else. The message says what is missing, or what is expected.
+    The format is "image", "sequence" of a data folder, a name in `FORMATS` of a capture (a folder,
+    the zip or .r3d file of an app, or a transforms.json), or "frames" for what is no path.
+    InputError for another path. The message says what is missing, or what is expected.
     """
-    path = Path(path)
+    if not isinstance(given, str | Path):
+        return "frames", given
+    path = Path(given)
+    if path.is_file() and path.suffix.lower() in PICTURES:
+        return "image", path
+    # The path as it is given, or behind links; both absolute, so that "." and "mine/cup/.." have
+    # names.
+    for folder in (Path(os.path.abspath(path)), path.resolve()):
+        if folder.is_dir() and (folder.parent / FRAMES_FILE).is_file():
+            return "sequence", folder
     folder = path
     if path.is_file() and path.suffix.lower() in PACKED:
         folder = unpack(path.resolve())
@@ -172,9 +185,20 @@ def open_capture(
     folder = Path(path)
     if layout is None:
         layout, folder = recognise(path)
+        check_choice(f"format of {path}", layout, FORMATS)
     if layout == "stray":  # the reader chooses the sharp frames, because it decodes a video
         options["count"] = count
-    frames, left_out = collect(FORMATS[layout].read(folder, **options))
+    frames = []
+    left_out = []
+    for make in FORMATS[layout].read(folder, **options):
+        try:
+            frames.append(make())
+        # A path out of the folder is no mistake of one frame: nothing of such a capture is read.
+        except OutsideError:
+            raise
+        except (InputError, OSError) as error:  # OSError for a name that is too long
+            left_out.append(str(error))
+    frames.sort(key=lambda frame: natural_order(frame.image))
 
     # A frame's own mask comes before the one in the capture's folder masks/. If the folder `masks`
     # is given, all masks are from it.
@@ -190,8 +214,8 @@ def open_capture(
         paths = [frame.mask or mask for frame, mask in zip(frames, paths)]
     frames = [replace(frame, mask=mask, **files) for frame, mask in zip(frames, paths)]
 
-    frames_and_images = sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
-    frames = [frame for frame, _ in frames_and_images]
+    sharp = sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
+    frames = [frame for frame, _ in sharp]
     if not frames:
         problem = "no frame, expected some"
         if left_out:

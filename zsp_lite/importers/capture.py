@@ -3,7 +3,7 @@
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PureWindowsPath
@@ -181,22 +181,7 @@ def refuse(problem: str) -> NoReturn:
     raise InputError(problem)
 
 
-def collect(makers: Iterable[Callable[[], CaptureFrame]]) -> tuple[list[CaptureFrame], list[str]]:
-    """Return the frames sorted by the names of their images, and what is wrong with the others."""
-    frames = []
-    left_out = []
-    for make in makers:
-        try:
-            frames.append(make())
-        # A path out of the folder is no mistake of one frame: nothing of such a capture is read.
-        except OutsideError:
-            raise
-        except (InputError, OSError) as error:  # OSError for a name that is too long
-            left_out.append(str(error))
-    return sorted(frames, key=lambda frame: _natural_order(frame.image)), left_out
-
-
-def _natural_order(path: Path) -> list[str | int]:
+def natural_order(path: Path) -> list[str | int]:
     """Return a key to sort paths: frame 10 follows frame 9."""
     parts = re.split(r"(\d+)", path.as_posix())  # every second part is a number
     return [int(part) if k % 2 else part for k, part in enumerate(parts)]

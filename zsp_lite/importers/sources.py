@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from zsp_lite.data.annotations import FRAMES_FILE
 from zsp_lite.data.arrays import camera_from_pose
 from zsp_lite.data.cameras import Box, Camera, Values
 from zsp_lite.data.co3d import Co3D
@@ -23,7 +22,6 @@ from zsp_lite.importers.files import (
     CO3D_DEPTH,
     DEPTHS,
     MASKS,
-    PICTURES,
     question_intrinsics,
     read_picture,
 )
@@ -100,26 +98,23 @@ class Source:
         """
         # The frames, and those from which their masks are made.
         needed = set(positions)
+        missing = needed & self.missing.keys() if self.mask == "given" else needed
         if self.mask == "box":
-            needed.add(0)
-        elif self.mask == "auto":
-            needed.update(map(int, np.linspace(0, len(self.numbers) - 1, context).round()))
+            needed = needed | {0}
+        elif missing:
+            every = np.linspace(0, len(self.numbers) - 1, context).round()
+            needed = needed.union(map(int, every))
         frames = {position: self.read_frame(position) for position in sorted(needed)}
-        loaded = list(frames.values())
 
         # Make all masks, or those that are missing.
-        if self.mask != "given":
+        if missing:
+            loaded = list(frames.values())
             try:
-                masks = masks_from_box(loaded, self.box) if self.box else masks_from_depth(loaded)
-                frames = dict(zip(frames, masks))
+                made = masks_from_box(loaded, self.box) if self.box else masks_from_depth(loaded)
             except InputError as error:
                 reasons = (str(error), self.contradiction())
                 raise InputError("; ".join(filter(None, reasons))) from error
-        elif any(frame.mask is None for frame in loaded):
-            masked = replace(self, mask="auto").load(list(frames), context)
-            for position, frame in zip(list(frames), masked):
-                if frames[position].mask is None:
-                    frames[position] = frame
+            frames |= {k: frame for k, frame in zip(frames, made) if k in missing}
         return [frames[position] for position in positions]
 
     def segmented(self) -> "Source":
@@ -194,8 +189,13 @@ class Source:
                 f"{min(self.numbers)} to {max(self.numbers)}"
             )
         start = 0 if first is None else self.numbers.index(first)
-        every = range(len(self.numbers))
-        chosen = self._spread(count, [*every[start:], *every[:start]])
+        # By the directions of the cameras, or by the order.
+        every = [*range(len(self.numbers))]
+        every = every[start:] + every[:start]
+        chosen = spread(count, len(every))
+        if self.cameras and count:
+            chosen = spread_views([self.cameras[position] for position in every], count)
+        chosen = [every[k] for k in chosen]
         frames = dict(zip(chosen, self.load(chosen)))
         defects = {position: frame_defect(frame) for position, frame in frames.items()}
         usable = [position for position in chosen if not defects[position]]
@@ -206,13 +206,6 @@ class Source:
                 "--reference-frame, --mask or --box"
             )
         return usable, frames
-
-    def _spread(self, count: int, positions: Sequence[int]) -> list[int]:
-        """Choose at most `count` positions, the first among them, by directions or by the order."""
-        chosen = spread(count, len(positions))
-        if self.cameras and count:
-            chosen = spread_views([self.cameras[position] for position in positions], count)
-        return [positions[k] for k in chosen]
 
 
 # A path, frames, or what `open_source` returns.
@@ -238,6 +231,7 @@ def open_source(
     masks: Path | None = None,
     count: int | None = None,
     up: Values | Literal["floor"] | None = None,
+    recognised: tuple[str, Any] | None = None,
 ) -> Source:
     """Open a sequence, a capture, an image, or frames of one object in one world.
 
@@ -263,6 +257,7 @@ def open_source(
         count: Number of sharp frames of a capture to choose; by default 100.
         up: Direction up in the object's world, or zeros if it is not to be used. By default that of
             the format, or "floor": the floor or table around the object tells it (see `upright`).
+        recognised: What `recognise` returns for the path, if it is known.
 
     Raises:
         InputError: The path is none of these, a file cannot be read, or an option is missing or
@@ -281,7 +276,7 @@ def open_source(
         "orientation": orientation,
     }
     options = {name: value for name, value in options.items() if value is not None}
-    layout, place = _format(path)
+    layout, place = recognised or recognise(path)
 
     # Refuse options that do not fit the format, or each other.
     if layout == "frames":
@@ -407,11 +402,13 @@ def open_pair(
     Options have the names of arguments of `open_source`. Each has one value for each path that
     takes it (`depth`: each image), or one for all of them. There may be fewer values, for the
     reference and the target alone. A single `box` is for the first path whose `mask` is "box", if
-    any, or the first of all. An open source takes none.
+    any, or the first of all. An open source takes none. InputError if helpers are there and two
+    paths are of one object.
     """
     sides = (reference, target, *helpers)
-    formats = [_format(side)[0] for side in sides]
-    options_of_side: list[dict] = [{} for _ in sides]
+    recognised = [("open", side) if isinstance(side, Source) else recognise(side) for side in sides]
+    formats = [layout for layout, _ in recognised]
+    options_of_side: list[dict] = [{"recognised": found} for found in recognised]
     for name, values in options.items():
         takers = [k for k, layout in enumerate(formats) if name in _TAKEN[layout]]
         # There is a value for each path that takes the option, or only for those of the reference
@@ -433,7 +430,13 @@ def open_pair(
             values = [*values] * len(takers)
         for k, value in zip(takers, values):
             options_of_side[k][name] = value
-    return [open_source(side, **own_options) for side, own_options in zip(sides, options_of_side)]
+    sources = [open_source(side, **own) for side, own in zip(sides, options_of_side)]
+    # The names of frames in memory may be equal.
+    paths = [source.path.resolve() for source in sources if source.format != "frames"]
+    if len(sides) > 2 and len(set(paths)) < len(paths):
+        named = ", ".join(str(source.path) for source in sources)
+        raise InputError(f"{named}: expected different objects")
+    return sources
 
 
 def _check_poses(cameras: Sequence[Camera], where: str | Path) -> None:
@@ -443,29 +446,6 @@ def _check_poses(cameras: Sequence[Camera], where: str | Path) -> None:
             f"{where}: all {len(cameras)} frames have one camera pose, expected their poses "
             "in one world"
         )
-
-
-def _format(side: SourceLike) -> tuple[str, Any]:
-    """Tell "open", "frames", "image" or "sequence", or return what `recognise` does."""
-    if not isinstance(side, str | Path):
-        return "open" if isinstance(side, Source) else "frames", side
-    path = Path(side)
-    if path.is_file() and path.suffix.lower() in PICTURES:
-        return "image", path
-    folder = _sequence_folder(path)
-    if folder:
-        return "sequence", folder
-    return recognise(path)
-
-
-def _sequence_folder(path: Path) -> Path | None:
-    """Return the folder of a sequence, None if the path is no sequence of a data folder."""
-    # The path as it is given, or behind links; both absolute, so that "." and "mine/cup/.." have
-    # names.
-    for folder in (Path(os.path.abspath(path)), path.resolve()):
-        if folder.is_dir() and (folder.parent / FRAMES_FILE).is_file():
-            return folder
-    return None
 
 
 def _open_image(

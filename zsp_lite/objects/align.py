@@ -34,8 +34,8 @@ from zsp_lite.scans.category import CategoryAlignment, PairHypotheses, partners,
 logger = logging.getLogger(__name__)
 
 
-class _Line(msgspec.Struct):
-    """Hypotheses of a pair (see `PairHypotheses`); none if the views determine no pose."""
+class _Line(msgspec.Struct, omit_defaults=True):
+    """A line of the run: the hypotheses of a pair; none if the views determine no pose."""
 
     results: ClassVar[tuple[str]] = ("alignment",)  # the rows of a line, as in `ResultLine`
     repeat: ClassVar[int] = 0
@@ -43,6 +43,19 @@ class _Line(msgspec.Struct):
     centre: list[float] = []
     matrices: list[list[list[float]]] = []
     probabilities: list[float] = []
+
+    def hypotheses(self) -> PairHypotheses | None:
+        """Return the hypotheses, if there are some."""
+        if not self.matrices:
+            return None
+        pair = Pair.from_key(self.pair)
+        return PairHypotheses(
+            pair.reference_sequence,
+            pair.target_sequence,
+            tuple(map(Sim3.from_matrix, np.array(self.matrices))),
+            np.array(self.probabilities),
+            np.array(self.centre),
+        )
 
 
 class _Written(msgspec.Struct):
@@ -99,17 +112,13 @@ class HypothesisFinder:
             self.store = FrameStore(self.dataset, extractors, threads)
         return self.line
 
-    def line(self, pair: Pair, names: Sequence[str]) -> dict[str, Any]:
-        """Find the hypotheses of a pair: a `_Line` of the run."""
-        line: dict[str, Any] = {"pair": pair.key}
-        hypotheses = self.store.hypotheses(pair)
-        if hypotheses is not None:
-            line |= {
-                "centre": hypotheses.centre.tolist(),
-                "matrices": [sim3.matrix.tolist() for sim3 in hypotheses.sim3s],
-                "probabilities": hypotheses.probabilities.tolist(),
-            }
-        return line
+    def line(self, pair: Pair, names: Sequence[str]) -> _Line:
+        """Find the hypotheses of a pair."""
+        found = self.store.hypotheses(pair)
+        if found is None:
+            return _Line(pair.key)
+        matrices = [sim3.matrix.tolist() for sim3 in found.sim3s]
+        return _Line(pair.key, found.centre.tolist(), matrices, found.probabilities.tolist())
 
 
 def align_category(
@@ -167,9 +176,9 @@ def align_category(
 
         def solve(asked: list[Pair]) -> list[PairHypotheses | None]:
             work = dict.fromkeys(asked, ["alignment"])
-            evaluate_pairs(folder, finder.open, work, executor, _Line)
-            stored = read_hypotheses(folder)
-            return [stored.get(pair.key) for pair in asked]
+            evaluate_pairs(folder, finder.open, work, executor, lines)
+            found = {line.pair: line.hypotheses() for line in lines}
+            return [found[pair.key] for pair in asked]
 
         with open_run(
             folder,
@@ -178,8 +187,9 @@ def align_category(
             targets,
             {"alignment": "hypotheses of the verified solver"},
             {},
+            _Line,
             pairs={category: len(names)},
-        ):
+        ) as lines:
             store = FrameStore(opened, {})
             judged = store.judged(category, frames, pairs=partners(names, pairs), solve=solve)
     if not judged:
@@ -203,18 +213,8 @@ def alignment_errors(alignment: CategoryAlignment, labels: Mapping[str, PoseLabe
 def read_hypotheses(out: str | Path) -> dict[str, PairHypotheses]:
     """Read the hypotheses that a run of `align_category` keeps, by the key of the pair of frames,
     for `synchronise`."""
-    hypotheses = {}
-    for line in read_lines(out, _Line):
-        if line.matrices:
-            pair = Pair.from_key(line.pair)
-            hypotheses[line.pair] = PairHypotheses(
-                pair.reference_sequence,
-                pair.target_sequence,
-                tuple(map(Sim3.from_matrix, np.array(line.matrices))),
-                np.array(line.probabilities),
-                np.array(line.centre),
-            )
-    return hypotheses
+    lines = read_lines(out, _Line)
+    return {line.pair: line.hypotheses() for line in lines if line.matrices}
 
 
 def write_alignment(found: CategoryAlignment, out: str | Path, axes: Sim3 | None = None) -> Path:

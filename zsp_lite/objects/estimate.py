@@ -8,12 +8,13 @@ is solved by `ZeroShotPose`; several are asked by `judge.judge_pairs`, and `_ans
 estimate of its pose. `_pair_result` collects all, `write_pair` writes it.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -23,12 +24,12 @@ from zsp_lite.backbones.load import DEFAULT
 from zsp_lite.backbones.named import BackboneLike, as_backbone
 from zsp_lite.choices import SOLVERS
 from zsp_lite.data.cameras import Values
-from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer
+from zsp_lite.errors import NoPoseError, check_choice, check_integer
 from zsp_lite.estimates import Hypothesis, PoseEstimate, timed
-from zsp_lite.importers.convert import scale_frame
-from zsp_lite.importers.sources import Source, SourceLike, list_sources, open_pair
+from zsp_lite.importers.sources import SourceLike, list_sources, open_pair
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import write_ply
+from zsp_lite.matching import Matches
 from zsp_lite.metrics import SAME_ANGLE, rotation_angle, rotation_error, vector_angle
 from zsp_lite.objects.scan import Scan, scan_flags, stood_up
 from zsp_lite.pipeline import ZeroShotPose
@@ -38,7 +39,7 @@ from zsp_lite.scans.judge import REFERENCES, Question, judge_pairs
 from zsp_lite.scans.pair_result import PairResult, Vote, label_errors
 from zsp_lite.verified.confidence import reliability_flags
 from zsp_lite.verified.solver import measured_inliers
-from zsp_lite.views import View, usable_targets
+from zsp_lite.views import usable_targets
 
 _TARGETS = 5
 _LEAST_CONFIDENT = 0.3  # with less, the images may stand on their heads
@@ -61,6 +62,7 @@ def estimate_pose(
     helpers: Iterable[SourceLike] = (),
     workers: int = 1,
     report: bool = True,
+    options: Mapping[str, Sequence[Any]] = {},
 ) -> PairResult:
     """Estimate the pose between two objects of one category, given as paths or frames; no label is
     needed.
@@ -93,6 +95,7 @@ def estimate_pose(
             can.
         workers: Number of frames that are solved at once, by threads.
         report: Whether `out` gets the report beside the point clouds.
+        options: Options of `open_source` by name, each with its values (see `open_pair`).
 
     Raises:
         InputError: An input or an option is missing or wrong, or the pose cannot be estimated.
@@ -111,7 +114,10 @@ def estimate_pose(
 
     # A folder that cannot be written is an error at once.
     with nullcontext() if out is None else writing(out):
-        sources = _open_objects(reference, target, mask, intrinsics, helpers)
+        for name, value in (("mask", mask), ("intrinsics", intrinsics)):
+            if value is not None:
+                options = {**options, name: (value,)}
+        sources = open_pair(reference, target, options, helpers)
         model = as_backbone(backbone)
         foreground = "saliency" if getattr(model, "has_saliency", True) else "mask"
         # Turns, and frames that vote, take the last solver, of both the verified one.
@@ -136,9 +142,9 @@ def estimate_pose(
             turned = f"the reference is turned by {turn}° counterclockwise"
             flags = (*flags, f"{turned}: the pose is that of the turned image")
 
-        # The pose, in the lengths of the sources.
+        # The pose.
         first = scans[0].references[0]
-        solved = {
+        estimates = {
             name: replace(method, solver=name).estimate_from_views(
                 scans[0].views[first], scans[1].target_views
             )
@@ -147,41 +153,17 @@ def estimate_pose(
         }
         votes = ()
         if several:
-            solved["verified"], votes = _by_all(scans, method, workers, flags)
-        estimates = {}
-        for name, estimate in solved.items():
+            estimates["verified"], votes = _by_all(scans, method, workers, flags)
+        for name, estimate in estimates.items():
             notes = flags
             if upright and estimate.hypotheses and estimate.confidence < _LEAST_CONFIDENT:
                 notes = (*flags, "low confidence: --not-upright helps if images are turned")
             estimate = replace(estimate, timings=shared | estimate.timings)
-            estimates[name] = _in_units(estimate, scans[0].scale, scans[1].scale, notes)
+            estimates[name] = _flagged(estimate, notes)
         result = _pair_result(scans, estimates, votes, getattr(model, "name", str(backbone)))
         if out is not None:
             result = replace(result, files=tuple(write_pair(result, out, report)))
     return result
-
-
-def _open_objects(
-    reference: SourceLike,
-    target: SourceLike,
-    mask: str | None,
-    intrinsics: Values | None,
-    helpers: Sequence[SourceLike],
-) -> list[Source]:
-    """Open the sources of all objects that are not open; InputError if two of several are the
-    same."""
-    given = {}
-    if mask is not None:
-        given["mask"] = (mask,)
-    if intrinsics is not None:
-        given["intrinsics"] = (intrinsics,)
-    sources = open_pair(reference, target, given, helpers)
-    # The names of frames in memory may be equal.
-    paths = [source.path.resolve() for source in sources if source.format != "frames"]
-    if helpers and len(set(paths)) < len(paths):
-        named = ", ".join(str(source.path) for source in sources)
-        raise InputError(f"{named}: expected different objects")
-    return sources
 
 
 def _pair_result(
@@ -206,10 +188,7 @@ def _pair_result(
         backbone=backbone,
         votes=votes,
         frames={first.source.numbers[k]: frame for k, frame in first.frames.items()},
-        views=tuple(
-            [_unscaled(view, scan.scale) for view in scan.views.values()]
-            for scan in (first, second)
-        ),
+        views=([*first.views.values()], [*second.views.values()]),
     )
     path = first.source.path.resolve()
     target_path = second.source.path.resolve()
@@ -229,17 +208,21 @@ def _by_all(
     names = [f"{k} {scan.source.name}" for k, scan in enumerate(scans)]
     of_name = dict(zip(names, scans))
     estimates: dict[Question, PoseEstimate] = {}
+    matches: dict[Question, list[Matches]] = {}  # with each target view
     problems: list[NoPoseError] = []
 
     def solve(question: Question) -> PairHypotheses | None:
         scan = of_name[question.reference]
         view = scan.views[scan.references[question.rank]]
+        targets = of_name[question.target].target_views
         try:
-            found = method.estimate_from_views(view, of_name[question.target].target_views)
+            matched = method.match_views(view, targets)
+            found = method.estimate_from_views(view, targets, matched)
         except NoPoseError as error:
             problems.append(error)
             return None
         estimates[question] = found
+        matches[question] = [one.matches for one in matched]
         return world_hypotheses(question.reference, question.target, found)
 
     def ask(questions: list[Question]) -> list[PairHypotheses | None]:
@@ -279,14 +262,14 @@ def _by_all(
     votes = []
     for question in sorted(estimates):  # by the names of the objects, which begin with a number
         estimate = estimates[question]
-        a, b = of_name[question.reference], of_name[question.target]
         if {question.reference, question.target} == {*names[:2]}:
             backward = question.reference == names[1]
-            name = f"frame {a.source.numbers[a.references[question.rank]]} of {a.source.name}"
+            scan = of_name[question.reference]
+            number = scan.source.numbers[scan.references[question.rank]]
+            name = f"frame {number} of {scan.source.name}"
             agreed = best.R.T if backward else best.R
             degrees = float(rotation_error(estimate.world_sim3.R, agreed))
-            own = _in_units(estimate, a.scale, b.scale, scan_doubts)
-            votes.append(Vote(name, own, degrees, backward))
+            votes.append(Vote(name, _flagged(estimate, scan_doubts), degrees, backward))
     flags += dissent(votes)
     first, second = (shapes[name] for name in names[:2])
     if first.upright and second.upright:
@@ -296,7 +279,8 @@ def _by_all(
             flags.append(
                 f"the objects lie differently: their verticals are {tilt:.0f} degrees apart"
             )
-    answer = _answer(scans, method, answers, flags)
+    asked = Question(names[0], 0, names[1])
+    answer = _answer(scans, method, answers, matches[asked], flags)
     return replace(answer, timings=timings), tuple(votes)
 
 
@@ -313,10 +297,11 @@ def _answer(
     scans: Sequence[Scan],
     method: ZeroShotPose,
     answers: Sequence[tuple[Sim3, float]],
+    matches: Sequence[Matches],
     flags: Sequence[str],
 ) -> PoseEstimate:
     """Make an estimate of the first reference frame from similarities between the worlds, each with
-    its probability."""
+    its probability, and its matches with the target views."""
     reference = scans[0].views[scans[0].references[0]]
     targets = scans[1].target_views
     usable, views_left_out = usable_targets(targets)
@@ -339,15 +324,16 @@ def _answer(
     # The first is the pose of the estimate.
     best = hypotheses[0]
     target = targets[best.view]
-    (matched,) = method.match_views(reference, [target])
+    found = matches[best.view]
+    threshold = method.threshold * target.size
     turns = np.stack([sim3.R for sim3, _ in answers])
     between = rotation_angle(turns[:, None], turns)
     doubts, one_of_two = reliability_flags(hypotheses, between)
     return PoseEstimate(
         best.sim3,
         best.view,
-        matched.matches,
-        measured_inliers(reference, target, matched.matches, best.sim3, method.threshold),
+        found,
+        measured_inliers(reference, target, found, best.sim3, threshold),
         -view_angles[0],
         reference,
         tuple(targets),
@@ -388,36 +374,15 @@ def write_pair(result: PairResult, out: str | Path, report: bool = True) -> list
     return paths
 
 
-def _in_units(
-    estimate: PoseEstimate, reference_scale: float, target_scale: float, flags: tuple[str, ...]
-) -> PoseEstimate:
-    """Express an estimate on scaled frames in the lengths before scaling, and add flags; doubts
-    limit the confidence."""
-
-    def unscaled(sim3: Sim3) -> Sim3:
-        return Sim3(sim3.scale * reference_scale / target_scale, sim3.R, sim3.t / target_scale)
-
+def _flagged(estimate: PoseEstimate, flags: tuple[str, ...]) -> PoseEstimate:
+    """Add flags to an estimate; doubts limit its confidence."""
     most = min([getattr(flag, "most", 1.0) for flag in flags], default=1.0)
     factor = min(1.0, most / (estimate.confidence or 1.0))
-    reference = estimate.reference_view
-    targets = estimate.target_views
     return replace(
         estimate,
         flags=(*estimate.flags, *flags),
-        sim3=unscaled(estimate.sim3),
         hypotheses=tuple(
-            replace(
-                hypothesis,
-                sim3=unscaled(hypothesis.sim3),
-                confidence=factor * hypothesis.confidence,
-            )
+            replace(hypothesis, confidence=factor * hypothesis.confidence)
             for hypothesis in estimate.hypotheses
         ),
-        reference_view=_unscaled(reference, reference_scale),
-        target_views=tuple(_unscaled(view, target_scale) for view in targets),
     )
-
-
-def _unscaled(view: View, scale: float) -> View:
-    """Return a view in the lengths before scaling."""
-    return replace(view, frame=scale_frame(view.frame, 1 / scale))

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from zsp_lite.data.azimuths import view_span
 from zsp_lite.data.frames import Frame, frame_defect, with_images
 from zsp_lite.errors import Doubt, NoPoseError
-from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.sources import Source
 from zsp_lite.pipeline import ZeroShotPose
 from zsp_lite.points import axis_deviation, world_cloud
@@ -28,8 +27,7 @@ _ALL_SIDES = 120.0
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """The frames of a source that an estimate uses, whole and as views of an object of unit
-    standard deviation."""
+    """The frames of a source that an estimate uses, whole and as views."""
 
     source: Source
     # positions of the frames that are solved against target views of other objects, in their order
@@ -37,7 +35,7 @@ class Scan:
     targets: list[int]  # positions of the target views
     frames: dict[int, Frame]
     views: dict[int, View]
-    scale: float  # from the lengths of the frames to those of the views
+    size: float  # standard deviation of the object
     cloud: Float[np.ndarray, "n 3"]
     quarters: int = 0  # by which the frames are turned
 
@@ -63,20 +61,17 @@ class Scan:
             frames = {usable[0]: frames[usable[0]]}
         chosen = [usable[k] for k in asked_positions(references, len(usable))] if references else []
         cloud = world_cloud(list(frames.values()))[0]
-        # The method expects objects of about unit standard deviation. Sequences of data folders
-        # have it.
-        scale = 1.0
+        size = 1.0  # that of sequences of data folders
         if source.format != "sequence" and len(cloud):
-            scale = 1 / (axis_deviation(cloud) or 1)
-        views = method.views([scale_frame(frame, scale) for frame in frames.values()])
+            size = axis_deviation(cloud) or 1.0
+        views = [replace(view, size=size) for view in method.views(frames.values())]
         shown = [] if alone else sorted(frames)
-        return cls(source, chosen, shown, frames, dict(zip(frames, views)), scale, cloud)
+        return cls(source, chosen, shown, frames, dict(zip(frames, views)), size, cloud)
 
     def shape(self) -> tuple[Shape, str]:
         """Return the fused shape, and why its vertical is not known, if sources disagree."""
         usable, loaded = self.source.select(FRAMES, references=True)
-        scaled = [scale_frame(loaded[position], self.scale) for position in usable]
-        frames = [object_crop(turn_frame(frame, self.quarters)) for frame in scaled]
+        frames = [object_crop(turn_frame(loaded[k], self.quarters)) for k in usable]
         if isinstance(self.source.up, str):
             up, problem = find_up(frames)
             return Shape.of(frames, up), problem
@@ -108,8 +103,8 @@ def stood_up(scan: Scan, target: Scan, method: ZeroShotPose) -> tuple[Scan, int]
     """
 
     def views_of(positions: Iterable[int], quarters: int) -> list[View]:
-        frames = [scale_frame(scan.frames[position], scan.scale) for position in positions]
-        return method.views([turn_frame(frame, quarters) for frame in frames])
+        turned = method.views([turn_frame(scan.frames[k], quarters) for k in positions])
+        return [replace(view, size=scan.size) for view in turned]
 
     scores = {}
     for quarters in range(4):
