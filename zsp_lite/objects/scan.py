@@ -1,5 +1,5 @@
-"""The frames of one's own objects that an estimate uses: load, scale and turn them, and flag what
-is doubtful about them."""
+"""The frames of one's own objects that an estimate uses: load and turn them, and flag what is
+doubtful about them."""
 
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
