@@ -7,17 +7,6 @@ const SLACK = 4; // largest movement within a click, in pixels
 
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 
-// Row-major 3x3 times row-major 3x3.
-const times = (a, b) =>
-  [0, 3, 6].flatMap((i) => [0, 1, 2].map((j) => a[i] * b[j] + a[i + 1] * b[j + 3] + a[i + 2] * b[j + 6]));
-
-// Rotate the view by dx radians about the vertical axis of the screen, then by dy about the horizontal one.
-function rotated(view, dx, dy) {
-  const [c, s, d, t] = [Math.cos(dx), Math.sin(dx), Math.cos(dy), Math.sin(dy)];
-  return times(times([1, 0, 0, 0, d, -t, 0, t, d], [c, 0, -s, 0, 1, 0, s, 0, c]), view);
-}
-
-const floats = (data) => new Float32Array(data.buffer.slice(data.byteOffset, data.byteOffset + data.byteLength));
 const bytes = (data) => new Uint8Array(data.buffer, data.byteOffset, data.byteLength);
 
 function render({ model, el }) {
@@ -27,7 +16,7 @@ function render({ model, el }) {
   canvas.setAttribute("role", "img");
   el.append(canvas);
   const pen = canvas.getContext("2d");
-  let points, colours, crosses, view, zoom, pan, side, unit, scheduled = false, held = null;
+  let points, colours, crosses, view, zoom, pan, side, unit, ratio, n, depth, scheduled = false, held = null;
 
   const project = (p) => {
     const at = [0, 3, 6].map((i) => view[i] * p[0] + view[i + 1] * p[1] + view[i + 2] * p[2]);
@@ -37,7 +26,7 @@ function render({ model, el }) {
   canvas.pointOnCanvas = (index) => project(points.subarray(3 * index, 3 * index + 3)).slice(0, 2);
 
   function updatePoints() {
-    points = floats(model.get("points"));
+    points = new Float32Array(bytes(model.get("points")).slice().buffer);
     colours = bytes(model.get("colours"));
     crosses = bytes(model.get("crosses"));
     canvas.dataset.points = points.length / 3;
@@ -59,23 +48,29 @@ function render({ model, el }) {
     scheduled = false;
     side = model.get("side");
     unit = side * FILL * zoom;
-    const ratio = window.devicePixelRatio || 1;
-    const n = Math.round(side * ratio);
+    ratio = window.devicePixelRatio || 1;
+    n = Math.round(side * ratio);
     if (canvas.width !== n) canvas.width = canvas.height = n;
     canvas.style.width = canvas.style.height = `${side}px`;
-    const depth = spots(n, ratio);
+    drawSpots();
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    model.get("marks").forEach((at, i) => drawMark(at, i + 1, depth, n, ratio));
+    for (const [p, q] of model.get("lines") ?? []) {
+      outlined(`M${project(p).slice(0, 2)}L${project(q).slice(0, 2)}`, [2, 1], "#D55E00");
+    }
+    model.get("marks").forEach((at, i) => drawMark(at, i + 1));
     const cursor = model.get("cursor");
-    if (cursor.length) drawCursor(project(cursor));
+    if (cursor.length) {
+      const [x, y] = project(cursor);
+      outlined(`M${x - 14} ${y}h9m10 0h9M${x} ${y - 14}v9m0 10v9`, [5, 2]);
+    }
     canvas.dataset.marks = model.get("marks").length;
     canvas.dataset.cursor = cursor.join(" ");
     canvas.setAttribute("aria-label", model.get("alt"));
   }
 
-  // Draw the points with hidden ones removed, paler with depth; return the depth of every pixel.
-  function spots(n, ratio) {
-    const depth = new Float32Array(n * n).fill(Infinity);
+  // Draw the points with hidden ones removed, paler with depth; keep the depth of every pixel.
+  function drawSpots() {
+    depth = new Float32Array(n * n).fill(Infinity);
     const picture = pen.createImageData(n, n);
     const pixels = new Uint32Array(picture.data.buffer).fill(0xffffffff);
     const reach = Math.max(1, Math.round((SPOT * unit * ratio) / 2));
@@ -96,27 +91,25 @@ function render({ model, el }) {
       }
     }
     pen.putImageData(picture, 0, 0);
-    return depth;
+  }
+
+  // Draw a path, in SVG's words, with a white outline.
+  function outlined(path, widths, colour = "black") {
+    for (const [k, strokeStyle] of ["white", colour].entries()) {
+      Object.assign(pen, { strokeStyle, lineWidth: widths[k] });
+      pen.stroke(new Path2D(path));
+    }
   }
 
   // Draw a number in a disc beside its point; the outline is dashed where the cloud hides the point.
-  function drawMark(at, number, depth, n, ratio) {
+  function drawMark(at, number) {
     const [x, y, z] = project(at);
     const pixel = clamp(Math.round(y * ratio), 0, n - 1) * n + clamp(Math.round(x * ratio), 0, n - 1);
     const hidden = z > depth[pixel] + 0.12;
     const [left, top] = [clamp(x + 15, 10, side - 10), clamp(y - 15, 10, side - 10)];
     pen.globalAlpha = hidden ? 0.6 : 1;
     pen.setLineDash(hidden ? [3, 2] : []);
-    for (const [width, colour] of [[4, "white"], [1.5, "black"]]) {
-      [pen.lineWidth, pen.strokeStyle] = [width, colour];
-      pen.beginPath();
-      pen.moveTo(x, y);
-      pen.lineTo(left, top);
-      pen.stroke();
-      pen.beginPath();
-      pen.arc(x, y, 3.5, 0, 7);
-      pen.stroke();
-    }
+    outlined(`M${x} ${y}L${left} ${top}M${x + 3.5} ${y}a3.5 3.5 0 1 0-7 0a3.5 3.5 0 1 0 7 0`, [4, 1.5]);
     pen.beginPath();
     pen.arc(left, top, 9, 0, 7);
     pen.fillStyle = "white";
@@ -130,28 +123,21 @@ function render({ model, el }) {
     pen.globalAlpha = 1;
   }
 
-  function drawCursor([x, y]) {
-    for (const [width, colour] of [[5, "white"], [2, "black"]]) {
-      [pen.lineWidth, pen.strokeStyle] = [width, colour];
-      pen.beginPath();
-      for (const [a, b] of [[-14, -5], [5, 14]]) {
-        pen.moveTo(x + a, y);
-        pen.lineTo(x + b, y);
-        pen.moveTo(x, y + a);
-        pen.lineTo(x, y + b);
+  // Rotate the view by angles about the vertical axis of the screen, then about the horizontal one.
+  function turn(...angles) {
+    view = [...view];
+    for (const [i, angle] of angles.entries()) {
+      for (const k of [0, 1, 2]) {
+        const [a, b, c, s] = [view[3 * i + k], view[6 + k], Math.cos(angle), Math.sin(angle)];
+        [view[3 * i + k], view[6 + k]] = [c * a - s * b, s * a + c * b];
       }
-      pen.stroke();
     }
-  }
-
-  function sendView() {
     model.set("view", view);
-    model.save_changes();
   }
 
   function zoomBy(factor, x, y) {
     const next = clamp(zoom * factor, 0.4, 20);
-    pan = [pan[0], pan[1]].map((p, k) => p + ([x, y][k] - side / 2 - p) * (1 - next / zoom));
+    pan = pan.map((p, k) => p + ([x, y][k] - side / 2 - p) * (1 - next / zoom));
     zoom = next;
     schedule();
   }
@@ -168,14 +154,14 @@ function render({ model, el }) {
     if (!held.moved && Math.hypot(dx, dy) < SLACK) return;
     held = { x: event.offsetX, y: event.offsetY, moved: true };
     if (event.shiftKey) pan = [pan[0] + dx, pan[1] + dy];
-    else view = rotated(view, (2.4 * dx) / side, (2.4 * dy) / side);
+    else turn((2.4 * dx) / side, (2.4 * dy) / side);
     schedule();
   });
   canvas.addEventListener("pointerup", (event) => {
     if (!held) return;
     const still = !held.moved;
     held = null;
-    if (!still) return sendView();
+    if (!still) return model.save_changes();
     const at = [event.offsetX, event.offsetY].map((x, k) => (x - side / 2 - pan[k]) / unit);
     model.send({ at, view, reach: 9 / unit });
   });
@@ -188,10 +174,10 @@ function render({ model, el }) {
     zoomBy(Math.exp(-clamp(event.deltaY, -100, 100) * 0.002), event.offsetX, event.offsetY);
   }, { passive: false });
   canvas.addEventListener("keydown", (event) => {
-    const turn = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-    if (turn) {
-      view = rotated(view, 0.12 * turn[0], 0.12 * turn[1]);
-      sendView();
+    const by = { ArrowLeft: [-0.12, 0], ArrowRight: [0.12, 0], ArrowUp: [0, -0.12], ArrowDown: [0, 0.12] }[event.key];
+    if (by) {
+      turn(...by);
+      model.save_changes();
     } else if (event.key === "+" || event.key === "-") zoomBy(event.key === "+" ? 1.2 : 1 / 1.2, side / 2, side / 2);
     else return;
     event.preventDefault();
@@ -205,6 +191,28 @@ function render({ model, el }) {
   model.on("change:marks change:cursor change:alt change:side", schedule);
   updatePoints();
   resetView();
+}
+
+// Show clouds that a page stores, beside each other: they turn together.
+function stored(el, { panels, legend, alt }) {
+  const listeners = [];
+  const redraw = () => listeners.forEach((listener) => listener());
+  const decoded = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt());
+  let view = [1, 0, 0, 0, 1, 0, 0, 0, 1];
+  for (const { title, points, colours, lines } of panels) {
+    const box = el.appendChild(document.createElement("figure"));
+    box.append(title);
+    const state = {
+      points: Float32Array.from(new Int16Array(decoded(points).buffer), (x) => x / 8192),
+      colours: decoded(colours), crosses: [], marks: [], cursor: [], lines, alt: `${title}: ${alt}`,
+    };
+    const get = (name) => ({ ...state, view, side: box.clientWidth - 2 })[name];
+    const set = (_, value) => { view = value; redraw(); };
+    const on = (name, listener) => { if (name === "change:view") listeners.push(listener); };
+    render({ el: box, model: { get, set, on, save_changes() {}, send() {} } });
+  }
+  el.insertAdjacentHTML("beforeend", legend);
+  new ResizeObserver(redraw).observe(el);
 }
 
 export default { render };
