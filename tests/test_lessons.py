@@ -39,14 +39,14 @@ def test_a_tree_believes_the_surest_answer_and_all_pairs_can_outvote_it(truth):
     together = {name: one.sim3.R for name, one in objects.items()}
     assert hypotheses.all_alike(truth, together)
 
-    surest = hypotheses.surest_right(drawn, truth)
+    surest = hypotheses.right_answers(drawn, truth)
     wrong = {pair for pair, right in surest.items() if not right}
     assert wrong == {
         ("seat_leon", "peugeot_308"),
         ("suv", "peugeot_308"),
         ("peugeot_308", "wooden_car"),
     }
-    fitting = hypotheses.fitting_right(drawn, truth, together)
+    fitting = hypotheses.right_answers(drawn, truth, together)
     assert len(fitting) == 12 and all(fitting.values())
 
 

@@ -21,20 +21,10 @@ def show_view_circle(
     turns: Float[np.ndarray, " n"],
     scores: Float[np.ndarray, " n"],
 ) -> Figure:
-    """Show the scores of views as radius over their turn from the reference, which is in the
-    middle.
+    """Show scores of views as radius over their turn from the reference, which is in the middle.
 
-    A thumbnail with its score stands outside at every third view, the one with the best score among
-    them.
-
-    Args:
-        reference: Image of the reference.
-        images: Images of the views.
-        turns: Angle from the reference to each view, degrees, of both signs.
-        scores: Score of each view.
-
-    Returns:
-        The figure, with 0 degrees at the top and 180 at the bottom.
+    `turns` are the angles from the reference to the views in degrees, of both signs; 0 is at the
+    top. Every third view has a thumbnail with its score, the best one among them.
     """
     figure = plt.figure(figsize=(7, 7))
     circle = figure.add_axes((0.25, 0.25, 0.5, 0.5), projection="polar")

@@ -568,9 +568,8 @@ def show_residuals(
 ) -> Figure:
     """Show below each title the target with the reference's points, moved by a fit.
 
-    `views` and the `points` of matches are those of the reference and of the target. Discs mark the
-    partners of residuals below 0.2; of the other matches, every third has a line from the moved
-    point to its partner.
+    `views` and `points` of matches are those of the reference and of the target. Discs mark the
+    partners of residuals below 0.2; every third other moved point has a line to its partner.
     """
     camera = views[1].frame.camera
     figure, axes = show_images([pale(views[1].frame.rgb)] * len(fits), list(fits), size=4)
@@ -579,9 +578,7 @@ def show_residuals(
     for axis, fit in zip(axes, fits.values()):
         fitted = fit.apply(points[0])
         inliers = np.linalg.norm(fitted - points[1], axis=1) < _RESIDUAL
-        starts, partners = (
-            camera.project(camera.to_world(ends))[0] for ends in (fitted, points[1])
-        )
+        starts, partners = (camera.project(camera.to_world(p))[0] for p in (fitted, points[1]))
         lines = np.stack([starts, partners], axis=1)[~inliers][::3]
         style = {"linewidths": 1.5, "label": "moved point to partner, far apart (every third)"}
         axis.add_collection(LineCollection(lines, colors=VERMILLION, zorder=5, **style))

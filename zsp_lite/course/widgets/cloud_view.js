@@ -16,7 +16,7 @@ function render({ model, el }) {
   canvas.setAttribute("role", "img");
   el.append(canvas);
   const pen = canvas.getContext("2d");
-  let points, colours, crosses, view, zoom, pan, side, unit, ratio, n, depth, scheduled = false, held = null;
+  let points, colours, view, zoom, pan, side, unit, spots, scheduled = false, held = null;
 
   const project = (p) => {
     const at = [0, 3, 6].map((i) => view[i] * p[0] + view[i + 1] * p[1] + view[i + 2] * p[2]);
@@ -28,7 +28,6 @@ function render({ model, el }) {
   function updatePoints() {
     points = new Float32Array(bytes(model.get("points")).slice().buffer);
     colours = bytes(model.get("colours"));
-    crosses = bytes(model.get("crosses"));
     canvas.dataset.points = points.length / 3;
     schedule();
   }
@@ -48,49 +47,40 @@ function render({ model, el }) {
     scheduled = false;
     side = model.get("side");
     unit = side * FILL * zoom;
-    ratio = window.devicePixelRatio || 1;
-    n = Math.round(side * ratio);
-    if (canvas.width !== n) canvas.width = canvas.height = n;
+    const ratio = window.devicePixelRatio || 1;
+    canvas.width = canvas.height = side * ratio; // also clears it
     canvas.style.width = canvas.style.height = `${side}px`;
+    pen.scale(ratio, ratio);
     drawSpots();
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    for (const [p, q] of model.get("lines") ?? []) {
-      outlined(`M${project(p).slice(0, 2)}L${project(q).slice(0, 2)}`, [2, 1], "#D55E00");
+    for (const ends of model.get("lines") ?? []) {
+      outlined("M" + ends.map((end) => project(end).slice(0, 2)).join("L"), [2, 1], "#D55E00");
     }
-    model.get("marks").forEach((at, i) => drawMark(at, i + 1));
     const cursor = model.get("cursor");
     if (cursor.length) {
       const [x, y] = project(cursor);
       outlined(`M${x - 14} ${y}h9m10 0h9M${x} ${y - 14}v9m0 10v9`, [5, 2]);
     }
+    model.get("marks").forEach(drawMark); // last, as it leaves dashes and transparency
     canvas.dataset.marks = model.get("marks").length;
     canvas.dataset.cursor = cursor.join(" ");
     canvas.setAttribute("aria-label", model.get("alt"));
   }
 
-  // Draw the points with hidden ones removed, paler with depth; keep the depth of every pixel.
+  // Draw the points, far ones first, paler with depth.
   function drawSpots() {
-    depth = new Float32Array(n * n).fill(Infinity);
-    const picture = pen.createImageData(n, n);
-    const pixels = new Uint32Array(picture.data.buffer).fill(0xffffffff);
-    const reach = Math.max(1, Math.round((SPOT * unit * ratio) / 2));
-    for (let i = 0; i < points.length; i += 3) {
-      const [x, y, z] = project(points.subarray(i, i + 3));
-      const [column, row] = [Math.round(x * ratio), Math.round(y * ratio)];
+    spots = [];
+    for (let i = 0; i < points.length; i += 3) spots.push([...project(points.subarray(i, i + 3)), i]);
+    spots.sort((a, b) => b[2] - a[2]);
+    const radius = Math.max(1, (SPOT * unit) / 2);
+    Object.assign(pen, { font: `${5 * radius}px sans-serif`, textAlign: "center", textBaseline: "middle" });
+    for (const [x, y, z, i] of spots) {
       const pale = clamp(0.15 + 0.3 * z, 0, 0.45);
-      const [r, g, b] = [0, 1, 2].map((k) => colours[i + k] + pale * (255 - colours[i + k]));
-      const colour = (255 << 24) | (b << 16) | (g << 8) | r;
-      const cross = crosses[i / 3];
-      const arm = cross ? reach + 1 : reach;
-      for (let v = Math.max(row - arm, 0); v <= Math.min(row + arm, n - 1); v++) {
-        for (let u = Math.max(column - arm, 0); u <= Math.min(column + arm, n - 1); u++) {
-          const [du, dv] = [Math.abs(u - column), Math.abs(v - row)];
-          if (cross ? Math.abs(du - dv) > 0.5 * ratio : du * du + dv * dv > reach * (reach + 1)) continue;
-          if (z < depth[v * n + u]) [depth[v * n + u], pixels[v * n + u]] = [z, colour];
-        }
-      }
+      pen.fillStyle = `rgb(${[0, 1, 2].map((k) => colours[i + k] + pale * (255 - colours[i + k]))})`;
+      pen.beginPath();
+      if (i / 3 < model.get("discs")) pen.arc(x, y, radius, 0, 7);
+      else pen.fillText("×", x, y);
+      pen.fill();
     }
-    pen.putImageData(picture, 0, 0);
   }
 
   // Draw a path, in SVG's words, with a white outline.
@@ -102,10 +92,9 @@ function render({ model, el }) {
   }
 
   // Draw a number in a disc beside its point; the outline is dashed where the cloud hides the point.
-  function drawMark(at, number) {
+  function drawMark(at, index) {
     const [x, y, z] = project(at);
-    const pixel = clamp(Math.round(y * ratio), 0, n - 1) * n + clamp(Math.round(x * ratio), 0, n - 1);
-    const hidden = z > depth[pixel] + 0.12;
+    const hidden = spots.some((spot) => Math.hypot(spot[0] - x, spot[1] - y) < 4 && spot[2] < z - 0.12);
     const [left, top] = [clamp(x + 15, 10, side - 10), clamp(y - 15, 10, side - 10)];
     pen.globalAlpha = hidden ? 0.6 : 1;
     pen.setLineDash(hidden ? [3, 2] : []);
@@ -115,12 +104,8 @@ function render({ model, el }) {
     pen.fillStyle = "white";
     pen.fill();
     pen.stroke();
-    pen.setLineDash([]);
-    pen.fillStyle = "black";
-    pen.font = "bold 12px sans-serif";
-    [pen.textAlign, pen.textBaseline] = ["center", "middle"];
-    pen.fillText(number, left, top + 0.5);
-    pen.globalAlpha = 1;
+    Object.assign(pen, { fillStyle: "black", font: "bold 12px sans-serif" });
+    pen.fillText(index + 1, left, top + 0.5);
   }
 
   // Rotate the view by angles about the vertical axis of the screen, then about the horizontal one.
@@ -135,7 +120,7 @@ function render({ model, el }) {
     model.set("view", view);
   }
 
-  function zoomBy(factor, x, y) {
+  function zoomBy(factor, x = side / 2, y = x) {
     const next = clamp(zoom * factor, 0.4, 20);
     pan = pan.map((p, k) => p + ([x, y][k] - side / 2 - p) * (1 - next / zoom));
     zoom = next;
@@ -159,9 +144,9 @@ function render({ model, el }) {
   });
   canvas.addEventListener("pointerup", (event) => {
     if (!held) return;
-    const still = !held.moved;
+    const { moved } = held;
     held = null;
-    if (!still) return model.save_changes();
+    if (moved) return model.save_changes();
     const at = [event.offsetX, event.offsetY].map((x, k) => (x - side / 2 - pan[k]) / unit);
     model.send({ at, view, reach: 9 / unit });
   });
@@ -174,18 +159,19 @@ function render({ model, el }) {
     zoomBy(Math.exp(-clamp(event.deltaY, -100, 100) * 0.002), event.offsetX, event.offsetY);
   }, { passive: false });
   canvas.addEventListener("keydown", (event) => {
-    const by = { ArrowLeft: [-0.12, 0], ArrowRight: [0.12, 0], ArrowUp: [0, -0.12], ArrowDown: [0, 0.12] }[event.key];
-    if (by) {
-      turn(...by);
-      model.save_changes();
-    } else if (event.key === "+" || event.key === "-") zoomBy(event.key === "+" ? 1.2 : 1 / 1.2, side / 2, side / 2);
-    else return;
+    const act = {
+      ArrowLeft: () => turn(-0.12, 0), ArrowRight: () => turn(0.12, 0), "+": () => zoomBy(1.2),
+      ArrowUp: () => turn(0, -0.12), ArrowDown: () => turn(0, 0.12), "-": () => zoomBy(1 / 1.2),
+    }[event.key];
+    if (!act) return;
+    act();
+    model.save_changes();
     event.preventDefault();
     event.stopPropagation();
     schedule();
   });
 
-  model.on("change:points change:colours change:crosses", updatePoints);
+  model.on("change:points change:colours change:discs", updatePoints);
   model.on("change:view", () => { if (!held) { view = model.get("view"); schedule(); } });
   model.on("change:view_resets", resetView);
   model.on("change:marks change:cursor change:alt change:side", schedule);
@@ -193,25 +179,33 @@ function render({ model, el }) {
   resetView();
 }
 
+const STYLE = `<style>
+.zsp-turning { display: flex; flex-wrap: wrap; gap: 6px 16px; font-size: 14px; line-height: 1.4; }
+.zsp-turning figure { flex: 1 1 260px; max-width: 360px; min-width: 0; margin: 0; }
+.zsp-turning p { flex: 1 0 100%; margin: 0; }
+.zsp-turning b { padding: 0 1.5em; margin-right: 0.5em; background: linear-gradient(90deg, #fde725, #21918c, #440154); }
+.zsp-turning canvas { display: block; background: white; cursor: grab; touch-action: pan-y; }
+</style>`;
+
 // Show clouds that a page stores, beside each other: they turn together.
-function stored(el, { panels, legend, alt }) {
+function stored(el, panels, alt) {
   const listeners = [];
   const redraw = () => listeners.forEach((listener) => listener());
   const decoded = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt());
   let view = [1, 0, 0, 0, 1, 0, 0, 0, 1];
-  for (const { title, points, colours, lines } of panels) {
+  for (const [title, points, colours, lines] of panels) {
     const box = el.appendChild(document.createElement("figure"));
     box.append(title);
     const state = {
       points: Float32Array.from(new Int16Array(decoded(points).buffer), (x) => x / 8192),
-      colours: decoded(colours), crosses: [], marks: [], cursor: [], lines, alt: `${title}: ${alt}`,
+      colours: decoded(colours), discs: Infinity, marks: [], cursor: [], lines, alt: `${title}: ${alt}`,
     };
     const get = (name) => ({ ...state, view, side: box.clientWidth - 2 })[name];
     const set = (_, value) => { view = value; redraw(); };
     const on = (name, listener) => { if (name === "change:view") listeners.push(listener); };
     render({ el: box, model: { get, set, on, save_changes() {}, send() {} } });
   }
-  el.insertAdjacentHTML("beforeend", legend);
+  el.insertAdjacentHTML("beforeend", `${STYLE}<p><b></b>${alt}</p>`);
   new ResizeObserver(redraw).observe(el);
 }
 

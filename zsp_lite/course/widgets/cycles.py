@@ -32,8 +32,8 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
         draw(axes, cells, grid)
         text = (
             f"u {cells[0]} → v {cells[1]}, cosine {values[u, v]:.2f} → u' {cells[2]}, cosine "
-            f"{values[w, v]:.2f}: "
-            f"d(u, u') = {np.hypot(*np.subtract(cells[0], cells[2])):.1f} patches"
+            f"{values[w, v]:.2f}: d(u, u') = {np.hypot(*np.subtract(cells[0], cells[2])):.1f} "
+            "patches"
         )
         off = []
         for name, cell, view in zip(("u", "v", "u'"), cells, (reference, target, reference)):
@@ -46,8 +46,5 @@ def cycle(reference: View, target: View, sim: Float[Tensor, "n1 n2"]) -> Widget:
     # It begins at the foreground patch with the most similar neighbour; -2 is below every cosine.
     similar = np.where(reference.foreground, values.max(1).reshape(grid), -2)
     start = divmod(int(similar.argmax()), grid[1])
-    alt = (
-        "A solid arrow from the patch u to its nearest neighbour v, a dashed arrow from v to the "
-        "patch u'."
-    )
+    alt = "A solid arrow from the patch u to its nearest neighbour v, a dashed one from v to u'"
     return interactive_figure(figure, patch_sliders(grid, start, " of u"), update, alt)

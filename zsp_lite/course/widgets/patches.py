@@ -31,12 +31,8 @@ def patch_similarities(
     """Show how similar one patch is to all patches of the target, its nearest neighbour and its
     true match.
 
-    Args:
-        reference: Image of the reference.
-        target: Image of the target.
-        sims: Similarities of all pairs of patches, by the name of their kind.
-        cells: True match (row, col) of each reference patch, as of `ground_truth_matches`.
-        valid: Whether a reference patch has a true match.
+    `sims` has similarities of all pairs of patches by the name of their kind; `cells` and `valid`
+    are those of `ground_truth_matches`.
     """
     grid = valid.shape
     figure, axes = plots.show_images(
@@ -76,10 +72,9 @@ def patch_similarities(
             distance = np.abs(np.subtract(nearest, cells[row, col])).max()
             true = f"true match ({true_row}, {true_col}), distance {distance} patches"
         return (
-            f"{kind}: nearest neighbour {nearest}, cosine {similar[nearest]:.2f}; {true}. Of "
-            f"the {valid.sum()} patches "
-            f"with a true match, {share_correct(kind):.0%} have their nearest neighbour "
-            "within one patch of it."
+            f"{kind}: nearest neighbour {nearest}, cosine {similar[nearest]:.2f}; {true}. Of the "
+            f"{valid.sum()} patches with a true match, {share_correct(kind):.0%} have their "
+            "nearest neighbour within one patch of it."
         )
 
     # It begins at the patch with a true match that is nearest to the middle of all of them.
@@ -88,8 +83,5 @@ def patch_similarities(
     middle = tuple(known[off_middle.argmin()].tolist())
     kinds = load_package().Dropdown(options=list(sims), description="similarity")
     controls = {**patch_sliders(grid, middle), "kind": kinds}
-    alt = (
-        "A patch of the reference; its similarities, nearest neighbour and true match in the "
-        "target."
-    )
+    alt = "A patch of the reference, and its nearest neighbour and true match in the target"
     return interactive_figure(figure, controls, update, alt)

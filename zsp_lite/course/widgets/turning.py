@@ -8,26 +8,30 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Real
 
+from zsp_lite.alignment import Sim3
+from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.viz.plots import coordinate_colours, object_cloud
 
-CLOUD_VIEW = (Path(__file__).parent / "cloud_view.js").read_text(encoding="utf-8")
-_PAGE = """<div data-lm-suppress-shortcuts="true"><div class="zsp-turning"></div><style>
-.zsp-turning { display: flex; flex-wrap: wrap; gap: 6px 16px; font-size: 14px; line-height: 1.4; }
-.zsp-turning figure { flex: 1 1 260px; max-width: 360px; min-width: 0; margin: 0; }
-.zsp-turning p { flex: 1 0 100%%; margin: 0; }
-.zsp-turning b { padding: 0 1.5em; background: linear-gradient(90deg, #fde725, #21918c, #440154); }
-.zsp-turning canvas { display: block; background: white; cursor: grab; touch-action: pan-y; }
-</style><script>(() => {\n%s})()</script></div>"""
-_CALL = 'stored(document.currentScript.parentElement.querySelector(".zsp-turning"), %s);'
-_TURN = "Drag or press arrow keys to turn, + and − to zoom."
+SCRIPT = (Path(__file__).parent / "cloud_view.js").read_text(encoding="utf-8")
+_PAGE = """<div data-lm-suppress-shortcuts="true"><div class="zsp-turning"></div>
+<script>(() => {\n%s})()</script></div>"""
+_CALL = 'stored(document.currentScript.parentElement.querySelector(".zsp-turning"), %s, %s);'
+_Lines = Mapping[str, Real[np.ndarray, "k 2 3"]]
 
 
-def show_turning(
-    poses: Mapping[str, PoseEstimate],
-    legend: str,
-    lines: Mapping[str, Real[np.ndarray, "k 2 3"]] = {},
-) -> None:
+def view_units(points: Real[np.ndarray, "n 3"]) -> Sim3:
+    """Return the similarity from the world to view units, in which a cloud fills the unit ball,
+    except for outliers: the ball is around the box from the 1st to the 99th percentile."""
+    low, high = np.percentile(points, [1, 99], axis=0) if len(points) else np.zeros((2, 3))
+    radius = float(np.linalg.norm(high - low)) / 2
+    if not radius >= 1e-12:  # also for a radius that is NaN, for which `<` is false
+        text = f"point cloud of {len(points)} points has no extent, expected finite points"
+        raise InputError(text)
+    return Sim3(1 / radius, np.eye(3), -(low + high) / 2 / radius)
+
+
+def show_turning(poses: Mapping[str, PoseEstimate], legend: str, lines: _Lines = {}) -> None:
     """Show, by title, the target and the moved points of the reference as clouds that turn
     together; nothing where no script runs.
 
@@ -45,14 +49,13 @@ def show_turning(
             column, row = view.frame.camera.project(world)[0].astype(int).T
             clouds.append(one.target_camera.to_camera(world))
             colours.append(view.frame.rgb[row, column] / 2 + 127)  # pale
-        corners = np.percentile(np.concatenate(clouds[1:]), [0, 100], axis=0)
-        middle, unit = corners.mean(axis=0), np.linalg.norm(np.ptp(corners, axis=0)) / 2
-        points = (np.concatenate(clouds) - middle) / unit
-        parts = (8192 * points.clip(-3.9, 3.9)).astype("<i2"), np.concatenate(colours).astype("u1")
-        panel = dict(zip(("points", "colours"), (b64encode(part).decode() for part in parts)))
-        joined = ((lines.get(title, np.zeros((0, 2, 3))) - middle) / unit).round(3).tolist()
-        panels.append({"title": title, "lines": joined, **panel})
-    alt = f"{legend}. {_TURN}"
-    state = {"panels": panels, "alt": alt, "legend": f"<p><b></b> {alt}</p>"}
-    script = CLOUD_VIEW.replace("export default { render };", _CALL % json.dumps(state))
-    display(HTML(_PAGE % script))
+        to_view = view_units(np.concatenate(clouds[1:]))
+        points = (8192 * to_view.apply(np.concatenate(clouds)).clip(-3.9, 3.9)).astype("<i2")
+        parts = [
+            b64encode(part).decode() for part in (points, np.concatenate(colours).astype("u1"))
+        ]
+        joined = to_view.apply(lines.get(title, np.zeros((0, 2, 3)))).round(3).tolist()
+        panels.append([title, *parts, joined])
+    alt = f"{legend}. Drag or press arrow keys to turn, + and − to zoom."
+    call = _CALL % (json.dumps(panels), json.dumps(alt))
+    display(HTML(_PAGE % SCRIPT.replace("export default { render };", call)))
