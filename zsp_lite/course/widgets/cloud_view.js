@@ -184,7 +184,7 @@ const STYLE = `<style>
 .zsp-turning figure { flex: 1 1 260px; max-width: 360px; min-width: 0; margin: 0; }
 .zsp-turning p { flex: 1 0 100%; margin: 0; }
 .zsp-turning b { padding: 0 1.5em; margin-right: 0.5em; background: linear-gradient(90deg, #fde725, #21918c, #440154); }
-.zsp-turning canvas { display: block; background: white; cursor: grab; touch-action: pan-y; }
+.zsp-turning canvas { display: block; border: 1px solid #888; background: white; cursor: grab; touch-action: pan-y; }
 </style>`;
 
 // Show clouds that a page stores, beside each other: they turn together.
