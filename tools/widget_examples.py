@@ -1,4 +1,20 @@
-"""Every widget on sample data, for the tests."""
+"""Every widget on sample data, for the tests.
+
+How to write a widget:
+
+- Write one function that takes computed data (views, matrices, errors), draws a matplotlib figure
+  once, and returns `interactive_figure(...)`.
+- Its `update` callback is called when a control moves. It changes existing artists (`set_data`,
+  `set_offsets`, `set_text`), or draws a primitive of `viz.plots` anew (`redrawing`). Expensive
+  results are computed before.
+- `update` returns a caption with the numbers that the figure shows, also for readers who cannot see
+  it or its colours.
+- The latency of a control should be at most 150 ms. Keep figures below about 9 by 4 inches.
+- The figure is a PNG in an image widget, which every frontend shows. Patches and points are chosen
+  by sliders, which work by keyboard.
+- The notebook shows a static figure as well (`show`), because widgets need a running kernel.
+- Add an example here.
+"""
 
 import shutil
 from collections.abc import Callable

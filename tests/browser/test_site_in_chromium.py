@@ -70,3 +70,15 @@ def test_notes_are_shown_in_the_presenters_view_alone(windows):
         for note in notes:
             assert note in presenter.inner_text("article")
             assert note not in page.inner_text("main")
+
+
+def test_the_clouds_of_a_lesson_turn_together(browser, site):
+    page = browser.new_page()
+    page.goto((site / "notebooks/00_quickstart.html").as_uri())
+    clouds = page.locator(".zsp-turning canvas")
+    place = "cloud => cloud.pointOnCanvas(0)[0]"
+    places = {clouds.last.evaluate(place)}
+    clouds.first.drag_to(clouds.first, target_position={"x": 50, "y": 90})
+    places.add(clouds.last.evaluate(place))
+    clouds.last.press("ArrowRight")
+    assert len(places | {clouds.first.evaluate(place)}) == 3

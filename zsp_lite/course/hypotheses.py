@@ -1,41 +1,14 @@
-"""What the lesson on hypotheses computes beside the library: a full turn of a pose, and the answers
-of several objects."""
+"""What the lesson on hypotheses computes beside the library, of the answers of several objects."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
-import torch
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from zsp_lite.metrics import SAME_ANGLE, rotation_angle
 from zsp_lite.scans.category import PairHypotheses
-from zsp_lite.verified.poses import Poses
-from zsp_lite.verified.solver import Solution
-from zsp_lite.verified.verification import ScoreCoefficients, score_terms
 
 _Rotations = Mapping[str, Float[np.ndarray, "3 3"]]  # of objects, by their names
-
-
-def full_turn(
-    solution: Solution,
-) -> tuple[Float[np.ndarray, " n"], Poses, Float[np.ndarray, " n"]]:
-    """Turn the best pose of a solution by a full circle, in steps of 5 degrees, about the axis that
-    leads to the second.
-
-    Returns the angles in degrees, the turned poses, and their scores.
-    """
-    best = solution.poses[[0]]
-    first, second = solution.poses.rotation[:2].double().numpy()
-    axis = Rotation.from_matrix(second @ first.T).as_rotvec()
-    degrees = np.arange(0, 365, 5.0)
-    vectors = np.outer(np.radians(degrees), axis / np.linalg.norm(axis))
-    turns = torch.from_numpy(Rotation.from_rotvec(vectors).as_matrix()).float()
-    # The turn is about the origin of the scene, which is amid the object.
-    shift = (turns @ best.translation[..., None])[..., 0]
-    turned = Poses(best.scale.expand(len(turns)), turns @ best.rotation, shift)
-    scores = ScoreCoefficients().score(score_terms(solution.scene, turned))
-    return degrees, turned, scores.numpy()
 
 
 def draw_answers(every: Iterable[PairHypotheses], seed: int) -> list[PairHypotheses]:
@@ -65,26 +38,17 @@ def spanning_tree(answers: Sequence[PairHypotheses]) -> dict[str, Float[np.ndarr
     return {name: placed[name] for name in names}
 
 
-def surest_right(
-    answers: Sequence[PairHypotheses], truth: _Rotations
-) -> dict[tuple[str, str], bool]:
-    """Say of each ordered pair whether its surest answer is right.
+def right_answers(
+    answers: Sequence[PairHypotheses], truth: _Rotations, rotations: _Rotations | None = None
+) -> dict[tuple[str, str], bool | None]:
+    """Say of each ordered pair whether its surest answer is right, or the one that fits
+    `rotations`; None if none fits.
 
     `truth` leads from the objects' worlds to a common frame.
     """
-    return {
-        (one.reference, one.target): bool(_angles(one, truth)[0] < SAME_ANGLE) for one in answers
-    }
-
-
-def fitting_right(
-    answers: Sequence[PairHypotheses], truth: _Rotations, rotations: _Rotations
-) -> dict[tuple[str, str], bool | None]:
-    """Say of each ordered pair whether the answer that fits `rotations` is right; None if none
-    fits."""
     right = {}
     for one in answers:
-        away = _angles(one, rotations)
+        away = _angles(one, rotations) if rotations else np.zeros(1)
         nearest = away.argmin()
         is_right = bool(_angles(one, truth)[nearest] < SAME_ANGLE)
         right[one.reference, one.target] = is_right if away[nearest] <= SAME_ANGLE else None

@@ -26,10 +26,7 @@ from zsp_lite.viz.report import PhotographSection
 
 _COLUMNS = ("foreground", "solver", "front off by", "up off by", "confidence")
 # Values of the setting `foreground` of `ZeroShotPose`, and their names in tables and figures.
-_FOREGROUNDS = {
-    "mask": "mask",
-    "saliency": "own saliency",
-}
+_FOREGROUNDS = {"mask": "mask", "saliency": "own saliency"}
 _SOLVERS = ("paper", "verified")
 _POINTS = 1500  # largest number of points that are drawn of the aligned cloud
 # Length of the arrows; the points of the photographed motorcycle have unit standard deviation.

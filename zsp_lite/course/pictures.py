@@ -17,24 +17,9 @@ def show_winners(gains: Mapping[str, np.ndarray], true_gain: float) -> Figure:
         height = row + np.linspace(-0.28, 0.28, len(values))
         wins = np.asarray(values) > 0
         better, worse = ("", "") if row else ("better method wins", "it does not")
-        axis.scatter(
-            values[wins],
-            height[wins],
-            s=42,
-            color=BLUE,
-            edgecolors="white",
-            linewidths=0.5,
-            label=better,
-        )
-        axis.scatter(
-            values[~wins],
-            height[~wins],
-            s=46,
-            color=VERMILLION,
-            marker="x",
-            linewidths=2.2,
-            label=worse,
-        )
+        axis.plot(values[wins], height[wins], "o", color=BLUE, label=better)
+        style = {"color": VERMILLION, "markeredgewidth": 2.2, "label": worse}
+        axis.plot(values[~wins], height[~wins], "x", **style)
     axis.axvline(0, color="0.3", linewidth=1)
     axis.axvline(true_gain, color=GREEN, linestyle="--", label="true gain")
     axis.set_yticks(range(len(gains)), gains)

@@ -3,23 +3,25 @@
 from collections.abc import Mapping
 from typing import Any
 
-import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch
 
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.scans.shapes import Shape
 from zsp_lite.viz.category_sheet import nearest_crop
-from zsp_lite.viz.plots import BLUE, GREEN, VERMILLION, draw_image
+from zsp_lite.viz.plots import GREEN, VERMILLION, draw_image
 
 # Pictures stand on a circle of radius 1; half the width of a picture, and how far from its middle
 # arrows end.
 _PICTURE = 0.34
 _ENDS = 0.42
-_ARROWS = {True: (GREEN, "-"), False: (VERMILLION, "--"), None: ("0.6", ":")}
+# Of right answers, of wrong ones, and where none fits.
+_ARROWS = {
+    True: (GREEN, "-", "right answer"),
+    False: (VERMILLION, "--", "wrong answer"),
+    None: ("0.6", ":", ""),
+}
 
 
 def curve_above_pictures(
@@ -51,27 +53,11 @@ def curve_above_pictures(
     return figure, [axes[place] for place in places]
 
 
-def from_the_side(first: Shape, second: Shape, pose: np.ndarray) -> np.ndarray:
-    """Return a picture of the points of two upright shapes from their long side, the first in
-    orange after a pose (4, 4), the second in blue."""
-    length = np.linalg.svd(second.points[:, :2], full_matrices=False)[2][0]
-    picture = np.full((150, 300, 3), 255, np.uint8)
-    moved = first.points @ pose[:3, :3].T + pose[:3, 3]
-    for points, colour in ((second.points, BLUE), (moved, VERMILLION)):
-        column = 150 + 55 * (points[:, :2] @ length)
-        row = 75 - 55 * points[:, 2]
-        for at in np.stack([column, row], axis=1).round().astype(int).tolist():
-            cv2.circle(picture, at, 2, [int(colour[k : k + 2], 16) for k in (1, 3, 5)], -1)
-    return picture
-
-
 def show_graphs(
     graphs: Mapping[str, tuple[Mapping[str, np.ndarray], Mapping[tuple[str, str], bool | None]]],
 ) -> Figure:
-    """Show for each title named pictures on a circle, with arrows between them.
-
-    An arrow is green if it is true, red and dashed if it is false, grey and dotted if it is None.
-    """
+    """Show for each title named pictures on a circle, with arrows between them: True is green,
+    False red and dashed, None grey and dotted."""
     size = (4.1 * len(graphs), 4.4)
     figure, axes = plt.subplots(1, len(graphs), figsize=size, layout="constrained", squeeze=False)
     for axis, (title, (pictures, arrows)) in zip(axes.flat, graphs.items()):
@@ -85,22 +71,23 @@ def show_graphs(
         for (start, end), right in arrows.items():
             along = centres[end] - centres[start]
             gap = _ENDS * along / np.linalg.norm(along)
-            colour, line = _ARROWS[right]
+            colour, line, _ = _ARROWS[right]
             # Curved, so that two opposite arrows can be told apart.
-            arrow = FancyArrowPatch(
-                centres[start] + gap,
-                centres[end] - gap,
-                arrowstyle="-|>",
-                mutation_scale=16,
-                connectionstyle="arc3,rad=0.12",
-                color=colour,
-                linestyle=line,
-                linewidth=2.2,
-                zorder=1,
-            )
-            axis.add_patch(arrow)
+            style = {
+                "arrowstyle": "-|>",
+                "connectionstyle": "arc3,rad=0.12",
+                "mutation_scale": 16,
+                "color": colour,
+                "linestyle": line,
+                "linewidth": 2.2,
+            }
+            ends = centres[end] - gap, centres[start] + gap
+            axis.annotate("", *ends, arrowprops=style, zorder=1)
         axis.set(xlim=(-1.1, 1.1), ylim=(-1.15, 1.1), aspect="equal", title=title)
         axis.set_axis_off()
+    for colour, line, name in _ARROWS.values():
+        axes[0, 0].plot([], [], line, color=colour, label=name)
+    figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 

@@ -37,12 +37,8 @@ class GroundTruthPair:
 def patch_coordinates(
     frame: Frame, pose: ObjectPose, grid: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
-    """Return the box coordinates of the object point that each patch shows, and the patches with
-    known coordinates.
-
-    Coordinates are known where the mask covers a quarter of the patch, one of its object pixels has
-    depth, and the point is inside the box.
-    """
+    """Return the box coordinates of the object point that each patch shows, and where they are
+    known: the mask covers a quarter of the patch, and an object pixel has depth inside the box."""
     # Only object pixels count: the floor between the spokes of a bicycle is inside the box, too.
     points, measured = patch_points(
         np.where(frame.mask > _MASK_THRESHOLD, frame.depth, 0), frame.camera, grid
@@ -56,11 +52,10 @@ def ground_truth_matches(
     reference: tuple[Float[np.ndarray, "r1 c1 3"], Bool[np.ndarray, "r1 c1"]],
     target: tuple[Float[np.ndarray, "r2 c2 3"], Bool[np.ndarray, "r2 c2"]],
 ) -> tuple[Int[np.ndarray, "r1 c1 2"], Bool[np.ndarray, "r1 c1"]]:
-    """Match each reference patch to the target patch with the nearest box coordinates, at most 0.1
-    away.
+    """Match each reference patch to the target patch with the nearest of the `patch_coordinates`,
+    at most 0.1 away.
 
-    `reference` and `target` are results of `patch_coordinates`. Returns the target patch (row, col)
-    of each reference patch, (0, 0) without a match, and the reference patches that have one.
+    Returns the target patch of each reference patch, (0, 0) without a match, and which have one.
     """
     points, known = reference
     target_points, target_known = target

@@ -567,31 +567,25 @@ def show_residuals(
     points: Sequence[Real[np.ndarray, "n 3"]],
     fits: Mapping[str, Sim3],
 ) -> Figure:
-    """Show the reference, and below each title the target with the reference's points, moved by a
-    fit.
+    """Show below each title the target with the reference's points, moved by a fit.
 
-    `views` and the `points` of matches are those of the reference and of the target. Lines join
-    fitted points to their partners; discs mark residuals below 0.2, in the reference those of the
-    last fit, crosses the others.
+    `views` and `points` of matches are those of the reference and of the target. Discs mark the
+    partners of residuals below 0.2; every third other moved point has a line to its partner.
     """
-    target = views[1].frame
-    images = [views[0].frame.rgb, *[target.rgb] * len(fits)]
-    titles = ["reference", *fits]
-    figure, axes = show_images([pale(image) for image in images], titles, columns=2, size=3.6)
-    cameras = [target.camera] * len(fits)
+    camera = views[1].frame.camera
+    figure, axes = show_images([pale(views[1].frame.rgb)] * len(fits), list(fits), size=4)
     cloud = object_cloud(views[0], most=900)
-    draw_moved_cloud(axes[1:], cameras, cloud, list(fits.values()), names=None, size=5)
-    partners = target.camera.project(target.camera.to_world(points[1]))[0]
-    for axis, fit in zip(axes[1:], fits.values()):
+    draw_moved_cloud(axes, [camera] * len(fits), cloud, list(fits.values()), names=None, size=5)
+    for axis, fit in zip(axes, fits.values()):
         fitted = fit.apply(points[0])
         inliers = np.linalg.norm(fitted - points[1], axis=1) < _RESIDUAL
-        starts = target.camera.project(target.camera.to_world(fitted))[0]
-        lines = np.stack([starts, partners], axis=1)
-        colours = np.where(inliers, BLUE, VERMILLION)
-        axis.add_collection(LineCollection(lines, colors=colours, linewidths=0.8, zorder=5))
-        _mark_matches(axis, partners, inliers)
-    camera = views[0].frame.camera
-    _mark_matches(axes[0], camera.project(camera.to_world(points[0]))[0], inliers)
+        starts, partners = (camera.project(camera.to_world(p))[0] for p in (fitted, points[1]))
+        lines = np.stack([starts, partners], axis=1)[~inliers][::3]
+        style = {"linewidths": 1.5, "label": "moved point to partner, far apart (every third)"}
+        axis.add_collection(LineCollection(lines, colors=VERMILLION, zorder=5, **style))
+        style = {"edgecolors": "white", "label": "partner that the moved point meets"}
+        axis.scatter(*partners[inliers].T, 45, BLUE, zorder=6, **style)
+    _legend(figure, axes[0], "outside lower center")
     return figure
 
 

@@ -1,9 +1,5 @@
 """Widgets for the notebooks: one function each, from computed data to sliders above a figure (see
-`common`).
-
-`self_check` shows questions with instant feedback. `tools/widget_examples.py` builds every widget
-on sample data.
-"""
+`common`), and questions with instant feedback, `self_check`."""
 
 from zsp_lite.course.widgets.quiz import self_check
 

@@ -7,17 +7,6 @@ const SLACK = 4; // largest movement within a click, in pixels
 
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 
-// Row-major 3x3 times row-major 3x3.
-const times = (a, b) =>
-  [0, 3, 6].flatMap((i) => [0, 1, 2].map((j) => a[i] * b[j] + a[i + 1] * b[j + 3] + a[i + 2] * b[j + 6]));
-
-// Rotate the view by dx radians about the vertical axis of the screen, then by dy about the horizontal one.
-function rotated(view, dx, dy) {
-  const [c, s, d, t] = [Math.cos(dx), Math.sin(dx), Math.cos(dy), Math.sin(dy)];
-  return times(times([1, 0, 0, 0, d, -t, 0, t, d], [c, 0, -s, 0, 1, 0, s, 0, c]), view);
-}
-
-const floats = (data) => new Float32Array(data.buffer.slice(data.byteOffset, data.byteOffset + data.byteLength));
 const bytes = (data) => new Uint8Array(data.buffer, data.byteOffset, data.byteLength);
 
 function render({ model, el }) {
@@ -27,7 +16,7 @@ function render({ model, el }) {
   canvas.setAttribute("role", "img");
   el.append(canvas);
   const pen = canvas.getContext("2d");
-  let points, colours, crosses, view, zoom, pan, side, unit, scheduled = false, held = null;
+  let points, colours, view, zoom, pan, side, unit, spots, scheduled = false, held = null;
 
   const project = (p) => {
     const at = [0, 3, 6].map((i) => view[i] * p[0] + view[i + 1] * p[1] + view[i + 2] * p[2]);
@@ -37,9 +26,8 @@ function render({ model, el }) {
   canvas.pointOnCanvas = (index) => project(points.subarray(3 * index, 3 * index + 3)).slice(0, 2);
 
   function updatePoints() {
-    points = floats(model.get("points"));
+    points = new Float32Array(bytes(model.get("points")).slice().buffer);
     colours = bytes(model.get("colours"));
-    crosses = bytes(model.get("crosses"));
     canvas.dataset.points = points.length / 3;
     schedule();
   }
@@ -60,98 +48,81 @@ function render({ model, el }) {
     side = model.get("side");
     unit = side * FILL * zoom;
     const ratio = window.devicePixelRatio || 1;
-    const n = Math.round(side * ratio);
-    if (canvas.width !== n) canvas.width = canvas.height = n;
+    canvas.width = canvas.height = side * ratio; // also clears it
     canvas.style.width = canvas.style.height = `${side}px`;
-    const depth = spots(n, ratio);
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    model.get("marks").forEach((at, i) => drawMark(at, i + 1, depth, n, ratio));
+    pen.scale(ratio, ratio);
+    drawSpots();
+    for (const ends of model.get("lines") ?? []) {
+      outlined("M" + ends.map((end) => project(end).slice(0, 2)).join("L"), [2, 1], "#D55E00");
+    }
     const cursor = model.get("cursor");
-    if (cursor.length) drawCursor(project(cursor));
+    if (cursor.length) {
+      const [x, y] = project(cursor);
+      outlined(`M${x - 14} ${y}h9m10 0h9M${x} ${y - 14}v9m0 10v9`, [5, 2]);
+    }
+    model.get("marks").forEach(drawMark); // last, as it leaves dashes and transparency
     canvas.dataset.marks = model.get("marks").length;
     canvas.dataset.cursor = cursor.join(" ");
     canvas.setAttribute("aria-label", model.get("alt"));
   }
 
-  // Draw the points with hidden ones removed, paler with depth; return the depth of every pixel.
-  function spots(n, ratio) {
-    const depth = new Float32Array(n * n).fill(Infinity);
-    const picture = pen.createImageData(n, n);
-    const pixels = new Uint32Array(picture.data.buffer).fill(0xffffffff);
-    const reach = Math.max(1, Math.round((SPOT * unit * ratio) / 2));
-    for (let i = 0; i < points.length; i += 3) {
-      const [x, y, z] = project(points.subarray(i, i + 3));
-      const [column, row] = [Math.round(x * ratio), Math.round(y * ratio)];
+  // Draw the points, far ones first, paler with depth.
+  function drawSpots() {
+    spots = [];
+    for (let i = 0; i < points.length; i += 3) spots.push([...project(points.subarray(i, i + 3)), i]);
+    spots.sort((a, b) => b[2] - a[2]);
+    const radius = Math.max(1, (SPOT * unit) / 2);
+    Object.assign(pen, { font: `${5 * radius}px sans-serif`, textAlign: "center", textBaseline: "middle" });
+    for (const [x, y, z, i] of spots) {
       const pale = clamp(0.15 + 0.3 * z, 0, 0.45);
-      const [r, g, b] = [0, 1, 2].map((k) => colours[i + k] + pale * (255 - colours[i + k]));
-      const colour = (255 << 24) | (b << 16) | (g << 8) | r;
-      const cross = crosses[i / 3];
-      const arm = cross ? reach + 1 : reach;
-      for (let v = Math.max(row - arm, 0); v <= Math.min(row + arm, n - 1); v++) {
-        for (let u = Math.max(column - arm, 0); u <= Math.min(column + arm, n - 1); u++) {
-          const [du, dv] = [Math.abs(u - column), Math.abs(v - row)];
-          if (cross ? Math.abs(du - dv) > 0.5 * ratio : du * du + dv * dv > reach * (reach + 1)) continue;
-          if (z < depth[v * n + u]) [depth[v * n + u], pixels[v * n + u]] = [z, colour];
-        }
-      }
+      pen.fillStyle = `rgb(${[0, 1, 2].map((k) => colours[i + k] + pale * (255 - colours[i + k]))})`;
+      pen.beginPath();
+      if (i / 3 < model.get("discs")) pen.arc(x, y, radius, 0, 7);
+      else pen.fillText("×", x, y);
+      pen.fill();
     }
-    pen.putImageData(picture, 0, 0);
-    return depth;
+  }
+
+  // Draw a path, in SVG's words, with a white outline.
+  function outlined(path, widths, colour = "black") {
+    for (const [k, strokeStyle] of ["white", colour].entries()) {
+      Object.assign(pen, { strokeStyle, lineWidth: widths[k] });
+      pen.stroke(new Path2D(path));
+    }
   }
 
   // Draw a number in a disc beside its point; the outline is dashed where the cloud hides the point.
-  function drawMark(at, number, depth, n, ratio) {
+  function drawMark(at, index) {
     const [x, y, z] = project(at);
-    const pixel = clamp(Math.round(y * ratio), 0, n - 1) * n + clamp(Math.round(x * ratio), 0, n - 1);
-    const hidden = z > depth[pixel] + 0.12;
+    const hidden = spots.some((spot) => Math.hypot(spot[0] - x, spot[1] - y) < 4 && spot[2] < z - 0.12);
     const [left, top] = [clamp(x + 15, 10, side - 10), clamp(y - 15, 10, side - 10)];
     pen.globalAlpha = hidden ? 0.6 : 1;
     pen.setLineDash(hidden ? [3, 2] : []);
-    for (const [width, colour] of [[4, "white"], [1.5, "black"]]) {
-      [pen.lineWidth, pen.strokeStyle] = [width, colour];
-      pen.beginPath();
-      pen.moveTo(x, y);
-      pen.lineTo(left, top);
-      pen.stroke();
-      pen.beginPath();
-      pen.arc(x, y, 3.5, 0, 7);
-      pen.stroke();
-    }
+    outlined(`M${x} ${y}L${left} ${top}M${x + 3.5} ${y}a3.5 3.5 0 1 0-7 0a3.5 3.5 0 1 0 7 0`, [4, 1.5]);
     pen.beginPath();
     pen.arc(left, top, 9, 0, 7);
     pen.fillStyle = "white";
     pen.fill();
     pen.stroke();
-    pen.setLineDash([]);
-    pen.fillStyle = "black";
-    pen.font = "bold 12px sans-serif";
-    [pen.textAlign, pen.textBaseline] = ["center", "middle"];
-    pen.fillText(number, left, top + 0.5);
-    pen.globalAlpha = 1;
+    Object.assign(pen, { fillStyle: "black", font: "bold 12px sans-serif" });
+    pen.fillText(index + 1, left, top + 0.5);
   }
 
-  function drawCursor([x, y]) {
-    for (const [width, colour] of [[5, "white"], [2, "black"]]) {
-      [pen.lineWidth, pen.strokeStyle] = [width, colour];
-      pen.beginPath();
-      for (const [a, b] of [[-14, -5], [5, 14]]) {
-        pen.moveTo(x + a, y);
-        pen.lineTo(x + b, y);
-        pen.moveTo(x, y + a);
-        pen.lineTo(x, y + b);
+  // Rotate the view by angles about the vertical axis of the screen, then about the horizontal one.
+  function turn(...angles) {
+    view = [...view];
+    for (const [i, angle] of angles.entries()) {
+      for (const k of [0, 1, 2]) {
+        const [a, b, c, s] = [view[3 * i + k], view[6 + k], Math.cos(angle), Math.sin(angle)];
+        [view[3 * i + k], view[6 + k]] = [c * a - s * b, s * a + c * b];
       }
-      pen.stroke();
     }
-  }
-
-  function sendView() {
     model.set("view", view);
-    model.save_changes();
   }
 
-  function zoomBy(factor, x, y) {
+  function zoomBy(factor, x = side / 2, y = x) {
     const next = clamp(zoom * factor, 0.4, 20);
-    pan = [pan[0], pan[1]].map((p, k) => p + ([x, y][k] - side / 2 - p) * (1 - next / zoom));
+    pan = pan.map((p, k) => p + ([x, y][k] - side / 2 - p) * (1 - next / zoom));
     zoom = next;
     schedule();
   }
@@ -168,14 +139,14 @@ function render({ model, el }) {
     if (!held.moved && Math.hypot(dx, dy) < SLACK) return;
     held = { x: event.offsetX, y: event.offsetY, moved: true };
     if (event.shiftKey) pan = [pan[0] + dx, pan[1] + dy];
-    else view = rotated(view, (2.4 * dx) / side, (2.4 * dy) / side);
+    else turn((2.4 * dx) / side, (2.4 * dy) / side);
     schedule();
   });
   canvas.addEventListener("pointerup", (event) => {
     if (!held) return;
-    const still = !held.moved;
+    const { moved } = held;
     held = null;
-    if (!still) return sendView();
+    if (moved) return model.save_changes();
     const at = [event.offsetX, event.offsetY].map((x, k) => (x - side / 2 - pan[k]) / unit);
     model.send({ at, view, reach: 9 / unit });
   });
@@ -188,23 +159,54 @@ function render({ model, el }) {
     zoomBy(Math.exp(-clamp(event.deltaY, -100, 100) * 0.002), event.offsetX, event.offsetY);
   }, { passive: false });
   canvas.addEventListener("keydown", (event) => {
-    const turn = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-    if (turn) {
-      view = rotated(view, 0.12 * turn[0], 0.12 * turn[1]);
-      sendView();
-    } else if (event.key === "+" || event.key === "-") zoomBy(event.key === "+" ? 1.2 : 1 / 1.2, side / 2, side / 2);
-    else return;
+    const act = {
+      ArrowLeft: () => turn(-0.12, 0), ArrowRight: () => turn(0.12, 0), "+": () => zoomBy(1.2),
+      ArrowUp: () => turn(0, -0.12), ArrowDown: () => turn(0, 0.12), "-": () => zoomBy(1 / 1.2),
+    }[event.key];
+    if (!act) return;
+    act();
+    model.save_changes();
     event.preventDefault();
     event.stopPropagation();
     schedule();
   });
 
-  model.on("change:points change:colours change:crosses", updatePoints);
+  model.on("change:points change:colours change:discs", updatePoints);
   model.on("change:view", () => { if (!held) { view = model.get("view"); schedule(); } });
   model.on("change:view_resets", resetView);
   model.on("change:marks change:cursor change:alt change:side", schedule);
   updatePoints();
   resetView();
+}
+
+const STYLE = `<style>
+.zsp-turning { display: flex; flex-wrap: wrap; gap: 6px 16px; font-size: 14px; line-height: 1.4; }
+.zsp-turning figure { flex: 1 1 260px; max-width: 360px; min-width: 0; margin: 0; }
+.zsp-turning p { flex: 1 0 100%; margin: 0; }
+.zsp-turning b { padding: 0 1.5em; margin-right: 0.5em; background: linear-gradient(90deg, #fde725, #21918c, #440154); }
+.zsp-turning canvas { display: block; border: 1px solid #888; background: white; cursor: grab; touch-action: pan-y; }
+</style>`;
+
+// Show clouds that a page stores, beside each other: they turn together.
+function stored(el, panels, alt) {
+  const listeners = [];
+  const redraw = () => listeners.forEach((listener) => listener());
+  const decoded = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt());
+  let view = [1, 0, 0, 0, 1, 0, 0, 0, 1];
+  for (const [title, points, colours, lines] of panels) {
+    const box = el.appendChild(document.createElement("figure"));
+    box.append(title);
+    const state = {
+      points: Float32Array.from(new Int16Array(decoded(points).buffer), (x) => x / 8192),
+      colours: decoded(colours), discs: Infinity, marks: [], cursor: [], lines, alt: `${title}: ${alt}`,
+    };
+    const get = (name) => ({ ...state, view, side: box.clientWidth - 2 })[name];
+    const set = (_, value) => { view = value; redraw(); };
+    const on = (name, listener) => { if (name === "change:view") listeners.push(listener); };
+    render({ el: box, model: { get, set, on, save_changes() {}, send() {} } });
+  }
+  el.insertAdjacentHTML("beforeend", `${STYLE}<p><b></b>${alt}</p>`);
+  new ResizeObserver(redraw).observe(el);
 }
 
 export default { render };

@@ -6,7 +6,6 @@ the full cloud.
 
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from scipy.spatial import KDTree
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.course.widgets.common import load_package
-from zsp_lite.errors import InputError
+from zsp_lite.course.widgets.turning import SCRIPT, view_units
 from zsp_lite.viz.plots import BLUE, ORANGE
 
 MAX_POINTS = 6000  # points drawn; more are slow in the browser
@@ -26,22 +25,6 @@ _STYLE = """
 .zsp-cloud { border: 1px solid #888; background: white; cursor: crosshair; touch-action: none; }
 .zsp-cloud:focus { outline: 3px solid #0072B2; outline-offset: -3px; }
 """
-
-
-def view_units(points: Real[np.ndarray, "n 3"]) -> Sim3:
-    """Return the similarity from the world to view units, in which a cloud fills the unit ball.
-
-    The ball is around the box from the 1st to the 99th percentile along each axis, which is robust
-    to outliers.
-    """
-    low, high = np.percentile(points, [1, 99], axis=0) if len(points) else np.zeros((2, 3))
-    radius = float(np.linalg.norm(high - low)) / 2
-    if not radius >= 1e-12:  # also for a radius that is NaN, for which `<` is false
-        raise InputError(
-            f"point cloud of {len(points)} points has no extent, expected an object of finite "
-            "points"
-        )
-    return Sim3(1 / radius, np.eye(3), -(low + high) / 2 / radius)
 
 
 def subsample(points: Real[np.ndarray, "n 3"], most: int = MAX_POINTS) -> Int[np.ndarray, " m"]:
@@ -108,18 +91,16 @@ class CloudView:
         self._cloud = np.asarray(points, dtype=np.float64)
         self._to_view = view_units(points)
         chosen = subsample(points, MAX_POINTS if overlay is None else MAX_POINTS // 2)
-        drawn = points[chosen]
-        colours = colours[chosen]
-        crosses = np.zeros(len(drawn), np.uint8)
+        drawn, colours, discs = points[chosen], colours[chosen], len(chosen)
         if overlay is not None:
             second = overlay[subsample(overlay, MAX_POINTS // 2)]
-            crosses = np.repeat(np.uint8([0, 1]), [len(drawn), len(second)])
-            colours = np.uint8([list(bytes.fromhex(name[1:])) for name in (ORANGE, BLUE)])[crosses]
             drawn = np.concatenate([drawn, second])
+            both = np.uint8([list(bytes.fromhex(name[1:])) for name in (ORANGE, BLUE)])
+            colours = both.repeat([discs, len(second)], axis=0)
         with self.widget.hold_sync():
             self.widget.points = self._to_view.apply(drawn).astype(np.float32).tobytes()
             self.widget.colours = colours.tobytes()
-            self.widget.crosses = crosses.tobytes()
+            self.widget.discs = discs
             self.widget.alt = alt
             if view is not None:
                 self.widget.view = np.asarray(view, dtype=np.float64).ravel().tolist()
@@ -129,7 +110,7 @@ class CloudView:
         """Show an empty canvas; `alt` gives the reason."""
         self._to_view = None
         with self.widget.hold_sync():
-            self.widget.points = self.widget.colours = self.widget.crosses = b""
+            self.widget.points = self.widget.colours = b""
             self.widget.marks = []
             self.widget.cursor = []
             self.widget.alt = alt
@@ -163,11 +144,11 @@ def _cloud_widget() -> type:
     class CloudCanvas(anywidget.AnyWidget):
         """State shared with the browser, see `cloud_view.js`."""
 
-        _esm = (Path(__file__).parent / "cloud_view.js").read_text(encoding="utf-8")
+        _esm = SCRIPT
         _css = _STYLE
         points = Bytes().tag(sync=True)  # float32 (n, 3), view units
         colours = Bytes().tag(sync=True)  # uint8 (n, 3)
-        crosses = Bytes().tag(sync=True)  # uint8 (n): 1 a cross, 0 a disc
+        discs = Int().tag(sync=True)  # so many points are discs, the others are crosses
         marks = List().tag(sync=True)
         cursor = List(Float()).tag(sync=True)  # [] or a point
         view = List(Float(), [1.0, 0, 0, 0, 1, 0, 0, 0, 1]).tag(sync=True)

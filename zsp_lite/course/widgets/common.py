@@ -1,19 +1,6 @@
 """Controls and interactive figures, the building blocks of all widgets.
 
-How to write a widget:
-
-- Write one function that takes computed data (views, matrices, errors), draws a matplotlib figure
-  once, and returns `interactive_figure(...)`.
-- Its `update` callback is called when a control moves. It changes existing artists (`set_data`,
-  `set_offsets`, `set_text`), or draws a primitive of `viz.plots` anew (`redrawing`). Expensive
-  results are computed before.
-- `update` returns a caption with the numbers that the figure shows, also for readers who cannot see
-  it or its colours.
-- The latency of a control should be at most 150 ms. Keep figures below about 9 by 4 inches.
-- The figure is a PNG in an image widget, which every frontend shows. Patches and points are chosen
-  by sliders, which work by keyboard.
-- The notebook shows a static figure as well (`show`), because widgets need a running kernel.
-- Add an example on sample data to `tools/widget_examples.py`.
+`tools/widget_examples.py` says how to write a widget.
 """
 
 import importlib
@@ -48,23 +35,12 @@ def slider(label: str, low: float, high: float, value: float, step: float = 1) -
     """Return a slider from `low` to `high`, with integer values if all four numbers are
     integers."""
     widgets = load_package()
+    style = {"min": low, "max": high, "step": step, "description": label, "style": _LABEL}
+    style["layout"] = {"width": "22em"}
     if all(isinstance(x, int | np.integer) for x in (low, high, value, step)):
-        kind = widgets.IntSlider
-        readout = "d"
-    else:
-        kind = widgets.FloatSlider
-        # The decimals that the step needs.
-        readout = f".{max(0, -int(np.floor(np.log10(step))))}f"
-    return kind(
-        value,
-        min=low,
-        max=high,
-        step=step,
-        description=label,
-        style=_LABEL,
-        layout={"width": "22em"},
-        readout_format=readout,
-    )
+        return widgets.IntSlider(value, **style)
+    decimals = max(0, -int(np.floor(np.log10(step))))  # that the step needs
+    return widgets.FloatSlider(value, readout_format=f".{decimals}f", **style)
 
 
 def patch_sliders(grid: tuple[int, int], start: tuple[int, int], of: str = "") -> dict[str, Widget]:

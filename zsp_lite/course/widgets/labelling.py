@@ -75,7 +75,7 @@ class _LabellingWidget:
         # For each canvas, the sequence and the overlay that it shows.
         self.shown: dict[str, object] = {}
         # Sequence and picks of the label in doubt for which accept was pressed once.
-        self.asked: tuple[str, bytes] | None = None
+        self.asked = ()
         # Whether the display is being updated, which must not start another update.
         self.refreshing = False
         self.box = self._build()
@@ -136,33 +136,22 @@ class _LabellingWidget:
             widgets.VBox([self.captions[name], view.widget], layout={"margin": "0 8px 0 0"})
             for name, view in self.views.items()
         ]
-        actions = [
-            buttons["undo"],
-            buttons["redo"],
-            controls["overlay"],
-            buttons["accept"],
-            buttons["skip"],
-            buttons["next"],
-        ]
+        actions = map(parts.get, ("undo", "redo", "overlay", "accept", "skip", "next"))
         wrap = {"flex_flow": "row wrap"}
-        centred = {**wrap, "align_items": "center"}
+        row = partial(widgets.HBox, layout={**wrap, "align_items": "center"})
         rows = [
             widgets.HTML(_STYLE),
-            widgets.HBox([controls["sequence"], controls["name"]], layout=centred),
-            widgets.HBox(actions, layout=centred),
+            row([controls["sequence"], controls["name"]]),
+            row([*actions]),
             self.message,
             widgets.HBox(clouds, layout=wrap),
             widgets.HTML(_HELP),
-            widgets.HBox([controls["point"], buttons["pick"]], layout=centred),
+            row([controls["point"], buttons["pick"]]),
             widgets.HBox([*self.tables.values()], layout={**wrap, "align_items": "flex-start"}),
         ]
         box = widgets.VBox(rows)
         box.add_class("zsp-label")
-        box.controls = controls
-        box.buttons = buttons
-        box.views = self.views
-        box.message = self.message
-        box.tables = self.tables
+        vars(box).update(vars(self))
         return box
 
     @property
@@ -262,8 +251,7 @@ class _LabellingWidget:
     def _do(self, action: Callable[[], str]) -> None:
         """Run an action and update the display; an InputError is shown as a message."""
         self.refreshing = True
-        text = ""
-        problem = ""
+        text = problem = ""
         try:
             # The display is updated even if the action fails.
             for step in (action, self._refresh):
@@ -273,13 +261,8 @@ class _LabellingWidget:
                     problem = str(error)
         finally:
             self.refreshing = False
-        kind = "info"
-        shown = text
-        if problem:
-            kind = "problem"
-            shown = f"Not done: {problem}"
-        elif not text:
-            shown = self._instruction()
+        kind = "problem" if problem else "info"
+        shown = f"Not done: {problem}" if problem else text or self._instruction()
         # With this role, screen readers announce the message.
         self.message.value = (
             f'<p class="{kind}" role="status" aria-live="polite">{html.escape(shown)}</p>'
@@ -304,10 +287,9 @@ class _LabellingWidget:
         names = self.labelling.names
         picked = len(self.labelling.picks(self.current))
         if self.on_reference:
-            missing = MIN_KEYPOINTS - len(names)
-            more = "enough; add more, or go on with next"
-            if missing > 0:
-                more = f"at least {missing} more"
+            more = f"at least {MIN_KEYPOINTS - len(names)} more"
+            if len(names) >= MIN_KEYPOINTS:
+                more = "enough; add more, or go on with next"
             return (
                 "Click a point of the reference that all objects of the category have: "
                 f"{len(names)} so far, {more}."
@@ -319,10 +301,9 @@ class _LabellingWidget:
         alignment = self.labelling.alignment(self.current)
         if alignment is None:
             return f"Pick at least {MIN_KEYPOINTS} keypoints on the reference first."
-        rms = 100 * alignment.rms
         return (
-            f"All {picked} keypoints are picked, residual {rms:.1f} %. Accept if both clouds "
-            "agree, otherwise redo."
+            f"All {picked} keypoints are picked, residual {100 * alignment.rms:.1f} %. Accept if "
+            "both clouds agree, otherwise redo."
         )
 
     def _refresh(self) -> None:
@@ -366,21 +347,19 @@ class _LabellingWidget:
     def _aligned_reference(self, alignment: Alignment | None) -> np.ndarray | None:
         """Return the reference cloud in the world of the sequence, by its keypoints, its label, or
         a proposal."""
+        labelling = self.labelling
         if self.on_reference:
             return None
-        if alignment is None and len(self.labelling.picks(self.current)):
-            return None  # The picks are not complete.
-        label = read_labels(self.labelling.root, self.labelling.category).get(self.current)
+        label = read_labels(labelling.root, labelling.category).get(self.current)
         if alignment is not None:
             sim3 = alignment.sim3
+        elif len(labelling.picks(self.current)):
+            return None  # The picks are not complete.
         elif label is not None:
             sim3 = Sim3(1.0, label.trans[:3, :3], label.trans[:3, 3])
         else:
-            sim3 = self.labelling.proposal(self.current)
-        if sim3 is None:
-            return None
-        points, _ = self.labelling.cloud(self.labelling.reference)
-        return sim3.apply(points)
+            sim3 = labelling.proposal(self.current)
+        return sim3 and sim3.apply(labelling.cloud(labelling.reference)[0])
 
     def _show_cloud(self, name: str, sequence: str, overlay: np.ndarray | None) -> None:
         """Show a cloud, unless it is on the canvas already, and the keypoints."""
@@ -393,9 +372,7 @@ class _LabellingWidget:
                 "the arrow keys rotate."
             )
             # A cloud that is shown already stays as the user has turned it.
-            view = None
-            if before[0] != sequence:
-                view = self.labelling.first_view(sequence)
+            view = None if before[0] == sequence else self.labelling.first_view(sequence)
             try:
                 self.views[name].show(points, colours, view, alt, overlay)
             except InputError as error:
@@ -413,25 +390,22 @@ class _LabellingWidget:
 
     def _move_cursor(self, only_if_shown: bool = False) -> None:
         """Move the cross-hair to the point of the slider."""
-        current = "sequence"
-        other = "reference"
+        current, other = self.views["sequence"], self.views["reference"]
         if self.on_reference:
             current, other = other, current
-        self.views[other].point_at(None)
-        if not only_if_shown or self.views[current].widget.cursor:
-            self.views[current].point_at(self._slider_point())
+        other.point_at(None)
+        if not only_if_shown or current.widget.cursor:
+            current.point_at(self._slider_point())
 
 
 def _progress_table(rows: Sequence[Progress], current: str) -> str:
     """Return the table of all sequences, the current one marked."""
     cells = []
     for row in rows:
-        residual = ""
-        if row.problem:
-            residual = "see above"
-        elif row.rms is not None:
+        residual = "see above" if row.problem else ""
+        if row.rms is not None:
             residual = f"{100 * row.rms:.1f} %"
-        marker = "▸" if row.sequence == current else ""
+        marker = "▸" * (row.sequence == current)
         state = f"{_STATE_SYMBOLS.get(row.state, '●')} {row.state}"
         cells.append((marker, row.sequence, state, row.picks, residual))
     return _table(("", "sequence", "state", "keypoints", "residual"), cells)
@@ -444,12 +418,10 @@ def _keypoint_table(names: Sequence[str], picked: int, alignment: Alignment | No
     if alignment is not None:
         residuals = [f"{100 * residual:.1f} %" for residual in alignment.residuals]
         residuals[int(alignment.residuals.argmax())] += " ← largest"
-    cells = []
-    for index, (name, residual) in enumerate(zip(names, residuals)):
-        state = "✓" if index < picked else ""
-        if index == picked:
-            state = "next"
-        cells.append((index + 1, name, state, residual))
+    cells = [
+        (k + 1, name, "✓" if k < picked else "next" * (k == picked), residual)
+        for k, (name, residual) in enumerate(zip(names, residuals))
+    ]
     return _table(("", "keypoint", "picked", "residual"), cells or [("", "none yet", "", "")])
 
 

@@ -36,10 +36,7 @@ _SEEN_FROM = Rotation.from_euler("yx", [-25, 15], degrees=True).as_matrix()
 RIGHT = _SEEN_FROM[0]  # the picture's direction to the right, in which a corner is dragged
 _FARTHEST = 4.0  # largest distance of the dragged point from its place, scene units
 _THRESHOLD = 0.2  # largest residual of a match that agrees, scene units
-_DRAGGED = (
-    "A chair of bars in grey, one corner of which is dragged to the right, and the chair after "
-    "each fit: least squares tilts it towards the corner, RANSAC leaves it in its place"
-)
+_DRAGGED = "A grey chair, one corner dragged away; least squares tilts its fit, RANSAC does not"
 _TRIALS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
@@ -49,13 +46,10 @@ def ransac_settings(
     points: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
     truth: Float[np.ndarray, "3 3"] | None = None,
 ) -> Widget:
-    """Show the inliers of RANSAC on matches.
+    """Show the inliers of RANSAC on matches: their pixels (x, y) in the images of the reference and
+    of the target, and their points in the frames of both cameras, scene units.
 
-    Args:
-        images: Images of the reference and of the target.
-        pixels: Pixels (x, y) of the matches in both images.
-        points: Points of the matches in the frames of both cameras, scene units.
-        truth: True rotation, for the error of the fit; None leaves the error out.
+    `truth` is the true rotation, for the error of the fit.
     """
     source, target = points
     n = len(source)
@@ -102,10 +96,7 @@ def ransac_settings(
         "threshold": slider("threshold", 0.02, 1.0, 0.2, 0.02),
         "seed": slider("seed", 0, 20, 0),
     }
-    alt = (
-        "Two images with the inliers between them, and the residual of each match with the "
-        "threshold"
-    )
+    alt = "Two images with the inliers between them, and the residual of each match"
     return interactive_figure(figure, controls, update, alt)
 
 

@@ -45,10 +45,7 @@ def self_check(notebook: str, number: int) -> None:
     jupyterquiz = load_package("jupyterquiz")
     ipython = load_package("IPython")
     if ipython.get_ipython() is None:
-        raise InputError(
-            "self_check was called outside IPython, expected a notebook, which can show the "
-            "questions"
-        )
+        raise InputError("self_check was called outside IPython, expected a notebook")
     with ipython.utils.capture.capture_output() as captured:
         jupyterquiz.display_quiz(checks[number - 1], colors=_COLOURS)
     # The form is a <div> that jupyterquiz leaves open: the style goes inside, and closes it.
