@@ -15,10 +15,10 @@ from zsp_lite.io.files import REPOSITORY
 LAYERS = [
     "choices errors",
     "io",
-    "alignment features matchers metrics minimal",
+    "alignment features metrics minimal",
     "data",
     "matching",
-    "views",
+    "matchers views",
     "best_view estimates points",
     "pipeline backbones",
     "verified importers baselines",
@@ -48,6 +48,7 @@ BY_NAME = {
     "data.arrays",
     "data.clouds",
     "data.evaluation",
+    "matchers",
     "verified",
 }
 

@@ -20,9 +20,9 @@ DRAWING = Path(__file__).parents[1] / "docs" / "rooms.svg"
 # From the bottom to the top: the modules and subpackages of each room.
 ROOMS = {
     "files": "choices errors io",
-    "geometry": "alignment features matchers metrics minimal",
+    "geometry": "alignment features metrics minimal",
     "data": "data",
-    "stages": "best_view estimates matching pipeline points views",
+    "stages": "best_view estimates matchers matching pipeline points views",
     "backbones": "backbones",
     "verified": "scans verified",
     "importers": "importers",

@@ -7,6 +7,8 @@ from typing import Literal, get_args
 
 # Solvers of a pair, each with those that it runs.
 SOLVERS = {"paper": ("paper",), "verified": ("verified",), "both": ("paper", "verified")}
+# Ways to match patches: the paper's, and the alternatives of its supplement.
+MATCHERS = ("cyclical", "mutual", "dual softmax", "optimal transport")
 # Activation of a transformer block that describes a patch (compared by Amir et al. 2021): an input
 # of its attention, or its output, not normalised ("token").
 Facet = Literal["key", "query", "value", "token"]

@@ -6,47 +6,12 @@ matcher, "cyclical", is in `matching`.
 """
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-Matched = tuple[Int[Tensor, " _"], Float[Tensor, " _"]]  # partner and score of each patch
-
-
-@runtime_checkable
-class Matcher(Protocol):
-    """A way to match patches. Any callable with this signature is accepted.
-
-    A matcher that takes the nearest neighbour if it is clearly better than the second nearest
-    (Lowe's ratio test):
-
-        def ratio_test(similarity, foreground1, foreground2):
-            distance = (2 - 2 * similarity).clamp_min(0).sqrt()
-            distance[:, ~foreground2] = torch.inf
-            (first, second), (partner, _) = (part.T for part in distance.topk(2, largest=False))
-            score = (second - first).masked_fill(~foreground1, -torch.inf)
-            return partner, score
-
-        ZeroShotPose(backbone, matcher=ratio_test)
-    """
-
-    def __call__(
-        self,
-        similarity: Float[Tensor, "n1 n2"],
-        foreground1: Bool[Tensor, " n1"],
-        foreground2: Bool[Tensor, " n2"],
-        /,
-    ) -> Matched:
-        """Match the patches of image 1 with those of image 2, given the cosines between their
-        descriptors.
-
-        Returns for each patch of image 1 the index of its partner in image 2, and the score of the
-        match, higher is better; -inf for no match.
-        """
-        ...
-
+from zsp_lite.matching import Matched, Matcher
 
 # The paper gives none; LoFTR (Sun et al. 2021) divides its similarities by this before a dual
 # softmax.

@@ -13,10 +13,11 @@ the 3x3 average pooling in both images, the sum is J_1 J_1' S + (J_3 J_3' - 1) P
 additions of S to itself.
 """
 
+import pkgutil
 import threading
 import warnings
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -27,13 +28,46 @@ from torch import Tensor
 from zsp_lite.errors import InputError
 from zsp_lite.features import FeatureMap, Grid, average_pool, bin_indices, descriptors
 from zsp_lite.io.threads import one_thread
-from zsp_lite.matchers import MATCHERS, Matched, Matcher
 
 Keys = FeatureMap | Float[Tensor, "_ _ _"] | Float[np.ndarray, "_ _ _"]
 Similarities = Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"]
 Mask = Bool[Tensor, "_ _"] | Bool[np.ndarray, "_ _"]
+Matched = tuple[Int[Tensor, " _"], Float[Tensor, " _"]]  # partner and score of each patch
 
 _filters = threading.Lock()  # of warnings: threads would restore each other's
+
+
+@runtime_checkable
+class Matcher(Protocol):
+    """A way to match patches. Any callable with this signature is accepted.
+
+    A matcher that takes the nearest neighbour if it is clearly better than the second nearest
+    (Lowe's ratio test):
+
+        def ratio_test(similarity, foreground1, foreground2):
+            distance = (2 - 2 * similarity).clamp_min(0).sqrt()
+            distance[:, ~foreground2] = torch.inf
+            (first, second), (partner, _) = (part.T for part in distance.topk(2, largest=False))
+            score = (second - first).masked_fill(~foreground1, -torch.inf)
+            return partner, score
+
+        ZeroShotPose(backbone, matcher=ratio_test)
+    """
+
+    def __call__(
+        self,
+        similarity: Float[Tensor, "n1 n2"],
+        foreground1: Bool[Tensor, " n1"],
+        foreground2: Bool[Tensor, " n2"],
+        /,
+    ) -> Matched:
+        """Match the patches of image 1 with those of image 2, given the cosines between their
+        descriptors.
+
+        Returns for each patch of image 1 the index of its partner in image 2, and the score of the
+        match, higher is better; -inf for no match.
+        """
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +190,7 @@ def match(
         ref_foreground: (H1, W1) foreground of the reference; by default `ref.foreground()`.
         target_foreground: (H2, W2) foreground of the target.
         sim: (H1 * W1, H2 * W2) similarities, if they are computed already.
-        matcher: "cyclical" ranks by cyclical distance; or a name in `MATCHERS`, or a `Matcher`.
+        matcher: "cyclical" ranks by cyclical distance; or another name, or a `Matcher`.
         binning: Compare and cluster log-binned descriptors; False takes the keys themselves.
     """
     if sim is None:
@@ -201,7 +235,7 @@ def _matched_by(
 ) -> Matched:
     """Return what a matcher finds."""
     if isinstance(matcher, str):
-        matcher = MATCHERS[matcher]
+        matcher = pkgutil.resolve_name("zsp_lite.matchers:MATCHERS")[matcher]
     # Copies, since a matcher may overwrite what it gets, such as the similarities of the
     # background.
     partner, score = matcher(sim.clone(), on_start.clone(), on_end.clone())

@@ -13,13 +13,12 @@ from jaxtyping import Float
 
 from zsp_lite.alignment import SCALE_RANGE, Sim3, ransac
 from zsp_lite.best_view import VIEW_SELECTORS, ViewSelector
-from zsp_lite.choices import SOLVERS
+from zsp_lite.choices import MATCHERS, SOLVERS
 from zsp_lite.data.frames import Frame, frame_defect, list_frames
 from zsp_lite.errors import InputError, NoPoseError, check_choice, check_integer, check_number
 from zsp_lite.estimates import PoseEstimate, Solver, match_points, timed
 from zsp_lite.features import FeatureExtractor
-from zsp_lite.matchers import MATCHERS, Matcher
-from zsp_lite.matching import match, similarities
+from zsp_lite.matching import Matcher, match, similarities
 from zsp_lite.points import standard_deviation
 from zsp_lite.views import IMAGE_SIZE, View, ViewMatch, extract_views, object_crop, usable_targets
 
@@ -46,7 +45,7 @@ class ZeroShotPose:
         cycle_from: View in which cycles start: "reference", as in the paper, or "target", as in the
             cycle step of the published code (see `matching.match`; docs/published_code.md lists all
             its differences).
-        matcher: "cyclical", as in the paper, another name in `matchers.MATCHERS`, or a `Matcher`.
+        matcher: "cyclical", as in the paper, another name in `choices.MATCHERS`, or a `Matcher`.
         binning: Compare log-binned descriptors, as in the paper; False compares the keys
             themselves.
         solver: "paper" selects the best view and aligns with it by RANSAC; or "verified", or a
@@ -73,7 +72,7 @@ class ZeroShotPose:
 
     def __post_init__(self):
         choices = {
-            "matcher": ("cyclical", *MATCHERS),
+            "matcher": MATCHERS,
             "view_selector": VIEW_SELECTORS,
             "solver": SOLVERS["both"],
             "foreground": ("saliency", "mask"),

@@ -154,21 +154,8 @@ def estimate(problem):
     return Sim3(scale, R, t), view
 
 
-_PARTS = {
-    part.__name__: part
-    for part in (
-        descriptor,
-        cycle,
-        choose,
-        view_score,
-        unproject,
-        umeyama,
-        ransac,
-        rotation_error,
-        interval,
-        estimate,
-    )
-}
+_FIRST = descriptor, cycle, choose, view_score, unproject, umeyama, ransac
+_PARTS = {part.__name__: part for part in (*_FIRST, rotation_error, interval, estimate)}
 _TESTS = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
 _TOLERANCE = {"interval": 0.05}  # of random draws; else 1e-6
 
