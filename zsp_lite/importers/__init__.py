@@ -113,7 +113,6 @@ def recognise(path: str | Path) -> tuple[str, Path]:
         places.append(path.resolve().parent)
     for place in places:
         for name, layout in FORMATS.items():
-            signs = [(sign, True) for sign in layout.signs]
             if all(any(place.glob(sign)) for sign in layout.signs) and not any(
                 any(place.glob(sign)) for sign in layout.unless
             ):

@@ -5,10 +5,9 @@ the drift (Choi, Zhou and Koltun 2015).
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +33,11 @@ _LONGEST_SIDE = 320  # pixels of the images that are tracked
 _BACK = 3  # a frame is joined to one of so many before it
 _FARTHEST = 4.0  # greater depth is not used, relative to the mean depth of the first frame
 # Frames are joined if their details, finer than the first number in pixels, have at least this
-# correlation after the motion. On renderings, it is above 0.66 for right motions between neighbours.
+# correlation. On renderings, it is above 0.66 for right motions between neighbours.
 _DETAIL = 8
 _ALIKE = 0.6
-# Loops are closed between so many frames: from each to that of the most similar rotation, at most
-# this angle in degrees away, with at least this part of the recording in between.
+# Loops are closed between so many frames, where two are turned by at most this angle in degrees and
+# are at least this part of the recording apart.
 _KEY_FRAMES = 40
 _ANGLE = 15
 _APART = 1 / 6
@@ -51,8 +50,7 @@ def read_recording(
 
     `attributes` are of `CaptureFrame`. Frames that cannot be joined to the others are left out.
     """
-    images = _numbered(folder.glob(f"{RECORDED}/*"), folder)
-    depths = _numbered(folder.glob("depth/*"), folder)
+    images, depths = (_numbered(folder, name) for name in (RECORDED, "depth"))
     if intrinsics is None:
         intrinsics = _known_intrinsics(folder, min(images.values()))
     # The numbers are of frames or times: an image and its depth have the same, or nearly.
@@ -62,20 +60,21 @@ def read_recording(
         nearest = numbers[np.abs(numbers - number).argmin()]
         if abs(nearest - number) > 0.75 * np.ptp(numbers) / len(numbers):
             yield partial(refuse, f"{image}: no depth of its number in {folder}/depth")
-            continue
-        options = {"intrinsics": intrinsics, "where": str(image), **attributes}
-        makers.append(partial(make_frame, folder, image, depths[nearest], **options))
+        else:
+            options = {"intrinsics": intrinsics, "where": str(image), **attributes}
+            makers.append(partial(make_frame, folder, image, depths[nearest], **options))
     step = -(-len(makers) // _MOST)
     yield from _track(makers[::step], f"{folder.name}, 1 of {step} frames")
 
 
-def _numbered(paths: Iterable[Path], folder: Path) -> dict[float, Path]:
-    """Return pictures by the numbers at the end of their names, in this order."""
-    numbered = {}
-    for path in paths:
-        number = re.search(r"\d+(\.\d+)?$", path.stem)
-        if number and path.suffix.lower() in files.PICTURES:
-            numbered[float(number[0])] = path
+def _numbered(folder: Path, name: str) -> dict[float, Path]:
+    """Return the pictures of a folder by the numbers at the end of their names, in this order."""
+    numbered = {
+        float(number[0]): path
+        for path in folder.glob(f"{name}/*")
+        if (number := re.search(r"\d+(\.\d+)?$", path.stem))
+        and path.suffix.lower() in files.PICTURES
+    }
     if not numbered:
         raise InputError(f"{folder}: no picture with a number in rgb/ or depth/, expected 0001.png")
     return dict(sorted(numbered.items()))
@@ -106,78 +105,99 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
     import open3d as o3d
 
     registration = o3d.pipelines.registration
-    motion = still = np.eye(4)
+    still = np.eye(4)
     unit = 0.0
 
     @lru_cache(_BACK + 1)
-    def read(position: int) -> Frame:
-        """Read a small copy of a frame as it is stored, in units of the first one's mean depth."""
+    def read(position: int) -> tuple[Frame, Any, np.ndarray]:
+        """Read a small copy of a frame as it is stored, and of its details for comparison."""
         nonlocal unit
         frame = makers[position](still)
         rgb, _ = files.read_picture(frame.image)
+        scale = min(1, _LONGEST_SIDE / max(rgb.shape))
+        rgb = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        camera = frame.camera.resize(rgb.shape[:2])
         depth = files.read_depth_file(frame.depth) * frame.depth_unit
-        unit = unit or depth.sum() / max(1, np.count_nonzero(depth))
-        camera = frame.camera
-        shrink = max(1, *np.divide(camera.size, _LONGEST_SIDE))
-        camera = camera.resize([round(side / shrink) for side in camera.size])
-        size = camera.size[::-1]
-        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-        depth = cv2.resize(depth / unit, size, interpolation=cv2.INTER_NEAREST_EXACT)
-        return Frame(rgb, depth, None, camera)
+        unit = unit or float(depth.sum() / max(1, np.count_nonzero(depth)))
+        depth = cv2.resize(depth / unit, camera.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+        images = map(o3d.geometry.Image, (rgb, depth))
+        pair = o3d.geometry.RGBDImage.create_from_color_and_depth(*images, 1.0, _FARTHEST)
+        grey = rgb.mean(axis=2)
+        return Frame(rgb, depth, None, camera), pair, grey - cv2.GaussianBlur(grey, (0, 0), _DETAIL)
 
-    # A part of the recording has the poses, world to camera, of frames that are joined.
+    edges = []
+
+    def join(first: int, second: int, guess: np.ndarray, loop: bool = False) -> np.ndarray | None:
+        """Find the motion between two cameras, None if their details do not agree by it."""
+        frame, pair, details = read(first)
+        other, other_pair, other_details = read(second)
+        width_height = other.camera.size[::-1]
+        odometry = o3d.pipelines.odometry
+        # By colours alone: if depth counts, smooth surfaces slow the convergence.
+        _, motion, information = odometry.compute_rgbd_odometry(
+            pair,
+            other_pair,
+            o3d.camera.PinholeCameraIntrinsic(*width_height, other.camera.K - HALF_PIXEL),
+            guess,
+            odometry.RGBDOdometryJacobianFromColorTerm(),
+        )
+        if np.isnan(motion).any():  # of images without details, as is their correlation
+            return None
+        moved = replace(other.camera, R=motion[:3, :3], t=motion[:3, 3])
+        known = frame.depth > 0
+        with np.errstate(invalid="ignore"):
+            pixels, _ = moved.project(world_points(frame, known))
+            columns, rows = pixels.astype(int).clip(0, np.subtract(width_height, 1)).T
+            alike = np.corrcoef(details[known], other_details[rows, columns])[0, 1]
+        if not alike > _ALIKE:
+            return None
+        edges.append((first, second, motion, information, loop))
+        return motion
+
+    # A part of the recording has the poses, camera to world, of frames that are joined.
     parts = []
     seen = []
-    edges = []
+    guess = still
     for position in tqdm(range(len(makers)), f"tracking {name}", disable=None):
         try:
-            frame = read(position)
+            read(position)
         except InputError as error:
             yield partial(refuse, str(error))
             continue
         for before, part in seen[: -_BACK - 1 : -1]:
-            found = _motion(read(before), frame, motion)
-            if found:
-                motion, _ = found
-                part[position] = motion @ part[before]
-                edges.append((before, position, *found, False))
+            motion = join(before, position, guess)
+            if motion is not None:
+                guess = motion
+                part[position] = part[before] @ np.linalg.inv(motion)
                 break
         else:
             part = {position: still}
             parts.append(part)
         seen.append((position, part))
-    longest = max(parts, key=len, default={})
+    if not parts:
+        return
+    longest = max(parts, key=len)
     for part in parts:
         if part is not longest:
             image = makers[min(part)].args[1]
-            problem = f"the recording breaks: {len(part)} frames from {image} on do not join"
-            yield from repeat(partial(refuse, problem), len(part))
+            problem = f"the recording breaks: {len(part)} frames from {image} on cannot be joined"
+            yield from [partial(refuse, problem)] * len(part)
 
-    # Close loops.
-    order = [*longest]
-    keys = order[:: -(-len(order) // _KEY_FRAMES)]
-    loops = 0
-    for late in keys:
-        angles = {
-            rotation_angle(longest[early][:3, :3], longest[late][:3, :3]): early
-            for early in keys
-            if late - early > _APART * len(makers)
-        }
-        nearest = min(angles, default=_ANGLE)
-        if nearest < _ANGLE:
-            loops += 1
-            early = angles[nearest]
-            found = _motion(read(early), read(late), longest[late] @ np.linalg.inv(longest[early]))
-            if found:
-                edges.append((early, late, *found, True))
-
-    # Distribute the drift.
+    # Close loops, and distribute the drift.
+    order = np.array([*longest])
+    poses = np.array([*longest.values()])
+    thin = slice(None, None, -(-len(order) // _KEY_FRAMES))
+    keys = order[thin]
+    turns = poses[thin, :3, :3]
+    near = rotation_angle(turns[:, None], turns) < _ANGLE
+    loops = np.argwhere(near & (keys - keys[:, None] > _APART * len(makers)))
+    for early, late in keys[loops].tolist():
+        join(early, late, np.linalg.inv(longest[late]) @ longest[early], loop=True)
     graph = registration.PoseGraph()
-    for pose in longest.values():
-        graph.nodes.append(registration.PoseGraphNode(np.linalg.inv(pose)))
+    graph.nodes.extend(map(registration.PoseGraphNode, poses))
     for first, second, *edge in edges:
         if first in longest:
-            ends = order.index(first), order.index(second)
+            ends = np.searchsorted(order, (first, second))
             graph.edges.append(registration.PoseGraphEdge(*ends, *edge))
     registration.global_optimization(
         graph,
@@ -187,40 +207,8 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
     )
     # Open3D has removed loops that contradict the rest.
     closed = sum(edge.uncertain for edge in graph.edges)
-    doubt = f"the poses may drift: {closed} of {loops} loops close" if closed < loops / 2 else ""
+    doubt = ""
+    if closed < len(loops) / 2:
+        doubt = f"the poses may drift: {closed} of {len(loops)} loops close"
     for position, node in zip(order, graph.nodes):
         yield partial(makers[position], node.pose[:3] * [1, 1, 1, unit], doubt=doubt)
-
-
-def _motion(
-    first: Frame, second: Frame, guess: Float[np.ndarray, "4 4"]
-) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]] | None:
-    """Find the motion between two cameras and its information, None if the images disagree."""
-    import open3d as o3d
-
-    camera = first.camera
-    odometry = o3d.pipelines.odometry
-    # By colours alone: with depth, it moves too little from frame to frame where depth is smooth.
-    _, motion, information = odometry.compute_rgbd_odometry(
-        *(
-            o3d.geometry.RGBDImage.create_from_color_and_depth(
-                o3d.geometry.Image(frame.rgb), o3d.geometry.Image(frame.depth), 1.0, _FARTHEST
-            )
-            for frame in (first, second)
-        ),
-        o3d.camera.PinholeCameraIntrinsic(*camera.size[::-1], camera.K - HALF_PIXEL),
-        guess,
-        odometry.RGBDOdometryJacobianFromColorTerm(),
-    )
-    known = first.depth > 0
-    camera = replace(camera, R=motion[:3, :3], t=motion[:3, 3])
-    pixels, _ = camera.project(world_points(first, known))
-    columns, rows = pixels.astype(int).clip(0, np.subtract(camera.size[::-1], 1)).T
-    values = _details(first)[known], _details(second)[rows, columns]
-    return (motion, information) if np.corrcoef(*values)[0, 1] > _ALIKE else None
-
-
-def _details(frame: Frame) -> Float[np.ndarray, "h w"]:
-    """Return the brightness without what is larger than details."""
-    grey = frame.rgb.mean(axis=2)
-    return grey - cv2.GaussianBlur(grey, (0, 0), _DETAIL)
