@@ -36,9 +36,9 @@ _FARTHEST = 4.0  # greater depth is not used, relative to the mean depth of the 
 # correlation. On renderings, it is above 0.66 for right motions between neighbours.
 _DETAIL = 8
 _ALIKE = 0.6
-# Loops are closed between so many frames, where two are turned by at most this angle in degrees and
-# are at least this part of the recording apart.
-_KEY_FRAMES = 40
+# So many loops are closed, between frames that are turned by at most this angle in degrees, at
+# least this part of the recording apart.
+_LOOPS = 60
 _ANGLE = 15
 _APART = 1 / 6
 
@@ -61,8 +61,17 @@ def read_recording(
         if abs(nearest - number) > 0.75 * np.ptp(numbers) / len(numbers):
             yield partial(refuse, f"{image}: no depth of its number in {folder}/depth")
         else:
-            options = {"intrinsics": intrinsics, "where": str(image), **attributes}
-            makers.append(partial(make_frame, folder, image, depths[nearest], **options))
+            makers.append(
+                partial(
+                    make_frame,
+                    folder,
+                    image,
+                    depths[nearest],
+                    intrinsics=intrinsics,
+                    where=str(image),
+                    **attributes,
+                )
+            )
     step = -(-len(makers) // _MOST)
     yield from _track(makers[::step], f"{folder.name}, 1 of {step} frames")
 
@@ -127,7 +136,7 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
 
     edges = []
 
-    def join(first: int, second: int, guess: np.ndarray, loop: bool = False) -> np.ndarray | None:
+    def join(first: int, second: int, guess: np.ndarray) -> np.ndarray | None:
         """Find the motion between two cameras, None if their details do not agree by it."""
         frame, pair, details = read(first)
         other, other_pair, other_details = read(second)
@@ -151,7 +160,7 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
             alike = np.corrcoef(details[known], other_details[rows, columns])[0, 1]
         if not alike > _ALIKE:
             return None
-        edges.append((first, second, motion, information, loop))
+        edges.append((first, second, motion, information, second - first > _BACK))
         return motion
 
     # A part of the recording has the poses, camera to world, of frames that are joined.
@@ -186,13 +195,12 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
     # Close loops, and distribute the drift.
     order = np.array([*longest])
     poses = np.array([*longest.values()])
-    thin = slice(None, None, -(-len(order) // _KEY_FRAMES))
-    keys = order[thin]
-    turns = poses[thin, :3, :3]
+    turns = poses[:, :3, :3]
     near = rotation_angle(turns[:, None], turns) < _ANGLE
-    loops = np.argwhere(near & (keys - keys[:, None] > _APART * len(makers)))
-    for early, late in keys[loops].tolist():
-        join(early, late, np.linalg.inv(longest[late]) @ longest[early], loop=True)
+    loops = np.argwhere(near & (order - order[:, None] > _BACK + _APART * len(makers)))
+    loops = loops[:: len(loops) // _LOOPS + 1]
+    for early, late in order[loops].tolist():
+        join(early, late, np.linalg.inv(longest[late]) @ longest[early])
     graph = registration.PoseGraph()
     graph.nodes.extend(map(registration.PoseGraphNode, poses))
     for first, second, *edge in edges:
