@@ -273,12 +273,12 @@ class _Import(click.Command):
 def import_(scan, root, category, sequence, mask, box, **options) -> None:
     """Import an RGB-D capture as a sequence of a data folder.
 
-    A capture is images with depth and camera poses in one world, or a recording (rgb/ or color/, and
-    depth/) whose poses Open3D finds. SCAN is a folder, or the zip file
+    A capture is images with depth and camera poses in one world. SCAN is a folder, or the zip file
     that an app has exported. Its format is recognised: nerfstudio (also of Blender, NeRFCapture and
     instant-ngp), stray (Stray Scanner), polycam (its raw data), record3d
     (needs `pip install lzfse`), tum (RGB-D benchmark), bop, scannet, open3d (recorder, with the
-    trajectory of its reconstruction), or lists of your own:
+    trajectory of its reconstruction), recording (rgb/ or color/, and depth/, whose poses Open3D
+    finds), or lists of your own:
 
     \b
       rgb.txt, depth.txt  one file per line; depth as 16-bit PNG, TIFF, .npy, ...

@@ -127,7 +127,9 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
         rgb = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         camera = frame.camera.resize(rgb.shape[:2])
         depth = files.read_depth_file(frame.depth) * frame.depth_unit
-        unit = unit or float(depth.sum() / max(1, np.count_nonzero(depth)))
+        if not depth.any():
+            raise InputError(f"{frame.depth} has no known depth")
+        unit = unit or float(depth[depth > 0].mean())
         depth = cv2.resize(depth / unit, camera.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
         images = map(o3d.geometry.Image, (rgb, depth))
         pair = o3d.geometry.RGBDImage.create_from_color_and_depth(*images, 1.0, _FARTHEST)
@@ -189,7 +191,9 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
     for part in parts:
         if part is not longest:
             image = makers[min(part)].args[1]
-            problem = f"the recording breaks: {len(part)} frames from {image} on cannot be joined"
+            problem = (
+                f"the recording breaks: {image} and {len(part) - 1} more do not join the others"
+            )
             yield from [partial(refuse, problem)] * len(part)
 
     # Close loops, and distribute the drift.
