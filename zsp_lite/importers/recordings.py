@@ -220,7 +220,7 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
     # Open3D has removed loops that contradict the rest.
     closed = sum(edge.uncertain for edge in graph.edges)
     doubt = ""
-    if closed < len(loops) / 2:
+    if closed < len(loops) / 4:
         doubt = f"the poses may drift: {closed} of {len(loops)} loops close"
     for position, node in zip(order, graph.nodes):
         yield partial(makers[position], node.pose[:3] * [1, 1, 1, unit], doubt=doubt)
