@@ -204,7 +204,7 @@ def test_the_examples_of_methods_of_ones_own_run_as_they_stand(
     rows = {}
     for line in command_blocks(page):
         program, *words = shlex.split(line) or [""]
-        if program == "zsp-lite":
+        if program == "zsp-lite" and "$" not in line:  # the loop needs downloads
             benchmark = words[0] == "benchmark"
             assert main(words + few if benchmark else words) == 0, line
             if benchmark and "--out" in words:

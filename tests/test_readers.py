@@ -498,7 +498,7 @@ def test_the_unit_of_depth_can_be_given(tmp_path, views):
             ["depth/0.exr", "rgb/0.jpg", "metadata.json"],
             r"has depth/\*.exr, .*Record3D's .* no library here decodes, expected .*'s .r3d export",
         ),
-        (["depth/0.png", "rgb/0.jpg"], "has images and depth, but no poses"),
+        (["depth/0.png", "images/0.jpg"], "has images and depth, but no poses"),
         (["scan.bag"], "is a recording of RealSense, expected the folder that open3d.t.io"),
         (["Scan.MKV"], "is a video, such as Azure Kinect's, expected .* azure_kinect_mkv_reader"),
         (["0.JPG"], "has photographs, but no depth and poses in a known .* expected raw"),

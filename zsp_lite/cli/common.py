@@ -147,7 +147,7 @@ def source_options(multiple: bool) -> Callable[..., Any]:
         option(
             "--intrinsics",
             type=INTRINSICS,
-            help="Of an image or TUM; pixel centres at half-integers.",
+            help="Of an image, a recording or TUM; pixel centres at half-integers.",
         ),
         option("--label", type=INDEX, help="Number of the object in masks that label several."),
         option(

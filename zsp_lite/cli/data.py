@@ -277,7 +277,8 @@ def import_(scan, root, category, sequence, mask, box, **options) -> None:
     that an app has exported. Its format is recognised: nerfstudio (also of Blender, NeRFCapture and
     instant-ngp), stray (Stray Scanner), polycam (its raw data), record3d
     (needs `pip install lzfse`), tum (RGB-D benchmark), bop, scannet, open3d (recorder, with the
-    trajectory of its reconstruction), or lists of your own:
+    trajectory of its reconstruction), recording (rgb/ or color/, and depth/, whose poses Open3D
+    finds), or lists of your own:
 
     \b
       rgb.txt, depth.txt  one file per line; depth as 16-bit PNG, TIFF, .npy, ...

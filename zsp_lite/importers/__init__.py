@@ -23,6 +23,7 @@ from zsp_lite.importers.files import PICTURES
 from zsp_lite.importers.lists import read_lists, read_tum
 from zsp_lite.importers.nerfstudio import read_nerfstudio
 from zsp_lite.importers.phones import read_polycam, read_record3d, read_stray
+from zsp_lite.importers.recordings import RECORDED, read_recording
 from zsp_lite.importers.scenes import read_bop, read_open3d, read_scannet
 from zsp_lite.importers.unpacked import unpack
 
@@ -37,6 +38,7 @@ class Format:
     options: tuple[str, ...] = ()  # options that `read` takes, without `count`
     # Direction up in its worlds, by their documents; "floor" if they say nothing of it.
     up: tuple[float, float, float] | Literal["floor"] = "floor"
+    unless: tuple[str, ...] = ()  # patterns of files that a folder of the format does not have
 
 
 PACKED = (".zip", ".r3d")  # extensions of files that apps export
@@ -54,6 +56,14 @@ FORMATS = {
     "tum": Format(("groundtruth.txt", "rgb.txt"), "TUM RGB-D", read_tum, ("intrinsics",)),
     "bop": Format(("scene_gt.json", "scene_camera.json", "rgb"), "BOP", read_bop, ("object",)),
     "scannet": Format(("pose", "intrinsic/intrinsic_color.txt"), "ScanNet", read_scannet),
+    "recording": Format(
+        (RECORDED, "depth"),
+        "recordings without poses: rgb/ or color/, and depth/",
+        read_recording,
+        ("intrinsics",),
+        # Signs of other formats: poses that they have are not to be found again.
+        unless=("scene*", "pose", "groundtruth.txt", "rgb.txt", "trajectory.log", "depth/*.exr"),
+    ),
     "open3d": Format(("intrinsic.json", "color"), "Open3D's recorder", read_open3d),
 }
 _HOW = (
@@ -149,7 +159,9 @@ def recognise(given: Any) -> tuple[str, Any]:
         places.append(path.resolve().parent)
     for place in places:
         for name, layout in FORMATS.items():
-            if all(any(place.glob(sign)) for sign in layout.signs):
+            if all(any(place.glob(sign)) for sign in layout.signs) and not any(
+                any(place.glob(sign)) for sign in layout.unless
+            ):
                 return name, place
 
     # The path has no format: say why, if its files show a reason.
@@ -188,6 +200,8 @@ def open_capture(
         check_choice(f"format of {path}", layout, FORMATS)
     if layout == "stray":  # the reader chooses the sharp frames, because it decodes a video
         options["count"] = count
+    if layout == "recording":
+        options["attributes"] = files
     frames = []
     left_out = []
     for make in FORMATS[layout].read(folder, **options):

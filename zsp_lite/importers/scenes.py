@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from zsp_lite.errors import InputError, check_number, real_array
 from zsp_lite.importers.capture import HALF_PIXEL, CaptureFrame, Makers, make_frame, read_numbers
+from zsp_lite.importers.recordings import open3d_camera
 from zsp_lite.io.files import read_json
 
 _MILLIMETRES = 0.001
@@ -102,11 +103,7 @@ def read_open3d(folder: Path) -> Makers:
             f"{folder} has no trajectory.log, expected poses: run Open3D's reconstruction "
             "system on it"
         )
-    camera = read_json(folder / "intrinsic.json", dict[str, Any], "capture")
-    # The file has the matrix in column-major order.
-    K = real_array(
-        f"{folder}/intrinsic.json: intrinsic_matrix", camera.get("intrinsic_matrix"), (9,)
-    )
+    camera = open3d_camera(folder)
     images = sorted(
         path.stem
         for path in (folder / "color").glob("*")
@@ -127,8 +124,6 @@ def read_open3d(folder: Path) -> Makers:
             f"color/{image}",
             f"depth/{image}",
             pose,
-            K.reshape(3, 3).T + HALF_PIXEL,
-            f"{log}, frame {image}",
-            # RealSense's, which its SDK applies like OpenCV's k1, k2, p1, p2, k3.
-            distortion=camera.get("coeffs", ()),
+            where=f"{log}, frame {image}",
+            **camera,
         )

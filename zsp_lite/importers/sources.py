@@ -241,8 +241,8 @@ def open_source(
             NAME_depth.png (16 bit), .npy, .tiff, ..., registered to its colours, and its mask, if
             there is one, NAME_mask.png. Or frames, such as of `Frame.from_arrays`: one, or any
             iterable of several. An open source is returned as it is.
-        intrinsics: fx, fy, cx, cy of an image or of TUM RGB-D in pixels, or K as 3 x 3, with pixel
-            centres at half-integers (0.5 more than OpenCV's cx and cy).
+        intrinsics: fx, fy, cx, cy of an image, a recording or TUM RGB-D in pixels, or K as 3 x 3,
+            with pixel centres at half-integers (0.5 more than OpenCV's cx and cy).
         depth: Depth file of an image, if it is named otherwise.
         depth_unit: World units per stored depth value; by default the format's own, and 0.001 of an
             image.
