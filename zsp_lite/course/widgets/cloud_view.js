@@ -181,7 +181,7 @@ function render({ model, el }) {
 
 const STYLE = `<style>
 .zsp-turning { display: flex; flex-wrap: wrap; gap: 6px 16px; font-size: 14px; line-height: 1.4; }
-.zsp-turning figure { flex: 1 1 260px; max-width: 360px; min-width: 0; margin: 0; }
+.zsp-turning figure { flex: 1 1 260px; max-width: 360px; min-width: 0; margin: 0; padding: 0; }
 .zsp-turning p { flex: 1 0 100%; margin: 0; }
 .zsp-turning b { padding: 0 1.5em; margin-right: 0.5em; background: linear-gradient(90deg, #fde725, #21918c, #440154); }
 .zsp-turning canvas { display: block; border: 1px solid #888; background: white; cursor: grab; touch-action: pan-y; }
