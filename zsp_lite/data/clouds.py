@@ -68,7 +68,7 @@ def best_plane(
     # The least-squares plane of the inliers: their direction of least variance is its normal.
     inliers = points[inside[counts.argmax()]]
     middle = inliers.mean(axis=0)
-    return np.linalg.svd(inliers - middle, full_matrices=False)[2][2], middle, counts.max()
+    return np.linalg.svd(inliers - middle, full_matrices=False)[2][2], middle, int(counts.max())
 
 
 def _cloud_path(dataset: Co3D, category: str, sequence: str) -> Path | None:
