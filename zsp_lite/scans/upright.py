@@ -37,16 +37,16 @@ def find_up(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"] | None, str
     ring = _ring_axis(centres)
     # Images may be stored turned, cameras that walk around an object do not roll over.
     floor = _floor_normal(frames, of_images if ring is None else ring, centres.mean(axis=0))
-    if floor is None and ring is not None:
+    if ring is None:
+        if floor is not None and floor @ of_images < 0:
+            return None, "no vertical: the cameras are below the floor, or the images upside down"
+        return floor, ""
+    if floor is None:
         up = ring * np.sign(ring @ of_images)
         return (up if vector_angle(up, of_images) < _STEEPEST else None), ""
-    if floor is None:
-        return None, ""
-    if ring is not None and _between_axes(floor, ring) > _AGREE:
-        angle = _between_axes(floor, ring)
+    angle = _between_axes(floor, ring)
+    if angle > _AGREE:
         return None, f"no vertical: floor and ring of the cameras differ by {angle:.0f} degrees"
-    if ring is None and floor @ of_images < 0:
-        return None, "no vertical: the cameras are below the floor, or the images upside down"
     return floor, ""
 
 
