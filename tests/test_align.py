@@ -139,7 +139,7 @@ def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     out = tmp_path / "out"
     shutil.copytree(small_folder(), root)
     _, alignment = run
-    turned = alignment.between(A, C) @ Sim3(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    turned = alignment.between(A, C) @ Sim3(1.0, HALF_TURN, np.zeros(3))
     wrong = PairHypotheses(A, C, (turned,), np.ones(1), np.zeros(3))
     disagreeing = replace(alignment, pairs=(wrong,))
     monkeypatch.setattr("zsp_lite.objects.align.align_category", lambda *_, **__: disagreeing)

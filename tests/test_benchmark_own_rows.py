@@ -591,7 +591,6 @@ def test_a_row_that_fails_does_not_stop_the_others(workers, tmp_path, monkeypatc
             lambda reference, targets, matched, seed, threshold: np.eye(3),
             ".*AttributeError",
         ),
-        "answer": (lambda problem: (np.eye(3), "first"), ".*ValueError: invalid literal"),
         "exit": (lambda problem: sys.exit("\udcff"), r".*SystemExit: \?"),
         "backbone": (ZeroShotPose(lambda images: []), ".*FatalError: backbone .* returned 0"),
         "endless": (never_ends, "takes more than 1 s"),

@@ -357,8 +357,6 @@ def test_a_runs_summary_is_of_the_pairs_and_rows_with_results(mine):
     assert list(summary["methods"]) == ["mine"]
     figures = {"failed": 1, "translation": 0.5, "scale": 1.1, "symmetric_acc30": 50}
     assert figures.items() <= summary["methods"]["mine"].items()
-    table = every_table(summary, ["milliseconds"])[0]
-    assert cell(table, "mine", "ms per pair").value == 2000
 
 
 @pytest.fixture

@@ -242,9 +242,7 @@ def partly_masked(tmp_path, balls):
     return tmp_path / "others"
 
 
-def test_given_masks_are_required_only_on_request(tmp_path, balls):
-    message = "no mask, expected masks named like the images, --mask auto or --box"
-    refused(message, open_source, tmp_path, mask="given")
+def test_a_capture_without_masks_is_imported(tmp_path, balls):
     done = import_source(open_source(tmp_path), tmp_path / "auto", "ball", "one")
     assert (done.frames, done.flags) == (4, ())
 

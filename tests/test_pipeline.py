@@ -212,7 +212,6 @@ def nearest(similarity, *_):
     "settings",
     [
         {"matcher": nearest},
-        {"matcher": nearest, "solver": "verified"},
         {"solver": first_view},
         {"view_selector": lambda one: correspondence_score(one.matches, one.k)},
         {"backbone": CoordinateBackbone()},

@@ -454,12 +454,6 @@ def test_lists_have_names_with_signs_cameras_for_each_image_and_several_sizes(tm
     assert wide.focal_length.tolist() == [300, 301]
 
 
-def test_lists_may_have_one_camera_for_all_images(tmp_path, views):
-    write_lists(tmp_path, views)
-    (tmp_path / "intrinsics.txt").write_text("300 301 60 48\n")
-    assert {frame.camera.focal_length[0] for frame in open_capture(tmp_path).frames} == {300}
-
-
 def test_the_camera_of_tum_is_by_default_that_of_its_sensors(tmp_path, views):
     write("tum", tmp_path / "tum", views)
     assert open_capture(tmp_path / "tum").frames[0].camera.principal_point.tolist() == [320, 240]
@@ -526,11 +520,15 @@ def test_a_file_that_is_no_capture_is_answered_with_what_it_is(tmp_path):
     refused("scan.bag is a recording of RealSense", open_capture, tmp_path / "scan.bag")
 
 
-@pytest.mark.parametrize("layout", ["lists", "open3d"])
+@pytest.mark.parametrize("layout", ["lists", "open3d", "nerfstudio"])
 def test_files_carry_the_distortion(tmp_path, views, layout):
     folder, _ = write(layout, tmp_path / "scan", views)
     if layout == "open3d":
         edited(lambda c: c.update(coeffs=DISTORTION), name="intrinsic.json")(folder)
+    elif layout == "nerfstudio":
+        folder = tmp_path
+        write_nerfstudio(folder, views)
+        edited(lambda c: c.update(zip(("k1", "k2", "p1", "p2", "k3"), DISTORTION)))(folder)
     else:
         (folder / "intrinsics.txt").write_text(" ".join(map(str, [60, 61, 64, 48, *DISTORTION])))
     for frame in open_capture(folder).frames:
@@ -611,12 +609,6 @@ def test_a_surface_of_middle_confidence_is_kept():
 def test_polycams_levels_of_confidence_mean_the_same():
     levels = np.array([0, 127, 255], np.uint8)[DARK]
     assert_array_equal(trusted(levels), trusted(DARK))
-
-
-def test_no_confidence_is_never_trusted():
-    levels = DARK.copy()
-    levels[:20] = 0
-    assert not trusted(levels)[:20].any()
 
 
 def test_a_confidence_map_has_the_size_of_the_depth(tmp_path, views):

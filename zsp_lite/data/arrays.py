@@ -29,7 +29,7 @@ def frame_from_arrays(
     pose: Values | None,
     depth_unit: float,
     name: str,
-    distortion: Values | None,
+    distortion: Values,
 ) -> Frame:
     """Make a frame of arrays (see `Frame.from_arrays`)."""
     label = f"frame {name}".rstrip()
@@ -73,9 +73,7 @@ def frame_from_arrays(
         if largest > 1:
             mask = mask / np.float32(255)
     frame = Frame(image, enlarge_depth(depth, size), mask, camera, name, defect)
-    return undistort(
-        frame, distortion_coefficients(label, () if distortion is None else distortion)
-    )
+    return undistort(frame, distortion_coefficients(label, distortion))
 
 
 def distortion_coefficients(where: str, values: Values) -> Float[np.ndarray, " n"]:
@@ -103,11 +101,10 @@ def undistort(frame: Frame, coefficients: Float[np.ndarray, " n"], fisheye: bool
     K[:2, 2] -= 0.5  # OpenCV's pixel centres
     undistortion = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     maps = undistortion(K, coefficients, np.eye(3), K, camera.size[::-1], cv2.CV_32FC1)
-    images = {name: getattr(frame, name) for name in _SAMPLING}
     straight = {
-        name: cv2.remap(image, *maps, _SAMPLING[name])
-        for name, image in images.items()
-        if image is not None
+        name: cv2.remap(getattr(frame, name), *maps, sampling)
+        for name, sampling in _SAMPLING.items()
+        if getattr(frame, name) is not None
     }
     return replace(frame, **straight)
 

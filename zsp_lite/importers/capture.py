@@ -132,7 +132,6 @@ def make_frame(
     mask: str | None = None,
     confidence: str | Path | None = None,
     distortion: Values = (),
-    fisheye: bool = False,
     **others: Any,
 ) -> CaptureFrame:
     """Make a frame from files and numbers of a capture; InputError if a file is missing or wrong.
@@ -162,15 +161,13 @@ def make_frame(
         pose = pose.reshape(-1, 4) @ axes
 
     camera = camera_from_pose(pose, intrinsics, size or files.picture_size(paths[0]), where)
-    if not fisheye:
+    if not others.get("fisheye"):
         distortion = distortion_coefficients(where, distortion)
     return CaptureFrame(
-        paths[0],
-        paths[1],
+        *paths[:2],
         camera,
         distortion=distortion,
         mask=paths[2],
-        fisheye=fisheye,
         confidence=paths[3],
         **others,
     )

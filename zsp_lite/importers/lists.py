@@ -22,10 +22,8 @@ def read_lists(folder: Path) -> Makers:
     poses = read_numbers(folder / "poses.txt", (12, 16))
     # K, or fx, fy, cx, cy and coefficients of distortion.
     intrinsics = read_numbers(folder / "intrinsics.txt", (3, 4, 8, 9, 12))
-    distortion = intrinsics[:, 4:]
     if intrinsics.shape[1] == 3 or len(intrinsics) == 1:
         intrinsics = [intrinsics.squeeze()] * len(poses)
-        distortion = [distortion[0]] * len(poses)
     counts = {
         "rgb.txt": len(images),
         "depth.txt": len(depths),
@@ -44,7 +42,7 @@ def read_lists(folder: Path) -> Makers:
             poses[line],
             intrinsics[line][:4],
             where,
-            distortion=distortion[line],
+            distortion=intrinsics[line][4:],
         )
 
 

@@ -73,7 +73,7 @@ def read_recording(
                     **attributes,
                 )
             )
-    step = -(-len(makers) // _MOST)
+    step = max(1, -(-len(makers) // _MOST))
     yield from _track(makers[::step], f"{folder.name}, 1 of {step} frames")
 
 
@@ -135,7 +135,7 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
             raise InputError(f"{frame.depth} has no known depth")
         unit = unit or float(depth[depth > 0].mean())
         depth = cv2.resize(depth / unit, camera.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-        small = undistort(Frame(rgb, depth, None, camera), frame.distortion, frame.fisheye)
+        small = undistort(Frame(rgb, depth, None, camera), frame.distortion)
         images = map(o3d.geometry.Image, (small.rgb, small.depth))
         pair = o3d.geometry.RGBDImage.create_from_color_and_depth(*images, 1.0, _FARTHEST)
         grey = small.rgb.mean(axis=2)

@@ -4,6 +4,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from zsp_lite.data.clouds import best_plane
+
 _PLANE_TRIALS = 500  # number of samples of three points
 _PLANE_POINTS = 4000  # largest number of points to which a plane is fitted, for speed
 
@@ -14,19 +16,8 @@ def fit_plane(
     """Fit a plane `normal @ x = offset` to points with outliers by RANSAC, up to its sign."""
     # The step is rounded up.
     points = points[:: -(-len(points) // _PLANE_POINTS)]
-    # A plane through three points in each trial: normals (trials, 3), distances (trials, n).
-    corners = points[np.random.default_rng(0).integers(len(points), size=(_PLANE_TRIALS, 3))]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = normals / np.where(lengths > 0, lengths, 1)
-    distances = np.abs(normals @ points.T - (normals * corners[:, 0]).sum(axis=1, keepdims=True))
-    # Collinear points span no plane: such a sample counts 0.
-    counts = (distances < threshold).sum(axis=1) * (lengths[:, 0] > 0)
-    # The least-squares plane of the inliers: their direction of least variance is its normal.
-    inliers = points[distances[counts.argmax()] < threshold]
-    centre = inliers.mean(axis=0)
-    normal = np.linalg.svd(inliers - centre, full_matrices=False)[2][2]
-    return normal, float(normal @ centre)
+    normal, middle, _ = best_plane(points, threshold, _PLANE_TRIALS)
+    return normal, float(normal @ middle)
 
 
 def largest_region(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

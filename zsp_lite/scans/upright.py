@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from zsp_lite.data.clouds import best_plane
 from zsp_lite.data.frames import Frame
 from zsp_lite.metrics import vector_angle
 from zsp_lite.points import world_points
@@ -36,16 +37,16 @@ def find_up(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"] | None, str
     ring = _ring_axis(centres)
     # Images may be stored turned, cameras that walk around an object do not roll over.
     floor = _floor_normal(frames, of_images if ring is None else ring, centres.mean(axis=0))
-    if floor is None and ring is not None:
+    if ring is None:
+        if floor is not None and floor @ of_images < 0:
+            return None, "no vertical: the cameras are below the floor, or the images upside down"
+        return floor, ""
+    if floor is None:
         up = ring * np.sign(ring @ of_images)
         return (up if vector_angle(up, of_images) < _STEEPEST else None), ""
-    if floor is None:
-        return None, ""
-    if ring is not None and _between_axes(floor, ring) > _AGREE:
-        angle = _between_axes(floor, ring)
+    angle = _between_axes(floor, ring)
+    if angle > _AGREE:
         return None, f"no vertical: floor and ring of the cameras differ by {angle:.0f} degrees"
-    if ring is None and floor @ of_images < 0:
-        return None, "no vertical: the cameras are below the floor, or the images upside down"
     return floor, ""
 
 
@@ -72,22 +73,12 @@ def _floor_normal(
     if len(points) < _POINTS // 2:
         return None
     near = _NEAR * np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
-
-    # Planes through three random points each.
-    corners = points[np.random.default_rng(0).integers(len(points), size=(_TRIALS, 3))]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normals, axis=1)
-    allowed = (length > 0) & (_between_axes(normals, axis) < _STEEPEST)
-    if not allowed.any():
+    normal, middle, count = best_plane(
+        points, near, _TRIALS, lambda normals: _between_axes(normals, axis) < _STEEPEST
+    )
+    if count < _LEAST_SHARE * len(points):
         return None
-    normals = normals[allowed] / length[allowed, None]
-    heights = np.einsum("td,td->t", normals, corners[allowed, 0])
-    on_plane = np.abs(normals @ points.T - heights[:, None]) < near  # (t, n)
-    floor = points[on_plane[on_plane.sum(axis=1).argmax()]]
-    if len(floor) < _LEAST_SHARE * len(points):
-        return None
-    normal = np.linalg.svd(floor - floor.mean(axis=0), full_matrices=False)[2][2]
-    return normal * np.sign(normal @ (above - floor.mean(axis=0)))
+    return normal * np.sign(normal @ (above - middle))
 
 
 def _ring_axis(centres: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
