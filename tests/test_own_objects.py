@@ -367,8 +367,8 @@ def test_several_frames_of_both_objects_agree_on_the_similarity_between_their_wo
     assert several.errors["verified"] < 5
     estimate, reference = several.estimate, several.reference.camera
     target = several.targets[estimate.view].camera
-    in_target = Sim3(1.0, target.R, target.t) @ several.world_sim3
-    by_estimate = estimate.sim3 @ Sim3(1.0, reference.R, reference.t)
+    in_target = target.sim3 @ several.world_sim3
+    by_estimate = estimate.sim3 @ reference.sim3
     assert_allclose(by_estimate.matrix, in_target.matrix, atol=1e-9)
 
 
