@@ -25,7 +25,7 @@ from test_importers import write_lists
 from test_masks import overlap
 
 import zsp_lite
-from zsp_lite import Frame, PoseEstimate, Sim3, ZeroShotPose, estimate_pose, open_source
+from zsp_lite import Frame, PoseEstimate, ZeroShotPose, estimate_pose, open_source
 from zsp_lite.course.samples import sample_data
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.evaluation import spread

@@ -274,7 +274,7 @@ def _defect(name: str, source: str) -> str:
         source = inspect.getsource(_PARTS[name])
         for right_one, wrong_one in mistake["change"]:
             source = source.replace(right_one, wrong_one)
-        wrong = _define(name, source, _PARTS[name].__globals__)
+        wrong = _define(name, source, vars(sys.modules[_PARTS[name].__module__]))
         if all(_same(name, came, _outcome(wrong, case)) for case, came in zip(cases, found)):
             lines.append(mistake["says"])
             break

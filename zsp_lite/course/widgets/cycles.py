@@ -48,8 +48,5 @@ def cycle(
             text += f"; {', '.join(off)} not on the foreground, so the distance is infinite"
         return f"{text}."
 
-    alt = (
-        "A solid arrow from the patch u to its nearest neighbour v, a dashed arrow from v to the "
-        "patch u'."
-    )
+    alt = "A solid arrow from the patch u to its nearest neighbour v, a dashed one from v to u'."
     return interactive_figure(figure, patch_sliders(grid, start, " of u"), update, alt)
