@@ -139,8 +139,8 @@ class CoordinateBackbone:
 def true_pose(reference: Camera, placement: Sim3, target: Camera, target_placement: Sim3) -> Sim3:
     """The true map from the reference's camera frame to the target's, for one object at two
     placements."""
-    first = Sim3(1.0, reference.R, reference.t) @ placement
-    return Sim3(1.0, target.R, target.t) @ target_placement @ first.inverse()
+    first = reference.sim3 @ placement
+    return target.sim3 @ target_placement @ first.inverse()
 
 
 def reference_and_targets(targets: int = 3) -> list[Frame]:

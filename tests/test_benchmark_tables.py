@@ -372,7 +372,6 @@ def folder(tmp_path) -> Path:
         ('"error":1.0', '"error":"1"'),
         ('"error":1.0', '"error":181'),
         ("chair/a:0/b:0", "chair/a:0/b"),
-        ("chair/a:0/b:0", "chair/a:0/b:0,"),
         ("chair/a:0/b:0", "chair/a:0/b/c:0"),
     ],
 )

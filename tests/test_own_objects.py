@@ -25,7 +25,7 @@ from test_importers import write_lists
 from test_masks import overlap
 
 import zsp_lite
-from zsp_lite import Frame, PoseEstimate, Sim3, ZeroShotPose, estimate_pose, open_source
+from zsp_lite import Frame, PoseEstimate, ZeroShotPose, estimate_pose, open_source
 from zsp_lite.course.samples import sample_data
 from zsp_lite.data.co3d import Pair
 from zsp_lite.data.evaluation import spread
@@ -367,8 +367,8 @@ def test_several_frames_of_both_objects_agree_on_the_similarity_between_their_wo
     assert several.errors["verified"] < 5
     estimate, reference = several.estimate, several.reference.camera
     target = several.targets[estimate.view].camera
-    in_target = Sim3(1.0, target.R, target.t) @ several.world_sim3
-    by_estimate = estimate.sim3 @ Sim3(1.0, reference.R, reference.t)
+    in_target = target.sim3 @ several.world_sim3
+    by_estimate = estimate.sim3 @ reference.sim3
     assert_allclose(by_estimate.matrix, in_target.matrix, atol=1e-9)
 
 

@@ -141,6 +141,11 @@ def test_a_recording_without_intrinsics_is_refused(tmp_path, views):
     refused("has no intrinsics, expected --intrinsics FX,FY,CX,CY", open_source, tmp_path)
 
 
+def test_a_recording_whose_images_have_no_depth_is_refused(tmp_path, views):
+    write(tmp_path, views[:2], "rgb/{:06d}.jpg depth/9{:06d}.png")
+    refused("none of 2 frames can be used: .*no depth of its number", open_recording, tmp_path)
+
+
 def test_recorders_of_open3d_and_redwood_need_no_option(tmp_path, views):
     recorder = write(tmp_path / "open3d", views[:3], "color/{:05d}.jpg depth/{:05d}.png")
     fx, fy, cx, cy = INTRINSICS

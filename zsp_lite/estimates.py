@@ -93,7 +93,7 @@ class PoseEstimate:
         """Return the similarity between the worlds that a pose in a target view stands for."""
         reference = self.reference_view.frame.camera
         target = self.target_views[view].frame.camera
-        return Sim3(1.0, target.R, target.t).inverse() @ sim3 @ Sim3(1.0, reference.R, reference.t)
+        return target.sim3.inverse() @ sim3 @ reference.sim3
 
     def angle_to(self, pose: Hypothesis) -> float:
         """Return the angle in degrees between the rotation of the estimate and that of another

@@ -60,11 +60,7 @@ def align(
     # with their own places, the worlds of CO3D's sequences would be nearly aligned already.
     first_reference, first_target = firsts
     aligned = icp(first_reference.to_world(source), first_target.to_world(destination))
-    return (
-        Sim3(1.0, first_target.R, first_target.t)
-        @ aligned
-        @ Sim3(1.0, first_reference.R, first_reference.t).inverse()
-    )
+    return first_target.sim3 @ aligned @ first_reference.sim3.inverse()
 
 
 def _subsample(

@@ -132,8 +132,6 @@ def _between_worlds(problem: PairProblem, alignment: CategoryAlignment) -> Answe
 
 def _answer(problem: PairProblem, between: Sim3, confidence: float | None = None) -> Answer:
     """Return a pose from world to world as one in the first target view."""
-    reference, target = (
-        Sim3(1.0, frame.camera.R, frame.camera.t) for frame in problem.frames()[:2]
-    )
+    reference, target = (frame.camera.sim3 for frame in problem.frames()[:2])
     sim3 = target @ between @ reference.inverse()
     return Answer(sim3.R, 0, sim3.t, sim3.scale, confidence=confidence)

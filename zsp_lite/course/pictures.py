@@ -53,7 +53,7 @@ def show_winners(gains: Mapping[str, np.ndarray], true_gain: float) -> Figure:
     figure, axis = plt.subplots(figsize=(7.4, 0.9 + 0.75 * len(gains)), layout="constrained")
     for row, values in enumerate(gains.values()):
         height = row + np.linspace(-0.28, 0.28, len(values))
-        wins = np.asarray(values) > 0
+        wins = values > 0
         better, worse = ("", "") if row else ("better method wins", "it does not")
         axis.plot(values[wins], height[wins], "o", color=plots.BLUE, label=better)
         style = {"color": plots.VERMILLION, "markeredgewidth": 2.2, "label": worse}

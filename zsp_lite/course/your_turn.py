@@ -87,8 +87,8 @@ def patches(crop: Crop, descriptor: Callable) -> Patches:
         far = list(descriptor(coarse, row, column, 3))
         rows.append(np.concatenate([*descriptor(crop.keys, row, column, 1), *far[:4], *far[5:]]))
     salience = crop.saliency.ravel()
-    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    return Patches(rows / lengths, place, salience, salience > minimal.SALIENT)
+    descriptors = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return Patches(descriptors, place, salience, salience > minimal.SALIENT)
 
 
 def rotation_error(first, second):
@@ -154,8 +154,21 @@ def estimate(problem):
     return Sim3(scale, R, t), view
 
 
-_FIRST = descriptor, cycle, choose, view_score, unproject, umeyama, ransac
-_PARTS = {part.__name__: part for part in (*_FIRST, rotation_error, interval, estimate)}
+_PARTS = {
+    part.__name__: part
+    for part in (
+        descriptor,
+        cycle,
+        choose,
+        view_score,
+        unproject,
+        umeyama,
+        ransac,
+        rotation_error,
+        interval,
+        estimate,
+    )
+}
 _TESTS = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
 
 
@@ -198,7 +211,7 @@ def _refusal(name: str, function: Callable) -> str:
         for one in written.body
         if not (isinstance(one, ast.Expr) and isinstance(one.value, ast.Constant))
     ]
-    if not body or all(isinstance(one, ast.Pass) for one in body):
+    if all(isinstance(one, ast.Pass) for one in body):
         return f"{name} is not written yet: the lesson goes on with the library's"
     nodes = [*ast.walk(written)]
     if any(isinstance(one, ast.Import | ast.ImportFrom) for one in nodes):
@@ -245,18 +258,17 @@ def _defect(name: str, source: str) -> str:
     cases = cases or [{"problem": _toy_problem()}]
     expected = [_outcome(_PARTS[name], case) for case in cases]
     found = [_outcome(function, case, end) for case in cases]
-    if any(isinstance(came, _Slow) for came in found):
+    if any(isinstance(came, TimeoutError) for came in found):
         return f"{name} was stopped after {SECONDS:.0f} s: does a loop never end?"
-    differ = [k for k, right in enumerate(expected) if not _same(name, found[k], right)]
+    differ = [one for one in zip(cases, found, expected) if not _same(name, *one[1:])]
     if not differ:
         return ""
-    case, came, right = cases[differ[0]], found[differ[0]], expected[differ[0]]
+    case, came, right = differ[0]
     given = "a pair whose second target view shows the reference at twice its size"
     if name != "estimate":
         given = ", ".join(f"{key} = {_shown([value])}" for key, value in case.items())
-    error = isinstance(came, Exception)
-    lines = [f"{name} is not right yet.", f"in:       {given}"]
-    lines.append(f"out:      {f'{type(came).__name__}: {came}' if error else _shown(came)}")
+    out = f"{type(came).__name__}: {came}" if isinstance(came, Exception) else _shown(came)
+    lines = [f"{name} is not right yet.", f"in:       {given}", f"out:      {out}"]
     lines.append(f"expected: {_shown(right)}")
     for mistake in test["mistakes"]:
         source = inspect.getsource(_PARTS[name])
@@ -276,16 +288,12 @@ def _define(name: str, source: str, names: Mapping[str, Any]) -> Callable:
     return names[name]
 
 
-class _Slow(Exception):
-    """A part takes too long."""
-
-
 def _outcome(
     function: Callable, case: Mapping[str, Any], end: float = math.inf
 ) -> list[np.ndarray] | Exception:
     """Call a part with copies of arguments, and make arrays of what it gives, or return its error.
 
-    It is stopped by `_Slow` at its first line after the time `end`.
+    It is stopped by TimeoutError at its first line after the time `end`.
     """
     case = copy.deepcopy(dict(case))
     if "rng" in inspect.signature(function).parameters:
@@ -293,7 +301,7 @@ def _outcome(
 
     def trace(frame: FrameType, event: str, value: Any) -> Any:
         if time.monotonic() > end:
-            raise _Slow
+            raise TimeoutError
         return trace if frame.f_code.co_filename == f"<{function.__name__}>" else None
 
     before = sys.gettrace()
@@ -331,11 +339,8 @@ def _same(
 
 def _shown(values: Iterable[Any]) -> str:
     """Write arrays in a short form."""
-    lines = (
-        np.array2string(np.asarray(one), precision=2, suppress_small=True, threshold=60)
-        for one in values
-    )
-    return ", ".join(line.replace("\n", "") for line in lines)
+    style = {"precision": 2, "suppress_small": True, "threshold": 60}
+    return ", ".join(np.array2string(np.asarray(one), **style).replace("\n", "") for one in values)
 
 
 def _keep(name: str, source: str) -> int:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Real
 from numpy.typing import ArrayLike
 
+from zsp_lite.alignment import Sim3
 from zsp_lite.errors import (
     check_integer,
     check_magnitude,
@@ -114,6 +115,11 @@ class Camera:
     def matrix(self) -> Float[np.ndarray, "4 4"]:
         """World-to-camera transform for column vectors (T^cam in the paper)."""
         return np.vstack([np.column_stack([self.R, self.t]), [0.0, 0.0, 0.0, 1.0]])
+
+    @property
+    def sim3(self) -> Sim3:
+        """World-to-camera transform."""
+        return Sim3(1.0, self.R, self.t)
 
     @property
     def centre(self) -> Float[np.ndarray, "3"]:

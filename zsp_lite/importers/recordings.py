@@ -108,9 +108,11 @@ def open3d_camera(folder: Path) -> dict[str, Any]:
     path = folder / "intrinsic.json"
     camera = read_json(path, dict[str, Any], "capture")
     matrix = real_array(f"{path}: intrinsic_matrix", camera.get("intrinsic_matrix"), (9,))
-    # RealSense's coefficients, which its SDK applies like OpenCV's k1, k2, p1, p2, k3.
-    distortion = camera.get("coeffs", ())
-    return {"intrinsics": matrix.reshape(3, 3).T + HALF_PIXEL, "distortion": distortion}
+    return {
+        "intrinsics": matrix.reshape(3, 3).T + HALF_PIXEL,
+        # RealSense's coefficients, which its SDK applies like OpenCV's k1, k2, p1, p2, k3.
+        "distortion": camera.get("coeffs", ()),
+    }
 
 
 def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:

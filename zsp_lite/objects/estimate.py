@@ -307,9 +307,7 @@ def _answer(
     usable, views_left_out = usable_targets(targets)
     left_out = np.full(len(targets), np.inf)
     left_out[usable] = 0.0
-    to_reference, *to_targets = [
-        Sim3(1.0, view.frame.camera.R, view.frame.camera.t) for view in (reference, *targets)
-    ]
+    to_reference, *to_targets = [view.frame.camera.sim3 for view in (reference, *targets)]
     # Each answer becomes a hypothesis in the usable target view that is nearest to the reference.
     hypotheses = []
     view_angles = []  # of each hypothesis, in degrees by target view

@@ -68,7 +68,7 @@ def objects_figure(
                 crop = nearest_crop(dataset, _frames(dataset, category, name), rotation)
                 axis.imshow(crop.rgb)
                 if front:
-                    seen = Sim3(1.0, crop.camera.R, crop.camera.t) @ (front @ poses[name]).inverse()
+                    seen = crop.camera.sim3 @ (front @ poses[name]).inverse()
                     # An arrow that is parallel to the image has 0.35 of its width.
                     reach = 0.35 * seen.t[2] * len(crop.rgb) / crop.camera.K[0, 0]
                     ends = seen.t + reach * seen.R.T

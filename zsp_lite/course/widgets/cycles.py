@@ -40,16 +40,13 @@ def cycle(
             f"{values[w, v]:.2f}: "
             f"d(u, u') = {np.hypot(*np.subtract(cells[0], cells[2])):.1f} patches"
         )
-        off = []
-        for name, cell, view in zip(("u", "v", "u'"), cells, (reference, target, reference)):
-            if not view.foreground[cell]:
-                off.append(name)
+        views = reference, target, reference
+        off = [
+            n for n, cell, view in zip(("u", "v", "u'"), cells, views) if not view.foreground[cell]
+        ]
         if off:
             text += f"; {', '.join(off)} not on the foreground, so the distance is infinite"
         return f"{text}."
 
-    alt = (
-        "A solid arrow from the patch u to its nearest neighbour v, a dashed arrow from v to the "
-        "patch u'."
-    )
+    alt = "A solid arrow from the patch u to its nearest neighbour v, a dashed one from v to u'."
     return interactive_figure(figure, patch_sliders(grid, start, " of u"), update, alt)

@@ -356,7 +356,7 @@ class _LabellingWidget:
         elif len(labelling.picks(self.current)):
             return None  # The picks are not complete.
         elif label is not None:
-            sim3 = Sim3(1.0, label.trans[:3, :3], label.trans[:3, 3])
+            sim3 = Sim3.from_matrix(label.trans)
         else:
             sim3 = labelling.proposal(self.current)
         return sim3 and sim3.apply(labelling.cloud(labelling.reference)[0])

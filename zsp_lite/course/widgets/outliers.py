@@ -90,9 +90,8 @@ def ransac_settings(
             text += f"; rotation error {rotation_error(sim3.R, truth):.0f}°"
         return f"{text}."
 
-    widgets = load_package()
     controls = {
-        "trials": widgets.SelectionSlider(options=_TRIALS, value=1000, description="trials"),
+        "trials": load_package().SelectionSlider(options=_TRIALS, value=1000, description="trials"),
         "threshold": slider("threshold", 0.02, 1.0, 0.2, 0.02),
         "seed": slider("seed", 0, 20, 0),
     }

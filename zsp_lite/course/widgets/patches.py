@@ -87,7 +87,7 @@ def patch_similarities(
             "within one patch of it."
         )
 
-    kinds = load_package().Dropdown(options=list(sims), description="similarity")
-    controls = {**patch_sliders(grid, start), "kind": kinds}
+    controls = patch_sliders(grid, start)
+    controls["kind"] = load_package().Dropdown(options=list(sims), description="similarity")
     alt = "A patch of the reference; its similarities, nearest neighbour and partner in the target."
     return interactive_figure(figure, controls, update, alt)

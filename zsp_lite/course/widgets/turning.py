@@ -17,7 +17,6 @@ SCRIPT = (Path(__file__).parent / "cloud_view.js").read_text(encoding="utf-8")
 _PAGE = """<div data-lm-suppress-shortcuts="true"><div class="zsp-turning"></div>
 <script>(() => {\n%s})()</script></div>"""
 _CALL = 'stored(document.currentScript.parentElement.querySelector(".zsp-turning"), %s, %s);'
-_Lines = Mapping[str, Real[np.ndarray, "k 2 3"]]
 
 
 def view_units(points: Real[np.ndarray, "n 3"]) -> Sim3:
@@ -26,12 +25,17 @@ def view_units(points: Real[np.ndarray, "n 3"]) -> Sim3:
     low, high = np.percentile(points, [1, 99], axis=0) if len(points) else np.zeros((2, 3))
     radius = float(np.linalg.norm(high - low)) / 2
     if not radius >= 1e-12:  # also for a radius that is NaN, for which `<` is false
-        text = f"point cloud of {len(points)} points has no extent, expected finite points"
-        raise InputError(text)
+        raise InputError(
+            f"point cloud of {len(points)} points has no extent, expected finite points"
+        )
     return Sim3(1 / radius, np.eye(3), -(low + high) / 2 / radius)
 
 
-def show_turning(poses: Mapping[str, PoseEstimate], legend: str, lines: _Lines = {}) -> None:
+def show_turning(
+    poses: Mapping[str, PoseEstimate],
+    legend: str,
+    lines: Mapping[str, Real[np.ndarray, "k 2 3"]] = {},
+) -> None:
     """Show, by title, the target and the moved points of the reference as clouds that turn
     together; nothing where no script runs.
 
