@@ -16,6 +16,8 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextvars import ContextVar
+from functools import partial
 from pathlib import Path
 from types import FrameType, SimpleNamespace
 from typing import Any, NamedTuple
@@ -29,7 +31,6 @@ from zsp_lite.errors import InputError
 from zsp_lite.io.files import write_atomic
 from zsp_lite.minimal import (
     Crop,
-    choose,
     cycle,
     descriptor,
     pixel_depths,
@@ -49,12 +50,16 @@ HEADER = '''\
 import numpy as np
 
 from zsp_lite.alignment import Sim3
-from zsp_lite.course.your_turn import composed, crops, draws, interval, patches, rotation_error
-from zsp_lite.minimal import choose, cycle, descriptor, kmeans, pixel_depths
+from zsp_lite.course.your_turn import choose, composed, crops, draws, interval, kmeans
+from zsp_lite.course.your_turn import patches, rotation_error
+from zsp_lite.minimal import cycle, descriptor, pixel_depths
 from zsp_lite.minimal import ransac, umeyama, unproject, view_score
 '''
 # What stands at its end until the student's own `estimate` does.
 COMPOSED = "estimate = composed(globals())  # the library's, of the parts above\n"
+
+
+_seed = ContextVar("seed of the pair", default=0)
 
 
 class Patches(NamedTuple):
@@ -69,13 +74,23 @@ class Patches(NamedTuple):
 def crops(problem: Any) -> list[Crop]:
     """Return the crops of a pair, the reference's first: features, depth, intrinsics.
 
-    A pair is whatever has views: `problem.views()`, as the benchmark's problems have.
+    A pair is whatever has `views()` and a `seed`, as the benchmark's problems. `kmeans` draws by
+    the seed from now on.
     """
+    _seed.set(problem.seed)
     return [
         Crop(view.features.keys.numpy(), view.features.saliency.numpy(), view.frame.depth,
              view.frame.camera.K)
         for view in problem.views()
     ]  # fmt: skip
+
+
+def kmeans(vectors: np.ndarray, k: int) -> np.ndarray:
+    """Assign n vectors to k clusters, as the library does for this pair: labels (n,)."""
+    return minimal.kmeans(vectors, k, _seed.get())
+
+
+choose = partial(minimal.choose, kmeans=kmeans)
 
 
 def patches(crop: Crop, descriptor: Callable) -> Patches:
@@ -154,21 +169,8 @@ def estimate(problem):
     return Sim3(scale, R, t), view
 
 
-_PARTS = {
-    part.__name__: part
-    for part in (
-        descriptor,
-        cycle,
-        choose,
-        view_score,
-        unproject,
-        umeyama,
-        ransac,
-        rotation_error,
-        interval,
-        estimate,
-    )
-}
+_FIRST = descriptor, cycle, minimal.choose, view_score, unproject, umeyama, ransac
+_PARTS = {part.__name__: part for part in (*_FIRST, rotation_error, interval, estimate)}
 _TESTS = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
 
 
@@ -193,7 +195,7 @@ def check(function: Callable) -> None:
 
 def my_method() -> Callable[[Any], tuple[Sim3, int]]:
     """Return the `estimate` of `my_method.py`; without this file the library's."""
-    return _namespace()["estimate"]
+    return _executed(_kept())["estimate"]
 
 
 def _source(function: Callable) -> str:
@@ -220,16 +222,16 @@ def _refusal(name: str, function: Callable) -> str:
     known = {one.id for one in names if not isinstance(one.ctx, ast.Load)}
     known |= {one.arg for one in nodes if isinstance(one, ast.arg)}
     known |= {one.name for one in nodes if isinstance(one, ast.FunctionDef)}
-    unknown = {one.id for one in names} - known - {*_namespace(), *dir(builtins)}
+    unknown = {one.id for one in names} - known - {*_executed(_kept()), *dir(builtins)}
     if unknown:
         return f"{name} uses {min(unknown)}, which {FILE} does not have: put it into the function"
     return ""
 
 
-def _namespace() -> dict[str, Any]:
-    """Return what a part can use: the parts that are kept, and the library's for the others."""
+def _executed(text: str) -> dict[str, Any]:
+    """Return the names that a text of Python defines."""
     names: dict[str, Any] = {}
-    exec(compile(_kept(), FILE, "exec"), names)
+    exec(compile(text, FILE, "exec"), names)
     return names
 
 
@@ -248,14 +250,15 @@ def _kept() -> str:
 
 
 def _defect(name: str, source: str) -> str:
-    """Compare a part with the library's; "" if all results are the same."""
-    function = _define(name, source, _namespace())
+    """Compare a part, among the library's others, with the library's; "" if all is the same."""
+    _seed.set(0)
+    function = _define(name, source, _executed(HEADER))
     test, end = _TESTS[name], time.monotonic() + SECONDS
     cases = [
         {key: np.array(value) if isinstance(value, list) else value for key, value in case.items()}
         for case in test["cases"]
     ]
-    cases = cases or [{"problem": _toy_problem()}]
+    cases = cases or [{"problem": _toy_problem(noise)} for noise in (0, 0.05)]
     expected = [_outcome(_PARTS[name], case) for case in cases]
     found = [_outcome(function, case, end) for case in cases]
     if any(isinstance(came, TimeoutError) for came in found):
@@ -295,7 +298,7 @@ def _outcome(
 
     It is stopped by TimeoutError at its first line after the time `end`.
     """
-    case = copy.deepcopy(dict(case))
+    given, case = case, copy.deepcopy(dict(case))
     if "rng" in inspect.signature(function).parameters:
         case["rng"] = draws(0)
 
@@ -318,6 +321,9 @@ def _outcome(
                 todo = [*one, *todo]
             else:
                 flat.append(np.asarray(one, float))
+        for key, value in given.items():
+            if isinstance(value, np.ndarray) and not np.array_equal(value, case[key]):
+                raise ValueError(f"{key} is overwritten, which the caller still needs")
     except Exception as error:  # of any kind, as it is the student's
         return error
     finally:
@@ -361,19 +367,21 @@ def _places(text: str) -> dict[str, slice]:
     return {name: slice(one.lineno - 1, one.end_lineno) for one, name in names if name in _PARTS}
 
 
-def _toy_problem() -> Any:
-    """Build a pair with two target views: noise, and the reference at twice its size."""
+def _toy_problem(noise: float) -> Any:
+    """Build a pair with three target views: the second shows the reference at twice its size."""
     rng = np.random.default_rng(3)
-    keys, salience = rng.normal(size=(6, 6, 8)), rng.uniform(0.1, 1, (6, 6))
-    depth = rng.uniform(4, 6, (24, 24)).astype(np.float32)
+    keys, depth = rng.normal(size=(12, 12, 8)), rng.uniform(4, 6, (48, 48)).astype(np.float32)
 
-    def view(keys: np.ndarray, depth: np.ndarray = depth, middle: int = 12) -> SimpleNamespace:
-        K = np.array([[40, 0, middle], [0, 40, 12], [0, 0, 1.0]])
-        features = SimpleNamespace(keys=torch.from_numpy(keys), saliency=torch.from_numpy(salience))
+    def view(keys: np.ndarray, depth: np.ndarray = depth, middle: int = 24) -> SimpleNamespace:
+        salience = torch.from_numpy(rng.uniform(0, 0.4, (12, 12)))
+        features = SimpleNamespace(keys=torch.from_numpy(keys), saliency=salience)
+        K = np.array([[80, 0, middle], [0, 80, 24], [0, 0, 1.0]])
         frame = SimpleNamespace(depth=depth, camera=SimpleNamespace(K=K))
         return SimpleNamespace(features=features, frame=frame)
 
     # A patch has 4 pixels: the picture moves to the right by one patch.
-    larger = view(np.roll(keys, 1, axis=1), 2 * np.roll(depth, 4, axis=1), 12 + 4)
-    views = [view(keys), view(rng.normal(size=keys.shape)), larger]
-    return SimpleNamespace(views=lambda: views, seed=0)
+    larger = np.roll(keys, 1, axis=1) + 9 * noise * rng.normal(size=keys.shape)
+    farther = np.roll(depth, 4, axis=1) * rng.normal(2, noise, depth.shape).astype(np.float32)
+    others = [view(rng.normal(size=keys.shape)) for _ in range(2)]
+    views = [view(keys), others[1], view(larger, farther, 24 + 4), others[0]]
+    return SimpleNamespace(views=lambda: views, seed=1)
