@@ -1,7 +1,9 @@
 """What each part of the method gains: the accuracy of a row of the benchmark with it, minus that of
 a row without it, on the same pairs."""
 
+import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,42 +15,7 @@ from zsp_lite.viz import plots
 from zsp_lite.viz.reliability import reliability
 
 # By section and part: the row with the part, and the row without it.
-PARTS = {
-    "features and matches": {
-        "network, not RootSIFT": ("ours-mask", "rootsift"),
-        "log-binning, not bare keys": ("ours", "ours-keys"),
-        "saliency, not the true mask": ("ours", "ours-mask"),
-        "cycles, not nearest patches": ("ours", "ours-nearest"),
-        "cycles, not dual softmax": ("ours", "ours-dualsoftmax"),
-        "cycles, not optimal transport": ("ours", "ours-transport"),
-        "cycle from the reference, not the target": ("ours", "ours-published"),
-        "k-means, K = 30": ("ours-k30", "ours-k30-nokmeans"),
-        "k-means, K = 50": ("ours", "ours-k50-nokmeans"),
-        "k-means, K = 70": ("ours-k70", "ours-k70-nokmeans"),
-        "50 matches, not 30": ("ours", "ours-k30"),
-    },
-    "the view": {
-        "5 views, not 1": ("ours", "ours-n1"),
-        "10 views, not 5": ("ours-n10", "ours"),
-        "equation 3, not the global feature": ("ours", "ours-globalsim"),
-        "equation 3, not saliency": ("ours", "ours-saliencyiou"),
-        "equation 3, not cycles": ("ours", "ours-cyclicaliou"),
-        "the nearest view given": ("oracle-view", "ours"),
-    },
-    "the fit": {
-        "fit, not the view's pose": ("ours", "ours-bv"),
-        "RANSAC, not least squares": ("ours", "ours-least-squares"),
-        "depth, not none": ("ours", "ours-nodepth"),
-        "1,000 trials, not 500": ("ours", "ours-trials500"),
-    },
-    "beyond the paper": {
-        "verified, not the paper's": ("verified", "ours"),
-        "5 views, not 1 (verified)": ("verified", "verified-n1"),
-        "4 frames, not 1": ("scans-4", "verified"),
-        "votes and shape, not shape alone": ("scans-4", "shape-upright"),
-        "all objects, not 2": ("category", "scans-4"),
-    },
-}
+PARTS = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
 
 
 def gains(runs: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
