@@ -124,6 +124,14 @@ def test_frames_that_are_dark_or_damaged_are_left_out(tmp_path, views):
         assert re.search(reason, left_out)
 
 
+def test_a_depth_of_half_the_images_goes_to_no_second_image(tmp_path, views):
+    write(tmp_path, views[:8])
+    for path in sorted((tmp_path / "depth").iterdir())[1::2]:
+        path.unlink()
+    left_out = open_recording(tmp_path).left_out
+    assert [re.search(r"(\d).jpg: no depth", text)[1] for text in left_out] == ["1", "3", "5", "7"]
+
+
 def test_the_unit_of_depth_scales_the_poses(tmp_path, views):
     write(tmp_path, views[:3])
     far = open_recording(tmp_path, depth_unit=0.002).cameras[2].t

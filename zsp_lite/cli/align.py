@@ -107,7 +107,8 @@ def align(
 
     An arrow between two places of one object, --axes, names the front: alignment.json gets
     world_to_axes, the rigid pose of each object with x to the front, y to the left and z up, by the
-    floor or the cameras of that scan. The origin is amid the objects, lengths are those of DATA.
+    floor or the cameras of that scan. The origin is amid the objects; lengths are those of DATA,
+    for scans of OUT/data.
     """
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.data.co3d import Co3D

@@ -56,10 +56,11 @@ def read_recording(
         camera = _known_camera(folder, min(images.values()))
     # The numbers are of frames or times: an image and its depth have the same, or nearly.
     numbers = np.array([*depths])
+    farthest = 0.75 * np.ptp([*images]) / len(images)
     makers = []
     for number, image in images.items():
         nearest = numbers[np.abs(numbers - number).argmin()]
-        if abs(nearest - number) > 0.75 * np.ptp(numbers) / len(numbers):
+        if abs(nearest - number) > farthest:
             yield partial(refuse, f"{image}: no depth of its number in {folder}/depth")
         else:
             makers.append(
