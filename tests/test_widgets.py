@@ -12,7 +12,7 @@ from numpy.random import default_rng
 from refusals import refused
 
 from zsp_lite import Sim3
-from zsp_lite.alignment import ransac, umeyama
+from zsp_lite.alignment import umeyama
 from zsp_lite.course.true_matches import correct_matches
 from zsp_lite.matching import cyclical_distances, similarity
 from zsp_lite.metrics import rotation_error

@@ -382,6 +382,6 @@ def _toy_problem(noise: float) -> Any:
     # A patch has 4 pixels: the picture moves to the right by one patch.
     larger = np.roll(keys, 1, axis=1) + 9 * noise * rng.normal(size=keys.shape)
     farther = np.roll(depth, 4, axis=1) * rng.normal(2, noise, depth.shape).astype(np.float32)
-    others = [view(rng.normal(size=keys.shape)) for _ in range(2)]
-    views = [view(keys), others[1], view(larger, farther, 24 + 4), others[0]]
+    other = view(rng.normal(size=keys.shape))
+    views = [view(keys), other, view(larger, farther, 24 + 4), other]
     return SimpleNamespace(views=lambda: views, seed=1)

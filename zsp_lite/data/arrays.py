@@ -9,13 +9,12 @@ from jaxtyping import Float, Float32, Float64
 from zsp_lite.data.cameras import Camera, Values
 from zsp_lite.data.depth import zero_unknown
 from zsp_lite.data.frames import ON_OBJECT, Frame
-from zsp_lite.errors import InputError, check_number, real_array, rigid_matrix
+from zsp_lite.errors import InputError, check_magnitude, check_number, real_array, rigid_matrix
 
 # Largest relative difference of the aspect ratios of an image and its smaller depth map: sides are
 # rounded to whole pixels.
 _SAME_ASPECT = 0.01
-# Largest coefficients of distortion: all, and p1 and p2, which are small for every lens.
-_MOST_DISTORTED = 100
+# Largest p1 and p2 of a distortion, which are small for every lens.
 _MOST_TANGENTIAL = 0.1
 # How each image of a frame is sampled: means of depth lie on no surface.
 _SAMPLING = {"rgb": cv2.INTER_LINEAR, "depth": cv2.INTER_NEAREST, "mask": cv2.INTER_LINEAR}
@@ -29,7 +28,7 @@ def frame_from_arrays(
     pose: Values | None,
     depth_unit: float,
     name: str,
-    distortion: Values,
+    distortion: Values | None,
 ) -> Frame:
     """Make a frame of arrays (see `Frame.from_arrays`)."""
     label = f"frame {name}".rstrip()
@@ -76,15 +75,12 @@ def frame_from_arrays(
     return undistort(frame, distortion_coefficients(label, distortion))
 
 
-def distortion_coefficients(where: str, values: Values) -> Float[np.ndarray, " n"]:
+def distortion_coefficients(where: str, values: Values | None) -> Float[np.ndarray, " n"]:
     """Check coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of OpenCV, or none; errors begin with
     `where`."""
-    numbers = real_array(f"{where}: distortion", values).ravel()
-    if (
-        numbers.shape not in ((0,), (4,), (5,), (8,))
-        or not (np.abs(numbers) <= _MOST_DISTORTED).all()
-        or not (np.abs(numbers[2:4]) <= _MOST_TANGENTIAL).all()
-    ):
+    numbers = real_array(f"{where}: distortion", () if values is None else values).ravel()
+    check_magnitude(f"{where}: distortion", numbers)
+    if numbers.size not in (0, 4, 5, 8) or not (np.abs(numbers[2:4]) <= _MOST_TANGENTIAL).all():
         raise InputError(
             f"{where}: distortion is {numbers.tolist()}, expected OpenCV's k1, k2, p1, p2, then k3,"
             f" or k3 to k6, or none, with p1 and p2 from -{_MOST_TANGENTIAL} to {_MOST_TANGENTIAL}"

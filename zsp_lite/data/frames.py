@@ -85,7 +85,7 @@ class Frame:
         pose: Values | None = None,
         depth_unit: float = 1.0,
         name: str = "",
-        distortion: Values = (),
+        distortion: Values | None = None,
     ) -> "Frame":
         """Make a frame of arrays as a camera gives them, in any unit of length.
 

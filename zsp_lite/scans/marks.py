@@ -190,7 +190,7 @@ def read_front(dataset: Co3D, category: str, tail: Mark, tip: Mark) -> Float[np.
     length = np.linalg.norm(arrow)
     least = _SHORTEST * (extent(dataset, category, name) or (None, 0.0))[1]
     tilt = abs(90 - vector_angle(arrow, up))
-    if length < least or tilt > _STEEPEST:
+    if not length > least or tilt > _STEEPEST:
         raise InputError(
             f"the arrow on {name} is {length:.2g} long and {tilt:.0f} degrees from the floor, "
             f"expected at least {least:.2g}, a tenth of the object, and at most {_STEEPEST:.0f}"
