@@ -198,7 +198,7 @@ def test_the_distortion_of_arrays_is_corrected(count):
     [
         ({"distortion": [0.1, 0.2, 0]}, r"distortion is \[0.1, 0.2, 0.0\], expected OpenCV's k1"),
         ({"distortion": [0.1, 0.2, 0.5, 0, 0]}, "with p1 and p2 from -0.1 to 0.1"),
-        ({"distortion": [np.nan] * 5}, "distortion is .nan"),
+        ({"distortion": [np.nan] * 5}, "distortion holds nan"),
         (
             {"rgb": np.zeros((3, *SIZE), np.uint8)},
             r"rgb has shape \(3, 24, 32\), expected \(H, W\), \(H, W, 3\)",

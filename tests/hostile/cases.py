@@ -1,6 +1,5 @@
 """The cases: endless, oversized and malicious files and options, for every reader and command."""
 
-import gzip
 import io
 import json
 import struct
