@@ -88,6 +88,15 @@ def test_the_solutions_pass_one_after_the_other_and_are_kept(folder, capsys):
     assert kept.count("def cycle(") == 1 and "home" in kept
 
 
+def test_the_pose_is_one_value_and_the_ends_of_an_interval_may_be_two():
+    flat = SOLUTIONS["ransac"].replace(
+        "return umeyama(x[best], y[best]), best", "return 1, 2, 3, best"
+    )
+    assert "4 values are returned, expected 2" in your_turn._defect("ransac", flat)
+    ends = SOLUTIONS["interval"].replace("return np", "return tuple(np").rstrip() + ")\n"
+    assert your_turn._defect("interval", ends) == ""
+
+
 @pytest.mark.slow
 def test_the_assembled_method_gives_the_poses_of_the_one_page_version():
     for name, source in SOLUTIONS.items():

@@ -5,6 +5,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -58,8 +59,6 @@ def gains(runs: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
 def show_trust(runs: Mapping[str, pd.DataFrame], rows: Sequence[str]) -> Figure:
     """Draw the share of right poses over their probability, in ten bins of equal size, for rows of
     each run; the legend has the calibration errors."""
-    import matplotlib.pyplot as plt
-
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.6), sharey=True, layout="constrained")
     for axis, (name, table) in zip(axes, runs.items()):
         for row, style in zip(rows, ("o-", "s--", "^:")):
@@ -77,8 +76,6 @@ def show_trust(runs: Mapping[str, pd.DataFrame], rows: Sequence[str]) -> Figure:
 def show_gains(found: pd.DataFrame, section: str) -> Figure:
     """Draw the gains of a section's parts: a dot with its interval for each run, a cross for the
     paper."""
-    import matplotlib.pyplot as plt
-
     here = found.loc[section]
     heights = np.arange(len(here))
     figure, axis = plt.subplots(figsize=(8, 1.1 + 0.42 * len(here)), layout="constrained")
