@@ -129,7 +129,7 @@ def test_what_is_not_written_or_not_ones_own_is_said(capsys, monkeypatch, folder
     assert lines[:5] == [
         "cycle is not written yet: the lesson goes on with the library's",
         "umeyama is the library's own: write yours",
-        "umeyama uses minimal, which my_method.py does not have: use np and the parts of the method",
+        "umeyama uses minimal, which my_method.py does not have, only np and the parts",
         "umeyama imports something: np and the parts of the method are there",
         f"len is no part of the method, expected one of {', '.join(_PARTS)}",
     ]

@@ -224,7 +224,7 @@ def _refusal(name: str, function: Callable) -> str:
     known |= {one.name for one in nodes if isinstance(one, ast.FunctionDef)}
     unknown = {one.id for one in names} - known - {*_executed(_kept()), *dir(builtins)}
     if unknown:
-        return f"{name} uses {min(unknown)}, which {FILE} does not have: use np and the parts of the method"
+        return f"{name} uses {min(unknown)}, which {FILE} does not have, only np and the parts"
     return ""
 
 
