@@ -313,5 +313,6 @@ def photograph(page, path: Path) -> None:
         "() => document.querySelector('.jp-WindowedPanel-inner').getBoundingClientRect().height"
     )
     page.set_viewport_size({"width": 1300, "height": int(min(cells + 150, 15_000))})
+    page.evaluate("document.querySelector('.jp-WindowedPanel-outer').scrollTop = 0")
     time.sleep(2)  # until everything is laid out anew
     page.screenshot(path=path, timeout=120_000)
