@@ -1,4 +1,4 @@
-"""Views of an asymmetric implicit surface, and a backbone whose features are functions of the
+"""Views of an asymmetric object, and a backbone whose features are functions of the
 object coordinates.
 
 The colours of the images encode the object coordinates. Features computed from them are exact, so
@@ -12,20 +12,17 @@ import torch
 from numpy.random import default_rng
 
 from zsp_lite import Camera, FeatureMap, Frame, Sim3
-from zsp_lite.matching import match, similarities
-from zsp_lite.verified.poses import Poses
-from zsp_lite.verified.scene import Scene, build_scene
-from zsp_lite.views import View
+from zsp_lite.course.synthetic.sequences import orbit_pose
 
-AXES = np.array([1.2, 0.8, 0.6])  # half axes of the ellipsoid without its bumps
+# The object is the union of ellipsoids along its axes: middle and half axes of each.
+PARTS = np.array(
+    [
+        [(0, 0, 0), (1.2, 0.8, 0.6)],
+        [(0.7, 0.3, 0.3), (0.5, 0.4, 0.4)],
+        [(-0.6, -0.4, 0.2), (0.4, 0.6, 0.5)],
+    ]
+)
 REACH = 1.6  # no point of the object is farther from its middle; colours encode [-REACH, REACH]
-
-
-def inside(points: np.ndarray) -> np.ndarray:
-    """Implicit function of the object, (..., 3) -> (...), negative inside."""
-    x, y, z = np.moveaxis(points, -1, 0)
-    bumps = 0.08 * np.sin(4 * x + 1) + 0.08 * np.sin(5 * y - 2 * z) + 0.06 * np.cos(6 * z + x)
-    return np.linalg.norm(points / AXES, axis=-1) - 1 - bumps
 
 
 def look_at(direction, distance: float = 4.0, size=(140, 180), focal: float = 190.0) -> Camera:
@@ -38,19 +35,10 @@ def look_at(direction, distance: float = 4.0, size=(140, 180), focal: float = 19
     return Camera(rotation, np.array([0, 0, distance]), np.full(2, focal), middle, size)
 
 
-def level_camera(azimuth, height=0.0, distance=3.0):
+def level_camera(azimuth, height=0.0):
     """A camera that looks at (1, 2, 3) horizontally or from above; +z of the world is up."""
-    turn, tilt = np.radians([azimuth, height])
-    away = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
-    right = np.array([-np.sin(turn), np.cos(turn), 0])
-    R = np.stack([right, np.cross(-away, right), -away])
-    return Camera(
-        R,
-        np.array([0, 0, distance]) - R @ [1, 2, 3],
-        np.full(2, 100.0),
-        np.full(2, 50.0),
-        (100, 100),
-    )
+    pose = orbit_pose(*np.radians([azimuth, height]), 0, 3.0, (1, 2, 3))
+    return Camera(*pose, np.full(2, 100.0), np.full(2, 50.0), (100, 100))
 
 
 # Object poses of the two sequences of a pair, and directions of cameras.
@@ -66,37 +54,24 @@ def turned(camera: Camera, turn: np.ndarray) -> Camera:
 
 def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
     """Render the object; `placement` maps object to world coordinates."""
-    height, width = camera.size
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width)))
-    # Rays that miss the ball around the object see nothing.
-    middle = camera.to_camera(placement.t)
-    reach = REACH * placement.scale
-    near = np.linalg.norm(np.cross(rays, middle), axis=-1) < reach * np.linalg.norm(rays, axis=-1)
-    start, *ends = placement.inverse().apply(
-        camera.to_world(np.concatenate([np.zeros((1, 3)), rays[near]]))
-    )
-    along = ends - start  # per unit of depth, in object coordinates
-    # From far to near, so that the last crossing found is the nearest one.
-    far = np.full(len(along), np.inf)
-    behind = np.zeros(len(along), dtype=bool)
-    steps, step = np.linspace(7.0, 1.5, 56, retstep=True)
-    for depth in steps[np.abs(steps - middle[2]) < reach - step]:
-        now = inside(start + depth * along) <= 0
-        far[behind & ~now] = depth - step
-        behind = now
-    # Bisection between the last step inside the object, `low`, and the step before it, `high`.
-    hit = np.isfinite(far)
-    high = np.where(hit, far, 1.0)
-    low = high + step
-    for _ in range(14):
-        middle = (low + high) / 2
-        outside = inside(start + middle[:, None] * along) > 0
-        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
-    colour = np.rint(((start + high[:, None] * along) / REACH + 1) * 127).clip(1, 254)
-    rgb, depth = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.float32)
-    rgb[near], depth[near] = np.where(hit[:, None], colour, 0), np.where(hit, high, 0)
-    return Frame(rgb, depth, (depth > 0).astype(np.float32), camera, name)
+    x, y = np.meshgrid(np.arange(camera.size[1]) + 0.5, np.arange(camera.size[0]) + 0.5)
+    rays = camera.unproject_camera(np.stack([x, y], -1), np.ones(camera.size))
+    to_object = placement.inverse()
+    start = to_object.apply(camera.centre)
+    along = to_object.apply(camera.to_world(rays)) - start  # per unit of depth
+    depth = np.full(camera.size, np.inf)
+    for middle, axes in PARTS:
+        # |offset + depth * step| = 1 is quadratic in the depth.
+        offset, step = (start - middle) / axes, along / axes
+        square, half = (step**2).sum(-1), step @ offset
+        root = half**2 - square * (offset @ offset - 1)
+        nearest = (-half - np.sqrt(np.maximum(root, 0))) / square
+        depth = np.where(root > 0, np.minimum(depth, nearest), depth)
+    hit = np.isfinite(depth)
+    depth = np.where(hit, depth, 0).astype(np.float32)
+    colour = np.rint(((start + depth[..., None] * along) / REACH + 1) * 127).clip(1, 254)
+    rgb = (colour * hit[..., None]).astype(np.uint8)
+    return Frame(rgb, depth, hit.astype(np.float32), camera, name)
 
 
 def around(placement: Sim3, count: int = 7, arc: float = 360) -> list[Frame]:
@@ -121,12 +96,14 @@ class CoordinateBackbone:
     def features(self, image: np.ndarray) -> FeatureMap:
         """The features of one image from the mean colour of each of n x n patches."""
         n, p = self.grid, len(image) // self.grid
-        patches = image.reshape(n, p, n, p, 3).swapaxes(1, 2).reshape(n, n, p * p, 3).astype(float)
-        painted = patches.min(axis=-1) > 0
-        share = painted.mean(axis=-1)
-        mean = (patches * painted[..., None]).sum(axis=2) / np.maximum(painted.sum(axis=-1), 1)[
-            ..., None
-        ]
+
+        def average(pixels: np.ndarray) -> np.ndarray:
+            return pixels.reshape(n, p, n, p, -1).mean(axis=(1, 3))
+
+        painted = image.min(axis=-1, keepdims=True) > 0
+        share = average(painted)
+        mean = average(image * painted) / np.maximum(share, 1e-9)
+        share = share[..., 0]
         coordinates = (mean / 127 - 1) * REACH
         waves = default_rng(5).normal(0, 1.6, (3, self.frequencies))
         keys = np.concatenate([np.sin(coordinates @ waves), np.cos(coordinates @ waves)], axis=-1)
@@ -151,29 +128,3 @@ def reference_and_targets(targets: int = 3) -> list[Frame]:
     ]
     elsewhere = [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras)]
     return [render(look_at((1, 0.6, 0.4)), AT_HOME, "reference"), *elsewhere]
-
-
-def matched_scene(views: list[View]) -> Scene:
-    """The verified solver's scene of a reference view and its target views."""
-    reference, *targets = views
-    found = similarities(reference.features, [target.features for target in targets])
-    matches = [
-        match(reference.features, target.features, kmeans=False, sim=sim)
-        for target, sim in zip(targets, found)
-    ]
-    return build_scene(reference, targets, found, matches)
-
-
-def working_pose(scene: Scene, sim3: Sim3, view: int) -> Poses:
-    """A similarity from the reference's camera to that of a target view, in the scene's working
-    units."""
-    first, camera = scene.target_cameras[0], scene.target_cameras[view]
-    rotation = first.R @ camera.R.T
-    to_first = Sim3(1.0, rotation, first.t - rotation @ camera.t)
-    pose = scene.target_to_working @ to_first @ sim3 @ scene.reference_to_working.inverse()
-    return Poses(
-        *(
-            torch.tensor(np.array(part)[None], dtype=torch.float32)
-            for part in (pose.scale, pose.R, pose.t)
-        )
-    )

@@ -127,7 +127,7 @@ def speed(device: str) -> Result:
             if device == "cuda":
                 torch.cuda.synchronize()
 
-        return seconds(to_its_end, repeats=3)
+        return seconds(to_its_end)
 
     for place in dict.fromkeys((device, "cpu")):
         dino = Backbone(VisionTransformer(), "DINO ViT-S/8, random weights", device=place)
