@@ -88,7 +88,6 @@ class CoordinateBackbone:
     background."""
 
     grid: int = 28
-    frequencies: int = 32
 
     def __call__(self, images) -> list[FeatureMap]:
         return [self.features(np.asarray(image)) for image in images]
@@ -105,7 +104,7 @@ class CoordinateBackbone:
         mean = average(image * painted) / np.maximum(share, 1e-9)
         share = share[..., 0]
         coordinates = (mean / 127 - 1) * REACH
-        waves = default_rng(5).normal(0, 1.6, (3, self.frequencies))
+        waves = default_rng(5).normal(0, 1.6, (3, 32))
         keys = np.concatenate([np.sin(coordinates @ waves), np.cos(coordinates @ waves)], axis=-1)
         keys[share < 0.5] = 0.05 * default_rng(6).normal(size=keys.shape[-1])
         keys = torch.as_tensor(keys, dtype=torch.float32)

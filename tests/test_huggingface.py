@@ -141,7 +141,7 @@ def test_the_image_processors_mean_and_deviation_are_taken(processor, mean, std,
 
 def test_without_transformers_the_package_is_named(folders, monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
-    refused(r"pip install transformers", load_backbone, f"hf:{folders['vit']}", "cpu")
+    refused(r"pip install transformers", load_backbone, f"hf:{folders['vit']}")
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_models_that_cannot_be_read_are_refused(kind, settings, message, tmp_pat
     # A convolutional network has none of the settings of a transformer.
     make = transformers.ResNetConfig if kind == "resnet" else functools.partial(configuration, kind)
     folder = save_model(tmp_path / "model", make(**settings))
-    refused(message, load_backbone, f"hf:{folder}", "cpu", image_size=32)
+    refused(message, load_backbone, f"hf:{folder}", image_size=32)
 
 
 def without(vit: Path, part: str) -> str:
@@ -183,14 +183,14 @@ def test_a_missing_pooler_changes_nothing_because_no_feature_depends_on_it(vit):
 
 def test_missing_weights_are_refused(vit):
     name = without(vit, "layernorm.weight")
-    refused("1 weights are not in the file, first layernorm.weight", load_backbone, name, "cpu")
+    refused("1 weights are not in the file, first layernorm.weight", load_backbone, name)
 
 
 def test_pickles_are_not_read(vit):
     torch.save(load_file(vit / "model.safetensors"), vit / "pytorch_model.bin")
     (vit / "model.safetensors").unlink()
-    refused("no model.safetensors", load_backbone, f"hf:{vit}", "cpu")
-    refused("no config.json", load_backbone, f"hf:{vit.parent}", "cpu")
+    refused("no model.safetensors", load_backbone, f"hf:{vit}")
+    refused("no config.json", load_backbone, f"hf:{vit.parent}")
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_damaged_folders_are_refused_in_one_line(file, content, message, vit):
     (vit / file).write_bytes(content)
     name = f"hf:{vit}"
     refusal = f"{re.escape(name)}: cannot be loaded by the package transformers .*{message}"
-    refused(refusal, load_backbone, name, "cpu")
+    refused(refusal, load_backbone, name)
 
 
 @pytest.fixture
@@ -239,5 +239,4 @@ def test_what_is_neither_a_folder_nor_a_name_is_refused(name, offline):
         "neither a folder nor a model OWNER/MODEL that the Hugging Face hub gives",
         load_backbone,
         name,
-        "cpu",
     )

@@ -37,13 +37,14 @@ def frame():
 
 
 def test_the_mask_holds_the_seat_and_both_wheels_and_neither_the_floor_nor_the_bench(frame):
-    seat = (240, 230)
-    rear_tyre = (320, 135)
-    front_tyre = (370, 675)
-    floor = (470, 300)
-    bench = (160, 100)
-    pixels = (seat, rear_tyre, front_tyre, floor, bench)
-    assert [frame.mask[pixel] for pixel in pixels] == [1, 1, 1, 0, 0]
+    on_object = {
+        (240, 230): 1,  # seat
+        (320, 135): 1,  # rear tyre
+        (370, 675): 1,  # front tyre
+        (470, 300): 0,  # floor
+        (160, 100): 0,  # bench
+    }
+    assert {pixel: frame.mask[pixel] for pixel in on_object} == on_object
 
 
 def test_up_is_the_normal_of_the_floor_and_front_is_parallel_to_it(frame):

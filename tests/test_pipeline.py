@@ -70,11 +70,10 @@ def test_an_estimate_by_the_papers_solver_has_times_but_no_doubts(estimate):
 def test_propagation_gives_the_pose_against_every_target_view(estimate, targets):
     cameras = [frame.camera for frame in targets]
     poses = estimate.propagate(cameras)
-    assert_allclose(poses[estimate.view].matrix, estimate.sim3.matrix, atol=1e-12)
-    point = np.array([0.1, 0.2, 4.0])
-    world = estimate.target_camera.to_world(estimate.sim3.apply(point))
+    points = np.eye(4, 3)
+    world = estimate.target_camera.to_world(estimate.sim3.apply(points))
     for pose, camera in zip(poses, cameras):
-        assert_allclose(pose.apply(point), camera.to_camera(world), atol=1e-9)
+        assert_allclose(pose.apply(points), camera.to_camera(world), atol=1e-9)
 
 
 def test_the_best_view_alone_maps_spread_and_centroid_onto_the_targets(reference):
@@ -317,7 +316,9 @@ def test_unusable_frames_are_refused_in_one_line(reference, targets):
         refused("expected one zsp_lite.Frame or several", METHOD.estimate, reference, none)
     refused(
         "mask",
-        lambda: replace(METHOD, foreground="mask").estimate(replace(reference, mask=None), targets),
+        replace(METHOD, foreground="mask").estimate,
+        replace(reference, mask=None),
+        targets,
     )
 
 
@@ -338,4 +339,4 @@ OUT_OF_RANGE = {
     "name, value", [(name, value) for name, values in OUT_OF_RANGE.items() for value in values]
 )
 def test_settings_out_of_range_are_refused(name, value):
-    refused(f"^{name} is ", lambda: ZeroShotPose(CoordinateBackbone(), **{name: value}))
+    refused(f"^{name} is ", replace, METHOD, **{name: value})

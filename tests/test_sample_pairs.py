@@ -1,25 +1,30 @@
-"""The sample pairs: the one-page version of the method against the library, and both solvers
-against stored poses.
+"""The shipped backbone and the sample pairs: the one-page version of the method against the
+library, both solvers against stored poses.
 
 `sample_poses.json` holds poses of the first pairs of five target views. Last digits of features
 depend on the processor, and a tie may fall the other way: one pair of a solver may differ.
 """
 
 import json
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
+from safetensors import safe_open
 
 import zsp_lite
 from zsp_lite import Sim3, load_backbone, minimal
+from zsp_lite.backbones.load import TINY
+from zsp_lite.best_view import mask_iou
 from zsp_lite.choices import SOLVERS
+from zsp_lite.course.demo import demo_pairs
 from zsp_lite.data.pairs import labelled_categories, shipped_pairs
 from zsp_lite.io.files import REPOSITORY
 from zsp_lite.scans.pair_result import run_pair
-from zsp_lite.views import View
+from zsp_lite.views import object_crop, patch_mask
 
 STORED = json.loads(Path(__file__).with_name("sample_poses.json").read_text("utf-8"))
 
@@ -28,14 +33,6 @@ STORED = json.loads(Path(__file__).with_name("sample_poses.json").read_text("utf
 def dataset():
     """The sample data."""
     return zsp_lite.Co3D(REPOSITORY / "data_samples")
-
-
-def as_crop(view: View) -> minimal.Crop:
-    """A view as the one-page version takes it."""
-    features, frame = view.features, view.frame
-    return minimal.Crop(
-        features.keys.numpy(), features.saliency.numpy(), frame.depth, frame.camera.K
-    )
 
 
 def test_it_is_one_page():
@@ -52,7 +49,10 @@ def test_it_gives_the_librarys_view_matches_inliers_and_pose(dataset):
         first, others = dataset.load_pair(shipped_pairs(dataset, category, 3)[0])
         reference, *targets = views = method.views([first, *others])
         expected = method.estimate_from_views(reference, targets)
-        crop, *crops = map(as_crop, views)
+        crop, *crops = [
+            minimal.Crop(one.keys.numpy(), one.saliency.numpy(), frame.depth, frame.camera.K)
+            for one, frame in [(view.features, view.frame) for view in views]
+        ]
         found = minimal.estimate_pose(crop, crops)
         assert found.view == expected.view, category
         assert_array_equal(found.matches[0], expected.matches.reference, category)
@@ -81,3 +81,24 @@ def test_views_and_poses_are_the_stored_ones(dataset):
                 same_pose = np.allclose(estimate.sim3.matrix[:3], matrix, atol=1e-4)
                 equal[solver] += estimate.view == values[solver]["view"] and same_pose
     assert min(equal.values()) >= 7  # of 8, see above
+
+
+def test_the_shipped_backbone_is_small_and_in_half_precision():
+    assert TINY.stat().st_size <= 12e6
+    with safe_open(TINY, "pt") as file:
+        assert {str(file.get_tensor(name).dtype) for name in file.keys()} == {"torch.float16"}
+
+
+@pytest.mark.slow
+def test_the_shipped_backbones_attention_finds_objects_that_it_has_never_seen(dataset):
+    """The paper's rule, saliency above 0.05, on two target views of each of the demo's pairs."""
+    tiny = load_backbone()
+    shares = defaultdict(list)
+    for pair in demo_pairs(dataset):
+        _, targets = dataset.load_pair(pair)
+        crops = [object_crop(frame) for frame in targets[1::2]]
+        for crop, features in zip(crops, tiny([crop.rgb for crop in crops]), strict=True):
+            mask = patch_mask(crop, features.grid)
+            shares[pair.category].append(mask_iou(mask, features.foreground()))
+    for category, found in shares.items():
+        assert np.mean(found) > 0.7, category

@@ -22,17 +22,12 @@ from zsp_lite.course.training.trainee import Trainee, initial_backbone
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module", autouse=True)
-def two_rooms():
-    """Two rooms in place of many: a room takes five times as long as a view."""
-    with patch.object(rendering, "ROOMS", 2):
-        yield
-
-
 @pytest.fixture(scope="module")
 def renders():
-    """The renders of three training objects."""
-    return render_set(range(3))
+    """The renders of three training objects, in two rooms in place of many: a room takes five times
+    as long as a view."""
+    with patch.object(rendering, "ROOMS", 2):
+        return render_set(range(3))
 
 
 def test_surface_points_of_renders_are_coordinates_of_the_object(renders):

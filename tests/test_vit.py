@@ -12,13 +12,8 @@ from zsp_lite.choices import FACETS
 
 DEPTH, DIM, HEADS = 3, 48, 6
 PATCH = 8  # pixels
-# Parts of a block, and their names in PyTorch.
-RENAMED = {
-    "attn.qkv.": "self_attn.in_proj_",
-    "attn.proj": "self_attn.out_proj",
-    "mlp.fc1": "linear1",
-    "mlp.fc2": "linear2",
-}
+# The parts of a block, in the order in which PyTorch keeps them.
+PARTS = "attn.qkv attn.proj mlp.fc1 mlp.fc2 norm1 norm2".split()
 
 
 # A small network for images of 32 x 32 pixels, a grid of 4 x 4 patches, and two images of noise.
@@ -36,18 +31,17 @@ def oracle():
     facets = []
     attentions = []
     for index in range(DEPTH):
-        w = {}
-        for name, weight in weights.items():
-            if name.startswith(f"blocks.{index}."):
-                for ours, of_pytorch in RENAMED.items():
-                    name = name.replace(ours, of_pytorch)
-                w[name.partition(".")[2].partition(".")[2]] = weight
+        parts = [
+            weights[f"blocks.{index}.{part}.{kind}"]
+            for part in PARTS
+            for kind in ("weight", "bias")
+        ]
         block = nn.TransformerEncoderLayer(
             DIM, HEADS, 4 * DIM, 0.0, F.gelu, 1e-6, batch_first=True, norm_first=True
         )
-        block.load_state_dict(w)
+        block.load_state_dict(dict(zip(block.state_dict(), parts)))
         normed = block.norm1(x)
-        projections = F.linear(normed, w["self_attn.in_proj_weight"], w["self_attn.in_proj_bias"])
+        projections = F.linear(normed, *parts[:2])
         _, probabilities = block.self_attn(normed, normed, normed, average_attn_weights=False)
         attentions.append(probabilities)
         x = block(x)
