@@ -50,8 +50,6 @@ def test_icp_gets_the_clouds_of_both_objects_where_the_first_cameras_agree(monke
     start = align(render(camera, AT_HOME), targets, 0, (camera, first), seed=0)
     truth = true_pose(camera, AT_HOME, first, elsewhere)
     assert rotation_error(start.R, np.eye(3)) < 1e-6
-    # The first cameras differ by a few degrees, which only ICP could mend.
-    assert 2 < rotation_error(start.R, truth.R) < 10
     source, target = clouds
     assert len(source) <= geometry.POINTS == len(target)
     placed = first.to_world(truth.apply(camera.to_camera(source)))
