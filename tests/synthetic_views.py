@@ -1,4 +1,4 @@
-"""Views of an asymmetric object, and a backbone whose features are functions of the
+"""Views of an asymmetric implicit surface, and a backbone whose features are functions of the
 object coordinates.
 
 The colours of the images encode the object coordinates. Features computed from them are exact, so
@@ -14,15 +14,15 @@ from numpy.random import default_rng
 from zsp_lite import Camera, FeatureMap, Frame, Sim3
 from zsp_lite.course.synthetic.sequences import orbit_pose
 
-# The object is the union of ellipsoids along its axes: middle and half axes of each.
-PARTS = np.array(
-    [
-        [(0, 0, 0), (1.2, 0.8, 0.6)],
-        [(0.7, 0.3, 0.3), (0.5, 0.4, 0.4)],
-        [(-0.6, -0.4, 0.2), (0.4, 0.6, 0.5)],
-    ]
-)
+AXES = np.array([1.2, 0.8, 0.6])  # half axes of the ellipsoid without its bumps
 REACH = 1.6  # no point of the object is farther from its middle; colours encode [-REACH, REACH]
+
+
+def inside(points: np.ndarray) -> np.ndarray:
+    """Implicit function of the object, (..., 3) -> (...), negative inside."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    bumps = 0.08 * np.sin(4 * x + 1) + 0.08 * np.sin(5 * y - 2 * z) + 0.06 * np.cos(6 * z + x)
+    return np.linalg.norm(points / AXES, axis=-1) - 1 - bumps
 
 
 def look_at(direction, distance: float = 4.0, size=(140, 180), focal: float = 190.0) -> Camera:
@@ -54,24 +54,37 @@ def turned(camera: Camera, turn: np.ndarray) -> Camera:
 
 def render(camera: Camera, placement: Sim3, name: str = "") -> Frame:
     """Render the object; `placement` maps object to world coordinates."""
-    x, y = np.meshgrid(np.arange(camera.size[1]) + 0.5, np.arange(camera.size[0]) + 0.5)
-    rays = camera.unproject_camera(np.stack([x, y], -1), np.ones(camera.size))
-    to_object = placement.inverse()
-    start = to_object.apply(camera.centre)
-    along = to_object.apply(camera.to_world(rays)) - start  # per unit of depth
-    depth = np.full(camera.size, np.inf)
-    for middle, axes in PARTS:
-        # |offset + depth * step| = 1 is quadratic in the depth.
-        offset, step = (start - middle) / axes, along / axes
-        square, half = (step**2).sum(-1), step @ offset
-        root = half**2 - square * (offset @ offset - 1)
-        nearest = (-half - np.sqrt(np.maximum(root, 0))) / square
-        depth = np.where(root > 0, np.minimum(depth, nearest), depth)
-    hit = np.isfinite(depth)
-    depth = np.where(hit, depth, 0).astype(np.float32)
-    colour = np.rint(((start + depth[..., None] * along) / REACH + 1) * 127).clip(1, 254)
-    rgb = (colour * hit[..., None]).astype(np.uint8)
-    return Frame(rgb, depth, hit.astype(np.float32), camera, name)
+    height, width = camera.size
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = camera.unproject_camera(np.stack([x, y], -1), np.ones((height, width)))
+    # Rays that miss the ball around the object see nothing.
+    middle = camera.to_camera(placement.t)
+    reach = REACH * placement.scale
+    near = np.linalg.norm(np.cross(rays, middle), axis=-1) < reach * np.linalg.norm(rays, axis=-1)
+    start, *ends = placement.inverse().apply(
+        camera.to_world(np.concatenate([np.zeros((1, 3)), rays[near]]))
+    )
+    along = ends - start  # per unit of depth, in object coordinates
+    # From far to near, so that the last crossing found is the nearest one.
+    far = np.full(len(along), np.inf)
+    behind = np.zeros(len(along), dtype=bool)
+    steps, step = np.linspace(7.0, 1.5, 56, retstep=True)
+    for depth in steps[np.abs(steps - middle[2]) < reach - step]:
+        now = inside(start + depth * along) <= 0
+        far[behind & ~now] = depth - step
+        behind = now
+    # Bisection between the last step inside the object, `low`, and the step before it, `high`.
+    hit = np.isfinite(far)
+    high = np.where(hit, far, 1.0)
+    low = high + step
+    for _ in range(14):
+        middle = (low + high) / 2
+        outside = inside(start + middle[:, None] * along) > 0
+        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+    colour = np.rint(((start + high[:, None] * along) / REACH + 1) * 127).clip(1, 254)
+    rgb, depth = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.float32)
+    rgb[near], depth[near] = np.where(hit[:, None], colour, 0), np.where(hit, high, 0)
+    return Frame(rgb, depth, (depth > 0).astype(np.float32), camera, name)
 
 
 def around(placement: Sim3, count: int = 7, arc: float = 360) -> list[Frame]:
