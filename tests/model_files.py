@@ -5,12 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from zsp_lite import Camera
-from zsp_lite.course.synthetic.meshes import Material, TexturedMesh, smooth_normals
 from zsp_lite.course.synthetic.primitives import Mesh, box, joined
 from zsp_lite.course.synthetic.room import CheapCamera, Room
-from zsp_lite.course.synthetic.sequences import orbit_pose
-from zsp_lite.course.training.renders import framed_camera
 
 # Two triangles in the plane z = 0 of the file, 2 x 2, seen upright from +z.
 _QUAD = """mtllib {stem}.mtl
@@ -68,29 +64,10 @@ def write_wedge(path: Path, seat: float = 0.5) -> Path:
     return path
 
 
-def painted(mesh: Mesh) -> TexturedMesh:
-    """Return a textured mesh of one colour, with smooth normals except at sharp edges."""
-    n, normals = len(mesh.faces), smooth_normals(mesh.vertices, mesh.faces)
-    uv = np.zeros((n, 3, 2), np.float32)
-    white = np.ones((n, 3, 3), np.float32)
-    material = np.zeros(n, int)
-    colour = Material(np.array((0.7, 0.4, 0.3, 1.0)))
-    return TexturedMesh(mesh.vertices, mesh.faces, normals, uv, white, material, (colour,))
-
-
-def view(
-    vertices: np.ndarray, azimuth: float = 40, elevation: float = 25, size: int = 64
-) -> Camera:
-    """A camera that frames the vertices; angles in degrees."""
-    pose = orbit_pose(np.radians(azimuth), np.radians(elevation), 0.05, 6.0, vertices.mean(0))
-    return framed_camera(vertices, *pose, size, margin=1.3)
-
-
 def studio() -> Room:
     """Return plain, light grey surroundings with one soft light, for pictures of single models."""
     plain = np.full((8, 8, 3), 0.55, np.float32)
-    light = np.array([0.55, 0.45, 0.7])
-    light /= np.linalg.norm(light)
+    light = np.array([0.6, 0.48, 0.64])
     camera = CheapCamera(exposure=0.42, noise=0.0, vignetting=0.0)
     size = np.array([14.0, 14, 12])
     return Room(size * [-1, -1, 0], size, (plain,) * 6, light, 0.15, np.ones(3), camera)

@@ -5,8 +5,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 import transformers
+from numpy.random import default_rng
 from torch import nn
 from torch.testing import assert_close
 from transformers import AutoModel
@@ -18,6 +20,9 @@ DEPTH, HEADS, DIM = 3, 4, 32
 # Mean and standard deviation of the colours of ImageNet, (3, 1, 1).
 MEAN = torch.tensor([0.485, 0.456, 0.406]).view(3, 1, 1)
 STD = torch.tensor([0.229, 0.224, 0.225]).view(3, 1, 1)
+# A square picture, and others that become square images.
+SHAPES = (32, 32, 3), (50, 40, 3), (9, 64, 3)
+PICTURES = [default_rng(0).integers(0, 256, shape, dtype=np.uint8) for shape in SHAPES]
 # Two implementations in single precision agree up to these tolerances.
 close = partial(assert_close, atol=2e-5, rtol=1e-4)
 

@@ -12,10 +12,7 @@ import torch
 from numpy.random import default_rng
 
 from zsp_lite import Camera, FeatureMap, Frame, Sim3
-from zsp_lite.matching import match, similarities
-from zsp_lite.verified.poses import Poses
-from zsp_lite.verified.scene import Scene, build_scene
-from zsp_lite.views import View
+from zsp_lite.course.synthetic.sequences import orbit_pose
 
 AXES = np.array([1.2, 0.8, 0.6])  # half axes of the ellipsoid without its bumps
 REACH = 1.6  # no point of the object is farther from its middle; colours encode [-REACH, REACH]
@@ -38,19 +35,10 @@ def look_at(direction, distance: float = 4.0, size=(140, 180), focal: float = 19
     return Camera(rotation, np.array([0, 0, distance]), np.full(2, focal), middle, size)
 
 
-def level_camera(azimuth, height=0.0, distance=3.0):
+def level_camera(azimuth, height=0.0):
     """A camera that looks at (1, 2, 3) horizontally or from above; +z of the world is up."""
-    turn, tilt = np.radians([azimuth, height])
-    away = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
-    right = np.array([-np.sin(turn), np.cos(turn), 0])
-    R = np.stack([right, np.cross(-away, right), -away])
-    return Camera(
-        R,
-        np.array([0, 0, distance]) - R @ [1, 2, 3],
-        np.full(2, 100.0),
-        np.full(2, 50.0),
-        (100, 100),
-    )
+    pose = orbit_pose(*np.radians([azimuth, height]), 0, 3.0, (1, 2, 3))
+    return Camera(*pose, np.full(2, 100.0), np.full(2, 50.0), (100, 100))
 
 
 # Object poses of the two sequences of a pair, and directions of cameras.
@@ -113,7 +101,6 @@ class CoordinateBackbone:
     background."""
 
     grid: int = 28
-    frequencies: int = 32
 
     def __call__(self, images) -> list[FeatureMap]:
         return [self.features(np.asarray(image)) for image in images]
@@ -121,14 +108,16 @@ class CoordinateBackbone:
     def features(self, image: np.ndarray) -> FeatureMap:
         """The features of one image from the mean colour of each of n x n patches."""
         n, p = self.grid, len(image) // self.grid
-        patches = image.reshape(n, p, n, p, 3).swapaxes(1, 2).reshape(n, n, p * p, 3).astype(float)
-        painted = patches.min(axis=-1) > 0
-        share = painted.mean(axis=-1)
-        mean = (patches * painted[..., None]).sum(axis=2) / np.maximum(painted.sum(axis=-1), 1)[
-            ..., None
-        ]
+
+        def average(pixels: np.ndarray) -> np.ndarray:
+            return pixels.reshape(n, p, n, p, -1).mean(axis=(1, 3))
+
+        painted = image.min(axis=-1, keepdims=True) > 0
+        share = average(painted)
+        mean = average(image * painted) / np.maximum(share, 1e-9)
+        share = share[..., 0]
         coordinates = (mean / 127 - 1) * REACH
-        waves = default_rng(5).normal(0, 1.6, (3, self.frequencies))
+        waves = default_rng(5).normal(0, 1.6, (3, 32))
         keys = np.concatenate([np.sin(coordinates @ waves), np.cos(coordinates @ waves)], axis=-1)
         keys[share < 0.5] = 0.05 * default_rng(6).normal(size=keys.shape[-1])
         keys = torch.as_tensor(keys, dtype=torch.float32)
@@ -151,29 +140,3 @@ def reference_and_targets(targets: int = 3) -> list[Frame]:
     ]
     elsewhere = [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras)]
     return [render(look_at((1, 0.6, 0.4)), AT_HOME, "reference"), *elsewhere]
-
-
-def matched_scene(views: list[View]) -> Scene:
-    """The verified solver's scene of a reference view and its target views."""
-    reference, *targets = views
-    found = similarities(reference.features, [target.features for target in targets])
-    matches = [
-        match(reference.features, target.features, kmeans=False, sim=sim)
-        for target, sim in zip(targets, found)
-    ]
-    return build_scene(reference, targets, found, matches)
-
-
-def working_pose(scene: Scene, sim3: Sim3, view: int) -> Poses:
-    """A similarity from the reference's camera to that of a target view, in the scene's working
-    units."""
-    first, camera = scene.target_cameras[0], scene.target_cameras[view]
-    rotation = first.R @ camera.R.T
-    to_first = Sim3(1.0, rotation, first.t - rotation @ camera.t)
-    pose = scene.target_to_working @ to_first @ sim3 @ scene.reference_to_working.inverse()
-    return Poses(
-        *(
-            torch.tensor(np.array(part)[None], dtype=torch.float32)
-            for part in (pose.scale, pose.R, pose.t)
-        )
-    )

@@ -1,6 +1,7 @@
 """Umeyama and RANSAC: recovery, reflections, outliers, degenerate input."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,42 +36,39 @@ def assert_same(first: Sim3, second: Sim3, atol: float = 1e-9):
 
 
 @given(seeds, scales)
-def test_composition_is_the_product_of_the_matrices_and_application_in_turn(seed, scale):
+def test_composition_and_application_are_products_with_the_matrix(seed, scale):
     a, b, points = similarity(seed, scale), similarity(seed + 7), cloud(seed)
     assert_same(a @ a.inverse(), Sim3.identity())
+    assert_same(Sim3.from_matrix(a.matrix), a)
     assert_allclose((a @ b).matrix, a.matrix @ b.matrix, atol=1e-9)
-    assert_allclose((a @ b).apply(points), a.apply(b.apply(points)), atol=1e-9)
     homogeneous = np.c_[points, np.ones(len(points))] @ a.matrix.T
     assert_allclose(a.apply(points), homogeneous[:, :3], atol=1e-9)
 
 
 @pytest.mark.parametrize(
-    "scale, R, t",
+    "part, value",
     [
-        (0.0, np.eye(3), np.zeros(3)),
-        (1.0, np.diag([1.0, 1.0, -1.0]), np.zeros(3)),
-        (1.0, np.eye(4), np.zeros(3)),
-        (1.0, np.eye(3), np.array([0.0, np.inf, 0.0])),
+        ("scale", 0.0),
+        ("R", np.diag([1.0, 1.0, -1.0])),
+        ("R", np.eye(4)),
+        ("t", np.array([0.0, np.inf, 0.0])),
     ],
 )
-def test_what_is_no_similarity_is_refused(scale, R, t):
-    refused(".", Sim3, scale, R, t)
+def test_what_is_no_similarity_is_refused(part, value):
+    refused(".", replace, Sim3.identity(), **{part: value})
 
 
 def test_a_rounded_rotation_becomes_the_nearest_one_and_another_is_refused():
     exact = similarity(3).R
     R = exact.round(2)
     nearest = Rotation.from_matrix(R).as_matrix()
-    found = Sim3.from_matrix(np.vstack([np.c_[2 * R, np.ones(3)], [0, 0, 0, 1]]))
     camera = Camera(R, np.zeros(3), np.ones(2), np.ones(2), (2, 2))
     for one in (
         Sim3(1.0, R, np.zeros(3)).R,
         rotation_matrix("R", np.stack([R, R]))[1],
-        found.R,
         camera.R,
     ):
         assert_allclose(one, nearest, atol=1e-12)
-    assert_allclose(found.scale, 2, atol=0.02)
     assert_array_equal(Sim3(1.0, exact.astype(np.float32), np.zeros(3)).R, exact.astype(np.float32))
     refused(
         r"Sim3: R is .*, 0\.029 off the nearest rotation, expected",
@@ -90,13 +88,10 @@ def test_records_keep_their_values_when_the_arrays_that_they_were_made_of_change
     frame, features = Frame(rgb, depth, depth, camera), FeatureMap(keys, keys[..., 0], keys[0, 0])
     for array in (R, t, trans, rgb, depth, keys):
         array[0] = 5
-    assert_same(sim3, Sim3.identity())
-    assert_array_equal(label.trans, np.eye(4))
-    assert_array_equal(camera.matrix, np.eye(4))
-    assert not frame.rgb.any()
-    assert not frame.depth.any()
-    assert not frame.mask.any()
-    assert not features.keys.any()
+    for matrix in (sim3.matrix, label.trans, camera.matrix):
+        assert_array_equal(matrix, np.eye(4))
+    for zeros in (frame.rgb, frame.depth, frame.mask, features.keys):
+        assert not zeros.any()
 
 
 @given(seeds, scales, st.integers(4, 40))
@@ -161,14 +156,12 @@ def test_ransac_recovers_the_pose_with_sixty_percent_outliers(seed):
 
 
 def test_many_trials_need_little_memory_and_the_best_wins_in_blocks_too(monkeypatch):
-    source, target, truth, right = contaminated(3, outliers=0.8)
+    source, target, *_ = contaminated(3, outliers=0.8)
     tracemalloc.start()
-    found, inliers = ransac(np.tile(source, (20, 1)), np.tile(target, (20, 1)), trials=20_000)
+    ransac(np.tile(source, (20, 1)), np.tile(target, (20, 1)), trials=20_000)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 100e6  # all residuals at once are 160 MB, their offsets 480 MB
-    assert inliers.reshape(20, 50).all(axis=0)[right].mean() > 0.9
-    assert_allclose(found.matrix, truth.matrix, atol=0.15)
     whole = ransac(source, target)
     monkeypatch.setattr("zsp_lite.alignment._BLOCK", 50 * 64)
     in_blocks = ransac(source, target, seed=default_rng(0))
@@ -180,12 +173,6 @@ def test_of_two_motions_with_as_many_inliers_the_closer_fit_wins():
     source, loose, exact = cloud(0, 40), similarity(1), similarity(2)
     target = np.concatenate([loose.apply(source[:20] + 0.02 * cloud(1)), exact.apply(source[20:])])
     assert ransac(source, target)[1].tolist() == [False] * 20 + [True] * 20
-
-
-def test_scales_out_of_range_are_not_considered():
-    source = cloud(0)
-    refused("scale", ransac, source, 10 * source, scale_range=(0.2, 5))
-    assert ransac(source, 10 * source, scale_range=(1, 20))[0].scale == pytest.approx(10)
 
 
 def test_the_final_fit_keeps_to_the_scale_range():
@@ -202,8 +189,15 @@ def test_the_final_fit_keeps_to_the_scale_range():
 
 
 @pytest.mark.parametrize(
-    "settings", [{"trials": 0}, {"sample_size": 2}, {"scale_range": (2, 1)}, {"threshold": 0}]
+    "settings",
+    [
+        {"trials": 0},
+        {"sample_size": 2},
+        {"scale_range": (2, 3)},
+        {"scale_range": (0.2, 0.5)},
+        {"threshold": 0},
+    ],
 )
 def test_settings_of_ransac_out_of_range_are_refused(settings):
-    refused(next(iter(settings)), lambda: ransac(cloud(0), cloud(0), **settings))
-    refused("at least 4", lambda: ransac(cloud(0, 3), cloud(0, 3)))
+    refused(*settings, ransac, cloud(0), cloud(0), **settings)
+    refused("at least 4", ransac, cloud(0, 3), cloud(0, 3))

@@ -13,7 +13,7 @@ from loopback import Server
 from numpy.random import default_rng
 from refusals import refused
 from safetensors.torch import save_file
-from small_backbones import ARCHITECTURES, MEAN, STD, close, save_all, small_vit
+from small_backbones import ARCHITECTURES, MEAN, PICTURES, STD, close, save_all, small_vit
 from torch import nn
 from torch.testing import assert_close
 
@@ -27,33 +27,19 @@ from zsp_lite.benchmark.runs import fingerprint
 from zsp_lite.choices import FACETS
 from zsp_lite.io.download import fetch
 
-
-@pytest.fixture(scope="module")
-def vit() -> VisionTransformer:
-    return small_vit()
-
-
-@pytest.fixture()
-def pictures():
-    rng = default_rng(0)
-    return [
-        rng.integers(0, 256, shape, dtype=np.uint8)
-        for shape in ((32, 32, 3), (50, 40, 3), (9, 64, 3))
-    ]
+VIT = small_vit()
 
 
 def assert_same_features(first, second):
-    for a, b in zip(first, second, strict=True):
-        for name in ("keys", "saliency", "global_feature"):
-            close(getattr(a, name), getattr(b, name))
+    close([*map(vars, first)], [*map(vars, second)])
 
 
 @pytest.fixture(scope="module")
-def places(tmp_path_factory, vit):
+def places(tmp_path_factory):
     """What `load_backbone` takes for the embedded backbone, for a checkpoint in DINO's layout, and
     for each architecture of Hugging Face's format."""
     root = tmp_path_factory.mktemp("backbones")
-    torch.save(vit.state_dict(), root / "checkpoint.pth")
+    torch.save(VIT.state_dict(), root / "checkpoint.pth")
     models = {kind: f"hf:{folder}" for kind, folder in save_all(root).items()}
     return models | {"zsp-tiny": "zsp-tiny", "checkpoint": str(root / "checkpoint.pth")}
 
@@ -70,25 +56,14 @@ def backbone(place):
     return load_backbone(place, "cpu", image_size=4 * load_backbone(place, "cpu").patch_size)
 
 
-def test_keys_are_float32_per_patch_and_saliency_spans_0_to_1(backbone, pictures):
-    features = backbone(pictures)
-    for maps in features:
-        assert maps.keys.shape == (4, 4, backbone.embed_dim)
-        assert maps.keys.dtype == torch.float32
-        assert maps.saliency.min() == 0
-        assert maps.saliency.max() == 1
-        assert maps.saliency.std() > 0.05  # not one value for all patches
-    assert not torch.allclose(features[0].keys, features[1].keys)
-
-
-def test_features_depend_on_nothing_but_the_image(backbone, pictures):
-    features = backbone(pictures)
-    frozen = pictures[2].copy()
+def test_features_depend_on_nothing_but_the_image(backbone):
+    features = backbone(PICTURES)
+    frozen = PICTURES[2].copy()
     frozen.flags.writeable = False
     assert_same_features(
-        backbone([torch.from_numpy(pictures[0]), pictures[1] / 255, frozen]), features
+        backbone([torch.from_numpy(PICTURES[0]), PICTURES[1] / 255, frozen]), features
     )
-    assert_same_features(backbone([pictures[1][::-1][::-1]]), features[1:2])
+    assert_same_features(backbone([PICTURES[1][::-1][::-1]]), features[1:2])
     assert backbone([]) == []
 
 
@@ -97,8 +72,8 @@ def test_a_backbone_loaded_twice_has_one_fingerprint(backbone, place):
     assert fingerprint(again) == fingerprint(backbone)
 
 
-def test_keys_are_tensors_of_their_own_that_can_enter_a_graph_with_gradients(backbone, pictures):
-    keys = backbone(pictures)[0].keys
+def test_keys_are_tensors_of_their_own_that_can_enter_a_graph_with_gradients(backbone):
+    keys = backbone(PICTURES)[0].keys
     # They do not keep the batch in memory.
     assert keys.untyped_storage().nbytes() == keys.numel() * 4
     layer = nn.Linear(backbone.embed_dim, 2)
@@ -106,7 +81,7 @@ def test_keys_are_tensors_of_their_own_that_can_enter_a_graph_with_gradients(bac
     assert layer.weight.grad is not None
 
 
-def test_layer_and_facet_change_the_keys_alone_and_stand_in_the_name(place, pictures):
+def test_layer_and_facet_change_the_keys_alone_and_stand_in_the_name(place):
     plain = load_backbone(place, "cpu")
     size = 3 * plain.patch_size
     found = []
@@ -116,15 +91,13 @@ def test_layer_and_facet_change_the_keys_alone_and_stand_in_the_name(place, pict
         assert (backbone.layer, backbone.facet, backbone.image_size) == (index, facet, size)
         chosen = f"block{index}" + (f", {facet}" if facet != "key" else "")
         assert backbone.name == f"{plain.name} ({chosen}, {size + 1} px)"
-        found += backbone(pictures[:1])
+        found += backbone(PICTURES[:1])
     first, *others = found
     for other in others:
         assert not torch.allclose(other.keys, first.keys)
-        assert_close(
+        close(
             (other.saliency, other.global_feature),
             (first.saliency, first.global_feature),
-            atol=1e-5,
-            rtol=1e-4,
         )
 
 
@@ -133,22 +106,22 @@ def test_layer_and_facet_change_the_keys_alone_and_stand_in_the_name(place, pict
 )
 def test_options_out_of_range_are_refused_by_every_backbone(place, options):
     (name,) = options
-    refused(f"{name} is .*expected [^\n]+$", load_backbone, place, "cpu", **options)
+    refused(f"{name} is .*expected [^\n]+$", load_backbone, place, **options)
 
 
-def test_features_are_the_models_keys_saliency_and_cls(pictures):
+def test_features_are_the_models_keys_saliency_and_cls():
     vit = small_vit(num_heads=4)
     features = Backbone(vit, "small", layer=1, saliency_heads=(0, 3), device="cpu", batch_size=2)(
-        pictures
+        PICTURES
     )
-    pixels = torch.from_numpy(pictures[0]).permute(2, 0, 1)[None] / 255
+    pixels = torch.from_numpy(PICTURES[0]).permute(2, 0, 1)[None] / 255
     with torch.no_grad():
         tokens = vit.extract((pixels - MEAN) / STD, 1)
     assert_close(features[0].keys, tokens.keys[0].view(4, 4, 64))
     assert_close(features[0].global_feature, tokens.cls[0])
     raw = tokens.attention[0, [0, 3]].mean(0).view(4, 4)
     assert_close(features[0].saliency, (raw - raw.min()) / (raw.max() - raw.min()))
-    assert_same_features(Backbone(vit, "small", 1, (0, 3), "cpu", batch_size=1)(pictures), features)
+    assert_same_features(Backbone(vit, "small", 1, (0, 3), "cpu", batch_size=1)(PICTURES), features)
 
 
 def test_uniform_attention_is_no_foreground():
@@ -156,7 +129,7 @@ def test_uniform_attention_is_no_foreground():
     vit.blocks[-1].attn.qkv.weight.data.zero_()
     vit.blocks[-1].attn.qkv.bias.data.zero_()
     features = Backbone(vit, "small", device="cpu")([np.zeros((32, 32, 3), np.uint8)])
-    assert bool((features[0].saliency == 0).all())
+    assert not features[0].saliency.any()
 
 
 def test_of_dino_vits_four_heads_are_salient_and_of_others_all():
@@ -166,24 +139,24 @@ def test_of_dino_vits_four_heads_are_salient_and_of_others_all():
     assert (other.saliency_heads, other.layer) == ((0, 1, 2, 3), 2)
 
 
-BAD_IMAGES = [
-    np.zeros((8, 8), np.uint8),
-    np.zeros((0, 8, 3), np.uint8),
-    np.zeros((8, 8, 3), np.int64),
-    np.full((8, 8, 3), 1.5),
-    np.full((8, 8, 3), np.nan),
-]
-
-
-@pytest.mark.parametrize("image", BAD_IMAGES)
-def test_bad_images_are_refused_by_number(vit, image):
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((8, 8), np.uint8),
+        np.zeros((0, 8, 3), np.uint8),
+        np.zeros((8, 8, 3), np.int64),
+        np.full((8, 8, 3), 1.5),
+        np.full((8, 8, 3), np.nan),
+    ],
+)
+def test_bad_images_are_refused_by_number(image):
     with pytest.raises(InputError, match="^image 1 is .*, expected [^\n]+$"):
-        Backbone(vit, "small", device="cpu", batch_size=1)([np.zeros((8, 8, 3), np.uint8), image])
+        Backbone(VIT, "small", device="cpu", batch_size=1)([np.zeros((8, 8, 3), np.uint8), image])
 
 
 @pytest.mark.parametrize("wrapping", ["plain", "teacher", "state_dict", "prefixed"])
-def test_torch_checkpoints_load_however_they_are_wrapped(vit, pictures, tmp_path, wrapping):
-    weights = vit.state_dict()
+def test_torch_checkpoints_load_however_they_are_wrapped(tmp_path, wrapping):
+    weights = VIT.state_dict()
     teacher = {f"module.backbone.{k}": v for k, v in weights.items()}
     content = {
         "plain": weights,
@@ -200,33 +173,33 @@ def test_torch_checkpoints_load_however_they_are_wrapped(vit, pictures, tmp_path
         32,
         64,
     )
-    assert_same_features(loaded(pictures), Backbone(vit, "small", device="cpu")(pictures))
+    assert_same_features(loaded(PICTURES), Backbone(VIT, "small", device="cpu")(PICTURES))
 
 
-def test_safetensors_bring_their_settings_and_options_override_them(pictures, tmp_path):
+def test_safetensors_bring_their_settings_and_options_override_them(tmp_path):
     vit = small_vit(num_heads=4)
     half = {key: x.half() for key, x in vit.state_dict().items()}
     metadata = {"num_heads": "4", "key_block": "1", "saliency_heads": "0,2"}
     save_file(half, tmp_path / "tiny.safetensors", metadata=metadata)
     loaded = load_backbone(str(tmp_path / "tiny.safetensors"), "cpu")
     assert (loaded.model.num_heads, loaded.layer, loaded.saliency_heads) == (4, 1, (0, 2))
-    for a, b in zip(loaded(pictures), Backbone(vit, "small", layer=1, device="cpu")(pictures)):
+    for a, b in zip(loaded(PICTURES), Backbone(vit, "small", layer=1, device="cpu")(PICTURES)):
         assert a.keys.dtype == torch.float32
         assert F.cosine_similarity(a.keys, b.keys, dim=-1).min() > 0.999
     assert load_backbone(tmp_path / "tiny.safetensors", "cpu", layer=0).layer == 0
 
 
-def test_the_embedded_backbone_is_found_by_its_name(vit, tmp_path, monkeypatch):
+def test_the_embedded_backbone_is_found_by_its_name(tmp_path, monkeypatch):
     path = tmp_path / "zsp-tiny.safetensors"
     for module in (load, released):
         monkeypatch.setattr(module, "TINY", path)
     refused(
         "checkpoint .*zsp-tiny.safetensors cannot be read: no such file", load_backbone, "zsp-tiny"
     )
-    save_file(vit.state_dict(), path, metadata={"num_heads": "1"})
+    save_file(VIT.state_dict(), path, metadata={"num_heads": "1"})
     assert load_backbone("zsp-tiny").name == "zsp-tiny"
     assert available_backbones()["zsp-tiny"] == path
-    assert as_backbone(path).embed_dim == as_backbone(str(path)).embed_dim == vit.embed_dim
+    assert as_backbone(path).embed_dim == as_backbone(str(path)).embed_dim == VIT.embed_dim
 
 
 @pytest.mark.parametrize(
@@ -234,36 +207,28 @@ def test_the_embedded_backbone_is_found_by_its_name(vit, tmp_path, monkeypatch):
     [
         (lambda w: {k: x for k, x in w.items() if k != "pos_embed"}, "DINO layout"),
         (
-            lambda w: {k: x for k, x in w.items() if "1.norm1.bias" not in k},
-            "not fit: .* Missing .*1.norm1.bias",
-        ),
-        (
-            lambda w: w | {"norm.weight": torch.zeros(3)},
-            "not fit: .* size mismatch for norm.weight",
-        ),
-        (lambda w: w | {"extra": torch.zeros(1)}, "not fit: .* Unexpected .*extra"),
-        (
             lambda w: w | {"blocks.100000000.norm1.bias": torch.zeros(1)},
-            "Missing .*blocks.3.norm1.weight",
+            "not fit: .* Missing .*blocks.3.norm1.weight",
         ),
         (
             lambda w: w | {"norm.weight": torch.full((64,), torch.nan)},
             "norm.weight holds values that are not finite",
         ),
+        (lambda w: w | {"extra": torch.zeros(1)}, "not fit: .* Unexpected .*extra"),
         (lambda w: {"epoch": 3}, "state dict"),
     ],
 )
-def test_other_models_weights_are_refused_naming_what_differs(vit, tmp_path, change, message):
-    torch.save(change(dict(vit.state_dict())), tmp_path / "other.pth")
-    refused(message, load_backbone, tmp_path / "other.pth", "cpu")
+def test_other_models_weights_are_refused_naming_what_differs(tmp_path, change, message):
+    torch.save(change(dict(VIT.state_dict())), tmp_path / "other.pth")
+    refused(message, load_backbone, tmp_path / "other.pth")
 
 
 @pytest.mark.parametrize(
     "key, value", [("num_heads", "four"), ("num_heads", "0"), ("saliency_heads", "7")]
 )
-def test_metadata_that_does_not_fit_is_refused(vit, tmp_path, key, value):
-    save_file(vit.state_dict(), tmp_path / "x.safetensors", metadata={key: value})
-    refused(f"{key} .*expected", load_backbone, tmp_path / "x.safetensors", "cpu")
+def test_metadata_that_does_not_fit_is_refused(tmp_path, key, value):
+    save_file(VIT.state_dict(), tmp_path / "x.safetensors", metadata={key: value})
+    refused(f"{key} .*expected", load_backbone, tmp_path / "x.safetensors")
 
 
 @pytest.mark.parametrize(
@@ -273,12 +238,12 @@ def test_metadata_that_does_not_fit_is_refused(vit, tmp_path, key, value):
         ("rope_embed.periods", "DINOv3, expected hf:facebook/dinov3-vits16-pretrain-lvd1689m or"),
     ],
 )
-def test_files_of_later_dino_models_are_refused_naming_the_ones_to_take(vit, tmp_path, key, told):
-    weights = vit.state_dict() | {"blocks.0.ls1.gamma": torch.ones(4), key: torch.ones(4)}
+def test_files_of_later_dino_models_are_refused_naming_the_ones_to_take(tmp_path, key, told):
+    weights = VIT.state_dict() | {"blocks.0.ls1.gamma": torch.ones(4), key: torch.ones(4)}
     if "rope" in key:
         weights.pop("pos_embed")
     torch.save(weights, tmp_path / "meta.pth")
-    refused(f"meta.pth is Meta's own file of {told}", load_backbone, tmp_path / "meta.pth", "cpu")
+    refused(f"meta.pth is Meta's own file of {told}", load_backbone, tmp_path / "meta.pth")
 
 
 def test_an_unknown_name_or_device_is_refused():
@@ -333,8 +298,8 @@ def cache(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
-def test_dino_models_come_from_the_server(server, vit, pictures, tmp_path, cache, monkeypatch):
-    torch.save(vit.state_dict(), tmp_path / "made.pth")
+def test_dino_models_come_from_the_server(server, tmp_path, cache, monkeypatch):
+    torch.save(VIT.state_dict(), tmp_path / "made.pth")
     content = (tmp_path / "made.pth").read_bytes()
     server.files["/dino/some/vit.pth"] = content
     monkeypatch.setenv("ZSP_LITE_DINO_URL", f"{server.url}/dino")
@@ -345,17 +310,16 @@ def test_dino_models_come_from_the_server(server, vit, pictures, tmp_path, cache
     loaded = load_backbone("dino_vits8", "cpu")
     assert loaded.name == "dino_vits8"
     assert available_backbones()["dino_vits8"] == cache / "vit.pth"
-    assert_same_features(loaded(pictures), Backbone(vit, "small", device="cpu")(pictures))
+    assert_same_features(loaded(PICTURES), Backbone(VIT, "small", device="cpu")(PICTURES))
 
 
-def test_a_file_that_is_not_the_released_one_is_refused(vit, cache):
+def test_a_file_that_is_not_the_released_one_is_refused(cache):
     cache.mkdir()
-    torch.save(vit.state_dict(), cache / "dino_deitsmall16_pretrain.pth")
+    torch.save(VIT.state_dict(), cache / "dino_deitsmall16_pretrain.pth")
     refused(
         "dino_vits16: .*not the released file.*weights fetch dino_vits16",
         load_backbone,
         "dino_vits16",
-        "cpu",
     )
 
 
@@ -378,19 +342,12 @@ def test_a_backbone_of_ones_own_is_named_by_its_module_and_takes_no_options(tmp_
     # as a console script has it
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     assert type(named_backbone("my_backbone_file:maps", None, "key", None)).__name__ == "Maps"
-    for thing, told in (
-        ("Maps", "is of type type, expected"),
-        ("size", "is of type int, expected"),
-        ("no", "imported"),
+    for thing, layer, told in (
+        ("Maps", None, "is of type type, expected"),
+        ("size", None, "is of type int, expected"),
+        ("no", None, "imported"),
+        ("maps", "last", "is your own, expected no layer, facet or image size"),
     ):
-        refused(told, named_backbone, f"my_backbone_file:{thing}", None, "key", None)
-    refused(
-        "is your own, expected no layer, facet or image size",
-        named_backbone,
-        "my_backbone_file:maps",
-        "last",
-        "key",
-        None,
-    )
+        refused(told, named_backbone, f"my_backbone_file:{thing}", layer, "key", None)
     assert named_backbone("hf:gpt2", None, "key", None) == "hf:gpt2"
     assert named_backbone("hf:gpt2", None, "key", 96) == BackboneConfig("hf:gpt2", image_size=96)

@@ -4,20 +4,18 @@ concept (`tools/concepts.csv`) and no model file in common."""
 import csv
 import json
 import re
-from collections.abc import Mapping
 
 import pytest
 
-from tools.models import LICENCES, Entry, attribution, read_catalogue
+from tools.models import LICENCES, Catalogue, Entry, attribution, read_catalogue
 from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.io.files import REPOSITORY
 
 TOOLS = REPOSITORY / "tools"
-ARTISTS, SAMPLES = TOOLS / "artists.json", TOOLS / "samples.json"
-TRAINING_MODELS, VALIDATION_MODELS = TOOLS / "training.json", TOOLS / "validation.json"
-PATHS = ARTISTS, SAMPLES, TRAINING_MODELS, VALIDATION_MODELS
-# The works of each catalogue by category and name of the model.
-CATALOGUES = {path.stem: read_catalogue(path).models for path in PATHS}
+CATALOGUES = {
+    name: read_catalogue(TOOLS / f"{name}.json")
+    for name in ("artists", "samples", "training", "validation")
+}
 WEIGHTS = REPOSITORY / "zsp_lite/weights"
 
 # Licences of the models that the network sees, and such of Creative Commons.
@@ -25,26 +23,26 @@ FREE = LICENCES.keys() - {"Public Domain Mark 1.0"}
 CC = {"CC0 1.0", "CC BY 3.0", "CC BY 3.0 US"}
 
 
-def works(catalogue: Mapping[str, Mapping[str, Entry]]) -> list[Entry]:
+def works(catalogue: Catalogue) -> list[Entry]:
     """All works of a catalogue."""
-    return [work for models in catalogue.values() for work in models.values()]
+    return [work for models in catalogue.models.values() for work in models.values()]
 
 
 # A model that is added or lost by mistake changes the numbers of categories and models.
 @pytest.mark.parametrize(
-    "path, categories, count, licences",
+    "name, categories, count, licences",
     [
-        (ARTISTS, 8, 59, CC | {"Public Domain Mark 1.0", "GPL-2+"}),
-        (SAMPLES, 4, 16, CC),
-        (TRAINING_MODELS, 49, 320, FREE),
-        (VALIDATION_MODELS, 10, 28, FREE),
+        ("artists", 8, 59, CC | {"Public Domain Mark 1.0", "GPL-2+"}),
+        ("samples", 4, 16, CC),
+        ("training", 49, 320, FREE),
+        ("validation", 10, 28, FREE),
     ],
 )
 def test_every_model_of_a_catalogue_has_a_free_licence_and_names_its_author(
-    path, categories, count, licences
+    name, categories, count, licences
 ):
-    catalogue = read_catalogue(path)
-    listed = works(catalogue.models)
+    catalogue = CATALOGUES[name]
+    listed = works(catalogue)
     assert len(catalogue.models) == categories
     assert len(listed) == count
     assert {work.package for work in listed} == set(catalogue.packages)
@@ -70,7 +68,7 @@ def test_the_sample_data_show_the_models_of_their_catalogue():
 
 def test_the_weights_name_every_model_that_they_were_trained_on():
     text = " ".join((WEIGHTS / "ATTRIBUTION.md").read_text("utf-8").split())
-    for models in CATALOGUES["training"].values():
+    for models in CATALOGUES["training"].models.values():
         for name, work in models.items():
             assert f"**{work.author}**: " in text
             assert " ".join((work.title or name.replace("_", " ")).split()) in text
@@ -106,13 +104,13 @@ def test_every_category_is_listed_on_its_side():
         "washbasin aircraft"
     )
     names_of = {
-        "training": [*trained, *CATALOGUES["training"]],
-        "validation": CATALOGUES["validation"],
+        "training": [*trained, *CATALOGUES["training"].models],
+        "validation": CATALOGUES["validation"].models,
         "evaluation": [
             *CATEGORIES,
             *samples,
-            *CATALOGUES["artists"],
-            *CATALOGUES["samples"],
+            *CATALOGUES["artists"].models,
+            *CATALOGUES["samples"].models,
             *reserved.split(),
         ],
     }
@@ -125,7 +123,7 @@ def test_no_model_for_training_has_the_name_of_an_evaluation_category():
     models = [
         model
         for side in ("training", "validation")
-        for names in CATALOGUES[side].values()
+        for names in CATALOGUES[side].models.values()
         for model in names
     ]
     # A brush and a dispenser are no toilets.

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import huggingface_hub
-import numpy as np
 import pytest
 import torch
 import transformers
@@ -16,9 +15,8 @@ from refusals import refused
 from safetensors.torch import load, load_file, save_file
 from small_backbones import (
     ARCHITECTURES,
-    DIM,
-    HEADS,
     MEAN,
+    PICTURES,
     STD,
     close,
     configuration,
@@ -40,9 +38,10 @@ def folders(tmp_path_factory) -> dict[str, Path]:
     return save_all(tmp_path_factory.mktemp("models"))
 
 
-# A square picture and a wide one: both become square images.
-SHAPES = (64, 64, 3), (50, 90, 3)
-PICTURES = [np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8) for shape in SHAPES]
+@pytest.fixture
+def vit(tmp_path) -> Path:
+    """The folder of a small ViT that a test may change."""
+    return save_model(tmp_path / "vit", configuration("vit"))
 
 
 @functools.cache
@@ -103,21 +102,9 @@ def test_facets_are_the_projections_of_the_blocks_normalised_input_and_its_outpu
 def test_saliency_is_the_last_cls_attention_and_the_global_feature_the_cls_output(kind, folders):
     architecture = ARCHITECTURES[kind]
     size = 4 * architecture.patch
-    calls, output, blocks = by_transformers(folders[kind], kind, size)
+    _, output, _ = by_transformers(folders[kind], kind, size)
     # The attention of the CLS token to all tokens, (pictures, heads, tokens).
-    if kind == "dinov3_vit":
-        # Its attention adds a rotary embedding, which the projections lack.
-        attention = output.attentions[-1][:, :, 0]
-    else:
-
-        def heads(facet: str) -> torch.Tensor:
-            """The projection of the last block, (pictures, heads, tokens, dimensions)."""
-            x, _ = calls[-1]
-            tokens = projection(architecture, blocks[-1], x, facet)
-            return tokens.unflatten(-1, (HEADS, -1)).transpose(1, 2)
-
-        logits = heads("query") @ heads("key").mT / (DIM / HEADS) ** 0.5
-        attention = logits.softmax(-1)[:, :, 0]
+    attention = output.attentions[-1][:, :, 0]
     mean = attention[:, :, architecture.special :].mean(1)
     # Saliency is scaled to 0 to 1 in each picture.
     raised = mean - mean.amin(1, keepdim=True)
@@ -134,7 +121,7 @@ def test_a_model_that_nobody_thought_of_is_read_by_the_names_of_its_parts(tmp_pa
     backbone = load_backbone(
         f"hf:{save_model(tmp_path, configuration('beit'))}", "cpu", image_size=48
     )
-    assert [features.grid for features in backbone(PICTURES)] == [(3, 3), (3, 3)]
+    assert backbone(PICTURES)[0].grid == (3, 3)
 
 
 @pytest.mark.parametrize(
@@ -144,18 +131,17 @@ def test_a_model_that_nobody_thought_of_is_read_by_the_names_of_its_parts(tmp_pa
         ({"do_normalize": False, "image_mean": [0.5] * 3, "image_std": [1] * 3}, 0, 1),
     ],
 )
-def test_the_image_processors_mean_and_deviation_are_taken(processor, mean, std, tmp_path):
-    folder = save_model(tmp_path / "vit", configuration("vit"))
-    plain = load_backbone(f"hf:{folder}", "cpu", image_size=48)
-    (folder / "preprocessor_config.json").write_text(json.dumps(processor))
-    backbone = load_backbone(f"hf:{folder}", "cpu", image_size=48)
+def test_the_image_processors_mean_and_deviation_are_taken(processor, mean, std, vit):
+    plain = load_backbone(f"hf:{vit}", "cpu", image_size=48)
+    (vit / "preprocessor_config.json").write_text(json.dumps(processor))
+    backbone = load_backbone(f"hf:{vit}", "cpu", image_size=48)
     assert (backbone.mean, backbone.std) == ((mean,) * 3, (std,) * 3)
     assert not torch.allclose(backbone(PICTURES)[0].keys, plain(PICTURES)[0].keys)
 
 
 def test_without_transformers_the_package_is_named(folders, monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
-    refused(r"pip install transformers", load_backbone, f"hf:{folders['vit']}", "cpu")
+    refused(r"pip install transformers", load_backbone, f"hf:{folders['vit']}")
 
 
 @pytest.mark.parametrize(
@@ -177,36 +163,34 @@ def test_models_that_cannot_be_read_are_refused(kind, settings, message, tmp_pat
     # A convolutional network has none of the settings of a transformer.
     make = transformers.ResNetConfig if kind == "resnet" else functools.partial(configuration, kind)
     folder = save_model(tmp_path / "model", make(**settings))
-    refused(message, load_backbone, f"hf:{folder}", "cpu", image_size=32)
+    refused(message, load_backbone, f"hf:{folder}", image_size=32)
 
 
-def without(tmp_path: Path, part: str) -> str:
-    """Save a model without the weights whose names contain a part; returns its name."""
-    folder = save_model(tmp_path / "vit", configuration("vit"))
+def without(vit: Path, part: str) -> str:
+    """Take the weights whose names contain a part from a folder; returns the model's name."""
     # From bytes: Windows does not replace a file whose tensors are in use.
-    weights = load((folder / "model.safetensors").read_bytes())
+    weights = load((vit / "model.safetensors").read_bytes())
     remaining = {name: weight for name, weight in weights.items() if part not in name}
-    save_file(remaining, folder / "model.safetensors", metadata={"format": "pt"})
-    return f"hf:{folder}"
+    save_file(remaining, vit / "model.safetensors", metadata={"format": "pt"})
+    return f"hf:{vit}"
 
 
-def test_a_missing_pooler_changes_nothing_because_no_feature_depends_on_it(tmp_path):
-    name = without(tmp_path, "pooler")
+def test_a_missing_pooler_changes_nothing_because_no_feature_depends_on_it(vit):
+    name = without(vit, "pooler")
     # transformers draws weights that are missing: two models would differ.
     assert fingerprint(load_backbone(name, "cpu")) == fingerprint(load_backbone(name, "cpu"))
 
 
-def test_missing_weights_are_refused(tmp_path):
-    name = without(tmp_path, "layernorm.weight")
-    refused("1 weights are not in the file, first layernorm.weight", load_backbone, name, "cpu")
+def test_missing_weights_are_refused(vit):
+    name = without(vit, "layernorm.weight")
+    refused("1 weights are not in the file, first layernorm.weight", load_backbone, name)
 
 
-def test_pickles_are_not_read(tmp_path):
-    folder = save_model(tmp_path / "vit", configuration("vit"))
-    torch.save(load_file(folder / "model.safetensors"), folder / "pytorch_model.bin")
-    (folder / "model.safetensors").unlink()
-    refused("no model.safetensors", load_backbone, f"hf:{folder}", "cpu")
-    refused("no config.json", load_backbone, f"hf:{tmp_path}", "cpu")
+def test_pickles_are_not_read(vit):
+    torch.save(load_file(vit / "model.safetensors"), vit / "pytorch_model.bin")
+    (vit / "model.safetensors").unlink()
+    refused("no model.safetensors", load_backbone, f"hf:{vit}")
+    refused("no config.json", load_backbone, f"hf:{vit.parent}")
 
 
 @pytest.mark.parametrize(
@@ -222,12 +206,11 @@ def test_pickles_are_not_read(tmp_path):
         ),
     ],
 )
-def test_damaged_folders_are_refused_in_one_line(file, content, message, tmp_path):
-    folder = save_model(tmp_path / "vit", configuration("vit"))
-    (folder / file).write_bytes(content)
-    name = f"hf:{folder}"
+def test_damaged_folders_are_refused_in_one_line(file, content, message, vit):
+    (vit / file).write_bytes(content)
+    name = f"hf:{vit}"
     refusal = f"{re.escape(name)}: cannot be loaded by the package transformers .*{message}"
-    refused(refusal, load_backbone, name, "cpu")
+    refused(refusal, load_backbone, name)
 
 
 @pytest.fixture
@@ -256,5 +239,4 @@ def test_what_is_neither_a_folder_nor_a_name_is_refused(name, offline):
         "neither a folder nor a model OWNER/MODEL that the Hugging Face hub gives",
         load_backbone,
         name,
-        "cpu",
     )

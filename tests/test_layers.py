@@ -40,6 +40,8 @@ OF_THE_COURSE = {"anywidget", "ipywidgets", "IPython", "jupyterquiz", "skimage"}
 LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names.split()}
 
 
+MODULES, IMPORTS = modules(), [*imports()]
+
 # What a lesson up to 06 never asks for, found by its name when it is used, so that lessons do not
 # stand on it.
 BY_NAME = {
@@ -63,11 +65,11 @@ def layer_name(module: str) -> str:
 
 
 def test_every_module_has_a_layer():
-    assert {layer_name(module) for module in modules()} == set(LAYER_OF)
+    assert {*map(layer_name, MODULES)} == set(LAYER_OF)
 
 
 def test_no_module_imports_from_a_higher_layer_or_from_another_name_of_its_own():
-    for module, imported, line in imports():
+    for module, imported, line in IMPORTS:
         package, _, name = imported.partition(".")
         if package == "zsp_lite" and name != "__version__":
             own, other = layer_name(module), layer_name(name)
@@ -78,7 +80,7 @@ def test_no_module_imports_from_a_higher_layer_or_from_another_name_of_its_own()
 
 
 def test_only_the_commands_import_the_course_and_only_it_imports_its_packages():
-    for module, imported, line in imports():
+    for module, imported, line in IMPORTS:
         room = module.partition(".")[0]
         where = f"zsp_lite.{module}, line {line}, imports {imported}"
         assert room == "course" or imported.partition(".")[0] not in OF_THE_COURSE, where
@@ -93,13 +95,12 @@ def home(name: str) -> set[str]:
     """The module of the library that has an imported name, and the packages above it."""
     parts = name.split(".")
     above = {".".join(parts[1:end]) for end in range(2, len(parts) + 1)}
-    return above & modules().keys() if parts[0] == "zsp_lite" else set()
+    return above & MODULES.keys() if parts[0] == "zsp_lite" else set()
 
 
 def test_lessons_00_to_06_stand_on_at_most_6300_lines():
-    files = modules()
     below = defaultdict(set)
-    for module, name, _ in imports():
+    for module, name, _ in IMPORTS:
         below[module] |= home(name)
     todo = set()
     for path in REPOSITORY.glob("notebooks/0[0-6]*.ipynb"):
@@ -111,7 +112,7 @@ def test_lessons_00_to_06_stand_on_at_most_6300_lines():
     found = {}
     while todo:
         module = todo.pop()
-        text = files[module].read_text("utf-8")
+        text = MODULES[module].read_text("utf-8")
         found[module] = text.count("\n")
         todo |= below[module] - found.keys()
         by_name = re.findall(r'resolve_name\("zsp_lite\.([\w.]+)', text)
@@ -121,15 +122,10 @@ def test_lessons_00_to_06_stand_on_at_most_6300_lines():
     assert not BY_NAME & found.keys()
 
 
-def test_every_room_is_within_its_limit():
-    for room in size.rooms():
-        assert 0 < room.size <= room.limit, (
-            f"{room.name}: {room.size} {room.unit}, at most {room.limit}"
-        )
-
-
-def test_every_file_of_the_library_is_in_one_room():
-    code = [room for room in size.rooms() if room.name.startswith("zsp_lite")]
-    parts, whole = [room.size for room in code if room.name != "zsp_lite in all"], code[-1]
-    assert whole.name == "zsp_lite in all"
-    assert sum(parts) == whole.size
+def test_every_room_is_within_its_limit_and_every_file_of_the_library_in_one_room():
+    code = {}
+    for name, unit, count, limit in size.rooms():
+        assert 0 < count <= limit, f"{name}: {count} {unit}, at most {limit}"
+        if name.startswith("zsp_lite"):
+            code[name] = count
+    assert code.pop("zsp_lite in all") == sum(code.values())

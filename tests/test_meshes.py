@@ -4,13 +4,13 @@ exact geometry."""
 import numpy as np
 import pytest
 import trimesh
-from model_files import painted, studio, view, wedge, write_quad, write_wedge
+from model_files import studio, wedge, write_quad, write_wedge
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
 from zsp_lite.course.synthetic import meshes
 from zsp_lite.course.synthetic.meshes import ModelInfo, canonical_mesh, list_models, read_mesh
-from zsp_lite.course.synthetic.primitives import box, surface_spread
+from zsp_lite.course.synthetic.primitives import surface_spread
 from zsp_lite.course.synthetic.raytracing import MeshScene
 from zsp_lite.course.synthetic.sequences import orbit_pose
 from zsp_lite.course.synthetic.textures import srgb_to_linear
@@ -36,10 +36,10 @@ def test_an_obj_file_gives_texture_coordinates_texture_colour_and_opacity(tmp_pa
 
 def test_the_linear_colour_factor_of_gltf_becomes_srgb(tmp_path):
     linear = np.array([5, 51, 255]) / 255
-    cube = box((1, 1, 1))
+    cube = trimesh.creation.box()
     material = trimesh.visual.material.PBRMaterial(baseColorFactor=[*linear, 1.0])
-    visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(cube.vertices), 2)), material=material)
-    trimesh.Trimesh(cube.vertices, cube.faces, visual=visual).export(tmp_path / "cube.glb")
+    cube.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
+    cube.export(tmp_path / "cube.glb")
     (read,) = read_mesh(tmp_path / "cube.glb").materials
     assert_allclose(srgb_to_linear(read.colour[:3]), linear, atol=1e-4)
 
@@ -52,7 +52,7 @@ def test_every_format_gives_the_same_canonical_shape(tmp_path, extension):
     vertices = turned if extension == "stl" else shape.vertices[:, [1, 2, 0]]
     path = tmp_path / f"wedge.{extension}"
     trimesh.Trimesh(vertices, shape.faces, process=False).export(path)
-    mesh = canonical_mesh(read_mesh(path), ModelInfo().axes(path.suffix))
+    mesh = canonical(path)
     centred = shape.vertices - (shape.vertices.max(0) + shape.vertices.min(0)) / 2
     expected = centred / surface_spread(centred, shape.faces)
     # Formats differ in the order of faces: compare the sorted coordinates of all corners.
@@ -63,12 +63,11 @@ def test_every_format_gives_the_same_canonical_shape(tmp_path, extension):
 
 def test_parts_of_a_scene_are_placed_by_its_graph(tmp_path):
     # A cube around the origin, and one around x = 5 that is mirrored and twice as long in x.
-    cube = box((1, 1, 1))
     mirrored = np.diag([-2.0, 1, 1, 1])
     mirrored[0, 3] = 5
     scene = trimesh.Scene()
     for transform in (np.eye(4), mirrored):
-        scene.add_geometry(trimesh.Trimesh(cube.vertices, cube.faces), transform=transform)
+        scene.add_geometry(trimesh.creation.box(), transform=transform)
     scene.export(tmp_path / "two.glb")
     mesh = read_mesh(tmp_path / "two.glb")
     x = mesh.vertices[:, 0]
@@ -147,15 +146,15 @@ def render(mesh, camera, samples=1):
     return MeshScene(mesh, STUDIO, 0, samples=samples).render(camera)
 
 
-def standing_quad(folder, texture, **material):
-    """A textured square, 2 x 2, that faces +x and stands on an edge."""
-    mesh = read_mesh(write_quad(folder / "quad.obj", texture, **material))
-    return canonical_mesh(mesh, ModelInfo().axes(".obj"))
+def canonical(path):
+    """The mesh of a file in the canonical frame."""
+    return canonical_mesh(read_mesh(path), ModelInfo().axes(path.suffix))
 
 
-def from_the_front(mesh):
-    """A camera in front of a mesh, slightly above it, for an image of 48 x 48 pixels."""
-    return framed_camera(mesh.vertices, *orbit_pose(0, 0.02, 0, 8, np.zeros(3)), 48, margin=1.5)
+def framed(mesh, azimuth, elevation, size):
+    """A camera that frames a mesh; angles in degrees."""
+    pose = orbit_pose(*np.radians([azimuth, elevation]), 0, 8, np.zeros(3))
+    return framed_camera(mesh.vertices, *pose, size, margin=1.5)
 
 
 def intersect(camera, vertices, faces):
@@ -173,9 +172,9 @@ def intersect(camera, vertices, faces):
 
 
 @pytest.mark.parametrize("samples", [1, 2])
-def test_depth_and_mask_are_those_of_the_triangles_and_the_floor(samples):
-    mesh = painted(wedge())
-    camera = view(mesh.vertices, azimuth=200)
+def test_depth_and_mask_are_those_of_the_triangles_and_the_floor(tmp_path, samples):
+    mesh = canonical(write_wedge(tmp_path / "wedge.obj"))
+    camera = framed(mesh, 200, 25, 64)
     drawn = render(mesh, camera, samples)
     expected = intersect(camera, mesh.vertices, mesh.faces)
     # A pixel whose centre lies on an edge may be inside or outside.
@@ -191,13 +190,12 @@ def test_depth_and_mask_are_those_of_the_triangles_and_the_floor(samples):
 def test_a_texture_is_upright_and_not_mirrored(tmp_path):
     # Red and green above blue and yellow, 16 x 16 pixels each.
     colours = np.array([[[200, 40, 40], [40, 180, 40]], [[40, 60, 200], [200, 190, 60]]], np.uint8)
-    mesh = standing_quad(tmp_path, colours.repeat(16, axis=0).repeat(16, axis=1))
-    drawn = render(mesh, from_the_front(mesh))
-    # A pixel in the middle of each quarter of the square.
-    row, col = np.nonzero(drawn.mask)
-    rows = np.quantile(row, (0.25, 0.75)).astype(int)
-    columns = np.quantile(col, (0.25, 0.75)).astype(int)
-    (red, green), (blue, yellow) = drawn.rgb[np.ix_(rows, columns)].astype(int)
+    mesh = canonical(
+        write_quad(tmp_path / "quad.obj", np.kron(colours, np.ones((16, 16, 1), np.uint8)))
+    )
+    drawn = render(mesh, framed(mesh, 0, 1, 48))
+    # The square is 32 pixels wide, in the middle: a pixel in the middle of each quarter.
+    (red, green), (blue, yellow) = drawn.rgb[16:48:16, 16:48:16].astype(int)
     # The light changes the colours; their brightest and darkest channels tell them apart.
     assert [red.argmax(), green.argmax(), blue.argmax(), yellow.argmin()] == [0, 1, 2, 2]
 
@@ -207,17 +205,15 @@ def holed(tmp_path):
     """A square that is clear in its middle, a quarter of its area."""
     texture = np.full((64, 64, 4), 255, np.uint8)
     texture[16:48, 16:48, 3] = 0
-    return standing_quad(tmp_path, texture)
+    return canonical(write_quad(tmp_path / "quad.obj", texture))
 
 
 def test_a_hole_in_a_texture_is_a_hole_in_mask_and_coordinates(holed):
-    drawn = render(holed, from_the_front(holed))
-    row, col = np.nonzero(drawn.mask)
-    middle = round(row.mean()), round(col.mean())
-    assert not drawn.mask[middle]
-    assert np.isnan(drawn.canonical[middle]).all()
-    square = (np.ptp(row) + 1) * (np.ptp(col) + 1)  # pixels, hole included
-    assert_allclose(drawn.mask.sum() / square, 0.75, atol=0.05)
+    drawn = render(holed, framed(holed, 0, 1, 48))
+    assert not drawn.mask[24, 24]
+    assert np.isnan(drawn.canonical[24, 24]).all()
+    # The square is 32 pixels wide.
+    assert_allclose(drawn.mask.sum() / 32**2, 0.75, atol=0.05)
 
 
 def test_light_falls_through_a_hole_in_a_texture(holed):

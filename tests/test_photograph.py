@@ -9,6 +9,7 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, look_at, render
 
+from zsp_lite import Sim3
 from zsp_lite.cli.demo import MODELS_NOTE
 from zsp_lite.course.motorcycle import FRONT, UP, load_photograph, motorcycle_frame
 from zsp_lite.course.photograph import run_photograph
@@ -16,7 +17,7 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.writing import SequenceData, write_co3d
 from zsp_lite.importers.segments import fit_plane
-from zsp_lite.metrics import rotation_error
+from zsp_lite.metrics import rotation_error, vector_angle
 from zsp_lite.points import axis_deviation, object_points
 
 pytestmark = pytest.mark.slow
@@ -24,12 +25,6 @@ pytestmark = pytest.mark.slow
 # Front, left and up of the object, in the coordinates of `synthetic_views`: any rotation does.
 CANONICAL = look_at((1, 0.5, 0.2)).R
 FLOOR = np.s_[450:, :]  # the lowest rows, which the motorcycle does not reach
-
-
-def angle(first, second) -> float:
-    """The angle between two vectors in degrees."""
-    cosine = np.dot(first, second) / np.linalg.norm(first) / np.linalg.norm(second)
-    return float(np.degrees(np.arccos(cosine)))
 
 
 @pytest.fixture(scope="module")
@@ -42,13 +37,14 @@ def frame():
 
 
 def test_the_mask_holds_the_seat_and_both_wheels_and_neither_the_floor_nor_the_bench(frame):
-    seat = (240, 230)
-    rear_tyre = (320, 135)
-    front_tyre = (370, 675)
-    floor = (470, 300)
-    bench = (160, 100)
-    pixels = (seat, rear_tyre, front_tyre, floor, bench)
-    assert [frame.mask[pixel] for pixel in pixels] == [1, 1, 1, 0, 0]
+    on_object = {
+        (240, 230): 1,  # seat
+        (320, 135): 1,  # rear tyre
+        (370, 675): 1,  # front tyre
+        (470, 300): 0,  # floor
+        (160, 100): 0,  # bench
+    }
+    assert {pixel: frame.mask[pixel] for pixel in on_object} == on_object
 
 
 def test_up_is_the_normal_of_the_floor_and_front_is_parallel_to_it(frame):
@@ -56,8 +52,8 @@ def test_up_is_the_normal_of_the_floor_and_front_is_parallel_to_it(frame):
     points = unproject_depth(frame.depth, frame.camera)[FLOOR][known]
     normal, _ = fit_plane(points, 0.01)
     # y points down in cameras: the normal that points up has a negative y. In degrees.
-    assert angle(-np.sign(normal[1]) * normal, UP) < 2
-    assert abs(angle(FRONT, UP) - 90) < 1
+    assert vector_angle(-np.sign(normal[1]) * normal, UP) < 2
+    assert abs(vector_angle(FRONT, UP) - 90) < 1
 
 
 def test_the_photograph_is_scaled_as_scenes_of_co3d(frame):
@@ -89,9 +85,7 @@ def motorcycles(tmp_path_factory):
     frames = around(ELSEWHERE)
     points = ELSEWHERE.apply(default_rng(0).uniform(-1, 1, (400, 3)))
     colours = np.full((400, 3), 128, np.uint8)
-    trans = np.eye(4)
-    trans[:3, :3] = ELSEWHERE.R @ CANONICAL
-    trans[:3, 3] = ELSEWHERE.t
+    trans = Sim3(1.0, ELSEWHERE.R @ CANONICAL, ELSEWHERE.t).matrix
     pose = {
         "trans": trans.tolist(),
         "scale": ELSEWHERE.scale,
@@ -129,8 +123,8 @@ def test_with_perfect_features_the_directions_and_the_cloud_are_those_of_the_obj
         assert error < 12  # degrees: two patches
         assert_allclose(rotation_error(result.axes, truth), error, atol=1e-4)
         front, _, up = result.axes.T
-        assert_allclose(result.front_error, angle(front, FRONT), atol=1e-4)
-        assert_allclose(result.up_error, angle(up, UP), atol=1e-4)
+        assert_allclose(result.front_error, vector_angle(front, FRONT), atol=1e-4)
+        assert_allclose(result.up_error, vector_angle(up, UP), atol=1e-4)
         # The cloud has a size of 2; `along` is the coordinate of each point towards the front.
         assert np.linalg.norm(result.cloud - points, axis=1).mean() < 0.3
         assert np.corrcoef(points @ truth[:, 0], result.along)[0, 1] > 0.999

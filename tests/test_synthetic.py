@@ -43,18 +43,15 @@ def folder(tmp_path_factory) -> Path:
     return out
 
 
-@pytest.fixture(scope="module")
-def chairs():
-    """Two chairs as recorded by a sensor, with their exact pose, scale and views."""
-
-    def recorded(index):
-        name, key = sequence_name(SEED, "chair", index), stable_hash(f"{SEED}/chair/{index}")
-        mesh = make_object("chair", index, SEED)
-        # `record_sequence` draws the views with the same generator.
-        views, _ = render_sequence(mesh, default_rng([key, 1]), FRAMES, SIZE)
-        return *record_sequence(mesh, name, key, FRAMES, SIZE), views
-
-    return [recorded(0), recorded(1)]
+@pytest.fixture(scope="module", params=[0, 1])
+def chair(request):
+    """A chair as recorded by a sensor, with its exact pose, scale and views."""
+    index = request.param
+    name, key = sequence_name(SEED, "chair", index), stable_hash(f"{SEED}/chair/{index}")
+    mesh = make_object("chair", index, SEED)
+    # `record_sequence` draws the views with the same generator.
+    views, _ = render_sequence(mesh, default_rng([key, 1]), FRAMES, SIZE)
+    return *record_sequence(mesh, name, key, FRAMES, SIZE), views
 
 
 @pytest.fixture(scope="module", params=sorted(CATEGORIES))
@@ -78,66 +75,66 @@ def test_an_object_differs_from_its_half_turn_so_that_its_pose_is_unique(shapes)
     assert distances.min(0).max() > 0.2
 
 
-def test_depth_has_holes_and_noise(chairs):
-    for data, _, scale, views in chairs:
-        for frame, view in zip(data.frames, views, strict=True):
-            depth = frame.depth[view.mask]
-            known = depth > 0
-            assert 0.45 < known.mean() < 0.8
-            ratios = depth[known] / (scale * view.depth[view.mask][known])
-            assert 0 < np.abs(ratios - 1).mean() < 0.02
+def test_depth_has_holes_and_noise(chair):
+    data, _, scale, views = chair
+    for frame, view in zip(data.frames, views, strict=True):
+        depth = frame.depth[view.mask]
+        known = depth > 0
+        assert 0.45 < known.mean() < 0.8
+        ratios = depth[known] / (scale * view.depth[view.mask][known])
+        assert 0 < np.abs(ratios - 1).mean() < 0.02
 
 
-def test_masks_are_accurate_to_two_pixels(chairs):
-    for data, _, _, views in chairs:
-        for frame, view in zip(data.frames, views, strict=True):
-            inside = view.mask.astype(np.uint8)
-            # The distance of each pixel from the edge, in pixels.
-            distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
-            distance += cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
-            wrong = (frame.mask > 0.5) != view.mask
-            assert distance[wrong].max() <= 2.5
+def test_masks_are_accurate_to_two_pixels(chair):
+    data, _, _, views = chair
+    for frame, view in zip(data.frames, views, strict=True):
+        inside = view.mask.astype(np.uint8)
+        # The distance of each pixel from the edge, in pixels.
+        distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
+        distance += cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
+        wrong = (frame.mask > 0.5) != view.mask
+        assert distance[wrong].max() <= 2.5
 
 
-def test_a_flat_object_seen_edge_on_has_finite_depth(chairs):
-    *_, views = chairs[0]
+def test_a_flat_object_seen_edge_on_has_finite_depth(chair):
+    *_, views = chair
     edge_on = replace(views[0], mask=np.zeros_like(views[0].mask))
     assert np.isfinite(stereo_depth(edge_on, 0.3, 0.2, default_rng(0))).all()
 
 
-def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chairs):
-    for data, pose, scale, views in chairs:
-        assert data.points.std(0).mean() == pytest.approx(1)
-        assert_allclose(np.linalg.norm(data.normals, axis=1), 1, atol=1e-4)
-        R, t = pose[:3, :3], pose[:3, 3]
-        canonical = (data.points - t) @ R / scale
-        seen = np.concatenate([view.canonical[view.mask] for view in views])
-        # The views do not show all of the object, so that points may lie a little outside.
-        assert (canonical > seen.min(0) - 0.3).all()
-        assert (canonical < seen.max(0) + 0.3).all()
+def test_the_point_cloud_has_unit_spread_and_lies_on_the_object(chair):
+    data, pose, scale, views = chair
+    assert data.points.std(0).mean() == pytest.approx(1)
+    assert_allclose(np.linalg.norm(data.normals, axis=1), 1, atol=1e-4)
+    R, t = pose[:3, :3], pose[:3, 3]
+    canonical = (data.points - t) @ R / scale
+    seen = np.concatenate([view.canonical[view.mask] for view in views])
+    # The views do not show all of the object, so that points may lie a little outside.
+    assert (canonical > seen.min(0) - 0.3).all()
+    assert (canonical < seen.max(0) + 0.3).all()
 
 
-def test_coordinates_of_the_object_project_onto_their_own_pixels_and_depth(chairs):
-    for data, pose, scale, views in chairs:
-        R, t = pose[:3, :3], pose[:3, 3]
-        for frame, view in zip(data.frames, views, strict=True):
-            row, col = np.nonzero(view.mask)
-            points = scale * view.canonical[row, col].astype(float) @ R.T + t
-            pixels, depth = frame.camera.project(points)
-            assert np.abs(pixels - np.stack([col + 0.5, row + 0.5], 1)).max() < 0.02
-            assert_allclose(depth, scale * view.depth[row, col], rtol=1e-4)
+def test_coordinates_of_the_object_project_onto_their_own_pixels_and_depth(chair):
+    data, pose, scale, views = chair
+    R, t = pose[:3, :3], pose[:3, 3]
+    for frame, view in zip(data.frames, views, strict=True):
+        row, col = np.nonzero(view.mask)
+        points = scale * view.canonical[row, col].astype(float) @ R.T + t
+        pixels, depth = frame.camera.project(points)
+        assert np.abs(pixels - np.stack([col + 0.5, row + 0.5], 1)).max() < 0.02
+        assert_allclose(depth, scale * view.depth[row, col], rtol=1e-4)
 
 
-def test_an_export_reads_back(folder, chairs):
+def test_an_export_reads_back(folder, chair):
     dataset = Co3D(folder)
     assert dataset.categories() == ["chair", "toytruck"]
     assert len(dataset.select("toytruck")) == 2
-    assert list(read_labels(folder, "chair")) == [data.name for data, *_ in chairs]
-    for data, *_ in chairs:
-        assert_allclose(dataset.point_cloud("chair", data.name)[0], data.points, atol=1e-4)
-        for annotation, frame in zip(dataset.frames("chair", data.name), data.frames, strict=True):
-            # Files hold depth in 16 bits.
-            assert_allclose(dataset.load(annotation).depth, frame.depth, rtol=1e-3)
+    data, *_ = chair
+    assert data.name in read_labels(folder, "chair")
+    assert_allclose(dataset.point_cloud("chair", data.name)[0], data.points, atol=1e-4)
+    for annotation, frame in zip(dataset.frames("chair", data.name), data.frames, strict=True):
+        # Files hold depth in 16 bits.
+        assert_allclose(dataset.load(annotation).depth, frame.depth, rtol=1e-3)
 
 
 def test_an_interrupted_export_is_completed_and_complete_sequences_stay(tmp_path, monkeypatch):

@@ -12,37 +12,28 @@ from zsp_lite import FeatureMap, Frame, PoseEstimate, Sim3, ZeroShotPose
 from zsp_lite.metrics import rotation_error
 from zsp_lite.points import object_points
 from zsp_lite.verified.verification import TERM_NAMES, ScoreCoefficients
-from zsp_lite.views import View, extract_views, object_crop
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def method() -> ZeroShotPose:
-    """The verified solver with perfect features."""
-    return ZeroShotPose(CoordinateBackbone(), solver="verified")
+METHOD = ZeroShotPose(CoordinateBackbone(), solver="verified")
 
 
 @pytest.fixture(scope="module")
-def views(method, frames):
+def views(frames):
     """A reference and five target views."""
-    return extract_views(method.backbone, [object_crop(frame) for frame in frames])
+    return METHOD.views(frames)
 
 
 @pytest.fixture(scope="module")
-def estimate(method, views) -> PoseEstimate:
+def estimate(views) -> PoseEstimate:
     """The estimate from all views."""
-    return method.estimate_from_views(views[0], views[1:])
+    return METHOD.estimate_from_views(views[0], views[1:])
 
 
 def truth(estimate: PoseEstimate, frames: list[Frame]) -> Sim3:
     """The true pose in the view of an estimate."""
     return true_pose(frames[0].camera, Sim3.identity(), estimate.target_camera, ELSEWHERE)
-
-
-def changed(view: View, **parts) -> View:
-    """The view with parts of its frame exchanged; its features stay."""
-    return replace(view, frame=replace(view.frame, **parts))
 
 
 def test_perfect_features_give_the_true_pose(estimate, frames):
@@ -103,58 +94,53 @@ def test_inliers_agree_with_the_pose_within_a_fraction_of_the_objects_size(estim
     assert_array_equal(estimate.inliers[sure], (residual < most)[sure])
 
 
-def test_the_order_of_the_views_does_not_matter(method, estimate, views):
+def test_the_order_of_the_views_does_not_matter(estimate, views):
     order = [3, 0, 4, 2, 1]
-    other = method.estimate_from_views(views[0], [views[1 + index] for index in order])
+    other = METHOD.estimate_from_views(views[0], [views[1 + index] for index in order])
     assert order[other.view] == estimate.view
     assert_array_equal(other.sim3.matrix, estimate.sim3.matrix)
     assert_array_equal(other.view_scores, estimate.view_scores[order])
 
 
-def test_a_larger_scene_that_is_rotated_has_a_larger_scale_and_a_rotated_pose(
-    method, estimate, views
-):
+def test_a_larger_scene_that_is_rotated_has_a_larger_scale_and_a_rotated_pose(estimate, views):
     turn = look_at((0.2, 0.5, -1)).R
 
     def moved(view):
         camera = turned(view.frame.camera, turn)
-        return changed(view, camera=replace(camera, t=7 * camera.t), depth=7 * view.frame.depth)
+        camera = replace(camera, t=7 * camera.t)
+        return replace(view, frame=replace(view.frame, camera=camera, depth=7 * view.frame.depth))
 
-    other = method.estimate_from_views(views[0], [moved(view) for view in views[1:]])
+    other = METHOD.estimate_from_views(views[0], [moved(view) for view in views[1:]])
     assert_allclose(other.sim3.scale, 7 * estimate.sim3.scale, rtol=0.02)
-    # Against a camera the rotation is the same, in the world it has turned.
+    # Against a camera, which turns with the world, the rotation is the same.
     assert other.view == estimate.view
     assert rotation_error(other.sim3.R, estimate.sim3.R) < 0.5
-    in_world = [one.target_camera.R.T @ one.sim3.R for one in (estimate, other)]
-    assert rotation_error(turn @ in_world[0], in_world[1]) < 0.5
 
 
-def test_one_target_view_is_enough(method, views, frames):
-    alone = method.estimate_from_views(views[0], views[1:2])
+def test_one_target_view_is_enough(views, frames):
+    alone = METHOD.estimate_from_views(views[0], views[1:2])
     assert alone.view == 0
     assert rotation_error(alone.sim3.R, truth(alone, frames).R) < 10
 
 
-def test_views_that_share_no_side_of_the_object_are_flagged(method):
+def test_views_that_share_no_side_of_the_object_are_flagged():
     cameras = [
         turned(look_at(side, distance=4.5), ELSEWHERE.R)
         for side in [(-1, -0.2, -0.1), (-1, 0.3, -0.2)]
     ]
-    frames = [render(look_at((1, 0.2, 0.1)), Sim3.identity(), "reference")]
-    frames += [render(camera, ELSEWHERE, f"target {i}") for i, camera in enumerate(cameras)]
-    reference, *targets = extract_views(method.backbone, [object_crop(frame) for frame in frames])
-    found = method.estimate_from_views(reference, targets)
+    reference = render(look_at((1, 0.2, 0.1)), Sim3.identity())
+    found = METHOD.estimate(reference, [render(camera, ELSEWHERE) for camera in cameras])
     assert "are not similar" in found.note
 
 
-def test_uninformative_features_give_a_low_confidence(method, views, estimate):
+def test_uninformative_features_give_a_low_confidence(views, estimate):
     rng = torch.Generator().manual_seed(0)
 
     def meaningless(view):
         keys = torch.randn(28, 28, 16, generator=rng)
         return replace(view, features=FeatureMap(keys, view.features.saliency, keys[0, 0]))
 
-    found = method.estimate_from_views(
+    found = METHOD.estimate_from_views(
         meaningless(views[0]), [meaningless(view) for view in views[1:]]
     )
     assert found.confidence < estimate.confidence
@@ -181,31 +167,20 @@ ALL_AROUND = [
 ]
 
 
-@pytest.fixture(scope="module")
-def symmetric():
-    """An estimate for an object that a half turn about z leaves alone."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("synthetic_views.inside", ellipsoid)
-        cameras = map(look_at, [(0.9, -0.5, 0.3), *ALL_AROUND])
-        reference, *targets = [render(camera, Sim3.identity()) for camera in cameras]
-        method = ZeroShotPose(SymmetricBackbone(), solver="verified")
-        return method.estimate(reference, targets)
+def test_a_symmetric_object_is_flagged_as_one_of_two_nearly_as_probable_poses(monkeypatch):
+    # A half turn about z leaves it alone.
+    def ellipsoid(points):
+        return np.linalg.norm(points / (1.3, 0.9, 0.6), axis=-1) - 1
 
-
-def ellipsoid(points: np.ndarray) -> np.ndarray:
-    """Implicit function of an ellipsoid, (..., 3) -> (...), negative inside."""
-    return np.linalg.norm(points / (1.3, 0.9, 0.6), axis=-1) - 1
-
-
-def test_a_symmetric_object_is_flagged_as_one_of_two(symmetric):
-    assert symmetric.one_of_two
-    assert "one of two: poses" in symmetric.note
-    assert "the object may be symmetric" in symmetric.note
-    assert symmetric.angle_to(symmetric.alternatives[0]) > 150
-
-
-def test_both_poses_of_a_symmetric_object_are_nearly_as_probable(symmetric):
-    others = [one.confidence for one in symmetric.alternatives]
-    assert symmetric.confidence >= others[0] > symmetric.confidence / np.e
-    assert symmetric.confidence < 0.75
-    assert symmetric.confidence + sum(others) <= 1
+    monkeypatch.setattr("synthetic_views.inside", ellipsoid)
+    cameras = map(look_at, [(0.9, -0.5, 0.3), *ALL_AROUND])
+    reference, *targets = [render(camera, Sim3.identity()) for camera in cameras]
+    found = ZeroShotPose(SymmetricBackbone(), solver="verified").estimate(reference, targets)
+    assert found.one_of_two
+    assert "one of two: poses" in found.note
+    assert "the object may be symmetric" in found.note
+    assert found.angle_to(found.alternatives[0]) > 150
+    others = [one.confidence for one in found.alternatives]
+    assert found.confidence >= others[0] > found.confidence / np.e
+    assert found.confidence < 0.75
+    assert found.confidence + sum(others) <= 1

@@ -9,6 +9,7 @@ a line break costs anything; text in words of Markdown files and of the text cel
 
 import ast
 import csv
+import functools
 import io
 import itertools
 import json
@@ -44,16 +45,17 @@ class Room(NamedTuple):
 
 def rooms() -> Iterator[Room]:
     """Measure all rooms. A file that several patterns of a room match counts once."""
-    with LIMITS.open(newline="") as table:
+    with LIMITS.open() as table:
         for row in csv.DictReader(table):
             files = {file for pattern in row["files"].split() for file in ROOT.glob(pattern)}
             count = _words if row["unit"] == "words" else _tokens
             yield Room(row["room"], row["unit"], sum(map(count, files)), int(row["limit"]))
 
 
+@functools.cache  # most files are in several rooms
 def _tokens(file: Path) -> int:
     """Count the tokens of a file of code."""
-    text = file.read_text(encoding="utf-8")
+    text = file.read_text("utf-8")
     return python_tokens(text) if file.suffix == ".py" else other_tokens(text, file.name)
 
 
@@ -100,7 +102,7 @@ def other_tokens(text: str, name: str) -> int:
 
 def _words(file: Path) -> int:
     """Count the words of a page, or of the text cells of a notebook without their code."""
-    text = file.read_text(encoding="utf-8")
+    text = file.read_text("utf-8")
     if file.suffix == ".ipynb":
         cells = json.loads(text)["cells"]
         pages = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown"]
