@@ -87,10 +87,6 @@ def download(run):
     return command
 
 
-def files_of(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.rglob("*") if path.is_file())
-
-
 def test_a_category_is_downloaded_verified_unpacked_and_checked(server, source, tmp_path, download):
     root = tmp_path / "co3d"
     text = download(root)
@@ -98,7 +94,7 @@ def test_a_category_is_downloaded_verified_unpacked_and_checked(server, source, 
         part in text for part in ("toaster_001.zip", "0.00 GB", "CC BY-NC 4.0", "No problems")
     )
     assert contents(root / "toaster") == contents(source / "toaster")
-    assert files_of(root / ".download") == ["unpacked.json"]  # the archives are removed
+    assert [*contents(root / ".download")] == ["unpacked.json"]  # the archives are removed
     requests = len(server.ranges)
     text = download(root)
     assert len(server.ranges) == requests
@@ -200,7 +196,7 @@ def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkey
     monkeypatch.setattr(zipfile.ZipFile, "read", stop_at_third)
     download(root, dataset="co3d-v1", code=130)
     # annotations last
-    assert len(files_of(root / "toaster")) == 3
+    assert len(contents(root / "toaster")) == 3
     assert Co3D(root).categories() == []
     monkeypatch.setattr(zipfile.ZipFile, "read", read)
     download(root, dataset="co3d-v1")
@@ -233,7 +229,7 @@ def test_a_link_in_the_folder_is_not_followed_out_of_it(server, tmp_path, downlo
     (tmp_path / "co3d/toaster").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
     text = download(tmp_path / "co3d", code=2)
     assert "leads out of the data folder" in text
-    assert files_of(tmp_path / "elsewhere") == []
+    assert not contents(tmp_path / "elsewhere")
 
 
 @pytest.mark.parametrize(

@@ -15,23 +15,25 @@ from zsp_lite.data.frames import mask_to_bbox
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.importers.masks import mask_flags, masks_from_box, masks_from_depth, separate_colours
 
-FLOOR = -0.8  # height, just below the object
+WALL, FLOOR = -3.0, -0.8  # along x, and below the object
 # Directions of cameras, from the middle of the object.
 DIRECTIONS = [(1, 0.2, 0.6), (0.4, 1, 0.5), (0.7, -0.8, 0.4), (1, 0.5, 1.5)]
 
 
 def object_on_floor(direction) -> tuple[Frame, np.ndarray]:
-    """A frame of the object of `synthetic_views`, in red on a grey floor; the depth has holes. And
-    the true mask."""
+    """A frame of the object of `synthetic_views`, in red on a grey floor before a wall, whose depth
+    has holes, and the true mask."""
     camera = look_at(direction, 5.0)
     seen = render(camera, AT_HOME)
     truth = seen.mask > 0
     # Directions of the rays in the world, with depth 1.
     rays = unproject_depth(np.ones(camera.size), camera) @ camera.R
-    depth = np.where(truth, seen.depth, (FLOOR - camera.centre[2]) / rays[..., 2])
+    # The depth of the wall and of the floor.
+    depths = (np.array([WALL, FLOOR]) - camera.centre[[0, 2]]) / rays[..., [0, 2]]
+    depth = np.where(truth, seen.depth, np.where(depths > 0, depths, np.inf).min(axis=-1))
     rng = np.random.default_rng(0)
     holes = np.kron(rng.random((20, 20)) < 0.3, np.ones((7, 9)))  # of 7 x 9 pixels
-    depth = np.where((holes > 0) | (depth < 0) | (depth > 20), 0, depth)
+    depth = np.where((holes > 0) | (depth > 20), 0, depth)
     rgb = np.where(truth[..., None], (200, 40, 40), 90) + rng.integers(-9, 9, (*camera.size, 3))
     return Frame(rgb.astype(np.uint8), depth.astype(np.float32), None, camera), truth
 

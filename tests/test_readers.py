@@ -19,7 +19,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
-from synthetic_views import level_camera
+from synthetic_views import look_at
 from test_importers import (
     HALF_PIXEL,
     edited,
@@ -492,7 +492,6 @@ def test_what_is_no_capture_is_answered_with_what_it_lacks(tmp_path, files, mess
 
 
 def test_a_file_that_is_no_capture_is_answered_with_what_it_is(tmp_path):
-    refused("scan.bag does not exist", open_capture, tmp_path / "scan.bag")
     (tmp_path / "scan.bag").touch()
     refused("scan.bag is a recording of RealSense", open_capture, tmp_path / "scan.bag")
 
@@ -588,8 +587,11 @@ def test_a_confidence_map_has_the_size_of_the_depth(tmp_path, views):
 
 
 def spread(degrees: np.ndarray, count: int) -> np.ndarray:
-    """Choose some of the azimuths of cameras around an object."""
-    return np.sort(degrees[spread_views([*map(level_camera, degrees)], count)])
+    """Choose some of the azimuths of cameras around the origin."""
+    turns = Rotation.from_euler("y", degrees[:, None], degrees=True).as_matrix()
+    camera = look_at((1, 0, 0))
+    cameras = [replace(camera, R=turn) for turn in turns]
+    return np.sort(degrees[spread_views(cameras, count)])
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8])
