@@ -104,9 +104,7 @@ WRONG = [
     ("estimate a --helpers c --helpers d b", "Missing argument 'TARGET'"),
     ("estimate a b --helpers c --solver paper", "--helpers"),
     ("demo --data no/such/folder", str(Path("no/such/folder"))),
-    ("demo --layer block12", "'block0' to 'block11'"),
     ("benchmark --categories ellipsoid,cube", "'cube'"),
-    ("synth --category sofa --out x", "sofa"),
     (f"{DOWNLOAD} co3d --category spaceship", "co3d (full) is 'spaceship', expected one of "),
     (
         f"{DOWNLOAD} co3d-v1 --category toaster --single-sequence",

@@ -136,7 +136,6 @@ def test_an_invalid_frame_fails_by_name_and_field(root, change, message):
 @pytest.mark.parametrize(
     "call, message",
     [
-        (lambda root: Co3D(root / "nowhere"), "nowhere does not exist"),
         (
             lambda root: Co3D(root / "chair/frame_annotations.jgz"),
             "frame_annotations.jgz is not a folder",

@@ -83,7 +83,6 @@ LARGE = encoded(np.zeros((8, 8), np.uint8), "JPEG").replace(b"\0\x08\0\x08\1", b
 # For each case: the reader, and the content of its file.
 OVERSIZED = [
     ("image", LARGE),
-    ("depth", LARGE),
     ("frame annotations", gzip_bomb),
     ("nerfstudio", b"[" * 100_000),
     ("pairs", b"\x80\x02" + b"]" * 100_000 + b"."),
