@@ -277,7 +277,7 @@ def test_holes_in_a_plane_are_filled_with_the_plane(seed):
     known[10:20, 12:25] = False
     depth = np.where(known, plane, 0)
     filled = inpaint_depth(depth)
-    assert np.abs(filled - plane).mean() < 0.05  # depth differs by 0.27 across the hole
+    assert np.abs(filled - plane).mean() < 0.02  # depth differs by 0.27 across the hole
     assert_array_equal(filled[known], plane[known])
     assert filled.min() >= depth[known].min()
     assert filled.max() <= depth.max()
