@@ -89,7 +89,7 @@ def convert_to_v2(folder: Path) -> None:
             camera = Camera.from_pytorch3d(
                 **frame["viewpoint"],
                 intrinsics_format="ndc_norm_image_bounds",
-                size=frame["image"]["size"],
+                size=tuple(frame["image"]["size"]),
             )
             frame["viewpoint"] = camera.to_pytorch3d("ndc_isotropic")
             frame["meta"] = {"frame_splits": ["train"], "eval_batch_maps": []}
