@@ -76,7 +76,8 @@ def edit_json(path: Path, change: Callable) -> None:
     """Rewrite a gzipped JSON file with `change` applied to its content."""
     content = json.loads(gzip.decompress(path.read_bytes()))
     changed = change(content)
-    path.write_bytes(gzip.compress(json.dumps(content if changed is None else changed).encode()))
+    content = content if changed is None else changed
+    path.write_bytes(gzip.compress(json.dumps(content, default=np.ndarray.tolist).encode()))
 
 
 def convert_to_v2(folder: Path) -> None:
@@ -85,14 +86,12 @@ def convert_to_v2(folder: Path) -> None:
 
     def convert(frames):
         for frame in frames:
-            size = tuple(frame["image"]["size"])
             camera = Camera.from_pytorch3d(
-                **frame["viewpoint"], intrinsics_format="ndc_norm_image_bounds", size=size
+                **frame["viewpoint"],
+                intrinsics_format="ndc_norm_image_bounds",
+                size=tuple(frame["image"]["size"]),
             )
-            view = camera.to_pytorch3d("ndc_isotropic")
-            frame["viewpoint"] = {
-                name: x if isinstance(x, str) else x.tolist() for name, x in view.items()
-            }
+            frame["viewpoint"] = camera.to_pytorch3d("ndc_isotropic")
             frame["meta"] = {"frame_splits": ["train"], "eval_batch_maps": []}
 
     edit_json(folder / "frame_annotations.jgz", convert)

@@ -100,19 +100,13 @@ def ellipsoids(tmp_path_factory):
     turn = look_at((0.3, -1.0, 0.4)).R
     placements = {"a": Sim3.identity(), "b": Sim3(1.0, turn, np.array([0.1, -0.2, 0.1]))}
     points = np.random.default_rng(0).normal(size=(50, 3))
+    colours = np.full((50, 3), 128, np.uint8)
+    cameras = [look_at((np.cos(a), np.sin(a), 0.3)) for a in 2 * np.pi / 7 * np.arange(7)]
     sequences = []
     for name, placement in placements.items():
-        angles = np.linspace(0, 2 * np.pi, 7, endpoint=False)
-        frames = [
-            render(look_at((np.cos(a), np.sin(a), 0.3)), placement, f"{name}/{i}")
-            for i, a in enumerate(angles)
-        ]
-        colours = np.full((50, 3), 128, np.uint8)
-        sequences.append(
-            SequenceData(
-                name, frames, list(range(7)), placement.apply(points), colours, None, 2.0, 1.0
-            )
-        )
+        frames = [render(camera, placement) for camera in cameras]
+        cloud = placement.apply(points)
+        sequences.append(SequenceData(name, frames, range(7), cloud, colours, None, 2.0, 1.0))
         write_label(root, "ellipsoid", PoseLabel(placement.matrix, name, "a"))
     write_co3d(root, "ellipsoid", sequences, quality=98)
     return Co3D(root)

@@ -14,7 +14,6 @@ import pytest
 from co3d_folders import contents, write_category, write_identities
 from loopback import Server
 
-from zsp_lite.cli.main import main
 from zsp_lite.data import archives
 from zsp_lite.data.archives import list_archives
 from zsp_lite.data.co3d import Co3D, Pair
@@ -23,7 +22,6 @@ from zsp_lite.data.writing import write_published_pairs
 from zsp_lite.io.locks import writing
 
 SEQUENCES, UNLABELLED = ("100_1_1", "200_2_2"), "300_3_3"
-COMMAND = "data download co3d --category toaster --root"
 CHUNKS = ["/toaster_000.zip", "/toaster_001.zip"]
 
 
@@ -53,14 +51,11 @@ def source(tmp_path_factory):
 
 @pytest.fixture
 def server(source, tmp_path, monkeypatch):
-    """A mirror: two chunks of toasters, a single-sequence subset, and an archive of v1."""
-    annotations = ("toaster/frame_", "toaster/sequence_")
+    """A mirror: two chunks of toasters, and an archive of v1."""
     first, second, third = (f"toaster/{name}" for name in (*SEQUENCES, UNLABELLED))
     files = {
-        CHUNKS[0]: zipped(source, *annotations, first),
+        CHUNKS[0]: zipped(source, "toaster/frame_", "toaster/sequence_", first),
         CHUNKS[1]: zipped(source, second, third),
-        "/toaster_000_singlesequence.zip": zipped(source, *annotations),
-        "/toaster_001_singlesequence.zip": zipped(source, first, second, third),
         "/toaster.zip": zipped(source, "toaster"),
     }
     server = Server(files)
@@ -68,19 +63,17 @@ def server(source, tmp_path, monkeypatch):
     monkeypatch.setattr(archives, "CATALOGUE", server.catalogue)
     monkeypatch.setenv("ZSP_LITE_CO3D_URL", server.url + "/")
     monkeypatch.setenv("ZSP_LITE_CO3D_V1_URL", server.url)
-    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
-        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("no_proxy", "*")
     write_catalogue(server)
     yield server
     server.close()
 
 
 def write_catalogue(server) -> None:
-    chunk0, chunk1, single0, single1, v1 = (
-        hashlib.sha256(one).hexdigest() for one in server.files.values()
-    )
-    v2 = {"full": {"toaster": [chunk0, chunk1]}, "single-sequence": {"toaster": [single0, single1]}}
-    server.catalogue.write_text(json.dumps({"co3d": v2, "co3d-v1": {"full": {"toaster": [v1]}}}))
+    *chunks, v1 = [hashlib.sha256(one).hexdigest() for one in server.files.values()]
+    archives = {"co3d": chunks, "co3d-v1": [v1]}
+    catalogue = {name: {"full": {"toaster": digests}} for name, digests in archives.items()}
+    server.catalogue.write_text(json.dumps(catalogue))
 
 
 @pytest.fixture
@@ -94,10 +87,6 @@ def download(run):
     return command
 
 
-def files_of(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.rglob("*") if path.is_file())
-
-
 def test_a_category_is_downloaded_verified_unpacked_and_checked(server, source, tmp_path, download):
     root = tmp_path / "co3d"
     text = download(root)
@@ -105,7 +94,7 @@ def test_a_category_is_downloaded_verified_unpacked_and_checked(server, source, 
         part in text for part in ("toaster_001.zip", "0.00 GB", "CC BY-NC 4.0", "No problems")
     )
     assert contents(root / "toaster") == contents(source / "toaster")
-    assert files_of(root / ".download") == ["unpacked.json"]  # the archives are removed
+    assert [*contents(root / ".download")] == ["unpacked.json"]  # the archives are removed
     requests = len(server.ranges)
     text = download(root)
     assert len(server.ranges) == requests
@@ -113,13 +102,12 @@ def test_a_category_is_downloaded_verified_unpacked_and_checked(server, source, 
 
 
 def test_the_official_list_has_the_archives_of_every_category():
-    for category, count in {"toyplane": 4, "chair": 14}.items():  # as published
-        full, single = (list_archives("co3d", category, subset) for subset in (False, True))
-        (old,) = list_archives("co3d-v1", category)
-        assert (len(full), len(single)) == (count, 2)
-        assert single[1].name == f"{category}_001_singlesequence.zip"
-        assert full[0].url == f"https://dl.fbaipublicfiles.com/co3dv2_231130/{category}_000.zip"
-        assert old.url == f"https://dl.fbaipublicfiles.com/co3d/{category}.zip"
+    full, single = (list_archives("co3d", "toyplane", subset) for subset in (False, True))
+    (old,) = list_archives("co3d-v1", "toyplane")
+    assert (len(full), len(single)) == (4, 2)  # as published
+    assert single[1].name == "toyplane_001_singlesequence.zip"
+    assert full[0].url == "https://dl.fbaipublicfiles.com/co3dv2_231130/toyplane_000.zip"
+    assert old.url == "https://dl.fbaipublicfiles.com/co3d/toyplane.zip"
 
 
 def test_the_first_chunk_can_be_used_alone_and_completed_later(
@@ -162,10 +150,6 @@ def test_labelled_sequences_are_read_out_of_the_archive_on_the_server(
 
 def test_sequences_of_an_archive_need_a_server_that_sends_parts(server, source, tmp_path, download):
     options = ("--labels", str(source), "--labelled-only")
-    with pytest.MonkeyPatch.context() as elsewhere:
-        elsewhere.setenv("ZSP_LITE_CO3D_V1_URL", "http://127.0.0.1:9")
-        text = download(tmp_path / "v1", *options, dataset="co3d-v1", code=2)
-        assert "http://127.0.0.1:9/toaster.zip cannot be reached" in text
     server.knows_ranges = False
     assert "expected range requests" in download(
         tmp_path / "v1", *options, dataset="co3d-v1", code=2
@@ -176,15 +160,13 @@ def test_sequences_of_an_archive_need_a_server_that_sends_parts(server, source, 
 
 @pytest.mark.parametrize("answer, code", [("\n", 1), ("Y\n", 0), ("", 130), (None, 2)])
 def test_the_user_is_asked_on_a_terminal_or_has_said_yes(
-    server, tmp_path, capsys, monkeypatch, answer, code
+    server, tmp_path, run, monkeypatch, answer, code
 ):
     monkeypatch.setattr("sys.stdin", io.StringIO(answer or ""))
     monkeypatch.setattr("sys.stdin.isatty", lambda: answer is not None)
-    assert main(f"{COMMAND} {tmp_path}/co3d".split()) == code
-    out, error = capsys.readouterr()
-    assert "toaster_001.zip" in out
-    assert ("expected --yes" in error) == (code == 2)
-    assert error.count("\n") == (code > 1)
+    text = run(f"data download co3d --category toaster --root {tmp_path}/co3d", code)
+    assert "toaster_001.zip" in text
+    assert ("expected --yes" in text) == (code == 2)
     assert (tmp_path / "co3d").exists() == (server.ranges != []) == (code == 0)
 
 
@@ -214,7 +196,7 @@ def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkey
     monkeypatch.setattr(zipfile.ZipFile, "read", stop_at_third)
     download(root, dataset="co3d-v1", code=130)
     # annotations last
-    assert len(files_of(root / "toaster")) == 3
+    assert len(contents(root / "toaster")) == 3
     assert Co3D(root).categories() == []
     monkeypatch.setattr(zipfile.ZipFile, "read", read)
     download(root, dataset="co3d-v1")
@@ -222,25 +204,22 @@ def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkey
     assert len(server.ranges) == 1  # the archive that was there is not downloaded again
 
 
+# The last two are no files of the category, or inside.
 @pytest.mark.parametrize(
-    "name", ["../outside", "/outside", "toaster/../../outside", "toaster\\..\\x", "toaster//x"]
+    "name, code", [("toaster/../../outside", 2), ("../outside", 1), ("toaster//x", 1)]
 )
-def test_nothing_is_written_outside_the_folder_and_no_link_is_made(server, tmp_path, capsys, name):
+def test_nothing_is_written_outside_the_folder_and_no_link_is_made(
+    server, tmp_path, download, name, code
+):
     data, member = io.BytesIO(), zipfile.ZipInfo(name)
     member.external_attr = (stat.S_IFLNK | 0o777) << 16
     with zipfile.ZipFile(data, "w") as archive:
-        archive.writestr("toaster/good.txt", b"good")
         archive.writestr(member, b"/etc/passwd")
     server.files[CHUNKS[1]] = data.getvalue()
     write_catalogue(server)
-    code = main(f"{COMMAND} {tmp_path}/co3d --yes".split())
-    if name.startswith("toaster/.."):  # the others are no files of the category
-        (line,) = capsys.readouterr().err.splitlines()
-        assert "leads out of the data folder" in line
-        assert code == 2
-        assert not (tmp_path / "co3d/toaster").exists()
+    text = download(tmp_path / "co3d", code=code)
+    assert ("leads out of the data folder" in text) == (code == 2)
     assert {path.name for path in tmp_path.iterdir()} == {"co3d", "catalogue.json"}
-    assert not Path("/outside").exists()
     assert not any(path.is_symlink() for path in tmp_path.rglob("*"))
 
 
@@ -250,7 +229,7 @@ def test_a_link_in_the_folder_is_not_followed_out_of_it(server, tmp_path, downlo
     (tmp_path / "co3d/toaster").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
     text = download(tmp_path / "co3d", code=2)
     assert "leads out of the data folder" in text
-    assert files_of(tmp_path / "elsewhere") == []
+    assert not contents(tmp_path / "elsewhere")
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,11 @@
-"""Cameras: projection, crops, formats of others."""
+"""Cameras: projection, formats of others, the span of several."""
 
 import numpy as np
 import pytest
 from co3d_folders import random_camera, seeds
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from refusals import refused
 from synthetic_views import level_camera
 
@@ -15,24 +15,11 @@ from zsp_lite.data.cameras import Camera
 FORMATS = ["ndc_norm_image_bounds", "ndc_isotropic"]
 
 
-def visible_points(seed: int) -> tuple[Camera, np.ndarray]:
-    camera = random_camera(seed)
-    in_camera = np.random.default_rng(seed).uniform([-2, -2, 0.5], [2, 2, 8], (20, 3))
-    return camera, camera.to_world(in_camera)
-
-
-@given(seeds, st.sampled_from(FORMATS))
-def test_conversion_to_pytorch3d_and_back_changes_nothing(seed, intrinsics_format):
-    camera = random_camera(seed)
-    back = Camera.from_pytorch3d(**camera.to_pytorch3d(intrinsics_format), size=camera.size)
-    for name in ("R", "t", "focal_length", "principal_point"):
-        assert_allclose(getattr(back, name), getattr(camera, name), rtol=1e-9, atol=1e-9)
-    assert back.size == camera.size
-
-
 @given(seeds, st.sampled_from(FORMATS))
 def test_projection_agrees_with_pytorch3ds_own_row_vector_formula(seed, intrinsics_format):
-    camera, points = visible_points(seed)
+    camera = random_camera(seed)
+    in_camera = np.random.default_rng(seed).uniform([-2, -2, 0.5], [2, 2, 8], (20, 3))
+    points = camera.to_world(in_camera)
     other = camera.to_pytorch3d(intrinsics_format)
     row = points @ other["R"] + other["T"]
     ndc = other["focal_length"] * row[:, :2] / row[:, 2:] + other["principal_point"]
@@ -45,25 +32,11 @@ def test_projection_agrees_with_pytorch3ds_own_row_vector_formula(seed, intrinsi
     assert_allclose(depth, row[:, 2], rtol=1e-9)
 
 
-@given(seeds, st.integers(0, 50), st.integers(0, 50), st.integers(1, 300), st.integers(1, 300))
-def test_cropping_shifts_pixels_and_resizing_scales_them(seed, top, left, height, width):
-    camera, points = visible_points(seed)
-    pixels, depth = camera.project(points)
-    cropped, resized = camera.crop((top, left, height, width)), camera.resize((height, width))
-    assert cropped.size == resized.size == (height, width)
-    assert_allclose(cropped.project(points)[0] + (left, top), pixels, rtol=1e-9)
-    scale = np.array([width / camera.size[1], height / camera.size[0]])
-    assert_allclose(resized.project(points)[0], pixels * scale, rtol=1e-9)
-    assert_array_equal(resized.project(points)[1], depth)
-
-
 @pytest.mark.parametrize(
     "changes, message",
     [
         ({"R": np.eye(2)}, r"R has shape \(2, 2\)"),
-        ({"R": 2 * np.eye(3)}, "expected a rotation"),
         ({"R": np.diag([1.0, 1.0, -1.0])}, "expected a rotation"),
-        ({"t": [0, 0, np.inf]}, "t holds inf"),
         ({"t": [0, 0, 1e155]}, r"t holds 1e\+155"),
         ({"focal_length": [500, 0]}, "focal_length is .*0.0.*, expected .*greater than 0.001"),
         ({"size": (0, 5)}, "image size .* is 0, expected an integer from 1"),

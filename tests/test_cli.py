@@ -2,29 +2,21 @@
 
 import json
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import click
-import numpy as np
 import pytest
-from co3d_folders import convert_to_v2, write_category, write_identities
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite import __version__, errors
-from zsp_lite.backbones.load import BackboneConfig
-from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.cli import demo, doctor
 from zsp_lite.cli.estimate import estimate
-from zsp_lite.cli.main import cli, main
+from zsp_lite.cli.main import cli
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import PoseLabel, read_labels
-from zsp_lite.data.writing import write_label
 from zsp_lite.importers import FORMATS
-from zsp_lite.importers.convert import ImportResult
 
 DOWNLOAD = "data download --yes"
 IMPORT = "data import --root=x --category=c --sequence=s"
@@ -39,15 +31,12 @@ def commands(group: click.Group = cli, path: str = "zsp-lite") -> Iterator[str]:
 
 
 @pytest.mark.parametrize("command", [*commands()])
-def test_help_of_every_command_has_an_example(command, run):
-    text = run(f"{command} --help".removeprefix("zsp-lite "))
+def test_every_command_has_an_example_and_says_of_an_unknown_option_where_help_is(command, run):
+    words = command.removeprefix("zsp-lite ")
+    text = run(f"{words} --help")
     assert text.startswith(f"Usage: {command}")
     assert f"    {command}" in text.partition("Examples:")[2]
-
-
-@pytest.mark.parametrize("command", [*commands()])
-def test_an_unknown_option_is_one_line(command, run):
-    (line,) = run(f"{command} --unknown".removeprefix("zsp-lite "), 2).splitlines()
+    (line,) = run(f"{words} --unknown", 2).splitlines()
     assert "--unknown" in line
     assert line.endswith(f"(see: {command} --help)")
 
@@ -68,7 +57,7 @@ import sys
 from zsp_lite.cli.main import main
 main(['benchmark', '--help'])
 large = {'torch', 'numpy', 'pandas', 'scipy', 'matplotlib', 'cv2', 'rich'}
-print(large & set(sys.modules), file=sys.stderr)
+print(large & set(sys.modules))
 """
 
 
@@ -80,9 +69,7 @@ def test_helpers_are_the_paths_up_to_the_next_option():
 
 
 def test_help_imports_no_large_library():
-    command = [sys.executable, "-c", HELP]
-    finished = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert finished.stderr.strip() == "set()"
+    assert subprocess.check_output([sys.executable, "-c", HELP]).endswith(b"set()\n")
 
 
 THREADS = """
@@ -117,12 +104,7 @@ WRONG = [
     ("estimate a --helpers c --helpers d b", "Missing argument 'TARGET'"),
     ("estimate a b --helpers c --solver paper", "--helpers"),
     ("demo --data no/such/folder", str(Path("no/such/folder"))),
-    ("demo --backbone resnet", "resnet"),
-    ("demo --layer block12", "'block0' to 'block11'"),
-    ("benchmark --methods magic", "magic"),
     ("benchmark --categories ellipsoid,cube", "'cube'"),
-    ("tables .", "run.json"),
-    ("synth --category sofa --out x", "sofa"),
     (f"{DOWNLOAD} co3d --category spaceship", "co3d (full) is 'spaceship', expected one of "),
     (
         f"{DOWNLOAD} co3d-v1 --category toaster --single-sequence",
@@ -241,12 +223,14 @@ def test_a_benchmark_prints_its_rows_unless_it_is_quiet(
     ellipsoids, tmp_path, monkeypatch, loaded, run
 ):
     monkeypatch.setenv("COLUMNS", "200")
-    line = f"benchmark --data {ellipsoids.root} --pairs 2 --targets 3 --methods table3"
-    assert "ours-globalsim" in run(f"{line} --out {tmp_path}/a")
-    assert run(f"{line} --out {tmp_path}/b --quiet") == ""
-    table, again = [(tmp_path / name / "tables/table_3.md").read_text() for name in "ab"]
-    assert table == again
-    methods = json.loads((tmp_path / "a/summary.json").read_text())["methods"]
+    options = f"--categories ellipsoid --pairs 2 --targets 3 --methods table3 --out {tmp_path}"
+    line = f"benchmark --data {ellipsoids.root} {options}"
+    assert "ours-globalsim" in run(line)
+    table = tmp_path / "tables/table_3.md"
+    before = table.read_text()
+    assert run(f"{line} --quiet") == ""
+    assert table.read_text() == before
+    methods = json.loads((tmp_path / "summary.json").read_text())["methods"]
     assert methods["ours"]["n"] == methods["ours-globalsim"]["n"] == 2
 
 
@@ -286,106 +270,6 @@ def test_runs_are_compared(table3, monkeypatch, run):
     monkeypatch.setenv("COLUMNS", "200")
     rows = "ours,ours:ours-globalsim"
     assert "ours:ours-globalsim" in run(f"compare {table3} {table3} --rows {rows}")
-
-
-def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path):
-    given = []
-
-    def record(*arguments, **options):
-        given.append((*arguments, options))
-        raise errors.InputError("reached")
-
-    monkeypatch.setattr("zsp_lite.benchmark.run.evaluate", record)
-    line = f"benchmark --data {tmp_path} " + (
-        "--backbone small --layer 3 --facet value --image-size 64 --categories lump,chair "
-        "--pairs 7 --targets 3 --methods ours,x=a:b --out there --quiet"
-    )
-    config, numbers = BackboneConfig("small", "3", "value", 64), {"lump": 7, "chair": 7}
-    common = {
-        "backbone": config,
-        "methods": ["ours", "x=a:b"],
-        "pairs": numbers,
-        "targets": 3,
-        "out": Path("there"),
-        "executor": 1,
-        "row_seconds": 60,
-        "seeds": 1,
-        "sweep": (),
-        "metrics": list(METRICS_SHOWN),
-    }
-    for more, changed in (
-        ("--workers 5", {"executor": 5}),
-        ("--row-seconds 9 --metrics scale", {"row_seconds": 9, "metrics": ["scale"]}),
-        ("--seeds 3 --sweep threshold=0.1,0.2", {"seeds": 3, "sweep": [0.1, 0.2]}),
-    ):
-        assert main(f"{line} {more}".split()) == 2
-        assert given == [(tmp_path, common | changed)]
-        given.clear()
-
-
-@pytest.fixture
-def chairs(tmp_path) -> Path:
-    """A data folder of two sequences without labels."""
-    write_category(tmp_path / "data", "chair", "ab")
-    return tmp_path / "data"
-
-
-def test_labels_are_imported(chairs, tmp_path, run):
-    write_identities(tmp_path / "clone/data", "chair", "ab")
-    text = run(f"data labels {tmp_path}/clone --root {chairs}")
-    assert "2 labels, 0 files of pairs" in text
-
-
-def test_labels_are_transferred(chairs, tmp_path, run):
-    write_identities(chairs, "chair", "ab")
-    shutil.copytree(chairs / "chair", tmp_path / "v2/chair")
-    convert_to_v2(tmp_path / "v2/chair")
-    write_label(tmp_path / "v2", "chair", PoseLabel(np.diag([-1.0, -1, 1, 1]), "b", "a"))
-    transfer = f"data transfer {chairs} {tmp_path}/v2 chair"
-    assert "expected --replace" in run(transfer, 2)
-    assert "camera centres differ by 0.00 %" in run(f"{transfer} --replace")
-    assert list(read_labels(tmp_path / "v2", "chair")) == ["a", "b"]
-
-
-OPTIONS = "--root mine --category cup --sequence one --frames 7"
-
-
-@pytest.mark.parametrize(
-    "words, options",
-    [
-        (
-            "scan --box 1,2,3,4",
-            {"mask": "box", "box": (1, 2, 3, 4)},
-        ),
-        (
-            "scan --masks there --depth-unit 0.5 --object 0 --label 3 --orientation stored",
-            {
-                "mask": "given",
-                "masks": Path("there"),
-                "depth_unit": 0.5,
-                "object": 0,
-                "label": 3,
-                "orientation": "stored",
-            },
-        ),
-    ],
-)
-def test_options_of_the_import_reach_the_library(words, options, monkeypatch, run):
-    given = []
-
-    def open_source(path, **options):
-        given.append((path, {name: value for name, value in options.items() if value is not None}))
-        return "source"
-
-    def import_source(*arguments):
-        given.append(arguments)
-        return ImportResult(1, 0, 1, 1.0, ("the masks may be wrong: why",))
-
-    monkeypatch.setattr("zsp_lite.importers.sources.open_source", open_source)
-    monkeypatch.setattr("zsp_lite.importers.convert.import_source", import_source)
-    assert "flag: the masks may be wrong: why\n" in run(f"data import {words} {OPTIONS}")
-    source = (Path("scan"), {"count": 7} | options)
-    assert given == [source, ("source", Path("mine"), "cup", "one")]
 
 
 def test_the_import_names_its_formats(run):

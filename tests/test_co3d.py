@@ -3,11 +3,12 @@
 import gzip
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from co3d_folders import convert_to_v2, edit_json, sequence_data, write_category
+from co3d_folders import convert_to_v2, edit_json, sequence_data
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
@@ -40,18 +41,13 @@ def test_a_pair_is_loaded_as_its_reference_frame_and_its_target_frames_in_order(
     refused("chair/b_2 has no frame number 9", Co3D(root).load_pair, lost)
 
 
-@pytest.fixture(params=[1, 2], ids="CO3D v{}".format)
-def read_back(root, request):
-    """A sequence that was written, and the data set that has it, in a version of CO3D."""
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_written_sequence_is_read_back(root, version):
     written = sequence_data("b_2", depth_scale_adjustment=1.7)
     write_co3d(root, "chair", [written])
-    if request.param == 2:
+    if version == 2:
         convert_to_v2(root / "chair")
-    return written, Co3D(root)
-
-
-def test_written_frames_are_read_back(read_back):
-    written, dataset = read_back
+    dataset = Co3D(root)
     annotations = dataset.frames("chair", "b_2")
     assert [annotation.frame_timestamp for annotation in annotations] == written.timestamps
     for annotation, expected in zip(annotations, written.frames, strict=True):
@@ -62,10 +58,6 @@ def test_written_frames_are_read_back(read_back):
         assert_allclose(frame.depth, expected.depth, rtol=2**-11)  # a float16
         # JPEG, colours at half resolution
         assert np.abs(frame.rgb.astype(int) - expected.rgb).mean() < 8
-
-
-def test_a_written_point_cloud_is_read_back(read_back):
-    written, dataset = read_back
     points, colours = dataset.point_cloud("chair", "b_2")
     assert_allclose(points, written.points, rtol=1e-6)
     assert_array_equal(colours, written.colours)
@@ -120,12 +112,8 @@ def test_optional_fields_may_be_null_and_unknown_ones_are_ignored(root):
             r"frame_annotations\.jgz: .*missing required field `sequence_name`",
         ),
         (
-            lambda frame: frame["viewpoint"].pop("T"),
-            r"frame 0 of b_2.*required field `T` - at `\$\.viewpoint`",
-        ),
-        (
             lambda frame: frame["viewpoint"].update(T=[0, float("nan"), 1]),
-            r"got `null` - at `\$\.viewpoint\.T",
+            r"frame 0 of b_2.*got `null` - at `\$\.viewpoint\.T",
         ),
         (
             lambda frame: frame["viewpoint"].update(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]),
@@ -148,17 +136,14 @@ def test_an_invalid_frame_fails_by_name_and_field(root, change, message):
 @pytest.mark.parametrize(
     "call, message",
     [
-        (lambda root: Co3D(root / "nowhere"), "nowhere does not exist"),
         (
             lambda root: Co3D(root / "chair/frame_annotations.jgz"),
             "frame_annotations.jgz is not a folder",
         ),
-        (lambda root: Co3D(root).frame_list("sofa"), "category is 'sofa', expected one of chair"),
         (
             lambda root: Co3D(root).frame_list("../chair"),
             "category is '../chair', expected one of chair",
         ),
-        (lambda root: write_co3d(root, "../chair", []), "category name is '../chair', expected"),
         (lambda root: Co3D(root).frames("chair", "c_3"), "no frames of 'c_3'"),
     ],
 )
@@ -192,12 +177,11 @@ def test_the_depth_mask_makes_depth_unknown(root):
 def test_missing_files_and_files_of_another_size_are_refused(root, part, write):
     annotation = first(root)
     path = root / getattr(annotation, part).path
+    load = Co3D(root).load
     path.unlink()
-    refused(f"{part} .*{path.name} cannot be read", lambda: Co3D(root).load(annotation))
+    refused(f"{part} .*{path.name} cannot be read", load, annotation)
     write(path, np.ones((5, 6, 3) if part == "image" else (5, 6), np.uint8))
-    refused(
-        r"is \(5, 6\) pixels, expected \(H, W\) = \(24, 32\)", lambda: Co3D(root).load(annotation)
-    )
+    refused(r"is \(5, 6\) pixels, expected \(H, W\) = \(24, 32\)", load, annotation)
 
 
 def test_selection_takes_the_best_clouds_above_both_bounds(tmp_path):
@@ -209,15 +193,10 @@ def test_selection_takes_the_best_clouds_above_both_bounds(tmp_path):
         "blurred": (1.25, 2),
         "sparse": (3, 0.3),
     }
-    write_category(tmp_path, "chair", scores, frames=1)
-
-    def score(items):
-        for item in items:
-            of_views, of_cloud = scores[item["sequence_name"]]
-            item["viewpoint_quality_score"] = of_views
-            item["point_cloud"]["quality_score"] = of_cloud
-
-    edit_json(tmp_path / "chair/sequence_annotations.jgz", score)
-    dataset = Co3D(tmp_path)
-    names = [sequence.sequence_name for sequence in dataset.select("chair")]
+    sequences = [
+        replace(sequence_data(name, frames=1, quality=of_cloud), viewpoint_quality=of_views)
+        for name, (of_views, of_cloud) in scores.items()
+    ]
+    write_co3d(tmp_path, "chair", sequences)
+    names = [sequence.sequence_name for sequence in Co3D(tmp_path).select("chair")]
     assert names == ["best", "good", "fair"]

@@ -10,22 +10,23 @@ from packaging.utils import canonicalize_name
 from zsp_lite.io.files import REPOSITORY
 
 
+def applying(lines):
+    """The requirements in lines that apply to this machine."""
+    requirements = map(Requirement, lines)
+    return [one for one in requirements if one.marker is None or one.marker.evaluate()]
+
+
 def test_the_tested_environment_pins_every_dependency_within_its_range():
-    pins = {}
-    for line in (REPOSITORY / "environment.txt").read_text().splitlines():
-        if line.startswith("#") or not line:
-            continue
-        requirement = Requirement(line)
-        if requirement.marker is None or requirement.marker.evaluate():
-            (pins[canonicalize_name(requirement.name)],) = [
-                one.version for one in requirement.specifier if one.operator == "=="
-            ]
+    lines = (REPOSITORY / "environment.txt").read_text().splitlines()
+    pins = {
+        canonicalize_name(pin.name): str(pin.specifier).removeprefix("==")
+        for pin in applying(line for line in lines if line and not line.startswith("#"))
+    }
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
     optional = [one for extra in sorted(set(extras) - {"dev"}) for one in extras[extra]]
-    for requirement in map(Requirement, project["dependencies"] + optional):
-        own_extra = requirement.name == "zsp-lite"
-        if not own_extra and (requirement.marker is None or requirement.marker.evaluate()):
+    for requirement in applying(project["dependencies"] + optional):
+        if requirement.name != "zsp-lite":  # an extra of another one
             assert pins[canonicalize_name(requirement.name)] in requirement.specifier, requirement
 
 

@@ -24,15 +24,14 @@ from zsp_lite.data import frames
 from zsp_lite.data.annotations import read_frame_index
 from zsp_lite.data.frames import read_depth, read_image, read_mask
 from zsp_lite.data.pairs import read_pair_file
+from zsp_lite.importers import recognise
 from zsp_lite.importers.files import read_depth_file, read_picture
-from zsp_lite.io.files import GROWTH_ALLOWED, decompress, path_inside, plain_name, read_bytes
+from zsp_lite.io.files import GROWTH_ALLOWED, path_inside, plain_name, read_bytes
 from zsp_lite.io.locks import writing
 from zsp_lite.io.ply import read_ply, write_ply
 
 PICTURE = cv2.resize(default_rng(0).integers(0, 255, (9, 16, 3), np.uint8), (160, 90))
-JPEG, PNG, WEBP = (
-    cv2.imencode(extension, PICTURE)[1].tobytes() for extension in (".jpg", ".png", ".webp")
-)
+PNG, WEBP = (cv2.imencode(extension, PICTURE)[1].tobytes() for extension in (".png", ".webp"))
 INDEX = "frame_annotations.jgz"
 FRAME = b'{"sequence_name": "a", "frame_number": 1}'
 COLOUR_NAMES = ("red", "green", "blue")
@@ -76,13 +75,11 @@ BAD_FILES = [
         {
             "empty": b"",
             "text": b"text",
-            "GIF": b"GIF89a" + bytes(20),
-            "PNG length": PNG[:11] + b"\5" + PNG[12:],
             "PNG with a wrong checksum": PNG[:60] + b"\0\0\0\0" + PNG[64:],
         },
     ),
     ("mask.png", read_mask, "cannot be decoded", {"empty": b""}),
-    ("depth.png", read_depth, "cannot be decoded", {"empty": b""}),
+    ("scan.zip", recognise, "zip .* cannot be unpacked", {"damaged": b"PK" + bytes(99)}),
     ("depth.png", read_depth, "expected a 16-bit greyscale PNG", {"8 bits": PNG}),
     (
         "a.heic",
@@ -91,18 +88,17 @@ BAD_FILES = [
         {"": bytes(99)},
     ),
     ("a.webp", read_picture, "cannot be decoded", {"cut": WEBP[:-40]}),
-    ("a.webp", read_depth_file, "holds uint8 of shape .*, expected numbers", {"colours": WEBP}),
     (
         "d.npy",
         read_depth_file,
         r"holds .*, expected numbers \(H, W\)",
         {
             "text": _saved(np.save, ["x"]),
-            "a number": _saved(np.save, 3.0),
             "colours": _saved(np.save, np.ones((4, 4, 3))),
             "empty": _saved(np.save, np.ones((0, 4))),
         },
     ),
+    ("d.npy", read_depth_file, "cannot be decoded", {"code": _saved(np.save, [Code()])}),
     ("d.npz", read_depth_file, "holds 2 arrays, expected one", {"two": _saved(np.savez, 1, 2)}),
     (
         "d.exr",
@@ -142,7 +138,6 @@ BAD_FILES = [
             "too long": _ply(3, bytes(37)),
             "10^12 points": _ply(10**12, bytes(36)),
             "no points": _ply(0, b""),
-            "cut text": _ply(3, b"0 0 0\n1 1 1\n", "ascii"),
         },
     ),
     (
@@ -236,15 +231,9 @@ def test_a_file_above_the_limit_is_refused_before_it_is_read(tmp_path, name, rea
     refused(f"{name} cannot be read: {5 << 30} bytes, expected at most", read, tmp_path / name)
 
 
-def test_gzip_data_of_several_members_is_read():
-    content = os.urandom(1000)
-    assert decompress(3 * gzip.compress(content), "data") == 3 * content
-
-
-@pytest.mark.parametrize("data", [JPEG, PNG], ids=["JPEG", "PNG"])
-def test_the_limit_on_pixels_is_compared_with_the_header(tmp_path, monkeypatch, data):
+def test_the_limit_on_pixels_is_compared_with_the_header(tmp_path, monkeypatch):
     path = tmp_path / "x"
-    path.write_bytes(data)
+    path.write_bytes(PNG)
     monkeypatch.setattr(frames, "MAX_PIXELS", 14_399)
     refused("90 x 160 pixels.* of at most 14399 pixels", read_image, path)
     monkeypatch.setattr(frames, "MAX_PIXELS", 14_400)

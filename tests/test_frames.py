@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from co3d_folders import random_camera, seeds, sequence_data
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -19,15 +19,13 @@ from zsp_lite.data.depth import decode_depth, inpaint_depth, patch_points, unpro
 from zsp_lite.data.frames import (
     crop_to_object,
     mask_to_bbox,
-    read_depth,
     read_image,
     read_mask,
     resize_frame,
 )
-from zsp_lite.data.writing import encode_depth, write_depth, write_mask
+from zsp_lite.data.writing import encode_depth, write_mask
 from zsp_lite.io.files import write_atomic
 from zsp_lite.points import (
-    axis_deviation,
     object_pixels,
     object_points,
     standard_deviation,
@@ -42,7 +40,6 @@ SIZE = (24, 32)
         # Padding adds a tenth of each side, half of it at each end.
         ([(20, 40, 40, 60, 1.0)], 0.1, (18, 37, 44, 66)),
         # The box stays in the image.
-        ([(0, 0, 100, 200, 1.0)], 0.1, (0, 0, 100, 200)),
         ([(0, 180, 40, 20, 1.0)], 0.1, (0, 179, 42, 21)),
         # Pixels below the threshold do not count.
         ([(20, 40, 40, 60, 1.0), (0, 0, 5, 5, 0.4)], 0, (20, 40, 40, 60)),
@@ -82,6 +79,8 @@ def test_cropping_keeps_every_pixels_world_point():
 def test_resized_depth_is_the_depth_under_the_new_pixels_centre(seed, height, width):
     whole = sequence_data("one", frames=1, seed=seed).frames[0]
     small = resize_frame(whole, (height, width))
+    scale = np.diag([width / SIZE[1], height / SIZE[0], 1])
+    assert_allclose(small.camera.K, scale @ whole.camera.K)
     rows = np.floor((np.arange(height) + 0.5) * SIZE[0] / height).astype(int)
     cols = np.floor((np.arange(width) + 0.5) * SIZE[1] / width).astype(int)
     assert_array_equal(small.depth, whole.depth[rows][:, cols])
@@ -100,11 +99,8 @@ def test_colours_are_averaged_along_a_side_that_shrinks_while_the_other_grows(si
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"rgb": np.zeros((*SIZE, 3))}, "rgb is float64"),
         ({"rgb": np.zeros((5, 5, 3), np.uint8)}, r"rgb is uint8 \(5, 5, 3\)"),
-        ({"depth": np.zeros((5, 5), np.float32)}, r"depth has shape \(5, 5\)"),
         ({"depth": np.full(SIZE, np.nan, np.float32)}, "depth has nan"),
-        ({"depth": np.full(SIZE, -1, np.float32)}, "depth has -1"),
         ({"mask": np.full(SIZE, 1.5, np.float32)}, "mask has 1.5 to 1.5"),
     ],
 )
@@ -148,16 +144,10 @@ def test_smaller_depth_of_arrays_is_enlarged_and_zero_where_it_is_unknown():
     assert_array_equal(depth[2:], np.float32(2))
 
 
-@pytest.mark.parametrize(
-    "rgb",
-    [
-        np.full(SIZE, 128, np.uint8),
-        np.full((*SIZE, 1), 128, np.uint8),
-        np.full((*SIZE, 4), 128, np.uint8),
-        np.full((*SIZE, 3), 128 / 255, np.float32),
-    ],
-)
-def test_grey_images_alpha_and_floats_are_colours(rgb):
+@pytest.mark.parametrize("channels", [(), (1,), (3,), (4,)])
+@pytest.mark.parametrize("value", [np.uint8(128), np.float32(128 / 255)])
+def test_grey_images_alpha_and_floats_are_colours(channels, value):
+    rgb = np.full((*SIZE, *channels), value)
     assert_array_equal(Frame.from_arrays(**arrays(rgb=rgb)).rgb, np.full((*SIZE, 3), 128))
 
 
@@ -198,21 +188,18 @@ def test_the_distortion_of_arrays_is_corrected(count):
     [
         ({"distortion": [0.1, 0.2, 0]}, r"distortion is \[0.1, 0.2, 0.0\], expected OpenCV's k1"),
         ({"distortion": [0.1, 0.2, 0.5, 0, 0]}, "with p1 and p2 from -0.1 to 0.1"),
-        ({"distortion": [np.nan] * 5}, "distortion holds nan"),
         (
             {"rgb": np.zeros((3, *SIZE), np.uint8)},
-            r"rgb has shape \(3, 24, 32\), expected \(H, W\), \(H, W, 3\)",
+            r"rgb has shape \(3, 24, 32\), expected \(H, W\)",
         ),
         ({"rgb": np.full((*SIZE, 3), 128.0)}, "rgb is float64"),
         ({"depth": np.ones((12, 12))}, r"depth has shape \(12, 12\), expected shape \(24, 32\)"),
-        ({"depth": np.full(SIZE, "far")}, "expected real numbers"),
         ({"depth_unit": 0.0}, "depth_unit is 0.0, expected a finite number greater than 0"),
         ({"K": np.eye(4)}, r"K has shape \(4, 4\), expected real numbers of shape \(4,\)"),
         (
             {"K": np.array([[40, 0, 16], [1, 41, 12], [0, 0, 1]])},
             "expected fx 0 cx, 0 fy cy, 0 0 1 in pixels",
         ),
-        ({"K": (-40, 41, 16, 12)}, "focal_length is -40.0"),
         ({"mask": np.full(SIZE, 7)}, "mask has 7 at most, expected booleans, 0 and 1, or 0 to 255"),
         ({"mask": np.ones((0, 0))}, r"mask has shape \(0, 0\), expected \(h, w\)"),
         ({"pose": np.diag([2.0, 2, 2, 1])}, "camera-to-world pose"),
@@ -223,45 +210,22 @@ def test_arrays_that_cannot_be_a_frame_are_refused_by_one_line(changes, message)
     assert line.startswith(("frame cup", "depth_unit"))
 
 
-def test_depth_and_masks_survive_their_files(tmp_path):
-    rng = default_rng(0)
-    depth = np.where(rng.random(SIZE) < 0.5, rng.uniform(1, 9, SIZE), 0).astype(np.float32)
-    write_depth(tmp_path / "depth.png", depth, 2.0)
-    assert_allclose(read_depth(tmp_path / "depth.png", 2.0), depth, rtol=2**-11)
-    mask = rng.integers(0, 256, SIZE).astype(np.float32) / 255
-    write_mask(tmp_path / "mask.png", mask)
-    assert_array_equal(read_mask(tmp_path / "mask.png"), mask)
-    write_mask(tmp_path / "known.png", depth > 0)
-    assert_array_equal(read_mask(tmp_path / "known.png"), depth > 0)
+def test_masks_survive_their_files(tmp_path):
+    path = tmp_path / "mask.png"
+    mask = default_rng(0).integers(0, 256, SIZE).astype(np.float32) / 255
     # Byte 24 of a PNG is the bits per pixel: a mask of booleans has one.
-    assert (tmp_path / "known.png").read_bytes()[24] == 1
+    for written, bits in ((mask, 8), (mask > 0.5, 1)):
+        write_mask(path, written)
+        assert_array_equal(read_mask(path), written)
+        assert path.read_bytes()[24] == bits
 
 
-@pytest.mark.parametrize(
-    "extension, options",
-    [
-        (".png", ()),
-        (".jpg", ()),
-        (".jpg", (cv2.IMWRITE_JPEG_PROGRESSIVE, 1)),
-        (".jpg", (cv2.IMWRITE_JPEG_RST_INTERVAL, 2)),
-    ],
-)
-def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension, options):
+@pytest.mark.parametrize("extension", [".png", ".jpg"])
+def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension):
     pixels = default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
-    data, path = cv2.imencode(extension, pixels, options)[1].tobytes(), tmp_path / "image"
-    # A thumbnail, which ends as the image does, in a segment of its own.
-    if extension == ".jpg":
-        thumbnail = cv2.imencode(".jpg", pixels[::4, ::4])[1].tobytes()
-        data = data[:2] + b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2) + thumbnail + data[2:]
+    data, path = cv2.imencode(extension, pixels)[1].tobytes(), tmp_path / "image"
     decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    for behind in (
-        b"",
-        b"mp4 \xff\xda \xff\xd9 \xff\xda",
-        b"\xff\xd9",
-        data[:-9],
-        bytes(99),
-        b"IDAT IEND IDAT",
-    ):
+    for behind in (b"", b"\xff\xda \xff\xd9 IDAT IEND", data[:-9]):
         path.write_bytes(data + behind)
         assert_array_equal(read_image(path), decoded)
     for end in (*range(0, len(data), 37), len(data) - 2, len(data) - 1):
@@ -292,16 +256,9 @@ def test_a_pixel_is_on_the_object_if_probably_so_and_of_known_depth():
     assert repr(frame) == "Frame('', 1 x 6 pixels)"
 
 
-def test_the_two_spreads_average_deviations_and_variances_of_the_axes():
+def test_the_spread_averages_the_variances_of_the_axes():
     points = np.array([[1, 2, 3], [-1, -2, -3], [1, -2, 3], [-1, 2, -3]]) + 7.0
-    assert axis_deviation(points) == pytest.approx(2)
     assert standard_deviation(points) == pytest.approx(np.sqrt((1 + 4 + 9) / 3))
-
-
-def frontal(size):
-    """A camera at the origin that looks along z."""
-    centre = np.array([size[1] / 2, size[0] / 2])
-    return Camera(np.eye(3), np.zeros(3), np.array([50.0, 60.0]), centre, size)
 
 
 def test_the_bits_are_those_of_a_float16_and_only_positive_finite_values_known():
@@ -312,22 +269,17 @@ def test_the_bits_are_those_of_a_float16_and_only_positive_finite_values_known()
     assert not encode_depth(np.array([[np.inf, np.nan, -1, 1e9]])).any()
 
 
-def test_a_hole_in_a_plane_is_filled_with_the_plane():
-    plane = np.add.outer(np.zeros(40), np.linspace(2, 3, 50)).astype(np.float32)
-    holed = plane.copy()
-    holed[10:20, 12:25] = 0
-    filled = inpaint_depth(holed)
-    assert_allclose(filled, plane, atol=0.05)  # depth differs by 0.27 across the hole
-    assert_array_equal(filled[holed > 0], plane[holed > 0])
-
-
+@settings(max_examples=30)
 @given(seeds)
-def test_filled_depth_stays_between_the_known_depths(seed):
-    rng = default_rng(seed)
-    depth = np.where(rng.random((20, 24)) < 0.3, rng.uniform(1, 5, (20, 24)), 0).astype(np.float32)
-    depth[3, 4] = 2.0
+def test_holes_in_a_plane_are_filled_with_the_plane(seed):
+    plane = np.add.outer(np.zeros(40), np.linspace(2, 3, 50)).astype(np.float32)
+    known = default_rng(seed).random(plane.shape) < 0.3
+    known[10:20, 12:25] = False
+    depth = np.where(known, plane, 0)
     filled = inpaint_depth(depth)
-    assert filled.min() >= depth[depth > 0].min()
+    assert np.abs(filled - plane).mean() < 0.02  # depth differs by 0.27 across the hole
+    assert_array_equal(filled[known], plane[known])
+    assert filled.min() >= depth[known].min()
     assert filled.max() <= depth.max()
     assert_array_equal(inpaint_depth(filled), filled)  # complete depth needs no filling
     refused("no known pixel", inpaint_depth, 0 * depth)
@@ -338,35 +290,37 @@ def test_unprojected_depth_projects_onto_its_own_pixels():
     depth = default_rng(0).uniform(1, 2, (7, 9))
     pixels, back = camera.project(camera.to_world(unproject_depth(depth, camera)))
     assert_allclose(pixels[2, 5], [5.5, 2.5])  # pixel centres lie at half-integers
-    assert_allclose(pixels[6, 0], [0.5, 6.5])
     assert_allclose(back, depth)
 
 
-@given(seeds)
-def test_a_patchs_point_has_the_lower_quartile_of_its_known_depths(seed):
+@settings(max_examples=30)
+@given(seeds, st.integers(6, 40), st.integers(8, 40))
+def test_a_patchs_point_has_the_lower_quartile_of_its_known_depths(seed, height, width):
     rng = default_rng(seed)
-    depth = np.where(rng.random((24, 32)) < 0.2, rng.uniform(1, 5, (24, 32)), 0).astype(np.float32)
-    depth[0, 0] = 3
-    camera = frontal((24, 32))
-    points, known = patch_points(depth, camera, (6, 8))
-    # The depths of the 4 x 4 pixels of each patch.
-    patches = depth.reshape(6, 4, 8, 4).swapaxes(1, 2).reshape(6, 8, 16)
-    assert_array_equal(known, (patches > 0).any(axis=-1))
-    measured = np.where(patches[known] > 0, patches[known], np.nan)
-    quartile = np.nanquantile(measured, 0.25, axis=-1, method="lower")
-    assert_array_equal(points[known][:, 2], quartile)
-    # The point lies on the ray of a pixel of the patch, which has this depth.
-    pixels, _ = camera.project(points)
-    columns, rows = np.floor(pixels).astype(int).reshape(-1, 2).T
-    assert_array_equal(rows // 4, np.arange(48) // 8)
-    assert_array_equal(columns // 4, np.arange(48) % 8)
-    assert_array_equal(depth[rows, columns][known.ravel()], quartile)
+    depth = rng.uniform(1, 5, (height, width)) * (rng.random((height, width)) < 0.2)
+    camera = random_camera(seed, (height, width))
+    points, known = patch_points(depth, camera, (6, 8), inpaint=False)
+    pixels, _ = camera.project(camera.to_world(points))
+    for row, column in np.ndindex(6, 8):
+        # Patches need not divide the image.
+        first, last = height * row // 6, height * (row + 1) // 6
+        left, right = width * column // 8, width * (column + 1) // 8
+        measured = depth[first:last, left:right]
+        measured = measured[measured > 0]
+        assert known[row, column] == measured.any()
+        if measured.any():
+            # The point lies on the ray of a pixel of the patch, which has this depth.
+            quartile = np.quantile(measured, 0.25, method="lower")
+            x, y = np.floor(pixels[row, column]).astype(int)
+            assert left <= x < right and first <= y < last
+            assert points[row, column, 2] == pytest.approx(quartile)
+            assert depth[y, x] == quartile
 
 
 def test_a_patch_without_depth_takes_the_filled_depth_at_its_centre():
     depth = np.full((16, 16), 2, np.float32)
     depth[4:8, 8:12] = 0
-    camera = frontal((16, 16))
+    camera = random_camera(0, (16, 16))
     points, known = patch_points(depth, camera, (4, 4))
     assert not known[1, 2]
     assert known.sum() == 15
@@ -376,11 +330,3 @@ def test_a_patch_without_depth_takes_the_filled_depth_at_its_centre():
     assert_array_equal(same, known)
     assert_array_equal(measured[known], points[known])
     assert_array_equal(measured[1, 2], 0)
-
-
-def test_patches_need_not_divide_the_image():
-    depth = np.arange(1, 36, dtype=np.float32).reshape(5, 7)
-    points, known = patch_points(depth, frontal((5, 7)), (2, 3))
-    assert points.shape == (2, 3, 3)
-    assert known.all()
-    assert points[1, 2, 2] == np.sort(depth[2:, 4:].ravel())[2]

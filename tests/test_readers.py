@@ -19,6 +19,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
+from synthetic_views import look_at
 from test_importers import (
     HALF_PIXEL,
     edited,
@@ -29,7 +30,8 @@ from test_importers import (
     write_nerfstudio,
 )
 
-from zsp_lite import Camera, open_source
+from zsp_lite import open_source
+from zsp_lite.data.frames import with_images
 from zsp_lite.data.writing import write_image, write_mask
 from zsp_lite.importers import open_capture, recognise
 from zsp_lite.importers.capture import find_masks, trusted
@@ -127,26 +129,20 @@ def write_record3d(folder, frames):
     height, width = frames[0].camera.size
     poses = [to_world(frame) @ OPENGL for frame in frames]
     metadata = {
-        "w": width,
-        "h": height,
         "dw": width,
         "dh": height,
         "K": frames[0].camera.K.T.ravel().tolist(),
         "poses": [[*quaternion(pose), *pose[:3, 3]] for pose in poses],
     }
-    path = folder.with_suffix(".r3d")
-    with zipfile.ZipFile(path, "w") as zipped:
-        zipped.writestr("metadata", json.dumps(metadata))
-        for k, frame in enumerate(frames):
-            _, image = cv2.imencode(".jpg", frame.rgb[..., ::-1])
-            _, mask = cv2.imencode(".png", np.uint8(255 * frame.mask))
-            depth = np.where(frame.depth > 0, frame.depth, np.nan)
-            confidence = np.full(depth.shape, CERTAIN, np.uint8)
-            zipped.writestr(f"rgbd/{k}.jpg", image.tobytes())
-            zipped.writestr(f"rgbd/{k}.depth", lzfse.compress(depth.tobytes()))
-            zipped.writestr(f"rgbd/{k}.conf", lzfse.compress(confidence.tobytes()))
-            zipped.writestr(f"masks/{k}.png", mask.tobytes())
-    return path
+    (folder / "metadata").write_text(json.dumps(metadata))
+    for k, frame in enumerate(frames):
+        write_image(folder / f"rgbd/{k}.jpg", frame.rgb, quality=95)
+        write_mask(folder / f"masks/{k}.png", frame.mask)
+        depth = np.where(frame.depth > 0, frame.depth, np.nan)
+        confidence = np.full(depth.shape, CERTAIN, np.uint8)
+        for name, values in (("depth", depth), ("conf", confidence)):
+            (folder / f"rgbd/{k}.{name}").write_bytes(lzfse.compress(values.tobytes()))
+    return Path(shutil.make_archive(folder, "zip", folder)).rename(folder.with_suffix(".r3d"))
 
 
 def write_tum(folder, frames):
@@ -242,6 +238,20 @@ def write(layout, folder, frames):
     return path, {"intrinsics": (*camera.focal_length, *camera.principal_point)}
 
 
+def check_frames(capture, views, tolerance):
+    """Compare the frames of a capture with those it was written from; K with a relative
+    tolerance."""
+    for read, view in zip(capture.frames, views, strict=True):
+        frame = read.load()
+        known = view.depth > 0
+        assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
+        assert_allclose(frame.camera.K, view.camera.K, rtol=tolerance)
+        assert_allclose(frame.depth[known], view.depth[known], atol=6e-4)  # depth in millimetres
+        assert_array_equal(frame.mask > 0.5, view.mask > 0.5)
+        # The images are JPEG, or frames of a video.
+        assert np.abs(frame.rgb.astype(int) - view.rgb).mean() < 8
+
+
 @pytest.mark.parametrize("layout", WRITERS)
 def test_each_layout_is_recognised_and_gives_the_cameras_the_depth_and_the_masks(
     tmp_path, views, layout
@@ -251,15 +261,7 @@ def test_each_layout_is_recognised_and_gives_the_cameras_the_depth_and_the_masks
     assert recognise(path)[0] == layout
     assert not capture.left_out
     assert open_source(path, **options).mask == "given"
-    for read, view in zip(capture.frames, views, strict=True):
-        frame = read.load()
-        known = view.depth > 0
-        assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
-        assert_allclose(frame.camera.K, view.camera.K, atol=1e-6)
-        assert_allclose(frame.depth[known], view.depth[known], atol=6e-4)  # depth in millimetres
-        assert_array_equal(frame.mask > 0.5, view.mask > 0.5)
-        # The images are JPEG, or frames of a video.
-        assert np.abs(frame.rgb.astype(int) - view.rgb).mean() < 8
+    check_frames(capture, views, tolerance=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -271,7 +273,7 @@ def test_each_layout_is_recognised_and_gives_the_cameras_the_depth_and_the_masks
     ],
 )
 def test_odometry_is_read_by_the_names_of_its_columns(tmp_path, views, names, factor):
-    path, _ = write("stray", tmp_path / "scan", views)
+    path = write_stray(tmp_path, views)
     table = pd.read_csv(path / "odometry.csv", skipinitialspace=True).assign(note="good")
     table[names].to_csv(path / "odometry.csv", index=False)
     for frame, view in zip(open_capture(path).frames, views, strict=True):
@@ -280,7 +282,7 @@ def test_odometry_is_read_by_the_names_of_its_columns(tmp_path, views, names, fa
 
 
 def test_odometry_without_a_row_or_a_column_is_refused(tmp_path, views):
-    path, _ = write("stray", tmp_path / "scan", views)
+    path = write_stray(tmp_path, views)
     (path / "odometry.csv").write_text(",".join(ODOMETRY))
     refused("odometry.csv has 1 lines, expected at least 2", open_capture, path)
     (path / "odometry.csv").write_text("timestamp, frame, x, y, z, qx, qy\n0, 0, 0, 0, 0, 0, 0")
@@ -292,7 +294,7 @@ def test_images_that_a_video_lacks_are_counted_and_found_by_time(
     tmp_path, monkeypatch, steps, last
 ):
     views = hairdryer_views()[:6]
-    path, _ = write("stray", tmp_path / "scan", views)
+    path = write_stray(tmp_path, views)
     write_video(path / "rgb.mp4", [view.rgb for view in views[:2] + views[4:]])
     assert_allclose(Video(path / "rgb.mp4").times(), 1000 / 30 * np.arange(4))
     monkeypatch.setattr(Video, "times", lambda _: [1000 / 60 * step for step in steps])
@@ -304,7 +306,7 @@ def test_images_that_a_video_lacks_are_counted_and_found_by_time(
 
 
 def test_the_inner_folder_of_polycam_is_its_scan(tmp_path, views):
-    path, _ = write("polycam", tmp_path / "scan", views)
+    path = write_polycam(tmp_path, views)
     assert recognise(path / "keyframes") == ("polycam", path)
 
 
@@ -350,14 +352,8 @@ RELATIVES = {
 def test_relatives_of_nerfstudio_are_read(tmp_path, views, kind, links):
     (tmp_path / "scan").mkdir()
     write_nerfstudio(tmp_path / "scan", views)
-    capture = open_capture(RELATIVES[kind](tmp_path / "scan"))
-    for read, view in zip(capture.frames, views, strict=True):
-        frame = read.load()
-        known = view.mask > 0
-        assert_allclose(frame.camera.matrix, view.camera.matrix, atol=1e-6)
-        # Where a file gives an angle alone, the principal point is the middle, 0.6 pixels off.
-        assert_allclose(frame.camera.K, view.camera.K, rtol=0.02)
-        assert_allclose(frame.depth[known], view.depth[known], atol=6e-4)
+    # Where a file gives an angle alone, the principal point is the middle, 0.6 pixels off.
+    check_frames(open_capture(RELATIVES[kind](tmp_path / "scan")), views, tolerance=0.02)
 
 
 def first(change):
@@ -373,14 +369,9 @@ def first(change):
             "frame 0: pose is .*None",
         ),
         (
-            first(lambda f: f["transform_matrix"][0].__setitem__(0, 5.0)),
-            "frame 0: .*expected a rotation",
-        ),
-        (
             first(lambda f: f.update(file_path="images/lost.jpg")),
             "frame 0: images/lost.jpg is missing in",
         ),
-        (first(lambda f: f.update(depth_file_path="lost")), "frame 0: lost is missing in"),
         (
             lambda folder: (folder / "masks/0000.png").write_bytes(b""),
             "mask .*0000.png cannot be decoded",
@@ -403,7 +394,7 @@ def test_an_import_names_a_damaged_image_unless_too_few_remain(tmp_path, views, 
     write_nerfstudio(images.parent, views)
     (images / "0002.jpg").write_bytes((images / "0002.jpg").read_bytes()[:500])
     line = f"data import {tmp_path}/scan --root {tmp_path}/mine --category teapot --sequence"
-    text = run(f"{line} one")
+    text = run(f"{line} one --box 20,30,60,70 --frames 4")
     assert "3 frames" in text
     assert "flag: frames left out: 1: image" in text
     (images / "0001.jpg").write_bytes(b"")
@@ -437,13 +428,8 @@ def test_masks_belong_to_images_by_relative_path_then_name_then_stem(tmp_path):
 
 
 def test_lists_have_names_with_signs_cameras_for_each_image_and_several_sizes(tmp_path, views):
-    upright = replace(
-        views[1],
-        rgb=views[1].rgb[:, :64],
-        depth=views[1].depth[:, :64],
-        mask=views[1].mask[:, :64],
-        camera=views[1].camera.crop((0, 0, 96, 64)),
-    )
+    camera = views[1].camera.crop((0, 0, 96, 64))
+    upright = with_images(views[1], camera, lambda image: image[:, :64])
     write_lists(tmp_path, [replace(views[0], name="cup #10"), replace(upright, name="cup #9")])
     np.savetxt(tmp_path / "intrinsics.txt", [[300, 301, 60, 48], [200, 201, 40, 48]])
     # Frames are in the order of the numbers in their names.
@@ -455,21 +441,14 @@ def test_lists_have_names_with_signs_cameras_for_each_image_and_several_sizes(tm
 
 
 def test_the_camera_of_tum_is_by_default_that_of_its_sensors(tmp_path, views):
-    write("tum", tmp_path / "tum", views)
-    assert open_capture(tmp_path / "tum").frames[0].camera.principal_point.tolist() == [320, 240]
+    write_tum(tmp_path, views)
+    assert open_capture(tmp_path).frames[0].camera.principal_point.tolist() == [320, 240]
 
 
 def test_of_several_objects_of_bop_one_is_chosen(tmp_path, views):
     write_bop(tmp_path, views, objects=(3, 5))
     refused("has the objects 3, 5, expected one of them as --object N", open_source, tmp_path)
     assert open_source(tmp_path, object=5).mask == "given"
-
-
-def test_the_unit_of_depth_can_be_given(tmp_path, views):
-    write_bop(tmp_path, views)
-    # 10 mm, where the files say 0.5 mm: 20 times as far.
-    (frame,) = open_source(tmp_path, depth_unit=0.01).load([0])
-    assert frame.depth.max() == pytest.approx(20 * views[0].depth.max(), rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -479,7 +458,6 @@ def test_the_unit_of_depth_can_be_given(tmp_path, views):
             ["sparse/0/images.bin"],
             "has COLMAP's poses, but no measured depth, expected raw data .* Stray Scanner",
         ),
-        (["cameras.bin", "points3D.bin", "0.jpg"], "has COLMAP's poses, but no measured depth"),
         (["frame_00000.json", "depth_00000.png"], "is a scan of 3d Scanner App, .* format lists: "),
         (["lowres_wide.traj", "mesh.ply"], "is a scene of ARKitScenes, expected .* lists: rgb.txt"),
         (
@@ -496,7 +474,6 @@ def test_the_unit_of_depth_can_be_given(tmp_path, views):
         (["scan.bag"], "is a recording of RealSense, expected the folder that open3d.t.io"),
         (["Scan.MKV"], "is a video, such as Azure Kinect's, expected .* azure_kinect_mkv_reader"),
         (["0.JPG"], "has photographs, but no depth and poses in a known .* expected raw"),
-        (["images/0.heic"], "has photographs, but no depth and poses in a known .* expected raw"),
         (["scan.mp4"], "is a video without depth and poses"),
         (["model.obj", "model.mtl"], "is a model as Luma or KIRI export it"),
         (
@@ -515,50 +492,40 @@ def test_what_is_no_capture_is_answered_with_what_it_lacks(tmp_path, files, mess
 
 
 def test_a_file_that_is_no_capture_is_answered_with_what_it_is(tmp_path):
-    refused("scan.bag does not exist", open_capture, tmp_path / "scan.bag")
     (tmp_path / "scan.bag").touch()
     refused("scan.bag is a recording of RealSense", open_capture, tmp_path / "scan.bag")
 
 
-@pytest.mark.parametrize("layout", ["lists", "open3d", "nerfstudio"])
-def test_files_carry_the_distortion(tmp_path, views, layout):
-    folder, _ = write(layout, tmp_path / "scan", views)
-    if layout == "open3d":
-        edited(lambda c: c.update(coeffs=DISTORTION), name="intrinsic.json")(folder)
-    elif layout == "nerfstudio":
-        folder = tmp_path
-        write_nerfstudio(folder, views)
-        edited(lambda c: c.update(zip(("k1", "k2", "p1", "p2", "k3"), DISTORTION)))(folder)
-    else:
-        (folder / "intrinsics.txt").write_text(" ".join(map(str, [60, 61, 64, 48, *DISTORTION])))
-    for frame in open_capture(folder).frames:
+@pytest.mark.parametrize(
+    "write, change",
+    [
+        (write_open3d, edited(lambda c: c.update(coeffs=DISTORTION), name="intrinsic.json")),
+        (
+            write_nerfstudio,
+            edited(lambda c: c.update(zip(("k1", "k2", "p1", "p2", "k3"), DISTORTION))),
+        ),
+        (
+            write_lists,
+            lambda folder: np.savetxt(folder / "intrinsics.txt", [[60, 61, 64, 48, *DISTORTION]]),
+        ),
+    ],
+)
+def test_files_carry_the_distortion(tmp_path, views, write, change):
+    write(tmp_path, views)
+    change(tmp_path)
+    for frame in open_capture(tmp_path).frames:
         assert_array_equal(frame.distortion, DISTORTION)
 
 
-def zipped(path, name="rgb.txt", data=b"", flag=0):
-    """Write a zip with one file; the flag 1 says that it is encrypted."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
-        member = zipfile.ZipInfo(name)
-        member.compress_type = zipfile.ZIP_DEFLATED
-        file.writestr(member, data)
-        member.flag_bits |= flag
-    return path
-
-
 @pytest.mark.parametrize(
-    "make, message",
-    [
-        (lambda path: path.write_bytes(b"PK\3\4" + bytes(99)), "File is not a zip file"),
-        (lambda path: zipped(path, "../../climbs"), "path ../../climbs leads out of"),
-        (lambda path: zipped(path, "/etc/x"), "path /etc/x leads out of"),
-        (lambda path: zipped(path, flag=1), "File .*'rgb.txt' .* is encrypted"),
-        (lambda path: zipped(path, data=bytes(60_000)), "1.. bytes unpack to 60,000"),
-    ],
+    "name, size, message",
+    [("../../climbs", 0, "path ../../climbs leads"), ("a", 60_000, "1.. bytes unpack to 60,000")],
 )
-def test_a_zip_that_is_damaged_malicious_or_large_is_refused(tmp_path, monkeypatch, make, message):
+def test_a_zip_that_is_malicious_or_large_is_refused(tmp_path, monkeypatch, name, size, message):
     monkeypatch.setattr("zsp_lite.importers.unpacked._LARGE", 20_000)
-    make(tmp_path / "scan.zip")
-    refused(f"zip .*scan.zip cannot be unpacked: {message}", recognise, tmp_path / "scan.zip")
+    with zipfile.ZipFile(tmp_path / "scan.zip", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr(name, bytes(size))
+    refused(f"zip .*scan.zip cannot be unpacked: .*{message}", recognise, tmp_path / "scan.zip")
 
 
 # Images of a video, of files, and of a zip.
@@ -597,22 +564,16 @@ LEVELS = np.where(WRONG, 1, CERTAIN).astype(np.uint8)
 DARK = np.where(DISC, 1, LEVELS).astype(np.uint8)
 
 
-def test_thin_bands_of_middle_confidence_are_dropped():
+@pytest.mark.parametrize("values", [[0, 1, 2], [0, 127, 255]])  # those of Apple, of Polycam
+def test_thin_bands_of_middle_confidence_are_dropped_and_surfaces_kept(values):
+    values = np.array(values, np.uint8)
     assert WRONG.mean() > 0.01
-    assert_array_equal(trusted(LEVELS), ~WRONG)
-
-
-def test_a_surface_of_middle_confidence_is_kept():
-    assert trusted(DARK)[DISC & ~WRONG].mean() > 0.95
-
-
-def test_polycams_levels_of_confidence_mean_the_same():
-    levels = np.array([0, 127, 255], np.uint8)[DARK]
-    assert_array_equal(trusted(levels), trusted(DARK))
+    assert_array_equal(trusted(values[LEVELS]), ~WRONG)
+    assert trusted(values[DARK])[DISC & ~WRONG].mean() > 0.95
 
 
 def test_a_confidence_map_has_the_size_of_the_depth(tmp_path, views):
-    path, _ = write("stray", tmp_path / "scan", views)
+    path = write_stray(tmp_path, views)
     # The depth of the upper half is not trusted.
     levels = np.full((96, 128), CERTAIN, np.uint8)
     levels[:48] = 0
@@ -625,36 +586,30 @@ def test_a_confidence_map_has_the_size_of_the_depth(tmp_path, views):
     assert "000001.png is (48, 128) pixels, expected (H, W) = (96, 128)" in line
 
 
-def circle(degrees: np.ndarray) -> list[Camera]:
-    """Cameras around the origin at some azimuths."""
+def spread(degrees: np.ndarray, count: int) -> np.ndarray:
+    """Choose some of the azimuths of cameras around the origin."""
     turns = Rotation.from_euler("y", degrees[:, None], degrees=True).as_matrix()
-    return [
-        Camera(turn, np.array([0, 0, 2.0]), np.array([90.0, 90]), np.array([32.0, 32]), (64, 64))
-        for turn in turns
-    ]
+    camera = look_at((1, 0, 0))
+    cameras = [replace(camera, R=turn) for turn in turns]
+    return np.sort(degrees[spread_views(cameras, count)])
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8])
 def test_views_are_spread_evenly_whatever_their_order(count):
     degrees = np.arange(0, 360, 10.0)
-    chosen = np.sort(degrees[spread_views(circle(degrees), count)])
+    chosen = spread(degrees, count)
     gaps = np.diff(chosen, append=chosen[0] + 360)
     assert len(chosen) == count
     assert chosen[0] == 0
     assert np.abs(gaps - 360 / count).max() <= 15  # the cameras stand 10 degrees apart
     # The first view is always taken; the order of the others is of no account.
     shuffled = np.array([0, *np.random.default_rng(0).permutation(degrees[1:])])
-    assert_array_equal(np.sort(shuffled[spread_views(circle(shuffled), count)]), chosen)
+    assert_array_equal(spread(shuffled, count), chosen)
 
 
-def test_an_object_that_is_twice_in_an_image_of_bop_leaves_it_out(tmp_path, views):
-    write_bop(tmp_path, views)
-    scene = json.loads((tmp_path / "scene_gt.json").read_text())
-    first = min(scene)
-    scene[first] += scene[first]
-    (tmp_path / "scene_gt.json").write_text(json.dumps(scene))
-    (line,) = open_capture(tmp_path).left_out
-    assert re.search(r"shows object \d+ 2 times, expected once", line)
+def test_images_of_bop_with_an_object_twice_are_left_out(tmp_path, views):
+    write_bop(tmp_path, views, objects=(5, 5))
+    refused("none of 4 .* shows object 5 2 times, expected once", open_capture, tmp_path)
 
 
 def test_frames_with_one_pose_are_refused(tmp_path, views):

@@ -1,6 +1,5 @@
 """Writes a small data set in the layout of uCO3D, made of sequences of a data folder."""
 
-import functools
 import sqlite3
 from dataclasses import replace
 
@@ -41,23 +40,11 @@ def blob(values, kind="<f4") -> bytes:
     return np.asarray(values).astype(kind).tobytes()
 
 
-@functools.cache
-def distortion_maps(size, K):
-    """Map each pixel of a camera with the `DISTORTION` to the pixel of a pinhole camera,
-    (H, W, 2)."""
-    K = np.reshape(K, (3, 3))
-    rows, columns = np.indices(size, dtype=np.float64)
-    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
-    # Up to 50 iterations, until a step is below 1e-9 pixels.
-    precisely = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-9)
-    straight = cv2.undistortPoints(pixels, K, DISTORTION, R=None, P=K, criteria=precisely)
-    return straight.reshape(*size, 2).astype(np.float32)
-
-
 def distort(image, K):
     """The image of a pinhole camera as the camera with the `DISTORTION` takes it."""
-    maps = distortion_maps(image.shape[:2], tuple(K.ravel()))
-    return cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    size = image.shape[1::-1]
+    maps = cv2.initInverseRectificationMap(K, DISTORTION, None, K, size, cv2.CV_32FC1)
+    return cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def insert(metadata, table, **values):
@@ -66,6 +53,12 @@ def insert(metadata, table, **values):
     metadata.execute(
         f"INSERT INTO {table} ({', '.join(values)}) VALUES ({marks})", [*values.values()]
     )
+
+
+def write_depth(path, shape, **options):
+    """Write depth maps with one of a shape, without values."""
+    with h5py.File(path, "w") as depths:
+        depths.create_dataset("1", shape, np.float32, **options)
 
 
 def open_metadata(root):
@@ -94,7 +87,6 @@ def write_uco3d(root, dataset, category, names):
             "sequence_annots",
             sequence_name=name,
             category=category,
-            super_category="things",
             _video_path=f"{folder}/rgb_video.mp4",
             _mask_video_path=f"{folder}/mask_video.mkv",
             _depth_video_path=f"{folder}/depth_maps.h5",
@@ -133,12 +125,13 @@ def _write_frames(folder, metadata, name, frames):
             camera = frame.camera
             K = camera.K - HALF_PIXEL
             has_depth = number % STEP == 0
-            # The other frames are black, so that a test sees if they are read.
-            rgb = frame.rgb if has_depth else np.zeros_like(frame.rgb)
-            mask = frame.mask if has_depth else np.zeros_like(frame.mask)
-            videos[0].write(np.ascontiguousarray(distort(rgb, K)[..., ::-1]))
-            videos[1].write(np.rint(255 * distort(mask, K)).astype(np.uint8))
+            images = frame.rgb[..., ::-1], np.rint(255 * frame.mask).astype(np.uint8)
+            for video, image in zip(videos, images):
+                # The other frames are black, so that a test sees if they are read.
+                seen = distort(image, K) if has_depth else np.zeros_like(image)
+                video.write(np.ascontiguousarray(seen))
             view = replace(camera, t=WORLD * camera.t).to_pytorch3d(NDC_ISOTROPIC)
+            del view["intrinsics_format"]
             insert(
                 metadata,
                 "frame_annots",
@@ -148,12 +141,9 @@ def _write_frames(folder, metadata, name, frames):
                 _image_size=blob(size, "<i4"),
                 _depth_scale_adjustment=ADJUSTMENT if has_depth else None,
                 _mask_mass=float(frame.mask.sum()),
-                _viewpoint_R=blob(view["R"]),
-                _viewpoint_T=blob(view["T"]),
-                _viewpoint_focal_length=blob(view["focal_length"]),
-                _viewpoint_principal_point=blob(view["principal_point"]),
                 _viewpoint_colmap_distortion_coeffs=blob(DISTORTION),
                 _viewpoint_intrinsics_format="ndc_norm_image_bounds",
+                **{f"_viewpoint_{name}": blob(values) for name, values in view.items()},
             )
             if has_depth:
                 depths[str(number + 1)] = _stored_depth(frame, K)

@@ -9,6 +9,7 @@ minutes, or if it needs 1 GB more memory than an idle process. Linux only.
 """
 
 import gc
+import json
 import multiprocessing
 import os
 import resource
@@ -34,12 +35,13 @@ from zsp_lite.errors import InputError  # noqa: E402
 
 # Limits of a case: seconds of processor time, seconds, and bytes above those of an idle process.
 SECONDS, WAIT, MEMORY = 20, 120, 1 << 30
+OUTCOME = "outcome.json"  # file of a case's folder
 # A message of a refusal is one line that can be read.
 LONGEST_MESSAGE = 1500
 
 
-def attempt(case, folder: Path, answers) -> None:
-    """Run a case with limits, and send (outcome, message, bytes of memory used)."""
+def attempt(case, folder: Path) -> None:
+    """Run a case with limits, and write [outcome, message, bytes of memory used] to a file."""
     os.setsid()  # a group of its own, which can be killed with all that the case starts
     for stream in (1, 2):
         os.dup2(os.open(folder / f"stream{stream}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
@@ -58,7 +60,8 @@ def attempt(case, folder: Path, answers) -> None:
         kind, message = "traceback", f"{type(error).__name__}: {error} | {' '.join(lines[-3:-1])}"
     # The code in a malicious file writes this file.
     kind = "wrong" if (folder / "executed").exists() else kind
-    answers.send((kind, message, 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))
+    used = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    (folder / OUTCOME).write_text(json.dumps([kind, message, used]))
 
 
 def run_case(case, folder: Path, idle: int) -> tuple[str, str]:
@@ -66,18 +69,16 @@ def run_case(case, folder: Path, idle: int) -> tuple[str, str]:
 
     Returns the outcome and the message.
     """
-    context = multiprocessing.get_context("fork")
-    answers, sending = context.Pipe(duplex=False)
-    process = context.Process(target=attempt, args=(case, folder, sending))
+    process = multiprocessing.get_context("fork").Process(target=attempt, args=(case, folder))
     process.start()
-    sending.close()
-    try:
-        kind, message, used = answers.recv() if answers.poll(WAIT) else ("hang", "", 0)
-    except EOFError:
-        kind, message, used = "traceback", "the process died", 0
-    if kind == "hang":
+    process.join(WAIT)
+    if process.is_alive():
         os.killpg(process.pid, signal.SIGKILL)
-    process.join()
+        process.join()
+        return "hang", ""
+    if not (folder / OUTCOME).exists():
+        return "traceback", "the process died"
+    kind, message, used = json.loads((folder / OUTCOME).read_text())
     return ("memory" if used - idle > MEMORY else kind), message
 
 

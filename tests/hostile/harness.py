@@ -8,8 +8,6 @@ from contextlib import redirect_stderr
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
-import numpy as np
 from co3d_folders import sequence_data, write_identities
 from safetensors.torch import save_file
 from test_importers import write_lists, write_nerfstudio
@@ -82,7 +80,6 @@ def prepare(folder: Path) -> Path:
     - uco3d: one of them in the layout of uCO3D
     - out: a benchmark run on them
     - capture: one frame in the layouts of lists and of nerfstudio
-    - a.png, b.png: pictures of a tilted disc, with depth and mask
     - poses.csv: one pose
     - x.safetensors: a small network
     """
@@ -93,14 +90,6 @@ def prepare(folder: Path) -> Path:
     assert main(f"{BENCHMARK} --data {data} --out {folder}/out --quiet".split()) == 0
     for write in (write_lists, write_nerfstudio):
         write(folder / "capture", [replace(sequence_data("c", 1).frames[0], name="0")])
-    y, x = np.mgrid[:64, :64]
-    disc = (y - 32) ** 2 + (x - 32) ** 2 < 24**2
-    depth = np.where(disc, 1000 + 4 * x + 2 * y, 0).astype(np.uint16)
-    picture = np.stack([4 * x, 4 * y, 2 * (x + y)], axis=-1).astype(np.uint8)
-    for name in ("a", "b"):
-        cv2.imwrite(str(folder / f"{name}.png"), picture)
-        cv2.imwrite(str(folder / f"{name}_depth.png"), depth)
-        cv2.imwrite(str(folder / f"{name}_mask.png"), 255 * disc.astype(np.uint8))
     (folder / "poses.csv").write_text(POSES)
     save_file(
         VisionTransformer(32, 8, 64, 2, 1).state_dict(),
@@ -134,12 +123,21 @@ SEQUENCES = "data/cup/sequence_annotations.jgz"
 PAIRS = "data/determ_eval/1samples_2tgt/cup.pt"
 LABEL = "data/class_labels/cup/b.json"
 RESULTS = "out/run.jsonl"
-# Every reader, by a name: the file, relative to the folder, and the call that reads it.
+# Readers of single files, by a name: the file, relative to the folder, and its reader.
+_OF_FILES = {
+    "image": ("a.jpg", read_image),
+    "mask": ("a_mask.png", read_mask),
+    "depth": ("a_depth.png", read_depth),
+    "depth file": ("z.npz", read_depth_file),
+    "checkpoint": ("x.pth", load_backbone),
+    "safetensors": ("x.safetensors", load_backbone),
+    "poses": ("poses.csv", read_stored_poses),
+}
+# Every reader, by a name: the file, and the call that reads it in the folder.
 READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
-    "image": ("a.png", lambda folder: read_image(folder / "a.png")),
-    "mask": ("a_mask.png", lambda folder: read_mask(folder / "a_mask.png")),
-    "depth": ("a_depth.png", lambda folder: read_depth(folder / "a_depth.png")),
-    "depth file": ("z.npz", lambda folder: read_depth_file(folder / "z.npz")),
+    what: (name, lambda folder, name=name, read=read: read(folder / name))
+    for what, (name, read) in _OF_FILES.items()
+} | {
     "frame annotations": (FRAMES, read_frames),
     "sequence annotations": (SEQUENCES, lambda folder: Co3D(folder / "data").sequences("cup")),
     "point cloud": (
@@ -152,15 +150,12 @@ READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
         "new/class_labels/cup/c.json",
         lambda folder: import_labels(folder / "new", folder / "data"),
     ),
-    "checkpoint": ("x.pth", lambda folder: load_backbone(folder / "x.pth", "cpu")),
-    "safetensors": ("x.safetensors", lambda folder: load_backbone(folder / "x.safetensors", "cpu")),
     "lists": ("capture/rgb.txt", read_capture("lists")),
     "nerfstudio": ("capture/transforms.json", read_capture("nerfstudio")),
     "uCO3D's metadata": ("uco3d/metadata.sqlite", read_uco3d),
     "uCO3D's images": (f"{OF_UCO3D}/rgb_video.mp4", read_uco3d),
     "uCO3D's masks": (f"{OF_UCO3D}/mask_video.mkv", read_uco3d),
     "uCO3D's depth": (f"{OF_UCO3D}/depth_maps.h5", read_uco3d),
-    "poses": ("poses.csv", lambda folder: read_stored_poses(folder / "poses.csv")),
 }
 BENCHMARK = "benchmark --pairs 2 --targets 2 --methods icp"
 POSES = """pair,target_frame,rotation,translation,scale
@@ -177,16 +172,6 @@ def written(name: str, data: bytes | str | Callable[[], bytes]) -> Callable[[Pat
         (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
 
     return write
-
-
-def both(*changes: Callable[[Path], object]) -> Callable[[Path], None]:
-    """Return a function that makes several changes of the folder."""
-
-    def change(folder: Path) -> None:
-        for apply in changes:
-            apply(folder)
-
-    return change
 
 
 def gzip_bomb() -> bytes:
