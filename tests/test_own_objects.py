@@ -329,11 +329,6 @@ def test_several_frames_of_both_objects_agree_on_the_similarity_between_their_wo
     label = read_labels(ellipsoids.root, "ellipsoid")["b"].trans
     assert rotation_error(several.world_sim3.R, label[:3, :3]) < 5
     assert several.errors["verified"] < 5
-    estimate, reference = several.estimate, several.reference.camera
-    target = several.targets[estimate.view].camera
-    in_target = target.sim3 @ several.world_sim3
-    by_estimate = estimate.sim3 @ reference.sim3
-    assert_allclose(by_estimate.matrix, in_target.matrix, atol=1e-9)
 
 
 def test_frames_that_vote_for_another_pose_are_named(several):
@@ -343,13 +338,10 @@ def test_frames_that_vote_for_another_pose_are_named(several):
     against = [vote.name for vote in several.votes if vote.degrees > 30]
     assert against == ["frame 0 of b"]
     assert "1 of 4 frames vote for another pose: frame 0 of b" in several.estimate.flags
-
-
-def test_json_has_the_votes_and_the_similarity_between_the_worlds(several):
-    numbers = several.as_json()
-    matrix = numbers["estimates"]["verified"]["world_matrix"]
+    content = several.as_json()
+    assert [one["frame"] for one in content["votes"]] == names
+    matrix = content["estimates"]["verified"]["world_matrix"]
     assert_array_equal(matrix, several.world_sim3.matrix)
-    assert [one["frame"] for one in numbers["votes"]] == [vote.name for vote in several.votes]
 
 
 @pytest.fixture

@@ -121,14 +121,11 @@ def poses(text) -> np.ndarray:
     return np.array(json.loads(content)["poses"])
 
 
-def test_the_scene_names_every_pose(text, poses):
-    names = re.findall(r'<option value="\d">([^<]+)</option>', text)
-    assert names[:3] == ["paper solver", "verified solver", "verified solver, hypothesis 2"]
-    assert len(names) == len(poses)
-
-
-def test_the_scene_has_the_poses_of_both_solvers_in_one_frame(results, poses):
+def test_the_scene_has_the_poses_of_both_solvers_in_one_frame(results, text, poses):
     (result,) = results
+    names = re.findall(r'<option value="\d">([^<]+)</option>', text)
+    assert names[:2] == ["paper solver", "verified solver"]
+    assert len(names) == len(poses)
     assert_allclose(poses[0], result.estimate.sim3.matrix[:3], atol=1e-5)
     (moved,) = result.estimates["verified"].propagate([result.estimate.target_camera])
     assert_allclose(poses[1], moved.matrix[:3], atol=1e-5)
