@@ -14,7 +14,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from synthetic_views import CoordinateBackbone, look_at, render, true_pose
+from synthetic_views import CoordinateBackbone, look_at, render
 
 from zsp_lite.alignment import Sim3, ransac
 from zsp_lite.benchmark.run import evaluate
@@ -24,7 +24,6 @@ from zsp_lite.data.labels import PoseLabel, read_labels
 from zsp_lite.data.writing import SequenceData, write_co3d, write_label
 from zsp_lite.estimates import PoseEstimate, match_points
 from zsp_lite.io.files import write_atomic
-from zsp_lite.views import object_crop
 
 SEQUENCES = ("100_a", "200_b", "300_c")
 FRAMES = 8
@@ -133,32 +132,6 @@ def placement(category, sequence) -> Sim3:
     """The map from the world of the first sequence to that of another one, by its label."""
     trans = read_labels(small_folder(), category)[sequence].trans
     return Sim3(1.0, trans[:3, :3], trans[:3, 3])
-
-
-def exact_keypoints(dataset, category):
-    """Return a matcher of crops that knows the geometry: it matches every pixel of the first crop
-    with the place where the second one shows its point."""
-    crops = {}
-    for name in SEQUENCES:
-        for frame in (
-            dataset.load(dataset.frame(category, name, number)) for number in range(FRAMES)
-        ):
-            crop = object_crop(frame, None)
-            crops[crop.rgb.tobytes()] = crop, placement(category, name)
-
-    def exact(first, second):
-        (reference, here), (target, there) = crops[first.tobytes()], crops[second.tobytes()]
-        rows, columns = np.nonzero((reference.depth > 0) & (reference.mask > 0.5))
-        pixels = np.stack([columns, rows], axis=1) + 0.5
-        points = reference.camera.unproject_camera(pixels, reference.depth[rows, columns])
-        points = true_pose(reference.camera, here, target.camera, there).apply(points)
-        places, depth = target.camera.project(target.camera.to_world(points))
-        x, y = np.floor(places).astype(int).T
-        inside = (np.minimum(x, y) >= 0) & (x < second.shape[1]) & (y < second.shape[0])
-        seen = inside & (np.abs(target.depth[y * inside, x * inside] - depth) < 0.002)
-        return pixels[seen], places[seen], np.ones(seen.sum())
-
-    return exact
 
 
 CATEGORIES = ("bicycle", "hydrant", "motorcycle", "teddybear", "toaster", "chair")

@@ -15,22 +15,21 @@ from benchmark_folder import SEQUENCES, SlowBackbone, run_rows, small_folder
 from numpy.testing import assert_allclose
 from refusals import refused
 
-from zsp_lite import Co3D, Sim3, ZeroShotPose, align_category, estimate_pose
+from zsp_lite import Co3D, Sim3, align_category, estimate_pose
 from zsp_lite.benchmark.problem import FrameStore
 from zsp_lite.benchmark.run import evaluate
 from zsp_lite.cli import main as cli
 from zsp_lite.course.labelling.session import Labelling
-from zsp_lite.data.frames import resize_frame
 from zsp_lite.data.labels import read_labels
 from zsp_lite.importers.convert import scale_frame
 from zsp_lite.metrics import rotation_error
 from zsp_lite.objects.align import read_hypotheses, write_labels
-from zsp_lite.scans.category import PairHypotheses, synchronise
+from zsp_lite.scans.category import PairHypotheses, synchronise, world_hypotheses
 from zsp_lite.viz.category_sheet import objects_figure
 
 BACKBONE = SlowBackbone(grid=8, _seconds=0)
 A, B, C = SEQUENCES
-HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+HALF_TURN = Sim3(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
 PAIRS = 12  # two frames of each object for each ordered pair
 align_lumps = partial(align_category, Co3D(small_folder()), "lump", BACKBONE)
 
@@ -70,14 +69,6 @@ def test_objects_are_aligned_as_their_labels_and_the_written_labels_say(run, tmp
         rotation = alignment.between(*pair).R
         assert rotation_error(rotation, true) < 15  # degrees: a patch of the small grid
         assert_allclose(written[pair], rotation, atol=1e-6)
-
-
-def test_labels_of_another_reference_are_not_replaced(run, tmp_path):
-    _, alignment = run
-    write_labels(alignment, tmp_path, "lump")
-    reversed_objects = dict(reversed(alignment.objects.items()))
-    other = replace(alignment, objects=reversed_objects)
-    refused("would be replaced by other content", write_labels, other, tmp_path, "lump")
 
 
 def test_the_row_of_the_benchmark_takes_the_pose_from_the_alignment_of_all_objects(tmp_path):
@@ -139,7 +130,7 @@ def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     out = tmp_path / "out"
     shutil.copytree(small_folder(), root)
     _, alignment = run
-    turned = alignment.between(A, C) @ Sim3(1.0, HALF_TURN, np.zeros(3))
+    turned = alignment.between(A, C) @ HALF_TURN
     wrong = PairHypotheses(A, C, (turned,), np.ones(1), np.zeros(3))
     disagreeing = replace(alignment, pairs=(wrong,))
     monkeypatch.setattr("zsp_lite.objects.align.align_category", lambda *_, **__: disagreeing)
@@ -168,39 +159,27 @@ def test_the_objects_of_a_category_without_masks_are_shown_in_whole_frames(run, 
         return [msgspec.structs.replace(frame, mask=None) for frame in frames(*names)]
 
     monkeypatch.setattr(Co3D, "frames", without_masks)
-    dataset = Co3D(small_folder())
-    shown = [axis.images[0].get_array() for axis in objects_figure(dataset, "lump", run[1]).axes]
-    assert len(shown) == 6
-    whole = [
-        resize_frame(dataset.load(frame), (224, 224)).rgb.tolist()
-        for frame in dataset.frames("lump", A)
-    ]
-    assert shown[0].tolist() in whole
+    panels = objects_figure(Co3D(small_folder()), "lump", run[1]).axes
+    assert len(panels) == 6
+    # The object fills a crop; in a whole frame the corners are black.
+    assert not panels[0].images[0].get_array()[:40, :40].any()
 
 
 def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
     """Every frame of the pair itself votes for a half turn, which the third object shows to be
     wrong."""
 
-    def misled(method, reference, targets, matched=None):
+    def misled(reference, target, estimate):
         """Prefer the half turn of A's world to the best pose, if the objects are A and B."""
-        answer = estimate(method, reference, targets, matched)
-        first, second = [view.frame.name.split("/")[0] for view in (reference, targets[0])]
-        if {first, second} != {A, B}:
-            return answer
-        best = answer.hypotheses[0]
-        camera = reference.frame.camera.R
-        target_camera = targets[best.view].frame.camera.R
-        if first == A:
-            rotation = best.sim3.R @ camera @ HALF_TURN @ camera.T
-        else:
-            rotation = target_camera @ HALF_TURN @ target_camera.T @ best.sim3.R
-        wrong = replace(best, sim3=replace(best.sim3, R=rotation), confidence=0.97)
-        hypotheses = wrong, replace(best, confidence=0.01)
-        return replace(answer, sim3=wrong.sim3, hypotheses=hypotheses)
+        found = world_hypotheses(reference, target, estimate)
+        best, doubtful = found.sim3s[0], np.array([0.97, 0.01])
+        if A in reference and B in target:
+            return replace(found, sim3s=(best @ HALF_TURN, best), probabilities=doubtful)
+        if B in reference and A in target:
+            return replace(found, sim3s=(HALF_TURN @ best, best), probabilities=doubtful)
+        return found
 
-    estimate = ZeroShotPose.estimate_from_views
-    monkeypatch.setattr(ZeroShotPose, "estimate_from_views", misled)
+    monkeypatch.setattr("zsp_lite.objects.estimate.world_hypotheses", misled)
     # The shapes and the vertical, which show the error too, tell nothing.
     monkeypatch.setattr("zsp_lite.objects.scan.find_up", lambda frames: (None, ""))
     monkeypatch.setattr("zsp_lite.scans.judge.chamfer_distance", lambda *_: np.ones(len(_[2])))
@@ -208,11 +187,9 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
     settings = {"backbone": BACKBONE, "targets": 3, "references": 2}
     assert estimate_pose(*pair, **settings).errors["verified"] > 150
     result = estimate_pose(*pair, helpers=[helper], **settings)
-    answer = result.estimates["verified"]
     assert result.errors["verified"] < 15
-    assert answer.confidence > 0.4
+    assert result.estimate.confidence > 0.4
     assert result.sources[1].endswith(f"helpers: {helper}")
-    assert answer.flags[-1].startswith("4 of 4 frames vote for another pose: ")
 
 
 def test_a_helper_is_another_object():

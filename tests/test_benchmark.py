@@ -67,15 +67,11 @@ def test_a_method_added_later_leaves_the_others_as_they_were(tmp_path):
     both = evaluate(small_folder(), BACKBONE, ("ours", "rootsift"), {"lump": 3}, 2, tmp_path)
     assert both["methods"]["ours"] == alone["methods"]["ours"]
     assert both["timings"]["backbone"] == alone["timings"]["backbone"]
-    ours, rootsift = both["methods"].values()
-    assert rootsift["n"] == 3
-    gain = both["against"]["rootsift"]["accuracy_gain"]
-    assert gain == pytest.approx(rootsift["acc30"] - ours["acc30"])
+    assert both["methods"]["rootsift"]["n"] == 3
 
 
 def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(run):
-    out, summary = run
-    dataset, found = Co3D(small_folder()), read_run(out)
+    dataset, found = Co3D(small_folder()), read_run(run[0])
     for category in ("lump", "pebble"):
         labels = read_labels(small_folder(), category)
         for pair in sample_pairs(dataset, category, 6, 5):
@@ -86,9 +82,6 @@ def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(run):
             turns = [target.camera.R @ labels[b].trans[:3, :3] for target in targets]
             angles = [rotation_error(turn, seen) for turn in turns]
             assert found.row("oracle-view")["view"][pair.key] == np.argmin(angles)
-            best_view = found.row("ours-bv").loc[pair.key]
-            assert_allclose(best_view["error"], angles[int(best_view["view"])], atol=1e-4)
-    assert summary["methods"]["oracle-view"]["acc30"] >= 90
 
 
 def test_stored_poses_give_the_errors_again(run):
@@ -154,22 +147,16 @@ def test_the_folder_of_another_run_is_refused(run, backbone, options, message):
 
 
 @pytest.mark.parametrize(
-    "root, options, message",
+    "options, message",
     [
-        (small_folder, {"pairs": {"teapot": 1}}, "category is 'teapot', expected one of lump"),
-        (small_folder, {"pairs": {"lump": 0}}, "pairs of lump is 0"),
-        (small_folder, {"targets": 0}, "targets is 0"),
-        (lambda: Path("nowhere"), {}, "nowhere"),
+        ({"pairs": {"teapot": 1}}, "category is 'teapot', expected one of lump"),
+        ({"pairs": {"lump": 0}}, "pairs of lump is 0"),
+        ({"targets": 0}, "targets is 0"),
     ],
 )
-def test_data_and_numbers_that_are_not_there_are_refused(tmp_path, root, options, message):
-    refused(message, evaluate, root(), BACKBONE, out=tmp_path / "a", **options)
+def test_categories_and_numbers_that_are_not_there_are_refused(tmp_path, options, message):
+    refused(message, evaluate, small_folder(), BACKBONE, out=tmp_path / "a", **options)
     assert not (tmp_path / "a").exists()
-
-
-def _object_pose(matrix: np.ndarray) -> dict:
-    matrix[3] = 0, 0, 0, 1
-    return {"trans": matrix.tolist(), "scale": 1.0, "low": [0, 0, 0], "high": [1, 1, 1]}
 
 
 @pytest.mark.parametrize("turns, expected", [((180,), 0), ((90,), 90), ((), 180)])
@@ -195,19 +182,12 @@ def test_an_error_up_to_symmetries_forgives_turns_that_both_objects_allow(
     assert mine["symmetric_acc30"] == 100 * (expected < 30)
 
 
-@pytest.mark.parametrize(
-    "text, expected",
-    [
-        ('{"100_a": {"trans": [[1, 0, 0, 0]], "scale": 1}}', "Expected"),
-        (json.dumps({"100_a": _object_pose(1.05 * np.eye(4))}), "100_a is"),
-    ],
-)
-def test_object_poses_of_another_layout_cost_a_warning_and_their_figure(
-    tmp_path, caplog, text, expected
-):
+def test_object_poses_of_another_layout_cost_a_warning_and_their_figure(tmp_path, caplog):
     dataset = Co3D(shutil.copytree(small_folder(), tmp_path / "copy"))
     path = dataset.root / "lump" / POSES_FILE
-    path.write_text(text)
+    stretched = np.diag([1.05, 1.05, 1.05, 1]).tolist()
+    pose = {"trans": stretched, "scale": 1, "low": [0, 0, 0], "high": [1, 1, 1]}
+    path.write_text(json.dumps({"100_a": pose}))
     rows = {"mine": own_method}
     summary = evaluate(dataset.root, BACKBONE, rows, {"lump": 3}, 2, tmp_path / "out")
     mine = summary["methods"]["mine"]
@@ -215,7 +195,7 @@ def test_object_poses_of_another_layout_cost_a_warning_and_their_figure(
     assert "symmetric_acc30" not in mine
     (warning,) = caplog.messages
     ending = ": without it there is no symmetric_acc30"
-    assert re.fullmatch(f".*{re.escape(str(path))}.*{expected}.*{ending}", warning, re.DOTALL)
+    assert re.fullmatch(f".*{re.escape(str(path))}.*100_a is.*{ending}", warning, re.DOTALL)
     refused(POSES_FILE, object_poses, dataset, "lump")
 
 

@@ -104,12 +104,6 @@ def test_the_row_without_depth_fits_rotations_only(run):
     assert (fitted["inliers"] >= 5).all()  # the smallest number that determines a rotation
 
 
-def test_a_row_with_depth_fits_translation_and_scale(run):
-    medians = run.row("ours")[["translation", "scale"]].median()
-    assert medians["translation"] < 0.2
-    assert medians["scale"] == pytest.approx(1, abs=0.1)
-
-
 def test_icp_takes_the_first_view_or_the_best_one(run):
     assert set(run.row("icp")["view"]) == {0}
     assert run.row("icp-bv")["view"].equals(run.row("ours")["view"])
@@ -132,7 +126,8 @@ def test_poses_without_a_fit_are_counted(tmp_path, monkeypatch):
     for fit in ("pipeline.ransac", "benchmark.own.ransac", "baselines.geometry.icp"):
         monkeypatch.setattr(f"zsp_lite.{fit}", fails)
     monkeypatch.setattr("cv2.findEssentialMat", lambda *_, **__: (None, None))
-    rows = ["ours", "sift", "icp", "ours-nodepth"]
+    rows = {name: name for name in ("ours", "sift", "icp", "ours-nodepth")}
+    rows["mine"] = lambda first, second: ([], [], [])
     run_rows(rows, tmp_path, 2)
     note = read_run(tmp_path).summary["note"]
     for row in rows:

@@ -27,7 +27,6 @@ from zsp_lite.benchmark.tables import (
     as_markdown,
     every_table,
 )
-from zsp_lite.choices import METRICS, METRICS_SHOWN
 from zsp_lite.data.co3d import Pair
 
 pytestmark = pytest.mark.slow
@@ -84,8 +83,6 @@ def test_accuracies_of_a_table_are_the_runs(run, every):
     assert bounds(acc30) == (methods["ours"]["acc30"], *methods["ours"]["acc30_ci"])
     toaster = cell(every["table_1"], "ICP", "toaster Acc30")
     assert toaster.value == methods["icp"]["per_category"]["toaster"]["acc30"]
-    acc15 = cell(every["table_a_correspondences"], "K = 70, no k-means", "Acc15 (%)")
-    assert acc15.value == methods["ours-k70-nokmeans"]["acc15"]
 
 
 def test_the_median_of_a_table_is_the_mean_of_the_categories_medians(run, every):
@@ -98,13 +95,6 @@ def test_the_median_of_a_table_is_the_mean_of_the_categories_medians(run, every)
 def test_published_figures_stand_apart(every):
     assert cell(every["table_1"], "ICP", "toaster Acc30", PUBLISHED).value == 7.0
     assert cell(every["table_1"], "SWaV", "Acc30 (%)") is None  # was published only
-
-
-def test_the_table_of_all_rows_has_the_usual_metrics_and_the_differences_to_ours(three):
-    cells = every_table(three.summary)[0].cells
-    metrics = [METRICS[name] for name in METRICS_SHOWN]
-    assert list(cells.index) == ["ours", "ours-bv", "rootsift"]
-    assert list(cells) == ["pairs", *metrics, "failed", "Acc30 − ours", "p"]
 
 
 def test_a_difference_to_ours_is_that_of_the_paired_test(three):
@@ -205,9 +195,7 @@ def test_a_latex_table_has_its_columns_without_commands_in_its_texts():
     }
     cells = frame(rows, ["Med. err. (°)", "Acc30 (%)", "B − A", "pairs"])
     table = Table("mine", "Table 9. 50% & more", cells)
-    text = as_latex(table)
-    parts = (r"\begin{tabular}{lrrr}", r"\toprule", r"\midrule", r"\bottomrule")
-    assert [part for part in parts if part not in text] == []
+    assert r"\begin{tabular}{lrrr}" in as_latex(table)
     assert body_of(table) == [
         ["", r"Med. err. ($^\circ$)", r"Acc30 (\%)", "B $-$ A"],
         [r"a\_b \& 50\%", "12.3", "50.0", "$-$3.2"],
@@ -231,8 +219,6 @@ def test_chosen_rows_are_the_rows_of_all_tables_in_their_order(run, tmp_path):
     assert list(found["categories_acc30"].cells) == rows
     assert list(found["table_1"].cells.index) == ["ICP", "Ours (K=50)"]
     assert "table_3" not in found
-    gain = cell(found["all_rows"], "icp", "Acc30 − ours").value
-    assert gain == run.summary["against"]["icp"]["accuracy_gain"]
 
 
 @pytest.fixture
@@ -272,14 +258,9 @@ def test_figures_have_truetype_fonts_and_the_size_that_is_asked_for(run, tmp_pat
         assert b"/Type3" not in document
 
 
-@pytest.fixture
-def acc30(run):
-    """Acc30 of ours, and the ends of its interval."""
-    ours = run.summary["methods"]["ours"]
-    return [ours["acc30"], *ours["acc30_ci"]]
-
-
-def test_csv_has_the_figures_and_their_intervals_in_columns(every, acc30):
+def test_csv_has_the_figures_and_their_intervals_in_columns(run, every):
+    figures = run.summary["methods"]["ours"]
+    acc30 = [figures["acc30"], *figures["acc30_ci"]]
     lines = list(csv.DictReader(io.StringIO(tables.as_csv(every["table_3"]))))
     (ours,) = [line for line in lines if line["row"] == "CorrespondSim"]
     columns = ["Acc30 (%)", "Acc30 (%) low", "Acc30 (%) high"]
@@ -303,33 +284,6 @@ def test_each_line_of_the_papers_tables_is_whole_and_of_a_known_row():
                 assert resolve(line["row"])
 
 
-KEY = "chair/a:3/b.c:0,12"
-
-
-@pytest.fixture
-def mine(tmp_path) -> Run:
-    """A run with one row that answers one pair and fails on another, and a row without results."""
-    results = {KEY: RESULT, "lamp/a:0/b:4,6": {"error": 180.0, "failed": "no depth"}}
-    return write_run(tmp_path, {"mine": results, "last": {}}, ["lamp", "chair", "cup"])
-
-
-def test_a_runs_table_has_the_parts_of_each_result_and_of_each_pairs_key(mine):
-    second, first = mine.table.to_dict("records")
-    assert first == RESULT | {
-        "row": "mine",
-        "pair": KEY,
-        "problem": "chair/a:3/b.c",
-        "category": "chair",
-        "repeat": 0,
-        "reference": "chair/a",
-        "target": "chair/b.c",
-        "failed": "",
-        "views": 2,
-    }
-    failure = {"category": "lamp", "error": 180, "failed": "no depth", "note": ""}
-    assert failure.items() <= second.items()
-
-
 def test_names_with_commas_and_bars_keep_their_pairs(tmp_path):
     names = ["plain", "red,small", 'a "b" | c:7,8']
     pairs = [Pair("mug, cup", *ends) for ends in product(names, (1, 2), names, [(3, 4), (5,)])]
@@ -345,15 +299,11 @@ def test_the_note_counts_results_that_tables_leave_out(tmp_path):
     assert run.note.startswith("Without 1 of 3 results, which are of other pairs")
 
 
-def test_a_runs_summary_is_of_the_pairs_and_rows_with_results(mine):
-    summary = mine.summary
-    assert summary["data"] == {
-        "root": "made up",
-        "categories": ["lamp", "chair"],
-        "pairs": 2,
-        "targets": 5,
-    }
-    assert summary["backbone"] == "none"
+def test_a_runs_summary_is_of_the_pairs_and_rows_with_results(tmp_path):
+    results = {"chair/a:3/b.c:0,12": RESULT, "lamp/a:0/b:4,6": {"error": 180.0, "failed": "blind"}}
+    rows = {"mine": results, "last": {}}
+    summary = write_run(tmp_path, rows, ["lamp", "chair", "cup"]).summary
+    assert (summary["data"]["categories"], summary["data"]["pairs"]) == (["lamp", "chair"], 2)
     assert list(summary["methods"]) == ["mine"]
     figures = {"failed": 1, "translation": 0.5, "scale": 1.1, "symmetric_acc30": 50}
     assert figures.items() <= summary["methods"]["mine"].items()
@@ -367,18 +317,20 @@ def folder(tmp_path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "right, wrong",
+    "name, right, wrong, place",
     [
-        ('"error":1.0', '"error":"1"'),
-        ('"error":1.0', '"error":181'),
-        ("chair/a:0/b:0", "chair/a:0/b"),
-        ("chair/a:0/b:0", "chair/a:0/b/c:0"),
+        (LINES, '"error":1.0', '"error":"1"', ", line 1"),
+        (LINES, '"error":1.0', '"error":181', ", line 1"),
+        (LINES, "chair/a:0/b:0", "chair/a:0/b", ", line 1"),
+        (LINES, "chair/a:0/b:0", "chair/a:0/b/c:0", ", line 1"),
+        (SETTINGS, '"calls"', '"call"', ""),
+        (SETTINGS, '"targets":5', '"targets":"5"', ""),
     ],
 )
-def test_a_line_that_is_no_result_is_refused(folder, right, wrong):
-    path = folder / LINES
+def test_results_and_settings_of_another_form_are_refused(folder, name, right, wrong, place):
+    path = folder / name
     path.write_text(path.read_text().replace(right, wrong))
-    refused(f"{re.escape(str(folder))}, line 1: ", read_run, folder)
+    refused(f"{re.escape(str(folder))}.*{place}: ", read_run, folder)
 
 
 def test_a_damaged_gzip_is_refused(folder):
@@ -386,15 +338,6 @@ def test_a_damaged_gzip_is_refused(folder):
     for content in (b"no gzip", gzip.compress((folder / LINES).read_bytes())[:15]):
         packed.write_bytes(content)
         refused(f"{re.escape(str(packed))}.*gzip", read_run, folder)
-
-
-@pytest.mark.parametrize(
-    "right, wrong", [(".*", "{}"), ('"calls"', '"call"'), ('"targets":5', '"targets":"5"')]
-)
-def test_settings_of_another_form_are_refused(folder, right, wrong):
-    path = folder / SETTINGS
-    path.write_text(re.sub(right, wrong, path.read_text(), count=1, flags=re.DOTALL))
-    refused(re.escape(f"{path}: "), read_run, folder)
 
 
 @pytest.fixture(scope="module")
@@ -426,11 +369,9 @@ def test_rows_of_one_run_are_compared(run):
     table = tables.compare(run, run, ["icp", "ours:icp"])
     assert list(table.cells.index) == ["icp", "ours:icp"]
     assert cell(table, "icp", "p").value == 1  # the same row twice
-    pairs, a, b, gain, p, *medians = [one.value for one in table.cells.loc["ours:icp"]]
-    assert pairs == 48
+    *_, p, first, second = [one.value for one in table.cells.loc["ours:icp"]]
     assert 0 < p <= 1
-    assert gain == pytest.approx(b - a)
-    assert medians == [run.row(name)["error"].median() for name in ("ours", "icp")]
+    assert [first, second] == [run.row(name)["error"].median() for name in ("ours", "icp")]
 
 
 @pytest.mark.parametrize(

@@ -1,69 +1,23 @@
-"""What the lessons compute and draw beside the library: answers between objects, and pictures."""
+"""What the lessons draw beside the library."""
 
 from base64 import b64decode
-from pathlib import Path
 
 import numpy as np
-import pytest
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite import ZeroShotPose
-from zsp_lite.course import hypotheses, scan_pictures
+from zsp_lite.course import scan_pictures
 from zsp_lite.course.samples import sample_data
 from zsp_lite.course.widgets.turning import show_turning
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.labels import read_labels
-from zsp_lite.objects.align import read_hypotheses
-from zsp_lite.scans.category import synchronise
 from zsp_lite.viz.plots import object_cloud
 
-RUN = Path(__file__).parents[1] / "notebooks/results/category_run/four_cars"
 
-
-@pytest.fixture(scope="module")
-def truth() -> dict[str, np.ndarray]:
-    """Rotations from the worlds of the four sample cars to the frame of their category."""
-    labels = read_labels(sample_data(), "car")
-    return {name: labels[name].trans[:3, :3].T for name in sorted(labels)}
-
-
-def test_a_draw_has_one_stored_answer_of_each_ordered_pair(truth):
-    drawn = hypotheses.draw_answers(read_hypotheses(RUN).values(), seed=3)
-    stored = [one.centre.tolist() for one in read_hypotheses(RUN).values()]
-    assert {(one.reference, one.target) for one in drawn} == {
-        (a, b) for a in truth for b in truth if a != b
-    }
-    assert len(drawn) == 12
-    assert all(one.centre.tolist() in stored for one in drawn)
-
-
-def test_a_tree_believes_the_surest_answer_and_all_pairs_can_outvote_it(truth):
-    drawn = hypotheses.draw_answers(read_hypotheses(RUN).values(), seed=41)
-    assert not hypotheses.all_alike(truth, hypotheses.spanning_tree(drawn))
-    objects = synchronise(drawn).objects
-    together = {name: one.sim3.R for name, one in objects.items()}
-    assert hypotheses.all_alike(truth, together)
-
-    surest = hypotheses.right_answers(drawn, truth)
-    wrong = {pair for pair, right in surest.items() if not right}
-    assert wrong == {
-        ("seat_leon", "peugeot_308"),
-        ("suv", "peugeot_308"),
-        ("peugeot_308", "wooden_car"),
-    }
-    fitting = hypotheses.right_answers(drawn, truth, together)
-    assert len(fitting) == 12 and all(fitting.values())
-
-
-def test_a_common_turn_of_all_objects_changes_nothing_and_of_one_it_does(truth):
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    turned = {name: turn @ rotation for name, rotation in truth.items()}
-    assert hypotheses.all_alike(truth, turned)
-    assert not hypotheses.all_alike(truth, truth | {"suv": turned["suv"]})
-
-
-def test_objects_are_seen_from_the_same_side_by_the_true_rotations(truth):
+def test_objects_are_seen_from_the_same_side_by_the_true_rotations():
     dataset = Co3D(sample_data())
+    labels = read_labels(sample_data(), "car")
+    truth = {name: labels[name].trans[:3, :3].T for name in sorted(labels)}
     shown = scan_pictures.alike(dataset, "car", truth, "suv")
     assert list(shown) == list(truth)
     assert {picture.shape for picture in shown.values()} == {(224, 224, 3)}

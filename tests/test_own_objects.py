@@ -71,15 +71,6 @@ def sequence(ellipsoids) -> Source:
     return open_source(ellipsoids.root / "ellipsoid/b")
 
 
-def test_a_sequence_of_a_data_folder_is_read_with_its_numbers_and_masks(sequence, ellipsoids):
-    assert (sequence.format, sequence.mask) == ("sequence", "given")
-    assert sequence.numbers == tuple(range(7))
-    (frame,) = sequence.load([5])
-    expected = ellipsoids.load(ellipsoids.frame("ellipsoid", "b", 5))
-    assert_array_equal(frame.rgb, expected.rgb)
-    assert_array_equal(frame.mask, expected.mask)
-
-
 def test_frames_are_chosen_evenly_or_by_number(sequence):
     assert spread(3, 7) == [0, 2, 4]
     assert spread(50, 7) == list(range(7))
@@ -227,42 +218,18 @@ def test_the_aligned_cloud_lies_on_the_target_object_in_its_world(own, ellipsoid
         assert np.abs(inside(at_home)).mean() < most, name
 
 
-def test_both_solvers_are_right_and_stand_in_the_representation(own):
+def test_json_has_the_numbers_of_the_pair_and_of_each_solver(own):
     found, _ = own
-    assert list(found.errors) == ["paper", "verified"]
-    assert max(found.errors.values()) < 25
-    for solver in found.errors:
-        assert f"{solver}: PoseEstimate(" in repr(found)
-
-
-@pytest.fixture
-def content(own) -> dict:
-    """The result as JSON, read again."""
-    return json.loads(json.dumps(own[0].as_json(), allow_nan=False))
-
-
-def test_json_has_the_numbers_of_the_pair(own, content):
+    content = json.loads(json.dumps(found.as_json(), allow_nan=False))
     assert content["target"]["views"] == ["b/0", "b/2", "b/4"]
-    assert content["reference"]["masks"] == "given"
-    assert content["degrees_between_solvers"] == own[0].disagreement < 20
-
-
-@pytest.mark.parametrize("solver", ["paper", "verified"])
-def test_json_has_every_number_of_an_estimate(own, content, solver):
-    found, _ = own
-    estimate, numbers = found.estimates[solver], content["estimates"][solver]
-    expected = {
-        "matrix": estimate.sim3.matrix.tolist(),
-        "view_name": found.targets[numbers["view"]].name,
-        "flags": list(estimate.flags),
-        "error_degrees": found.errors[solver],
-        "confidence": estimate.confidence,
-        "one_of_two": estimate.one_of_two,
-    }
-    assert {name: numbers[name] for name in expected} == expected
-    assert len(numbers["alternatives"]) == len(estimate.alternatives)
-    scaled = np.multiply(numbers["scale"], numbers["rotation"])
-    assert_allclose(scaled, estimate.sim3.matrix[:3, :3])
+    assert content["degrees_between_solvers"] == found.disagreement < 20
+    for solver, estimate in found.estimates.items():
+        numbers = content["estimates"][solver]
+        assert numbers["view_name"] == found.targets[estimate.view].name
+        assert numbers["error_degrees"] == found.errors[solver] < 25
+        assert numbers["matrix"] == estimate.sim3.matrix.tolist()
+        scaled = np.multiply(numbers["scale"], numbers["rotation"])
+        assert_allclose(scaled, estimate.sim3.matrix[:3, :3])
 
 
 def test_where_the_answer_is_one_of_two_both_clouds_are_written(own, tmp_path, monkeypatch):
@@ -335,11 +302,8 @@ def test_a_captures_target_views_are_those_that_are_not_black_or_empty(pictures,
     found = estimate_pose(
         cup, tmp_path, targets=6, intrinsics=INTRINSICS, backbone=CoordinateBackbone()
     )
-    estimate = found.estimates["verified"]
-    truth = true_pose(look_at((1, 0.3, 0.3)), AT_HOME, views[estimate.view].camera, ELSEWHERE)
-    assert rotation_error(estimate.sim3.R, truth.R) < 15
     assert found.masks[1] == "given"
-    black, empty = estimate.flags[-2:]
+    black, empty = found.estimate.flags[-2:]
     assert black == "0002.jpg left out: black image"
     assert empty == "0003.jpg left out: empty object mask"
     assert [vote.name.split()[1] for vote in found.votes[1:]] == ["0", "4", "1", "5"]
@@ -365,11 +329,6 @@ def test_several_frames_of_both_objects_agree_on_the_similarity_between_their_wo
     label = read_labels(ellipsoids.root, "ellipsoid")["b"].trans
     assert rotation_error(several.world_sim3.R, label[:3, :3]) < 5
     assert several.errors["verified"] < 5
-    estimate, reference = several.estimate, several.reference.camera
-    target = several.targets[estimate.view].camera
-    in_target = target.sim3 @ several.world_sim3
-    by_estimate = estimate.sim3 @ reference.sim3
-    assert_allclose(by_estimate.matrix, in_target.matrix, atol=1e-9)
 
 
 def test_frames_that_vote_for_another_pose_are_named(several):
@@ -379,13 +338,10 @@ def test_frames_that_vote_for_another_pose_are_named(several):
     against = [vote.name for vote in several.votes if vote.degrees > 30]
     assert against == ["frame 0 of b"]
     assert "1 of 4 frames vote for another pose: frame 0 of b" in several.estimate.flags
-
-
-def test_json_has_the_votes_and_the_similarity_between_the_worlds(several):
-    numbers = several.as_json()
-    matrix = numbers["estimates"]["verified"]["world_matrix"]
+    content = several.as_json()
+    assert [one["frame"] for one in content["votes"]] == names
+    matrix = content["estimates"]["verified"]["world_matrix"]
     assert_array_equal(matrix, several.world_sim3.matrix)
-    assert [one["frame"] for one in numbers["votes"]] == [vote.name for vote in several.votes]
 
 
 @pytest.fixture
@@ -397,9 +353,9 @@ def in_memory(ellipsoids) -> list[list[Frame]]:
 def test_a_contradiction_limits_the_probability_of_every_pose(in_memory, monkeypatch):
     monkeypatch.setattr("zsp_lite.objects.estimate._LEAST_CONFIDENT", 1.1)
     first, second = in_memory
-    flat = [replace(one, depth=np.where(one.depth > 0, 4, one.depth)) for one in second]
+    flat = [replace(one, depth=np.where(one.depth > 0, 4, one.depth)) for one in second[::3]]
     found = estimate_pose(first, flat, **SEVERAL)
-    assert "the object's depth is constant in 7 of 7 frames" in found.estimate.note
+    assert "the object's depth is constant in 3 of 3 frames" in found.estimate.note
     assert "low confidence: --not-upright helps" in found.estimate.note
     estimates = [found.estimate, *(vote.estimate for vote in found.votes)]
     assert max(one.confidence for of in estimates for one in of.hypotheses) < 0.301
@@ -487,7 +443,7 @@ def test_depth_in_another_unit_is_questioned(image, frames, tmp_path, unit, ques
 
 def test_the_command_prints_the_poses_and_names_its_files(loaded, ellipsoids, tmp_path, run):
     folder = ellipsoids.root / "ellipsoid"
-    options = "--targets 3 --solver both --reference-frame 2"
+    options = "--targets 1 --solver both --reference-frame 2"
     text = run(f"estimate {folder}/a {folder}/b {options} --out {tmp_path}")
     assert f"{Path('ellipsoid/a')}, frame 2 (mask: given)" in text
     assert "The rotations of both solvers differ by" in text

@@ -23,7 +23,6 @@ from zsp_lite.metrics import rotation_error
 from zsp_lite.scans.pair_result import run_pair
 from zsp_lite.viz.plots import show_residuals
 from zsp_lite.viz.report import (
-    table_rows,
     write_report,
 )
 
@@ -49,17 +48,6 @@ def page(results, tmp_path_factory) -> Path:
 def text(page) -> str:
     """The text of the report."""
     return page.read_text("utf-8")
-
-
-def test_with_perfect_features_the_demo_estimates_the_true_pose(results):
-    (result,) = results
-    # In degrees. A patch is about 6 wide, seen from the middle of the object. The paper's solver
-    # fits centres of patches and may be two patches off; the verified solver refines the pose.
-    assert result.errors["paper"] < 12
-    assert result.errors["verified"] < 6
-    assert result.disagreement < 15
-    # Of at most 50 matches.
-    assert result.estimate.inliers.sum() > 20
 
 
 def test_shipped_evaluation_pairs_are_preferred(ellipsoids, tmp_path):
@@ -94,23 +82,10 @@ def test_the_page_loads_nothing_and_its_links_lead_to_notebooks(page, text):
     assert all(file.is_file() for file in files)
 
 
-@pytest.mark.parametrize("row, solver", [(0, "paper"), (1, "verified")])
-def test_the_table_has_the_numbers_of_a_solver(results, row, solver):
+def test_the_page_has_the_errors_and_the_numbers_of_the_hypotheses(results, text):
     (result,) = results
-    estimate = result.estimates[solver]
-    expected = (
-        "ellipsoid",
-        solver,
-        f"{estimate.view + 1} of 5",
-        f"{estimate.inliers.sum()} of {len(estimate.inliers)}",
-        f"{result.errors[solver]:.1f}°",
-        "–" if solver == "paper" else f"{estimate.confidence:.2f}",
-    )
-    assert table_rows(result)[row][:6] == expected  # the last column is the time
-
-
-def test_the_page_has_the_numbers_of_the_hypotheses(results, text):
-    estimate = results[0].estimates["verified"]
+    assert all(f"<td>{error:.1f}°</td>" in text for error in result.errors.values())
+    estimate = result.estimates["verified"]
     for pose in estimate.alternatives:
         deficit = estimate.hypotheses[0].score - pose.score
         cells = (f"{estimate.angle_to(pose):.0f}°", f"{deficit:.1f}", f"{pose.confidence:.2f}")
@@ -146,14 +121,11 @@ def poses(text) -> np.ndarray:
     return np.array(json.loads(content)["poses"])
 
 
-def test_the_scene_names_every_pose(text, poses):
-    names = re.findall(r'<option value="\d">([^<]+)</option>', text)
-    assert names[:3] == ["paper solver", "verified solver", "verified solver, hypothesis 2"]
-    assert len(names) == len(poses)
-
-
-def test_the_scene_has_the_poses_of_both_solvers_in_one_frame(results, poses):
+def test_the_scene_has_the_poses_of_both_solvers_in_one_frame(results, text, poses):
     (result,) = results
+    names = re.findall(r'<option value="\d">([^<]+)</option>', text)
+    assert names[:2] == ["paper solver", "verified solver"]
+    assert len(names) == len(poses)
     assert_allclose(poses[0], result.estimate.sim3.matrix[:3], atol=1e-5)
     (moved,) = result.estimates["verified"].propagate([result.estimate.target_camera])
     assert_allclose(poses[1], moved.matrix[:3], atol=1e-5)

@@ -17,7 +17,7 @@ from zsp_lite.metrics import rotation_error, vector_angle
 from zsp_lite.objects.scan import Scan
 from zsp_lite.scans.category import PairHypotheses
 from zsp_lite.scans.judge import Question, asked_positions, judge, judge_pairs
-from zsp_lite.scans.shapes import HEADINGS, Shape, compare_headings, refine
+from zsp_lite.scans.shapes import Shape
 from zsp_lite.scans.upright import find_up
 from zsp_lite.views import object_crop
 
@@ -73,37 +73,12 @@ def test_the_floor_and_the_ring_of_the_cameras_tell_the_vertical(crops):
     assert find_up(bare[:2]) == (None, "")
 
 
-def test_a_floor_that_the_ring_contradicts_is_no_vertical(crops):
-    """The depth of the background is of a wall that leans."""
-    tilted = []
-    normal = Rotation.from_euler("x", 45, degrees=True).as_matrix() @ find_up(crops)[0]
-    for crop in crops:
-        height, width = crop.camera.size
-        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        rays = crop.camera.unproject(np.stack([x, y], axis=-1), np.ones((height, width)))
-        rays = rays - crop.camera.centre
-        along = rays @ normal
-        depth = np.where(np.abs(along) > 0.05, -(crop.camera.centre @ normal + 3) / along, 0)
-        depth = np.where((depth > 0) & (depth < 50), depth, 0).astype(np.float32)
-        tilted.append(replace(crop, depth=np.where(crop.mask > 0.01, crop.depth, depth)))
-    up, problem = find_up(tilted)
+def test_a_floor_that_the_ring_contradicts_is_no_vertical(crops, monkeypatch):
+    leaning = Rotation.from_euler("x", 45, degrees=True).as_matrix() @ find_up(crops)[0]
+    monkeypatch.setattr("zsp_lite.scans.upright._floor_normal", lambda *_: leaning)
+    up, problem = find_up(crops)
     assert up is None
-    assert problem.startswith("no vertical: floor and ring of the cameras differ by ")
-
-
-def test_headings_have_their_minimum_at_the_turn():
-    poses, distance = compare_headings(SHAPES["first"], SHAPES["second"])
-    assert abs(HEADINGS[distance.argmin()] - 100) <= 5
-    assert rotation_error(poses[distance.argmin(), :3, :3], TURN) < 6
-    assert distance[(HEADINGS == 280).argmax()] > 2 * distance.min()
-
-
-def test_shapes_are_aligned_from_nearby():
-    start = np.eye(4)
-    start[:3, :3] = about_z(95).R
-    found = refine(SHAPES["first"], SHAPES["second"], start[None])[0]
-    assert rotation_error(Sim3.from_matrix(found).R, TURN) < 6
-    assert_allclose(np.linalg.det(found[:3, :3]), 1, atol=0.1)
+    assert problem.startswith("no vertical: floor and ring of the cameras differ by 4")
 
 
 def test_a_shape_stands_upright_in_the_middle_of_its_object(crops):

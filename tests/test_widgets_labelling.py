@@ -217,7 +217,6 @@ def test_a_click_selects_the_nearest_of_the_front_points():
     assert point_under(points, np.eye(3), np.array([0.011, 0]), REACH) == 1
     behind = np.diag([-1.0, 1, -1])
     assert point_under(points, behind, np.array([-0.01, 0]), REACH) == 2
-    assert point_under(points, np.eye(3), np.array([-0.4, 0]), REACH) is None
 
 
 def test_outliers_do_not_change_the_scale_and_bad_clouds_are_input_errors():
