@@ -379,7 +379,7 @@ def test_options_of_the_import_reach_the_library(words, options, monkeypatch, ru
 
     def import_source(*arguments):
         given.append(arguments)
-        return ImportResult(1, 0, 1, 1.0, ("the masks may be wrong: why",))
+        return ImportResult(1, 1, 1.0, ("the masks may be wrong: why",))
 
     monkeypatch.setattr("zsp_lite.importers.sources.open_source", open_source)
     monkeypatch.setattr("zsp_lite.importers.convert.import_source", import_source)

@@ -15,6 +15,7 @@ from zsp_lite.cli.common import (
     COUNT,
     NAMES,
     PATH,
+    Once,
     examples,
     refuse_options,
     replace_option,
@@ -238,7 +239,7 @@ def transfer(v1, v2, category, replace) -> None:
     print(f"Written: {len(residuals)} labels of {category} in {v2}")
 
 
-class _Import(click.Command):
+class _Import(Once):
     """The command `data import`; `data import uco3d` is another command, with its own arguments."""
 
     def make_context(self, info_name, args, parent=None, **extra):
@@ -336,12 +337,9 @@ def uco3d(root, category, sequences, best, count, out) -> None:
 
 def _print_import(folder: Path, imported: Any) -> None:
     """Print the numbers of an `ImportResult`."""
-    left_out = ""
-    if imported.empty:
-        left_out = f"; {imported.empty} frames without the object left out"
     print(
         f"Written: {folder}: {imported.frames} frames, {imported.points:,} points, "
-        f"scaled by {imported.scale:.4g}{left_out}"
+        f"scaled by {imported.scale:.4g}"
     )
     for flag in imported.flags:
         print(f"flag: {flag}")

@@ -26,8 +26,10 @@ _NOT_READ = {
     ".exr": "the depth as .npy or a float .tiff",
 }
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
-# An image whose colours are all below this value is black, as CO3D's hidden frames are.
-_BLACK = 10
+# An image is black, as CO3D's hidden frames are, if at most this share of its values is brighter
+# than the second number: noise under a lens cap is.
+_BRIGHT = 0.001
+_BLACK = 25
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +141,7 @@ def frame_defect(frame: Frame) -> str:
     """Say why a frame cannot be used, such as "black image"; "" for a usable frame."""
     if frame.defect:
         return frame.defect
-    if frame.rgb.max() < _BLACK:
+    if (frame.rgb > _BLACK).mean() <= _BRIGHT:
         return "black image"
     if not frame.shows_object:
         return "empty object mask"

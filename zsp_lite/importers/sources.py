@@ -57,7 +57,8 @@ class Source:
 
     path: Path  # the sequence, the capture or the image; a name for frames in memory
     format: str  # "sequence", "image", "frames", or the format of a capture
-    # Number of each frame: its number in the annotations, or its position in the capture.
+    # Number of each frame: that in the annotations, that of a capture (see `CaptureFrame`), or the
+    # position.
     numbers: tuple[int, ...]
     # Reads the frame at a position of `numbers`, with the mask that comes with it, if any.
     read_frame: Callable[[int], Frame]
@@ -184,9 +185,10 @@ class Source:
         wanted, and the frames by position.
         """
         if first not in (None, *self.numbers):
+            near = min(self.numbers, key=lambda number: abs(number - first))
             raise InputError(
-                f"{self.path} has no frame {first}, expected one of {len(self.numbers)} from "
-                f"{min(self.numbers)} to {max(self.numbers)}"
+                f"{self.path} has no frame {first}, expected one of {len(self.numbers)}, such as "
+                f"{near}"
             )
         start = 0 if first is None else self.numbers.index(first)
         # By the directions of the cameras, or by the order.
@@ -378,10 +380,12 @@ def _from_capture(path: Path, layout: str, place: Path, options: dict[str, Any])
     # Intrinsics may differ from frame to frame: a doubt about them is said once.
     questioned = [question_intrinsics(camera, str(path)) for camera in cameras]
     doubts = [next(filter(None, questioned), ""), *{frame.doubt for frame in frames}]
+    if layout == "tum" and "intrinsics" not in options:
+        doubts.append("no --intrinsics FX,FY,CX,CY: the camera is taken for TUM's")
     return Source(
         path,
         layout,
-        tuple(range(len(frames))),
+        tuple(frame.number for frame in frames),
         lambda k: frames[k].load(),
         cameras=cameras,
         left_out=left_out,
