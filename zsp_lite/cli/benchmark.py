@@ -1,7 +1,6 @@
 """The commands of the benchmark: `benchmark`, `tables`, `compare`."""
 
 import logging
-import textwrap
 
 import click
 
@@ -143,14 +142,7 @@ def _list_methods() -> None:
     for name, method in METHODS.items():
         print(f"{name:18} {description(method)}")
     for name, members in GROUPS.items():
-        print(
-            textwrap.fill(
-                f"{name}: {', '.join(members)}",
-                100,
-                subsequent_indent="    ",
-                break_on_hyphens=False,
-            )
-        )
+        print(f"{name}: {', '.join(members)}")
 
 
 def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:

@@ -90,9 +90,6 @@ def _print_checks(root: Path, checks: Sequence[Any]) -> int:
         ]
         messages = [f"{count:,} of {total:,} {what}" for count, total, what in counted if count > 0]
         messages += check.problems[:_PROBLEMS_SHOWN]
-        more = len(check.problems) - _PROBLEMS_SHOWN
-        if more > 0:
-            messages.append(f"and {more} more")
         lines += [f"{check.category}: {message}" for message in messages]
     size = decimal(sum(check.size for check in checks))
     print_rows(f"{root}: {len(checks)} categories, {size}", _CHECK_COLUMNS, rows, texts=2)

@@ -26,9 +26,8 @@ _NOT_READ = {
     ".exr": "the depth as .npy or a float .tiff",
 }
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
-# An image is black, as CO3D's hidden frames are, if at most this share of its values is brighter
-# than the second number: noise under a lens cap is.
-_BRIGHT = 0.001
+# An image of which at most one value in 1000 is above this one is black, as CO3D's hidden frames
+# are, and noise under a lens cap.
 _BLACK = 25
 
 
@@ -141,7 +140,7 @@ def frame_defect(frame: Frame) -> str:
     """Say why a frame cannot be used, such as "black image"; "" for a usable frame."""
     if frame.defect:
         return frame.defect
-    if (frame.rgb > _BLACK).mean() <= _BRIGHT:
+    if (frame.rgb > _BLACK).mean() <= 0.001:
         return "black image"
     if not frame.shows_object:
         return "empty object mask"

@@ -44,10 +44,9 @@ _UNITS = {1.0: "metres", 0.001: "millimetres", 0.0002: "1/5000 m"}
 _SCALES = np.geomspace(1e-3, 1e3, 280)  # factors of the depth in steps of 5 %
 _NEAR = np.geomspace(0.6, 1.7, 27)  # in steps of 4 %
 _FINE = np.linspace(0.95, 1.05, 11)  # in steps of 1 %
-# A factor nearer to 1, or whose points are less times as near to the surfaces, may be noise: on
-# renderings with the noise of phones, 1.28 times is the most. Of wrong units, those that are off by
-# 15 % or more make at least 1.4 times.
-_LEAST_OFF = 0.07
+# The right factor makes the weighted share at least so many times as great. On renderings with the
+# noise of phones, where the unit is right, 1.28 times is the most; units that are off by 15 % make
+# at least 1.4 times without noise.
 _NEARER = 1.35
 _SNAP = 0.04  # a unit that differs from a usual one by less is that
 _OWN_SCALES = np.geomspace(0.4, 2.5, 39)  # of a single frame
@@ -163,9 +162,7 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     if _NEARER * near > 1:
         return ""
     factors = _NEAR
-    doubt = Doubt
     if given <= _AGREEING:
-        doubt = Contradiction
         shares = np.array([_share(pairs, correct) for _, correct in _CORRECTIONS])
         likeliest = int(np.argmax(shares > shares.max() - _ALIKE))
         if shares[likeliest] > max(_FITTING, given + _GAIN):
@@ -177,9 +174,11 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     factor = _best_scale(pairs, _best_scale(pairs, factors) * _FINE)
     nearer = _share(pairs, scale=factor, weighted=True)
     share = _share(pairs, scale=factor)
-    if share > _FITTING and nearer > _NEARER * near and abs(np.log(factor)) > _LEAST_OFF:
+    if share > _FITTING and nearer > _NEARER * near:
         distance = float(np.median([surface.distance for surface, _ in pairs]))
-        return doubt(f"{found}; they agree best ({share:.0%}) if {_scaled(factor, distance, unit)}")
+        return Contradiction(
+            f"{found}; they agree best ({share:.0%}) if {_scaled(factor, distance, unit)}"
+        )
     if given > _AGREEING:
         return ""
     # Two factors fit many wrong poses of a single pair, but not those of all of several pairs.

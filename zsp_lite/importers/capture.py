@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 import cv2
@@ -32,7 +32,6 @@ HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's camera: +y up, looking along -z
 _FARTHEST = 1e4  # greater depth counts as unknown, in units of the world
 MOST_FRAMES = 100  # by default, so many sharp frames of a larger capture are chosen
-_CANDIDATES = 10  # largest number of frames of which the sharpest is chosen
 # Longest side in pixels of the copy of an image whose sharpness is measured.
 _SHARPNESS_SIDE = 640
 
@@ -197,8 +196,7 @@ def sharpest(
     if len(items) > count:
         # With a count of 1, the slice below drops the single later stretch.
         later = np.array_split(np.arange(1, len(items)), max(count - 1, 1))
-        # Evenly spaced candidates of each stretch: the step is rounded up.
-        stretches = [[0], *(part[:: -(-len(part) // _CANDIDATES)].tolist() for part in later)]
+        stretches = [[0], *(part.tolist() for part in later)]
     for stretch in stretches[:count]:
         best = -1.0
         chosen = None
@@ -291,8 +289,7 @@ def find_inside(root: str | Path, text: str) -> Path | None:
     """
     root = os.path.abspath(root)
     text = text.replace("\\", "/")
-    # A path with a drive is absolute, also on systems that have no drives.
-    path = os.path.normpath(text if PureWindowsPath(text).drive else os.path.join(root, text))
+    path = os.path.normpath(os.path.join(root, text))
     # An absolute path may begin with the folder as it is given, or with the folder behind links.
     if text and not path.startswith(
         (os.path.join(root, ""), os.path.join(os.path.realpath(root), ""))

@@ -55,8 +55,8 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
     problem = source.contradiction()
     if problem:
         # Wrong intrinsics have the same signs as wrong depth: they come first.
-        problems = filter(None, (*source.doubts, problem))
-        raise InputError(f"{source.path}: {'; '.join(problems)}")
+        problem = "; ".join(filter(None, (*source.doubts, problem)))
+        raise InputError(f"{source.path}: {problem}")
 
     source = source.segmented()
     left_out = [*source.left_out]

@@ -14,7 +14,7 @@ from zsp_lite.data.cameras import Box, Camera, Values
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.evaluation import spread
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, list_frames
-from zsp_lite.errors import Doubt, InputError
+from zsp_lite.errors import Doubt, InputError, check_choice
 from zsp_lite.importers import FORMATS, open_capture, recognise
 from zsp_lite.importers.agreement import disagreement, neighbours
 from zsp_lite.importers.capture import CaptureFrame
@@ -87,9 +87,8 @@ class Source:
         """Name the source and its frames at some positions."""
         if self.format == "image":
             return f"image {self.path}"
-        kind = self.format if self.format in ("sequence", "frames") else "capture"
         frames = ", ".join(str(self.numbers[position]) for position in positions)
-        return f"{kind} {self.path}, frame{'s' if len(positions) > 1 else ''} {frames}"
+        return f"{self.format} {self.path}, frame{'s' if len(positions) > 1 else ''} {frames}"
 
     def load(self, positions: Sequence[int], context: int = _CONTEXT) -> list[Frame]:
         """Load frames with masks of the object.
@@ -152,8 +151,7 @@ class Source:
         flags = []
         if self.left_out:
             reasons = list(dict.fromkeys(self.left_out))
-            more = f"; and {len(reasons) - 3} more" if len(reasons) > 3 else ""
-            flags.append(f"frames left out: {len(self.left_out)}: {'; '.join(reasons[:3])}{more}")
+            flags.append(f"frames left out: {len(self.left_out)}: {'; '.join(reasons[:3])}")
         flags += depth_flags(frames, metric=self.format != "sequence")
         flags += map(Doubt, self.doubts)
         if self.mask == "given":
@@ -184,12 +182,8 @@ class Source:
         Returns the positions of those without a defect, of which there is one if `references` are
         wanted, and the frames by position.
         """
-        if first not in (None, *self.numbers):
-            near = min(self.numbers, key=lambda number: abs(number - first))
-            raise InputError(
-                f"{self.path} has no frame {first}, expected one of {len(self.numbers)}, such as "
-                f"{near}"
-            )
+        if first is not None:
+            check_choice(f"{self.path}: frame", first, self.numbers)
         start = 0 if first is None else self.numbers.index(first)
         # By the directions of the cameras, or by the order.
         every = [*range(len(self.numbers))]
@@ -285,10 +279,6 @@ def open_source(
         frames = list_frames(path)
         path = frames[0].name or f"{len(frames)} frames"
     path = Path(path)
-    if masks is not None and not Path(masks).is_dir():
-        raise InputError(
-            f"--masks {masks} is no folder, expected one with masks that are named like the images"
-        )
     for name in options:
         if name not in _TAKEN[layout]:
             option = {"count": "frames"}.get(name, name.replace("_", "-"))
@@ -498,10 +488,8 @@ def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
     point = np.linalg.lstsq(matrix, right_side, rcond=None)[0]
     directions = np.stack([camera.centre for camera in cameras]) - point
     directions /= np.linalg.norm(directions, axis=1, keepdims=True).clip(1e-9)
-    # Sorted, so that the choice is the same for every order of the other cameras.
-    order = [0, *(1 + np.lexsort(directions[1:].T.round(6)))]
     # The energy of each pair of charges, (n, n).
-    gaps = directions[order][:, None] - directions[order]
+    gaps = directions[:, None] - directions
     energy = 1 / (np.sum(gaps**2, axis=-1) + 1e-9)
     np.fill_diagonal(energy, np.inf)  # no camera is chosen twice
     # Each chosen camera but the first moves in turn to where its energy with the others is least.
@@ -511,4 +499,4 @@ def spread_views(cameras: Sequence[Camera], count: int) -> list[int]:
             others = chosen[:k] + chosen[k + 1 :]
             # In the first sweep, the camera is added at the end of the list.
             chosen[k : k + 1] = [int(energy[others].sum(axis=0).argmin())]
-    return sorted(int(order[k]) for k in chosen)
+    return sorted(chosen)

@@ -47,10 +47,6 @@ from zsp_lite.points import axis_deviation
 logger = logging.getLogger(__name__)
 
 _METADATA = "metadata.sqlite"
-# Limits of a query. The rows of a sequence need some 10,000 steps of SQLite's machine; a search
-# through the rows of all categories needs hundreds of millions.
-_MOST_STEPS = 1_000_000
-_LONGEST_VALUE = 1 << 20  # bytes; the longest values are captions
 # A frame agrees if the median distance of its depth from the point cloud is below this multiple of
 # the object's standard deviation: most of its points can then be inliers of RANSAC. The depth is
 # from a network and may be wrong.
@@ -218,12 +214,10 @@ def import_uco3d(
 
 
 def _open_metadata(path: Path) -> sqlite3.Connection:
-    """Open a database for reading, with limits for each query."""
+    """Open a database for reading."""
     file_size(path, "uCO3D's metadata")
     metadata = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
     metadata.row_factory = sqlite3.Row
-    metadata.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE)
-    metadata.set_progress_handler(lambda: 1, _MOST_STEPS)  # 1 ends the query with an error
     return metadata
 
 
@@ -259,15 +253,9 @@ class _DepthMaps:
             self.names = set(file)
 
     def read(self, name: str) -> Float32[np.ndarray, "h w"]:
-        """Read the stored values of a depth map, which must be in this file itself."""
-        import h5py
-
+        """Read the stored values of a depth map."""
         with self._open() as file:
-            if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-                raise ValueError("a link")
             values = file[name]
-            if values.external or values.is_virtual:
-                raise ValueError("stored in another file")
             if len(values.shape) != 2 or not 0 < values.size <= MAX_PIXELS:
                 raise ValueError(f"shape {values.shape}")
             return values.astype(np.float32)[:]
