@@ -637,7 +637,7 @@ def circle(degrees: np.ndarray) -> list[Camera]:
     ]
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8])
+@pytest.mark.parametrize("count", [3, 8])
 def test_views_are_spread_evenly(count):
     degrees = np.arange(0, 360, 10.0)
     chosen = np.sort(degrees[spread_views(circle(degrees), count)])

@@ -23,7 +23,6 @@ from zsp_lite.cli.common import (
 )
 from zsp_lite.errors import InputError
 
-_LICENCE = "CO3D is under CC BY-NC 4.0: no commercial use."
 _PROBLEMS_SHOWN = 5  # of a category
 _CHECK_COLUMNS = (
     "category",
@@ -192,7 +191,10 @@ def _confirmed(
         shown = "unknown size" if size is None else f"{size / 1e9:,.2f} GB"
         print(f"{part}{archive.name}: {shown}")
     print(f"To download: {sum(filter(None, sizes)) / 1e9:,.2f} GB.")
-    print(f"Needed on the disk of {root}: {needed / 1e9:,.2f} GB. {_LICENCE}")
+    print(
+        f"Needed on the disk of {root}: {needed / 1e9:,.2f} GB. "
+        "CO3D is under CC BY-NC 4.0: no commercial use."
+    )
     if not yes and not sys.stdin.isatty():
         raise InputError(
             "nobody can confirm the download: standard input is not a terminal, expected --yes"

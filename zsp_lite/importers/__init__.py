@@ -112,7 +112,6 @@ _OTHERS = (
         "has images and depth, but no poses (groundtruth.txt, poses.txt, pose/, ...)",
         _HOW,
     ),
-    (("*.sens",), "is ScanNet's packed scan", "expected it unpacked by ScanNet's SensReader"),
     (
         ("*.bag",),
         "is a recording of RealSense",

@@ -182,9 +182,10 @@ class Source:
         Returns the positions of those without a defect, of which there is one if `references` are
         wanted, and the frames by position.
         """
+        start = 0
         if first is not None:
             check_choice(f"{self.path}: frame", first, self.numbers)
-        start = 0 if first is None else self.numbers.index(first)
+            start = self.numbers.index(first)
         # By the directions of the cameras, or by the order.
         every = [*range(len(self.numbers))]
         every = every[start:] + every[:start]

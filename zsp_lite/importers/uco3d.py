@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
 import msgspec
@@ -55,7 +55,6 @@ _TOLERANCE = 0.2
 # in each cell: an object covers several hundred cells, and a cloud has points in all of them.
 _CELLS = 48
 _GREY = 128  # colour of points without colours
-_LONGEST_VIDEO = 1e6  # seconds
 # Columns whose names begin with no underscore.
 _PLAIN_COLUMNS = ("sequence_name", "frame_number", "frame_timestamp")
 # The reference of the proposed labels: uCO3D's aligned frame, which is the world of no sequence.
@@ -112,7 +111,7 @@ class _FrameRow(_Row):
     """A row of `frame_annots`."""
 
     frame_number: int
-    frame_timestamp: Annotated[float, msgspec.Meta(ge=0, le=_LONGEST_VIDEO)]  # seconds
+    frame_timestamp: float  # seconds
     depth_scale_adjustment: float
     image_size: bytes
     viewpoint_R: bytes
