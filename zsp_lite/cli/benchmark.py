@@ -1,6 +1,7 @@
 """The commands of the benchmark: `benchmark`, `tables`, `compare`."""
 
 import logging
+import textwrap
 
 import click
 
@@ -142,7 +143,14 @@ def _list_methods() -> None:
     for name, method in METHODS.items():
         print(f"{name:18} {description(method)}")
     for name, members in GROUPS.items():
-        print(f"{name}: {', '.join(members)}")
+        print(
+            textwrap.fill(
+                f"{name}: {', '.join(members)}",
+                100,
+                subsequent_indent="    ",
+                break_on_hyphens=False,
+            )
+        )
 
 
 def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:

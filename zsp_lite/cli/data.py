@@ -23,7 +23,6 @@ from zsp_lite.cli.common import (
 )
 from zsp_lite.errors import InputError
 
-_PROBLEMS_SHOWN = 5  # of a category
 _CHECK_COLUMNS = (
     "category",
     "layout",
@@ -88,7 +87,7 @@ def _print_checks(root: Path, checks: Sequence[Any]) -> int:
             (check.defects.total(), check.frames, f"frames cannot be used ({kinds})"),
         ]
         messages = [f"{count:,} of {total:,} {what}" for count, total, what in counted if count > 0]
-        messages += check.problems[:_PROBLEMS_SHOWN]
+        messages += check.problems[:5]
         lines += [f"{check.category}: {message}" for message in messages]
     size = decimal(sum(check.size for check in checks))
     print_rows(f"{root}: {len(checks)} categories, {size}", _CHECK_COLUMNS, rows, texts=2)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from zsp_lite.data.annotations import FRAMES_FILE
-from zsp_lite.errors import InputError, check_choice
+from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import (
     MOST_FRAMES,
     Capture,
@@ -205,7 +205,6 @@ def open_capture(
     folder = Path(path)
     if layout is None:
         layout, folder = recognise(path)
-        check_choice(f"format of {path}", layout, FORMATS)
     if layout == "stray":  # the reader chooses the sharp frames, because it decodes a video
         options["count"] = count
     if layout == "recording":

@@ -48,7 +48,6 @@ _FINE = np.linspace(0.95, 1.05, 11)  # in steps of 1 %
 # noise of phones, where the unit is right, 1.28 times is the most; units that are off by 15 % make
 # at least 1.4 times without noise.
 _NEARER = 1.35
-_SNAP = 0.04  # a unit that differs from a usual one by less is that
 _OWN_SCALES = np.geomspace(0.4, 2.5, 39)  # of a single frame
 
 _Pose = Float[np.ndarray, "4 4"]  # world to camera
@@ -246,7 +245,8 @@ def _scaled(factor: float, distance: float, unit: float | None) -> str:
     if not unit:
         return f"the depth is multiplied by {factor:.3g}"
     new = factor * unit
-    new = next((usual for usual in _UNITS if abs(usual / new - 1) < _SNAP), new)
+    # A unit within 4 % of a usual one is that.
+    new = next((usual for usual in _UNITS if abs(usual / new - 1) < 0.04), new)
     # The depth is right if its factor would make a plausible distance of the object implausible.
     nearest, farthest = PLAUSIBLE
     if nearest <= distance <= farthest and not nearest <= distance * new / unit <= farthest:
