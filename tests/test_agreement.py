@@ -86,8 +86,14 @@ def farther(frame: Frame) -> Frame:
         (partial(scaled, 0.001), r"if the depth is taken in metres: --depth-unit 1$"),
         (partial(scaled, 5), "if the depth is taken in 1/5000 m: --depth-unit 0.0002$"),
         (partial(scaled, 1000), "if the depth is multiplied by 0.001: --depth-unit 1e-06$"),
-        (partial(scaled, 1.8), "if the depth is multiplied by 0.5[2-9]"),
-        (lambda frame: scaled(1 + 0.2 * int(frame.name), frame), "factor of its own: depth of a n"),
+        (partial(scaled, 1.8), r"by 0.5[56]\d?: --depth-unit 0.0005[56]"),
+        (partial(scaled, 0.26), r"by 3.8\d?: --depth-unit 0.0038"),  # no usual unit is near
+        (partial(scaled, 1.15), r"by 0.8[678]\d?: --depth-unit 0.0008[678]"),
+        (partial(scaled, 0.85), r"by 1.1[78]: --depth-unit 0.0011[78]"),
+        (
+            lambda frame: scaled(1 + 0.2 * int(frame.name), frame),
+            "by a factor of its own, as depth of a n",
+        ),
         (farther, "no usual mistake in units or poses explains it"),
     ],
 )

@@ -12,11 +12,14 @@ import pytest
 from synthetic_views import CoordinateBackbone
 
 from zsp_lite import __version__, errors
+from zsp_lite.backbones.load import BackboneConfig
+from zsp_lite.choices import METRICS_SHOWN
 from zsp_lite.cli import demo, doctor
 from zsp_lite.cli.estimate import estimate
-from zsp_lite.cli.main import cli
+from zsp_lite.cli.main import cli, main
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.importers import FORMATS
+from zsp_lite.importers.convert import ImportResult
 
 DOWNLOAD = "data download --yes"
 IMPORT = "data import --root=x --category=c --sequence=s"
@@ -270,6 +273,82 @@ def test_runs_are_compared(table3, monkeypatch, run):
     monkeypatch.setenv("COLUMNS", "200")
     rows = "ours,ours:ours-globalsim"
     assert "ours:ours-globalsim" in run(f"compare {table3} {table3} --rows {rows}")
+
+
+def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path):
+    given = []
+
+    def record(*arguments, **options):
+        given.append((*arguments, options))
+        raise errors.InputError("reached")
+
+    monkeypatch.setattr("zsp_lite.benchmark.run.evaluate", record)
+    line = f"benchmark --data {tmp_path} " + (
+        "--backbone small --layer 3 --facet value --image-size 64 --categories lump,chair "
+        "--pairs 7 --targets 3 --methods ours,x=a:b --out there --quiet"
+    )
+    config, numbers = BackboneConfig("small", "3", "value", 64), {"lump": 7, "chair": 7}
+    common = {
+        "backbone": config,
+        "methods": ["ours", "x=a:b"],
+        "pairs": numbers,
+        "targets": 3,
+        "out": Path("there"),
+        "executor": 1,
+        "row_seconds": 60,
+        "seeds": 1,
+        "sweep": (),
+        "metrics": list(METRICS_SHOWN),
+    }
+    for more, changed in (
+        ("--workers 5", {"executor": 5}),
+        ("--row-seconds 9 --metrics scale", {"row_seconds": 9, "metrics": ["scale"]}),
+        ("--seeds 3 --sweep threshold=0.1,0.2", {"seeds": 3, "sweep": [0.1, 0.2]}),
+    ):
+        assert main(f"{line} {more}".split()) == 2
+        assert given == [(tmp_path, common | changed)]
+        given.clear()
+
+
+OPTIONS = "--root mine --category cup --sequence one --frames 7"
+
+
+@pytest.mark.parametrize(
+    "words, options",
+    [
+        (
+            "scan --box 1,2,3,4",
+            {"mask": "box", "box": (1, 2, 3, 4)},
+        ),
+        (
+            "scan --masks there --depth-unit 0.5 --object 0 --label 3 --orientation stored",
+            {
+                "mask": "given",
+                "masks": Path("there"),
+                "depth_unit": 0.5,
+                "object": 0,
+                "label": 3,
+                "orientation": "stored",
+            },
+        ),
+    ],
+)
+def test_options_of_the_import_reach_the_library(words, options, monkeypatch, run):
+    given = []
+
+    def open_source(path, **options):
+        given.append((path, {name: value for name, value in options.items() if value is not None}))
+        return "source"
+
+    def import_source(*arguments):
+        given.append(arguments)
+        return ImportResult(1, 1, 1.0, ("the masks may be wrong: why",))
+
+    monkeypatch.setattr("zsp_lite.importers.sources.open_source", open_source)
+    monkeypatch.setattr("zsp_lite.importers.convert.import_source", import_source)
+    assert "flag: the masks may be wrong: why\n" in run(f"data import {words} {OPTIONS}")
+    source = (Path("scan"), {"count": 7} | options)
+    assert given == [source, ("source", Path("mine"), "cup", "one")]
 
 
 def test_the_import_names_its_formats(run):

@@ -260,6 +260,16 @@ def test_the_stored_drawing_of_the_rooms_follows_the_imports():
     assert rooms.DRAWING.read_text("utf-8") == rooms.draw(), "run python -m tools.rooms"
 
 
+def test_the_readme_says_how_many_lines_the_library_has_without_the_course():
+    (claimed,) = re.findall(
+        r"the library has about ([\d,]+) lines", markdown(REPOSITORY / "README.md")
+    )
+    library = set((REPOSITORY / "zsp_lite").rglob("*.py"))
+    course = set((REPOSITORY / "zsp_lite/course").rglob("*.py"))
+    counted = sum(len(path.read_text("utf-8").splitlines()) for path in library - course)
+    assert abs(int(claimed.replace(",", "")) - counted) <= 500
+
+
 def code_lines(cell) -> list[str]:
     return [line for line in cell.source.splitlines() if line.strip()]
 

@@ -211,6 +211,17 @@ def test_each_mistake_fails_its_own_function_and_students_see_that_of_the_common
         assert seen and all(len(message.split()) > 4 for message in seen.values())
 
 
+def test_the_minutes_of_the_labs_add_up_in_the_guide_and_on_the_slides():
+    guide = (EXERCISES.parent / "README.md").read_text("utf-8")
+    rows = re.findall(r"^\| (\d+) \| .* \| ([\d +]+) \|$", guide, re.MULTILINE)
+    ends = np.cumsum([int(part) for _, minutes in rows for part in minutes.split("+")])
+    *three, one = sorted(EXERCISES.parents[1].glob("docs/slides/lab_*"))
+    until = re.findall(r"until \D*(\d+)", one.read_text("utf-8"))
+    assert {"90", *until, *dict(rows)} <= {*map(str, ends)}
+    for deck in three:
+        assert sum(map(int, re.findall(r"(\d+) min\b", deck.read_text("utf-8")))) == 120
+
+
 CALLS_THE_LIBRARY = """
 own = {0}
 def {0}(*arguments):

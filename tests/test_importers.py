@@ -296,11 +296,15 @@ def test_bad_boxes_empty_depth_and_frames_without_overlap_are_refused(views):
 
 def test_frames_without_the_object_are_left_out_and_a_sequence_is_not_replaced(tmp_path, views):
     folder = tmp_path / "scan"
-    write_nerfstudio(folder, [*views[:5], replace(views[5], mask=np.zeros_like(views[5].mask))])
+    dark = replace(views[1], rgb=views[1].rgb // 10)
+    empty = replace(views[5], mask=np.zeros_like(views[5].mask))
+    write_nerfstudio(folder, [views[0], dark, *views[2:5], empty])
     source = open_source(folder)
     done = import_source(source, tmp_path / "data", "teapot", "mine")
-    assert (done.frames, done.empty) == (5, 1)
-    assert len(Co3D(tmp_path / "data").frames("teapot", "mine")) == 5
+    (flag,) = done.flags
+    assert flag == "frames left out: 2: frame 1: black image; frame 5: empty object mask"
+    frames = Co3D(tmp_path / "data").frames("teapot", "mine")
+    assert [frame.frame_number for frame in frames] == [0, 2, 3, 4]
     message = "mine exists already, expected another"
     refused(message, import_source, source, tmp_path / "data", "teapot", "mine")
 

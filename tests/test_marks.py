@@ -139,7 +139,7 @@ def test_the_command_takes_an_arrow_or_two_marks(axes, alignment, tmp_path, run,
     line = f"align data_samples --category motorcycle --out {tmp_path}"
     marks = "--mark scooter:0:200.5,124.5:rear --mark scooter:0:128.5,76.5:bow"
     for given in ("scooter:front=0:200.5,124.5,0:128.5,76.5", f"rear,bow {marks}"):
-        run(f"{line} --axes {given}")
+        assert f"world_to_axes of each object in {tmp_path}" in run(f"{line} --axes {given}")
         content = json.loads((tmp_path / "alignment.json").read_text())
         pose = np.array(content["objects"]["scooter"]["world_to_axes"])
         assert np.allclose(pose[:3, :3], axes.R @ alignment.objects["scooter"].sim3.R)
@@ -167,10 +167,14 @@ def test_the_command_takes_an_arrow_or_two_marks(axes, alignment, tmp_path, run,
             "'tip of --axes': pixel 900,1 of frame 0 is out",
         ),
         ("--axes scooter:front=0:200,124,0:200,124", "is 0 long"),
+        ("--axes a,b --axes c,d", "--axes is given twice, expected once"),
         ("--axes scooter:front=0:200,124,0:201,124", "at least 0.62, a tenth of the object"),
         ("--axes scooter:front=0:128.5,140.5,0:128.5,76.5", "84 degrees from the floor"),
         ("--axes scooter:front=0:200,124,0:128,76 --sequences scooter2", "sequence of the mark"),
-        ("--mark scooter:0:180,114:a --axes a,b", "mark of --axes is 'b', expected one of a"),
+        (
+            "--mark scooter:0:180,114:a --axes a,b",
+            "--mark of this command is 'b', expected one of a",
+        ),
         (
             "--mark scooter:0:200,124:a --mark scooter2:0:128,120:b --axes a,b",
             "of the arrow's tip is 'scooter2'",

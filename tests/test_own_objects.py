@@ -77,7 +77,7 @@ def test_frames_are_chosen_evenly_or_by_number(sequence):
     usable, frames = sequence.select(3, True)
     assert (usable, list(frames)) == ([0, 2, 4], [0, 2, 4])
     assert sequence.select(3, True, 5)[0] == [5, 0, 2]
-    refused("no frame 7, expected one of 7 from 0 to 6", sequence.select, 1, True, 7)
+    refused("frame is 7, expected one of 0, 1, 2, 3", sequence.select, 1, True, 7)
 
 
 def test_a_sequence_is_described_by_its_folder(sequence, monkeypatch):

@@ -149,6 +149,12 @@ def test_a_recording_without_intrinsics_is_refused(tmp_path, views):
     refused("has no intrinsics, expected --intrinsics FX,FY,CX,CY", open_source, tmp_path)
 
 
+def test_two_images_of_one_number_are_refused(tmp_path, views):
+    write(tmp_path, views[:1])
+    write(tmp_path, views[:1], "color/{}.jpg depth/{:06d}.png")
+    refused("0.jpg and .*000000.jpg have one number", open_recording, tmp_path)
+
+
 def test_a_recording_whose_images_have_no_depth_is_refused(tmp_path, views):
     write(tmp_path, views[:2], "rgb/{:06d}.jpg depth/9{:06d}.png")
     refused("none of 2 frames can be used: .*no depth of its number", open_recording, tmp_path)

@@ -75,6 +75,7 @@ def test_the_solutions_pass_one_after_the_other_and_are_kept(folder, capsys):
         assert ("argmax" in (folder / your_turn.FILE).read_text("utf-8")) == (count > 1)
         assert capsys.readouterr().out == f"right: {count} of 10 parts are yours\n"
     assert count == len(_PARTS)
+    assert max(source.count("\n") for source in SOLUTIONS.values()) <= 16
     kept = (folder / your_turn.FILE).read_text("utf-8")
     assert all(source.strip() in kept for source in SOLUTIONS.values())
     # A part that is written again replaces the one before.
@@ -98,15 +99,16 @@ def test_the_assembled_method_gives_the_poses_of_the_one_page_version():
     for name, source in SOLUTIONS.items():
         check(written(source, name))
     dataset, method = Co3D(REPOSITORY / "data_samples"), ZeroShotPose(load_backbone())
-    reference, targets = dataset.load_pair(demo_pairs(dataset)[0])
-    views = method.views([reference, *targets])
-    problem = SimpleNamespace(views=lambda: views, seed=0)
-    first, *others = your_turn.crops(problem)
-    expected = minimal.estimate_pose(first, others)
-    sim3, view = my_method()(problem)
-    assert view == expected.view
-    assert_allclose(sim3.R, expected.R, atol=1e-6)
-    assert_allclose([sim3.scale, *sim3.t], [expected.scale, *expected.t], rtol=1e-6)
+    for pair in demo_pairs(dataset):
+        reference, targets = dataset.load_pair(pair)
+        views = method.views([reference, *targets])
+        problem = SimpleNamespace(views=lambda views=views: views, seed=0)
+        first, *others = your_turn.crops(problem)
+        expected = minimal.estimate_pose(first, others)
+        sim3, view = my_method()(problem)
+        assert view == expected.view
+        assert_allclose(sim3.R, expected.R, atol=1e-6)
+        assert_allclose([sim3.scale, *sim3.t], [expected.scale, *expected.t], rtol=1e-6)
 
 
 def test_what_is_not_written_or_not_ones_own_is_said(capsys, monkeypatch, folder):

@@ -8,6 +8,7 @@ from zsp_lite.cli.common import (
     COUNT,
     NAMES,
     PATH,
+    Once,
     Parsed,
     backbone_options,
     examples,
@@ -45,10 +46,11 @@ AXES = Parsed(
 
 
 @click.command(
+    cls=Once,
     epilog=examples(
         "align path/to/scans --category cup",
         "align data_samples --category car --out outputs/cars --propose",
-    )
+    ),
 )
 @click.argument("data", type=PATH)
 @click.option("--category", metavar="NAME", required=True, help="Category of the objects.")
@@ -107,8 +109,8 @@ def align(
 
     An arrow between two places of one object, --axes, names the front: alignment.json gets
     world_to_axes, the rigid pose of each object with x to the front, y to the left and z up, by the
-    floor or the cameras of that scan. The origin is amid the objects; lengths are those of DATA,
-    for scans of OUT/data.
+    floor or the cameras of that scan. The origin is amid the objects. Lengths are those of DATA; of
+    scans those of OUT/data, in which each object has unit standard deviation, not metres.
     """
     from zsp_lite.cli.terminal import print_rows
     from zsp_lite.data.co3d import Co3D
@@ -146,7 +148,7 @@ def align(
         named = {mark.name: mark for mark in marks}
         for end in axes:
             if isinstance(end, str):
-                check_choice("mark of --axes", end, named)
+                check_choice("--axes: name of a --mark of this command", end, named)
         tail, tip = (named.get(end, end) for end in axes)
         marked_points(dataset, category, (tail, tip), sequences)
         front = read_front(dataset, category, tail, tip)
@@ -166,6 +168,8 @@ def align(
         written += [write_marks(placed, dataset, category, out), out / "marks.jpg", out / "marks"]
     title = f"{category}: {len(alignment.objects)} objects in one frame"
     print_rows(title, COLUMNS, object_rows(alignment))
+    if axes:
+        print(f"Axes: world_to_axes of each object in {written[0]}, in the lengths of {data}")
     for one in placed:
         places = [
             (name, f"{100 * place.confidence:.0f}" if place.found else "nothing here")

@@ -70,6 +70,17 @@ def examples(*lines: str) -> str:
     return "\b\nExamples:\n" + "\n".join(f"  zsp-lite {line}" for line in lines)
 
 
+class Once(click.Command):
+    """A command that refuses a second value of an option for one."""
+
+    def parse_args(self, context, args):
+        *_, given = self.make_parser(context).parse_args([*args])
+        for option in given:
+            if given.count(option) > 1 and not option.multiple:
+                raise click.UsageError(f"{option.opts[0]} is given twice, expected once", context)
+        return super().parse_args(context, args)
+
+
 def refuse_options(given: Mapping[str, Any], taken: Collection[str], by: str) -> None:
     """Raise click.UsageError if an option was given that is not among those `taken`; `by` names
     what takes them."""

@@ -15,6 +15,7 @@ from zsp_lite.cli.common import (
     COUNT,
     NAMES,
     PATH,
+    Once,
     examples,
     refuse_options,
     replace_option,
@@ -22,8 +23,6 @@ from zsp_lite.cli.common import (
 )
 from zsp_lite.errors import InputError
 
-_LICENCE = "CO3D is under CC BY-NC 4.0: no commercial use."
-_PROBLEMS_SHOWN = 5  # of a category
 _CHECK_COLUMNS = (
     "category",
     "layout",
@@ -88,10 +87,7 @@ def _print_checks(root: Path, checks: Sequence[Any]) -> int:
             (check.defects.total(), check.frames, f"frames cannot be used ({kinds})"),
         ]
         messages = [f"{count:,} of {total:,} {what}" for count, total, what in counted if count > 0]
-        messages += check.problems[:_PROBLEMS_SHOWN]
-        more = len(check.problems) - _PROBLEMS_SHOWN
-        if more > 0:
-            messages.append(f"and {more} more")
+        messages += check.problems[:5]
         lines += [f"{check.category}: {message}" for message in messages]
     size = decimal(sum(check.size for check in checks))
     print_rows(f"{root}: {len(checks)} categories, {size}", _CHECK_COLUMNS, rows, texts=2)
@@ -194,7 +190,10 @@ def _confirmed(
         shown = "unknown size" if size is None else f"{size / 1e9:,.2f} GB"
         print(f"{part}{archive.name}: {shown}")
     print(f"To download: {sum(filter(None, sizes)) / 1e9:,.2f} GB.")
-    print(f"Needed on the disk of {root}: {needed / 1e9:,.2f} GB. {_LICENCE}")
+    print(
+        f"Needed on the disk of {root}: {needed / 1e9:,.2f} GB. "
+        "CO3D is under CC BY-NC 4.0: no commercial use."
+    )
     if not yes and not sys.stdin.isatty():
         raise InputError(
             "nobody can confirm the download: standard input is not a terminal, expected --yes"
@@ -238,7 +237,7 @@ def transfer(v1, v2, category, replace) -> None:
     print(f"Written: {len(residuals)} labels of {category} in {v2}")
 
 
-class _Import(click.Command):
+class _Import(Once):
     """The command `data import`; `data import uco3d` is another command, with its own arguments."""
 
     def make_context(self, info_name, args, parent=None, **extra):
@@ -336,12 +335,9 @@ def uco3d(root, category, sequences, best, count, out) -> None:
 
 def _print_import(folder: Path, imported: Any) -> None:
     """Print the numbers of an `ImportResult`."""
-    left_out = ""
-    if imported.empty:
-        left_out = f"; {imported.empty} frames without the object left out"
     print(
         f"Written: {folder}: {imported.frames} frames, {imported.points:,} points, "
-        f"scaled by {imported.scale:.4g}{left_out}"
+        f"scaled by {imported.scale:.4g}"
     )
     for flag in imported.flags:
         print(f"flag: {flag}")

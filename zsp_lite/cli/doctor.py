@@ -53,11 +53,7 @@ def run_checks() -> Iterator[tuple[str, str, str, str]]:
             f"{sys.executable} -m pip install path/to/zsp-lite",
         )
         return
-    cuda = (
-        f"CUDA on {torch.cuda.get_device_name(0)}"
-        if torch.cuda.is_available()
-        else "no CUDA (not required)"
-    )
+    cuda = "CUDA" if torch.cuda.is_available() else "no CUDA (not required)"
     yield "torch", "ok", f"{torch.__version__}, {torch.get_num_threads()} threads, {cuda}", ""
     path = available_backbones()[DEFAULT]
     state, fix = ("ok", "") if path else ("bad", how_to_obtain(DEFAULT))

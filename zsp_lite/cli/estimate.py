@@ -5,10 +5,19 @@ from typing import Any
 import click
 
 from zsp_lite.choices import SOLVERS
-from zsp_lite.cli.common import COUNT, INDEX, PATH, UP, backbone_options, examples, source_options
+from zsp_lite.cli.common import (
+    COUNT,
+    INDEX,
+    PATH,
+    UP,
+    Once,
+    backbone_options,
+    examples,
+    source_options,
+)
 
 
-class _Estimate(click.Command):
+class _Estimate(Once):
     """The command `estimate`, whose option --helpers takes all paths up to the next option."""
 
     def parse_args(self, context, args):
@@ -45,7 +54,10 @@ class _Estimate(click.Command):
     "--solver", type=click.Choice(SOLVERS), default="verified", help="Solver of the pose."
 )
 @click.option(
-    "--reference-frame", type=INDEX, show_default="first usable", help="Its number in REFERENCE."
+    "--reference-frame",
+    type=INDEX,
+    show_default="first usable",
+    help="Number in the name of its image; of CO3D, one less.",
 )
 @click.option(
     "--references",

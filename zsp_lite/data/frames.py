@@ -26,8 +26,9 @@ _NOT_READ = {
     ".exr": "the depth as .npy or a float .tiff",
 }
 ON_OBJECT = 0.5  # a pixel is on the object if its mask probability is above this
-# An image whose colours are all below this value is black, as CO3D's hidden frames are.
-_BLACK = 10
+# An image of which at most one value in 1000 is above this one is black, as CO3D's hidden frames
+# are, and noise under a lens cap.
+_BLACK = 25
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +140,7 @@ def frame_defect(frame: Frame) -> str:
     """Say why a frame cannot be used, such as "black image"; "" for a usable frame."""
     if frame.defect:
         return frame.defect
-    if frame.rgb.max() < _BLACK:
+    if (frame.rgb > _BLACK).mean() <= 0.001:
         return "black image"
     if not frame.shows_object:
         return "empty object mask"

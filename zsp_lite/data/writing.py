@@ -41,7 +41,7 @@ class SequenceData:
     """Content of a sequence for `write_co3d`; the points are in world coordinates."""
 
     name: str
-    frames: Sequence[Frame]  # numbered from 0 in this order
+    frames: Sequence[Frame]
     timestamps: Sequence[float]  # of each frame, seconds
     points: Real[np.ndarray, "n 3"]
     colours: UInt8[np.ndarray, "n 3"]
@@ -49,6 +49,7 @@ class SequenceData:
     viewpoint_quality: float | None = None
     point_cloud_quality: float | None = None
     depth_scale_adjustment: float = 1.0  # CO3D's factor from stored depth to depth
+    numbers: Sequence[int] = ()  # of the frames; by default from 0 on
 
 
 def write_co3d(
@@ -193,8 +194,8 @@ def _write_sequence(
     """Write the files of a sequence; return the annotations of its frames, and of the sequence."""
     base = f"{category}/{plain_name(sequence.name, 'sequence')}"
     annotations = []
-    for number, (frame, timestamp) in enumerate(
-        zip(sequence.frames, sequence.timestamps, strict=True)
+    for number, frame, timestamp in zip(
+        sequence.numbers or range(len(sequence.frames)), sequence.frames, sequence.timestamps
     ):
         stem = f"frame{number + 1:06d}"  # CO3D numbers frames from 0, and their files from 1
         image = ImageAnnotation(f"{base}/images/{stem}.jpg", frame.camera.size)

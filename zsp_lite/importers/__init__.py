@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from zsp_lite.data.annotations import FRAMES_FILE
-from zsp_lite.errors import InputError, check_choice
+from zsp_lite.errors import InputError
 from zsp_lite.importers.capture import (
     MOST_FRAMES,
     Capture,
@@ -43,6 +43,7 @@ class Format:
 
 PACKED = (".zip", ".r3d")  # extensions of files that apps export
 
+_COLMAP = ("sparse", "images.bin", "images.txt", "cameras.*", "points3[Dd].*", "database.db")
 _ARKIT_UP = (0.0, 1.0, 0.0)  # gravity points along -y
 # The format of a folder is the first one whose signs it has.
 FORMATS = {
@@ -62,7 +63,10 @@ FORMATS = {
         read_recording,
         ("intrinsics",),
         # Signs of other formats: poses that they have are not to be found again.
-        unless=("scene*", "pose", "groundtruth.txt", "rgb.txt", "trajectory.log", "depth/*.exr"),
+        unless=(
+            *("scene*", "pose", "groundtruth.txt", "rgb.txt", "trajectory.log", "depth/*.exr"),
+            *_COLMAP,
+        ),
     ),
     "open3d": Format(("intrinsic.json", "color"), "Open3D's recorder", read_open3d),
 }
@@ -74,6 +78,11 @@ _LISTS = "expected its files as the format lists: rgb.txt, depth.txt, poses.txt,
 # Patterns of files, in lower case, that show what is no capture; what it is, and the way out. The
 # first that has a match counts.
 _OTHERS = (
+    (
+        ("cameras/*.json", "corrected_cameras/*.json"),
+        "is the inner folder of Polycam's raw data",
+        "expected all of it in a folder keyframes/",
+    ),
     (("frame_[0-9]*.json",), "is a scan of 3d Scanner App", _LISTS),
     (("lowres_wide.traj", "lowres_depth"), "is a scene of ARKitScenes", _LISTS),
     (
@@ -94,9 +103,9 @@ _OTHERS = (
         "expected Record3D's .r3d export, or the depth as .npy or a float .tiff",
     ),
     (
-        ("sparse", "images.bin", "images.txt", "cameras.*", "points3d.*", "database.db"),
-        "has COLMAP's poses, but no measured depth",
-        _HOW,
+        _COLMAP,
+        "has COLMAP's poses, whose lengths are not those of measured depth",
+        "expected rgb/ and depth/ without them, raw data of LiDAR, or lists in metres",
     ),
     (
         ("rgb.txt", "depth.txt", "depth"),
@@ -197,7 +206,6 @@ def open_capture(
     folder = Path(path)
     if layout is None:
         layout, folder = recognise(path)
-        check_choice(f"format of {path}", layout, FORMATS)
     if layout == "stray":  # the reader chooses the sharp frames, because it decodes a video
         options["count"] = count
     if layout == "recording":
@@ -214,6 +222,11 @@ def open_capture(
             left_out.append(str(error))
     frames.sort(key=lambda frame: natural_order(frame.image))
 
+    # Frames are counted as their files are named; without different numbers, by position.
+    numbers = dict.fromkeys([0, *natural_order(frame.image)][-2] % 10**15 for frame in frames)
+    if len(numbers) < len(frames):
+        numbers = range(len(frames))
+
     # A frame's own mask comes before the one in the capture's folder masks/. If the folder `masks`
     # is given, all masks are from it.
     images = [frame.image for frame in frames]
@@ -226,7 +239,10 @@ def open_capture(
         )
     if not masks:
         paths = [frame.mask or mask for frame, mask in zip(frames, paths)]
-    frames = [replace(frame, mask=mask, **files) for frame, mask in zip(frames, paths)]
+    frames = [
+        replace(frame, mask=mask, number=number, **files)
+        for frame, mask, number in zip(frames, paths, numbers)
+    ]
 
     sharp = sharpest(frames, count, lambda frame: frame.load().rgb, left_out)
     frames = [frame for frame, _ in sharp]

@@ -61,6 +61,7 @@ class CaptureFrame:
     orientation: str | None = None
     posed: bool = True  # False for a single image, whose world is its camera's frame
     doubt: str = ""  # why the image may be that of another frame
+    number: int = 0  # the last in the image's name, or else the position
 
     def load(self) -> Frame:
         """Load the frame as viewers display it; InputError if a file cannot be used."""

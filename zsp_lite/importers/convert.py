@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from zsp_lite.data.annotations import FRAMES_FILE, read_frame_index
-from zsp_lite.data.frames import Frame
+from zsp_lite.data.frames import Frame, frame_defect
 from zsp_lite.data.writing import SequenceData, write_co3d
 from zsp_lite.errors import InputError
 from zsp_lite.importers import PACKED
@@ -36,7 +36,6 @@ class ImportResult:
     """Numbers of frames and points of an import."""
 
     frames: int
-    empty: int  # frames that were left out because their masks are empty
     points: int
     scale: float  # factor from the capture's lengths to those of the sequence
     flags: tuple[str, ...]  # reasons to doubt the masks, the depth or the intrinsics
@@ -46,37 +45,43 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
     """Write a source as the sequence ROOT/CATEGORY/SEQUENCE, with masks and a fused point cloud.
 
     Lengths are scaled so that the point cloud has unit standard deviation, averaged over the axes,
-    as in CO3D. Frames whose mask is empty are left out. An interrupted import can be repeated. If
-    the source cannot be read, segmented or fused, or if the sequence exists, InputError is raised
-    before anything is written.
+    as in CO3D. Frames with a defect, such as an empty mask, are left out; the others keep their
+    numbers. An interrupted import can be repeated. If the source cannot be read, segmented or
+    fused, or if the sequence exists, InputError is raised before anything is written.
     """
     folder = Path(root) / plain_name(category, "category") / plain_name(sequence, "sequence")
-    count = len(source.numbers)
     if is_imported(root, category, sequence):
         raise InputError(f"{folder} exists already, expected another sequence name")
-    if source.left_out and count < MIN_VIEWS:
-        raise InputError(
-            f"{source.path}: {count} frames remain, expected {MIN_VIEWS}: {source.left_out[0]}"
-        )
     problem = source.contradiction()
     if problem:
+        # Wrong intrinsics have the same signs as wrong depth: they come first.
+        problem = "; ".join(filter(None, (*source.doubts, problem)))
         raise InputError(f"{source.path}: {problem}")
 
     source = source.segmented()
-    seen = [position for position in range(count) if source.read_frame(position).shows_object]
-    if not seen:
-        raise InputError(f"the masks of all {count} frames are empty, expected an object")
+    left_out = [*source.left_out]
+    seen = []
+    for position, number in enumerate(source.numbers):
+        defect = frame_defect(source.read_frame(position))
+        if defect:
+            left_out.append(f"frame {number}: {defect}")
+        else:
+            seen.append(position)
+    if left_out and len(seen) < MIN_VIEWS:
+        raise InputError(
+            f"{source.path}: {len(seen)} frames remain, expected {MIN_VIEWS}: {left_out[0]}"
+        )
     frames = LazyFrames(source.read_frame, seen)
     points, colours, normals = fuse(frames)
     scale = 1 / axis_deviation(points)
     scaled = LazyFrames(lambda position: scale_frame(source.read_frame(position), scale), seen)
+    numbers = [source.numbers[position] for position in seen]
     data = SequenceData(
-        sequence, scaled, [float(position) for position in seen], points * scale, colours, normals
+        sequence, scaled, [*map(float, numbers)], points * scale, colours, normals, numbers=numbers
     )
     write_co3d(root, category, [data])
-    return ImportResult(
-        len(seen), count - len(seen), len(points), scale, tuple(source.flags(frames))
-    )
+    flags = replace(source, left_out=left_out).flags(frames)
+    return ImportResult(len(seen), len(points), scale, tuple(flags))
 
 
 def is_imported(root: str | Path, category: str, sequence: str) -> bool:

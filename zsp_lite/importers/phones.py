@@ -144,7 +144,7 @@ def read_record3d(folder: Path) -> Makers:
     unpacked = new_folder()
     if not any(map(any, scan.poses)):
         raise InputError(
-            f"{folder}/metadata: all {len(scan.poses)} poses are zero: the tracking failed, "
+            f"{folder.name}/metadata: all {len(scan.poses)} poses are zero: the tracking failed, "
             "expected another scan"
         )
     # fx, fy, cx, cy of each frame. A file without them has one K for all frames.

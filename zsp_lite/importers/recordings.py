@@ -80,12 +80,13 @@ def read_recording(
 
 def _numbered(folder: Path, name: str) -> dict[float, Path]:
     """Return the pictures of a folder by the numbers at the end of their names, in this order."""
-    numbered = {
-        float(number[0]): path
-        for path in folder.glob(f"{name}/*")
-        if (number := re.search(r"\d+(\.\d+)?$", path.stem))
-        and path.suffix.lower() in files.PICTURES
-    }
+    numbered = {}
+    for path in sorted(folder.glob(f"{name}/*")):
+        number = re.search(r"\d+(\.\d+)?$", path.stem)
+        if number and path.suffix.lower() in files.PICTURES:
+            other = numbered.setdefault(float(number[0]), path)
+            if other != path:
+                raise InputError(f"{other} and {path} have one number, expected one picture of it")
     if not numbered:
         raise InputError(f"{folder}: no picture with a number in rgb/ or depth/, expected 0001.png")
     return dict(sorted(numbered.items()))

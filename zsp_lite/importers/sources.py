@@ -14,7 +14,7 @@ from zsp_lite.data.cameras import Box, Camera, Values
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.evaluation import spread
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, list_frames
-from zsp_lite.errors import Doubt, InputError
+from zsp_lite.errors import Doubt, InputError, check_choice
 from zsp_lite.importers import FORMATS, open_capture, recognise
 from zsp_lite.importers.agreement import disagreement, neighbours
 from zsp_lite.importers.capture import CaptureFrame
@@ -57,7 +57,8 @@ class Source:
 
     path: Path  # the sequence, the capture or the image; a name for frames in memory
     format: str  # "sequence", "image", "frames", or the format of a capture
-    # Number of each frame: its number in the annotations, or its position in the capture.
+    # Number of each frame: that in the annotations, that of a capture (see `CaptureFrame`), or the
+    # position.
     numbers: tuple[int, ...]
     # Reads the frame at a position of `numbers`, with the mask that comes with it, if any.
     read_frame: Callable[[int], Frame]
@@ -86,9 +87,8 @@ class Source:
         """Name the source and its frames at some positions."""
         if self.format == "image":
             return f"image {self.path}"
-        kind = self.format if self.format in ("sequence", "frames") else "capture"
         frames = ", ".join(str(self.numbers[position]) for position in positions)
-        return f"{kind} {self.path}, frame{'s' if len(positions) > 1 else ''} {frames}"
+        return f"{self.format} {self.path}, frame{'s' if len(positions) > 1 else ''} {frames}"
 
     def load(self, positions: Sequence[int], context: int = _CONTEXT) -> list[Frame]:
         """Load frames with masks of the object.
@@ -151,8 +151,7 @@ class Source:
         flags = []
         if self.left_out:
             reasons = list(dict.fromkeys(self.left_out))
-            more = f"; and {len(reasons) - 3} more" if len(reasons) > 3 else ""
-            flags.append(f"frames left out: {len(self.left_out)}: {'; '.join(reasons[:3])}{more}")
+            flags.append(f"frames left out: {len(self.left_out)}: {'; '.join(reasons[:3])}")
         flags += depth_flags(frames, metric=self.format != "sequence")
         flags += map(Doubt, self.doubts)
         if self.mask == "given":
@@ -183,12 +182,10 @@ class Source:
         Returns the positions of those without a defect, of which there is one if `references` are
         wanted, and the frames by position.
         """
-        if first not in (None, *self.numbers):
-            raise InputError(
-                f"{self.path} has no frame {first}, expected one of {len(self.numbers)} from "
-                f"{min(self.numbers)} to {max(self.numbers)}"
-            )
-        start = 0 if first is None else self.numbers.index(first)
+        start = 0
+        if first is not None:
+            check_choice(f"{self.path}: frame", first, self.numbers)
+            start = self.numbers.index(first)
         # By the directions of the cameras, or by the order.
         every = [*range(len(self.numbers))]
         every = every[start:] + every[:start]
@@ -283,10 +280,6 @@ def open_source(
         frames = list_frames(path)
         path = frames[0].name or f"{len(frames)} frames"
     path = Path(path)
-    if masks is not None and not Path(masks).is_dir():
-        raise InputError(
-            f"--masks {masks} is no folder, expected one with masks that are named like the images"
-        )
     for name in options:
         if name not in _TAKEN[layout]:
             option = {"count": "frames"}.get(name, name.replace("_", "-"))
@@ -378,10 +371,12 @@ def _from_capture(path: Path, layout: str, place: Path, options: dict[str, Any])
     # Intrinsics may differ from frame to frame: a doubt about them is said once.
     questioned = [question_intrinsics(camera, str(path)) for camera in cameras]
     doubts = [next(filter(None, questioned), ""), *{frame.doubt for frame in frames}]
+    if layout == "tum" and "intrinsics" not in options:
+        doubts.append("no --intrinsics FX,FY,CX,CY: the camera is taken for TUM's")
     return Source(
         path,
         layout,
-        tuple(range(len(frames))),
+        tuple(frame.number for frame in frames),
         lambda k: frames[k].load(),
         cameras=cameras,
         left_out=left_out,

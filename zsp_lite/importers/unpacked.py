@@ -36,7 +36,7 @@ def new_folder() -> Path:
 def unpack(path: Path) -> Path:
     """Unpack a zip to a temporary folder; InputError if it is damaged, encrypted or too large."""
     size = file_size(path, "zip")
-    folder = new_folder()
+    folder = new_folder() / path.name  # messages name the zip
     try:
         with zipfile.ZipFile(path) as zipped:
             total = sum(member.file_size for member in zipped.infolist())

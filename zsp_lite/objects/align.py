@@ -238,7 +238,7 @@ def write_alignment(found: CategoryAlignment, out: str | Path, axes: Sim3 | None
     ]
     document = {"objects": objects, "disagreements": pairs}
     if axes:
-        document["axes"] = "x front, y left, z up; origin amid the objects; lengths of each world"
+        document["axes"] = "x front, y left, z up; origin amid the objects; lengths of the data"
         for name, one in found.objects.items():
             matrix = (axes @ one.sim3).matrix
             matrix[:3] /= one.sim3.scale  # rigid: in the lengths of the object's world
