@@ -11,7 +11,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from sklearn.cluster import KMeans
 from torch.nn.functional import avg_pool2d, normalize
 
 from zsp_lite.errors import InputError
@@ -87,9 +86,10 @@ def cycle(cosine, place, on1, on2):
 
 def kmeans(vectors, k, seed=0):
     """Assign n vectors to k clusters: labels (n,)."""
-    # k-means needs only distances: points in n dimensions with the same inner products do.
+    from sklearn.cluster import KMeans  # takes half a second
+
     values, axes = np.linalg.eigh((vectors @ vectors.T).round(decimals=6))
-    points = axes * np.sqrt(np.maximum(values, 0))
+    points = axes * np.sqrt(np.maximum(values, 0))  # of the same distances: k-means needs no more
     draw = int(np.random.default_rng(seed).integers(2**31))
     return KMeans(k, n_init=1, random_state=draw).fit_predict(points)
 

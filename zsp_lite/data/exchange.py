@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
-from scipy.stats import binom
 
 from zsp_lite.data.co3d import Co3D, Pair
 from zsp_lite.data.evaluation import true_poses
@@ -177,6 +176,9 @@ def other_convention(dataset: Co3D, poses: Mapping[Pair, StoredPose]) -> str:
     errors = {name: rotation_error(rotations, truths) for name, rotations in readings.items()}
     medians = {name: float(np.median(error)) for name, error in errors.items()}
     best = min(medians, key=medians.get)
+    # Imported here: it takes half a second.
+    from scipy.stats import binom
+
     # The errors of a wrong reading may be small by chance, as for rotations by small angles: a sign
     # test decides whether more pairs agree with the other reading than chance explains.
     by_chance = binom.sf((errors[best] < errors[""]).sum() - 1, len(truths), 1 / 2)
