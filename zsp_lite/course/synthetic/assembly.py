@@ -60,16 +60,15 @@ class Assembly:
         """Draw one of the options."""
         return options[self.choice(len(options))]
 
-    def add(self, mesh: Mesh, material: int = BODY, mirror: bool = False) -> None:
-        """Add a part of material 0 .. 7; with `mirror`, also its image in the plane y = 0."""
+    def add(self, mesh: Mesh, material: int = BODY) -> None:
+        """Add a part of material 0 .. 7."""
         self.meshes.append(mesh)
         self.materials.append(material)
-        if mirror:
-            self.add(mesh.mirrored(), material)
 
     def add_pair(self, mesh: Mesh, material: int = BODY) -> None:
         """Add a part and its mirror image in the plane y = 0."""
-        self.add(mesh, material, mirror=True)
+        self.add(mesh, material)
+        self.add(mesh.mirrored(), material)
 
 
 Builder = Callable[[Assembly], None]  # adds the parts of one random object of a category

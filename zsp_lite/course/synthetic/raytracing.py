@@ -23,6 +23,7 @@ from zsp_lite.course.synthetic.textures import (
     srgb_to_linear,
 )
 from zsp_lite.data.cameras import Camera
+from zsp_lite.data.depth import unproject_depth
 
 _LAYERS = 4  # surfaces that a ray meets at most, as it passes through the holes of textures
 _HOLE = 128  # opacity of a texture, 0 to 255, below which it has a hole
@@ -338,12 +339,9 @@ class MeshScene:
 
 def _pixel_rays(camera: Camera, n: int) -> Image:
     """Return rays of unit z in the camera frame through n x n points of each pixel."""
-    height, width = camera.size
-    x = ((np.arange(width * n) + 0.5) / n - camera.principal_point[0]) / camera.focal_length[0]
-    y = ((np.arange(height * n) + 0.5) / n - camera.principal_point[1]) / camera.focal_length[1]
-    # The world direction of (x, y, 1) is x R[0] + y R[1] + R[2], here with the shape (h, w, 3).
-    rays = x[None, :, None] * camera.R[0] + (y[:, None, None] * camera.R[1] + camera.R[2])
-    return rays.astype(np.float32)
+    finer = camera.resize(np.multiply(camera.size, n))
+    rays = unproject_depth(np.ones(finer.size), finer)
+    return (rays @ camera.R).astype(np.float32)
 
 
 def _interpolated(

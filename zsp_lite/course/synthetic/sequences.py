@@ -18,6 +18,7 @@ from zsp_lite.course.synthetic.raytracing import MeshScene, Rendering
 from zsp_lite.course.synthetic.room import random_room
 from zsp_lite.course.synthetic.textures import blur, smooth_noise
 from zsp_lite.data.cameras import Camera
+from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.writing import SequenceData
 from zsp_lite.points import axis_deviation
@@ -195,8 +196,7 @@ def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Float[np.nd
     edge = np.minimum(blur((jump > 0.03).astype(np.float32), max(0.5 * scale, 0.3)) * 2, 1)
 
     # Grazing angles: 0 up to 60 degrees between ray and normal, 1 at 90.
-    x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
-    ray = view.camera.unproject_camera(np.stack([x, y], -1), np.ones((h, w)))
+    ray = unproject_depth(np.ones((h, w)), view.camera)
     facing = np.abs((view.normals * ray).sum(-1)) / np.linalg.norm(ray, axis=-1)
     grazing = np.where(view.mask, np.clip(1 - facing / 0.5, 0, 1), 0)
 
@@ -227,10 +227,10 @@ def fused_cloud(
     """Sample world points of the object from all depth maps, with normals and 8-bit colours."""
     clouds = []
     for view, depth in zip(views, depths):
-        row, col = np.nonzero((depth > 0) & view.mask)
-        points = view.camera.unproject(np.stack([col + 0.5, row + 0.5], -1), depth[row, col])
-        normals = view.normals[row, col] @ view.camera.R  # from the camera frame to the world
-        clouds.append((points, normals, view.rgb[row, col]))
+        known = (depth > 0) & view.mask
+        points = view.camera.to_world(unproject_depth(depth, view.camera)[known])
+        normals = view.normals[known] @ view.camera.R  # from the camera frame to the world
+        clouds.append((points, normals, view.rgb[known]))
     cloud = [np.concatenate(values) for values in zip(*clouds)]
     n = len(cloud[0])
     chosen = np.sort(rng.choice(n, min(n_points, n), replace=False))

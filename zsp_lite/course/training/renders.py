@@ -178,12 +178,13 @@ def build_random_object(a: Assembly) -> None:
         # The centre is on a box about the parent, so that the two parts overlap.
         centre = parent + direction / np.abs(direction).max() * (parent_size * 0.4 + size * 0.3)
         mesh = _random_solid(a, size)
-        mirror = a.chance(0.55)
         # A part is on the left with its mirror image on the right, or in the middle.
+        mirror = a.chance(0.55)
+        add = a.add_pair if mirror else a.add
         centre[1] = abs(centre[1]) if mirror else 0
         if mirror and a.chance(0.5):
             mesh = mesh.rotated("z", a.uniform(-0.7, 0.7)).rotated("x", a.uniform(-0.7, 0.7))
-        a.add(mesh.translated(centre), a.choice(5), mirror)
+        add(mesh.translated(centre), a.choice(5))
         nodes.append((centre, size))
 
 
