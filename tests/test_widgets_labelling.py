@@ -158,15 +158,6 @@ def test_proposals_are_looked_at_one_by_one_and_accepted_without_a_click(labelli
     assert not box.buttons["accept"].disabled
 
 
-def test_the_slider_chooses_a_point(labelling):
-    box = label_poses(labelling)
-    box.controls["point"].value = 1234
-    view = box.views["reference"]
-    cursor = np.array(view.widget.cursor)
-    box.buttons["pick"].click()
-    assert_allclose(view._to_view.apply(labelling.picks("best")[0]), cursor)
-
-
 def test_the_reference_comes_first(labelling):
     box = label_poses(labelling)
     assert "at least 4 more" in message(box)

@@ -339,7 +339,8 @@ class MeshScene:
 
 def _pixel_rays(camera: Camera, n: int) -> Image:
     """Return rays of unit z in the camera frame through n x n points of each pixel."""
-    finer = camera.resize(np.multiply(camera.size, n))
+    height, width = camera.size
+    finer = camera.resize((n * height, n * width))
     rays = unproject_depth(np.ones(finer.size), finer)
     return (rays @ camera.R).astype(np.float32)
 

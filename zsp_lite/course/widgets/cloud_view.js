@@ -55,14 +55,8 @@ function render({ model, el }) {
     for (const ends of model.get("lines") ?? []) {
       outlined("M" + ends.map((end) => project(end).slice(0, 2)).join("L"), [2, 1], "#D55E00");
     }
-    const cursor = model.get("cursor");
-    if (cursor.length) {
-      const [x, y] = project(cursor);
-      outlined(`M${x - 14} ${y}h9m10 0h9M${x} ${y - 14}v9m0 10v9`, [5, 2]);
-    }
     model.get("marks").forEach(drawMark); // last, as it leaves dashes and transparency
     canvas.dataset.marks = model.get("marks").length;
-    canvas.dataset.cursor = cursor.join(" ");
     canvas.setAttribute("aria-label", model.get("alt"));
   }
 
@@ -174,7 +168,7 @@ function render({ model, el }) {
   model.on("change:points change:colours change:discs", updatePoints);
   model.on("change:view", () => { if (!held) { view = model.get("view"); schedule(); } });
   model.on("change:view_resets", resetView);
-  model.on("change:marks change:cursor change:alt change:side", schedule);
+  model.on("change:marks change:alt change:side", schedule);
   updatePoints();
   resetView();
 }
@@ -198,7 +192,7 @@ function stored(el, panels, alt) {
     box.append(title);
     const state = {
       points: Float32Array.from(new Int16Array(decoded(points).buffer), (x) => x / 8192),
-      colours: decoded(colours), discs: Infinity, marks: [], cursor: [], lines, alt: `${title}: ${alt}`,
+      colours: decoded(colours), discs: Infinity, marks: [], lines, alt: `${title}: ${alt}`,
     };
     const get = (name) => ({ ...state, view, side: box.clientWidth - 2 })[name];
     const set = (_, value) => { view = value; redraw(); };
