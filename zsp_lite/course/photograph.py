@@ -119,14 +119,9 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
 
     The left column shows a view of the synthetic motorcycle, and the directions judged by eye.
     """
-    # A view of the synthetic motorcycle, with white margins to the aspect of the photograph.
     first = results[0]
     photograph = first.photograph
-    height, width = photograph.camera.size
-    estimate = first.estimate
-    view = estimate.target_views[estimate.view].frame.rgb
-    margin = round((view.shape[0] * width / height - view.shape[1]) / 2)
-    view = np.pad(view, ((0, 0), (margin, margin), (0, 0)), constant_values=255)
+    _, view = plots.chosen_views([first.estimate])
 
     # A row for each foreground: a panel at the left, then one for each solver.
     columns = 1 + len(_SOLVERS)
@@ -137,7 +132,7 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
         for result in results
     ]
     titles.insert(columns, "directions judged by eye\n")
-    images = [view] + [photograph.rgb] * (len(results) + 1)
+    images = [view.frame.rgb] + [photograph.rgb] * (len(results) + 1)
     figure, axes = plots.show_images(images, titles, columns=columns, size=3.6)
     by_eye = axes.pop(columns)
 

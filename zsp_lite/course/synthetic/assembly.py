@@ -74,11 +74,6 @@ class Assembly:
 Builder = Callable[[Assembly], None]  # adds the parts of one random object of a category
 
 
-def by_name(*builders: Builder) -> dict[str, Builder]:
-    """Return the builders by the names of their categories, which are those of the functions."""
-    return {build.__name__: build for build in builders}
-
-
 def make_shape(
     build: Builder, seed: int | list[int], variation: np.random.Generator | None = None
 ) -> TexturedMesh:
@@ -114,11 +109,10 @@ def rounded_box(
     vertices = np.reshape(grids, (-1, 3))
     # Two triangles fill each cell of a grid, counter-clockwise seen from outside; `corner` is the
     # cell's vertex of the lowest index.
-    corner = np.arange(n * n).reshape(n, n)[:-1, :-1].reshape(-1, 1)
-    cells = np.concatenate([corner + [0, n, n + 1], corner + [0, n + 1, 1]])
-    faces = np.concatenate([cells + side * n * n for side in range(6)])
+    corner = np.arange(6 * n * n).reshape(6, n, n)[:, :-1, :-1].reshape(-1, 1)
+    faces = np.concatenate([corner + [0, n, n + 1], corner + [0, n + 1, 1]])
     # The points move along their rays to where |x|^p + |y|^p + |z|^p = 1, p the squareness.
-    vertices /= (np.abs(vertices) ** squareness).sum(1, keepdims=True) ** (1 / squareness)
+    vertices /= np.linalg.norm(vertices, squareness, axis=1, keepdims=True)
     return Mesh(vertices, faces).scaled(np.asarray(size) / 2).translated(centre)
 
 

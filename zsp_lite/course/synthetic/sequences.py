@@ -13,7 +13,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from zsp_lite.course.synthetic.meshes import TexturedMesh
-from zsp_lite.course.synthetic.primitives import TAU, Coordinates, box_centre, direction, rotation
+from zsp_lite.course.synthetic.primitives import (
+    TAU,
+    Coordinates,
+    box_centre,
+    direction,
+    rotation,
+    unit,
+)
 from zsp_lite.course.synthetic.raytracing import MeshScene, Rendering
 from zsp_lite.course.synthetic.room import random_room
 from zsp_lite.course.synthetic.textures import blur, smooth_noise
@@ -48,8 +55,7 @@ def orbit_pose(
     """
     away = direction(azimuth, elevation)
     forward = -away
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
+    right = unit(np.cross(forward, [0, 0, 1.0]))
     # The rows are the camera's axes: right, down and forward.
     R = rotation("z", roll) @ np.stack([right, np.cross(forward, right), forward])
     return R, -R @ (np.asarray(target, float) + away * distance)

@@ -333,3 +333,6 @@ def remote(a: Assembly) -> None:
             place = (ring_x - ring - 0.12 - row * length * 0.085, column * pitch * waist, top)
             a.add(key.translated(place), KEY if row < n_rows - 1 else COLOURED_KEY)
     a.add_pair(box((0.06, pitch * 0.75, 0.05), (ring_x + ring + 0.11, pitch, top)), COLOURED_KEY)
+
+
+BUILDERS = (backpack, book, handbag, keyboard, laptop, mouse, remote)

@@ -261,3 +261,6 @@ def toaster(a: Assembly) -> None:
     if a.chance(0.6):
         cable_end = (-end - a.uniform(0.1, 0.25), a.uniform(-0.2, 0.2), 0.03)
         a.add(capsule((-end, 0.1, feet + 0.1), cable_end, 0.025), DARK)
+
+
+BUILDERS = (chair, hairdryer, toaster, toilet)

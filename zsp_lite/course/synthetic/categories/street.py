@@ -272,3 +272,6 @@ def hydrant(a: Assembly) -> None:
     if a.chance(0.6):
         place = (radius + 0.12, 0.03, outlet - bore - 0.08)
         a.add(torus(a.uniform(0.1, 0.16), 0.018, Y, place), RING)
+
+
+BUILDERS = (bicycle, car, hydrant, motorcycle)

@@ -347,3 +347,6 @@ def toytrain(a: Assembly) -> None:
         add_wheels(a, x, width / 2 - 0.03, wheel, 0.08)
     connection = (axles[-1] - axles[0], 0.03, 0.05)
     a.add_pair(box(connection, (axles.mean(), width / 2 + 0.06, wheel)), BRASS)
+
+
+BUILDERS = (teddybear, toybus, toyplane, toytrain, toytruck)
