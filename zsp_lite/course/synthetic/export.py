@@ -7,14 +7,13 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial import KDTree
 from tqdm import tqdm
 
 from zsp_lite.course.synthetic.assembly import make_shape, random_materials
 from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.course.synthetic.meshes import TexturedMesh, canonical_mesh, list_models, read_mesh
-from zsp_lite.course.synthetic.primitives import box_centre
+from zsp_lite.course.synthetic.primitives import Vertices, box_centre
 from zsp_lite.course.synthetic.sequences import record_sequence
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.evaluation import sample_pairs
@@ -249,7 +248,7 @@ def write_sequence(
     write_atomic(out / category / POSES_FILE, text.encode())
 
 
-def shape_turns(vertices: Float[np.ndarray, "v 3"]) -> tuple[int, ...]:
+def shape_turns(vertices: Vertices) -> tuple[int, ...]:
     """Return the quarter turns about z, in degrees, that map the vertices to themselves."""
     points = vertices - box_centre(vertices)
     tree = KDTree(points)

@@ -16,7 +16,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from zsp_lite.course.synthetic.primitives import (
+    Faces,
     Mesh,
+    Vertices,
     area_normals,
     box_centre,
     joined,
@@ -60,8 +62,8 @@ class Material:
 class TexturedMesh:
     """A triangle mesh with materials."""
 
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]  # indices of vertices
+    vertices: Vertices
+    faces: Faces
     normals: Float[np.ndarray, "f 3 3"]  # unit shading normal of each corner of each face
     # of each corner; (0, 0) is the lower left corner of the texture, which repeats
     uv: Float[np.ndarray, "f 3 2"]

@@ -8,6 +8,8 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 TAU = 2 * np.pi
+Vertices = Float[np.ndarray, "v 3"]
+Faces = Int[np.ndarray, "f 3"]  # indices of vertices
 # Of a point (3,), of a point (2,) in the plane of an outline, or of an outline's points (n, 2).
 Coordinates = Sequence | np.ndarray
 # Radius where a lathe's profile meets the axis; zero would give triangles without an area.
@@ -24,8 +26,8 @@ _PLANES = {
 class Mesh:
     """A triangle mesh: vertices in object units, and faces as indices of vertices."""
 
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
+    vertices: Vertices
+    faces: Faces
 
     def translated(self, offset: Coordinates) -> "Mesh":
         """Return the mesh shifted by `offset` (3,)."""
@@ -57,19 +59,19 @@ def point(*coordinates: float) -> Float[np.ndarray, " d"]:
     return np.array(coordinates)
 
 
-def joined(meshes: Sequence[Mesh]) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+def joined(meshes: Sequence[Mesh]) -> tuple[Vertices, Faces]:
     """Return the vertices and the faces of several meshes as those of one."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts)]
     return np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces)
 
 
-def box_centre(vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "3"]:
+def box_centre(vertices: Vertices) -> Float[np.ndarray, "3"]:
     """Return the centre of the vertices' bounding box."""
     return (vertices.max(0) + vertices.min(0)) / 2
 
 
-def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
+def surface_spread(vertices: Vertices, faces: Faces) -> float:
     """Return the standard deviation of the surface's points, averaged over the three axes."""
     # Each face counts as its middle, weighted by its (twofold) area.
     area = np.linalg.norm(area_normals(vertices, faces), axis=1)
@@ -78,9 +80,7 @@ def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
     return float(np.sqrt(covariance.diagonal()).mean())
 
 
-def area_normals(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> Float[np.ndarray, "f 3"]:
+def area_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "f 3"]:
     """Return the normals of faces, with twice their areas as lengths."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     return np.cross(b - a, c - a)

@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from zsp_lite.course.synthetic.meshes import TexturedMesh
-from zsp_lite.course.synthetic.primitives import TAU, area_normals, box_centre, unit
+from zsp_lite.course.synthetic.primitives import TAU, Vertices, area_normals, box_centre, unit
 from zsp_lite.course.synthetic.room import FLOOR_REACH, Room, Values, Vectors
 from zsp_lite.course.synthetic.textures import (
     Image,
+    Map,
     pyramid,
     sample_image,
     sample_pyramid,
@@ -45,7 +46,7 @@ class Rendering:
 
     rgb: UInt8[np.ndarray, "h w 3"]
     # z in the camera frame, 0 where the ray hits neither the object nor the floor
-    depth: Float[np.ndarray, "h w"]
+    depth: Map
     mask: Bool[np.ndarray, "h w"]  # pixels of the object
     canonical: Image  # object coordinates of each object pixel, NaN elsewhere
     # unit normals of the object pixels in the camera frame, 0 elsewhere
@@ -78,7 +79,7 @@ class MeshScene:
         mesh: TexturedMesh,
         room: Room,
         seed: int | np.random.Generator,
-        coordinates: Float[np.ndarray, "v 3"] | None = None,
+        coordinates: Vertices | None = None,
         samples: int = 2,
     ):
         import open3d as o3d
@@ -323,7 +324,7 @@ class MeshScene:
         around = cv2.GaussianBlur(around, (0, 0), 2.0)
         return np.dstack([key, around]), width
 
-    def _background(self, camera: Camera, rays: Image) -> tuple[Image, Float[np.ndarray, "h w"]]:
+    def _background(self, camera: Camera, rays: Image) -> tuple[Image, Map]:
         """Return the room's radiance with the object's shadow, and the depth of the floor."""
         eye = camera.centre - self.origin
         flat_rays = rays.reshape(-1, 3)

@@ -16,6 +16,7 @@ from zsp_lite.course.synthetic.meshes import TexturedMesh
 from zsp_lite.course.synthetic.primitives import (
     TAU,
     Coordinates,
+    Vertices,
     box_centre,
     direction,
     rotation,
@@ -23,7 +24,7 @@ from zsp_lite.course.synthetic.primitives import (
 )
 from zsp_lite.course.synthetic.raytracing import MeshScene, Rendering
 from zsp_lite.course.synthetic.room import random_room
-from zsp_lite.course.synthetic.textures import blur, smooth_noise
+from zsp_lite.course.synthetic.textures import Map, blur, smooth_noise
 from zsp_lite.data.cameras import Camera
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import Frame
@@ -62,7 +63,7 @@ def orbit_pose(
 
 
 def handheld_sweep(
-    vertices: Float[np.ndarray, "v 3"],
+    vertices: Vertices,
     rng: np.random.Generator,
     frames: int,
     size: tuple[int, int],
@@ -109,7 +110,7 @@ def handheld_sweep(
 
 
 def image_box(
-    vertices: Float[np.ndarray, "v 3"], R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]
+    vertices: Vertices, R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Return the lower and upper corner (x, y) of the vertices' image at focal length 1."""
     in_camera = vertices @ R.T + t
@@ -158,7 +159,7 @@ def render_sequence(
 
 def stereo_depth(
     view: Rendering, object_holes: float, floor_holes: float, rng: np.random.Generator
-) -> Float[np.ndarray, "h w"]:
+) -> Map:
     """Simulate the depth map of multi-view stereo, 0 where the depth is unknown.
 
     Args:
@@ -183,7 +184,7 @@ def stereo_depth(
     return np.where(known, view.depth * np.maximum(1 + noise, 0.5), 0).astype(np.float32)
 
 
-def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
+def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Map:
     """Return how well stereo would match each pixel: badly at depth edges and grazing angles."""
     h, w = view.mask.shape
     scale = min(h, w) / 100  # pixels per percent of the shorter side
@@ -211,7 +212,7 @@ def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Float[np.nd
     return texture + noise - 1.5 * edge - 1.5 * grazing
 
 
-def soft_mask(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
+def soft_mask(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Map:
     """Simulate the probabilities (float32) of a segmentation network: a soft, displaced edge."""
     # Distance from the edge in pixels, positive inside. OpenCV measures from the centre of a pixel
     # to the centre of the nearest pixel of the other kind; the edge is half a pixel nearer.
@@ -226,7 +227,7 @@ def soft_mask(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Float[
 
 def fused_cloud(
     views: Sequence[Rendering],
-    depths: Sequence[Float[np.ndarray, "h w"]],
+    depths: Sequence[Map],
     n_points: int,
     rng: np.random.Generator,
 ) -> list[np.ndarray]:

@@ -10,6 +10,8 @@ from jaxtyping import Float
 Colour = Float[np.ndarray, "3"]
 # A colour, vector or point per pixel.
 Image = Float[np.ndarray, "h w 3"]
+# A number per pixel.
+Map = Float[np.ndarray, "h w"]
 ANY_HUE = (0, 360)  # range in degrees
 
 _FOLD = 4096  # points per row of OpenCV's maps, whose sides are limited to 32,767
@@ -51,7 +53,7 @@ def blur(image: np.ndarray, sigma: float) -> np.ndarray:
 
 def smooth_noise(
     rng: np.random.Generator, size: tuple[int, int], sigma: float, stretch: float = 1.0
-) -> Float[np.ndarray, "h w"]:
+) -> Map:
     """Return smooth Gaussian noise of unit variance.
 
     It is smoothed over `sigma` pixels down the columns and `sigma * stretch` along the rows.
@@ -94,9 +96,7 @@ def surface_albedo(
     return srgb_to_linear(np.clip(brightness[..., None] * colour.astype(np.float32), 0, 0.92))
 
 
-def _tiles(
-    rng: np.random.Generator, size: tuple[int, int], height: int, width: int
-) -> Float[np.ndarray, "h w"]:
+def _tiles(rng: np.random.Generator, size: tuple[int, int], height: int, width: int) -> Map:
     """Return the brightness (about 1) of tiles that differ at random, with dark joints."""
     row = np.arange(size[0])[:, None]
     # Each row of tiles is shifted by the same offset against the row before it.

@@ -19,6 +19,7 @@ from zsp_lite.course.synthetic.primitives import (
     TAU,
     Coordinates,
     Mesh,
+    Vertices,
     box,
     box_centre,
     capsule,
@@ -112,7 +113,7 @@ def _geometry(image: Rendering) -> tuple[np.ndarray, np.ndarray]:
 
 
 def framed_camera(
-    vertices: Float[np.ndarray, "v 3"],
+    vertices: Vertices,
     R: np.ndarray,
     t: np.ndarray,
     size: int,
@@ -139,7 +140,7 @@ def framed_camera(
 def render_instance(
     number: int,
     mesh: TexturedMesh,
-    coordinates: Float[np.ndarray, "v 3"],
+    coordinates: Vertices,
     camera: Camera,
     rng: np.random.Generator,
 ) -> Rendering:
