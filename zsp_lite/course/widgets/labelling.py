@@ -17,7 +17,6 @@ from zsp_lite.course.labelling.session import (
     ACCEPTED,
     MIN_KEYPOINTS,
     OPEN,
-    SKIPPED,
     Alignment,
     Labelling,
     Progress,
@@ -28,16 +27,14 @@ from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, ORANGE
 
-_STATE_SYMBOLS = {ACCEPTED: "✓", OPEN: "○", SKIPPED: "–"}
+_STATE_SYMBOLS = {ACCEPTED: "✓", OPEN: "○"}
 _PROPOSED = (
-    "A proposal is laid over the cloud: accept it if both clouds agree; otherwise click "
-    "keypoints, or skip."
+    "A proposal is laid over the cloud: accept it if both clouds agree; otherwise click keypoints."
 )
 _TOOLTIPS = {
     "undo": "Remove the last keypoint of this sequence",
     "redo": "Remove all keypoints of this sequence",
     "accept": "Write the label of this sequence",
-    "skip": "Leave this sequence without a label",
     "next": "Go to the next open sequence",
 }
 _HELP = (
@@ -133,7 +130,7 @@ class _LabellingWidget:
             widgets.VBox([self.captions[name], view.widget], layout={"margin": "0 8px 0 0"})
             for name, view in self.views.items()
         ]
-        actions = map(parts.get, ("undo", "redo", "overlay", "accept", "skip", "next"))
+        actions = map(parts.get, ("undo", "redo", "overlay", "accept", "next"))
         wrap = {"flex_flow": "row wrap"}
         row = partial(widgets.HBox, layout={**wrap, "align_items": "center"})
         rows = [
@@ -183,11 +180,6 @@ class _LabellingWidget:
             )
         path = self.labelling.accept(sequence, confirmed=True)
         return f"Written: {'/'.join(path.parts[-3:])}. {self.next()}"
-
-    def skip(self) -> str:
-        """Leave the sequence without a label."""
-        self.labelling.skip(self.current)
-        return f"{self.current} is skipped. {self.next()}"
 
     def next(self) -> str:
         """Go to the next open sequence."""
@@ -310,7 +302,6 @@ class _LabellingWidget:
         controls["name"].disabled = not self.on_reference
         waiting = not self.on_reference and self._proposed(self.current)
         self.buttons["accept"].disabled = alignment is None and not waiting
-        self.buttons["skip"].disabled = self.on_reference
         self.tables["progress"].value = _progress_table(rows, self.current)
         self.tables["keypoints"].value = _keypoint_table(labelling.names, row.picks, alignment)
 
