@@ -13,7 +13,7 @@ from tqdm import tqdm
 from zsp_lite.course.synthetic.assembly import make_shape, random_materials
 from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.course.synthetic.meshes import TexturedMesh, canonical_mesh, list_models, read_mesh
-from zsp_lite.course.synthetic.primitives import Vertices, box_centre
+from zsp_lite.course.synthetic.primitives import Vertices, box_centre, rotation
 from zsp_lite.course.synthetic.sequences import record_sequence
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.evaluation import sample_pairs
@@ -253,10 +253,9 @@ def shape_turns(vertices: Vertices) -> tuple[int, ...]:
     points = vertices - box_centre(vertices)
     tree = KDTree(points)
     limit = 0.03 * np.ptp(points)
-    x, y, z = points.T
     turns = []
-    for degrees, turned in {90: (-y, x, z), 180: (-x, -y, z), 270: (y, -x, z)}.items():
-        distances, _ = tree.query(np.stack(turned, 1))
+    for degrees in (90, 180, 270):
+        distances, _ = tree.query(points @ rotation("z", np.radians(degrees)).T)
         if distances.max() < limit:
             turns.append(degrees)
     return tuple(turns)
