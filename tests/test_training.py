@@ -64,9 +64,7 @@ def test_renders_hold_unit_normals_and_centred_depth_on_the_object(renders):
 
 def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
     """A patch's surface point must be one that the uncropped view shows."""
-    batch = sample_batch(
-        renders, default_rng(0), 3, VIEWS, 96, (0.4, 1.0), members=np.array([0, 1, 2])
-    )
+    batch = sample_batch(renders, default_rng(0), 3, 96, (0.4, 1.0), members=np.array([0, 1, 2]))
     crops = 3 * VIEWS
     assert batch.images.shape == (crops, 3, 96, 96)
     assert batch.surface.shape == (crops, 144, 3)
@@ -82,7 +80,7 @@ def test_a_batch_carries_surface_points_through_crops_and_flips(renders):
 
 def test_normals_turn_and_flip_with_the_crop(renders):
     grid, turn = crop_grids(default_rng(3), 3 * VIEWS, VIEWS, 96, (0.5, 1.0))
-    batch = sample_batch(renders, default_rng(3), 3, VIEWS, 96, (0.5, 1.0), members=np.arange(3))
+    batch = sample_batch(renders, default_rng(3), 3, 96, (0.5, 1.0), members=np.arange(3))
     assert set(torch.linalg.det(turn).round().tolist()) == {-1.0, 1.0}
     for crop in range(3 * VIEWS):
         right, down = grid[crop, 4, 5] - grid[crop, 4, 4], grid[crop, 5, 4] - grid[crop, 4, 4]
@@ -150,7 +148,7 @@ def test_attention_on_the_mask_is_worth_more_than_attention_off_it():
 def test_the_helping_losses_count_by_their_weight(renders):
     torch.manual_seed(0)
     model = Trainee(initial_backbone(renders, 24, 2, 2), 1)
-    batch = sample_batch(renders, default_rng(5), 2, VIEWS, 48, (0.8, 1.0))
+    batch = sample_batch(renders, default_rng(5), 2, 48, (0.8, 1.0))
     total, figures = losses(model, batch, torch.Generator().manual_seed(0), helpers=0.5)
     expected = figures["match"] + 0.5 * (figures["geometry"] + figures["attention"])
     assert_allclose(total.item(), expected, rtol=1e-5)

@@ -34,9 +34,9 @@ def make_challenge(
     secret: str,
     categories: Sequence[str],
     out: str | Path,
-    sequences: int = 6,
-    frames: int = 24,
-    pairs: int = 200,
+    sequences: int,
+    frames: int,
+    pairs: int,
 ) -> None:
     """Render objects from a secret, into OUT/give without labels and into OUT/keep with them.
 
