@@ -119,9 +119,13 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
 
     The left column shows a view of the synthetic motorcycle, and the directions judged by eye.
     """
+    # A view of the synthetic motorcycle, with white margins to the aspect of the photograph.
     first = results[0]
     photograph = first.photograph
-    _, view = plots.chosen_views([first.estimate])
+    height, width = photograph.camera.size
+    view = plots.chosen_views([first.estimate])[1].frame.rgb
+    margin = round((view.shape[0] * width / height - view.shape[1]) / 2)
+    view = np.pad(view, ((0, 0), (margin, margin), (0, 0)), constant_values=255)
 
     # A row for each foreground: a panel at the left, then one for each solver.
     columns = 1 + len(_SOLVERS)
@@ -132,7 +136,7 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
         for result in results
     ]
     titles.insert(columns, "directions judged by eye\n")
-    images = [view.frame.rgb] + [photograph.rgb] * (len(results) + 1)
+    images = [view] + [photograph.rgb] * (len(results) + 1)
     figure, axes = plots.show_images(images, titles, columns=columns, size=3.6)
     by_eye = axes.pop(columns)
 
