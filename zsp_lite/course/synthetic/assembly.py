@@ -27,20 +27,18 @@ Y = (0.0, 1.0, 0.0)
 BODY = 0  # the material of the main part of most objects
 
 
-class Assembly:
-    """Collects the parts of one object, and draws the random numbers that its builder asks for.
+class Draw:
+    """Draws the random numbers of one object.
 
-    With `variation`, noise from that source perturbs the proportions that `uniform` draws; the
-    choices between parts stay.
+    With `variation`, noise from that source perturbs the proportions; the choices between parts
+    stay.
     """
 
     def __init__(self, rng: np.random.Generator, variation: np.random.Generator | None = None):
         self.rng = rng
         self._variation = variation
-        self.meshes: list[Mesh] = []
-        self.materials: list[int] = []  # of each mesh
 
-    def uniform(self, low: float, high: float) -> float:
+    def __call__(self, low: float, high: float) -> float:
         """Draw a proportion uniformly from [low, high)."""
         value = float(self.rng.uniform(low, high))
         if self._variation is not None:
@@ -60,6 +58,14 @@ class Assembly:
         """Draw one of the options."""
         return options[self.choice(len(options))]
 
+
+class Assembly:
+    """Collects the parts of one object."""
+
+    def __init__(self):
+        self.meshes: list[Mesh] = []
+        self.materials: list[int] = []  # of each mesh
+
     def add(self, mesh: Mesh, material: int = BODY) -> None:
         """Add a part of material 0 .. 7."""
         self.meshes.append(mesh)
@@ -71,19 +77,21 @@ class Assembly:
         self.add(mesh.mirrored(), material)
 
 
-Builder = Callable[[Assembly], None]  # adds the parts of one random object of a category
+# Adds the parts of one random object of a category.
+Builder = Callable[[Assembly, Draw], None]
 
 
 def make_shape(
     build: Builder, seed: int | list[int], variation: np.random.Generator | None = None
 ) -> TexturedMesh:
     """Return what `build` composes, centred, of unit `surface_spread`, without materials."""
-    assembly = Assembly(np.random.default_rng(seed), variation)
-    build(assembly)
+    rng = np.random.default_rng(seed)
+    assembly = Assembly()
+    build(assembly, Draw(rng, variation))
     vertices, faces = joined(assembly.meshes)
     material = np.repeat(assembly.materials, [len(mesh.faces) for mesh in assembly.meshes])
     # Each axis has a small random scale of its own.
-    vertices *= np.exp(assembly.rng.normal(0, 0.08, 3))
+    vertices *= np.exp(rng.normal(0, 0.08, 3))
     vertices -= box_centre(vertices)
     vertices /= surface_spread(vertices, faces)
     n = len(faces)
