@@ -1,6 +1,6 @@
 """Procedural objects: meshes composed of primitives, parts of several, and random materials."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,26 +59,17 @@ class Draw:
         return options[self.choice(len(options))]
 
 
-class Assembly:
-    """Collects the parts of one object."""
-
-    def __init__(self):
-        self.meshes: list[Mesh] = []
-        self.materials: list[int] = []  # of each mesh
-
-    def add(self, mesh: Mesh, material: int = BODY) -> None:
-        """Add a part of material 0 .. 7."""
-        self.meshes.append(mesh)
-        self.materials.append(material)
-
-    def add_pair(self, mesh: Mesh, material: int = BODY) -> None:
-        """Add a part and its mirror image in the plane y = 0."""
-        self.add(mesh, material)
-        self.add(mesh.mirrored(), material)
+# Meshes of one object, each with its material 0 .. 7.
+Parts = Iterator[tuple[Mesh, int]]
+# Builds one random object of a category.
+Builder = Callable[[Draw], Parts]
 
 
-# Adds the parts of one random object of a category.
-Builder = Callable[[Assembly, Draw], None]
+def pair(mesh: Mesh, material: int = BODY, mirror: bool = True) -> Parts:
+    """Build a part and, with `mirror`, its mirror image in the plane y = 0."""
+    yield mesh, material
+    if mirror:
+        yield mesh.mirrored(), material
 
 
 def make_shape(
@@ -86,10 +77,9 @@ def make_shape(
 ) -> TexturedMesh:
     """Return what `build` composes, centred, of unit `surface_spread`, without materials."""
     rng = np.random.default_rng(seed)
-    assembly = Assembly()
-    build(assembly, Draw(rng, variation))
-    vertices, faces = joined(assembly.meshes)
-    material = np.repeat(assembly.materials, [len(mesh.faces) for mesh in assembly.meshes])
+    meshes, materials = zip(*build(Draw(rng, variation)))
+    vertices, faces = joined(meshes)
+    material = np.repeat(materials, [len(mesh.faces) for mesh in meshes])
     # Each axis has a small random scale of its own.
     vertices *= np.exp(rng.normal(0, 0.08, 3))
     vertices -= box_centre(vertices)
@@ -148,13 +138,13 @@ def disc(radius: float, thickness: float, centre: Coordinates) -> Mesh:
     return cylinder(radius, radius, thickness, 22).rotated("x", TAU / 4).translated(centre)
 
 
-def add_wheels(a: Assembly, x: float, y: float, radius: float, width: float) -> None:
-    """Add the two wheels of an axle at x, standing on the ground at y and -y."""
+def wheels(x: float, y: float, radius: float, width: float) -> Parts:
+    """Build the two wheels of an axle at x, standing on the ground at y and -y."""
     RIM = 2
     TYRE = 3
 
-    a.add_pair(disc(radius, width, (x, y, radius)), TYRE)
-    a.add_pair(disc(radius * 0.6, width * 1.2, (x, y, radius)), RIM)
+    yield from pair(disc(radius, width, (x, y, radius)), TYRE)
+    yield from pair(disc(radius * 0.6, width * 1.2, (x, y, radius)), RIM)
 
 
 class _Kind(NamedTuple):

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from zsp_lite.course.synthetic.assembly import Assembly, Draw, make_shape, random_materials
+from zsp_lite.course.synthetic.assembly import Draw, Parts, make_shape, pair, random_materials
 from zsp_lite.course.synthetic.meshes import TexturedMesh
 from zsp_lite.course.synthetic.primitives import (
     TAU,
@@ -166,12 +166,12 @@ def _room(index: int) -> Room:
     return replace(room, images=tuple(halves))
 
 
-def build_random_object(a: Assembly, draw: Draw) -> None:
+def build_random_object(draw: Draw) -> Parts:
     """Build a symmetric tree of 5 to 10 random parts, each attached to an earlier part."""
     # The nodes of the tree: centre and size of each part.
     body = point(draw(0.5, 1.3), draw(0.4, 1.0), draw(0.4, 1.2))
     nodes = [(np.zeros(3), body)]
-    a.add(_random_solid(draw, body), draw.choice(5))
+    yield _random_solid(draw, body), draw.choice(5)
     for _ in range(4 + draw.choice(6)):
         parent, parent_size = draw.pick(*nodes)
         direction = draw.rng.normal(size=3)
@@ -181,11 +181,10 @@ def build_random_object(a: Assembly, draw: Draw) -> None:
         mesh = _random_solid(draw, size)
         # A part is on the left with its mirror image on the right, or in the middle.
         mirror = draw.chance(0.55)
-        add = a.add_pair if mirror else a.add
         centre[1] = abs(centre[1]) if mirror else 0
         if mirror and draw.chance(0.5):
             mesh = mesh.rotated("z", draw(-0.7, 0.7)).rotated("x", draw(-0.7, 0.7))
-        add(mesh.translated(centre), draw.choice(5))
+        yield from pair(mesh.translated(centre), draw.choice(5), mirror)
         nodes.append((centre, size))
 
 
