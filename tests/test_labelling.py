@@ -48,7 +48,7 @@ def test_accepting_writes_the_similarity_of_the_picks_and_the_references_identit
     assert_array_equal(labels["best"].trans, np.eye(4))
 
 
-def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
+def test_picks_are_undone_moved_and_cleared(root):
     labelling = Labelling(root, "chair")
     pick_all(labelling, "best", corners())
     pick_all(labelling, "a", corners())
@@ -62,20 +62,6 @@ def test_picks_are_undone_moved_and_cleared_and_sequences_skipped(root):
     labelling.undo("a")
     labelling.undo("best")
     assert len(labelling.names) == 4
-    pick_all(labelling, "b", corners()[:4])
-    labelling.accept("b")
-    write_label(root, "chair", PoseLabel(np.eye(4), "a", "best"))
-    refused(
-        "a cannot be skipped: it has a label not made of picks; remove .*a.json",
-        labelling.skip,
-        "a",
-    )
-    labelling.skip("b")
-    assert Labelling(root, "chair").progress()[-1].state == "skipped"
-    assert "b" not in read_labels(root, "chair")
-    labelling.put("b", [])
-    labelling.pick("b", (0, 0, 0))
-    assert labelling.progress()[-1].state == "open"
 
 
 def test_invalid_categories_sequences_and_picks_are_refused(root):
@@ -88,7 +74,6 @@ def test_invalid_categories_sequences_and_picks_are_refused(root):
             lambda: labelling.pick("none", (0, 0, 0)),
             "sequence is 'none', expected one of best, a, b",
         ),
-        (lambda: labelling.skip("best"), "best cannot be skipped: it is the reference"),
         (lambda: labelling.pick("a", (0, np.nan, 0)), "picks on a holds nan, expected finite"),
         (
             lambda: labelling.pick("a", (0, 1)),

@@ -59,7 +59,7 @@ def test_a_batch_carries_surface_points_and_normals_through_crops_and_flips(rend
     the crop."""
     crops = 3 * VIEWS
     grid, turn = crop_grids(default_rng(3), crops, VIEWS, 96, (0.4, 1.0))
-    batch = sample_batch(renders, default_rng(3), 3, VIEWS, 96, (0.4, 1.0), members=np.arange(3))
+    batch = sample_batch(renders, default_rng(3), 3, 96, (0.4, 1.0), members=np.arange(3))
     assert batch.images.shape == (crops, 3, 96, 96)
     assert set(torch.linalg.det(turn).round().tolist()) == {-1.0, 1.0}
     surface = torch.from_numpy(renders.surface).float().view(crops, -1, 3)
@@ -133,7 +133,7 @@ def test_attention_on_the_mask_is_worth_more_than_attention_off_it():
 def test_the_helping_losses_count_by_their_weight(renders):
     torch.manual_seed(0)
     model = Trainee(initial_backbone(renders, 24, 2, 2), 1)
-    batch = sample_batch(renders, default_rng(5), 2, VIEWS, 48, (0.8, 1.0))
+    batch = sample_batch(renders, default_rng(5), 2, 48, (0.8, 1.0))
     total, figures = losses(model, batch, torch.Generator().manual_seed(0), helpers=0.5)
     expected = figures["match"] + 0.5 * (figures["geometry"] + figures["attention"])
     assert_allclose(total.item(), expected, rtol=1e-5)

@@ -10,8 +10,8 @@ How to write a widget:
 - `update` returns a caption with the numbers that the figure shows, also for readers who cannot see
   it or its colours.
 - The latency of a control should be at most 150 ms. Keep figures below about 9 by 4 inches.
-- The figure is a PNG in an image widget, which every frontend shows. Patches and points are chosen
-  by sliders, which work by keyboard.
+- The figure is a PNG in an image widget, which every frontend shows. Patches are chosen by
+  sliders, which work by keyboard.
 - The notebook shows a static figure as well (`show`), because widgets need a running kernel.
 - Add an example here.
 """

@@ -69,7 +69,6 @@ def show_trust(runs: Mapping[str, pd.DataFrame], rows: Sequence[str]) -> Figure:
         axis.plot([0, 100], [0, 100], ":", color="0.5")
         axis.set(title=name, xlabel="probability (%)", ylabel="right (%)")
         axis.legend(loc="lower right")
-    plt.close(figure)
     return figure
 
 
@@ -89,5 +88,4 @@ def show_gains(found: pd.DataFrame, section: str) -> Figure:
     axis.set_yticks(heights, here.index)
     axis.set(xlabel="gain in Acc30 (points)", ylim=(len(here) - 0.4, -0.6))
     figure.legend(loc="outside upper center", ncols=3)
-    plt.close(figure)
     return figure

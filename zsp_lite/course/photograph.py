@@ -123,8 +123,7 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
     first = results[0]
     photograph = first.photograph
     height, width = photograph.camera.size
-    estimate = first.estimate
-    view = estimate.target_views[estimate.view].frame.rgb
+    view = plots.chosen_views([first.estimate])[1].frame.rgb
     margin = round((view.shape[0] * width / height - view.shape[1]) / 2)
     view = np.pad(view, ((0, 0), (margin, margin), (0, 0)), constant_values=255)
 

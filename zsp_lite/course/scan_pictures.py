@@ -27,7 +27,7 @@ _ARROWS = {
 def curve_above_pictures(
     curve: tuple[np.ndarray, np.ndarray],
     pictures: Mapping[float, np.ndarray],
-    title: str = "x = {:.0f}",
+    title: str,
     **labels: Any,
 ) -> tuple[Figure, list[Axes]]:
     """Show a curve (x, y) with dots at some x, and below it one picture for each of these x.

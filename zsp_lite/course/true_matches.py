@@ -22,6 +22,10 @@ _MARGIN = 0.05  # a point farther outside the box than this belongs to the backg
 _MASK_THRESHOLD = 0.8  # above this a pixel is surely of the object: masks are soft at its border
 
 
+# Box coordinates of patches, and where they are known.
+PatchCoordinates = tuple[Float[np.ndarray, "_ _ 3"], Bool[np.ndarray, "_ _"]]
+
+
 @dataclass(frozen=True, eq=False)
 class GroundTruthPair:
     """Object crops of two instances of a category with their ground-truth matches."""
@@ -34,9 +38,7 @@ class GroundTruthPair:
     valid: Bool[np.ndarray, "rows cols"]  # reference patches that have a match
 
 
-def patch_coordinates(
-    frame: Frame, pose: ObjectPose, grid: tuple[int, int]
-) -> tuple[Float[np.ndarray, "rows cols 3"], Bool[np.ndarray, "rows cols"]]:
+def patch_coordinates(frame: Frame, pose: ObjectPose, grid: tuple[int, int]) -> PatchCoordinates:
     """Return the box coordinates of the object point that each patch shows, and where they are
     known: the mask covers a quarter of the patch, and an object pixel has depth inside the box."""
     # Only object pixels count: the floor between the spokes of a bicycle is inside the box, too.
@@ -49,9 +51,8 @@ def patch_coordinates(
 
 
 def ground_truth_matches(
-    reference: tuple[Float[np.ndarray, "r1 c1 3"], Bool[np.ndarray, "r1 c1"]],
-    target: tuple[Float[np.ndarray, "r2 c2 3"], Bool[np.ndarray, "r2 c2"]],
-) -> tuple[Int[np.ndarray, "r1 c1 2"], Bool[np.ndarray, "r1 c1"]]:
+    reference: PatchCoordinates, target: PatchCoordinates
+) -> tuple[Int[np.ndarray, "rows cols 2"], Bool[np.ndarray, "rows cols"]]:
     """Match each reference patch to the target patch with the nearest of the `patch_coordinates`,
     at most 0.1 away.
 

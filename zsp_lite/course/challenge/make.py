@@ -34,9 +34,9 @@ def make_challenge(
     secret: str,
     categories: Sequence[str],
     out: str | Path,
-    sequences: int = 6,
-    frames: int = 24,
-    pairs: int = 200,
+    sequences: int,
+    frames: int,
+    pairs: int,
 ) -> None:
     """Render objects from a secret, into OUT/give without labels and into OUT/keep with them.
 
@@ -66,7 +66,7 @@ def make_challenge(
     salt = b"zsp-lite challenge"
     key = hashlib.scrypt(secret.encode(), salt=salt, n=1 << 15, r=8, p=1, maxmem=1 << 26, dklen=7)
     kept = out / "keep" / "data"
-    export_categories(categories, kept, sequences, frames, int.from_bytes(key), name_of=_plain_name)
+    export_categories(categories, kept, sequences, frames, int.from_bytes(key), plain_names=True)
 
     given = out / "give"
     dataset = Co3D(kept)
@@ -81,11 +81,6 @@ def make_challenge(
     shutil.copyfile(_STARTER, given / "starter.py")
     for path in [*given.rglob("*"), given]:
         os.utime(path, (_TIME, _TIME))
-
-
-def _plain_name(seed: int, category: str, index: int) -> str:
-    """Return a name that says nothing of the seed, other than that of `sequence_name`."""
-    return str(100 + index)
 
 
 def copy_for_pairs(data: Path, pairs: Sequence[Pair], out: Path) -> None:

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from zsp_lite.alignment import Sim3, umeyama
 from zsp_lite.data.annotations import Row
 from zsp_lite.data.co3d import Co3D
-from zsp_lite.data.labels import PoseLabel, label_folder, read_label_folder, read_labels
+from zsp_lite.data.labels import PoseLabel, read_label_folder, read_labels
 from zsp_lite.data.writing import rigid_label, write_label
 from zsp_lite.errors import InputError, check_choice, check_magnitude, real_array
 from zsp_lite.io.files import plain_name, read_json, write_atomic
@@ -37,7 +37,6 @@ MAX_RESIDUAL = 0.15
 # States of a sequence.
 OPEN = "open"
 ACCEPTED = "accepted"
-SKIPPED = "skipped"
 REFERENCE = "reference"
 
 
@@ -89,7 +88,6 @@ class _Picks(msgspec.Struct):
     reference_seq: str
     names: list[str]
     picks: dict[str, list[Row]]
-    skipped: list[str]
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ class Progress:
     """Progress of a sequence."""
 
     sequence: str
-    state: str  # "reference", "open", "accepted" or "skipped"
+    state: str  # "reference", "open" or "accepted"
     picks: int
     # RMS residual relative to the spread of the picks; None before all keypoints are picked
     rms: float | None
@@ -161,7 +159,7 @@ class Labelling:
         self.reference = next(iter(references), best)
         # The reference comes first; the order of the others stays.
         self.sequences = sorted(chosen, key=lambda name: name != self.reference)
-        self._stored = stored or _Picks(self.reference, [], {}, [])
+        self._stored = stored or _Picks(self.reference, [], {})
         proposals = read_label_folder(self.root / "label_proposals" / self.category)
         self._proposals = {name: label.trans for name, label in proposals.items()}
         self._clouds: dict[str, tuple[np.ndarray, np.ndarray]] = {}
@@ -236,8 +234,7 @@ class Labelling:
     ) -> None:
         """Replace all picks (n, 3) of a sequence, and on the reference the names of the keypoints.
 
-        A sequence that was skipped is open again. An accepted label is kept until another one is
-        accepted.
+        An accepted label is kept until another one is accepted.
         """
         points = points if len(points) else np.zeros((0, 3))
         points = real_array(f"picks on {sequence}", points, (None, 3))
@@ -252,7 +249,7 @@ class Labelling:
                 )
             stored.names[:] = names
         stored.picks[sequence] = points.tolist()
-        self._save(sequence)
+        write_atomic(self.path, msgspec.json.format(msgspec.json.encode(stored), indent=1))
 
     def alignment(self, sequence: str) -> Alignment | None:
         """Align the reference with a sequence by the picks; None before all are picked."""
@@ -325,38 +322,16 @@ class Labelling:
         centre = self.cloud(self.reference)[0].mean(axis=0)
         label = rigid_label(sim3, centre, sequence, self.reference)
         write_label(self.root, self.category, PoseLabel(np.eye(4), self.reference, self.reference))
-        path = write_label(self.root, self.category, label)
-        self._save(sequence)
-        return path
-
-    def skip(self, sequence: str) -> None:
-        """Exclude a sequence, for instance one with a bad point cloud, and delete the label made of
-        its picks."""
-        path = label_folder(self.root, self.category) / f"{self._known(sequence)}.json"
-        # Labels do not say where they come from. If all keypoints are picked, the label was made of
-        # the picks.
-        all_picked = len(self.picks(sequence)) == len(self.names) > 0
-        refusal = f"sequence {sequence} cannot be skipped: it"
-        if path.is_file() and not all_picked:
-            raise InputError(f"{refusal} has a label not made of picks; remove {path}")
-        if sequence == self.reference:
-            raise InputError(f"{refusal} is the reference")
-        path.unlink(missing_ok=True)
-        if sequence not in self._stored.skipped:
-            self._stored.skipped.append(sequence)
-            self._save()
+        return write_label(self.root, self.category, label)
 
     def progress(self) -> list[Progress]:
         """Return the progress of every sequence, the reference first."""
         labels = read_labels(self.root, self.category)
         rows = []
         for name in self.sequences:
-            if name in self._stored.skipped:
-                state = SKIPPED
-            elif name == self.reference:
+            state = ACCEPTED if name in labels else OPEN
+            if name == self.reference:
                 state = REFERENCE
-            else:
-                state = ACCEPTED if name in labels else OPEN
             alignment = None
             problem = ""
             if name != self.reference:
@@ -372,9 +347,3 @@ class Labelling:
         """Return the name of a sequence of the session; refuse others."""
         check_choice("sequence", sequence, self.sequences)
         return sequence
-
-    def _save(self, changed: str | None = None) -> None:
-        """Write the session; a changed sequence is no longer skipped."""
-        if changed in self._stored.skipped:
-            self._stored.skipped.remove(changed)
-        write_atomic(self.path, msgspec.json.format(msgspec.json.encode(self._stored), indent=1))

@@ -1,6 +1,6 @@
 """Procedural objects: meshes composed of primitives, parts of several, and random materials."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,20 +27,18 @@ Y = (0.0, 1.0, 0.0)
 BODY = 0  # the material of the main part of most objects
 
 
-class Assembly:
-    """Collects the parts of one object, and draws the random numbers that its builder asks for.
+class Draw:
+    """Draws the random numbers of one object.
 
-    With `variation`, noise from that source perturbs the proportions that `uniform` draws; the
-    choices between parts stay.
+    With `variation`, noise from that source perturbs the proportions; the choices between parts
+    stay.
     """
 
     def __init__(self, rng: np.random.Generator, variation: np.random.Generator | None = None):
         self.rng = rng
         self._variation = variation
-        self.meshes: list[Mesh] = []
-        self.materials: list[int] = []  # of each mesh
 
-    def uniform(self, low: float, high: float) -> float:
+    def __call__(self, low: float, high: float) -> float:
         """Draw a proportion uniformly from [low, high)."""
         value = float(self.rng.uniform(low, high))
         if self._variation is not None:
@@ -60,36 +58,30 @@ class Assembly:
         """Draw one of the options."""
         return options[self.choice(len(options))]
 
-    def add(self, mesh: Mesh, material: int = BODY, mirror: bool = False) -> None:
-        """Add a part of material 0 .. 7; with `mirror`, also its image in the plane y = 0."""
-        self.meshes.append(mesh)
-        self.materials.append(material)
-        if mirror:
-            self.add(mesh.mirrored(), material)
 
-    def add_pair(self, mesh: Mesh, material: int = BODY) -> None:
-        """Add a part and its mirror image in the plane y = 0."""
-        self.add(mesh, material, mirror=True)
+# Meshes of one object, each with its material 0 .. 7.
+Parts = Iterator[tuple[Mesh, int]]
+# Builds one random object of a category.
+Builder = Callable[[Draw], Parts]
 
 
-Builder = Callable[[Assembly], None]  # adds the parts of one random object of a category
-
-
-def by_name(*builders: Builder) -> dict[str, Builder]:
-    """Return the builders by the names of their categories, which are those of the functions."""
-    return {build.__name__: build for build in builders}
+def pair(mesh: Mesh, material: int = BODY, mirror: bool = True) -> Parts:
+    """Build a part and, with `mirror`, its mirror image in the plane y = 0."""
+    yield mesh, material
+    if mirror:
+        yield mesh.mirrored(), material
 
 
 def make_shape(
     build: Builder, seed: int | list[int], variation: np.random.Generator | None = None
 ) -> TexturedMesh:
     """Return what `build` composes, centred, of unit `surface_spread`, without materials."""
-    assembly = Assembly(np.random.default_rng(seed), variation)
-    build(assembly)
-    vertices, faces = joined(assembly.meshes)
-    material = np.repeat(assembly.materials, [len(mesh.faces) for mesh in assembly.meshes])
+    rng = np.random.default_rng(seed)
+    meshes, materials = zip(*build(Draw(rng, variation)))
+    vertices, faces = joined(meshes)
+    material = np.repeat(materials, [len(mesh.faces) for mesh in meshes])
     # Each axis has a small random scale of its own.
-    vertices *= np.exp(assembly.rng.normal(0, 0.08, 3))
+    vertices *= np.exp(rng.normal(0, 0.08, 3))
     vertices -= box_centre(vertices)
     vertices /= surface_spread(vertices, faces)
     n = len(faces)
@@ -115,11 +107,10 @@ def rounded_box(
     vertices = np.reshape(grids, (-1, 3))
     # Two triangles fill each cell of a grid, counter-clockwise seen from outside; `corner` is the
     # cell's vertex of the lowest index.
-    corner = np.arange(n * n).reshape(n, n)[:-1, :-1].reshape(-1, 1)
-    cells = np.concatenate([corner + [0, n, n + 1], corner + [0, n + 1, 1]])
-    faces = np.concatenate([cells + side * n * n for side in range(6)])
+    corner = np.arange(6 * n * n).reshape(6, n, n)[:, :-1, :-1].reshape(-1, 1)
+    faces = np.concatenate([corner + [0, n, n + 1], corner + [0, n + 1, 1]])
     # The points move along their rays to where |x|^p + |y|^p + |z|^p = 1, p the squareness.
-    vertices /= (np.abs(vertices) ** squareness).sum(1, keepdims=True) ** (1 / squareness)
+    vertices /= np.linalg.norm(vertices, squareness, axis=1, keepdims=True)
     return Mesh(vertices, faces).scaled(np.asarray(size) / 2).translated(centre)
 
 
@@ -147,13 +138,13 @@ def disc(radius: float, thickness: float, centre: Coordinates) -> Mesh:
     return cylinder(radius, radius, thickness, 22).rotated("x", TAU / 4).translated(centre)
 
 
-def add_wheels(a: Assembly, x: float, y: float, radius: float, width: float) -> None:
-    """Add the two wheels of an axle at x, standing on the ground at y and -y."""
+def wheels(x: float, y: float, radius: float, width: float) -> Parts:
+    """Build the two wheels of an axle at x, standing on the ground at y and -y."""
     RIM = 2
     TYRE = 3
 
-    a.add_pair(disc(radius, width, (x, y, radius)), TYRE)
-    a.add_pair(disc(radius * 0.6, width * 1.2, (x, y, radius)), RIM)
+    yield from pair(disc(radius, width, (x, y, radius)), TYRE)
+    yield from pair(disc(radius * 0.6, width * 1.2, (x, y, radius)), RIM)
 
 
 class _Kind(NamedTuple):

@@ -1,27 +1,25 @@
 """Export of procedural categories, or of models, to a data folder with labels and pairs."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial import KDTree
 from tqdm import tqdm
 
 from zsp_lite.course.synthetic.assembly import make_shape, random_materials
 from zsp_lite.course.synthetic.categories import CATEGORIES
 from zsp_lite.course.synthetic.meshes import TexturedMesh, canonical_mesh, list_models, read_mesh
-from zsp_lite.course.synthetic.primitives import box_centre
+from zsp_lite.course.synthetic.primitives import Vertices, box_centre, rotation
 from zsp_lite.course.synthetic.sequences import record_sequence
 from zsp_lite.data.co3d import Co3D
 from zsp_lite.data.evaluation import sample_pairs
 from zsp_lite.data.ground_truth import POSES_FILE, ObjectPose, read_poses
 from zsp_lite.data.labels import PoseLabel
 from zsp_lite.data.writing import (
-    SequenceData,
     pairs_path,
     write_co3d,
     write_label,
@@ -84,7 +82,7 @@ def export_categories(
     frames: int,
     seed: int,
     image_size: int = 256,
-    name_of: Callable[[int, str, int], str] = sequence_name,
+    plain_names: bool = False,
 ) -> None:
     """Write sequences of procedural categories to a folder, with pose labels.
 
@@ -98,7 +96,7 @@ def export_categories(
         frames: number of frames per sequence.
         seed: seed of everything random.
         image_size: shorter image side in pixels.
-        name_of: name of a sequence, from the seed, its category and its index.
+        plain_names: whether the names of sequences say nothing of the seed.
 
     Raises:
         InputError: if a category is unknown, or the folder was written with other settings.
@@ -111,16 +109,16 @@ def export_categories(
         written = read_json(out / SETTINGS_FILE, dict[str, int], "settings")
         _check_same_settings(out, written, settings)
     write_atomic(out / SETTINGS_FILE, json.dumps(settings).encode())
-    jobs = [(category, index) for category in categories for index in range(sequences)]
-    for category, index in tqdm(jobs, "rendering", disable=None):
-        name = name_of(seed, category, index)
-        key = _key(seed, category, index)
-        if name not in read_poses(out, category):
-            mesh = make_object(category, index, seed)
-            recorded = record_sequence(mesh, name, key, frames, image_size)
-            write_sequence(out, category, mesh, recorded)
     for category in categories:
-        names = [name_of(seed, category, index) for index in range(sequences)]
+        names = [
+            str(100 + index) if plain_names else sequence_name(seed, category, index)
+            for index in range(sequences)
+        ]
+        for index, name in enumerate(tqdm(names, category, disable=None)):
+            if name not in read_poses(out, category):
+                mesh = make_object(category, index, seed)
+                key = _key(seed, category, index)
+                write_sequence(out, category, mesh, name, key, frames, image_size)
         write_true_labels(out, category, names)
 
 
@@ -199,8 +197,7 @@ def export_models(
             left_out[f"{model.category}/{model.name}"] = str(error)
             continue
         key = _key(seed, model.category, model.name)
-        recorded = record_sequence(mesh, model.name, key, frames, image_size)
-        write_sequence(out, model.category, mesh, recorded)
+        write_sequence(out, model.category, mesh, model.name, key, frames, image_size)
         # The record is written last; a sequence with a record is complete.
         rendered.sequences.setdefault(model.category, {})[model.name] = record
         text = msgspec.json.format(msgspec.json.encode(rendered), indent=1)
@@ -233,29 +230,32 @@ def write_sequence(
     out: Path,
     category: str,
     mesh: TexturedMesh,
-    recorded: tuple[SequenceData, Float[np.ndarray, "4 4"], float],
+    name: str,
+    key: int,
+    frames: int,
+    image_size: int,
 ) -> None:
-    """Add a result of `record_sequence` to a data folder, with the pose of its object."""
-    data, pose, scale = recorded
+    """Add a sequence to a data folder, as `record_sequence` makes it, with the pose of its
+    object."""
+    data, pose, scale = record_sequence(mesh, name, key, frames, image_size)
     write_co3d(out, category, [data], quality=88)
     low = mesh.vertices.min(0).tolist()
     high = mesh.vertices.max(0).tolist()
     # The pose is written last; a sequence with a pose is complete.
     poses = read_poses(out, category)
-    poses[data.name] = ObjectPose(pose.tolist(), scale, low, high, shape_turns(mesh.vertices))
+    poses[name] = ObjectPose(pose.tolist(), scale, low, high, shape_turns(mesh.vertices))
     text = json.dumps(msgspec.to_builtins(poses), indent=1)
     write_atomic(out / category / POSES_FILE, text.encode())
 
 
-def shape_turns(vertices: Float[np.ndarray, "v 3"]) -> tuple[int, ...]:
+def shape_turns(vertices: Vertices) -> tuple[int, ...]:
     """Return the quarter turns about z, in degrees, that map the vertices to themselves."""
     points = vertices - box_centre(vertices)
     tree = KDTree(points)
     limit = 0.03 * np.ptp(points)
-    x, y, z = points.T
     turns = []
-    for degrees, turned in {90: (-y, x, z), 180: (-x, -y, z), 270: (y, -x, z)}.items():
-        distances, _ = tree.query(np.stack(turned, 1))
+    for degrees in (90, 180, 270):
+        distances, _ = tree.query(points @ rotation("z", np.radians(degrees)).T)
         if distances.max() < limit:
             turns.append(degrees)
     return tuple(turns)

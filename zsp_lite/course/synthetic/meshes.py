@@ -16,7 +16,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from zsp_lite.course.synthetic.primitives import (
+    Faces,
     Mesh,
+    Vertices,
     area_normals,
     box_centre,
     joined,
@@ -60,8 +62,8 @@ class Material:
 class TexturedMesh:
     """A triangle mesh with materials."""
 
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]  # indices of vertices
+    vertices: Vertices
+    faces: Faces
     normals: Float[np.ndarray, "f 3 3"]  # unit shading normal of each corner of each face
     # of each corner; (0, 0) is the lower left corner of the texture, which repeats
     uv: Float[np.ndarray, "f 3 2"]
@@ -123,7 +125,8 @@ def list_models(folder: str | Path, front: str | None = None, up: str | None = N
         InputError: if there is no model, two files of one model, or an entry without a file.
     """
     folder = Path(folder)
-    infos = read_infos(folder)
+    path = folder / MODELS_FILE
+    infos = read_json(path, dict[str, ModelInfo], "model list") if path.is_file() else {}
     models = {}
     files = [(path.parent.name, path.stem, path) for path in folder.glob("*/*")]
     files += [(path.parts[-3], path.parts[-2], path) for path in folder.glob("*/*/*")]
@@ -150,12 +153,6 @@ def list_models(folder: str | Path, front: str | None = None, up: str | None = N
             f"{folder / MODELS_FILE} names {min(infos)!r}, which has no file in {folder}"
         )
     return [models[key] for key in sorted(models)]
-
-
-def read_infos(folder: str | Path) -> dict[str, ModelInfo]:
-    """Return the entries of a folder's `models.json` by "CATEGORY/NAME"; empty without the file."""
-    path = Path(folder) / MODELS_FILE
-    return read_json(path, dict[str, ModelInfo], "model list") if path.is_file() else {}
 
 
 def read_mesh(path: str | Path) -> TexturedMesh:
@@ -342,23 +339,19 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray,
     weighted = area_normals(unit_size, faces)
     normal = unit(weighted)
     # Faces meet where their corners are at the same point, even if they share no vertex. Corners
-    # 3 f to 3 f + 2 belong to face f. `corner` lists all corners point by point: the corners of
-    # point p are at `count[p]` positions from `first[p]` on; `of[i]` is the point at position i.
+    # 3 f to 3 f + 2 belong to face f; `by_point` lists them point by point.
     _, point = np.unique(np.round(unit_size, 6), axis=0, return_inverse=True)
     point = point.ravel()[faces.ravel()]
-    corner = np.argsort(point, kind="stable")
-    _, first, of, count = np.unique(
-        point[corner], return_index=True, return_inverse=True, return_counts=True
-    )
-    face = corner // 3
-    total = np.zeros((len(corner), 3))
+    by_point = np.argsort(point, kind="stable")
+    count = np.bincount(point)
+    first = np.cumsum(count) - count  # position of the first corner of each point
+    total = np.zeros((len(point), 3))
     # In each step, every corner meets the step-th corner of its point, if there is one.
-    position = np.arange(len(corner))
-    for step in range(min(int(count.max()), _FACES_PER_POINT)):
-        position = position[count[of[position]] > step]
-        other = face[first[of[position]] + step]
-        smooth = np.einsum("nd,nd->n", normal[face[position]], normal[other]) > _CREASE
-        total[corner[position[smooth]]] += weighted[other[smooth]]
+    for step in range(min(count.max(), _FACES_PER_POINT)):
+        corner = np.flatnonzero(count[point] > step)
+        other = by_point[first[point[corner]] + step] // 3
+        smooth = np.einsum("nd,nd->n", normal[corner // 3], normal[other]) > _CREASE
+        total[corner[smooth]] += weighted[other[smooth]]
     # At a point of more than _FACES_PER_POINT faces, a corner may have met none, not even its own
     # face; it keeps the normal of that face.
     normals = unit(np.where(total.any(1, keepdims=True), total, np.repeat(normal, 3, axis=0)))

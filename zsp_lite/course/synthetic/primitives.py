@@ -5,8 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 TAU = 2 * np.pi
+Vertices = Float[np.ndarray, "v 3"]
+Faces = Int[np.ndarray, "f 3"]  # indices of vertices
 # Of a point (3,), of a point (2,) in the plane of an outline, or of an outline's points (n, 2).
 Coordinates = Sequence | np.ndarray
 # Radius where a lathe's profile meets the axis; zero would give triangles without an area.
@@ -23,8 +26,8 @@ _PLANES = {
 class Mesh:
     """A triangle mesh: vertices in object units, and faces as indices of vertices."""
 
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
+    vertices: Vertices
+    faces: Faces
 
     def translated(self, offset: Coordinates) -> "Mesh":
         """Return the mesh shifted by `offset` (3,)."""
@@ -40,10 +43,9 @@ class Mesh:
 
     def pointing(self, direction: Coordinates) -> "Mesh":
         """Return the mesh rotated so that its z axis points along `direction` (3,)."""
-        z = np.asarray(direction, float) / np.linalg.norm(direction)
+        z = unit(np.asarray(direction, float))
         # The x axis may be any that is perpendicular to z; y does for it unless it is nearly z.
-        x = np.cross([0, 1, 0] if abs(z[1]) < 0.9 else [1, 0, 0], z)
-        x /= np.linalg.norm(x)
+        x = unit(np.cross([0, 1, 0] if abs(z[1]) < 0.9 else [1, 0, 0], z))
         return Mesh(self.vertices @ np.stack([x, np.cross(z, x), z]), self.faces)
 
     def mirrored(self) -> "Mesh":
@@ -57,30 +59,28 @@ def point(*coordinates: float) -> Float[np.ndarray, " d"]:
     return np.array(coordinates)
 
 
-def joined(meshes: Sequence[Mesh]) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+def joined(meshes: Sequence[Mesh]) -> tuple[Vertices, Faces]:
     """Return the vertices and the faces of several meshes as those of one."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts)]
     return np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces)
 
 
-def box_centre(vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "3"]:
+def box_centre(vertices: Vertices) -> Float[np.ndarray, "3"]:
     """Return the centre of the vertices' bounding box."""
     return (vertices.max(0) + vertices.min(0)) / 2
 
 
-def surface_spread(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
+def surface_spread(vertices: Vertices, faces: Faces) -> float:
     """Return the standard deviation of the surface's points, averaged over the three axes."""
     # Each face counts as its middle, weighted by its (twofold) area.
-    area = np.linalg.norm(area_normals(vertices, faces), axis=1, keepdims=True)
-    middle = vertices[faces].sum(1) / 3
-    mean = (middle * area).sum(0) / area.sum()
-    return float(np.sqrt(((middle - mean) ** 2 * area).sum(0) / area.sum()).mean())
+    area = np.linalg.norm(area_normals(vertices, faces), axis=1)
+    middle = vertices[faces].mean(1)
+    covariance = np.cov(middle.T, ddof=0, aweights=area)
+    return float(np.sqrt(covariance.diagonal()).mean())
 
 
-def area_normals(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> Float[np.ndarray, "f 3"]:
+def area_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "f 3"]:
     """Return the normals of faces, with twice their areas as lengths."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     return np.cross(b - a, c - a)
@@ -88,20 +88,12 @@ def area_normals(
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Return vectors scaled to unit length; zeros stay."""
-    length = np.sqrt(np.einsum("...d,...d->...", vectors, vectors))[..., None]
-    return vectors / np.maximum(length, 1e-30)
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
 
 
 def rotation(axis: str, angle: float) -> Float[np.ndarray, "3 3"]:
     """Return the right-handed rotation about the axis "x", "y" or "z"; the angle in radians."""
-    i = "xyz".index(axis)
-    j = (i + 1) % 3
-    k = (i + 2) % 3
-    R = np.eye(3)
-    R[j, j] = R[k, k] = np.cos(angle)
-    R[k, j] = np.sin(angle)
-    R[j, k] = -R[k, j]
-    return R
+    return Rotation.from_euler(axis, angle).as_matrix()
 
 
 def direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
@@ -113,12 +105,12 @@ def direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
 def box(size: float | Coordinates, centre: Coordinates = (0, 0, 0)) -> Mesh:
     """Return an axis-aligned box of the given size (3,); one number gives a cube."""
     # Corner 4 i + 2 j + k is on side i along x, side j along y, side k along z (0 for -, 1 for +).
-    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    corners = np.indices((2, 2, 2)).reshape(3, 8).T - 0.5
     # The four corners of each side, counter-clockwise seen from outside.
     sides = np.array(
         [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     )
-    faces = np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
+    faces = sides[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
     return Mesh(corners, faces).scaled(size).translated(centre)
 
 
@@ -127,17 +119,16 @@ def lathe(profile: Coordinates, sides: int = 20, start: float = 0.0, stop: float
     profile = np.asarray(profile, float)
     closed = np.isclose(stop - start, TAU)
     angle = np.linspace(start, stop, sides, endpoint=not closed)
-    x = np.outer(profile[:, 0], np.cos(angle))
-    y = np.outer(profile[:, 0], np.sin(angle))
+    circle = np.stack([np.cos(angle), np.sin(angle), np.ones(sides)], 1)
     # Vertex i * sides + j is point i of the profile at angle j.
-    vertices = np.stack([x, y, np.repeat(profile[:, 1:], sides, 1)], -1).reshape(-1, 3)
-    columns = np.arange(sides if closed else sides - 1)
-    ring, j = np.meshgrid(np.arange(len(profile) - 1) * sides, columns, indexing="ij")
+    vertices = profile[:, None, [0, 0, 1]] * circle
     # Two triangles fill the cell between the vertices a and b of a ring and those above them.
-    a = (ring + j).ravel()
-    b = (ring + (j + 1) % sides).ravel()
-    faces = np.stack([np.stack([a, b, b + sides], 1), np.stack([a, b + sides, a + sides], 1)], 1)
-    return Mesh(vertices, faces.reshape(-1, 3))
+    a = np.arange(vertices[1:, :, 0].size).reshape(-1, sides)
+    b = np.roll(a, -1, axis=1)
+    faces = np.stack([a, b, b + sides, a, b + sides, a + sides], -1)
+    if not closed:
+        faces = faces[:, :-1]
+    return Mesh(vertices.reshape(-1, 3), faces.reshape(-1, 3))
 
 
 def cylinder(bottom: float, top: float, height: float, sides: int = 18) -> Mesh:
@@ -209,19 +200,14 @@ def extrusion(
     # Vertices 0 .. n - 1 are the outline at the back, n is its mean; then the same at the front.
     flat = np.concatenate([outline, [outline.mean(0)]])
     across = np.repeat([-thickness / 2, thickness / 2], n + 1) + offset
-    back = np.arange(n)
-    after = (back + 1) % n
-    back_mean = np.full(n, n)
-    front = n + 1
-    front_mean = back_mean + front
-    faces = [
-        [back_mean, back, after],
-        [front_mean, front + after, front + back],
-        [back, after, front + after],
-        [back, front + after, front + back],
-    ]
     vertices = np.zeros((2 * n + 2, 3))
     vertices[:, _PLANES[plane]] = np.column_stack([np.tile(flat, (2, 1)), across])
-    # Each row of `faces` holds the corners (3, n) of one face per edge; the result is ordered by
-    # edge, with four faces each.
-    return Mesh(vertices, np.array(faces).transpose(2, 0, 1).reshape(-1, 3))
+    # Four faces belong to the edge from `a` to `b`: one at the back, one at the front, two between.
+    a = np.arange(n)
+    b = np.roll(a, -1)
+    mean = np.full(n, n)
+    front_a, front_b, front_mean = np.stack([a, b, mean]) + n + 1
+    back = [mean, a, b]
+    front = [front_mean, front_b, front_a]
+    faces = np.stack([*back, *front, a, b, front_b, a, front_b, front_a], 1)
+    return Mesh(vertices, faces.reshape(-1, 3))

@@ -13,16 +13,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from zsp_lite.course.synthetic.meshes import TexturedMesh
-from zsp_lite.course.synthetic.primitives import TAU, area_normals, box_centre, unit
+from zsp_lite.course.synthetic.primitives import TAU, Vertices, area_normals, box_centre, unit
 from zsp_lite.course.synthetic.room import FLOOR_REACH, Room, Values, Vectors
 from zsp_lite.course.synthetic.textures import (
     Image,
+    Map,
     pyramid,
     sample_image,
     sample_pyramid,
     srgb_to_linear,
 )
 from zsp_lite.data.cameras import Camera
+from zsp_lite.data.depth import unproject_depth
 
 _LAYERS = 4  # surfaces that a ray meets at most, as it passes through the holes of textures
 _HOLE = 128  # opacity of a texture, 0 to 255, below which it has a hole
@@ -44,7 +46,7 @@ class Rendering:
 
     rgb: UInt8[np.ndarray, "h w 3"]
     # z in the camera frame, 0 where the ray hits neither the object nor the floor
-    depth: Float[np.ndarray, "h w"]
+    depth: Map
     mask: Bool[np.ndarray, "h w"]  # pixels of the object
     canonical: Image  # object coordinates of each object pixel, NaN elsewhere
     # unit normals of the object pixels in the camera frame, 0 elsewhere
@@ -77,7 +79,7 @@ class MeshScene:
         mesh: TexturedMesh,
         room: Room,
         seed: int | np.random.Generator,
-        coordinates: Float[np.ndarray, "v 3"] | None = None,
+        coordinates: Vertices | None = None,
         samples: int = 2,
     ):
         import open3d as o3d
@@ -322,7 +324,7 @@ class MeshScene:
         around = cv2.GaussianBlur(around, (0, 0), 2.0)
         return np.dstack([key, around]), width
 
-    def _background(self, camera: Camera, rays: Image) -> tuple[Image, Float[np.ndarray, "h w"]]:
+    def _background(self, camera: Camera, rays: Image) -> tuple[Image, Map]:
         """Return the room's radiance with the object's shadow, and the depth of the floor."""
         eye = camera.centre - self.origin
         flat_rays = rays.reshape(-1, 3)
@@ -339,11 +341,9 @@ class MeshScene:
 def _pixel_rays(camera: Camera, n: int) -> Image:
     """Return rays of unit z in the camera frame through n x n points of each pixel."""
     height, width = camera.size
-    x = ((np.arange(width * n) + 0.5) / n - camera.principal_point[0]) / camera.focal_length[0]
-    y = ((np.arange(height * n) + 0.5) / n - camera.principal_point[1]) / camera.focal_length[1]
-    # The world direction of (x, y, 1) is x R[0] + y R[1] + R[2], here with the shape (h, w, 3).
-    rays = x[None, :, None] * camera.R[0] + (y[:, None, None] * camera.R[1] + camera.R[2])
-    return rays.astype(np.float32)
+    finer = camera.resize((n * height, n * width))
+    rays = unproject_depth(np.ones(finer.size), finer)
+    return (rays @ camera.R).astype(np.float32)
 
 
 def _interpolated(

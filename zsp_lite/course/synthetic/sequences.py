@@ -13,11 +13,20 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from zsp_lite.course.synthetic.meshes import TexturedMesh
-from zsp_lite.course.synthetic.primitives import TAU, Coordinates, box_centre, direction, rotation
+from zsp_lite.course.synthetic.primitives import (
+    TAU,
+    Coordinates,
+    Vertices,
+    box_centre,
+    direction,
+    rotation,
+    unit,
+)
 from zsp_lite.course.synthetic.raytracing import MeshScene, Rendering
 from zsp_lite.course.synthetic.room import random_room
-from zsp_lite.course.synthetic.textures import blur, smooth_noise
+from zsp_lite.course.synthetic.textures import Map, blur, smooth_noise
 from zsp_lite.data.cameras import Camera
+from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import Frame
 from zsp_lite.data.writing import SequenceData
 from zsp_lite.points import axis_deviation
@@ -47,15 +56,14 @@ def orbit_pose(
     """
     away = direction(azimuth, elevation)
     forward = -away
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
+    right = unit(np.cross(forward, [0, 0, 1.0]))
     # The rows are the camera's axes: right, down and forward.
     R = rotation("z", roll) @ np.stack([right, np.cross(forward, right), forward])
     return R, -R @ (np.asarray(target, float) + away * distance)
 
 
 def handheld_sweep(
-    vertices: Float[np.ndarray, "v 3"],
+    vertices: Vertices,
     rng: np.random.Generator,
     frames: int,
     size: tuple[int, int],
@@ -102,7 +110,7 @@ def handheld_sweep(
 
 
 def image_box(
-    vertices: Float[np.ndarray, "v 3"], R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]
+    vertices: Vertices, R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Return the lower and upper corner (x, y) of the vertices' image at focal length 1."""
     in_camera = vertices @ R.T + t
@@ -151,7 +159,7 @@ def render_sequence(
 
 def stereo_depth(
     view: Rendering, object_holes: float, floor_holes: float, rng: np.random.Generator
-) -> Float[np.ndarray, "h w"]:
+) -> Map:
     """Simulate the depth map of multi-view stereo, 0 where the depth is unknown.
 
     Args:
@@ -176,7 +184,7 @@ def stereo_depth(
     return np.where(known, view.depth * np.maximum(1 + noise, 0.5), 0).astype(np.float32)
 
 
-def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
+def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Map:
     """Return how well stereo would match each pixel: badly at depth edges and grazing angles."""
     h, w = view.mask.shape
     scale = min(h, w) / 100  # pixels per percent of the shorter side
@@ -195,8 +203,7 @@ def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Float[np.nd
     edge = np.minimum(blur((jump > 0.03).astype(np.float32), max(0.5 * scale, 0.3)) * 2, 1)
 
     # Grazing angles: 0 up to 60 degrees between ray and normal, 1 at 90.
-    x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
-    ray = view.camera.unproject_camera(np.stack([x, y], -1), np.ones((h, w)))
+    ray = unproject_depth(np.ones((h, w)), view.camera)
     facing = np.abs((view.normals * ray).sum(-1)) / np.linalg.norm(ray, axis=-1)
     grazing = np.where(view.mask, np.clip(1 - facing / 0.5, 0, 1), 0)
 
@@ -205,7 +212,7 @@ def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Float[np.nd
     return texture + noise - 1.5 * edge - 1.5 * grazing
 
 
-def soft_mask(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
+def soft_mask(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Map:
     """Simulate the probabilities (float32) of a segmentation network: a soft, displaced edge."""
     # Distance from the edge in pixels, positive inside. OpenCV measures from the centre of a pixel
     # to the centre of the nearest pixel of the other kind; the edge is half a pixel nearer.
@@ -220,17 +227,17 @@ def soft_mask(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Float[
 
 def fused_cloud(
     views: Sequence[Rendering],
-    depths: Sequence[Float[np.ndarray, "h w"]],
+    depths: Sequence[Map],
     n_points: int,
     rng: np.random.Generator,
 ) -> list[np.ndarray]:
     """Sample world points of the object from all depth maps, with normals and 8-bit colours."""
     clouds = []
     for view, depth in zip(views, depths):
-        row, col = np.nonzero((depth > 0) & view.mask)
-        points = view.camera.unproject(np.stack([col + 0.5, row + 0.5], -1), depth[row, col])
-        normals = view.normals[row, col] @ view.camera.R  # from the camera frame to the world
-        clouds.append((points, normals, view.rgb[row, col]))
+        known = (depth > 0) & view.mask
+        points = view.camera.to_world(unproject_depth(depth, view.camera)[known])
+        normals = view.normals[known] @ view.camera.R  # from the camera frame to the world
+        clouds.append((points, normals, view.rgb[known]))
     cloud = [np.concatenate(values) for values in zip(*clouds)]
     n = len(cloud[0])
     chosen = np.sort(rng.choice(n, min(n_points, n), replace=False))

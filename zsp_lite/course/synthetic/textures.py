@@ -1,6 +1,7 @@
 """Colours, smooth noise, the albedo of floors and walls, and sampling between pixels."""
 
 from collections.abc import Sequence
+from colorsys import hsv_to_rgb
 
 import cv2
 import numpy as np
@@ -9,6 +10,8 @@ from jaxtyping import Float
 Colour = Float[np.ndarray, "3"]
 # A colour, vector or point per pixel.
 Image = Float[np.ndarray, "h w 3"]
+# A number per pixel.
+Map = Float[np.ndarray, "h w"]
 ANY_HUE = (0, 360)  # range in degrees
 
 _FOLD = 4096  # points per row of OpenCV's maps, whose sides are limited to 32,767
@@ -30,22 +33,16 @@ def linear_to_srgb(colour: np.ndarray) -> np.ndarray:
     return np.where(colour <= 0.0031308, 12.92 * colour, 1.055 * colour ** (1 / 2.4) - 0.055)
 
 
-def hsv(hue: float, saturation: float, value: float) -> Colour:
-    """Return an sRGB colour from its hue in degrees, its saturation and its value."""
-    # Each channel has a cycle of six: lowest from 1 to 3, full from 4 to 6, linear in between.
-    # The offsets put 5, the middle of the full part, at 0 degrees (red), 120 (green), 240 (blue).
-    phase = (np.array([5, 3, 1]) + hue / 60) % 6
-    return value - value * saturation * np.clip(np.minimum(phase, 4 - phase), 0, 1)
-
-
 def random_colour(
     rng: np.random.Generator,
     hue: tuple[float, float],
     saturation: tuple[float, float],
     value: tuple[float, float],
 ) -> Colour:
-    """Draw an sRGB colour from ranges of the arguments of `hsv`."""
-    return hsv(rng.uniform(*hue), rng.uniform(*saturation), rng.uniform(*value))
+    """Draw an sRGB colour from ranges of hue (in degrees), saturation and value."""
+    return np.array(
+        hsv_to_rgb(rng.uniform(*hue) / 360, rng.uniform(*saturation), rng.uniform(*value))
+    )
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:
@@ -56,7 +53,7 @@ def blur(image: np.ndarray, sigma: float) -> np.ndarray:
 
 def smooth_noise(
     rng: np.random.Generator, size: tuple[int, int], sigma: float, stretch: float = 1.0
-) -> Float[np.ndarray, "h w"]:
+) -> Map:
     """Return smooth Gaussian noise of unit variance.
 
     It is smoothed over `sigma` pixels down the columns and `sigma * stretch` along the rows.
@@ -99,9 +96,7 @@ def surface_albedo(
     return srgb_to_linear(np.clip(brightness[..., None] * colour.astype(np.float32), 0, 0.92))
 
 
-def _tiles(
-    rng: np.random.Generator, size: tuple[int, int], height: int, width: int
-) -> Float[np.ndarray, "h w"]:
+def _tiles(rng: np.random.Generator, size: tuple[int, int], height: int, width: int) -> Map:
     """Return the brightness (about 1) of tiles that differ at random, with dark joints."""
     row = np.arange(size[0])[:, None]
     # Each row of tiles is shifted by the same offset against the row before it.
@@ -154,15 +149,10 @@ def sample_image(
     if not len(u):
         return np.empty((0, channels), np.float32)
     # In OpenCV's pixel coordinates, the centre of the first pixel is at 0.
-    x = _folded(u * width - 0.5)
-    y = _folded(v * height - 0.5)
+    places = np.stack([u * width, v * height]) - 0.5
+    places = np.pad(places, ((0, 0), (0, -len(u) % _FOLD))).astype(np.float32)
+    x, y = places.reshape(2, -1, _FOLD)
     samples = cv2.remap(
         image, x, y, cv2.INTER_LINEAR, borderMode=border, borderValue=(1.0, 1.0, 1.0, 1.0)
     )
     return samples.reshape(-1, channels)[: len(u)].astype(np.float32, copy=False)
-
-
-def _folded(coordinates: np.ndarray) -> Float[np.ndarray, "rows n"]:
-    """Return coordinates (n,) in rows of `_FOLD`, padded by zeros."""
-    padding = -len(coordinates) % _FOLD
-    return np.pad(coordinates, (0, padding)).astype(np.float32).reshape(-1, _FOLD)

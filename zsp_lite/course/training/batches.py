@@ -98,19 +98,16 @@ def sample_batch(
     renders: RenderSet,
     rng: np.random.Generator,
     objects: int,
-    views: int,
     side: int,
     scale: tuple[float, float],
     members: np.ndarray | None = None,
 ) -> Batch:
-    """Draw random crops of rendered views.
+    """Draw a random crop of each view of some objects.
 
     Args:
         renders: the training set.
         rng: source of the random numbers.
         objects: number of objects.
-        views: number of views per object: 8 (all), 4 (two pairs, a quarter turn apart) or 2 (one
-            pair).
         side: of the crops in pixels.
         scale: range of their widths, as a fraction of the image's.
         members: indices of the objects; by default random.
@@ -119,16 +116,12 @@ def sample_batch(
         The crops, recoloured, with the geometry of their patches.
     """
     index = rng.integers(0, len(renders.rgb), objects) if members is None else members
-    # Indices of views (objects, views): all, or consecutive ones from a random pair on.
-    chosen = np.arange(VIEWS)[None].repeat(objects, 0)
-    if views < VIEWS:
-        chosen = (2 * rng.integers(0, VIEWS // 2, (objects, 1)) + np.arange(views)) % VIEWS
 
     def maps_of(array: np.ndarray) -> Tensor:  # (crops, channels, rows, columns)
-        maps = torch.from_numpy(array[index[:, None], chosen])
+        maps = torch.from_numpy(array[index])
         return maps.flatten(0, 1).permute(0, 3, 1, 2).float()
 
-    grid, turn = crop_grids(rng, objects * views, views, side, scale)
+    grid, turn = crop_grids(rng, objects * VIEWS, VIEWS, side, scale)
     images = F.grid_sample(
         maps_of(renders.rgb) / 255, grid, padding_mode="reflection", align_corners=False
     )

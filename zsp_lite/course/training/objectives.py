@@ -133,7 +133,7 @@ def attention_loss(
 
 
 def losses(
-    model: Trainee, batch: Batch, generator: torch.Generator, helpers: float = 0.4
+    model: Trainee, batch: Batch, generator: torch.Generator, helpers: float
 ) -> tuple[Tensor, dict[str, float]]:
     """Compute the correspondence loss plus `helpers` times the geometry and attention losses.
 

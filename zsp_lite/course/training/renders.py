@@ -13,12 +13,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from zsp_lite.course.synthetic.assembly import Assembly, make_shape, random_materials
+from zsp_lite.course.synthetic.assembly import Draw, Parts, make_shape, pair, random_materials
 from zsp_lite.course.synthetic.meshes import TexturedMesh
 from zsp_lite.course.synthetic.primitives import (
     TAU,
     Coordinates,
     Mesh,
+    Vertices,
     box,
     box_centre,
     capsule,
@@ -112,7 +113,7 @@ def _geometry(image: Rendering) -> tuple[np.ndarray, np.ndarray]:
 
 
 def framed_camera(
-    vertices: Float[np.ndarray, "v 3"],
+    vertices: Vertices,
     R: np.ndarray,
     t: np.ndarray,
     size: int,
@@ -139,7 +140,7 @@ def framed_camera(
 def render_instance(
     number: int,
     mesh: TexturedMesh,
-    coordinates: Float[np.ndarray, "v 3"],
+    coordinates: Vertices,
     camera: Camera,
     rng: np.random.Generator,
 ) -> Rendering:
@@ -165,40 +166,40 @@ def _room(index: int) -> Room:
     return replace(room, images=tuple(halves))
 
 
-def build_random_object(a: Assembly) -> None:
+def build_random_object(draw: Draw) -> Parts:
     """Build a symmetric tree of 5 to 10 random parts, each attached to an earlier part."""
     # The nodes of the tree: centre and size of each part.
-    body = point(a.uniform(0.5, 1.3), a.uniform(0.4, 1.0), a.uniform(0.4, 1.2))
+    body = point(draw(0.5, 1.3), draw(0.4, 1.0), draw(0.4, 1.2))
     nodes = [(np.zeros(3), body)]
-    a.add(_random_solid(a, body), a.choice(5))
-    for _ in range(4 + a.choice(6)):
-        parent, parent_size = a.pick(*nodes)
-        direction = a.rng.normal(size=3)
-        size = a.rng.uniform(0.12, 0.8, 3) * a.uniform(0.5, 1.0)
+    yield _random_solid(draw, body), draw.choice(5)
+    for _ in range(4 + draw.choice(6)):
+        parent, parent_size = draw.pick(*nodes)
+        direction = draw.rng.normal(size=3)
+        size = draw.rng.uniform(0.12, 0.8, 3) * draw(0.5, 1.0)
         # The centre is on a box about the parent, so that the two parts overlap.
         centre = parent + direction / np.abs(direction).max() * (parent_size * 0.4 + size * 0.3)
-        mesh = _random_solid(a, size)
-        mirror = a.chance(0.55)
+        mesh = _random_solid(draw, size)
         # A part is on the left with its mirror image on the right, or in the middle.
+        mirror = draw.chance(0.55)
         centre[1] = abs(centre[1]) if mirror else 0
-        if mirror and a.chance(0.5):
-            mesh = mesh.rotated("z", a.uniform(-0.7, 0.7)).rotated("x", a.uniform(-0.7, 0.7))
-        a.add(mesh.translated(centre), a.choice(5), mirror)
+        if mirror and draw.chance(0.5):
+            mesh = mesh.rotated("z", draw(-0.7, 0.7)).rotated("x", draw(-0.7, 0.7))
+        yield from pair(mesh.translated(centre), draw.choice(5), mirror)
         nodes.append((centre, size))
 
 
-def _random_solid(a: Assembly, size: np.ndarray) -> Mesh:
+def _random_solid(draw: Draw, size: np.ndarray) -> Mesh:
     """Return a solid of about the given size (3,), sometimes rotated about the axis to the left."""
     # The outline of the slab is an irregular pentagon about the origin.
-    angle = np.arange(5) * TAU / 5 + a.rng.uniform(0, TAU / 5, 5)
-    outline = np.stack([np.cos(angle), np.sin(angle)], 1) * a.rng.uniform(0.3, 0.6, (5, 1))
+    angle = np.arange(5) * TAU / 5 + draw.rng.uniform(0, TAU / 5, 5)
+    outline = np.stack([np.cos(angle), np.sin(angle)], 1) * draw.rng.uniform(0.3, 0.6, (5, 1))
     solids = (
         box(1),
         ellipsoid(0.55),
-        cylinder(0.5, 0.5 * a.uniform(0.3, 1), 1.0),
+        cylinder(0.5, 0.5 * draw(0.3, 1), 1.0),
         capsule((-0.25, 0, 0), (0.25, 0, 0), 0.25).scaled((1, 2, 2)),
-        torus(0.36, 0.12, a.pick(*np.eye(3))),
-        extrusion(outline, a.uniform(0.1, 0.9), a.pick("xz", "xy", "yz")),
+        torus(0.36, 0.12, draw.pick(*np.eye(3))),
+        extrusion(outline, draw(0.1, 0.9), draw.pick("xz", "xy", "yz")),
     )
-    mesh = a.pick(*solids).scaled(size)
-    return mesh.rotated("y", a.uniform(-0.8, 0.8)) if a.chance(0.4) else mesh
+    mesh = draw.pick(*solids).scaled(size)
+    return mesh.rotated("y", draw(-0.8, 0.8)) if draw.chance(0.4) else mesh

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from zsp_lite.backbones.vit import TrainingTokens, VisionTransformer
 from zsp_lite.course.training.batches import PATCH_SIZE, sample_batch
-from zsp_lite.course.training.renders import VIEWS, RenderSet
+from zsp_lite.course.training.renders import RenderSet
 
 
 class Trainee(nn.Module):
@@ -53,7 +53,7 @@ def as_trainee(backbone: VisionTransformer, layer: int, renders: RenderSet, side
     """
     trainee = Trainee(backbone, layer)
     batch = sample_batch(
-        renders, np.random.default_rng(7), min(6, len(renders.rgb)), VIEWS, side, (0.85, 1.0)
+        renders, np.random.default_rng(7), min(6, len(renders.rgb)), side, (0.85, 1.0)
     )
     trainee.centred(trainee(batch.images).keys, update_mean=True)
     return trainee
@@ -86,7 +86,7 @@ def initial_backbone(
 
     # The patches (n, 3 p p) of some crops, and their principal axes by increasing variance.
     rng = np.random.default_rng([0, 1])
-    batches = [sample_batch(renders, rng, 15, VIEWS, 96, (0.4, 1.0)) for _ in range(4)]
+    batches = [sample_batch(renders, rng, 15, 96, (0.4, 1.0)) for _ in range(4)]
     images = torch.cat([batch.images for batch in batches])
     patches = F.unfold(images, p, stride=p).transpose(1, 2).flatten(0, 1)
     patches = patches - patches.mean(0)

@@ -16,7 +16,7 @@ function render({ model, el }) {
   canvas.setAttribute("role", "img");
   el.append(canvas);
   const pen = canvas.getContext("2d");
-  let points, colours, view, zoom, pan, side, unit, spots, scheduled = false, held = null;
+  let points, colours, view, zoom, pan, side, unit, scheduled = false, held = null;
 
   const project = (p) => {
     const at = [0, 3, 6].map((i) => view[i] * p[0] + view[i + 1] * p[1] + view[i + 2] * p[2]);
@@ -55,20 +55,14 @@ function render({ model, el }) {
     for (const ends of model.get("lines") ?? []) {
       outlined("M" + ends.map((end) => project(end).slice(0, 2)).join("L"), [2, 1], "#D55E00");
     }
-    const cursor = model.get("cursor");
-    if (cursor.length) {
-      const [x, y] = project(cursor);
-      outlined(`M${x - 14} ${y}h9m10 0h9M${x} ${y - 14}v9m0 10v9`, [5, 2]);
-    }
-    model.get("marks").forEach(drawMark); // last, as it leaves dashes and transparency
+    model.get("marks").forEach(drawMark);
     canvas.dataset.marks = model.get("marks").length;
-    canvas.dataset.cursor = cursor.join(" ");
     canvas.setAttribute("aria-label", model.get("alt"));
   }
 
   // Draw the points, far ones first, paler with depth.
   function drawSpots() {
-    spots = [];
+    const spots = [];
     for (let i = 0; i < points.length; i += 3) spots.push([...project(points.subarray(i, i + 3)), i]);
     spots.sort((a, b) => b[2] - a[2]);
     const radius = Math.max(1, (SPOT * unit) / 2);
@@ -91,13 +85,10 @@ function render({ model, el }) {
     }
   }
 
-  // Draw a number in a disc beside its point; the outline is dashed where the cloud hides the point.
+  // Draw a number in a disc beside its point.
   function drawMark(at, index) {
-    const [x, y, z] = project(at);
-    const hidden = spots.some((spot) => Math.hypot(spot[0] - x, spot[1] - y) < 4 && spot[2] < z - 0.12);
+    const [x, y] = project(at);
     const [left, top] = [clamp(x + 15, 10, side - 10), clamp(y - 15, 10, side - 10)];
-    pen.globalAlpha = hidden ? 0.6 : 1;
-    pen.setLineDash(hidden ? [3, 2] : []);
     outlined(`M${x} ${y}L${left} ${top}M${x + 3.5} ${y}a3.5 3.5 0 1 0-7 0a3.5 3.5 0 1 0 7 0`, [4, 1.5]);
     pen.beginPath();
     pen.arc(left, top, 9, 0, 7);
@@ -174,7 +165,7 @@ function render({ model, el }) {
   model.on("change:points change:colours change:discs", updatePoints);
   model.on("change:view", () => { if (!held) { view = model.get("view"); schedule(); } });
   model.on("change:view_resets", resetView);
-  model.on("change:marks change:cursor change:alt change:side", schedule);
+  model.on("change:marks change:alt change:side", schedule);
   updatePoints();
   resetView();
 }
@@ -198,7 +189,7 @@ function stored(el, panels, alt) {
     box.append(title);
     const state = {
       points: Float32Array.from(new Int16Array(decoded(points).buffer), (x) => x / 8192),
-      colours: decoded(colours), discs: Infinity, marks: [], cursor: [], lines, alt: `${title}: ${alt}`,
+      colours: decoded(colours), discs: Infinity, marks: [], lines, alt: `${title}: ${alt}`,
     };
     const get = (name) => ({ ...state, view, side: box.clientWidth - 2 })[name];
     const set = (_, value) => { view = value; redraw(); };

@@ -9,8 +9,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, Real, UInt8
-from scipy.spatial import KDTree
+from jaxtyping import Float, Real, UInt8
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.course.widgets.common import load_package
@@ -25,15 +24,6 @@ _STYLE = """
 .zsp-cloud { border: 1px solid #888; background: white; cursor: crosshair; touch-action: none; }
 .zsp-cloud:focus { outline: 3px solid #0072B2; outline-offset: -3px; }
 """
-
-
-def subsample(points: Real[np.ndarray, "n 3"], most: int = MAX_POINTS) -> Int[np.ndarray, " m"]:
-    """Return the indices of at most `most` points, in an order in which neighbours follow each
-    other: the slider goes through it."""
-    chosen = np.arange(len(points))
-    if len(points) > most:
-        chosen = np.random.default_rng(0).choice(len(points), most, replace=False)
-    return chosen[KDTree(points[chosen]).indices]  # ordered leaf by leaf
 
 
 def point_under(
@@ -90,10 +80,11 @@ class CloudView:
         """
         self._cloud = np.asarray(points, dtype=np.float64)
         self._to_view = view_units(points)
-        chosen = subsample(points, MAX_POINTS if overlay is None else MAX_POINTS // 2)
-        drawn, colours, discs = points[chosen], colours[chosen], len(chosen)
+        most = MAX_POINTS if overlay is None else MAX_POINTS // 2
+        drawn, colours = (_shuffled(part)[:most] for part in (points, colours))
+        discs = len(drawn)
         if overlay is not None:
-            second = overlay[subsample(overlay, MAX_POINTS // 2)]
+            second = _shuffled(overlay)[:most]
             drawn = np.concatenate([drawn, second])
             both = np.uint8([list(bytes.fromhex(name[1:])) for name in (ORANGE, BLUE)])
             colours = both.repeat([discs, len(second)], axis=0)
@@ -112,19 +103,11 @@ class CloudView:
         with self.widget.hold_sync():
             self.widget.points = self.widget.colours = b""
             self.widget.marks = []
-            self.widget.cursor = []
             self.widget.alt = alt
 
     def mark(self, points: Real[np.ndarray, "k 3"]) -> None:
         """Draw the numbers 1, 2, ... beside world points."""
         self.widget.marks = self._to_view.apply(points).tolist()
-
-    def point_at(self, point: Real[np.ndarray, "3"] | None) -> None:
-        """Draw a cross-hair at a world point; None removes it."""
-        cursor = []
-        if point is not None and self._to_view is not None:
-            cursor = self._to_view.apply(point).tolist()
-        self.widget.cursor = cursor
 
     def _clicked(self, widget: Any, content: dict, buffers: list) -> None:
         """Find the point of a click that the browser sends, and pass it on."""
@@ -133,6 +116,11 @@ class CloudView:
             points = self._to_view.apply(self._cloud)
             index = point_under(points, view, np.array(content["at"]), content["reach"])
             self.on_pick(None if index is None else self._cloud[index])
+
+
+def _shuffled(rows: np.ndarray) -> np.ndarray:
+    """Return rows in a random order, always the same."""
+    return np.random.default_rng(0).permutation(rows)
 
 
 @cache
@@ -150,7 +138,6 @@ def _cloud_widget() -> type:
         colours = Bytes().tag(sync=True)  # uint8 (n, 3)
         discs = Int().tag(sync=True)  # so many points are discs, the others are crosses
         marks = List().tag(sync=True)
-        cursor = List(Float()).tag(sync=True)  # [] or a point
         view = List(Float(), [1.0, 0, 0, 0, 1, 0, 0, 0, 1]).tag(sync=True)
         view_resets = Int().tag(sync=True)  # increases when the browser must take over `view`
         side = Int(400).tag(sync=True)

@@ -39,8 +39,7 @@ def slider(label: str, low: float, high: float, value: float, step: float = 1) -
     style["layout"] = {"width": "22em"}
     if all(isinstance(x, int | np.integer) for x in (low, high, value, step)):
         return widgets.IntSlider(value, **style)
-    decimals = max(0, -int(np.floor(np.log10(step))))  # that the step needs
-    return widgets.FloatSlider(value, readout_format=f".{decimals}f", **style)
+    return widgets.FloatSlider(value, **style)
 
 
 def patch_sliders(grid: tuple[int, int], start: tuple[int, int], of: str = "") -> dict[str, Widget]:

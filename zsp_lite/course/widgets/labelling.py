@@ -17,34 +17,29 @@ from zsp_lite.course.labelling.session import (
     ACCEPTED,
     MIN_KEYPOINTS,
     OPEN,
-    SKIPPED,
     Alignment,
     Labelling,
     Progress,
 )
-from zsp_lite.course.widgets.cloud_view import CloudView, subsample
+from zsp_lite.course.widgets.cloud_view import CloudView
 from zsp_lite.course.widgets.common import Widget, load_package
 from zsp_lite.data.labels import read_labels
 from zsp_lite.errors import InputError
 from zsp_lite.viz.plots import BLUE, ORANGE
 
-_STATE_SYMBOLS = {ACCEPTED: "✓", OPEN: "○", SKIPPED: "–"}
+_STATE_SYMBOLS = {ACCEPTED: "✓", OPEN: "○"}
 _PROPOSED = (
-    "A proposal is laid over the cloud: accept it if both clouds agree; otherwise click "
-    "keypoints, or skip."
+    "A proposal is laid over the cloud: accept it if both clouds agree; otherwise click keypoints."
 )
 _TOOLTIPS = {
     "undo": "Remove the last keypoint of this sequence",
     "redo": "Remove all keypoints of this sequence",
     "accept": "Write the label of this sequence",
-    "skip": "Leave this sequence without a label",
     "next": "Go to the next open sequence",
-    "pick": "Pick the point under the cross-hair",
 }
 _HELP = (
     "Click: pick. Drag: rotate. Shift and drag: pan. Wheel: zoom, after a click on the "
-    "cloud. Keyboard: arrows and + − "
-    "on a cloud; the slider chooses a point, the button picks it."
+    "cloud. Keyboard: arrows and + − on a cloud."
 )
 _STYLE = """<style>
 .zsp-label table { border-collapse: collapse; margin: 0 1.5em 0 0; }
@@ -72,8 +67,8 @@ class _LabellingWidget:
 
     def __init__(self, labelling: Labelling):
         self.labelling = labelling
-        # For each canvas, the sequence and the overlay that it shows.
-        self.shown: dict[str, object] = {}
+        # For each canvas, the sequence that it shows.
+        self.shown: dict[str, str] = {}
         # Sequence and picks of the label in doubt for which accept was pressed once.
         self.asked = ()
         # Whether the display is being updated, which must not start another update.
@@ -108,7 +103,6 @@ class _LabellingWidget:
                 tooltip="Show both clouds, aligned, in two colours",
                 layout=narrow,
             ),
-            "point": widgets.IntSlider(description="point", style=style, layout={"width": "32em"}),
         }
         self.buttons = buttons = {
             name: widgets.Button(description=name, tooltip=tooltip, layout=narrow)
@@ -126,7 +120,7 @@ class _LabellingWidget:
         parts = {**controls, **buttons, **self.tables, "message": self.message}
         for name, part in parts.items():
             part.add_class(f"zsp-{name}")
-        for name in ("sequence", "overlay", "point"):
+        for name in ("sequence", "overlay"):
             controls[name].observe(self._changed, names="value")
         for name, button in buttons.items():
             button.on_click(lambda _, name=name: self._do(getattr(self, name)))
@@ -136,7 +130,7 @@ class _LabellingWidget:
             widgets.VBox([self.captions[name], view.widget], layout={"margin": "0 8px 0 0"})
             for name, view in self.views.items()
         ]
-        actions = map(parts.get, ("undo", "redo", "overlay", "accept", "skip", "next"))
+        actions = map(parts.get, ("undo", "redo", "overlay", "accept", "next"))
         wrap = {"flex_flow": "row wrap"}
         row = partial(widgets.HBox, layout={**wrap, "align_items": "center"})
         rows = [
@@ -146,7 +140,6 @@ class _LabellingWidget:
             self.message,
             widgets.HBox(clouds, layout=wrap),
             widgets.HTML(_HELP),
-            row([controls["point"], buttons["pick"]]),
             widgets.HBox([*self.tables.values()], layout={**wrap, "align_items": "flex-start"}),
         ]
         box = widgets.VBox(rows)
@@ -163,10 +156,6 @@ class _LabellingWidget:
     def on_reference(self) -> bool:
         """Whether the reference is chosen."""
         return self.current == self.labelling.reference
-
-    def pick(self) -> str:
-        """Pick the point under the cross-hair."""
-        return self._add(self.current, self._slider_point())
 
     def undo(self) -> str:
         """Remove the last keypoint of the sequence."""
@@ -191,11 +180,6 @@ class _LabellingWidget:
             )
         path = self.labelling.accept(sequence, confirmed=True)
         return f"Written: {'/'.join(path.parts[-3:])}. {self.next()}"
-
-    def skip(self) -> str:
-        """Leave the sequence without a label."""
-        self.labelling.skip(self.current)
-        return f"{self.current} is skipped. {self.next()}"
 
     def next(self) -> str:
         """Go to the next open sequence."""
@@ -241,11 +225,7 @@ class _LabellingWidget:
 
     def _changed(self, change: Any) -> None:
         """Follow a control that the user moves."""
-        if self.refreshing:
-            return
-        if change.owner is self.controls["point"]:
-            self._move_cursor()
-        else:
+        if not self.refreshing:
             self._do(self._instruction)
 
     def _do(self, action: Callable[[], str]) -> None:
@@ -322,11 +302,10 @@ class _LabellingWidget:
         controls["name"].disabled = not self.on_reference
         waiting = not self.on_reference and self._proposed(self.current)
         self.buttons["accept"].disabled = alignment is None and not waiting
-        self.buttons["skip"].disabled = self.on_reference
         self.tables["progress"].value = _progress_table(rows, self.current)
         self.tables["keypoints"].value = _keypoint_table(labelling.names, row.picks, alignment)
 
-        # Clouds and the cross-hair.
+        # Clouds.
         caption = f"{_dot(BLUE)} reference {html.escape(labelling.reference)}"
         self.captions["reference"].value = caption
         self._show_cloud("reference", labelling.reference, overlay=None)
@@ -339,8 +318,6 @@ class _LabellingWidget:
             suffix = "" if overlay is None else f" and {_dot(BLUE, '✕')} the aligned reference"
             self.captions["sequence"].value = f"{_dot(ORANGE)} {html.escape(self.current)}{suffix}"
             self._show_cloud("sequence", self.current, overlay)
-        controls["point"].max = max(len(subsample(labelling.cloud(self.current)[0])) - 1, 0)
-        self._move_cursor(only_if_shown=True)
         if row.problem:
             raise InputError(row.problem)
 
@@ -362,40 +339,19 @@ class _LabellingWidget:
         return sim3 and sim3.apply(labelling.cloud(labelling.reference)[0])
 
     def _show_cloud(self, name: str, sequence: str, overlay: np.ndarray | None) -> None:
-        """Show a cloud, unless it is on the canvas already, and the keypoints."""
-        before = self.shown.get(name, (None, None))
-        key = (sequence, None if overlay is None else overlay.tobytes())
-        if before != key:
-            points, colours = self.labelling.cloud(sequence)
-            alt = (
-                f"Point cloud of {sequence}. The slider named point chooses a point by keyboard, "
-                "the arrow keys rotate."
-            )
-            # A cloud that is shown already stays as the user has turned it.
-            view = None if before[0] == sequence else self.labelling.first_view(sequence)
-            try:
-                self.views[name].show(points, colours, view, alt, overlay)
-            except InputError as error:
-                self.shown.pop(name, None)
-                self.views[name].clear(f"Empty: {error}")
-                raise InputError(f"sequence {sequence}: {error}") from error
-            self.shown[name] = key
+        """Show a cloud and its keypoints."""
+        points, colours = self.labelling.cloud(sequence)
+        alt = f"Point cloud of {sequence}. The arrow keys rotate."
+        # A cloud that is shown already stays as the user has turned it.
+        shown = self.shown.pop(name, None) == sequence
+        view = None if shown else self.labelling.first_view(sequence)
+        try:
+            self.views[name].show(points, colours, view, alt, overlay)
+        except InputError as error:
+            self.views[name].clear(f"Empty: {error}")
+            raise InputError(f"sequence {sequence}: {error}") from error
+        self.shown[name] = sequence
         self.views[name].mark(self.labelling.picks(sequence))
-
-    def _slider_point(self) -> np.ndarray:
-        """Return the point of the slider, which goes through neighbours after each other."""
-        points, _ = self.labelling.cloud(self.current)
-        drawn = subsample(points)
-        return points[drawn[min(self.controls["point"].value, len(drawn) - 1)]]
-
-    def _move_cursor(self, only_if_shown: bool = False) -> None:
-        """Move the cross-hair to the point of the slider."""
-        current, other = self.views["sequence"], self.views["reference"]
-        if self.on_reference:
-            current, other = other, current
-        other.point_at(None)
-        if not only_if_shown or current.widget.cursor:
-            current.point_at(self._slider_point())
 
 
 def _progress_table(rows: Sequence[Progress], current: str) -> str:

@@ -3,45 +3,13 @@
 No backbone is trained on them, and no setting is chosen by them.
 """
 
-from zsp_lite.course.synthetic.assembly import by_name
-from zsp_lite.course.synthetic.categories.belongings import (
-    backpack,
-    book,
-    handbag,
-    keyboard,
-    laptop,
-    mouse,
-    remote,
-)
-from zsp_lite.course.synthetic.categories.household import chair, hairdryer, toaster, toilet
-from zsp_lite.course.synthetic.categories.street import bicycle, car, hydrant, motorcycle
-from zsp_lite.course.synthetic.categories.toys import (
-    teddybear,
-    toybus,
-    toyplane,
-    toytrain,
-    toytruck,
-)
+from zsp_lite.course.synthetic.categories import belongings, household, street, toys
 
-CATEGORIES = by_name(
-    backpack,
-    bicycle,
-    book,
-    car,
-    chair,
-    hairdryer,
-    handbag,
-    hydrant,
-    keyboard,
-    laptop,
-    motorcycle,
-    mouse,
-    remote,
-    teddybear,
-    toaster,
-    toilet,
-    toybus,
-    toyplane,
-    toytrain,
-    toytruck,
+_BUILDERS = (
+    *belongings.BUILDERS,
+    *household.BUILDERS,
+    *street.BUILDERS,
+    *toys.BUILDERS,
 )
+# A category has the name of its function.
+CATEGORIES = {build.__name__: build for build in sorted(_BUILDERS, key=lambda one: one.__name__)}
