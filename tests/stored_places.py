@@ -12,20 +12,20 @@ FOLDER = REPOSITORY / "docs/playground/found"
 
 
 def stored_objects(category: str) -> list[dict]:
-    """Read the objects of a category (see `docs.playground.found.category_data`).
-
-    Their "pixels" are (points, pictures, 2), "places" and "confidences" (objects, marks).
-    """
+    """Read the objects of a category."""
     text = (FOLDER / f"{category}.js").read_text()
-    objects = json.loads(text.partition(" = ")[2].rstrip(";\n"))
-    for one in objects:
-        for name, kind, shape in (
-            ("pixels", "u1", (-1, len(one["pictures"]), 2)),
-            ("places", "<u2", (len(objects), -1)),
-            ("confidences", "u1", (len(objects), -1)),
-        ):
-            one[name] = unpacked(one[name], kind).reshape(shape)
-    return objects
+    return list(map(unpacked_object, json.loads(text.partition(" = ")[2].rstrip(";\n"))))
+
+
+def unpacked_object(one: dict) -> dict:
+    """An object of `docs.playground.found.category_data` with its arrays: "pixels" (points,
+    pictures, 2), "places" and "confidences" (objects, marks)."""
+    pictures, marks = len(one["pictures"]), one["starts"][-1]
+    return one | {
+        "pixels": unpacked(one["pixels"], "u1").reshape(-1, pictures, 2),
+        "places": unpacked(one["places"], "<u2").reshape(-1, marks),
+        "confidences": unpacked(one["confidences"], "u1").reshape(-1, marks),
+    }
 
 
 def unpacked(text: str, kind: str) -> np.ndarray:

@@ -6,18 +6,16 @@ import json
 import numpy as np
 import pytest
 import torch
-from numpy.testing import assert_allclose
-from stored_places import stored_objects, unpacked
+from stored_places import stored_objects, unpacked, unpacked_object
 
 from docs.playground.build import KEY_STEP, pair_data, stored_pairs
-from docs.playground.found import HIDDEN, PICTURE, RENDERED, STEP, shown_object
+from docs.playground.found import RENDERED, category_data
 from zsp_lite import Co3D, ZeroShotPose, load_backbone
 from zsp_lite.alignment import Sim3
 from zsp_lite.course.samples import sample_data
 from zsp_lite.course.synthetic.export import export_categories
 from zsp_lite.matching import key_similarities, similarity
 from zsp_lite.scans.category import AlignedObject, CategoryAlignment
-from zsp_lite.scans.transfer import FOUND, surface_views, transfer
 
 
 @pytest.mark.slow
@@ -45,26 +43,18 @@ def test_a_stored_pair_is_small_accurate_and_has_the_similarities_of_the_origina
 @pytest.mark.slow
 def test_the_stored_places_of_chairs_are_those_that_the_library_finds(tmp_path):
     """Others are of an earlier renderer, network or `transfer`: docs/rebuild.md writes new ones."""
-    stored = {one["name"]: one for one in stored_objects("chair")[:2]}
+    stored = stored_objects("chair")[:2]
     export_categories(["chair"], tmp_path, 2, **RENDERED)
-    dataset, backbone = Co3D(tmp_path), load_backbone("zsp-tiny", "cpu")
-    sim3s = {name: Sim3.from_matrix(np.array(one["pose"])) for name, one in stored.items()}
-    poses = {name: AlignedObject(sim3, np.zeros(3), 1.0, None, 0.0) for name, sim3 in sim3s.items()}
+    poses = {
+        one["name"]: AlignedObject(
+            Sim3.from_matrix(np.array(one["pose"])), np.zeros(3), 1.0, None, 0.0
+        )
+        for one in stored
+    }
     alignment = CategoryAlignment(poses, ())
-    views = [surface_views(alignment, dataset, "chair", name, backbone) for name in stored]
-    directions = [view.direction for view in views[0][::2]]
-    source, target = [
-        shown_object(dataset, "chair", name, several, directions)
-        for name, several in zip(stored, views)
-    ]
-    old, other = stored.values()
-    found = transfer(source.surface[: old["starts"][-1]], *views)
-    confidence = old["confidences"][1] / 256
-    assert_allclose(confidence, found.confidence, atol=0.005)
-    # Places that are found are where a picture shows them, if they are not hidden there.
-    pixels = other["pixels"][old["places"][1], 0]
-    visible = (confidence >= FOUND) & (pixels[:, 0] != HIDDEN)
-    steps = target.pictures[0].camera.project(found.world[visible])[0] / PICTURE / STEP
-    error = abs(pixels[visible] - steps).max(axis=1)
-    # Another processor may round a few values to another point.
-    assert (error < 0.51).mean() > 0.99
+    found = category_data(Co3D(tmp_path), "chair", alignment, load_backbone("zsp-tiny", "cpu"))
+    for old, new in zip(stored, map(unpacked_object, found)):
+        for name in ("pixels", "places", "confidences"):
+            difference = abs(old[name][: len(new[name])] - new[name].astype(int))
+            # Another processor may round a few values to another one.
+            assert (difference <= 1).mean() > 0.97
