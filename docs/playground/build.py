@@ -6,20 +6,26 @@ onnxruntime-web is fetched into the cache, from the npm registry or from the reg
 npm_config_registry names.
 """
 
+import io
 import json
 import os
 import sys
 import tarfile
+import warnings
 import zlib
 from base64 import b64encode
+from copy import deepcopy
 from pathlib import Path
+from unittest.mock import MagicMock, patch
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from torch.overrides import TorchFunctionMode
 
 from zsp_lite import Backbone, Co3D, InputError, ZeroShotPose, load_backbone
+from zsp_lite.backbones.backbone import normalize
 from zsp_lite.course.samples import sample_data
 from zsp_lite.course.true_matches import ground_truth_matches, patch_coordinates
 from zsp_lite.data.co3d import Pair
@@ -43,12 +49,6 @@ GRID = (28, 28)  # rows and columns of patches
 NUMBER = (28, 1)  # row and column of a patch times these factors give its number
 RUNTIME = "onnxruntime-web-1.30.0.tgz"
 RUNTIME_SHA256 = "d2228df7e4616bc3348bf504ee888f3bec43789a273f0a63f3e68d203ce3bf71"
-# Numbers of onnx.proto: types of tensors, and field and type of an attribute by its Python type.
-_TYPES = {"float32": 1, "int64": 7, "float16": 10}
-_ATTRIBUTES = {float: (2, 1), int: (3, 2), str: (4, 3), list: (8, 7)}
-# Starts and ends of the slice [:1, 1:], which leaves out the token CLS; the last end is beyond any
-# length.
-_FROM_SECOND = (np.array([0, 1]), np.array([1, 1 << 30]))
 
 
 def stored_pairs(dataset: Co3D) -> list[Pair]:
@@ -186,149 +186,59 @@ def _view_data(view: View, keys: np.ndarray) -> dict:
     }
 
 
-# ONNX files are protocol buffers. Weights are float16, as in the embedded checkpoint, and cast
-# where they are used.
 def onnx_model(backbone: Backbone) -> bytes:
     """Encode a backbone as an ONNX file.
 
     Its input is "image" (1, 3, side, side), RGB in [0, 1]; its outputs are "keys" (1, n, d) and
-    "saliency" (1, 1, 1, n).
+    "saliency" (1, n).
     """
-    graph = _Graph()
-    add = graph.add
-    linear = graph.linear
-    model = backbone.model
-
-    # From the image to tokens: standardised colours, patches, positions.
-    mean = np.float32(backbone.mean).reshape(1, 3, 1, 1)
-    std = np.float32(backbone.std).reshape(1, 3, 1, 1)
-    image = add("Div", add("Sub", "image", mean), std)
-    patches = add(
-        "Conv", image, *model.patch_embed.proj.parameters(), strides=[model.patch_size] * 2
-    )
-    patches = add(
-        "Transpose", add("Reshape", patches, np.array([1, model.embed_dim, -1])), perm=[0, 2, 1]
-    )
-    tokens = add("Add", add("Concat", model.cls_token, patches, axis=1), model.pos_embed)
-
-    # The blocks: (1, tokens, d) and, by heads, (1, tokens, heads, d / heads).
-    joined = np.array([1, -1, model.embed_dim])
-    split = np.array([1, 0, model.num_heads, -1])
-    for index, block in enumerate(model.blocks):
-        normed = add(
-            "LayerNormalization", tokens, *block.norm1.parameters(), epsilon=block.norm1.eps
+    image = torch.zeros(1, 3, backbone.image_size, backbone.image_size)
+    file = io.BytesIO()
+    # torch imports the package onnx, which only functions of onnxscript need. Constants are not
+    # folded, so that weights stay in float16. Warnings are about images of other sizes.
+    with warnings.catch_warnings(action="ignore"), patch.dict(sys.modules, onnx=MagicMock()):
+        torch.onnx.export(
+            _Network(backbone),
+            (image,),
+            file,
+            input_names=["image"],
+            output_names=["keys", "saliency"],
+            opset_version=17,
+            dynamo=False,
+            do_constant_folding=False,
         )
-        weights, biases = [p.chunk(3) for p in block.attn.qkv.parameters()]
-        query, key, value = [linear(normed, *both) for both in zip(weights, biases)]
-        if index == backbone.layer:
-            add("Slice", key, *_FROM_SECOND, np.array([0, 1]), name="keys")
-        query = add("Reshape", query, split)
-        key = add("Reshape", key, split)
-        value = add("Reshape", value, split)
-        products = add("Einsum", query, key, equation="bihd,bjhd->bhij")
-        attention = add("Softmax", add("Mul", products, np.float32(block.attn.scale)), axis=-1)
-        if block is model.blocks[-1]:
-            break  # Of the last block only the attention is needed.
-        heads = add("Reshape", add("Einsum", attention, value, equation="bhij,bjhd->bihd"), joined)
-        tokens = add("Add", tokens, linear(heads, *block.attn.proj.parameters()))
-        normed = add(
-            "LayerNormalization", tokens, *block.norm2.parameters(), epsilon=block.norm2.eps
-        )
-        hidden = add("Gelu", linear(normed, *block.mlp.fc1.parameters()))
-        tokens = add("Add", tokens, linear(hidden, *block.mlp.fc2.parameters()))
-
-    # Saliency: the attention of CLS to patches, averaged over heads, scaled to [0, 1].
-    heads = add("Gather", attention, np.array(backbone.saliency_heads), axis=1)
-    saliency = add(
-        "ReduceMean", add("Slice", heads, *_FROM_SECOND, np.array([2, 3])), np.array([1])
-    )
-    low = add("ReduceMin", saliency)
-    high = add("ReduceMax", saliency)
-    add("Div", add("Sub", saliency, low), add("Sub", high, low), name="saliency")
-    # Field 11 of the graph has its inputs, field 12 its outputs.
-    side = backbone.image_size
-    return graph.encode((11, "image", (1, 3, side, side)), (12, "keys", ()), (12, "saliency", ()))
+    return file.getvalue()
 
 
-class _Graph:
-    """Nodes (field 1) and stored tensors (field 5) of a network, by the numbers of onnx.proto."""
+class _Network(torch.nn.Module):
+    """What the page computes of a photograph, with weights in float16 as in the embedded
+    checkpoint."""
 
-    def __init__(self):
-        self.fields = [(2, "vit")]  # the graph's name
+    def __init__(self, backbone: Backbone):
+        super().__init__()
+        self.backbone = backbone
+        self.model = deepcopy(backbone.model).half()
 
-    def add(
-        self, operator: str, *inputs: str | np.ndarray | torch.Tensor, name: str = "", **attributes
-    ) -> str:
-        """Add a node and return the name of its output.
-
-        Arrays are stored as they are, tensors as float16.
-        """
-        fields = []
-        for value in inputs:
-            fields.append((1, value if isinstance(value, str) else self._store(value)))
-        name = name or f"{operator}{len(self.fields)}"
-        for attribute, value in attributes.items():
-            field, kind = _ATTRIBUTES[type(value)]
-            values = [(field, number) for number in np.atleast_1d(value).tolist()]
-            fields.append((5, _message((1, attribute), *values, (20, kind))))
-        self.fields.append((1, _message(*fields, (2, name), (4, operator))))
-        return name
-
-    def linear(self, x: str, weight: torch.Tensor, bias: torch.Tensor) -> str:
-        """Add a linear layer and return the name of its output."""
-        return self.add("Add", self.add("MatMul", x, weight.T), bias)
-
-    def _store(self, values: np.ndarray | torch.Tensor) -> str:
-        """Store values and return their name: an array as it is, a tensor as float16 with a cast to
-        float32."""
-        name = f"tensor{len(self.fields)}"
-        is_weight = torch.is_tensor(values)
-        if is_weight:
-            array = values.detach().cpu().numpy().astype(np.float16)
-        else:
-            array = np.asarray(values)
-        shape = [(1, n) for n in array.shape]
-        content = ((2, _TYPES[array.dtype.name]), (8, name), (9, array.tobytes()))
-        self.fields.append((5, _message(*shape, *content)))
-        return self.add("Cast", name, to=_TYPES["float32"]) if is_weight else name
-
-    def encode(self, *ends: tuple[int, str, tuple[int, ...]]) -> bytes:
-        """Encode the model with float32 inputs (field 11) and outputs (12); an output needs no
-        shape."""
-        for field, name, shape in ends:
-            content = [(1, _TYPES["float32"])]
-            if shape:
-                sizes = [(1, _message((1, n))) for n in shape]
-                content.append((2, _message(*sizes)))
-            kind = _message((1, _message(*content)))
-            self.fields.append((field, _message((1, name), (2, kind))))
-        # Version 9 of the format (field 1), the graph (7), and version 20 of the operators (8).
-        return _message((1, 9), (7, _message(*self.fields)), (8, _message((1, ""), (2, 20))))
+    def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        backbone = self.backbone
+        with _Float32Weights():
+            tokens = self.model.extract(
+                normalize(image, backbone.mean, backbone.std), backbone.layer
+            )
+        saliency = tokens.attention[:, list(backbone.saliency_heads)].mean(1)
+        low = saliency.amin()
+        return tokens.keys, (saliency - low) / (saliency.amax() - low)
 
 
-def _message(*fields: tuple[int, int | float | str | bytes]) -> bytes:
-    """Encode fields (number, value) of a protocol buffer.
+class _Float32Weights(TorchFunctionMode):
+    """Casts weights to float32 where they are used."""
 
-    Each field begins with its number and, in the low three bits, the kind of its value: an integer
-    (0), bytes with their length (2) or a float32 (5).
-    """
-    parts = []
-    for number, value in fields:
-        if isinstance(value, float):
-            parts += [_varint(number << 3 | 5), np.float32(value).tobytes()]
-        elif isinstance(value, int):
-            parts += [_varint(number << 3), _varint(value)]
-        else:
-            value = value.encode() if isinstance(value, str) else value
-            parts += [_varint(number << 3 | 2), _varint(len(value)), value]
-    return b"".join(parts)
+    def __torch_function__(self, function, types, args=(), kwargs=None):
+        def cast(value):
+            return value.float() if isinstance(value, torch.nn.Parameter) else value
 
-
-def _varint(value: int) -> bytes:
-    """Encode an integer in groups of seven bits, the lowest first; bit 8 says that more follow."""
-    # Negative numbers are in two's complement of 64 bits.
-    rest, last = divmod(value & (1 << 64) - 1, 128)
-    return bytes([last | 128]) + _varint(rest) if rest else bytes([last])
+        named = {name: cast(value) for name, value in (kwargs or {}).items()}
+        return function(*map(cast, args), **named)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,22 @@ const loadScript = (src) => new Promise((onload, onerror) => {
   document.head.append(create("script", { src, onload, onerror }));
 });
 
+/** Where a pointer is on a picture, from 0 to 1. A click holds or releases the mark; null while it is held. */
+function pointedAt({ type, currentTarget, clientX, clientY }) {
+  if (type === "click") state.held = !state.held;
+  else if (state.held) return null;
+  const { left, top, width, height } = currentTarget.getBoundingClientRect();
+  return [(clientX - left) / width, (clientY - top) / height];
+}
+
+/** The step of an arrow key, which moves the mark. Enter and the space bar hold or release it. */
+function pressed(event) {
+  const step = STEPS[event.key], isHold = ["Enter", " "].includes(event.key);
+  if (step || isHold) event.preventDefault();
+  if (isHold) state.held = !state.held;
+  return step;
+}
+
 /** Decode base64, inflate, and view as a typed array. */
 async function unpack(text, ArrayType) {
   const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));

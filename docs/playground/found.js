@@ -87,20 +87,13 @@ function show() {
 const indexOf = (event) => [...element("objects").children].indexOf(event.currentTarget.parentElement);
 
 function point(event) {
-  if (event.type === "click") state.held = !state.held;
-  else if (state.held) return;
-  const { left, top, width } = event.currentTarget.getBoundingClientRect();
-  markNearest(indexOf(event), [event.clientX - left, event.clientY - top].map((one) => one / width * FULL));
+  const place = pointedAt(event);
+  if (place) markNearest(indexOf(event), place.map((share) => share * FULL));
 }
 
 function press(event) {
-  const step = STEPS[event.key], i = indexOf(event), { kind, pixel } = placeOn(i);
-  if (!step && !["Enter", " "].includes(event.key)) return;
-  event.preventDefault();
-  if (!step) {
-    state.held = !state.held;
-    return show();
-  }
+  const step = pressed(event), i = indexOf(event), { kind, pixel } = placeOn(i);
+  if (!step) return show();
   const [down, right] = step, from = ["mark", "found"].includes(kind) ? pixel : [FULL / 2, FULL / 2];
   // The nearest point in the direction of the key, preferably straight on.
   markNearest(i, from, (x, y) => {

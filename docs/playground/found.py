@@ -21,10 +21,10 @@ from zsp_lite.backbones.named import BackboneLike
 from zsp_lite.course.synthetic.export import export_categories
 from zsp_lite.data.frames import Frame, mask_to_bbox, resize_frame
 from zsp_lite.scans.category import CategoryAlignment
-from zsp_lite.scans.transfer import SurfaceView, object_size, surface_views, transfer
+from zsp_lite.scans.transfer import VIEWS, SurfaceView, object_size, surface_views, transfer
 
 CATEGORIES = ["chair", "toyplane"]
-RENDERED = {"frames": 24, "seed": 17, "image_size": 384}
+RENDERED = {"frames": VIEWS, "seed": 17, "image_size": 384}
 OBJECTS = 8  # of each category
 SIDES = 6  # from which objects are shown
 PICTURE = 288  # side in pixels

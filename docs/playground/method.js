@@ -38,14 +38,11 @@ function keyProducts(keys1, keys2) {
 
 /** J_s: the sum of S(u + s i, v + s i) over i = -1, 0, 1, where both patches move along one axis. */
 function jointShifts(matrix, step, axis) {
-  const total = new Float32Array(matrix.length), before = moved(-step, axis), after = moved(step, axis);
-  for (let u = 0; u < PATCHES; u++) {
-    const row = u * PATCHES, rowBefore = before[u] * PATCHES, rowAfter = after[u] * PATCHES;
-    for (let v = 0; v < PATCHES; v++) {
-      total[row + v] = matrix[row + v] + matrix[rowBefore + before[v]] + matrix[rowAfter + after[v]];
-    }
-  }
-  return total;
+  const before = moved(-step, axis), after = moved(step, axis);
+  return matrix.map((value, i) => {
+    const u = Math.floor(i / PATCHES), v = i % PATCHES;
+    return value + matrix[before[u] * PATCHES + before[v]] + matrix[after[u] * PATCHES + after[v]];
+  });
 }
 
 /** Average keys (PATCHES, axes) over patches and their neighbours inside the image, along one axis of the image. */
@@ -83,12 +80,7 @@ function shiftSum(values, step, axis) {
 
 /** Divide products by the lengths of both vectors. */
 function cosines(products, squared1, squared2) {
-  const inverse = squared2.map((value) => 1 / Math.sqrt(value)), result = new Float32Array(products.length);
-  for (let u = 0; u < PATCHES; u++) {
-    const length = Math.sqrt(squared1[u]);
-    for (let v = 0; v < PATCHES; v++) result[u * PATCHES + v] = products[u * PATCHES + v] * inverse[v] / length;
-  }
-  return result;
+  return products.map((value, i) => value / Math.sqrt(squared1[Math.floor(i / PATCHES)] * squared2[i % PATCHES]));
 }
 
 /** Cosine similarities (PATCHES, PATCHES) of the keys of two images (see `describe`) and of their descriptors. */

@@ -242,21 +242,24 @@ async function openPhotographs(files) {
 }
 
 function point(event) {
-  const { left, top, width, height } = event.target.getBoundingClientRect();
-  if (event.type === "click") state.held = !state.held;
-  else if (state.held) return;
-  const [row, column] = [(event.clientY - top) / height, (event.clientX - left) / width];
-  state.patch = inside(Math.floor(SIDE * row)) * SIDE + inside(Math.floor(SIDE * column));
+  const place = pointedAt(event);
+  if (!place) return;
+  const [column, row] = place.map((share) => inside(Math.floor(SIDE * share)));
+  state.patch = row * SIDE + column;
   show();
 }
 
 function press(event) {
-  const step = STEPS[event.key], isCloud = event.target.id === "cloud", [row, column] = rowColumn(state.patch);
-  if (!step && (isCloud || !["Enter", " "].includes(event.key))) return;
+  const step = pressed(event), [row, column] = rowColumn(state.patch);
+  if (step) state.patch = inside(row + step[0]) * SIDE + inside(column + step[1]);
+  show();
+}
+
+function pressCloud(event) {
+  const step = STEPS[event.key];
+  if (!step) return;
   event.preventDefault();
-  if (!step) state.held = !state.held;
-  else if (isCloud) state.turn = state.turn.map((angle, i) => angle + 0.1 * step[1 - i]);
-  else state.patch = inside(row + step[0]) * SIDE + inside(column + step[1]);
+  state.turn = state.turn.map((angle, i) => angle + 0.1 * step[1 - i]);
   show();
 }
 
@@ -271,13 +274,20 @@ function change() {
   show();
 }
 
+/** Add four copies of an element, one for each of the other target views. */
+function repeat(one) {
+  for (let i = 0; i < 4; i++) one.before(one.cloneNode(true));
+}
+
 async function start() {
+  repeat(all(".views figure")[0]);
+  repeat(all("#scores button")[0]);
   try { await loadScript("playground/data.js"); } catch { return; } // the notice says what is missing
   state.draws = await unpack(DATA.draws, Uint32Array);
   element("pair").append(...DATA.titles.map((title, i) => new Option(title, i, false, i === FIRST_PAIR)));
   await openStored(FIRST_PAIR);
   Object.assign(element("reference"), { onpointermove: point, onpointerdown: point, onclick: point, onkeydown: press });
-  Object.assign(element("cloud"), { onpointermove: turn, onkeydown: press });
+  Object.assign(element("cloud"), { onpointermove: turn, onkeydown: pressCloud });
   element("stages").oninput = change;
   all("#scores button").forEach((button, i) => { button.onclick = () => show(i); });
   element("pair").onchange = (event) => openStored(Number(event.target.value));

@@ -16,7 +16,6 @@ _project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))[
 project = "zsp-lite"
 author = ", ".join(person["name"] for person in _project["authors"])
 copyright = author
-language = "en"
 
 extensions = [
     "myst_nb",
@@ -44,8 +43,6 @@ exclude_patterns = [
     path.name for path in ROOT.iterdir() if path.is_dir() and path.name not in _sources
 ]
 exclude_patterns += [
-    "**/.ipynb_checkpoints",
-    "notebooks/exercises/release",
     "data_samples/*/*",
     "zsp_lite/course/**",  # texts that commands write, not pages
 ]
@@ -60,7 +57,6 @@ suppress_warnings = ["mystnb.unknown_mime_type"]
 
 default_role = "py:obj"  # `name` in a docstring becomes a link if the name is documented here.
 autodoc_default_options = {"members": True, "member-order": "bysource"}
-autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 autodoc_use_type_comments = False
 toc_object_entries = False
@@ -81,7 +77,6 @@ templates_path = ["templates"]
 html_additional_pages = {"index": "redirect.html"}
 html_math_renderer = "mathml"
 html_copy_source = False  # The sources of the exercises hold their solutions.
-html_show_sourcelink = False
 html_domain_indices = False
 html_use_index = False
 html_context = {"default_mode": "auto"}  # Pages are light or dark as the system is.
@@ -91,7 +86,6 @@ html_theme_options = {
     # The button would offer the source; `course` links to the notebook for students.
     "use_download_button": False,
     "navbar_persistent": [],  # The search field is in the sidebar.
-    "show_navbar_depth": 1,
     "max_navbar_depth": 1,
     "pygments_light_style": "a11y-high-contrast-light",
     "pygments_dark_style": "a11y-high-contrast-dark",

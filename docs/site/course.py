@@ -7,17 +7,16 @@
 - Each notebook can be downloaded and, if the repository's address is known, opened in Colab with an
   install cell.
 - Docstrings keep their indented examples.
-- Intervals such as [47.6, 66.2] never break over two lines. Wide tables use the margin at the
-  right.
+- Intervals such as [47.6, 66.2] never break over two lines.
 - The members of the modules in the reference are folded.
 """
 
 import re
 import shutil
+from collections.abc import Iterator
 from copy import deepcopy
 from html import escape, unescape
 from pathlib import Path
-from types import FunctionType, ModuleType
 from urllib.parse import urljoin, urlsplit
 
 import nbformat
@@ -34,9 +33,6 @@ from tools.lab import answering_cells, clear_answers
 WIDGET = "application/vnd.jupyter.widget-view+json"
 BRANCH = "gh-pages"  # where the workflow publishes the site, and so the notebooks that Colab opens
 
-# A table uses the margin if one of its rows has at least as many cells and characters.
-WIDE_COLUMNS = 7
-WIDE_ROW = 80
 # An interval such as [47.6, −6.2].
 INTERVAL = re.compile(r"\[[-−]?[\d.]+, [-−]?[\d.]+\]")
 
@@ -81,40 +77,36 @@ if "google.colab" in sys.modules:
 
 
 def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Prepare the text of a page before it is parsed (Sphinx's event `source-read`)."""
-    path = app.env.doc2path(docname)
-    if path.suffix == ".ipynb":
+    """Prepare the text of a page before it is parsed, and write the notebook to run (Sphinx's event
+    `source-read`)."""
+    if app.env.doc2path(docname).suffix == ".ipynb":
         notebook = nbformat.reads(source[0], as_version=4)
         remove_solutions(notebook, app.srcdir)
-        for cell in answering_cells(notebook):
-            cell.metadata.tags = [*cell.metadata.get("tags", []), "hide-output"]  # folded
+        copy = runnable(notebook, docname, app.config.course_repository)
+        file = app.outdir / "run" / f"{docname}.ipynb"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        nbformat.write(copy, file)
+        # Checks, and outputs that answer a prediction, are folded.
+        answering = answering_cells(notebook)
         widgets = notebook.metadata.pop("widgets", {})
         for cell in notebook.cells:
             if cell.cell_type == "code":
-                if "checks" in cell.metadata.get("tags", []):
-                    cell.metadata.tags.append("hide-cell")  # folded
+                tags = cell.metadata.setdefault("tags", [])
+                if cell in answering:
+                    tags.append("hide-output")
+                if "checks" in tags:
+                    tags.append("hide-cell")
                 cell.outputs = [
-                    shown for output in cell.outputs for shown in static_outputs(output, widgets)
+                    shown for output in cell.outputs for shown in without_widget(output, widgets)
                 ]
         # `describe_pictures` gives these to the pictures of the page, in the same order.
         app.env.temp_data["alternative texts"] = [
-            output.metadata[form]["alt"]
-            for cell in notebook.cells
-            for output in cell.get("outputs", [])
-            for form in output.get("data", {})
-            if form.startswith("image/")
+            alt for cell in notebook.cells for *_, alt in pictures(cell)
         ]
         notebook.cells.insert(
             1, nbformat.v4.new_markdown_cell(run_links(docname, app.config.course_repository))
         )
         source[0] = nbformat.writes(notebook)
-    else:
-        # A link to a folder, which has no page, becomes its text.
-        source[0] = re.sub(
-            r"\[([^]]*)\]\(([^)#:\s]+)\)",
-            lambda link: link[1] if (path.parent / link[2]).is_dir() else link[0],
-            source[0],
-        )
     if docname in CHILDREN:
         source[0] += HIDDEN_LINKS % CHILDREN[docname]
     if docname.startswith("docs/api/"):
@@ -122,45 +114,28 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
 
 
 def remove_solutions(notebook: NotebookNode, root: Path) -> None:
-    """Make the student version of an exercise; other notebooks, without cells of nbgrader, stay as
-    they are."""
-    if any("nbgrader" in cell.metadata for cell in notebook.cells):
-        config = PyFileConfigLoader(
-            "nbgrader_config.py", path=str(root / "notebooks" / "exercises")
-        ).load_config()
-        for clear in (ClearSolutions, ClearHiddenTests, ClearMarkScheme):
-            clear(config=config).preprocess(notebook, {})
+    """Make the student version of an exercise; other notebooks stay as they are."""
+    folder = str(root / "notebooks" / "exercises")
+    config = PyFileConfigLoader("nbgrader_config.py", path=folder).load_config()
+    for clear in (ClearSolutions, ClearHiddenTests, ClearMarkScheme):
+        clear(config=config).preprocess(notebook, {})
 
 
-def static_outputs(output: NotebookNode, widgets: dict) -> list[NotebookNode]:
-    """Return the picture and the caption of a stored widget; other outputs stay as they are."""
+def without_widget(output: NotebookNode, widgets: dict) -> list[NotebookNode]:
+    """Return what a stored widget shows: its picture, its caption, and the names and values of its
+    controls; other outputs stay as they are."""
     data = output.get("data", {})
-    if WIDGET in data:
-        return widget_outputs(
-            widgets["application/vnd.jupyter.widget-state+json"]["state"], data[WIDGET]["model_id"]
-        )
-    return [output]
-
-
-def html_output(html: str) -> NotebookNode:
-    """Make an output of a cell."""
-    return nbformat.v4.new_output("display_data", {"text/html": html})
-
-
-def widget_outputs(models: dict, identifier: str) -> list[NotebookNode]:
-    """Return the stored picture of a widget, its caption, and the names and values of its
-    controls."""
-    pictures = []
+    if WIDGET not in data:
+        return [output]
+    models = widgets["application/vnd.jupyter.widget-state+json"]["state"]
+    images = []
     captions = []
     controls = []
-
-    def visit(identifier: str) -> None:
-        """Collect what a part of the widget, and the parts inside it, show."""
-        model = models[identifier]
+    for model in widget_parts(models, data[WIDGET]["model_id"]):
         state = model["state"]
         if model["model_name"] == "ImageModel":
             (buffer,) = model["buffers"]
-            pictures.append({f"image/{state['format']}": buffer["data"]})
+            images.append({f"image/{state['format']}": buffer["data"]})
         elif model["model_name"] == "HTMLModel":
             captions.append(
                 re.sub("<style>.*?</style>|<[^>]*>", "", state["value"], flags=re.DOTALL).strip()
@@ -171,97 +146,78 @@ def widget_outputs(models: dict, identifier: str) -> list[NotebookNode]:
                 value = state["_options_labels"][state["index"]]
             text = state["description"]
             controls.append(text if value == "" else f"{text} = {value}")
-        for child in state.get("children", []):
-            visit(child.removeprefix("IPY_MODEL_"))
+    shown = []
+    for image in images:
+        alt = unescape(" ".join(captions).removeprefix("Picture: "))
+        metadata = {form: {"alt": alt} for form in image}
+        shown.append(nbformat.v4.new_output("display_data", image, metadata=metadata))
+        shown.append(note(captions[-1]))
+    return [*shown, note(f"Interactive in a running notebook: {escape(', '.join(controls))}.")]
 
-    visit(identifier)
-    note = html_output(
-        f'<p class="widget">Interactive in a running notebook: {escape(", ".join(controls))}.</p>'
-    )
-    if not pictures:
-        return [note]
-    alt = " ".join(captions).removeprefix("Picture: ")
-    (picture,) = pictures
-    metadata = {form: {"alt": unescape(alt)} for form in picture}
+
+def widget_parts(models: dict, identifier: str) -> Iterator[dict]:
+    """Yield the models of a widget and of the parts inside it."""
+    model = models[identifier.removeprefix("IPY_MODEL_")]
+    yield model
+    for child in model["state"].get("children", []):
+        yield from widget_parts(models, child)
+
+
+def note(html: str) -> NotebookNode:
+    """Make an output that is a small text below a widget."""
+    html = f'<p class="widget">{html}</p>'
+    return nbformat.v4.new_output("display_data", {"text/html": html})
+
+
+def pictures(cell: NotebookNode) -> list[tuple[str, str, str]]:
+    """List media type, data in base64 and alternative text of the pictures in a cell's outputs."""
     return [
-        nbformat.v4.new_output("display_data", picture, metadata=metadata),
-        html_output(f'<p class="widget">{captions[-1]}</p>'),
-        note,
+        (form, output.data[form], output.metadata[form]["alt"])
+        for output in cell.get("outputs", [])
+        for form in output.get("data", {})
+        if form.startswith("image/")
     ]
 
 
 def describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
     """Give the pictures of stored outputs their alternative texts, which MyST-NB leaves out
     (`doctree-read`)."""
-    pictures = [node for node in doctree.findall(nodes.image) if "jupyter_execute" in node["uri"]]
-    for node, alt in zip(pictures, app.env.temp_data.get("alternative texts", []), strict=True):
+    images = [node for node in doctree.findall(nodes.image) if "jupyter_execute" in node["uri"]]
+    for node, alt in zip(images, app.env.temp_data.get("alternative texts", []), strict=True):
         node["alt"] = alt
 
 
 def keep_intervals(app: Sphinx, doctree: nodes.document) -> None:
     """Join the ends of intervals in text, and in the HTML tables of outputs, by a no-break space
     (`doctree-read`)."""
-
-    def join(interval: re.Match[str]) -> str:
-        return interval[0].replace(" ", "\N{NO-BREAK SPACE}")
-
     verbatim = nodes.raw | nodes.literal | nodes.literal_block | nodes.math | nodes.math_block
+    space = "\N{NO-BREAK SPACE}"
     for text in list(doctree.findall(nodes.Text)):
         table = isinstance(text.parent, nodes.raw) and "<table" in text
         if table or not isinstance(text.parent, verbatim):
-            text.parent.replace(text, nodes.Text(INTERVAL.sub(join, text)))
-
-
-def widen_tables(app: Sphinx, doctree: nodes.document) -> None:
-    """Let wide tables, and outputs that have one, use the margin at the right (`doctree-read`)."""
-    for table in list(doctree.findall(nodes.table)):
-        rows = [[cell.astext() for cell in row] for row in table.findall(nodes.row)]
-        if is_wide(rows):
-            box = nodes.container(classes=["full-width"])
-            table.replace_self(box)
-            box += table
-    for part in doctree.findall(nodes.raw):
-        rows = [
-            re.findall(r"<t[hd].*?>(.*?)</t[hd]>", row, re.DOTALL)
-            for row in part.astext().split("</tr>")
-        ]
-        if is_wide([[re.sub("<.*?>", "", cell) for cell in row] for row in rows]):
-            output = part.parent
-            while "cell_output" not in output.get("classes", ["cell_output"]):
-                output = output.parent
-            output["classes"].append("full-width")
-
-
-def is_wide(rows: list[list[str]]) -> bool:
-    """Whether a table has a row of many cells and characters."""
-    return any(len(row) >= WIDE_COLUMNS and len("".join(row)) >= WIDE_ROW for row in rows)
+            joined = INTERVAL.sub(lambda interval: interval[0].replace(" ", space), text)
+            text.parent.replace(text, nodes.Text(joined))
 
 
 def mark_place(app: Sphinx, doctree: nodes.document) -> None:
-    """Give the strip at the top of a notebook a class such as here-42: the middle of its first
-    marked box is at 42 % of its width (`doctree-read`)."""
+    """Give the strip at the top of a notebook a class such as here-324: the first pixel of its
+    first marked box (`doctree-read`)."""
     for image in doctree.findall(nodes.image):
         if "/here_" in image["uri"]:
             strip = (app.srcdir / image["uri"]).read_text(encoding="utf-8")
-            box = re.search('<rect x="([^"]*)"[^>]*? width="([^"]*)"[^>]*stroke="#0072B2"', strip)
-            middle = float(box[1]) + float(box[2]) / 2
-            width = float(re.search('width="(.*?)"', strip)[1])  # the first is that of the strip
-            image["classes"].append(f"here-{100 * (middle / width):.0f}")
+            box = re.search(r'<rect x="(\d+)[^>]*stroke="#0072B2"', strip)
+            image["classes"].append(f"here-{box[1]}")
 
 
 def fold_members(app: Sphinx, doctree: nodes.document) -> None:
     """Fold what a module of the reference defines, below links to all of it (`doctree-read`)."""
-    if not app.env.docname.startswith("docs/api/"):
-        return
     for section in list(doctree.findall(nodes.section)):
         members = [node for node in section.children if isinstance(node, addnodes.desc)]
         if members:
-            links = []
-            for member in members:
-                signature = member[0]
-                if signature["ids"]:
-                    name = f"<code>{signature['fullname']}</code>"
-                    links.append(f'<a href="#{signature["ids"][0]}">{name}</a>')
+            links = [
+                f'<a href="#{member[0]["ids"][0]}"><code>{member[0]["fullname"]}</code></a>'
+                for member in members
+            ]
             start = (
                 f'<p class="members">{", ".join(links)}</p><details class="members"><summary>'
                 "Signatures and arguments</summary>"
@@ -282,27 +238,25 @@ def shorten_titles(app: Sphinx, env: BuildEnvironment) -> None:
 def run_links(docname: str, repository: str) -> str:
     """Return HTML with links to run a notebook: instructions, download, Colab, dev container."""
     up = "../" * docname.count("/")
-    links = [
-        (f"{up}docs/install.html#run-the-notebooks", "Run it"),
-        (f"{up}run/{docname}.ipynb", "Download"),
-    ]
+    links = {
+        "Run it": f"{up}docs/install.html#run-the-notebooks",
+        "Download": f"{up}run/{docname}.ipynb",
+    }
     if repository:
         name = urlsplit(repository).path.strip("/")
-        links += [
-            (
-                f"https://colab.research.google.com/github/{name}/blob/{BRANCH}/run/{docname}.ipynb",
-                "Open in Colab",
-            ),
-            (f"https://codespaces.new/{name}", "Open in a dev container"),
-        ]
-    shown = " ".join(f'<a href="{escape(link)}">{text}</a>' for link, text in links)
+        place = f"{name}/blob/{BRANCH}/run/{docname}.ipynb"
+        links["Open in Colab"] = f"https://colab.research.google.com/github/{place}"
+        links["Open in a dev container"] = f"https://codespaces.new/{name}"
+    shown = " ".join(f'<a href="{link}">{text}</a>' for text, link in links.items())
     return f'<p class="run">{shown}</p>'
 
 
 def runnable(notebook: NotebookNode, docname: str, repository: str) -> NotebookNode:
-    """Copy a notebook for Colab, if the repository's address is known: with a first cell that
-    installs zsp-lite, and with the addresses of drawings and pages on GitHub."""
+    """Copy a notebook for readers to run, without answers. If the repository's address is known, it
+    has a first cell that installs zsp-lite in Colab, and the addresses of drawings and pages on
+    GitHub."""
     notebook = deepcopy(notebook)
+    clear_answers(notebook)
     if repository:
         for cell in notebook.cells:
             if cell.cell_type == "markdown":
@@ -319,36 +273,10 @@ def runnable(notebook: NotebookNode, docname: str, repository: str) -> NotebookN
     return notebook
 
 
-def write_files(app: Sphinx, error: Exception | None) -> None:
-    """Write the notebooks to run with their drawings (Sphinx's event `build-finished`)."""
-    if error or app.builder.format != "html":
-        return
-    for docname in app.env.found_docs:
-        path = app.env.doc2path(docname)
-        if path.suffix == ".ipynb":
-            notebook = nbformat.read(path, as_version=4)
-            remove_solutions(notebook, app.srcdir)
-            clear_answers(notebook)
-            copy = app.outdir / "run" / f"{docname}.ipynb"
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            nbformat.write(runnable(notebook, docname, app.config.course_repository), copy)
-    shutil.copytree(
-        app.srcdir / "notebooks" / "figures",
-        app.outdir / "run" / "notebooks" / "figures",
-        dirs_exist_ok=True,
-    )
-
-
-def skip_imported(
-    app: Sphinx, what: str, name: str, member: object, skip: bool, options: object
-) -> bool | None:
-    """Leave out what a module imports from other packages, before autodoc analyses them
-    (`autodoc-skip-member`)."""
-    if what != "module" or not isinstance(member, ModuleType | type | FunctionType):
-        return None
-    home = getattr(member, "__module__", "")
-    foreign = isinstance(member, ModuleType) or not home.startswith("zsp_lite")
-    return True if foreign else None
+def copy_drawings(app: Sphinx) -> None:
+    """Copy the drawings of the notebooks to run (Sphinx's event `builder-inited`)."""
+    drawings = Path("notebooks", "figures")
+    shutil.copytree(app.srcdir / drawings, app.outdir / "run" / drawings, dirs_exist_ok=True)
 
 
 def mark_examples(
@@ -370,17 +298,14 @@ def mark_examples(
     lines[:] = text
 
 
-def setup(app: Sphinx) -> dict[str, bool]:
+def setup(app: Sphinx) -> None:
     """Connect the functions to Sphinx's events."""
     app.add_config_value("course_repository", "", "env", str)
+    app.connect("builder-inited", copy_drawings)
     app.connect("source-read", read_source)
     app.connect("doctree-read", describe_pictures)
     app.connect("doctree-read", keep_intervals)
-    app.connect("doctree-read", widen_tables)
     app.connect("doctree-read", mark_place)
     app.connect("doctree-read", fold_members)
     app.connect("env-updated", shorten_titles)
-    app.connect("autodoc-skip-member", skip_imported)
     app.connect("autodoc-process-docstring", mark_examples, priority=400)
-    app.connect("build-finished", write_files)
-    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -2,61 +2,50 @@
 
 MathML needs no script from the network, but a font with mathematical metrics: without one, brackets
 do not grow and bars touch letters. The font is STIX Two Math of the package `ziamath`, cut down to
-the characters of formulas. Where the package is not installed, the reader's own fonts are used.
+the characters of formulas.
 """
 
-import base64
 import io
 import re
-import unicodedata
 from functools import cache
 from html import unescape
-from importlib.util import find_spec
 from pathlib import Path
 
+import ziamath
 from docutils import nodes
-from fontTools.subset import Options, Subsetter
-from fontTools.ttLib import TTFont
+from fontTools.subset import Options, Subsetter, load_font, parse_unicodes, save_font
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
+from ziamath.styles import MathVariant, parse_variant, styledstr
 
-# First and last code of the characters of formulas.
-CHARACTERS = [
-    (0x20, 0xFF),  # Latin
-    (0x300, 0x36F),  # accents
-    (0x391, 0x3F6),  # Greek
-    (0x2010, 0x2063),  # punctuation and invisible operators
-    (0x2100, 0x22FF),  # letter-like symbols, arrows and operators
-    (0x2308, 0x230B),  # ceilings and floors
-    (0x27E6, 0x27EB),  # brackets
-    (0x1D400, 0x1D503),  # bold, italic and script Latin
-    (0x1D6A4, 0x1D7FF),  # bold and italic Greek, bold digits
+# First and last code of the characters of formulas: Latin, accents, Greek, punctuation and
+# invisible operators, letter-like symbols with arrows and operators, ceilings and floors, brackets,
+# bold to script Latin, bold and italic Greek with bold digits.
+CHARACTERS = (
+    "20-FF, 300-36F, 391-3F6, 2010-2063, 2100-22FF, 2308-230B, 27E6-27EB, 1D400-1D503, 1D6A4-1D7FF"
+)
+FEATURES = [
+    "ssty",  # forms of subscripts and superscripts
+    "dtls",  # letters without a dot, below accents
+    "flac",  # flat accents, above capitals
+    "kern",  # distances between letters
+    "mark",  # places of accents
 ]
 
 
 @cache
 def math_font() -> bytes:
-    """Return the font of formulas in the format WOFF, or nothing where ziamath is not installed."""
-    package = find_spec("ziamath")
-    if package is None:
-        return b""
-    font = TTFont(Path(package.origin).parent / "fonts" / "STIXTwoMath-Regular.ttf")
-    features = [
-        "ssty",  # forms of subscripts and superscripts
-        "dtls",  # letters without a dot, below accents
-        "flac",  # flat accents, above capitals
-        "kern",  # distances between letters
-        "mark",  # places of accents
-    ]
+    """Return the font of formulas in the format WOFF."""
     # All names of the font are kept, since the licence is one of them.
-    subsetter = Subsetter(Options(hinting=False, layout_features=features, name_IDs=["*"]))
-    codes = [code for first, last in CHARACTERS for code in range(first, last + 1)]
-    subsetter.populate(unicodes=codes)
+    options = Options(hinting=False, layout_features=FEATURES, name_IDs=["*"], flavor="woff")
+    path = Path(ziamath.__file__).parent / "fonts" / "STIXTwoMath-Regular.ttf"
+    font = load_font(str(path), options)
+    subsetter = Subsetter(options)
+    subsetter.populate(unicodes=parse_unicodes(CHARACTERS))
     subsetter.subset(font)
-    font.flavor = "woff"
     file = io.BytesIO()
-    font.save(file)
+    save_font(font, file, options)
     return file.getvalue()
 
 
@@ -82,13 +71,7 @@ def mathml(latex: str, display: str = "inline") -> str:
 def _letter(element: re.Match[str]) -> str:
     """Replace an element <mi> with a style, such as bold, by one with the character of this
     style."""
-    style = element[1].upper().replace("-", " ")
-    # LATIN CAPITAL LETTER R becomes MATHEMATICAL BOLD CAPITAL R.
-    name = re.sub("LATIN |GREEK |LETTER ", "", unicodedata.name(unescape(element[2])))
-    try:
-        return f"<mi>{unicodedata.lookup(f'MATHEMATICAL {style} {name}')}</mi>"
-    except KeyError:  # Older characters, such as SCRIPT CAPITAL R, lack the first word.
-        return f"<mi>{unicodedata.lookup(f'{style} {name}')}</mi>"
+    return f"<mi>{styledstr(unescape(element[2]), parse_variant(element[1], MathVariant()))}</mi>"
 
 
 def visit_math(translator: HTML5Translator, node: nodes.math) -> None:
@@ -105,20 +88,11 @@ def visit_displayed_math(translator: HTML5Translator, node: nodes.math_block) ->
 
 def write_font(app: Sphinx, error: Exception | None) -> None:
     """Write the font beside the pages (Sphinx's event `build-finished`)."""
-    if not error and app.builder.format == "html" and math_font():
+    if not error and app.builder.format == "html":
         (app.outdir / "_static" / "math.woff").write_bytes(math_font())
 
 
-def pass_font(
-    app: Sphinx, pagename: str, templatename: str, context: dict, doctree: nodes.document | None
-) -> None:
-    """Pass the font to the templates, which may embed it (`html-page-context`)."""
-    context["math_font"] = base64.b64encode(math_font()).decode()
-
-
-def setup(app: Sphinx) -> dict[str, bool]:
-    """Register how formulas are written, and connect the functions to Sphinx's events."""
+def setup(app: Sphinx) -> None:
+    """Register how formulas are written, and that their font is."""
     app.add_html_math_renderer("mathml", (visit_math, None), (visit_displayed_math, None))
-    app.connect("html-page-context", pass_font)
     app.connect("build-finished", write_font)
-    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -8,9 +8,9 @@ the slides show the stored results:
     :heading: The map of a real pair
     ```
 
-embeds the first picture below the heading that contains these words; with the option `number` the
-second one, the third one, ... The path may also be that of a drawing, whose description becomes the
-alternative text. The text of the directive `notes` is shown in the presenter's view only.
+embeds the first picture below the heading ## that contains these words; with the option `number`
+the second one, the third one, ... The path may also be that of a drawing, whose description becomes
+the alternative text. The text of the directive `notes` is shown in the presenter's view only.
 """
 
 import base64
@@ -19,8 +19,10 @@ from html import escape, unescape
 from pathlib import Path
 
 import nbformat
+from course import pictures
 from docutils import nodes
 from docutils.parsers.rst import directives
+from formulas import math_font
 from nbformat import NotebookNode
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
@@ -36,9 +38,7 @@ class Picture(SphinxDirective):
     option_spec = {"heading": directives.unchanged, "number": directives.positive_int}
 
     def run(self) -> list[nodes.Node]:
-        path = (Path(self.env.doc2path(self.env.docname)).parent / self.arguments[0]).resolve()
-        if not path.is_file():
-            raise self.error(f"no file {self.arguments[0]}")
+        path = Path(self.env.relfn2path(self.arguments[0])[1])
         self.env.note_dependency(str(path))
         if path.suffix == ".svg":
             form = "image/svg+xml"
@@ -46,11 +46,11 @@ class Picture(SphinxDirective):
             alt = unescape(re.search("<desc[^>]*>(.*?)</desc>", path.read_text("utf-8"))[1])
         else:
             heading = self.options["heading"]
-            pictures = pictures_below(nbformat.read(path, as_version=4), heading)
+            found = pictures_below(nbformat.read(path, as_version=4), heading)
             number = self.options.get("number", 1)
-            if len(pictures) < number:
+            if len(found) < number:
                 raise self.error(f"no picture {number} below {heading!r}")
-            form, data, alt = pictures[number - 1]
+            form, data, alt = found[number - 1]
         image = f'<img src="data:{form};base64,{data}" alt="{escape(alt)}">'
         return [nodes.raw("", image, format="html")]
 
@@ -65,44 +65,31 @@ class Notes(SphinxDirective):
 
 
 def pictures_below(notebook: NotebookNode, heading: str) -> list[tuple[str, str, str]]:
-    """Find the pictures of a section.
-
-    Args:
-        notebook: Notebook with stored outputs.
-        heading: Words of the section's heading.
-
-    Returns:
-        Media type, data in base64 and alternative text of each PNG or JPEG picture in the outputs
-        from the cell with the heading to the next cell with a heading of the same or a higher
-        level. Empty without such a heading.
-    """
-    pictures = []
-    level = 0  # number of # of the heading; 0 above it
+    """Find the `pictures` of a section, whose title has the words `heading`."""
+    found = []
+    inside = False
     for cell in notebook.cells:
-        if cell.cell_type == "markdown" and level:  # Does the section end here?
-            if re.search(rf"(?m)^#{{1,{level}}} ", cell.source):
-                break
-        elif cell.cell_type == "markdown":
-            mark = re.search(rf"(?m)^(#+) .*{re.escape(heading)}", cell.source)
-            level = len(mark[1]) if mark else 0
-        elif level:
-            for output in cell.get("outputs", []):
-                for form in {"image/png", "image/jpeg"} & set(output.get("data", {})):
-                    pictures.append((form, output.data[form], output.metadata[form]["alt"]))
-    return pictures
+        if cell.cell_type == "markdown":
+            for title in re.findall("^## .*", cell.source, re.MULTILINE):
+                inside = heading in title
+        elif inside:
+            found += pictures(cell)
+    return found
 
 
 def choose_template(
     app: Sphinx, pagename: str, templatename: str, context: dict, doctree: object
 ) -> str | None:
-    """Use the template of the slides for the pages of `docs/slides/` (Sphinx's event
-    `html-page-context`)."""
-    return "slides.html" if pagename.startswith(DECKS) else None
+    """Use the template of the slides, which embeds the font of formulas, for the pages of
+    `docs/slides/` (Sphinx's event `html-page-context`)."""
+    if not pagename.startswith(DECKS):
+        return None
+    context["math_font"] = base64.b64encode(math_font()).decode()
+    return "slides.html"
 
 
-def setup(app: Sphinx) -> dict[str, bool]:
+def setup(app: Sphinx) -> None:
     """Register the directives and the choice of the template with Sphinx."""
     app.add_directive("picture", Picture)
     app.add_directive("notes", Notes)
     app.connect("html-page-context", choose_template)
-    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,21 +1,15 @@
-"""The page docs/find_on_all.md in Chromium: it shows the places that the library finds, and a
-person can use it."""
-
-from pathlib import Path
-from typing import NamedTuple
+"""The page docs/find_on_all.md in Chromium: it shows the places that are stored, and a person can
+use it. tests/test_playground.py tests that the library finds these."""
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from one_page import SCREENS, build_page, open_page, screen, tab_to, wait_until_drawn
 from playwright.sync_api import Browser, Page
+from stored_places import FOLDER, stored_objects
 
-from docs.playground.found import CATEGORIES, OBJECTS, RENDERED, ShownObject, shown_object
-from zsp_lite import Co3D, load_backbone
-from zsp_lite.alignment import Sim3
-from zsp_lite.course.synthetic.export import export_categories
-from zsp_lite.scans.category import AlignedObject, CategoryAlignment
-from zsp_lite.scans.transfer import TransferredPoints, surface_views, transfer
+from docs.playground.found import CATEGORIES, HIDDEN, OBJECTS
+from zsp_lite.scans.transfer import FOUND
 
 # What the page shows on the second object of every mark of a side of the first.
 SHOWN = """() => {
@@ -46,80 +40,29 @@ def choose(page: Page, category: str) -> None:
     wait_until_drawn(page, "objects")
 
 
-class Expected(NamedTuple):
-    """The library's places, on the second object of a category, of all marks of the first."""
-
-    category: str
-    source: ShownObject
-    target: ShownObject
-    places: TransferredPoints
-
-
-@pytest.fixture(scope="module", params=CATEGORIES)
-def expected(browser, address, tmp_path_factory, request) -> Expected:
-    """Two objects of a category of the page, rendered again, in the poses that the page has."""
-    category = request.param
-    root = tmp_path_factory.mktemp("data")
-    export_categories([category], root, 2, **RENDERED)
-    dataset = Co3D(root)
-    page = open_objects(browser, address)
-    choose(page, category)
-    objects = page.evaluate("state.objects.map(({ name, pose }) => [name, pose])")
-    alignment = CategoryAlignment(
-        {
-            name: AlignedObject(Sim3.from_matrix(np.array(pose)), np.zeros(3), 1.0, None, 0.0)
-            for name, pose in objects[:2]
-        },
-        (),
-    )
-    first, second = alignment.objects
-    backbone = load_backbone("zsp-tiny", "cpu")
-    views = [
-        surface_views(alignment, dataset, category, name, backbone) for name in (first, second)
-    ]
-    directions = [view.direction for view in views[0][::2]]
-    source, target = [
-        shown_object(dataset, category, name, one, directions)
-        for name, one in zip((first, second), views, strict=True)
-    ]
-    marks = source.surface[: source.starts[-1]]
-    return Expected(category, source, target, transfer(marks, *views))
-
-
 @pytest.fixture(scope="module")
 def shown(browser, address) -> Page:
     return open_objects(browser, address)
 
 
 @pytest.mark.parametrize("side", range(6))
-def test_the_page_shows_the_librarys_places(shown, expected, side):
-    choose(shown, expected.category)
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_the_page_shows_the_stored_places(shown, category, side):
+    choose(shown, category)
     shown.fill("#side", str(side))
     marks = shown.evaluate(SHOWN)
-    picture = expected.source.sides[side]
-    index = np.arange(*expected.source.starts[picture : picture + 2])
+    source, target = stored_objects(category)[:2]
+    picture = source["sides"][side]
+    index = np.arange(*source["starts"][picture : picture + 2])
     assert [mark["index"] for mark in marks] == index.tolist()
-
-    # The marks are where the picture shows these points.
-    def stored(one: ShownObject, points: np.ndarray) -> np.ndarray:
-        frame = one.pictures[one.sides[side]]
-        return frame.camera.project(points)[0] / frame.camera.size * 254
-
-    marked = [mark["marked"] for mark in marks]
-    assert_allclose(marked, stored(expected.source, expected.source.surface[index]), atol=0.51)
-
-    # So are their places, if they are found and not hidden.
-    confidence = expected.places.confidence[index]
-    assert_allclose([mark["confidence"] / 256 for mark in marks], confidence, atol=0.005)
-    nothing = np.array([mark["kind"] == "nothing" for mark in marks])
-    # Another processor may round a few values across the threshold, or to another point.
-    assert (nothing == (expected.places.confidence[index] < 0.5)).mean() > 0.99
-    found = np.array([mark["kind"] == "found" for mark in marks])
-    assert found.mean() > 0.3
-    places = stored(expected.target, expected.places.world[index])
-    pixels = np.array([mark["pixel"] for mark in marks])
-    error = abs(pixels[found] - places[found]).max(axis=1)
-    assert (error < 0.51).mean() > 0.99
+    assert_array_equal([mark["marked"] for mark in marks], source["pixels"][index, picture])
+    pixels = target["pixels"][source["places"][1, index], target["sides"][side]]
+    assert_array_equal([mark["pixel"] for mark in marks], pixels)
+    confidence = source["confidences"][1, index]
+    hidden = np.where(pixels[:, 0] == HIDDEN, "hidden", "found")
+    kinds = np.where(confidence < 256 * FOUND, "nothing", hidden)
+    assert [mark["kind"] for mark in marks] == kinds.tolist()
+    assert (kinds == "found").mean() > 0.3
 
 
 def spot(page: Page, number: int) -> dict | None:
@@ -187,6 +130,6 @@ def test_the_page_fits_the_screen_and_asks_for_files_alone(touched):
 
 
 def test_the_data_are_small():
-    files = list(Path("docs/playground/found").glob("*.js"))
+    files = list(FOLDER.glob("*.js"))
     assert sorted(file.stem for file in files) == sorted(CATEGORIES)
     assert sum(file.stat().st_size for file in files) < 4e6

@@ -1,9 +1,15 @@
 // Additions to the theme of the course site.
 
-// On a phone the strip at the top of a notebook is cut: show the marked box.
+// On a phone the strip at the top of a notebook, 940 pixels wide, is cut: show the marked box.
 for (const strip of document.querySelectorAll('img[class*="here-"]')) {
-  const box = strip.parentElement, share = strip.className.match(/here-(\d+)/)[1] / 100;
-  box.scrollLeft = share * box.scrollWidth - box.clientWidth / 2;
+  const box = strip.parentElement;
+  box.scrollLeft = strip.className.match(/here-(\d+)/)[1] / 940 * box.scrollWidth - box.clientWidth / 4;
+}
+
+// A table with a row of many columns and characters uses the margin at the right.
+for (const table of document.querySelectorAll("table:has(td:nth-child(7))")) {
+  const box = table.closest(".cell_output") ?? table.parentElement, isWide = (row) => row.innerText.length > 80;
+  if ([...table.rows].some(isWide)) box.classList.add("full-width");
 }
 
 // A link to something folded unfolds it, also where the browser does not.
