@@ -295,7 +295,11 @@ def draw_matches(
         )
         drawn.append(axes[0].figure.add_artist(line))
     for axis, places in zip(axes, pixels):
-        drawn += _mark_matches(axis, places, inliers)
+        # Columns x and y: inliers by discs, others by crosses.
+        wrong, right = places[~inliers].T, places[inliers].T
+        drawn.append(axis.scatter(*wrong, 25, VERMILLION, marker="x", linewidths=1.2, zorder=6))
+        style = {"edgecolors": "white", "linewidths": 0.7, "zorder": 6}
+        drawn.append(axis.scatter(*right, 25, BLUE, **style))
     return drawn
 
 
@@ -385,8 +389,7 @@ def show_dots(rows: Mapping[str, ArrayLike], median: bool = True, **labels: Any)
     for row, values in enumerate(rows.values()):
         # Dots are scattered over a band, so that equal values can be told apart.
         height = row + 0.5 * rng.uniform(-0.4, 0.4, len(values))
-        style = {"s": 40, "c": BLUE, "edgecolors": "white", "linewidths": 0.4}
-        axis.scatter(values, height, **style)
+        axis.scatter(values, height, 40, BLUE, edgecolors="white", linewidths=0.4)
         if median and len(values):
             centre = np.median(values)
             axis.vlines(centre, row - 0.4, row + 0.4, color=VERMILLION, linewidth=2.5)
@@ -635,18 +638,6 @@ def frame_cloud(
         chosen = np.random.default_rng(0).choice(len(points), most, replace=False)
         points = points[np.sort(chosen)]
     return points
-
-
-def _mark_matches(
-    axis: Axes, pixels: Real[np.ndarray, "n 2"], inliers: Bool[np.ndarray, " n"]
-) -> list[Artist]:
-    """Mark matches at pixels (x, y) of one image: inliers by discs, others by crosses."""
-    wrong = pixels[~inliers].T  # rows: x, y
-    right = pixels[inliers].T
-    return [
-        axis.scatter(*wrong, 25, VERMILLION, marker="x", linewidths=1.2, zorder=6),
-        axis.scatter(*right, 25, BLUE, edgecolors="white", linewidths=0.7, zorder=6),
-    ]
 
 
 def _panels(
