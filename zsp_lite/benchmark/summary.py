@@ -83,7 +83,7 @@ def draws_of(row: pd.DataFrame) -> Draws:
     return drawn * of_seeds[:, repeat]
 
 
-def figures_of(errors: ArrayLike, weights: Draws) -> dict:
+def figures_of(errors: ArrayLike, weights: Draws | None = None) -> dict:
     """Compute the paper's figures of rotation errors (n,) in degrees, with 95 % intervals (see
     `bootstrap_ci`).
 
