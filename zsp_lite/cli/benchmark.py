@@ -186,7 +186,8 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
 @click.option(
     "--pair", metavar="KEY", help="Only draw this pair of run.jsonl, with the pose of each row."
 )
-def tables(run, out, metrics, rows, latex, size, pair) -> None:
+@click.option("--data", type=PATH, show_default="the run's", help="Data folder, for --pair.")
+def tables(run, out, metrics, rows, latex, size, pair, data) -> None:
     """Write tables and figures of a benchmark run. The run may still go on."""
     from zsp_lite.benchmark.run import write_reports
     from zsp_lite.benchmark.runs import read_run
@@ -196,7 +197,7 @@ def tables(run, out, metrics, rows, latex, size, pair) -> None:
     if pair:
         results = read_run(run)
         # `folder` is absolute. A run may have none, and `data`, the path as it was given, only.
-        dataset = Co3D(results.settings.folder or results.settings.data)
+        dataset = Co3D(data or results.settings.folder or results.settings.data)
         figure = pair_figure(results, pair, dataset, rows)
         print(f"Written: {save_figure(figure, (out or run) / 'figures', f'pair_{pair}', size)}")
         return
