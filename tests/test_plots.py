@@ -54,7 +54,8 @@ def axis():
 
 def test_points_are_drawn_where_they_project_unless_behind_the_camera(axis):
     # The first point is 0.1 to the right at depth 1: 10 pixels right of the principal point.
-    plots.draw_points(axis, CAMERA, np.array([[0.1, 0, 1], [0, 0, 2], [0, 0, -1]]))
+    points = np.array([[0.1, 0, 1], [0, 0, 2], [0, 0, -1]])
+    plots.draw_points(axis, CAMERA, points, colours=np.eye(3))
     assert_allclose(axis.collections[0].get_offsets(), [[40, 30], [50, 30]])
     # The picture keeps its limits, with y down.
     assert axis.get_xlim() == (0, 80)

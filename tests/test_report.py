@@ -41,7 +41,7 @@ def results(ellipsoids):
 def page(results, tmp_path_factory) -> Path:
     """The report of the demo."""
     path = tmp_path_factory.mktemp("demo") / "in/report.html"
-    return write_report(path, results, "name")
+    return write_report(path, results, "name", "data")
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_the_page_says_where_the_answer_is_one_of_two(results, text, tmp_path):
     assert "One of two" not in text  # With perfect features the answer is certain.
     estimate = results[0].estimates["verified"]
     uncertain = replace(results[0], estimates={"verified": replace(estimate, one_of_two=True)})
-    page = write_report(tmp_path / "report.html", [uncertain], "name").read_text("utf-8")
+    page = write_report(tmp_path / "report.html", [uncertain], "name", "data").read_text("utf-8")
     assert "One of two" in page
     angle = estimate.angle_to(estimate.alternatives[0])
     assert f"turned by {angle:.0f} degrees" in page

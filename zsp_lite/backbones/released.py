@@ -54,9 +54,7 @@ PRETRAINED = {
 
 def available_backbones() -> dict[str, Path | None]:
     """Return the names of all backbones with their file, or None if it is not downloaded."""
-    paths = {DEFAULT: TINY}
-    for name, weights in PRETRAINED.items():
-        paths[name] = weights.path
+    paths = {DEFAULT: TINY} | {name: weights.path for name, weights in PRETRAINED.items()}
     return {name: path if path.is_file() else None for name, path in paths.items()}
 
 

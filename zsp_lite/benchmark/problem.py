@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from itertools import combinations
 from typing import Any, Protocol
 
@@ -146,9 +146,8 @@ class FrameStore:
         self.extractors = extractors
         self.threads = threads
         self.timings: dict[str, list[float]] = {}  # seconds of the stages of the present pair
-        # By category, sequence and number of the frame; the last used are the last.
-        self._crops: dict[tuple, Crop] = {}
         # Functions that remember what they return.
+        self._crop = lru_cache(CAPACITY)(self._read_crop)
         self.hypotheses = cache(self._hypotheses)
         self.shape = cache(self._shape)
         self.aligned = cache(self._aligned)
@@ -207,21 +206,19 @@ class FrameStore:
         frames = evenly_spaced(self.dataset.frame_numbers(category), targets)
         return synchronise(self.judged(category, frames, pairs=partners([*frames], None)))
 
+    def _read_crop(self, category: str, sequence: str, number: int) -> Crop:
+        """Read a frame and crop it to its object."""
+        size = getattr(self.extractors.get("backbone"), "image_size", IMAGE_SIZE)
+        with ends_the_run(f"reading frame {sequence}/{number}"):
+            annotation = self.dataset.frame(category, sequence, number)
+            with _time_added(self.timings, "reading"):
+                frame = object_crop(self.dataset.load(annotation), size)
+        # Rows are not told the names of objects.
+        return Crop(replace(frame, name=f"frame {number}"))
+
     def crop(self, category: str, sequence: str, number: int, features: Iterable[str] = ()) -> Crop:
         """Return a frame's crop with what some extractors compute from it, each once."""
-        key = category, sequence, number
-        crop = self._crops.pop(key, None)
-        if crop is None:
-            size = getattr(self.extractors.get("backbone"), "image_size", IMAGE_SIZE)
-            with ends_the_run(f"reading frame {sequence}/{number}"):
-                annotation = self.dataset.frame(*key)
-                with _time_added(self.timings, "reading"):
-                    frame = object_crop(self.dataset.load(annotation), size)
-            # Rows are not told the names of objects.
-            crop = Crop(replace(frame, name=f"frame {number}"))
-        self._crops[key] = crop
-        if len(self._crops) > CAPACITY:
-            del self._crops[next(iter(self._crops))]
+        crop = self._crop(category, sequence, number)
         for name in features:
             if name in crop.described:
                 continue

@@ -387,7 +387,7 @@ def write_figures(
     errors = dict(list(run.row(first).groupby("category")["error"]))
     label = f"rotation error of {first} (degrees)"
     with plt.rc_context({"text.parse_math": False}):  # names of rows and categories are no TeX
-        dots = show_dots({first: errors}, xlabel=label, xlim=(-3, 183), xticks=range(0, 181, 30))
+        dots = show_dots(errors, xlabel=label, xlim=(-3, 183), xticks=range(0, 181, 30))
         save_figure(dots, folder, "error_distribution", size)
         save_figure(error_curves(run, rows), folder, "error_curves", size)
 

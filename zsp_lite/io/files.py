@@ -111,13 +111,14 @@ def digest(*parts: str | bytes) -> str:
     """Return a hash of texts and bytes, 16 hexadecimal digits."""
     hasher = hashlib.sha256()
     for part in parts:
-        hasher.update(part.encode() if isinstance(part, str) else part)
+        is_text = isinstance(part, str)
+        hasher.update(part.encode(errors="surrogateescape") if is_text else part)
     return hasher.hexdigest()[:16]
 
 
 def stable_hash(text: str) -> int:
     """Hash text to 64 bits; unlike Python's `hash`, the result is the same in every process."""
-    return int.from_bytes(hashlib.sha256(text.encode(errors="surrogateescape")).digest()[:8], "big")
+    return int(digest(text), 16)
 
 
 def decompress(data: bytes, what: str) -> bytes:

@@ -182,21 +182,16 @@ def outline_patch(
     axis: Axes,
     cell: Cell,
     grid: tuple[int, int],
-    reach: int = 0,
     colour: str = "white",
     label: str = "",
     **style: Any,
 ) -> list[Artist]:
-    """Outline a patch of the image of an axis, or the block of patches up to `reach` around it,
-    with a label beside it.
-
-    The block is cut at the border of the image.
-    """
-    # First and last corner (row, col) of the block, and the same in pixels (x, y).
-    corners = np.clip([np.subtract(cell, reach), np.add(cell, reach + 1)], 0, grid)
+    """Outline a patch of the image of an axis, with a label beside it."""
+    # First and last corner (row, col) of the patch, and the same in pixels (x, y).
+    corners = np.stack([cell, np.add(cell, 1)])
     (left, top), (right, bottom) = corners[:, ::-1] * np.divide(_size(axis), grid)[::-1]
     box = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=colour, **style)
-    # The label is at the right of the block, but near the right border at its left.
+    # The label is at the right of the patch, but near the right border at its left.
     near_border = cell[1] >= 0.8 * grid[1]
     name = axis.text(
         left if near_border else right,
@@ -300,7 +295,11 @@ def draw_matches(
         )
         drawn.append(axes[0].figure.add_artist(line))
     for axis, places in zip(axes, pixels):
-        drawn += _mark_matches(axis, places, inliers)
+        # Columns x and y: inliers by discs, others by crosses.
+        wrong, right = places[~inliers].T, places[inliers].T
+        drawn.append(axis.scatter(*wrong, 25, VERMILLION, marker="x", linewidths=1.2, zorder=6))
+        style = {"edgecolors": "white", "linewidths": 0.7, "zorder": 6}
+        drawn.append(axis.scatter(*right, 25, BLUE, **style))
     return drawn
 
 
@@ -349,7 +348,6 @@ def show_points(
     panels: Mapping[str, Mapping[str, Real[np.ndarray, "_ _"]]],
     columns: int | None = None,
     size: float = 4.5,
-    colours: Sequence[str] = (BLUE, ORANGE),
     **labels: Any,
 ) -> Figure:
     """Show sets of points (x, y, ...) in each panel, by its title, with equal scales and one
@@ -366,7 +364,7 @@ def show_points(
     height = size * half[1] / half[0] + 0.6 + _TITLE_LINE * _lines_of(panels)  # 0.6: the legend
     figure, axes = _panels(len(panels), columns, size, height)
     for axis, (title, sets), centre in zip(axes, panels.items(), ranges.mean(axis=1)):
-        for (name, points), colour, marker in zip(sets.items(), colours, _CLOUD_MARKERS):
+        for (name, points), colour, marker in zip(sets.items(), COLOURS, _CLOUD_MARKERS):
             # The more points, the smaller their marks (square points) and the thinner their lines.
             area = np.clip(6000 / max(len(points), 1), 3, 40)
             thick = 0.3 + 0.03 * area
@@ -381,43 +379,22 @@ def show_points(
     return figure
 
 
-def show_dots(
-    groups: Mapping[str, Mapping[str, ArrayLike]], median: bool = True, **labels: Any
-) -> Figure:
-    """Show values as a row of dots for each name, with a bar at the `median`; several groups differ
-    in colour.
+def show_dots(rows: Mapping[str, ArrayLike], median: bool = True, **labels: Any) -> Figure:
+    """Show the values of each row, by its name, as dots, with a bar at the `median`.
 
-    `groups` has the values by the name of the row, by the name of the group; `labels` is what
-    `Axes.set` takes.
+    `labels` is what `Axes.set` takes.
     """
-    rows = list(next(iter(groups.values())))
     figure, axis = plt.subplots(figsize=(8, 1.1 + 0.42 * len(rows)), layout="constrained")
     rng = np.random.default_rng(0)
-    width = 0.5 / len(groups)  # of the band of a group; rows are 1 apart
-    styles = zip(groups.items(), cycle(COLOURS), cycle(_MARKERS))
-    for index, ((group, values), colour, marker) in enumerate(styles):
-        for row, name in enumerate(rows):
-            x = values[name]
-            middle = row + width * (index - (len(groups) - 1) / 2)
-            # Dots are scattered over the band, so that equal values can be told apart.
-            height = middle + width * rng.uniform(-0.4, 0.4, len(x))
-            axis.scatter(
-                x,
-                height,
-                s=40,
-                c=colour,
-                marker=marker,
-                edgecolors="white",
-                linewidths=0.4,
-                label="" if row else group,  # one entry of the legend for all rows
-            )
-            if median and len(x):
-                centre = np.median(x)
-                axis.vlines(centre, middle - 0.4, middle + 0.4, color=VERMILLION, linewidth=2.5)
+    for row, values in enumerate(rows.values()):
+        # Dots are scattered over a band, so that equal values can be told apart.
+        height = row + 0.5 * rng.uniform(-0.4, 0.4, len(values))
+        axis.scatter(values, height, 40, BLUE, edgecolors="white", linewidths=0.4)
+        if median and len(values):
+            centre = np.median(values)
+            axis.vlines(centre, row - 0.4, row + 0.4, color=VERMILLION, linewidth=2.5)
     axis.set_yticks(range(len(rows)), rows)
     axis.set(ylim=(len(rows) - 0.4, -0.6), **labels)
-    if len(groups) > 1:
-        _legend(figure, axis)
     return figure
 
 
@@ -491,7 +468,7 @@ def draw_points(
     axis: Axes,
     camera: Camera,
     points: Real[np.ndarray, "n 3"],
-    colours: np.ndarray | str = BLUE,
+    colours: np.ndarray,
     size: float = 5.0,
 ) -> None:
     """Draw points of a camera's frame in its image, far ones first; those behind the camera are
@@ -500,8 +477,7 @@ def draw_points(
     order = np.argsort(-points[:, 2])  # far points first
     order = order[points[order, 2] > 0]
     pixels, _ = camera.project(camera.to_world(points[order]))
-    colours = colours if isinstance(colours, str) else np.asarray(colours)[order]
-    axis.scatter(*pixels.T, s=size, c=colours, linewidths=0, alpha=0.85, zorder=3)
+    axis.scatter(*pixels.T, s=size, c=colours[order], linewidths=0, alpha=0.85, zorder=3)
 
 
 def draw_axes(
@@ -662,18 +638,6 @@ def frame_cloud(
         chosen = np.random.default_rng(0).choice(len(points), most, replace=False)
         points = points[np.sort(chosen)]
     return points
-
-
-def _mark_matches(
-    axis: Axes, pixels: Real[np.ndarray, "n 2"], inliers: Bool[np.ndarray, " n"]
-) -> list[Artist]:
-    """Mark matches at pixels (x, y) of one image: inliers by discs, others by crosses."""
-    wrong = pixels[~inliers].T  # rows: x, y
-    right = pixels[inliers].T
-    return [
-        axis.scatter(*wrong, 25, VERMILLION, marker="x", linewidths=1.2, zorder=6),
-        axis.scatter(*right, 25, BLUE, edgecolors="white", linewidths=0.7, zorder=6),
-    ]
 
 
 def _panels(

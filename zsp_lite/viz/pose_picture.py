@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Arc, Wedge
+from matplotlib.patches import Wedge
 
 from zsp_lite.alignment import Sim3
 from zsp_lite.data.azimuths import azimuths, ground_axes
@@ -120,12 +120,9 @@ def _draw_from_above(
     axis.images[0].remove()  # the white image that held the place
     gap = f"no target view in these {end - begin:.0f}°"
     axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0, label=gap))
-    # An arc is given by the width and the height of its whole ellipse.
-    arc = Arc((0, 0), 2, 2, theta1=end, theta2=begin + 360, color=plots.BLUE, linewidth=4)
-    axis.add_patch(arc)
-    # Its entry of the legend is a line.
+    arc = np.radians(np.linspace(end, begin + 360, 100))
     span = f"the target views span {360 - end + begin:.0f}°"
-    axis.plot([], [], color=plots.BLUE, linewidth=4, label=span)
+    axis.plot(np.cos(arc), np.sin(arc), color=plots.BLUE, linewidth=4, label=span)
     step = -(-len(target) // _POINTS)  # rounded up
     flat = [(points - centre) @ axes.T for points in (target[::step], reference)]
     # Nine tenths of the target's points are within `_OBJECT`.

@@ -35,7 +35,10 @@ from zsp_lite.viz.votes import ring_figure, votes_figure
 
 _GREY = "#7a828b"  # contrast of 3.9 and more to white and to the page's dark ground
 _TEMPLATES = Environment(
-    loader=PackageLoader("zsp_lite.viz"), autoescape=True, undefined=StrictUndefined
+    loader=PackageLoader("zsp_lite.viz"),
+    autoescape=True,
+    undefined=StrictUndefined,
+    extensions=["jinja2.ext.do"],
 )
 # Parts of figures in this grey on the page, as keys of matplotlib's settings.
 _COLOURED = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")
@@ -58,7 +61,7 @@ def write_pair_report(path: Path, result: PairResult) -> Path:
         "auto": "found by depth and colours",
     }
     note = f"reference {origins[result.masks[0]]}, target {origins[result.masks[1]]}"
-    return write_report(path, [result], result.backbone, data_note=note, own=True)
+    return write_report(path, [result], result.backbone, data_note=note)
 
 
 def write_category_report(
@@ -102,18 +105,16 @@ def write_report(
     data: str = "",
     data_note: str = "",
     photograph: PhotographSection | None = None,
-    own: bool = False,
 ) -> Path:
-    """Write the page of the demo, or of a pair of the user's `own`.
+    """Write the page of the demo, or of a pair of the user's own, which has no `data`.
 
     Args:
         path: File to write.
         results: Results in the order of the page.
         backbone: Name of the backbone.
-        data: Name of the data, for the first paragraph.
+        data: Name of the demo's data, for the first paragraph.
         data_note: What the page says of the data.
         photograph: Section on the photographed motorcycle; None leaves it out.
-        own: Whether the pair is the user's own.
 
     Returns:
         The path of the page.
@@ -128,7 +129,7 @@ def write_report(
         pairs=pairs,
         data=data,
         data_note=data_note,
-        own=own,
+        own=not data,
         grey=_GREY,
         photograph=photograph,
         photograph_picture=picture,
