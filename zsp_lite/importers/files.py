@@ -42,6 +42,7 @@ _VOID = 255  # label of pixels that belong to nothing, as in PASCAL VOC
 # Range of the field of view of a camera, degrees.
 _LEAST_VIEW = 10.0
 _LARGEST_VIEW = 120.0
+_LARGEST_SENSOR = 60  # width of the largest sensor of a camera, millimetres
 _UNEQUAL = 1.3  # ratio of the focal lengths above which they are doubtful
 # Distance of the principal point from the middle, relative to half of the side, above which it is
 # doubtful.
@@ -261,9 +262,10 @@ def _doubt(values: Float[np.ndarray, "4"], side: Float[np.ndarray, "2"]) -> str:
     ratio = ratios.mean()
     alike = min(ratios) > 0 and np.ptp(ratios) < 0.05 * ratio
     if alike and abs(ratio - 1) > _OFF_MIDDLE:
+        fitted_to = "an image" if max(2 * centre) > _LARGEST_SENSOR else "a sensor in millimetres"
         wide, high = 2 * centre
         return (
-            f"fit an image of {wide:.4g} x {high:.4g}, not {side[0]:.0f} x {side[1]:.0f} pixels:"
+            f"fit {fitted_to} of {wide:.4g} x {high:.4g}, not {side[0]:.0f} x {side[1]:.0f} pixels:"
             f" for this image they would be {_listed(values / ratio)}"
         )
     if np.abs(ratios - 1).max() > _OFF_MIDDLE:

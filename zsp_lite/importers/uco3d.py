@@ -355,9 +355,7 @@ class _Sequence:
                 f"{left_out} of {len(chosen)} frames left out, whose depth disagrees with the "
                 "point cloud",
             )
-        return ImportResult(
-            len(agreeing), empty=0, points=len(self.points), scale=scale, flags=flags
-        )
+        return ImportResult(len(agreeing), len(self.points), scale, flags)
 
     def _load(self, frame: _FrameRow) -> Frame:
         """Load a frame without distortion."""
