@@ -182,16 +182,21 @@ def outline_patch(
     axis: Axes,
     cell: Cell,
     grid: tuple[int, int],
+    reach: int = 0,
     colour: str = "white",
     label: str = "",
     **style: Any,
 ) -> list[Artist]:
-    """Outline a patch of the image of an axis, with a label beside it."""
-    # First and last corner (row, col) of the patch, and the same in pixels (x, y).
-    corners = np.stack([cell, np.add(cell, 1)])
+    """Outline a patch of the image of an axis, or the block of patches up to `reach` around it,
+    with a label beside it.
+
+    The block is cut at the border of the image.
+    """
+    # First and last corner (row, col) of the block, and the same in pixels (x, y).
+    corners = np.clip([np.subtract(cell, reach), np.add(cell, reach + 1)], 0, grid)
     (left, top), (right, bottom) = corners[:, ::-1] * np.divide(_size(axis), grid)[::-1]
     box = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=colour, **style)
-    # The label is at the right of the patch, but near the right border at its left.
+    # The label is at the right of the block, but near the right border at its left.
     near_border = cell[1] >= 0.8 * grid[1]
     name = axis.text(
         left if near_border else right,
