@@ -353,6 +353,7 @@ def show_points(
     panels: Mapping[str, Mapping[str, Real[np.ndarray, "_ _"]]],
     columns: int | None = None,
     size: float = 4.5,
+    colours: Sequence[str] = (BLUE, ORANGE),
     **labels: Any,
 ) -> Figure:
     """Show sets of points (x, y, ...) in each panel, by its title, with equal scales and one
@@ -369,7 +370,7 @@ def show_points(
     height = size * half[1] / half[0] + 0.6 + _TITLE_LINE * _lines_of(panels)  # 0.6: the legend
     figure, axes = _panels(len(panels), columns, size, height)
     for axis, (title, sets), centre in zip(axes, panels.items(), ranges.mean(axis=1)):
-        for (name, points), colour, marker in zip(sets.items(), COLOURS, _CLOUD_MARKERS):
+        for (name, points), colour, marker in zip(sets.items(), colours, _CLOUD_MARKERS):
             # The more points, the smaller their marks (square points) and the thinner their lines.
             area = np.clip(6000 / max(len(points), 1), 3, 40)
             thick = 0.3 + 0.03 * area
