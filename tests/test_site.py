@@ -120,6 +120,12 @@ def test_a_notebook_shows_its_stored_pictures_its_drawings_and_what_it_printed(p
             assert output.text.strip().splitlines()[0].strip() in page.text
 
 
+def test_no_formula_shows_a_command_of_latex(site, pages):
+    for path in pages:
+        formulas = re.findall("<math.*?</math>", (site / path).read_text("utf-8"))
+        assert not re.findall(r"\\\w+", " ".join(formulas)), path
+
+
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_shows_every_line_also_one_that_begins_with_a_percent_sign(pages, path):
     shown = "".join(pages[page_of(path)].text.split())
