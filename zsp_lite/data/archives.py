@@ -122,7 +122,8 @@ def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | Non
             present += path.stat().st_size
     needed = sum(size or 0 for size in sizes) + max(whole, default=0) - present
     # `root` may not exist yet: its disk is that of the nearest folder above it that exists.
-    existing = next(path for path in (root.absolute(), *root.absolute().parents) if path.exists())
+    absolute = root.absolute()
+    existing = next(path for path in (absolute, *absolute.parents) if path.exists())
     free = shutil.disk_usage(existing).free
     if needed > free:
         raise InputError(

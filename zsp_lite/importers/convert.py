@@ -76,6 +76,7 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
     scale = 1 / axis_deviation(points)
     scaled = LazyFrames(lambda position: scale_frame(source.read_frame(position), scale), seen)
     numbers = [source.numbers[position] for position in seen]
+    # The numbers count as the times, too.
     data = SequenceData(
         sequence, scaled, [*map(float, numbers)], points * scale, colours, normals, numbers=numbers
     )

@@ -48,8 +48,7 @@ def read_stray(folder: Path, count: int) -> Makers:
             f"({len(times)} of {len(rows)})"
         )
         # The times of the images, in steps of their median distance (1 ms at least), count frames.
-        # They show which images are missing, if the first and
-        # the last one are there.
+        # They show which images are missing, if the first and the last one are there.
         steps = np.rint((times - times[0]) / np.median(np.diff(times)).clip(1))
         timed = np.isin(images - images[0], steps)
         if timed[-1] and timed.sum() == len(times):
@@ -158,7 +157,10 @@ def read_record3d(folder: Path) -> Makers:
 def _make_record3d(
     folder: Path, unpacked: Path, scan: _Record3D, intrinsics: list[float | None]
 ) -> CaptureFrame:
-    """Make a frame; its depth and confidence are decompressed to `unpacked`.npy and .png."""
+    """Make a frame; its depth and confidence are decompressed to `unpacked`.npy and .png.
+
+    The name of `unpacked` is the number of the frame.
+    """
     name = f"rgbd/{unpacked.name}"
     pose = scan.poses[int(unpacked.name)]
     depth = unpacked.with_suffix(".npy")

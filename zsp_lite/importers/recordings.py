@@ -54,7 +54,7 @@ def read_recording(
     depths = _numbered(folder, "depth")
     camera = {"intrinsics": intrinsics}
     if intrinsics is None:
-        camera = _known_camera(folder, min(images.values()))
+        camera = _known_camera(folder, min(images.values()))  # any image tells
     # The numbers are of frames or times: an image and its depth have the same, or nearly. They
     # differ by at most 3/4 of the mean distance between images.
     numbers = np.array([*depths])
@@ -236,4 +236,5 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
     if closed < len(loops) / 4:
         doubt = f"the poses may drift: {closed} of {len(loops)} loops close"
     for position, node in zip(order, graph.nodes):
+        # The translation, the last column, back in the units of the depth.
         yield partial(makers[position], node.pose[:3] * [1, 1, 1, unit], doubt=doubt)

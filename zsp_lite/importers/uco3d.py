@@ -186,11 +186,11 @@ def import_uco3d(
         for name in sequences or ():
             check_choice(f"{root}: sequence of {category}", name, names)
         asked = sorted(set(sequences or names))
-        places = ", ".join("?" * len(asked))  # one place per name
+        placeholders = ", ".join("?" * len(asked))
         rows = _select(
             metadata,
             _SequenceRow,
-            f"sequence_annots WHERE sequence_name IN ({places}) "
+            f"sequence_annots WHERE sequence_name IN ({placeholders}) "
             "ORDER BY _reconstruction_quality_viewpoint DESC, sequence_name",
             asked,
         )
