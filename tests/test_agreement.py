@@ -121,11 +121,14 @@ def test_positions_of_another_unit_are_named_where_the_depth_is_plausible(frames
     assert "if the positions of the cameras are multiplied by 0.001" in line
 
 
-@pytest.mark.parametrize("turning", [True, False])
-def test_an_object_that_turns_before_a_standing_camera_is_named(frames, turning):
+# Of frames 2 and 3, about 30 % of the points agree; with each frame itself, all would.
+@pytest.mark.parametrize(
+    "images, turning", [((0, 1, 2, 3), True), ((2, 3), True), ((0, 0, 0, 0), False)]
+)
+def test_an_object_that_turns_before_a_standing_camera_is_named(frames, images, turning):
     camera = frames[0].camera
     standing = [
-        replace(frames[k * turning], camera=replace(camera, t=camera.t + 0.002 * k))
-        for k in range(4)
+        replace(frames[image], camera=replace(camera, t=camera.t + 0.002 * k))
+        for k, image in enumerate(images)
     ]
     assert disagreement(standing).startswith("the cameras hardly turn, but the object") == turning

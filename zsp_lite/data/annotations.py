@@ -20,6 +20,7 @@ SEQUENCES_FILE = "sequence_annotations.jgz"
 Row = tuple[float, float, float]
 
 
+# `gc=False`: Python's search for reference cycles skips these records, which cannot form any.
 class ImageAnnotation(msgspec.Struct, frozen=True, gc=False):
     path: str
     size: tuple[int, int]  # (height, width)

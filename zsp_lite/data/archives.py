@@ -26,7 +26,8 @@ from zsp_lite.io.locks import writing
 CATALOGUE = Path(__file__).with_name("co3d_archives.json")  # names and SHA-256 digests
 # Environment variables with the address of a mirror, by data set. v1 is the version of the paper.
 URL_VARIABLES = {"co3d": "ZSP_LITE_CO3D_URL", "co3d-v1": "ZSP_LITE_CO3D_V1_URL"}
-# Bytes of one request for a part of an archive: fewer requests would read more than is needed.
+# Bytes of one request for a part of an archive. Larger parts would hold more that is not needed,
+# smaller ones need more requests.
 _PART = 1 << 22
 _DOWNLOADS = ".download"  # folder in the data folder that holds archives until they are unpacked
 _RECORD = f"{_DOWNLOADS}/unpacked.json"  # the list of what is unpacked, by category
@@ -121,7 +122,8 @@ def check_disk(root: Path, missing: Sequence[Archive], sizes: Sequence[int | Non
             present += path.stat().st_size
     needed = sum(size or 0 for size in sizes) + max(whole, default=0) - present
     # `root` may not exist yet: its disk is that of the nearest folder above it that exists.
-    existing = next(path for path in (root.absolute(), *root.absolute().parents) if path.exists())
+    absolute = root.absolute()
+    existing = next(path for path in (absolute, *absolute.parents) if path.exists())
     free = shutil.disk_usage(existing).free
     if needed > free:
         raise InputError(

@@ -33,7 +33,7 @@ def frame_from_arrays(
     """Make a frame of arrays (see `Frame.from_arrays`)."""
     label = f"frame {name}".rstrip()
 
-    # Colours (H, W, 3), uint8. What is still of another type below is refused by `__init__`.
+    # Colours (H, W, 3), uint8. `Frame` refuses what is still of another type below.
     image = np.asarray(rgb)
     if image.ndim == 2:
         image = image[..., None]
@@ -44,7 +44,7 @@ def frame_from_arrays(
     image = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[..., :3]
     size = image.shape[:2]
 
-    # The camera, from pixel centres at integers to ones at half-integers.
+    # The camera. Pixel centres at integers become ones at half-integers.
     intrinsics = _split_intrinsics(f"{label} K", K) + (0, 0, 0.5, 0.5)
     pose = real_array(f"{label} pose", np.eye(4) if pose is None else pose)
     defect = ""
@@ -120,13 +120,13 @@ def enlarge_depth(
 ) -> Float32[np.ndarray, "..."]:
     """Enlarge a depth map of the same aspect ratio to an image's size (H, W).
 
-    Depth maps of other aspect ratios, or no smaller than the image, are returned as they are.
+    Pixels take the nearest value, because the mean of two surfaces' depths lies on neither. Depth
+    maps of other aspect ratios, or no smaller than the image, are returned as they are.
     """
     rows, columns = depth.shape
     height, width = size
     if rows >= height or abs(rows * width / (columns * height) - 1) > _SAME_ASPECT:
         return depth
-    # Pixels take the nearest value, because the mean of two surfaces' depths lies on neither.
     return cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
 
 

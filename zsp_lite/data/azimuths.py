@@ -7,7 +7,8 @@ from jaxtyping import Float
 
 from zsp_lite.data.cameras import Camera
 
-# A camera looks along the vertical if the sine of its angle to the vertical is at most this.
+# A camera stands above or below a point if the sine of its angle to the vertical is at most this,
+# which is that of 24 degrees.
 _STEEP = 0.4
 
 

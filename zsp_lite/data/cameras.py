@@ -66,7 +66,7 @@ class Camera:
         real_array("image size (height, width)", tuple(self.size), (2,))
         for side in self.size:
             check_integer("image size (height, width)", side, 1, MOST_PIXELS)
-        object.__setattr__(self, "size", (int(self.size[0]), int(self.size[1])))
+        object.__setattr__(self, "size", tuple(map(int, self.size)))
 
     @classmethod
     def from_pytorch3d(

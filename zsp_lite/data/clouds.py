@@ -40,7 +40,7 @@ def extent(
 
 def best_plane(
     points: Float[np.ndarray, "n 3"],
-    near: float,
+    tolerance: float,
     trials: int,
     allowed: Callable[[np.ndarray], Bool[np.ndarray, " trials"]] = lambda normals: True,
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], int]:
@@ -48,7 +48,7 @@ def best_plane(
 
     Args:
         points: Points.
-        near: Largest distance of an inlier.
+        tolerance: Largest distance of an inlier.
         trials: Number of samples of three points.
         allowed: Whether planes with some normals (trials, 3), of any length, count.
 
@@ -63,7 +63,7 @@ def best_plane(
     counting = (lengths[:, 0] > 0) & allowed(normals)
     normals = normals / np.where(lengths > 0, lengths, 1)
     offsets = (normals * corners[:, 0]).sum(axis=1, keepdims=True)
-    inside = np.abs(normals @ points.T - offsets) < near  # (trials, n)
+    inside = np.abs(normals @ points.T - offsets) < tolerance  # (trials, n)
     counts = inside.sum(axis=1) * counting
     # The least-squares plane of the inliers: their direction of least variance is its normal.
     inliers = points[inside[counts.argmax()]]

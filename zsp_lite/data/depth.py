@@ -1,4 +1,4 @@
-"""Depth maps: CO3D's 16-bit encoding, in-painting, points of pixels and patches, and planes.
+"""Depth maps: CO3D's 16-bit encoding, in-painting, and points of pixels and patches.
 
 A depth map is (H, W), along +z in units of the world; 0 means unknown.
 """
@@ -88,8 +88,8 @@ def patch_points(
     chosen = np.take_along_axis(
         np.argsort(values, axis=-1, kind="stable"), rank[..., None], axis=-1
     )
-    nearer = np.take_along_axis(pixel, chosen, axis=-1)[..., 0]
-    index = np.where(known, nearer, row_middle[:, None] * width + col_middle)
+    at_percentile = np.take_along_axis(pixel, chosen, axis=-1)[..., 0]
+    index = np.where(known, at_percentile, row_middle[:, None] * width + col_middle)
     filled = inpaint_depth(depth) if inpaint and not known.all() else depth
     y, x = np.divmod(index, width)
     depths = filled.ravel()[index]

@@ -27,7 +27,7 @@ def sample_pairs(dataset: Co3D, category: str, n: int, n_targets: int, seed: int
     is random; the target frames are evenly spaced from a random start. The pairs for a smaller `n`
     are the first pairs for a larger one.
     """
-    rng = np.random.default_rng([seed, stable_hash(category) >> 1])
+    rng = np.random.default_rng([seed, stable_hash(category) >> 1])  # 63 bits, as in `Pair.seed`
     numbers = _labelled_frames(dataset, category, n_targets)
     # The number of pairs of each reference sequence that are not sampled yet. Each frame of another
     # sequence is the start of one choice of target frames.

@@ -170,11 +170,10 @@ def mask_to_bbox(mask: Real[np.ndarray, "h w"], padding: float = 0.1) -> Box:
 
 def crop_to_object(frame: Frame) -> Frame:
     """Crop a frame and its camera to the bounding box of its object mask (see `mask_to_bbox`)."""
-    top, left, height, width = mask_to_bbox(frame.mask)
+    box = mask_to_bbox(frame.mask)
+    top, left, height, width = box
     inside = np.s_[top : top + height, left : left + width]
-    return with_images(
-        frame, frame.camera.crop((top, left, height, width)), lambda image: image[inside]
-    )
+    return with_images(frame, frame.camera.crop(box), lambda image: image[inside])
 
 
 def resize_frame(frame: Frame, size: tuple[int, int]) -> Frame:

@@ -35,7 +35,7 @@ class Format:
     signs: tuple[str, ...]  # patterns of files: a folder of the format has a match for each
     what: str  # name of the format, for messages
     read: Callable[..., Makers]
-    options: tuple[str, ...] = ()  # options that `read` takes, without `count`
+    options: tuple[str, ...] = ()  # options of this format alone, which `read` takes
     # Direction up in its worlds, by their documents; "floor" if they say nothing of it.
     up: tuple[float, float, float] | Literal["floor"] = "floor"
     unless: tuple[str, ...] = ()  # patterns of files that a folder of the format does not have
@@ -194,13 +194,13 @@ def open_capture(
     layout: str | None = None,
     count: int = MOST_FRAMES,
     masks: Path | None = None,
-    files: Mapping[str, Any] = {},
+    attributes: Mapping[str, Any] = {},
     **options: Any,
 ) -> Capture:
     """Read a capture's frames (see `open_source`), with the masks of its folder masks/, if any.
 
     The `layout`, a name in `FORMATS`, is recognised by default; otherwise the path is what its
-    reader takes. `files` has attributes of `CaptureFrame` that replace those of every frame.
+    reader takes. `attributes` are of `CaptureFrame` and replace those of every frame.
     InputError if the capture cannot be read, or no frame can be used.
     """
     folder = Path(path)
@@ -208,8 +208,8 @@ def open_capture(
         layout, folder = recognise(path)
     if layout == "stray":  # the reader chooses the sharp frames, because it decodes a video
         options["count"] = count
-    if layout == "recording":
-        options["attributes"] = files
+    if layout == "recording":  # the reader loads the frames to find their poses
+        options["attributes"] = attributes
     frames = []
     left_out = []
     for make in FORMATS[layout].read(folder, **options):
@@ -222,7 +222,8 @@ def open_capture(
             left_out.append(str(error))
     frames.sort(key=lambda frame: natural_order(frame.image))
 
-    # Frames are counted as their files are named; without different numbers, by position.
+    # The number of a frame is the last one in its image's path, or 0; of a long number, the last 15
+    # digits, which a float holds, too. If these are not all different, it is the position.
     numbers = dict.fromkeys([0, *natural_order(frame.image)][-2] % 10**15 for frame in frames)
     if len(numbers) < len(frames):
         numbers = range(len(frames))
@@ -240,7 +241,7 @@ def open_capture(
     if not masks:
         paths = [frame.mask or mask for frame, mask in zip(frames, paths)]
     frames = [
-        replace(frame, mask=mask, number=number, **files)
+        replace(frame, mask=mask, number=number, **attributes)
         for frame, mask, number in zip(frames, paths, numbers)
     ]
 

@@ -26,15 +26,15 @@ from zsp_lite.points import object_pixels, world_points
 _POINTS = 500  # largest number of points of a frame, about
 _LEAST_POINTS = 50  # with fewer points, a share says little
 _PAIRS = 8  # largest number of pairs of frames
-# Angles between the two cameras of a pair, degrees. Of nearer cameras, wrong poses agree, too;
-# cameras farther apart see other sides of the object.
-_NEAREST = 4.0
-_BEST = 20.0
-_FARTHEST = 50.0
+# Angles between the two cameras of a pair, degrees. With a smaller angle, wrong poses agree, too;
+# with a larger one, the cameras see other sides of the object.
+_LEAST_TURN = 4.0
+_BEST_TURN = 20.0
+_LARGEST_TURN = 50.0
 _TOLERANCE = 0.05  # largest difference of depth on a surface, relative to the object's distance
 _AGREEING = 0.6  # frames agree without doubt above this share of points
 _FITTING = 0.5  # the right correction makes at least this share of points agree
-_GAIN = 0.25  # that of poses raises the share by at least this value
+_GAIN = 0.25  # a correction of poses raises the share by at least this value
 _ALIKE = 0.03  # of corrections whose shares differ by less, the likelier is named
 # Depth along the ray raises the share in the whole image by at least this factor. The gain is
 # small, because both depths are nearly equal near the optical axis.
@@ -42,12 +42,12 @@ _RAY_GAIN = 1.2
 _CONTRADICTING = 0.4  # frames contradict each other below this share of points
 _UNITS = {1.0: "metres", 0.001: "millimetres", 0.0002: "1/5000 m"}
 _SCALES = np.geomspace(1e-3, 1e3, 280)  # factors of the depth in steps of 5 %
-_NEAR = np.geomspace(0.6, 1.7, 27)  # in steps of 4 %
-_FINE = np.linspace(0.95, 1.05, 11)  # in steps of 1 %
+_SMALL_SCALES = np.geomspace(0.6, 1.7, 27)  # in steps of 4 %, where the given unit is about right
+_FINE = np.linspace(0.95, 1.05, 11)  # in steps of 1 %, around the best of the others
 # The right factor makes the weighted share at least so many times as great. On renderings with the
 # noise of phones, where the unit is right, 1.28 times is the most; units that are off by 15 % make
 # at least 1.4 times without noise.
-_NEARER = 1.35
+_SCALE_GAIN = 1.35
 _OWN_SCALES = np.geomspace(0.4, 2.5, 39)  # of a single frame
 
 _Pose = Float[np.ndarray, "4 4"]  # world to camera
@@ -117,8 +117,9 @@ _Pair = tuple[_Surface, _Surface]
 def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     """Say that frames of one object do not agree, and which usual mistake explains it.
 
-    Returns "" if the frames agree, or if none of them overlap. Frames without a mask get one by
-    depth. `unit` has the world units per stored depth value, if the user can change it.
+    Returns a `Doubt` or `Contradiction`, which are texts, or "" if the frames agree or none of them
+    overlap. Frames without a mask get one by depth. `unit` has the world units per stored depth
+    value, if the user can change it.
     """
     # The surfaces of each frame: of the object, and of everything in the image.
     objects = []
@@ -134,8 +135,10 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
     pairs = _pairs(objects)
     whole = _pairs(scenes)
     if not pairs:
-        still = _pairs(objects, 0.0)
-        if not still or _share(still) > _AGREEING:
+        # No two cameras are turned enough to test the poses. Those that are hardly turned agree,
+        # unless the object turns.
+        unturned = _pairs(objects, 0.0)
+        if not unturned or _share(unturned) > _AGREEING:
             return ""
         return Contradiction(
             "the cameras hardly turn, but the object does: expected the poses of the cameras "
@@ -157,13 +160,15 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
         )
 
     # Mistakes in poses and units.
-    near = _share(pairs, weighted=True)
-    if _NEARER * near > 1:
+    closeness = _share(pairs, weighted=True)
+    # The closeness is 1 at most: no factor can raise it enough, and the share, which is no less, is
+    # above `_AGREEING`.
+    if _SCALE_GAIN * closeness > 1:
         return ""
-    factors = _NEAR
+    factors = _SMALL_SCALES
     if given <= _AGREEING:
         shares = np.array([_share(pairs, correct) for _, correct in _CORRECTIONS])
-        likeliest = int(np.argmax(shares > shares.max() - _ALIKE))
+        likeliest = np.argmax(shares > shares.max() - _ALIKE)  # the first of those alike
         if shares[likeliest] > max(_FITTING, given + _GAIN):
             return Contradiction(
                 f"{found}; they agree ({shares[likeliest]:.0%}) if the poses "
@@ -171,16 +176,17 @@ def disagreement(frames: Iterable[Frame], unit: float | None = None) -> str:
             )
         factors = _SCALES
     factor = _best_scale(pairs, _best_scale(pairs, factors) * _FINE)
-    nearer = _share(pairs, scale=factor, weighted=True)
+    closeness_scaled = _share(pairs, scale=factor, weighted=True)
     share = _share(pairs, scale=factor)
-    if share > _FITTING and nearer > _NEARER * near:
+    if share > _FITTING and closeness_scaled > _SCALE_GAIN * closeness:
         distance = float(np.median([surface.distance for surface, _ in pairs]))
         return Contradiction(
             f"{found}; they agree best ({share:.0%}) if {_scaled(factor, distance, unit)}"
         )
     if given > _AGREEING:
         return ""
-    # Two factors fit many wrong poses of a single pair, but not those of all of several pairs.
+    # Two factors, of all depth and of the second frame's alone, fit many wrong poses of a single
+    # pair, but not those of all of several pairs.
     share = min(
         max(_share([pair], scale=scale, own_scale=True) for scale in _OWN_SCALES) for pair in pairs
     )
@@ -204,17 +210,18 @@ def neighbours(count: int) -> list[int]:
     return sorted({(third + step) % count for third in thirds for step in steps})
 
 
-def _pairs(surfaces: Sequence[_Surface], nearest: float = _NEAREST) -> list[_Pair]:
-    """Pair each surface with the one whose camera is turned by about `_BEST` degrees, and at least
-    by `nearest`."""
-    # No mistake changes the angle between two cameras.
+def _pairs(surfaces: Sequence[_Surface], least_turn: float = _LEAST_TURN) -> list[_Pair]:
+    """Pair each surface with another one whose camera is turned by about `_BEST_TURN` degrees, and
+    by `least_turn` at least."""
     surfaces = [surface for surface in surfaces if len(surface.points) >= _LEAST_POINTS]
     pairs = []
     for surface in surfaces:
-        angles = np.array([rotation_angle(surface.camera.R, other.camera.R) for other in surfaces])
-        angles[(angles < nearest) | (angles > _FARTHEST)] = np.inf
+        others = [other for other in surfaces if other is not surface]
+        # These angles can be trusted: no usual mistake in the poses changes them.
+        angles = np.array([rotation_angle(surface.camera.R, other.camera.R) for other in others])
+        angles[(angles < least_turn) | (angles > _LARGEST_TURN)] = np.inf
         if np.isfinite(angles).any():
-            pairs.append((surface, surfaces[int(np.abs(angles - _BEST).argmin())]))
+            pairs.append((surface, others[np.abs(angles - _BEST_TURN).argmin()]))
     return pairs[:: len(pairs) // _PAIRS + 1]
 
 
@@ -267,8 +274,8 @@ _OTHER_AXES = (
     "have the other axes, OpenGL's for OpenCV's or the reverse: negate the columns y and z"
 )
 _INVERSE = "are world to camera"
-# Corrections from wrong to right world-to-camera matrices. An inverse may be in OpenGL's axes, too.
-# The axes of the world do not matter.
+# Corrections from wrong to right world-to-camera matrices, the likeliest first. An inverse may be
+# in OpenGL's axes, too. The axes of the world do not matter.
 _CORRECTIONS: list[tuple[str, _Correction]] = [
     (_INVERSE, np.linalg.inv),
     (_INVERSE, lambda pose: FROM_OPENGL @ np.linalg.inv(pose)),

@@ -30,7 +30,8 @@ from zsp_lite.io.files import read_bytes, shown
 # OpenCV's and Open3D's pixel centres are at integers: their principal points are smaller by this.
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's camera: +y up, looking along -z
-_FARTHEST = 1e4  # greater depth counts as unknown, in units of the world
+# Greater depth counts as unknown, such as Blender's 1e10; in units of the world.
+_FARTHEST = 1e4
 MOST_FRAMES = 100  # by default, so many sharp frames of a larger capture are chosen
 _CANDIDATES = 10  # largest number of frames of which the sharpest is chosen
 # Longest side in pixels of the copy of an image whose sharpness is measured.
@@ -153,7 +154,7 @@ def make_frame(
         raise InputError(f"{where}: the pose has {pose.size} numbers, expected 7, 12 or 16")
     if pose.size == 7:
         length = np.linalg.norm(pose[3:])
-        if not 0.9 < length < 1.1:
+        if not 0.9 < length < 1.1:  # farther from 1 than by rounding: other numbers
             raise InputError(
                 f"{where}: quaternion {pose[3:].tolist()} has the length {length:.3g}, expected 1"
             )
@@ -307,9 +308,9 @@ def find_inside(root: str | Path, text: str) -> Path | None:
     return None
 
 
-def convert_json(value: Any, kind: Any, what: str) -> Any:
-    """Convert decoded JSON, or what is like it, to a type of msgspec, with the errors of
-    `decode_json`."""
+def convert_plain(value: Any, kind: Any, what: str) -> Any:
+    """Convert plain values, such as decoded JSON or the row of a table, to a type of msgspec, with
+    the errors of `decode_json`."""
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:

@@ -54,7 +54,7 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
         raise InputError(f"{folder} exists already, expected another sequence name")
     problem = source.contradiction()
     if problem:
-        # Wrong intrinsics have the same signs as wrong depth: they come first.
+        # Wrong intrinsics may show as wrong depth: doubts about them come first.
         problem = "; ".join(filter(None, (*source.doubts, problem)))
         raise InputError(f"{source.path}: {problem}")
 
@@ -76,6 +76,7 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
     scale = 1 / axis_deviation(points)
     scaled = LazyFrames(lambda position: scale_frame(source.read_frame(position), scale), seen)
     numbers = [source.numbers[position] for position in seen]
+    # The numbers count as the times, too.
     data = SequenceData(
         sequence, scaled, [*map(float, numbers)], points * scale, colours, normals, numbers=numbers
     )
@@ -136,7 +137,7 @@ def fuse(
     """Fuse the depth inside the masks (Curless and Levoy 1996) to points, colours and normals."""
     import open3d as o3d
 
-    voxel = 3 * _spread(frames) / _VOXELS
+    voxel = 3 * _robust_deviation(frames) / _VOXELS
     # A voxel has a distance to the surface, a weight and a colour. The grid starts with space for
     # 2000 blocks and grows.
     volume = o3d.t.geometry.VoxelBlockGrid(
@@ -170,10 +171,13 @@ def fuse(
     # number of frames that saw the voxel.
     weight = min(MIN_VIEWS, len(frames)) - 0.5
     cloud = volume.extract_point_cloud(weight_threshold=weight).to_legacy()
+    # A point is an outlier if its mean distance from 20 neighbours is more than 2.5 standard
+    # deviations above the mean of all points.
     cloud, _ = cloud.remove_statistical_outlier(nb_neighbors=20, std_ratio=2.5)
     if len(cloud.points) > _MAX_POINTS:
-        cloud = cloud.uniform_down_sample(int(np.ceil(len(cloud.points) / _MAX_POINTS)))
-    if len(cloud.points) < 4:
+        # Every so many points, rounded up.
+        cloud = cloud.uniform_down_sample(-(-len(cloud.points) // _MAX_POINTS))
+    if len(cloud.points) < 4:  # fewer have no volume
         raise InputError(
             f"{len(frames)} frames fuse to {len(cloud.points)} points, expected overlapping "
             "depth maps"
@@ -188,7 +192,7 @@ def scale_frame(frame: Frame, scale: float) -> Frame:
     return replace(frame, camera=camera, depth=(frame.depth * scale).astype(np.float32))
 
 
-def _spread(frames: Collection[Frame]) -> float:
+def _robust_deviation(frames: Collection[Frame]) -> float:
     """Estimate the object's standard deviation, averaged over the axes, despite outliers."""
     clouds = []
     for frame in frames:

@@ -20,9 +20,7 @@ from zsp_lite.data.frames import decode_image, decoding, open_image, read_depth,
 from zsp_lite.errors import InputError
 from zsp_lite.io.files import MAX_FILE
 
-# Windows of OpenCV's filters of masks: 3 x 3 and 5 x 5 pixels.
-WINDOW_3 = np.ones((3, 3), np.uint8)
-WINDOW_5 = np.ones((5, 5), np.uint8)
+WINDOW_5 = np.ones((5, 5), np.uint8)  # of OpenCV's filters of masks, pixels
 PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif")
 _FORMATS = ("JPEG", "PNG", "WEBP")
 DEPTHS = (".png", ".npy", ".npz", ".tiff", ".tif", ".pfm", ".exr")
@@ -53,6 +51,7 @@ def read_picture(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], int]:
     """Read the colours of a JPEG, PNG or WebP file as stored, and its EXIF orientation."""
     with decoding(path, "image") as data:
         file = open_image(data, _FORMATS)
+        # Without EXIF, `getexif` would decode a whole PNG, and take the orientation of XMP.
         orientation = file.getexif().get(ExifTags.Base.Orientation) if "exif" in file.info else 1
         rgb = np.array(file.convert("RGB")) if file.format == "WEBP" else read_image(path)
     return rgb, orientation if orientation in _QUARTERS else 1
@@ -260,6 +259,7 @@ def _doubt(values: Float[np.ndarray, "4"], side: Float[np.ndarray, "2"]) -> str:
     # unless it was cropped. The ratios of that image's sides to those of this image:
     ratios = 2 * centre / side
     ratio = ratios.mean()
+    # Both ratios are equal within 5 %: that image has the aspect ratio of this one.
     alike = min(ratios) > 0 and np.ptp(ratios) < 0.05 * ratio
     if alike and abs(ratio - 1) > _OFF_MIDDLE:
         fitted_to = "an image" if max(2 * centre) > _LARGEST_SENSOR else "a sensor in millimetres"

@@ -20,7 +20,7 @@ def read_lists(folder: Path) -> Makers:
     images = read_text_lines(folder / "rgb.txt")
     depths = read_text_lines(folder / "depth.txt")
     poses = read_numbers(folder / "poses.txt", (12, 16))
-    # K, or fx, fy, cx, cy and coefficients of distortion.
+    # Three lines of K; or lines of fx, fy, cx, cy and 0, 4, 5 or 8 coefficients of distortion.
     intrinsics = read_numbers(folder / "intrinsics.txt", (3, 4, 8, 9, 12))
     if intrinsics.shape[1] == 3 or len(intrinsics) == 1:
         intrinsics = [intrinsics.squeeze()] * len(poses)

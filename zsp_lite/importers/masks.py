@@ -18,8 +18,8 @@ from scipy import ndimage
 from zsp_lite.data.cameras import Box, Camera
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect, mask_to_bbox
 from zsp_lite.errors import Contradiction, Doubt, InputError
-from zsp_lite.importers.files import WINDOW_3, WINDOW_5
-from zsp_lite.importers.segments import fit_plane, largest_region
+from zsp_lite.importers.files import WINDOW_5
+from zsp_lite.importers.segments import WINDOW_3, fit_plane, largest_region
 from zsp_lite.points import object_pixels, sampling_step, standard_deviation, world_points
 
 # Masks by colours.
@@ -35,6 +35,7 @@ _POINTS = 4000  # largest number of the object's points that are projected into 
 # at, the focus.
 _REACH = 0.7  # points farther from the focus are not part of the object
 _PLANE_DISTANCE = 0.01  # largest distance of a point of the plane
+_OFF_PLANE = 3  # points farther than so many times this distance are clearly above or below it
 _CLEARANCE = 0.02  # smallest height of a point of the object above the plane
 _VOXEL = 0.07  # parts that are farther apart than this are separate
 _PLANES = 3  # planes to try: the largest may be a wall or a side of the object
@@ -51,7 +52,7 @@ _ALIKE = 0.7
 # by the factor below. Fewer views of an object that hides parts of itself have gaps of this size.
 _MANY = 8
 _FINER = 4
-_CLOUD_POINTS = 20_000  # largest number of points to which a plane is fitted
+_CLOUD_POINTS = 20_000  # largest number of points by which a plane is judged
 _MIN_PIXELS = 100  # least number of pixels of a mask, and of points of a plane
 # The bounding box of the object in known depth grows by these shares of its sides, half of it on
 # each side. Pixels of unknown depth inside the first box may be on the object. The second box shows
@@ -179,6 +180,7 @@ def _project_box(frame: Frame, points: Float[np.ndarray, "n 3"]) -> Box:
     pixels = pixels[depth > 0]
     if not len(pixels):
         return 0, 0, 0, 0
+    # Single points may be off the object.
     low, high = np.percentile(pixels, [1, 99], axis=0)
     margin = _PADDING / 2 * (high - low).max()
     left, top = np.floor(low - margin).clip(0, (width - 1, height - 1)).astype(int)
@@ -252,7 +254,7 @@ def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
     # Numbers of pixels on the object: all, and those of known depth.
     seen = 0
     known = 0
-    flat = 0
+    flat = 0  # number of frames in which the object's depth is constant
     for frame in frames:
         pixels = object_pixels(frame)
         depth = frame.depth[pixels]
@@ -260,6 +262,7 @@ def depth_flags(frames: Iterable[Frame], metric: bool) -> Iterator[str]:
         known += len(depth)
         distances.append(np.quantile(depth, 0.25) if len(depth) else np.nan)
         flat += len(depth) > _MIN_PIXELS and np.std(depth) < _FLAT * distances[-1]
+    # An unknown distance is not flagged.
     distance = float(np.nanmedian(distances)) if known else PLAUSIBLE[0]
     if metric and not PLAUSIBLE[0] <= distance <= PLAUSIBLE[1]:
         yield (
@@ -290,7 +293,10 @@ def given_mask_flags(frames: Collection[Frame], missing: Collection[str]) -> Ite
 
 
 def _plane_around(frames: Collection[Frame]) -> tuple[Plane | None, float]:
-    """Fit the plane that an object stands on, outside its masks; also return its distance."""
+    """Fit the plane that an object stands on, outside its masks.
+
+    Also returns the mean distance of the cameras from the object.
+    """
     on_object = []
     around = []
     centres = []
@@ -338,7 +344,7 @@ def _supporting_plane(
         # The supporting plane is wide, has many points, and nearly none below.
         height = cloud @ normal - offset
         on = np.abs(height) < tolerance
-        below = (height < -3 * _PLANE_DISTANCE * distance).mean()
+        below = (height < -_OFF_PLANE * tolerance).mean()
         spread = standard_deviation(cloud[on]) if on.any() else 0.0
         other_spread = 0.0 if on.all() else standard_deviation(cloud[~on])
         if (
@@ -362,7 +368,7 @@ def _focus(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"], float]:
         if all(frame.camera.to_camera(focus)[2] > 0 for frame in frames):
             return focus, float(np.linalg.norm(focus - centres, axis=1).mean())
     # With one camera or parallel axes, the focus is the median of the nearest quarter of the points
-    # in the central part of an image.
+    # in the central third of an image, along each side.
     first = next(k for k, frame in enumerate(frames) if (frame.depth > 0).any())
     known = frames[first].depth > 0
     height, width = known.shape
@@ -417,8 +423,9 @@ def _part_at(
         indices = np.floor((points - low) / voxel).astype(int)
         # The voxel of each pixel, as an index of the flattened grid.
         cells.append(np.ravel_multi_index(indices.T, shape).astype(np.int32))
-        near = np.exp(-np.square(np.linalg.norm(points - focus, axis=1) / (8 * voxel)))
-        weight += np.bincount(cells[-1], near, len(weight))
+        # The weight of a point falls to 1 / e at a distance of 8 voxels from the focus.
+        weights = np.exp(-np.square(np.linalg.norm(points - focus, axis=1) / (8 * voxel)))
+        weight += np.bincount(cells[-1], weights, len(weight))
 
     # Label the connected parts of voxels. The part with the most weight is the object.
     part = ndimage.label(weight.reshape(shape) > 0, np.ones((3, 3, 3)))[0].ravel()
@@ -497,5 +504,5 @@ def _signs(frame: Frame, plane: Plane | None, distance: float) -> Iterator[str]:
     if own_plane is not None:
         # Heights in units of the tolerance of a plane.
         height = (points @ own_plane[0] - own_plane[1]) / (_PLANE_DISTANCE * distance)
-        if (np.abs(height) < 1).mean() > _CARRYING and (height > 3).mean() > _CARRIED:
+        if (np.abs(height) < 1).mean() > _CARRYING and (height > _OFF_PLANE).mean() > _CARRIED:
             yield "part of it is a surface that the rest stands on"

@@ -12,7 +12,7 @@ from zsp_lite.importers.capture import (
     FROM_OPENGL,
     CaptureFrame,
     Makers,
-    convert_json,
+    convert_plain,
     find_inside,
     make_frame,
 )
@@ -66,7 +66,7 @@ def read_nerfstudio(path: str | Path) -> Makers:
     if path.suffix != ".json":
         path = next((path / name for name in _NAMES if (path / name).is_file()), path / _NAMES[0])
     common = read_json(path, dict[str, Any], "capture")
-    listed = convert_json(common.pop("frames", None), list[dict[str, Any]], f"{path}, frames")
+    listed = convert_plain(common.pop("frames", None), list[dict[str, Any]], f"{path}, frames")
     with_depth = [
         k
         for k, frame in enumerate(listed)
@@ -83,14 +83,15 @@ def read_nerfstudio(path: str | Path) -> Makers:
 
 def _make(folder: Path, values: dict[str, Any], where: str) -> CaptureFrame:
     """Make a frame from its values, those of all frames included."""
-    frame = convert_json(values, _Frame, where)
+    frame = convert_plain(values, _Frame, where)
     fisheye = frame.camera_model == _FISHEYE
     if not fisheye and (frame.camera_model not in _MODELS or frame.k4):
         raise InputError(
             f"{where}: camera_model is {frame.camera_model!r} with k4 = {frame.k4:g}, expected one "
             f"of {', '.join(_MODELS)} with k4 = 0, or {_FISHEYE}"
         )
-    # OpenCV's order of the coefficients; its model has no r^8 term, k4.
+    # OpenCV's order of the coefficients. Only its fisheye model has the term of the eighth
+    # power, k4.
     last = (frame.k3, frame.k4) if fisheye else (frame.p1, frame.p2, frame.k3)
     size = (int(frame.h or 0), int(frame.w or 0))
     if 0 in size:

@@ -41,14 +41,14 @@ def read_stray(folder: Path, count: int) -> Makers:
     doubt = ""
     times = np.array(video.times() if video.count < len(rows) else [])
     if 1 < len(times) < len(rows):
-        video = Video(video.path)  # from the first image again
+        video = Video(video.path)  # `times` has read the other to its end
         missing = len(rows) - len(times)
         fewer = (
             f"{folder}: the video has {missing} images fewer than odometry.csv "
             f"({len(times)} of {len(rows)})"
         )
-        # The times of the images count frames. They show which images are missing, if the first and
-        # the last one are there.
+        # The times of the images, in steps of their median distance (1 ms at least), count frames.
+        # They show which images are missing, if the first and the last one are there.
         steps = np.rint((times - times[0]) / np.median(np.diff(times)).clip(1))
         timed = np.isin(images - images[0], steps)
         if timed[-1] and timed.sum() == len(times):
@@ -63,7 +63,7 @@ def read_stray(folder: Path, count: int) -> Makers:
     for (row, _), image in sharpest(items, count, lambda item: video.frame(int(item[1])), left_out):
         name = f"{row[0]:06.0f}"
         picture = pictures / f"{name}.jpg"
-        write_image(picture, image, 95)
+        write_image(picture, image, quality=95)
         yield partial(
             make_frame,
             folder,
@@ -119,7 +119,7 @@ def _make_polycam(folder: Path, path: Path, image: str) -> CaptureFrame:
         f"depth/{path.stem}",
         pose,
         intrinsics,
-        f"{path}",
+        str(path),
         FROM_OPENGL,
         confidence=f"confidence/{path.stem}",
     )
@@ -157,7 +157,10 @@ def read_record3d(folder: Path) -> Makers:
 def _make_record3d(
     folder: Path, unpacked: Path, scan: _Record3D, intrinsics: list[float | None]
 ) -> CaptureFrame:
-    """Make a frame; its depth and confidence are decompressed to `unpacked`.npy and .png."""
+    """Make a frame; its depth and confidence are decompressed to `unpacked`.npy and .png.
+
+    The name of `unpacked` is the number of the frame.
+    """
     name = f"rgbd/{unpacked.name}"
     pose = scan.poses[int(unpacked.name)]
     depth = unpacked.with_suffix(".npy")
@@ -188,6 +191,7 @@ def _decompressed(path: Path, kind: type, scan: _Record3D) -> np.ndarray:
         ) from error
     data = read_bytes(path, "depth")
     try:
+        # Compressed, a map may be a little larger, not twice as large.
         if len(data) > 2 * scan.dh * scan.dw * np.dtype(kind).itemsize:
             raise ValueError(f"{len(data)} compressed bytes")
         return np.frombuffer(lzfse.decompress(data), kind).reshape(scan.dh, scan.dw)

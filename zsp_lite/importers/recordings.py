@@ -50,11 +50,13 @@ def read_recording(
 
     `attributes` are of `CaptureFrame`. Frames that cannot be joined to the others are left out.
     """
-    images, depths = (_numbered(folder, name) for name in (RECORDED, "depth"))
+    images = _numbered(folder, RECORDED)
+    depths = _numbered(folder, "depth")
     camera = {"intrinsics": intrinsics}
     if intrinsics is None:
-        camera = _known_camera(folder, min(images.values()))
-    # The numbers are of frames or times: an image and its depth have the same, or nearly.
+        camera = _known_camera(folder, min(images.values()))  # any image tells
+    # The numbers are of frames or times: an image and its depth have the same, or nearly. They
+    # differ by at most 3/4 of the mean distance between images.
     numbers = np.array([*depths])
     farthest = 0.75 * np.ptp([*images]) / len(images)
     makers = []
@@ -74,7 +76,7 @@ def read_recording(
                     **attributes,
                 )
             )
-    step = max(1, -(-len(makers) // _MOST))
+    step = max(1, -(-len(makers) // _MOST))  # rounded up
     yield from _track(makers[::step], f"{folder.name}, 1 of {step} frames")
 
 
@@ -123,7 +125,7 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
 
     registration = o3d.pipelines.registration
     still = np.eye(4)
-    unit = 0.0
+    unit = 0.0  # mean depth of the first frame, the unit of all lengths until the end
 
     @lru_cache(_BACK + 1)
     def read(position: int) -> tuple[Frame, Any, np.ndarray]:
@@ -141,7 +143,9 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
         depth = cv2.resize(depth / unit, camera.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
         small = undistort(Frame(rgb, depth, None, camera), frame.distortion)
         images = map(o3d.geometry.Image, (small.rgb, small.depth))
-        pair = o3d.geometry.RGBDImage.create_from_color_and_depth(*images, 1.0, _FARTHEST)
+        pair = o3d.geometry.RGBDImage.create_from_color_and_depth(
+            *images, depth_scale=1.0, depth_trunc=_FARTHEST
+        )
         grey = small.rgb.mean(axis=2)
         return small, pair, grey - cv2.GaussianBlur(grey, (0, 0), _DETAIL)
 
@@ -184,7 +188,7 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
         except InputError as error:
             yield partial(refuse, str(error))
             continue
-        for before, part in seen[: -_BACK - 1 : -1]:
+        for before, part in seen[: -_BACK - 1 : -1]:  # the latest first
             motion = join(before, position, guess)
             if motion is not None:
                 guess = motion
@@ -199,7 +203,7 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
     longest = max(parts, key=len)
     for part in parts:
         if part is not longest:
-            image = makers[min(part)].args[1]
+            image = makers[min(part)].args[1]  # as `read_recording` gives it to `make_frame`
             problem = (
                 f"the recording breaks: {image} and {len(part) - 1} more do not join the others"
             )
@@ -209,8 +213,8 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
     order = np.array([*longest])
     poses = np.array([*longest.values()])
     turns = poses[:, :3, :3]
-    near = rotation_angle(turns[:, None], turns) < _ANGLE
-    loops = np.argwhere(near & (order - order[:, None] > _BACK + _APART * len(makers)))
+    alike = rotation_angle(turns[:, None], turns) < _ANGLE
+    loops = np.argwhere(alike & (order - order[:, None] > _BACK + _APART * len(makers)))
     loops = loops[:: len(loops) // _LOOPS + 1]
     for early, late in order[loops].tolist():
         join(early, late, np.linalg.inv(longest[late]) @ longest[early])
@@ -232,4 +236,5 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
     if closed < len(loops) / 4:
         doubt = f"the poses may drift: {closed} of {len(loops)} loops close"
     for position, node in zip(order, graph.nodes):
+        # The translation, the last column, back in the units of the depth.
         yield partial(makers[position], node.pose[:3] * [1, 1, 1, unit], doubt=doubt)

@@ -16,12 +16,13 @@ from zsp_lite.errors import Doubt
 _FRAMES = 8  # largest number of frames, about
 _LEAST = 3  # fewer frames do not tell flat objects from a shift
 _SIDE = 160  # longest side of the images that are compared, pixels
-_SHIFT = 20  # largest shift along either axis
+_SHIFT = 20  # largest shift along either axis, pixels of these images
 _BORDER = ((_SHIFT, _SHIFT), (_SHIFT, _SHIFT), (0, 0))
 _AROUND = 0.1  # least share of the image where depth around the object is known
 # Masks that are a little too wide or narrow look like depth at one of the middle scales.
 _SCALES = (0.8, 0.9, 1.0, 1.1, 1.25)
-_REGISTERED = np.s_[1:4, 19:22, 19:22]  # the middle scales and shifts
+# Positions of the scales 0.9 to 1.1, and of the shifts -1 to 1 among those from -`_SHIFT` on.
+_REGISTERED = np.s_[1:4, 19:22, 19:22]
 # Steps are between pixels this far on both sides: right at an outline, depth is often unknown.
 _APART = 3
 _HIGHEST = 0.15  # higher steps, of the logarithm of depth, count as this one
@@ -53,7 +54,9 @@ def misregistration(frames: Sequence[Frame]) -> str:
     if len(frames) < _LEAST or steps[_REGISTERED].max() >= _SHARE * steps.max():
         return ""
     scale, down, right = np.unravel_index(steps.argmax(), steps.shape)
-    x, y = step * (_SHIFT - right), step * (_SHIFT - down)
+    # The step is that of the last frame: sizes are taken to be equal.
+    x = step * (_SHIFT - right)
+    y = step * (_SHIFT - down)
     return Doubt(
         "depth is not registered to the colours, or the masks are wrong: it fits if moved by about "
         f"{x}, {y} pixels and scaled by {1 / _SCALES[scale]:.2f}"

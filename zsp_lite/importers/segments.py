@@ -8,6 +8,7 @@ from zsp_lite.data.clouds import best_plane
 
 _PLANE_TRIALS = 500  # number of samples of three points
 _PLANE_POINTS = 4000  # largest number of points to which a plane is fitted, for speed
+WINDOW_3 = np.ones((3, 3), np.uint8)  # of OpenCV's filters of masks, pixels
 
 
 def fit_plane(
@@ -25,7 +26,7 @@ def largest_region(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
     It is empty if there is no region.
     """
-    opened = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    opened = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, WINDOW_3)
     _, regions, statistics, _ = cv2.connectedComponentsWithStats(opened)
     areas = statistics[1:, cv2.CC_STAT_AREA]  # the first region is the outside
     return regions == 1 + areas.argmax() if len(areas) else np.zeros_like(inside)

@@ -37,11 +37,11 @@ from zsp_lite.importers.registration import misregistration
 
 # The options that each format takes. "open" stands for a source that is open already.
 _MASKED = ("mask", "box", "up")
-_FILES = ("label", "orientation", "depth_unit")  # attributes of `CaptureFrame`
-_CAPTURE = (*_MASKED, *_FILES, "masks", "count")
+_ATTRIBUTES = ("label", "orientation", "depth_unit")  # attributes of `CaptureFrame`
+_CAPTURE = (*_MASKED, *_ATTRIBUTES, "masks", "count")
 _TAKEN = {
     "open": (),
-    "image": (*_MASKED, *_FILES, "intrinsics", "depth"),
+    "image": (*_MASKED, *_ATTRIBUTES, "intrinsics", "depth"),
     "sequence": _MASKED,
     "frames": _MASKED,
     **{name: (*_CAPTURE, *layout.options) for name, layout in FORMATS.items()},
@@ -96,7 +96,7 @@ class Source:
         Masks by depth are made with up to `context` more frames from all around the object.
         InputError if a file cannot be read, or no frame shows the object.
         """
-        # The frames, and those from which their masks are made.
+        # Positions of the frames, and of those from which their masks are made.
         needed = set(positions)
         missing = needed & self.missing.keys() if self.mask == "given" else needed
         if self.mask == "box":
@@ -282,6 +282,7 @@ def open_source(
     path = Path(path)
     for name in options:
         if name not in _TAKEN[layout]:
+            # The command line's name of the argument.
             option = {"count": "frames"}.get(name, name.replace("_", "-"))
             raise InputError(f"--{option} does not go with {path}, of the format {layout}")
     ways = ("given", "auto") if box is None else ("box",)
@@ -361,11 +362,11 @@ def _from_sequence(path: Path, folder: Path) -> Source:
 def _from_capture(path: Path, layout: str, place: Path, options: dict[str, Any]) -> Source:
     """Make the source of a capture, whose reader takes `place`, or of an image."""
     left_out = ()
-    files = {name: options.pop(name) for name in _FILES if name in options}
+    attributes = {name: options.pop(name) for name in _ATTRIBUTES if name in options}
     if layout == "image":
-        frames = [replace(_open_image(path, **options), **files)]
+        frames = [replace(_open_image(path, **options), **attributes)]
     else:
-        frames, left_out = open_capture(place, layout, files=files, **options)
+        frames, left_out = open_capture(place, layout, attributes=attributes, **options)
     cameras = tuple(frame.camera for frame in frames)
     _check_poses(cameras, path)
     # Intrinsics may differ from frame to frame: a doubt about them is said once.

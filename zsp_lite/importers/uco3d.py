@@ -31,7 +31,7 @@ from zsp_lite.errors import (
     check_number,
     rotation_matrix,
 )
-from zsp_lite.importers.capture import HALF_PIXEL, convert_json
+from zsp_lite.importers.capture import HALF_PIXEL, convert_plain
 from zsp_lite.importers.convert import (
     MIN_VIEWS,
     ImportResult,
@@ -106,9 +106,7 @@ class _SequenceRow(_Row):
     depth_video_path: str  # the HDF5 file
     segmented_point_cloud_path: str
     reconstruction_quality_viewpoint: float | None
-    # Rotation R and translation T: the aligned point of a row vector x is a multiple of `x @ R +
-    # T`.
-    alignment_R: bytes | None
+    alignment_R: bytes | None  # see `_Sequence._label`
     alignment_T: bytes | None
 
 
@@ -127,7 +125,7 @@ class _FrameRow(_Row):
 
     def depth_name(self) -> str:
         """Return the name of the frame's depth map."""
-        return str(self.frame_number + 1)
+        return str(self.frame_number + 1)  # maps are numbered from 1
 
     def distortion(self) -> Float[np.ndarray, "12"]:
         """Return the coefficients of OpenCV's rational model with a thin prism."""
@@ -146,8 +144,9 @@ class _FrameRow(_Row):
         )
 
     def undistorted(self) -> Camera:
-        """Return the camera of the undistorted image, whose pixels are all inside the video's."""
+        """Return the camera of the undistorted image, as uCO3D's own code computes it."""
         camera = self.camera()
+        # With alpha = 0, all its pixels are inside the image of the video.
         K, _ = cv2.getOptimalNewCameraMatrix(
             camera.K - HALF_PIXEL, self.distortion(), camera.size[::-1], alpha=0
         )
@@ -187,17 +186,17 @@ def import_uco3d(
         for name in sequences or ():
             check_choice(f"{root}: sequence of {category}", name, names)
         asked = sorted(set(sequences or names))
-        places = ", ".join("?" * len(asked))  # one place per name
+        placeholders = ", ".join("?" * len(asked))
         rows = _select(
             metadata,
             _SequenceRow,
-            f"sequence_annots WHERE sequence_name IN ({places}) "
+            f"sequence_annots WHERE sequence_name IN ({placeholders}) "
             "ORDER BY _reconstruction_quality_viewpoint DESC, sequence_name",
             asked,
         )
-        if sequences is None:
+        if not sequences:
             rows = rows[:best]
-        present = False  # whether any sequence is in OUT
+        present = False  # whether any of the sequences is in OUT
         problem = "no sequence on the disk is in the metadata"
         for row in rows:
             name = row["sequence_name"]
@@ -205,7 +204,7 @@ def import_uco3d(
                 present = True
                 continue
             try:
-                sequence = _Sequence(root, metadata, convert_json(row, _SequenceRow, _METADATA))
+                sequence = _Sequence(root, metadata, convert_plain(row, _SequenceRow, _METADATA))
                 result = sequence.write(out, category, count)
             except InputError as error:
                 problem = f"{name}: {error}"
@@ -312,7 +311,7 @@ class _Sequence:
             "AND _depth_scale_adjustment > 0 ORDER BY frame_number",
             [row.sequence_name],
         )
-        frames = [convert_json(frame, _FrameRow, _METADATA) for frame in rows]
+        frames = [convert_plain(frame, _FrameRow, _METADATA) for frame in rows]
         self.frames = [frame for frame in frames if frame.depth_name() in self.depths.names]
 
     def write(self, out: Path, category: str, count: int) -> ImportResult:
@@ -381,7 +380,8 @@ class _Sequence:
         return Frame(rgb, depth, mask, camera, f"{frame.sequence_name}/{frame.frame_number}")
 
     def _depth(self, frame: _FrameRow) -> Float32[np.ndarray, "h w"]:
-        """Read the depth of a frame: undistorted, 0 where unknown, not of the image's size."""
+        """Read the depth of a frame, 0 where unknown; its size need not be the image's."""
+        # It is stored undistorted: uCO3D's own code unprojects it by the camera of `undistorted`.
         stored = self.depths.read(frame.depth_name())
         return zero_unknown(stored * np.float32(frame.depth_scale_adjustment))
 
@@ -412,7 +412,8 @@ class _Sequence:
             return None
         rotation = rotation_matrix("_alignment_R", self.row.numbers("alignment_R", (3, 3)))
         translation = scale * self.row.numbers("alignment_T", (3,))
-        # For row vectors, aligned = x @ R + T. So for column vectors, x = R @ (aligned - T).
+        # uCO3D aligns row vectors: aligned = factor * (x @ R + T). Labels are rigid: the factor is
+        # dropped. So for column vectors, x = R @ (aligned - T).
         trans = np.eye(4)
         trans[:3, :3] = rotation
         trans[:3, 3] = -rotation @ translation

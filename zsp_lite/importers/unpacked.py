@@ -32,7 +32,7 @@ def new_folder() -> Path:
     return Path(folder)
 
 
-@cache
+@cache  # callers recognise a path more than once: its zip is unpacked once
 def unpack(path: Path) -> Path:
     """Unpack a zip to a temporary folder; InputError if it is damaged, encrypted or too large."""
     size = file_size(path, "zip")
@@ -43,7 +43,7 @@ def unpack(path: Path) -> Path:
             if total > min(_MOST, max(_LARGE, _RATIO * size)):
                 raise InputError(f"{size:,} bytes unpack to {total:,}")
             for member in zipped.infolist():
-                path_inside(folder, member.filename)
+                path_inside(folder, member.filename)  # InputError if the path leads out
             zipped.extractall(folder)  # makes no links
     except Exception as error:  # a damaged zip may raise anything
         raise InputError(
@@ -53,7 +53,10 @@ def unpack(path: Path) -> Path:
 
 
 class Video:
-    """Frames of an MP4 or Matroska file."""
+    """Frames of an MP4 or Matroska file.
+
+    Use one of `times`, `frame` and `at` per object: each moves the position in the file.
+    """
 
     def __init__(self, path: Path, displayed: bool = False):
         """Open a file; `displayed` frames are turned as players show them, others lie as stored.
