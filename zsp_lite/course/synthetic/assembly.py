@@ -42,6 +42,7 @@ class Draw:
         """Draw a proportion uniformly from [low, high)."""
         value = float(self.rng.uniform(low, high))
         if self._variation is not None:
+            # The standard deviation is 0.3 of the range.
             value += self._variation.normal(0, 0.3) * (high - low)
             value = float(np.clip(value, low, high))
         return value
@@ -80,7 +81,7 @@ def make_shape(
     meshes, materials = zip(*build(Draw(rng, variation)))
     vertices, faces = joined(meshes)
     material = np.repeat(materials, [len(mesh.faces) for mesh in meshes])
-    # Each axis has a small random scale of its own.
+    # Each axis has a random scale of its own, by about 8 %.
     vertices *= np.exp(rng.normal(0, 0.08, 3))
     vertices -= box_centre(vertices)
     vertices /= surface_spread(vertices, faces)
@@ -140,10 +141,12 @@ def disc(radius: float, thickness: float, centre: Coordinates) -> Mesh:
 
 def wheels(x: float, y: float, radius: float, width: float) -> Parts:
     """Build the two wheels of an axle at x, standing on the ground at y and -y."""
+    # Materials of all wheels; vehicles use the same numbers for other parts as well.
     RIM = 2
     TYRE = 3
 
     yield from pair(disc(radius, width, (x, y, radius)), TYRE)
+    # The rim sticks out of the tyre.
     yield from pair(disc(radius * 0.6, width * 1.2, (x, y, radius)), RIM)
 
 
@@ -165,7 +168,7 @@ class _Kind(NamedTuple):
 
 _MUTED = (0, 0.8)  # saturation of painted and woven surfaces
 _NO_EXTREMES = (0.25, 0.95)  # value: neither black nor white
-# The numbers in a row are share, hue, saturation, value and roughness.
+# The numbers in a row, chosen by hand, are share, hue, saturation, value and roughness.
 _KINDS = (
     # paint
     _Kind(0.22, ANY_HUE, _MUTED, _NO_EXTREMES, (0.35, 0.75)),
@@ -229,7 +232,7 @@ def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
     if not kind.two_hues:
         second = 0  # black
     mixed = colour + rng.uniform(*kind.contrast) * (second - colour)
-    # The wave vectors (k, 3) have one length.
+    # The wave vectors (k, 3) have one length, the drawn frequency.
     waves = rng.normal(size=(rng.choice(kind.waves), 3))
     waves *= rng.uniform(*kind.frequency) / np.linalg.norm(waves, axis=1, keepdims=True)
     phases = rng.uniform(0, TAU, len(waves))
