@@ -28,11 +28,11 @@ RENDERED = {"frames": VIEWS, "seed": 17, "image_size": 384}
 OBJECTS = 8  # of each category
 SIDES = 6  # from which objects are shown
 PICTURE = 288  # side in pixels
-# Coordinates are stored as whole multiples, 0 to 254, of this share of a picture's side.
+# Coordinates are stored in bytes: whole multiples, 0 to 254, of this share of a picture's side.
 STEP = 1 / 254
 HIDDEN = 255  # coordinate of a point that a picture does not show
-# A point is hidden if it is farther behind the surface that a picture shows, in sizes of the
-# object.
+# A point is hidden if it is farther than this behind the surface that a picture shows, in sizes of
+# the object.
 _BEHIND = 0.02
 
 
@@ -105,6 +105,7 @@ def shown_object(
     chosen = sorted(set(nearest))
     every = {frame.name: frame for frame in map(dataset.load, dataset.frames(category, name))}
     frames = [every[views[k].name] for k in chosen]
+    # The points of the shown views come first: these can be marked.
     others = sorted(set(range(len(views))) - set(chosen))
     points = [views[k].points for k in chosen + others]
     return ShownObject(
