@@ -99,7 +99,8 @@ def rounded_box(
     Squareness 2 gives an ellipsoid, 10 nearly a box.
     """
     # The surface of the cube from -1 to 1 has a grid of n x n points on each of its sides. They are
-    # denser at the edges, where the curvature is largest.
+    # denser at the edges, where the curvature is largest. `sign * u` mirrors the grid of one of two
+    # opposite sides, so that both have the same order seen from outside.
     n = 11
     line = np.sin(np.linspace(-TAU / 4, TAU / 4, n))
     u, v = np.meshgrid(line, line, indexing="ij")
@@ -116,7 +117,10 @@ def rounded_box(
 
 
 def tapered(mesh: Mesh, low: float, high: float, factor: float) -> Mesh:
-    """Scale the width (y) of a mesh: by 1 up to height `low`, by `factor` from height `high` on."""
+    """Scale the width (y) of a mesh: by 1 up to height `low`, by `factor` from height `high` on.
+
+    If `high` is the lower one of the two, the width changes downwards.
+    """
     share = np.clip((mesh.vertices[:, 2] - low) / (high - low), 0, 1)
     vertices = mesh.vertices.copy()
     vertices[:, 1] *= 1 + (factor - 1) * share
@@ -231,7 +235,7 @@ def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
     # random numbers from here on, and seeds other objects.
     if not kind.two_hues:
         second = 0  # black
-    mixed = colour + rng.uniform(*kind.contrast) * (second - colour)
+    contrasting = colour + rng.uniform(*kind.contrast) * (second - colour)
     # The wave vectors (k, 3) have one length, the drawn frequency.
     waves = rng.normal(size=(rng.choice(kind.waves), 3))
     waves *= rng.uniform(*kind.frequency) / np.linalg.norm(waves, axis=1, keepdims=True)
@@ -244,7 +248,7 @@ def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
         bend = np.sin(points @ warp)[:, None]
         value = np.sin(points @ waves.T + phases + bend).mean(1, keepdims=True)
         share = np.clip(0.5 + 0.5 * sharpness * value, 0, 1)
-        return (colour + share * (mixed - colour)).astype(np.float32)
+        return (colour + share * (contrasting - colour)).astype(np.float32)
 
     return Material(
         colour=np.ones(4),

@@ -268,9 +268,9 @@ def write_true_labels(out: Path, category: str, names: Sequence[str]) -> None:
     poses = {name: np.array(pose.trans) for name, pose in read_poses(out, category).items()}
     from_reference = np.linalg.inv(poses[names[0]])
     for name in names:
-        # Rounding makes rotations equal on all processors (translations are in units that differ by
-        # some 3e-5), and the label of the reference exactly the identity; adding 0.0 turns negative
-        # zeros into zeros.
+        # Rounding makes rotations equal on all processors, and the label of the reference exactly
+        # the identity. It does not make translations equal: their unit, that of the sequence,
+        # differs by some 3e-5 between processors. Adding 0.0 turns negative zeros into zeros.
         trans = np.round(poses[name] @ from_reference, 12) + 0.0
         write_label(out, category, PoseLabel(trans, name, names[0]))
 

@@ -126,8 +126,8 @@ def list_models(folder: str | Path, front: str | None = None, up: str | None = N
         InputError: if there is no model, two files of one model, or an entry without a file.
     """
     folder = Path(folder)
-    path = folder / MODELS_FILE
-    infos = read_json(path, dict[str, ModelInfo], "model list") if path.is_file() else {}
+    listing = folder / MODELS_FILE
+    infos = read_json(listing, dict[str, ModelInfo], "model list") if listing.is_file() else {}
     models = {}
     files = [(path.parent.name, path.stem, path) for path in folder.glob("*/*")]
     files += [(path.parts[-3], path.parts[-2], path) for path in folder.glob("*/*/*")]
@@ -150,9 +150,7 @@ def list_models(folder: str | Path, front: str | None = None, up: str | None = N
         )
     # The loop has removed the entries of all models that have a file.
     if infos:
-        raise InputError(
-            f"{folder / MODELS_FILE} names {min(infos)!r}, which has no file in {folder}"
-        )
+        raise InputError(f"{listing} names {min(infos)!r}, which has no file in {folder}")
     return [models[key] for key in sorted(models)]
 
 
@@ -269,7 +267,7 @@ def _part(mesh: Any, transform: np.ndarray) -> tuple[Mesh, np.ndarray, np.ndarra
         material = _material(visual.material)
     elif visual.kind is None:  # the file gives no colour: light grey
         material = Material(np.array([0.6, 0.6, 0.6, 1.0]))
-    else:
+    else:  # colours of vertices or of faces
         colours = (np.asarray(visual.vertex_colors)[faces][..., :3] / 255).astype(np.float32)
     return Mesh(vertices, faces), uv, colours, material
 

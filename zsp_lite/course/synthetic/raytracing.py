@@ -83,7 +83,7 @@ class MeshScene:
         coordinates: Vertices | None = None,
         samples: int = 2,
     ):
-        import open3d as o3d
+        import open3d as o3d  # slow to import
 
         self.mesh = mesh
         self.room = room
@@ -257,7 +257,7 @@ class MeshScene:
         """Return the key light that reaches each point, and the share of the room that it sees."""
         of_light = np.ones(len(key), np.float32)
         lit = np.flatnonzero(key)
-        of_light[lit] = self._lit_share(point[lit], 1)
+        of_light[lit] = self._lit_share(point[lit], count=1)
         of_room = self._room_share(point, normal)
         # Few rays per sample are noisy: each sample takes the mean of its neighbours on the object.
         # The blur divides by all nine neighbours; the third channel becomes the share of these that

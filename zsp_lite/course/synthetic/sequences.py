@@ -102,11 +102,11 @@ def handheld_sweep(
     low, high = np.moveaxis([image_box(vertices, R, t) for R, t in poses], 1, 0)
     sides = np.array(size[::-1], float)  # width and height, as image points are (x, y)
     principal_point = np.round(sides / 2 + rng.normal(0, 0.004, 2) * sides, 6)
-    room = np.minimum(principal_point, sides - principal_point) - _FRAME_MARGIN * sides
+    space = np.minimum(principal_point, sides - principal_point) - _FRAME_MARGIN * sides
     # The object fills 55 to 75 % of the shorter side in the median view, if it is then inside the
     # image in all views.
     wanted = rng.uniform(0.55, 0.75) * sides.min() / np.median((high - low).max(1))
-    allowed = (room / np.maximum(-low, high).max(0)).min()
+    allowed = (space / np.maximum(-low, high).max(0)).min()
     focal_length = np.full(2, round(min(wanted, allowed), 6))
     return [Camera(R, t, focal_length, principal_point, size) for R, t in poses]
 

@@ -193,7 +193,7 @@ def laptop(draw: Draw) -> Parts:
         return mesh.rotated("y", -opening).translated(hinge)
 
     middle = lid / 2
-    back = thick * 0.6
+    back = thick * 0.6  # of the closed lid, whose screen is at z = 0
     yield on_lid(rounded_box((lid, width, back), (middle, 0, thick * 0.3), 12)), BODY
     yield on_lid(box((lid - 2 * rim, width - 2 * rim, 0.02), (middle + 0.01, 0, 0))), SCREEN
     sign = cylinder(draw(0.06, 0.12), 0.06, 0.02, 16)
