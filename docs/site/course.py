@@ -59,8 +59,8 @@ MODULE = r"""
 ```
 """
 
-# The link is for `sample_data`, which looks in the working folder: the installed package is outside
-# the clone.
+# The link to data_samples is for `sample_data`, which looks in the working folder: the installed
+# package is outside the clone.
 INSTALL_IN_COLAB = """\
 # Colab only: fetches zsp-lite with its sample data, installs what Colab lacks (about a minute).
 import sys
