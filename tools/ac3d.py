@@ -43,7 +43,7 @@ def read_ac3d(path: Path) -> tuple[list[Material], list[Ac3dObject]]:
         for line in lines:
             words = shlex.split(line)
             if words[:1] == ["MATERIAL"]:
-                materials.append(_material(words[2:]))
+                materials.append(_material(words[2:]))  # the second word is its name
             elif words[:1] == ["OBJECT"]:
                 _read_object(lines, np.eye(3), np.zeros(3), objects)
     except (StopIteration, ValueError, LookupError) as error:
@@ -119,6 +119,7 @@ def _read_object(
     displacement = (0, 0)
     faces: list[tuple[int, Corners]] = []
     for line in lines:
+        # Few lines have names in quotes; `shlex` is much slower than `str.split`.
         keyword, *rest = shlex.split(line) if '"' in line else line.split()
         if keyword == "loc":
             offset = np.array(rest, float)
@@ -140,7 +141,7 @@ def _read_object(
             material, corners = _read_surface(lines, repeat, displacement)
             if is_polygon and len(corners) >= 3:
                 faces.append((material, corners))
-        elif keyword == "kids":
+        elif keyword == "kids":  # the last entry of an object
             shift = shift + rotation @ offset
             rotation = rotation @ turn
             if faces:

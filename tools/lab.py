@@ -25,7 +25,8 @@ def answering_cells(notebook: NotebookNode) -> list[NotebookNode]:
 def clear_answers(notebook: NotebookNode) -> None:
     """Remove the outputs of these cells."""
     for cell in answering_cells(notebook):
-        cell.outputs, cell.execution_count = [], None
+        cell.outputs = []
+        cell.execution_count = None
 
 
 if __name__ == "__main__":

@@ -46,11 +46,12 @@ def overview(results: Sequence[PairResult]) -> Figure:
             right = error < SAME_ANGLE
             word = "right" if right else "wrong"
             colour = plots.BLUE if right else plots.VERMILLION
-            plots.mark(axis, f"{word}: {error:.0f}° off", colour, 14)
+            plots.mark(axis, f"{word}: {error:.0f}° off", colour, size=14)
     return figure
 
 
 if __name__ == "__main__":
-    dataset, method = Co3D(sample_data()), ZeroShotPose(load_backbone())
+    dataset = Co3D(sample_data())
+    method = ZeroShotPose(load_backbone())
     found = [run_pair(dataset, pair, method, SOLVERS["both"]) for pair in demo_pairs(dataset)]
     overview(found).savefig(PICTURE, dpi=110, bbox_inches="tight", pil_kwargs={"quality": 88})

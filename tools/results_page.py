@@ -42,6 +42,7 @@ def updated(text: str) -> str:
         cells = [f"{gain:+.1f} [{low:.1f}, {high:.1f}]" for gain, low, high in ours]
         cells.append("–" if np.isnan(paper) else f"{paper:+.1f}")
         lines.append(f"|{part}|{'|'.join(cells)}|")
+    # chr(10) is the line break: an f-string of Python 3.11 has no backslash in braces.
     text = _GAINS.sub(lambda found: f"{found[1]}{chr(10).join(lines)}\n{found[3]}", text)
     return _MARKED.sub(render, text)
 

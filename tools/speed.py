@@ -73,6 +73,7 @@ def main() -> None:
         for stage, duration in stages.items():
             report(f"{solver} solver: {stage}", duration)
         report(f"{solver} solver: all but features", sum(stages.values()) - stages["features"])
+    # Both solvers read and extract alike; `method` is the last one.
     frame = dataset.frame(pair.category, pair.target_sequence, pair.target_frames[0])
     report(
         "reading and features, per frame",

@@ -34,19 +34,19 @@ from zsp_lite.data.labels import read_labels, relative_pose
 from zsp_lite.data.pairs import shipped_pairs
 from zsp_lite.io.download import fetch
 from zsp_lite.io.files import cache_folder
-from zsp_lite.metrics import rotation_error
+from zsp_lite.metrics import SAME_ANGLE, rotation_error
 from zsp_lite.points import near_median
 from zsp_lite.views import View
 
-# Indices of evaluation pairs: in each category the first, whatever its result, and the next with an
-# error below 15 degrees.
+# Indices of evaluation pairs with five target views: in each category the first, whatever its
+# result, and the next with an error below 15 degrees.
 PAIRS = {"bicycle": (0, 1), "car": (0, 6), "chair": (0, 4), "motorcycle": (0, 1)}
 # Keys and points are stored as 16-bit integers in these steps. Cosines of descriptors are off by at
 # most 5e-4, cosines of bare keys by at most 2e-3.
 KEY_STEP = 1 / 64
 POINT_STEP = 1 / 1024
 GRID = (28, 28)  # rows and columns of patches
-NUMBER = (28, 1)  # row and column of a patch times these factors give its number
+NUMBER = (28, 1)  # (row, column) @ NUMBER is the number of a patch
 RUNTIME = "onnxruntime-web-1.30.0.tgz"
 RUNTIME_SHA256 = "d2228df7e4616bc3348bf504ee888f3bec43789a273f0a63f3e68d203ce3bf71"
 
@@ -71,7 +71,8 @@ def pair_data(dataset: Co3D, pair: Pair, method: ZeroShotPose) -> tuple[list[dic
     views = method.views([reference, *targets])
     first, *others = views
 
-    # Keys (views, patches, d) on their principal axes, of which few matter, and rounded.
+    # Keys (views, patches, d) are turned to their principal axes and rounded, as (views, axes,
+    # patches); on most axes they are 0 then.
     keys = np.stack([view.features.keys.flatten(0, 1).numpy() for view in views])
     axes = np.linalg.svd(np.concatenate(keys), full_matrices=False)[2]
     rounded = np.round(keys @ axes.T / KEY_STEP).astype("<i2").swapaxes(1, 2)
@@ -124,7 +125,7 @@ def write_page_data(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for index, pair in enumerate(stored_pairs(dataset)):
         views, error = pair_data(dataset, pair, method)
-        mark = "✓ right" if error < 30 else "✕ wrong"
+        mark = "✓ right" if error < SAME_ANGLE else "✕ wrong"
         titles.append(
             f"{pair.category}: {pair.reference_sequence} → {pair.target_sequence} ({mark}, "
             f"{error:.0f}°)"
@@ -133,7 +134,8 @@ def write_page_data(folder: Path) -> None:
             f"STORED[{index}] = {json.dumps(views, separators=(',', ':'))};\n"
         )
     (folder / "zsp-tiny.onnx").write_bytes(onnx_model(method.backbone))
-    # The random numbers that RANSAC draws in Python, for the same samples in the browser.
+    # The random numbers that RANSAC draws in Python, for the same samples in the browser. Each of
+    # the 5,000 has two halves of 32 bits: four for each of at most 2,000 trials, and some to spare.
     draws = np.random.default_rng(method.seed).bit_generator.random_raw(5000)
     content = {
         "titles": titles,
@@ -168,7 +170,7 @@ def fetch_runtime(folder: Path) -> bool:
 
 def _view_data(view: View, keys: np.ndarray) -> dict:
     """Compute the data of one view."""
-    points, _ = view.patch_points
+    points, _ = view.patch_points  # `known_foreground` says where they are known
     camera = view.frame.camera
     solid = view.known_foreground
     # The 3D drawing leaves out points more than 2.5 median distances from the middle.
@@ -194,7 +196,9 @@ def onnx_model(backbone: Backbone) -> bytes:
     """
     image = torch.zeros(1, 3, backbone.image_size, backbone.image_size)
     file = io.BytesIO()
-    # torch imports the package onnx, which only functions of onnxscript need. Constants are not
+    # Of torch's two exporters, the one with `dynamo` needs the package onnxscript. The other one
+    # uses the package onnx only to search its result for functions of onnxscript. There are none
+    # here: a stand-in for onnx, in which nothing is found, spares the dependency. Constants are not
     # folded, so that weights stay in float16. Warnings are about images of other sizes.
     with warnings.catch_warnings(action="ignore"), patch.dict(sys.modules, onnx=MagicMock()):
         torch.onnx.export(
@@ -203,7 +207,7 @@ def onnx_model(backbone: Backbone) -> bytes:
             file,
             input_names=["image"],
             output_names=["keys", "saliency"],
-            opset_version=17,
+            opset_version=17,  # the first with layer normalisation
             dynamo=False,
             do_constant_folding=False,
         )

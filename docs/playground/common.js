@@ -1,4 +1,4 @@
-// What both pages use.
+// What both pages use. Each has its own `state`, whose field `held` says whether the mark stays where it is.
 "use strict";
 
 const STEPS = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0] }; // rows and columns

@@ -2,7 +2,8 @@
 "use strict";
 
 const FOUND = {}; // by category; the files of found/ fill it
-const FULL = 254, HIDDEN = 255, LEAST = 128; // of coordinates; the least confidence of a place, of 256
+// Coordinates are 0 to FULL, or HIDDEN; a place of less confidence than LEAST, of 256, is not shown.
+const FULL = 254, HIDDEN = 255, LEAST = 128;
 const state = { objects: [], side: 0, source: 0, mark: 0, held: false };
 
 async function openCategory(name) {
@@ -22,12 +23,12 @@ async function openCategory(name) {
 
 /** The pictures and the mark of object i. */
 function figure(_, i) {
-  const whole = create("figure", {});
+  const whole = create("figure");
   const picture = create("div", { className: "picture", tabIndex: 0, role: "application" });
   picture.ariaLabel = `Object ${i + 1}. Arrow keys move the mark, Enter holds and releases it.`;
-  picture.append(create("img", { alt: "", draggable: false }), create("span", {}));
+  picture.append(create("img", { alt: "", draggable: false }), create("span"));
   Object.assign(picture, { onpointermove: point, onpointerdown: point, onclick: point, onkeydown: press });
-  whole.append(picture, create("figcaption", {}));
+  whole.append(picture, create("figcaption"));
   return whole;
 }
 
@@ -57,7 +58,7 @@ function placeOn(i) {
   return { kind: i === source ? "mark" : "found", confidence, pixel };
 }
 
-/** Mark that patch of the picture of object i that is nearest to a pixel, by a distance of columns and rows. */
+/** Mark the patch in the picture of object i that is nearest to the pixel `from`, by a distance of columns and rows. */
 function markNearest(i, from, distance = Math.hypot) {
   const object = state.objects[i], picture = object.sides[state.side];
   let least = Infinity;
@@ -74,6 +75,7 @@ function show() {
   document.querySelectorAll("#objects figure").forEach((whole, i) => {
     const { kind, confidence, pixel: [x, y] } = shown[i], [picture, caption] = whole.children;
     whole.className = i === state.source ? "chosen" : kind;
+    // Places and confidences as percent of 254 and of 256.
     Object.assign(picture.lastChild, { className: kind, style: `left: ${x / 2.54}%; top: ${y / 2.54}%` });
     caption.textContent = {
       mark: state.held ? "□ held" : "□ click to hold", found: `● ${Math.round(confidence / 2.56)} %`,

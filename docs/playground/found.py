@@ -28,11 +28,11 @@ RENDERED = {"frames": VIEWS, "seed": 17, "image_size": 384}
 OBJECTS = 8  # of each category
 SIDES = 6  # from which objects are shown
 PICTURE = 288  # side in pixels
-# Coordinates are stored as whole multiples, 0 to 254, of this share of a picture's side.
+# Coordinates are stored in bytes: whole multiples, 0 to 254, of this share of a picture's side.
 STEP = 1 / 254
 HIDDEN = 255  # coordinate of a point that a picture does not show
-# A point is hidden if it is farther behind the surface that a picture shows, in sizes of the
-# object.
+# A point is hidden if it is farther than this behind the surface that a picture shows, in sizes of
+# the object.
 _BEHIND = 0.02
 
 
@@ -56,13 +56,15 @@ def category_data(
     The place of a mark on another object is an index of that object's surface.
     """
     names = list(alignment.objects)
-    views = [surface_views(alignment, dataset, category, name, backbone) for name in names]
+    all_views = [surface_views(alignment, dataset, category, name, backbone) for name in names]
     # The views of the first object go around it.
-    directions = [view.direction for view in views[0][:: len(views[0]) // SIDES][:SIDES]]
+    around = all_views[0]
+    directions = [view.direction for view in around[:: len(around) // SIDES][:SIDES]]
     shown = [
-        shown_object(dataset, category, name, one, directions) for name, one in zip(names, views)
+        shown_object(dataset, category, name, views, directions)
+        for name, views in zip(names, all_views)
     ]
-    trees = [KDTree(one.surface) for one in shown]
+    trees = [KDTree(target.surface) for target in shown]
     data = []
     for name, source in zip(names, shown):
         marks = source.surface[: source.starts[-1]]
@@ -101,18 +103,22 @@ def shown_object(
     directions: list[Float[np.ndarray, "3"]],
 ) -> ShownObject:
     """Show an object in those of its views that are nearest to some directions."""
-    nearest = [int(np.argmax([view.direction @ one for view in views])) for one in directions]
+    nearest = [
+        int(np.argmax([view.direction @ direction for view in views])) for direction in directions
+    ]
     chosen = sorted(set(nearest))
     every = {frame.name: frame for frame in map(dataset.load, dataset.frames(category, name))}
     frames = [every[views[k].name] for k in chosen]
+    # The points of the shown views come first: these can be marked.
     others = sorted(set(range(len(views))) - set(chosen))
     points = [views[k].points for k in chosen + others]
+    # The points of views are in the common frame; all views of an object have one `sim3`.
     return ShownObject(
-        views,
-        [square_crop(frame) for frame in frames],
-        [chosen.index(k) for k in nearest],
-        [sum(map(len, points[:k])) for k in range(len(chosen) + 1)],
-        views[0].sim3.inverse().apply(np.concatenate(points)),
+        views=views,
+        pictures=[square_crop(frame) for frame in frames],
+        sides=[chosen.index(k) for k in nearest],
+        starts=[sum(map(len, points[:k])) for k in range(len(chosen) + 1)],
+        surface=views[0].sim3.inverse().apply(np.concatenate(points)),
     )
 
 
@@ -135,6 +141,7 @@ def square_crop(frame: Frame) -> Frame:
 
 def stored_pixels(shown: ShownObject) -> UInt8[np.ndarray, "n pictures 2"]:
     """Project the surface into all pictures; `HIDDEN` where a picture does not show a point."""
+    # From the common frame to the object's world.
     behind = _BEHIND * object_size(shown.views) / shown.views[0].sim3.scale
     projected = []
     for frame in shown.pictures:

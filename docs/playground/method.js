@@ -2,12 +2,14 @@
 // patch of the reference, v a patch of a target view, both numbered row by row; x and y are points in camera frames.
 "use strict";
 
-const SIDE = 28, PATCHES = SIDE * SIDE, ORTHOGONAL = Math.SQRT2;
+const SIDE = 28, PATCHES = SIDE * SIDE, ORTHOGONAL = Math.SQRT2; // ORTHOGONAL: distance of orthogonal unit vectors
 const rowColumn = (patch) => [Math.floor(patch / SIDE), patch % SIDE];
+// Limits of the scale, and of the second singular value relative to the first, as in zsp_lite/alignment.py.
 const SCALES = [0.2, 5], COLLINEAR = 1e-6, IDENTITY = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
 
 // ---- Similarity: sec. 4.1, and the algebra in the docstring of zsp_lite/matching.py ----
 
+/** The row or column i, clamped to the grid. */
 const inside = (i) => Math.min(SIDE - 1, Math.max(0, i));
 
 /** For each patch the patch `step` away along an axis ("row" or "column"), clamped at the border. */
@@ -58,7 +60,7 @@ function averaged(keys, axis) {
 /** Add to the keys of an image what similarities need: pooled keys, and squared lengths of keys and descriptors. */
 function describe(keys) {
   const pooled = averaged(averaged(keys, "row"), "column");
-  const [squared, squaredPooled] = [squaredLengths(keys), squaredLengths(pooled)];
+  const squared = squaredLengths(keys), squaredPooled = squaredLengths(pooled);
   const near = shiftSum(shiftSum(squared, 1, "row"), 1, "column");
   const far = shiftSum(shiftSum(squaredPooled, 3, "row"), 3, "column");
   return { keys, pooled, squared, squaredBinned: withoutCentre(near, far, squaredPooled) };
@@ -134,7 +136,7 @@ function findMatches(view, on1, on2, saliency, gram, { k, kmeans, cycle }) {
   return order.map((u) => [u, view.forth[u]]);
 }
 
-/** k-means of unit vectors given by their cosines, from starts that are far apart. Returns the clusters' numbers. */
+/** k-means of unit vectors given by their cosines, from starts that are far apart. Returns each vector's cluster. */
 function cluster(gram, k) {
   const starts = [0];
   while (starts.length < k) starts.push(argMax(gram.map((row) => -Math.max(...starts.map((start) => row[start])))));
@@ -174,9 +176,12 @@ const scaled = (a, factor) => [factor * a[0], factor * a[1], factor * a[2]];
 const minus = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
 const apply = ({ scale, R, t }, x) => plus(scaled(times(R, x), scale), t);
 
-/** Eigenvalues, largest first, and eigenvectors of a symmetric 3x3 matrix by Jacobi's rotations J. */
+/**
+ * Eigenvalues, largest first, and eigenvectors of a symmetric 3x3 matrix by Jacobi's rotations J. Six sweeps suffice
+ * for double precision; an element below 1e-17 of those on the diagonal counts as 0.
+ */
 function eigenvectors(matrix) {
-  let [a, V] = [matrix, IDENTITY];
+  let a = matrix, V = IDENTITY;
   for (let sweep = 0; sweep < 6; sweep++) {
     for (const [p, q] of [[0, 1], [0, 2], [1, 2]]) {
       if (a[p][q] ** 2 <= 1e-34 * Math.abs(a[p][p] * a[q][q])) continue;

@@ -1,11 +1,13 @@
 // The page: pairs, controls and pictures. method.js has the method; build.py writes playground/.
 "use strict";
 
-const CANVAS = 448, CELL = CANVAS / SIDE, CROP = 224, FIRST_PAIR = 3; // sizes in pixels
+const CANVAS = 448, CELL = CANVAS / SIDE, CROP = 224; // sides in pixels: of a canvas, a patch, a photograph
+const FIRST_PAIR = 3; // the pair that is shown first: cars that the method gets right
 const MARKS = { // told apart by shape as well as by colour
   right: ["●", "#56b4e9"], wrong: ["✕", "#e69f00"], unknown: ["▲", "#d0d0d0"], u: ["□", "white"], back: ["○", "yellow"],
 };
 const LIBRARY_DEFAULTS = { saliency: 0.05, binned: true, cycle: true, k: 50, kmeans: true };
+// The patch u starts in the middle; the angles `turn` of the 3D view are in radians.
 const state = { views: [], solved: null, patch: 14 * SIDE + 14, held: false, shown: 0, turn: [0.5, 0.3] };
 
 const all = (selector) => [...document.querySelectorAll(`#playground ${selector}`)];
@@ -155,6 +157,7 @@ function drawOverlay(context, i) {
   const isOn = i ? target.on : on, v = target.forth[patch];
   if (stageIs("saliency")) drawMap(context, views[i].saliency.map((value, u) => (isOn[u] ? value : NaN)), 0, 0.5);
   if (stageIs("similarity") && i) drawMap(context, rows[i - 1], Math.min(...rows.map((row) => Math.min(...row))), 1);
+  // Distances of 8 patches and more look alike.
   if (stageIs("cycle") && !i) drawMap(context, target.distances.map((d) => -d), -8, 0);
   if (stageIs("pose") && pose && i) {
     context.fillStyle = MARKS.wrong[1];
@@ -192,7 +195,10 @@ function drawLines() {
   }
 }
 
-/** Both objects in the camera of the chosen view, turned by the angles `state.turn`, without perspective. */
+/**
+ * Both objects in the camera of the chosen view, turned by the angles `state.turn`, without perspective. The target's
+ * root mean square distance from its centre is a quarter of the canvas.
+ */
 function drawCloud() {
   const { views, solved: { targets, best, pose } } = state, context = element("cloud").getContext("2d");
   context.clearRect(0, 0, CANVAS, CANVAS);
@@ -256,7 +262,7 @@ function press(event) {
 }
 
 function pressCloud(event) {
-  const step = STEPS[event.key];
+  const step = STEPS[event.key]; // columns turn about the vertical axis, rows about the horizontal one
   if (!step) return;
   event.preventDefault();
   state.turn = state.turn.map((angle, i) => angle + 0.1 * step[1 - i]);

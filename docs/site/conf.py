@@ -59,9 +59,9 @@ default_role = "py:obj"  # `name` in a docstring becomes a link if the name is d
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_preserve_defaults = True
 autodoc_use_type_comments = False
-toc_object_entries = False
-python_maximum_signature_line_length = 80
-napoleon_use_ivar = True
+toc_object_entries = False  # The contents of a page list modules, not their members.
+python_maximum_signature_line_length = 80  # Longer ones have a line per argument.
+napoleon_use_ivar = True  # Attributes of a class are a list, as arguments are.
 
 # Address of the repository on GitHub, for the links "Open in Colab"; without it there are none.
 course_repository = _project.get("urls", {}).get("Repository", "").rstrip("/").removesuffix(".git")

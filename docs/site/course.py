@@ -36,7 +36,8 @@ BRANCH = "gh-pages"  # where the workflow publishes the site, and so the noteboo
 # An interval such as [47.6, −6.2].
 INTERVAL = re.compile(r"\[[-−]?[\d.]+, [-−]?[\d.]+\]")
 
-# Pages that belong to a page but that the sidebar leaves out, as patterns.
+# Pages that belong to a page but that the sidebar leaves out, as patterns. Each page below
+# notebooks/exercises/ but its README has an underscore in its path.
 CHILDREN = {"notebooks/README": "../docs/slides/*", "notebooks/exercises/README": "**_*"}
 HIDDEN_LINKS = """
 
@@ -58,6 +59,8 @@ MODULE = r"""
 ```
 """
 
+# The link to data_samples is for `sample_data`, which looks in the working folder: the installed
+# package is outside the clone.
 INSTALL_IN_COLAB = """\
 # Colab only: fetches zsp-lite with its sample data, installs what Colab lacks (about a minute).
 import sys
@@ -103,6 +106,7 @@ def read_source(app: Sphinx, docname: str, source: list[str]) -> None:
         app.env.temp_data["alternative texts"] = [
             alt for cell in notebook.cells for *_, alt in pictures(cell)
         ]
+        # The links stand below the title, which is the first cell.
         notebook.cells.insert(
             1, nbformat.v4.new_markdown_cell(run_links(docname, app.config.course_repository))
         )
@@ -137,12 +141,14 @@ def without_widget(output: NotebookNode, widgets: dict) -> list[NotebookNode]:
             (buffer,) = model["buffers"]
             images.append({f"image/{state['format']}": buffer["data"]})
         elif model["model_name"] == "HTMLModel":
+            # The first HTML of a widget describes its picture and is not visible, the last is the
+            # caption below it: see `interactive_figure`.
             captions.append(
                 re.sub("<style>.*?</style>|<[^>]*>", "", state["value"], flags=re.DOTALL).strip()
             )
         elif state.get("description"):
             value = state.get("value", "")
-            if "index" in state:
+            if "index" in state:  # a choice, which stores only the place of its value
                 value = state["_options_labels"][state["index"]]
             text = state["description"]
             controls.append(text if value == "" else f"{text} = {value}")
@@ -200,8 +206,12 @@ def keep_intervals(app: Sphinx, doctree: nodes.document) -> None:
 
 
 def mark_place(app: Sphinx, doctree: nodes.document) -> None:
-    """Give the strip at the top of a notebook a class such as here-324: the first pixel of its
-    first marked box (`doctree-read`)."""
+    """Give the strip at the top of a notebook, a drawing of the method's stages, a class such as
+    here-324 (`doctree-read`).
+
+    The number is the left end, in pixels, of the first box that is marked as this notebook's;
+    `static/site.js` scrolls to it.
+    """
     for image in doctree.findall(nodes.image):
         if "/here_" in image["uri"]:
             strip = (app.srcdir / image["uri"]).read_text(encoding="utf-8")
@@ -214,6 +224,7 @@ def fold_members(app: Sphinx, doctree: nodes.document) -> None:
     for section in list(doctree.findall(nodes.section)):
         members = [node for node in section.children if isinstance(node, addnodes.desc)]
         if members:
+            # The first part of a member is its signature.
             links = [
                 f'<a href="#{member[0]["ids"][0]}"><code>{member[0]["fullname"]}</code></a>'
                 for member in members
@@ -260,6 +271,8 @@ def runnable(notebook: NotebookNode, docname: str, repository: str) -> NotebookN
     if repository:
         for cell in notebook.cells:
             if cell.cell_type == "markdown":
+                # Pictures have the sign ! and need the file itself; pages are shown by GitHub. Once
+                # the pictures have full addresses, the second pass leaves them.
                 for sign, kind in (("!", "raw"), ("", "blob")):
                     place = f"{repository}/{kind}/HEAD/{docname}"
                     cell.source = re.sub(
@@ -293,6 +306,7 @@ def mark_examples(
             literal = True
             text += ["::", ""]
         literal = literal and (indented or not line)
+        # In reST, a bar would begin a substitution.
         page = re.sub(r"\bdocs/(\w+)\.md", r"`docs/\1.md <../\1.html>`__", line.replace("|", r"\|"))
         text.append(line if literal else page)
     lines[:] = text

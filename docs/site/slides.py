@@ -38,6 +38,7 @@ class Picture(SphinxDirective):
     option_spec = {"heading": directives.unchanged, "number": directives.positive_int}
 
     def run(self) -> list[nodes.Node]:
+        # The second of two paths is absolute.
         path = Path(self.env.relfn2path(self.arguments[0])[1])
         self.env.note_dependency(str(path))
         if path.suffix == ".svg":

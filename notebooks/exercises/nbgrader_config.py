@@ -38,7 +38,8 @@ c.ClearSolutions.text_stub = "*Write your answer here, in place of this line.*"
 
 # Names of handed-in files, for `nbgrader zip_collect`. Moodle:
 # NAME_STUDENT_assignsubmission_file_EXERCISE.ipynb, or with "/" before EXERCISE.
-# Canvas: NAME_STUDENT_NUMBER_EXERCISE.ipynb. Browsers and people add " (1)", "-Copy1".
+# Canvas: NAME_STUDENT_NUMBER_EXERCISE.ipynb, with LATE_ before STUDENT after the
+# deadline. Browsers and people add " (1)", "-Copy1".
 # From the path: the number of the student and the name of the exercise.
 EXERCISES = "|".join(sorted(folder.name for folder in (HERE / "source").glob("*")))
 STUDENT = r".*/[^/]+?_(?:LATE_)?(?P<student_id>\d+)_(?:assignsubmission_file_?/?|\d+_)"
@@ -87,6 +88,7 @@ class Collector(FileNameCollectorPlugin):
             folder = HERE / "submitted" / student / assignment
             time = self.parent.coursedir.get_existing_timestamp(str(folder))
             if not time or not same(folder / f"{name}.ipynb", submitted_file):
+                # nbgrader's times are UTC, without a time zone.
                 time = datetime.now(UTC).replace(tzinfo=None)
             info["timestamp"] = time
         return info
@@ -227,6 +229,7 @@ class ExecuteHandIn(Execute):
         return cell, resources
 
 
+# nbgrader's own steps, but for the execution.
 steps = Autograde().autograde_preprocessors
 steps[steps.index(Execute)] = ExecuteHandIn
 c.Autograde.autograde_preprocessors = steps
@@ -263,7 +266,7 @@ class FeedbackPage(HTMLExporter):
         page = re.sub(r"(?s)<script.*?</script>", "", page)
 
         # A graded cell is named by its task, a test also by the comment in line 1.
-        names = {}
+        names = {}  # by grade id
         task = ""
         for cell in nb.cells:
             heading = re.match(r"## (Task .*?) \(\d+ points", cell.source)

@@ -1,6 +1,7 @@
 // Additions to the theme of the course site.
 
-// On a phone the strip at the top of a notebook, 940 pixels wide, is cut: show the marked box.
+// On a phone the strip at the top of a notebook, 940 pixels wide, is cut: scroll to the marked box. The class here-N,
+// which course.py sets, has the left end of the box in pixels; a quarter of what is in view stays before it.
 for (const strip of document.querySelectorAll('img[class*="here-"]')) {
   const box = strip.parentElement;
   box.scrollLeft = strip.className.match(/here-(\d+)/)[1] / 940 * box.scrollWidth - box.clientWidth / 4;

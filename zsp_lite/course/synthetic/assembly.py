@@ -42,6 +42,7 @@ class Draw:
         """Draw a proportion uniformly from [low, high)."""
         value = float(self.rng.uniform(low, high))
         if self._variation is not None:
+            # The standard deviation is 0.3 of the range.
             value += self._variation.normal(0, 0.3) * (high - low)
             value = float(np.clip(value, low, high))
         return value
@@ -80,7 +81,7 @@ def make_shape(
     meshes, materials = zip(*build(Draw(rng, variation)))
     vertices, faces = joined(meshes)
     material = np.repeat(materials, [len(mesh.faces) for mesh in meshes])
-    # Each axis has a small random scale of its own.
+    # Each axis has a random scale of its own, by about 8 %.
     vertices *= np.exp(rng.normal(0, 0.08, 3))
     vertices -= box_centre(vertices)
     vertices /= surface_spread(vertices, faces)
@@ -98,7 +99,8 @@ def rounded_box(
     Squareness 2 gives an ellipsoid, 10 nearly a box.
     """
     # The surface of the cube from -1 to 1 has a grid of n x n points on each of its sides. They are
-    # denser at the edges, where the curvature is largest.
+    # denser at the edges, where the curvature is largest. `sign * u` mirrors the grid of one of two
+    # opposite sides, so that both have the same order seen from outside.
     n = 11
     line = np.sin(np.linspace(-TAU / 4, TAU / 4, n))
     u, v = np.meshgrid(line, line, indexing="ij")
@@ -115,7 +117,10 @@ def rounded_box(
 
 
 def tapered(mesh: Mesh, low: float, high: float, factor: float) -> Mesh:
-    """Scale the width (y) of a mesh: by 1 up to height `low`, by `factor` from height `high` on."""
+    """Scale the width (y) of a mesh: by 1 up to height `low`, by `factor` from height `high` on.
+
+    If `high` is the lower one of the two, the width changes downwards.
+    """
     share = np.clip((mesh.vertices[:, 2] - low) / (high - low), 0, 1)
     vertices = mesh.vertices.copy()
     vertices[:, 1] *= 1 + (factor - 1) * share
@@ -140,10 +145,12 @@ def disc(radius: float, thickness: float, centre: Coordinates) -> Mesh:
 
 def wheels(x: float, y: float, radius: float, width: float) -> Parts:
     """Build the two wheels of an axle at x, standing on the ground at y and -y."""
+    # Materials of all wheels; vehicles use the same numbers for other parts as well.
     RIM = 2
     TYRE = 3
 
     yield from pair(disc(radius, width, (x, y, radius)), TYRE)
+    # The rim sticks out of the tyre.
     yield from pair(disc(radius * 0.6, width * 1.2, (x, y, radius)), RIM)
 
 
@@ -165,7 +172,7 @@ class _Kind(NamedTuple):
 
 _MUTED = (0, 0.8)  # saturation of painted and woven surfaces
 _NO_EXTREMES = (0.25, 0.95)  # value: neither black nor white
-# The numbers in a row are share, hue, saturation, value and roughness.
+# The numbers in a row, chosen by hand, are share, hue, saturation, value and roughness.
 _KINDS = (
     # paint
     _Kind(0.22, ANY_HUE, _MUTED, _NO_EXTREMES, (0.35, 0.75)),
@@ -228,8 +235,8 @@ def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
     # random numbers from here on, and seeds other objects.
     if not kind.two_hues:
         second = 0  # black
-    mixed = colour + rng.uniform(*kind.contrast) * (second - colour)
-    # The wave vectors (k, 3) have one length.
+    contrasting = colour + rng.uniform(*kind.contrast) * (second - colour)
+    # The wave vectors (k, 3) have one length, the drawn frequency.
     waves = rng.normal(size=(rng.choice(kind.waves), 3))
     waves *= rng.uniform(*kind.frequency) / np.linalg.norm(waves, axis=1, keepdims=True)
     phases = rng.uniform(0, TAU, len(waves))
@@ -241,7 +248,7 @@ def _random_material(kind: _Kind, rng: np.random.Generator) -> Material:
         bend = np.sin(points @ warp)[:, None]
         value = np.sin(points @ waves.T + phases + bend).mean(1, keepdims=True)
         share = np.clip(0.5 + 0.5 * sharpness * value, 0, 1)
-        return (colour + share * (mixed - colour)).astype(np.float32)
+        return (colour + share * (contrasting - colour)).astype(np.float32)
 
     return Material(
         colour=np.ones(4),

@@ -50,6 +50,7 @@ class Preset:
 
 
 PRESETS = {
+    # The three numbers are `sequences`, `frames` and `image_size`.
     # The sample data outside the repository, made in some 15 s. The photograph of the demo needs a
     # motorcycle.
     "demo": Preset(("bicycle", "chair", "motorcycle"), 2, 12, 176, pairs=10, targets=(1, 3, 5)),
@@ -63,10 +64,10 @@ PRESETS = {
 def export_preset(preset: str, out: str | Path, seed: int = 0) -> None:
     """Write a preset with its evaluation pairs to a folder; see `export_categories`."""
     check_choice("preset", preset, PRESETS)
-    size = PRESETS[preset]
-    export_categories(size.categories, out, size.sequences, size.frames, seed, size.image_size)
-    for category in size.categories:
-        write_pairs(Path(out), category, size.pairs, size.targets, seed)
+    data = PRESETS[preset]
+    export_categories(data.categories, out, data.sequences, data.frames, seed, data.image_size)
+    for category in data.categories:
+        write_pairs(Path(out), category, data.pairs, data.targets, seed)
 
 
 def sequence_name(seed: int, category: str, index: int) -> str:
@@ -125,6 +126,7 @@ def export_categories(
 def make_object(category: str, index: int, seed: int) -> TexturedMesh:
     """Return the object of sequence number `index` in canonical coordinates, with its materials."""
     key = _key(seed, category, index)
+    # Shape and materials have random numbers of their own; `record_sequence` takes [key, 1 and 2].
     return replace(make_shape(CATEGORIES[category], [key, 0]), materials=random_materials([key, 3]))
 
 
@@ -178,11 +180,11 @@ def export_models(
             f"folder {out} holds other data, expected an empty one or an export of models"
         )
     for model in tqdm(models, "rendering", disable=None):
-        rotation = model.info.axes(model.path.suffix)  # to the canonical frame
+        to_canonical = model.info.axes(model.path.suffix)
         record = {
             "file": model.path.relative_to(folder).as_posix(),
             "sha256": sha256(model.path, "model"),
-            "rotation": np.round(rotation, 9).ravel().tolist(),
+            "rotation": np.round(to_canonical, 9).ravel().tolist(),
             "author": model.info.author,
             "licence": model.info.licence,
             "source": model.info.source,
@@ -192,7 +194,7 @@ def export_models(
         if known and model.name in read_poses(out, model.category):
             continue
         try:
-            mesh = canonical_mesh(read_mesh(model.path), rotation)
+            mesh = canonical_mesh(read_mesh(model.path), to_canonical)
         except InputError as error:
             left_out[f"{model.category}/{model.name}"] = str(error)
             continue
@@ -203,8 +205,8 @@ def export_models(
         text = msgspec.json.format(msgspec.json.encode(rendered), indent=1)
         write_atomic(out / RENDERED_FILE, text)
     if not rendered.sequences:
-        key, reason = next(iter(left_out.items()))
-        raise InputError(f"{folder} holds no usable model; {key}: {reason}")
+        name, reason = next(iter(left_out.items()))
+        raise InputError(f"{folder} holds no usable model; {name}: {reason}")
     for category, sequences in rendered.sequences.items():
         write_true_labels(out, category, sorted(sequences))
         if len(sequences) > 1:
@@ -252,7 +254,7 @@ def shape_turns(vertices: Vertices) -> tuple[int, ...]:
     """Return the quarter turns about z, in degrees, that map the vertices to themselves."""
     points = vertices - box_centre(vertices)
     tree = KDTree(points)
-    limit = 0.03 * np.ptp(points)
+    limit = 0.03 * np.ptp(points)  # a share of the longest side, chosen by hand
     turns = []
     for degrees in (90, 180, 270):
         distances, _ = tree.query(points @ rotation("z", np.radians(degrees)).T)
@@ -266,9 +268,9 @@ def write_true_labels(out: Path, category: str, names: Sequence[str]) -> None:
     poses = {name: np.array(pose.trans) for name, pose in read_poses(out, category).items()}
     from_reference = np.linalg.inv(poses[names[0]])
     for name in names:
-        # Rounding makes rotations equal on all processors (translations are in units that differ by
-        # some 3e-5), and the label of the reference exactly the identity; adding 0.0 turns negative
-        # zeros into zeros.
+        # Rounding makes rotations equal on all processors, and the label of the reference exactly
+        # the identity. It does not make translations equal: their unit, that of the sequence,
+        # differs by some 3e-5 between processors. Adding 0.0 turns negative zeros into zeros.
         trans = np.round(poses[name] @ from_reference, 12) + 0.0
         write_label(out, category, PoseLabel(trans, name, names[0]))
 

@@ -12,8 +12,10 @@ Vertices = Float[np.ndarray, "v 3"]
 Faces = Int[np.ndarray, "f 3"]  # indices of vertices
 # Of a point (3,), of a point (2,) in the plane of an outline, or of an outline's points (n, 2).
 Coordinates = Sequence | np.ndarray
-# Radius where a lathe's profile meets the axis; zero would give triangles without an area.
-_ON_AXIS = 1e-4
+# Radius where the profile of a part meets the axis; zero would give triangles without an area.
+# Cylinders, which may be thin, have a smaller one.
+ON_AXIS = 1e-3
+_CYLINDER_ON_AXIS = 1e-4
 # The plane of an outline: indices of the outline's two axes, and of the axis of the thickness.
 _PLANES = {
     "xz": (0, 2, 1),
@@ -44,7 +46,8 @@ class Mesh:
     def pointing(self, direction: Coordinates) -> "Mesh":
         """Return the mesh rotated so that its z axis points along `direction` (3,)."""
         z = unit(np.asarray(direction, float))
-        # The x axis may be any that is perpendicular to z; y does for it unless it is nearly z.
+        # Any x axis perpendicular to z will do: here it is perpendicular to the old y axis as well,
+        # or to the old x axis if z is nearly along y.
         x = unit(np.cross([0, 1, 0] if abs(z[1]) < 0.9 else [1, 0, 0], z))
         return Mesh(self.vertices @ np.stack([x, np.cross(z, x), z]), self.faces)
 
@@ -115,7 +118,11 @@ def box(size: float | Coordinates, centre: Coordinates = (0, 0, 0)) -> Mesh:
 
 
 def lathe(profile: Coordinates, sides: int = 20, start: float = 0.0, stop: float = TAU) -> Mesh:
-    """Revolve a profile (n, 2) of radii and heights about z, upwards for normals that point out."""
+    """Revolve a profile (n, 2) of radii and heights about z, between two angles in radians.
+
+    Normals point out of a profile that runs upwards. Its ends have a radius `ON_AXIS`, not 0, where
+    they close a solid.
+    """
     profile = np.asarray(profile, float)
     closed = np.isclose(stop - start, TAU)
     angle = np.linspace(start, stop, sides, endpoint=not closed)
@@ -135,7 +142,9 @@ def cylinder(bottom: float, top: float, height: float, sides: int = 18) -> Mesh:
     """Return a closed cone frustum about z, centred at the origin, of radii `bottom` and `top`."""
     high = height / 2
     low = -high
-    return lathe([[_ON_AXIS, low], [bottom, low], [top, high], [_ON_AXIS, high]], sides)
+    return lathe(
+        [[_CYLINDER_ON_AXIS, low], [bottom, low], [top, high], [_CYLINDER_ON_AXIS, high]], sides
+    )
 
 
 def ellipsoid(radii: float | Coordinates, centre: Coordinates = (0, 0, 0), sides: int = 18) -> Mesh:
@@ -166,6 +175,7 @@ def capsule(
     along = np.subtract(end, start)
     half = np.linalg.norm(along) / 2
     angle = np.linspace(0, TAU / 4, 5)  # from the rim to the pole
+    # As in `ellipsoid`, no radius is 0.
     round_end = np.stack([np.cos(angle) + 1e-5, np.sin(angle)], 1)
     tail = round_end[::-1] * [radius, -radius]
     head = round_end * (end_radius or radius)
@@ -183,7 +193,7 @@ def torus(
     sides: int = 24,
 ) -> Mesh:
     """Return a torus about `axis`, or its arc from angle `start` to `stop` in radians."""
-    angle = np.linspace(-np.pi, np.pi, 11)
+    angle = np.linspace(-np.pi, np.pi, 11)  # around the tube
     tube = np.stack([major + minor * np.cos(angle), minor * np.sin(angle)], 1)
     return lathe(tube, sides, start, stop).pointing(axis).translated(centre)
 

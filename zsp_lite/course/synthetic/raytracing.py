@@ -35,7 +35,8 @@ _OFFSET = 2e-3
 # key light from each point of the floor.
 _RAYS = 4
 _LEAST_FACING = 0.02  # cosine of the largest angle between a visible point's normal and its ray
-# Light from parts of the object that block the room, relative to the light of the room.
+# Light from parts of the object that block the room, relative to the light of the room; chosen by
+# hand.
 _BLOCKED = 0.25
 _SHADOW_CELLS = 96  # along each side of the grid on which the shadow on the floor is known
 
@@ -82,7 +83,7 @@ class MeshScene:
         coordinates: Vertices | None = None,
         samples: int = 2,
     ):
-        import open3d as o3d
+        import open3d as o3d  # slow to import
 
         self.mesh = mesh
         self.room = room
@@ -215,8 +216,9 @@ class MeshScene:
         footprint = hits.distance / (camera.focal_length.mean() * self._samples)
         diffuse = (key[:, None] * light_colour + around) * self._albedo(hits, footprint)
 
-        # Light that is reflected: Schlick's approximation of the reflectance, the room in the
-        # direction of the mirrored ray, and a normalised Blinn-Phong highlight of the key light.
+        # Light that is reflected: Schlick's approximation of the reflectance, which grows less
+        # towards grazing angles on rough surfaces, the room in the direction of the mirrored ray,
+        # and a normalised Blinn-Phong highlight of the key light.
         specular, roughness, opacity = self._properties[self.mesh.material[hits.face]].T
         reflectance = specular + np.maximum(1 - roughness - specular, 0) * (1 - facing) ** 5
         reflectance = reflectance[:, None]
@@ -255,7 +257,7 @@ class MeshScene:
         """Return the key light that reaches each point, and the share of the room that it sees."""
         of_light = np.ones(len(key), np.float32)
         lit = np.flatnonzero(key)
-        of_light[lit] = self._lit_share(point[lit], 1)
+        of_light[lit] = self._lit_share(point[lit], count=1)
         of_room = self._room_share(point, normal)
         # Few rays per sample are noisy: each sample takes the mean of its neighbours on the object.
         # The blur divides by all nine neighbours; the third channel becomes the share of these that
@@ -306,8 +308,9 @@ class MeshScene:
         """Return the shares of key light and room seen from a grid on the floor, and its width."""
         # The grid is as wide as the object with a shadow on either side. The shadow counts as at
         # most 5 units long, and as at least 0.8 of the object's height even below a light from
-        # above: the object also shades the floor from the room. The grid has the axes of the room,
-        # as its border and its cells are visible.
+        # above: the object also shades the floor from the room. The slope of the light counts as
+        # at most 1 / 0.3. The grid has the axes of the room, as its border and its cells are
+        # visible.
         extent = np.ptp(self.mesh.vertices @ self.room.axes, axis=0)
         light = self.room.light
         length = extent[2] * max(float(np.linalg.norm(light[:2]) / max(light[2], 0.3)), 0.8)
@@ -319,7 +322,7 @@ class MeshScene:
         point = point @ self.room.axes.T + self.origin
         key = self._lit_share(point, _RAYS).reshape(n, n)
         around = self._room_share(point, np.float32([[0, 0, 1]])).reshape(n, n)
-        # A blur hides the noise of few rays.
+        # A blur, in cells of the grid, hides the noise of few rays.
         key = cv2.GaussianBlur(key, (0, 0), 0.8)
         around = cv2.GaussianBlur(around, (0, 0), 2.0)
         return np.dstack([key, around]), width

@@ -45,7 +45,8 @@ class CheapCamera:
     exposure: float = 0.2  # mean luminance after automatic exposure, with 1 for white
     # factor per channel: the error of the automatic white balance
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    noise: float = 0.01  # standard deviation at mid-grey, relative to white
+    # 2.5 times the standard deviation at mid-grey, relative to white, in a picture of 256 pixels
+    noise: float = 0.01
     vignetting: float = 0.1  # loss of light in the corners, as a fraction
 
     def exposure_gain(self, radiance: Image) -> float:
@@ -133,14 +134,14 @@ class Room:
         self,
         eye: Vector,
         rays: Vectors,
-        blur: float | Values,
+        angle: float | Values,
     ) -> tuple[Vectors, Values]:
         """Return what rays meet in the room.
 
         Args:
             eye: where the rays start.
             rays: directions of any length.
-            blur: angle in radians that each ray covers.
+            angle: angle in radians that each ray covers.
 
         Returns:
             The radiance of walls and ceiling, and the albedo of the floor; and the parameter of
@@ -150,7 +151,7 @@ class Room:
         low = self.low[:, None].astype(np.float32)
         high = self.high[:, None].astype(np.float32)
         size = high - low
-        # An eye outside the room sees it from just inside its walls.
+        # An eye outside the room sees it from just inside its walls, by 0.05 units.
         eye = (eye @ self.axes)[:, None]
         eye = np.clip(eye, low + 0.05, high - 0.05).astype(np.float32)
         # No coordinate of a ray may be zero: the distances to the planes are divided by them.
@@ -163,7 +164,7 @@ class Room:
         axis = reach.argmin(0)
         face = 2 * axis + (np.take_along_axis(rays, axis[None], 0)[0] > 0)
         x, y, z = (eye + nearest * rays - low) / size  # in [0, 1]
-        width = nearest * np.sqrt((rays**2).sum(0)) * blur  # of each ray at its end, in units
+        width = nearest * np.sqrt((rays**2).sum(0)) * angle  # of each ray at its end, in units
 
         radiance = np.empty((len(nearest), 3), np.float32)
         for index, image in enumerate(self._pyramids):
@@ -184,7 +185,7 @@ class Room:
 
 
 def random_room(seed: int | np.random.Generator, turn: float = 0.0) -> Room:
-    """Draw a room, independent of the object."""
+    """Draw a room, independent of the object; all ranges are chosen by hand."""
     rng = np.random.default_rng(seed)
     sides = rng.uniform(11.5, 17, 4)
     low = np.array([-sides[0], -sides[1], 0])
@@ -195,12 +196,13 @@ def random_room(seed: int | np.random.Generator, turn: float = 0.0) -> Room:
     temperature = rng.normal(0, 0.045)  # error of the camera's white balance
 
     floor = _floor(rng)
-    if rng.random() < 0.75:  # pale walls
+    # Ranges of hue, saturation and value; three in four rooms have pale walls.
+    if rng.random() < 0.75:
         wall_colour = random_colour(rng, (25, 60), (0, 0.14), (0.6, 0.92))
     else:
         wall_colour = random_colour(rng, ANY_HUE, (0, 0.4), (0.6, 0.92))
     walls = [_wall(rng, side, height, wall_colour) for side in (depth, depth, width, width)]
-    ceiling = np.full((8, 8, 3), 0.7, np.float32)
+    ceiling = np.full((8, 8, 3), 0.7, np.float32)  # of one radiance
     return Room(
         low=low,
         high=high,
@@ -222,14 +224,14 @@ def _floor(rng: np.random.Generator) -> Float[np.ndarray, "n n 3"]:
     """Return the albedo of a floor: boards, tiles or one surface, sometimes with a rug."""
     colour = random_colour(rng, (15, 60), (0.02, 0.6), (0.3, 0.8))
     tiled = rng.random() < 0.75
-    floor = surface_albedo(rng, (_FLOOR_PIXELS, _FLOOR_PIXELS), colour, 1.0, tiled)
+    floor = surface_albedo(rng, (_FLOOR_PIXELS, _FLOOR_PIXELS), colour, tiled=tiled)
     if rng.random() < 0.3:
         # The edges of the rug, in pixels, on all sides of the middle of the floor, where the object
         # stands.
         edges = _FLOOR_PIXELS * (0.5 + [-1, -1, 1, 1] * rng.uniform(0.09, 0.22, 4))
         top, left, bottom, right = edges.astype(int).tolist()
         colour = random_colour(rng, ANY_HUE, (0.02, 0.4), (0.25, 0.7))
-        rug = surface_albedo(rng, (bottom - top, right - left), colour, 1.0)
+        rug = surface_albedo(rng, (bottom - top, right - left), colour)
         floor[top:bottom, left:right] = rug
     return floor
 
@@ -238,7 +240,7 @@ def _wall(rng: np.random.Generator, width: float, height: float, colour: Colour)
     """Return the radiance of a wall with rectangular blocks: furniture, pictures, windows."""
     rows = round(height * _WALL_DENSITY)
     cols = round(width * _WALL_DENSITY)
-    image = surface_albedo(rng, (rows, cols), colour, 0.2)
+    image = surface_albedo(rng, (rows, cols), colour, grain=0.2)
     image[-8:] *= 0.4  # a dark skirting board, 0.4 units high
     left = rng.uniform(0.3, 2)
     while left < width - 2:
@@ -246,7 +248,7 @@ def _wall(rng: np.random.Generator, width: float, height: float, colour: Colour)
         tall = rng.uniform(1.2, 5)
         hangs = rng.random() < 0.5
         # A block is a picture or a window if it hangs, otherwise a piece of furniture. Two in five
-        # blocks that hang are windows; they shine.
+        # blocks that hang are windows; they shine, three times as bright.
         brightness = 3.0 if hangs and rng.random() < 0.4 else 1.0
         cells = _cell_colours(rng)
         bottom = rows - round(rng.uniform(2.5, 4) * _WALL_DENSITY if hangs else 0)

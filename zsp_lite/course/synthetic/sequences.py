@@ -84,12 +84,14 @@ def handheld_sweep(
     progress = (np.arange(frames) + rng.normal(0, 0.12, frames)) / frames
     phase = rng.uniform(0, TAU, 4)
 
+    # Quantity k swings this often on the way around the object.
     def wave(k: int, turns: float) -> Float[np.ndarray, " frames"]:
         return np.sin(turns * TAU * progress + phase[k])
 
     azimuth = rng.uniform(0, TAU) + rng.choice([-1, 1]) * TAU * progress + 0.06 * wave(0, 2)
     elevation = rng.uniform(*_HEIGHTS) + rng.uniform(3, 9) * wave(1, float(rng.choice([1, 2])))
     elevation += rng.normal(0, 1, frames)
+    # No single view is more than 9 degrees below or 5 above the range of means.
     elevation = np.radians(elevation.clip(_HEIGHTS[0] - 9, _HEIGHTS[1] + 5))
     distance = rng.uniform(6, 9) * (1 + 0.08 * wave(2, 1) + rng.normal(0, 0.01, frames))
     roll = np.radians(3 * wave(3, 1.5) + rng.normal(0, 2, frames))
@@ -100,11 +102,11 @@ def handheld_sweep(
     low, high = np.moveaxis([image_box(vertices, R, t) for R, t in poses], 1, 0)
     sides = np.array(size[::-1], float)  # width and height, as image points are (x, y)
     principal_point = np.round(sides / 2 + rng.normal(0, 0.004, 2) * sides, 6)
-    room = np.minimum(principal_point, sides - principal_point) - _FRAME_MARGIN * sides
+    space = np.minimum(principal_point, sides - principal_point) - _FRAME_MARGIN * sides
     # The object fills 55 to 75 % of the shorter side in the median view, if it is then inside the
     # image in all views.
     wanted = rng.uniform(0.55, 0.75) * sides.min() / np.median((high - low).max(1))
-    allowed = (room / np.maximum(-low, high).max(0)).min()
+    allowed = (space / np.maximum(-low, high).max(0)).min()
     focal_length = np.full(2, round(min(wanted, allowed), 6))
     return [Camera(R, t, focal_length, principal_point, size) for R, t in poses]
 
@@ -145,16 +147,16 @@ def render_sequence(
     scene = MeshScene(mesh, random_room(rng, turn), rng)
     # The frame of the first camera is the world, so that the object's pose does not depend on the
     # category.
-    first = cameras[0].matrix
-    to_object = np.linalg.inv(first)
+    object_to_world = cameras[0].matrix
+    world_to_object = np.linalg.inv(object_to_world)
     # The last digits of sines and products depend on the processor; rounded poses are equal
     # everywhere. Adding 0.0 turns negative zeros into zeros.
     views = []
     for camera in cameras:
         view = scene.render(camera)
-        pose = np.round(view.camera.matrix @ to_object, 9) + 0.0
+        pose = np.round(view.camera.matrix @ world_to_object, 9) + 0.0
         views.append(replace(view, camera=replace(view.camera, R=pose[:3, :3], t=pose[:3, 3])))
-    return views, np.round(first, 9)
+    return views, np.round(object_to_world, 9)
 
 
 def stereo_depth(
@@ -176,11 +178,12 @@ def stereo_depth(
         if region.any():
             known |= region & (confidence >= np.quantile(confidence[region], holes))
     # A flat object that is seen edge-on may have no pixel; then there is no noise.
-    near = np.median(view.depth[view.mask]) if view.mask.any() else np.inf
-    # The noise, mostly correlated between pixels, grows with the square of the depth.
+    object_depth = np.median(view.depth[view.mask]) if view.mask.any() else np.inf
+    # The noise relative to the depth grows with the depth, up to three times the object's. It is
+    # mostly correlated between pixels; the squares of both weights sum to about 1.
     correlated = 0.95 * smooth_noise(rng, view.mask.shape, 2.0)
     independent = 0.3 * rng.standard_normal(view.mask.shape)
-    noise = (correlated + independent) * (_DEPTH_NOISE * np.minimum(view.depth / near, 3))
+    noise = (correlated + independent) * (_DEPTH_NOISE * np.minimum(view.depth / object_depth, 3))
     return np.where(known, view.depth * np.maximum(1 + noise, 0.5), 0).astype(np.float32)
 
 
@@ -197,7 +200,8 @@ def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Map:
     texture = (texture - texture.mean()) / (texture.std() + 1e-6)
 
     # Edges: steps of the depth of more than 3 % between neighbours. The wall, whose depth is 0,
-    # counts as the farthest point of the floor.
+    # counts as the farthest point of the floor. An edge is the blurred mark of a step, doubled, and
+    # at most 1.
     far = np.where(view.depth > 0, view.depth, view.depth.max())
     jump = cv2.dilate(far, np.ones((3, 3))) / cv2.erode(far, np.ones((3, 3))) - 1
     edge = np.minimum(blur((jump > 0.03).astype(np.float32), max(0.5 * scale, 0.3)) * 2, 1)
@@ -207,6 +211,7 @@ def _stereo_confidence(view: Rendering, rng: np.random.Generator) -> Map:
     facing = np.abs((view.normals * ray).sum(-1)) / np.linalg.norm(ray, axis=-1)
     grazing = np.where(view.mask, np.clip(1 - facing / 0.5, 0, 1), 0)
 
+    # The weights of noise, edges and grazing angles, relative to texture, are chosen by hand.
     noise = 0.7 * smooth_noise(rng, (h, w), 5 * scale)
     noise += 0.4 * smooth_noise(rng, (h, w), 1.5 * scale)
     return texture + noise - 1.5 * edge - 1.5 * grazing
@@ -220,6 +225,7 @@ def soft_mask(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Map:
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
     distance -= cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
     distance -= np.where(mask, 0.5, -0.5)
+    # The edge wanders by at most 1.5 pixels, smoothly over 4 % of the image's side.
     wander = np.clip(0.8 * smooth_noise(rng, mask.shape, 0.04 * min(mask.shape)), -1.5, 1.5)
     # A logistic function, 0.7 pixels wide; beyond 14 pixels it is 0 or 1.
     return (1 / (1 + np.exp(-np.clip(distance + wander, -14, 14) / 0.7))).astype(np.float32)
@@ -269,7 +275,7 @@ def record_sequence(
     views, pose = render_sequence(mesh, rng, frames, image_size)
     seconds = np.round(np.arange(frames) * rng.uniform(0.4, 0.9), 3).tolist()
 
-    # The fractions of holes vary from view to view about the fractions of the sequence.
+    # The fractions of holes vary from view to view about the fractions of the sequence, by 0.03.
     rng = np.random.default_rng([key, 2])
     holes = np.array([rng.uniform(*_OBJECT_HOLES), rng.uniform(*_FLOOR_HOLES)])
     depths = []

@@ -75,12 +75,12 @@ def surface_albedo(
     rng: np.random.Generator,
     size: tuple[int, int],
     colour: Colour,
-    grain: float,
+    grain: float = 1.0,
     tiled: bool = False,
 ) -> Image:
     """Return the albedo of a surface with grain about an sRGB colour.
 
-    With `tiled`, the surface consists of boards or tiles.
+    The factor `grain` weakens the grain. With `tiled`, the surface consists of boards or tiles.
     """
     stretch = 1.0
     brightness = np.ones(size, np.float32)
@@ -92,7 +92,7 @@ def surface_albedo(
         brightness = _tiles(rng, size, height, width)
     for sigma, amount in _GRAIN:
         brightness += grain * rng.uniform(0.3, 1) * amount * smooth_noise(rng, size, sigma, stretch)
-    # No surface of a room is whiter than 0.92.
+    # No surface of a room is whiter than sRGB 0.92.
     return srgb_to_linear(np.clip(brightness[..., None] * colour.astype(np.float32), 0, 0.92))
 
 

@@ -12,4 +12,6 @@ _BUILDERS = (
     *toys.BUILDERS,
 )
 # A category has the name of its function.
-CATEGORIES = {build.__name__: build for build in sorted(_BUILDERS, key=lambda one: one.__name__)}
+CATEGORIES = {
+    build.__name__: build for build in sorted(_BUILDERS, key=lambda build: build.__name__)
+}

@@ -1,12 +1,16 @@
 """Bags, books, and what lies on a desk (front +x, left +y, up +z).
 
 The constants at the head of a builder name its materials, 0 to 7: parts of one material look alike.
+Other numbers are lengths or shares of lengths, chosen by hand; the unit is arbitrary, since
+`make_shape` scales each object. The third argument of `rounded_box` is its squareness. The second
+of `lathe` and the fourth of `cylinder` are numbers of sides.
 """
 
 import numpy as np
 
 from zsp_lite.course.synthetic.assembly import BODY, Draw, Parts, X, Y, pair, rounded_box, tapered
 from zsp_lite.course.synthetic.primitives import (
+    ON_AXIS,
     TAU,
     Mesh,
     box,
@@ -18,7 +22,7 @@ from zsp_lite.course.synthetic.primitives import (
     torus,
 )
 
-# The materials of the keys of laptops and keyboards.
+# The materials of the keys of laptops and keyboards. Edge keys look like a laptop's touchpad.
 _KEY = 1
 _EDGE_KEY = 2
 _SPACE_BAR = 3
@@ -66,7 +70,7 @@ def backpack(draw: Draw) -> Parts:
     yield from pair(capsule((back + 0.02, strap_y * 0.8, height * 0.93), bend, 0.05), STRAP)
     yield from pair(capsule(bend, (back + 0.02, strap_y * 1.35, height * 0.12), 0.05), STRAP)
     if draw.chance(0.6):
-        bottle_pocket = lathe([[0.12, 0], [0.15, 0.35], [0.14, 0.35], [0.001, 0.3]], 14)
+        bottle_pocket = lathe([[0.12, 0], [0.15, 0.35], [0.14, 0.35], [ON_AXIS, 0.3]], 14)
         yield from pair(bottle_pocket.translated((0, width / 2, height * 0.08)), FLAP)
 
 
@@ -75,7 +79,7 @@ def handbag(draw: Draw) -> Parts:
     FRONT = 1  # flap or pocket
     HANDLE = 2
     CLASP = 3
-    TAG = 5
+    TAG = 5  # 4 is free
 
     depth = draw(0.3, 0.5)
     width = draw(1.0, 1.5)
@@ -104,6 +108,7 @@ def handbag(draw: Draw) -> Parts:
     loop = top_width * draw(0.2, 0.3)
     strap = draw(0.025, 0.045)
     handle = torus(loop, strap, X, (0, 0, 0), *_ARCH, sides=20).scaled((1, 1, draw(0.9, 1.6)))
+    # One handle in the middle, or two.
     places = (0.0,) if draw.chance(0.35) else (front * 0.7, -front * 0.7)
     for x in places:
         yield handle.translated((x, 0, height * 0.95)), HANDLE
@@ -158,7 +163,7 @@ def book(draw: Draw) -> Parts:
 
 def laptop(draw: Draw) -> Parts:
     """Build a laptop, opened by 80 to 130 degrees, with its user at the front."""
-    TOUCHPAD = 2
+    TOUCHPAD = 2  # and the keys at the edges
     SCREEN = 4
     KEY_FIELD = 5
     SIGN = 6
@@ -167,7 +172,7 @@ def laptop(draw: Draw) -> Parts:
     width = draw(1.2, 1.6)
     thick = draw(0.05, 0.1)
     yield rounded_box((depth, width, thick), (0, 0, thick / 2), 12), BODY
-    # The keys in a field of their own, and the touchpad before them.
+    # The keys in a field of their own, whose front edge is at x = front; the touchpad before them.
     n_rows = 4 + draw.choice(2)
     n_keys = 10 + draw.choice(4)
     field = depth * draw(0.4, 0.5)
@@ -188,7 +193,7 @@ def laptop(draw: Draw) -> Parts:
         return mesh.rotated("y", -opening).translated(hinge)
 
     middle = lid / 2
-    back = thick * 0.6
+    back = thick * 0.6  # of the closed lid, whose screen is at z = 0
     yield on_lid(rounded_box((lid, width, back), (middle, 0, thick * 0.3), 12)), BODY
     yield on_lid(box((lid - 2 * rim, width - 2 * rim, 0.02), (middle + 0.01, 0, 0))), SCREEN
     sign = cylinder(draw(0.06, 0.12), 0.06, 0.02, 16)
@@ -229,7 +234,8 @@ def mouse(draw: Draw) -> Parts:
     width = draw(0.65, 0.9)
     height = draw(0.32, 0.55)
     shell = rounded_box((length, width, 2 * height), squareness=draw(2.2, 3.5))
-    # Only the upper half of the shell remains, lower at the front.
+    # Only the upper half of the shell remains, lower at the front and higher at the back. The
+    # height is as before at x = -0.1 length.
     vertices = shell.vertices.copy()
     slope = 1 - draw(0.1, 0.4) * (vertices[:, 0] / length + 0.1)
     vertices[:, 2] = np.maximum(vertices[:, 2], 0) * slope
@@ -238,7 +244,7 @@ def mouse(draw: Draw) -> Parts:
     # A button is the front quarter of the shell, slightly raised.
     button = vertices * [1.02, 1.0, 1.06] + [0, 0, 0.015]
     button[:, 0] = np.maximum(button[:, 0], length * draw(0.02, 0.12))
-    button[:, 1] = np.maximum(button[:, 1], 0.025)
+    button[:, 1] = np.maximum(button[:, 1], 0.025)  # half the gap between the buttons
     yield from pair(Mesh(button, shell.faces), BUTTON)
     wheel = (length * draw(0.25, 0.33), 0, height * 0.78)
     yield torus(0.09, 0.045, Y, wheel, sides=16), WHEEL
@@ -279,6 +285,7 @@ def keyboard(draw: Draw) -> Parts:
     if has_pad:
         pad_key = box((row_depth * 0.78, width * 0.04, 0.1))
         for row in range(n_rows - 1):
+            # From left to right; -y is to the right.
             for key, material in enumerate((_KEY, _KEY, _KEY, _EDGE_KEY)):
                 place = (front - (row + 0.5) * row_depth, -width * (0.275 + 0.05 * key), top)
                 yield tilted(pad_key.translated(place)), material
@@ -304,10 +311,11 @@ def remote(draw: Draw) -> Parts:
     thick = draw(0.14, 0.26)
     front = length / 2
     top = thick + 0.005
-    # The body is built upright, narrower at its foot, and laid down.
-    upright = rounded_box((thick, width, length), (0, 0, front), draw(4, 9))
-    waist = draw(0.8, 1.0)
-    body = tapered(upright, front, 0, waist).rotated("y", TAU / 4)
+    # The body is built upright, front end on top, and laid down. From its middle down to its foot,
+    # it narrows: the heights of `tapered` are in reverse.
+    upright = rounded_box((thick, width, length), (0, 0, length / 2), draw(4, 9))
+    narrowing = draw(0.8, 1.0)
+    body = tapered(upright, length / 2, 0, narrowing).rotated("y", TAU / 4)
     yield body.translated((-front, 0, thick / 2)), BODY
     emitter = (0.06, width * 0.2, thick * 0.3)
     yield ellipsoid(emitter, (front - 0.02, 0, thick * 0.55)), EMITTER
@@ -322,13 +330,14 @@ def remote(draw: Draw) -> Parts:
         for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
             yield box((0.09, 0.09, 0.06), (ring_x + ring * x, ring * y, top)), RING
     yield cylinder(ring * 0.45, ring * 0.4, 0.06).translated((ring_x, 0, top)), BUTTON
-    # Rows of three keys; the keys of the last row and two before the ring have another colour.
+    # Rows of three keys, closer together if the body narrows; the keys of the last row and two
+    # before the ring have another colour.
     n_rows = 3 + draw.choice(3)
     pitch = width * 0.27
     key = cylinder(0.045, 0.04, 0.05) if draw.chance(0.5) else box((0.07, pitch * 0.7, 0.05))
     for row in range(n_rows):
         for column in (-1, 0, 1):
-            place = (ring_x - ring - 0.12 - row * length * 0.085, column * pitch * waist, top)
+            place = (ring_x - ring - 0.12 - row * length * 0.085, column * pitch * narrowing, top)
             yield key.translated(place), KEY if row < n_rows - 1 else COLOURED_KEY
     yield from pair(
         box((0.06, pitch * 0.75, 0.05), (ring_x + ring + 0.11, pitch, top)), COLOURED_KEY

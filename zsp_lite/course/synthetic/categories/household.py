@@ -1,12 +1,16 @@
 """Furniture and devices of a household (front +x, left +y, up +z).
 
 The constants at the head of a builder name its materials, 0 to 7: parts of one material look alike.
+Other numbers are lengths or shares of lengths, chosen by hand; the unit is arbitrary, since
+`make_shape` scales each object. The third argument of `rounded_box` is its squareness. The second
+of `lathe` and the fourth of `cylinder` are numbers of sides.
 """
 
 import numpy as np
 
 from zsp_lite.course.synthetic.assembly import BODY, Draw, Parts, pair, rounded_box
 from zsp_lite.course.synthetic.primitives import (
+    ON_AXIS,
     TAU,
     Mesh,
     box,
@@ -51,8 +55,7 @@ def chair(draw: Draw) -> Parts:
         panel = (thick * 1.5, width * 0.95, back * 0.6)
         yield on_back(rounded_box(panel, (0, 0, back * 0.7), 3)), BACK
         post = rod((0, width * 0.3, 0), (0, width * 0.3, back * 0.6), leg)
-        yield on_back(post), FRAME
-        yield on_back(post.mirrored()), FRAME
+        yield from pair(on_back(post), FRAME)
     else:
         # Slats are many posts with one rung on top; heights are shares of the back's.
         rungs = (0.35, 0.65, 0.95)
@@ -114,15 +117,15 @@ def toilet(draw: Draw) -> Parts:
     height = draw(0.6, 0.8)
     foot = draw(0.5, 0.75)
     bowl_x = length * 0.75
-    # The bowl: profiles of unit radius, 0.001 at the axis to close it.
+    # The bowl: profiles of unit radius.
     outside = [
-        [0.001, 0],
+        [ON_AXIS, 0],
         [foot * 0.9, 0],
         [foot * 0.8, height * 0.3],
         [0.95, height * 0.75],
         [1, height],
     ]
-    inside = [[0.78, height], [0.55, height * 0.72], [0.001, height * 0.55]]
+    inside = [[0.78, height], [0.55, height * 0.72], [ON_AXIS, height * 0.55]]
     yield lathe(outside + inside, 28).scaled((length, width, 1)).translated((bowl_x, 0, 0)), BODY
     base = (bowl_x + 0.15, width * foot * 1.5, height * 0.95)
     yield rounded_box(base, (bowl_x * 0.35, 0, height * 0.47), 6), BODY
@@ -166,11 +169,15 @@ def hairdryer(draw: Draw) -> Parts:
     rear = -length * 0.43
     front = length * 0.57
     # The barrel, from its back to its mouth.
-    back = [[0.001, rear], [radius * 0.7, rear], [radius, -length * 0.3]]
-    yield (
-        lathe([*back, [radius, 0], [mouth, front], [0.001, front]], 24).rotated("y", TAU / 4),
-        BODY,
-    )
+    barrel = [
+        [ON_AXIS, rear],
+        [radius * 0.7, rear],
+        [radius, -length * 0.3],
+        [radius, 0],
+        [mouth, front],
+        [ON_AXIS, front],
+    ]
+    yield lathe(barrel, 24).rotated("y", TAU / 4), BODY
     # The nozzle or the diffuser is built about z, upwards from the mouth.
     if draw.chance(0.6):
         # A nozzle becomes more or less flat towards its slot.
@@ -182,7 +189,12 @@ def hairdryer(draw: Draw) -> Parts:
         nozzle = Mesh(cone.vertices * (1 + share * (point(high, wide, 1) - 1)), cone.faces)
     else:
         reach = draw(0.2, 0.3)
-        bowl = [[mouth, 0], [mouth * 1.1, reach * 0.3], [radius * 1.4, reach], [0.001, reach * 0.8]]
+        bowl = [
+            [mouth, 0],
+            [mouth * 1.1, reach * 0.3],
+            [radius * 1.4, reach],
+            [ON_AXIS, reach * 0.8],
+        ]
         nozzle = lathe(bowl, 24)
     yield nozzle.rotated("y", TAU / 4).translated((front, 0, 0)), NOZZLE
     # The bars of the grille.

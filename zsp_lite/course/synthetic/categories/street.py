@@ -1,6 +1,9 @@
 """Vehicles and street furniture (front +x, left +y, up +z).
 
 The constants at the head of a builder name its materials, 0 to 7: parts of one material look alike.
+Other numbers are lengths or shares of lengths, chosen by hand; the unit is arbitrary, since
+`make_shape` scales each object. The third argument of `rounded_box` is its squareness. The second
+of `lathe` and the fourth of `cylinder` are numbers of sides.
 """
 
 import numpy as np
@@ -18,6 +21,7 @@ from zsp_lite.course.synthetic.assembly import (
     wheels,
 )
 from zsp_lite.course.synthetic.primitives import (
+    ON_AXIS,
     TAU,
     box,
     capsule,
@@ -127,11 +131,11 @@ def motorcycle(draw: Draw) -> Parts:
     seat_z = wheel * 2 + draw(0, 0.12)
     if style == "scooter":
         # Leg shield, footboard, body, seat and rear light.
-        floor = wheel * draw(0.75, 1.0)
-        yield pane((half_base - 0.3, floor), head_xz, draw(0.4, 0.55), 0.07), BODY
-        yield box((half_base * 1.1, 0.36, 0.08), (0, 0, floor)), BODY
-        body = (half_base * 1.15, 0.42, seat_z - floor + 0.1)
-        yield rounded_box(body, (-half_base * 0.75, 0, (seat_z + floor) / 2), 4), BODY
+        board = wheel * draw(0.75, 1.0)  # height of the footboard
+        yield pane((half_base - 0.3, board), head_xz, draw(0.4, 0.55), 0.07), BODY
+        yield box((half_base * 1.1, 0.36, 0.08), (0, 0, board)), BODY
+        body = (half_base * 1.15, 0.42, seat_z - board + 0.1)
+        yield rounded_box(body, (-half_base * 0.75, 0, (seat_z + board) / 2), 4), BODY
         seat = (half_base * 1.05, 0.36, 0.14)
         yield rounded_box(seat, (-half_base * 0.65, 0, seat_z + 0.08), 3), SEAT
         yield box((0.06, 0.2, 0.09), (-half_base * 1.35, 0, seat_z * 0.85)), GLASS
@@ -161,7 +165,7 @@ def motorcycle(draw: Draw) -> Parts:
 
 def car(draw: Draw) -> Parts:
     """Build a saloon, hatchback, pickup or van: bonnet, cabin with windows, lights, wheels."""
-    BUMPER = 2
+    BUMPER = 2  # and rims
     GLASS = 4
     HEADLAMP = 5
     GRILLE = 6
@@ -180,6 +184,7 @@ def car(draw: Draw) -> Parts:
     taper = draw(0.76, 0.88)
     bonnet = draw(0.11, 0.18) if style == "van" else draw(0.24, 0.31)
     bonnet_end = nose - length * bonnet
+    # The boot, or the bed of a pickup, is this share of the length.
     boot_start = tail + length * {"saloon": 0.18, "pickup": 0.43}.get(style, 0.02)
     nose_z = belt - (belt - sill) * draw(0.15, 0.35)
     # The body, below the windows: its outline (x, z) from the sill in front to the sill behind.
@@ -244,7 +249,7 @@ def hydrant(draw: Draw) -> Parts:
     neck = radius * draw(0.85, 1)
     rim = radius * 1.22
     bonnet_z = height * 0.82
-    foot = [[0.001, 0], [radius * 1.45, 0], [radius * 1.45, 0.09], [radius, 0.11]]
+    foot = [[ON_AXIS, 0], [radius * 1.45, 0], [radius * 1.45, 0.09], [radius, 0.11]]
     flange = [[neck, height * 0.75], [rim, height * 0.76], [rim, bonnet_z], [neck, bonnet_z + 0.01]]
     yield lathe(foot + flange, 24), BODY
     # The bonnet, with the nut that opens the valve and covers its tip, where the radius is 0.

@@ -1,6 +1,9 @@
 """Toys (front +x, left +y, up +z).
 
 The constants at the head of a builder name its materials, 0 to 7: parts of one material look alike.
+Other numbers are lengths or shares of lengths, chosen by hand; the unit is arbitrary, since
+`make_shape` scales each object. The third argument of `rounded_box` is its squareness. The second
+of `lathe` and the fourth of `cylinder` are numbers of sides.
 """
 
 import numpy as np
@@ -16,6 +19,7 @@ from zsp_lite.course.synthetic.assembly import (
     wheels,
 )
 from zsp_lite.course.synthetic.primitives import (
+    ON_AXIS,
     TAU,
     box,
     capsule,
@@ -27,10 +31,10 @@ from zsp_lite.course.synthetic.primitives import (
     rod,
 )
 
-# Materials of several vehicles.
-CHASSIS = 2
-GLASS = 4
-HEADLAMP = 5
+# Materials of several vehicles; `wheels` gives their rims material 2, and their tyres 3.
+_CHASSIS = 2
+_GLASS = 4
+_HEADLAMP = 5
 
 
 def teddybear(draw: Draw) -> Parts:
@@ -44,10 +48,10 @@ def teddybear(draw: Draw) -> Parts:
     tall = draw(0.48, 0.68)
     skull = draw(0.32, 0.46)
     standing = draw.chance(0.3)
-    floor = draw(0.35, 0.5) if standing else 0.0
-    yield ellipsoid((belly * 0.85, belly, tall), (0, 0, floor + tall)), BODY
+    seat = draw(0.35, 0.5) if standing else 0.0  # height of the body's lower end
+    yield ellipsoid((belly * 0.85, belly, tall), (0, 0, seat + tall)), BODY
     # The head: skull, muzzle, nose, eyes and ears.
-    head = point(0.05, 0, floor + tall * 1.85 + skull * 0.68)
+    head = point(0.05, 0, seat + tall * 1.85 + skull * 0.68)
     yield ellipsoid((skull * 0.9, skull * draw(0.95, 1.18), skull), head), BODY
     snout = draw(0.13, 0.26)
     face = head + [skull * 0.82, 0, 0]
@@ -59,7 +63,7 @@ def teddybear(draw: Draw) -> Parts:
     yield from pair(ellipsoid((0.075, ear, ear), ear_centre), LIGHT_FUR)
     # Each arm has its own pose, raised or hanging.
     for side in (1, -1):
-        shoulder = point(0, side * belly * 0.8, floor + tall * 1.45)
+        shoulder = point(0, side * belly * 0.8, seat + tall * 1.45)
         forwards = draw(-0.05, 0.45)
         outwards = draw(0.2, 0.42)
         hand = shoulder + [forwards, side * outwards, draw(-0.5, 0.45)]
@@ -68,7 +72,7 @@ def teddybear(draw: Draw) -> Parts:
     leg = draw(0.14, 0.21)
     if standing:
         foot = point(0.08, belly * 0.6, leg)
-        yield from pair(capsule((0, belly * 0.5, floor + tall * 0.4), foot, leg))
+        yield from pair(capsule((0, belly * 0.5, seat + tall * 0.4), foot, leg))
         yield from pair(ellipsoid((leg * 1.5, leg, leg * 0.7), foot + [0.1, 0, -leg * 0.35]), FOOT)
     else:
         foot = point(draw(0.45, 0.75), belly * draw(0.7, 1.1), leg)
@@ -76,13 +80,13 @@ def teddybear(draw: Draw) -> Parts:
         sole = ellipsoid((0.07, leg * 0.85, leg * 1.15), foot + [leg * 0.85, 0, 0.05])
         yield from pair(sole, LIGHT_FUR)
     # The tail; then a light belly, a shirt, or neither.
-    yield ellipsoid(0.1, (-belly * 0.85, 0, floor + 0.25)), BODY
+    yield ellipsoid(0.1, (-belly * 0.85, 0, seat + 0.25)), BODY
     if draw.chance(0.6):
         light_belly = (belly * 0.3, belly * 0.65, tall * 0.65)
-        yield ellipsoid(light_belly, (belly * 0.62, 0, floor + tall * 0.95)), LIGHT_FUR
+        yield ellipsoid(light_belly, (belly * 0.62, 0, seat + tall * 0.95)), LIGHT_FUR
     elif draw.chance(0.6):
         shirt = np.array([[0.97, 0.75], [1.04, 1.0], [0.96, 1.4], [0.66, 1.78]]) * [belly, tall]
-        yield lathe(shirt, 24).scaled((0.87, 1, 1)).translated((0, 0, floor)), SHIRT
+        yield lathe(shirt, 24).scaled((0.87, 1, 1)).translated((0, 0, seat)), SHIRT
 
 
 def toyplane(draw: Draw) -> Parts:
@@ -154,7 +158,7 @@ def toyplane(draw: Draw) -> Parts:
             yield upright.rotated("x", turn + k * TAU / n_blades), BLADE
     # The cockpit, and wheels on struts.
     cockpit = (draw(0.2, 0.35), radius * 0.7, radius * 0.7)
-    yield ellipsoid(cockpit, (length * draw(0.16, 0.28), 0, radius * 0.75)), GLASS
+    yield ellipsoid(cockpit, (length * draw(0.16, 0.28), 0, radius * 0.75)), _GLASS
     if draw.chance(0.6):
         gear = point(wing_x + 0.1, 0.25, -radius - 0.22)
         # The strut reaches from the middle of the hull outwards.
@@ -165,7 +169,7 @@ def toyplane(draw: Draw) -> Parts:
 def toytruck(draw: Draw) -> Parts:
     """Build a truck: cab, some with a bonnet; a box, flat bed, tank, tipper or crane behind."""
     LOAD = 1
-    CABLE = 3
+    CABLE = 3  # and tyres
     GRILLE = 6
 
     length = draw(1.7, 2.6)
@@ -177,7 +181,7 @@ def toytruck(draw: Draw) -> Parts:
     cab_length = draw(0.4, 0.65)
     cab_height = draw(0.5, 0.85)
     slope = draw(0.04, 0.18)
-    yield box((length, width * 0.8, 0.12), (0, 0, deck)), CHASSIS
+    yield box((length, width * 0.8, 0.12), (0, 0, deck)), _CHASSIS
     bonnet = draw(0.25, 0.45) if draw.chance(0.5) else 0.0
     if bonnet:
         size = (bonnet * 1.3, width * 0.85, cab_height * 0.55)
@@ -192,10 +196,10 @@ def toytruck(draw: Draw) -> Parts:
     floor = deck + 0.04
     yield extrusion([(rear, floor), (front, floor), bend, top, (rear, roof)], width), BODY
     side_window = (cab_length * 0.5, width * 1.02, cab_height * 0.3)
-    yield box(side_window, (rear + cab_length * 0.48, 0, deck + cab_height * 0.72)), GLASS
-    yield pane(bend + [0.01, 0.04], top + [0.01, -0.04], width * 0.84), GLASS
+    yield box(side_window, (rear + cab_length * 0.48, 0, deck + cab_height * 0.72)), _GLASS
+    yield pane(bend + [0.01, 0.04], top + [0.01, -0.04], width * 0.84), _GLASS
     lamp = ellipsoid((0.05, 0.08, 0.08), (nose, width * 0.34, deck + cab_height * 0.28))
-    yield from pair(lamp, HEADLAMP)
+    yield from pair(lamp, _HEADLAMP)
     grille_size = (0.06, width * 0.4, cab_height * 0.2)
     yield box(grille_size, (nose + 0.01, 0, deck + cab_height * 0.27)), GRILLE
 
@@ -284,14 +288,14 @@ def toybus(draw: Draw) -> Parts:
         z = floor + height * share
         for k in range(n_windows):
             x = tail + body * 0.05 + (k + 0.5) * pitch
-            yield box((pitch * 0.82, width * 1.015, window_height), (x, 0, z)), GLASS
-        yield box((0.04, width * 0.84, window_height * 1.2), (front, 0, z)), GLASS
-        yield box((0.04, width * 0.6, window_height * 0.8), (tail, 0, z)), GLASS
+            yield box((pitch * 0.82, width * 1.015, window_height), (x, 0, z)), _GLASS
+        yield box((0.04, width * 0.84, window_height * 1.2), (front, 0, z)), _GLASS
+        yield box((0.04, width * 0.6, window_height * 0.8), (tail, 0, z)), _GLASS
     # The door on the right, headlamps and rear lights.
     door = height * door_share
     place = (front - body * 0.12, -width / 2, floor + 0.06 + door / 2)
     yield box((pitch * 0.9, 0.04, door), place), DOOR
-    yield from pair(ellipsoid((0.05, 0.07, 0.07), (nose, width * 0.33, floor + 0.14)), HEADLAMP)
+    yield from pair(ellipsoid((0.05, 0.07, 0.07), (nose, width * 0.33, floor + 0.14)), _HEADLAMP)
     yield from pair(box((0.03, 0.09, 0.14), (tail, width * 0.4, floor + 0.2)), REAR_LIGHT)
     for x in (nose - length * draw(0.18, 0.24), tail + length * draw(0.17, 0.24)):
         yield from wheels(x, width / 2 - 0.04, wheel, 0.12)
@@ -300,7 +304,7 @@ def toybus(draw: Draw) -> Parts:
 def toytrain(draw: Draw) -> Parts:
     """Build a locomotive: steam engine with boiler, chimney and cab, or diesel with a long hood."""
     ROOF = 1
-    CHIMNEY = 3
+    CHIMNEY = 3  # and tyres
     BOILER_DOOR = 6
     BRASS = 7  # dome, cowcatcher and rods
 
@@ -310,7 +314,7 @@ def toytrain(draw: Draw) -> Parts:
     nose = length / 2
     tail = -nose
     deck = wheel * 1.5
-    yield box((length, width * 0.85, 0.12), (0, 0, deck)), CHASSIS
+    yield box((length, width * 0.85, 0.12), (0, 0, deck)), _CHASSIS
     # The cab with windows and a roof.
     cab_length = length * draw(0.22, 0.34)
     cab_height = draw(0.65, 0.95)
@@ -318,7 +322,7 @@ def toytrain(draw: Draw) -> Parts:
     floor = deck + 0.06
     yield box((cab_length, width, cab_height), (cab_x, 0, floor + cab_height / 2)), BODY
     windows = (cab_length * 0.5, width * 1.03, cab_height * 0.3)
-    yield box(windows, (cab_x, 0, deck + cab_height * 0.72)), GLASS
+    yield box(windows, (cab_x, 0, deck + cab_height * 0.72)), _GLASS
     roof = (cab_length * 0.68, width * 0.6, draw(0.08, 0.18))
     yield ellipsoid(roof, (cab_x, 0, floor + cab_height)), ROOF
     # Before the cab, a boiler with chimney, dome and lamp, or a hood with lamps and exhaust.
@@ -333,12 +337,18 @@ def toytrain(draw: Draw) -> Parts:
         yield rod(end, (front + 0.05, 0, axis_z), radius * 0.86, sides=24), BOILER_DOOR
         chimney = draw(0.2, 0.45)
         mouth = draw(0.08, 0.18)
-        # The chimney's ends are closed; the radius 0 would give triangles without an area.
-        profile = [[0.001, 0], [0.09, 0], [0.09, chimney * 0.6], [mouth, chimney], [0.001, chimney]]
+        # The chimney's ends are closed.
+        profile = [
+            [ON_AXIS, 0],
+            [0.09, 0],
+            [0.09, chimney * 0.6],
+            [mouth, chimney],
+            [ON_AXIS, chimney],
+        ]
         yield lathe(profile).translated((front - 0.2, 0, top)), CHIMNEY
         dome = (0.13, 0.13, draw(0.12, 0.2))
         yield ellipsoid(dome, (rear + (front - rear) * 0.42, 0, top)), BRASS
-        yield rod(end, (front + 0.15, 0, axis_z), 0.08, 0.1), HEADLAMP
+        yield rod(end, (front + 0.15, 0, axis_z), 0.08, 0.1), _HEADLAMP
     else:
         hood_width = width * draw(0.7, 0.95)
         hood_height = cab_height * draw(0.55, 0.8)
@@ -346,7 +356,7 @@ def toytrain(draw: Draw) -> Parts:
         hood = (front - rear, hood_width, hood_height)
         yield rounded_box(hood, (middle, 0, floor + hood_height / 2), 9), BODY
         lamp = ellipsoid((0.05, 0.07, 0.07), (front, width * 0.22, deck + hood_height * 0.8))
-        yield from pair(lamp, HEADLAMP)
+        yield from pair(lamp, _HEADLAMP)
         yield box((0.25, width * 0.3, 0.14), (middle, 0, deck + 0.1 + hood_height)), CHIMNEY
     # The cowcatcher; wheels on two to four axles, and the rods that connect them.
     cowcatcher = [[nose, deck + 0.05], [nose + draw(0.12, 0.25), 0.05], [nose, 0.05]]
