@@ -140,8 +140,8 @@ class HuggingFaceViT(nn.Module):
         except Exception as error:  # any model may be given, which may raise any exception
             raise InputError(
                 f"{name}: {type(self.vit).__name__} does not run on {self.image_size} x "
-                f"{self.image_size} pixels with "
-                f"one token per patch of {self.patch_size} x {self.patch_size} ({one_line(error)})"
+                f"{self.image_size} pixels with one token per patch of {self.patch_size} x "
+                f"{self.patch_size} ({one_line(error)})"
             ) from error
 
 
@@ -269,8 +269,7 @@ def _projections(attention: nn.Module) -> dict[str, nn.Linear]:
 
 
 def _normalisation(folder: Path) -> Normalisation:
-    """Return the image processor's mean and standard deviation, ImageNet's if it has
-    none."""
+    """Return the image processor's mean and standard deviation, ImageNet's if it has none."""
     from transformers import ImageProcessingMixin
 
     if not any((folder / file).is_file() for file in PROCESSORS):

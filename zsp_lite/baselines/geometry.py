@@ -13,7 +13,7 @@ from zsp_lite.errors import InputError
 from zsp_lite.matching import Matches
 from zsp_lite.points import object_points
 
-POINTS = 5000  # largest number of points per cloud
+POINTS = 5000  # largest number of points per cloud, the paper's (supplement)
 _MIN_POINTS = 10  # fewer points do not determine a shape
 # Points correspond at any distance, as in PyTorch3D's ICP, which the paper uses.
 _MAX_DISTANCE = 1e6
@@ -31,6 +31,7 @@ def icp(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> S
         _MAX_DISTANCE,
         np.eye(4),
         registration.TransformationEstimationPointToPoint(with_scaling=True),
+        # PyTorch3D's defaults.
         registration.ICPConvergenceCriteria(
             relative_fitness=1e-6, relative_rmse=1e-6, max_iteration=100
         ),
@@ -84,7 +85,7 @@ def essential_rotation(
     source = _directions(reference.camera, matches.reference, grid)
     destination = _directions(target.camera, matches.target, grid)
     focal = np.concatenate([reference.camera.focal_length, target.camera.focal_length]).mean()
-    # The threshold is the width of a patch at depth 1, because matches are patch centres.
+    # The threshold is the height of a patch at depth 1, because matches are patch centres.
     threshold = reference.camera.size[0] / grid[0] / focal
     poses = []
     # The five-point algorithm in RANSAC; OpenCV's random draws are always the same.
@@ -94,7 +95,7 @@ def essential_rotation(
         )
         # OpenCV stacks the s solutions of one sample, (3 s, 3). The right solution has the most
         # points in front of both cameras: `recoverPose` returns their number first, and then the
-        # rotation.
+        # rotation. It changes its mask.
         if matrices is not None:
             for matrix in np.split(matrices, len(matrices) // 3):
                 poses.append(

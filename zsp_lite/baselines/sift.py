@@ -15,12 +15,13 @@ from zsp_lite.data.frames import ON_OBJECT, Frame
 from zsp_lite.features import FeatureMap
 from zsp_lite.matchers import mutual_nearest_neighbours
 
-KEYPOINT_SIZE = 24.0  # of RootSIFT, pixels
+# Of RootSIFT, pixels: a descriptor covers 144 of 224 pixels, most of an object around its patch.
+KEYPOINT_SIZE = 24.0
+# OpenCV's constants:
 _CELLS = 4  # along each side of a descriptor
 _BINS = 8  # orientations per cell
 _CELL = 1.5  # side of a cell, in keypoint sizes
-# OpenCV's constants follow. Blur that adds to the image's own, 0.5 pixels, up to 1.6 pixels.
-_BLUR = (1.6**2 - 0.5**2) ** 0.5
+_BLUR = (1.6**2 - 0.5**2) ** 0.5  # from the image's own blur, 0.5 pixels, to 1.6 pixels
 _CLIP = 0.2  # largest entry of a descriptor, relative to its length
 _SCALE = 512.0  # length of a descriptor before it is rounded
 

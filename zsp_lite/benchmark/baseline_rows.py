@@ -1,6 +1,6 @@
-"""What the library's own rows consist of: functions of a `PairProblem` for the paper's baselines
-(sec. 5.2 and supplement), for the fit without RANSAC and for poses that several pairs of frames or
-objects agree on, and the matcher without cycles."""
+"""Rows of the library that are functions of a `PairProblem`: the paper's baselines (sec. 5.2 and
+supplement), the fit without RANSAC, and poses that several pairs of frames or objects agree on; and
+the matcher without cycles."""
 
 from dataclasses import dataclass
 
@@ -92,8 +92,9 @@ class Scans:
     references: int
 
     def __call__(self, problem: PairProblem) -> Answer:
-        # The frames of both objects, evenly spaced over their sequences from the pair's own ones
-        # on: as many as the pair has views, or as are solved.
+        # Frames of both objects, evenly spaced over their sequences. They start at the reference
+        # frame and at the first target frame; there are as many as the pair has target views, or
+        # `references` if that is more.
         pair = problem.pair
         numbers = problem.store.dataset.frame_numbers(pair.category)
         ordered = {}

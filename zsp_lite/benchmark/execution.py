@@ -37,9 +37,9 @@ Evaluator = Callable[[Pair, list[str]], Any]
 # and is called there.
 Opener = Callable[[int], Evaluator]
 Chunk = list[tuple[Pair, list[str]]]  # pairs, each with the names of its rows
-# Workers keep frames from chunk to chunk: chunks are small, so that the progress bar moves.
-_LARGEST_CHUNK = 4  # pairs
-_MOST_WORKERS = 4096  # largest number of processes that is accepted
+# Pairs. Small, so that the progress bar moves; workers keep frames from chunk to chunk anyway.
+_LARGEST_CHUNK = 4
+_MOST_WORKERS = 4096  # processes; a larger number is taken for a mistake
 logger = logging.getLogger(__name__)
 
 
@@ -76,7 +76,7 @@ def evaluate_pairs(
     if not todo:
         return
 
-    # Few pairs are handed out one by one, so that every worker has some.
+    # Fewer than 64 pairs are handed out one by one, so that every worker has some.
     size = min(_LARGEST_CHUNK, 1 + len(todo) // 64)
     chunks = [todo[start : start + size] for start in range(0, len(todo), size)]
     # None shows the bar in a terminal only.
@@ -106,6 +106,7 @@ def _lines(
         return
 
     given = isinstance(executor, Executor)
+    # An Executor has one worker per core (docs/scale.md).
     threads = 1 if given else max(1, get_num_threads() // executor)
     # A backbone has megabytes: each worker reads the opener once, from a file in the run's
     # folder, which all workers see. Absolute, because a worker may have another current folder.
@@ -139,7 +140,7 @@ def _lines(
 def _pickle(opener: Opener, workers: Executor) -> bytes:
     """Pickle an opener; what a notebook or a module in the current folder defines goes with it,
     since workers need not see it."""
-    # Processes of this machine import what this one can import.
+    # Processes of this machine import what this one can import; others have zsp_lite installed.
     if not isinstance(workers, ProcessPoolExecutor):
         local = {module.name for module in pkgutil.iter_modules([os.getcwd()])} - {"zsp_lite"}
         for name in local & sys.modules.keys():

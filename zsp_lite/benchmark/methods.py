@@ -47,7 +47,7 @@ METHODS: dict[str, Method] = {
     "ours-bv": Method(answer="best view"),
     # SIFT has no saliency and uses the true mask. Other rows use the mask only if their name says
     # so.
-    "rootsift": replace(_ours(foreground="mask"), features="rootsift"),
+    "rootsift": Method(features="rootsift", settings={"foreground": "mask"}),
     "ours-mask": _ours(foreground="mask"),
     "oracle-view": Method(answer="true view"),
     # Supplement, "Number and diversity of correspondences"; K = 50 with k-means is "ours".
@@ -73,9 +73,9 @@ METHODS: dict[str, Method] = {
     "ours-nearest": _ours(matcher=baseline_rows.nearest_patches),
     "ours-least-squares": Method(solve=baseline_rows.least_squares),
     # Table 1, the baselines; SWaV and PoseContrast have published figures only.
-    "icp": Method("none", solve=baseline_rows.icp),
+    "icp": Method(features="none", solve=baseline_rows.icp),
     "icp-bv": Method(solve=baseline_rows.icp_best_view),
-    "sift": Method("sift", solve=baseline_rows.sift),
+    "sift": Method(features="sift", solve=baseline_rows.sift),
     # Beyond the paper.
     "verified": _ours(solver="verified"),
     "verified-mask": _ours(solver="verified", foreground="mask"),
@@ -104,7 +104,7 @@ GROUPS: dict[str, list[str]] = {
     },
     "scans": "shape-upright scans-2 scans-4 scans-8".split(),
     "verified-views": "verified verified-n1 verified-n3 verified-n10 verified-mask".split(),
-    # at one N
+    # all at the run's number of target views
     "ablations": "ours table3 matchers correspondences trials depth published parts".split(),
     "paper": "ours ours-bv table1 ablations views rootsift ours-mask".split(),
     "all": "paper verified-views oracle-view".split(),
@@ -112,7 +112,7 @@ GROUPS: dict[str, list[str]] = {
 
 
 def _members(name: str) -> list[str]:
-    """The rows of a group, or the name of a row itself."""
+    """Return the rows of a group, or the name of a row itself."""
     if name not in GROUPS:
         return [name]
     return [row for member in GROUPS[name] for row in _members(member)]
@@ -145,7 +145,7 @@ def resolve(
     # "alignment" is the row that `align` stores.
     taken = {*METHODS, *GROUPS, "alignment"}
     for name, meant in methods.items():
-        # Tables have a line for each row, and legends of figures no name with an underscore.
+        # A row is one line of a table. matplotlib's legends leave out labels that begin with _.
         if not name.isprintable() or name.startswith("_"):
             raise InputError(f"method {name!r}: expected a printable name, not with _ first")
         text = meant if isinstance(meant, str) else ""
@@ -164,7 +164,7 @@ def _method(name: str, meant: Any) -> Method:
         if row in METHODS:
             return replace(METHODS[row], targets=int(views)) if views else METHODS[row]
         if meant.endswith(".csv"):
-            return Method("none", solve=StoredPoses(meant, *read_stored_poses(meant)))
+            return Method(features="none", solve=StoredPoses(meant, *read_stored_poses(meant)))
         if ":" not in meant:
             raise InputError(
                 f"method {meant!r} is unknown; `zsp-lite benchmark --list` lists all, "
@@ -175,16 +175,16 @@ def _method(name: str, meant: Any) -> Method:
         return meant
     kind = kind_of(name, meant)
     if kind == "estimator":
-        return Method("none", solve=Estimator(meant))
+        return Method(features="none", solve=Estimator(meant))
     if kind == "keypoints":
-        return Method("none", solve=KeypointMatcher(meant))
+        return Method(features="none", solve=KeypointMatcher(meant))
     if kind == "problem":
         return Method(solve=meant)
     return Method(settings={kind: meant})  # a matcher or a solver
 
 
 def base_name(name: str) -> str:
-    """ROW of "ROW-nN@threshold=V"."""
+    """Return ROW of "ROW-nN@threshold=V"."""
     return re.sub(r"(-n\d+)?(@.*)?$", "", name)
 
 

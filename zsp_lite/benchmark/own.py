@@ -43,9 +43,9 @@ def kind_of(name: str, thing: Any) -> str:
         known = parameters(thing)
         positional = Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD
         needed = [
-            name
-            for name, parameter in known.items()
-            if name not in ("seed", "threshold")
+            argument
+            for argument, parameter in known.items()
+            if argument not in ("seed", "threshold")
             and parameter.default is Parameter.empty
             and parameter.kind in positional
         ]
@@ -100,18 +100,22 @@ def fails_alone(seconds: int) -> Iterator[None]:
 
 def problem_of_own(solve: Any, problem: PairProblem) -> Problem:
     """Return the problem that a row of one's own gets: copies that do not lead to the data set and
-    its labels. A matcher or solver of the paper's method, and stored poses, get no problem."""
+    its labels. For stored poses, and for a matcher or solver inside the paper's method, which does
+    not see the problem, it is `problem` itself."""
     if solve is None or isinstance(solve, StoredPoses):
         return problem
     if not isinstance(solve, Estimator | KeypointMatcher):
         return Problem(problem.seed, deepcopy(problem.crops), problem.store.extractors, {})
     with ends_the_run("reading frames"):
         reference, targets = problem.store.dataset.load_pair(problem.pair)
-    # A crop has no object's name.
-    named = zip([reference, *targets], problem.frames())
-    frames = [replace(frame, name=crop.name) for frame, crop in named]
+    # The frames get the names of the crops, which do not tell the object.
+    frames = [
+        replace(frame, name=crop.name)
+        for frame, crop in zip([reference, *targets], problem.frames())
+    ]
     if isinstance(solve, KeypointMatcher):
         frames = [object_crop(frame, size=None) for frame in frames]
+    # Without extractors, and with timings of its own, which nobody reads.
     return Problem(problem.seed, [Crop(frame) for frame in frames], {}, {})
 
 
@@ -143,6 +147,7 @@ class KeypointMatcher:
         matches = []
         sums = []
         for target in targets:
+            # A matcher may change its images, and the next target needs the reference again.
             first, second, scores = own(reference.rgb.copy(), target.rgb)
             first = _points_in(reference, first)
             second = _points_in(target, second, len(first))
@@ -176,7 +181,7 @@ def fit_keypoints(
     threshold: float = 0.2,
 ) -> Answer:
     """Fit the pose to matched pixels of the crops of the reference and of a target: unproject them,
-    then RANSAC (sec. 4.3)."""
+    then RANSAC (sec. 4.3) with a `threshold`, by default the paper's."""
     reference, *targets = problem.frames(depth=True)
     try:
         points = unproject_pixels(reference, first), unproject_pixels(targets[view], second)
@@ -195,7 +200,7 @@ class StoredPoses:
     """Row of poses that another program computed (see `exchange`)."""
 
     path: str
-    _poses: Mapping[str, StoredPose]  # by the key of the pair
+    _poses: Mapping[str, StoredPose]  # by the key of the pair; private: not in descriptions
     digest: str  # of the file
 
     def __call__(self, problem: PairProblem) -> Answer:

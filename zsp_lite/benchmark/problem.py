@@ -96,8 +96,8 @@ def as_answer(found: Any) -> Answer:
 
 
 def parameters(plugin: Any) -> Mapping[str, inspect.Parameter]:
-    """Return the parameters of a plug-in by name; none of a compiled function without a
-    signature."""
+    """Return the parameters of a plug-in by name, of a torch module those of `forward`; none of a
+    compiled function without a signature."""
     with suppress(TypeError, ValueError):
         return inspect.signature(getattr(plugin, "forward", plugin)).parameters
     return {}
@@ -136,7 +136,7 @@ def evenly_spaced(numbers: Mapping[str, Sequence[int]], count: int) -> dict[str,
 
 
 class FrameStore:
-    """The crops of frames, of which the last used are kept in memory.
+    """The crops of frames; the most recently used are kept in memory.
 
     Features are extracted with a number of `threads`; None leaves it as it is.
     """
@@ -166,7 +166,7 @@ class FrameStore:
         vertical."""
         chosen = [numbers[k] for k in spread(FRAMES, len(numbers))]
         frames = [self.crop(category, sequence, number).frame for number in chosen]
-        return Shape.of(frames, find_up(frames)[0])
+        return Shape.of(frames, find_up(frames)[0])  # [1] says why there is none
 
     def judged(
         self,
@@ -177,11 +177,20 @@ class FrameStore:
         repeat: int = 0,
         solve: Callable[[list[Pair]], Iterable[PairHypotheses | None]] | None = None,
     ) -> list[PairHypotheses]:
-        """Find the poses between objects of a category by their shapes and by some frames of each,
-        whose numbers are given by their names (see `judge.judge_pairs`).
+        """Find the poses between objects of a category by their shapes and by some frames of each
+        (see `judge.judge_pairs`).
 
-        `solve` finds the hypotheses of pairs of frames in the store's place, in another process.
+        `frames` has the numbers of an object's frames by its name. `pairs` are pairs of names, by
+        default all. `solve` finds the hypotheses of pairs of frames in the store's place, in
+        another process.
         """
+        shapes = {}
+        every = self.dataset.frame_numbers(category)
+        order = {}  # by name, the numbers of the frames that are asked, in this order
+        for name, numbers in frames.items():
+            with suppress(NoPoseError):  # objects without a surface are left out
+                shapes[name] = self.shape(category, name, tuple(every[name]))
+            order[name] = [numbers[k] for k in asked_positions(references, len(numbers))]
 
         def ask(questions: list[Question]) -> Iterable[PairHypotheses | None]:
             asked = []
@@ -190,21 +199,15 @@ class FrameStore:
                 asked.append(Pair(category, name, number, other, frames[other], repeat))
             return solve(asked) if solve else map(self.hypotheses, asked)
 
-        shapes = {}
-        every = self.dataset.frame_numbers(category)
-        order = {}  # the numbers of the frames that are asked
-        for name, numbers in frames.items():
-            with suppress(NoPoseError):  # objects without a surface are left out
-                shapes[name] = self.shape(category, name, tuple(every[name]))
-            order[name] = [numbers[k] for k in asked_positions(references, len(numbers))]
         counts = {name: len(numbers) for name, numbers in order.items()}
-        known = [pair for pair in pairs or combinations(frames, 2) if {*pair} <= shapes.keys()]
-        return judge_pairs(shapes, counts, ask, known)
+        shaped = [pair for pair in pairs or combinations(frames, 2) if {*pair} <= shapes.keys()]
+        return judge_pairs(shapes, counts, ask, shaped)
 
     def _aligned(self, category: str, targets: int) -> CategoryAlignment:
         """Align all objects of a category."""
         frames = evenly_spaced(self.dataset.frame_numbers(category), targets)
-        return synchronise(self.judged(category, frames, pairs=partners([*frames], None)))
+        pairs = partners([*frames], per_object=None)  # None for its default
+        return synchronise(self.judged(category, frames, pairs=pairs))
 
     def _read_crop(self, category: str, sequence: str, number: int) -> Crop:
         """Read a frame and crop it to its object."""
@@ -249,7 +252,7 @@ class Problem:
     seed: int
     crops: Sequence[Crop]  # the reference's crop first
     _extractors: Mapping[str, Any]
-    _timings: dict[str, list]  # those of the store, which this problem adds to
+    _timings: dict[str, list]  # seconds by stage, to which this problem adds
     # What is computed already: estimates by the arguments of `estimate`, similarities by two
     # feature maps and `binning`.
     _estimates: dict[tuple, PoseEstimate] = field(default_factory=dict)

@@ -4,7 +4,8 @@ The way of a pair: `evaluate` samples it, `evaluate_pairs` hands it to this proc
 `evaluate_pair` reads frames and features, asks each row (`ask`) and measures its answer;
 `runs.add_lines` adds the line to run.jsonl, from which `write_reports` makes tables.
 
-`rows` are always the `Method`s by name, `names` are names of rows.
+`rows` are the `Method`s by name, `names` are names of rows; only in `write_reports`, `rows` are
+names, too.
 """
 
 import json
@@ -124,7 +125,7 @@ def evaluate(
     for row in rows.values():
         if row.solve is None:
             ZeroShotPose(extractors[row.features], **row.settings)
-    # The lines of the run, pair by pair.
+    # Each pair once for each seed.
     repeated = {
         replace(pair, repeat=seed): names for seed in range(seeds) for pair, names in work.items()
     }
@@ -255,8 +256,9 @@ def evaluate_pair(
     extents = [store.extent(pair.category, name) for name in objects]
     # The ground truth from the reference's camera to each target's.
     labels = store.labels(pair.category)
-    views = range(len(pair.target_frames))
-    truths = [true_pose(store.dataset, labels, pair, view) for view in views]
+    truths = [
+        true_pose(store.dataset, labels, pair, view) for view in range(len(pair.target_frames))
+    ]
     nearest = int(np.argmin([rotation_error(np.eye(3), truth[:3, :3]) for truth in truths]))
 
     # The answers of the rows, measured.
@@ -326,7 +328,7 @@ def _measure(
     }
     reference, *targets = [frame.camera for frame in problem.frames()]
 
-    # Turns of the target object that look the same are no errors of its symmetric error.
+    # The symmetric error is the smallest over the turns after which both objects look the same.
     pair = problem.pair
     root = problem.store.dataset.root
     turns = common_turns(root, pair.category, pair.reference_sequence, pair.target_sequence)
@@ -335,7 +337,8 @@ def _measure(
         turned = to_camera @ turns @ to_camera.T @ truth[:3, :3]
         found["symmetric_error"] = np.min(rotation_error(answer.rotation, turned))
 
-    # Where the reference object's centre comes to lie, in diameters of the target object.
+    # Where the reference object's centre comes to lie, in diameters of the target object; an extent
+    # is the centre and the diameter.
     reference_extent, target_extent = extents
     if answer.translation is not None:
         found["position"] = answer.translation.round(6).tolist()

@@ -1,8 +1,8 @@
 """A run: its folder, to which results are only ever added, and what it found as one table.
 
 run.json holds what decides the results, and every call of `evaluate`. A line of run.jsonl, or of
-run.jsonl.gz, is the `ResultLine` of a pair. One process writes to a folder;
-others can read it meanwhile.
+run.jsonl.gz, is the `ResultLine` of a pair. One process writes to a folder; others can read it
+meanwhile.
 """
 
 import dataclasses
@@ -110,11 +110,10 @@ def described(value: Any) -> str:
     named = value if hasattr(value, "__qualname__") else type(value)
     name = f"{named.__module__}:{named.__qualname__}"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = [field.name for field in dataclasses.fields(value)]
         texts = [
-            f"{field}={described(getattr(value, field))}"
-            for field in fields
-            if not field.startswith("_")
+            f"{field.name}={described(getattr(value, field.name))}"
+            for field in dataclasses.fields(value)
+            if not field.name.startswith("_")
         ]
         return f"{name}({', '.join(texts)})"
     return name
@@ -146,6 +145,7 @@ def library_version() -> dict[str, str | None]:
     commit = None
     # An installed copy may lie inside the repository of another project, whose commit says nothing.
     if (REPOSITORY / ".git").exists():
+        # Without tags, git describes by the commit alone.
         words = "describe --always --abbrev=40 --dirty --exclude *".split()
         describe = ["git", "-C", str(REPOSITORY), *words]
         with suppress(OSError):  # git is not installed
@@ -195,6 +195,7 @@ class Run:
         the first."""
         for name, row in self.table.groupby("row", sort=False):
             pairs = row["pair"].nunique()
+            # "." is any text. Every note on a pose without a fit says "not a fit".
             for column, pattern, what in (
                 ("failed", ".", "failed on {} of {} pairs, counted as 180°"),
                 ("note", "not a fit", "has no fit on {} of {} pairs"),
@@ -220,8 +221,8 @@ class Run:
     ) -> tuple[
         list[Pair], Int[np.ndarray, " n"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]
     ]:
-        """Return the pairs for which a row has a pose, the target views, the rotations and the
-        translations, or NaN."""
+        """Return the pairs for which a row has a pose, the target views, the rotations, and the
+        translations, which are NaN where there is none."""
         found = self.row(name).dropna(subset=["rotation", "view"])
         pairs = [Pair.from_key(key) for key in found.index]
         rotations = np.array(found["rotation"].tolist()).reshape(-1, 3, 3)
@@ -243,7 +244,7 @@ def open_run(
     """Be the only writer of a run's folder, which is new or holds a run with these settings.
 
     Yields its lines, of a `kind`, to which `add_lines` adds. `call` has the members of this `Call`
-    that the rest does not tell.
+    that the other arguments do not give.
     """
     words = [Path(sys.argv[0]).name.replace("__main__.py", "zsp-lite"), *sys.argv[1:]]
     versions = {one.__name__: str(one.__version__) for one in (torch, np, scipy, cv2)}
@@ -280,6 +281,7 @@ def open_run(
 
 
 def _write_settings(out: Path, settings: Settings) -> None:
+    """Write run.json."""
     write_atomic(out / SETTINGS, msgspec.json.format(msgspec.json.encode(settings), indent=1))
 
 
@@ -344,6 +346,7 @@ def _finished_lines(out: Path) -> bytes:
     packed = out / f"{LINES}.gz"
     what = "results of a run"
     data = read_bytes(path, what) if path.exists() else b""
+    # A process that was killed in `open_run` may have left both, with the same lines.
     if packed.exists():
         data = decompress(read_bytes(packed, what), f"{what} {packed}")
     return data[: data.rfind(b"\n") + 1]

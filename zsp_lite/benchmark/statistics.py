@@ -1,4 +1,4 @@
-"""Bootstrap intervals of figures over pairs (paper sec. 5.1).
+"""Bootstrap intervals of figures over pairs.
 
 Pairs that share an object are not independent: `object_draws` resamples objects, and its draws give
 the intervals of this project. Draws are weights: a row for each bootstrap replicate, a column for
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from zsp_lite.io.files import stable_hash
 
 Draws = Float[np.ndarray, "resamples n"]
-RESAMPLES = 2000
+RESAMPLES = 2000  # number of bootstrap replicates
 _FEWEST_OBJECTS = 3  # two objects have one pair in each direction: nothing to resample
 
 
@@ -32,6 +32,7 @@ def object_draws(objects: ArrayLike, categories: ArrayLike = "") -> Draws:
     categories = np.broadcast_to(np.asarray(categories, dtype=str), len(objects))
     weights = np.empty((RESAMPLES, len(objects)))  # a column for each pair
     for category in np.unique(categories):
+        # A seed for each category: its draws do not depend on the other categories.
         rng = np.random.default_rng([0, stable_hash(category)])
         members = np.nonzero(categories == category)[0]
         names, sides = np.unique(objects[members], return_inverse=True)

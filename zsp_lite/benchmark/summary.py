@@ -1,4 +1,4 @@
-"""Figures of a run with their intervals, and tests of differences (paper sec. 5.1)."""
+"""Figures of a run (paper sec. 5.1) with their intervals, and tests of differences."""
 
 from collections.abc import Callable
 from typing import Any
@@ -51,14 +51,15 @@ def _summarise_row(row: pd.DataFrame, drawn: Draws) -> dict[str, Any]:
     summary = figures_of(errors, drawn)
     summary["failed"] = row.loc[row["failed"] != "", "pair"].nunique()
     summary["per_category"] = {}
-    medians = []  # of each category by draw
+    drawn_medians = []  # of each category by draw
     for category in np.unique(categories).tolist():
         members = categories == category
         summary["per_category"][category] = figures_of(errors[members], drawn[:, members])
-        medians.append(median(errors[members], drawn[:, members]))
-    known = [figures["median"] for figures in summary["per_category"].values()]
-    summary["mean_category_median"] = float(np.mean(known))
-    summary["mean_category_median_ci"] = interval_of(np.mean(medians, axis=0))
+        drawn_medians.append(median(errors[members], drawn[:, members]))
+    medians = [figures["median"] for figures in summary["per_category"].values()]
+    summary["mean_category_median"] = float(np.mean(medians))
+    summary["mean_category_median_ci"] = interval_of(np.mean(drawn_medians, axis=0))
+    # `figures_of` has counted each pair once for each seed.
     seeds = row["repeat"].nunique()
     for figures in (summary, *summary["per_category"].values()):
         figures["n"] //= seeds
@@ -79,6 +80,7 @@ def draws_of(row: pd.DataFrame) -> Draws:
     seeds, repeat = np.unique(row["repeat"], return_inverse=True)
     if len(seeds) == 1:
         return drawn
+    # The same draws of seeds for every row with so many.
     of_seeds = multiplicities(len(seeds), np.random.default_rng([0, len(seeds)]))
     return drawn * of_seeds[:, repeat]
 
@@ -137,11 +139,11 @@ def paired_test(first: ArrayLike, second: ArrayLike) -> dict:
     """Test whether the second method is better than the first on the same pairs. All p values are
     two-sided.
 
-    Errors (n,) are in degrees; a pair is solved below 30. To what `paired_difference`
-    returns is added "sign_test_p", of McNemar's exact test. It treats pairs as independent: where
-    pairs share objects, this p value is too small.
+    Errors (n,) are in degrees; a pair is solved below 30. To what `paired_difference` returns is
+    added "sign_test_p", of McNemar's exact test. It treats pairs as independent: where pairs share
+    objects, this p value is too small.
     """
-    from scipy.stats import binomtest
+    from scipy.stats import binomtest  # takes a second, and no command needs it
 
     first = np.asarray(first, np.float64)
     second = np.asarray(second, np.float64)

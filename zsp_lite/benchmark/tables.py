@@ -96,7 +96,7 @@ def every_table(summary: Mapping[str, Any], metrics: Sequence[str] = METRICS_SHO
     papers = [_paper_table(spec, summary, of_paper) for spec in read_paper_tables()]
     return [
         *(table for table in by_row if table.cells.size),
-        # With two of the run's rows.
+        # Those that show at least two rows of the run.
         *(table for table in papers if table.cells[METRICS["acc30"]].count() > 1),
         *(by_category(summary, metric) for metric in PAPER),
     ]
@@ -106,7 +106,7 @@ def _all_rows(summary: Mapping[str, Any], metrics: Sequence[str], table: str) ->
     """Return one of `ROW_TABLES`; rows that see more stand below "verified", which does not."""
     methods = summary["methods"]
     names = [name for name in methods if _table_of(name) == table]
-    if table != "all_rows" and names and "verified" in methods:  # what they add to
+    if table != "all_rows" and names and "verified" in methods:  # to compare them with
         names.insert(0, "verified")
     titles = {
         "n": "pairs",
@@ -152,11 +152,13 @@ def _paper_table(
     columns = {METRICS[metric]: [_cell(row, metric) for _, row in shown] for metric in metrics}
     published = {}
     for place, title in enumerate(spec["published"]):
+        # Titles are "CATEGORY Acc30" for a single category; those for all pairs stay as they are.
         category = title.removesuffix(" Acc30")
         if category in categories:
             parts = [row.get("per_category", {}).get(category, {}) for _, row in shown]
             columns[title] = [_cell(part, "acc30") for part in parts]
         if category in (title, *categories):
+            # Lists of one figure, or empty: rows of one's own have none.
             figures = [line["published"][place : place + 1] for line, _ in shown]
             published[f"{PUBLISHED}: {title}"] = [Cell(*one) if one else None for one in figures]
     labels = [line["label"] for line, _ in shown]
@@ -176,6 +178,7 @@ def by_category(
         row = summary["methods"][name]
         parts = [row["per_category"].get(category, {}) for category in categories]
         cells[name] = [_cell(part, metric) for part in (*parts, row)]
+    # "median" of "mean_category_median": a category has one median.
     name = f"categories_{metric.rpartition('_')[2]}"
     title = f"By category: {METRICS[metric]}"
     return _table(summary, name, title, pd.DataFrame(cells, [*categories, "all"], dtype=object))
@@ -231,8 +234,8 @@ def own_rows(summary: Mapping[str, Any]) -> list[str]:
 
 
 def important_rows(summary: Mapping[str, Any]) -> list[str]:
-    """List the rows of a run that see the pair only, or all if none does, "ours" and one's own
-    first; or the chosen."""
+    """List the rows of a run that see the pair only (all rows if none does), "ours" and one's own
+    first; or the rows that were chosen in `write_reports`."""
     if "chosen" in summary:
         return summary["chosen"]
     names = [name for name in summary["methods"] if _table_of(name) == "all_rows"]
@@ -275,8 +278,8 @@ def _table(
     deviation = summary["methods"].get("ours", {}).get("acc30_sd_of_seeds")
     if deviation is not None:
         notes.append(
-            "Means over seeds, which the intervals hold; by seed, Acc30 of ours has a standard "
-            f"deviation of {deviation:.1f} points."
+            "Means over seeds, whose spread the intervals include; by seed, Acc30 of ours has a "
+            f"standard deviation of {deviation:.1f} points."
         )
     return Table(name, title, cells, " ".join(filter(None, [*notes, *more])))
 
@@ -306,7 +309,8 @@ def _lines(cells: pd.DataFrame, form: str) -> str:
 
 
 def as_latex(table: Table, intervals: bool = False) -> str:
-    """Format three columns and the time as the body of a booktabs table."""
+    """Format the first three figures, by default those of the paper, and the time as the body of a
+    booktabs table."""
     time = METRICS["milliseconds"]
     titles = [title for title in table.cells if title not in ("pairs", time)][:3]
     if time in table.cells:
@@ -314,6 +318,7 @@ def as_latex(table: Table, intervals: bool = False) -> str:
     cells = table.text[titles][table.cells[titles].notna().any(axis="columns")]
     if not intervals:
         cells = cells.replace(r" \[.*", "", regex=True)
+    # Minus signs, which `_LATEX` puts into math mode.
     cells = cells.replace(r"(^|\[|, )-", "\\1−", regex=True)
     lines = _lines(cells, "latex_booktabs")
     return lines.translate(_LATEX) + "\n"
@@ -387,6 +392,7 @@ def write_figures(
     errors = dict(list(run.row(first).groupby("category")["error"]))
     label = f"rotation error of {first} (degrees)"
     with plt.rc_context({"text.parse_math": False}):  # names of rows and categories are no TeX
+        # With margins, so that dots at 0 and 180 degrees are whole.
         dots = show_dots(errors, xlabel=label, xlim=(-3, 183), xticks=range(0, 181, 30))
         save_figure(dots, folder, "error_distribution", size)
         save_figure(error_curves(run, rows), folder, "error_curves", size)
@@ -397,12 +403,14 @@ def save_figure(
 ) -> Path:
     """Write and close a figure of a size in inches as NAME.pdf and NAME.png, whose path is
     returned."""
+    # The key of a pair holds slashes, and may be longer than a file's name may be.
     path = Path(folder) / f"{re.sub('[^A-Za-z0-9.,-]', '_', name)[:200]}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     if size is not None:
         figure.set_size_inches(size)
-    # publishers refuse fonts of type 3
+    # Publishers refuse fonts of type 3; 42 is TrueType.
     with plt.rc_context({"pdf.fonttype": 42, "ps.fonttype": 42}):
+        # Without a date, equal figures are equal files.
         figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})
     figure.savefig(path, dpi=150)
     plt.close(figure)

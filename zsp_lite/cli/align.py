@@ -11,6 +11,7 @@ from zsp_lite.cli.common import (
     Once,
     Parsed,
     backbone_options,
+    category_option,
     examples,
     replace_option,
     workers_option,
@@ -18,31 +19,21 @@ from zsp_lite.cli.common import (
 
 
 def _read_mark(text: str):
+    """Read the mark of --mark."""
     from zsp_lite.scans.marks import Mark  # slow to import, and most calls have no mark
 
     return Mark.parse(text)
 
 
 def _read_axes(text: str):
+    """Read the tail and the tip of --axes: names of marks, or marks of their own."""
     name, given, arrow = text.partition(":front=")
     if not given:
         tail, tip = text.split(",")
         return tail, tip
-    x, y, other_x, other_y = arrow.split(",")
-    tail = _read_mark(f"{name}:{x},{y}:tail of --axes")
-    return tail, _read_mark(f"{name}:{other_x},{other_y}:tip of --axes")
-
-
-MARK = Parsed(
-    "sequence:frame:x,y[:name]",
-    parse=_read_mark,
-    expected="SEQUENCE:FRAME:X,Y or SEQUENCE:FRAME:X,Y:NAME",
-)
-AXES = Parsed(
-    "tail,tip",
-    parse=_read_axes,
-    expected="SEQUENCE:front=FRAME:X,Y,FRAME:X,Y or the names of two marks",
-)
+    tail_x, tail_y, tip_x, tip_y = arrow.split(",")  # each x has its frame before it: FRAME:X
+    tail = _read_mark(f"{name}:{tail_x},{tail_y}:tail of --axes")
+    return tail, _read_mark(f"{name}:{tip_x},{tip_y}:tip of --axes")
 
 
 @click.command(
@@ -53,7 +44,7 @@ AXES = Parsed(
     ),
 )
 @click.argument("data", type=PATH)
-@click.option("--category", metavar="NAME", required=True, help="Category of the objects.")
+@category_option
 @click.option(
     "--sequences", type=NAMES, show_default="all of the category", help="Sequences, one per object."
 )
@@ -77,13 +68,21 @@ AXES = Parsed(
 @click.option(
     "--mark",
     "marks",
-    type=MARK,
+    type=Parsed(
+        "sequence:frame:x,y[:name]",
+        parse=_read_mark,
+        expected="SEQUENCE:FRAME:X,Y or SEQUENCE:FRAME:X,Y:NAME",
+    ),
     multiple=True,
     help="A pixel with depth to find on all objects; may be repeated.",
 )
 @click.option(
     "--axes",
-    type=AXES,
+    type=Parsed(
+        "tail,tip",
+        parse=_read_axes,
+        expected="SEQUENCE:front=FRAME:X,Y,FRAME:X,Y or the names of two marks",
+    ),
     help="An arrow to the front: two marks by name, or SEQUENCE:front=FRAME:X,Y,FRAME:X,Y.",
 )
 @replace_option
@@ -162,7 +161,7 @@ def align(
         write_alignment(alignment, out, frame),
         write_labels(alignment, out, category, replace=True),
         write_category_report(out / "report.html", alignment, dataset, category, placed, frame),
-        out / "objects.jpg",
+        out / "objects.jpg",  # written with the report, as is marks.jpg
     ]
     if placed:
         written += [write_marks(placed, dataset, category, out), out / "marks.jpg", out / "marks"]

@@ -16,24 +16,6 @@ from zsp_lite.cli.common import (
     workers_option,
 )
 
-SIZE = Parsed(
-    "W,H",
-    parse=lambda text: tuple(map(float, text.split(","))),
-    valid=lambda size: len(size) == 2 and all(1 <= side <= 100 for side in size),
-    expected="two numbers from 1 to 100",
-)
-# The text may begin with the name of the setting, as the rows of a sweep are named.
-THRESHOLDS = Parsed(
-    "threshold=V,V",
-    parse=lambda text: [float(value) for value in text.removeprefix("threshold=").split(",")],
-    expected="threshold=V,V",
-)
-LATEX = Parsed(
-    "intervals,time",
-    parse=lambda text: text.split(","),
-    valid={"", "intervals", "time"}.issuperset,  # "" is the default: neither of them
-    expected="intervals, time",
-)
 _ROWS_SHOWN = 4  # rows of the table by category that fit in a terminal
 metrics_option = click.option(
     "--metrics",
@@ -82,7 +64,14 @@ metrics_option = click.option(
     "--seeds", type=COUNT, default=1, help="Evaluations of each pair, with other random draws."
 )
 @click.option(
-    "--sweep", type=THRESHOLDS, help="Evaluate each row with each of these thresholds of RANSAC."
+    "--sweep",
+    # The text may begin with the name of the setting, as the rows of a sweep are named.
+    type=Parsed(
+        "threshold=V,V",
+        parse=lambda text: [float(value) for value in text.removeprefix("threshold=").split(",")],
+        expected="threshold=V,V",
+    ),
+    help="Evaluate each row with each of these thresholds of RANSAC.",
 )
 @click.option("--list", "list_only", is_flag=True, help="Print every method and group, and exit.")
 @click.option(
@@ -102,7 +91,8 @@ def benchmark(
 ) -> None:
     """Measure rotation errors over many pairs. OUT gets tables, figures and results."""
     if list_only:
-        return _list_methods()
+        _list_methods()
+        return
     from zsp_lite.benchmark.methods import resolve
     from zsp_lite.benchmark.run import evaluate, pairs_of_rows
     from zsp_lite.course.make_samples import make_sample_data
@@ -119,7 +109,7 @@ def benchmark(
         rows = resolve(options["methods"])
         asked = pairs_of_rows(dataset, rows, pairs_per_category, targets)
         print(f"Written: {write_questions(list_pairs, dataset, list(asked))}, {len(asked)} pairs")
-        return None
+        return
     summary = evaluate(
         dataset.root,
         pairs=pairs_per_category,
@@ -129,10 +119,9 @@ def benchmark(
     )
     if not quiet:
         print(f"{dataset.root}, backbone {summary['backbone']}, {targets} target views")
-        # More rows than the default ones are for the paper's tables.
+        # Who asks for more than the three default rows wants the paper's tables.
         _print_summary(summary, options["metrics"], with_paper=len(summary["methods"]) > 3)
         print(f"Written: {options['out'] / 'summary.json'}, tables/, figures/")
-    return None
 
 
 def _list_methods() -> None:
@@ -180,9 +169,27 @@ def _print_summary(summary: dict, metrics: list[str], with_paper: bool) -> None:
     "--rows", type=NAMES, show_default="all", help="Rows of the tables and figures, in order."
 )
 @click.option(
-    "--latex", type=LATEX, default="", show_default="none", help="Add these to LaTeX tables."
+    "--latex",
+    type=Parsed(
+        "intervals,time",
+        parse=lambda text: text.split(","),
+        valid={"", "intervals", "time"}.issuperset,  # "" is the default: neither of them
+        expected="intervals, time",
+    ),
+    default="",
+    show_default="none",
+    help="Add these to LaTeX tables.",
 )
-@click.option("--size", type=SIZE, help="Width and height of the figures in inches.")
+@click.option(
+    "--size",
+    type=Parsed(
+        "W,H",
+        parse=lambda text: tuple(map(float, text.split(","))),
+        valid=lambda size: len(size) == 2 and all(1 <= side <= 100 for side in size),
+        expected="two numbers from 1 to 100",
+    ),
+    help="Width and height of the figures in inches.",
+)
 @click.option(
     "--pair", metavar="KEY", help="Only draw this pair of run.jsonl, with the pose of each row."
 )
@@ -196,7 +203,7 @@ def tables(run, out, metrics, rows, latex, size, pair, data) -> None:
 
     if pair:
         results = read_run(run)
-        # `folder` is absolute. A run may have none, and `data`, the path as it was given, only.
+        # `folder` is absolute. A run without it has only `data`, the path as it was given.
         dataset = Co3D(data or results.settings.folder or results.settings.data)
         figure = pair_figure(results, pair, dataset, rows)
         print(f"Written: {save_figure(figure, (out or run) / 'figures', f'pair_{pair}', size)}")

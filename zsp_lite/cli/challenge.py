@@ -8,7 +8,7 @@ import click
 from zsp_lite.cli.common import COUNT, NAMES, PATH, examples
 from zsp_lite.errors import InputError
 
-# Signals that end a process; SIGHUP is none of Windows.
+# Signals that end a process. Windows has no SIGHUP.
 _ENDING = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}
 
 
@@ -71,9 +71,15 @@ def rank(handins, keep, out, workers, minutes, pair_seconds, memory, unprotected
     columns = ("team", "place", "Acc30 (%)", "95 % interval", "answered")
     rows = []
     for place, one in found.places:
-        answered = f"{one.answered} of {found.pairs}"
-        interval = f"{one.low:.1f} to {one.high:.1f}"
-        rows.append((one.team, str(place), f"{one.acc30:.1f}", interval, answered))
+        rows.append(
+            (
+                one.team,
+                str(place),
+                f"{one.acc30:.1f}",
+                f"{one.low:.1f} to {one.high:.1f}",
+                f"{one.answered} of {found.pairs}",
+            )
+        )
     print_rows("Ranking", columns, rows)
     for _, one in found.places:
         if one.note:

@@ -53,16 +53,17 @@ BOX = Parsed(
 INTRINSICS = Parsed(
     "fx,fy,cx,cy",
     parse=lambda text: tuple(map(float, text.split(","))),
+    # The nine are those of K, row by row.
     valid=lambda values: len(values) in (4, 9) and all(map(math.isfinite, values)),
     expected="four numbers, or K",
 )
 UP = Parsed(
     "x,y,z",
+    # Zeros are for `open_source` that no vertical is to be used.
     parse=lambda text: (0.0,) * 3 if text == "none" else tuple(map(float, text.split(","))),
     valid=lambda values: len(values) == 3 and all(map(math.isfinite, values)),
     expected="three numbers, or none",
 )
-ORIENTATION = click.Choice(("stored", "displayed"))
 
 
 def examples(*lines: str) -> str:
@@ -71,9 +72,10 @@ def examples(*lines: str) -> str:
 
 
 class Once(click.Command):
-    """A command that refuses a second value of an option for one."""
+    """A command that refuses an option given twice, unless it may be repeated."""
 
     def parse_args(self, context, args):
+        # The parser returns values, arguments, and the options as often as they stand in `args`.
         *_, given = self.make_parser(context).parse_args([*args])
         for option in given:
             if given.count(option) > 1 and not option.multiple:
@@ -89,6 +91,9 @@ def refuse_options(given: Mapping[str, Any], taken: Collection[str], by: str) ->
             raise click.UsageError(f"--{name.replace('_', '-')} does not go with {by}")
 
 
+category_option = click.option(
+    "--category", metavar="NAME", required=True, help="Name of the category."
+)
 replace_option = click.option(
     "--replace", is_flag=True, help="Replace existing files that have other content."
 )
@@ -109,7 +114,7 @@ def backbone_options(command: Callable[..., Any]) -> Callable[..., Any]:
     @click.option(
         "--backbone",
         "name",
-        default="zsp-tiny",
+        default="zsp-tiny",  # `load.DEFAULT`, whose module is slow to import
         is_eager=True,
         callback=_one_thread,
         help="Name of `weights list`, file, hf:NAME, module:thing.",
@@ -163,7 +168,7 @@ def source_options(multiple: bool) -> Callable[..., Any]:
         option("--label", type=INDEX, help="Number of the object in masks that label several."),
         option(
             "--orientation",
-            type=ORIENTATION,
+            type=click.Choice(("stored", "displayed")),
             help="How depth, mask and camera refer to a photograph with EXIF.",
         ),
         option(

@@ -16,6 +16,7 @@ from zsp_lite.cli.common import (
     NAMES,
     PATH,
     Once,
+    category_option,
     examples,
     refuse_options,
     replace_option,
@@ -53,10 +54,10 @@ def data() -> None:
     help="A sequence without any file is not a problem: it was not downloaded.",
 )
 def check(root, deep, partial) -> int:
-    """Report missing or broken files. The number of files of evaluation pairs and the size on disk
-    are reported too.
+    """Report missing or broken files.
 
-    The exit code is 1 if there is any problem.
+    The number of files of evaluation pairs and the size on disk are shown, too. The exit code is 1
+    if there is any problem.
     """
     from zsp_lite.data.check import check_folder
 
@@ -72,26 +73,26 @@ def _print_checks(root: Path, checks: Sequence[Any]) -> int:
 
     rows = []
     lines = []
-    for check in checks:
-        counts = (f"{getattr(check, name):,}" for name in _CHECK_COLUMNS[2:-1])
-        rows.append((check.category, check.layout, *counts, decimal(check.size)))
-        kinds = ", ".join(f"{kind} {count:,}" for kind, count in sorted(check.defects.items()))
+    for found in checks:
+        counts = (f"{getattr(found, name):,}" for name in _CHECK_COLUMNS[2:-1])
+        rows.append((found.category, found.layout, *counts, decimal(found.size)))
+        kinds = ", ".join(f"{kind} {count:,}" for kind, count in sorted(found.defects.items()))
         counted = [
-            (check.absent, check.sequences, "annotated sequences are not downloaded"),
+            (found.absent, found.sequences, "annotated sequences are not downloaded"),
             (
-                check.labelled - check.usable,
-                check.labelled,
+                found.labelled - found.usable,
+                found.labelled,
                 "labelled sequences cannot be evaluated",
             ),
-            (check.cloudless, check.sequences, "sequences have no point cloud"),
-            (check.defects.total(), check.frames, f"frames cannot be used ({kinds})"),
+            (found.cloudless, found.sequences, "sequences have no point cloud"),
+            (found.defects.total(), found.frames, f"frames cannot be used ({kinds})"),
         ]
         messages = [f"{count:,} of {total:,} {what}" for count, total, what in counted if count > 0]
-        messages += check.problems[:5]
-        lines += [f"{check.category}: {message}" for message in messages]
-    size = decimal(sum(check.size for check in checks))
+        messages += found.problems[:5]  # there may be thousands
+        lines += [f"{found.category}: {message}" for message in messages]
+    size = decimal(sum(found.size for found in checks))
     print_rows(f"{root}: {len(checks)} categories, {size}", _CHECK_COLUMNS, rows, texts=2)
-    problems = sum(len(check.problems) for check in checks)
+    problems = sum(len(found.problems) for found in checks)
     print(*lines, f"{problems} problems." if problems else "No problems.", sep="\n")
     return 1 if problems else 0
 
@@ -132,15 +133,21 @@ def _print_checks(root: Path, checks: Sequence[Any]) -> int:
 )
 @click.option("--yes", is_flag=True, help="Download without asking.")
 def download(dataset, categories, single_sequence, chunks, root, labels, labelled_only, yes) -> int:
-    """Download categories of CO3D, check them, and import labels. They are on its official server.
+    """Download categories of CO3D, check them, and import labels.
 
     DATASET is co3d (version 2, in chunks of up to 20 GB) or co3d-v1 (the version of the paper and
-    of its labels, one archive for each category). The sizes are shown and confirmed first. An
-    interrupted download is resumed by the same command. With --labelled-only, sequences are read
-    out of the archive on the server. The environment variables ZSP_LITE_CO3D_URL and
-    ZSP_LITE_CO3D_V1_URL give the address of a mirror.
+    of its labels, one archive for each category), from the official server. The sizes are shown and
+    confirmed first. An interrupted download is resumed by the same command. With --labelled-only,
+    sequences are read out of the archive on the server. The environment variables ZSP_LITE_CO3D_URL
+    and ZSP_LITE_CO3D_V1_URL give the address of a mirror.
     """
-    from zsp_lite.data import archives as co3d
+    from zsp_lite.data.archives import (
+        check_disk,
+        download_archives,
+        download_size,
+        list_archives,
+        missing_archives,
+    )
     from zsp_lite.data.check import check_folder
     from zsp_lite.data.published import import_labels, published_sequences
 
@@ -157,22 +164,22 @@ def download(dataset, categories, single_sequence, chunks, root, labels, labelle
     categories = tuple(dict.fromkeys(categories))
     archives = []
     for name in categories:
-        archives += co3d.list_archives(dataset, name, single_sequence, chunks)
+        archives += list_archives(dataset, name, single_sequence, chunks)
     if labelled_only:
         labelled = published_sequences(labels, categories)
         archives = [
             dataclasses.replace(archive, sequences=labelled[archive.category])
             for archive in archives
         ]
-    missing = co3d.missing_archives(root, archives)
-    sizes = [co3d.download_size(archive) for archive in missing]
+    missing = missing_archives(root, archives)
+    sizes = [download_size(archive) for archive in missing]
     if not missing:
         print(f"{root}: everything is unpacked already")
-    elif not _confirmed(missing, sizes, co3d.check_disk(root, missing, sizes), root, yes):
+    elif not _confirmed(missing, sizes, check_disk(root, missing, sizes), root, yes):
         print("Nothing was downloaded.")
         return 1
     else:
-        co3d.download_archives(root, missing)
+        download_archives(root, missing)
     if labels:
         counts = import_labels(labels, root, categories=categories)
         print(f"Imported: {counts['class_labels']} labels, {counts['determ_eval']} files of pairs")
@@ -256,7 +263,7 @@ class _Import(Once):
 )
 @click.argument("scan", type=PATH)
 @root_option
-@click.option("--category", metavar="NAME", required=True, help="Category of the object.")
+@category_option
 @click.option("--sequence", metavar="NAME", required=True, help="Name of the new sequence.")
 @source_options(multiple=False)
 @click.option(
@@ -303,6 +310,9 @@ def import_(scan, root, category, sequence, mask, box, **options) -> None:
     _print_import(root / category / sequence, import_source(opened, root, category, sequence))
 
 
+_BEST = 10  # number of sequences that are imported by default
+
+
 @click.command(
     epilog=examples(
         "data import uco3d path/to/uco3d --category mug --out mugs",
@@ -310,12 +320,12 @@ def import_(scan, root, category, sequence, mask, box, **options) -> None:
     )
 )
 @click.argument("root", type=PATH)
-@click.option("--category", metavar="NAME", required=True, help="Category of the objects.")
+@category_option
 @click.option("--sequences", type=NAMES, show_default="--best", help="Names of the sequences.")
 @click.option(
     "--best",
     type=COUNT,
-    show_default="10",
+    show_default=str(_BEST),
     help="Number of sequences, those with the best cameras.",
 )
 @click.option("--frames", "count", type=COUNT, default=24, help="Frames of each sequence.")
@@ -329,7 +339,7 @@ def uco3d(root, category, sequences, best, count, out) -> None:
     from zsp_lite.importers.uco3d import import_uco3d
 
     refuse_options({"best": sequences and best}, (), "--sequences")
-    for name, imported in import_uco3d(root, out, category, sequences, best or 10, count):
+    for name, imported in import_uco3d(root, out, category, sequences, best or _BEST, count):
         _print_import(out / category / name, imported)
 
 

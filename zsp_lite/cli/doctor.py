@@ -17,7 +17,7 @@ def doctor() -> int:
     for name, state, found, fix in run_checks():
         print(f"{state:4}  {name:16}  {found}")
         if fix:
-            print(f"{'':24}-> {fix}")
+            print(f"{'':24}-> {fix}")  # below what was found
         if state == "bad":
             failed.append(name)
     print(

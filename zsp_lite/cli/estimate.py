@@ -1,5 +1,6 @@
 """The command `estimate`: the pose between two objects of the user's own."""
 
+import json
 from typing import Any
 
 import click
@@ -133,8 +134,6 @@ def estimate(
     between two poses, the report shows both, and aligned_SOLVER_2.ply is the other. Where both are
     labelled sequences of one category, the rotation error is shown too.
     """
-    import json
-
     from zsp_lite.objects.estimate import estimate_pose
 
     if helpers and solver != "verified":

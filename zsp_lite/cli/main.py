@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with cli.make_context("zsp-lite", list(sys.argv[1:] if argv is None else argv)) as context:
             code = cli.invoke(context) or 0
-        sys.stdout.flush()
+        sys.stdout.flush()  # BrokenPipeError is raised here, and not at the exit of Python
         return code
     except click.exceptions.Exit as stop:  # --help
         return stop.exit_code

@@ -70,7 +70,7 @@ def synth(preset, categories, models_folder, seed, out, **given) -> None:
             export_preset(preset, out, seed)
         elif categories:
             refuse_options(chosen, ("sequences", "frames"), "--category")
-            sizes = {"sequences": 4, "frames": 24} | chosen
+            sizes = {"sequences": 4, "frames": 24} | chosen  # the defaults of the help text
             export_categories(list(categories), out, seed=seed, **sizes)
         else:
             refuse_options(chosen, ("frames", "image_size", "front", "up"), "--models")

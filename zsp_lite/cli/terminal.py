@@ -26,13 +26,19 @@ def print_table(table: Any) -> None:
     """Print a `Table` of a benchmark run: intervals below their figures, published figures dim."""
     from zsp_lite.benchmark.tables import PUBLISHED
 
-    look = {"box": SIMPLE_HEAD, "pad_edge": False, "caption_justify": "left"}
-    printed = RichTable(title=table.title, caption=table.note or None, **look)
+    printed = RichTable(
+        title=table.title,
+        caption=table.note or None,
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        caption_justify="left",
+    )
     longest = max(map(len, table.text.index), default=0)
-    # A row's name is folded, never cut off.
+    # A row's name is folded, never cut off; up to 14 characters stay in one line.
     printed.add_column("", justify="left", min_width=min(longest, 14), overflow="fold")
     for title in table.text.columns:
         style = "dim" if title.startswith(PUBLISHED) else None
+        # Titles of several lines keep columns narrow.
         title = title.replace(": ", "\n").replace(" (", "\n(").replace(" Acc30", "\nAcc30")
         printed.add_column(title, justify="right", style=style, header_style=style)
     for label, *cells in table.text.itertuples():
@@ -41,6 +47,8 @@ def print_table(table: Any) -> None:
 
 
 def _print_whole(table: RichTable) -> None:
+    """Print a table in its full width, also where the terminal is narrower."""
     console = Console(markup=False)  # names may hold brackets
+    # 1000 characters are wider than any table.
     needed = console.measure(table, options=console.options.update(max_width=1000)).maximum
     Console(width=max(console.width, needed), markup=False).print(table)

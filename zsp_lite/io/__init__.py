@@ -1,1 +1,1 @@
-"""Files, downloads, and point clouds."""
+"""Files, downloads, point clouds, locks, imports by name, and threads."""

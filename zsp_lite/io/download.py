@@ -176,6 +176,7 @@ def _fetch_rest(url: str, part: Path, most: float) -> bool:
         bar = tqdm.wrapattr(response, "read", total, desc=part.stem, initial=start, disable=None)
         with bar as source, open(part, "ab" if start else "wb") as file:
             try:
+                # Up to a chunk more than `most`, by which `fetch` tells that the file is larger.
                 while file.tell() <= most and (chunk := source.read(CHUNK)):
                     file.write(chunk)
             except (http.client.IncompleteRead, ConnectionError, TimeoutError):

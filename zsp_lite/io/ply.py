@@ -69,12 +69,12 @@ def read_ply(
 
 
 def _colours(stored: Real[np.ndarray, "n c"] | None) -> UInt8[np.ndarray, "n 3"] | None:
-    """Return 8-bit colours of 16-bit ones or numbers to 1 or 255; None if there are none."""
+    """Convert colours of 8 or 16 bits, or floats up to 1 or 255; None if there are none."""
     if stored is None:
         return None
     colours = np.where(np.isfinite(stored), stored, 0.0)[:, :3]
     if stored.dtype == np.uint16 and colours.max(initial=0) > 255:
-        colours /= 257
+        colours /= 257  # 65535 / 255
     elif stored.dtype.kind == "f" and colours.max(initial=0) < 1.01:  # rounding may exceed 1
         colours *= 255
     return colours.round().clip(0, 255).astype(np.uint8)
