@@ -357,5 +357,6 @@ def _cluster(gram: Float[np.ndarray, "m m"], k: int, seed: int) -> Int[np.ndarra
         # Equal descriptors (a uniform surface) leave clusters empty: that gives fewer matches and
         # needs no warning.
         warnings.simplefilter("ignore", ConvergenceWarning)
+        # scikit-learn takes seeds of 32 bits only.
         state = int(np.random.default_rng(seed).integers(2**31))
         return KMeans(k, n_init=1, random_state=state).fit(points).labels_

@@ -99,8 +99,8 @@ def stood_up(scan: Scan, target: Scan, method: ZeroShotPose) -> tuple[Scan, int]
     """Turn the frames of a scan by 0 to 3 quarters, so that its first reference frame fits best.
 
     Returns the scan and the turn in degrees. The scores are of the same pixels and target views,
-    and so comparable between the turns: of 48 pairs of samples, the best score finds 42, and the
-    highest confidence, which says how unlike the poses of one turn are, 14.
+    and so comparable between the turns: of 48 pairs of samples, the best score finds the turn of
+    42. The highest confidence, which compares the poses of one turn only, finds that of 14.
     """
 
     def views_of(positions: Iterable[int], quarters: int) -> list[View]:

@@ -119,8 +119,8 @@ def build_scene(
     # the first target camera.
     source = reference.measured_points[0].reshape(-1, 3)
     clouds = [
-        (view.measured_points[0].reshape(-1, 3) - moved.t) @ moved.R
-        for view, moved in zip(targets, to_camera)
+        (view.measured_points[0].reshape(-1, 3) - motion.t) @ motion.R  # its inverse
+        for view, motion in zip(targets, to_camera)
     ]
     cloud = np.concatenate(clouds)
     known = np.concatenate([target.known_foreground.ravel() for target in targets])
@@ -152,10 +152,10 @@ def build_scene(
 
     # Points of the matches with measured depth on both sides.
     matched = []
-    for target, moved, match in zip(targets, to_camera, matches):
+    for target, motion, match in zip(targets, to_camera, matches):
         x, y, measured = measured_match_points(reference, target, match)
         x = reference_to_working.apply(x[measured])
-        y = target_to_working.apply((y[measured] - moved.t) @ moved.R)
+        y = target_to_working.apply((y[measured] - motion.t) @ motion.R)
         matched.append((float_tensor(x), float_tensor(y)))
 
     # The mean of the targets' points, in the first target camera's frame.
@@ -221,8 +221,8 @@ def project_points(
     """
     # The points in all cameras, (m, v, 3, n), by one product of (m * v * 3, 3) and (3, n).
     camera_linear = (maps.rotation @ poses.linear[:, None]).reshape(-1, 3)
-    moved = maps.rotation @ poses.translation[:, None, :, None]
-    camera_translation = moved[..., 0] + maps.translation
+    rotated = maps.rotation @ poses.translation[:, None, :, None]
+    camera_translation = rotated[..., 0] + maps.translation
     in_camera = (camera_linear @ points.T).view(len(poses), len(maps.size), 3, -1)
     in_camera = in_camera.add_(camera_translation[..., None])
     depth = in_camera[:, :, 2]

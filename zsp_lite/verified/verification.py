@@ -51,7 +51,7 @@ from zsp_lite.verified.scene import Scene, project_points
 
 # The symbols of the module's docstring; chosen, not fitted.
 _SURFACE_SIGMA = 0.25  # sigma, working units
-_MAX_VIOLATION = 0.5  # rho, working units: distance at which b and c reach 1
+_MAX_VIOLATION = 0.5  # rho, working units: distance over which b and c rise to 1
 VIEWPOINT_SIGMA = 45.0  # degrees, where the exponential falls to 1/e
 _SIMILARITY_PRIOR = 0.5  # kappa
 # So many projected points are scored at a time: intermediate results stay in the processor's cache.
@@ -101,7 +101,7 @@ def score_terms(
     # Entry (i, j) of `similarity` is at i * columns + j of its flat array. Reference points are
     # rows i, and the patches that they fall on columns j; for target points it is the reverse.
     n, columns = scene.similarity.shape
-    rows = torch.arange(0, n, stride[0]) * columns
+    row_starts = torch.arange(0, n, stride[0]) * columns
     target_columns = scene.target_column[:: stride[1]]
     per_pose = len(source) * len(scene.target_cameras) + len(target)
     size = max(_CHUNK // per_pose, 1)
@@ -109,7 +109,7 @@ def score_terms(
     for first in range(0, len(poses), size):
         chunk = poses[first : first + size]
         seen = project_points(scene.target_maps, chunk, source)
-        forward = _averages(scene, seen, source_weights, rows, patch_stride=1)
+        forward = _averages(scene, seen, source_weights, row_starts, patch_stride=1)
         seen = project_points(scene.reference_maps, chunk.inverse(), target)
         reverse = _averages(scene, seen, target_weights, target_columns, patch_stride=columns)
         chunks.append(torch.stack([*forward, *reverse], dim=1))
