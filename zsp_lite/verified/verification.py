@@ -109,9 +109,9 @@ def score_terms(
     for first in range(0, len(poses), size):
         chunk = poses[first : first + size]
         seen = project_points(scene.target_maps, chunk, source)
-        forward = _averages(scene, seen, source_weights, row_starts, patch_stride=1)
+        forward = _averages(scene, seen, row_starts, patch_stride=1, point_weights=source_weights)
         seen = project_points(scene.reference_maps, chunk.inverse(), target)
-        reverse = _averages(scene, seen, target_weights, target_columns, patch_stride=columns)
+        reverse = _averages(scene, seen, target_columns, columns, target_weights)
         chunks.append(torch.stack([*forward, *reverse], dim=1))
     # The angle includes rotation about the line of sight, because it changes features, too.
     angle = scene.view_angles(poses)
@@ -122,9 +122,9 @@ def score_terms(
 def _averages(
     scene: Scene,
     projection: tuple[Tensor, ...],
-    point_weights: Float[Tensor, " n"],
     offset: Int[Tensor, " n"],
     patch_stride: int,
+    point_weights: Float[Tensor, " n"],
 ) -> Iterator[Float[Tensor, " m"]]:
     """Yield similarity, overlap, silhouette and free space, each averaged for every pose, with a,
     b, c and s of each projected point as in the module's docstring.
