@@ -47,7 +47,7 @@ for _node in _STUB.body:
 
 __all__ = ["__version__", *_HOME_OF]
 
-# Without it, Open3D starts a server in a notebook.
+# Without this variable, Open3D starts a server in a notebook.
 os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
 # Open3D's Linux wheels link against libusb-1.0, which is often not installed. A package of Python
 # carries it; importing that package takes longer than all else here.
@@ -62,7 +62,7 @@ def __getattr__(name: str):
     home = importlib.import_module(_HOME_OF[name])
     if name in vars(home):
         return vars(home)[name]
-    # A public module is no name of its package, the home, before it is imported.
+    # A public module, such as `co3d`, is an attribute of its package only after its import.
     return importlib.import_module(f"{home.__name__}.{name}")
 
 

@@ -145,8 +145,9 @@ def umeyama_batch(
     """Fit similarities to a batch of point sets, without checks (see `umeyama`).
 
     Squared errors count by the `weight` of their points. The best rotation does not depend on the
-    scale, in which the error is quadratic. Returns scales, rotations, translations, and the ratio
-    of the second to the first singular value of the covariance, 0 for collinear points.
+    scale, and the error is quadratic in the scale: the best scale, clipped to the range, is the
+    best within it. Returns scales, rotations, translations, and the ratio of the second to the
+    first singular value of the covariance, 0 for collinear points.
     """
     if weight is None:
         source_mean = source.mean(axis=1)
@@ -158,9 +159,9 @@ def umeyama_batch(
         target_mean = (weight[:, None] @ target)[:, 0]
     centred = source - source_mean[:, None]
     weighted = weight[:, :, None] * centred
-    covariance = (target - target_mean[:, None]).swapaxes(1, 2) @ weighted  # (b, 3, 3), times n
+    covariance = (target - target_mean[:, None]).swapaxes(1, 2) @ weighted  # (b, 3, 3)
     rotation, singular, sign = nearest_rotation(covariance)
-    variance = (weighted * centred).sum(axis=(1, 2))  # times n, too
+    variance = (weighted * centred).sum(axis=(1, 2))  # not divided by n, as the covariance
     trace = singular[:, 0] + singular[:, 1] + sign * singular[:, 2]
     scale = (trace / np.where(variance > 0, variance, 1)).clip(*scale_range)
     translation = target_mean - scale[:, None] * (rotation @ source_mean[:, :, None])[:, :, 0]

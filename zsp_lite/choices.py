@@ -28,5 +28,5 @@ METRICS = {
     "scale": "scale ratio",
     "milliseconds": "ms per pair",
 }
-# By default: the paper's, and one more.
+# Figures that are shown by default: the paper's three, and AUC@30.
 METRICS_SHOWN = ("mean_category_median", "acc30", "acc15", "auc30")

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
+# Functions import NumPy themselves: `zsp-lite --help` imports this module and does not need it.
 if TYPE_CHECKING:
     import numpy as np
 
@@ -44,15 +45,15 @@ class NoPoseError(InputError):
 class FatalError(ValueError):
     """An error that ends a benchmark run: a broken backbone or an unreadable frame.
 
-    It is no InputError, by which a row says that a pair has no pose, and nothing is stored for the
-    pair that it hits.
+    It is not an InputError: for that one, a row stores that the pair has no pose. For the pair of a
+    FatalError nothing is stored.
     """
 
 
 class Doubt(str):
     """A flag that says why an input is doubtful."""
 
-    most = 0.8  # largest confidence of a pose from it
+    most = 0.8  # largest confidence of a pose from such an input; chosen, not fitted
 
 
 class Contradiction(Doubt):
@@ -61,7 +62,7 @@ class Contradiction(Doubt):
     Solvers take all as measured in one world: what they find may be far off however well it fits.
     """
 
-    most = 0.3
+    most = 0.3  # chosen, too
 
 
 def describe_failure(error: BaseException) -> str:
@@ -110,7 +111,6 @@ def check_number(name: str, value: object, above: float) -> None:
 def check_magnitude(name: str, values: object) -> None:
     """Raise InputError if a number of an array is not finite, or above `MAX_LENGTH` in
     magnitude."""
-    # Imported here, because `zsp-lite --help` imports this module and does not need NumPy
     import numpy as np
 
     sizes = np.abs(values)

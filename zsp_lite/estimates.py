@@ -16,7 +16,8 @@ from zsp_lite.matching import Matches
 from zsp_lite.metrics import rotation_error
 from zsp_lite.views import View, ViewMatch
 
-PointPairs = tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]  # of matches
+# points of k matches in the frames of the reference's and of the target's camera
+PointPairs = tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +132,8 @@ class Solver(Protocol):
     A solver that fits the pose in the first target view:
 
         def first_view(reference, targets, matched, *, seed, threshold):
-            matches, scores = matched[0].matches, np.zeros(len(targets))
+            matches = matched[0].matches
+            scores = np.zeros(len(targets))
             points = match_points(reference, targets[0], matches)
             sim3, inliers = ransac(*points, threshold=threshold, seed=seed)
             return PoseEstimate(sim3, 0, matches, inliers, scores, reference, tuple(targets))

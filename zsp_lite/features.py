@@ -36,7 +36,7 @@ class FeatureMap:
     saliency: Float[Tensor, "h w"]  # saliency of each patch, in [0, 1]
     global_feature: Float[Tensor, " e"]  # feature of the whole image
 
-    def __post_init__(self):  # because a user may plug in any backbone, on any device
+    def __post_init__(self):  # any backbone may be plugged in, on any device
         for name, values in list(vars(self).items()):
             values = torch.as_tensor(values).detach().cpu()
             # `clone` outside inference mode: the copy can enter a graph with gradients.

@@ -34,7 +34,8 @@ Similarities = Float[Tensor, "n1 n2"] | Float[np.ndarray, "n1 n2"]
 Mask = Bool[Tensor, "_ _"] | Bool[np.ndarray, "_ _"]
 Matched = tuple[Int[Tensor, " _"], Float[Tensor, " _"]]  # partner and score of each patch
 
-_filters = threading.Lock()  # of warnings: threads would restore each other's
+# Filters of warnings are global: without a lock, threads would restore each other's.
+_filters = threading.Lock()
 
 
 @runtime_checkable
@@ -233,7 +234,7 @@ def _matched_by(
     on_start: Bool[Tensor, " n1"],
     on_end: Bool[Tensor, " n2"],
 ) -> Matched:
-    """Return what a matcher finds."""
+    """Return what another matcher than "cyclical" finds, on the CPU."""
     if isinstance(matcher, str):
         matcher = pkgutil.resolve_name("zsp_lite.matchers:MATCHERS")[matcher]
     # Copies, since a matcher may overwrite what it gets, such as the similarities of the
@@ -278,7 +279,8 @@ def _cycles(
     on2: Mask,
     published: bool = False,
 ) -> Matched:
-    """Find each patch's nearest neighbour, scored as in `cyclical_distances`."""
+    """Find each patch's nearest neighbour, scored as in `cyclical_distances`, or as `published`,
+    with the masks of that code."""
     forth, nearest = nearest_neighbours(sim)
     back = nearest[forth]  # u' of each u
     columns = on1.shape[1]
@@ -305,6 +307,7 @@ def _bin_products(products: Float[Tensor, "h1 w1 h2 w2"]) -> Float[Tensor, "h1 w
     """Sum the products of keys over the 17 bins, as the module's docstring explains."""
 
     def columns(x: Tensor) -> Tensor:
+        """Exchange the rows and the columns of both images."""
         return x.permute(1, 0, 3, 2)
 
     # Every sum and average is separable: along the rows of both images (axes 0 and 2), then along
@@ -354,5 +357,6 @@ def _cluster(gram: Float[np.ndarray, "m m"], k: int, seed: int) -> Int[np.ndarra
         # Equal descriptors (a uniform surface) leave clusters empty: that gives fewer matches and
         # needs no warning.
         warnings.simplefilter("ignore", ConvergenceWarning)
+        # scikit-learn takes seeds of 32 bits only.
         state = int(np.random.default_rng(seed).integers(2**31))
         return KMeans(k, n_init=1, random_state=state).fit(points).labels_

@@ -22,7 +22,7 @@ from zsp_lite.matching import Matcher, match, similarities
 from zsp_lite.points import standard_deviation
 from zsp_lite.views import IMAGE_SIZE, View, ViewMatch, extract_views, object_crop, usable_targets
 
-_FEW = 10  # the standard deviation of fewer points says little of the object's size
+_FEW = 10  # the standard deviation of fewer points says little of the object's size; chosen
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class ZeroShotPose:
         choices = {
             "matcher": MATCHERS,
             "view_selector": VIEW_SELECTORS,
-            "solver": SOLVERS["both"],
+            "solver": SOLVERS["both"],  # all that have a name
             "foreground": ("saliency", "mask"),
             "cycle_from": ("reference", "target"),
             "kmeans": (None, True, False),
@@ -84,7 +84,7 @@ class ZeroShotPose:
             if not callable(chosen):  # else a plug-in
                 check_choice(name, chosen, allowed)
         check_integer("k", self.k, 1)
-        check_integer("trials", self.trials, 1, 1_000_000)
+        check_integer("trials", self.trials, 1, 1_000_000)  # all are in memory at once
         check_integer("sample_size", self.sample_size, 3)
         check_integer("seed", self.seed, 0)
         if not callable(self.backbone):
@@ -179,12 +179,12 @@ class ZeroShotPose:
             with timed(timings, "matching"):
                 matched = self.match_views(reference, targets)
         usable, flags = usable_targets(targets)
-        seen = (reference, [targets[i] for i in usable], [matched[i] for i in usable])
+        inputs = (reference, [targets[i] for i in usable], [matched[i] for i in usable])
         if not isinstance(self.solver, str):  # a plug-in may overwrite what it gets
-            seen = deepcopy(seen)
-        found = self._solver()(*seen, seed=self.seed, threshold=self.threshold)
-        # The solver's views are the usable ones: back to the numbers of all. `reshape` refuses
-        # another number of scores, of which a single one would be written to all views.
+            inputs = deepcopy(inputs)
+        found = self._solver()(*inputs, seed=self.seed, threshold=self.threshold)
+        # The solver numbers the usable views only: back to the numbers of all views. `reshape`
+        # fails for a wrong number of scores; a single score would else be written to all views.
         scores = np.full(len(targets), -np.inf)
         scores[usable] = np.reshape(found.view_scores, len(usable))
         return replace(
@@ -199,6 +199,7 @@ class ZeroShotPose:
         )
 
     def _solver(self) -> Solver:
+        """Return the solver that the setting names."""
         if self.solver == "paper":
             return self._align_best_view
         if self.solver == "verified":  # a room above, imported when it is used
@@ -220,6 +221,7 @@ class ZeroShotPose:
         with timed(timings, "alignment"):
             points = match_points(reference, targets[best], matches)
             size = targets[best].size
+            # `SCALE_RANGE` is for objects of size 1.
             scales = tuple(size / reference.size * scale for scale in SCALE_RANGE)
             flags = ()
             try:

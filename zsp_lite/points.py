@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float, UInt8
 from zsp_lite.data.depth import unproject_depth
 from zsp_lite.data.frames import ON_OBJECT, Frame, frame_defect
 
-# points of a frame farther from their median than this multiple of the median distance are outliers
+# Points farther from their median than this multiple of the median distance are outliers; chosen.
 _FAR = 4.0
-_SAMPLE = 1 << 21  # points of many frames that are held at once; 50 MB
+_SAMPLE = 1 << 21  # points of many frames that are in memory at once: 50 MB
 
 
 def object_pixels(frame: Frame) -> Bool[np.ndarray, "height width"]:
@@ -41,7 +41,7 @@ def sampling_step(frame: Frame, count: int) -> int:
     return max(1, count * frame.depth.size // _SAMPLE)
 
 
-def near_median(points: Float[np.ndarray, "n 3"], factor: float) -> Bool[np.ndarray, " n"]:
+def near_median(points: Float[np.ndarray, "n 3"], factor: float = _FAR) -> Bool[np.ndarray, " n"]:
     """Select the points that are at most `factor` times the median distance from the median point.
 
     A mask that is too wide by a pixel includes points of the background, far behind the object.
@@ -74,7 +74,7 @@ def world_cloud(
         inside = object_pixels(frame)
         if inside.any():
             points = world_points(frame, inside)
-            near = near_median(points, _FAR)
+            near = near_median(points)
             clouds.append(points[near])
             colours.append(frame.rgb[inside][near])
     return np.concatenate(clouds), np.concatenate(colours)

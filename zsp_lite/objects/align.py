@@ -37,7 +37,8 @@ logger = logging.getLogger(__name__)
 class _Line(msgspec.Struct, omit_defaults=True):
     """A line of the run: the hypotheses of a pair; none if the views determine no pose."""
 
-    results: ClassVar[tuple[str]] = ("alignment",)  # the rows of a line, as in `ResultLine`
+    # The rows and the repeat, as a `ResultLine` has them.
+    results: ClassVar[tuple[str]] = ("alignment",)
     repeat: ClassVar[int] = 0
     pair: str
     centre: list[float] = []
@@ -107,13 +108,13 @@ class HypothesisFinder:
 
     def open(self, threads: int) -> Evaluator:
         """Load the backbone, once in each process."""
-        if not hasattr(self, "store"):
+        if not hasattr(self, "store"):  # the first call in this process
             extractors = {"backbone": as_backbone(self.backbone)}
             self.store = FrameStore(self.dataset, extractors, threads)
         return self.line
 
     def line(self, pair: Pair, names: Sequence[str]) -> _Line:
-        """Find the hypotheses of a pair."""
+        """Find the hypotheses of a pair; `names` of rows are those of `_Line.results`."""
         found = self.store.hypotheses(pair)
         if found is None:
             return _Line(pair.key)
@@ -173,23 +174,24 @@ def align_category(
     # Workers load a named backbone themselves; an object travels to them.
     finder = HypothesisFinder(opened, loaded if executor == 1 else backbone)
     with tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder:
-
-        def solve(asked: list[Pair]) -> list[PairHypotheses | None]:
-            work = dict.fromkeys(asked, ["alignment"])
-            evaluate_pairs(folder, finder.open, work, executor, lines)
-            found = {line.pair: line.hypotheses() for line in lines}
-            return [found[pair.key] for pair in asked]
-
         with open_run(
             folder,
             dataset.root,
             loaded,
             targets,
             {"alignment": "hypotheses of the verified solver"},
-            {},
+            {},  # no hash of an object is kept
             _Line,
             pairs={category: len(names)},
         ) as lines:
+
+            def solve(asked: list[Pair]) -> list[PairHypotheses | None]:
+                work = dict.fromkeys(asked, ["alignment"])
+                evaluate_pairs(folder, finder.open, work, executor, lines)
+                found = {line.pair: line.hypotheses() for line in lines}
+                return [found[pair.key] for pair in asked]
+
+            # Without a backbone among its extractors: `solve` stands in for it.
             store = FrameStore(opened, {})
             judged = store.judged(category, frames, pairs=partners(names, pairs), solve=solve)
     if not judged:

@@ -4,8 +4,9 @@ A source is a sequence of a data folder, a folder with a capture, an image with 
 memory.
 
 The way of a pair: `estimate_pose` opens the sources and loads a `Scan` of each. One reference frame
-is solved by `ZeroShotPose`; several are asked by `judge.judge_pairs`, and `_answer` makes an
-estimate of its pose. `_pair_result` collects all, `write_pair` writes it.
+is solved by `ZeroShotPose`. Several frames are solved in `_by_all`: `judge.judge_pairs` asks them,
+and `_answer` makes an estimate of the pose that they tell. `_pair_result` collects all,
+`write_pair` writes it.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -41,8 +42,9 @@ from zsp_lite.verified.confidence import reliability_flags
 from zsp_lite.verified.solver import measured_inliers
 from zsp_lite.views import usable_targets
 
-_TARGETS = 5
-_LEAST_CONFIDENT = 0.3  # with less, the images may stand on their heads
+_TARGETS = 5  # target views by default, as in the paper
+# What follows is chosen, not fitted.
+_LEAST_CONFIDENT = 0.3  # with less, a flag says that the images may be turned
 _LEAST_PROBABLE = 0.005  # an alternative is named above this, where two decimals show 0.01
 _TILTED = 45.0  # degrees between two verticals from which objects lie differently
 
@@ -134,8 +136,10 @@ def estimate_pose(
         flags = scan_flags(scans)
         available = len(scans[1].targets)
         if targets and targets > available:
-            there = f"{available}, all that there are, not {targets}"
-            flags = (*flags, f"number of target views: {there}")
+            flags = (
+                *flags,
+                f"number of target views: {available}, all that there are, not {targets}",
+            )
         if not upright:
             with timed(shared, "turns"):
                 scans[0], turn = stood_up(scans[0], scans[1], method)
@@ -183,7 +187,7 @@ def _pair_result(
         first.frames[first.references[0]],
         tuple(second.frames[position] for position in second.targets),
         estimates,
-        {},
+        errors={},
         masks=(first.source.mask, second.source.mask),
         backbone=backbone,
         votes=votes,
@@ -273,6 +277,7 @@ def _by_all(
     flags += dissent(votes)
     first, second = (shapes[name] for name in names[:2])
     if first.upright and second.upright:
+        # The last row of a shape's rotation is up in its world.
         up = best.R @ first.from_world.R[2]
         tilt = vector_angle(up, second.from_world.R[2])
         if tilt > _TILTED:
@@ -305,17 +310,18 @@ def _answer(
     reference = scans[0].views[scans[0].references[0]]
     targets = scans[1].target_views
     usable, views_left_out = usable_targets(targets)
-    left_out = np.full(len(targets), np.inf)
-    left_out[usable] = 0.0
+    penalty = np.full(len(targets), np.inf)  # of the views that are left out
+    penalty[usable] = 0.0
     to_reference, *to_targets = [view.frame.camera.sim3 for view in (reference, *targets)]
     # Each answer becomes a hypothesis in the usable target view that is nearest to the reference.
     hypotheses = []
     view_angles = []  # of each hypothesis, in degrees by target view
     for mode, (sim3, probability) in enumerate(answers):
         poses = [camera @ sim3 @ to_reference.inverse() for camera in to_targets]
-        angles = rotation_angle(np.stack([pose.R for pose in poses]), np.eye(3)) + left_out
+        angles = rotation_angle(np.stack([pose.R for pose in poses]), np.eye(3)) + penalty
         nearest = int(angles.argmin())
         score = float(np.log(max(probability, 1e-9)))  # finite for a probability of 0
+        # It combines several scores, so it has no terms of one.
         hypotheses.append(Hypothesis(poses[nearest], nearest, score, {}, probability, mode))
         view_angles.append(angles)
 
@@ -366,6 +372,7 @@ def write_pair(result: PairResult, out: str | Path, report: bool = True) -> list
             moved = pose.sim3.apply(points)
             write_ply(paths[-1], result.targets[pose.view].camera.to_world(moved), colours)
     if report:
+        # Imported here: it takes matplotlib and plotly, which nothing else here needs.
         from zsp_lite.viz.report import write_pair_report
 
         paths.insert(0, write_pair_report(out / "report.html", result))

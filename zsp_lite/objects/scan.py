@@ -20,7 +20,8 @@ from zsp_lite.scans.shapes import FRAMES, Shape
 from zsp_lite.scans.upright import find_up
 from zsp_lite.views import View, object_crop
 
-_TRIED = 8  # frames of which the first usable one is a single reference
+# These values are chosen, not fitted.
+_TRIED = 8  # frames that are loaded to find a single reference: the first usable one
 # Target views that span less than this angle, in degrees, show one side of the object.
 _ALL_SIDES = 120.0
 
@@ -36,7 +37,7 @@ class Scan:
     frames: dict[int, Frame]
     views: dict[int, View]
     size: float  # standard deviation of the object
-    cloud: Float[np.ndarray, "n 3"]
+    cloud: Float[np.ndarray, "n 3"]  # points of the object in the frames, in their world
     quarters: int = 0  # by which the frames are turned
 
     @classmethod
@@ -98,8 +99,8 @@ def stood_up(scan: Scan, target: Scan, method: ZeroShotPose) -> tuple[Scan, int]
     """Turn the frames of a scan by 0 to 3 quarters, so that its first reference frame fits best.
 
     Returns the scan and the turn in degrees. The scores are of the same pixels and target views,
-    and so comparable between the turns: of 48 pairs of samples, the best score finds 42, and the
-    highest confidence, which says how unlike the poses of one turn are, 14.
+    and so comparable between the turns: of 48 pairs of samples, the best score finds the turn of
+    42. The highest confidence, which compares the poses of one turn only, finds that of 14.
     """
 
     def views_of(positions: Iterable[int], quarters: int) -> list[View]:

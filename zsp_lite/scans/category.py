@@ -38,23 +38,24 @@ from zsp_lite.errors import InputError
 from zsp_lite.estimates import PoseEstimate
 from zsp_lite.metrics import SAME_ANGLE, rotation_angle
 
+# The values down to `_AVERAGING_SWEEPS` are chosen, not fitted.
 # \kappa of the objective: a hypothesis 20 degrees off counts 1/e of one that agrees.
 KAPPA = 16.0
 # \epsilon of the objective, where a sure hypothesis that agrees counts 1.
 FLOOR = 0.1
 # All pairs of a category are solved below this number of objects, since pairs grow as its square;
 # from it on, each object is the reference of a few.
-ALL_PAIRS_BELOW = 12
-PAIRS_PER_OBJECT = 6
+_ALL_PAIRS_BELOW = 12
+_PAIRS_PER_OBJECT = 6
 _STARTS = 48  # of the search, of which the best result is kept
 _SEARCH_SWEEPS = 8  # over all objects, at most
 _AVERAGING_SWEEPS = 30
 # Coefficients of the logit in `_judge`: of the margin, of the case that no rotation is right, and
 # of the share of agreeing pairs in this case. Fitted on validation categories to sets of
 # three and four objects (docs/rebuild.md).
-MARGIN = 2.52
-NONE = -0.93
-NONE_AGREEING = -3.03
+_MARGIN = 2.52
+_NONE = -0.93
+_NONE_AGREEING = -3.03
 
 _Poses = Float[np.ndarray, "_ 4 4"]  # matrices of similarities
 
@@ -117,7 +118,7 @@ def partners(names: Sequence[str], per_object: int | None) -> list[tuple[str, st
     """
     n = len(names)
     if per_object is None:
-        per_object = n - 1 if n < ALL_PAIRS_BELOW else PAIRS_PER_OBJECT
+        per_object = n - 1 if n < _ALL_PAIRS_BELOW else _PAIRS_PER_OBJECT
     if per_object >= n - 1:
         return list(combinations(sorted(names), 2))
     # The objects stand in a random circle. Each has those as partners that are some steps before
@@ -226,7 +227,8 @@ def _collect(
     """Return the votes of all pairs."""
     rows = []
     for k, pair in enumerate(pairs):
-        a, b = names.index(pair.reference), names.index(pair.target)
+        a = names.index(pair.reference)
+        b = names.index(pair.target)
         for sim3, probability in zip(pair.sim3s, pair.probabilities):
             forward = to_centre[b] @ sim3 @ to_centre[a].inverse()
             rows.append((a, b, k, probability, forward.matrix))
@@ -245,6 +247,7 @@ def _random_tree(votes: _Votes, names: Sequence[str], rng: np.random.Generator) 
     InputError if none leads to the rest."""
     poses = np.tile(np.eye(4), (len(names), 1, 1))
     placed = np.arange(len(names)) == 0
+    # With Gumbel noise, the highest rank is a draw by the probabilities.
     rank = np.log(votes.probability) + rng.gumbel(size=len(votes.pair))
     while not placed.all():
         leading = placed[votes.there] & ~placed[votes.here]
@@ -278,19 +281,21 @@ def _judge(votes: _Votes, poses: _Poses, to_centre: Sim3) -> AlignedObject:
     scores = votes.scores(options)
     different = rotation_angle(rotations[0], rotations) > SAME_ANGLE
     others = np.where(different, scores, -np.inf)
-    surest = np.unique(votes.pair, return_index=True)[1]  # vote of each pair
+    surest = np.unique(votes.pair, return_index=True)[1]  # most probable vote of each pair
 
     # A conditional logit of three cases: this rotation is right, the other one is, or none. The
     # pairs of an object err together, so the margin counts by the root of their number. That none
     # is right is less probable if more of the object's pairs agree.
     margin = (scores[0] - others.max()) / np.sqrt(len(surest))
-    none = NONE + NONE_AGREEING * (1 - different[1:][surest].mean())
-    probability, other, _ = softmax([0.0, -MARGIN * margin, none]).tolist()
-    if len(surest) == 1:  # its own probabilities say more
+    none = _NONE + _NONE_AGREEING * (1 - different[1:][surest].mean())
+    probability, other, _ = softmax([0.0, -_MARGIN * margin, none]).tolist()
+    # The probabilities of a single pair say more; it may have one hypothesis only.
+    if len(surest) == 1:
         probability, other, *_ = (*votes.probability.tolist(), 0.0)
 
     # The alternative is turned about the object's centre.
-    pose, alternative = Sim3.from_matrix(options[0]), None
+    pose = Sim3.from_matrix(options[0])
+    alternative = None
     if different.any():
         alternative = Sim3(pose.scale, rotations[others.argmax()], pose.t) @ to_centre
     return AlignedObject(pose @ to_centre, -to_centre.t, probability, alternative, other)

@@ -35,14 +35,15 @@ from zsp_lite.verified.poses import float_tensor, non_maximum_suppression
 # w_1 to w_5, and the score of the case that no candidate is right. Fitted on validation
 # categories (docs/rebuild.md).
 WEIGHTS = (2.15, -3.76, 3.16, -4.38, 2.67)
-NONE = -0.42
+_NONE = -0.42
+# What follows is chosen, not fitted.
 REFERENCES = 4  # frames of each object that are asked at most
 _FIRST = 2  # frames of each object that are asked first
 _SURE = 0.9  # a pair with this probability asks no more
 _DIFFERENT = 15.0  # degrees between the candidates of the votes
 _OF_VOTES = 10  # largest number of these candidates
-_OF_HEADINGS = 3
-_TILT = 45.0  # degrees
+_OF_HEADINGS = 3  # largest number of the candidates of the headings
+_TILT = 45.0  # degrees, the unit of T
 _ROUNDING = 1e-4  # added to Chamfer distances, which are 0 between equal shapes
 _LEAST = 0.05  # weight of the aligned shapes in a pose for which frames vote
 
@@ -74,8 +75,8 @@ def judge_pairs(
 ) -> list[PairHypotheses]:
     """Find the poses between the objects of each pair.
 
-    Two frames of each object are asked, and up to `references`, by its name, where the answer is
-    not sure. Pairs for which nothing speaks are left out.
+    Two frames of each object are asked; where the answer is not sure, up to the number that
+    `references` has for the object. Pairs for which nothing speaks are left out.
     """
     answers: dict[tuple[str, str], list[PairHypotheses]] = {pair: [] for pair in pairs}
     judged: dict[tuple[str, str], PairHypotheses | None] = {}
@@ -115,14 +116,15 @@ def judge(
         return None
     scores = terms @ WEIGHTS
     order = np.argsort(-scores, kind="stable")
-    probabilities = softmax([*scores, NONE])
+    probabilities = softmax([*scores, _NONE])
 
     # Candidates within 30 degrees of a better one are the same pose.
     mode_of = order[modes(rotation_angle(candidates[order][:, None], candidates[order]))]
     sums = np.bincount(mode_of, probabilities[order])
     best = np.argsort(-sums, kind="stable")[: np.count_nonzero(sums)]
     poses = tuple(votes.mean(candidates[k], aligned[k]) for k in best)
-    return PairHypotheses(*names, poses, sums[best], first.from_world.inverse().t)
+    centre = first.from_world.inverse().t
+    return PairHypotheses(*names, poses, sums[best], centre)
 
 
 class Votes:
@@ -145,7 +147,7 @@ class Votes:
         return np.exp(KAPPA / 2 * (trace - 3))
 
     def score(self, turns: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, " m"]:
-        """Return V of rotations."""
+        """Return V of rotations, 0 without votes."""
         if not len(self.turns):
             return np.zeros(len(turns))
         return np.log(FLOOR + self.agreement(turns) @ self.weights.T).mean(axis=1)

@@ -32,6 +32,7 @@ from zsp_lite.scans.transfer import (
 from zsp_lite.scans.upright import find_up
 from zsp_lite.views import object_crop
 
+# All these lengths and angles are chosen, not fitted.
 # A point is seen if the depth map is nearer by at most this part of the object's size.
 _HIDDEN = 0.05
 _SHORTEST = 0.1  # length of an arrow, in sizes of its object
@@ -180,6 +181,7 @@ def read_front(dataset: Co3D, category: str, tail: Mark, tip: Mark) -> Float[np.
     name = tail.sequence
     check_choice("sequence of the arrow's tip", tip.sequence, [name])
     start, end = marked_points(dataset, category, (tail, tip))
+    # A crop shows the floor close around the object.
     crops = map(object_crop, spread_frames(dataset, category, name))
     up, problem = find_up([*crops])
     if up is None:
@@ -188,7 +190,8 @@ def read_front(dataset: Co3D, category: str, tail: Mark, tip: Mark) -> Float[np.
         )
     arrow = end - start
     length = np.linalg.norm(arrow)
-    least = _SHORTEST * (extent(dataset, category, name) or (None, 0.0))[1]
+    box = extent(dataset, category, name)
+    least = _SHORTEST * (box[1] if box else 0.0)  # any length without a point cloud
     tilt = abs(90 - vector_angle(arrow, up))
     if not length > least or tilt > _STEEPEST:
         raise InputError(
@@ -266,6 +269,7 @@ def write_marks(
                 "objects": places,
             }
         )
+    # 400 points on its surface show a ball.
     directions = np.random.default_rng(0).normal(size=(400, 3))
     ball = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     for name in placed[0].places:

@@ -87,8 +87,9 @@ class PairResult:
             points: Points (n, 3) in the world of the reference.
             frame: In their place, the number of a frame of the reference that was used (see
                 `frames`), with a pixel that has depth.
-            x: The pixel from the image's left edge; pixel centres are at half-integers.
-            y: From its upper edge.
+            x: Pixels from the left edge of the image to the place; pixel centres are at
+                half-integers.
+            y: Pixels from the upper edge.
 
         Returns:
             The places in the world of the target, with their confidence if the pose is right.
@@ -192,7 +193,7 @@ def run_pair(dataset: Co3D, pair: Pair, method: ZeroShotPose, solvers: Sequence[
         reference,
         tuple(targets),
         estimates,
-        {},
+        errors={},
         backbone=getattr(method.backbone, "name", ""),
     )
     return replace(

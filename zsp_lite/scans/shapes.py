@@ -21,6 +21,7 @@ from zsp_lite.errors import NoPoseError
 from zsp_lite.points import near_median, standard_deviation, world_cloud
 
 HEADINGS = np.arange(0, 360, 5)  # degrees
+# These values are chosen, not fitted.
 FRAMES = 12  # of a scan that its shape is fused from
 _POINTS = 600  # of a shape
 # Largest distance that counts, in sizes of the object: what only one of two objects has costs no
@@ -53,10 +54,10 @@ class Shape:
         if not len(cloud):
             raise NoPoseError("no frame shows the object with depth")
         vertical = np.array([0.0, 0.0, 1.0]) if up is None else up / np.linalg.norm(up)
-        # The second and the third right singular vector of (1, 3) are normal to the vertical.
+        # The second right singular vector of the vertical as a (1, 3) matrix is normal to it.
         across = np.linalg.svd(vertical[None])[2][1]
         axes = np.stack([across, np.cross(vertical, across), vertical])
-        cloud = cloud[near_median(cloud, 4)]
+        cloud = cloud[near_median(cloud)]
         chosen = np.random.default_rng(0).permutation(len(cloud))[:_POINTS]
         points = cloud[chosen] @ axes.T
         middle = _middle(points)

@@ -39,6 +39,7 @@ from zsp_lite.points import near_median, object_pixels
 from zsp_lite.scans.category import CategoryAlignment
 from zsp_lite.views import View
 
+# All but the coefficients of the confidence is chosen, not fitted.
 VIEWS = 12  # frames of an object whose patches are its surface
 _TARGET_VIEWS = 3  # views of the target that a source view is compared with
 # Lengths in sizes of the target object.
@@ -49,7 +50,7 @@ _TEMPERATURE = 0.05  # of cosines, for the patches of the target
 _SOURCE_TEMPERATURE = 0.1  # of cosines, for the patches around a marked point
 # Coefficients of the confidence: constant, cosine, and distance to the surface in sizes of the
 # object. Fitted on validation categories (docs/rebuild.md).
-CONFIDENCE = (-10.4, 18.4, -22.7)
+_CONFIDENCE = (-10.4, 18.4, -22.7)
 FOUND = 0.5  # least confidence of a point that is found
 
 
@@ -66,8 +67,8 @@ class TransferredPoints:
     @property
     def confidence(self) -> Float[np.ndarray, " n"]:
         """Probability that a place is within a tenth of the object's size of the right one, if the
-        pose is right."""
-        constant, cosine, distance = CONFIDENCE
+        pose is right; 0 for a marked point too far from the surface."""
+        constant, cosine, distance = _CONFIDENCE
         logit = constant + cosine * self.cosine + distance * self.distance
         return np.where(self.distance < _BALL, expit(logit), 0.0)
 
@@ -134,7 +135,7 @@ def describe_surface(views: Iterable[View], sim3: Sim3) -> list[SurfaceView]:
             continue
         camera = view.frame.camera
         points = sim3.apply(camera.to_world(view.measured_points[0].reshape(-1, 3)[patches]))
-        near = near_median(points, 4)  # as in `points.world_cloud`
+        near = near_median(points)
         towards = sim3.apply(camera.centre) - np.median(points, axis=0)
         index = bin_indices(view.features.grid)[:, patches[near]]
         (built,) = descriptors(view.features.keys[None], index)
@@ -214,8 +215,8 @@ def _compare(
     """
     similar = sorted(target, key=lambda other: other.direction @ view.direction)[-_TARGET_VIEWS:]
     points = np.concatenate([other.points for other in similar])
-    descriptors = torch.cat([other.descriptors for other in similar])
-    cosines = (view.descriptors @ descriptors.T).double().numpy()
+    other_descriptors = torch.cat([other.descriptors for other in similar])
+    cosines = (view.descriptors @ other_descriptors.T).double().numpy()
     squared = cdist(view.points, points, "sqeuclidean") / size**2
     weights = _softmax_within(squared, cosines / _TEMPERATURE - squared / (2 * _PRIOR**2))
     displacement = weights @ points - weights.sum(axis=1, keepdims=True) * view.points
@@ -227,4 +228,5 @@ def _softmax_within(
 ) -> Float[np.ndarray, "n m"]:
     """Return the softmax of each row over the patches in the ball; 0 for a row without one."""
     inside = squared < _BALL**2
+    # Not -inf, of which the softmax of a row without a patch would be NaN.
     return inside * softmax(np.where(inside, logits, -1e9), axis=1)

@@ -15,19 +15,25 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.metrics import vector_angle
 from zsp_lite.points import world_points
 
+# These values are chosen, not fitted.
 _TRIALS = 400  # planes through three points each
-_NEAR = 0.03  # distance of a point on the floor, in median distances of the points to their middle
+# Largest distance of a point of the floor to its plane, in median distances of the background's
+# points to their middle.
+_NEAR = 0.03
 _LEAST_SHARE = 0.2  # of the background's points that a floor has
 _POINTS = 600  # of the background of a frame
 _STEEPEST = 60.0  # degrees between a floor's normal and what it must agree with, roughly
 _AGREE = 25.0  # degrees between the floor's normal and that of the ring
-# A ring is flat and round: the ratios of its extents across its plane and along it.
-_FLAT, _ROUND = 0.15, 0.3
+# A ring of cameras is flat and round: the largest ratio of its extent across its plane to the
+# smaller one within, and the smallest ratio of the smaller one to the larger one.
+_FLAT = 0.15
+_ROUND = 0.3
 
 
 def find_up(frames: Sequence[Frame]) -> tuple[Float[np.ndarray, "3"] | None, str]:
     """Find the direction up from the background's depth and the cameras of an object's frames.
 
+    The frames may be object crops, which show the floor close around the object.
     Returns None where nothing tells it, or what tells it disagrees; then also a sentence that says
     so.
     """
@@ -66,15 +72,16 @@ def _floor_normal(
     clouds = [np.zeros((0, 3))]
     for frame in frames:
         if frame.depth is not None and frame.mask is not None:
+            # Surely background, not the rim of a soft mask.
             background = (frame.mask < 0.02) & (frame.depth > 0)
             step = 1 + int(background.sum()) // _POINTS
             clouds.append(world_points(frame, background, step))
     points = np.concatenate(clouds)
-    if len(points) < _POINTS // 2:
+    if len(points) < _POINTS // 2:  # too few for a floor
         return None
-    near = _NEAR * np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
+    tolerance = _NEAR * np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
     normal, middle, count = best_plane(
-        points, near, _TRIALS, lambda normals: _between_axes(normals, axis) < _STEEPEST
+        points, tolerance, _TRIALS, lambda normals: _between_axes(normals, axis) < _STEEPEST
     )
     if count < _LEAST_SHARE * len(points):
         return None
@@ -83,7 +90,7 @@ def _floor_normal(
 
 def _ring_axis(centres: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
     """Return the axis of the ring in which cameras stand around an object, if they do."""
-    if len(centres) < 4:
+    if len(centres) < 4:  # three are always in a plane
         return None
     _, extents, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
     widest, middle, least = extents

@@ -27,8 +27,9 @@ from zsp_lite.estimates import Hypothesis
 from zsp_lite.metrics import SAME_ANGLE
 from zsp_lite.verified.verification import VIEWPOINT_SIGMA
 
-# A pose with more than this share of the best pose's probability is nearly as probable.
-TIE_RATIO = float(np.exp(-1))
+# A pose with more than this share of the best pose's probability is nearly as probable. It and the
+# next two are chosen, not fitted.
+_TIE_RATIO = float(np.exp(-1))
 # A pose is flagged if in both directions a smaller share of its points lies on an observed surface.
 _MIN_OVERLAP = 0.05
 # A pose is flagged if in both directions its similarity term is smaller. Poses, right or wrong,
@@ -68,13 +69,13 @@ class Calibration:
     def probabilities(
         self, deficit: Float[np.ndarray, " m"], x: Float[np.ndarray, " k"]
     ) -> Float[np.ndarray, " m"]:
-        """Return the probabilities of poses by their `deficit` S_1 - S_k; infinite for none."""
+        """Return the probabilities of poses by their `deficit` S_1 - S_k; 0 if it is infinite."""
         odds = np.exp(-np.exp(x @ self.scale) * deficit)
         return (1 - self.unseen * hidden_share(x[1])) * odds / (np.exp(x @ self.none) + odds.sum())
 
 
 def hidden_share(span: float) -> float:
-    """Return h for views that span a share of the circle around the target."""
+    """Return h for views whose `span` is a share of the circle around the target, in [0, 1]."""
     # A single view sees 60 degrees to both sides and leaves 240 degrees hidden. Views that span an
     # angle leave that much less: h = (240 - 360 * span) / 240.
     return max(0.0, 1 - 1.5 * span)
@@ -100,7 +101,7 @@ def reliability_flags(
     flags = []
 
     # The best hypotheses of all modes that are about as probable as the first.
-    enough = TIE_RATIO * hypotheses[0].confidence
+    enough = _TIE_RATIO * hypotheses[0].confidence
     tied = [k for k, one in enumerate(hypotheses) if one.mode == k and one.confidence > enough]
     probabilities = [hypotheses[k].confidence for k in tied]
     # One of two is meant if the two are together more probable than not, and if they are so far

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from zsp_lite.metrics import rotation_angle
 
-# Scales that the solver allows, in every stage. In working units (see `scene`) both point clouds
-# have unit spread, so a scale differs from 1 only where the views show different parts of the two
+# Scales that the verified solver allows, in every stage; chosen, and narrower than those of the
+# paper's solver, `alignment.SCALE_RANGE`. In working units (see `scene`) both point clouds have
+# unit spread, so a scale differs from 1 only where the views show different parts of the two
 # objects, or their proportions differ.
 SCALE_RANGE = (0.5, 2.0)
 
@@ -74,8 +75,8 @@ def rotation_matrices(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
     """Convert rotation vectors (axis times angle in radians) by Rodrigues' formula, in float32."""
     angle = vectors.norm(dim=-1, keepdim=True)
     x, y, z = (vectors / angle.clamp_min(1e-12)).unbind(-1)
-    # (n, 3, 3): `cross @ v` is the cross product of the axis and v.
     zero = torch.zeros_like(x)
+    # (n, 3, 3): `cross @ v` is the cross product of the axis and v.
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(-1, 3, 3)
     sine = angle.sin()[..., None]
     cosine = angle.cos()[..., None]
@@ -85,7 +86,8 @@ def rotation_matrices(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
 def non_maximum_suppression(
     rotation: Float[Tensor, "m 3 3"], score: Float[Tensor, " m"], min_angle: float, max_count: int
 ) -> Int[Tensor, " kept"]:
-    """Return the indices of the best poses whose rotations differ by `min_angle` degrees."""
+    """Return the indices of at most `max_count` poses, best first, whose rotations differ by at
+    least `min_angle` degrees."""
     order = torch.argsort(score, descending=True, stable=True)
     # (m, m): rows and columns are sorted by the scores, as `order` is.
     near = (rotation_angles(rotation[order], rotation[order]) < min_angle).numpy()

@@ -21,13 +21,15 @@ from zsp_lite.verified.poses import (
 )
 from zsp_lite.verified.scene import Scene
 
+# These values are chosen, not fitted.
 _TRIALS = 300  # number of samples of three matches, per view
 _PER_VIEW = 6  # largest number of proposals of a view
 _INLIER_DISTANCE = 0.3  # working units
 _MIN_ANGLE = 20.0  # degrees between the proposals of a view
 # So many best samples of a view go into non-maximum suppression, which compares all pairs.
 _POOL = 200
-# Turns of the first view's viewpoint about the vertical: once around in steps of 30 degrees.
+# Turns of the first view's viewpoint about the vertical: once around in steps of 30 degrees. By 0
+# it is a proposal already.
 _TURNS = torch.deg2rad(torch.arange(30.0, 360.0, 30.0))
 # Scale of the proposals that are viewpoints: the points that one view shows have about this
 # fraction of the whole object's spread.
@@ -37,8 +39,7 @@ _VIEW_SCALE = 0.9
 def poses_from_matches(
     source: Float[Tensor, "k 3"], target: Float[Tensor, "k 3"], rng: np.random.Generator
 ) -> Poses:
-    """Fit poses to random samples of three matches, of at least three, and keep the best that
-    differ."""
+    """Fit poses to random samples of three of k >= 3 matches, and keep the best that differ."""
     # The positions of the three smallest of k random numbers are a sample without repetition:
     # (trials, 3).
     sample = np.argpartition(rng.random((_TRIALS, len(source))), (0, 1, 2), axis=1)[:, :3]

@@ -23,6 +23,7 @@ from zsp_lite.verified.poses import (
 from zsp_lite.verified.scene import Scene
 from zsp_lite.verified.verification import WEIGHTS, score_terms
 
+# All values here are chosen, not fitted.
 # Each search keeps at most this many poses, as does the ranking after the last one.
 MAX_HYPOTHESES = 6
 # The rotations of the poses that are kept differ by at least this angle, degrees.
@@ -48,8 +49,8 @@ class SearchSchedule(NamedTuple):
     decay: float  # factor on all three after each round
 
 
-# These values are chosen, not fitted. Each search begins with narrower steps than the one before
-# began with, but with wider steps than that one ended with.
+# Each search begins with narrower steps than the one before began with, but with wider steps than
+# that one ended with.
 COARSE = SearchSchedule(
     rounds=3, samples=16, rotation=7.0, translation=0.12, scale=0.08, decay=0.65
 )
@@ -90,16 +91,16 @@ def refine(
     weights = np.log(_PARENTS + 0.5) - np.log(np.arange(1, _PARENTS + 1))
     weights = torch.tensor(weights / weights.sum(), dtype=torch.float32)[:, None]
     recombined = None  # (m, 7), one step of the next round for each pose
-    for turn in range(schedule.rounds):
+    for done in range(schedule.rounds):
         # All poses get the same random steps: the result for one pose does not depend on the number
-        # of others. From the second round on, the mean of a pose's best steps replaces the first.
-        draws = rng.standard_normal((schedule.samples, 7)).astype(np.float32) * schedule.decay**turn
+        # of others. From the second round on, the mean of a pose's best steps replaces the first
+        # step.
+        draws = rng.standard_normal((schedule.samples, 7)).astype(np.float32) * schedule.decay**done
         steps = torch.from_numpy(draws).repeat(m, 1, 1)  # (m, samples, 7)
         if recombined is not None:
             steps[:, 0] = recombined
 
-        # A step has 3 components of rotation, 3 of translation, 1 of log-scale. Scores and numbers
-        # of each pose's best steps, best first: (m, parents).
+        # A step has 3 components of rotation, 3 of translation, 1 of log-scale.
         vectors = torch.deg2rad(schedule.rotation * steps[..., :3]).flatten(0, 1)
         turns = rotation_matrices(vectors).view(*steps.shape[:2], 3, 3)
         scale = poses.scale[:, None] * torch.exp(schedule.scale * steps[..., 6])
@@ -109,6 +110,7 @@ def refine(
             (turns @ poses.rotation[:, None]).flatten(0, 1),
             translation.flatten(0, 1),
         )
+        # Scores and numbers of each pose's best steps, best first: (m, parents).
         top_scores, top_steps = score(candidates).view(m, -1).topk(_PARENTS, dim=1)
         best_step = top_steps[:, 0]
         improved = top_scores[:, 0] > best_score

@@ -1,10 +1,9 @@
 """The scene: the points, feature similarities and maps of all views, in two normalised frames.
 
 Working units: the reference's points are centred at their mean and divided by their spread
-(standard deviation, averaged over the axes). The points of all target views together are normalised
-in the same way, with the axes of the first target camera. A pose between the two frames then has a
-scale near 1 and a translation near 0, and all lengths in the solver are relative to the size of the
-object.
+(`points.standard_deviation`). The points of all target views together are normalised in the same
+way, with the axes of the first target camera. A pose between the two frames then has a scale near 1
+and a translation near 0, and all lengths in the solver are relative to the size of the object.
 
 Maps have depth, mask, silhouette distance and patch of each pixel. A pixel of unknown depth gives
 no information about surfaces: its weight is 0. It may still lie inside or outside the silhouette,
@@ -33,9 +32,10 @@ from zsp_lite.views import View
 # Points farther from the median point than this many median distances are outliers: patches at a
 # silhouette may have the depth of the background.
 _OUTLIER_DISTANCE = 3.0
-_DENSITY_SIGMA = 0.25  # width of the kernel by which points are weighted, working units
+# Width of the kernel by which points are weighted, working units: one to two patches; chosen.
+_DENSITY_SIGMA = 0.25
 _DENSITY_ROWS = 200  # number of points whose densities are computed together
-MIN_POINTS = 8  # fewer do not determine a shape to align
+_MIN_POINTS = 8  # fewer do not determine a shape to align; chosen
 # Resolution of the maps. Finer maps do not change results with patches of 8 pixels, and exceed the
 # processor's cache.
 _MAP_PIXELS = 128 * 128
@@ -59,7 +59,8 @@ class ViewMaps:
     first_row: Int[Tensor, " v"]  # table row of each view's first pixel
     # row-major, view after view, each column contiguous: depth in working units; its weight (the
     # soft mask, 0 where the depth is unknown); distance to the silhouette in map pixels (0 inside);
-    # similarity column of the patch (-1: none)
+    # row (of the reference's maps) or column (of the targets') of the patch in `Scene.similarity`
+    # (-1: none)
     table: Float[Tensor, "pixels 4"]
 
 
@@ -83,7 +84,6 @@ class Scene:
     # for each target, the points of its matches: in the reference, and in the target
     matches: tuple[tuple[Float[Tensor, "_ 3"], Float[Tensor, "_ 3"]], ...]
     view_similarity: Float[Tensor, " v"]  # of each target view to the reference, less their mean
-    view_similarity_std: float  # standard deviation of that similarity over the target views
     view_span: float  # angle in degrees that the target views span around the target
 
     def view_angles(self, poses: Poses) -> Float[Tensor, "m v"]:
@@ -119,8 +119,8 @@ def build_scene(
     # the first target camera.
     source = reference.measured_points[0].reshape(-1, 3)
     clouds = [
-        (view.measured_points[0].reshape(-1, 3) - moved.t) @ moved.R
-        for view, moved in zip(targets, to_camera)
+        (view.measured_points[0].reshape(-1, 3) - motion.t) @ motion.R  # its inverse
+        for view, motion in zip(targets, to_camera)
     ]
     cloud = np.concatenate(clouds)
     known = np.concatenate([target.known_foreground.ravel() for target in targets])
@@ -144,20 +144,22 @@ def build_scene(
     ]
     # The similarity of a target view to the reference: the highest similarity of each patch to any
     # patch of the other view, averaged over the reference's patches and over the target's.
-    best = torch.stack(
+    closeness = torch.stack(
         [(block.amax(dim=1).mean() + block.amax(dim=0).mean()) / 2 for block in between_foregrounds]
     )
-    view_similarity = best - best.mean()
+    view_similarity = closeness - closeness.mean()
     valid_rows = torch.from_numpy(source_valid)[reference_foreground]
 
     # Points of the matches with measured depth on both sides.
     matched = []
-    for target, moved, match in zip(targets, to_camera, matches):
-        x, y, known = measured_match_points(reference, target, match)
-        x = reference_to_working.apply(x[known])
-        y = target_to_working.apply((y[known] - moved.t) @ moved.R)
+    for target, motion, match in zip(targets, to_camera, matches):
+        x, y, measured = measured_match_points(reference, target, match)
+        x = reference_to_working.apply(x[measured])
+        y = target_to_working.apply((y[measured] - motion.t) @ motion.R)
         matched.append((float_tensor(x), float_tensor(y)))
 
+    # The mean of the targets' points, in the first target camera's frame.
+    centre = target_to_working.inverse().t
     starts = np.cumsum([len(points) for points in clouds])[:-1]  # rows where later targets begin
     return Scene(
         reference_points=float_tensor(source[source_valid]),
@@ -165,7 +167,7 @@ def build_scene(
         target_column=torch.from_numpy(column[valid]),
         target_weight=surface_weights(float_tensor(cloud[valid])),
         similarity=torch.cat(
-            [double_centre(block[valid_rows]) for block in between_foregrounds], dim=1
+            [_double_centre(block[valid_rows]) for block in between_foregrounds], dim=1
         ),
         # The reference's points are in its camera's frame: its camera has the identity as pose.
         reference_maps=build_maps(
@@ -180,8 +182,7 @@ def build_scene(
         target_cameras=cameras,
         matches=tuple(matched),
         view_similarity=view_similarity,
-        view_similarity_std=float(view_similarity.std(correction=0)),
-        view_span=view_span(cameras, cameras[0].to_world(target_to_working.inverse().t)),
+        view_span=view_span(cameras, cameras[0].to_world(centre)),
     )
 
 
@@ -191,13 +192,14 @@ def build_maps(
     to_working: Sim3,
     columns: Sequence[Int[np.ndarray, " _"]],
 ) -> ViewMaps:
-    """Build the maps of views that share a world frame."""
+    """Build the maps of views that share a world frame; `columns` has the number of each patch."""
     maps = [_table(view, column, to_working.scale) for view, column in zip(views, columns)]
     cameras, tables = zip(*maps)
     pixels = [0, *(table.shape[1] for table in tables[:-1])]  # their running sum: the first rows
     return ViewMaps(
         float_tensor([one.R for one in world_to_camera]),
-        # From x_cam = R @ x + t, with x_working = scale * x + to_working.t.
+        # In working units, with x_working = scale * x + to_working.t and x_cam times the scale:
+        # scale * x_cam = scale * (R @ x + t) = R @ x_working + scale * t - R @ to_working.t.
         float_tensor([to_working.scale * one.t - one.R @ to_working.t for one in world_to_camera]),
         float_tensor([np.sqrt(camera.focal_length.prod()) for camera in cameras]),
         float_tensor([camera.principal_point for camera in cameras]),
@@ -214,13 +216,13 @@ def project_points(
 
     Returns (m, v, n) each: the depth of the point, and the measured depth at its pixel, working
     units; the weight of the measured depth, in [0, 1], 0 where it is unknown or background; the
-    distance to the silhouette at the point's depth, working units, 0 inside; the similarity column
-    of the patch at the pixel, -1 for none.
+    distance to the silhouette at the point's depth, working units, 0 inside; the row or column of
+    the patch at the pixel in `Scene.similarity`, -1 for none.
     """
     # The points in all cameras, (m, v, 3, n), by one product of (m * v * 3, 3) and (3, n).
     camera_linear = (maps.rotation @ poses.linear[:, None]).reshape(-1, 3)
-    moved = maps.rotation @ poses.translation[:, None, :, None]
-    camera_translation = moved[..., 0] + maps.translation
+    rotated = maps.rotation @ poses.translation[:, None, :, None]
+    camera_translation = rotated[..., 0] + maps.translation
     in_camera = (camera_linear @ points.T).view(len(poses), len(maps.size), 3, -1)
     in_camera = in_camera.add_(camera_translation[..., None])
     depth = in_camera[:, :, 2]
@@ -228,7 +230,7 @@ def project_points(
     pixels = (
         in_camera[:, :, :2].mul_(pixels_per_unit[:, :, None]).add_(maps.principal_point[..., None])
     )
-    # The greatest coordinates within the image: its size is beyond it.
+    # The largest floats below the size: they truncate to the last pixel.
     last = torch.nextafter(maps.size, torch.zeros(()))[..., None]
     # A point beyond the border reads the nearest border pixel, and the distance to that pixel is
     # added to its silhouette distance. Where the silhouette reaches the border, the object is cut
@@ -279,7 +281,7 @@ def _at_centres(size: tuple[int, int], grid: tuple[int, int]) -> tuple[Int[np.nd
     return np.ix_(*((2 * np.arange(n) + 1) * cells // (2 * n) for n, cells in zip(size, grid)))
 
 
-def double_centre(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
+def _double_centre(similarity: Float[Tensor, "n1 n2"]) -> Float[Tensor, "n1 n2"]:
     """Subtract the means of rows and columns."""
     # Patches amid an object are similar to most, those at its rim to few.
     rows = similarity.mean(dim=1, keepdim=True)
@@ -324,9 +326,9 @@ def _normalisation(
 ) -> tuple[Sim3, Bool[np.ndarray, " n"]]:
     """Return the transform to mean 0 and unit spread, and which valid points are no outliers."""
     n = int(valid.sum())
-    if n < MIN_POINTS:
+    if n < _MIN_POINTS:
         raise NoPoseError(
-            f"{name}: {n} foreground patches of known depth, expected at least {MIN_POINTS}"
+            f"{name}: {n} foreground patches of known depth, expected at least {_MIN_POINTS}"
         )
     inliers = valid.copy()
     inliers[valid] = near_median(points[valid], _OUTLIER_DISTANCE)

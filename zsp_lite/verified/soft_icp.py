@@ -20,6 +20,7 @@ from zsp_lite.data.evaluation import spread
 from zsp_lite.verified.poses import SCALE_RANGE, Poses, exp_, float_tensor
 from zsp_lite.verified.scene import Scene
 
+# These values are chosen, not fitted.
 _ITERATIONS = 6
 _FEATURE_WEIGHT = 8.0  # lambda
 _MAX_POINTS = (100, 300)  # largest numbers of reference points and of target points
@@ -40,8 +41,8 @@ def soft_icp(scene: Scene, poses: Poses) -> Poses:
         # Squared distances |x|^2 + |y|^2 - 2 x.y of each source to each target point: (m, n, k).
         moved = poses.apply(source)
         square = moved.square().sum(dim=2, keepdim=True) + target_square
-        every = target.T.expand(len(moved), 3, -1)
-        square = torch.baddbmm(square, moved, every, alpha=-2).clamp_min_(0)
+        targets = target.T.expand(len(moved), 3, -1)  # a view of it for each pose
+        square = torch.baddbmm(square, moved, targets, alpha=-2).clamp_min_(0)
 
         # Each source point gets a soft partner, (m, n, 3), and a weight that says if it has one.
         affinity = exp_(square.mul_(-0.5 / sigma**2).add_(feature_term))

@@ -20,6 +20,7 @@ from zsp_lite.verified.soft_icp import soft_icp
 from zsp_lite.verified.verification import TERM_NAMES, WEIGHTS, score_terms
 from zsp_lite.views import View, ViewMatch
 
+# Chosen, not fitted.
 _MAX_REFINED = 12  # largest number of proposals that are refined
 _MIN_ANGLE_REFINED = 20.0  # degrees between the rotations of these proposals
 
@@ -118,14 +119,14 @@ class VerifiedSolver:
             # Poses of one mode share a probability: the odds of all but the best one are 0.
             mode = modes(rotation_angles(poses.rotation, poses.rotation).numpy())
             deficit = np.where(mode == np.arange(len(mode)), score[0] - score, np.inf)
-            known = evidence(
+            x = evidence(
                 scene.view_span,
                 len(order),
                 float(angles[0].min()),
-                scene.view_similarity_std,
+                float(scene.view_similarity.std(correction=0)),
                 float(WEIGHTS.of_shape().score(terms)[0]),
             )
-            confidence = Calibration().probabilities(deficit, known)[mode]
+            confidence = Calibration().probabilities(deficit, x)[mode]
             # The view of each hypothesis is the one whose camera is nearest under its pose.
             hypotheses = tuple(
                 Hypothesis(
@@ -144,7 +145,7 @@ class VerifiedSolver:
 
 
 def _content_order(targets: Sequence[View]) -> tuple[int, ...]:
-    """Order views by a hash of their pixels, whatever their order and the axes of their world."""
+    """Order views by a hash of their pixels: the order in which they come changes no result."""
     digests = []
     for target in targets:
         content = target.frame.rgb.tobytes() + target.foreground.numpy().tobytes()

@@ -49,9 +49,10 @@ from torch import Tensor
 from zsp_lite.verified.poses import Poses, exp_
 from zsp_lite.verified.scene import Scene, project_points
 
-SURFACE_SIGMA = 0.25  # sigma, working units
-MAX_VIOLATION = 0.5  # rho, working units: distance at which b and c reach 1
-VIEWPOINT_SIGMA = 45.0  # degrees
+# The symbols of the module's docstring; chosen, not fitted.
+_SURFACE_SIGMA = 0.25  # sigma, working units
+_MAX_VIOLATION = 0.5  # rho, working units: distance over which b and c rise to 1
+VIEWPOINT_SIGMA = 45.0  # degrees, where the exponential falls to 1/e
 _SIMILARITY_PRIOR = 0.5  # kappa
 # So many projected points are scored at a time: intermediate results stay in the processor's cache.
 _CHUNK = 250_000
@@ -76,13 +77,13 @@ class ScoreCoefficients:
         return terms @ torch.tensor(astuple(self), dtype=torch.float32)
 
     def of_shape(self) -> "ScoreCoefficients":
-        """Return the same weights, but 0 for `FEATURE_TERMS`: what remains compares shapes."""
-        return replace(self, **dict.fromkeys(FEATURE_TERMS, 0.0))
+        """Return the same weights, but 0 for `_FEATURE_TERMS`: what remains compares shapes."""
+        return replace(self, **dict.fromkeys(_FEATURE_TERMS, 0.0))
 
 
 TERM_NAMES = tuple(field.name for field in fields(ScoreCoefficients))
 # Terms that compare features; the others compare shapes.
-FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint")
+_FEATURE_TERMS = ("forward_similarity", "reverse_similarity", "viewpoint")
 WEIGHTS = ScoreCoefficients()
 
 
@@ -97,9 +98,10 @@ def score_terms(
     target = scene.target_points[:: stride[1]]
     source_weights = torch.ones(len(source))
     target_weights = scene.target_weight[:: stride[1]]
-    # The similarity of a point to a patch is found by where those of its row, or column, begin.
+    # Entry (i, j) of `similarity` is at i * columns + j of its flat array. Reference points are
+    # rows i, and the patches that they fall on columns j; for target points it is the reverse.
     n, columns = scene.similarity.shape
-    rows = torch.arange(0, n, stride[0]) * columns
+    row_starts = torch.arange(0, n, stride[0]) * columns
     target_columns = scene.target_column[:: stride[1]]
     per_pose = len(source) * len(scene.target_cameras) + len(target)
     size = max(_CHUNK // per_pose, 1)
@@ -107,7 +109,7 @@ def score_terms(
     for first in range(0, len(poses), size):
         chunk = poses[first : first + size]
         seen = project_points(scene.target_maps, chunk, source)
-        forward = _averages(scene, seen, rows, 1, source_weights)
+        forward = _averages(scene, seen, row_starts, patch_stride=1, point_weights=source_weights)
         seen = project_points(scene.reference_maps, chunk.inverse(), target)
         reverse = _averages(scene, seen, target_columns, columns, target_weights)
         chunks.append(torch.stack([*forward, *reverse], dim=1))
@@ -132,9 +134,9 @@ def _averages(
     depth, surface_depth, weight, silhouette_distance, patch = projection
     # Intermediate results are overwritten in place, because new arrays would leave the cache.
     delta = depth - surface_depth
-    surface = exp_(delta.square().mul_(-0.5 / SURFACE_SIGMA**2)).mul_(weight)
-    free_space = delta.add_(SURFACE_SIGMA).div_(-MAX_VIOLATION).clamp_(0, 1).mul_(weight)
-    silhouette = (silhouette_distance / MAX_VIOLATION).clamp_max_(1)
+    surface = exp_(delta.square().mul_(-0.5 / _SURFACE_SIGMA**2)).mul_(weight)
+    free_space = delta.add_(_SURFACE_SIGMA).div_(-_MAX_VIOLATION).clamp_(0, 1).mul_(weight)
+    silhouette = (silhouette_distance / _MAX_VIOLATION).clamp_max_(1)
     index = patch.clamp_min(0).mul_(patch_stride).add_(offset.int())
     similarity = scene.similarity.reshape(-1).index_select(0, index.flatten()).view(index.shape)
     # Without a foreground patch at the pixel, s = a = 0.
