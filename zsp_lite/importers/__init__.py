@@ -59,7 +59,7 @@ FORMATS = {
     "scannet": Format(("pose", "intrinsic/intrinsic_color.txt"), "ScanNet", read_scannet),
     "recording": Format(
         (RECORDED, "depth"),
-        "recordings without poses: rgb/ or color/, and depth/",
+        "recordings without poses",
         read_recording,
         ("intrinsics",),
         # Signs of other formats: poses that they have are not to be found again.
@@ -107,6 +107,7 @@ _OTHERS = (
         "has COLMAP's poses, whose lengths are not those of measured depth",
         "expected rgb/ and depth/ without them, raw data of LiDAR, or lists in metres",
     ),
+    (("odometry.csv",), "lacks rgb.mp4 of Stray Scanner's scan", _HOW),
     (
         ("rgb.txt", "depth.txt", "depth"),
         "has images and depth, but no poses (groundtruth.txt, poses.txt, pose/, ...)",
@@ -182,7 +183,10 @@ def recognise(given: Any) -> tuple[str, Any]:
             if fnmatch(name, sign) and name.count("/") == sign.count("/"):
                 raise InputError(f"{path} {problem}, {way_out}")
     problem = "has another format" if path.exists() else "does not exist"
+    if files:
+        problem += f" ({', '.join(sorted(file.name for file in files)[:4])}, ...)"
     known = "; ".join(f"{layout.what} ({', '.join(layout.signs)})" for layout in FORMATS.values())
+    known = known.replace(RECORDED, "rgb or color")
     raise InputError(
         f"{path} {problem}, expected a picture (.jpg, .png, .webp), CATEGORY/SEQUENCE of a data "
         f"folder, or a folder or zip with the files of {known}"
@@ -251,5 +255,5 @@ def open_capture(
         problem = "no frame, expected some"
         if left_out:
             problem = f"none of {len(left_out)} frames can be used: {left_out[0]}"
-        raise InputError(f"capture {path}: {problem}")
+        raise InputError(f"capture {folder.name}: {problem}")
     return Capture(frames, left_out)

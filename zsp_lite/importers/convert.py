@@ -69,7 +69,8 @@ def import_source(source: Source, root: str | Path, category: str, sequence: str
             seen.append(position)
     if left_out and len(seen) < MIN_VIEWS:
         raise InputError(
-            f"{source.path}: {len(seen)} frames remain, expected {MIN_VIEWS}: {left_out[0]}"
+            f"{source.path}: {len(seen)} of {len(seen) + len(left_out)} frames remain, expected "
+            f"{MIN_VIEWS}: {'; '.join(filter(None, (*source.doubts, left_out[0])))}"
         )
     frames = LazyFrames(source.read_frame, seen)
     points, colours, normals = fuse(frames)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from zsp_lite.errors import InputError
-from zsp_lite.importers.capture import Makers, make_frame, read_numbers, read_text_lines
+from zsp_lite.importers.capture import Makers, make_frame, read_numbers, read_text_lines, refuse
 
 # The benchmark's default, with pixel centres at half-integers.
 _TUM_INTRINSICS = (525.0, 525.0, 320.0, 240.0)
@@ -22,8 +22,15 @@ def read_lists(folder: Path) -> Makers:
     poses = read_numbers(folder / "poses.txt", (12, 16))
     # Three lines of K; or lines of fx, fy, cx, cy and 0, 4, 5 or 8 coefficients of distortion.
     intrinsics = read_numbers(folder / "intrinsics.txt", (3, 4, 8, 9, 12))
+    if intrinsics.shape[1] == 3 and len(intrinsics) != 3:
+        raise InputError(
+            f"{folder}/intrinsics.txt has {len(intrinsics)} lines of 3 numbers, expected K in 3 "
+            "lines, or fx, fy, cx, cy in each"
+        )
     if intrinsics.shape[1] == 3 or len(intrinsics) == 1:
         intrinsics = [intrinsics.squeeze()] * len(poses)
+    if len(set(images)) < len(images):
+        raise InputError(f"{folder}/rgb.txt names a picture twice, expected another in each line")
     counts = {
         "rgb.txt": len(images),
         "depth.txt": len(depths),
@@ -60,17 +67,19 @@ def read_tum(
     for time, image, depth, pose in zip(
         times, images, _nearest(depth_times, times), _nearest(poses[:, 0], times)
     ):
-        if min(depth, pose) >= 0:
-            yield partial(
-                make_frame,
-                folder,
-                image,
-                depths[depth],
-                poses[pose, 1:],
-                intrinsics,
-                f"{folder}, time {time:.6f}",
-                depth_unit=_TUM_UNIT,
-            )
+        if min(depth, pose) < 0:
+            yield partial(refuse, f"{image} has no depth or no pose within {_TUM_TOLERANCE} s")
+            continue
+        yield partial(
+            make_frame,
+            folder,
+            image,
+            depths[depth],
+            poses[pose, 1:],
+            intrinsics,
+            f"{folder}, time {time:.6f}",
+            depth_unit=_TUM_UNIT,
+        )
 
 
 def _nearest(times: np.ndarray, wanted: np.ndarray) -> list[int]:

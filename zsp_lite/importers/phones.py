@@ -197,5 +197,5 @@ def _decompressed(path: Path, kind: type, scan: _Record3D) -> np.ndarray:
         return np.frombuffer(lzfse.decompress(data), kind).reshape(scan.dh, scan.dw)
     except (lzfse.error, MemoryError, ValueError) as error:
         raise InputError(
-            f"{path.name} is no map of {scan.dh} x {scan.dw} numbers ({error or 'damaged'})"
+            f"{path.name} is no map of {scan.dh} x {scan.dw} numbers ({str(error) or 'damaged'})"
         ) from error

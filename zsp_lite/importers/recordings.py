@@ -205,7 +205,8 @@ def _track(makers: list[Callable[..., CaptureFrame]], name: str) -> Makers:
         if part is not longest:
             image = makers[min(part)].args[1]  # as `read_recording` gives it to `make_frame`
             problem = (
-                f"the recording breaks: {image} and {len(part) - 1} more do not join the others"
+                f"the recording breaks: {len(part)} frames from {image} on do not join the others "
+                "(fast motion, plain surfaces, wrong intrinsics, or depth of other times)"
             )
             yield from [partial(refuse, problem)] * len(part)
 

@@ -82,8 +82,8 @@ def read_scannet(folder: Path) -> Makers:
     # ScanNet's depth is aligned to its colours: their intrinsics hold for both. The format does not
     # document its pixel centres, so that K counts as it is.
     K = read_numbers(folder / "intrinsic/intrinsic_color.txt", columns=(3, 4))[:3, :3]
-    for path in sorted((folder / "pose").glob("*.txt")):
-        yield partial(_make_scannet, folder, path, K)
+    for image in sorted((folder / "color").glob("*")):
+        yield partial(_make_scannet, folder, folder / f"pose/{image.stem}.txt", K)
 
 
 def _make_scannet(folder: Path, path: Path, K: Float[np.ndarray, "3 3"]) -> CaptureFrame:
