@@ -10,8 +10,8 @@ class Reliability(NamedTuple):
     """How well confidences are calibrated."""
 
     calibration_error: float  # expected calibration error, in [0, 1]
-    confidence: Float[np.ndarray, " bins"]  # mean
-    accuracy: Float[np.ndarray, " bins"]  # fraction of correct estimates
+    confidence: Float[np.ndarray, " bins"]  # mean of each bin
+    accuracy: Float[np.ndarray, " bins"]  # fraction of correct estimates of each bin
 
 
 def reliability(
@@ -25,10 +25,11 @@ def reliability(
         bins: Number of bins, which have equal numbers of estimates, in order of confidence.
 
     Returns:
-        The mean confidence and the accuracy of each bin, and the mean of their differences.
+        The mean confidence and the accuracy of each bin, and the mean of their absolute differences,
+        the calibration error.
     """
     parts = np.array_split(np.argsort(confidence, kind="stable"), bins)
     means = np.array([confidence[part].mean() for part in parts])
     accuracy = np.array([correct[part].mean() for part in parts])
-    error = np.average(np.abs(means - accuracy), weights=list(map(len, parts)))
+    error = np.average(np.abs(means - accuracy), weights=[len(part) for part in parts])
     return Reliability(float(error), means, accuracy)

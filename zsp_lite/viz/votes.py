@@ -17,7 +17,8 @@ _SHOWN = 8  # largest number of votes with pictures
 
 
 def votes_figure(votes: Sequence[Vote]) -> Figure:
-    """Show reference frames, each beside the view of the other object that its own pose leads to.
+    """Show at most eight reference frames, each beside the view of the other object that its own pose
+    leads to.
 
     The colour of a point is its position along the frame's object, in both pictures.
     """
@@ -64,7 +65,7 @@ def ring_figure(result: PairResult) -> Figure:
             colour = plots.BLUE if agrees else plots.VERMILLION
             axis.scatter(angle, 1, 260 * pose.confidence, colour, alpha=0.45)
 
-    # Stars inside, each with its confidence below.
+    # Stars half-way to the circle, each with its confidence nearer to the middle.
     for pose in (answer.hypotheses[0], *answer.alternatives):
         angle = turn(answer.between_worlds(pose.sim3, pose.view).R)
         axis.scatter(
