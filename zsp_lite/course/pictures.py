@@ -51,8 +51,8 @@ def draw_fronts(axes: Sequence[Axes], dataset: Co3D, pair: Pair, estimate: PoseE
 
 
 def show_winners(gains: Mapping[str, np.ndarray], true_gain: float) -> Figure:
-    """Show the measured gains of simulated benchmarks, by a name, as a row of dots; those in which the
-    better method does not win are red crosses."""
+    """Show the measured gains of simulated benchmarks, by a name, as a row of dots; those in which
+    the better method does not win are red crosses."""
     figure, axis = plt.subplots(figsize=(7.4, 0.9 + 0.75 * len(gains)), layout="constrained")
     for row, values in enumerate(gains.values()):
         height = row + np.linspace(-0.28, 0.28, len(values))

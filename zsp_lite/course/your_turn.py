@@ -286,7 +286,7 @@ def _defect(name: str, source: str) -> str:
     out = f"{type(came).__name__}: {came}" if isinstance(came, Exception) else _shown(came)
     lines = [f"{name} is not right yet.", f"in:       {given}", f"out:      {out}"]
     lines.append(f"expected: {_shown(right)}")
-    # The part has a known mistake if it gives in all cases what the library gives with this mistake.
+    # The part has a known mistake if its results are those of the library with this mistake.
     for mistake in test["mistakes"]:
         source = inspect.getsource(_PARTS[name])
         for right_one, wrong_one in mistake["change"]:

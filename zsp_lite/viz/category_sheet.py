@@ -142,8 +142,8 @@ def _found(place: Place, shown: bool) -> str:
 def nearest_crop(
     dataset: Co3D, frames: Sequence[FrameAnnotation], rotation: Float[np.ndarray, "3 3"]
 ) -> Frame:
-    """Return the object crop of the frame whose camera has the rotation from the world that is nearest
-    to the given one."""
+    """Return the object crop of the frame whose camera's rotation from the world is nearest to the
+    given one."""
     cameras = np.stack([dataset.camera(frame).R for frame in frames])
     nearest = rotation_angle(cameras, rotation).argmin()
     return object_crop(dataset.load(frames[nearest]))

@@ -359,8 +359,8 @@ def show_points(
     colours: Sequence[str] = COLOURS,
     **labels: Any,
 ) -> Figure:
-    """Show sets of points (x, y, ...), by their names, in each panel, by its title, with equal scales
-    and one legend.
+    """Show sets of points (x, y, ...), by their names, in each panel, by its title, with equal
+    scales and one legend.
 
     All panels have the same extent, around the first set of each; points far off it are cut.
     `labels` is what `Axes.set` takes.
@@ -374,8 +374,8 @@ def show_points(
     figure, axes = _panels(len(panels), columns, size, height)
     for axis, (title, sets), centre in zip(axes, panels.items(), ranges.mean(axis=1)):
         for (name, points), colour, marker in zip(sets.items(), colours, _CLOUD_MARKERS):
-            # The more points, the smaller their marks (square points) and the thinner their lines; the
-            # factors are chosen by eye.
+            # The more points, the smaller their marks (square points) and the thinner their lines;
+            # the factors are chosen by eye.
             area = np.clip(6000 / max(len(points), 1), 3, 40)
             thick = 0.3 + 0.03 * area
             axis.scatter(

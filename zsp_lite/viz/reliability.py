@@ -25,8 +25,8 @@ def reliability(
         bins: Number of bins, which have equal numbers of estimates, in order of confidence.
 
     Returns:
-        The mean confidence and the accuracy of each bin, and the mean of their absolute differences,
-        the calibration error.
+        The mean confidence and the accuracy of each bin, and the calibration error: the mean of
+        their absolute differences, weighted by the sizes of the bins.
     """
     parts = np.array_split(np.argsort(confidence, kind="stable"), bins)
     means = np.array([confidence[part].mean() for part in parts])

@@ -17,8 +17,8 @@ _SHOWN = 8  # largest number of votes with pictures
 
 
 def votes_figure(votes: Sequence[Vote]) -> Figure:
-    """Show at most eight reference frames, each beside the view of the other object that its own pose
-    leads to.
+    """Show at most eight reference frames, each beside the view of the other object that its own
+    pose leads to.
 
     The colour of a point is its position along the frame's object, in both pictures.
     """
