@@ -35,8 +35,8 @@ WEIGHT_DECAY = 0.04, 0.4  # AdamW's, at the first and the last step
 LEARNING_RATE_DECAY = 1.0, 0.01  # factors of the largest rate, at the first and the last step
 # Share of the run in which the last layer is fixed; DINO fixes it in the first epoch.
 FIXED_LAST_LAYER = 0.05
-_CROPS = 3  # seeds the random crops with the run's seed and the step; any other number would do
 MAX_GRADIENT_NORM = 3.0  # gradients with a larger norm are scaled down to it
+_CROPS = 3  # seeds the random crops with the run's seed and the step; any other number would do
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Head(nn.Module):
         )
         self.directions = nn.Parameter(torch.randn(outputs, BOTTLENECK))
         for linear in self.mlp[::2]:
-            nn.init.trunc_normal_(linear.weight, std=0.02)
+            nn.init.trunc_normal_(linear.weight, std=0.02)  # as in DINO
             nn.init.zeros_(linear.bias)
 
     def forward(self, cls: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch outputs"]:
@@ -218,7 +218,7 @@ class Distillation:
             for slow, fast in zip(self.teacher.parameters(), self.student.parameters()):
                 slow.lerp_(fast, weight)
         if config.centring:
-            self.centre.lerp_(teacher.mean((0, 1)), 1 - CENTRE_MOMENTUM)  # eq. 4
+            self.centre.lerp_(teacher.mean((0, 1)), 1 - CENTRE_MOMENTUM)  # eq. 4 of DINO
         self.steps_done += 1
         return figures
 
