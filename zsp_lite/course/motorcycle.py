@@ -64,7 +64,8 @@ def motorcycle_frame(
     points = unproject_depth(depth, camera)
     floor = points[_FLOOR_ROWS][known[_FLOOR_ROWS]]
     normal, offset = fit_plane(floor, _FLOOR_DISTANCE)
-    height = (points @ normal - offset) * -np.sign(normal[1])  # upwards, where -y is
+    # Above the floor, whichever way the normal points: +y is down.
+    height = (points @ normal - offset) * -np.sign(normal[1])
     # This mask lacks thin parts, such as the brake cables and a mirror, and the lowest 2 cm of the
     # tyres.
     mask = largest_region(known & (depth < _FARTHEST) & (height > _CLEARANCE))

@@ -362,8 +362,9 @@ def show_points(
     """Show sets of points (x, y, ...), by their names, in each panel, by its title, with equal
     scales and one legend.
 
-    All panels have the same extent, around the first set of each; points far off it are cut.
-    `labels` is what `Axes.set` takes.
+    A panel has at most four sets, which take the `colours` in their order. All panels have the same
+    extent, around the first set of each; points far off it are cut. `labels` is what `Axes.set`
+    takes.
     """
     # The range of each panel's first set, without outliers: (panels, low and high, x and y).
     firsts = [next(iter(sets.values()))[:, :2] for sets in panels.values()]

@@ -56,14 +56,15 @@ def ring_figure(result: PairResult) -> Figure:
         x, y, z, w = Rotation.from_matrix(rotation @ answer.world_sim3.R.T).as_quat()
         return 2 * np.arctan2(up @ (x, y, z), w)
 
-    # Dots on the outer circle, of radius 1; their areas in square points grow with confidence.
+    # Dots on the outer circle, of radius 1; their areas in square points are proportional to the
+    # confidence, by a factor that is chosen by eye.
     for vote in result.votes:
         for pose in vote.estimate.hypotheses:
             world = vote.estimate.between_worlds(pose.sim3, pose.view)
             angle = turn(world.inverse().R if vote.backward else world.R)
             agrees = np.cos(angle) > np.cos(np.radians(SAME_ANGLE))
             colour = plots.BLUE if agrees else plots.VERMILLION
-            axis.scatter(angle, 1, 260 * pose.confidence, colour, alpha=0.45)
+            axis.scatter(angle, 1, s=260 * pose.confidence, c=colour, alpha=0.45)
 
     # Stars half-way to the circle, each with its confidence nearer to the middle.
     for pose in (answer.hypotheses[0], *answer.alternatives):
@@ -71,8 +72,8 @@ def ring_figure(result: PairResult) -> Figure:
         axis.scatter(
             angle,
             0.5,
-            400 * pose.confidence,
-            plots.ORANGE,
+            s=400 * pose.confidence,
+            c=plots.ORANGE,
             marker="*",
             edgecolors="black",
             linewidths=0.5,

@@ -1,7 +1,7 @@
 """Self-distillation of the backbone, DINO (Caron et al. 2021).
 
 Only images are used: no labels, masks, depth or other views. Each image is cut into two global and
-several local crops. Student and teacher map each crop to a distribution over K outputs, and the
+several local crops. Student and teacher map each crop to a distribution over M outputs, and the
 student is trained to predict, from every crop, the teacher's distribution for the other global
 crop. The teacher is an exponential average of the student.
 
@@ -49,7 +49,7 @@ class DistillationConfig:
     local_crops: int = 4  # per image, at least 1, in addition to two global ones
     global_side: int = 96  # of the crops, pixels
     local_side: int = 48
-    outputs: int = 512  # K; DINO has 65,536
+    outputs: int = 512  # M; DINO has 65,536
     teacher_temperature: float = 0.04  # of the teacher's softmax
     learning_rate: float = 1e-3  # the largest
     centring: bool = True  # if false, the centre stays 0
@@ -57,7 +57,7 @@ class DistillationConfig:
 
 
 class Head(nn.Module):
-    """Projection head: an MLP, then cosine similarities to K learned directions."""
+    """Projection head: an MLP, then cosine similarities to M learned directions."""
 
     def __init__(self, dim: int, outputs: int):
         super().__init__()
