@@ -106,7 +106,7 @@ def _draw_from_above(
     x, y = axes @ directions[-1]
     turn = -np.pi / 2 - np.arctan2(y, x)
     axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ axes
-    *places, reference_place = directions @ axes.T
+    *places, reference_place = directions @ axes.T  # (x, y) in the drawing
 
     # The widest gap between neighbours on the circle, in degrees. The azimuth of a camera right
     # above the object is NaN.

@@ -33,6 +33,7 @@ def votes_figure(votes: Sequence[Vote]) -> Figure:
             vote.name.replace(" of ", "\nof "),
             f"{vote.degrees:.0f}° off,\nprob. {vote.estimate.confidence:.2f}",
         ]
+    # Four frames to a row, each with its view.
     figure, axes = plots.show_images(images, titles, columns=8, size=1.45)
     for k, vote in enumerate(shown):
         panels = axes[2 * k : 2 * k + 2]  # the frame and the view that it leads to

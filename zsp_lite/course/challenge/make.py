@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 QUESTIONS_FILE = "pairs.csv"
 _TARGETS = 5  # target views of a pair
-_FEW = 100  # fewer pairs are warned of
+_FEW = 100  # with fewer pairs, a warning says that they tell few teams apart
 _SHORTEST = 8  # characters of a secret; shorter ones are soon guessed
 # Of all files that are given, the first second of 2000: times of rendering tell nothing then.
 _TIME = 946_684_800

@@ -211,7 +211,7 @@ def _run_alone(
         size = printed.seek(0, os.SEEK_END)
         printed.seek(max(0, size - _LAST_PRINTED))
         text = printed.read().decode(errors="replace")
-    # A hand-in that is hidden sees its folder in place of the one above.
+    # A hand-in that is kept apart sees its folder in place of the one above (see apart.sh).
     for path in (folder, folder.parent):
         text = text.replace(f"{path}{os.sep}", "")
     last = text.strip().splitlines()[-1:]

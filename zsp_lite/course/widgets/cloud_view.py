@@ -17,7 +17,7 @@ from zsp_lite.course.widgets.turning import SCRIPT, view_units
 from zsp_lite.viz.plots import BLUE, ORANGE
 
 MAX_POINTS = 6000  # points drawn; more are slow in the browser
-# A point that is farther behind the front point under the pointer cannot be clicked, in view units.
+# View units. A point that is farther behind the front point under the pointer cannot be clicked.
 _DEPTH_TOLERANCE = 0.15
 
 _STYLE = """
