@@ -10,7 +10,7 @@ def demo_pairs(dataset: Co3D) -> list[Pair]:
     """Select the first evaluation pair, stored or sampled, of every labelled category: no result is
     looked at."""
     return [
-        category_pairs(dataset, category, n=1, n_targets=N_TARGETS)[0]
+        category_pairs(dataset, category, 1, N_TARGETS)[0]
         for category in labelled_categories(dataset)
     ]
 

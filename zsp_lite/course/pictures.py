@@ -57,7 +57,6 @@ def show_winners(gains: Mapping[str, np.ndarray], true_gain: float) -> Figure:
     for row, values in enumerate(gains.values()):
         height = row + np.linspace(-0.28, 0.28, len(values))
         wins = values > 0
-        # The legend has each kind once.
         better, worse = ("", "") if row else ("better method wins", "it does not")
         axis.plot(values[wins], height[wins], "o", color=plots.BLUE, label=better)
         style = {"color": plots.VERMILLION, "markeredgewidth": 2.2, "label": worse}

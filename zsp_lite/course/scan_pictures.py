@@ -81,8 +81,8 @@ def show_graphs(
                 "linestyle": line,
                 "linewidth": 2.2,
             }
-            ends = centres[end] - gap, centres[start] + gap
-            axis.annotate("", *ends, arrowprops=style, zorder=1)
+            # `annotate` takes the head of the arrow first.
+            axis.annotate("", centres[end] - gap, centres[start] + gap, arrowprops=style, zorder=1)
         axis.set(xlim=(-1.1, 1.1), ylim=(-1.15, 1.1), aspect="equal", title=title)
         axis.set_axis_off()
     for colour, line, name in _ARROWS.values():

@@ -78,14 +78,10 @@ def crops(problem: Any) -> list[Crop]:
     the seed from now on.
     """
     _seed.set(problem.seed)
+    views = [(view.features, view.frame) for view in problem.views()]
     return [
-        Crop(
-            view.features.keys.numpy(),
-            view.features.saliency.numpy(),
-            view.frame.depth,
-            view.frame.camera.K,
-        )
-        for view in problem.views()
+        Crop(features.keys.numpy(), features.saliency.numpy(), frame.depth, frame.camera.K)
+        for features, frame in views
     ]
 
 
@@ -103,8 +99,7 @@ def patches(crop: Crop, descriptor: Callable) -> Patches:
     place = np.argwhere(np.ones(crop.saliency.shape))
     rows = []
     for row, column in place:
-        # Of the far ones the patch itself, the fifth, is left out.
-        far = list(descriptor(coarse, row, column, 3))
+        far = list(descriptor(coarse, row, column, 3))  # the fifth is the patch itself
         rows.append(np.concatenate([*descriptor(crop.keys, row, column, 1), *far[:4], *far[5:]]))
     salience = crop.saliency.ravel()
     descriptors = rows / np.linalg.norm(rows, axis=1, keepdims=True)
@@ -158,8 +153,7 @@ def composed(parts: dict[str, Any]) -> Callable[[Any], tuple[Sim3, int]]:
 
 
 def estimate(problem):
-    """Estimate the pose of the reference object in the best of the target views, and the number of
-    this view; with the paper's K = 50, 1,000 trials and threshold 0.2."""
+    """Estimate the pose of the reference object in the best of the target views."""
     reference, *targets = crops(problem)
     one = patches(reference, descriptor)
     found = []
@@ -168,12 +162,12 @@ def estimate(problem):
         cosine = one.descriptors @ other.descriptors.T
         v, distance = cycle(cosine, one.place, one.on, other.on)
         nearest = cosine.max(axis=1)
-        u = choose(distance, nearest, one.descriptors, one.salience, 50)
+        u = choose(distance, nearest, one.descriptors, one.salience, 50)  # K
         found.append((one.place[u], other.place[v[u]], nearest[u]))
     view = int(np.argmax([view_score(cosine, 50) for _, _, cosine in found]))
     x = unproject(*pixel_depths(reference, found[view][0]))
     y = unproject(*pixel_depths(targets[view], found[view][1]))
-    (scale, R, t), _ = ransac(x, y, 1000, 0.2, draws(problem.seed))
+    (scale, R, t), _ = ransac(x, y, 1000, 0.2, draws(problem.seed))  # trials, threshold
     return Sim3(scale, R, t), view
 
 
@@ -275,7 +269,6 @@ def _defect(name: str, source: str) -> str:
     found = [_outcome(function, case, end) for case in cases]
     if any(isinstance(came, TimeoutError) for came in found):
         return f"{name} was stopped after {SECONDS:.0f} s: does a loop never end?"
-    # The first case in which the part is wrong.
     differ = [one for one in zip(cases, found, expected) if not _same(name, *one[1:])]
     if not differ:
         return ""
@@ -317,8 +310,7 @@ def _outcome(
     if "rng" in inspect.signature(function).parameters:
         arguments["rng"] = draws(0)
 
-    # Python calls this as each function begins, and at each line of the part: `<name>` is the file
-    # that `_define` gives it.
+    # Python calls this at each function, and at each line of the part, whose file is `<name>`.
     def trace(frame, event, value):
         if time.monotonic() > end:
             raise TimeoutError

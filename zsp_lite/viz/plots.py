@@ -196,8 +196,7 @@ def outline_patch(
     corners = np.clip([np.subtract(cell, reach), np.add(cell, reach + 1)], 0, grid)
     (left, top), (right, bottom) = corners[:, ::-1] * np.divide(_size(axis), grid)[::-1]
     box = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=colour, **style)
-    # The label is at the right of the block; at its left in the last fifth of the columns, where it
-    # would leave the image.
+    # The label is at the right of the block, in the last fifth of the columns at its left.
     near_border = cell[1] >= 0.8 * grid[1]
     text = axis.text(
         left if near_border else right,
@@ -362,9 +361,8 @@ def show_points(
     """Show sets of points (x, y, ...), by their names, in each panel, by its title, with equal
     scales and one legend.
 
-    A panel has at most four sets, which take the `colours` in their order. All panels have the same
-    extent, around the first set of each; points far off it are cut. `labels` is what `Axes.set`
-    takes.
+    A panel has at most four sets, of the `colours` in turn. All panels have the same extent, around
+    the first set of each; points far off it are cut. `labels` is what `Axes.set` takes.
     """
     # The range of each panel's first set, without outliers: (panels, low and high, x and y).
     firsts = [next(iter(sets.values()))[:, :2] for sets in panels.values()]
@@ -375,13 +373,10 @@ def show_points(
     figure, axes = _panels(len(panels), columns, size, height)
     for axis, (title, sets), centre in zip(axes, panels.items(), ranges.mean(axis=1)):
         for (name, points), colour, marker in zip(sets.items(), colours, _CLOUD_MARKERS):
-            # The more points, the smaller their marks (square points) and the thinner their lines;
-            # the factors are chosen by eye.
+            # More points have smaller marks (square points) and thinner lines, chosen by eye.
             area = np.clip(6000 / max(len(points), 1), 3, 40)
             thick = 0.3 + 0.03 * area
-            axis.scatter(
-                *points.T[:2], s=area, c=colour, marker=marker, linewidths=thick, label=name
-            )
+            axis.scatter(*points.T[:2], area, colour, marker=marker, linewidths=thick, label=name)
         axis.set_title(title, fontsize=_FONT, parse_math=False)
         left, bottom = centre - half
         right, top = centre + half
@@ -660,13 +655,8 @@ def _panels(
     """Return panels of a size in inches in a grid, in one row if `columns` is None."""
     columns = min(columns or number, number)
     rows = -(-number // columns)  # rounded up
-    figure, axes = plt.subplots(
-        rows,
-        columns,
-        figsize=(columns * width, rows * height),
-        squeeze=False,
-        layout="constrained",
-    )
+    size = (columns * width, rows * height)
+    figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
     for axis in axes.flat[number:]:
         axis.remove()
     return figure, list(axes.flat[:number])

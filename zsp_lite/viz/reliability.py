@@ -31,5 +31,5 @@ def reliability(
     parts = np.array_split(np.argsort(confidence, kind="stable"), bins)
     means = np.array([confidence[part].mean() for part in parts])
     accuracy = np.array([correct[part].mean() for part in parts])
-    error = np.average(np.abs(means - accuracy), weights=[len(part) for part in parts])
+    error = np.average(np.abs(means - accuracy), weights=list(map(len, parts)))
     return Reliability(float(error), means, accuracy)

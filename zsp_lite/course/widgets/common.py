@@ -35,14 +35,8 @@ def slider(label: str, low: float, high: float, value: float, step: float = 1) -
     """Return a slider from `low` to `high`, with integer values if all four numbers are
     integers."""
     widgets = load_package()
-    options = {
-        "min": low,
-        "max": high,
-        "step": step,
-        "description": label,
-        "style": _LABEL,
-        "layout": {"width": "22em"},
-    }
+    options = {"min": low, "max": high, "step": step, "description": label, "style": _LABEL}
+    options["layout"] = {"width": "22em"}
     if all(isinstance(x, int | np.integer) for x in (low, high, value, step)):
         return widgets.IntSlider(value, **options)
     return widgets.FloatSlider(value, **options)

@@ -40,12 +40,8 @@ def cycle(
             f"u' {cells[2]}, cosine {values[w, v]:.2f}: "
             f"d(u, u') = {np.hypot(*np.subtract(cells[0], cells[2])):.1f} patches"
         )
-        views = reference, target, reference
-        off = [
-            name
-            for name, cell, view in zip(("u", "v", "u'"), cells, views)
-            if not view.foreground[cell]
-        ]
+        stops = zip(("u", "v", "u'"), cells, (reference, target, reference))
+        off = [name for name, cell, view in stops if not view.foreground[cell]]
         if off:
             text += f"; {', '.join(off)} not on the foreground, so the distance is infinite"
         return f"{text}."

@@ -64,17 +64,9 @@ def ransac_settings(
     lines = redrawing(draw_matches)
     inside = graph.scatter([], [], s=26, color=BLUE, label="inlier")
     outside = graph.scatter([], [], s=26, color="0.45", marker="x", label="outlier")
-    line = graph.axhline(
-        1, color=VERMILLION, linestyle="--", label="threshold"
-    )  # moved by `update`
-    graph.set(
-        xlim=(-1, n),
-        ylim=(0.01, 10),
-        yscale="log",
-        title="residuals",
-        xlabel="match, sorted by residual",
-        ylabel="residual (scene units)",
-    )
+    line = graph.axhline(1, color=VERMILLION, linestyle="--", label="threshold")
+    graph.set(xlim=(-1, n), ylim=(0.01, 10), yscale="log", title="residuals")
+    graph.set(xlabel="match, sorted by residual", ylabel="residual (scene units)")
     graph.legend(loc="upper left")
 
     def update(trials: int, threshold: float, seed: int) -> str:
@@ -102,7 +94,7 @@ def ransac_settings(
 
     controls = {
         "trials": load_package().SelectionSlider(options=_TRIALS, value=1000, description="trials"),
-        "threshold": slider("threshold", 0.02, 1.0, value=0.2, step=0.02),
+        "threshold": slider("threshold", 0.02, 1.0, 0.2, step=0.02),
         "seed": slider("seed", 0, 20, 0),
     }
     alt = "Two images with the inliers between them, and the residual of each match"
@@ -119,7 +111,7 @@ def drag_match() -> Widget:
         titles = [axis.get_title().replace("\n", " ") for axis in axes[0]]
         return f"{'; '.join(titles)}."
 
-    controls = {"distance": slider("one match is wrong by", 0.0, _FARTHEST, value=0.0, step=0.1)}
+    controls = {"distance": slider("one match is wrong by", 0.0, _FARTHEST, 0.0, step=0.1)}
     return interactive_figure(figure, controls, update, _DRAGGED)
 
 

@@ -60,7 +60,7 @@ def patch_similarities(
             axes[0], cell, grid, label="u", linewidth=2, path_effects=plots.BORDER
         )
         if valid[cell]:
-            drawn += plots.circle_patch(axes[1], cells[cell], grid, marker="*")
+            drawn += plots.circle_patch(axes[1], cells[cell], grid, "*")
         return drawn + plots.circle_patch(axes[1], nearest, grid)  # the dot lies on the star
 
     @cache

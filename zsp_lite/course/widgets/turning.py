@@ -17,7 +17,6 @@ SCRIPT = (Path(__file__).parent / "cloud_view.js").read_text(encoding="utf-8")
 # JupyterLab's keys do nothing in this <div>, so that the arrow keys turn the clouds.
 _PAGE = """<div data-lm-suppress-shortcuts="true"><div class="zsp-turning"></div>
 <script>(() => {\n%s})()</script></div>"""
-# The panels and the alternative text, as JSON.
 _CALL = 'stored(document.currentScript.parentElement.querySelector(".zsp-turning"), %s, %s);'
 
 
@@ -51,7 +50,7 @@ def show_turning(
         clouds = [one.sim3.apply(own)]
         colours = [255 * coordinate_colours(own)]
         for view in one.target_views:
-            cloud = object_cloud(view, most=2000 // len(one.target_views))
+            cloud = object_cloud(view, 2000 // len(one.target_views))
             world = view.frame.camera.to_world(cloud)
             column, row = view.frame.camera.project(world)[0].astype(int).T
             clouds.append(one.target_camera.to_camera(world))
