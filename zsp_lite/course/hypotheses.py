@@ -12,7 +12,7 @@ _Rotations = Mapping[str, Float[np.ndarray, "3 3"]]  # of objects, by their name
 
 
 def draw_answers(every: Iterable[PairHypotheses], seed: int) -> list[PairHypotheses]:
-    """Draw one answer for each ordered pair of objects, of those from several frames."""
+    """Draw one answer for each ordered pair of objects, from those of its several frames."""
     answers: dict[tuple[str, str], list[PairHypotheses]] = {}
     for answer in every:
         answers.setdefault((answer.reference, answer.target), []).append(answer)
@@ -48,6 +48,7 @@ def right_answers(
     """
     right = {}
     for one in answers:
+        # Without rotations the first answer counts, which is the surest.
         away = _angles(one, rotations) if rotations else np.zeros(1)
         nearest = away.argmin()
         is_right = bool(_angles(one, truth)[nearest] < SAME_ANGLE)
@@ -63,6 +64,7 @@ def _angles(answers: PairHypotheses, rotations: _Rotations) -> Float[np.ndarray,
 
 
 def all_alike(truth: _Rotations, rotations: _Rotations) -> bool:
-    """Whether rotations from the objects' worlds turn all objects the same way."""
+    """Whether rotations from the objects' worlds turn all objects the same way, judged by the
+    `truth` of `right_answers`."""
     frames = np.stack([rotations[name] @ truth[name].T for name in truth])
     return bool((rotation_angle(frames[0], frames) < SAME_ANGLE).all())

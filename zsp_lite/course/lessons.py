@@ -5,7 +5,7 @@ import os
 from zsp_lite.backbones.backbone import Backbone
 from zsp_lite.backbones.load import load_backbone
 from zsp_lite.course.samples import sample_data
-from zsp_lite.course.widgets.common import show as show
+from zsp_lite.course.widgets.common import show as show  # lessons import it from here
 from zsp_lite.data.co3d import Co3D
 
 
@@ -15,6 +15,7 @@ def open_lesson() -> tuple[Co3D, Backbone]:
 
     Figures of the notebook are stored as JPEG from now on, which is smaller than PNG.
     """
+    # A package of Jupyter, which only the lessons need.
     from matplotlib_inline.backend_inline import set_matplotlib_formats
 
     set_matplotlib_formats("jpeg", pil_kwargs={"quality": 85})

@@ -42,9 +42,9 @@ def load_photograph() -> Frame:
     is the camera's frame. Lengths are scaled as in CO3D, so that the points of the object have unit
     standard deviation; one unit is about 0.22 m.
     """
-    import skimage.data
+    import skimage.data  # only the photograph needs it
 
-    rgb, _, disparity = skimage.data.stereo_motorcycle()
+    rgb, _, disparity = skimage.data.stereo_motorcycle()  # second: the image of the right camera
     frame = motorcycle_frame(rgb, disparity)
     unit = np.float32(axis_deviation(object_points(frame)))  # metres
     return replace(frame, depth=frame.depth / unit)
@@ -64,7 +64,8 @@ def motorcycle_frame(
     points = unproject_depth(depth, camera)
     floor = points[_FLOOR_ROWS][known[_FLOOR_ROWS]]
     normal, offset = fit_plane(floor, _FLOOR_DISTANCE)
-    height = (points @ normal - offset) * -np.sign(normal[1])  # +y is down
+    # Above the floor, whichever way the normal points: +y is down.
+    height = (points @ normal - offset) * -np.sign(normal[1])
     # This mask lacks thin parts, such as the brake cables and a mirror, and the lowest 2 cm of the
     # tyres.
     mask = largest_region(known & (depth < _FARTHEST) & (height > _CLEARANCE))

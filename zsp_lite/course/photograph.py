@@ -43,7 +43,7 @@ class PhotographResult:
     foreground: str  # as set in `ZeroShotPose`
     solver: str  # as set in `ZeroShotPose`
     estimate: PoseEstimate  # the photograph is the reference
-    # columns: front, left and up of the photographed motorcycle, as estimated
+    # columns: front, left and up of the photographed motorcycle in its camera, as estimated
     axes: Float[np.ndarray, "3 3"]
     # point cloud of the synthetic motorcycle, aligned with the photographed one
     cloud: Float[np.ndarray, "n 3"]
@@ -135,7 +135,7 @@ def photograph_figure(results: Sequence[PhotographResult]) -> Figure:
         f"front {result.front_error:.0f}°, up {result.up_error:.0f}° off"
         for result in results
     ]
-    titles.insert(columns, "directions judged by eye\n")
+    titles.insert(columns, "directions judged by eye\n")  # at the left of the second row
     images = [view] + [photograph.rgb] * (len(results) + 1)
     figure, axes = plots.show_images(images, titles, columns=columns, size=3.6)
     by_eye = axes.pop(columns)

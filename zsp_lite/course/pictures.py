@@ -1,4 +1,4 @@
-"""Pictures of lessons: a turned pose, arrows to the front of objects, a row of benchmarks."""
+"""Pictures of lessons: a turned pose, arrows to the front of objects, gains of benchmarks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -28,9 +28,10 @@ _TRUE = {"color": plots.GREEN, "linewidth": 6, "label": "front of the target"}
 
 
 def turned(estimate: PoseEstimate, up: Float[np.ndarray, "3"], degrees: float) -> PoseEstimate:
-    """Turn an estimate about a direction of the target's world and its moved points' middle."""
-    axis = np.radians(degrees) * estimate.target_camera.R @ up
-    turn = Rotation.from_rotvec(axis).as_matrix()
+    """Turn an estimate about an axis through the middle of the moved points; `up` is its direction
+    in the target's world."""
+    rotvec = np.radians(degrees) * estimate.target_camera.R @ up
+    turn = Rotation.from_rotvec(rotvec).as_matrix()
     middle = estimate.sim3.apply(plots.object_cloud(estimate.reference_view)).mean(axis=0)
     return replace(estimate, sim3=Sim3(1.0, turn, middle - turn @ middle) @ estimate.sim3)
 
@@ -38,9 +39,11 @@ def turned(estimate: PoseEstimate, up: Float[np.ndarray, "3"], degrees: float) -
 def draw_fronts(axes: Sequence[Axes], dataset: Co3D, pair: Pair, estimate: PoseEstimate) -> None:
     """Draw arrows to the front of the reference and of the chosen target over their images."""
     poses = [object_poses(dataset, pair.category)[name] for name, _ in pair.frames[:2]]
+    # Arrows in the objects' worlds, two standard deviations of the object long; +x is the front.
     fronts = [pose.t + np.outer([0, 2], pose.scale * pose.R[:, 0]) for pose in poses]
     fronts.append(estimate.world_sim3.apply(fronts[0]))
     seen = plots.chosen_views([estimate])
+    # In the image of the reference its own arrow, in that of the target both.
     for k, front, style in zip((0, 1, 1), fronts, (_MOVED, _TRUE, _MOVED)):
         (tail, tip), _ = seen[k].frame.camera.project(front)
         arrow = FancyArrowPatch(tail, tip, arrowstyle="-|>", mutation_scale=18, zorder=4, **style)
@@ -48,8 +51,8 @@ def draw_fronts(axes: Sequence[Axes], dataset: Co3D, pair: Pair, estimate: PoseE
 
 
 def show_winners(gains: Mapping[str, np.ndarray], true_gain: float) -> Figure:
-    """Show the measured gains of simulated benchmarks as a row of dots for each name; those in
-    which the better method does not win are red crosses."""
+    """Show the measured gains of simulated benchmarks, by a name, as a row of dots; those in which
+    the better method does not win are red crosses."""
     figure, axis = plt.subplots(figsize=(7.4, 0.9 + 0.75 * len(gains)), layout="constrained")
     for row, values in enumerate(gains.values()):
         height = row + np.linspace(-0.28, 0.28, len(values))

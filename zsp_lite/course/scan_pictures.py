@@ -1,4 +1,4 @@
-"""Pictures of the lesson on scans: a curve above what it measures, a graph of objects."""
+"""Pictures of the lesson on hypotheses: a curve above what it measures, a graph of objects."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,11 +12,10 @@ from zsp_lite.data.co3d import Co3D
 from zsp_lite.viz.category_sheet import nearest_crop
 from zsp_lite.viz.plots import GREEN, VERMILLION, draw_image
 
-# Pictures stand on a circle of radius 1; half the width of a picture, and how far from its middle
-# arrows end.
-_PICTURE = 0.34
-_ENDS = 0.42
-# Of right answers, of wrong ones, and where none fits.
+# In `show_graphs`, where pictures stand on a circle of radius 1.
+_PICTURE = 0.34  # half the width of a picture
+_ENDS = 0.42  # distance of the ends of arrows from the middle of a picture
+# Colour, line and label of right answers, of wrong ones, and where none fits.
 _ARROWS = {
     True: (GREEN, "-", "right answer"),
     False: (VERMILLION, "--", "wrong answer"),
@@ -56,11 +55,12 @@ def curve_above_pictures(
 def show_graphs(
     graphs: Mapping[str, tuple[Mapping[str, np.ndarray], Mapping[tuple[str, str], bool | None]]],
 ) -> Figure:
-    """Show for each title named pictures on a circle, with arrows between them: True is green,
-    False red and dashed, None grey and dotted."""
+    """Show for each title named pictures on a circle, with arrows between pairs of names: True is
+    green, False red and dashed, None grey and dotted."""
     size = (4.1 * len(graphs), 4.4)
     figure, axes = plt.subplots(1, len(graphs), figsize=size, layout="constrained", squeeze=False)
     for axis, (title, (pictures, arrows)) in zip(axes.flat, graphs.items()):
+        # The first picture is at the upper left.
         angles = np.pi * (0.75 + 2 * np.arange(len(pictures)) / len(pictures))
         centres = dict(zip(pictures, np.column_stack([np.cos(angles), np.sin(angles)])))
         for name, picture in pictures.items():
@@ -81,8 +81,8 @@ def show_graphs(
                 "linestyle": line,
                 "linewidth": 2.2,
             }
-            ends = centres[end] - gap, centres[start] + gap
-            axis.annotate("", *ends, arrowprops=style, zorder=1)
+            # `annotate` takes the head of the arrow first.
+            axis.annotate("", centres[end] - gap, centres[start] + gap, arrowprops=style, zorder=1)
         axis.set(xlim=(-1.1, 1.1), ylim=(-1.15, 1.1), aspect="equal", title=title)
         axis.set_axis_off()
     for colour, line, name in _ARROWS.values():
@@ -94,7 +94,8 @@ def show_graphs(
 def alike(
     dataset: Co3D, category: str, rotations: Mapping[str, np.ndarray], first: str
 ) -> dict[str, np.ndarray]:
-    """Return for each object the picture that is nearest to the first frame of one of them.
+    """Return for each object the crop of the frame that is nearest to the first frame of the object
+    `first`.
 
     `rotations` lead from the objects' worlds to a common frame: if they are right, all objects are
     seen from the same side.

@@ -17,10 +17,9 @@ from zsp_lite.data.frames import Frame
 from zsp_lite.data.ground_truth import ObjectPose, object_poses
 from zsp_lite.views import object_crop, patch_mask
 
-_NEAR = 0.1  # largest distance of a match in box coordinates
+_LARGEST_DISTANCE = 0.1  # of the points of a match, in box coordinates
 _MARGIN = 0.05  # a point farther outside the box than this belongs to the background
 _MASK_THRESHOLD = 0.8  # above this a pixel is surely of the object: masks are soft at its border
-
 
 # Box coordinates of patches, and where they are known.
 PatchCoordinates = tuple[Float[np.ndarray, "_ _ 3"], Bool[np.ndarray, "_ _"]]
@@ -31,7 +30,7 @@ class GroundTruthPair:
     """Object crops of two instances of a category with their ground-truth matches."""
 
     category: str
-    reference: Frame  # object crops
+    reference: Frame  # object crop, like the target
     target: Frame
     # matching target patch (row, col) of each reference patch
     cells: Int[np.ndarray, "rows cols 2"]
@@ -65,7 +64,7 @@ def ground_truth_matches(
     if known.any() and target_known.any():
         distance, index = cKDTree(target_points[target_known]).query(points[known])
         cells[known] = np.argwhere(target_known)[index]
-        valid[known] = distance <= _NEAR
+        valid[known] = distance <= _LARGEST_DISTANCE
         cells[~valid] = 0
     return cells, valid
 
@@ -83,7 +82,7 @@ def correct_matches(
 def ground_truth_pair(dataset: Co3D, pair: Pair) -> GroundTruthPair:
     """Load a pair with its ground-truth matches of 28 x 28 patches, for the target view that has
     the most of them."""
-    grid = (28, 28)
+    grid = (28, 28)  # of ViT-S/8 on a crop of 224 x 224 pixels
     poses = object_poses(dataset, pair.category)
     reference, targets = dataset.load_pair(pair)
     reference, *targets = map(object_crop, (reference, *targets))

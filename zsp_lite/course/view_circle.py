@@ -9,10 +9,11 @@ from matplotlib.figure import Figure
 
 from zsp_lite.viz.plots import BLUE, CHOSEN, draw_image, mark
 
-_RINGS = (-45, -35, -25)
+_RINGS = (-45, -35, -25)  # scores with a circle
 _EVERY = 3  # views from one thumbnail to the next
-_THUMBNAIL = 0.17  # width and height, of the figure's
-_RING = 0.395  # distance of the thumbnails from the middle, of the figure's width
+# As fractions of the figure's width:
+_THUMBNAIL = 0.17  # width of a thumbnail
+_RADIUS = 0.395  # distance of the thumbnails from the middle
 
 
 def show_view_circle(
@@ -37,10 +38,10 @@ def show_view_circle(
     """
     figure = plt.figure(figsize=(7, 7))
     circle = figure.add_axes((0.25, 0.25, 0.5, 0.5), projection="polar")
-    # Scores of -52 lie in the middle, of -22 at the rim.
+    # A score of -52 is in the middle, one of -22 at the rim: the lesson's scores are between.
     circle.set(theta_zero_location="N", theta_direction=-1, ylim=(-52, -22))
     circle.set_thetagrids(range(0, 360, 90), ["turn 0°", "+90°", "180°", "−90°"])
-    # The rings have their labels where the curve is farthest from all of them.
+    # The rings have their labels at the view whose score is farthest from all of them.
     away = np.abs(scores[:, None] - _RINGS).min(axis=1)
     circle.set_rgrids(_RINGS, ["−45", "−35", "score −25"], turns[away.argmax()], fontsize=8)
 
@@ -55,7 +56,7 @@ def show_view_circle(
 
     for view in order[place % _EVERY :: _EVERY]:
         angle = np.radians(turns[view])
-        centre = 0.5 + _RING * np.array([np.sin(angle), np.cos(angle)])
+        centre = 0.5 + _RADIUS * np.array([np.sin(angle), np.cos(angle)])
         axis = figure.add_axes((*(centre - _THUMBNAIL / 2), _THUMBNAIL, _THUMBNAIL))
         draw_image(axis, images[view])
         axis.set_axis_off()

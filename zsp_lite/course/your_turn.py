@@ -42,7 +42,7 @@ from zsp_lite.minimal import (
 
 FILE = "my_method.py"  # in the current folder
 SECONDS = 10.0  # that a part has for all its tests
-TRIALS = 1000  # of RANSAC
+TRIALS = 1000  # of the library's RANSAC
 # What a kept file begins with: the library's parts, which those of the student replace.
 HEADER = '''\
 """My method: the parts that I wrote. For the others it takes the library's."""
@@ -58,7 +58,7 @@ from zsp_lite.minimal import ransac, umeyama, unproject, view_score
 # What stands at its end until the student's own `estimate` does.
 COMPOSED = "estimate = composed(globals())  # the library's, of the parts above\n"
 
-
+# Set by `crops` and read by `kmeans`, which a student's code calls without a seed.
 _seed = ContextVar("seed of the pair", default=0)
 
 
@@ -78,11 +78,11 @@ def crops(problem: Any) -> list[Crop]:
     the seed from now on.
     """
     _seed.set(problem.seed)
+    views = [(view.features, view.frame) for view in problem.views()]
     return [
-        Crop(view.features.keys.numpy(), view.features.saliency.numpy(), view.frame.depth,
-             view.frame.camera.K)
-        for view in problem.views()
-    ]  # fmt: skip
+        Crop(features.keys.numpy(), features.saliency.numpy(), frame.depth, frame.camera.K)
+        for features, frame in views
+    ]
 
 
 def kmeans(vectors: np.ndarray, k: int) -> np.ndarray:
@@ -99,7 +99,7 @@ def patches(crop: Crop, descriptor: Callable) -> Patches:
     place = np.argwhere(np.ones(crop.saliency.shape))
     rows = []
     for row, column in place:
-        far = list(descriptor(coarse, row, column, 3))
+        far = list(descriptor(coarse, row, column, 3))  # the fifth is the patch itself
         rows.append(np.concatenate([*descriptor(crop.keys, row, column, 1), *far[:4], *far[5:]]))
     salience = crop.saliency.ravel()
     descriptors = rows / np.linalg.norm(rows, axis=1, keepdims=True)
@@ -117,7 +117,8 @@ def interval(right, first, second, rng):
 
     A pair counts as often as its objects, numbers `first` and `second` (n,), are drawn.
     """
-    shares, n = [], max(*first, *second) + 1
+    shares = []
+    n = max(*first, *second) + 1  # objects
     while len(shares) < 2000:
         times = np.bincount(rng.integers(n, size=n), minlength=n)
         weight = times[first] * times[second]
@@ -127,9 +128,9 @@ def interval(right, first, second, rng):
 
 
 class _Draws(np.random.Generator):
-    """A random generator that draws samples of 4 one by one as the library draws them at once."""
+    """A random generator that gives one by one the samples of 4 that the library draws at once."""
 
-    _samples: Sequence[np.ndarray] = ()
+    _samples: Sequence[np.ndarray] = ()  # that are left; the next one is the last
 
     def choice(self, a: Any, size: Any = None, replace: bool = True, **others: Any) -> Any:
         """Return the next sample of 4 of `a` matches without replacement; else what NumPy does."""
@@ -154,23 +155,25 @@ def composed(parts: dict[str, Any]) -> Callable[[Any], tuple[Sim3, int]]:
 def estimate(problem):
     """Estimate the pose of the reference object in the best of the target views."""
     reference, *targets = crops(problem)
-    one, found = patches(reference, descriptor), []
+    one = patches(reference, descriptor)
+    found = []
     for target in targets:
         other = patches(target, descriptor)
         cosine = one.descriptors @ other.descriptors.T
         v, distance = cycle(cosine, one.place, one.on, other.on)
         nearest = cosine.max(axis=1)
-        u = choose(distance, nearest, one.descriptors, one.salience, 50)
+        u = choose(distance, nearest, one.descriptors, one.salience, 50)  # K
         found.append((one.place[u], other.place[v[u]], nearest[u]))
     view = int(np.argmax([view_score(cosine, 50) for _, _, cosine in found]))
     x = unproject(*pixel_depths(reference, found[view][0]))
     y = unproject(*pixel_depths(targets[view], found[view][1]))
-    (scale, R, t), _ = ransac(x, y, 1000, 0.2, draws(problem.seed))
+    (scale, R, t), _ = ransac(x, y, 1000, 0.2, draws(problem.seed))  # trials, threshold
     return Sim3(scale, R, t), view
 
 
-_FIRST = descriptor, cycle, minimal.choose, view_score, unproject, umeyama, ransac
-_PARTS = {part.__name__: part for part in (*_FIRST, rotation_error, interval, estimate)}
+# In the order of the lessons. The name of the partial `choose` is that of `minimal`'s function.
+_OF_MINIMAL = descriptor, cycle, minimal.choose, view_score, unproject, umeyama, ransac
+_PARTS = {part.__name__: part for part in (*_OF_MINIMAL, rotation_error, interval, estimate)}
 _TESTS = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
 
 
@@ -181,7 +184,7 @@ def check(function: Callable) -> None:
     tested.
 
     Raises:
-        InputError: if `my_method.py` is no Python, or has no `estimate`.
+        InputError: if the `my_method.py` that is there is no Python, or has no `estimate`.
     """
     name = getattr(function, "__name__", "?")
     reason = f"{name} is no part of the method, expected one of {', '.join(_PARTS)}"
@@ -218,6 +221,7 @@ def _refusal(name: str, function: Callable) -> str:
     nodes = [*ast.walk(written)]
     if any(isinstance(one, ast.Import | ast.ImportFrom) for one in nodes):
         return f"{name} imports something: np and the parts of the method are there"
+    # Known are the names that the part binds itself, those of the file, and Python's own.
     names = [one for one in nodes if isinstance(one, ast.Name)]
     known = {one.id for one in names if not isinstance(one.ctx, ast.Load)}
     known |= {one.arg for one in nodes if isinstance(one, ast.arg)}
@@ -253,11 +257,13 @@ def _defect(name: str, source: str) -> str:
     """Compare a part, among the library's others, with the library's; "" if all is the same."""
     _seed.set(0)
     function = _define(name, source, _executed(HEADER))
-    test, end = _TESTS[name], time.monotonic() + SECONDS
+    test = _TESTS[name]
+    end = time.monotonic() + SECONDS
     cases = [
         {key: np.array(value) if isinstance(value, list) else value for key, value in case.items()}
         for case in test["cases"]
     ]
+    # Of `estimate` the file has none: a toy pair, without noise and with it.
     cases = cases or [{"problem": _toy_problem(noise)} for noise in (0, 0.05)]
     expected = [_outcome(_PARTS[name], case) for case in cases]
     found = [_outcome(function, case, end) for case in cases]
@@ -273,6 +279,7 @@ def _defect(name: str, source: str) -> str:
     out = f"{type(came).__name__}: {came}" if isinstance(came, Exception) else _shown(came)
     lines = [f"{name} is not right yet.", f"in:       {given}", f"out:      {out}"]
     lines.append(f"expected: {_shown(right)}")
+    # The part has a known mistake if its results are those of the library with this mistake.
     for mistake in test["mistakes"]:
         source = inspect.getsource(_PARTS[name])
         for right_one, wrong_one in mistake["change"]:
@@ -296,23 +303,25 @@ def _outcome(
 ) -> list[np.ndarray] | Exception:
     """Call a part with copies of arguments, and make arrays of what it gives, or return its error.
 
-    It is stopped by TimeoutError at its first line after the time `end`.
+    It is stopped by TimeoutError at its first line after the time `end`, in `time.monotonic`.
     """
-    given, case = case, copy.deepcopy(dict(case))
+    name = function.__name__
+    arguments = copy.deepcopy(dict(case))
     if "rng" in inspect.signature(function).parameters:
-        case["rng"] = draws(0)
+        arguments["rng"] = draws(0)
 
+    # Python calls this at each function, and at each line of the part, whose file is `<name>`.
     def trace(frame, event, value):
         if time.monotonic() > end:
             raise TimeoutError
-        return trace if frame.f_code.co_filename == f"<{function.__name__}>" else None
+        return trace if frame.f_code.co_filename == f"<{name}>" else None
 
     before = sys.gettrace()
     if end < math.inf:
         sys.settrace(trace)
     flat = []
     try:
-        name, result = function.__name__, function(**case)
+        result = function(**arguments)
         if name in ("ransac", "estimate") and len(result) != 2:
             raise ValueError(f"{len(result)} values are returned, expected 2")
         # The ends of an interval may stand in one array or not.
@@ -325,8 +334,8 @@ def _outcome(
                 todo = [*one, *todo]
             else:
                 flat.append(np.asarray(one, float))
-        for key, value in given.items():
-            if isinstance(value, np.ndarray) and not np.array_equal(value, case[key]):
+        for key, value in case.items():
+            if isinstance(value, np.ndarray) and not np.array_equal(value, arguments[key]):
                 raise ValueError(f"{key} is overwritten, which the caller still needs")
     except Exception as error:  # of any kind, as it is the student's
         return error
@@ -356,17 +365,20 @@ def _shown(values: Iterable[Any]) -> str:
 def _keep(name: str, source: str) -> int:
     """Put a part into `my_method.py`; return how many are the student's."""
     text = _kept()
-    lines, places = text.splitlines(keepends=True), _places(text)
+    lines = text.splitlines(keepends=True)
+    places = _places(text)
+    # In place of the one that is there, or else before `estimate`, which calls it.
     start = places["estimate"].start
     lines[places.get(name, slice(start, start))] = [source, "" if name in places else "\n\n"]
     text = "".join(lines)
     write_atomic(FILE, text.encode())
-    return len(_places(text)) - (COMPOSED in text)
+    return len(_places(text)) - (COMPOSED in text)  # this `estimate` is the library's
 
 
 def _places(text: str) -> dict[str, slice]:
     """Find the parts in the lines of a text."""
     body = ast.parse(text).body
+    # A part is a function, or the left side of an assignment, as in `COMPOSED`.
     names = ((one, getattr(one, "name", ast.unparse(one).partition(" = ")[0])) for one in body)
     return {name: slice(one.lineno - 1, one.end_lineno) for one, name in names if name in _PARTS}
 
@@ -374,16 +386,17 @@ def _places(text: str) -> dict[str, slice]:
 def _toy_problem(noise: float) -> Any:
     """Build a pair with three target views: the second shows the reference at twice its size."""
     rng = np.random.default_rng(3)
-    keys, depth = rng.normal(size=(12, 12, 8)), rng.uniform(4, 6, (48, 48)).astype(np.float32)
+    keys = rng.normal(size=(12, 12, 8))
+    depth = rng.uniform(4, 6, (48, 48)).astype(np.float32)
 
-    def view(keys, depth=depth, middle=24):
+    def view(keys, depth=depth, middle=24):  # middle: x of the principal point, pixels
         salience = torch.from_numpy(rng.uniform(0, 0.4, (12, 12)))
         features = SimpleNamespace(keys=torch.from_numpy(keys), saliency=salience)
         K = np.array([[80, 0, middle], [0, 80, 24], [0, 0, 1.0]])
         frame = SimpleNamespace(depth=depth, camera=SimpleNamespace(K=K))
         return SimpleNamespace(features=features, frame=frame)
 
-    # A patch has 4 pixels: the picture moves to the right by one patch.
+    # The picture moves to the right by one patch, which has 4 pixels, and to twice the depth.
     larger = np.roll(keys, 1, axis=1) + 9 * noise * rng.normal(size=keys.shape)
     farther = np.roll(depth, 4, axis=1) * rng.normal(2, noise, depth.shape).astype(np.float32)
     other = view(rng.normal(size=keys.shape))

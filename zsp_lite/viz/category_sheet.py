@@ -17,9 +17,10 @@ from zsp_lite.scans.marks import COLOURS, Place, PlacedMark
 from zsp_lite.views import object_crop
 from zsp_lite.viz.plots import VERMILLION, draw_axes
 
-# Probabilities that the pose is right, and that the next best one is, by the angle between both.
+# Of the table of objects: the probability that the pose is right, the angle to the next best pose,
+# and the probability of that one.
 COLUMNS = ("object", "right (%)", "else turned by", "that (%)")
-_DOUBTFUL = 0.8  # an object with a lower probability should be looked at
+_DOUBTFUL = 0.8  # an object whose pose has a lower probability should be looked at
 MOST = 10  # objects of a figure
 # Width and height of a picture with its texts, and the figure's border, in inches.
 _WIDTH = 1.25
@@ -49,8 +50,8 @@ def objects_figure(
     surest = max(objects, key=lambda name: objects[name].probability)
     camera = dataset.camera(_frames(dataset, category, surest)[0]).R
     common = camera @ objects[surest].sim3.R.T  # from the common frame to the camera
-    poses = {name: objects[name].sim3 for name in names}
-    rows = {"as scanned": poses, "aligned": poses}
+    aligned = {name: objects[name].sim3 for name in names}
+    rows = {"as scanned": aligned, "aligned": aligned}
     turned = {
         name: pose for name in names if name in flagged and (pose := objects[name].alternative)
     }
@@ -72,9 +73,9 @@ def objects_figure(
                     # An arrow that is parallel to the image has 0.35 of its width.
                     reach = 0.35 * seen.t[2] * len(crop.rgb) / crop.camera.K[0, 0]
                     ends = seen.t + reach * seen.R.T
-                    draw_axes(axis, crop.camera, seen.t, ends, ("front", "left", "up"), 7)
+                    draw_axes(axis, crop.camera, seen.t, ends, ("front", "left", "up"), size=7)
 
-    # Names and probabilities below the row "aligned".
+    # Names, of which 16 characters have room, and probabilities below the row "aligned".
     for axis, name in zip(axes[1], names):
         text = f"{name[:16]}\n{100 * objects[name].probability:.0f} %"
         colour = VERMILLION if name in flagged else "black"
@@ -90,12 +91,16 @@ def marks_figure(
     names: Sequence[str],
 ) -> Figure:
     """Show marks on objects, a row for each mark: each object by the frame that sees the place from
-    the most similar side, the marked one by the frame that is marked."""
+    the most similar side, the marked one by the frame that is marked.
+
+    Of the names, as many characters are shown as have room.
+    """
     figure, axes = _panels(len(placed), len(names), (_HEIGHT + _BORDER) * len(placed))
     for number, (panels, one) in enumerate(zip(axes, placed)):
         mark = one.mark
         marked = dataset.camera(dataset.frame(category, mark.sequence, mark.frame)).R
-        common = marked @ alignment.objects[mark.sequence].sim3.R.T  # from the common frame
+        # From the common frame to the camera that is marked.
+        common = marked @ alignment.objects[mark.sequence].sim3.R.T
         panels[0].set_ylabel(mark.name[:24], fontsize=8, parse_math=False)
         for axis, name in zip(panels, names):
             place = one.places[name]
@@ -127,7 +132,7 @@ def _panels(rows: int, columns: int, height: float) -> tuple[Figure, np.ndarray]
 
 
 def _found(place: Place, shown: bool) -> str:
-    """Say whether and how surely an object has a place."""
+    """Say whether and how surely an object has a place, and whether the picture shows it."""
     if not place.found:
         return "nothing here"
     percent = f"{100 * place.confidence:.0f} %"
@@ -137,9 +142,10 @@ def _found(place: Place, shown: bool) -> str:
 def nearest_crop(
     dataset: Co3D, frames: Sequence[FrameAnnotation], rotation: Float[np.ndarray, "3 3"]
 ) -> Frame:
-    """Return the object crop of the frame whose camera is nearest to a rotation from the world."""
-    seen_from = np.stack([dataset.camera(frame).R for frame in frames])
-    nearest = rotation_angle(seen_from, rotation).argmin()
+    """Return the object crop of the frame whose camera's rotation from the world is nearest to the
+    given one."""
+    cameras = np.stack([dataset.camera(frame).R for frame in frames])
+    nearest = rotation_angle(cameras, rotation).argmin()
     return object_crop(dataset.load(frames[nearest]))
 
 

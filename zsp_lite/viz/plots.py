@@ -54,7 +54,7 @@ _TITLE_LINE = 0.2  # height of a line of a title at this font, in inches
 _MARKED = 20  # a curve with more points has no markers, which would cover it
 _JOINED = 15  # number of matches with a line: more lines would cover the images
 _INSIDE = 0.9  # a soft mask above this leaves out the border of the object
-_RESIDUAL = 0.2  # an inlier has a smaller one: the default threshold of RANSAC
+_RESIDUAL = 0.2  # an inlier has a smaller residual: the default threshold of RANSAC
 _OUTLIER = 2.5  # median distances; points farther out are background (see `near_median`)
 # A white outline lets lines and texts stand out from dark images, a black one white lines from
 # light images.
@@ -192,13 +192,13 @@ def outline_patch(
 
     The block is cut at the border of the image.
     """
-    # First and last corner (row, col) of the block, and the same in pixels (x, y).
+    # The corners at the upper left and the lower right as (row, col), then in pixels (x, y).
     corners = np.clip([np.subtract(cell, reach), np.add(cell, reach + 1)], 0, grid)
     (left, top), (right, bottom) = corners[:, ::-1] * np.divide(_size(axis), grid)[::-1]
     box = Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=colour, **style)
-    # The label is at the right of the block, but near the right border at its left.
+    # The label is at the right of the block, in the last fifth of the columns at its left.
     near_border = cell[1] >= 0.8 * grid[1]
-    name = axis.text(
+    text = axis.text(
         left if near_border else right,
         (top + bottom) / 2,
         f" {label} ",
@@ -207,7 +207,7 @@ def outline_patch(
         weight="bold",
         path_effects=_OUTLINE,
     )
-    return [axis.add_patch(box), name]
+    return [axis.add_patch(box), text]
 
 
 def draw_cycle(
@@ -218,7 +218,8 @@ def draw_cycle(
     names: Sequence[str] = ("u", "v", "u'"),
 ) -> list[Artist]:
     """Draw a cycle between the images of two axes: a solid arrow from u to v, a dashed one from v
-    back to u'."""
+    back to u', with `names` or without any."""
+    # A closed cycle has both names of its start beside each other.
     if names and tuple(cells[0]) == tuple(cells[2]):
         names = (f"{names[0]} = {names[2]}", names[1], "")
     stops = (axes[0], axes[1], axes[0])  # the axes of u, v and u'
@@ -274,7 +275,7 @@ def draw_matches(
     inliers: Bool[np.ndarray, " n"] | None = None,
 ) -> list[Artist]:
     """Mark matches, at pixels (x, y) of two images, and join some: inliers solid, blue; others
-    dashed, orange.
+    dashed, vermillion.
 
     Of more than 15 matches, 15 have a line, with the same share of inliers.
     """
@@ -300,11 +301,12 @@ def draw_matches(
         )
         drawn.append(axes[0].figure.add_artist(line))
     for axis, places in zip(axes, pixels):
-        # Columns x and y: inliers by discs, others by crosses.
-        wrong, right = places[~inliers].T, places[inliers].T
-        drawn.append(axis.scatter(*wrong, 25, VERMILLION, marker="x", linewidths=1.2, zorder=6))
-        style = {"edgecolors": "white", "linewidths": 0.7, "zorder": 6}
-        drawn.append(axis.scatter(*right, 25, BLUE, **style))
+        # Inliers by discs, others by crosses; `.T` are the x and the y of the pixels.
+        style = {"s": 25, "zorder": 6}
+        drawn += [
+            axis.scatter(*places[~inliers].T, c=VERMILLION, marker="x", linewidths=1.2, **style),
+            axis.scatter(*places[inliers].T, c=BLUE, edgecolors="white", linewidths=0.7, **style),
+        ]
     return drawn
 
 
@@ -353,14 +355,14 @@ def show_points(
     panels: Mapping[str, Mapping[str, Real[np.ndarray, "_ _"]]],
     columns: int | None = None,
     size: float = 4.5,
-    colours: Sequence[str] = (BLUE, ORANGE),
+    colours: Sequence[str] = COLOURS,
     **labels: Any,
 ) -> Figure:
-    """Show sets of points (x, y, ...) in each panel, by its title, with equal scales and one
-    legend.
+    """Show sets of points (x, y, ...), by their names, in each panel, by its title, with equal
+    scales and one legend.
 
-    All panels have the same extent, around the first set of each; points far off it are cut.
-    `labels` is what `Axes.set` takes.
+    A panel has at most four sets, of the `colours` in turn. All panels have the same extent, around
+    the first set of each; points far off it are cut. `labels` is what `Axes.set` takes.
     """
     # The range of each panel's first set, without outliers: (panels, low and high, x and y).
     firsts = [next(iter(sets.values()))[:, :2] for sets in panels.values()]
@@ -371,7 +373,7 @@ def show_points(
     figure, axes = _panels(len(panels), columns, size, height)
     for axis, (title, sets), centre in zip(axes, panels.items(), ranges.mean(axis=1)):
         for (name, points), colour, marker in zip(sets.items(), colours, _CLOUD_MARKERS):
-            # The more points, the smaller their marks (square points) and the thinner their lines.
+            # More points have smaller marks (square points) and thinner lines, chosen by eye.
             area = np.clip(6000 / max(len(points), 1), 3, 40)
             thick = 0.3 + 0.03 * area
             axis.scatter(*points.T[:2], area, colour, marker=marker, linewidths=thick, label=name)
@@ -379,7 +381,7 @@ def show_points(
         left, bottom = centre - half
         right, top = centre + half
         axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
-        axis.set(**labels)
+        axis.set(**labels)  # may have other limits
     for handle in _legend(figure, axes[0], "outside lower center").legend_handles:
         handle.set(sizes=[40], linewidths=[1.5])  # small marks would be pale
     return figure
@@ -394,13 +396,12 @@ def show_dots(rows: Mapping[str, ArrayLike], median: bool = True, **labels: Any)
     rng = np.random.default_rng(0)
     for row, values in enumerate(rows.values()):
         # Dots are scattered over a band, so that equal values can be told apart.
-        height = row + 0.5 * rng.uniform(-0.4, 0.4, len(values))
-        axis.scatter(values, height, 40, BLUE, edgecolors="white", linewidths=0.4)
+        height = row + rng.uniform(-0.2, 0.2, len(values))
+        axis.scatter(values, height, s=40, c=BLUE, edgecolors="white", linewidths=0.4)
         if median and len(values):
-            centre = np.median(values)
-            axis.vlines(centre, row - 0.4, row + 0.4, color=VERMILLION, linewidth=2.5)
+            axis.vlines(np.median(values), row - 0.4, row + 0.4, color=VERMILLION, linewidth=2.5)
     axis.set_yticks(range(len(rows)), rows)
-    axis.set(ylim=(len(rows) - 0.4, -0.6), **labels)
+    axis.set(ylim=(len(rows) - 0.4, -0.6), **labels)  # the first row is at the top
     return figure
 
 
@@ -419,7 +420,7 @@ def show_intervals(
     for index, ((name, (values, low, high)), colour, line, marker) in enumerate(styles):
         (row,) = axis.plot(x, values, linestyle=line, marker=marker, color=colour, label=name)
         bars = axis.vlines(x, low, high, color=colour, alpha=0.5, linewidth=3)
-        # Rows are 5 points apart. They are moved here, since the axis has got its limits from them.
+        # Rows are 5 points apart. They are moved after the axis has got its limits from them.
         shift = 5 * (index - (len(intervals) - 1) / 2)
         beside = offset_copy(axis.transData, figure, x=shift, units="points")
         row.set_transform(beside)
@@ -456,8 +457,7 @@ def pca_colours(
     with one pixel per patch.
     """
     features = [np.asarray(values, dtype=np.float64) for values in maps]
-    foreground = foreground or [np.ones(values.shape[:2]) for values in features]
-    inside = [np.asarray(mask, bool) for mask in foreground]
+    inside = foreground or [np.ones(values.shape[:2], bool) for values in features]
     fitted = np.concatenate([values[mask] for values, mask in zip(features, inside)])
     centred = fitted - fitted.mean(axis=0)
     # The last three eigenvectors (d, 3), those of the largest eigenvalues, in falling order.
@@ -506,6 +506,7 @@ def draw_axes(
             continue
         style = {"arrowstyle": "-|>", "color": colour, "linewidth": 2, "shrinkA": 0, "shrinkB": 0}
         arrow = axis.annotate("", end, pixels[0], zorder=6, annotation_clip=False, arrowprops=style)
+        # What is outside the image is cut off, and takes no space in the figure.
         arrow.set_in_layout(False)
         arrow.arrow_patch.set_clip_path(axis.patch)
         axis.text(
@@ -551,8 +552,9 @@ def show_residuals(
 ) -> Figure:
     """Show below each title the target with the reference's points, moved by a fit.
 
-    `views` and `points` of matches are those of the reference and of the target. Discs mark the
-    partners of residuals below 0.2; every third other moved point has a line to its partner.
+    `views` are those of the reference and of the target, and `points` the points of their matches.
+    A disc marks the partner in the target of a moved point that is less than 0.2 from it; every
+    third of the other matches has a line from its moved point to the partner.
     """
     camera = views[1].frame.camera
     figure, axes = show_images([pale(views[1].frame.rgb)] * len(fits), list(fits), size=4)
@@ -566,7 +568,7 @@ def show_residuals(
         style = {"linewidths": 1.5, "label": "moved point to partner, far apart (every third)"}
         axis.add_collection(LineCollection(lines, colors=VERMILLION, zorder=5, **style))
         style = {"edgecolors": "white", "label": "partner that the moved point meets"}
-        axis.scatter(*partners[inliers].T, 45, BLUE, zorder=6, **style)
+        axis.scatter(*partners[inliers].T, s=45, c=BLUE, zorder=6, **style)
     _legend(figure, axes[0], "outside lower center")
     return figure
 
@@ -603,8 +605,8 @@ def draw_estimates(
 
 
 def _rounded(pose: Sim3) -> Sim3:
-    """Round a pose, so that the number of threads, which changes its last digits, does not change
-    pictures."""
+    """Round a pose, so that pictures do not depend on its last digits, which the number of threads
+    changes."""
     turn = Rotation.from_rotvec(Rotation.from_matrix(pose.R).as_rotvec().round(3))
     return Sim3(round(pose.scale, 3), turn.as_matrix(), pose.t.round(3))
 
@@ -625,6 +627,7 @@ def object_cloud(view: View, most: int = 2000) -> Float[np.ndarray, "n 3"]:
     The object is where the mask is above 0.9, which leaves out its border; without a mask, the
     foreground patches.
     """
+    # A view without a mask has a soft one by saliency: 0.5 at the threshold of the foreground.
     return frame_cloud(view.frame, view.soft_mask > 0.5, most)
 
 
@@ -649,7 +652,7 @@ def frame_cloud(
 def _panels(
     number: int, columns: int | None, width: float, height: float
 ) -> tuple[Figure, list[Axes]]:
-    """Return panels of a size in inches in a grid, by default in one row."""
+    """Return panels of a size in inches in a grid, in one row if `columns` is None."""
     columns = min(columns or number, number)
     rows = -(-number // columns)  # rounded up
     size = (columns * width, rows * height)

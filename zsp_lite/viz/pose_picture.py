@@ -52,7 +52,7 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
     # A white image holds the place of the drawing from above, which removes it.
     images.append(np.full_like(images[0], 255))
     figure, axes = plots.show_images(images, titles, columns=4, size=2.5)
-    figure.set_figheight(figure.get_figheight() + 0.4)  # space for the legend
+    figure.set_figheight(figure.get_figheight() + 0.4)  # inches, for the legend
 
     # The outline of the mask at the centres of pixels, and the reference's points in each view.
     mask = frames[chosen].mask
@@ -60,7 +60,7 @@ def pose_picture(result: PairResult, solver: str) -> Figure:
         rows = np.arange(mask.shape[0]) + 0.5
         columns = np.arange(mask.shape[1]) + 0.5
         axes[1].contour(columns, rows, mask, [ON_OBJECT], colors=["white"], linewidths=1.5)
-    # Dense, and without axes: `names=None`.
+    # Dense, and without axes, which have `names`.
     cloud = plots.object_cloud(reference, most=20000)
     cameras = [frames[view].camera for view in shown]
     plots.draw_moved_cloud(axes[:1], [reference.frame.camera], cloud, [Sim3.identity()], names=None)
@@ -106,17 +106,19 @@ def _draw_from_above(
     x, y = axes @ directions[-1]
     turn = -np.pi / 2 - np.arctan2(y, x)
     axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ axes
-    *places, reference_place = directions @ axes.T
+    *places, reference_place = directions @ axes.T  # (x, y) in the drawing
 
     # The widest gap between neighbours on the circle, in degrees. The azimuth of a camera right
     # above the object is NaN.
     around = azimuths([*cameras.values()], centre)
     around = np.sort(around[~np.isnan(around)] + np.degrees(turn))
-    begin, end = 0.0, 360.0
+    begin = 0.0
+    end = 360.0
     if len(around):
         following = np.append(around[1:], around[0] + 360)
         widest = (following - around).argmax()
-        begin, end = around[widest], following[widest]
+        begin = around[widest]
+        end = following[widest]
     axis.images[0].remove()  # the white image that held the place
     gap = f"no target view in these {end - begin:.0f}°"
     axis.add_patch(Wedge((0, 0), 1, begin, end, color="0.5", alpha=0.25, linewidth=0, label=gap))
@@ -128,7 +130,7 @@ def _draw_from_above(
     # Nine tenths of the target's points are within `_OBJECT`.
     scale = _OBJECT / np.quantile(np.linalg.norm(flat[0], axis=1), 0.9)
     for points, colours in zip(flat, ("0.6", plots.coordinate_colours(reference))):
-        # Points near the circle of the cameras would cover their marks.
+        # Points beyond nine tenths of the cameras' circle would cover their marks.
         inside = np.linalg.norm(scale * points, axis=1, keepdims=True) < 0.9
         axis.scatter(*np.where(inside, scale * points, np.nan).T, s=4, c=colours, linewidths=0)
 

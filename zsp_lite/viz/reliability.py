@@ -10,8 +10,8 @@ class Reliability(NamedTuple):
     """How well confidences are calibrated."""
 
     calibration_error: float  # expected calibration error, in [0, 1]
-    confidence: Float[np.ndarray, " bins"]  # mean
-    accuracy: Float[np.ndarray, " bins"]  # fraction of correct estimates
+    confidence: Float[np.ndarray, " bins"]  # mean of each bin
+    accuracy: Float[np.ndarray, " bins"]  # fraction of correct estimates of each bin
 
 
 def reliability(
@@ -25,7 +25,8 @@ def reliability(
         bins: Number of bins, which have equal numbers of estimates, in order of confidence.
 
     Returns:
-        The mean confidence and the accuracy of each bin, and the mean of their differences.
+        The mean confidence and the accuracy of each bin, and the calibration error: the mean of
+        their absolute differences, weighted by the sizes of the bins.
     """
     parts = np.array_split(np.argsort(confidence, kind="stable"), bins)
     means = np.array([confidence[part].mean() for part in parts])

@@ -77,11 +77,11 @@ def write_category_report(
     names = list(alignment.objects)
     most = category_sheet.MOST
     parts = [names[start : start + most] for start in range(0, len(names), most)]
-    shown = dataset, category, alignment
-    sheets = [_sheet(category_sheet.objects_figure(*shown, part, axes)) for part in parts]
+    of_all = dataset, category, alignment  # what both kinds of figures begin with
+    sheets = [_sheet(category_sheet.objects_figure(*of_all, part, axes)) for part in parts]
     marked = []
     if placed:
-        marked = [_sheet(category_sheet.marks_figure(*shown, placed, part)) for part in parts]
+        marked = [_sheet(category_sheet.marks_figure(*of_all, placed, part)) for part in parts]
     text = _TEMPLATES.get_template("category.html").render(
         category=category,
         columns=category_sheet.COLUMNS,
@@ -113,7 +113,7 @@ def write_report(
         results: Results in the order of the page.
         backbone: Name of the backbone.
         data: Name of the demo's data, for the first paragraph.
-        data_note: What the page says of the data.
+        data_note: What the page says of the data; of the user's own pair, where its masks are from.
         photograph: Section on the photographed motorcycle; None leaves it out.
 
     Returns:
@@ -192,7 +192,13 @@ def _stages(result: PairResult) -> dict[str, str]:
     figures = {
         "saliency": plots.show_maps(images, saliency, size=2.7, limits=(0, 1), label="saliency"),
         "cycles": plots.show_maps(
-            images, cycles, size=2.7, limits=(-10, 0), cmap="cividis", label="− distance (patches)"
+            # Distances of ten patches and more have one colour.
+            images,
+            cycles,
+            size=2.7,
+            limits=(-10, 0),
+            cmap="cividis",
+            label="− distance (patches)",
         ),
         "matches": plots.show_matches(images, cells, grid, estimate.inliers, names, size=2.7),
     }
@@ -222,7 +228,7 @@ def _scene(result: PairResult) -> dict[str, Any]:
     return {
         "names": list(poses),
         "poses": [move.matrix[:3].round(6).tolist() for move in moves],
-        # Columns. For a cloud of unit standard deviation four decimals are finer than a pixel.
+        # Lists of x, y and z. Of a cloud with unit deviation, four decimals are finer than a pixel.
         "clouds": [cloud.T.round(4).tolist() for cloud in clouds],
         "ranges": np.stack([middle - half, middle + half], axis=1).tolist(),
     }
@@ -248,14 +254,17 @@ def _picture(figure: Figure) -> str:
     Its method 2 takes half the time of the default, 4, for 4 % more bytes.
     """
     options = {"quality": 86, "method": 2}
-    return _data_uri(_encode(figure, 110, "webp", transparent=True, pil_kwargs=options), "webp")
+    image = _encode(figure, dpi=110, kind="webp", transparent=True, pil_kwargs=options)
+    return _data_uri(image, "webp")
 
 
 def _sheet(figure: Figure) -> bytes:
-    return _encode(figure, 150, "jpg", pil_kwargs={"quality": 90})
+    """Encode a contact sheet as a file of its own, larger than the pictures of the report."""
+    return _encode(figure, dpi=150, kind="jpg", pil_kwargs={"quality": 90})
 
 
 def _data_uri(image: bytes, kind: str = "jpeg") -> str:
+    """Write an image file as a data URI."""
     return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"
 
 

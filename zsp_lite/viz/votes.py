@@ -17,7 +17,8 @@ _SHOWN = 8  # largest number of votes with pictures
 
 
 def votes_figure(votes: Sequence[Vote]) -> Figure:
-    """Show reference frames, each beside the view of the other object that its own pose leads to.
+    """Show at most eight reference frames, each beside the view of the other object that its own
+    pose leads to.
 
     The colour of a point is its position along the frame's object, in both pictures.
     """
@@ -32,6 +33,7 @@ def votes_figure(votes: Sequence[Vote]) -> Figure:
             vote.name.replace(" of ", "\nof "),
             f"{vote.degrees:.0f}° off,\nprob. {vote.estimate.confidence:.2f}",
         ]
+    # Four frames to a row, each with its view.
     figure, axes = plots.show_images(images, titles, columns=8, size=1.45)
     for k, vote in enumerate(shown):
         panels = axes[2 * k : 2 * k + 2]  # the frame and the view that it leads to
@@ -55,23 +57,24 @@ def ring_figure(result: PairResult) -> Figure:
         x, y, z, w = Rotation.from_matrix(rotation @ answer.world_sim3.R.T).as_quat()
         return 2 * np.arctan2(up @ (x, y, z), w)
 
-    # Dots on the outer circle, of radius 1; their areas in square points grow with confidence.
+    # Dots on the outer circle, of radius 1; their areas in square points are proportional to the
+    # confidence, by a factor that is chosen by eye.
     for vote in result.votes:
         for pose in vote.estimate.hypotheses:
             world = vote.estimate.between_worlds(pose.sim3, pose.view)
             angle = turn(world.inverse().R if vote.backward else world.R)
             agrees = np.cos(angle) > np.cos(np.radians(SAME_ANGLE))
             colour = plots.BLUE if agrees else plots.VERMILLION
-            axis.scatter(angle, 1, 260 * pose.confidence, colour, alpha=0.45)
+            axis.scatter(angle, 1, s=260 * pose.confidence, c=colour, alpha=0.45)
 
-    # Stars inside, each with its confidence below.
+    # Stars half-way to the circle, each with its confidence nearer to the middle.
     for pose in (answer.hypotheses[0], *answer.alternatives):
         angle = turn(answer.between_worlds(pose.sim3, pose.view).R)
         axis.scatter(
             angle,
             0.5,
-            400 * pose.confidence,
-            plots.ORANGE,
+            s=400 * pose.confidence,
+            c=plots.ORANGE,
             marker="*",
             edgecolors="black",
             linewidths=0.5,

@@ -15,14 +15,15 @@ from zsp_lite.errors import InputError, describe_failure
 from zsp_lite.io.files import read_bytes
 from zsp_lite.io.threads import one_thread
 
-_LARGEST_FILE = 1 << 28  # bytes
+_LARGEST_FILE = 1 << 28  # bytes of a file that a hand-in may write
 _COLUMNS = ("pair", "target_frame", "rotation")
 
 
-def answer(handin: Path, data: Path, questions: Path, out: Path, row_seconds: int) -> None:
+def answer(handin: Path, data: Path, questions: Path, out: Path, pair_seconds: int) -> None:
     """Write the poses of all pairs, each as soon as it is found.
 
-    Failed pairs have no line. Their first reason is printed at once, as the time may run out.
+    A pair that fails, also by taking longer than `pair_seconds`, has no line. The reason of the
+    first one is printed at once, as the time of the hand-in may run out.
     """
     method, backbone = _load(handin)
     store = FrameStore(Co3D(data), make_extractors(backbone, {"hand-in": method}), threads=1)
@@ -32,7 +33,7 @@ def answer(handin: Path, data: Path, questions: Path, out: Path, row_seconds: in
         lines.writerow(_COLUMNS)
         for pair in read_questions(questions):
             try:
-                with fails_alone(row_seconds):
+                with fails_alone(pair_seconds):
                     problem = PairProblem(pair, store, {method.features} - {"none"})
                     found = ask(method, problem_of_own(method.solve, problem))
                 frame = pair.target_frames[found.view]
@@ -54,7 +55,8 @@ def read_questions(path: Path) -> list[Pair]:
 
 
 def _load(handin: Path) -> tuple[Method, object]:
-    """Import a hand-in; return its row and its backbone, each the library's if it has none."""
+    """Import a hand-in; return its row of the benchmark and its backbone, each the library's if it
+    has none."""
     spec = importlib.util.spec_from_file_location("handin", handin)
     module = importlib.util.module_from_spec(spec)
     sys.modules["handin"] = module
@@ -68,20 +70,21 @@ def _load(handin: Path) -> tuple[Method, object]:
     elif backbone is None:
         raise InputError(f"{handin.name} defines neither `method` nor `backbone`, expected one")
     else:
+        # The paper's method; its foreground is the mask where the backbone has no saliency.
         masked = getattr(backbone, "has_saliency", True) is False
         method = Method(settings={"foreground": "mask"} if masked else {})
     return method, as_backbone("zsp-tiny" if backbone is None else backbone)
 
 
-def main(handin: str, data: str, questions: str, out: str, row_seconds: str, memory: str) -> None:
+def main(handin: str, data: str, questions: str, out: str, pair_seconds: str, memory: str) -> None:
     """Limit the memory of this process to a number of bytes where the system can, and answer."""
     if sys.platform == "linux":
-        import resource
+        import resource  # Windows has none
 
         resource.setrlimit(resource.RLIMIT_DATA, (int(memory), int(memory)))
         resource.setrlimit(resource.RLIMIT_FSIZE, (_LARGEST_FILE, _LARGEST_FILE))
     try:
-        answer(Path(handin), Path(data), Path(questions), Path(out), int(row_seconds))
+        answer(Path(handin), Path(data), Path(questions), Path(out), int(pair_seconds))
     except InputError as error:
         sys.exit(str(error))
 

@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 QUESTIONS_FILE = "pairs.csv"
 _TARGETS = 5  # target views of a pair
-_FEW = 100  # fewer pairs are warned of
+_FEW = 100  # with fewer pairs, a warning says that they tell few teams apart
 _SHORTEST = 8  # characters of a secret; shorter ones are soon guessed
 # Of all files that are given, the first second of 2000: times of rendering tell nothing then.
 _TIME = 946_684_800
@@ -46,7 +46,7 @@ def make_challenge(
         out: New folder.
         sequences: Number of objects of each category.
         frames: Number of frames of each object.
-        pairs: Number of pairs, in equal parts of each category.
+        pairs: Number of pairs, in equal parts of each category, rounded up.
 
     Raises:
         InputError: For a short secret, an unknown category, or a folder that has other files.
@@ -62,7 +62,8 @@ def make_challenge(
     if pairs < _FEW:
         logger.warning("%d pairs tell few teams apart, expected at least %d", pairs, _FEW)
 
-    # Slow on purpose: a guess costs a tenth of a second, so that no dictionary can be tried.
+    # A seed of seven bytes. Slow on purpose: a guess costs a tenth of a second, so that no
+    # dictionary can be tried.
     salt = b"zsp-lite challenge"
     key = hashlib.scrypt(secret.encode(), salt=salt, n=1 << 15, r=8, p=1, maxmem=1 << 26, dklen=7)
     kept = out / "keep" / "data"
@@ -70,7 +71,7 @@ def make_challenge(
 
     given = out / "give"
     dataset = Co3D(kept)
-    count = -(-pairs // len(categories))
+    count = -(-pairs // len(categories))  # rounded up
     by_category = [category_pairs(dataset, name, count, _TARGETS) for name in categories]
     # In turn, so that a hand-in that is cut off by time has answered as many of each.
     asked = [pair for pairs_in_turn in zip(*by_category) for pair in pairs_in_turn]

@@ -44,7 +44,7 @@ _PASSED = ("PATH", "PYTHONPATH", "SYSTEMROOT", "LANG")
 
 @dataclass(frozen=True)
 class Result:
-    """Result of a team."""
+    """Result of a team, a line of ranking.csv but for the errors."""
 
     team: str
     acc30: float  # percent
@@ -62,7 +62,7 @@ class Ranking:
     places: list[tuple[int, Result]]  # teams whose difference may be chance share a place
     pairs: int
     categories: list[str]
-    alone: bool  # hand-ins found neither labels nor each other
+    alone: bool  # hand-ins could read neither labels nor each other
 
 
 def rank(
@@ -101,7 +101,7 @@ def rank(
     if not (data / SETTINGS_FILE).is_file():
         raise InputError(f"{keep} has no labels, expected the folder keep/ of a challenge")
     pairs = read_questions(keep / QUESTIONS_FILE)
-    # Not the hidden files that macOS adds to archives.
+    # Without the hidden files that macOS adds to archives.
     found = sorted(handins.glob("[!.]*.*"))
     files = [path for path in found if path.suffix in (".py", ".csv") and path.is_file()]
     teams = {path.stem: path for path in files}
@@ -112,9 +112,11 @@ def rank(
         )
     hidden = ["hide", keep.resolve(), "hide", handins.resolve()]
     limits = [str(pair_seconds), str(int(memory * 1e9))]
+    ended = Event()
     with TemporaryDirectory(prefix="challenge-") as runs:
-        probe = Path(runs).resolve() / "probe"
+        probe = Path(runs).resolve() / "probe"  # a folder in which this system is tried
         probe.mkdir()
+        # Poses run no code.
         apart = {path.suffix for path in files} == {".csv"} or _works(
             [*_apart(probe, hidden), sys.executable, "-c", "import zsp_lite"]
         )
@@ -125,6 +127,7 @@ def rank(
             )
 
         def answers_of(team: str) -> tuple[dict[str, StoredPose], str]:
+            """Return the poses of a team, and why some are missing."""
             source = teams[team]
             if source.suffix == ".csv":
                 return _read(source)
@@ -137,7 +140,6 @@ def rank(
             poses, problem = _read(folder / _POSES_FILE)
             return poses, note or problem
 
-        ended = Event()
         pool = ThreadPoolExecutor(workers)
         try:
             done = tqdm(pool.map(answers_of, teams), "hand-ins", len(teams), disable=None)
@@ -163,6 +165,7 @@ def _read(path: Path) -> tuple[dict[str, StoredPose], str]:
             raise InputError(f"{path.name} is a link, expected a file")
         return read_stored_poses(path)[0], ""
     except (InputError, OSError) as error:
+        # The path of the folder says nothing to the team.
         return {}, str(error).replace(f"{path.parent}{os.sep}", "")
 
 
@@ -174,8 +177,11 @@ def _run_alone(
     limits: Sequence[str],
     ended: Event,
 ) -> str:
-    """Run a hand-in in a folder that has the data; return the last line that it printed, or why it
-    ended. The event ends it at once."""
+    """Run a hand-in in a folder that has the data, by a command with the words `before` (see
+    `_apart`); return why it ended early, and the last line that it printed.
+
+    `limits` are the seconds of a pair and the bytes of memory; the event ends it at once.
+    """
     copy = Path(shutil.copy(source, folder))
     words = [copy.name, "data", QUESTIONS_FILE, _POSES_FILE, *limits]
     # Without the folder in the search path, where `torch.py` of a team `torch` would be found.
@@ -205,7 +211,7 @@ def _run_alone(
         size = printed.seek(0, os.SEEK_END)
         printed.seek(max(0, size - _LAST_PRINTED))
         text = printed.read().decode(errors="replace")
-    # A hand-in that is hidden sees its folder in place of the one above.
+    # A hand-in that is kept apart sees its folder in place of the one above (see apart.sh).
     for path in (folder, folder.parent):
         text = text.replace(f"{path}{os.sep}", "")
     last = text.strip().splitlines()[-1:]
@@ -213,12 +219,12 @@ def _run_alone(
 
 
 def _apart(own: Path, last: Sequence[str | Path]) -> list[str | Path]:
-    """Return the words before a command that let it find little but its own folder, and write
-    there alone (see apart.sh, whose last steps are given).
+    """Return the words before a command that let it find little but the folder `own`, and write
+    there alone.
 
-    `own` takes the place of the folder of all runs.
+    See apart.sh: `own` takes the place of the folder above it, and `last` are the last steps.
     """
-    # The outer folder first: it would cover the other one.
+    # Where one of both holds the other, the outer folder first: it would cover the other one.
     outer, inner = sorted([Path.home().resolve(), Path(gettempdir()).resolve()])
     steps = ["hide", outer, "hide", inner]
     for needed in (sys.prefix, sys.base_prefix, REPOSITORY / "zsp_lite", cache_folder()):
@@ -235,7 +241,7 @@ def _works(command: Sequence[str | Path]) -> bool:
 
 
 def _end(process: subprocess.Popen) -> None:
-    """End a process and all of its group."""
+    """End a process, and where the system has groups of processes, all of its group."""
     with suppress(ProcessLookupError):
         if hasattr(os, "killpg"):
             os.killpg(process.pid, signal.SIGKILL)
@@ -247,7 +253,8 @@ def _end(process: subprocess.Popen) -> None:
 def _places(
     data: Path, pairs: Sequence[Pair], answers: Mapping[str, tuple[dict[str, StoredPose], str]]
 ) -> list[tuple[int, Result]]:
-    """Sort the teams by Acc30, and join those whose difference may be chance."""
+    """Sort the teams by Acc30. A team shares the place of the first one of this place, unless their
+    difference is significant."""
     objects = [
         [f"{pair.category}/{name}" for name in (pair.reference_sequence, pair.target_sequence)]
         for pair in pairs

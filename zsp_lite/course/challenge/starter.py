@@ -23,7 +23,7 @@ def method(similarity, foreground1, foreground2):
         The index of the partner of each patch of the first image, and its score; -inf for none.
     """
     similarity = similarity.clone()
-    similarity[:, ~foreground2] = -1
+    similarity[:, ~foreground2] = -1  # the lowest cosine
     best, partner = similarity.topk(2, dim=1)
     score = best[:, 0] - best[:, 1]
     score[~foreground1] = -torch.inf

@@ -223,6 +223,7 @@ class Labelling:
         None without one."""
         if not {self.reference, self._known(sequence)} <= self._proposals.keys():
             return None
+        # Proposals lead from a reference of their own, which need not be that of the session.
         trans = self._proposals[sequence] @ np.linalg.inv(self._proposals[self.reference])
         return Sim3(1.0, trans[:3, :3], trans[:3, 3])
 
@@ -344,6 +345,6 @@ class Labelling:
         return rows
 
     def _known(self, sequence: str) -> str:
-        """Return the name of a sequence of the session; refuse others."""
+        """Return the name of a sequence of the session; InputError for others."""
         check_choice("sequence", sequence, self.sequences)
         return sequence

@@ -1,4 +1,7 @@
-"""Training batches: random crops, flips and colours of views, with their geometry."""
+"""Training batches: random crops, flips and colours of views, with their geometry.
+
+The ranges of the random numbers are those of the training of `zsp-tiny` (docs/rebuild.md).
+"""
 
 from dataclasses import dataclass
 
@@ -11,7 +14,7 @@ from torch import Tensor
 from zsp_lite.course.training.renders import VIEWS, RenderSet
 
 PATCH_SIZE = 8  # pixels
-# normalisation of RGB values in [0, 1] during training
+# Normalisation of RGB values in [0, 1] during training, one number for all channels.
 MEAN = 0.45
 STD = 0.25
 
@@ -53,7 +56,7 @@ def crop_grids(
     ratio = np.exp(rng.uniform(-0.25, 0.25, n))
     width = np.minimum(size * ratio, 1)
     height = np.minimum(size / ratio, 1)
-    angle = rng.normal(0, 0.12, n)
+    angle = rng.normal(0, 0.12, n)  # radians
     # The centres, with the image from -1 to 1; a rotated crop stays inside most of the time.
     x = rng.uniform(-1, 1, n) * (1 - width) * 0.9
     y = rng.uniform(-1, 1, n) * (1 - height) * 0.9
@@ -88,7 +91,7 @@ def recolour(rng: np.random.Generator, x: Float[Tensor, "n 3 h w"]) -> Float[Ten
     saturation = draw(0.3, 1.4)
     coloured = torch.from_numpy(rng.random((n, 1, 1, 1)) > 0.2)
     x = grey + (x - grey) * (saturation * coloured)
-    # a blur over 3 x 3 pixels
+    # a blur over 3 x 3 pixels, of three images in ten
     blurred = torch.from_numpy(rng.random(n) < 0.3)
     x[blurred] = F.avg_pool2d(F.pad(x[blurred], (1, 1, 1, 1), mode="replicate"), 3, 1)
     return ((x - MEAN) / STD).contiguous()

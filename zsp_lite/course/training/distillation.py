@@ -1,7 +1,7 @@
 """Self-distillation of the backbone, DINO (Caron et al. 2021).
 
 Only images are used: no labels, masks, depth or other views. Each image is cut into two global and
-several local crops. Student and teacher map each crop to a distribution over K outputs, and the
+several local crops. Student and teacher map each crop to a distribution over M outputs, and the
 student is trained to predict, from every crop, the teacher's distribution for the other global
 crop. The teacher is an exponential average of the student.
 
@@ -35,8 +35,8 @@ WEIGHT_DECAY = 0.04, 0.4  # AdamW's, at the first and the last step
 LEARNING_RATE_DECAY = 1.0, 0.01  # factors of the largest rate, at the first and the last step
 # Share of the run in which the last layer is fixed; DINO fixes it in the first epoch.
 FIXED_LAST_LAYER = 0.05
-_CROPS = 3  # seeds the random crops with the run's seed and the step; any other number would do
 MAX_GRADIENT_NORM = 3.0  # gradients with a larger norm are scaled down to it
+_CROPS = 3  # seeds the random crops with the run's seed and the step; any other number would do
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class DistillationConfig:
     local_crops: int = 4  # per image, at least 1, in addition to two global ones
     global_side: int = 96  # of the crops, pixels
     local_side: int = 48
-    outputs: int = 512  # K; DINO has 65,536
+    outputs: int = 512  # M; DINO has 65,536
     teacher_temperature: float = 0.04  # of the teacher's softmax
     learning_rate: float = 1e-3  # the largest
     centring: bool = True  # if false, the centre stays 0
@@ -57,7 +57,7 @@ class DistillationConfig:
 
 
 class Head(nn.Module):
-    """Projection head: an MLP, then cosine similarities to K learned directions."""
+    """Projection head: an MLP, then cosine similarities to M learned directions."""
 
     def __init__(self, dim: int, outputs: int):
         super().__init__()
@@ -70,7 +70,7 @@ class Head(nn.Module):
         )
         self.directions = nn.Parameter(torch.randn(outputs, BOTTLENECK))
         for linear in self.mlp[::2]:
-            nn.init.trunc_normal_(linear.weight, std=0.02)
+            nn.init.trunc_normal_(linear.weight, std=0.02)  # as in DINO
             nn.init.zeros_(linear.bias)
 
     def forward(self, cls: Float[Tensor, "batch dim"]) -> Float[Tensor, "batch outputs"]:
@@ -218,7 +218,7 @@ class Distillation:
             for slow, fast in zip(self.teacher.parameters(), self.student.parameters()):
                 slow.lerp_(fast, weight)
         if config.centring:
-            self.centre.lerp_(teacher.mean((0, 1)), 1 - CENTRE_MOMENTUM)  # eq. 4
+            self.centre.lerp_(teacher.mean((0, 1)), 1 - CENTRE_MOMENTUM)  # eq. 4 of DINO
         self.steps_done += 1
         return figures
 

@@ -2,6 +2,8 @@
 
 The losses use ground truth of the renderer for the views of one object. The object's proportions
 differ from view to view. No loss compares two objects or uses category names.
+
+Limits and weights of the terms are those of the training of `zsp-tiny` (docs/rebuild.md).
 """
 
 import torch
@@ -63,7 +65,7 @@ def correspondence_loss(
         if len(query) < 20:
             continue
         # Rows are queries, columns all patches of the object. Patches of the background get a point
-        # that is far from the object.
+        # (99, 99, 99), which is far from the object: their targets are 0.
         same_view = view[query][:, None] == view[None]
         distance = torch.cdist(points[k, query], points[k].nan_to_num(nan=99.0))
         target = torch.exp(-distance.square() / (2 * radius**2)).masked_fill(same_view, 0)
@@ -91,6 +93,7 @@ def geometry_loss(
     on_object: Bool[Tensor, "crops n"],
 ) -> Tensor:
     """Compute the loss of predicted geometry (channels 0 to 3) and foreground logit (channel 4)."""
+    # Normals and depths of the background are unknown: their error counts on the object alone.
     inside = on_object.float()
     foreground = F.binary_cross_entropy_with_logits(prediction[..., 4], inside)
     error = F.smooth_l1_loss(prediction[..., :4], geometry, beta=0.3, reduction="none").mean(-1)

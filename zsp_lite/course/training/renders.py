@@ -36,7 +36,7 @@ from zsp_lite.course.synthetic.sequences import image_box, orbit_pose
 from zsp_lite.data.cameras import Camera
 
 VIEWS = 8  # per object
-SIZE = 192  # of a view, pixels
+SIZE = 192  # side of a view, pixels
 GRID = 48  # points along each side of a view at which geometry is known
 # Smallest and largest difference in azimuth of the two views of a pair. A reference and the nearest
 # of a few target views differ by about as much; views of different pairs differ by more.
@@ -74,7 +74,7 @@ def render_object(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     start = rng.uniform(0, TAU)
     views = []
     for view in range(VIEWS):
-        # The two views of a pair share their middle and their angle.
+        # The two views of a pair share their middle and their angle. All angles are in radians.
         if view % 2 == 0:
             azimuth = start + (view // 2) * TAU / 4
             apart = rng.uniform(*PAIR_ANGLES)
@@ -105,8 +105,7 @@ def _geometry(image: Rendering) -> tuple[np.ndarray, np.ndarray]:
     # The distance of the object does not matter: its depth is standardised.
     relative = np.zeros_like(depth)
     of_object = depth[on_object]
-    spread = max(float(of_object.std()), 1e-6)
-    relative[on_object] = (of_object - of_object.mean()) / spread
+    relative[on_object] = (of_object - of_object.mean()) / max(of_object.std(), 1e-6)
     geometry = np.dstack([image.normals[sampled, sampled], relative])
     surface = image.canonical[sampled, sampled]
     return surface.astype(np.float16), geometry.astype(np.float16)
@@ -150,7 +149,7 @@ def render_instance(
     normals = (mesh.normals @ turn.T).astype(np.float32)
     turned = replace(mesh, vertices=mesh.vertices @ turn.T, normals=normals)
     room = _room(number // SHARING * ROOMS + int(rng.integers(ROOMS)))
-    scene = MeshScene(turned, room, rng, coordinates, samples=1)
+    scene = MeshScene(turned, room, rng, coordinates, samples=1)  # one ray per pixel
     view = scene.render(replace(camera, R=camera.R @ turn.T))
     return replace(view, camera=camera)
 
@@ -167,7 +166,8 @@ def _room(index: int) -> Room:
 
 
 def build_random_object(draw: Draw) -> Parts:
-    """Build a symmetric tree of 5 to 10 random parts, each attached to an earlier part."""
+    """Build a symmetric tree of 5 to 10 random parts, each attached to an earlier part and of one
+    of the first five materials."""
     # The nodes of the tree: centre and size of each part.
     body = point(draw(0.5, 1.3), draw(0.4, 1.0), draw(0.4, 1.2))
     nodes = [(np.zeros(3), body)]

@@ -1,4 +1,7 @@
-"""The network that is trained: a transformer with two linear heads, and its initial values."""
+"""The network that is trained: a transformer with two linear heads, and its initial values.
+
+The factors of the initial values are those of the training of `zsp-tiny` (docs/rebuild.md).
+"""
 
 import math
 
@@ -49,9 +52,10 @@ class Trainee(nn.Module):
 def as_trainee(backbone: VisionTransformer, layer: int, renders: RenderSet, side: int) -> Trainee:
     """Wrap a transformer, with the mean of its keys on crops of `side` pixels.
 
-    The crops show at most six objects.
+    The crops show at most six objects, each nearly whole.
     """
     trainee = Trainee(backbone, layer)
+    # Any seed would do.
     batch = sample_batch(
         renders, np.random.default_rng(7), min(6, len(renders.rgb)), side, (0.85, 1.0)
     )
@@ -86,12 +90,13 @@ def initial_backbone(
 
     # The patches (n, 3 p p) of some crops, and their principal axes by increasing variance.
     rng = np.random.default_rng([0, 1])
-    batches = [sample_batch(renders, rng, 15, 96, (0.4, 1.0)) for _ in range(4)]
+    batches = [sample_batch(renders, rng, objects=15, side=96, scale=(0.4, 1.0)) for _ in range(4)]
     images = torch.cat([batch.images for batch in batches])
     patches = F.unfold(images, p, stride=p).transpose(1, 2).flatten(0, 1)
     patches = patches - patches.mean(0)
     variance, axes = torch.linalg.eigh(patches.T @ patches / len(patches))
-    # The embedding whitens the strongest axes, and mixes them by a random orthogonal matrix.
+    # The embedding whitens the strongest axes, with a damping of 0.02, and mixes them by a random
+    # orthogonal matrix.
     strongest = min(embed_dim, len(variance))
     whiten = (axes[:, -strongest:] / (variance[-strongest:] + 0.02).sqrt()).T
     mixing, _ = torch.linalg.qr(torch.randn(embed_dim, embed_dim, generator=generator))

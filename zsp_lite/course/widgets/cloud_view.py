@@ -17,7 +17,7 @@ from zsp_lite.course.widgets.turning import SCRIPT, view_units
 from zsp_lite.viz.plots import BLUE, ORANGE
 
 MAX_POINTS = 6000  # points drawn; more are slow in the browser
-# A point that is farther behind the front point under the pointer cannot be clicked, in view units.
+# View units. A point that is farther behind the front point under the pointer cannot be clicked.
 _DEPTH_TOLERANCE = 0.15
 
 _STYLE = """
@@ -40,11 +40,12 @@ def point_under(
     """
     on_screen = points @ view.T
     distance = np.hypot(*(on_screen[:, :2] - at).T)
-    near = np.flatnonzero(distance <= reach)
-    if not len(near):
+    under = np.flatnonzero(distance <= reach)
+    if not len(under):
         return None
-    near = near[on_screen[near, 2] <= on_screen[near, 2].min() + _DEPTH_TOLERANCE]
-    return int(near[distance[near].argmin()])
+    depth = on_screen[under, 2]
+    front = under[depth <= depth.min() + _DEPTH_TOLERANCE]
+    return int(front[distance[front].argmin()])
 
 
 class CloudView:
@@ -53,7 +54,7 @@ class CloudView:
     def __init__(self, name: str, on_pick: Callable[[np.ndarray | None], Any]):
         """Create an empty canvas, of class zsp-cloud-NAME; a click calls `on_pick` with the world
         point, or None."""
-        self.widget = _cloud_widget()()
+        self.widget = _cloud_widget()()  # an object of the class
         self.widget.add_class(f"zsp-cloud-{name}")
         self.widget.on_msg(self._clicked)
         self.on_pick = on_pick
@@ -80,12 +81,14 @@ class CloudView:
         """
         self._cloud = np.asarray(points, dtype=np.float64)
         self._to_view = view_units(points)
+        # Two clouds share the number of points that is not slow.
         most = MAX_POINTS if overlay is None else MAX_POINTS // 2
         drawn, colours = (_shuffled(part)[:most] for part in (points, colours))
         discs = len(drawn)
         if overlay is not None:
             second = _shuffled(overlay)[:most]
             drawn = np.concatenate([drawn, second])
+            # From "#RRGGBB" to three numbers.
             both = np.uint8([list(bytes.fromhex(name[1:])) for name in (ORANGE, BLUE)])
             colours = both.repeat([discs, len(second)], axis=0)
         with self.widget.hold_sync():
@@ -110,7 +113,8 @@ class CloudView:
         self.widget.marks = self._to_view.apply(points).tolist()
 
     def _clicked(self, widget: Any, content: dict, buffers: list) -> None:
-        """Find the point of a click that the browser sends, and pass it on."""
+        """Find the point of a click that the browser sends, and pass it on; what the browser sends
+        is said at `point_under`."""
         if self._to_view is not None:
             view = np.array(content["view"]).reshape(3, 3)
             points = self._to_view.apply(self._cloud)
@@ -125,7 +129,8 @@ def _shuffled(rows: np.ndarray) -> np.ndarray:
 
 @cache
 def _cloud_widget() -> type:
-    """Return the class of the canvas; anywidget is imported when the first one is made."""
+    """Return the class of the canvas; anywidget and traitlets, which only notebooks need, are
+    imported when the first one is made."""
     anywidget = load_package("anywidget")
     from traitlets import Bytes, Float, Int, List, Unicode
 
@@ -137,10 +142,11 @@ def _cloud_widget() -> type:
         points = Bytes().tag(sync=True)  # float32 (n, 3), view units
         colours = Bytes().tag(sync=True)  # uint8 (n, 3)
         discs = Int().tag(sync=True)  # so many points are discs, the others are crosses
-        marks = List().tag(sync=True)
+        marks = List().tag(sync=True)  # points (x, y, z) with a number, view units
+        # the rotation (3, 3), row by row
         view = List(Float(), [1.0, 0, 0, 0, 1, 0, 0, 0, 1]).tag(sync=True)
         view_resets = Int().tag(sync=True)  # increases when the browser must take over `view`
-        side = Int(400).tag(sync=True)
+        side = Int(400).tag(sync=True)  # of the canvas, pixels
         alt = Unicode().tag(sync=True)
 
     return CloudCanvas

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from zsp_lite.errors import InputError
 
 Widget = Any  # of ipywidgets, which is imported when a widget is made
-_LABEL = {"description_width": "initial"}
+_LABEL = {"description_width": "initial"}  # as wide as the text
 
 
 def load_package(name: str = "ipywidgets") -> Any:
@@ -35,11 +35,11 @@ def slider(label: str, low: float, high: float, value: float, step: float = 1) -
     """Return a slider from `low` to `high`, with integer values if all four numbers are
     integers."""
     widgets = load_package()
-    style = {"min": low, "max": high, "step": step, "description": label, "style": _LABEL}
-    style["layout"] = {"width": "22em"}
+    options = {"min": low, "max": high, "step": step, "description": label, "style": _LABEL}
+    options["layout"] = {"width": "22em"}
     if all(isinstance(x, int | np.integer) for x in (low, high, value, step)):
-        return widgets.IntSlider(value, **style)
-    return widgets.FloatSlider(value, **style)
+        return widgets.IntSlider(value, **options)
+    return widgets.FloatSlider(value, **options)
 
 
 def patch_sliders(grid: tuple[int, int], start: tuple[int, int], of: str = "") -> dict[str, Widget]:
@@ -84,6 +84,7 @@ def interactive_figure(
     def redraw(change: Any = None) -> None:
         caption.value = update(**{name: control.value for name, control in controls.items()})
         canvas.draw()
+        # As PNG with little compression, which is fast.
         pixels = cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR)
         picture.value = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
@@ -118,7 +119,7 @@ def redrawing(draw: Callable[..., list[Artist]]) -> Callable[..., None]:
 def show(figure: Figure, alt: str) -> None:
     """Show a static figure in a notebook, with an alternative text that is stored in the
     notebook."""
-    from IPython.display import display
+    from IPython.display import display  # a package that only notebooks need
 
-    plt.close(figure)
+    plt.close(figure)  # A notebook would show it a second time.
     display(figure, metadata={form: {"alt": alt} for form in ("image/png", "image/jpeg")})

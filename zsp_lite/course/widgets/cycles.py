@@ -23,7 +23,7 @@ def cycle(
     forth, back = nearest_neighbours(sim)
     titles = ["reference: similarity to v", "target: similarity to u"]
     figure, axes = plots.show_images([reference.frame.rgb, target.frame.rgb], titles, size=3.7)
-    maps = [plots.overlay_map(axis, np.zeros(grid), 0.4, limits=(0, 1)) for axis in axes]
+    maps = [plots.overlay_map(axis, np.zeros(grid), alpha=0.4, limits=(0, 1)) for axis in axes]
     draw = redrawing(plots.draw_cycle)
 
     def update(row: int, col: int) -> str:
@@ -33,17 +33,15 @@ def cycle(
         w = int(back[v])
         maps[0].set_data(values[:, v].reshape(grid))
         maps[1].set_data(values[u].reshape(grid))
-        cells = ((row, col), divmod(v, grid[1]), divmod(w, grid[1]))
+        cells = (row, col), divmod(v, grid[1]), divmod(w, grid[1])
         draw(axes, cells, grid)
         text = (
-            f"u {cells[0]} → v {cells[1]}, cosine {values[u, v]:.2f} → u' {cells[2]}, cosine "
-            f"{values[w, v]:.2f}: "
+            f"u {cells[0]} → v {cells[1]}, cosine {values[u, v]:.2f} → "
+            f"u' {cells[2]}, cosine {values[w, v]:.2f}: "
             f"d(u, u') = {np.hypot(*np.subtract(cells[0], cells[2])):.1f} patches"
         )
-        views = reference, target, reference
-        off = [
-            n for n, cell, view in zip(("u", "v", "u'"), cells, views) if not view.foreground[cell]
-        ]
+        stops = zip(("u", "v", "u'"), cells, (reference, target, reference))
+        off = [name for name, cell, view in stops if not view.foreground[cell]]
         if off:
             text += f"; {', '.join(off)} not on the foreground, so the distance is infinite"
         return f"{text}."

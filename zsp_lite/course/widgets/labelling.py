@@ -130,13 +130,13 @@ class _LabellingWidget:
             widgets.VBox([self.captions[name], view.widget], layout={"margin": "0 8px 0 0"})
             for name, view in self.views.items()
         ]
-        actions = map(parts.get, ("undo", "redo", "overlay", "accept", "next"))
+        actions = [parts[name] for name in ("undo", "redo", "overlay", "accept", "next")]
         wrap = {"flex_flow": "row wrap"}
         row = partial(widgets.HBox, layout={**wrap, "align_items": "center"})
         rows = [
             widgets.HTML(_STYLE),
             row([controls["sequence"], controls["name"]]),
-            row([*actions]),
+            row(actions),
             self.message,
             widgets.HBox(clouds, layout=wrap),
             widgets.HTML(_HELP),
@@ -144,6 +144,7 @@ class _LabellingWidget:
         ]
         box = widgets.VBox(rows)
         box.add_class("zsp-label")
+        # The caller has only the box: the parts, so far, are its attributes.
         vars(box).update(vars(self))
         return box
 
@@ -361,7 +362,7 @@ def _progress_table(rows: Sequence[Progress], current: str) -> str:
         residual = "see above" if row.problem else ""
         if row.rms is not None:
             residual = f"{100 * row.rms:.1f} %"
-        marker = "▸" * (row.sequence == current)
+        marker = "▸" if row.sequence == current else ""
         state = f"{_STATE_SYMBOLS.get(row.state, '●')} {row.state}"
         cells.append((marker, row.sequence, state, row.picks, residual))
     return _table(("", "sequence", "state", "keypoints", "residual"), cells)
@@ -375,7 +376,7 @@ def _keypoint_table(names: Sequence[str], picked: int, alignment: Alignment | No
         residuals = [f"{100 * residual:.1f} %" for residual in alignment.residuals]
         residuals[int(alignment.residuals.argmax())] += " ← largest"
     cells = [
-        (k + 1, name, "✓" if k < picked else "next" * (k == picked), residual)
+        (k + 1, name, "✓" if k < picked else "next" if k == picked else "", residual)
         for k, (name, residual) in enumerate(zip(names, residuals))
     ]
     return _table(("", "keypoint", "picked", "residual"), cells or [("", "none yet", "", "")])

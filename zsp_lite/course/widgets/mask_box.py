@@ -14,14 +14,14 @@ def box_to_mask(frame: Frame, box: Box) -> Widget:
     """Show the mask that GrabCut segments in a box (top, left, height, width), and its overlap with
     the frame's."""
     height, width = frame.camera.size
-    top, left, box_height, box_width = box
+    box_top, box_left, box_height, box_width = box
     figure, (axis,) = show_images([frame.rgb], ["box and mask"], size=4.2)
     shade = axis.imshow(
         np.zeros((height, width, 4)), extent=(0, width, height, 0), interpolation="nearest"
     )
     outline = axis.add_patch(
         Rectangle((0, 0), 1, 1, fill=False, edgecolor=ORANGE, linewidth=2, linestyle="--")
-    )
+    )  # `update` sets its place and size
 
     def update(top: int, left: int, bottom: int, right: int) -> str:
         outline.set(xy=(left, top), width=right - left, height=bottom - top)
@@ -35,10 +35,10 @@ def box_to_mask(frame: Frame, box: Box) -> Widget:
 
     # Sides may move up to 4 pixels from the opposite border. An empty box gives an empty mask.
     controls = {
-        "top": slider("top", 0, height - 4, top),
-        "left": slider("left", 0, width - 4, left),
-        "bottom": slider("bottom", 4, height, top + box_height),
-        "right": slider("right", 4, width, left + box_width),
+        "top": slider("top", 0, height - 4, box_top),
+        "left": slider("left", 0, width - 4, box_left),
+        "bottom": slider("bottom", 4, height, box_top + box_height),
+        "right": slider("right", 4, width, box_left + box_width),
     }
     alt = "An image with a dashed box; the background found by GrabCut is darkened."
     return interactive_figure(figure, controls, update, alt)

@@ -30,12 +30,13 @@ CHAIR = np.array(
     [[x, y, z] for y in (1.2, 0.0) for x in (-0.7, 0.7) for z in (-0.7, 0.7)]
     + [[-0.7, y, z] for y in (-0.8, -1.6) for z in (-0.7, 0.7)]
 )
+# Pairs of its points that are joined: legs and seat, then the back.
 _BARS = [(0, 4), (1, 5), (2, 6), (3, 7), (4, 5), (6, 7), (4, 6), (5, 7)]
 _BARS += [(4, 8), (5, 9), (8, 10), (9, 11), (8, 9), (10, 11)]
 _SEEN_FROM = Rotation.from_euler("yx", [-25, 15], degrees=True).as_matrix()
 RIGHT = _SEEN_FROM[0]  # the picture's direction to the right, in which a corner is dragged
 _FARTHEST = 4.0  # largest distance of the dragged point from its place, scene units
-_THRESHOLD = 0.2  # largest residual of a match that agrees, scene units
+_THRESHOLD = 0.2  # largest residual of a match that agrees, scene units: the default of RANSAC
 _DRAGGED = "A grey chair, one corner dragged away; least squares tilts its fit, RANSAC does not"
 _TRIALS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
@@ -61,7 +62,7 @@ def ransac_settings(
         axis.set_axis_off()
         axis.set_title(title)
     lines = redrawing(draw_matches)
-    inside = graph.scatter([], [], s=26, color=BLUE, marker="o", label="inlier")
+    inside = graph.scatter([], [], s=26, color=BLUE, label="inlier")
     outside = graph.scatter([], [], s=26, color="0.45", marker="x", label="outlier")
     line = graph.axhline(1, color=VERMILLION, linestyle="--", label="threshold")
     graph.set(xlim=(-1, n), ylim=(0.01, 10), yscale="log", title="residuals")
@@ -79,6 +80,7 @@ def ransac_settings(
             for dots in (inside, outside):
                 dots.set_offsets(np.empty((0, 2)))
             return f"No fit: {error}."
+        # Residuals beyond the range of the axis are drawn at its end.
         distance = np.linalg.norm(sim3.apply(source) - target, axis=1).clip(0.01, 10)
         order = np.argsort(distance)
         positions = np.column_stack([np.arange(n), distance[order]])
@@ -92,7 +94,7 @@ def ransac_settings(
 
     controls = {
         "trials": load_package().SelectionSlider(options=_TRIALS, value=1000, description="trials"),
-        "threshold": slider("threshold", 0.02, 1.0, 0.2, 0.02),
+        "threshold": slider("threshold", 0.02, 1.0, 0.2, step=0.02),
         "seed": slider("seed", 0, 20, 0),
     }
     alt = "Two images with the inliers between them, and the residual of each match"
@@ -109,7 +111,7 @@ def drag_match() -> Widget:
         titles = [axis.get_title().replace("\n", " ") for axis in axes[0]]
         return f"{'; '.join(titles)}."
 
-    controls = {"distance": slider("one match is wrong by", 0.0, _FARTHEST, 0.0, 0.1)}
+    controls = {"distance": slider("one match is wrong by", 0.0, _FARTHEST, 0.0, step=0.1)}
     return interactive_figure(figure, controls, update, _DRAGGED)
 
 

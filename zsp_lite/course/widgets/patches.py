@@ -49,7 +49,7 @@ def patch_similarities(
     shown = plots.overlay_map(
         axes[1],
         np.zeros(grid),
-        0.5,
+        alpha=0.5,
         limits=(0, 1),
         label="cosine; dot: nearest neighbour, star: partner",
     )
@@ -81,10 +81,9 @@ def patch_similarities(
             distance = np.abs(np.subtract(nearest, cells[row, col])).max()
             true = f"partner ({true_row}, {true_col}), distance {distance} patches"
         return (
-            f"{kind}: nearest neighbour {nearest}, cosine {similar[nearest]:.2f}; {true}. Of "
-            f"the {valid.sum()} patches "
-            f"with a partner, {share_correct(kind):.0%} have their nearest neighbour "
-            "within one patch of it."
+            f"{kind}: nearest neighbour {nearest}, cosine {similar[nearest]:.2f}; {true}. Of the "
+            f"{valid.sum()} patches with a partner, {share_correct(kind):.0%} have their nearest "
+            "neighbour within one patch of it."
         )
 
     controls = patch_sliders(grid, start)

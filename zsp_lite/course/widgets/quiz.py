@@ -51,8 +51,9 @@ def self_check(notebook: str, number: int) -> None:
     # The form is a <div> that jupyterquiz leaves open: the style goes inside, and closes it.
     form, script = captured.outputs
     html = f"{form.data['text/html']}<style>{_STYLE}</style></div>"
-    ipython.display.display(ipython.display.HTML(html))
+    display = ipython.display
+    display.display(display.HTML(html))
     # Where a page has MathJax, jupyterquiz would replace it by one from the network: hide it from
     # the script.
     hidden = f"{{ let MathJax;\n{script.data['application/javascript']}\n}}"
-    ipython.display.display(ipython.display.Javascript(hidden))
+    display.display(display.Javascript(hidden))

@@ -14,6 +14,7 @@ from zsp_lite.estimates import PoseEstimate
 from zsp_lite.viz.plots import coordinate_colours, object_cloud
 
 SCRIPT = (Path(__file__).parent / "cloud_view.js").read_text(encoding="utf-8")
+# JupyterLab's keys do nothing in this <div>, so that the arrow keys turn the clouds.
 _PAGE = """<div data-lm-suppress-shortcuts="true"><div class="zsp-turning"></div>
 <script>(() => {\n%s})()</script></div>"""
 _CALL = 'stored(document.currentScript.parentElement.querySelector(".zsp-turning"), %s, %s);'
@@ -36,24 +37,26 @@ def show_turning(
     legend: str,
     lines: Mapping[str, Real[np.ndarray, "k 2 3"]] = {},
 ) -> None:
-    """Show, by title, the target and the moved points of the reference as clouds that turn
-    together; nothing where no script runs.
+    """Show, by the title of a pose, the target and the moved points of the reference as clouds that
+    turn together; nothing where no script runs.
 
     The `legend` says whose points the colours are; `lines` join points of the target's camera.
     """
-    from IPython.display import HTML, display
+    from IPython.display import HTML, display  # a package that only notebooks need
 
     panels = []
     for title, one in poses.items():
-        own = object_cloud(one.reference_view, 1200)
-        clouds, colours = [one.sim3.apply(own)], [255 * coordinate_colours(own)]
+        own = object_cloud(one.reference_view, most=1200)
+        clouds = [one.sim3.apply(own)]
+        colours = [255 * coordinate_colours(own)]
         for view in one.target_views:
             cloud = object_cloud(view, 2000 // len(one.target_views))
             world = view.frame.camera.to_world(cloud)
             column, row = view.frame.camera.project(world)[0].astype(int).T
             clouds.append(one.target_camera.to_camera(world))
             colours.append(view.frame.rgb[row, column] / 2 + 127)  # pale
-        to_view = view_units(np.concatenate(clouds[1:]))
+        to_view = view_units(np.concatenate(clouds[1:]))  # the target fills the unit ball
+        # 16-bit integers, of which the script makes 8192 one view unit: they reach to 4.
         points = (8192 * to_view.apply(np.concatenate(clouds)).clip(-3.9, 3.9)).astype("<i2")
         parts = [
             b64encode(part).decode() for part in (points, np.concatenate(colours).astype("u1"))
