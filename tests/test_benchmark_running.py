@@ -21,7 +21,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from benchmark_folder import BACKBONE, SlowBackbone, after_each_save, run_rows, small_folder
+from benchmark_folder import (
+    BACKBONE,
+    QUICK,
+    SlowBackbone,
+    after_each_save,
+    run_rows,
+    small_folder,
+)
+from distributed import Client, LocalCluster
 from refusals import refused
 from synthetic_views import CoordinateBackbone
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -50,15 +58,15 @@ needs_signals = pytest.mark.skipif(
     sys.platform == "win32", reason="Windows has no SIGSTOP, SIGKILL and pgrep"
 )
 
-QUICK = SlowBackbone(grid=8, _seconds=0)
 ROWS = ("ours", "ours-bv")
+PAIRS = 12  # six of each of two categories
 TESTS = Path(__file__).parent
 PATHS = os.environ | {"PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)])}
 
 
 def again(out: Path, executor=1) -> dict:
     """The run of `benchmark_folder`'s main, in this process."""
-    return evaluate(small_folder(), QUICK, ROWS, 6, 3, out, executor)
+    return evaluate(small_folder(), QUICK, ROWS, 6, 3, out, executor)  # 3 target views
 
 
 @pytest.fixture(scope="module")
@@ -66,9 +74,6 @@ def undisturbed(tmp_path_factory):
     """The folder of a run that nothing interrupts, and what it returned."""
     out = tmp_path_factory.mktemp("undisturbed")
     return out, again(out)
-
-
-PAIRS = 12  # of both categories
 
 
 def pairs_in(out: Path) -> list[str]:
@@ -155,7 +160,8 @@ def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monke
 def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tables(
     undisturbed, tmp_path, monkeypatch
 ):
-    stored, before = [], _children(os.getpid())  # the numbers of pairs after each save
+    stored = []  # the number of pairs after each save
+    before = _children(os.getpid())
 
     def kill_a_worker() -> None:
         if not stored:
@@ -224,8 +230,6 @@ MODULES = {
 
 
 def test_modules_of_the_current_folder_travel_to_workers(tmp_path, monkeypatch):
-    from distributed import Client, LocalCluster
-
     for name, text in MODULES.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / f"{name}.py").write_text(text)
@@ -259,7 +263,7 @@ def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch
     arguments = (small_folder(), QUICK, ["ours-bv"], 2, 3, tmp_path)
     monkeypatch.setattr("zsp_lite.benchmark.execution.add_lines", after_each_save(look))
     evaluate(*arguments)
-    assert seen == [1, 2, 3, 4]
+    assert seen == [1, 2, 3, 4]  # two pairs of each category
     assert evaluate(*arguments)["methods"]["ours-bv"]["n"] == 4
 
 
@@ -271,7 +275,7 @@ def test_any_executor_will_do_and_gets_the_backbone_once(undisturbed, tmp_path):
             sizes.append(len(cloudpickle.dumps(arguments)))
             return super().submit(function, *arguments)
 
-    heavy = replace(QUICK, _weights=np.zeros(1_000_000))
+    heavy = replace(QUICK, weights=np.zeros(1_000_000))
     with Counting(2) as executor:
         found = evaluate(small_folder(), heavy, ROWS, 6, 3, tmp_path, executor)
     assert found["methods"] == undisturbed[1]["methods"]
@@ -324,6 +328,7 @@ def test_a_vision_transformers_features_do_not_depend_on_threads():
     pairs = pairs_to_evaluate(["ours"], 2, 2)
 
     def errors(threads: int) -> list[float]:
+        # A row has 60 seconds.
         evaluator = open_evaluator(str(small_folder()), resolve(["ours"]), backbone, 60, threads)
         lines = [evaluator(pair, names) for pair, names in pairs.items()]
         return [line.results["ours"].error for line in lines]

@@ -255,11 +255,12 @@ def test_a_long_message_keeps_its_beginning_and_end():
 
 POINTS = default_rng(0).normal(size=(5, 3)).astype(np.float32)
 COLOURS = default_rng(1).integers(0, 256, (5, 3)).astype(np.uint8)
-COLOURS[0] = 0, 128, 255
+COLOURS[0] = 0, 128, 255  # with both ends of the range, by which it is recognised
 
 
 @pytest.fixture
 def path(tmp_path):
+    """Where a test writes its PLY file."""
     return tmp_path / "cloud.ply"
 
 
