@@ -49,7 +49,7 @@ def sequence_data(
     points = rng.normal(size=(50, 3))
     colours = rng.integers(0, 256, (50, 3)).astype(np.uint8)
     times = [0.2 * number for number in range(frames)]
-    # Views of quality 2 are good enough for `Co3D.select`.
+    # No normals; views of quality 2 are good enough for `Co3D.select`.
     return SequenceData(name, made, times, points, colours, None, 2.0, quality, **options)
 
 

@@ -99,7 +99,7 @@ def ellipsoids(tmp_path_factory):
     from zsp_lite.data.writing import SequenceData, write_co3d, write_label
 
     root = tmp_path_factory.mktemp("co3d")
-    turn = look_at((0.3, -1.0, 0.4)).R
+    turn = look_at((0.3, -1.0, 0.4)).R  # some rotation
     placements = {"a": Sim3.identity(), "b": Sim3(1.0, turn, np.array([0.1, -0.2, 0.1]))}
     points = np.random.default_rng(0).normal(size=(50, 3))  # not on the object's surface
     colours = np.full((50, 3), 128, np.uint8)

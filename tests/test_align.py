@@ -28,7 +28,7 @@ from zsp_lite.viz.category_sheet import objects_figure
 
 A, B, C = SEQUENCES
 HALF_TURN = Sim3(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
-PAIRS = 12  # two frames of each object for each ordered pair
+PAIRS = 12  # six ordered pairs of objects, in each of which two frames of the first are asked
 align_lumps = partial(align_category, Co3D(small_folder()), "lump", QUICK)
 
 
@@ -176,7 +176,8 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
     def misled(reference, target, estimate):
         """Prefer a half turn in A's world to the best pose, if the objects are A and B."""
         found = world_hypotheses(reference, target, estimate)
-        best, doubtful = found.sim3s[0], np.array([0.97, 0.01])
+        best = found.sim3s[0]
+        doubtful = np.array([0.97, 0.01])
         if A in reference and B in target:
             return replace(found, sim3s=(best @ HALF_TURN, best), probabilities=doubtful)
         if B in reference and A in target:
@@ -184,7 +185,7 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
         return found
 
     monkeypatch.setattr("zsp_lite.objects.estimate.world_hypotheses", misled)
-    # The shapes and the vertical, which show the error too, tell nothing.
+    # The vertical and the shapes, which show the error too, tell nothing.
     monkeypatch.setattr("zsp_lite.objects.scan.find_up", lambda frames: (None, ""))
     monkeypatch.setattr(
         "zsp_lite.scans.judge.chamfer_distance", lambda first, second, poses: np.ones(len(poses))

@@ -37,7 +37,9 @@ def assert_same(first: Sim3, second: Sim3, atol: float = 1e-9):
 
 @given(seeds, scales)
 def test_composition_and_application_are_products_with_the_matrix(seed, scale):
-    a, b, points = similarity(seed, scale), similarity(seed + 7), cloud(seed)
+    a = similarity(seed, scale)
+    b = similarity(seed + 7)
+    points = cloud(seed)
     assert_same(a @ a.inverse(), Sim3.identity())
     assert_same(Sim3.from_matrix(a.matrix), a)
     assert_allclose((a @ b).matrix, a.matrix @ b.matrix, atol=1e-9)
@@ -80,12 +82,17 @@ def test_a_rounded_rotation_becomes_the_nearest_one_and_another_is_refused():
 
 
 def test_records_keep_their_values_when_the_arrays_that_they_were_made_of_change():
-    R, t, trans = np.eye(3), np.zeros(3), np.eye(4)
-    rgb, depth = np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.float32)
+    R = np.eye(3)
+    t = np.zeros(3)
+    trans = np.eye(4)
+    rgb = np.zeros((2, 2, 3), np.uint8)
+    depth = np.zeros((2, 2), np.float32)
     keys = torch.zeros(2, 2, 1)
-    sim3, label = Sim3(1.0, R, t), PoseLabel(trans, "a", "a")
+    sim3 = Sim3(1.0, R, t)
+    label = PoseLabel(trans, "a", "a")
     camera = Camera(R, t, np.ones(2), np.ones(2), (2, 2))
-    frame, features = Frame(rgb, depth, depth, camera), FeatureMap(keys, keys[..., 0], keys[0, 0])
+    frame = Frame(rgb, depth, depth, camera)
+    features = FeatureMap(keys, keys[..., 0], keys[0, 0])
     for array in (R, t, trans, rgb, depth, keys):
         array[0] = 5
     for matrix in (sim3.matrix, label.trans, camera.matrix):
@@ -110,7 +117,8 @@ def test_umeyama_is_the_best_rotation_by_scipy_also_for_a_mirrored_target(seed, 
 
 
 def test_without_scale_the_scale_is_one():
-    source, truth = cloud(0), similarity(1, 1.0)
+    source = cloud(0)
+    truth = similarity(1, 1.0)
     assert_same(umeyama(torch.as_tensor(source), truth.apply(source), with_scale=False), truth)
     assert umeyama(source, 3 * source, with_scale=False).scale == 1
 
@@ -140,7 +148,8 @@ def test_degenerate_or_malformed_points_are_refused_in_one_line(solver, points):
 def contaminated(seed: int, outliers: float = 0.6):
     """Source, target, true similarity, and which points are no outliers."""
     rng = default_rng(seed)
-    source, truth = rng.normal(size=(50, 3)), similarity(seed, 1.2)
+    source = rng.normal(size=(50, 3))
+    truth = similarity(seed, 1.2)
     target = truth.apply(source) + 0.01 * rng.normal(size=(50, 3))
     wrong = rng.permutation(50) < outliers * 50
     target[wrong] = truth.t + 2 * rng.normal(size=(wrong.sum(), 3))

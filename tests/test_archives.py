@@ -129,7 +129,8 @@ def test_labelled_sequences_are_read_out_of_the_archive_on_the_server(
     server, source, tmp_path, download, monkeypatch
 ):
     monkeypatch.setattr(archives, "_PART", 4_096)  # bytes: one part would be the whole archive
-    root, options = tmp_path / "v1", ("--labels", str(source), "--labelled-only")
+    root = tmp_path / "v1"
+    options = ("--labels", str(source), "--labelled-only")
     text = download(root, *options, dataset="co3d-v1")
     assert "2 labels, 1 files of pairs" in text
     assert list(read_labels(root, "toaster")) == list(SEQUENCES)
@@ -189,7 +190,8 @@ def test_a_truncated_archive_is_completed_by_the_next_call_of_one_process(
 
 
 def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkeypatch, download):
-    root, read = tmp_path / "co3d", zipfile.ZipFile.read
+    root = tmp_path / "co3d"
+    read = zipfile.ZipFile.read
     written = []
 
     def stop_at_third(archive, member):
@@ -217,7 +219,8 @@ def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkey
 def test_nothing_is_written_outside_the_folder_and_no_link_is_made(
     server, tmp_path, download, name, code
 ):
-    data, member = io.BytesIO(), zipfile.ZipInfo(name)
+    data = io.BytesIO()
+    member = zipfile.ZipInfo(name)
     member.external_attr = (stat.S_IFLNK | 0o777) << 16
     with zipfile.ZipFile(data, "w") as archive:
         archive.writestr(member, b"/etc/passwd")

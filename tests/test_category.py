@@ -59,7 +59,8 @@ def problem(seed: int, flipped: float = 0.0) -> tuple[list[Sim3], list[PairHypot
 @given(seeds)
 def test_poses_are_recovered_among_outliers_and_half_turns_in_any_order(seed):
     truth, pairs = problem(seed, flipped=0.1)
-    alignment, again = synchronise(pairs), synchronise(pairs[::-1])
+    alignment = synchronise(pairs)
+    again = synchronise(pairs[::-1])
     # The first object has the rotation of the frame and lies at its origin; the mean logarithm of
     # the scales is zero.
     scale = np.exp(np.mean(np.log([one.scale for one in truth])))

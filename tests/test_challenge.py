@@ -169,6 +169,7 @@ def test_a_hand_in_finds_and_changes_nothing_but_its_folder(
         tempfile.TemporaryDirectory(prefix="challenge-") as left,  # by a ranking that was killed
         socket.create_server(("127.0.0.1", 0)) as server,
     ):
+        # Files of others, and folders of others in which no file "none" exists.
         paths = [f"{handins}/right.csv", f"{challenge}/keep/pairs.csv", left + "/none", "/dev/tty"]
         paths += [f"{REPOSITORY}/environment.txt", f"{REPOSITORY}/zsp_lite/none"]
         paths += [sys.prefix + "/none", "/dev/shm/none", "/var/tmp/none"]

@@ -64,6 +64,11 @@ def test_helpers_are_the_paths_up_to_the_next_option():
         assert given["helpers"] == (Path("c"), Path("d"))
 
 
+def output_of(program: str) -> str:
+    """What a program in Python prints."""
+    return subprocess.check_output([sys.executable, "-c", program], text=True)
+
+
 HELP = """
 import sys
 from zsp_lite.cli.main import main
@@ -71,11 +76,6 @@ main(['benchmark', '--help'])
 large = {'torch', 'numpy', 'pandas', 'scipy', 'matplotlib', 'cv2', 'rich'}
 print(large & set(sys.modules))
 """
-
-
-def output_of(program: str) -> str:
-    """What a program in Python prints."""
-    return subprocess.check_output([sys.executable, "-c", program], text=True)
 
 
 def test_help_imports_no_large_library():
@@ -289,7 +289,8 @@ def test_every_option_of_the_benchmark_reaches_the_library(monkeypatch, tmp_path
         "--backbone small --layer 3 --facet value --image-size 64 --categories lump,chair "
         "--pairs 7 --targets 3 --methods ours,x=a:b --out there --quiet"
     )
-    config, numbers = BackboneConfig("small", "3", "value", 64), {"lump": 7, "chair": 7}
+    config = BackboneConfig("small", "3", "value", 64)
+    numbers = {"lump": 7, "chair": 7}
     common = {
         "backbone": config,
         "methods": ["ours", "x=a:b"],

@@ -181,7 +181,8 @@ def test_the_given_cells_run_and_agree_with_the_expected_outputs_and_the_guides(
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
 def test_the_solutions_pass_every_test_and_the_students_version_none(prepared, config, assignment):
-    notebook, handed_out = source(assignment), students_version(assignment, config)
+    notebook = source(assignment)
+    handed_out = students_version(assignment, config)
     text = "\n".join(cell.source for cell in handed_out.cells)
     assert not re.search("SOLUTION|HIDDEN|Guide for marking", text)
     assert failing_tests(prepared(assignment), notebook, notebook) == {}
@@ -252,7 +253,7 @@ def turn_into_text(cell: NotebookNode) -> None:
     del cell["outputs"], cell["execution_count"]
 
 
-# What is listed, and a damage to a solution that is its cause.
+# Reasons that the list of grades has, and the damage to a solution that is the cause of each.
 DAMAGES = {
     "cells that are there twice": lambda cell, cells: cells.append(copied(cell)),
     "solutions that are not code": lambda cell, _: turn_into_text(cell),
@@ -328,7 +329,8 @@ def copy_course(root: Path) -> Path:
 def answered(folder: Path) -> NotebookNode:
     """Ada's notebook."""
     notebook = nbformat.read(folder / "release" / METRICS / f"{METRICS}.ipynb", as_version=4)
-    solutions, answers = graded(source(METRICS), solution=True), graded(notebook, solution=True)
+    solutions = graded(source(METRICS), solution=True)
+    answers = graded(notebook, solution=True)
     answers[RIGHT].source = solutions[RIGHT].source
     answers[CALLS].source = solutions[CALLS].source + CALLS_THE_LIBRARY.format(CALLS)
     answers["better"].source = "See my remark: [Comment](#mine), $\\lambda R$ and $\\broken{$"

@@ -294,7 +294,8 @@ def test_positions_are_read_in_every_encoding(path, encoding):
 )
 def test_colours_of_8_or_16_bits_to_255_or_to_1_are_read_as_8_bit(path, kind, code, scale):
     table = np.zeros(len(POINTS), [("position", "<f4", 3), ("colour", f"<{code}", 3)])
-    table["position"], table["colour"] = POINTS, COLOURS * np.float64(scale)
+    table["position"] = POINTS
+    table["colour"] = COLOURS * np.float64(scale)
     path.write_bytes(_ply(len(POINTS), table.tobytes(), kind=kind))
     colours = read_ply(path)[1]
     assert colours.dtype == np.uint8

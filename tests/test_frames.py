@@ -224,7 +224,8 @@ def test_masks_survive_their_files(tmp_path):
 @pytest.mark.parametrize("extension", [".png", ".jpg"])
 def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension):
     pixels = default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
-    data, path = cv2.imencode(extension, pixels)[1].tobytes(), tmp_path / "image"
+    data = cv2.imencode(extension, pixels)[1].tobytes()
+    path = tmp_path / "image"
     decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     for behind in (b"", b"\xff\xda \xff\xd9 IDAT IEND", data[:-9]):
         path.write_bytes(data + behind)

@@ -56,7 +56,7 @@ def insert(metadata, table, **values):
 
 
 def write_depth(path, shape, **options):
-    """Write depth maps with one of a shape, without values."""
+    """Write a file with one depth map of a shape, whose values are not stored."""
     with h5py.File(path, "w") as depths:
         depths.create_dataset("1", shape, np.float32, **options)
 

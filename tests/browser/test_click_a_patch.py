@@ -158,6 +158,7 @@ def test_the_page_has_the_librarys_matches(shown, cycle, matcher):
     for i, (found, rounded) in enumerate(zip(shown.solved[cycle]["targets"], maps, strict=True)):
         sim = shown.compared(i, binned=True)
         matches = match(first, rounded, kmeans=False, sim=sim, matcher=matcher)
+        # Row and column of 28 to the number of a patch.
         pairs = np.stack([matches.reference @ (28, 1), matches.target @ (28, 1)], axis=1)
         assert_array_equal(found["matches"], pairs)
         assert_allclose(found["score"], correspondence_score(matches, 50), atol=1e-3)
@@ -217,7 +218,8 @@ def touched(browser, playground, request) -> Page:
 
 def test_a_patch_is_held_by_keyboard_and_touch(touched):
     tab_to(touched, "reference")
-    text, picture = touched.inner_text("#patch"), array(touched, FIRST_TARGET, np.uint8)
+    text = touched.inner_text("#patch")
+    picture = array(touched, FIRST_TARGET, np.uint8)
     assert picture.std() > 20  # a picture is shown
     touched.keyboard.press("ArrowLeft")
     touched.keyboard.press("Enter")

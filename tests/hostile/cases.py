@@ -60,7 +60,8 @@ for kind in STRANGE:
 # Oversized files: small on the disk, large in memory.
 def encoded(values: np.ndarray, kind: str, palette: bool = False, **options) -> bytes:
     """A picture in a format of Pillow."""
-    image, file = Image.fromarray(values), io.BytesIO()
+    image = Image.fromarray(values)
+    file = io.BytesIO()
     if palette:
         image.putpalette(range(256))
     image.save(file, kind, **options)
@@ -136,7 +137,8 @@ def without_lzfse(path: Path) -> None:
 def ten_hours(path: Path) -> None:
     """Make the video of Stray Scanner claim a duration of ten hours, for the movie and for its
     media, and ask for a frame of the ninth hour."""
-    video, odometry = path / "rgb.mp4", path / "odometry.csv"
+    video = path / "rgb.mp4"
+    odometry = path / "odometry.csv"
     data = video.read_bytes()
     for kind in (b"mvhd", b"mdhd"):
         # Behind the name of either header: 12 bytes, units per second, and the duration in units.

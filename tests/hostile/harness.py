@@ -42,7 +42,7 @@ class Case:
     """A call that gets a copy of the folder, and raises InputError or returns an outcome and a
     message.
 
-    The outcome is "refused" as InputError is, "right", or "wrong".
+    Outcomes are "refused", which an InputError counts as, "right" and "wrong".
     """
 
     group: str
