@@ -66,10 +66,8 @@ def small_folder() -> Path:
 
 @dataclass(frozen=True)
 class SlowBackbone(CoordinateBackbone):
-    """A backbone that takes some seconds for each image, so that a test can interrupt it.
-
-    Neither they nor its weights, which are large for one test, change its name in a run.
-    """
+    """A backbone that takes some seconds for each image, so that a test can interrupt it, and may
+    have weights that are large to send."""
 
     name = "slow"
     seconds: float = 0.05

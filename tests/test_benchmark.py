@@ -72,7 +72,8 @@ def test_a_method_added_later_leaves_the_others_as_they_were(tmp_path):
 
 
 def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(evaluated):
-    dataset, found = Co3D(small_folder()), read_run(evaluated[0])
+    dataset = Co3D(small_folder())
+    found = read_run(evaluated[0])
     for category in ("lump", "pebble"):
         labels = read_labels(small_folder(), category)
         for pair in sample_pairs(dataset, category, 6, 5):

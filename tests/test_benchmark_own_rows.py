@@ -279,7 +279,8 @@ def test_poses_from_a_file_are_measured_like_any_others(answers, tmp_path):
 
 
 def test_a_file_without_a_pose_of_the_pairs_or_of_another_view_is_refused(answers, tmp_path):
-    rows, out = {"exact": str(tmp_path / "exact.csv")}, tmp_path / "run"
+    rows = {"exact": str(tmp_path / "exact.csv")}
+    out = tmp_path / "run"
     message = "exact.csv has no pose for any of the pairs"
     refused(message, run_rows, rows, out, category="pebble")
     answers[1] = re.sub(r'",\d+,', '",99,', answers[1])
@@ -336,7 +337,7 @@ RIGHT = '"lump/a:0/b:1,5",1,1 0 0 0 1 0 0 0 1,0 0 1,1'
         (f"{COLUMNS}\n\n{RIGHT.replace(',1 0', ',nan 0')}", "line 3: rotation holds nan"),
         (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',-1 0')}", "line 2: "),
         (f"{COLUMNS}\n{RIGHT[:-1]}0", "scale is 0.0"),
-        (f"{COLUMNS}\n{RIGHT.replace(',1,', ',1.000,')}", "line 2: .*'1.000'"),  # or a thousand
+        (f"{COLUMNS}\n{RIGHT.replace(',1,', ',1.000,')}", "line 2: .*'1.000'"),  # one or a thousand
         (
             f"{COLUMNS}\n{RIGHT.replace(',0 0 1,', ',0 0,')}",
             "line 2: translation has shape .2,., expected",
@@ -360,6 +361,7 @@ def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_pat
 
 def test_poses_are_read_as_a_spreadsheet_saves_them_as_unicode(tmp_path):
     path = tmp_path / "poses.csv"
+    # Other titles of the columns, columns and a line that are empty, and UTF-16.
     saved = f"{COLUMNS.title()},,\n,,,,,,\n{RIGHT},,\n".replace("_", " ")
     path.write_text(saved, encoding="utf-16")
     assert resolve([f"theirs={path}"])["theirs"].solve._poses.keys() == {"lump/a:0/b:1,5"}
@@ -508,7 +510,8 @@ def overwrite(thing) -> None:
 
 
 def test_rows_get_the_pairs_seed_and_neither_labels_nor_names_and_do_not_reach_each_other(tmp_path):
-    handed, seeds = [], {}
+    handed = []
+    seeds = {}
 
     def keep(name: str, seed: int, answer, *things):
         """Store what the row `name` was handed, overwrite it, and give the row's answer."""

@@ -111,7 +111,8 @@ def test_icp_takes_the_first_view_or_the_best_one(of_rows):
 
 @pytest.mark.parametrize("row", ["icp", "sift"])
 def test_a_pair_without_depth_fails(row, monkeypatch):
-    dataset, load = Co3D(small_folder()), Co3D.load
+    dataset = Co3D(small_folder())
+    load = Co3D.load
     monkeypatch.setattr(Co3D, "load", lambda *frame: replace(load(*frame), depth=None))
     (pair,) = category_pairs(dataset, "pebble", 1, 2)
     problem = PairProblem(pair, FrameStore(dataset, {"sift": Sift()}), ["sift"])

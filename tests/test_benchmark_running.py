@@ -132,7 +132,8 @@ def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_tw
 
 def test_a_line_cut_off_by_a_kill_is_neither_read_nor_continued(undisturbed, tmp_path):
     run = shutil.copytree(undisturbed[0], tmp_path / "run")
-    before, path = read_run(run), run / LINES
+    before = read_run(run)
+    path = run / LINES
     whole = path.read_bytes()
     cut_off = whole[: len(whole) // 2].rpartition(b"\n")[2]
     path.write_bytes(whole + cut_off)
@@ -290,7 +291,9 @@ def thread_counts() -> list[int]:
 
 
 def test_numbers_of_threads_are_restored_after_blocks_that_overlap():
-    started, go, ended = threading.Barrier(2), threading.Event(), threading.Event()
+    started = threading.Barrier(2)
+    go = threading.Event()
+    ended = threading.Event()
 
     def block(waits_for: threading.Event, then: threading.Event) -> set[int]:
         with one_thread():
@@ -343,7 +346,8 @@ def test_the_note_of_a_run_says_that_several_versions_of_the_library_evaluated_i
         evaluate, small_folder(), BACKBONE, pairs={"lump": 1}, targets=2, out=tmp_path
     )
     run(["ours-bv"])
-    first, other = library_version(), {"version": "1", "commit": "0123abc"}
+    first = library_version()
+    other = {"version": "1", "commit": "0123abc"}
     monkeypatch.setattr("zsp_lite.benchmark.runs.library_version", lambda: other)
     assert "note" not in read_run(tmp_path).summary
     run(["ours"])
