@@ -26,7 +26,7 @@ from zsp_lite.estimates import PoseEstimate, match_points
 from zsp_lite.io.files import write_atomic
 
 SEQUENCES = ("100_a", "200_b", "300_c")
-FRAMES = 8
+FRAMES = 8  # of each sequence
 
 
 @functools.cache
@@ -38,10 +38,12 @@ def small_folder() -> Path:
     for offset, category in enumerate(("lump", "pebble")):
         sequences = []
         for index, name in enumerate(SEQUENCES):
+            # Some rotation for each other sequence of each category.
             turn = (
                 np.eye(3) if index == 0 else look_at(np.eye(3)[index] + (0.3, 0.2, 0.1 + offset)).R
             )
-            placement = Sim3(1.0, turn, np.zeros(3))
+            in_world = Sim3(1.0, turn, np.zeros(3))  # from the object to the world
+            # Every sequence has viewpoints of its own.
             angles = np.linspace(0, 2 * np.pi, FRAMES, endpoint=False) + 0.3 * index
             # Upright cameras around the object; then the world is turned with them.
             views = [
@@ -49,10 +51,10 @@ def small_folder() -> Path:
             ]
             cameras = [replace(camera, R=camera.R @ turn.T) for camera in views]
             frames = tuple(
-                render(camera, placement, f"{name}/{i}") for i, camera in enumerate(cameras)
+                render(camera, in_world, f"{name}/{i}") for i, camera in enumerate(cameras)
             )
             times = tuple(map(float, range(FRAMES)))
-            cloud = np.eye(3)
+            cloud = np.eye(3)  # three points, not of the object
             colours = np.zeros((3, 3), np.uint8)
             sequences.append(SequenceData(name, frames, times, cloud, colours))
             trans = np.eye(4)
@@ -64,18 +66,20 @@ def small_folder() -> Path:
 
 @dataclass(frozen=True)
 class SlowBackbone(CoordinateBackbone):
-    """A backbone that takes some time for each image, so that a test can interrupt it."""
+    """A backbone that takes some seconds for each image, so that a test can interrupt it, and may
+    have weights that are large to send."""
 
     name = "slow"
-    _seconds: float = 0.05
-    _weights: np.ndarray | None = None
+    seconds: float = 0.05
+    weights: np.ndarray | None = None
 
     def __call__(self, images):
-        time.sleep(self._seconds * len(images))
+        time.sleep(self.seconds * len(images))
         return super().__call__(images)
 
 
 BACKBONE = CoordinateBackbone(grid=8)
+QUICK = SlowBackbone(grid=8, seconds=0)
 
 
 def run_rows(
@@ -90,7 +94,7 @@ def own_method(problem):
     return np.eye(3), 0
 
 
-@dataclass  # has no hash
+@dataclass  # without a hash: a row needs none
 class OwnEstimator:
     """A user's estimator: turns the reference by 90 degrees."""
 
@@ -114,7 +118,7 @@ def own_keypoints(first, second):
     return grid, grid, np.ones(len(grid))
 
 
-@dataclass  # has no hash
+@dataclass  # without a hash
 class OwnSolver:
     """A user's solver: the pose in the first target view."""
 
@@ -135,7 +139,7 @@ def placement(category, sequence) -> Sim3:
 
 
 CATEGORIES = ("bicycle", "hydrant", "motorcycle", "teddybear", "toaster", "chair")
-PAIRS = 8
+PAIRS = 8  # of each category
 # All that a result of a pair can have.
 RESULT = {
     "error": 10.0,
@@ -153,10 +157,11 @@ RESULT = {
 
 
 def write_run(out, rows, categories=CATEGORIES, backbone="none 0123456789abcdef"):
-    """Write a run's folder with results by row and pair."""
+    """Write a run's folder with results by row and pair; `backbone` is a name and a hash."""
     call = Call("now", [], {}, list(rows), dict.fromkeys(categories, PAIRS))
-    library, methods = [{"version": "0", "commit": None}], dict.fromkeys(rows, "x")
-    settings = Settings("made up", backbone, 5, library, methods, [call])
+    library = [{"version": "0", "commit": None}]
+    methods = dict.fromkeys(rows, "x")
+    settings = Settings("made up", backbone, 5, library, methods, [call])  # 5 target views
     write_atomic(Path(out) / SETTINGS, msgspec.json.encode(settings))
     for name, results in rows.items():
         add_lines(out, ({"pair": key, "results": {name: found}} for key, found in results.items()))
@@ -165,8 +170,10 @@ def write_run(out, rows, categories=CATEGORIES, backbone="none 0123456789abcdef"
 
 def made_up_run(out, rows):
     """A run with random errors of pairs that share a few objects."""
-    rng, found = np.random.default_rng(0), {}
+    rng = np.random.default_rng(0)
+    found = {}
     for name in dict.fromkeys(rows):
+        # A row NAME-n3 has three target views, others have five.
         targets = tuple(range(int((re.findall(r"-n(\d+)$", name) or [5])[0])))
         pairs = [
             Pair(category, f"{i}", i, f"{(i * i + 1) % PAIRS}", targets)
@@ -190,9 +197,11 @@ def after_each_save(act: Callable[[], None]) -> Callable[..., None]:
     return add_and_act
 
 
+# A run that a test can kill: it prints a line after each save.
 if __name__ == "__main__":
     from zsp_lite.benchmark import execution, run
 
     data, out, workers = sys.argv[1:]
     execution.add_lines = after_each_save(lambda: print(flush=True))
+    # 6 pairs of each category, 3 target views.
     run.evaluate(data, SlowBackbone(grid=8), ("ours", "ours-bv"), 6, 3, out, int(workers))

@@ -32,7 +32,7 @@ def sequence_data(
     name: str, frames: int = 4, seed: int = 0, quality: float = 1.0, **options
 ) -> SequenceData:
     """A sequence of views of 24 x 32 pixels: a smooth picture, a disc as mask, random depth with a
-    hole."""
+    hole; `quality` is that of the point cloud."""
     rng = default_rng([seed, *name.encode()])
     height, width = 24, 32
     y, x = np.mgrid[:height, :width]
@@ -49,6 +49,7 @@ def sequence_data(
     points = rng.normal(size=(50, 3))
     colours = rng.integers(0, 256, (50, 3)).astype(np.uint8)
     times = [0.2 * number for number in range(frames)]
+    # No normals; views of quality 2 are good enough for `Co3D.select`.
     return SequenceData(name, made, times, points, colours, None, 2.0, quality, **options)
 
 
@@ -73,7 +74,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def edit_json(path: Path, change: Callable) -> None:
-    """Rewrite a gzipped JSON file with `change` applied to its content."""
+    """Rewrite a gzipped JSON file with its content changed: by what `change` returns, or in place
+    where it returns None."""
     content = json.loads(gzip.decompress(path.read_bytes()))
     changed = change(content)
     content = content if changed is None else changed

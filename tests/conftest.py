@@ -44,6 +44,8 @@ def raises(expected, **options):
 
 pytest.raises = raises
 
+# Fixtures import what they need, so that only the tests that use them load it.
+
 
 @pytest.fixture
 def links(tmp_path_factory):
@@ -97,16 +99,18 @@ def ellipsoids(tmp_path_factory):
     from zsp_lite.data.writing import SequenceData, write_co3d, write_label
 
     root = tmp_path_factory.mktemp("co3d")
-    turn = look_at((0.3, -1.0, 0.4)).R
+    turn = look_at((0.3, -1.0, 0.4)).R  # some rotation
     placements = {"a": Sim3.identity(), "b": Sim3(1.0, turn, np.array([0.1, -0.2, 0.1]))}
-    points = np.random.default_rng(0).normal(size=(50, 3))
+    points = np.random.default_rng(0).normal(size=(50, 3))  # not on the object's surface
     colours = np.full((50, 3), 128, np.uint8)
     cameras = [look_at((np.cos(a), np.sin(a), 0.3)) for a in 2 * np.pi / 7 * np.arange(7)]
     sequences = []
     for name, placement in placements.items():
         frames = [render(camera, placement) for camera in cameras]
         cloud = placement.apply(points)
-        sequences.append(SequenceData(name, frames, range(7), cloud, colours, None, 2.0, 1.0))
+        # Scores above the bounds of `Co3D.select`.
+        scores = {"viewpoint_quality": 2.0, "point_cloud_quality": 1.0}
+        sequences.append(SequenceData(name, frames, range(7), cloud, colours, **scores))
         write_label(root, "ellipsoid", PoseLabel(placement.matrix, name, "a"))
     write_co3d(root, "ellipsoid", sequences, quality=98)
     return Co3D(root)
@@ -130,6 +134,7 @@ def loaded(monkeypatch):
         "zsp_lite.backbones.named.load_backbone",
         lambda name: asked.append(name) or CoordinateBackbone(),
     )
+    # A name for reports, as every loaded backbone has one.
     monkeypatch.setattr(CoordinateBackbone, "name", "coordinates", raising=False)
     return asked
 

@@ -11,14 +11,13 @@ from itertools import permutations
 import msgspec
 import numpy as np
 import pytest
-from benchmark_folder import SEQUENCES, SlowBackbone, run_rows, small_folder
+from benchmark_folder import QUICK, SEQUENCES, run_rows, small_folder
 from numpy.testing import assert_allclose
 from refusals import refused
 
 from zsp_lite import Co3D, Sim3, align_category, estimate_pose
 from zsp_lite.benchmark.problem import FrameStore
 from zsp_lite.benchmark.run import evaluate
-from zsp_lite.cli import main as cli
 from zsp_lite.course.labelling.session import Labelling
 from zsp_lite.data.labels import read_labels
 from zsp_lite.importers.convert import scale_frame
@@ -27,15 +26,14 @@ from zsp_lite.objects.align import read_hypotheses, write_labels
 from zsp_lite.scans.category import PairHypotheses, synchronise, world_hypotheses
 from zsp_lite.viz.category_sheet import objects_figure
 
-BACKBONE = SlowBackbone(grid=8, _seconds=0)
 A, B, C = SEQUENCES
 HALF_TURN = Sim3(1.0, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
-PAIRS = 12  # two frames of each object for each ordered pair
-align_lumps = partial(align_category, Co3D(small_folder()), "lump", BACKBONE)
+PAIRS = 12  # six ordered pairs of objects, in each of which two frames of the first are asked
+align_lumps = partial(align_category, Co3D(small_folder()), "lump", QUICK)
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def aligned_run(tmp_path_factory):
     """The folder of a run, and the alignment that it returned."""
     out = tmp_path_factory.mktemp("align")
     return out, align_lumps(targets=3, out=out)
@@ -45,8 +43,8 @@ def test_sources_in_place_of_a_data_set_are_aligned_in_their_own_lengths():
     dataset = Co3D(small_folder())
     frames = [scale_frame(dataset.load(one), 1000.0) for one in dataset.frames("lump", B)]
     sources = (dataset.root / "lump" / A, iter(frames))
-    found = align_category(iter(sources), backbone=BACKBONE, targets=3)
-    pose = found.between(A, "2")
+    found = align_category(iter(sources), backbone=QUICK, targets=3)
+    pose = found.between(A, "2")  # objects in memory are named by their position, from 1
     assert rotation_error(pose.R, turns(dataset.root)[A, B]) < 15
     assert_allclose(pose.scale, 1000, rtol=0.1)
     refused("two objects are named 100_a", align_category, sources[:1] * 2)
@@ -61,8 +59,8 @@ def turns(root):
     }
 
 
-def test_objects_are_aligned_as_their_labels_and_the_written_labels_say(run, tmp_path):
-    _, alignment = run
+def test_objects_are_aligned_as_their_labels_and_the_written_labels_say(aligned_run, tmp_path):
+    _, alignment = aligned_run
     write_labels(alignment, tmp_path, "lump")
     written = turns(tmp_path)
     for pair, true in turns(small_folder()).items():
@@ -82,8 +80,10 @@ def poses(alignment) -> dict[str, list]:
     return {name: pose.sim3.matrix.tolist() for name, pose in alignment.objects.items()}
 
 
-def test_a_killed_run_is_continued_where_it_was_and_by_other_workers(run, tmp_path, monkeypatch):
-    out, whole = run
+def test_a_killed_run_is_continued_where_it_was_and_by_other_workers(
+    aligned_run, tmp_path, monkeypatch
+):
+    out, whole = aligned_run
     lines = (out / "run.jsonl").read_text().splitlines(keepends=True)
     assert len(lines) == PAIRS
     # The run was killed while it wrote its 8th line.
@@ -99,44 +99,47 @@ def test_a_killed_run_is_continued_where_it_was_and_by_other_workers(run, tmp_pa
     assert synchronise([*answers]).objects.keys() == whole.objects.keys()
 
 
-def test_a_run_is_continued_by_its_own_command_and_settings_alone(run):
-    out, _ = run
+def test_a_run_is_continued_by_its_own_command_and_settings_alone(aligned_run):
+    out, _ = aligned_run
     message = "holds a run with command align, this is benchmark"
-    refused(message, evaluate, small_folder(), BACKBONE, ["ours"], 1, 3, out)
+    refused(message, evaluate, small_folder(), QUICK, ["ours"], 1, 3, out)
     refused("holds a run with targets 3, this is 2", align_lumps, targets=2, out=out)
 
 
-def test_an_object_without_a_pose_is_left_out(monkeypatch):
+@pytest.fixture
+def without_vertical(monkeypatch):
+    """Shapes whose vertical is known would be aligned without any hypothesis."""
+    monkeypatch.setattr("zsp_lite.benchmark.problem.find_up", lambda frames: (None, ""))
+
+
+def test_an_object_without_a_pose_is_left_out(monkeypatch, without_vertical):
     def fail_for_c(store, pair):
         if C not in (pair.reference_sequence, pair.target_sequence):
             return solve(store, pair)
 
     solve = FrameStore._hypotheses
     monkeypatch.setattr(FrameStore, "_hypotheses", fail_for_c)
-    monkeypatch.setattr("zsp_lite.benchmark.problem.find_up", lambda frames: (None, ""))
     assert list(align_lumps(SEQUENCES, targets=3).objects) == [A, B]
 
 
-def test_objects_without_any_pose_are_refused(monkeypatch):
+def test_objects_without_any_pose_are_refused(monkeypatch, without_vertical):
     monkeypatch.setattr(FrameStore, "_hypotheses", lambda store, pair: None)
-    monkeypatch.setattr("zsp_lite.benchmark.problem.find_up", lambda frames: (None, ""))
     refused("nothing tells the pose between any two objects", align_lumps, targets=3)
 
 
 def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
-    run, tmp_path, monkeypatch, capsys
+    aligned_run, tmp_path, monkeypatch, run
 ):
     root = tmp_path / "data"
     out = tmp_path / "out"
     shutil.copytree(small_folder(), root)
-    _, alignment = run
+    _, alignment = aligned_run
     turned = alignment.between(A, C) @ HALF_TURN
     wrong = PairHypotheses(A, C, (turned,), np.ones(1), np.zeros(3))
     disagreeing = replace(alignment, pairs=(wrong,))
     monkeypatch.setattr("zsp_lite.objects.align.align_category", lambda *_, **__: disagreeing)
     line = f"align {root} --category lump --out {out}"
-    assert cli.main(f"{line} --propose".split()) == 0
-    text = capsys.readouterr().out
+    text = run(f"{line} --propose")
     assert "lump: 3 objects in one frame" in text
     assert "100.0% of 6 ordered pairs are within 30°" in text
     assert f"{A} to {C}: the best pose of the pair alone is 180° away" in text
@@ -148,19 +151,20 @@ def test_the_command_writes_labels_a_report_and_proposals_which_labelling_takes(
     labelling = Labelling(root, "lump")
     assert rotation_error(labelling.proposal(C).R, alignment.between(A, C).R) < 0.01
     # A later call compares with the proposals as well.
-    assert cli.main(line.split()) == 0
-    assert "By the proposals, 100.0% of 6 ordered pairs" in capsys.readouterr().out
+    assert "By the proposals, 100.0% of 6 ordered pairs" in run(line)
 
 
-def test_the_objects_of_a_category_without_masks_are_shown_in_whole_frames(run, monkeypatch):
+def test_the_objects_of_a_category_without_masks_are_shown_in_whole_frames(
+    aligned_run, monkeypatch
+):
     frames = Co3D.frames
 
     def without_masks(*names) -> list:
         return [msgspec.structs.replace(frame, mask=None) for frame in frames(*names)]
 
     monkeypatch.setattr(Co3D, "frames", without_masks)
-    panels = objects_figure(Co3D(small_folder()), "lump", run[1]).axes
-    assert len(panels) == 6
+    panels = objects_figure(Co3D(small_folder()), "lump", aligned_run[1]).axes
+    assert len(panels) == 6  # three objects, as they were scanned and aligned
     # The object fills a crop; in a whole frame the corners are black.
     assert not panels[0].images[0].get_array()[:40, :40].any()
 
@@ -170,9 +174,10 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
     wrong."""
 
     def misled(reference, target, estimate):
-        """Prefer the half turn of A's world to the best pose, if the objects are A and B."""
+        """Prefer a half turn in A's world to the best pose, if the objects are A and B."""
         found = world_hypotheses(reference, target, estimate)
-        best, doubtful = found.sim3s[0], np.array([0.97, 0.01])
+        best = found.sim3s[0]
+        doubtful = np.array([0.97, 0.01])
         if A in reference and B in target:
             return replace(found, sim3s=(best @ HALF_TURN, best), probabilities=doubtful)
         if B in reference and A in target:
@@ -180,11 +185,13 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
         return found
 
     monkeypatch.setattr("zsp_lite.objects.estimate.world_hypotheses", misled)
-    # The shapes and the vertical, which show the error too, tell nothing.
+    # The vertical and the shapes, which show the error too, tell nothing.
     monkeypatch.setattr("zsp_lite.objects.scan.find_up", lambda frames: (None, ""))
-    monkeypatch.setattr("zsp_lite.scans.judge.chamfer_distance", lambda *_: np.ones(len(_[2])))
+    monkeypatch.setattr(
+        "zsp_lite.scans.judge.chamfer_distance", lambda first, second, poses: np.ones(len(poses))
+    )
     *pair, helper = [small_folder() / "lump" / name for name in SEQUENCES]
-    settings = {"backbone": BACKBONE, "targets": 3, "references": 2}
+    settings = {"backbone": QUICK, "targets": 3, "references": 2}
     assert estimate_pose(*pair, **settings).errors["verified"] > 150
     result = estimate_pose(*pair, helpers=[helper], **settings)
     assert result.errors["verified"] < 15
@@ -194,5 +201,5 @@ def test_helpers_settle_what_the_pair_gets_wrong(monkeypatch):
 
 def test_a_helper_is_another_object():
     *pair, helper = [small_folder() / "lump" / name for name in SEQUENCES]
-    message = "expected different objects"
-    refused(message, estimate_pose, *pair, helpers=[pair[1], helper], backbone=BACKBONE)
+    helpers = [pair[1], helper]
+    refused("expected different objects", estimate_pose, *pair, helpers=helpers, backbone=QUICK)

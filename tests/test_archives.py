@@ -21,7 +21,8 @@ from zsp_lite.data.labels import read_labels
 from zsp_lite.data.writing import write_published_pairs
 from zsp_lite.io.locks import writing
 
-SEQUENCES, UNLABELLED = ("100_1_1", "200_2_2"), "300_3_3"
+SEQUENCES = ("100_1_1", "200_2_2")  # with labels
+UNLABELLED = "300_3_3"
 CHUNKS = ["/toaster_000.zip", "/toaster_001.zip"]
 
 
@@ -63,16 +64,17 @@ def server(source, tmp_path, monkeypatch):
     monkeypatch.setattr(archives, "CATALOGUE", server.catalogue)
     monkeypatch.setenv("ZSP_LITE_CO3D_URL", server.url + "/")
     monkeypatch.setenv("ZSP_LITE_CO3D_V1_URL", server.url)
-    monkeypatch.setenv("no_proxy", "*")
+    monkeypatch.setenv("no_proxy", "*")  # the server is on this machine
     write_catalogue(server)
     yield server
     server.close()
 
 
 def write_catalogue(server) -> None:
+    """Write the catalogue with the digests of the server's archives."""
     *chunks, v1 = [hashlib.sha256(one).hexdigest() for one in server.files.values()]
-    archives = {"co3d": chunks, "co3d-v1": [v1]}
-    catalogue = {name: {"full": {"toaster": digests}} for name, digests in archives.items()}
+    data_sets = {"co3d": chunks, "co3d-v1": [v1]}
+    catalogue = {name: {"full": {"toaster": digests}} for name, digests in data_sets.items()}
     server.catalogue.write_text(json.dumps(catalogue))
 
 
@@ -126,8 +128,9 @@ def test_the_first_chunk_can_be_used_alone_and_completed_later(
 def test_labelled_sequences_are_read_out_of_the_archive_on_the_server(
     server, source, tmp_path, download, monkeypatch
 ):
-    monkeypatch.setattr(archives, "_PART", 4_096)
-    root, options = tmp_path / "v1", ("--labels", str(source), "--labelled-only")
+    monkeypatch.setattr(archives, "_PART", 4_096)  # bytes: one part would be the whole archive
+    root = tmp_path / "v1"
+    options = ("--labels", str(source), "--labelled-only")
     text = download(root, *options, dataset="co3d-v1")
     assert "2 labels, 1 files of pairs" in text
     assert list(read_labels(root, "toaster")) == list(SEQUENCES)
@@ -154,10 +157,12 @@ def test_sequences_of_an_archive_need_a_server_that_sends_parts(server, source, 
     assert "expected range requests" in download(
         tmp_path / "v1", *options, dataset="co3d-v1", code=2
     )
-    server.knows_ranges, server.break_after = True, 1_000  # every response is cut off, and read on
+    server.knows_ranges = True
+    server.break_after = 1_000  # every response is cut off, and read on
     download(tmp_path / "v1", *options, dataset="co3d-v1")
 
 
+# No, yes, the end of the input, and no terminal.
 @pytest.mark.parametrize("answer, code", [("\n", 1), ("Y\n", 0), ("", 130), (None, 2)])
 def test_the_user_is_asked_on_a_terminal_or_has_said_yes(
     server, tmp_path, run, monkeypatch, answer, code
@@ -174,6 +179,7 @@ def test_a_truncated_archive_is_completed_by_the_next_call_of_one_process(
     server, source, tmp_path, download
 ):
     server.break_after = 1_000
+    # Each of three attempts gets 1,000 bytes.
     assert "at 3000 bytes; call again to resume" in download(tmp_path / "co3d", code=2)
     server.break_after = None
     with writing(tmp_path / "co3d/.download"):
@@ -184,7 +190,8 @@ def test_a_truncated_archive_is_completed_by_the_next_call_of_one_process(
 
 
 def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkeypatch, download):
-    root, read = tmp_path / "co3d", zipfile.ZipFile.read
+    root = tmp_path / "co3d"
+    read = zipfile.ZipFile.read
     written = []
 
     def stop_at_third(archive, member):
@@ -195,7 +202,7 @@ def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkey
 
     monkeypatch.setattr(zipfile.ZipFile, "read", stop_at_third)
     download(root, dataset="co3d-v1", code=130)
-    # annotations last
+    # Without annotations, which are unpacked last, there is no category.
     assert len(contents(root / "toaster")) == 3
     assert Co3D(root).categories() == []
     monkeypatch.setattr(zipfile.ZipFile, "read", read)
@@ -204,14 +211,16 @@ def test_unpacking_that_was_killed_is_completed(server, source, tmp_path, monkey
     assert len(server.ranges) == 1  # the archive that was there is not downloaded again
 
 
-# The last two are no files of the category, or inside.
+# The first leads out of the data folder, the second is not of the category and is left out, and the
+# last lies inside. The check lists the files that the archive lacks: exit code 1.
 @pytest.mark.parametrize(
     "name, code", [("toaster/../../outside", 2), ("../outside", 1), ("toaster//x", 1)]
 )
 def test_nothing_is_written_outside_the_folder_and_no_link_is_made(
     server, tmp_path, download, name, code
 ):
-    data, member = io.BytesIO(), zipfile.ZipInfo(name)
+    data = io.BytesIO()
+    member = zipfile.ZipInfo(name)
     member.external_attr = (stat.S_IFLNK | 0o777) << 16
     with zipfile.ZipFile(data, "w") as archive:
         archive.writestr(member, b"/etc/passwd")

@@ -63,7 +63,8 @@ def test_features_depend_on_nothing_but_the_image(backbone):
     assert_same_features(
         backbone([torch.from_numpy(PICTURES[0]), PICTURES[1] / 255, frozen]), features
     )
-    assert_same_features(backbone([PICTURES[1][::-1][::-1]]), features[1:2])
+    # Rows in reverse order in memory.
+    assert_same_features(backbone([PICTURES[1][::-1].copy()[::-1]]), features[1:2])
     assert backbone([]) == []
 
 
@@ -87,6 +88,7 @@ def test_layer_and_facet_change_the_keys_alone_and_stand_in_the_name(place):
     found = []
     last = plain.model.depth - 1
     for layer, index, facet in [("last", last, "key"), *((0, 0, facet) for facet in FACETS)]:
+        # The size is rounded to whole patches; the name keeps the one that was asked for.
         backbone = load_backbone(place, "cpu", layer=layer, facet=facet, image_size=size + 1)
         assert (backbone.layer, backbone.facet, backbone.image_size) == (index, facet, size)
         chosen = f"block{index}" + (f", {facet}" if facet != "key" else "")
@@ -239,6 +241,7 @@ def test_metadata_that_does_not_fit_is_refused(tmp_path, key, value):
     ],
 )
 def test_files_of_later_dino_models_are_refused_naming_the_ones_to_take(tmp_path, key, told):
+    # Both models have layer scale, and DINOv3 has rotations in place of position embeddings.
     weights = VIT.state_dict() | {"blocks.0.ls1.gamma": torch.ones(4), key: torch.ones(4)}
     if "rope" in key:
         weights.pop("pos_embed")
@@ -251,13 +254,15 @@ def test_an_unknown_name_or_device_is_refused():
     refused("device", load_backbone, device="nowhere")
 
 
-@pytest.fixture()
+@pytest.fixture
 def server(monkeypatch):
+    """A server of one file, with the content and its first digits of MD5 as attributes."""
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
     content = default_rng(0).bytes(10_000)
     server = Server({"/file": content})
-    server.content, server.md5 = content, hashlib.md5(content).hexdigest()[:6]
+    server.content = content
+    server.md5 = hashlib.md5(content).hexdigest()[:6]
     yield server
     server.close()
 
@@ -292,8 +297,9 @@ def test_a_file_of_another_size_or_hash_is_refused_and_removed(server, tmp_path,
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture()
+@pytest.fixture
 def cache(tmp_path, monkeypatch):
+    """The folder of downloaded models, which does not exist yet."""
     monkeypatch.setenv("ZSP_LITE_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
@@ -323,7 +329,7 @@ def test_a_file_that_is_not_the_released_one_is_refused(cache):
     )
 
 
-@pytest.mark.parametrize("address", ["{url}/missing", "http://127.0.0.1:9/"])
+@pytest.mark.parametrize("address", ["{url}/missing", "http://127.0.0.1:9/"])  # no server there
 def test_without_the_server_one_line_says_what_to_do(server, cache, monkeypatch, address):
     monkeypatch.setenv("ZSP_LITE_DINO_URL", address.format(url=server.url))
     message = refused(".", load_backbone, "dino_vits8")
@@ -339,8 +345,9 @@ def test_a_backbone_of_ones_own_is_named_by_its_module_and_takes_no_options(tmp_
     text = "class Maps:\n    def __call__(self, images): ...\n\nmaps, size = Maps(), 3"
     (tmp_path / "my_backbone_file.py").write_text(text)
     monkeypatch.chdir(tmp_path)
-    # as a console script has it
+    # A console script has no "" in its path, which stands for the current folder.
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    # After the name: layer, facet and image size.
     assert type(named_backbone("my_backbone_file:maps", None, "key", None)).__name__ == "Maps"
     for thing, layer, told in (
         ("Maps", None, "is of type type, expected"),

@@ -30,7 +30,7 @@ def test_icp_finds_a_small_motion_of_a_cloud_and_its_scale():
 
 def test_icp_refuses_a_cloud_without_extent():
     points = default_rng(0).normal(size=(20, 3))
-    refused(".", icp, points, np.zeros((20, 3)))
+    refused("the scale converged to 0", icp, points, np.zeros((20, 3)))
 
 
 def test_icp_gets_the_clouds_of_both_objects_where_the_first_cameras_agree(monkeypatch):
@@ -49,16 +49,16 @@ def test_icp_gets_the_clouds_of_both_objects_where_the_first_cameras_agree(monke
     first = targets[0].camera
     start = align(render(camera, AT_HOME), targets, 0, (camera, first), seed=0)
     truth = true_pose(camera, AT_HOME, first, elsewhere)
+    # ICP found nothing, so the answer is that both first cameras see the same.
     assert rotation_error(start.R, np.eye(3)) < 1e-6
     source, target = clouds
+    # The two target views together have more points than are taken.
     assert len(source) <= geometry.POINTS == len(target)
     placed = first.to_world(truth.apply(camera.to_camera(source)))
     assert np.median(cKDTree(target).query(placed)[0]) < 0.05
 
 
 SIZE = (224, 224)
-
-
 # Smooth noise, which has keypoints everywhere, and a camera.
 NOISE = default_rng(0).integers(0, 256, (28, 28, 3), dtype=np.uint8)
 PICTURE = cv2.resize(NOISE, SIZE, interpolation=cv2.INTER_CUBIC)
@@ -89,7 +89,8 @@ def test_an_image_without_keypoints_has_no_matches():
     assert len(mutual_matches(one, blank)[0]) == 0
 
 
-POINTS, WRONG = 60, 15  # matches, and how many of them are wrong: a quarter
+POINTS = 60  # matches
+WRONG = 15  # of the matches: a quarter
 
 
 def essential(first: Camera, second: Camera, matches: int) -> tuple[np.ndarray, int, str]:
@@ -116,7 +117,7 @@ def test_the_essential_matrix_gives_the_rotation_between_cameras_of_any_intrinsi
     first, second = CAMERAS
     rotation, inliers, note = essential(first, second, POINTS)
     assert rotation_error(rotation, second.R @ first.R.T) < 5
-    # Rounding to pixels loses some of the right matches, and chance adds some of the wrong ones.
+    # Rounding to pixels loses some of the right matches, chance adds a few of the wrong ones.
     assert POINTS / 2 <= inliers <= POINTS - WRONG + 5
     assert note == ""
 

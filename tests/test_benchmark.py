@@ -29,14 +29,15 @@ ROWS = ("ours", "ours-bv", "oracle-view")
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def evaluated(tmp_path_factory):
     """The folder of a run and what the call returned."""
     out = tmp_path_factory.mktemp("out")
+    # Six pairs of each of two categories, with five target views.
     return out, evaluate(small_folder(), BACKBONE, ROWS, 6, 5, out)
 
 
-def test_perfect_features_solve_nearly_every_pair_and_the_best_view_alone_does_not(run):
-    _, summary = run
+def test_perfect_features_solve_nearly_every_pair_and_the_best_view_alone_does_not(evaluated):
+    _, summary = evaluated
     ours = summary["methods"]["ours"]
     assert ours["acc30"] >= 90
     assert ours["median"] < 10
@@ -44,8 +45,8 @@ def test_perfect_features_solve_nearly_every_pair_and_the_best_view_alone_does_n
     assert summary["methods"]["ours-bv"]["median"] > ours["median"]
 
 
-def test_the_summary_has_the_fixed_form(run):
-    out, summary = run
+def test_the_summary_has_the_fixed_form(evaluated):
+    out, summary = evaluated
     assert read_run(out).summary == summary
     assert summary["data"] == {
         "root": str(small_folder()),
@@ -70,8 +71,9 @@ def test_a_method_added_later_leaves_the_others_as_they_were(tmp_path):
     assert both["methods"]["rootsift"]["n"] == 3
 
 
-def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(run):
-    dataset, found = Co3D(small_folder()), read_run(run[0])
+def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(evaluated):
+    dataset = Co3D(small_folder())
+    found = read_run(evaluated[0])
     for category in ("lump", "pebble"):
         labels = read_labels(small_folder(), category)
         for pair in sample_pairs(dataset, category, 6, 5):
@@ -84,15 +86,15 @@ def test_the_oracle_takes_the_view_that_is_truly_nearest_in_rotation(run):
             assert found.row("oracle-view")["view"][pair.key] == np.argmin(angles)
 
 
-def test_stored_poses_give_the_errors_again(run):
-    found = read_run(run[0])
+def test_stored_poses_give_the_errors_again(evaluated):
+    found = read_run(evaluated[0])
     for name in ROWS:
         pairs, views, rotations, positions = found.poses(name)
         truths = true_poses(small_folder(), pairs, views)
         errors = found.row(name)["error"][[pair.key for pair in pairs]]
         # Errors are stored with four decimals, rotations with fewer digits than a double has.
         assert_allclose(rotation_error(rotations, truths[:, :3, :3]), errors, atol=2e-4)
-    solved = errors < 1  # of "oracle-view"
+    solved = errors < 1  # of "oracle-view", the last row
     assert_allclose(positions[solved], truths[solved, :3, 3], atol=0.1)
 
 
@@ -142,8 +144,8 @@ class Renamed(CoordinateBackbone):
         (Renamed(grid=8), {}, "a run with backbone .*Renamed"),
     ],
 )
-def test_the_folder_of_another_run_is_refused(run, backbone, options, message):
-    refused(message, evaluate, small_folder(), backbone, out=run[0], **options)
+def test_the_folder_of_another_run_is_refused(evaluated, backbone, options, message):
+    refused(message, evaluate, small_folder(), backbone, out=evaluated[0], **options)
 
 
 @pytest.mark.parametrize(
@@ -199,13 +201,16 @@ def test_object_poses_of_another_layout_cost_a_warning_and_their_figure(tmp_path
     refused(POSES_FILE, object_poses, dataset, "lump")
 
 
-REPEATED = {"ours": "ours", "none": lambda problem: None}
+REPEATED = {"ours": "ours", "none": lambda problem: None}  # "none" fails on every pair
 
 
 @pytest.fixture(scope="module")
 def seeded(tmp_path_factory) -> Path:
-    """The folder of a run with three seeds, in which a row has the first seed only, and one result
-    of a call with more seeds that was interrupted."""
+    """The folder of a run with three seeds, in which "ours-mask" has the first seed only, and one
+    result of a call with more seeds that was interrupted.
+
+    It has three pairs of each of two categories.
+    """
     out = tmp_path_factory.mktemp("seeded")
     evaluate(small_folder(), BACKBONE, ["ours-mask"], 3, 3, out)
     first = read_lines(out)[0].pair

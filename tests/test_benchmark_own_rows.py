@@ -151,13 +151,13 @@ def test_sweeps_that_cannot_be_are_refused():
 
 
 @pytest.mark.parametrize(
-    "thing, told",
+    "thing, described",
     [(own_method, "benchmark_folder:own_method"), (LIBRARY["pipeline"], ".*ZeroShotPose.*")],
 )
-def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path, thing, told):
+def test_a_method_that_has_changed_does_not_mix_with_its_former_self(tmp_path, thing, described):
     run_rows({"mine": thing}, tmp_path)
     run_rows({"mine": thing, "ours": "ours"}, tmp_path)
-    told = f"methods of mine .*{told}, this is .*<lambda>; choose"
+    told = f"methods of mine .*{described}, this is .*<lambda>; choose"
     refused(told, run_rows, {"mine": lambda problem: np.eye(3)}, tmp_path)
 
 
@@ -173,7 +173,7 @@ def by_colour(first: np.ndarray, second: np.ndarray) -> tuple:
 def test_right_keypoints_give_the_pose_in_the_view_with_most_of_them():
     dataset = Co3D(small_folder())
     rows = resolve({"colours": by_colour})
-    evaluator = open_evaluator(str(dataset.root), rows, BACKBONE, 60, 1)
+    evaluator = open_evaluator(str(dataset.root), rows, BACKBONE, row_seconds=60, threads=1)
     for pair in category_pairs(dataset, "lump", 4, 3):
         found = evaluator(pair, rows).results["colours"]
         reference, targets = dataset.load_pair(pair)
@@ -274,12 +274,13 @@ def test_poses_from_a_file_are_measured_like_any_others(answers, tmp_path):
     similarity = found.loc[answered, ["translation", "scale"]].to_numpy(float)
     assert_allclose(similarity, [[0, 1]] * 3, atol=1e-9)
     assert found.loc[missing, ["error", "failed"]].tolist() == [180, f"{path} has no pose"]
-    path.write_text("\n".join(answers[:2]))  # another row
+    path.write_text("\n".join(answers[:2]))  # with other poses it is another row
     refused("a run with methods of exact", run_rows, {"exact": str(path)}, tmp_path / "run", 4, 3)
 
 
 def test_a_file_without_a_pose_of_the_pairs_or_of_another_view_is_refused(answers, tmp_path):
-    rows, out = {"exact": str(tmp_path / "exact.csv")}, tmp_path / "run"
+    rows = {"exact": str(tmp_path / "exact.csv")}
+    out = tmp_path / "run"
     message = "exact.csv has no pose for any of the pairs"
     refused(message, run_rows, rows, out, category="pebble")
     answers[1] = re.sub(r'",\d+,', '",99,', answers[1])
@@ -313,6 +314,7 @@ def test_a_spreadsheets_poses_are_read_and_the_note_names_their_convention(
     (tmp_path / "mine.csv").write_text("\ufeff" + "\r\n".join(lines), "utf-8")
     run_rows({"mine": str(tmp_path / "mine.csv")}, tmp_path / "run", 12, 3)
     found = read_run(tmp_path / "run")
+    # A mix of conventions is not named.
     named = convention.startswith("inverted and")
     told = "mine: 1 of 13 poses fit no pair"
     if named:
@@ -335,7 +337,7 @@ RIGHT = '"lump/a:0/b:1,5",1,1 0 0 0 1 0 0 0 1,0 0 1,1'
         (f"{COLUMNS}\n\n{RIGHT.replace(',1 0', ',nan 0')}", "line 3: rotation holds nan"),
         (f"{COLUMNS}\n{RIGHT.replace(',1 0', ',-1 0')}", "line 2: "),
         (f"{COLUMNS}\n{RIGHT[:-1]}0", "scale is 0.0"),
-        (f"{COLUMNS}\n{RIGHT.replace(',1,', ',1.000,')}", "line 2: .*'1.000'"),  # or a thousand
+        (f"{COLUMNS}\n{RIGHT.replace(',1,', ',1.000,')}", "line 2: .*'1.000'"),  # one or a thousand
         (
             f"{COLUMNS}\n{RIGHT.replace(',0 0 1,', ',0 0,')}",
             "line 2: translation has shape .2,., expected",
@@ -355,6 +357,11 @@ def test_wrong_files_of_poses_are_refused_with_path_and_line(text, told, tmp_pat
     path = tmp_path / "poses.csv"
     path.write_text(text, encoding="latin-1")
     refused(f"poses {re.escape(str(path))}.*{told}", resolve, [f"theirs={path}"])
+
+
+def test_poses_are_read_as_a_spreadsheet_saves_them_as_unicode(tmp_path):
+    path = tmp_path / "poses.csv"
+    # Other titles of the columns, columns and a line that are empty, and UTF-16.
     saved = f"{COLUMNS.title()},,\n,,,,,,\n{RIGHT},,\n".replace("_", " ")
     path.write_text(saved, encoding="utf-16")
     assert resolve([f"theirs={path}"])["theirs"].solve._poses.keys() == {"lump/a:0/b:1,5"}
@@ -386,11 +393,12 @@ def test_no_two_rows_of_the_library_have_one_description():
 
 
 def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
+    # A module that leaves the folder when it is imported.
     (tmp_path / "rows_of_my_own.py").write_text(
         "import os\nos.chdir('/')\ndef still(problem):\n    return None\n"
     )
     monkeypatch.chdir(tmp_path)
-    # as a console script has it
+    # A console script has no "" in its path, which stands for the current folder.
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     (tmp_path / "row_that_exits.py").write_text("raise SystemExit(3)")
     refused(
@@ -464,7 +472,8 @@ def test_a_row_that_fails_does_not_stop_the_others(workers, tmp_path, monkeypatc
         "backbone": (ZeroShotPose(lambda images: []), ".*FatalError: backbone .* returned 0"),
         "endless": (never_ends, "takes more than 1 s"),
         "untold": (untold, ".*Untold: <exception str"),
-        "else": (lambda problem: os.chdir("/"), ""),
+        "else": (lambda problem: os.chdir("/"), "Sim3: R is None"),
+        # Not in this process, which would wait for the thread.
         **({"thread": (leaves_a_thread, "Sim3: R is None")} if workers > 1 else {}),
     }
     monkeypatch.chdir(tmp_path)
@@ -501,7 +510,8 @@ def overwrite(thing) -> None:
 
 
 def test_rows_get_the_pairs_seed_and_neither_labels_nor_names_and_do_not_reach_each_other(tmp_path):
-    handed, seeds = [], {}
+    handed = []
+    seeds = {}
 
     def keep(name: str, seed: int, answer, *things):
         """Store what the row `name` was handed, overwrite it, and give the row's answer."""
@@ -528,15 +538,15 @@ def test_rows_get_the_pairs_seed_and_neither_labels_nor_names_and_do_not_reach_e
     def solver(*arguments, seed, threshold):
         return keep("solver", seed, benchmark_folder.own_solver(*arguments), *arguments)
 
-    own = {one.__name__: one for one in (problem, keypoints, matcher, solver)}
-    for name, function in own.items():
+    rows = {one.__name__: one for one in (problem, keypoints, matcher, solver)}
+    for name, function in rows.items():
         function.kind = name
-    own["estimator"] = Estimator()
+    rows["estimator"] = Estimator()
     library = ("verified", "sift", "ours-mask", "icp", "scans-2")
     run_rows(library, tmp_path / "alone", 2)
-    methods = run_rows(own | dict(zip(library, library)), tmp_path / "after", 2)
+    methods = run_rows(rows | dict(zip(library, library)), tmp_path / "after", 2)
     assert {row["failed"] for row in methods.values()} == {0}
-    assert seeds == dict.fromkeys(own, seeds["problem"])
+    assert seeds == dict.fromkeys(rows, seeds["problem"])
     for word in (*SEQUENCES, str(small_folder()), "Co3D", "PoseLabel"):
         assert word.encode() not in b"".join(handed)
     for name in library:
@@ -549,7 +559,7 @@ def test_a_pipeline_as_a_row_draws_with_the_pairs_seed(own_run):
 
 
 class Broken(CoordinateBackbone):
-    """A backbone with what is wrong in its feature maps."""
+    """A backbone whose feature maps the function `wrong` changes."""
 
     wrong = None
 
@@ -569,18 +579,18 @@ class Broken(CoordinateBackbone):
     ],
 )
 @pytest.mark.parametrize(
-    "run", ["ours", "category", lambda problem: problem.views() and np.eye(3), "align"]
+    "row", ["ours", "category", lambda problem: problem.views() and np.eye(3), "align"]
 )
 def test_a_broken_backbone_ends_the_run_and_nothing_is_stored(
-    tmp_path, monkeypatch, wrong, told, run
+    tmp_path, monkeypatch, wrong, told, row
 ):
     monkeypatch.setattr(Broken, "wrong", staticmethod(wrong))
     backbone = Broken(grid=8)
     with pytest.raises(FatalError, match=told):
-        if run == "align":
+        if row == "align":  # no row, but it computes features too
             align_category(Co3D(small_folder()), "lump", backbone, targets=2, out=tmp_path)
         else:
-            run_rows([run] if isinstance(run, str) else {"row": run}, tmp_path, backbone=backbone)
+            run_rows([row] if isinstance(row, str) else {"row": row}, tmp_path, backbone=backbone)
     assert not (tmp_path / LINES).read_bytes()
 
 

@@ -21,29 +21,29 @@ ROWS = tuple(resolve(["ablations", "table1", "table2"]))
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Run:
+def of_rows(tmp_path_factory) -> Run:
     """Six pairs by all these rows, those of table 2 with 1, 3 and 5 target views."""
     out = tmp_path_factory.mktemp("rows")
     run_rows(ROWS, out, 6, TARGETS, "pebble")
     return read_run(out)
 
 
-def test_every_row_answers_every_pair(run):
-    answered = {name: (one["n"], one["failed"]) for name, one in run.summary["methods"].items()}
+def test_every_row_answers_every_pair(of_rows):
+    answered = {name: (one["n"], one["failed"]) for name, one in of_rows.summary["methods"].items()}
     assert answered == dict.fromkeys(ROWS, (6, 0))
 
 
 @pytest.mark.parametrize("group", ["correspondences", "matchers", "trials", "published", "parts"])
-def test_with_perfect_features_every_way_to_match_and_fit_is_right(run, group):
-    accuracies = {name: run.summary["methods"][name]["acc30"] for name in GROUPS[group]}
+def test_with_perfect_features_every_way_to_match_and_fit_is_right(of_rows, group):
+    accuracies = {name: of_rows.summary["methods"][name]["acc30"] for name in GROUPS[group]}
     assert min(accuracies.values()) >= 80, accuracies
 
 
-def test_a_row_of_fewer_views_sees_the_first_ones(run):
-    assert run.row("ours-n5")["error"].equals(run.row("ours")["error"])
+def test_a_row_of_fewer_views_sees_the_first_ones(of_rows):
+    assert of_rows.row("ours-n5")["error"].equals(of_rows.row("ours")["error"])
     # A key ends with the numbers of the target frames, here with the only commas of the key.
-    assert [key.count(",") for key in run.row("ours-n3").index] == [2] * 6
-    methods = run.summary["methods"]
+    assert [key.count(",") for key in of_rows.row("ours-n3").index] == [2] * 6
+    methods = of_rows.summary["methods"]
     few, some, all_views = [methods[f"ours-n{count}"]["acc30"] for count in (1, 3, TARGETS)]
     # No law, but with perfect features more views can only help.
     assert few <= some <= all_views
@@ -63,9 +63,9 @@ def first_estimate(name):
     "ours ours-published ours-k70-nokmeans ours-transport ours-saliencyiou ours-keys "
     "ours-nearest".split(),
 )
-def test_a_row_is_the_method_with_its_settings_on_the_frames_themselves(run, name):
+def test_a_row_is_the_method_with_its_settings_on_the_frames_themselves(of_rows, name):
     estimate, key = first_estimate(name)
-    result = run.row(name).loc[key]
+    result = of_rows.row(name).loc[key]
     assert result["rotation"] == pytest.approx(estimate.sim3.R.ravel(), abs=1e-6)
     assert (result["view"], result["inliers"]) == (estimate.view, estimate.inliers.sum())
 
@@ -89,29 +89,30 @@ def test_the_row_of_nearest_neighbours_needs_no_way_back_but_both_objects():
     assert score.tolist() == [0.75, 0.5, -torch.inf, -torch.inf]
 
 
-def test_the_row_of_least_squares_fits_all_matches_of_the_best_view(run):
+def test_the_row_of_least_squares_fits_all_matches_of_the_best_view(of_rows):
     ours, key = first_estimate("ours")
-    result = run.row("ours-least-squares").loc[key]
+    result = of_rows.row("ours-least-squares").loc[key]
     assert result["rotation"] == pytest.approx(minimal.umeyama(*ours.points)[1].ravel(), abs=1e-6)
     assert result["view"] == ours.view
 
 
-def test_the_row_without_depth_fits_rotations_only(run):
-    rows = run.row("ours-nodepth")
+def test_the_row_without_depth_fits_rotations_only(of_rows):
+    rows = of_rows.row("ours-nodepth")
     fitted = rows[rows["note"] == ""]
-    assert len(fitted) >= 4
+    assert len(fitted) >= 4  # of six pairs
     assert fitted["translation"].isna().all()
     assert (fitted["inliers"] >= 5).all()  # the smallest number that determines a rotation
 
 
-def test_icp_takes_the_first_view_or_the_best_one(run):
-    assert set(run.row("icp")["view"]) == {0}
-    assert run.row("icp-bv")["view"].equals(run.row("ours")["view"])
+def test_icp_takes_the_first_view_or_the_best_one(of_rows):
+    assert set(of_rows.row("icp")["view"]) == {0}
+    assert of_rows.row("icp-bv")["view"].equals(of_rows.row("ours")["view"])
 
 
 @pytest.mark.parametrize("row", ["icp", "sift"])
 def test_a_pair_without_depth_fails(row, monkeypatch):
-    dataset, load = Co3D(small_folder()), Co3D.load
+    dataset = Co3D(small_folder())
+    load = Co3D.load
     monkeypatch.setattr(Co3D, "load", lambda *frame: replace(load(*frame), depth=None))
     (pair,) = category_pairs(dataset, "pebble", 1, 2)
     problem = PairProblem(pair, FrameStore(dataset, {"sift": Sift()}), ["sift"])

@@ -21,7 +21,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from benchmark_folder import BACKBONE, SlowBackbone, after_each_save, run_rows, small_folder
+from benchmark_folder import (
+    BACKBONE,
+    QUICK,
+    SlowBackbone,
+    after_each_save,
+    run_rows,
+    small_folder,
+)
+from distributed import Client, LocalCluster
 from refusals import refused
 from synthetic_views import CoordinateBackbone
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -50,15 +58,15 @@ needs_signals = pytest.mark.skipif(
     sys.platform == "win32", reason="Windows has no SIGSTOP, SIGKILL and pgrep"
 )
 
-QUICK = SlowBackbone(grid=8, _seconds=0)
 ROWS = ("ours", "ours-bv")
+PAIRS = 12  # six of each of two categories
 TESTS = Path(__file__).parent
 PATHS = os.environ | {"PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)])}
 
 
 def again(out: Path, executor=1) -> dict:
     """The run of `benchmark_folder`'s main, in this process."""
-    return evaluate(small_folder(), QUICK, ROWS, 6, 3, out, executor)
+    return evaluate(small_folder(), QUICK, ROWS, 6, 3, out, executor)  # 3 target views
 
 
 @pytest.fixture(scope="module")
@@ -66,9 +74,6 @@ def undisturbed(tmp_path_factory):
     """The folder of a run that nothing interrupts, and what it returned."""
     out = tmp_path_factory.mktemp("undisturbed")
     return out, again(out)
-
-
-PAIRS = 12  # of both categories
 
 
 def pairs_in(out: Path) -> list[str]:
@@ -127,7 +132,8 @@ def test_a_run_killed_again_and_again_loses_no_stored_pair_and_evaluates_none_tw
 
 def test_a_line_cut_off_by_a_kill_is_neither_read_nor_continued(undisturbed, tmp_path):
     run = shutil.copytree(undisturbed[0], tmp_path / "run")
-    before, path = read_run(run), run / LINES
+    before = read_run(run)
+    path = run / LINES
     whole = path.read_bytes()
     cut_off = whole[: len(whole) // 2].rpartition(b"\n")[2]
     path.write_bytes(whole + cut_off)
@@ -155,7 +161,8 @@ def test_a_run_packed_as_gzip_is_read_and_continued(undisturbed, tmp_path, monke
 def test_a_worker_that_dies_ends_the_run_which_can_be_continued_to_the_same_tables(
     undisturbed, tmp_path, monkeypatch
 ):
-    stored, before = [], _children(os.getpid())  # the numbers of pairs after each save
+    stored = []  # the number of pairs after each save
+    before = _children(os.getpid())
 
     def kill_a_worker() -> None:
         if not stored:
@@ -224,8 +231,6 @@ MODULES = {
 
 
 def test_modules_of_the_current_folder_travel_to_workers(tmp_path, monkeypatch):
-    from distributed import Client, LocalCluster
-
     for name, text in MODULES.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / f"{name}.py").write_text(text)
@@ -259,7 +264,7 @@ def test_a_run_that_goes_on_can_be_read_but_has_one_writer(tmp_path, monkeypatch
     arguments = (small_folder(), QUICK, ["ours-bv"], 2, 3, tmp_path)
     monkeypatch.setattr("zsp_lite.benchmark.execution.add_lines", after_each_save(look))
     evaluate(*arguments)
-    assert seen == [1, 2, 3, 4]
+    assert seen == [1, 2, 3, 4]  # two pairs of each category
     assert evaluate(*arguments)["methods"]["ours-bv"]["n"] == 4
 
 
@@ -271,7 +276,7 @@ def test_any_executor_will_do_and_gets_the_backbone_once(undisturbed, tmp_path):
             sizes.append(len(cloudpickle.dumps(arguments)))
             return super().submit(function, *arguments)
 
-    heavy = replace(QUICK, _weights=np.zeros(1_000_000))
+    heavy = replace(QUICK, weights=np.zeros(1_000_000))
     with Counting(2) as executor:
         found = evaluate(small_folder(), heavy, ROWS, 6, 3, tmp_path, executor)
     assert found["methods"] == undisturbed[1]["methods"]
@@ -286,7 +291,9 @@ def thread_counts() -> list[int]:
 
 
 def test_numbers_of_threads_are_restored_after_blocks_that_overlap():
-    started, go, ended = threading.Barrier(2), threading.Event(), threading.Event()
+    started = threading.Barrier(2)
+    go = threading.Event()
+    ended = threading.Event()
 
     def block(waits_for: threading.Event, then: threading.Event) -> set[int]:
         with one_thread():
@@ -324,6 +331,7 @@ def test_a_vision_transformers_features_do_not_depend_on_threads():
     pairs = pairs_to_evaluate(["ours"], 2, 2)
 
     def errors(threads: int) -> list[float]:
+        # A row has 60 seconds.
         evaluator = open_evaluator(str(small_folder()), resolve(["ours"]), backbone, 60, threads)
         lines = [evaluator(pair, names) for pair, names in pairs.items()]
         return [line.results["ours"].error for line in lines]
@@ -338,7 +346,8 @@ def test_the_note_of_a_run_says_that_several_versions_of_the_library_evaluated_i
         evaluate, small_folder(), BACKBONE, pairs={"lump": 1}, targets=2, out=tmp_path
     )
     run(["ours-bv"])
-    first, other = library_version(), {"version": "1", "commit": "0123abc"}
+    first = library_version()
+    other = {"version": "1", "commit": "0123abc"}
     monkeypatch.setattr("zsp_lite.benchmark.runs.library_version", lambda: other)
     assert "note" not in read_run(tmp_path).summary
     run(["ours"])

@@ -35,7 +35,7 @@ ROWS = list(resolve("table1 ablations views ours-bv rootsift verified".split()))
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Run:
+def whole(tmp_path_factory) -> Run:
     """A run of the paper's rows and the library's."""
     return made_up_run(tmp_path_factory.mktemp("made-up"), ROWS)
 
@@ -52,9 +52,9 @@ def by_name(found: list[Table]) -> dict[str, Table]:
 
 
 @pytest.fixture(scope="module")
-def every(run):
+def every(whole):
     """All tables of the run, by their names."""
-    return by_name(every_table(run.summary))
+    return by_name(every_table(whole.summary))
 
 
 def cell(table: Table, row: str, column: str, group: str = "") -> Cell | None:
@@ -77,16 +77,16 @@ def test_a_run_has_the_papers_tables_of_its_rows(every, three):
     assert names == ["table_2", "table_a_targets", "table_a_depth"]
 
 
-def test_accuracies_of_a_table_are_the_runs(run, every):
-    methods = run.summary["methods"]
+def test_accuracies_of_a_table_are_the_runs(whole, every):
+    methods = whole.summary["methods"]
     acc30 = cell(every["table_1"], "Ours (K=50)", "Acc30 (%)")
     assert bounds(acc30) == (methods["ours"]["acc30"], *methods["ours"]["acc30_ci"])
     toaster = cell(every["table_1"], "ICP", "toaster Acc30")
     assert toaster.value == methods["icp"]["per_category"]["toaster"]["acc30"]
 
 
-def test_the_median_of_a_table_is_the_mean_of_the_categories_medians(run, every):
-    ours = run.summary["methods"]["ours"]["per_category"]
+def test_the_median_of_a_table_is_the_mean_of_the_categories_medians(whole, every):
+    ours = whole.summary["methods"]["ours"]["per_category"]
     median = cell(every["table_1"], "Ours (K=50)", "Med. err. (°)")
     assert median.value == pytest.approx(np.mean([ours[name]["median"] for name in CATEGORIES]))
     assert median.low < median.value < median.high
@@ -147,12 +147,12 @@ def test_rows_that_see_more_stand_apart_from_those_that_see_the_pair_only(tmp_pa
         ("acc15", "acc15", "acc15"),
     ],
 )
-def test_figures_by_category_are_those_of_the_summary(run, every, name, metric, of_all):
+def test_figures_by_category_are_those_of_the_summary(whole, every, name, metric, of_all):
     cells = every[f"categories_{name}"].cells
     assert list(cells.index) == [*CATEGORIES, "all"]
-    assert list(cells) == tables.important_rows(run.summary)
+    assert list(cells) == tables.important_rows(whole.summary)
     for row in cells:
-        figures = run.summary["methods"][row]
+        figures = whole.summary["methods"][row]
         of_row = [figures["per_category"][category] for category in CATEGORIES]
         expected = [(one[metric], *one[f"{metric}_ci"]) for one in of_row]
         expected.append((figures[of_all], *figures[f"{of_all}_ci"]))
@@ -165,6 +165,7 @@ def test_rows_of_ones_own_stand_below_the_papers_and_in_every_figure(tmp_path):
     assert tables.own_rows(made.summary) == own
     table = by_name(every_table(made.summary))["table_1"]
     published = len(read_paper_tables()[0]["rows"])
+    # The last published row is the method itself.
     assert list(table.cells.index)[published - 1 :] == ["Ours (K=50)", *own]
     mine = made.summary["methods"]["mine"]
     assert cell(table, "mine", "hydrant Acc30").value == mine["per_category"]["hydrant"]["acc30"]
@@ -187,7 +188,7 @@ def body_of(table: Table) -> list[list[str]]:
     return [[part.strip() for part in row] for row in rows]
 
 
-def test_a_latex_table_has_its_columns_without_commands_in_its_texts():
+def test_a_latex_table_has_three_columns_and_its_texts_have_no_commands():
     rows = {
         "a_b & 50%": [Cell(12.34), Cell(50.0, 40, 60), Cell(-3.21), Cell(1, decimals=0)],
         "none ~^\\{}": [Cell(99.9), None, None, Cell(0.0002, decimals=3)],
@@ -195,6 +196,7 @@ def test_a_latex_table_has_its_columns_without_commands_in_its_texts():
     }
     cells = frame(rows, ["Med. err. (°)", "Acc30 (%)", "B − A", "pairs"])
     table = Table("mine", "Table 9. 50% & more", cells)
+    # The numbers of pairs are left out, and so is the row that has nothing else.
     assert r"\begin{tabular}{lrrr}" in as_latex(table)
     assert body_of(table) == [
         ["", r"Med. err. ($^\circ$)", r"Acc30 (\%)", "B $-$ A"],
@@ -211,10 +213,12 @@ def test_table_1_has_the_single_categories_that_the_run_has(tmp_path):
     assert single == ["bicycle Acc30", f"{PUBLISHED}: bicycle Acc30"]
 
 
-def test_chosen_rows_are_the_rows_of_all_tables_in_their_order(run, tmp_path):
+def test_chosen_rows_are_the_rows_of_all_tables_in_their_order(whole, tmp_path):
     rows = ["icp", "verified", "ours"]
-    found = by_name(every_table(write_reports(run.folder, tmp_path, rows=rows)))
-    refused("row 'nobody' is not in the run", write_reports, run.folder, tmp_path, rows=["nobody"])
+    found = by_name(every_table(write_reports(whole.folder, tmp_path, rows=rows)))
+    refused(
+        "row 'nobody' is not in the run", write_reports, whole.folder, tmp_path, rows=["nobody"]
+    )
     assert list(found["all_rows"].cells.index) == rows
     assert list(found["categories_acc30"].cells) == rows
     assert list(found["table_1"].cells.index) == ["ICP", "Ours (K=50)"]
@@ -249,8 +253,8 @@ def test_latex_has_intervals_where_they_are_asked_for(timed):
     assert "[" not in "".join(body_of(table)[1])
 
 
-def test_figures_have_truetype_fonts_and_the_size_that_is_asked_for(run, tmp_path):
-    tables.write_figures(run, tmp_path, ["icp", "ours"], (3.5, 2))
+def test_figures_have_truetype_fonts_and_the_size_that_is_asked_for(whole, tmp_path):
+    tables.write_figures(whole, tmp_path, ["icp", "ours"], (3.5, 2))
     for name in ("error_curves", "error_distribution"):
         document = (tmp_path / f"{name}.pdf").read_bytes()
         assert b"/MediaBox [ 0 0 252 144 ]" in document  # 72 points per inch
@@ -258,8 +262,8 @@ def test_figures_have_truetype_fonts_and_the_size_that_is_asked_for(run, tmp_pat
         assert b"/Type3" not in document
 
 
-def test_csv_has_the_figures_and_their_intervals_in_columns(run, every):
-    figures = run.summary["methods"]["ours"]
+def test_csv_has_the_figures_and_their_intervals_in_columns(whole, every):
+    figures = whole.summary["methods"]["ours"]
     acc30 = [figures["acc30"], *figures["acc30_ci"]]
     lines = list(csv.DictReader(io.StringIO(tables.as_csv(every["table_3"]))))
     (ours,) = [line for line in lines if line["row"] == "CorrespondSim"]
@@ -272,6 +276,7 @@ def test_csv_has_the_figures_and_their_intervals_in_columns(run, every):
 def test_markdown_escapes_bars_and_has_no_p_of_zero():
     cells = frame({"c|d": [Cell(0.00001, decimals=3)], "i": [None]}, ["a|b"])
     lines = as_markdown(Table("odd", "x", cells)).splitlines()[2:]  # below the title
+    # Titles, rule, and two rows have three bars each; escaped ones do not count.
     assert [re.sub(r"\\\|", "", line).count("|") for line in lines] == [3] * 4
     assert "< 0.001" in lines[2]
 
@@ -305,6 +310,7 @@ def test_a_runs_summary_is_of_the_pairs_and_rows_with_results(tmp_path):
     summary = write_run(tmp_path, rows, ["lamp", "chair", "cup"]).summary
     assert (summary["data"]["categories"], summary["data"]["pairs"]) == (["lamp", "chair"], 2)
     assert list(summary["methods"]) == ["mine"]
+    # One pair of two is right, and has the figures of `RESULT`.
     figures = {"failed": 1, "translation": 0.5, "scale": 1.1, "symmetric_acc30": 50}
     assert figures.items() <= summary["methods"]["mine"].items()
 
@@ -341,21 +347,21 @@ def test_a_damaged_gzip_is_refused(folder):
 
 
 @pytest.fixture(scope="module")
-def halved(run, tmp_path_factory) -> Run:
+def halved(whole, tmp_path_factory) -> Run:
     """A run with half the errors of two rows, in which one has no result of the last pair."""
     errors = {
-        name: (run.row(name)[["error"]] / 2).to_dict(orient="index") for name in ("ours", "icp")
+        name: (whole.row(name)[["error"]] / 2).to_dict(orient="index") for name in ("ours", "icp")
     }
     errors["ours"].popitem()
     return write_run(tmp_path_factory.mktemp("halved"), errors)
 
 
-def test_runs_are_compared_on_the_pairs_that_both_have(run, halved):
-    table = tables.compare(run, halved)
+def test_runs_are_compared_on_the_pairs_that_both_have(whole, halved):
+    table = tables.compare(whole, halved)
     assert list(table.cells.index) == ["icp", "ours"]
-    assert table.title == f"A = {run.folder}, B = {halved.folder}"
+    assert table.title == f"A = {whole.folder}, B = {halved.folder}"
     b = halved.row("icp").sort_index()
-    a = run.row("icp").loc[b.index]
+    a = whole.row("icp").loc[b.index]
     pairs, first, second, gain, p, *medians = table.cells.loc["icp"]
     assert pairs.value == 47  # of 48
     known = paired_difference(a["error"], b["error"], weights=draws_of(a))
@@ -365,13 +371,13 @@ def test_runs_are_compared_on_the_pairs_that_both_have(run, halved):
     assert [one.value for one in medians] == [np.median(a["error"]), np.median(b["error"])]
 
 
-def test_rows_of_one_run_are_compared(run):
-    table = tables.compare(run, run, ["icp", "ours:icp"])
+def test_rows_of_one_run_are_compared(whole):
+    table = tables.compare(whole, whole, ["icp", "ours:icp"])
     assert list(table.cells.index) == ["icp", "ours:icp"]
     assert cell(table, "icp", "p").value == 1  # the same row twice
     *_, p, first, second = [one.value for one in table.cells.loc["ours:icp"]]
     assert 0 < p <= 1
-    assert [first, second] == [run.row(name)["error"].median() for name in ("ours", "icp")]
+    assert [first, second] == [whole.row(name)["error"].median() for name in ("ours", "icp")]
 
 
 @pytest.mark.parametrize(
@@ -381,13 +387,13 @@ def test_rows_of_one_run_are_compared(run):
         (":ours", "row '.*' is not in the run, expected one of "),
     ],
 )
-def test_rows_that_cannot_be_compared_are_refused(run, halved, rows, message):
-    refused(message, tables.compare, run, halved, [rows])
+def test_rows_that_cannot_be_compared_are_refused(whole, halved, rows, message):
+    refused(message, tables.compare, whole, halved, [rows])
 
 
-def test_the_curve_of_errors_is_the_share_of_pairs_below_each(run):
-    (axis,) = tables.error_curves(run, ["ours", "icp"]).axes
+def test_the_curve_of_errors_is_the_share_of_pairs_below_each(whole):
+    (axis,) = tables.error_curves(whole, ["ours", "icp"]).axes
     curve = axis.get_lines()[0]
     last_below = np.searchsorted(curve.get_xdata(), 30, side="right") - 1
-    share = np.mean(run.row("ours")["error"] <= 30)
+    share = np.mean(whole.row("ours")["error"] <= 30)
     assert curve.get_ydata()[last_below] == pytest.approx(100 * share)

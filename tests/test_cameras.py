@@ -37,7 +37,7 @@ def test_projection_agrees_with_pytorch3ds_own_row_vector_formula(seed, intrinsi
     [
         ({"R": np.eye(2)}, r"R has shape \(2, 2\)"),
         ({"R": np.diag([1.0, 1.0, -1.0])}, "expected a rotation"),
-        ({"t": [0, 0, 1e155]}, r"t holds 1e\+155"),
+        ({"t": [0, 0, 1e155]}, r"t holds 1e\+155"),  # its square is not finite
         ({"focal_length": [500, 0]}, "focal_length is .*0.0.*, expected .*greater than 0.001"),
         ({"size": (0, 5)}, "image size .* is 0, expected an integer from 1"),
     ],
@@ -53,7 +53,7 @@ def test_invalid_cameras_are_refused(changes, message):
     refused(message, lambda: Camera(**(valid | changes)))
 
 
-@pytest.mark.parametrize("roll", [0, 1])
+@pytest.mark.parametrize("roll", [0, 1])  # quarter turns of the images
 def test_the_span_of_views_is_that_around_the_object(roll):
     def span(*angles):
         return view_span(
@@ -63,7 +63,7 @@ def test_the_span_of_views_is_that_around_the_object(roll):
     assert span((40, 20)) == pytest.approx(0, abs=1e-5)
     assert span(*((az, 0) for az in range(0, 73, 18))) == pytest.approx(72)
     for height in (0, 30, 60):
-        assert span(*((az, height) for az in range(0, 360, 72))) == pytest.approx(288)
+        assert span(*((az, height) for az in range(0, 360, 72))) == pytest.approx(288)  # 4 x 72
     assert 15 < span((0, 60), (20, 60), (40, 60)) < 40  # a cluster above is one side, too
     # a view from the top does not show the back
     assert span((0, 20), (20, 25), (40, 15), (180, 85)) < 60

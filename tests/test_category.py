@@ -38,7 +38,9 @@ def problem(seed: int, flipped: float = 0.0) -> tuple[list[Sim3], list[PairHypot
     """Make six poses and hypotheses of all 30 pairs; the half turn comes first in the share
     `flipped` of the pairs."""
     rng = np.random.default_rng(seed)
-    truth, pairs = [similarity(rng) for _ in range(6)], []
+    truth = [similarity(rng) for _ in range(6)]
+    pairs = []
+    # Each object is paired with those that are 1 to 5 places after it in a circle.
     ends = [(a, (a + step) % 6) for step in 1 + rng.permutation(5) for a in range(6)]
     wrong = set(rng.permutation(len(ends))[: int(flipped * len(ends))].tolist())
     for k, (a, b) in enumerate(ends):
@@ -57,23 +59,24 @@ def problem(seed: int, flipped: float = 0.0) -> tuple[list[Sim3], list[PairHypot
 @given(seeds)
 def test_poses_are_recovered_among_outliers_and_half_turns_in_any_order(seed):
     truth, pairs = problem(seed, flipped=0.1)
-    alignment, again = synchronise(pairs), synchronise(pairs[::-1])
-    # the mean log scale of the found poses is zero
+    alignment = synchronise(pairs)
+    again = synchronise(pairs[::-1])
+    # The first object has the rotation of the frame and lies at its origin; the mean logarithm of
+    # the scales is zero.
     scale = np.exp(np.mean(np.log([one.scale for one in truth])))
     for (name, one), true in zip(alignment.objects.items(), truth, strict=True):
         expected = Sim3(truth[0].scale / scale, np.eye(3), np.zeros(3)) @ truth[0].inverse() @ true
         assert_allclose(one.sim3.matrix, expected.matrix, atol=2e-2)
         assert_array_equal(one.sim3.matrix, again.objects[name].sim3.matrix)
-    assert len(alignment.disagreements) == 3
+    assert len(alignment.disagreements) == 3  # a tenth of the pairs
     assert min(alignment.disagreements.values()) > 150
 
 
 def test_contradictory_evidence_lowers_the_probability_and_names_the_other_turn():
     _, pairs = problem(3)
     before = synchronise(pairs).objects["004"]
-    for k in [k for k, one in enumerate(pairs) if "004" in (one.reference, one.target)][
-        :4
-    ]:  # of ten: half turn first
+    of_object = [k for k, one in enumerate(pairs) if "004" in (one.reference, one.target)]
+    for k in of_object[:4]:  # of ten: the half turn comes first
         pairs[k] = replace(pairs[k], sim3s=tuple(pairs[k].sim3s[m] for m in (1, 0, 2, 3)))
     after = synchronise(pairs).objects["004"]
     assert after.probability < before.probability - 0.1
@@ -84,11 +87,12 @@ def test_contradictory_evidence_lowers_the_probability_and_names_the_other_turn(
     )
 
 
+# All others below twelve objects, and six from there on.
 @pytest.mark.parametrize("n, per_object", [(2, 1), (4, 3), (11, 10), (12, 6), (40, 6)])
 def test_pairs_connect_all_objects_and_every_object_has_the_same_number_of_partners(n, per_object):
     names = [f"{k:02d}" for k in range(n)]
-    pairs = partners(names, None)
-    assert pairs == partners(names[::-1], None) == sorted(set(pairs))
+    pairs = partners(names, per_object=None)
+    assert pairs == partners(names[::-1], per_object=None) == sorted(set(pairs))
     ends = np.array(pairs, int)
     assert (ends[:, 0] < ends[:, 1]).all()
     assert_array_equal(np.bincount(ends.ravel()), np.full(n, per_object))

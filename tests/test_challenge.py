@@ -101,7 +101,7 @@ def test_what_is_given_leads_neither_to_the_secret_nor_to_labels(challenge):
     kept = {path.name for path in (challenge / "keep").rglob("*.json")}
     assert kept >= {"synthetic.json", "object_poses.json"}
     for path in given:
-        assert path.stat().st_mtime == 946_684_800  # one time for all
+        assert path.stat().st_mtime == 946_684_800  # for all files, the beginning of 2000
         content = path.read_bytes()
         if path.suffix == ".jgz":
             assert content[4:8] == bytes(4)  # the time in gzip's header
@@ -110,7 +110,7 @@ def test_what_is_given_leads_neither_to_the_secret_nor_to_labels(challenge):
         assert str(seed).encode() not in content
         assert b"Exif" not in content
         assert b"tEXt" not in content
-    # Names like CO3D's would give 26 bits of each object's key.
+    # The objects are numbered: names like CO3D's would give 26 bits of each object's key.
     assert {name for path in given for name in path.parts if name.startswith("1")} == {"100", "101"}
 
 
@@ -118,7 +118,8 @@ def test_only_the_frames_of_pairs_are_copied(challenge, tmp_path):
     pair = read_questions(challenge / "keep/pairs.csv")[0]
     copy_for_pairs(challenge / "keep/data", [pair], tmp_path)
     files = [path for path in tmp_path.rglob("*") if path.is_file()]
-    assert len(files) == 2 + 6 * 4  # annotations; image, depth and two masks of each frame
+    # Two annotations; image, depth and two masks of a reference and five target views.
+    assert len(files) == 2 + 6 * 4
 
 
 def test_another_secret_gives_other_objects(challenge, tmp_path, caplog):
@@ -168,6 +169,7 @@ def test_a_hand_in_finds_and_changes_nothing_but_its_folder(
         tempfile.TemporaryDirectory(prefix="challenge-") as left,  # by a ranking that was killed
         socket.create_server(("127.0.0.1", 0)) as server,
     ):
+        # Files of others, and folders of others in which no file "none" exists.
         paths = [f"{handins}/right.csv", f"{challenge}/keep/pairs.csv", left + "/none", "/dev/tty"]
         paths += [f"{REPOSITORY}/environment.txt", f"{REPOSITORY}/zsp_lite/none"]
         paths += [sys.prefix + "/none", "/dev/shm/none", "/var/tmp/none"]
@@ -207,7 +209,7 @@ def test_a_ranking_that_is_ended_leaves_no_hand_in(challenge, tmp_path, name, pa
 
 
 def test_hand_ins_that_cannot_be_kept_apart_are_refused(challenge, tmp_path, monkeypatch, run):
-    monkeypatch.setenv("PATH", "")
+    monkeypatch.setenv("PATH", "")  # the programs that make namespaces are not found
     (tmp_path / "team.py").write_text(CRASHES)
     words = f"challenge rank {tmp_path} --keep {challenge}/keep --out {tmp_path}/out"
     assert "--unprotected runs them" in run(words, code=2)

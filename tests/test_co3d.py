@@ -25,7 +25,8 @@ def root(tmp_path) -> Path:
 
 
 def edit_first(root: Path, change: Callable[[dict], object]) -> None:
-    """Change the entry of the frame that `first` returns."""
+    """Change the entry of the frame that `first` returns, in place."""
+    # `edit_json` would write what `change` returns.
     edit_json(root / "chair/frame_annotations.jgz", lambda frames: change(frames[0]) and None)
 
 
@@ -129,6 +130,7 @@ def test_optional_fields_may_be_null_and_unknown_ones_are_ignored(root):
 def test_an_invalid_frame_fails_by_name_and_field(root, change, message):
     edit_first(root, change)
     refused(message, lambda: Co3D(root).load(first(root)))
+    # Other sequences can be read, but for an entry that does not say of which sequence it is.
     if "`sequence_name`" not in message:
         assert len(Co3D(root).frames("chair", "a_1")) == 4
 

@@ -15,12 +15,14 @@ from zsp_lite.data.writing import pairs_path, write_label, write_published_pairs
 
 @pytest.fixture
 def root(tmp_path):
+    """A labelled data folder of two sequences of four frames."""
     write_category(tmp_path, "chair", "ab")
     write_identities(tmp_path, "chair", "ab")
     return tmp_path
 
 
 def frame_file(root, part, sequence="a"):
+    """The first file of a part of the frames of a sequence."""
     return sorted((root / "chair" / sequence / part).iterdir())[0]
 
 
@@ -36,7 +38,7 @@ def test_a_complete_folder_has_no_problems(root):
     assert stool.layout == "v2"
     assert (check.category, check.layout, check.sequences, check.frames) == ("chair", "v1", 2, 8)
     assert (check.complete, check.labelled, check.usable, check.pairs) == (2, 2, 2, 1)
-    files = contents(root / "chair")
+    files = contents(root / "chair")  # the annotations do not count
     assert check.size == sum(len(files[name]) for name in files if not name.endswith(".jgz"))
 
 
@@ -50,9 +52,8 @@ def test_a_missing_and_an_empty_file_are_named(root, part):
         f"{gone.relative_to(root).as_posix()} is missing",
         f"{empty.relative_to(root).as_posix()} is empty",
     ]
-    assert check.complete == 0 and check.usable == 2, (
-        "three whole frames are enough to be evaluated"
-    )
+    # Three whole frames of a sequence are enough for the evaluation.
+    assert (check.complete, check.usable) == (0, 2)
 
 
 def test_a_broken_file_is_found_by_a_deep_check_alone(root):
@@ -72,6 +73,7 @@ def test_black_and_empty_frames_are_counted_by_a_deep_check(root, run):
     (shallow,) = check_folder(root)
     assert (shallow.defects, shallow.usable) == ({}, 2)
     (deep,) = check_folder(root, deep=True)
+    # One of the four frames of a is left.
     assert (deep.defects, deep.problems, deep.usable) == ({"black image": 3}, [], 1)
     text = run(f"data check {root} --deep")
     assert "chair: 3 of 8 frames cannot be used (black image 3)" in text

@@ -16,8 +16,10 @@ import click
 import nbformat
 import numpy as np
 import pytest
+from test_importers import HALF_PIXEL, write_lists
 
 from tools import rooms
+from zsp_lite.benchmark.methods import GROUPS, METHODS
 from zsp_lite.cli.main import cli, main
 from zsp_lite.data.labels import read_labels
 from zsp_lite.metrics import rotation_error
@@ -35,6 +37,7 @@ PAGES = [
 IDS = {"ids": [str(page.relative_to(REPOSITORY)) for page in PAGES]}
 
 CODE = (".py", ".ipynb")
+# Text between single backquotes.
 _INLINE_CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 
 
@@ -47,6 +50,7 @@ def markdown(page: Path) -> str:
 
 
 def python_blocks(page: Path) -> list[str]:
+    """The fenced blocks of Python."""
     return re.findall(r"```python\n(.*?)```", markdown(page), re.DOTALL)
 
 
@@ -75,6 +79,7 @@ def test_every_module_and_file_of_the_package_that_is_named_exists(page):
 
 @functools.cache
 def all_code() -> str:
+    """The text of all modules and notebooks."""
     folders = REPOSITORY / "zsp_lite", REPOSITORY / "notebooks"
     paths = (path for folder in folders for path in folder.rglob("*") if path.suffix in CODE)
     return "\n".join(path.read_text("utf-8") for path in paths)
@@ -158,8 +163,6 @@ def test_every_command_and_option_in_running_text_exists(page):
 
 @pytest.mark.parametrize("page", PAGES, **IDS)
 def test_every_benchmark_row_that_is_named_exists(page):
-    from zsp_lite.benchmark.methods import GROUPS, METHODS
-
     known = {*GROUPS, *METHODS}
     for command in command_blocks(page):
         words = shlex.split(command, comments=True)
@@ -231,9 +234,8 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
 
     # The second block gets frames of a camera, and reads the scan of another object: here sample
     # sequences.
-    from test_importers import HALF_PIXEL, write_lists
-
-    dataset, scans = names["dataset"], []
+    dataset = names["dataset"]
+    scans = []
     for name in ("scooter", "scooter2"):
         frames = dataset.frames("motorcycle", name)[::4]
         scans.append([replace(dataset.load(frame), name=str(k)) for k, frame in enumerate(frames)])
@@ -267,19 +269,17 @@ def test_the_readme_says_how_many_lines_the_library_has_without_the_course():
     library = set((REPOSITORY / "zsp_lite").rglob("*.py"))
     course = set((REPOSITORY / "zsp_lite/course").rglob("*.py"))
     counted = sum(len(path.read_text("utf-8").splitlines()) for path in library - course)
-    assert abs(int(claimed.replace(",", "")) - counted) <= 500
+    assert abs(int(claimed.replace(",", "")) - counted) <= 500  # it says "about"
 
 
 def code_lines(cell) -> list[str]:
+    """The lines of a cell that are not blank."""
     return [line for line in cell.source.splitlines() if line.strip()]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_cells_of_code_are_short_and_at_most_a_third_of_a_cell_draws(path):
-    """Blank lines do not count.
-
-    A cell may also be one drawing call, with the line that shows it.
-    """
+    """A cell may also be one drawing call, with the line that shows it."""
     cells = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
     # What is imported from matplotlib, plotly and `zsp_lite.viz`: lists of names.
     imports = re.findall(

@@ -181,7 +181,8 @@ def test_the_given_cells_run_and_agree_with_the_expected_outputs_and_the_guides(
 
 @pytest.mark.parametrize("assignment", ASSIGNMENTS)
 def test_the_solutions_pass_every_test_and_the_students_version_none(prepared, config, assignment):
-    notebook, handed_out = source(assignment), students_version(assignment, config)
+    notebook = source(assignment)
+    handed_out = students_version(assignment, config)
     text = "\n".join(cell.source for cell in handed_out.cells)
     assert not re.search("SOLUTION|HIDDEN|Guide for marking", text)
     assert failing_tests(prepared(assignment), notebook, notebook) == {}
@@ -212,6 +213,8 @@ def test_each_mistake_fails_its_own_function_and_students_see_that_of_the_common
 
 
 def test_the_minutes_of_the_labs_add_up_in_the_guide_and_on_the_slides():
+    # The guide has a table for the lab of 90 minutes: until when, what, and how many minutes. The
+    # slides of this lab name the same times; those of three longer ones, the minutes of each part.
     guide = (EXERCISES.parent / "README.md").read_text("utf-8")
     rows = re.findall(r"^\| (\d+) \| .* \| ([\d +]+) \|$", guide, re.MULTILINE)
     ends = np.cumsum([int(part) for _, minutes in rows for part in minutes.split("+")])
@@ -219,7 +222,7 @@ def test_the_minutes_of_the_labs_add_up_in_the_guide_and_on_the_slides():
     until = re.findall(r"until \D*(\d+)", one.read_text("utf-8"))
     assert {"90", *until, *dict(rows)} <= {*map(str, ends)}
     for deck in three:
-        assert sum(map(int, re.findall(r"(\d+) min\b", deck.read_text("utf-8")))) == 120
+        assert sum(map(int, re.findall(r"(\d+) min\b", deck.read_text("utf-8")))) == 120  # 2 h
 
 
 CALLS_THE_LIBRARY = """
@@ -250,7 +253,7 @@ def turn_into_text(cell: NotebookNode) -> None:
     del cell["outputs"], cell["execution_count"]
 
 
-# What is listed, and a damage to a solution that is its cause.
+# Reasons that the list of grades has, and the damage to a solution that is the cause of each.
 DAMAGES = {
     "cells that are there twice": lambda cell, cells: cells.append(copied(cell)),
     "solutions that are not code": lambda cell, _: turn_into_text(cell),
@@ -326,7 +329,8 @@ def copy_course(root: Path) -> Path:
 def answered(folder: Path) -> NotebookNode:
     """Ada's notebook."""
     notebook = nbformat.read(folder / "release" / METRICS / f"{METRICS}.ipynb", as_version=4)
-    solutions, answers = graded(source(METRICS), solution=True), graded(notebook, solution=True)
+    solutions = graded(source(METRICS), solution=True)
+    answers = graded(notebook, solution=True)
     answers[RIGHT].source = solutions[RIGHT].source
     answers[CALLS].source = solutions[CALLS].source + CALLS_THE_LIBRARY.format(CALLS)
     answers["better"].source = "See my remark: [Comment](#mine), $\\lambda R$ and $\\broken{$"
@@ -338,7 +342,7 @@ def download(folder: Path, notebook: NotebookNode, bob: str) -> None:
     downloads = folder / "downloaded" / METRICS
     (downloads / "archive").mkdir(parents=True, exist_ok=True)
     files = {}
-    for number, damage in enumerate(DAMAGES.values(), 110):
+    for number, damage in enumerate(DAMAGES.values(), 110):  # of a participant
         damaged = deepcopy(notebook)
         damage(graded(damaged)[RIGHT], damaged.cells)
         files[f"A_{number}_assignsubmission_file_{METRICS}.ipynb"] = nbformat.writes(damaged)
@@ -385,6 +389,7 @@ def test_each_test_of_a_task_that_is_right_gives_two_points_and_the_others_none(
 
 def test_several_loops_cost_no_more_than_the_limit_and_spare_other_functions(config, monkeypatch):
     execute = config.Autograde.autograde_preprocessors[0]
+    # Seconds for a cell, and for all cells that do not end: enough for both loops.
     monkeypatch.setitem(execute.preprocess.__globals__, "LIMIT", 3)
     monkeypatch.setitem(execute.preprocess.__globals__, "LOST", 6)
     cells = []
@@ -396,8 +401,11 @@ def test_several_loops_cost_no_more_than_the_limit_and_spare_other_functions(con
         cells.append(copied(cells[-1]))  # a second test
     notebook, _ = execute(config=config).preprocess(nbformat.v4.new_notebook(cells=cells), {})
     failed = [bool(cell.outputs) for cell in notebook.cells]
-    stopped, passed = [False, True, True], [False] * 3
+    # A function and its two tests. After the second loop no time is left for the last function.
+    stopped = [False, True, True]
+    passed = [False] * 3
     assert failed == stopped + passed + stopped + [True] * 3
+    # The first test did not end; the second one was not run.
     (first, *_), (second, *_) = (notebook.cells[i].outputs[::-1] for i in (1, 2))
     assert first.traceback != second.traceback == ["not run: a cell before this one did not end"]
 
@@ -419,7 +427,7 @@ def test_every_hand_in_is_graded_or_named_with_the_reason(collected):
     *graded_or_damaged, dan = states
     assert graded_or_damaged == [
         *damaged,
-        "123,5.5,20,graded",
+        "123,5.5,20,graded",  # 4 for two tests, 1.5 for the answer that was written
         not_graded(124, "damaged file"),
         "125,,20,not collected: all/Eve_125_assignsubmission_file_homework.pdf",
     ]

@@ -80,6 +80,7 @@ def test_cyclical_iou_is_the_share_of_the_foreground_that_comes_back():
     # Target patch 5 goes to reference patch 0 and comes back: each foreground holds for its own
     # view.
     shifted = torch.eye(6).roll(1, 0)
-    first, last = everything & (torch.arange(6) == 0), everything & (torch.arange(6) == 5)
+    first = everything & (torch.arange(6) == 0)
+    last = everything & (torch.arange(6) == 5)
     assert cyclical_iou(shifted, first, last) == 1
     assert cyclical_iou(shifted, last, first) == 0

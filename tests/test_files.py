@@ -255,11 +255,12 @@ def test_a_long_message_keeps_its_beginning_and_end():
 
 POINTS = default_rng(0).normal(size=(5, 3)).astype(np.float32)
 COLOURS = default_rng(1).integers(0, 256, (5, 3)).astype(np.uint8)
-COLOURS[0] = 0, 128, 255
+COLOURS[0] = 0, 128, 255  # with both ends of the range, by which it is recognised
 
 
 @pytest.fixture
 def path(tmp_path):
+    """Where a test writes its PLY file."""
     return tmp_path / "cloud.ply"
 
 
@@ -293,7 +294,8 @@ def test_positions_are_read_in_every_encoding(path, encoding):
 )
 def test_colours_of_8_or_16_bits_to_255_or_to_1_are_read_as_8_bit(path, kind, code, scale):
     table = np.zeros(len(POINTS), [("position", "<f4", 3), ("colour", f"<{code}", 3)])
-    table["position"], table["colour"] = POINTS, COLOURS * np.float64(scale)
+    table["position"] = POINTS
+    table["colour"] = COLOURS * np.float64(scale)
     path.write_bytes(_ply(len(POINTS), table.tobytes(), kind=kind))
     colours = read_ply(path)[1]
     assert colours.dtype == np.uint8

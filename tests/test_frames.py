@@ -131,7 +131,7 @@ def test_arrays_of_a_camera_become_a_frame_with_half_integer_pixel_centres():
 
 def test_the_pose_of_arrays_is_that_of_the_camera_in_the_world():
     pose = np.eye(4)
-    pose[:3, :3] = random_camera(default_rng(0)).R
+    pose[:3, :3] = random_camera().R
     pose[:3, 3] = 1, 2, 3
     for matrix in (pose, pose[:3]):
         camera = Frame.from_arrays(**arrays(pose=matrix)).camera
@@ -177,7 +177,8 @@ def test_the_distortion_of_arrays_is_corrected(count):
     assert_array_equal(frame.camera.K, camera.K)
     inside = np.s_[4:-4, 4:-4]
     errors = np.abs(frame.depth - 100 - places[..., 0])[inside]
-    assert errors.max() < 1  # of the nearest pixel: no mean of two
+    assert errors.max() < 1  # pixel
+    # Depth is that of a pixel, not a mean of two.
     assert np.isin(frame.depth, np.float32(columns + 100)).all()
     assert_array_equal((frame.mask > 0.5)[inside][:, :50], False)
     assert_array_equal((frame.mask > 0.5)[inside][:, 60:], True)
@@ -223,7 +224,8 @@ def test_masks_survive_their_files(tmp_path):
 @pytest.mark.parametrize("extension", [".png", ".jpg"])
 def test_an_image_file_is_complete_whatever_follows_it(tmp_path, extension):
     pixels = default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
-    data, path = cv2.imencode(extension, pixels)[1].tobytes(), tmp_path / "image"
+    data = cv2.imencode(extension, pixels)[1].tobytes()
+    path = tmp_path / "image"
     decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     for behind in (b"", b"\xff\xda \xff\xd9 IDAT IEND", data[:-9]):
         path.write_bytes(data + behind)
@@ -262,6 +264,7 @@ def test_the_spread_averages_the_variances_of_the_axes():
 
 
 def test_the_bits_are_those_of_a_float16_and_only_positive_finite_values_known():
+    # 0x3C00 is 1 and 0x4000 is 2.
     assert encode_depth(np.array([[1.0, 0.0]])).tolist() == [[0x3C00, 0]]
     assert decode_depth(np.array([[0x4000]], np.uint16), 3.0).tolist() == [[6.0]]
     infinite, nan, negative = 0x7C00, 0x7E00, 0xBC00

@@ -141,7 +141,7 @@ def test_the_image_processors_mean_and_deviation_are_taken(processor, mean, std,
 
 def test_without_transformers_the_package_is_named(folders, monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
-    refused(r"pip install transformers", load_backbone, f"hf:{folders['vit']}")
+    refused("pip install transformers", load_backbone, f"hf:{folders['vit']}")
 
 
 @pytest.mark.parametrize(
@@ -151,6 +151,7 @@ def test_without_transformers_the_package_is_named(folders, monkeypatch):
         ("blip", {}, "a blip_vision_model model, expected .* the projections q_proj or query"),
         ("vit", {"num_channels": 1}, "does not run"),
         ("vit", {"patch_size": [8, 16]}, "one square patch_size"),
+        # Four patches and seven tokens for detection.
         ("yolos", {"image_size": [32, 32], "num_detection_tokens": 7}, "11 tokens without"),
         (
             "resnet",

@@ -56,7 +56,7 @@ def insert(metadata, table, **values):
 
 
 def write_depth(path, shape, **options):
-    """Write depth maps with one of a shape, without values."""
+    """Write a file with one depth map of a shape, whose values are not stored."""
     with h5py.File(path, "w") as depths:
         depths.create_dataset("1", shape, np.float32, **options)
 
@@ -108,6 +108,7 @@ def write_uco3d(root, dataset, category, names):
 def _write_frames(folder, metadata, name, frames):
     """Write the videos, the depth maps and the rows of the frames of a sequence."""
     height, width = size = frames[0].camera.size
+    # Both codecs are lossless.
     videos = [
         cv2.VideoWriter(
             str(folder / file),
@@ -123,7 +124,7 @@ def _write_frames(folder, metadata, name, frames):
         for number in range(STEP * len(frames)):
             frame = frames[number // STEP]
             camera = frame.camera
-            K = camera.K - HALF_PIXEL
+            K = camera.K - HALF_PIXEL  # OpenCV's pixel centres are integers
             has_depth = number % STEP == 0
             images = frame.rgb[..., ::-1], np.rint(255 * frame.mask).astype(np.uint8)
             for video, image in zip(videos, images):
@@ -143,7 +144,7 @@ def _write_frames(folder, metadata, name, frames):
                 _mask_mass=float(frame.mask.sum()),
                 _viewpoint_colmap_distortion_coeffs=blob(DISTORTION),
                 _viewpoint_intrinsics_format="ndc_norm_image_bounds",
-                **{f"_viewpoint_{name}": blob(values) for name, values in view.items()},
+                **{f"_viewpoint_{part}": blob(values) for part, values in view.items()},
             )
             if has_depth:
                 depths[str(number + 1)] = _stored_depth(frame, K)

@@ -20,7 +20,8 @@ import pytest
 
 REPOSITORY = Path(__file__).parents[2]
 
-# Every cell of a notebook is in the page at all times, and nothing is asked of the network.
+# Settings of JupyterLab: every cell of a notebook is in the page at all times, and nothing is asked
+# of the network.
 _SETTINGS = {
     "@jupyterlab/notebook-extension/tracker": {"windowingMode": "none"},
     "@jupyterlab/apputils-extension/notification": {"fetchNews": "false", "checkForUpdates": False},
@@ -42,6 +43,7 @@ def running_chromium():
 
     Without one the tests are skipped, but fail in continuous integration.
     """
+    # Imported here: conftest.py loads this module also where Playwright is not installed.
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -78,6 +80,7 @@ class Lab:
         return json.loads(body) if body else None
 
     def stop_kernels(self) -> None:
+        """End every kernel of the server."""
         for session in self.ask("sessions"):
             self.ask(f"sessions/{session['id']}", "DELETE")
 
@@ -139,6 +142,7 @@ def serve(folder: Path, state: Path, data: Path):
 
 
 def _answers(lab: Lab) -> bool:
+    """Whether the server is ready."""
     try:
         lab.ask("status")
     except (urllib.error.URLError, ConnectionError, TimeoutError):
@@ -168,7 +172,8 @@ def run_all(page, patience: float) -> None:
 
     TimeoutError after `patience` seconds.
     """
-    deadline, asked = time.monotonic() + patience, 0.0
+    deadline = time.monotonic() + patience
+    asked = 0.0  # the time of the last click on the menu
     while not page.evaluate(_BEGUN):
         if time.monotonic() > deadline:
             raise TimeoutError(f"no code cell had begun to run after {patience:.0f} s")

@@ -43,7 +43,7 @@ SOLVE = """(chosen) => {
   const kept = ({ matches, score }) => ({ matches, score });
   return { targets: targets.map(kept), best, pose, error };
 }"""
-FIRST_TARGET = (
+FIRST_TARGET = (  # 448: its width and height in pixels
     "document.querySelectorAll('.views canvas')[0].getContext('2d').getImageData(0, 0, 448, "
     "448).data"
 )
@@ -57,7 +57,7 @@ PACK = """(array) => {
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory) -> Path:
+def playground(tmp_path_factory) -> Path:
     """Folder of a site with this one page."""
     folder = build_page("docs/playground", tmp_path_factory.mktemp("site"))
     write_page_data(folder / "docs/playground")
@@ -71,9 +71,9 @@ def method() -> ZeroShotPose:
 
 
 @pytest.fixture(scope="module")
-def stored(browser, site) -> Page:
+def stored(browser, playground) -> Page:
     """The page opened as a file."""
-    return open_playground(browser, site.as_uri())
+    return open_playground(browser, playground.as_uri())
 
 
 def open_playground(browser: Browser, address: str, **options) -> Page:
@@ -110,7 +110,7 @@ class Shown(NamedTuple):
 GRID = (28, 28)
 
 
-@pytest.fixture(scope="module", params=range(8))
+@pytest.fixture(scope="module", params=range(8))  # all stored pairs
 def shown(stored, method, request) -> Shown:
     """Each stored pair in turn."""
     dataset = Co3D(sample_data())
@@ -144,7 +144,8 @@ def test_the_page_has_the_librarys_similarities(shown):
     first, *maps = shown.stored
     for i, (view, rounded) in enumerate(zip(targets, maps)):
         sim = shown.compared(i, binned=True)
-        # The similarities of the exact features, and of the rounded ones that the page has.
+        # The similarities of the exact features, and of the rounded ones that the page has:
+        # docs/playground/build.py says how far off rounding leads.
         assert_close(sim, similarity(reference.features, view.features), atol=1e-3, rtol=0)
         assert_close(sim, similarity(first, rounded), atol=1e-5, rtol=0)
         (plain,) = key_similarities(reference.features, [view.features])
@@ -157,15 +158,16 @@ def test_the_page_has_the_librarys_matches(shown, cycle, matcher):
     for i, (found, rounded) in enumerate(zip(shown.solved[cycle]["targets"], maps, strict=True)):
         sim = shown.compared(i, binned=True)
         matches = match(first, rounded, kmeans=False, sim=sim, matcher=matcher)
+        # Row and column of 28 to the number of a patch.
         pairs = np.stack([matches.reference @ (28, 1), matches.target @ (28, 1)], axis=1)
         assert_array_equal(found["matches"], pairs)
         assert_allclose(found["score"], correspondence_score(matches, 50), atol=1e-3)
 
 
 @pytest.fixture(scope="module")
-def address(site):
+def address(playground):
     """The address of a server of the site."""
-    handler = partial(SimpleHTTPRequestHandler, directory=site)
+    handler = partial(SimpleHTTPRequestHandler, directory=playground)
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"
@@ -186,9 +188,11 @@ def test_photographs_get_the_features_of_the_library_and_no_pose(
     files = [tmp_path / "a.png", tmp_path / "b.png"]
     for file, view in zip(files, views):
         cv2.imwrite(str(file), view.frame.rgb[..., ::-1])
-    page, requests = open_playground(browser, address), []
+    page = open_playground(browser, address)
+    requests = []
     if not page.evaluate("DATA.runtime"):
         pytest.skip("onnxruntime-web could not be fetched")
+    # What the page asks for from now on, and how: photographs would be sent by another method.
     page.on("request", lambda request: requests.append((request.method, request.url)))
     page.set_input_files("#files", files)
     wait_for_notice(page, "not left|cannot")
@@ -198,23 +202,24 @@ def test_photographs_get_the_features_of_the_library_and_no_pose(
         for name in ("keys", "saliency"):
             found = array(page, f"state.views[{i}].{name}")
             assert_allclose(found, getattr(view.features, name).flatten(), atol=1e-3)
-    page.select_option("#pair", "3")  # back to a stored pair
+    page.select_option("#pair", "3")  # a stored pair again
     wait_for_notice(page, "3D models")
-    assert page.evaluate("state.views.length") == 6
+    assert page.evaluate("state.views.length") == 6  # a reference and five target views
     assert "No pose" not in page.inner_text("#stages")
     assert {how for how, _ in requests} == {"GET"}
     assert all(url.startswith((address, "data:", "blob:")) for _, url in requests)
 
 
 @pytest.fixture(params=SCREENS, ids=str)
-def touched(browser, site, request) -> Page:
+def touched(browser, playground, request) -> Page:
     """The page on a screen of a width, in a scheme of colours."""
-    return open_playground(browser, site.as_uri(), **screen(*request.param))
+    return open_playground(browser, playground.as_uri(), **screen(*request.param))
 
 
 def test_a_patch_is_held_by_keyboard_and_touch(touched):
     tab_to(touched, "reference")
-    text, picture = touched.inner_text("#patch"), array(touched, FIRST_TARGET, np.uint8)
+    text = touched.inner_text("#patch")
+    picture = array(touched, FIRST_TARGET, np.uint8)
     assert picture.std() > 20  # a picture is shown
     touched.keyboard.press("ArrowLeft")
     touched.keyboard.press("Enter")

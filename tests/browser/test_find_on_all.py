@@ -42,6 +42,7 @@ def choose(page: Page, category: str) -> None:
 
 @pytest.fixture(scope="module")
 def shown(browser, address) -> Page:
+    """The page on a screen of the usual size."""
     return open_objects(browser, address)
 
 
@@ -58,11 +59,11 @@ def test_the_page_shows_the_stored_places(shown, category, side):
     assert_array_equal([mark["marked"] for mark in marks], source["pixels"][index, picture])
     pixels = target["pixels"][source["places"][1, index], target["sides"][side]]
     assert_array_equal([mark["pixel"] for mark in marks], pixels)
-    confidence = source["confidences"][1, index]
+    confidence = source["confidences"][1, index]  # of 256
     hidden = np.where(pixels[:, 0] == HIDDEN, "hidden", "found")
     kinds = np.where(confidence < 256 * FOUND, "nothing", hidden)
     assert [mark["kind"] for mark in marks] == kinds.tolist()
-    assert (kinds == "found").mean() > 0.3
+    assert (kinds == "found").mean() > 0.3  # of the marks, so that places are compared
 
 
 def spot(page: Page, number: int) -> dict | None:
@@ -75,7 +76,7 @@ def test_pointing_shows_a_place_where_the_data_have_it(shown):
     marks = [mark for mark in shown.evaluate(SHOWN) if mark["kind"] == "found"][::25]
     boxes = [shown.locator(".picture").nth(i).bounding_box() for i in range(2)]
     for mark in marks:
-        at, there = [
+        at, there = [  # coordinates are stored as 254ths of a picture's side
             [box["x"] + x / 254 * box["width"], box["y"] + y / 254 * box["width"]]
             for box, (x, y) in zip(boxes, (mark["marked"], mark["pixel"]), strict=True)
         ]
@@ -132,4 +133,4 @@ def test_the_page_fits_the_screen_and_asks_for_files_alone(touched):
 def test_the_data_are_small():
     files = list(FOLDER.glob("*.js"))
     assert sorted(file.stem for file in files) == sorted(CATEGORIES)
-    assert sum(file.stat().st_size for file in files) < 4e6
+    assert sum(file.stat().st_size for file in files) < 4e6  # bytes

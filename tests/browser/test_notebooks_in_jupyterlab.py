@@ -32,7 +32,8 @@ def lab(browser, tmp_path_factory):
         notebook = nbformat.read(path, as_version=4)
         for cell in notebook.cells:
             if cell.cell_type == "code":
-                cell.outputs, cell.execution_count = [], None
+                cell.outputs = []
+                cell.execution_count = None
         nbformat.write(notebook, path)
     python = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
     check = new_code_cell('from zsp_lite.course.widgets import self_check\nself_check("00", 1)')

@@ -8,18 +8,18 @@ SCREENS = [(390, 844), (1280, 720)]
 SLIDE = "section:not([hidden])"  # the slide that a window shows
 
 
-@pytest.mark.parametrize("screen, height", SCREENS)
-def test_no_page_is_wider_than_the_screen(browser, site, screen, height):
-    page = browser.new_page(viewport={"width": screen, "height": height})
+@pytest.mark.parametrize("width, height", SCREENS)
+def test_no_page_is_wider_than_the_screen(browser, site, width, height):
+    page = browser.new_page(viewport={"width": width, "height": height})
     wide = {}
     for path in sorted(site.rglob("*.html")):
         name = str(path.relative_to(site))
         # index.html leads on to the start page.
         if "_static" not in path.parts and name != "index.html":
             page.goto(path.as_uri())
-            width = page.evaluate("document.documentElement.scrollWidth")
-            if width > screen:
-                wide[name] = width
+            needed = page.evaluate("document.documentElement.scrollWidth")
+            if needed > width:
+                wide[name] = needed
     assert wide == {}
 
 
@@ -83,4 +83,5 @@ def test_the_clouds_of_a_lesson_turn_together(browser, site):
     clouds.first.drag_to(clouds.first, target_position={"x": 50, "y": 90})
     places.add(clouds.last.evaluate(place))
     clouds.last.press("ArrowRight")
+    # The last cloud has turned with the first one, and the first with the last.
     assert len(places | {clouds.first.evaluate(place)}) == 3

@@ -92,6 +92,7 @@ def notebooks(device: str) -> Result:
         words += " --nbval-cell-timeout=300 -n 4 --dist loadfile --rootdir"
         # The folder is the value of --rootdir, and what pytest collects.
         command = [sys.executable, *words.split(), folder, folder]
+        # The four workers of pytest share the cores.
         threads = {"OMP_NUM_THREADS": str(max(1, CORES // 4))}
         status = subprocess.run(command, cwd=REPOSITORY, env=os.environ | threads).returncode
     return [], [f"pytest of the notebooks ended with {status}"] if status else []

