@@ -231,7 +231,7 @@ def test_the_readmes_python_code_estimates_poses(tmp_path, monkeypatch, capsys):
 
     # The second block gets frames of a camera, and reads the scan of another object: here sample
     # sequences.
-    from test_importers import HALF_PIXEL, write_lists
+    from captures import HALF_PIXEL, write_lists
 
     dataset, scans = names["dataset"], []
     for name in ("scooter", "scooter2"):

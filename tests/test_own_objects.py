@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from captures import write_lists
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from synthetic_views import (
@@ -18,11 +19,10 @@ from synthetic_views import (
     around,
     inside,
     look_at,
+    overlap,
     render,
     true_pose,
 )
-from test_importers import write_lists
-from test_masks import overlap
 
 import zsp_lite
 from zsp_lite import Frame, PoseEstimate, ZeroShotPose, estimate_pose, open_source

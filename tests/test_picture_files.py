@@ -8,12 +8,21 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from captures import write_lists, write_nerfstudio
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageOps
 from refusals import refused
-from synthetic_views import AT_HOME, ELSEWHERE, CoordinateBackbone, around, look_at, render
-from test_importers import write_lists, write_nerfstudio
-from test_masks import DIRECTIONS, object_on_floor, overlap
+from synthetic_views import (
+    ABOVE_FLOOR,
+    AT_HOME,
+    ELSEWHERE,
+    CoordinateBackbone,
+    around,
+    look_at,
+    object_on_floor,
+    overlap,
+    render,
+)
 
 from zsp_lite import estimate_pose, open_source
 from zsp_lite.data.arrays import camera_from_pose
@@ -248,7 +257,7 @@ def on_floor(tmp_path, monkeypatch):
     """Four frames of an object on a floor, with true masks, written to `tmp_path`, the working
     folder, as lists without masks."""
     frames = []
-    for number, direction in enumerate(DIRECTIONS):
+    for number, direction in enumerate(ABOVE_FLOOR):
         frame, truth = object_on_floor(direction)
         frames.append(replace(frame, mask=truth.astype(np.float32), name=str(number)))
     write_lists(tmp_path, frames)

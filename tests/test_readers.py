@@ -16,11 +16,7 @@ import lzfse
 import numpy as np
 import pandas as pd
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
-from scipy.spatial.transform import Rotation
-from synthetic_views import look_at
-from test_importers import (
+from captures import (
     HALF_PIXEL,
     edited,
     hairdryer_views,
@@ -29,6 +25,10 @@ from test_importers import (
     write_lists,
     write_nerfstudio,
 )
+from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused
+from scipy.spatial.transform import Rotation
+from synthetic_views import look_at
 
 from zsp_lite import open_source
 from zsp_lite.data.frames import with_images

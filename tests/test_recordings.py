@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 import open3d as o3d
 import pytest
+from captures import METRES, write_depth16
 from numpy.testing import assert_allclose
 from refusals import refused
-from test_importers import METRES, write_depth16
 
 from zsp_lite import Frame, open_source
 from zsp_lite.course.synthetic.export import make_object
