@@ -19,8 +19,8 @@ METRES = 0.13  # per unit of the rendered world: the object is about 30 cm wide
 
 def hairdryer_views() -> list[Frame]:
     """Eight views around a hairdryer, in metres."""
-    shape = make_object("hairdryer", index=0, seed=4)
-    exact, _ = render_sequence(shape, np.random.default_rng(2), frames=8, image_size=96)
+    shape = make_object("hairdryer", 0, 4)  # any index and seed would do
+    exact, _ = render_sequence(shape, np.random.default_rng(2), 8, 96)  # 96 pixels high
     frames = []
     for view in exact:
         camera = replace(view.camera, t=view.camera.t * METRES)

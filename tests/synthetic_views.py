@@ -41,7 +41,8 @@ def look_at(direction, distance: float = 4.0, size=(140, 180), focal: float = 19
 def level_camera(azimuth, height=0.0):
     """A camera that looks at (1, 2, 3) from an azimuth and, by `height`, from above, both in
     degrees; +z of the world is up."""
-    pose = orbit_pose(*np.radians([azimuth, height]), roll=0, distance=3.0, target=(1, 2, 3))
+    # Without roll, at a distance of 3.
+    pose = orbit_pose(*np.radians([azimuth, height]), 0, 3.0, (1, 2, 3))
     return Camera(*pose, np.full(2, 100.0), np.full(2, 50.0), (100, 100))
 
 
@@ -156,8 +157,6 @@ def reference_and_targets(targets: int = 3) -> list[Frame]:
     return [render(look_at((1, 0.6, 0.4)), AT_HOME, "reference"), *elsewhere]
 
 
-WALL = -3.0  # its x
-FLOOR = -0.8  # its z, a little below the object
 ABOVE_FLOOR = [(1, 0.2, 0.6), (0.4, 1, 0.5), (0.7, -0.8, 0.4), (1, 0.5, 1.5)]  # as DIRECTIONS
 
 
@@ -169,8 +168,8 @@ def object_on_floor(direction) -> tuple[Frame, np.ndarray]:
     truth = seen.mask > 0
     # Directions of the rays in the world, with depth 1.
     rays = unproject_depth(np.ones(camera.size), camera) @ camera.R
-    # The depth of the wall and of the floor.
-    depths = (np.array([WALL, FLOOR]) - camera.centre[[0, 2]]) / rays[..., [0, 2]]
+    # The depth of the wall, at x = -3, and of the floor, at z = -0.8, a little below the object.
+    depths = (np.array([-3.0, -0.8]) - camera.centre[[0, 2]]) / rays[..., [0, 2]]
     depth = np.where(truth, seen.depth, np.where(depths > 0, depths, np.inf).min(axis=-1))
     rng = default_rng(0)
     # Three of ten blocks of 7 x 9 pixels are holes. Beyond 20 units a sensor measures nothing.

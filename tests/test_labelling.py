@@ -68,20 +68,13 @@ def test_invalid_categories_sequences_and_picks_are_refused(root):
     labelling = Labelling(root, "chair")
     pick_all(labelling, "best", corners())
     pick_all(labelling, "a", corners()[:3])
-    for call, message in (
-        (lambda: labelling.accept("a"), "a has 3 of 5 keypoints, expected all, at least 4"),
-        (
-            lambda: labelling.pick("none", (0, 0, 0)),
-            "sequence is 'none', expected one of best, a, b",
-        ),
-        (lambda: labelling.pick("a", (0, np.nan, 0)), "picks on a holds nan, expected finite"),
-        (
-            lambda: labelling.pick("a", (0, 1)),
-            "picks on a is .*, expected real numbers of shape .n, 3.",
-        ),
-        (lambda: Labelling(root, "stool"), "category is 'stool', expected one of"),
-    ):
-        refused(message, call)
+    refused("a has 3 of 5 keypoints, expected all, at least 4", labelling.accept, "a")
+    unknown = "sequence is 'none', expected one of best, a, b"
+    refused(unknown, labelling.pick, "none", (0, 0, 0))
+    refused("picks on a holds nan, expected finite", labelling.pick, "a", (0, np.nan, 0))
+    flat = "picks on a is .*, expected real numbers of shape .n, 3."
+    refused(flat, labelling.pick, "a", (0, 1))
+    refused("category is 'stool', expected one of", Labelling, root, "stool")
     assert read_labels(root, "chair") == {}
     assert_array_equal(Labelling(root, "chair").picks("a"), corners()[:3])
 

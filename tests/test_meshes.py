@@ -155,7 +155,8 @@ def canonical(path):
 
 def framed(mesh, azimuth, elevation, size):
     """A camera that frames a mesh; angles in degrees."""
-    pose = orbit_pose(*np.radians([azimuth, elevation]), roll=0, distance=8, target=np.zeros(3))
+    # Without roll, at a distance of 8.
+    pose = orbit_pose(*np.radians([azimuth, elevation]), 0, 8, np.zeros(3))
     return framed_camera(mesh.vertices, *pose, size, margin=1.5)
 
 

@@ -6,10 +6,9 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from captures import write_lists
+from captures import write_depth16, write_lists
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from synthetic_views import (
@@ -57,10 +56,9 @@ def image(tmp_path, views) -> Path:
 
 
 def write_picture(path: Path, frame: Frame, mask: bool = True) -> Path:
-    """Write a picture with its depth in millimetres and, if wanted, its mask; returns its path."""
+    """Write a picture with its depth and, if wanted, its mask; returns its path."""
     write_image(path, frame.rgb, quality=98)
-    millimetres = np.rint(1000 * frame.depth).astype(np.uint16)
-    cv2.imwrite(str(path.with_name(f"{path.stem}_depth.png")), millimetres)
+    write_depth16(path.with_name(f"{path.stem}_depth.png"), frame.depth)
     if mask:
         write_mask(path.with_name(f"{path.stem}_mask.png"), frame.mask)
     return path
@@ -378,8 +376,8 @@ def test_a_contradiction_limits_the_probability_of_every_pose(in_memory, monkeyp
     assert "the object's depth is constant in 3 of 3 frames" in found.estimate.note
     assert "low confidence: --not-upright helps" in found.estimate.note
     estimates = [found.estimate, *(vote.estimate for vote in found.votes)]
-    confidences = [one.confidence for estimate in estimates for one in estimate.hypotheses]
-    assert max(confidences) <= Contradiction.most + 1e-6  # rounding
+    most = max(one.confidence for estimate in estimates for one in estimate.hypotheses)
+    assert most <= Contradiction.most + 1e-6  # rounding
 
 
 @slow
