@@ -19,7 +19,7 @@ METRES = 0.13  # per unit of the rendered world: the object is about 30 cm wide
 
 def hairdryer_views() -> list[Frame]:
     """Eight views around a hairdryer, in metres."""
-    shape = make_object("hairdryer", 0, 4)  # any index and seed would do
+    shape = make_object("hairdryer", 0, 4)  # index and seed
     exact, _ = render_sequence(shape, np.random.default_rng(2), 8, 96)  # 96 pixels high
     frames = []
     for view in exact:

@@ -46,7 +46,7 @@ def level_camera(azimuth, height=0.0):
     return Camera(*pose, np.full(2, 100.0), np.full(2, 50.0), (100, 100))
 
 
-# Object poses of the two sequences of a pair, and directions of cameras: any would do.
+# Object poses of the two sequences of a pair, and directions of cameras.
 AT_HOME = Sim3.identity()
 ELSEWHERE = Sim3(1.15, look_at((0.3, -1, 0.6)).R, np.array([0.05, -0.1, 0.08]))
 DIRECTIONS = [(1, 0.2, 0.3), (-0.5, 1, 0.3), (-1, -0.6, 0.2), (0.3, -1, 0.4), (0.6, 0.8, -0.2)]

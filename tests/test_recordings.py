@@ -32,7 +32,7 @@ INTRINSICS = (131.25, 131.25, 80.0, 60.0)
 @pytest.fixture(scope="module")
 def views():
     """Once around a chair on a rug, and a little more, in metres."""
-    mesh = make_object("chair", 0, 1)  # any index and seed would do
+    mesh = make_object("chair", 0, 1)  # index and seed
     rng = np.random.default_rng([1, 7])
     scene = MeshScene(mesh, random_room(rng, turn=0.3), rng, samples=1)
     frames = []

@@ -75,6 +75,7 @@ def test_suppression_keeps_the_best_of_each_neighbourhood(seed):
     rng = default_rng(seed)
     rotation = rotation_matrices(torch.tensor(rng.normal(0, 0.5, (12, 3)), dtype=torch.float32))
     score = torch.tensor(rng.normal(size=12))
+    # At least 25 degrees apart; as many as there are, 12.
     kept = non_maximum_suppression(rotation, score, 25.0, 12)
     apart = rotation_angles(rotation, rotation)
     assert (score[kept].diff() <= 0).all()
@@ -147,6 +148,7 @@ def test_matches_with_outliers_propose_the_true_pose(seed):
     points = [torch.tensor(part, dtype=torch.float32) for part in (source, target)]
     found = poses_from_matches(*points, default_rng(seed))
     assert rotation_error(found.rotation[0], pose.R) < 1
+    # At most six proposals, at least 20 degrees apart.
     assert len(found) <= 6
     assert (rotation_angles(found.rotation, found.rotation).fill_diagonal_(180) >= 20).all()
 
