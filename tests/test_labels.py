@@ -78,6 +78,7 @@ def test_nothing_is_written_if_one_file_is_bad(clone, root):
     before = contents(root)
     refused("contains more than tensors", import_labels, clone, root)
     assert contents(root) == before
+    # Nor if the labels that are there have another reference.
     write_label(root, "chair", PoseLabel(np.eye(4), "z", "z"))
     before = contents(root)
     refused("have reference sequences a, z, expected one", import_labels, clone, root)

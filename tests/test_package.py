@@ -88,6 +88,7 @@ def test_the_wheel_makes_its_samples_in_an_empty_folder(wheel, tmp_path):
     subprocess.run([*install, "--target", str(site), str(wheel)], check=True)
     readme = (REPOSITORY / "README.md").read_text("utf-8")
     (example, *_) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    # The demo with few and small samples, then the example.
     code = (
         f"import zsp_lite; assert zsp_lite.__file__.startswith({str(site)!r})\n"
         "from dataclasses import replace; from zsp_lite.course.synthetic.export import PRESETS\n"

@@ -63,6 +63,7 @@ MASKS = {
     "palette of two.png": (2 * DISC + RING, 2),
     "labels.png": (2 * DISC + 5 * RING, 2),
     "colours.png": (DEEP * [90, 0, 0] + RING[..., None] * [0, 90, 200], 1),
+    # Any colours; the fourth channel is the object.
     "cut out.png": np.dstack([np.arange(1280).reshape(32, 40, 1).repeat(3, 2) % 256, 255 * DISC]),
     "alpha.png": np.where(DEEP, [255] * 4, [255, 255, 255, 0]),
 }

@@ -330,6 +330,7 @@ RELATIVES = {
         lambda c: c.update(camera_angle_x=2 * np.arctan(c.pop("w") / 2 / c.pop("fl_x"))),
         lambda c: [c.pop(name) for name in ("fl_y", "h", "cx", "cy")],
     ),
+    # The first of the two scales counts.
     "depth_path": edited(
         each(lambda f: f.update(depth_path=f.pop("depth_file_path"))),
         lambda c: c.update(integer_depth_scale=0.001, depth_unit_scale_factor=5),
